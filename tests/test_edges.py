@@ -85,7 +85,7 @@ def test_edges_of_several_periods():
     assert most_inside(world(0.1001, 0.7), np.array([1e-4, 2e-4])) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_edges_may_differ_between_members():
     """Each member moves as in a run of its own, also if the edges are traced."""
     starts, clock = np.array([0.002, 0.00203, 0.00217]), amb.Clock(40, T, amb.RK4(1), cuts=1)

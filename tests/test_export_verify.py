@@ -307,6 +307,7 @@ TUNED = {
 }
 
 
+@pytest.mark.thorough
 @compiled
 @pytest.mark.parametrize(
     "name", [pytest.param(x, marks=pytest.mark.slow if x == "F10-signs" else pytest.mark.thorough) for x in TUNED]

@@ -239,7 +239,7 @@ def peak_of(cascade, scenario):
     return jnp.max(jnp.abs(system.sensitivity(jnp.geomspace(1.0, 2000.0, 50))))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_peak_is_differentiable_in_the_gains_and_the_plant():
     """Forward mode, reverse mode and central differences agree along one direction.
 

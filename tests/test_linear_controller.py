@@ -251,7 +251,7 @@ def test_a_missing_file_or_period_is_refused_in_one_line(folder):
         save_controller("k.npz", np.eye(2))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_linear_controller_is_exported(folder):
     text = CASE + "[processor]\n[clock]\nduration = 0.02\n"
     pathlib.Path("case.toml").write_text(text + '[controller.current]\nkind = "dead-beat"\n')

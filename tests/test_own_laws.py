@@ -89,7 +89,7 @@ def case(elsewhere):
     [
         pytest.param("simulate case.toml --json", marks=pytest.mark.slow),
         pytest.param("ensemble case.toml --members 3 --json", marks=pytest.mark.thorough),
-        pytest.param("check case.toml --json", marks=pytest.mark.slow),
+        pytest.param("check case.toml --json", marks=pytest.mark.thorough),
         pytest.param("sensitivity case.toml --json", marks=pytest.mark.thorough),
         pytest.param(
             "map case.toml --x controller.position.stiff=8e3:1e4:2 --y plant.m=-1%:1%:2 --json",

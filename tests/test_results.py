@@ -80,7 +80,7 @@ def test_every_saved_signal_has_the_unit_of_its_description():
         assert words[name].split(". Eq.")[0] == unit
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_members_equal_those_of_the_command(path, members, tmp_path):
     main(["ensemble", str(path), "--members", "8", "--seed", "3", "--json", "--out", str(tmp_path / "out")])
     frame = members.to_pandas()

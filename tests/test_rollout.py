@@ -289,7 +289,7 @@ def test_vmap_equals_the_loop_over_members():
     assert len({float(x) for x in batch.measured["rms"]}) == 3
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_vmap_equals_the_loop_over_members_with_adaptive_steps(short):
     batch = jax.vmap(lambda m: rollout(REPAIRED, with_member(m), SHORT, fold=FOLDS))(jnp.arange(3))
     for m in range(3):
