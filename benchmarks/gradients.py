@@ -2,8 +2,8 @@
 
 Two loops, float64, one core: the tuner's loop on task A (sliding steps, held noise, the whole loss), and the common
 workload without noise (smooth gains, RK4, 10 us a step, mean square of e_z). The gradient is with respect to c, k,
-gamma and k_i. Forward mode carries one tangent for each gain. Reverse mode, measured on the second loop, recomputes
-each sample from its start. Memory is the peak of a separate process. Run: python benchmarks/gradients.py
+gamma and k_i. Forward mode carries one tangent for each gain. Reverse mode recomputes parts of the run, as the tuner
+does. Memory is the peak of a separate process. Run: python benchmarks/gradients.py
 """
 
 import argparse
@@ -26,6 +26,8 @@ import workload
 from ambjax import Cascade, Initial, current, inversion, position, rollout
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.simulation.folds import Rms
+from ambjax.simulation.parts import rolled_in_parts
+from ambjax.simulation.rollout import prepare
 from tuning.config import read_tune
 from tuning.objective.loss import weigh
 from tuning.problem import problem_of
@@ -40,9 +42,9 @@ HORIZONS = (20_000, 200_000)
 
 
 def loss_of(work: workload.Workload) -> Callable[..., Any]:
-    """Return the mean square of e_z over s_0^2 as a function of (log gains, initial position)."""
+    """Return the mean square of e_z over s_0^2 as a function of (log gains, initial position, whether in parts)."""
 
-    def loss(logs: Any, z: Any) -> Any:
+    def loss(logs: Any, z: Any, in_parts: bool) -> Any:
         c, k, gamma, k_i = GAINS * jnp.exp(logs)
         cascade = Cascade(
             position=position.SlidingMode(c, k),
@@ -50,24 +52,29 @@ def loss_of(work: workload.Workload) -> Callable[..., Any]:
             current=current.SlidingMode(k_i),
         )
         alone = dataclasses.replace(work.scenario, initial=Initial(z=z), member=0)
-        return (rollout(cascade, alone, work.clock, fold=Rms("e_z"), every=0).measured / 5e-3) ** 2
+        if in_parts:
+            done = rolled_in_parts(*prepare(cascade, alone, work.clock), Rms("e_z"))
+        else:
+            done = rollout(cascade, alone, work.clock, fold=Rms("e_z"), every=0)
+        return (done.measured / 5e-3) ** 2
 
     return loss
 
 
 def programs(loss: Callable[..., Any], members: int, axes: Any) -> dict[str, Callable[..., Any]]:
     """Return the forward run and its derivatives over all members, compiled as in the tuner."""
-    over = jax.vmap(loss, (None, axes)) if members > 1 else loss
+    run, in_parts = (functools.partial(loss, in_parts=given) for given in (False, True))
+    over = jax.vmap(run, (None, axes)) if members > 1 else run
 
     def forward(logs: Any, member: Any) -> Any:
         along = lambda d: jax.jvp(lambda x: over(x, member), (logs,), (d,))  # noqa: E731
         return jax.vmap(along, out_axes=(None, 0))(jnp.eye(len(GAINS)))
 
-    reverse = jax.value_and_grad(loss)
+    reverse = jax.value_and_grad(in_parts)
     return {
         "run": one_kernel(over),
         "forward": one_kernel(forward),
-        "reverse": jax.jit(jax.vmap(reverse, (None, axes)) if members > 1 else reverse),
+        "reverse": one_kernel(jax.vmap(reverse, (None, axes)) if members > 1 else reverse),
     }
 
 
@@ -81,12 +88,14 @@ def rk4(members: int, samples: int) -> tuple[Callable[..., Any], Any, Any, int]:
 def tuner(members: int, samples: int) -> tuple[Callable[..., Any], Any, Any, int]:
     """Return the same for the tuner's lanes, at gains that hold the rotor."""
     case, tune, _ = read_tune(TASK)
-    case = dataclasses.replace(case, clock=dataclasses.replace(case.clock, samples=samples))
+    clock = dataclasses.replace(case.clock, samples=samples)
+    case = dataclasses.replace(case, clock=clock, settle=float(clock.duration) / 5)
     objective = problem_of(case, tune).objective
     lanes, x_0 = objective.members(1, members), objective.space.encode(HELD)
 
-    def loss(logs: Any, member: Any) -> Any:
-        return weigh(tune.weights, objective.run(x_0 + logs, member, objective.loss), member.stressed)
+    def loss(logs: Any, member: Any, in_parts: bool) -> Any:
+        terms = objective.run(x_0 + logs, member, objective.loss, in_parts=in_parts)
+        return weigh(tune.weights, terms, member.stressed)
 
     one = jax.tree.map(lambda a: a[0], lanes)
     return (
@@ -108,23 +117,20 @@ def measure(name: str, build: Callable[..., Any], members: int) -> dict[str, Any
     """Return one row: a loop and a number of members."""
     loss, member, axes, steps = build(members, SAMPLES)
     compiled = programs(loss, members, axes)
-    if build is tuner:
-        del compiled["reverse"]
     runs = {mode: functools.partial(f, np.zeros(len(GAINS)), member) for mode, f in compiled.items()}
     found = _measure.alternating(runs, repeats=9)
     row: dict[str, Any] = {"step": name, "members": members, "steps": steps, "run_s": found["run"].seconds}
     for mode in ("forward", "reverse"):
-        row[mode] = found[mode].over(found["run"]) if mode in found else None
+        row[mode] = found[mode].over(found["run"])
+    slopes = [np.asarray(runs[mode]()[1]) for mode in ("forward", "reverse")]
+    slopes[0] = slopes[0].T if members > 1 else slopes[0]
+    row["modes_differ"] = float(np.max(np.abs(slopes[0] - slopes[1])) / np.max(np.abs(slopes[0])))
     each = 1e9 * row["run_s"] / members / steps
-    line = f"{name}, {members} members: run {each:.0f} ns a step; gradient in forward mode "
-    if row["reverse"]:
-        slopes = [np.asarray(runs[mode]()[1]) for mode in ("forward", "reverse")]
-        slopes[0] = slopes[0].T if members > 1 else slopes[0]
-        row["modes_differ"] = float(np.max(np.abs(slopes[0] - slopes[1])) / np.max(np.abs(slopes[0])))
-        line += f"{row['forward']:.2f}, in reverse {row['reverse']:.2f} runs; they differ by {row['modes_differ']:.0e}"
-    else:
-        line += f"{row['forward']:.2f} runs"
-    print(line, flush=True)
+    print(
+        f"{name}, {members} members: run {each:.0f} ns a step; gradient in forward mode {row['forward']:.2f}, "
+        f"in reverse {row['reverse']:.2f} runs; they differ by {row['modes_differ']:.0e}",
+        flush=True,
+    )
     return row
 
 

@@ -41,8 +41,8 @@ OVER = {"observer": ("error", ERRORS), "position": ("error", ERRORS)}
 REST = "reference", REFERENCES
 
 
-def problem(mode: str = "forward") -> tuple[TuningProblem, Any]:
-    """Return the problem and its members, on one core."""
+def problem(mode: str | None = None) -> tuple[TuningProblem, Any]:
+    """Return the problem and its members, on one core. `mode`: of differentiation; None: the one the tuner takes."""
     raw = copy.deepcopy(load(search.TASKS / "sampled" / "G20.toml")[0])
     raw["controller"]["observer"].setdefault("w", 800.0)
     for path in raw["tune"]["gains"]:
@@ -55,7 +55,7 @@ def problem(mode: str = "forward") -> tuple[TuningProblem, Any]:
     raw["tune"] |= {"members": MEMBERS, "stressed": STRESSED}
     case = case_from(raw, "G20 scheduled")
     found = problem_of(case, tune_from(Table(raw).table("tune"), case), threads=1)
-    found.engine.mode = mode
+    found.engine.mode = mode or found.engine.mode
     return found, training(found)
 
 
@@ -148,7 +148,7 @@ def cost(repeats: int = 5) -> dict[str, float]:
     """Return the processor time of one gradient of all gains, by mode, relative to one plain rollout."""
     runs = {}
     for mode in ("value", "forward", "reverse"):
-        found, members = problem("forward" if mode == "value" else mode)
+        found, members = problem(None if mode == "value" else mode)
         x = found.objective.space.encode(found.objective.space.clip(held(found)))[None]
         x, engine = np.repeat(x, GRADIENT_LANES // len(members.member), 0), found.engine
         engine.lanes = GRADIENT_LANES

@@ -30,9 +30,9 @@ REFERENCE_MEMBERS, REFERENCE_TOLERANCE, MOST_TRIALS = 4, 1e-6, 10_000
 TRACED = ("rms_error_m", "rms_u_V")
 # Initial multiplier of the limit on the error. It corresponds to 1.5 % more voltage for 1 % less error.
 EXCHANGE = 3.0
-# Largest number of gains for which forward mode is cheaper. On G20 a gradient of 24 gains takes 16 plain rollouts in
-# forward mode, 0.7 for each gain, and 39 in reverse mode (benchmarks/schedules.py).
-MOST_FORWARD = 48
+# A gradient takes about 1 + m plain rollouts in forward mode for m gains. In reverse mode, it takes SWEEP for each
+# quantity that is differentiated, and RERUN besides, for any number of gains (benchmarks/schedules.py, gradients.py).
+SWEEP, RERUN = 4, 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,9 +170,14 @@ def problem_of(
     space, box = bounded(objective, conditions, tune.space.values(case.cascade))
     objective = dataclasses.replace(objective, space=space)
     goal = Goal(space, tune.weights, tune.risk, conditions, tune.conditions, tune.margin, measured=tuple(names))
-    mode = "forward" if len(tune.space) <= MOST_FORWARD else "reverse"
+    mode = cheaper_mode(len(tune.space), 1 + len(loss.measures))
     engine = Engine(objective, settle=case.settle, mode=mode, threads=threads)
     return TuningProblem(case, tune, objective, engine, goal, box, finer, front=front).limited(limits.each)
+
+
+def cheaper_mode(gains: int, outcomes: int) -> str:
+    """Return "forward" or "reverse": the cheaper mode for the derivatives of `outcomes` quantities in `gains` gains."""
+    return "forward" if 1 + gains <= RERUN + SWEEP * outcomes else "reverse"
 
 
 def _loop_range(case: Case, limits: tuple[Limit, ...]) -> LoopRange | None:

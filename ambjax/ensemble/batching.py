@@ -101,7 +101,7 @@ def map_members(
       are fewer blocks than cores, some cores are idle.
     - `block`: members that run together in vector instructions (None: as many as fit the first-level cache,
       fewer in a small ensemble).
-    - `plain`: compile without the fast path, which does not support reverse-mode differentiation.
+    - `plain`: compile without the fast path, which does not support the functions of LAPACK, such as eigenvalues.
 
     Returns NumPy arrays in member order, every leaf with a leading axis [N].
 

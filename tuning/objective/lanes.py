@@ -99,7 +99,8 @@ class LaneGradient:
         return one(lane)
 
     def _outcomes(self, x: Array, lane: Lane) -> tuple[Array, dict[str, Array]]:
-        terms = Objective(self.space, *lane.world).run(x, lane.members, lane.world[-1])
+        objective = Objective(self.space, *lane.world)
+        terms = objective.run(x, lane.members, lane.world[-1], in_parts=self.reverse)
         return jnp.stack(outcomes(lane.weights, terms, lane.members.stressed)), terms
 
     def _along(self, outcomes: Callable[..., object], lane: Lane) -> Any:
@@ -171,8 +172,7 @@ class Engine:
         self.rollouts += len(x) * len(members.member) * (len(self.objective.space) + 1)
         each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS)))
         slope = LaneGradient(self.objective.space, self.mode == "reverse")
-        width, plain = min(self.lanes, GRADIENT_LANES), self.mode == "reverse"
-        found = self._lanes(slope, x, members, width, weights=each, plain=plain)
+        found = self._lanes(slope, x, members, min(self.lanes, GRADIENT_LANES), weights=each)
         return found if self.objective.loop is None else self._with_loops(found, x, members)
 
     def _with_loops(
@@ -199,17 +199,13 @@ class Engine:
         width: int,
         weights: Any = None,
         fold: Any = None,
-        plain: bool = False,
     ) -> Any:
-        """Apply the function to every start x [S, m], with its weights [S, 6], and member [N]: leaves [S, N, ...].
-
-        `plain`: as in `map_members`; reverse mode needs it.
-        """
+        """Apply the function to every start x [S, m], with its weights [S, 6], and member [N]: leaves [S, N, ...]."""
         start, member = np.divmod(np.arange(len(x) * len(members.member)), len(members.member))
         at = np.asarray(x, jnp.result_type(float))[start]
         selected = jax.tree.map(lambda a: a[member], members)
         lane = Lane(at, selected, self._world, None if weights is None else weights[start], fold)
-        results = map_members(function, lane, threads=self.threads, call=width, block=width, plain=plain)
+        results = map_members(function, lane, threads=self.threads, call=width, block=width)
         return jax.tree.map(lambda a: a.reshape(len(x), len(members.member), *a.shape[1:]), results)
 
 

@@ -11,7 +11,8 @@ from jax import Array
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble import Spread, apply, draw
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.rollout import rollout
+from ambjax.simulation.parts import rolled_in_parts
+from ambjax.simulation.rollout import prepare, rollout
 from ambjax.world.scenario import Scenario
 from tuning.objective.loss import Loss
 from tuning.objective.quantities import LOOPS
@@ -132,10 +133,16 @@ class Objective:
         cascade = self.space.decode(jnp.asarray(at), cascade)
         return cascade, _with_noise(scenario, members.noise_factor) if np.any(members.noise_factor != 1) else scenario
 
-    def run(self, x: Array, members: Members, fold: Any) -> Any:
-        """Return the fold's result for the rollout of one member at coordinates x [m]."""
+    def run(self, x: Array, members: Members, fold: Any, *, in_parts: bool = False) -> Any:
+        """Return the fold's result for the rollout of one member at coordinates x [m].
+
+        `in_parts`: recompute parts of the run in reverse mode, which saves memory (`rolled_in_parts`).
+        """
         cascade, scenario = self.world(members)
-        return rollout(self.space.decode(x + members.shift, cascade), scenario, self.clock, fold=fold, every=0).measured
+        cascade = self.space.decode(x + members.shift, cascade)
+        if in_parts:
+            return rolled_in_parts(*prepare(cascade, scenario, self.clock), fold).measured
+        return rollout(cascade, scenario, self.clock, fold=fold, every=0).measured
 
 
 def _with_noise(scenario: Scenario, noise_factor: Any) -> Scenario:

@@ -1,0 +1,38 @@
+"""A rollout in parts, for reverse mode: its memory grows with the square root of the number of samples."""
+
+import functools
+import math
+from typing import Any
+
+import jax
+from jax import Array, lax
+
+from ambjax.numerics.records import canonical
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.folds import Fold
+from ambjax.simulation.rollout import Outcome, RolloutState, System, begin, finish, segment
+
+
+def rolled_in_parts(system: System, clock: Clock, fold: Fold) -> Outcome:
+    """Simulate a rollout without rows, and recompute each part of it in reverse mode (`jax.checkpoint`).
+
+    Reverse mode stores the states between parts, and, while it goes through a part, the states between its samples. The
+    value is that of `rollout.run`, up to rounding. The function is not jitted.
+    """
+    system, clock, fold = canonical((system.realised(), clock, fold))
+    length = part_length(clock.samples)
+
+    @functools.partial(jax.checkpoint, prevent_cse=False)
+    def part(progress: RolloutState, first: Array, system: Any, clock: Clock, fold: Fold) -> RolloutState:
+        return segment(system, clock, fold, progress, first, length, 0)[0]
+
+    def advanced(number: Array, progress: RolloutState) -> RolloutState:
+        return part(progress, number * length, system, clock, fold)
+
+    progress = lax.fori_loop(0, clock.samples // length, advanced, begin(system, clock, fold))
+    return finish(progress, None, fold)
+
+
+def part_length(samples: int) -> int:
+    """Return the samples of a part: the largest divisor of `samples` that is at most its square root."""
+    return next(length for length in range(math.isqrt(samples), 0, -1) if samples % length == 0)
