@@ -194,6 +194,22 @@ def test_any_function_of_a_member_is_mapped_over_all_and_compiled_once(plain):
         map_members(Scaled(2), {"x": x, "scale": np.arange(69.0)})
 
 
+class ScaledBlock(Scaled):
+    """The same for a block of members, which it maps itself."""
+
+    def __call__(self, tree, axes):
+        return jax.vmap(super().__call__, (axes,))(tree)
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_a_vectorised_function_receives_blocks_and_their_axes(plain):
+    x = np.arange(70.0 * 3).reshape(70, 3)
+    tree = {"x": x, "scale": np.asarray(2.0)}
+    found = map_members(ScaledBlock(2), tree, call=32, block=16, plain=plain, vectorised=True)
+    np.testing.assert_array_equal(found["x"], x)
+    np.testing.assert_array_equal(found["sum"], 2 * x.sum(axis=1) ** 2)  # whole numbers
+
+
 def test_the_noise_of_each_member_is_independent_and_white():
     rows = run_ensemble(SMOOTH, members(200), SHORT, fold=None, every=1).trajectory.rows
     w = (rows.z_measured - rows.z) / 1e-7

@@ -32,7 +32,6 @@ LEAST_BYTES = 256
 MEMBERS = "members"
 
 # A pytree of an ensemble or of one member, and the result of a function of a member.
-Tree = TypeVar("Tree")
 Result = TypeVar("Result")
 
 
@@ -80,13 +79,14 @@ def _rollout(every: int) -> Callable[[tuple[System, Clock, Fold | None]], Outcom
 
 
 def map_members(
-    function: Callable[[Tree], Result],
-    tree: Tree,
+    function: Callable[..., Result],
+    tree: object,
     *,
     threads: int | None = None,
     call: int | None = None,
     block: int | None = None,
     plain: bool = False,
+    vectorised: bool = False,
 ) -> Result:
     """Return function(member) for every member of an ensemble.
 
@@ -102,12 +102,14 @@ def map_members(
     - `block`: members that run together in vector instructions (None: as many as fit the first-level cache,
       fewer in a small ensemble).
     - `plain`: compile without the fast path, which does not support the functions of LAPACK, such as eigenvalues.
+    - `vectorised`: the function maps a block of members itself. It receives the tree of the block, and a tree of the
+      axis of each leaf, 0 or None, as for `jax.vmap`. Each leaf of its result has a leading axis of the block.
 
     Returns NumPy arrays in member order, every leaf with a leading axis [N].
 
     Raises ValueError if the lengths of two leaves differ, or if no leaf is an array.
     """
-    return _Engine(function, tree, threads, call, block, plain).results()
+    return _Engine(function, tree, threads, call, block, plain, vectorised).results()
 
 
 def size(tree: object) -> int:
@@ -125,23 +127,25 @@ def size(tree: object) -> int:
     return lengths.pop()
 
 
-class _Engine(Generic[Tree, Result]):
+class _Engine(Generic[Result]):
     """One ensemble, split into calls of equal shape, so that the program compiles once."""
 
     def __init__(
         self,
-        function: Callable[[Tree], Result],
-        tree: Tree,
+        function: Callable[..., Result],
+        tree: object,
         threads: int | None,
         call: int | None,
         block: int | None,
         plain: bool,
+        vectorised: bool,
     ) -> None:
         leaves, self.tree = jax.tree.flatten(tree)
         self.members, self.moves = size(tree), tuple(bool(np.ndim(x)) for x in leaves)
         self.moving = [np.asarray(x) for x in leaves if np.ndim(x)]
         self.shared = tuple(x for x in leaves if not np.ndim(x))
-        self.function, self.devices = function, jax.devices()
+        self.static = {"function": function, "moves": self.moves, "tree": self.tree, "vectorised": vectorised}
+        self.devices = jax.devices()
         single_cpu = len(self.devices) == 1 and self.devices[0].platform == "cpu"
         self.workers = (threads or cores()) if single_cpu else 1
         # All calls have the same length; the last call may hold fewer members than its length.
@@ -169,7 +173,7 @@ class _Engine(Generic[Tree, Result]):
         """Run one call: members from `start` on; the last member is repeated to fill the call."""
         index = np.minimum(np.arange(start, start + self.call), self.members - 1)
         parts = Parts(tuple(x[index] for x in self.moving), self.shared)
-        results = self.program(parts, function=self.function, moves=self.moves, tree=self.tree, block=self.block)
+        results = self.program(parts, block=self.block, **self.static)
         return jax.tree.map(np.asarray, results)
 
 
@@ -181,25 +185,28 @@ def cores() -> int:
 def _blocks(
     parts: Parts,
     *,
-    function: Callable[[Tree], Result],
+    function: Callable[..., Result],
     moves: tuple[bool, ...],
     tree: Any,
     block: int,
+    vectorised: bool,
 ) -> Result:
     """Run all members of a call: a loop over blocks, with the whole function vectorised over a block."""
+    axes = jax.tree.unflatten(tree, [0 if varies else None for varies in moves])
 
-    def member(moving: tuple[Array, ...]) -> Result:
+    def together(moving: tuple[Array, ...]) -> Result:
         own, common = iter(moving), iter(parts.shared)
-        return function(jax.tree.unflatten(tree, [next(own) if varies else next(common) for varies in moves]))
+        members = jax.tree.unflatten(tree, [next(own) if varies else next(common) for varies in moves])
+        return function(members, axes) if vectorised else jax.vmap(function, (axes,))(members)
 
     if jax.default_backend() != "cpu":
-        return jax.vmap(member)(parts.moving)
+        return together(parts.moving)
     cut = jax.tree.map(lambda x: x.reshape(-1, block, *x.shape[1:]), parts.moving)
-    results = lax.map(jax.vmap(member), cut)
+    results = lax.map(together, cut)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), results)
 
 
-STATIC = ("function", "moves", "tree", "block")
+STATIC = ("function", "moves", "tree", "block", "vectorised")
 _fast = one_kernel(_blocks, static_argnames=STATIC)
 _plain = jax.jit(_blocks, static_argnames=STATIC)
 

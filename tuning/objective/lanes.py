@@ -8,7 +8,6 @@ another engine.
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -72,45 +71,38 @@ def measured(world: tuple[Cascade, Scenario, Clock, Any]) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class LaneGradient:
-    """Function of a lane that returns its outcomes, their derivatives and the terms of the loss.
+    """Function of a block of n lanes that returns their outcomes, the derivatives of these, and the terms of the loss.
 
-    The outcomes [1 + L] are the weighted loss and the L limited quantities. Their derivatives [1 + L, m] with respect
-    to the coordinates are computed in reverse mode if `reverse` is true, otherwise in forward mode.
+    The outcomes [n, 1 + L] are the weighted loss and the L limited quantities. Their derivatives [n, 1 + L, m] with
+    respect to the coordinates are computed in reverse mode if `reverse` is true, otherwise in forward mode.
     """
 
     space: Space
     reverse: bool
 
-    def __call__(self, lane: Lane) -> Any:
+    def __call__(self, lanes: Lane, axes: Lane) -> Any:
+        """Evaluate a block of lanes. `axes`: axis of each leaf, 0 or None, as for `jax.vmap`."""
         if self.reverse:
-            values, pull, terms = jax.vjp(lambda x: self._outcomes(x, lane), lane.x, has_aux=True)
-            (slopes,) = jax.vmap(pull)(jnp.eye(len(values), dtype=values.dtype))
-            return values, slopes, terms
-
-        one = jax.custom_batching.custom_vmap(lambda lane: self._along(self._outcomes, lane))
+            return jax.vmap(self._pulled, (axes,))(lanes)
+        each = jax.vmap(self._outcomes, (0, axes))
 
         # Map over directions outside and lanes inside, so that the contiguous axis in memory is that of the lanes.
-        @one.def_vmap
-        def every(size: int, batched: Any, lane: Lane) -> Any:
-            axes = jax.tree.map(lambda moves: 0 if moves else None, batched[0])
-            results = self._along(jax.vmap(self._outcomes, (0, axes)), lane)
-            return results, jax.tree.map(lambda _: True, results)
+        def along(direction: Array) -> Any:
+            every = jnp.broadcast_to(direction, lanes.x.shape)
+            return jax.jvp(lambda x: each(x, lanes), (lanes.x,), (every,), has_aux=True)
 
-        return one(lane)
+        return jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(len(self.space)))
+
+    def _pulled(self, lane: Lane) -> Any:
+        """Return outcomes, derivatives in reverse mode, and terms, of one lane."""
+        values, pull, terms = jax.vjp(lambda x: self._outcomes(x, lane), lane.x, has_aux=True)
+        (slopes,) = jax.vmap(pull)(jnp.eye(len(values), dtype=values.dtype))
+        return values, slopes, terms
 
     def _outcomes(self, x: Array, lane: Lane) -> tuple[Array, dict[str, Array]]:
         objective = Objective(self.space, *lane.world)
         terms = objective.run(x, lane.members, lane.world[-1], in_parts=self.reverse)
         return jnp.stack(outcomes(lane.weights, terms, lane.members.stressed)), terms
-
-    def _along(self, outcomes: Callable[..., object], lane: Lane) -> Any:
-        """Return outcomes, derivatives along each coordinate, and terms, of one lane or of many."""
-
-        def along(direction: Array) -> Any:
-            every = jnp.broadcast_to(direction, lane.x.shape)
-            return jax.jvp(lambda x: outcomes(x, lane), (lane.x,), (every,), has_aux=True)
-
-        return jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(len(self.space)))
 
 
 class Engine:
@@ -172,7 +164,7 @@ class Engine:
         self.rollouts += len(x) * len(members.member) * (len(self.objective.space) + 1)
         each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS)))
         slope = LaneGradient(self.objective.space, self.mode == "reverse")
-        found = self._lanes(slope, x, members, min(self.lanes, GRADIENT_LANES), weights=each)
+        found = self._lanes(slope, x, members, min(self.lanes, GRADIENT_LANES), weights=each, vectorised=True)
         return found if self.objective.loop is None else self._with_loops(found, x, members)
 
     def _with_loops(
@@ -199,13 +191,18 @@ class Engine:
         width: int,
         weights: Any = None,
         fold: Any = None,
+        vectorised: bool = False,
     ) -> Any:
-        """Apply the function to every start x [S, m], with its weights [S, 6], and member [N]: leaves [S, N, ...]."""
+        """Apply the function to every start x [S, m], with its weights [S, 6], and member [N]: leaves [S, N, ...].
+
+        `vectorised`: as in `map_members`.
+        """
         start, member = np.divmod(np.arange(len(x) * len(members.member)), len(members.member))
         at = np.asarray(x, jnp.result_type(float))[start]
         selected = jax.tree.map(lambda a: a[member], members)
         lane = Lane(at, selected, self._world, None if weights is None else weights[start], fold)
-        results = map_members(function, lane, threads=self.threads, call=width, block=width)
+        cut = {"threads": self.threads, "call": width, "block": width}
+        results = map_members(function, lane, vectorised=vectorised, **cut)
         return jax.tree.map(lambda a: a.reshape(len(x), len(members.member), *a.shape[1:]), results)
 
 
