@@ -266,7 +266,7 @@ def test_the_gains_of_a_custom_law_have_paths_and_ranges():
     assert next(bound for bound in problem.goal.conditions if bound.path == RHO).symbol == "Q_z"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_search_improves_the_gains_of_a_custom_law(tmp_path):
     problem, tune, case = tuning_problem()
     start = tune.space.values(case.cascade)

@@ -106,7 +106,7 @@ def test_the_error_of_a_run_is_at_most_that_of_100_steps():
     assert (errors[-1] < errors[0] / 100).all(), errors
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_errors_of_many_loops_are_bounded_by_those_of_a_step():
     loops = random_loops(examples(10, 300))
     exact, z_dot = motion(loops, 1e-9)
