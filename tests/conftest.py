@@ -47,6 +47,12 @@ def pytest_collection_modifyitems(config, items):
         items[:] = [item for item in items if not item.get_closest_marker("thorough")]
 
 
+def pytest_collection_finish(session):
+    """Exclude what the imports have allocated from later garbage collections."""
+    gc.collect()
+    gc.freeze()
+
+
 def _resident() -> float:
     """Return the resident memory of this process (bytes); infinity where it is not known."""
     if sys.platform != "linux":
