@@ -38,7 +38,7 @@ def main() -> None:
             "ambjax --version": [*ambjax, "--version"],
             "ambjax-tune --version": [sys.executable, "-m", "tuning", "--version"],
             "ambjax check": [*ambjax, "check", str(case)],
-            "ambjax simulate": [*ambjax, "simulate", str(case), "--out", folder],
+            "ambjax simulate": [*ambjax, "simulate", str(case), "--out", folder, "--force"],
         }
         found: dict[str, list[tuple[float, float]]] = {name: [] for name in commands}
         for turn in range(RUNS + 1):
