@@ -2660,6 +2660,27 @@ INJECTION = [
         "tests/test_injection.py::test_the_measured_peak_in_continuous_time_is_the_linear_peak[smooth]",
     ),
     M(
+        "an injection compiles another program for another number of lines",
+        "ambjax/linear/member_responses.py",
+        "-len(wave.harmonics) % PADDED",
+        "0 * PADDED",
+        "tests/test_injection.py::test_lines_that_extend_a_wave_add_nothing[15]",
+    ),
+    M(
+        "the lines that extend an injected wave are constant readings",
+        "ambjax/linear/member_responses.py",
+        "[0.5 * np.pi] * padding",
+        "[0.0] * padding",
+        "tests/test_injection.py::test_lines_that_extend_a_wave_add_nothing[15]",
+    ),
+    M(
+        "an injection into more members compiles another program",
+        "ambjax/linear/member_responses.py",
+        "SHORTEST if size(tree) <= FEW else None",
+        "None",
+        "tests/test_injection.py::test_measurements_with_other_lines_and_members_share_a_program",
+    ),
+    M(
         "the response includes members that are lost under the wave",
         "ambjax/linear/member_responses.py",
         "code == ALIVE, amplitude",

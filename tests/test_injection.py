@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from ambjax.control import inversion, position
 from ambjax.control.observer import Kalman
 from ambjax.control.processor import Processor
 from ambjax.linear import Zones, frequency_lines, injected, injected_members, linearise, peak
+from ambjax.linear.member_responses import PADDED, _split, _whole
 from ambjax.linear.multisine import multisine
 from ambjax.simulation.sliding import Slide
 
@@ -191,6 +193,35 @@ def test_a_slow_observer_starts_at_rest_under_noise():
     world = paper.scenario("regulation", "sampled", pulse=False)
     found = injected(paper.cascade("sampled"), world, Clock(500, T), [20.0, 100.0], members=8)
     assert found.lost == 0
+
+
+@pytest.mark.slow
+def test_measurements_with_other_lines_and_members_share_a_program(caplog):
+    cascade, clock = Cascade(**SMOOTH, processor=Processor(0.0)), Clock(4000, T)
+    sensor = Sensor(1e-10, 0.0, 0.0)
+    jax.config.update("jax_log_compiles", True)
+    try:
+        found = [
+            injected_members(cascade, Scenario(sensor=sensor, member=np.arange(n)), clock, f, amplitude=1e-6)
+            for n, f in ((8, [20.0, 30.0, 50.0]), (24, [20.0, 30.0, 50.0, 80.0, 100.0]))
+        ]
+    finally:
+        jax.config.update("jax_log_compiles", False)
+    names = ("Compiling jit(marked)", "Compiling jit(_blocks)")  # on the fast path, and without it
+    assert sum(message.startswith(names) for message in caplog.messages) == 1
+    # the sizes of the lines differ between the waves, but the loop is linear at this amplitude
+    assert found[1].peak[:8] == pytest.approx(found[0].peak, rel=0.01)
+
+
+@pytest.mark.parametrize("count", [1, 15, 16, 17])
+def test_lines_that_extend_a_wave_add_nothing(count):
+    """The padding's cosines are 6e-17."""
+    wave = multisine(np.arange(1, count + 1), 1000, T, 1.0)
+    extended = _whole(_split(wave))
+    assert len(extended.harmonics) % PADDED == 0
+    for n in (0, 1, 123):
+        assert float(extended.at(jnp.asarray(n))) == pytest.approx(float(wave.at(jnp.asarray(n))), abs=1e-14)
+        assert float(extended(n * T)) == pytest.approx(float(wave(n * T)), abs=1e-14)
 
 
 def test_the_wave_repeats_exactly_and_has_the_stated_amplitude():

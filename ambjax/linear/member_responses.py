@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from ambjax.compiler.fast_path import SHORTEST
 from ambjax.control.cascade import Cascade
-from ambjax.ensemble.batching import map_members
+from ambjax.ensemble.batching import map_members, size
 from ambjax.linear.equilibrium import ideal, reading
 from ambjax.linear.multisine import MultiSine, Reading, Response, multisine, with_wave
 from ambjax.numerics.records import Scalar, canonical
@@ -21,6 +22,10 @@ from ambjax.world.signals import Constant
 
 # Default amplitude of e, as a share of the gap s_0; at the velocity sensor, of s_0 times the plant's pole.
 AMPLITUDE = 0.01
+# The compiled program has a multiple of PADDED lines, so that measurements with a few lines more or less share it.
+PADDED = 16
+# Largest number of members that run in calls of SHORTEST members. These calls share one program and use all cores.
+FEW = 4 * SHORTEST
 
 
 class Responses(NamedTuple):
@@ -71,9 +76,10 @@ def member_responses(
     longer = dataclasses.replace(clock, samples=skip + periods * clock.samples, method=method)
     system, longer = prepare(*_at_rest(cascade, scenario, r), longer)
     response = Response(_split(wave), scenario.voltage_limit, skip)
-    sums, code = map_members(_member, canonical((system, longer, response)))
+    tree = canonical((system, longer, response))
+    sums, code = map_members(_member, tree, call=SHORTEST if size(tree) <= FEW else None)
     e = float(wave.size) * np.exp(1j * np.asarray(wave.phases))
-    S, KS = ((x[:, 0] + 1j * x[:, 1]) / e for x in (sums.read, sums.u))
+    S, KS = ((x[:, 0, : len(e)] + 1j * x[:, 1, : len(e)]) / e for x in (sums.read, sums.u))
     frequency = np.asarray(wave.harmonics) / float(clock.duration)
     return Responses(frequency, S, KS, sums.saturated, code == ALIVE, amplitude)
 
@@ -89,9 +95,12 @@ def _member(tree: Any) -> tuple[Any, Any]:
 def _split(wave: MultiSine) -> MultiSine:
     """Return the wave with its arrays [L] as tuples of numbers, which all members of an ensemble share.
 
-    The cosines of the wave are then computed once for all members of a block.
+    The cosines of the wave are then computed once for all members of a block. Lines of frequency 0 and phase pi/2,
+    whose cosine is 0, extend the tuples to a multiple of PADDED.
     """
-    return dataclasses.replace(wave, harmonics=tuple(wave.harmonics), phases=tuple(wave.phases))
+    padding = -len(wave.harmonics) % PADDED
+    harmonics, phases = (*wave.harmonics, *[0.0] * padding), (*wave.phases, *[0.5 * np.pi] * padding)
+    return dataclasses.replace(wave, harmonics=harmonics, phases=phases)
 
 
 def _whole(wave: Any) -> MultiSine:
