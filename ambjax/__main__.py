@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import difflib
+import errno
 import importlib
 import json
 import re
@@ -15,6 +16,9 @@ from ambjax._version import __version__
 from ambjax.host.interrupts import exit_on_interrupt
 from ambjax.host.streams import lenient, open_streams
 from ambjax.host.words import one_line
+
+# Errors of a file system that another folder or free space may resolve.
+UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO)
 
 FIRST_DAY = """\
 ambjax simulates, checks, tunes and exports the controller of a rotor in an active magnetic bearing.
@@ -30,7 +34,10 @@ ambjax simulates, checks, tunes and exports the controller of a rotor in an acti
 
 
 class Parser(argparse.ArgumentParser):
-    """Argument parser that prints an error on one line and exits with code 2. `commands`: parsers of its commands."""
+    """Argument parser that prints an error on one line and exits with code 2.
+
+    `commands`: the parsers of the commands by name.
+    """
 
     commands: Mapping[str, argparse.ArgumentParser] = MappingProxyType({})
 
@@ -53,7 +60,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _similar(word: str, names: Iterable[str]) -> str:
-    """Return a question with the most similar name, or nothing."""
+    """Return ' Did you mean NAME?' with the most similar name, or ''."""
     close = difflib.get_close_matches(word.partition("=")[0], list(names), n=1, cutoff=0.7)
     return f" Did you mean {close[0]!r}?" if close else ""
 
@@ -214,11 +221,11 @@ Run = Callable[[argparse.Namespace], tuple[int, object]]
 
 
 def run_command(parser: argparse.ArgumentParser, words: list[str] | None, run: Run) -> int:
-    """Parse the arguments `words`, call `run`, print its summary with --json, and return the exit code.
+    """Parse the arguments `words`, call `run`, print its summary if --json is given, and return the exit code.
 
     `run` returns an exit code and a summary. An error is printed on one line of stderr. The command continues if stdout
-    cannot be written. A pipe that its reader has closed (`| head`) is no error; any other failure of stdout gives exit
-    code 2. Raises SystemExit for --help, --version and wrong arguments, as argparse does.
+    cannot be written. A closed pipe (`| head`) is not an error; any other failure of stdout gives exit code 2. Raises
+    SystemExit for --help, --version and wrong arguments, as argparse does.
     """
     with lenient() as stdout:
         try:
@@ -233,11 +240,11 @@ def run_command(parser: argparse.ArgumentParser, words: list[str] | None, run: R
         if failure is None or isinstance(failure, BrokenPipeError):
             return code
         why = getattr(failure, "strerror", None) or failure
-        return complain(f"cannot write to stdout: {why}. Free disk space, or redirect it elsewhere.", parser.prog)
+        return complain(f"cannot write to stdout: {why}. Free disk space, or redirect the output.", parser.prog)
 
 
 def _code(run: Callable[[], tuple[int, object]], as_json: bool, program: str) -> int:
-    """Call `run` and return its exit code. Print an error that a user can fix on one line, and return code 2."""
+    """Call `run` and return its exit code. Print an error that a user can correct as one line, and return 2."""
     try:
         code, summary = run()
         if as_json:
@@ -246,10 +253,11 @@ def _code(run: Callable[[], tuple[int, object]], as_json: bool, program: str) ->
         return complain(str(error), program)
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        return complain(f"{where}{error.strerror or error}. Free disk space, or write elsewhere.", program)
+        fix = " Free disk space, or write elsewhere." if error.errno in UNWRITABLE else ""
+        return complain(f"{where}{error.strerror or error}.{fix}", program)
     except MemoryError:
         return complain("not enough memory. Use fewer members or samples.", program)
-    except (NotImplementedError, RecursionError):  # subclasses of RuntimeError that are bugs of ambjax
+    except (NotImplementedError, RecursionError):  # these subclasses of RuntimeError are bugs of ambjax
         raise
     except RuntimeError as error:  # JAX: a device is missing, or its memory is full
         return complain(str(error).strip().partition("\n")[0] or type(error).__name__, program)

@@ -1,4 +1,4 @@
-"""Names that a custom law, plant or package needs besides those of `ambjax` itself.
+"""Names for custom laws and plants, in addition to those of `ambjax`.
 
 Laws subclass `Observer`, `PositionLaw`, `InversionLaw` or `CurrentLaw`; plants subclass `Bearing`. Both are records:
 frozen dataclasses whose leaves are declared by `gain`, `leaf` or `static`.

@@ -124,7 +124,7 @@ def test_check_begins_with_the_numbers_of_the_machine(tmp_path, capsys):
     assert loop["zone"] == "D"
     assert loop["converter_step_m"] is None
     main(["check", str(path)])
-    assert capsys.readouterr().out.startswith("Sensitivity: zone D, a peak of 41.27 at 0 Hz.")
+    assert capsys.readouterr().out.startswith("Sensitivity: zone D, peak 41.27 at 0 Hz.")
 
 
 PROCESSOR = """

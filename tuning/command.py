@@ -32,7 +32,7 @@ from tuning.search.rounds import rounds
 from tuning.space import Gain, Space, tunable
 
 WRITTEN = ("tuned.toml", "history.npz", "report.html", "report.md", "report.json")
-# This file is written last: if none of the checkpoints is newer, the search has ended.
+# This file is written last. The search has ended if the file is newer than all checkpoints.
 REPORT = "report.json"
 
 

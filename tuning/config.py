@@ -36,7 +36,7 @@ from tuning.space import Space
 OTHER_KEYS = ["objective", "gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
 # Keys of [tune] that depend on the laws of the case.
 KEYS_OF_LAWS = ("gains", "bounds")
-# Allowed range of each limit: that in OTHER_RANGES, or LIMIT_RANGE. BAND_RANGE: that of settling_band_m.
+# Allowed range of each limit: OTHER_RANGES by name, LIMIT_RANGE for all others. BAND_RANGE: that of settling_band_m.
 LIMIT_RANGE: dataclasses.Field = leaf(at_least=1e-12, at_most=1e12, infinite=True)
 OTHER_RANGES: dict[str, dataclasses.Field] = {
     "clearance_used": leaf(above=0, at_most=1),
@@ -59,7 +59,7 @@ class LimitSettings:
     """band of the settling time, m"""
 
     def may_lose(self, members: int) -> int:
-        """Return the largest number of `members` that may be lost."""
+        """Return how many of `members` members may be lost."""
         return math.floor((1 - self.survival) * members + 1e-9)
 
 
@@ -68,8 +68,9 @@ class Tune:
     """The table [tune].
 
     - `space`: the gains to tune, with their bounds.
-    - `weights`: of the terms of the loss, in the order of TERMS. `conditions`: weight of the conditions of Theorem 1.
-    - `margin`: share by which each gain should exceed its condition of Theorem 1.
+    - `weights`: weights of the terms of the loss, in the order of TERMS. `conditions`: weight of the conditions of
+      Theorem 1.
+    - `margin`: share by which each gain should exceed its lower bound in Theorem 1.
     - `early`: weight of errors before run.settle. Errors after it have the weight 1.
     - `stress`, `gain_margin`: factors on the noise and on each gain of the stressed members.
     - `learning_rate`: step size of an optimiser of optax.
@@ -97,7 +98,7 @@ def read_tune(
     """Return the case, [tune] and the raw document of a case file.
 
     `settings_of`: a case file whose [tune] replaces that of the case, except for the keys `gains` and `bounds`. Raises
-    ValueError, one line, for an invalid file.
+    ValueError with a message of one line for an invalid file.
     """
     raw, text = load(path)
     name = pathlib.Path(path).stem
@@ -119,7 +120,7 @@ def _merged(own: Any, other: Any) -> Any:
 
 
 def tune_from(table: Table, case: Case) -> Tune:
-    """Return [tune] of a case. Missing keys have defaults. Raises ValueError for an invalid table."""
+    """Return [tune] of a case. A missing key has its default. Raises ValueError for an invalid table."""
     table.only([*OTHER_KEYS, *NUMBERS, *BUDGET])
     budget = Budget(**{name: table.whole(name, field) for name, field in BUDGET.items()})
     weights, conditions = _weights(table.table("weights"))

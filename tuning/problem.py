@@ -1,4 +1,4 @@
-"""The tuning problem: the objective, goal and engine of a case and its table [tune]."""
+"""The tuning problem: simulation (`objective`), cost function (`goal`) and compiled evaluation (`engine`) of a case."""
 
 import dataclasses
 import functools
@@ -24,14 +24,14 @@ from tuning.objective.shortfalls import bounds
 # Ratio of the number of steps of the judge to that of the search. On the tuned loops of tests/test_metrics_dense.py, 24
 # steps a sample have an error of at most 0.8 % in the settled rms voltage, 12 steps 4.6 %, 3 steps 56 %.
 REFINEMENT = 8
-# Number of members, relative tolerance and largest number of step trials of the accurate reference.
+# Accurate reference: number of members, relative tolerance, largest number of attempted steps.
 REFERENCE_MEMBERS, REFERENCE_TOLERANCE, MOST_TRIALS = 4, 1e-6, 10_000
 # Quantities that the front of error against voltage needs.
 TRACED = ("rms_error_m", "rms_u_V")
 # Initial multiplier of the limit on the error. It corresponds to 1.5 % more voltage for 1 % less error.
 EXCHANGE = 3.0
-# A gradient takes about 1 + m plain rollouts in forward mode for m gains. In reverse mode, it takes SWEEP for each
-# quantity that is differentiated, and RERUN besides, for any number of gains (benchmarks/schedules.py, gradients.py).
+# Cost of a gradient in plain rollouts: 1 + m in forward mode for m gains, RERUN + SWEEP q in reverse mode for q
+# differentiated quantities (benchmarks/schedules.py, gradients.py).
 SWEEP, RERUN = 4, 5
 
 
@@ -46,7 +46,7 @@ class TuningProblem:
     goal: Goal
     ranges: list[Range]
     finer: int = 1
-    """ratio of the number of steps to that of tune.substeps"""
+    """factor by which the search multiplies tune.substeps"""
     limits: tuple[Limit, ...] = ()
     """the limits, and the state of their augmented Lagrangian"""
 
@@ -60,13 +60,16 @@ class TuningProblem:
 
     @functools.cached_property
     def reference(self) -> Engine:
-        """The objective in accurate steps: adaptive RODAS3, or REFINEMENT times as many steps of the plant alone."""
+        """Engine with accurate steps: adaptive RODAS3, or on a processor REFINEMENT times as many steps."""
         accurate = AdaptiveRodas3(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS)
         return self._stepping(self._fine if self.sampled else accurate, lanes=REFERENCE_MEMBERS)
 
     @functools.cached_property
     def judging(self) -> Engine:
-        """The objective in the judge's steps: REFINEMENT times as many, or the case's own steps on a processor."""
+        """Engine of the judge: REFINEMENT times as many steps.
+
+        On a processor, the steps of the case, or the finer ones of the search.
+        """
         if not self.sampled:
             return self._stepping(self._fine, threads=self.engine.threads)
         method = self.case.clock.integrator
@@ -76,9 +79,9 @@ class TuningProblem:
 
     @property
     def replays(self) -> bool:
-        """Whether the judge uses the steps, and so has the values, of `ambjax ensemble` and `ambjax simulate`.
+        """Whether the judge uses the steps of `ambjax ensemble` and `ambjax simulate`, so that its values equal theirs.
 
-        It does on a processor, unless the search found these steps too coarse.
+        This is true on a processor, unless the search has refined the steps.
         """
         return self.sampled and self.finer == 1
 
@@ -99,10 +102,10 @@ class TuningProblem:
         )
 
     def towards_voltage(self, error_m: float, volts: float, factor: float) -> "TuningProblem":
-        """Return the problem of the least rms voltage with an rms error of at most `factor` times `error_m` (m).
+        """Return the problem: least rms voltage, subject to an rms error of at most `factor` times `error_m` (m).
 
-        The other limits stay. `volts` (V): rms voltage at `error_m`. The unit of the voltage is such that its square
-        there equals that of the error in units of s_0: so the loss of a rotor costs as much as before.
+        The other limits are kept. `volts` (V): rms voltage at `error_m`. The voltage is scaled so that (unit volts)^2
+        equals (error_m/s_0)^2. A lost rotor then costs as much, relative to the rest, as before.
         """
         weights = tuple(weight if name in HELD else 0.0 for name, weight in zip(TERMS, self.tune.weights, strict=True))
         unit = error_m / float(np.asarray(self.objective.loss.s_0)) / volts
@@ -126,7 +129,7 @@ class TuningProblem:
     def steps(self) -> tuple[Engine, Engine]:
         """Engines with the search's steps and with accurate ones, both without the sensor's converter.
 
-        The converter amplifies a difference in the last digit to one of a quantum, which would hide the step error.
+        Quantisation turns a rounding difference into one of a whole quantum, which would hide the step error.
         """
         scenario = self.objective.scenario
         if scenario.sensor is None or scenario.sensor.bits is None:
@@ -140,7 +143,7 @@ class TuningProblem:
 def method_for(case: Case, substeps: int, finer: int) -> Integrator:
     """Return the search's integration method, with `finer` times as many steps.
 
-    The number of steps is fixed, so that all members take equally long. In sliding mode there are `substeps` steps a
+    The number of steps is fixed, so every member takes the same time. In sliding mode there are `substeps` steps a
     sample, independent of the stiffness of the inversion law.
     """
     if slides(case.cascade, case.scenario.plant):
@@ -181,13 +184,13 @@ def cheaper_mode(gains: int, outcomes: int) -> str:
 
 
 def _loop_range(case: Case, limits: tuple[Limit, ...]) -> LoopRange | None:
-    """Return what the limits need of the linearised loops; None if they need nothing."""
+    """Return the settings for limits that concern linearised loops; None if there is no such limit."""
     names = tuple(limit.name for limit in limits if limit.kind.fold is None)
     if not names:
         return None
     plant = case.scenario.plant
     low, high = case.zones.range(None if case.cascade.processor is None else case.clock.sample_period)
     size = (plant.R + plant.L * plant.pole) * plant.i_0 / plant.s_0
-    # a member's own plant does not matter for a unit
+    # these are scale factors, so the mean plant of the ensemble is sufficient
     pole, size = (float(np.mean(np.asarray(one))) for one in (plant.pole, size))
     return LoopRange(names, low, high, pole, size)

@@ -31,7 +31,7 @@ from ambjax.world.signals import Reference
 T = TypeVar("T")
 
 (U_MAX,) = (field for field in dataclasses.fields(Scenario) if field.name == "u_max")
-# Singularity function of Eq. (9) below which a step reports the singular curve as near.
+# A step sets the bit `singular` if the function of Eq. (9) is below this value (1 at rest, 0 on the singular curve).
 NEAR = 0.1
 
 
@@ -43,12 +43,15 @@ def _end(of: str, unit: str) -> Any:
 class StepLimits:
     """The limit of the supply, and the limits of the reference.
 
-    The largest |r| is GAPS gaps; the limit of each derivative is that of the one before, per sample period.
+    The largest |r| is GAPS gaps. The limit of each derivative is the previous limit divided by the sample period.
     """
 
     u_max: Scalar = dataclasses.field(metadata=U_MAX.metadata)
     near: Scalar = leaf(
-        unit="1", at_least=-1e30, at_most=1, doc="value of Eq. (9) that counts as near; 1 at rest, 0 on the curve"
+        unit="1",
+        at_least=-1e30,
+        at_most=1,
+        doc="threshold of Eq. (9) for the bit `singular`; 1 at rest, 0 on the curve",
     )
     r: Scalar = _end("r", "m")
     r_dot: Scalar = _end("r_dot", "m/s")
@@ -57,7 +60,7 @@ class StepLimits:
 
 
 class Memory(NamedTuple):
-    """State that a step keeps for the next."""
+    """State that one step passes to the next."""
 
     laws: CascadeState
     last: Command
@@ -109,7 +112,7 @@ class Controller(Block):
             jnp.abs(getattr(inputs, name)) <= getattr(limits, name) for name in StepInputs._fields[3:] if name in read
         ]
         processor: Any = cascade.processor
-        if processor.predicts or processor.guard is not None:  # the prediction's program depends on the delay
+        if processor.predicts or processor.guard is not None:  # the number of prediction steps is fixed at export
             fine += [processor.delay >= 0, processor.delay <= processor.most]
         fine += [jnp.isfinite(p) for p in _steepnesses(cascade)]  # p = inf needs another program
         valid = functools.reduce(jnp.logical_and, fine, jnp.asarray(True))
@@ -121,7 +124,7 @@ class Controller(Block):
         watch, refused, safe = after.watch, jnp.asarray(False), jnp.asarray(False)
         if processor.guard is not None:
             refused, safe = processor.guard.refused(memory.watch, watch)
-        assert not isinstance(after.started, tuple)  # an array in the memory remains one
+        assert not isinstance(after.started, tuple)  # an array in the state stays an array
         laws, started = choose(valid, (after.control, after.started), (memory.laws, memory.started))
         # an invalid sample resets the guard: the next reading within its limits is accepted
         kept = Memory(laws, last, after.past[0], choose(valid, watch, jax.tree.map(jnp.zeros_like, watch)), started)
@@ -136,7 +139,7 @@ class Controller(Block):
         return kept, StepOutputs(last.u, last.i_ref, last.v_star, last.v_tilde), status
 
     def start(self) -> Memory:
-        """Return the memory before the first step: no voltage, laws without a state, no predicted reading."""
+        """Return the memory before the first step: zero voltage, zero states of the laws, no predicted readings."""
         cascade, zero = self.parameters.controller, jnp.zeros(())
         laws = jax.tree.map(jnp.zeros_like, cascade.init(Measurement(zero, zero, zero)))
         guard = cascade.processor.guard if cascade.processor else None

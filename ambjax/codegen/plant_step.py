@@ -47,7 +47,7 @@ FIELDS = {field.name: field.metadata for field in dataclasses.fields(Scenario)}
 
 
 class PlantMemory(NamedTuple):
-    """State that a step keeps for the next: that of a `SampledState`, without the laws.
+    """State that one step passes to the next: that of a `SampledState`, without the laws.
 
     - `motion`: state of the plant, in its units.
     - `last`, `before`: voltages commanded at the last two samples, the later one first, V.
@@ -113,7 +113,7 @@ class PlantStep(Block):
     ports: ClassVar[Any] = PlantInputs
     inputs: ClassVar[Ports] = {"u": ("V", "voltage commanded at the last sample"), **DISTURBANCES}
     outputs: ClassVar[Ports] = READINGS
-    bits = LOSSES | {"invalid": "the delay is out of range, or an input is not finite: 0 replaces this input"}
+    bits = LOSSES | {"invalid": "the delay is out of range, or an input is not finite and is replaced by 0"}
     crowded = ("touched", "diverged")
 
     def system(self, machine: Machine, period: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Sampled:
@@ -243,7 +243,7 @@ def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object
     for part in ("outliers", "dropouts", "runout"):
         if getattr(sensor, part, None) is not None:
             raise ValueError(
-                f"sensor.{part}: the exported plant has no such fault. Leave it out, and add it to z outside."
+                f"sensor.{part}: the exported plant does not model this error. Remove it, and add it to the output z."
             )
     if not isinstance(method, FixedSteps):
         raise ValueError(

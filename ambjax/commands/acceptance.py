@@ -67,8 +67,8 @@ def _verdict(case: Case, loop: Analysis) -> str:
     if not loop.stable:
         return "The linearised loop is not stable at r = 0."
     signs = any(set_valued_signs(getattr(case.cascade, stage)) for stage in DEFAULT_LAWS)
-    inside = " while the set-valued signs stay inside their bands" if signs else ""
-    return f"Sensitivity: zone {loop.zone}, a peak of {loop.S.height:.4g} at {loop.S.frequency:.4g} Hz{inside}."
+    inside = " (linear loop, valid inside the bands of the set-valued signs)" if signs else ""
+    return f"Sensitivity: zone {loop.zone}, peak {loop.S.height:.4g} at {loop.S.frequency:.4g} Hz{inside}."
 
 
 def _loop_facts(loop: Analysis) -> list[Fact]:

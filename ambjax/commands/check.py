@@ -22,15 +22,15 @@ CONTINUOUS = (
 )
 
 BAND = (
-    "Evaluated at the samples after run.settle. Disturbance: largest rate of the law's signal minus the rate that its "
-    "sign commands. Band: largest |signal| that such disturbances can cause. Difference: largest difference between "
-    "the law's signal and the plant's. Bound: band plus difference; it bounds the plant's signal. Largest: largest "
-    "value of the plant's signal."
+    "Evaluated at the samples after run.settle. Disturbance: largest difference between the rate of the law's signal "
+    "and the rate that its sign commands. Band: largest |signal| that such disturbances can cause. Difference: largest "
+    "difference between the signal that the law computes and that of the plant. Bound: band plus difference; it bounds "
+    "the signal of the plant. Largest: largest |signal| of the plant."
 )
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
-    """Check a case and print the results, first those of the loop with its processor.
+    """Check a case. Print the results of the loop with its processor first, then those of Theorem 1.
 
     Returns the exit code and the summary. The exit code is 1 if a condition fails or the magnets cannot carry the
     rotor.
@@ -76,7 +76,10 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
 
 def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
-    """Check and print the conditions on the processor of the case. Return their summary; "holds" is the verdict."""
+    """Check and print the conditions on the processor of the case.
+
+    Return their summary; "holds" is True if all conditions hold.
+    """
     from ambjax.ensemble.delays import DELAYS, delay_margin
     from ambjax.ensemble.replay import as_member, record_system
     from ambjax.theorem import advice, sampled_report

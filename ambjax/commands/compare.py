@@ -36,7 +36,7 @@ MAY_DIFFER = ("controller.", "clock.method")
 
 
 def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
-    """Compare cases. Exit code 1 if one of them loses a member, or is not stable at rest."""
+    """Compare cases. The exit code is 1 if one of them loses a member, or is not stable at rest."""
     cases = _read(args.cases)
     studies = [study_of(case, _seed(args, cases), args.members) for case in cases]
     notes = _differences(args.cases, cases, studies)
@@ -76,7 +76,7 @@ def _seed(args: argparse.Namespace, cases: Sequence[Case]) -> int:
 
 
 def _read(paths: Sequence[str]) -> list[Case]:
-    """Read the cases and number those of the same name.
+    """Read the cases. Append a number to a name that occurs more than once.
 
     Raises ValueError for fewer than 2 or too many files, a repeated file, or a file that `read_case` refuses.
     """

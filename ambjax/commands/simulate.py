@@ -41,8 +41,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     _check(numbers, args.case)
     if replayed is not None and replayed.deviation > replayed.rounding:
         say(
-            f"trajectory.npz and overview.png repeat this member only approximately: their metrics differ by up to "
-            f"{100 * replayed.deviation:.2g} % from those of the ensemble, which metrics.json holds."
+            f"trajectory.npz and overview.png reproduce this member only approximately: their metrics differ by up to "
+            f"{100 * replayed.deviation:.2g} % from those of the ensemble. metrics.json has the latter."
         )
     for warning in reversal(case, float(numbers["max_abs_i_A"])):
         say(warning)
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
 
 def _pages(case: Case, args: argparse.Namespace) -> dict[str, str]:
-    """Return the page with sliders by file name, or nothing without --page. Raises ValueError as `page` does."""
+    """Return the page with sliders by file name; an empty dict without --page. Raises ValueError as `page` does."""
     if not args.page:
         return {}
     if args.member is not None:
@@ -91,7 +91,7 @@ def _pages(case: Case, args: argparse.Namespace) -> dict[str, str]:
 
 
 def _check(numbers: dict[str, Any], path: str) -> None:
-    """Raise ValueError if a metric is not finite, which is a bug. Times may be infinite: the event never occurs."""
+    """Raise ValueError if a metric is not finite, which is a bug. A time may be inf: the event did not occur."""
     wrong = [name for name, x in numbers.items() if not (np.isfinite(x) or (UNITS.get(name) == "s" and x == math.inf))]
     if wrong:
         raise ValueError(
@@ -101,7 +101,7 @@ def _check(numbers: dict[str, Any], path: str) -> None:
 
 
 def _window(case: Case, args: argparse.Namespace) -> tuple[float, float] | None:
-    """Return begin and end of the plot in s, or None for the whole run. Raises ValueError outside the run."""
+    """Return begin and end of the plot in s, or None for the whole run. Raises ValueError for times outside the run."""
     if args.begin is None and args.end is None:
         return None
     period, last = float(case.clock.sample_period), float(case.clock.duration)

@@ -49,16 +49,16 @@ DEFAULT_LAWS = {
 class Cascade:
     """The controller: four laws, the nominal plant `model`, and the processor.
 
-    The laws compute with `model`; the true plant is `Scenario.plant`. The default of each law is that of the paper,
-    with the gains of Table 2 (but gamma = 7.5e4, see `inversion.Adaptive`), and with a steepness p scaled to the model
-    (`base.default_law`; 25 for the plant of Table 1). `dataclasses.replace` with another model does not change the
-    laws. `processor` is None in continuous time, as in the paper. Any gain of a law may be a `Schedule`.
+    The laws compute with `model`; the true plant is `Scenario.plant`. The default laws are those of the paper, with the
+    gains of Table 2, except gamma = 7.5e4 (`inversion.Adaptive`). Their steepness p is 25 for the plant of Table 1 and
+    is scaled to other models (`base.default_law`). `dataclasses.replace` with another model does not change the laws.
+    `processor` is None in continuous time, as in the paper. Any gain of a law may be a `Schedule`.
     """
 
-    observer: Observer = part(default=_LEFT_OUT, doc="law that estimates z, z_dot and i; left out: `Direct`")
-    position: PositionLaw = part(default=_LEFT_OUT, doc="law that computes v_star; left out: `SlidingMode`")
-    inversion: InversionLaw = part(default=_LEFT_OUT, doc="law that computes i_ref; left out: `Adaptive`")
-    current: CurrentLaw = part(default=_LEFT_OUT, doc="law that computes u; left out: `SlidingMode`")
+    observer: Observer = part(default=_LEFT_OUT, doc="law that estimates z, z_dot and i; default: `Direct`")
+    position: PositionLaw = part(default=_LEFT_OUT, doc="law that computes v_star; default: `SlidingMode`")
+    inversion: InversionLaw = part(default=_LEFT_OUT, doc="law that computes i_ref; default: `Adaptive`")
+    current: CurrentLaw = part(default=_LEFT_OUT, doc="law that computes u; default: `SlidingMode`")
     model: Plant = part(default=Plant(), doc="the nominal plant")
     processor: Processor | None = part(default=None, doc="processor of the controller; None: continuous time")
 
@@ -70,8 +70,8 @@ class Cascade:
     def init(self, measured: Measurement, reference: Reference | None = None) -> CascadeState:
         """Return the states of all laws at t = 0, in continuous time or on the processor.
 
-        `measured`: the first measurement, from which the observer starts. `reference`: its value and rates at t = 0; in
-        continuous time, a position law may choose its initial state from it (`PositionLaw.begin`).
+        `measured`: the first measurement, from which the observer starts. `reference`: the reference and its rates at t
+        = 0. In continuous time, they may determine the initial state of the position law (`PositionLaw.begin`).
         """
         observed = extremes(self.observer)[0].init(self.model, measured)
         rest = [extremes(law)[0] for law in self.laws[1:]]
@@ -91,12 +91,12 @@ class Cascade:
         return CascadeState(*(extremes(law)[0].scale_sampled(self.model) for law in self.laws))
 
     def layer(self) -> CascadeState:
-        """Return, for each state, the largest integration error that keeps it inside the boundary layer of its sign."""
+        """Return the largest integration error of each state with which it stays in the boundary layer of its sign."""
         layers = ([one.layer(self.model) for one in extremes(law)] for law in self.laws)
         return CascadeState(*(jax.tree.map(lambda *x: functools.reduce(jnp.minimum, x), *each) for each in layers))
 
     def slopes(self) -> dict[str, Scalar]:
-        """Return the largest slope of each law, 1/s, by the name of its stage: its fastest rate in closed loop."""
+        """Return the fastest rate of each law in closed loop (slope), 1/s, by the name of its stage."""
         laws = zip(CascadeState._fields, map(extremes, self.laws), strict=True)
         return {stage: functools.reduce(jnp.maximum, [one.slope(self.model) for one in ends]) for stage, ends in laws}
 
@@ -119,11 +119,12 @@ class Cascade:
         """Return the demanded force, the observer's estimate, and the rates of the states of observer and position law.
 
         `measured`: readings of z (m), z_dot (m/s) and i (A). `state`: states of all laws. `reference`: r and its rates.
-        The rates of z and v_star in the demanded force are total derivatives in time: along the reference, z_dot, the
-        nominal z_ddot and the states of the laws. Only inversion laws without a state use them, to compute i_ref'; XLA
-        removes them for other laws. If the observer estimates the velocity, z_dot is its estimate.
+        The rates of z and v_star in the demanded force are total derivatives in time: they include the rates of the
+        reference, z_dot, the nominal z_ddot and the rates of the states of the laws. Only inversion laws without a
+        state use them, to compute i_ref'; XLA removes them for other laws. If the observer estimates the velocity,
+        z_dot is its estimate.
 
-        In the returned states, those of the inversion and current laws are empty.
+        The returned rates of the inversion and current laws are ().
         """
 
         def demanded(
@@ -155,7 +156,7 @@ class Cascade:
         return with_gains_at(self.position, estimate.z, reference)(self.model, (estimate, reference), state)
 
     def on_processor(self, *delays: Scalar, between: bool = False) -> "Cascade":
-        """Return the cascade with the structure of its compiled program fixed, for use inside jit, grad or vmap.
+        """Fix all choices that determine the compiled program, so that the cascade can be used in jit, grad or vmap.
 
         A sign with steepness inf becomes set-valued. The program also supports the delays `delays` (samples) and, if
         `between` is true, every delay between them. Raises ValueError as `Processor.resolved` does.
@@ -183,7 +184,7 @@ class Cascade:
         return dataclasses.replace(self, **laws, processor=None)
 
     def _advance(self, sample: Sample) -> Callable[..., Any]:
-        """Return `laws.step_law` with the model, the period and the discretisation of this cascade."""
+        """Return `laws.step_law` with the model and the discretisation of this cascade, and the period of `sample`."""
         implicit = self.processor is not None and self.processor.implicit
         return functools.partial(step_law, model=self.model, period=sample.period, implicit=implicit)
 

@@ -44,7 +44,7 @@ class SlidingMode(CurrentLaw[tuple[()]]):
         return self._voltage(model, inputs, self.robust(inputs.measured.i - inputs.demand.i_ref)), ()
 
     def step(self, model: Plant, inputs: CurrentInputs, state: tuple[()], period: Scalar) -> tuple[Array, tuple[()]]:
-        """Step with the sign of i - i_ref at the end of the step."""
+        """Return the voltage of an implicit step, with the sign of i - i_ref at the end of the sample."""
         e = inputs.measured.i - inputs.demand.i_ref
         return self._voltage(model, inputs, -self.k_i * share(e, period * self.k_i, self.p)), ()
 
@@ -72,11 +72,11 @@ class SlidingMode(CurrentLaw[tuple[()]]):
 class ProportionalIntegral(CurrentLaw[Array]):
     """u = k_p (i_ref - i) + L i_ref' + x, x' = k_int (i_ref - i) + k_aw (clip(u) - u), with x in V.
 
-    The linear baseline: the inductance L is that at z = 0, and there is no motional term. While the supply limits u to
-    clip(u), back-calculation limits the integral x at the rate k_aw (Astrom and Murray, Feedback Systems, 2008, 10.4).
-    The default gains for a model give the current loop the bandwidth w = 10 w_m, w_m the pole of the magnets, but at
-    most 1/(4 T) on a processor with sample period T: with a sample of delay the phase margin is then above 50 degrees.
-    In the paper's tracking scenario, the default gains hold the rotor, and much lower gains lose it.
+    This linear law uses the inductance L at z = 0 and has no motional term. While the supply limits u to clip(u),
+    back-calculation limits the integral x at the rate k_aw (Astrom and Murray, Feedback Systems, 2008, 10.4). The
+    default gains for a model give the current loop the bandwidth w = 10 w_m, w_m the pole of the magnets, but at most
+    1/(4 T) on a processor with sample period T: with a sample of delay the phase margin is then above 50 degrees. In
+    the paper's tracking scenario, the default gains hold the rotor, and much lower gains lose it.
     """
 
     k_p: Scalar = gain(default=1.76e5, unit="V/A", doc="proportional gain; left out: w L")
@@ -116,7 +116,8 @@ class ProportionalIntegral(CurrentLaw[Array]):
 
 @record
 class DeadBeat(CurrentLaw[tuple[()]]):
-    """i' = i_ref' - w (i - i_ref) by inversion of Eq. (2); a sample of a processor multiplies i - i_ref by 1 - share.
+    """i' = i_ref' - w (i - i_ref) by inversion of Eq. (2); each sample of a processor multiplies i - i_ref by 1 -
+    share.
 
     In continuous time u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - w (i - i_ref)) + R i. On a processor with
     implicit steps u is the constant voltage that, for constant z and z_dot, changes the current in one sample from i to
@@ -128,7 +129,9 @@ class DeadBeat(CurrentLaw[tuple[()]]):
 
     w: Scalar = gain(default=1e4, unit="1/s", doc="decay rate of the current error in continuous time")
     share: Scalar = gain(
-        default=1.0, unit="1", doc="share of the error removed in a sample of a processor; 1: dead-beat"
+        default=1.0,
+        unit="1",
+        doc="share of the current error that each sample removes; 1: dead-beat",
     )
 
     def init(self, model: Plant) -> tuple[()]:
@@ -230,7 +233,9 @@ class AmplifierCurrent(CurrentLaw[tuple[()]]):
 
 
 def _mean_decay(x: Array) -> Array:
-    """Return (1 - exp(-x))/x with |x| limited to 30; near 0, where the difference loses digits, by its series."""
+    """Return (1 - exp(-x))/x with |x| limited to 30; near 0, where the difference loses digits, a series replaces the
+    formula.
+    """
     x = limited(x, 30.0)
     near = jnp.abs(x) < 1e-3
     far = jnp.where(near, 1.0, x)

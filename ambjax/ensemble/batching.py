@@ -25,8 +25,8 @@ from ambjax.world.scenario import Scenario
 
 # Largest number of members in one call of the compiled program, unless the caller gives it.
 MOST_CALL = 4096
-# Least size of one number's array in each of several calls (bytes). Two shorter calls on two cores are not faster than
-# one call on one core.
+# If an ensemble is split into several calls, the array of each number has at least this size (bytes) in a call. Two
+# smaller calls on two cores are not faster than one call on one core.
 LEAST_BYTES = 256
 # Name of the mesh axis over which members are distributed.
 MEMBERS = "members"
@@ -36,7 +36,7 @@ Result = TypeVar("Result")
 
 
 class Parts(NamedTuple):
-    """A pytree split into the leaves that vary between members, [N, ...] each, and the leaves that all share."""
+    """A pytree split into the leaves that vary between members, each [N, ...], and the leaves common to all members."""
 
     moving: Any
     shared: Any
@@ -56,7 +56,7 @@ def run_ensemble(
 
     Each leaf of `cascade`, `scenario` and `fold` is a number, shared by all members, or an array [N] with one entry per
     member. At least one leaf must be an array, for example `scenario.member`, which selects the noise of a member.
-    `fold` is updated at every sample. Rows are recorded at every `every`-th sample (0: none).
+    `fold` is updated at every sample; None: no metrics. Rows are recorded at every `every`-th sample (0: none).
     `threads` and `call` are those of `map_members`.
 
     Returns an Outcome in member order: every leaf has a leading axis [N], rows have shape [N, rows].
@@ -93,17 +93,18 @@ def map_members(
     Each leaf of `tree` is a number, shared by all members, or an array [N, ...] with one entry per member. At least one
     leaf must be an array. Members run on all devices of the default backend.
 
-    - `function`: maps a tree with the leaves of one member to a pytree of arrays. JAX traces it, and compiles it again
-      for a function that does not compare equal (==): use a named function or a frozen dataclass, not a new lambda.
+    - `function`: maps a tree with the leaves of one member to a pytree of arrays. JAX traces it. It compiles again if
+      the function is not equal (==) to that of an earlier call: use a named function or a frozen dataclass, not a new
+      lambda.
     - `threads`: CPU cores to use (None: all cores that this process may use).
     - `call`: members in one call of the compiled program, rounded up to whole blocks (None: equal shares for all cores,
-      at most 4096 members each). Memory grows with `call`, not with N. Another value of `call` compiles again. If there
+      at most 4096 members each). Memory grows with `call`, not with N. A new value of `call` compiles again. If there
       are fewer blocks than cores, some cores are idle.
     - `block`: members that run together in vector instructions (None: as many as fit the first-level cache,
       fewer in a small ensemble).
     - `plain`: compile without the fast path, which does not support the functions of LAPACK, such as eigenvalues.
-    - `vectorised`: the function maps a block of members itself. It receives the tree of the block, and a tree of the
-      axis of each leaf, 0 or None, as for `jax.vmap`. Each leaf of its result has a leading axis of the block.
+    - `vectorised`: the function is vectorised already. It receives the tree of a block of members, and the tree
+      `in_axes` of `jax.vmap` (0 or None for each leaf). Each leaf of its result has a leading axis of the block.
 
     Returns NumPy arrays in member order, every leaf with a leading axis [N].
 
@@ -128,7 +129,7 @@ def size(tree: object) -> int:
 
 
 class _Engine(Generic[Result]):
-    """One ensemble, split into calls of equal shape, so that the program compiles once."""
+    """One ensemble, split into calls of the compiled program. All calls have the same shape, so it compiles once."""
 
     def __init__(
         self,

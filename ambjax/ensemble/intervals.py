@@ -26,7 +26,7 @@ REPLICATES = 1000
 STATISTICS = ("mean", "std", "cvar")
 # The width of a group is its rank, counted from the nearer end, divided by this number.
 WIDTH = 512
-# Least number of values in the tail for which the largest value bounds the CVaR: see `bootstrap`.
+# With at least this many values in the tail, the largest value bounds the CVaR (`bootstrap`).
 TAIL = 10
 # Largest number of counts in one array: 16 MB.
 MOST_COUNTS = 2_000_000
@@ -61,9 +61,9 @@ def wilson(successes: ArrayLike, n: ArrayLike, confidence: float = 0.95) -> Esti
 def quantile(values: np.ndarray, q: npt.ArrayLike, confidence: float = 0.95) -> Estimate:
     """Compute the q-quantile of values [N], the value of rank ceil(q N), with its interval. q: a number or an array.
 
-    The number of values below the true quantile is binomial with N trials of probability q. Its quantiles are the
-    ranks of the two ends. An end is -inf or +inf if N is too small. Values of +inf are allowed. Raises ValueError as
-    `column_of` does.
+    The number of values below the true quantile is binomial with N trials of probability q. The quantiles of this
+    distribution are the ranks of the two ends. An end is -inf or +inf if N is too small. Values of +inf are allowed.
+    Raises ValueError as `column_of` does.
     """
     from scipy.stats import binom
 
@@ -91,8 +91,8 @@ def bootstrap(
 ) -> dict[str, Estimate]:
     """Estimate "mean", standard deviation ("std") and CVaR ("cvar") of finite columns [N], with their intervals.
 
-    Returns one Estimate per statistic, whose fields are arrays over the columns. An end is infinite if the ensemble is
-    too small to bound it.
+    Returns one Estimate per statistic; its fields are arrays [columns]. An end is infinite if the ensemble is too small
+    to bound it.
 
     Measured coverage of 95 % intervals from 200 members: 93 to 97 % for the CVaR of normal, lognormal and bounded
     values, and for the standard deviation of normal and bounded values. It is 87 % for the standard deviation of
@@ -129,7 +129,7 @@ def bootstrap(
     ends |= {kind: nothing for kind in STATISTICS if n < 3 or (kind == "cvar" and tail <= 1)}  # no standard error
     unbiased = (n / max(n - 1, 1)) ** 0.5
     low, high = (scale * end + centre for end in ends["cvar"])
-    with np.errstate(over="ignore"):  # with few members the upper end may exceed every number: it is inf
+    with np.errstate(over="ignore"):  # with few members the exponential may overflow to inf
         stds = [scale * unbiased * np.exp(end) for end in ends["std"]]
     return {
         "mean": Estimate(centre, *(scale * end + centre for end in ends["mean"])),

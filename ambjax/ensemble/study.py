@@ -20,9 +20,9 @@ from ambjax.simulation.trajectory import Trajectory
 from ambjax.world.scenario import Scenario
 
 SPREAD = "spread."
-# Upper bound on the columns of members.npz other than the spread numbers, to estimate the disk space of a study.
+# Largest number of columns of members.npz besides those of the spread, to estimate the disk space of a study.
 COLUMNS = 34
-# Number of equal parts of a run in each of which the variation of the voltage is computed.
+# Number of equal parts of a run. The variation of the voltage is computed in each part.
 WINDOWS = 25
 # Signals of a fan chart, and the corresponding fields of a Row.
 FAN_SIGNALS = {"z - r": "e_z", "u": "u_mean", "sigma": "sigma"}
@@ -99,8 +99,8 @@ class Study:
         """Simulate members start <= k < stop and return their columns, each [stop - start], by name.
 
         The columns are index, lost_at (s), every metric, and spread.PATH for each spread quantity. `call` and `threads`
-        are those of `map_members`. With `lost`, every rotor starts outside its clearance and is lost at once. Such a
-        run compiles the program of the study at almost no further cost.
+        are those of `map_members`. With `lost`, every rotor starts outside its clearance and is lost at once. This
+        compiles the program of the study without the cost of a run.
         """
         members = np.arange(start, stop)
         cascade, scenario = self.batch(members)

@@ -65,7 +65,10 @@ class Zones:
     )
 
     def check(self, period: Scalar | None) -> None:
-        """Raise ValueError if the limits are not in ascending order, and as `range` does. `period`: see `range`."""
+        """Raise ValueError if the limits are not in ascending order, or as `range` does.
+
+        `period`: see `range`.
+        """
         self.range(period)
         for names in (("zone_a", "zone_b", "zone_c"), ("clearance_a", "clearance_b", "clearance_c")):
             limits = [float(getattr(self, name)) for name in names]
@@ -99,9 +102,9 @@ class Zones:
 
 
 def _stiffness(system: StateSpace, m: float, f: float) -> float:
-    """Return the static stiffness, N/m. `f`: a frequency (Hz) that stands for 0.
+    """Return the static stiffness, N/m. `f`: a small frequency (Hz) at which the static response is computed.
 
-    It is infinite if the response is proportional to the frequency, as with integral action.
+    It is infinite if the response to a force vanishes at frequency 0, as with integral action.
     """
     static, above = np.abs(system.response(np.array([f, 10 * f]))[:, 3, 2])
     return m / float(static) if static > 0.5 * above else np.inf
@@ -120,7 +123,7 @@ class Analysis(NamedTuple):
     - `S_velocity`: peak of |S| for a test signal on the velocity reading; None if the velocity is not measured.
     - `margins`: see `Margins`; all are 0 if the loop is unstable.
     - `stiffness`: static stiffness, N/m; inf if the law integrates the measured position. If it integrates a prediction
-      over the delay T, the stiffness is finite, about 2 m / T^2, because the prediction does not know the force.
+      over the delay T, the stiffness is finite, about 2 m / T^2, because the prediction does not include the force.
     - `noise`: rms of z per rms of white noise on the reading of z, one value per sample; inf if the loop is unstable.
     - `poles`: poles in 1/s, in the order of decreasing real part.
     """
@@ -171,7 +174,7 @@ def _member(tree: Any) -> tuple[StateSpace, Any]:
 def linearisation_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Cascade, Scenario, Scalar]:
     """Check a case, and return the first three arguments of `loop_matrices`: cascade, scenario and sample period (s).
 
-    A cascade on a processor is returned as `Cascade.on_processor` does. Raises ValueError as `rollout` does.
+    A cascade with a processor is that of `Cascade.on_processor`. Raises ValueError as `rollout` does.
     """
     system, clock = prepare(cascade, scenario, clock)
     if cascade.processor is not None:
@@ -185,7 +188,7 @@ def analyse(
     """Analyse a linearised loop.
 
     - `m`: mass of the rotor, kg.
-    - `period`: sample period, s, for which a value of the noise is held.
+    - `period`: time for which a value of the noise is held, s.
     - `zones`: frequency range and zones; None: the defaults.
     - `velocity`: whether the velocity has its own sensor.
 

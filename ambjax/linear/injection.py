@@ -3,7 +3,7 @@
 A periodic multi-sine e is added to the reading of the position or velocity sensor, after low-pass and converter. After
 the loop has settled, the Fourier coefficients of e and of the sum (reading plus e) are computed over whole periods. At
 each frequency of the multi-sine, S is the coefficient of the sum divided by that of e (ISO 14839-3, as secondary
-sources cite it). The simulation includes converter, noise, limits and the true signs.
+sources cite it). The simulation includes the converter, the noise, the limits and the nonlinear signs.
 """
 
 import dataclasses
@@ -20,7 +20,8 @@ from ambjax.numerics.records import Scalar
 from ambjax.simulation.clock import Clock
 from ambjax.world.scenario import Scenario
 
-# Number of logarithmically spaced lines; number of lines near a peak, and their range as multiples of its frequency.
+# LINES: number of logarithmically spaced lines. NEAR: number of lines near a peak. AROUND: their range as multiples of
+# the frequency of the peak.
 LINES, NEAR, AROUND = 30, 11, (0.75, 1.33)
 
 
@@ -28,7 +29,7 @@ class Injection(NamedTuple):
     """Measured sensitivity of a loop. The frequencies of the multi-sine are called lines.
 
     - `frequency` [L]: lines, Hz.
-    - `S`, `T`, `KS` [L]: complex means over the members that did not lose the rotor; None if all did. S = reading/e
+    - `S`, `T`, `KS` [L]: complex means over the members that hold the rotor; None if no member holds it. S = reading/e
       (1), T = S - 1 (1), KS = u/e (V/m, or V s/m at the velocity sensor).
     - `peak`: largest |S| over the lines; None without S.
     - `peak_low`, `peak_high`: confidence interval of |S| at the line of the peak, from the members. Equal to `peak` if
@@ -94,8 +95,8 @@ def injected(
     - `settle`, `periods`: periods of the multi-sine before the measurement, and during it.
     - `confidence`: level of the confidence interval of the peak.
 
-    In continuous time e(t) is continuous. It is added to one reading only: an e at the position sensor does not change
-    the velocity reading. The Fourier sums are over samples.
+    In continuous time e(t) is a continuous function of time. It is added to one reading only: an e at the position
+    sensor does not change the velocity reading. The Fourier sums use its values at the samples.
 
     Returns an `Injection`. Raises ValueError as `rollout` does, for a frequency that the period or the samples cannot
     resolve, and for `reading` = "z_dot" if the observer does not use the velocity reading.
@@ -133,8 +134,8 @@ def injected_members(
     """Measure the peak of |S| of each member of an ensemble at rest at the constant reference r (m).
 
     The other arguments are those of `member_responses`. Each member is measured once, with its own noise, over
-    `periods` periods of the multi-sine. The noise makes the peak of a member too large rather than too small. Raises
-    ValueError as `injected` does.
+    `periods` periods of the multi-sine. Noise biases the peak of a member upwards. Raises ValueError as `injected`
+    does.
     """
     one = member_responses(cascade, scenario, clock, frequencies, amplitude=amplitude, r=r, periods=periods)
     size = np.where(one.held[:, None], np.abs(one.S), np.inf)

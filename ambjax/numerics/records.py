@@ -24,7 +24,7 @@ from ambjax.numerics.declared import check_number, item
 T = TypeVar("T")
 
 # A real number of one member, traced or not, or an array of numbers for an ensemble. NumPy arrays work too, but are not
-# in the type, because type checkers take the product of a NumPy array and a JAX array for a NumPy array.
+# in the type, because type checkers infer a NumPy array for the product of a NumPy array and a JAX array.
 Scalar: TypeAlias = Array | float
 
 
@@ -101,8 +101,8 @@ def record(cls: type[T]) -> type[T]:
     The type becomes part of the tree structure. With JAX's `register_dataclass`, the structures of two types with equal
     static fields compare equal, so that JAX could run the compiled program of one law for another.
 
-    The constructor checks each leaf that is a plain number. It checks no traced values and no arrays, which `validate`
-    checks before a rollout, and JAX does not call it to rebuild a record. The docstring lists the fields.
+    The constructor checks each leaf that is a plain number. It skips traced values and arrays; `validate` checks arrays
+    before a rollout. JAX rebuilds records without the constructor. The docstring lists the fields.
     """
     _check_at_construction(cls)
     record_type = dataclasses.dataclass(frozen=True)(cls)
@@ -146,7 +146,7 @@ def _check_at_construction(cls: type) -> None:
         """Check the numbers. Raise ValueError for a number outside its range."""
         if own is not None:
             own(self)
-        if type(self) is not cls:  # a subclass that is no record: JAX may construct it with other values
+        if type(self) is not cls:  # a subclass that is not a record: JAX may construct it with other values
             return
         given = self.__dict__
         for field, low, high in _leaves(type(self)):
@@ -170,10 +170,10 @@ def _getter(names: list[str]) -> Callable[[object], tuple[object, ...]]:
 
 
 class GainFunction:
-    """Base class of a record that stands in a law in the place of a gain, as a function of a signal."""
+    """Base class of records that replace a gain of a law by a function of a signal."""
 
     def check(self, field: dataclasses.Field, path: str) -> None:
-        """Raise ValueError unless the record may stand in the place of the number `field`, at a dotted path."""
+        """Raise ValueError if the record must not replace the number `field`. `path`: dotted path, for the message."""
         raise NotImplementedError
 
 
@@ -217,7 +217,7 @@ def check_leaf(field: dataclasses.Field, name: str, value: object) -> None:
 
 @functools.cache
 def _fields(kind: type) -> tuple[tuple[dataclasses.Field, bool], ...]:
-    """Return the fields of a record type, and whether each is a leaf; () for a type that is no record. Cached."""
+    """Return the fields of a record type, and whether each is a leaf; () for a type that is not a record. Cached."""
     fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
     return tuple((field, bool(field.metadata.get("leaf"))) for field in fields)
 

@@ -65,9 +65,9 @@ SINE_S = {
 def refined(x: Array) -> Array:
     """Return 1/x for |x| between 1e-37 and 1e37.
 
-    CPUs divide vectors of float32 much faster than vectors of float64. In float64 on a CPU, a float32 quotient is
-    therefore refined by one step of third order, with an error of at most about one unit in the last place. In a trace
-    it is a call named RECIPROCAL, so that the exporter can write the ordinary quotient.
+    CPUs divide vectors of float32 much faster than vectors of float64. In float64 on a CPU, the function therefore
+    refines a float32 quotient by one step of third order, with an error of at most about one unit in the last place. In
+    a trace it is a call named RECIPROCAL, which the exporter writes as a quotient.
     """
     return _refined_reciprocal(x)
 
@@ -221,7 +221,7 @@ def smooth_sign(x: Scalar, p: Scalar | None, per: Scalar = 1.0) -> Array:
 
 
 def smooth_root(x: Scalar, p: Scalar | None) -> Array:
-    """Return the smoothed root x / (x^2 + 1/p^2)^(1/4) of sqrt(|x|) sgn(x).
+    """Return x / (x^2 + 1/p^2)^(1/4), a smooth approximation of sqrt(|x|) sgn(x).
 
     The slope at 0 is sqrt(p). p = None gives sqrt(|x|) sgn(x) itself, whose slope at 0 is infinite.
     """
@@ -246,6 +246,6 @@ def away_from_zero(x: Scalar, floor: Scalar) -> Array:
 
 
 def limited(x: Scalar, most: Scalar) -> Array:
-    """Return x limited to -most..most. NaN stays NaN. jnp.clip tests for NaN, and takes three times as long."""
+    """Return x limited to -most..most. NaN stays NaN. jnp.clip, which tests for NaN, takes three times as long."""
     x, most = jnp.asarray(x), jnp.asarray(most)
     return jnp.where(x > most, most, jnp.where(x < -most, -most, x))

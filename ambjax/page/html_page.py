@@ -30,7 +30,7 @@ from ambjax.world.scenario import SLOTS
 NAME = "page.html"
 # Number of members of the envelope.
 MEMBERS = 64
-# Files of the scripts of the worker and of the page, in the order of execution.
+# Script files of the web worker and of the page, in the order of execution.
 WORKER, PAGE = (
     ("noise.js", "spectrum.js", "sensitivity.js", "worker.js"),
     ("controls.js", "plots.js", "machine.js", "app.js"),
@@ -64,7 +64,8 @@ def page(case: Case, others: Sequence[Case] = (), path: str = "case.toml") -> st
 def pages(cases: Sequence[Case], paths: Sequence[str]) -> dict[str, str]:
     """Return the pages of several cases by file name: page.html, page-2.html, ...
 
-    Cases that differ in numbers only share a page. `paths`: names of the case files. Raises ValueError as `page` does.
+    Cases can share a page if they differ only in their numbers. `paths`: names of the case files. Raises ValueError as
+    `page` does.
     """
     groups: list[list[int]] = []
     for k, case in enumerate(cases):
@@ -157,8 +158,8 @@ def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str,
 def _written(case: Case, others: list[Case]) -> tuple[list[Slider], list[list[TemplateLine]]]:
     """Return the sliders that have a place in all case files, and the template of each file.
 
-    If added lines make a file invalid, only numbers that the case file contains have a slider. If that is invalid too,
-    there are no sliders.
+    If a file becomes invalid by added lines, only numbers that it already contains have sliders. If it is still
+    invalid, there are no sliders.
     """
     cases, given = (case, *others), sliders(case, others)
     for kept in (given, [one for one in given if _in_file(one, case)]):
@@ -204,7 +205,7 @@ def _alike(case: Case, other: Case) -> bool:
 
 
 def _finest(case: Case, others: list[Case]) -> Case:
-    """Return the case, with the integrator of that case which has the smallest step."""
+    """Return the case with the integrator of smallest step among all cases."""
     period = float(case.clock.sample_period)
     steps = [one.clock for one in (case, *others) if one.clock.integrator.step_size(period) is not None]
     clock = min(steps, key=lambda clock: clock.integrator.step_size(period) or 0.0, default=case.clock)

@@ -1,4 +1,4 @@
-"""The claims of the paper's Section 4 and abstract, each with the function that judges it.
+"""The claims of the paper's Section 4 and abstract, each with the function that evaluates it.
 
 The function of a claim takes the evidence of one reading and returns a number, a verdict and its cause. Every verdict
 is computed from the runs in `ambjax.paper.evidence`.
@@ -38,7 +38,7 @@ CLAIMS: list[Claim] = []
 def claim(
     says: str, where: str, paper: str, criterion: str
 ) -> Callable[[Callable[[Evidence], Finding]], Callable[[Evidence], Finding]]:
-    """Decorator that adds a claim to CLAIMS; the decorated function judges it."""
+    """Decorator that adds a claim to CLAIMS; the decorated function evaluates it."""
 
     def enter(judge: Callable[[Evidence], Finding]) -> Callable[[Evidence], Finding]:
         CLAIMS.append(Claim(says, where, paper, criterion, judge))
@@ -127,7 +127,7 @@ def _radius(evidence: Evidence) -> Finding:
 
 @claim(
     "That radius is due to the noise of variance 1e-7", "4", f"std {TABLE_2.noise_std:.2e} m",
-    "radius reached at a std within 25 % of the printed one, at one of the sample periods tried",
+    "radius reached at 0.8 to 1.25 times the printed std, at one of the sample periods tried",
 )  # fmt: skip
 def _radius_by_noise(evidence: Evidence) -> Finding:
     stds = {n.sample_period: n.std_for(SIGMA_RADIUS) for n in evidence.noise}
@@ -206,7 +206,7 @@ def _noise(evidence: Evidence) -> Finding:
     largest = max(n.survived for n in evidence.noise)
     unknown = sum(bool(n.stalled.any()) and not n.lost.any() for n in evidence.noise)
     if largest == 0.0 and not unknown:
-        return Finding("lost at every std", 0.0, FAILS, "the rotor is lost at the smallest noise and without noise")
+        return Finding("lost at every std", 0.0, FAILS, "the rotor is lost at the smallest noise of the scan")
     words = "held up to std " + ", ".join(f"{n.survived:.1e} m, period {n.sample_period:g} s" for n in evidence.noise)
     survivors = sum(n.survived >= TABLE_2.noise_std * 0.999 for n in evidence.noise)
     cause = f"held at the printed std with {survivors} of {len(evidence.noise)} sample periods of the noise"

@@ -19,15 +19,15 @@ from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.signals import Reference, reference_at
 
-# A state that exceeds its scale by this factor counts as diverged. The model is not valid for such a state, and no
-# number has overflowed yet.
+# A state that exceeds its scale by this factor counts as diverged. For such a state the model is not valid, but the
+# numbers are still finite.
 DIVERGENCE = 1e6
 
 
 class ExternalInputs(NamedTuple):
     """External inputs of the loop at one instant.
 
-    The reference, the disturbances q_z (m/s^2) and q_i (A/s), and the runout (m), which is () for a sensor without one.
+    The reference, the disturbances q_z (m/s^2) and q_i (A/s), and the runout (m); () if the sensor has none.
     """
 
     reference: Reference
@@ -56,7 +56,7 @@ class Densities(NamedTuple):
     heat: Array
 
 
-# An Instant with the structure of those that the loop records.
+# An Instant with the pytree structure of the recorded signals.
 INSTANT_TREE = Instant(Sizes(*[0.0] * 7), Densities(*[0.0] * 3))  # pyright: ignore[reportArgumentType]
 
 
@@ -108,7 +108,7 @@ class ClosedLoop:
         return jax.tree.map(jnp.asarray, LoopState(self.scenario.plant.scale(), self.cascade.scale()))
 
     def layer(self) -> LoopState:
-        """Return, for each state, the largest integration error that keeps it inside the boundary layer of its sign.
+        """Return the largest integration error of each state with which it stays in the boundary layer of its sign.
 
         It is inf for the states of the plant.
         """
@@ -122,7 +122,10 @@ class ClosedLoop:
         return ExternalInputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t), runout)
 
     def received(self, inputs: Any, plant: Any, errors: Errors) -> Measurement:
-        """Return the readings that the controller receives. `inputs`: result of the method `inputs` at this instant."""
+        """Return the readings that the controller receives.
+
+        `inputs`: the external inputs at this instant (method `inputs`).
+        """
         measured, sensor = self.measured(plant, errors), self.scenario.sensor
         if sensor is None or isinstance(inputs.runout, tuple):
             return measured
@@ -149,7 +152,8 @@ class ClosedLoop:
     def instant(self, reference: Reference, plant: object, i_ref: Array, v_tilde: Array, u: Array) -> Instant:
         """Return the signals to record at one instant.
 
-        `plant`: state of the plant. `i_ref` (A), `v_tilde` (A^2/m^2): of the command. `u`: applied voltage, V.
+        `plant`: state of the plant. `i_ref` (A), `v_tilde` (A^2/m^2): the values in the command. `u`: applied voltage,
+        V.
         """
         motion, heat = self.scenario.plant.measurement(plant), self.scenario.plant.signals(plant).heat
         sigma = self.cascade.sigma(motion, reference)
@@ -157,7 +161,10 @@ class ClosedLoop:
         return Instant(sizes, Densities(u, u * u, heat))
 
     def derivative(self, inputs: ExternalInputs, state: LoopState, control: CascadeState, u: Array) -> LoopState:
-        """Return the time derivative of the state. `control`: rates of the cascade. `u`: applied voltage, V."""
+        """Return the time derivative of the state.
+
+        `control`: rates of the states of the laws. `u`: applied voltage, V.
+        """
         plant = self.scenario.plant
         q_z = self.scenario.pushed(inputs.q_z, plant.measurement(state.plant))
         return LoopState(plant.rates(state.plant, u, q_z, inputs.q_i), control)
@@ -210,7 +217,8 @@ class ClosedLoop:
     ) -> Row:
         """Return all signals at time t (s).
 
-        `state`: of the plant. `command`: with u within the limit of the supply. `measured`: the readings.
+        `state`: state of the plant. `command`: command with u within the limit of the supply. `measured`: readings of
+        the sensors.
         """
         plant = self.scenario.plant
         motion, signals, (i_1, i_2) = plant.measurement(state), plant.signals(state), plant.currents(state)

@@ -1,4 +1,4 @@
-"""A rollout in parts, for reverse mode: its memory grows with the square root of the number of samples."""
+"""A rollout in parts, for reverse mode: with about sqrt(N) parts, its memory grows with sqrt(N) for N samples."""
 
 import functools
 import math
@@ -14,10 +14,10 @@ from ambjax.simulation.rollout import Outcome, RolloutState, System, begin, fini
 
 
 def rolled_in_parts(system: System, clock: Clock, fold: Fold) -> Outcome:
-    """Simulate a rollout without rows, and recompute each part of it in reverse mode (`jax.checkpoint`).
+    """Simulate a rollout without rows. Reverse mode recomputes each part (`jax.checkpoint`).
 
-    Reverse mode stores the states between parts, and, while it goes through a part, the states between its samples. The
-    value is that of `rollout.run`, up to rounding. The function is not jitted.
+    Reverse mode stores the state at the start of each part and, for one part at a time, the state at each sample. The
+    result is that of `rollout.run`, up to rounding. `clock` must have fixed steps. The function is not jitted.
     """
     system, clock, fold = canonical((system.realised(), clock, fold))
     length = part_length(clock.samples)
@@ -34,5 +34,5 @@ def rolled_in_parts(system: System, clock: Clock, fold: Fold) -> Outcome:
 
 
 def part_length(samples: int) -> int:
-    """Return the samples of a part: the largest divisor of `samples` that is at most its square root."""
+    """Return the number of samples of a part: the largest divisor of `samples` that is at most its square root."""
     return next(length for length in range(math.isqrt(samples), 0, -1) if samples % length == 0)

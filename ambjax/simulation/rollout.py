@@ -48,7 +48,7 @@ class System(Protocol[S, E, R]):
     - `sensor_errors(sample)`: the errors of the sensors at sample number `sample`.
     - `start()`: the state at t = 0.
     - `status(state)`: the status code of the rotor, an index of `trajectory.STATUSES`.
-    - `rest(state, code)`: the state in which a rotor lost with this code is frozen.
+    - `rest(state, code)`: the frozen state of a rotor that is lost with this status code.
     - `row(t, state, errors, alive)`: the row at time t (s).
     - `completed(row, span)`: the row with the signals that are known only at the end of the sample.
     - `singularity(row)`: a number that is positive on the admissible side of the singular curve C. Eq. (9)
@@ -57,8 +57,8 @@ class System(Protocol[S, E, R]):
 
         jump(t, state, errors) -> state
 
-    It is called first in a sample: the row and the integrator use the state after the jump. The state of a lost rotor
-    does not jump. A system whose rates are smooth within a sample has
+    It is called at the start of a sample: the row and the integrator use the state that it returns. The state of a lost
+    rotor does not jump. A system whose rates are smooth within a sample has
 
         problem(errors) -> InitialValueProblem
 
@@ -80,7 +80,9 @@ class System(Protocol[S, E, R]):
 
 
 class RolloutState(NamedTuple):
-    """State of a rollout between two samples: of the system, the ending, the integrator and the fold."""
+    """State of a rollout between two samples: the states of the system, the integrator (`memory`) and the fold, and
+    `ending`.
+    """
 
     state: Any
     ending: Ending
@@ -94,13 +96,13 @@ def rollout(cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | 
     - `fold`: accumulated at every sample, so that metrics need no stored trajectory; None: no metrics.
     - `every`: a row is recorded at the start of every `every`-th sample; 0: no rows.
 
-    Returns an `Outcome`. If the rotor touches down, or a state leaves the range of the model, the state is frozen and
-    the trajectory reports the loss. Values and derivatives stay finite.
+    Returns an `Outcome`. If the rotor touches down, or a state leaves the range of the model (`loop.DIVERGENCE`), the
+    state is frozen and the trajectory reports the loss. Values and derivatives stay finite.
 
     The function is pure and jitted. It works under vmap, jvp and grad; reverse mode requires a method with fixed steps.
 
-    Raises ValueError for an invalid gain, parameter or clock, for an explicit step above its stability limit, and for a
-    clock without a method if gains are traced. In the last case, call `with_method` outside the transformation.
+    Raises ValueError for an invalid gain, parameter or clock, for an explicit step above its stability limit, and if
+    `clock.method` is None while gains are traced. In the last case, call `with_method` outside the transformation.
     """
     loop, clock, fold = canonical((*prepare(cascade, scenario, clock), fold))
     return roll(loop, clock, fold, every=every)
@@ -117,7 +119,7 @@ def prepare(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[ClosedL
 
 
 def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
-    """Raise ValueError, with the dotted path and the fix, for a concrete value that is not allowed.
+    """Raise ValueError for an invalid value that is not traced. The message has its path and a correction.
 
     Traced values are not checked.
     """
@@ -165,9 +167,9 @@ def begin(system: System, clock: Clock, fold: Fold | None) -> RolloutState:
 def segment(
     system: System, clock: Clock, fold: Fold | None, progress: RolloutState, first: Scalar, count: int, every: int
 ) -> tuple[RolloutState, Row | None]:
-    """Simulate `count` samples from number `first` on, and record a row at every `every`-th of them.
+    """Simulate `count` samples from number `first` on, and record a row at every `every`-th sample.
 
-    Returns the new state and the rows; None if every = 0.
+    Returns the new state and the rows; the rows are None if every = 0.
     """
     step = functools.partial(one_sample, system.realised(), clock, fold)
 
@@ -195,7 +197,7 @@ def recorded_segment(
 ) -> tuple[RolloutState, Row]:
     """Simulate `count` samples from number `first` on, and record every row. Returns the new state and the rows.
 
-    Samples after the last one of the clock do not change the state. One compiled program with a fixed `count` can
+    Samples after the last sample of the clock do not change the state. One compiled program with a fixed `count` can
     therefore simulate every part of a run.
     """
     step = functools.partial(one_sample, system.realised(), clock, fold)
@@ -240,8 +242,8 @@ def one_sample(
         t = k.astype(dtype) * clock.sample_period
         errors = system.sensor_errors(k)
         alive = ending.lost_code == ALIVE
-        # Signals are evaluated just after t. One that jumps at this instant then has its later value, even if t was
-        # rounded down.
+        # Signals are evaluated just after t. A signal that jumps at this instant then has its value after the jump,
+        # even if t was rounded down.
         just_after = t * (1 + 4 * jnp.finfo(dtype).eps)
         if hasattr(system, "jump"):
             state = choose(alive, system.jump(just_after, state, errors), state)

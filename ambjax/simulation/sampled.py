@@ -30,16 +30,17 @@ from ambjax.world.signals import Reference, reference_at
 
 
 class SampledState(NamedTuple):
-    """State of the closed loop on a processor. A part that the loop does not have is ().
+    """State of the closed loop on a processor. A field is () if the loop has no such part.
 
     - `plant`, `control`: states of the plant and of the laws.
     - `command`: last command, with u within the limit of the supply.
-    - `past`: the two voltages before that of `command`, V, the later one first.
-    - `finite`: 1; 0 after a law or the sensor has returned a number that is not finite.
+    - `past`: the two voltages before that of `command`, V, the most recent first.
+    - `finite`: 1 at the start; 0 after a law or the sensor has returned NaN or infinity.
     - `z_filtered`: output of the low-pass of the position sensor, m.
     - `u_a`: output voltage of the amplifier, V.
     - `watch`: state of the guard.
-    - `started`: 0 until the guard has accepted all readings of one sample, which initialise the laws; then 1.
+    - `started`: 0 until the guard has accepted all readings of one sample; then 1. Until then, each sample initialises
+      the laws.
     - `sensed`: state of a sensor with faults.
     """
 
@@ -61,7 +62,7 @@ class Sampled:
 
     - `loop`: the closed loop in continuous time.
     - `period`: sample period, s.
-    - `cuts`: largest number of edges of disturbances inside one sample; None: the number of all edges.
+    - `cuts`: largest number of jumps (edges) of disturbances inside one sample; None: the number of all edges.
     """
 
     loop: ClosedLoop
@@ -134,7 +135,7 @@ class Sampled:
         return self._with_faults(self.measured(state.plant, state.z_filtered, errors), state, errors)
 
     def reference(self, t: Scalar) -> Reference:
-        """Return the reference for the laws at the sample at t (s): with prediction, that at the end of the delay."""
+        """Return the reference of the laws in the sample at t (s); with prediction, that at the end of the delay."""
         late = self.processor.ahead * self.period if self.processor.predicts else 0.0
         return reference_at(self.loop.scenario.reference, t + late)
 

@@ -82,7 +82,7 @@ def processor_lines(sampled: SampledReport, margin: Delays, unknown: Delays | No
     ]
     words = f"No, {len(lines)} of {len(sampled.slopes)} {'is' if len(lines) == 1 else 'are'} not:" if lines else "Yes."
     end = status(sampled.lost_at, sampled.lost_why, sampled.stalled, STALLED_PLANT)
-    lines = [f"Is every law stable with its discrete step? {words}", *lines, _curve(*sampled.distance), end]
+    lines = [f"Is the discrete step of every law stable? {words}", *lines, _curve(*sampled.distance), end]
     if sampled.alternates:
         lines.append(_alternates(sampled.alternating or 0.0))
     if unknown is None:

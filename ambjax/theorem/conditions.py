@@ -31,12 +31,12 @@ from ambjax.world.signals import Reference, Signal, reference_at
 
 @dataclasses.dataclass(frozen=True)
 class Condition:
-    """One line of the check.
+    """One condition `gain` > `against`, evaluated along a run.
 
     `requires`: the condition as text. `gain`, `against`: its left and right side, in `unit`; `gain` is None if the law
     has no such gain. `at_s`: time of the worst value, s. `holds`: None for a line that is only informative, or if
-    `gain` is None. `path`, `over`: path of the gain in a case file and name of the right side, if the line is about a
-    gain. `ideal`: whether `against` depends on the reference only, not on the run.
+    `gain` is None. `path`, `over`: path of the gain in a case file and name of the right side; '' if the condition is
+    not about a gain. `ideal`: whether `against` depends on the reference only, not on the run.
     """
 
     name: str
@@ -77,14 +77,14 @@ class Report:
 
     @property
     def holds(self) -> bool:
-        """Whether every deciding condition holds and the rotor is levitated to the end."""
+        """Whether no condition fails and the rotor is held to the end."""
         return math.isinf(self.lost_at) and not any(c.holds is False for c in self.conditions)
 
 
 class Side(NamedTuple):
-    """One definition of the right side of a condition: the peak of `signal` along the run.
+    """One way to compute the right side of a condition: the peak of `signal` along the run.
 
-    `signal` None: the right side is computed for the ideal motion z = r. `name`: name of the condition. `where`: words
+    `signal` None: the right side is computed for the ideal motion z = r. `name`: name of the condition. `where`: text
     after the symbol of the right side.
     """
 
@@ -228,7 +228,7 @@ def _conditions(
 
 
 def constant_sigma(law: PositionLaw) -> list[Condition]:
-    """Return a condition for each schedule that changes the sliding variable, which the theorem takes as fixed."""
+    """Return a condition for each schedule that changes the sliding variable, which the theorem keeps constant."""
     plain: Any
     one: Any
     zero: Any

@@ -1,4 +1,4 @@
-"""The bearing: a vertical rotor between two electromagnets (Table 1, Eq. (3)), and the protocol of its plants."""
+"""The bearing: a vertical rotor between two electromagnets (Table 1, Eq. (3)), and the base class of the plants."""
 
 from typing import ClassVar, Generic, NamedTuple, TypeVar
 
@@ -24,12 +24,12 @@ class Signals(NamedTuple):
 
 @record
 class Bearing(Generic[S]):
-    """Parameters of rotor and magnets, Table 1, and the force of given currents. Scalars of one member, SI units.
+    """Parameters of rotor and magnets (Table 1), and the force of given currents. Scalars of one member, SI units.
 
     A plant is a subclass of this record, and its state is a NamedTuple of scalars. The subclass implements `start`,
     `rates`, `rest`, `scale`, `measurement` and `signals`; it inherits the other methods.
 
-    Deviation: the paper prints k_z in N m; it is a stiffness, N/m, negative (restoring).
+    The paper prints k_z in N m. Here it is a stiffness in N/m; a negative value is restoring.
     """
 
     m: Scalar = leaf(default=0.588, unit="kg", at_least=1e-6, at_most=1e6, doc="mass of rotor and axle")
@@ -53,7 +53,7 @@ class Bearing(Generic[S]):
     iron: Iron | None = part(
         default=None,
         doc="saturation, leakage and eddy currents of the true plant; None: ideal iron. "
-        "The laws' formulas never contain it",
+        "The formulas of the laws do not contain it",
     )
 
     one_current: ClassVar[bool] = False
@@ -115,7 +115,9 @@ class Bearing(Generic[S]):
         return self.i_0 + i, self.i_0 - i
 
     def flux_currents(self, state: S) -> tuple[Array, Array]:
-        """Return the currents (A) that determine the fluxes of the two coils; if there is a lag, delayed ones."""
+        """Return the currents (A) that determine the fluxes of the two coils; if the flux has a lag, the delayed
+        currents.
+        """
         return self.currents(state)
 
     def pull(self, flux_currents: tuple[Array, Array], z: Scalar, gaps: Gaps | None = None) -> Array:
@@ -188,7 +190,7 @@ class Bearing(Generic[S]):
         return (self.i_0 / self.s_0) * (self.i_0 / self.s_0)
 
     def gaps(self, z: Scalar) -> Gaps:
-        """Return the gaps s_0 - z and s_0 + z (m). Only their inverses are bounded (GAP_FLOOR)."""
+        """Return the gaps s_0 - z and s_0 + z (m). The gaps are not bounded; their inverses are (GAP_FLOOR)."""
         return gaps(z, self.s_0)
 
     def v(self, z: Scalar, i: Scalar) -> Array:
@@ -208,7 +210,7 @@ class Bearing(Generic[S]):
         return self.v_and_dv_di(z, i)[1]
 
     def v_and_dv_di(self, z: Scalar, i: Scalar, gaps: Gaps | None = None) -> tuple[Array, Array]:
-        """Return v (A^2/m^2) and dv/di (A/m^2). `gaps`: those at z; None: not computed yet."""
+        """Return v (A^2/m^2) and dv/di (A/m^2). `gaps`: those at z; None: computed here."""
         gaps = gaps or self.gaps(z)
         along = (self.i_0 * z + self.s_0 * i) * gaps.inverse
         across = (self.i_0 * self.s_0 + i * z) * gaps.inverse
@@ -217,8 +219,8 @@ class Bearing(Generic[S]):
     def current_for(self, z: Scalar, v: Scalar) -> Array:
         """Return the current (A) with scaled force v at z: the root of Eq. (3) that is continuous at i = 0.
 
-        The formula has no cancellation, so it is smooth through z = 0, where the quadratic degenerates. If no current
-        gives the force v at z, the result is the current on C at this z: its force is the closest to v.
+        At z = 0 the quadratic becomes linear. The formula has no cancellation there and is smooth. If no current gives
+        the force v at z, the result is the current on C at this z: its force is the closest to v.
         """
         # Eq. (3) times the squared product of the gaps: difference i^2 + 2 total i - above = 0. The root is written
         # without cancellation.

@@ -34,7 +34,7 @@ TOLERANCE_BELOW = 0.01
 LEAST_MARGIN = 0.002
 # Value of `Limit.source` for the limit on the rms error that traces the front of error against voltage.
 FRONT = "the front"
-# Replaces an infinite judged value: this factor times the larger of the limit and the search's value.
+# An infinite judged value is replaced by this factor times the larger of the limit and the search's value.
 LOST_FACTOR = 10.0
 # Intervals of the integral in `Limit.error_reduction`.
 PRICE_INTERVALS = 200
@@ -42,7 +42,7 @@ PRICE_INTERVALS = 200
 
 @record
 class LimitTerm:
-    """Term of a limit in the goal. Its numbers are leaves, so a change of a number does not recompile the search.
+    """Term of a limit in the goal. Its numbers are leaves: a change of them does not recompile the search.
 
     `name`: key of the quantity in KINDS. `log_allowed`: logarithm of `Limit.allowed`. `multiplier`, `penalty`, `ratio`:
     as in `Limit`.
@@ -74,16 +74,16 @@ class Limit:
     """A limit, and the state of its augmented Lagrangian.
 
     `name`: key of the quantity in KINDS. `threshold`: the limit, in the unit of the quantity. `source`: origin of the
-    limit, for the report. `multiplier`, `penalty`: of the augmented Lagrangian. `ratio`: the judge's value divided by
-    the search's value. `missed`: g of the judge's value at the last update. `history`: (judge's value, multiplier) of
-    every update.
+    limit (case file, default or FRONT), for the report. `multiplier`, `penalty`: of the augmented Lagrangian. `ratio`:
+    the judge's value divided by the search's value. `missed`: log excess of the judge's value at the last update; inf
+    before the first. `history`: (judge's value, multiplier) of every update.
     """
 
     name: str
     threshold: float
     source: str = "tune.limits"
     margin: float = 0.0
-    """share by which the search keeps the quantity below the limit, or above a lower one"""
+    """relative distance that the search keeps from the limit, on the allowed side"""
     multiplier: float = 0.0
     ratio: float = 1.0
     penalty: float = PENALTY
@@ -119,7 +119,7 @@ class Limit:
         return -excess if self.kind.at_least else excess
 
     def active(self, reached: float | None) -> bool:
-        """Return whether the limit is active: its multiplier is above 0, and the judge's value `reached` is near it.
+        """Return whether the limit is active: its multiplier is above 0, and `reached` (judged) is near the limit.
 
         The tolerance is TOLERANCE_BELOW plus the margin. `reached`: None if no member is judged; then only the
         multiplier decides.
@@ -152,8 +152,8 @@ class Limit:
         """Return the relative decrease of the minimised rms value if the limit is looser by the share `more`.
 
         The decrease is 1 - exp(-I/2), where I is the integral of the multiplier over the logarithm of the limit. The
-        optima of earlier updates are those of looser limits. The multiplier is interpolated linearly between them, and
-        is constant beyond them.
+        optima of earlier updates exceed the limit, so they are optima of looser limits. The multiplier is interpolated
+        linearly between them, and is constant beyond them.
         """
         if not self.multiplier:
             return 0.0
@@ -174,8 +174,8 @@ class Limit:
     def of_members(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the quantity of each member that is held, or of all members if none is held.
 
-        `columns`: as for `reached`. Lost rotors are left out, because their voltage is 0 after the loss, which would
-        lower a mean. The limit `survival` counts them.
+        `columns`: as for `reached`. Lost rotors are excluded, because their voltage is 0 afterwards, which would lower
+        a mean. The limit `survival` counts them.
         """
         alive = ~np.isfinite(columns["lost_at_s"])
         values = np.asarray(columns[self.kind.exact or f"loss.{PREFIX}{self.name}"])

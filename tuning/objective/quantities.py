@@ -28,8 +28,7 @@ TINY = 1e-30
 class Typical:
     """Fold: the 16-norm over samples of |row.`of`| in units of `size`, a smooth maximum.
 
-    The derivative of a saturated voltage is 0. The norm also includes the unsaturated samples, whose derivatives are
-    not.
+    The derivative of a saturated voltage is 0. The norm also includes unsaturated samples, whose derivatives are not 0.
     """
 
     of: str = static()

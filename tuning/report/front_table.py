@@ -53,7 +53,7 @@ def sentence(rows: list[Facts]) -> str:
     if taken is least:
         return f"This answer has the least error: {words}."
     return (
-        f"This answer has the least rms voltage among those within {100 * (KNEE - 1):g} % of the least error: "
+        f"This answer has the least rms voltage of those with an error of at most {KNEE:g} times the least error: "
         f"{taken['settled_rms_error_m']:.3g} m at {taken['settled_rms_u_V']:.3g} V. Least error: {words}."
     )
 

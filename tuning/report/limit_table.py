@@ -61,7 +61,10 @@ def facts(
 
 
 def _verdict(kept: bool | None, refuted: str) -> Facts:
-    """Return whether a limit is held, and its verdict. `kept`: whether the judged members keep it; None: no members."""
+    """Return whether a limit is held, and its verdict.
+
+    `kept`: whether the judged value is within the limit; None if no member was judged.
+    """
     if kept is None:
         return {"held": None, "verdict": UNJUDGED}
     if not kept:
@@ -102,7 +105,7 @@ def _row(
 
 
 def _tested(row: Facts, delayed: DelayTest | None, refuted: str) -> Facts:
-    """Return the row with the result of the test of the delay margin; unchanged if it is of another limit."""
+    """Return the row with the result of the test of the delay margin; unchanged if it belongs to another limit."""
     if row["name"] != DELAY_MARGIN or delayed is None:
         return row
     words = (
@@ -118,7 +121,7 @@ def _asked(problem: TuningProblem) -> list[Limit]:
 
 
 def _by_injection(limit: Limit, measured: Sensitivity | None) -> str:
-    """Return the words on the injection, if it measures the quantity."""
+    """Return the text about the injection; '' if injections do not measure the quantity."""
     if limit.name not in MEASURED or measured is None or not measured.peaks[0].repetitions:
         return ""
     those = f"injected into {len(measured.peaks)} of the worst members"
@@ -132,7 +135,7 @@ def _saturated(limit: Limit, reached: float | None, measured: Sensitivity | None
 
 
 def _at_the_supply(row: Facts) -> str:
-    """Return the words on a value that an injection measured while the supply limited u; '' if it did not."""
+    """Return a warning if the supply limited u during the injection; '' if it did not."""
     share = row.get("saturated")
     if share is None or share <= MOST_SATURATED:
         return ""

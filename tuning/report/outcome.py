@@ -111,7 +111,7 @@ def _statuses(facts: TuningFacts) -> str:
     undecided = f", {after['stalled']} not decided (their integration stalls)" if after["stalled"] else ""
     return (
         f"Of {after['members']} held-out members, {after['lost']} are lost under the tuned gains (before: "
-        f"{before['lost']}){undecided}; settled rms error of the held members: {_error(after)} (before: "
+        f"{before['lost']}){undecided}; settled rms error of the surviving members: {_error(after)} (before: "
         f"{_error(before)}){_largest(after)}."
     )
 

@@ -14,15 +14,15 @@ from tuning.objective.goal import shown
 from tuning.report.front_table import letter
 from tuning.search.explore import Slices
 
-# Upper end of the axis of the risk: a lost member costs about 1e6 times an error.
+# Largest plotted risk. A lost member raises the risk by about 1e6, which would hide the other values.
 HIGHEST = 30.0
 # Largest number of panels in a row of the picture of the objective along each gain.
 GAINS_PER_ROW = 5
-# Largest value of the goal in the picture, relative to the least; limits far from met give values above 1e300.
+# Largest plotted value of the goal, relative to the least. Strongly violated limits give values above 1e300.
 LARGEST_GOAL = 1e9
 # Length (s) of the enlarged start and end of a run; at most a quarter of the run.
 ZOOM = 0.02
-# Time shown after a loss as a share of the time before it.
+# Time shown after the loss of a rotor, as a share of the time before it.
 SHOWN_AFTER_LOSS = 0.15
 # Variations below this share of a signal's largest value are shown flat.
 FLAT = 1e-2
@@ -34,10 +34,10 @@ FAINTEST, FEWEST = 1e-5, 16
 
 @own_style
 def before_after(runs: dict[str, Trajectory], settle: float = 0.0) -> bytes:
-    """Draw z - r and u (averaged over each sample) of runs by name, as PNG: columns are the whole run, start and end.
+    """Draw z - r and u (averaged over each sample) of runs by name, as PNG. Columns: the whole run, its start, its end.
 
-    A lost run is cut shortly after the loss. A run "before" that is lost has one line of text and no panels. In the
-    first column the scale of a run that is held is that of its values from `settle` (s) on.
+    A lost run is cut shortly after the loss. If the run "before" is lost, a line of text replaces its panels. In the
+    first column, the axis of a run without loss is scaled to its values from `settle` (s) on.
     """
     from matplotlib.figure import Figure
 
@@ -70,7 +70,7 @@ def before_after(runs: dict[str, Trajectory], settle: float = 0.0) -> bytes:
                 margin = MARGIN * np.ptp(late)
                 ax.set_ylim(late.min() - margin, late.max() + margin)
             bottom, top = ax.get_ylim()
-            if top - bottom < least:  # what is smaller is rounding, or nothing to look at
+            if top - bottom < least:  # smaller variations are rounding, or not relevant
                 ax.set_ylim((bottom + top - least) / 2, (bottom + top + least) / 2)
             ax.ticklabel_format(axis="y", useOffset=False)
             ax.grid(alpha=0.3)
@@ -170,7 +170,7 @@ def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
 
 @own_style
 def landscape(slices: Slices, paths: list[str]) -> bytes:
-    """Draw the minimised goal along each gain through the answer, as PNG."""
+    """Draw the goal as a function of each gain, with the other gains of the answer, as PNG."""
     from matplotlib.figure import Figure
 
     m = len(paths)
@@ -205,7 +205,7 @@ def landscape(slices: Slices, paths: list[str]) -> bytes:
 
 @own_style
 def front(rows: list[dict[str, Any]]) -> bytes:
-    """Draw settled rms error over settled rms voltage, as PNG; points with lost members are crossed out.
+    """Draw settled rms error against settled rms voltage, as PNG. A cross marks a point with lost or stalled members.
 
     Each point has its letter of the table, its error and its voltage.
     """

@@ -1,4 +1,4 @@
-"""A sequence of searches, each of which starts from the result of earlier ones, and restarts around the best point.
+"""A sequence of searches. Each starts from the results of earlier ones. Restarts begin around the best point.
 
 A search can stop at a jump of the goal, although the goal is lower on the other side. A restart therefore tries
 quasi-random points around the best point so far.
@@ -28,19 +28,19 @@ from tuning.search.screen import around, initial_points
 
 # Largest number of searches in `search_and_restart`.
 MOST_SEARCHES = 5
-# Restarts end after two searches in a row that each lower the goal, a logarithm, by less than this. One such search is
-# not enough, because its points may miss a better optimum by chance.
+# Restarts end after two successive searches that each lower the goal, a logarithm, by less than this. One such search
+# is not enough, because its points may miss a better optimum by chance.
 LEAST_IMPROVEMENT = 0.01
 # Number of earlier points of the searches that are checked with accurate steps if these confirm none of the answers.
 FALLBACK_POINTS = 12
 # After PACED iterations of the first search, the time of all searches is estimated from the usual number of iterations:
-# 22 to 120 in benchmarks/tasks; more if a limit of |S| is measured while the supply limits.
+# 22 to 120 in benchmarks/tasks; and more if |S| is measured while the supply limits the voltage.
 PACED, USUAL_ITERATIONS = 4, (20, 450)
 
 
 @dataclasses.dataclass(frozen=True)
 class SearchResult:
-    """Result of the rounds.
+    """Result of all searches and validations (`rounds`).
 
     `problem`, `members`: of the last search. `x` [m]: coordinates of the gains. `error`: step error at x; None if it
     was not computed. `history`: arrays of all searches with a row for each iteration.
@@ -76,9 +76,9 @@ class SearchResult:
 class Course:
     """Mutable state of a sequence of searches.
 
-    `problem`, `members`: the problem and the training ensemble of the next search. `seed`: of all random numbers.
-    `out`: directory of the checkpoints; None: no checkpoints. `facts`: settings that a checkpoint must match.
-    `resume`: whether to continue from the checkpoints.
+    `problem`, `members`: the problem and the training ensemble of the next search. `seed`: seed of the random numbers.
+    `out`: directory of the checkpoints; None: no checkpoints. `facts`: settings that a checkpoint must match. `resume`:
+    whether to continue from the checkpoints.
     """
 
     problem: TuningProblem
@@ -92,7 +92,9 @@ class Course:
     past: list[SearchState] = dataclasses.field(default_factory=list)
     """the searches so far"""
     limit_searches: int = 0
-    """number of searches that follow an update of the limits' multipliers; they do not count against MOST_ROUNDS"""
+    """number of searches that follow an update of the limits' multipliers; they do not count towards
+    `rounds.MOST_ROUNDS`
+    """
     began: float = dataclasses.field(default_factory=time.perf_counter)
     """start of the first search, s"""
 
@@ -146,7 +148,7 @@ class Course:
 
 
 def search_and_restart(course: Course, start: np.ndarray) -> np.ndarray:
-    """Search from the gains `start` [m], SI units, then restart around the best point while that lowers the goal.
+    """Search from the gains `start` [m], SI units, then restart around the best point (`should_restart`).
 
     Returns the coordinates [m] of the best point. There is no restart if all members are lost or tune.screen is 0.
     """
@@ -165,7 +167,7 @@ def search_and_restart(course: Course, start: np.ndarray) -> np.ndarray:
 
 
 def should_restart(goals: Sequence[float]) -> bool:
-    """Return whether to restart after searches that ended at these goals, which are logarithms.
+    """Return whether to restart. `goals`: values of the goal, a logarithm, at the end of each search so far.
 
     True if one of the last two searches lowered the goal by more than LEAST_IMPROVEMENT, up to MOST_SEARCHES searches.
     """

@@ -106,7 +106,7 @@ def chosen(seen: Sequence[FrontPoint], factor: float) -> FrontPoint:
 def _admissible(seen: Sequence[FrontPoint]) -> list[FrontPoint]:
     """Return the points that lose no more members than the first point, and meet all limits if the first point does.
 
-    If the first point meets the limits with half of their margins, so do they: the held-out members may exceed the
+    If the first point is within all limits by half of their margins, so are they: the held-out members may exceed the
     values of the judged members by a few percent.
     """
     first = seen[0]
