@@ -11,7 +11,7 @@ from texts import case_and_tune
 
 from ambjax.linear import analyse, frequency_lines, injected, linearise
 from ambjax.results.operating import one_period
-from tuning.measured_peaks import injections
+from tuning.measured_peaks import INJECTED, injections
 from tuning.objective.limits import PREFIX
 from tuning.objective.loops import loops
 from tuning.objective.quantities import KINDS, LOOPS
@@ -145,7 +145,7 @@ def test_injections_find_the_members_with_the_largest_measured_peak():
     x = problem.objective.space.encode(problem.objective.space.values(problem.case.cascade))
     count = 6
     columns = {"loss.limit.sensitivity": np.arange(count)[::-1] + 1.0, "lost_at_s": np.full(count, np.inf)}
-    found = injections(problem, x, 1, columns, most=2)
+    found = injections(problem, x, 1, columns)
     assert found.decides
     case, masses = problem.case, problem.objective.chosen(1, np.arange(count), count).values["plant.m"]
     clock = one_period(case)
@@ -160,7 +160,7 @@ def test_injections_find_the_members_with_the_largest_measured_peak():
         )
         for m in masses
     ]
-    expected = sorted(range(count), key=lambda k: -each[k].peak)[:2]
+    expected = sorted(range(count), key=lambda k: -each[k].peak)[:INJECTED]
     assert [one.member for one in found.peaks] == expected
     # the same signal, amplitude and plant, in another program
     assert [one.peak for one in found.peaks] == pytest.approx([each[k].peak for k in expected], rel=1e-6)

@@ -68,13 +68,11 @@ def decides(problem: TuningProblem) -> bool:
     return injects(problem) and any(set_valued_signs(getattr(problem.case.cascade, stage)) for stage in DEFAULT_LAWS)
 
 
-def injections(
-    problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray], most: int = INJECTED
-) -> Sensitivity | None:
-    """Analyse and measure the members with the largest peak at coordinates x [m], of the judged `columns` [N].
+def injections(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray]) -> Sensitivity | None:
+    """Analyse and measure the INJECTED members with the largest peak at coordinates x [m], of judged `columns` [N].
 
-    `most`: number of these members. They are those with the largest linear peak or, if injections decide, with the
-    largest peak of one measurement each. Returns None if no limit needs it, or no member is held.
+    The members are those with the largest linear peak or, if injections decide, with the largest peak of one
+    measurement each. Returns None if no limit needs it, or no member is held.
     """
     name = next((name for name in MEASURED if f"loss.{PREFIX}{name}" in columns), None)
     alive = np.flatnonzero(~np.isfinite(columns["lost_at_s"]))
@@ -83,7 +81,7 @@ def injections(
     order = alive[np.argsort(-columns[f"loss.{PREFIX}{name}"][alive], kind="stable")]
     of = _Judged(problem, x, seed, len(columns["lost_at_s"]))
     if not injects(problem):
-        return Sensitivity(tuple(_summary(int(k), of.analysis(k), None) for k in order[:most]), False)
+        return Sensitivity(tuple(_summary(int(k), of.analysis(k), None) for k in order[:INJECTED]), False)
     first = of.analysis(order[0])
     peak = None if first is None else first.S.frequency
     if decides(problem):
@@ -92,9 +90,9 @@ def injections(
         order = alive[np.argsort(-size, kind="stable")]
     random = problem.objective.scenario.random
     repetitions = REPETITIONS if random else 1
-    every = of.responses(order[:most], repetitions, peak)
+    every = of.responses(order[:INJECTED], repetitions, peak)
     peaks = []
-    for at, k in enumerate(order[:most]):
+    for at, k in enumerate(order[:INJECTED]):
         own = slice(at * repetitions, (at + 1) * repetitions)
         parts = {name: getattr(every, name)[own] for name in ("S", "KS", "saturated", "held")}
         peaks.append(_summary(int(k), of.analysis(k), injection_of(every._replace(**parts), random)))

@@ -148,10 +148,9 @@ def judged_values(
 
     `columns` [N]: result of `judge` for the ensemble with this `seed`. `tuned`: the search's value of each limit.
 
-    On a processor, the member with the largest linear peak may break a limit. It is then measured by one injection, as
-    the held-out members are. So it is if the search's value, corrected by an earlier injection, may break the limit. If
-    only injections decide (`measured_peaks.decides`), there is no new injection while these corrected values are
-    clearly within their limits.
+    If on a processor a linear peak, or the search's value corrected by an earlier injection, may break a limit, members
+    are measured by injection as the held-out members are. If only injections decide (`measured_peaks.decides`), there
+    is no new injection while these corrected values are clearly within their limits.
     """
     if not injects(problem):
         return [limit.reached(columns) for limit in problem.limits]
@@ -168,6 +167,6 @@ def judged_values(
         )
         known = {}
     if near:
-        measured = injections(problem, x, seed, columns, most=1)
+        measured = injections(problem, x, seed, columns)
         return [reached_of(limit, columns, measured) for limit in problem.limits]
     return [known.get(limit.name, limit.reached(columns)) for limit in problem.limits]
