@@ -14,8 +14,8 @@ HEAD = """# Benchmarks
 Both times of a ratio come from the same run of a script. Absolute times depend on the machine and its load.
 
 The comparison with other libraries and the scaling were measured before metrics included substeps; ensembles with
-all metrics are slower now. The times of `ambjax tune`, of the search and of the page were measured while other programs
-ran, all other times on an idle machine.
+all metrics are slower now. Other programs ran while the times of `ambjax tune`, of the search and of the page were
+measured. All other times were measured on an idle machine.
 
 The scenario is the paper's tracking scenario with the disturbance as a scaled force, unless a section names another.
 Smooth gains are gamma = 1e9 and p = 25e-6 in the inversion; repaired gains are gamma = 7.5e4 and p = 25.
@@ -62,7 +62,7 @@ def single() -> list[str]:
     data = load("single")
     lines = ["## One run of 2 s, at equal accuracy (`single.py`)", "", facts(data["machine"])]
     lines += [
-        "Each solver uses its cheapest tolerance for which the largest error in z is at most",
+        "Each solver has the tolerance with the shortest run for which its largest error in z is at most",
         f"{data['target_error_m']:g} m.",
         "",
     ]
@@ -89,7 +89,7 @@ def work_precision() -> list[str]:
         "## Work against precision (`work_precision.py`)",
         "",
         facts(data["machine"]),
-        "Each run simulates 0.2 s at 10 kHz. References are two solutions with much smaller errors.",
+        "Each run simulates 0.2 s at 10 kHz. The references are two solutions whose errors are much smaller.",
         "",
     ]
     lines += ["![work against precision](results/work_precision.png)", ""]
@@ -113,10 +113,11 @@ def throughput() -> list[str]:
     data = load("throughput")
     lines = ["## Ensembles against the machine's limit (`throughput.py`)", "", facts(data["machine"])]
     lines += [
-        f"RK4 with steps of 10 us, {data['samples']} samples of 10 steps, or {data['samples_of_few']:,} for fewer",
-        "than 256 members. Times are in ns per member and step, without compilation. The limit is a C program with",
-        "SIMD (`limit.c`); the two programs run alternately. A single member is a `rollout`. Speed-up: speed relative",
-        "to one core, in brackets that of the limit.",
+        f"RK4 with steps of 10 us. A run has {data['samples']} samples of 10 steps, or {data['samples_of_few']:,}",
+        "samples if there are fewer than 256 members. Times are in ns per member and step, without compilation. The",
+        "limit is a C program with SIMD (`limit.c`); the two programs run alternately. A single member is a",
+        "`rollout`. Speed-up: speed relative to one core; in brackets, the speed-up of the limit. Held noise is",
+        "constant over a sample.",
         "",
     ]
     rows = []
@@ -134,11 +135,12 @@ def peers() -> list[str]:
     data = load("peers")
     lines = ["## Ensembles against other libraries (`peers.py`)", "", facts(data["machine"])]
     lines += [
-        "One core, no noise. Times are in ns per member and per 10 us of simulated time. Libraries with fixed steps",
-        "take RK4 steps of 10 us and are compared with the same steps of ambjax. Adaptive solvers (tolerance 1e-6) are",
-        "compared with the cheapest step of ambjax that reaches their measured error (column `with`), and with the",
-        "cheapest step whose error is at most 1e-6 of the largest z",
-        f"({data['largest_z_m']:.1e} m; column `at 1e-6 by`).",
+        "One core, no noise. Times are in ns per member and per 10 us of simulated time. `ambjax is faster by` is the",
+        "time of the row divided by the time of ambjax with the method in the column `with`. Libraries with fixed",
+        "steps take RK4 steps of 10 us, and are compared with the same steps of ambjax. Adaptive solvers (tolerance",
+        "1e-6) are compared with the fastest method of ambjax that reaches their measured error. `at 1e-6 by` is the",
+        "same ratio for the fastest method of ambjax whose error is at most 1e-6 of the largest z,",
+        f"{data['largest_z_m']:.1e} m.",
         "",
     ]
     rows = []
@@ -153,22 +155,23 @@ def peers() -> list[str]:
 def scaling() -> list[str]:
     data = load("scaling")
     lines = ["## Cost and memory against size (`scaling.py`)", "", facts(data["machine"])]
-    lines += ["Held noise, float64, one core, one process per row. Relative: time per member and step over that of"]
-    lines += ["1,024 members and 200 samples, measured alternately.", ""]
+    lines += ["Held noise, float64, one core, one process per row. Relative: time per member and step, divided by that"]
+    lines += ["of 1,024 members and 200 samples. The two are measured alternately.", ""]
     for name in ("members", "samples"):
         rows = []
         for row in data[name]["rows"]:
             cells = [f"{row['members']:,}", f"{row['samples']:,}", f"{row['seconds']:.3f}", f"{row['ns']:.2f}"]
             rows.append([*cells, f"{row['relative']:.3f}", f"{row['peak_bytes'] / 2**20:.0f}"])
         lines += table("members | samples | run (s) | ns per member and step | relative | peak memory (MiB)", rows)
-        lines += [f"Linear in {name} to within {100 * data[name]['deviation']:.0f} %.", ""]
+        lines += [f"The time is linear in the number of {name} to within {100 * data[name]['deviation']:.0f} %.", ""]
     return lines
 
 
 def held_noise() -> list[str]:
     data = load("held_noise")
     lines = ["## Held noise: steps per hold (`held_noise.py`)", "", facts(data["machine"])]
-    lines += ["64 members, one core, smooth gains. Errors are relative to the largest |z|.", ""]
+    lines += ["64 members, one core, smooth gains. The noise is constant over each sample of 100 us. Errors are"]
+    lines += ["relative to the largest |z|.", ""]
     for case in data["cases"]:
         lines += [f"Noise: {case['noise']}.", ""]
         cells = [[r["method"], f"{r['relative_error']:.1e}", f"{1e3 * r['seconds']:.1f}"] for r in case["methods"]]
@@ -176,7 +179,8 @@ def held_noise() -> list[str]:
         if case["ratio"]:
             best = case["best"]
             high, low = (best[kind]["method"] for kind in ("DOP853", "RK4"))
-            lines += [f"At {data['target']:g}: {high} takes {case['ratio']:.2f} of the time of {low}.", ""]
+            lines += [f"Time of the fastest steps with an error of at most {data['target']:g}: {high} takes"]
+            lines += [f"{case['ratio']:.2f} times as long as {low}.", ""]
     return lines
 
 
@@ -184,8 +188,8 @@ def gradients() -> list[str]:
     data = load("gradients")
     lines = ["## Cost of a gradient of four gains (`gradients.py`)", "", facts(data["machine"])]
     lines += [
-        "One core, float64. The cost of a gradient is its time over that of a forward run with the same code and",
-        "step. For four gains the tuner uses forward mode. Reverse mode recomputes parts of the run.",
+        "One core, float64. The cost of a gradient is its time divided by that of a forward run with the same code",
+        "and step. For four gains the tuner uses forward mode. Reverse mode recomputes parts of the run.",
         "",
     ]
     rows = []
@@ -205,8 +209,8 @@ def sampled() -> list[str]:
     lines += [
         f"{first['members']:,} members, float64, one core, held noise, 10 kHz, one sample of delay with prediction,",
         f"{first['substeps']} substeps. Times are in ns per member and sample. C: the program `sampled.c`. Error:",
-        "largest relative difference between C and a `rollout` under the same noise. Gradient: cost of a gradient",
-        f"of 4 gains in forward mode for {data['tangents_of']} members, in forward runs.",
+        "largest relative difference between C and a `rollout` under the same noise. Gradient: time of a gradient",
+        f"of 4 gains in forward mode for {data['tangents_of']} members, divided by the time of a forward run.",
         "",
     ]
     rows = []
@@ -292,13 +296,13 @@ def search() -> list[str]:
     data = load("search")
     lines = ["## The search against derivative-free methods (`search.py`)", "", facts(data["machine"])]
     lines += [
-        "All methods use the same loss, members, coordinates and ranges. TPE may leave the ranges by half their",
-        "width, random search may not. The budget of rollouts is the median number of rollouts of the gradient search",
+        "All methods use the same loss, members, coordinates and ranges. TPE may exceed the ranges by half their",
+        "width; random search may not. The budget of rollouts is the median number of rollouts of the gradient search",
         "over its seeds, or a multiple of it. Loss: median and range over seeds. Powell's method is deterministic;",
         "Nelder-Mead and CMA-ES have deterministic starting points. Reached: number of rollouts until a method",
         "reaches the final median loss of the gradient search, median over seeds; a dash: not within the budget.",
-        "The number of rollouts does not measure the cost, because a call always computes a full batch, of which",
-        "only the needed members count. Time: processor time of one search on one core.",
+        "A call always simulates a full batch, but only the members that a method needs count as rollouts. The number",
+        "of rollouts is therefore no measure of the cost. Time: processor time of one search on one core.",
         "",
     ]
     rows = []
@@ -331,8 +335,8 @@ def schedules() -> list[str]:
         f"CMA-ES. A gradient of all gains costs {each:.1f} plain rollouts in reverse mode, which the search uses, and",
         f"{data['cost']['forward']:.1f} in forward mode (ratios of processor time); it is counted as {each:.1f}.",
         f"Losses: median and range over {len(ends['CMA-ES'])} seeds, at {seconds:g} s of processor time on one core,",
-        f"without compilation, and at {least:,.0f} rollouts. Reached: rollouts until the median loss of CMA-ES at its",
-        "end, median over seeds. The machine had other load.",
+        f"without compilation, and at {least:,.0f} rollouts. Reached: rollouts until a method reaches the final median",
+        "loss of CMA-ES, median over seeds. Other programs ran during the measurement.",
         "",
     ]
     rows = []
@@ -386,7 +390,7 @@ def startup() -> list[str]:
     lines = ["## Time of whole commands (`startup.py`)", "", facts(data["machine"])]
     lines += [
         "Each command runs in a new process with a warm compilation cache, on the paper's tracking case. Medians of",
-        f"{data['runs']} runs; least: the shortest of them. Relative: processor time over that of `import jax`.",
+        f"{data['runs']} runs; least: the shortest of them. Relative: processor time divided by that of `import jax`.",
         "",
     ]
     rows = [
@@ -400,8 +404,8 @@ def workarounds() -> list[str]:
     data = load("workarounds")
     lines = ["## Workarounds for XLA's compiler (`workarounds.py`)", "", facts(data["machine"])]
     lines += [
-        f"Time without a workaround over the time with it, for three programs; medians of {data['rounds']} pairs of",
-        "runs.",
+        "The table gives the time without a workaround, divided by the time with it, for three programs: medians of",
+        f"{data['rounds']} pairs of runs.",
         "",
     ]
     jobs = [key for key in next(iter(data["rows"].values())) if key != "says"]
