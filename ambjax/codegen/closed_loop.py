@@ -33,7 +33,7 @@ class ControllerState(NamedTuple):
 
 
 class Machines:
-    """Compiled controllers behind one function of the controller's index, its state and its inputs."""
+    """Compiled controllers with one function `step`, which takes the controller's index, its state and its inputs."""
 
     def __init__(self, *machines: Compiled) -> None:
         self.machines = machines
@@ -114,7 +114,7 @@ def compare_loops(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, Lo
 
 
 def times_of(z: np.ndarray, horizon: Horizon) -> float:
-    """Return the distance of z from JAX's divided by that of the twins, the largest over the horizon."""
+    """Return the largest ratio, over the horizon, of the distance of z from JAX's to that of the farthest twin."""
     n = horizon.samples
     if not horizon.decisive:
         return np.nan

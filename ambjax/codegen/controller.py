@@ -205,9 +205,9 @@ class Controller(Block):
 def controller_of(cascade: Cascade, u_max: Scalar, period: float, scenario: Scenario | None = None) -> Controller:
     """Return the controller of a case. Raises ValueError for a cascade in continuous time.
 
-    `u_max`: limit of the command (`Scenario.command_limit`), V or A. `period`: sample period, s. `scenario`: clearance
-    and sensors, from which the limits of the guard are derived that the case does not give. None: the model's
-    clearance, and sensors without error.
+    `u_max`: limit of the command (`Scenario.command_limit`), V or A. `period`: sample period, s. `scenario`: its
+    clearance and sensors determine those limits of the guard that the case does not give. None: the model's clearance,
+    and sensors without error.
     """
     if cascade.processor is None:
         raise ValueError(

@@ -17,7 +17,7 @@ from ambjax.codegen.program import Operand, Program, Ref, of
 
 LOOPS = ("scan", "while")
 COMPOSED = ("rsqrt", "exp2", "logistic")
-# Primitives that whole numbers which depend on data may have.
+# Primitives whose operands may be whole numbers that depend on data.
 CODES = ("select_n", "eq", "ne", "lt", "le", "gt", "ge")
 
 
@@ -77,7 +77,7 @@ class _Reader:
         if name == "convert_element_type":
             return self._converted(args[0], dtype, law)
         counted = any(self.program.dtype(x).kind in "iu" and isinstance(x, Ref) for x in args)
-        if counted and name not in CODES:  # a status code is compared and chosen
+        if counted and name not in CODES:  # a status code is only compared and selected
             raise ValueError(refusal(name, law, "of whole numbers"))
         if name == "select_n":
             if len(args) != 3:

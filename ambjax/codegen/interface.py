@@ -51,7 +51,7 @@ INPUTS = {
 }
 
 
-# The output u by what the controller commands (`CurrentLaw.commands`).
+# The output u, by the quantity that the controller commands (`CurrentLaw.commands`).
 COMMANDS = {
     "voltage": ("V", "voltage to apply, within the supply's limit"),
     "current": ("A", "current to command to the amplifier, within its limit"),
@@ -74,6 +74,6 @@ BITS = {
     "refused": "a reading is NaN, beyond its limit or too far from the prediction, which replaces it",
     "failed": "a law returned a value that is not finite: its state is kept, u is held",
     "singular": "(z, i_ref) is near the singular curve of Eq. (9)",
-    "safe": "u is 0, the laws keep their states: more than guard.samples readings in a row, or all so far, are refused",
+    "safe": "more than guard.samples readings in a row, or all so far, are refused: u is 0, the laws keep their states",
     "invalid": "the reference, params->processor.delay or a steepness p is NaN or out of range: u is held",
 }

@@ -21,8 +21,8 @@ class Number(NamedTuple):
 
     - `ends`: further values of a parameter at which exported code is compared with JAX: the lowest and the highest
       first, then values that are not finite or that a step must reject.
-    - `among`: values of a state that is a flag or a code, each as often as the comparison shall draw it; () for a real
-      number.
+    - `among`: values of a state that is a flag or a code, from which the comparison draws; a value that occurs twice is
+      drawn twice as often. () for a real number.
     """
 
     name: str

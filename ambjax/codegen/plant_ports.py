@@ -60,7 +60,7 @@ COORDINATES = {
     "i": ("A", "current deviation"),
     "i_1": ("A", "current of the upper coil"),
     "i_2": ("A", "current of the lower coil"),
-    "delayed": ("A", "current deviation of the flux, behind the eddy currents"),
-    "delayed_1": ("A", "current of the upper coil's flux, behind the eddy currents"),
-    "delayed_2": ("A", "current of the lower coil's flux, behind the eddy currents"),
+    "delayed": ("A", "delayed current deviation that determines the flux, with eddy currents"),
+    "delayed_1": ("A", "delayed current that determines the flux of the upper coil, with eddy currents"),
+    "delayed_2": ("A", "delayed current that determines the flux of the lower coil, with eddy currents"),
 }

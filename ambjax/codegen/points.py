@@ -11,15 +11,18 @@ from ambjax.codegen.numbering import UNREAD
 from ambjax.codegen.program import PRECISIONS, Ref
 from ambjax.codegen.trace import Trace
 
-# Decades around the scale of each number; the probabilities that a number is an edge and that a point is a first step.
+# DECADES: range of the random numbers, in decades around the scale of each. EDGY: probability that a number is zero,
+# tiny, or at or near a limit. FIRST: probability that a point is a first step.
 DECADES, EDGY, FIRST = (-7.0, 1.7), 0.02, 0.05
-# Random points between which borders are searched; draws per point; share of points within the supply's limit, if any.
+# POOL: number of random points between which thresholds are searched. DRAWS: random points per selected point. CALM:
+# share of points that set no bit of `Block.crowded`, if there are enough.
 POOL, DRAWS, CALM = 3000, 4, 0.4
-# Pairs of points on both sides of the threshold of each comparison, and bisections of each pair.
+# PAIRS: pairs of points on both sides of the threshold of each comparison. HALVINGS: bisections of each pair.
 PAIRS, HALVINGS = 4, 64
-# Share of varied points that move one parameter, the others having the case's values; the rest move all at once.
+# ALONE: share of the varied points in which one parameter is changed; in the others, all are drawn at random.
 ALONE = 0.7
-# Share of the points with a limit at an end of its range whose input is set near that limit; its relative distances.
+# AT_LIMIT: share of the points with a changed limit whose input is set near this limit. BESIDE: relative distances from
+# the limit.
 AT_LIMIT, BESIDE = 0.5, (-1e-6, 1e-6)
 
 
@@ -33,7 +36,7 @@ class Points(NamedTuple):
 
 
 def verification_points(trace: Trace, count: int, seed: int = 0) -> Points:
-    """Return points with the case's parameters: random over decades, edges, and both sides of every comparison."""
+    """Return points with the case's parameters: random, special values, and both sides of every comparison."""
     random, dtype = np.random.default_rng(seed), PRECISIONS[trace.precision]
     drawn = max(DRAWS * count, POOL)
     own = np.array([x.value for x in trace.parameters])

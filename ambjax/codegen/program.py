@@ -18,7 +18,7 @@ PRECISIONS = {"float": "float32", "double": "float64"}
 
 
 class Ref(NamedTuple):
-    """Operand: the node of this number."""
+    """Operand: the node with this number."""
 
     node: int
 
@@ -41,7 +41,7 @@ STARTED, PERIOD = Location("started"), Location("period")
 
 
 class Node(NamedTuple):
-    """One operation: of OPS, or `input` with the location that it reads; dtype and the law that it is of."""
+    """One operation: its name in OPS, or `input` with the location that it reads; its dtype and its law."""
 
     op: str
     args: tuple[Operand, ...]
@@ -94,7 +94,7 @@ class Program:
         return seen
 
     def evaluate(self, inputs: Mapping[int, np.ndarray]) -> list[np.ndarray]:
-        """Return the value of every node, computed with NumPy from those of the input nodes, arrays of one shape."""
+        """Return the value of every node, computed with NumPy. `inputs`: values of the input nodes, of one shape."""
         values: list[np.ndarray] = []
         with np.errstate(all="ignore"):
             for number, node in enumerate(self.nodes):
@@ -105,7 +105,7 @@ class Program:
 
 
 def _key(x: Operand) -> tuple[str, str]:
-    """Return the key by which operands are equal: a node's number or a constant's bits, so that -0 differs from 0."""
+    """Return a key that is equal for equal operands: a node's number, or a constant's bits (-0 differs from 0)."""
     return ("node", f"{x.node:06}") if isinstance(x, Ref) else (x.dtype.str, x.tobytes().hex())
 
 

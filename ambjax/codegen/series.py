@@ -25,7 +25,7 @@ def just_after(t: Scalar) -> Scalar:
 def series(cascade: Cascade, scenario: Scenario, clock: Clock, samples: int) -> dict[str, np.ndarray]:
     """Return the inputs of the loop at samples 0 to `samples` - 1, by name.
 
-    The disturbances of sample n are those at the sample before, because they act until sample n.
+    The disturbances for sample n are those of the sample before, because these act until sample n.
     """
     given: Any = system_of(cascade, scenario, clock)
     found = _series(canonical(given), jnp.arange(samples))

@@ -38,7 +38,7 @@ class Trace:
     - `block`, `precision`: the block, and "float" or "double".
     - `program`: the operations.
     - `parameters`, `inputs`: the parameters and the inputs of the step, with names, units and values.
-    - `state`: pairs of a state and the operand of its next value, without states on which nothing depends.
+    - `state`: pairs of a state and the operand of its next value, without the states on which no result depends.
     - `started`: operand of the next value of the flag `started`.
     - `outputs`, `bits`: pairs of an output, or the name of a status bit, and its operand.
     - `read`: names of the inputs that the step uses.
@@ -97,7 +97,8 @@ class Trace:
 def trace(block: Block, to: str) -> Trace:
     """Trace the step of a block. `to`: the precision, "float" or "double".
 
-    The step is traced twice: the first trace shows which inputs it uses, and the second checks these only.
+    The step is traced twice: the first trace shows which inputs it uses, and the step of the second trace checks only
+    these.
 
     Raises ValueError for a law, a plant or a method that scalar code cannot express.
     """

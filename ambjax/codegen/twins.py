@@ -31,9 +31,10 @@ from ambjax.world.signals import Constant
 
 T = TypeVar("T")
 
-# Twins of each precision; the share of a signal's rms at which they have parted; samples that a verdict takes at least.
+# TWINS: number of twins of each precision. PARTED: difference of a twin, as a share of a signal's rms, that ends the
+# horizon. LEAST: smallest number of samples for a verdict.
 TWINS, PARTED, LEAST = 8, 1e-2, 20
-# Signals whose parting ends the horizon.
+# Signals in which a difference of a twin ends the horizon.
 SIGNALS = ("z", "u")
 
 
@@ -114,8 +115,8 @@ class Twin(Sampled):
     def _sizes(self, state: SampledState) -> SampledState:
         """Return the scale of each state. A number below its scale changes by the unit in the last place of the scale.
 
-        The scale of a voltage is that which drives the coil's current reference within one sample, because the laws
-        divide the difference of two references by the period. That of a commanded current is that of i_ref.
+        The scale of a voltage includes the voltage that changes the current by i_ref within one sample, because the
+        laws divide the difference of two references by the period. The scale of a commanded current is that of i_ref.
         """
         cascade, plant = self.loop.cascade, self.loop.scenario.plant
         model = cascade.model

@@ -45,7 +45,7 @@ class Check(NamedTuple):
 class Draft:
     """The files of a block in one precision, and JAX's results of its step.
 
-    `steps`: by check, points and results; one check has the case's parameters, the other has varied ones.
+    `steps`: points and results of each check, by its name. One check uses the case's parameters, the other varied ones.
     """
 
     trace: Trace
@@ -174,8 +174,9 @@ at which an intermediate number is subnormal are omitted, because XLA replaces i
 
 Parameters: one step with other parameters. This check finds a gain or a limit that the C has as a constant. Every
 parameter that the step reads is set to {1 / SPAN:g} and {SPAN:g} times the case's value, within the range in the
-header, first alone, then with the others at random ends of their ranges. Alone, it is also set to NaN, u_max and a
-steepness p to inf, and processor.delay to values outside its range: the C must reject what JAX rejects.
+header, first alone, then with the others at random ends of their ranges. When changed alone, a parameter is also
+set to NaN; u_max and a steepness p are also set to inf, and processor.delay to values outside its range. The C must
+reject what JAX rejects.
 
 Closed loop: the compiled C with the rest of the loop in JAX (a controller with JAX's plant and sensors, a plant with
 JAX's controller), compared with the same loop in JAX in double precision. An exported plant or loop has disturbances

@@ -37,10 +37,10 @@ class Law:
       structure of the state.
     - `own_steps`: the discretisations, "implicit" or "explicit", for which a processor calls the method `step`. For the
       others it makes an explicit Euler step. The default is ("implicit",) for a class that defines `step`.
-    - `stiff`: whether the law has a state that a smoothed sign keeps inside its boundary layer, so that it changes
-      fast; set for a class that defines `layer`.
+    - `stiff`: whether a smoothed sign keeps a state of the law inside its boundary layer, so that this state changes
+      fast; True for a class that defines `layer`.
     - `slides`: whether an inversion law has the method `slide`, which integrates across the boundary layer
-      (`laws.Relaxation`); set for a class that defines it.
+      (`laws.Relaxation`); True for a class that defines it.
     """
 
     requirement: ClassVar[Requirement | None] = None
@@ -58,16 +58,16 @@ class Law:
         cls.stiff, cls.slides = cls.stiff or "layer" in written, cls.slides or "slide" in written
 
     def size(self, model: Plant) -> Scalar | None:
-        """Return the characteristic size of the argument of the law's smoothed sign; None if it has no such sign.
+        """Return the characteristic size of the argument of the law's smoothed sign; None if the law has no such sign.
 
         Default steepnesses are proportional to 1/size (`default_law`).
         """
         return None
 
     def layer(self, model: Plant) -> object:
-        """Return, for each component of the state, the integration error that keeps it in the sign's boundary layer.
+        """Return the largest integration error of each state with which it stays in the boundary layer of its sign.
 
-        The default is inf, for a component that no sign moves.
+        The default is inf, which is the value for a state that no sign moves.
         """
         scale: Any = self
         return jax.tree.map(lambda _: jnp.inf, scale.scale(model))
@@ -80,7 +80,7 @@ class Law:
         return 0.0 * error
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        """Return the ranges of the tuner's search, by the names of the gains.
+        """Return the range in which the tuner searches each gain, by the name of the gain.
 
         A gain that is not in the dict is searched around its value.
         """
@@ -127,7 +127,7 @@ class Law:
         return
 
     def in_continuous_time(self: L) -> L:
-        """Return the law for a run in continuous time of a cascade that has a processor; by default itself."""
+        """Return the law for a run in continuous time of a cascade that has a processor; by default the law itself."""
         return self
 
     def has_own_step(self, implicit: bool) -> bool:
@@ -139,8 +139,8 @@ def default_law(kind: type[L], model: Plant, period: float | None = None) -> L:
     """Return the law of type `kind` with its default gains (`Law.designed`), and with steepnesses scaled to `model`.
 
     The default of a steepness p is for the plant of Table 1. It is scaled by the inverse size of the sign's argument,
-    so that the boundary layer 1/p is the same share of this size for every plant. With p = 25 m^2/A^2, for example,
-    that of v_tilde is 1.6e-5 of the size of v in Table 1, 2500 A^2/m^2.
+    so that the boundary layer 1/p is the same share of this size for every plant. With p = 25 m^2/A^2, for example, the
+    boundary layer of v_tilde is 1.6e-5 of the size of v for Table 1, which is 2500 A^2/m^2.
     """
     law: Any = kind().designed(model, period)
     size = law.size(model)

@@ -19,7 +19,7 @@ from ambjax.world.signals import Reference
 
 
 class ChainState(NamedTuple):
-    """State of `FilterChain`: the derivative's filter and the integral (A), and two numbers of each biquad."""
+    """State of `FilterChain`: the filter of the derivative and the integral (A), and the two states of each biquad."""
 
     derivative: Array
     integral: Array
@@ -34,12 +34,14 @@ class FilterChain(PositionLaw[ChainState]):
     """v_star = dv/dz z + dv/di i_star, i_star = i_r - H e: PID, lead-lag, two notches and a low-pass in series.
 
     H(s) = (k_p + k_int/s + k_d s/(1 + s/w_f)) (1 + s/w_z)/(1 + s/w_p) N_1(s) N_2(s) w_lp^2/(s^2 + sqrt(2) w_lp s +
-    w_lp^2) with N(s) = (s^2 + depth width w s + w^2)/(s^2 + width w s + w^2), and e = z - r. It uses the position only.
-    i_star and i_r are those of `state_feedback.StateFeedback`; for inversion.Linearised i_ref is i_star. Schweitzer and
-    Maslen, Magnetic Bearings (2009), 8.2. The integral takes up k_aw (i_star - i) while the supply limits u.
+    w_lp^2) with N(s) = (s^2 + depth width w s + w^2)/(s^2 + width w s + w^2), and e = z - r. The law uses the position
+    only. i_star and i_r are those of `state_feedback.StateFeedback`. With inversion.Linearised, i_ref is i_star.
+    Schweitzer and Maslen, Magnetic Bearings (2009), 8.2. The rate of the integral includes k_aw (i_star - i), which
+    limits the integral while the supply limits u.
 
-    On a processor each part is a bilinear transform, exact at the centre of a notch, which is at most 0.98 of the
-    Nyquist frequency. The lead-lag is off if w_z = w_p, and a notch is off if its depth is 1. By default all are off.
+    On a processor each part is discretised by the bilinear transform. The response of a notch is exact at its centre,
+    or at 0.98 of the Nyquist frequency if the centre is higher. The lead-lag is off if w_z = w_p, and a notch is off if
+    its depth is 1. By default, all of them are off.
     """
 
     k_p: Scalar = gain(default=135.0, unit="A/m", doc="proportional gain; left out: as state-feedback")
@@ -87,7 +89,7 @@ class FilterChain(PositionLaw[ChainState]):
         )  # fmt: skip
 
     def slope(self, model: Plant) -> Scalar:
-        """Return the largest corner of a part, k_aw, or the rate of e_ddot = -b (k_p e + k_d e_dot)."""
+        """Return the largest of k_aw, the poles of all parts, and the rate of e_ddot = -b (k_p e + k_d e_dot), 1/s."""
         corners = (self.w_f, self.k_aw, self.w_p, self.w_1, self.w_2, self.w_lp, self.explicit_rate(model))
         return jnp.max(jnp.stack([jnp.asarray(x) for x in corners]))
 
@@ -121,7 +123,7 @@ class FilterChain(PositionLaw[ChainState]):
     def step(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: ChainState, period: Scalar
     ) -> tuple[Array, ChainState]:
-        """Step each part by the bilinear transform, and the anti-windup with a share of at most 1."""
+        """Step each part by the bilinear transform; the anti-windup adds less than i_star - i to the integral."""
         motion, reference = inputs
         e = motion.z - reference.r
         half, leak = self.w_f * period / 2, self.k_aw * period
@@ -138,7 +140,7 @@ class FilterChain(PositionLaw[ChainState]):
         return force_of_current(model, motion.z, i_star), ChainState(derivative, integral, *after)
 
     def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of b k_d and sqrt(b k_p): the demanded current is that at the start of the sample."""
+        """Return the larger of b k_d and sqrt(b k_p), because their terms are evaluated at the start of a sample."""
         b = linear_mechanics(model).b
         return jnp.maximum(b * self.k_d, jnp.sqrt(b * self.k_p))
 

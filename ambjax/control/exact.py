@@ -23,7 +23,7 @@ WIDTH = 1e-6
 
 
 class ExactDifferentiator(Observer[tuple[Array, ...]]):
-    """Base class: a robust exact differentiator of `order`, with the bound `L` on the derivative of order + 1."""
+    """Base class of robust exact differentiators. `L` bounds the derivative of order `order` + 1 of the position."""
 
     L: Scalar
     order: ClassVar[int]

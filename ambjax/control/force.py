@@ -1,4 +1,4 @@
-"""The sliding variable, and the scaled forces that give an acceleration or that a linear magnet gives for a current."""
+"""The sliding variable, the scaled force for a wanted acceleration, and the scaled force of a linear magnet."""
 
 from typing import NamedTuple
 

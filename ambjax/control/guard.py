@@ -43,7 +43,7 @@ class GuardResult(NamedTuple):
     """Result of the guard at a sample.
 
     `reading`: the readings that the laws receive. `refused`: whether a reading was refused. `steps`: whether the laws
-    step; otherwise the command is the safe one. `left`: `Watch.left` of the next sample.
+    step; otherwise u = 0 (the safe command). `left`: `Watch.left` of the next sample.
     """
 
     reading: Measurement
@@ -84,7 +84,7 @@ class Guard:
         at_most=1_000_000,
         whole=True,
         optional=True,
-        doc="largest number of successive predictions; none: 1/(pole T), in which an error grows by the factor e",
+        doc="largest number of successive predictions; none: 1/(pole T); in this time, an error grows by the factor e",
     )
 
     @property
@@ -144,7 +144,7 @@ class Guard:
         return GuardResult(reading, ~good, good | (watch.left > 0), left)
 
     def refused(self, before: Watch, after: Watch) -> tuple[Array, Array]:
-        """Return whether the sample between two states refused a reading, and whether it gave the safe command."""
+        """Return whether a reading was refused at the sample between two states, and whether this sample gave u = 0."""
         refused = after.left < jnp.asarray(self.samples)
         return refused, refused & (before.left <= 0)
 
@@ -174,7 +174,7 @@ def guarded(cascade: C, scenario: Scenario, period: Scalar) -> C:
 def simulated(cascade: C, scenario: Scenario, period: Scalar) -> C:
     """Return the cascade for a simulation.
 
-    If all limits of its guard are derived and the sensor has no faults, no reading is refused, and the guard is
+    If all limits of its guard are derived and the sensor has no faults, the guard would refuse no reading, and it is
     removed. Otherwise the numbers of the guard are set (`guarded`).
     """
     one: Any = cascade

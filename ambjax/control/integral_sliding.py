@@ -1,4 +1,4 @@
-"""Sliding mode with the integral of the error on its manifold: the paper's position law with integral action."""
+"""The paper's position law with integral action: its sliding variable contains the integral of the error."""
 
 import jax.numpy as jnp
 from jax import Array
@@ -23,8 +23,9 @@ class IntegralSlidingMode(PositionLaw[Array]):
     Eq. (5) leaves an offset under a constant force, because s is then not zero. Here e = 0 at rest for any constant s.
     There is no anti-windup: the law continues to integrate while the supply limits u.
 
-    The integral starts at 0, and s reaches 0 later. In `manifolds.UtkinSlidingMode` s = 0 from the start, and the sign
-    only cancels the disturbance of a PD controller; there too, a constant force below k leaves no offset.
+    The integral starts at 0, and s reaches 0 later. In `manifolds.UtkinSlidingMode`, s is 0 from the start. There, a PD
+    controller determines the motion, and the sign only cancels the disturbance. That law, too, has no offset under a
+    constant disturbance |q_z| < k.
     """
 
     c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold")
@@ -64,7 +65,7 @@ class IntegralSlidingMode(PositionLaw[Array]):
         return force_for(self.c, model, motion, reference, robust - self.c_int * (motion.z - reference.r))
 
     def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of c and sqrt(c_int): on the manifold the demanded force is that at the sample's start."""
+        """Return the larger of c and sqrt(c_int), because their terms are evaluated at the start of a sample."""
         return jnp.maximum(self.c, jnp.sqrt(self.c_int))
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:

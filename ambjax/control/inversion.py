@@ -59,7 +59,7 @@ class AdaptiveReference(InversionLaw[Array]):
         return model.v_size
 
     def layer(self, model: Plant) -> Scalar:
-        """Return a third of the boundary layer in i_ref (A): v_tilde = 1/p divided by dv/di(0, 0)."""
+        """Return 0.3 of the boundary layer in i_ref (A), which is that in v_tilde, 1/p, divided by dv/di(0, 0)."""
         return 0.3 / (self.p * model.dv_di(0.0, 0.0))
 
 
@@ -67,7 +67,7 @@ class AdaptiveReference(InversionLaw[Array]):
 class Adaptive(AdaptiveReference):
     """i_ref' = gamma sgn(v_star - v(z, i_ref)) / (dv/di)(z, i_ref), with i_ref as its state. Eq. (6), sgn smoothed.
 
-    Deviation: the default gamma is 7.5e4; the printed 1000 violates the paper's own Eq. (7).
+    Deviation from the paper: the default gamma is 7.5e4, because the printed value, 1000, violates Eq. (7).
     """
 
     requirement: ClassVar = Requirement("gamma", "Delta_1")
@@ -90,7 +90,7 @@ class Adaptive(AdaptiveReference):
         return {"gamma": gamma, **steepness(context, "gamma")}
 
     def slide(self, model: Plant, begin: ForceDemand, end: ForceDemand, i_ref: Array, h: Scalar) -> Relaxation:
-        """Integrate i_ref over a step: at the rate gamma up to the boundary layer, then along v_star. Eq. (14a)."""
+        """Integrate i_ref over a step: at its initial rate up to the boundary layer, then inside it. Eq. (14a)."""
         v_0, gradient_0 = v_and_gradient(model, begin, i_ref)
         v_1, gradient_1 = v_and_gradient(model, end, i_ref)
         w = begin.v_star - v_0
@@ -99,7 +99,7 @@ class Adaptive(AdaptiveReference):
         return Relaxation(sliding / gradient_0, slaved / gradient_1, turn, path)
 
     def step(self, model: Plant, inputs: ForceDemand, state: Array, period: Scalar) -> tuple[CurrentDemand, Array]:
-        """Step v(z, i_ref) towards v_star with the sign at the end of the step; gamma bounds the slew rate."""
+        """Step v(z, i_ref) towards v_star with the sign at the end of the step; gamma bounds the rate of v."""
         w = inputs.v_star - model.v_and_dv_di(inputs.z, state, inputs.gaps)[0]
         after = model.current_for(inputs.z, inputs.v_star - relax(w, period * self.gamma, self.p))
         return CurrentDemand(state, (after - state) * (1 / period)), after
@@ -109,9 +109,9 @@ class Adaptive(AdaptiveReference):
 class FeedForwardAdaptive(AdaptiveReference):
     """i_ref' = (gamma sgn(w) + v_star' - dv/dz z')/(dv/di), w = v_star - v(z, i_ref): Eq. (6) with d of Eq. (8) added.
 
-    The feed-forward of the rates of v_star and z cancels d, so that w' = -gamma sgn(w) on a known plant: gamma exceeds
-    only the error of these rates, not Delta_1 of Eq. (7). The rates are those of the nominal model. They contain the
-    noise of the velocity, which Eq. (6) does not.
+    The feed-forward of the rates of v_star and z cancels d, so that w' = -gamma sgn(w) on a known plant. gamma must
+    therefore exceed only the error of these rates, not Delta_1 of Eq. (7). The rates are those of the nominal model.
+    They contain the noise of the velocity; Eq. (6) does not.
     """
 
     gamma: Scalar = gain(default=7.5e4, unit="A^2/m^2/s", doc="adaptation gain; above the error of the rates")
@@ -146,8 +146,9 @@ class StaticInversionState(NamedTuple):
 class StaticInversion(InversionLaw[tuple[()]]):
     """Base class of a law whose i_ref is a function of z and v_star, with its exact rate; no state in continuous time.
 
-    On a processor, the i_ref computed at a sample is the i_ref of the next sample, and i_ref' moves i_ref there in one
-    period. Without this state the current law would correct the step of i_ref that i_ref' has already commanded.
+    On a processor, the law returns the i_ref that it computed at the last sample, and the rate i_ref' that moves i_ref
+    to the new value in one period. The new value is the state of the law. Without this state, the current law would
+    respond twice to each change of i_ref: to i_ref', and to the change itself.
     """
 
     own_steps = ("implicit", "explicit")
@@ -179,7 +180,7 @@ class StaticInversion(InversionLaw[tuple[()]]):
     def step(
         self, model: Plant, inputs: ForceDemand, state: StaticInversionState, period: Scalar
     ) -> tuple[CurrentDemand, StaticInversionState]:
-        """Return the last sample's i_ref and the rate to the one of this sample; the first sample uses its own."""
+        """Return i_ref of the last sample (at the first sample: its own), and the rate from it to the new i_ref."""
         after = self.inverse(model, inputs.z, inputs.v_star)
         i_ref = jnp.where(state.begun > 0.5, state.i_ref, after)
         return CurrentDemand(i_ref, (after - i_ref) * (1 / period)), StaticInversionState(after, jnp.ones(()))

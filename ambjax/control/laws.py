@@ -6,10 +6,10 @@ A law is a frozen record: its type is the algorithm, its leaves are the gains. E
 - `init(model)`, for an observer `init(model, measured)`: the state at t = 0; () for a law without a state.
 - `law(model, inputs, state)`: the output, and the rate of the state.
 - `scale(model)`: the characteristic size of each component of the state; integration errors are relative to it.
-- `slope(model)`: the largest slope of the law, 1/s; the step size is chosen from it.
+- `slope(model)`: the fastest rate of the law in closed loop (slope), 1/s; the step size is chosen from it.
 - `sigma(motion, reference)`, for a position law: the sliding variable of a motion, m/s.
 
-`control.base.Law` has the other methods with their defaults. To add a law, write a record in the file of its stage, and
+`control.base.Law` defines the other methods, with defaults. To add a law, write a record in the file of its stage, and
 add it to `KINDS` in `ambjax/cases/controller_tables.py` and to the conformance test in `tests/test_laws.py`.
 """
 
@@ -111,7 +111,7 @@ class PositionLaw(Law, Generic[State], abc.ABC):
 
     @property
     def demand(self) -> str:
-        """The demanded quantity: "force", or a "voltage", which the inversion and current laws pass on unchanged."""
+        """The demanded quantity: "force" or "voltage". The inversion and current laws pass on a voltage unchanged."""
         return "force"
 
     @abc.abstractmethod
@@ -163,7 +163,7 @@ class CurrentLaw(Law, Generic[State], abc.ABC):
     """Base class of a current law: its input is the demanded current, its output the command u.
 
     `accepts`: the demands of a position law (`PositionLaw.demand`) with which the law can be combined. `commands`: what
-    u is, a "voltage" (V), or a "current" (A) for an amplifier that controls the current.
+    u is: a "voltage" (V), or a "current" (A) for an amplifier that controls the current.
     """
 
     accepts: ClassVar[tuple[str, ...]] = ("force",)

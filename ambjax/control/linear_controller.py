@@ -28,8 +28,8 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
     """v_star = dv/dz z + dv/di i_star, i_star = g/b + gain K(s) (r - z): a linear controller in state space.
 
     K has one input, r - z (m), or two inputs, r and z (m). Its output is a current (A) or a voltage u (V); for a
-    voltage, i_star = g/b + gain u/R. g/b is the current that carries the weight, b = a dv/di at z = 0, i = 0. For
-    inversion.Linearised i_ref is i_star; current.OpenLoop then applies R i_ref, which is the voltage itself.
+    voltage, i_star = g/b + gain u/R. g/b is the current that carries the weight, b = a dv/di at z = 0, i = 0. With
+    inversion.Linearised, i_ref is i_star. With a voltage, current.OpenLoop then applies R i_ref = gain u + R g/b.
 
     A continuous K is discretised by the bilinear (Tustin) transform at the period of a processor. A discrete K requires
     a processor with its own period. There is no anti-windup: the states of K do not depend on the supply's limit. The
@@ -69,7 +69,10 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
         return tuple((f"x_{k + 1}", "m", "state of the controller") for k in range(len(self.realisation.A)))
 
     def check_use(self, model: Plant, period: float | None) -> None:
-        """Raise ValueError for a discrete controller at another `period` (s; None: continuous), a voltage if R = 0."""
+        """Raise ValueError if a discrete controller has another period, or if the output is a voltage and R = 0.
+
+        `period`: sample period of the processor, s; None in continuous time.
+        """
         dt = self.realisation.dt
         if dt and period is None:
             raise ValueError(

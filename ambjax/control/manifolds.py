@@ -37,8 +37,8 @@ class UtkinSlidingMode(PositionLaw[Array]):
     Integral sliding mode: feedback linearisation, and a sign that cancels the disturbance (V. Utkin and J. Shi, Proc.
     35th IEEE Conf. Decision and Control, 1996, 4591-4596). x starts at -(e_dot + k_d e), so that s = 0 from the
     beginning: there is no reaching phase, and for |q_z| < k the error follows e_ddot = -k_p e - k_d e_dot at all times.
-    `integral_sliding.IntegralSlidingMode` starts its integral at 0 instead. s is not part of a trajectory, which
-    reports e_dot + (k_p/k_d) e as sigma. The default k_p and k_d for a model place a double pole at w/3.
+    `integral_sliding.IntegralSlidingMode` starts its integral at 0 instead. A trajectory does not contain s; it reports
+    e_dot + (k_p/k_d) e as sigma. The default k_p and k_d for a model place a double pole at w/3.
     """
 
     k_p: Scalar = gain(default=3.1e4, unit="1/s^2", doc="proportional gain; left out: (w/3)^2")
@@ -102,7 +102,7 @@ class UtkinSlidingMode(PositionLaw[Array]):
     def step(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: UtkinState, period: Scalar
     ) -> tuple[Array, UtkinState]:
-        """Step with the sign of s at the end of the step, from s = 0 at the first sample."""
+        """Step with the sign of s at the end of the step; s = 0 at the first sample."""
         motion, reference = inputs
         x = jnp.where(state.begun > 0.5, state.integral, self.begin(model, inputs))
         sign = share(sliding_variable(self.k_d, *inputs) + x, period * self.k, self.p)
@@ -115,10 +115,10 @@ class TerminalSlidingMode(PositionLaw[tuple[()]]):
     """v_star = (-2 k_z z/m + r_ddot + g - 2/3 c^2 l |y|^(1/2) sgn(y) - k sgn(sigma))/a, y = e_dot/(c l).
 
     Non-singular terminal sliding mode (Y. Feng, X. Yu and Z. Man, Automatica 38 (2002) 2159-2167) with the exponent
-    3/2: sigma = c (e + l |y|^(3/2) sgn(y)). On sigma = 0 the rate of the error is -c l |e/l|^(2/3) sgn(e), so an
-    error e_0 reaches 0 in the finite time 3 |e_0/l|^(1/3)/c. At |e| = l the error decays at the same rate as on the
-    manifold of Eq. (4), and faster if it is smaller. The root is smoothed below |y| = 0.01, and the sign with p. The
-    law has no integral.
+    3/2: sigma = c (e + l |y|^(3/2) sgn(y)). On sigma = 0 the rate of the error is -c l |e/l|^(2/3) sgn(e), so an error
+    e_0 reaches 0 in the finite time 3 |e_0/l|^(1/3)/c. At |e| = l the error decays at the rate c, as on the manifold of
+    Eq. (4). Below |e| = l it decays faster. The root is smoothed below |y| = 0.01, and the sign with p. The law has no
+    integral.
     """
 
     c: Scalar = gain(default=530.0, unit="1/s", doc="decay rate on the manifold where |e| = l; left out: w")
@@ -141,7 +141,7 @@ class TerminalSlidingMode(PositionLaw[tuple[()]]):
         return dataclasses.replace(self, c=model.pole, l=model.s_0 / 50, k=model.pole**2 * model.s_0 / 5)
 
     def slope(self, model: Plant) -> Scalar:
-        """Return the larger of the rates of the sign at |y| = 1, where d sigma/d e_dot is 3/2, and of the root."""
+        """Return the larger of the rate of the sign at |y| = 1 (d sigma/d e_dot is 3/2 there) and that of the root."""
         return jnp.maximum(1.5 * TWO_OVER_PI * self.k * self.p, self.explicit_rate(model))
 
     def size(self, model: Plant) -> Scalar:
@@ -181,7 +181,7 @@ class TerminalSlidingMode(PositionLaw[tuple[()]]):
     ) -> tuple[Array, tuple[()]]:
         """Step with the sign of sigma at the end of the step.
 
-        d sigma/d e_dot = 3/2 |y|^(1/2) is taken at the largest |y| that the sign reaches in the step.
+        d sigma/d e_dot = 3/2 |y|^(1/2) is evaluated at the largest |y| that can occur in the step.
         """
         reach = period * self.k
         most = jnp.abs(self._speed(*inputs)) + reach / (self.c * self.l)

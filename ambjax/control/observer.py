@@ -105,7 +105,7 @@ class Difference(Observer[Array]):
 
 
 class Predicted(NamedTuple):
-    """State of `Kalman`: the estimate; on a processor, the estimate for a sample from the earlier ones.
+    """State of `Kalman`: the estimate; on a processor, the prediction for a sample from the readings before it.
 
     - `z`, `z_dot`: position, m, and velocity, m/s.
     - `d`: disturbance, m/s^2.
@@ -167,7 +167,7 @@ class Kalman(Observer[Predicted]):
 
         The gains 1 - q^3, 3/2 (1-q)^2 (1+q)/T and (1-q)^3/T^2 are those of the fading-memory filter (N. Morrison,
         Introduction to Sequential Smoothing and Prediction, 1969). The acceleration of the model is interpolated
-        linearly between samples: the last step used a constant one, and this step corrects its prediction.
+        linearly between samples. The last step assumed a constant acceleration, and this step corrects its prediction.
         """
         z_ddot = model.z_ddot(inputs.z, inputs.i)
         change = z_ddot - state.z_ddot
@@ -188,8 +188,8 @@ class Kalman(Observer[Predicted]):
 class IRED1(ExactDifferentiator):
     """Robust exact differentiator of order 1: without noise, z_dot is exact while |z_ddot| <= L.
 
-    `ambjax.numerics.differentiator` has the equations. z itself is not filtered. The sign is smoothed in continuous
-    time, and evaluated at the end of the step with implicit steps on a processor.
+    `ambjax.numerics.differentiator` has the equations. z itself is not filtered. In continuous time, the sign is
+    smoothed. With implicit steps on a processor, it is evaluated at the end of the step.
     """
 
     L: Scalar = gain(default=50.0, unit="m/s^2", doc="bound on the acceleration")

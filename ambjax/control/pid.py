@@ -1,4 +1,4 @@
-"""Position laws that demand an acceleration, proportional to the error and its rate and integral."""
+"""Position laws that demand an acceleration, a linear function of the error, its rate and its integral."""
 
 from typing import NamedTuple
 
@@ -25,17 +25,18 @@ class PIDState(NamedTuple):
 class PID(PositionLaw[PIDState]):
     """v_star = (-2 k_z z/m + r_ddot + g - k_p e - k_d d - x)/a, e = z - r, d' = w_f (e_dot - d), x' = k_int e + ...
 
-    A PID controller with a filtered derivative and with the nominal plant's stiffness and weight fed forward, so that
-    e_ddot = -k_p e - k_d d - x where v = v_star: the gains do not depend on the plant. Astrom and Murray, Feedback
-    Systems (2008), 10.1 and 10.4; the feed-forward is that of Eq. (5). e_dot is that of the observer: with "difference"
-    d is the textbook's filtered derivative of the position.
+    A PID controller with a filtered derivative (Astrom and Murray, Feedback Systems, 2008, 10.1 and 10.4). As in Eq.
+    (5), the stiffness and the weight of the nominal plant are fed forward. If v = v_star, e_ddot = -k_p e - k_d d - x,
+    so the gains do not depend on the plant. e_dot contains the observer's estimate of the velocity. With the observer
+    "difference", d is the textbook's filtered derivative of the position.
 
-    The whole integral is x' = k_int e + k_aw (a v_star - a v(z, i)), back-calculation: while the supply limits u, the
-    force v(z, i) of the measured current is not the demanded one, and x follows it at the rate k_aw.
+    With back-calculation as anti-windup, the integral is x' = k_int e + k_aw (a v_star - a v(z, i)). While the supply
+    limits u, the force v(z, i) of the measured current differs from v_star, and x moves v_star towards it at the rate
+    k_aw.
 
-    k_d = 2 w, k_p = 2 w^2, k_int = w^3 are the optimal gains (LQR) for the cost w^6 (int e)^2 + e_ddot^2: its poles are
-    those of a Butterworth filter of bandwidth w. The default gains for a model have w = w_m/2, w_m the pole of the
-    magnets.
+    k_d = 2 w, k_p = 2 w^2, k_int = w^3 are the optimal gains (LQR) for the cost w^6 (int e)^2 + e_ddot^2. The closed
+    loop then has the poles of a Butterworth filter of bandwidth w. The default gains for a model have w = w_m/2, where
+    w_m is the pole of the magnets.
     """
 
     k_p: Scalar = gain(default=1.41e5, unit="1/s^2", doc="proportional gain; left out: w_m^2/2")
@@ -77,7 +78,7 @@ class PID(PositionLaw[PIDState]):
         return force_for(0.0, model, motion, reference, wanted)
 
     def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of k_d and sqrt(k_p): the demanded force is that at the start of the sample."""
+        """Return the larger of k_d and sqrt(k_p), because their terms are evaluated at the start of a sample."""
         return jnp.maximum(self.k_d, jnp.sqrt(self.k_p))
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
@@ -92,7 +93,7 @@ class PID(PositionLaw[PIDState]):
     def step(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: PIDState, period: Scalar
     ) -> tuple[Array, PIDState]:
-        """Step the filter and the anti-windup by backward Euler: both are stable for any rate.
+        """Step the filter and the anti-windup by backward Euler, which is stable for any rate.
 
         d+ = d + T w_f (e_dot - d+); v_star uses d+ and x; x+ = x + T (k_int e + k_aw (a v_star(x+) - a v(z, i))).
         """
@@ -141,7 +142,7 @@ class FeedbackLinearisation(PositionLaw[tuple[()]]):
         return force_for(0.0, model, motion, reference, -self.k_d * self.sigma(motion, reference)), ()
 
     def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of k_d and sqrt(k_p): the demanded force is that at the start of the sample."""
+        """Return the larger of k_d and sqrt(k_p), because their terms are evaluated at the start of a sample."""
         return self.slope(model)
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:

@@ -69,7 +69,7 @@ class SlidingMode(PositionLaw[tuple[()]]):
         return Relay(self.k, self.p)
 
     def explicit_rate(self, model: Plant) -> Scalar:
-        """Return c: on the manifold the demanded force is that at the start of the sample."""
+        """Return c, because its term is evaluated at the start of a sample."""
         return self.c
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
@@ -87,11 +87,11 @@ class SlidingMode(PositionLaw[tuple[()]]):
 
 @record
 class SuperTwisting(PositionLaw[Array]):
-    """sigma_dot = -k_1 sqrt|sigma| sgn(sigma) + w, w' = -k_2 sgn(sigma): the paper's future work.
+    """sigma_dot = -k_1 sqrt|sigma| sgn(sigma) + w, w' = -k_2 sgn(sigma): super-twisting, the paper's future work.
 
-    Levant, Int. J. Control 58 (1993) 1247-1263. Both terms are smoothed with p: the root as
-    sigma / (sigma^2 + 1/p^2)^(1/4), whose slope at zero is sqrt(p). The state w (m/s^2) integrates, so
-    a constant disturbance leaves no offset. Default slope at zero: k_1 sqrt(p) = 400 1/s, as SlidingMode has.
+    Levant, Int. J. Control 58 (1993) 1247-1263. Both terms are smoothed with p: the root as sigma / (sigma^2 +
+    1/p^2)^(1/4), whose slope at zero is sqrt(p). The state w (m/s^2) is an integral, so a constant disturbance leaves
+    no offset. The default slope at zero is k_1 sqrt(p) = 400 1/s, about that of SlidingMode.
     """
 
     c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold")
@@ -130,7 +130,7 @@ class SuperTwisting(PositionLaw[Array]):
         return force_for(self.c, model, motion, reference, robust), -self.k_2 * smooth_sign(sigma, self.p)
 
     def explicit_rate(self, model: Plant) -> Scalar:
-        """Return c: on the manifold the demanded force is that at the start of the sample."""
+        """Return c, because its term is evaluated at the start of a sample."""
         return self.c
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
@@ -153,7 +153,7 @@ class SuperTwisting(PositionLaw[Array]):
     ) -> tuple[Array, Array]:
         """Step with both terms at the end of the step (R. Seeber and B. Andritsch, Automatica 173 (2025) 112027).
 
-        The robust term is -k_1 root(y) + 2 w+ - w, y + T k_1 root(y) + T^2 k_2 sgn(y) = sigma.
+        The robust term is -k_1 root(y) + 2 w+ - w, where y solves y + T k_1 root(y) + T^2 k_2 sgn(y) = sigma.
         """
         motion, reference = inputs
         sigma = self.sigma(motion, reference)

@@ -72,11 +72,11 @@ class Processor:
         return bool(self.resolved().most) if self.predict is None else self.predict
 
     def resolved(self, *others: Scalar, between: bool = False) -> "Processor":
-        """Return this processor with all choices made that determine its compiled program.
+        """Return this processor with `whole` and `most` set, which determine its compiled program.
 
-        The program admits the processor's own delay and the delays `others`; with `between`, also every delay between
-        them. A program that already admits longer delays is kept, so that a part of an ensemble runs the program of
-        the whole ensemble. Raises ValueError if the delay is traced and no choice was made before.
+        The program supports the processor's own delay and the delays `others`; with `between`, also every delay between
+        them. If the processor already supports longer delays, it keeps them, so that a part of an ensemble runs the
+        program of the whole ensemble. Raises ValueError if the delay is traced and `most` is None.
         """
         if is_traced(self.delay):
             if self.most is None:
@@ -92,7 +92,7 @@ class Processor:
         return dataclasses.replace(self, whole=whole, most=most)
 
     def prediction_steps(self, period: Scalar) -> tuple[Array, ...]:
-        """Return the lengths (s) of the parts of the prediction in which u_{n-1} and, before it, u_{n-2} act."""
+        """Return the times (s) for which u_{n-1} and u_{n-2} act in the prediction; u_{n-2} acts first."""
         ahead = jnp.asarray(self.ahead)
         return (jnp.minimum(ahead, 1.0) * period, jnp.maximum(ahead - 1.0, 0.0) * period)[: self.most]
 
@@ -104,9 +104,9 @@ def predicted_over_delay(
     past: tuple[Array, Array],
     lengths: tuple[Array, ...],
 ) -> Measurement:
-    """Predict the estimate over these lengths (s), the last first, by one RK4 step of the model for each command.
+    """Predict the estimate by one RK4 step of the model for each command of `past`, the earliest first.
 
-    `driven`: `Cascade.driven`.
+    `driven`: `Cascade.driven`. `past`: the commands u_{n-1} and u_{n-2}. `lengths`: time for which each acts, s.
     """
     x = model.start(estimate)
     for u, h in reversed(list(zip(past, lengths, strict=False))):

@@ -38,8 +38,8 @@ class Realisation:
 
     `A` [n, n]: upper quasi-triangular (real Schur form). `B` [n, m], `C` [n], `D` [m]. The states are scaled, so that
     for inputs w of amplitude 1 their amplitudes are about 1 or less. `dt`: sample period of a discrete controller, s;
-    0: continuous. A discrete controller is stored as the continuous one that the bilinear transform with period dt
-    turns into it. `realisation` constructs it from arrays.
+    0: continuous. A discrete controller is stored as a continuous one, from which the bilinear transform with period dt
+    computes it. `realisation` constructs it from arrays.
     """
 
     A: tuple[Row, ...]
@@ -70,18 +70,18 @@ class Realisation:
         return np.array(self.C) @ states + np.array(self.D) if n else np.tile(np.array(self.D) + 0j, (len(s), 1))
 
     def output(self, x: Sequence[Array], w: Sequence[Array]) -> Array:
-        """Return y (a current in A or a voltage in V) for a state x of n and inputs w of m scalars, in m."""
+        """Return y (a current in A or a voltage in V) for the n states x and the inputs w (in metres)."""
         return _sum(self.C, x) + _sum(self.D, w)
 
     def rates(self, x: Sequence[Array], w: Sequence[Array]) -> tuple[Array, ...]:
-        """Return the rates of the n states for a state x and inputs w (m)."""
+        """Return the rates of the n states for the states x and the inputs w (in metres)."""
         return tuple(_sum(a, x) + _sum(b, w) for a, b in zip(self.A, self.B, strict=True))
 
     def step(self, x: Sequence[Array], w: Sequence[Array], period: Scalar) -> tuple[Array, tuple[Array, ...]]:
         """Return y and the next state of the bilinear (Tustin) transform of the controller.
 
-        `x`: n states. `w`: m inputs, m. `period`: T, s. With h = T/2 and the solution p of (1 - h A) p = x + h B w:
-        y = C p + D w, x+ = 2 p - x. Back substitution solves for p, in blocks of one row, or two rows for a pair of
+        `x`: n states. `w`: inputs, in metres. `period`: T, s. With h = T/2 and the solution p of (1 - h A) p = x + h B
+        w: y = C p + D w, x+ = 2 p - x. Back substitution solves for p, in blocks of one row, or two rows for a pair of
         complex poles.
         """
         h = jnp.asarray(period) / 2
@@ -138,7 +138,7 @@ def realisation(
 
 
 def _period(dt: npt.ArrayLike | None) -> float:
-    """Return the sample period, s; 0: continuous. Raises ValueError for a value that is not one."""
+    """Return the sample period, s; 0: continuous. Raises ValueError for any other value."""
     x = np.zeros(()) if dt is None else np.asarray(dt)
     if x.dtype == bool:
         raise ValueError("dt = True: a discrete controller needs a sample period. Give dt in seconds; 0: continuous.")

@@ -7,7 +7,7 @@ from ambjax.world.plant import Plant
 
 # Weights: the error, as a share of s_0, and the current, as a share of i_0, that cost the same.
 ERROR, CURRENT = 0.1, 0.1
-# The integral of the error costs as much as the error if it grows to the error in the time 1/(INTEGRAL w).
+# An error that lasts for the time 1/(INTEGRAL w) has an integral that costs as much as the error itself.
 INTEGRAL = 0.2
 # Longest sample period for which gains are designed, times the fastest rate of the mechanics.
 LONGEST = 0.5
@@ -20,7 +20,7 @@ def state_space(model: Plant) -> tuple[np.ndarray, np.ndarray]:
 
 
 def weights(model: Plant) -> tuple[np.ndarray, float]:
-    """Return Q [3, 3] and R of the cost of x'Q x + R i^2, x as in `state_space`, by Bryson's rule.
+    """Return Q [3, 3] and R of the cost x'Q x + R i^2 by Bryson's rule, with x as in `state_space`.
 
     A. E. Bryson and Y.-C. Ho, Applied Optimal Control (1975), 5.2.
     """
@@ -39,11 +39,11 @@ def discretised(A: np.ndarray, B: np.ndarray, period: float) -> tuple[np.ndarray
 
 
 def optimal_gains(model: Plant, period: float | None = None) -> np.ndarray:
-    """Return the K [3] for which i = -K x has the smallest cost of `weights`, for a model of numbers.
+    """Return the gains K [3] of the feedback i = -K x that minimises the cost of `weights`.
 
-    `period`: of the sampled feedback, s; at most LONGEST over the fastest rate. None: in continuous time. Raises
-    ValueError if the Riccati equation has no solution in floating-point numbers, or if a gain is not positive, as for
-    a rotor on springs much stiffer than the magnets.
+    `model`: its parameters are concrete numbers. `period`: sample period, s, replaced by LONGEST over the fastest rate
+    if it is longer; None: continuous time. Raises ValueError if the Riccati equation has no solution in floating-point
+    numbers, or if a gain is not positive, as for a rotor on springs much stiffer than the magnets.
     """
     import scipy.linalg
 

@@ -2,7 +2,7 @@
 
 A sign law drives x' = -k sgn_p(x) + w with |w| <= W < k. Steps of length T bring x into a band around 0. Explicit steps
 of the set-valued sign give |x| <= T (k + W), implicit steps |x| <= T W (V. Acary and B. Brogliato, Syst. Control Lett.
-59 (2010) 284-293). A smoothed sign adds the x at which it balances W.
+59 (2010) 284-293). A smoothed sign adds the |x| at which k sgn_p(x) balances W.
 """
 
 import functools
@@ -39,13 +39,15 @@ class SlopeLimits(NamedTuple):
 def slope_limits(late: float) -> SlopeLimits:
     """Return the limits of a = slope T in x_{n+1} = x_n - a x(n - late), 0 <= late <= 2.
 
-    x is interpolated linearly between samples. The limits are 2 and 1 without delay, 1 and 1/4 with one sample.
+    x is interpolated linearly between samples. The limits are 2 and 1 without delay, and 1 and 1/4 with a delay of one
+    sample.
     """
     if late <= 1:
         stable = min(1 / late if late else math.inf, 2 / (1 - 2 * late) if late < 0.5 else math.inf)
         return SlopeLimits(stable, 1 / (1 + math.sqrt(late)) ** 2)
     rest = late - 1
-    # characteristic polynomial r^2 (r - 1) + a ((1 - rest) r + rest): at the limit its real root r is double
+    # characteristic polynomial r^2 (r - 1) + a ((1 - rest) r + rest): at the limit for no oscillation, its real root r
+    # is double
     r = np.linspace(1e-6, 1.0, 20_001)
     non_oscillating = float(np.max(r * r * (1 - r) / ((1 - rest) * r + rest)))
     # Jury: a^2 rest^2 + a < 1
@@ -80,8 +82,8 @@ def _sign(x: Array, h: Array, p: Array | None, implicit: bool) -> Array:
 def band(relay: Relay, W: float, period: float, implicit: bool) -> float:
     """Return an invariant bound b of |x| (unit of x) under a disturbance of its rate up to W; inf if k <= W.
 
-    Implicit steps: b = T W + x_W with k sgn_p(x_W) = W, because a step from |x| <= b ends within x_W before the
-    disturbance acts. Explicit steps: the same if the slope of T k sgn_p is at most 1, so that x does not change sign;
+    Implicit steps: b = T W + x_W with k sgn_p(x_W) = W, because without the disturbance a step from |x| <= b ends at
+    |x| <= x_W. Explicit steps: the same if the slope of T k sgn_p is at most 1, so that x does not change sign;
     otherwise at least T (k + W). Every larger bound is invariant too.
     """
     k, p = float(relay.gain), math.inf if relay.steepness is None else float(relay.steepness)

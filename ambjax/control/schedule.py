@@ -46,7 +46,7 @@ class Schedule(GainFunction):
         """Return the gain at a position z (m) and a reference.
 
         At a knot, the derivative with respect to the signal is the mean of those on both sides. Where the signal is 0,
-        it is 0.
+        the derivative is 0.
         """
         signal = {"error": z - reference.r, "reference": reference.r, "reference-speed": reference.r_dot}[self.over]
         x, total = _magnitude(jnp.asarray(signal), ROUNDED * self.at[-1]), jnp.asarray(self.values[0])
@@ -84,7 +84,7 @@ class Schedule(GainFunction):
 
 
 def finite(field: dataclasses.Field) -> dataclasses.Field:
-    """Return the field that checks the value at a knot: that of the gain `field`, without infinite values."""
+    """Return the field by which the value at a knot is checked: the gain `field`, but finite."""
     return dataclasses.field(metadata={**field.metadata, "infinite": False, "steepness": False})
 
 

@@ -20,8 +20,9 @@ class SearchContext(NamedTuple):
     """Context of a search for gains.
 
     `model`: nominal plant. `w`: pole of the true plant, 1/s. `period`: sample period, s. `bounds`: lower bounds of
-    Theorem 1 on gains, by symbol (Q_z, Q_i, Delta_1). `delta_1`: the larger of the bounds of Eq. (7) on the reference
-    and in a fall, A^2/m^2/s. `stepped`: whether the laws run on a processor with implicit signs.
+    Theorem 1 on gains, by symbol (Q_z, Q_i, Delta_1). `delta_1`: the larger of the two bounds of gamma by Eq. (7),
+    along the reference and for a falling rotor, A^2/m^2/s. `stepped`: whether the laws run on a processor with implicit
+    signs.
     """
 
     model: Plant
@@ -40,8 +41,8 @@ class SearchContext(NamedTuple):
 class Interval(NamedTuple):
     """Log-uniform range of initial values of a gain, and a description of its source.
 
-    `firm`: the tuned gain stays within the range (or at most at its starting value, if that lies outside). `times`:
-    name of another gain of the law; the range is then that of the product of both gains.
+    `firm`: whether the tuned gain is at most `high`, or at most its starting value if that is higher. `times`: name of
+    another gain of the law; the range is then that of the product of both gains.
     """
 
     low: float
@@ -97,7 +98,7 @@ def position_switch(context: SearchContext, p: Scalar | None) -> Interval:
 
 
 def steepness(context: SearchContext, name: str) -> dict[str, Interval]:
-    """Return the range of the steepness p of a sign with the gain `name`, on a processor; in continuous time none."""
+    """Return the range of the steepness p of a sign with the gain `name`; {} unless the signs are implicit."""
     if not context.stepped:
         return {}
     low, high = (slope / TWO_OVER_PI for slope in (context.w / 3, 10 / context.period))

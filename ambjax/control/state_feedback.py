@@ -19,10 +19,10 @@ from ambjax.world.signals import Reference
 class StateFeedback(PositionLaw[Array]):
     """v_star = dv/dz z + dv/di i_star, i_star = i_r - k_p e - k_d e_dot - x, x' = k_int e + k_aw (i_star - i).
 
-    The linear controller of the textbooks (Schweitzer and Maslen, Magnetic Bearings, 2009, 8.3), which demands a
-    current i_star, with e = z - r. For inversion.Linearised i_ref is i_star. With an exact inversion the mechanics are
-    linear. i_r keeps the linearised rotor on the reference. dv/dz and dv/di are those at z = 0, i = 0. While the supply
-    limits u, the integral follows the measured current i at the rate k_aw.
+    The linear controller of the textbooks (Schweitzer and Maslen, Magnetic Bearings, 2009, 8.3) demands a current
+    i_star; e = z - r. With inversion.Linearised, i_ref is i_star. With an exact inversion, the mechanics are linear.
+    i_r keeps the linearised rotor on the reference. dv/dz and dv/di are those at z = 0, i = 0. While the supply limits
+    u, the integral follows the measured current i at the rate k_aw.
 
     The default gains k_p, k_d and k_int for a model are optimal (LQR) for the linearised mechanics
     e_ddot = s e + b (i_star - i_r): they minimise the integral of (e/0.1 s_0)^2 + (0.2 w int e/0.1 s_0)^2 +
@@ -67,7 +67,7 @@ class StateFeedback(PositionLaw[Array]):
         return resting_current(model, inputs[1]) - self.k_d * self.sigma(*inputs)
 
     def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of b k_d and sqrt(b k_p): the demanded current is that at the start of the sample."""
+        """Return the larger of b k_d and sqrt(b k_p), because their terms are evaluated at the start of a sample."""
         b = linear_mechanics(model).b
         return jnp.maximum(b * self.k_d, jnp.sqrt(b * self.k_p))
 
@@ -83,7 +83,7 @@ class StateFeedback(PositionLaw[Array]):
     def step(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: Array, period: Scalar
     ) -> tuple[Array, Array]:
-        """Step the anti-windup by backward Euler: x+ = x + T (k_int e + k_aw (i_star(x+) - i)); i_star uses x."""
+        """Step the anti-windup by backward Euler: x+ = x + T (k_int e + k_aw (i_star(x+) - i)). The output uses x."""
         motion, reference = inputs
         free, leak = self._current(model, inputs), period * self.k_aw
         after = state + period * self.k_int * (motion.z - reference.r) + leak * (free - motion.i)

@@ -174,7 +174,8 @@ def _member(tree: Any) -> tuple[StateSpace, Any]:
 def linearisation_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Cascade, Scenario, Scalar]:
     """Check a case, and return the first three arguments of `loop_matrices`: cascade, scenario and sample period (s).
 
-    A cascade with a processor is that of `Cascade.on_processor`. Raises ValueError as `rollout` does.
+    If the cascade has a processor, the returned cascade is that of `Cascade.on_processor`. Raises ValueError as
+    `rollout` does.
     """
     system, clock = prepare(cascade, scenario, clock)
     if cascade.processor is not None:

@@ -20,8 +20,8 @@ from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.signals import Constant, Reference, reference_at
 
-# Largest number of Newton trials. Near the equilibrium five suffice; far outside the boundary layer of a smoothed sign
-# more are necessary.
+# Largest number of Newton trials. Near the equilibrium, five suffice. Far outside the boundary layer of a smoothed
+# sign, more are necessary.
 STEPS = 60
 # A step is halved until the residual decreases. The iteration ends if the fraction of the full step is below this.
 SMALLEST = 1e-4

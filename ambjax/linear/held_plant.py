@@ -68,7 +68,7 @@ class Lagged:
         return ravel_pytree((self.scenario.plant.rates(plant, u, q_z), lag_rates))[0]
 
     def voltage(self, x: Array, u: Array) -> Array:
-        """Return the voltage (V) for a command: the command itself, or that by which the amplifier follows it."""
+        """Return the voltage (V) for a command: the command itself, or for a current command the coil voltage."""
         return self.scenario.coil_voltage(u, self.restore(x)[0]) if self.scenario.drive == "current" else u
 
     def sizes(self, sizes: Point) -> Array:

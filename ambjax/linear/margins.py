@@ -90,7 +90,7 @@ def poles_in_s(system: StateSpace) -> np.ndarray:
 
 
 def margins_of(system: StateSpace) -> Margins:
-    """Return the margins of a stable loop. Frequencies end at half the sampling rate or far beyond all poles."""
+    """Return the margins of a stable loop. The scan ends at half the sampling rate, or far above all poles."""
     fastest = float(np.max(np.abs(poles_in_s(system)), initial=1.0)) / (2 * math.pi)
     high = 100 * fastest if system.period is None else 0.5 / float(system.period)
     low = min(1e-3, 1e-6 * high)

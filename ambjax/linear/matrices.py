@@ -20,8 +20,8 @@ from ambjax.world.scenario import Scenario
 def loop_matrices(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> tuple[StateSpace, Array]:
     """Linearise the loop at the equilibrium of the constant reference r (m).
 
-    - `cascade`: of `Cascade.on_processor` if it has a processor. The guard is left out.
-    - `scenario`: `ideal` removes what a linear system cannot contain.
+    - `cascade`: a result of `Cascade.on_processor` if it has a processor. The guard is left out.
+    - `scenario`: the function removes what a linear system cannot contain (`ideal`).
     - `period`: sample period, s; not used in continuous time.
 
     The function is pure, works under jit and vmap, and is differentiable in all gains and parameters. Returns the state

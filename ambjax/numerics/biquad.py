@@ -8,14 +8,14 @@ from jax import Array
 from ambjax.numerics.records import Scalar
 from ambjax.numerics.smooth import HALF_PI, cosine, sine
 
-# Largest frequency that is kept by prewarping, as a share of the Nyquist frequency.
+# Largest frequency at which prewarping makes the response exact, as a share of the Nyquist frequency.
 NYQUIST_SHARE = 0.98
 
 
 class Biquad(NamedTuple):
     """d + (c_1 s + c_0)/(s^2 + a_1 s + a_0), coefficients in powers of 1/s; a filter that is off has c = 0 exactly.
 
-    `centre`: angular frequency (1/s) at which the sampled filter has exactly this response; None: 0. It is at most
+    `centre`: angular frequency (1/s) at which the sampled filter has exactly this response; None: 0. It is limited to
     NYQUIST_SHARE of the Nyquist frequency.
     """
 
@@ -27,7 +27,7 @@ class Biquad(NamedTuple):
     centre: Scalar | None = None
 
     def output(self, u: Array, x: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
-        """Return the output for an input u and a state x, and the rate of the state: the observer canonical form.
+        """Return the output for an input u and a state x, and the rate of the state, in observer canonical form.
 
         The state has the unit of u.
         """
@@ -35,7 +35,7 @@ class Biquad(NamedTuple):
         return self.d * u + x[0], (self.c_1 * u - self.a_1 * x[0] + w * x[1], self.c_0 / w * u - w * x[0])
 
     def step(self, u: Array, x: tuple[Array, Array], period: Scalar) -> tuple[Array, tuple[Array, Array]]:
-        """Return the output and the next state of the sampled filter: the transposed direct form II.
+        """Return the output and the next state of the sampled filter, in transposed direct form II.
 
         s = K (1 - q)/(1 + q), q the backward shift: K = 2/T, or w/tan(w T/2) at the centre w.
         """
@@ -66,6 +66,6 @@ def notch(w: Scalar, width: Scalar, depth: Scalar) -> Biquad:
 
 
 def lead_lag(zero: Scalar, pole: Scalar) -> Biquad:
-    """Return (1 + s/zero)/(1 + s/pole), written with a second pole and zero at -pole; zero and pole in 1/s."""
+    """Return (1 + s/zero)/(1 + s/pole) with another pole and zero, which cancel, at -pole; zero and pole in 1/s."""
     rest = (1 - pole / zero) * pole
     return Biquad(pole / zero, rest, rest * pole, 2 * pole, pole * pole)

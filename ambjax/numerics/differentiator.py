@@ -57,7 +57,7 @@ def implicit_step(x: tuple[Array, ...], f: Array, L: Scalar, T: Scalar) -> tuple
 
 
 def velocity(x: tuple[Array, ...], T: Scalar) -> Array:
-    """Return f' at this sample, exact for polynomials of degree m. States of order 2 lag by half a sample."""
+    """Return f' at this sample, exact for polynomials of degree m. For m = 2, the state x_1 lags by half a sample."""
     return x[1] + T / 2 * x[2] if len(x) == 3 else x[1]
 
 

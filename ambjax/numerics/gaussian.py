@@ -1,8 +1,8 @@
-"""Counter-based Gaussian random numbers: any sample of any member, directly, in a few vector operations.
+"""Counter-based Gaussian random numbers: a few vector operations compute any sample of any member directly.
 
 jax.random.normal draws other numbers from the same distribution. It uses the inverse error function, whose logarithm is
-a library call for every number on CPUs and costs twenty times as much as a step of the loop. Here the words of Threefry
-are transformed by the method of Box and Muller.
+a library call for every number on CPUs and costs twenty times as much as a step of the loop. Here the method of Box and
+Muller transforms the words of Threefry.
 """
 
 import jax
@@ -37,7 +37,7 @@ def _threefry(k_0: Array, k_1: Array, x: Array, y: Array) -> tuple[Array, Array]
 
 @compiled_alone
 def _both(*words: Array) -> Array:
-    """Return both words of `_threefry` in the bits of one complex number: XLA would repeat the work for two results."""
+    """Return both words of `_threefry` in the bits of one complex number. For two results XLA would repeat the work."""
     return lax.complex(*[lax.bitcast_convert_type(word, jnp.float32) for word in _threefry(*words)])
 
 

@@ -1,8 +1,8 @@
 """Implicit discretisation of signs, for laws on a processor: the sign is evaluated at the end of the step.
 
 relax(w, h, p) returns the w+ with w+ + h sgn_p(w+) = w, where sgn_p(x) = 2/pi arctan(p x). p = None is the set-valued
-sign, for which w+ = sign(w) max(|w| - h, 0). An explicit step changes its sign at every sample if h p is large. The
-implicit step never overshoots (V. Acary and B. Brogliato, Syst. Control Lett. 59 (2010) 284-293).
+sign, for which w+ = sign(w) max(|w| - h, 0). With an explicit step, w changes its sign at every sample if h p is large.
+The implicit step never overshoots (V. Acary and B. Brogliato, Syst. Control Lett. 59 (2010) 284-293).
 
 `relaxation` advances a variable under a smoothed sign in continuous time over a step of any length.
 """
@@ -16,8 +16,8 @@ from ambjax.numerics.records import Scalar
 from ambjax.numerics.smooth import TWO_OVER_PI, arctan_per, limited, refined, safe_sqrt, smooth_root, smooth_sign
 
 # Steps of Halley's method. They start from the solution for a rational sign with the same slope and tail, which is 0.4
-# to 1 times the solution. The relative residual is 3e-8 after 2 steps, and rounding after 3 (Newton's method: 2e-12
-# after 4).
+# to 1 times the exact one. The relative residual is 3e-8 after 2 steps, and at the level of rounding after 3 (with
+# Newton's method: 2e-12 after 4).
 HALLEY = 3
 # Steps of Halley's method for a sign and a root, in `twist`.
 TWIST = 7
@@ -98,7 +98,7 @@ def _hard_twist(x: Array, a: Array, b: Array) -> Array:
 def _twisted(x: Array, a: Array, b: Array, p: Array) -> Array:
     """Return the y of `twist`, by Halley's method safeguarded by bisection."""
     size = jnp.abs(x)
-    # Omitting the root term gives an upper bound; the root term of an upper bound gives a lower bound.
+    # The solution without the root term is an upper bound. With the root term at this bound, it is a lower bound.
     above = relax(size, b, p)
     below = jnp.maximum(relax(size - a * smooth_root(above, p), b, p), _hard_twist(size, a, b))
     y = low = jnp.maximum(below, size / _steep(jnp.zeros_like(size), a, b, p))
@@ -162,7 +162,7 @@ def relaxation(
 def _backward_euler(b: Array, reach: Array, p: Scalar) -> Array:
     """Return the w with w + reach sgn(w) = b, by Newton's method from below; the left side is concave in |w|.
 
-    The derivative is that of the implicit equation, not of the iteration, which takes a fifth of the work.
+    The derivative is that of the implicit equation. It takes a fifth of the work of a derivative of the iteration.
     """
     size = jnp.abs(b)
     w = jnp.maximum(size / (1 + reach * p * TWO_OVER_PI), size - reach)

@@ -12,7 +12,7 @@ State = TypeVar("State")
 
 
 def rk4_step(rates: Callable[[State], State], x: State, h: Scalar) -> State:
-    """Return the state after a step of length h (s) from x, with an error of order h^5. `rates(x)`: derivative, 1/s."""
+    """Return the state after a step of length h (s) from x, with an error of order h^5. `rates(x)`: rates of x."""
 
     def moved(h: Scalar, k: State) -> State:
         return jax.tree.map(lambda a, b: a + h * b, x, k)

@@ -87,7 +87,7 @@ RECIPROCAL = "_refined_reciprocal"
 @jax.custom_jvp
 @compiled_alone
 def reciprocal(x: Array) -> Array:
-    """Return `refined`, with a derivative that does not divide: a division per direction would dominate a gradient."""
+    """Return `refined(x)`. Its derivative does not divide, because divisions would dominate the cost of a gradient."""
     return refined(x)
 
 

@@ -45,12 +45,12 @@ def amplified(
 ) -> tuple[list[tuple[Voltage, Scalar]], Array | tuple[()]]:
     """Return the amplifier's voltage as functions of time with their durations (s), and the voltage at the end.
 
-    `commanded`: voltages (V) from t on, each with its duration (s). With a slew-rate limit each is divided at the end
-    of its ramp, where the slope of the voltage jumps.
+    `commanded`: voltages (V) from t on, each with its duration (s). With a slew-rate limit, each interval is divided at
+    the end of its ramp, where the slope of the voltage jumps.
     """
     if not isinstance(amplifier, Amplifier) or not amplifier.slow:
         return [(lambda _, u=u: u, time) for u, time in commanded], u_a
-    assert not isinstance(u_a, tuple)  # a slow amplifier has a voltage
+    assert not isinstance(u_a, tuple)  # a slow amplifier has an output voltage as its state
     given = []
     for u, time in commanded:
         voltage = lambda now, u_a=u_a, u=u, t=t: amplifier.followed(u_a, u, now - t)  # noqa: E731

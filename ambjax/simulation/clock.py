@@ -12,7 +12,11 @@ class Clock:
 
     samples: int = static(default=20_000, doc="number of sample periods")
     sample_period: Scalar = leaf(
-        default=1e-4, unit="s", at_least=1e-9, at_most=1e6, doc="time for which a measurement error is held"
+        default=1e-4,
+        unit="s",
+        at_least=1e-9,
+        at_most=1e6,
+        doc="sample period; each measurement error is held for this time",
     )
     method: Integrator | None = part(default=None, doc="the integrator; None: `ambjax.with_method` chooses it")
     cuts: int | None = static(

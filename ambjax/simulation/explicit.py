@@ -100,7 +100,7 @@ class RK4(_Explicit):
 
 @record
 class DOP853(_Explicit):
-    """Dormand and Prince's method of order 8, in 12 stages: for held noise, with one or two steps per hold.
+    """Dormand and Prince's method of order 8, in 12 stages: for held noise, with one or two steps per sample.
 
     Coefficients: Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I (2nd ed., 1993), II.10. The
     error estimates are omitted, because the steps are fixed.

@@ -38,8 +38,8 @@ class InitialValueProblem(NamedTuple, Generic[Inputs, State]):
     - `rates`: right-hand side rates(inputs, state).
     - `scale`: a state with the characteristic size of each component; integration errors are relative to it.
     - `status`: status(state) -> code, 0 while the state is valid.
-    - `layer`: a state with the largest error of each component that keeps it inside the boundary layer of a smoothed
-      sign; None: no such signs.
+    - `layer`: a state with the largest integration error with which each component stays in the boundary layer of a
+      smoothed sign; None: no such signs.
     - `observed`: observed(inputs, state) -> (rates, Instant), the rates and the signals to record; None: no signals.
     - `instant_structure`: any Instant, which defines the structure of those signals.
     - `jumps`: whether the rates jump at the start of a sample.

@@ -24,7 +24,7 @@ SAMPLED = 0.02
 # The coils may be stiff. SETTLED: product of step and R/L at which the error of RK4 is below 1e-11 m and 1e-6 A in a
 # sample in which the current settles. MOST_SETTLED: number of substeps above which an L-stable method is cheaper.
 SETTLED, MOST_SETTLED = 0.5, 64
-# The same for the lag of the flux by eddy currents. The force depends on it, so the error of z limits the step:
+# The same for the lag of the flux due to eddy currents. The force depends on it, so the error of z limits the step:
 # 1.3e-11 m in the first 30 samples of the rig.
 LAGGED = 0.5
 # The same for the slope of the stop. A contact begins and ends inside a step, which changes the velocity after an
@@ -61,8 +61,9 @@ def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
     named |= {} if scenario.stop is None else {STOP: scenario.stop.slope(plant.m)}
     if traced := [name for name, slope in named.items() if is_traced(slope)]:
         raise ValueError(
-            f"clock.method is None (dt = 'auto'), but inside jit, grad or vmap the slope of the {traced[0]} is traced "
-            "and no step can be read off it. Choose it outside: clock = with_method(clock, cascade, scenario)."
+            f"clock.method is None (dt = 'auto'), but inside jit, grad or vmap the slope of the {traced[0]} is "
+            "traced, and no step can be computed from it. Choose the method outside: "
+            "clock = with_method(clock, cascade, scenario)."
         )
     return {name: float(np.max(np.asarray(x))) for name, x in named.items()}
 
@@ -70,9 +71,10 @@ def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
 def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *, reverse: bool = False) -> Integrator:
     """Choose RK4, adaptive RODAS3, or RODAS3 with equal substeps.
 
-    RK4 is chosen for held noise if a few substeps resolve the slopes, and for a cascade on a processor. Otherwise the
-    choice is adaptive RODAS3. Without noise adaptive steps can be much longer than the slopes suggest. Under noise,
-    which jumps at every sample, they cannot, and the explicit method is cheaper.
+    RK4 is chosen for held noise if a few substeps resolve the slopes, and for a cascade on a processor if at most
+    MOST_SETTLED substeps resolve current and flux. Otherwise the choice is adaptive RODAS3. Without noise, adaptive
+    steps can be much longer than the slopes suggest. Under noise, which jumps at every sample, they cannot, and the
+    explicit method is cheaper.
 
     `reverse`: choose a method with a fixed number of steps, which supports reverse mode: RK4, or RODAS3 with equal
     substeps. A jump of a disturbance inside such a step causes an error of about 3e-8 m per m/s^2 on smooth gains. An
@@ -100,7 +102,8 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
         return RK4(substeps)
     if reverse:
         return Rodas3(fixed)
-    # The tolerance must be well above rounding, or steps are rejected because of it. In float32 it is 1.2e-4.
+    # The tolerance must be well above the rounding errors, which otherwise cause rejected steps. In float32 it is
+    # 1.2e-4.
     tolerance = QUIET_TOLERANCE if scenario.sensor is None else TOLERANCE
     return AdaptiveRodas3(max(tolerance, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps)))
 
@@ -114,8 +117,9 @@ def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: 
     """Return `clock` with an integration method that is valid for the cascade and the scenario.
 
     A clock without a method gets the result of `choose_method`; otherwise the method is checked against its stability
-    limit. For a cascade on a processor `cuts`, the number of edges of disturbances inside one sample, is computed too.
-    A larger `cuts` of the clock is kept, so that a part of an ensemble runs the compiled program of the whole.
+    limit. For a cascade on a processor, the function also computes `cuts`, the largest number of edges of disturbances
+    inside one sample. A larger `cuts` of the clock is kept, so that a part of an ensemble runs the compiled program of
+    the whole.
 
     Raises ValueError for an explicit step above the stability limit; the message names both and the fix.
     """

@@ -1,7 +1,7 @@
 """Settling time and overshoot, as folds.
 
-Both are differentiable in the gains. Their derivatives are those of the crossing of the band, and of the sample with
-the largest excursion.
+Both are differentiable in the gains. The derivative of the settling time is that of the instant at which |z - r|
+crosses the band. The derivative of the overshoot is that of the sample with the largest excursion.
 """
 
 from typing import NamedTuple
@@ -58,7 +58,7 @@ class Settling:
 
 
 class Reach(NamedTuple):
-    """State of `Overshoot`: minimum and maximum of the initial z and of r so far, and the excursion of z beyond, m."""
+    """State of `Overshoot`: extremes of the initial z and of r so far, and the excursion of z beyond them, m."""
 
     low: Array
     high: Array
@@ -67,7 +67,7 @@ class Reach(NamedTuple):
 
 @record
 class Overshoot:
-    """Overshoot, m: the largest excursion of z beyond the range of its initial value and of the reference so far.
+    """Overshoot, m: the largest excursion of z beyond the range spanned by its initial value and the reference so far.
 
     For a step of r it is the usual overshoot; for a rotor that is lifted to r = 0, the excursion beyond 0.
     """

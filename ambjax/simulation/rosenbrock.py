@@ -31,7 +31,7 @@ def rodas3_step(
 
     RODAS3 is a Rosenbrock method of order 3(2), L-stable and stiffly accurate (Sandu et al., Atmospheric Environment 31
     (1997) 3459-3472). A step takes one Jacobian, one factorisation of I - h J / 2 and three evaluations. Stages are
-    scaled by h, so that h = 0 is the identity.
+    scaled by h, so that a step with h = 0 does not change the state.
     """
     t_0 = at(0.0)
     rates = jax.jit(problem.rates)  # traced once here, not once per column of the Jacobian
@@ -78,16 +78,16 @@ _Trial = tuple[State, Array, Array, Array, Array, Array, Span]
 class AdaptiveRodas3:
     """RODAS3 with adaptive steps: the estimated error of each step stays below `tolerance` (scale + |state|).
 
-    The error also stays within the boundary layer of each smoothed sign. A larger error would move the state to the
-    other side of the sign and the next step back, so that the steps shrink until the run stalls. Where a stiff smoothed
-    sign leaves saturation, for a few microseconds, the steps shrink and then grow again. The last step of a sample is
-    the first trial step of the next.
+    The error also stays within the boundary layer of each smoothed sign. With a larger error, one step would move the
+    state to the other side of the sign, and the next step would move it back. The steps would then shrink until the run
+    stalls. When a stiff smoothed sign leaves saturation, the steps shrink for a few microseconds and then grow again.
+    The last step of a sample is the first trial step of the next.
 
     Forward mode and vmap work. Reverse mode does not, because JAX cannot reverse a while loop.
 
     The tolerance bounds the error of a step, not the error of z at the end, which is proportional to the response of
-    the loop to a disturbance. At a tolerance of 1e-7, z is within 1e-8 m if a velocity impulse of 1 m/s moves z by at
-    most 0.1 m. The response of a rotor that is nearly lost is larger.
+    the loop to a disturbance. At a tolerance of 1e-7, the error of z is at most 1e-8 m if a velocity change of 1 m/s
+    moves z by at most 0.1 m. The response of a rotor that is nearly lost is larger.
     """
 
     tolerance: Scalar = leaf(default=1e-6, unit="1", above=0, at_most=1.0, doc="relative error allowed per step")
@@ -129,8 +129,9 @@ class AdaptiveRodas3:
             # A step that an edge or the end of the sample shortened must not reduce the next step.
             h = jnp.where(last & accept, jnp.maximum(h, suggestion), suggestion)
             verdict = jnp.where(accept, problem.status(new), ALIVE)
-            # Trapezoidal rule: the weight of a state is half of the steps before and after it. The first step after a
-            # jump has only the value at its end, because fast states leave their initial values within nanoseconds.
+            # Trapezoidal rule: the weight of a state is half the sum of the steps before and after it. The first step
+            # after a jump uses only the value at its end, because fast states leave their initial values within
+            # nanoseconds.
             first = problem.jumps & (elapsed == 0)
             span = choose(accept, span.with_instant(here, (before + jnp.where(first, 0.0, step)) / 2, step), span)
             before = jnp.where(accept, jnp.where(first, 2 * step, step), before)

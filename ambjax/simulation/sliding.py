@@ -1,4 +1,4 @@
-"""The sliding step: an integration step for a closed loop whose stiffness is in a sliding inversion law.
+"""The sliding step: an integration step for a closed loop whose only stiff part is a sliding inversion law.
 
 The adaptive inversion law is such a law: w' = d - gamma sgn(w) for w = v_star - v(z, i_ref), Eq. (14a). When the
 measurements jump at a sample, i_ref slides to its new value within microseconds, and then follows that value.
@@ -60,7 +60,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     def current(
         plant: State, estimate: Measurement, i_ref: Array, rate: Array, inner: S, outside: Any, h: Array
     ) -> tuple[Array, S, _Voltage]:
-        """Return i - i_ref, the current law's state, and the voltage, over h (s) at constant i_ref' = rate."""
+        """Return i - i_ref and the current law's state after h (s), and the voltage, at constant i_ref' = rate."""
         law = with_gains_at(cascade.current, estimate.z, outside.reference)
 
         def rate_of(i: Array) -> tuple[Array, tuple[S, Array]]:
@@ -156,7 +156,7 @@ def _phi_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arra
 
 def slides(cascade: Cascade, plant: Bearing) -> bool:
     """Return whether this step applies to the cascade and the plant."""
-    slow = not cascade.observer.stiff  # integrated by Heun's method
+    slow = not cascade.observer.stiff  # Heun's method integrates the observer
     return cascade.processor is None and cascade.inversion.slides and plant.lumped and slow
 
 

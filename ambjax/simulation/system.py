@@ -38,7 +38,7 @@ def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> 
 
 
 def _check_coils(scenario: Scenario) -> None:
-    """Raise ValueError for limits of each coil with a plant that has one current, or with a limit of |i|."""
+    """Raise ValueError if each coil has limits, and the plant has one current for both or |i| is limited too."""
     amplifier = scenario.amplifier
     if amplifier is None or amplifier.coil is None:
         return

@@ -109,7 +109,7 @@ def _alternates(share: float) -> str:
     return (
         f"The voltage alternates: without noise, {100 * share:.0f} % of its rms value changes sign from sample to "
         "sample. A law corrects more than its whole error in one sample, or its output acts with a delay that it does "
-        "not include. Lower "
+        "not take into account. Lower "
         f"the gain or p of this law, set {IMPLICIT} or predict = true, or shorten clock.sample_period."
     )
 

@@ -93,7 +93,7 @@ class Side(NamedTuple):
     where: str = ""
 
 
-# Right sides by the name that a law's requirement uses.
+# Right sides by their name in `Requirement.over`.
 SIDES = {
     "Q_z": (Side("disturbance of z", "q_z"),),
     "Q_i": (Side("disturbance of i", "q_i"),),
@@ -228,7 +228,7 @@ def _conditions(
 
 
 def constant_sigma(law: PositionLaw) -> list[Condition]:
-    """Return a condition for each schedule that changes the sliding variable, which the theorem keeps constant."""
+    """Return a condition for each schedule that changes the sliding variable; the theorem requires a constant one."""
     plain: Any
     one: Any
     zero: Any

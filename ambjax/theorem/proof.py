@@ -1,8 +1,8 @@
 """The closed loop together with the steps of the stability proof, Section 3.5.
 
 The right-hand sides of the proof's identities, Eqs. (12)-(14), are integrated together with the loop and compared with
-its sigma, v_tilde and e. Where the proof's assumptions hold (exact model, measured state, no limit on u) they differ by
-the integration error only; elsewhere the difference shows the effect of a violated assumption. V = sigma^2 is compared
+its sigma, v_tilde and e. Where the proof's assumptions hold (exact model, measured state, no limit on u), the
+difference is the integration error; elsewhere it shows the effect of a violated assumption. V = sigma^2 is compared
 with its bound at every sample.
 """
 
@@ -155,7 +155,7 @@ class Monitored:
     ) -> Array:
         """Return d = v_star' - (dv/dz) z' along the true flow at constant i_ref: the left side of Eq. (7).
 
-        Errors of the sensors and runout are held.
+        The errors of the sensors and the runout are constant.
         """
         cascade, reference = self.loop.cascade, inputs.reference
 

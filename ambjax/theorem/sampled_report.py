@@ -101,9 +101,10 @@ class SampledReport:
 class Delays(NamedTuple):
     """Result of runs whose delays increase in steps of `step` (samples), from the delay of the case on.
 
-    `held`: the largest delay up to which the rotor survives every delay. `lost`: the delay at which it is lost first;
-    None if it survives every delay. `undecided`: the smallest delay above `held` at which the integrator stalled, or
-    None. If the rotor is lost at the delay of the case, the delays start at 0; if it is lost there too, `held` is None.
+    `held`: the largest delay up to which the rotor is held at every delay of the runs. `lost`: the smallest delay at
+    which it is lost; None if there is none. `undecided`: the smallest delay above `held` at which the integrator
+    stalled, or None. If the rotor is lost at the delay of the case, the delays start at 0; if it is lost there too,
+    `held` is None.
     """
 
     held: float | None
@@ -132,7 +133,7 @@ def check_sampled(
     """Return the report on a cascade with a processor, from two runs: without noise and with it.
 
     `run`: function that simulates a system; `ensemble.replay.record_system` rounds as `ambjax simulate` does. `settle`:
-    s. Raises ValueError as `rollout` does.
+    start of the evaluation, s. Raises ValueError as `rollout` does.
     """
     loop, clock = prepare(cascade, scenario, clock)
     cascade, quiet = cascade.on_processor(), _without_noise(scenario)
@@ -210,7 +211,7 @@ def _bands(cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, row
             if math.isinf(limit):
                 notes.append("the disturbance exceeds the gain")
             elif abs(x[0]) > limit:
-                notes.append("not reached at run.settle: the value at that time")
+                notes.append("at run.settle the signal is outside its band; the band shown is its value then")
                 limit = float(abs(x[0]))
         lines.append(
             Band(signal, unit, noise, gain, W, limit, _peak(x), _peak(true - x), _peak(true), "; ".join(notes))

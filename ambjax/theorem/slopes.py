@@ -20,9 +20,9 @@ class SlopeCheck:
     """Slope of a law times T, and the limits for stability and for no oscillation.
 
     `slope`: slope times T. `effective_slope`: its effective value in the discrete step of the law. For an explicit step
-    it equals `slope`. For an implicit step of a sign it is a/(1 + a) with a = `slope`, which is below both limits
-    unless the law is delayed. `limit`: the law is stable if `effective_slope` is below it. `oscillation_limit`: the law
-    does not oscillate if `effective_slope` is below it.
+    it equals `slope`. For an implicit step it is the larger of a/(1 + a), with a = `slope`, and T times
+    `Law.explicit_rate`. Without a delay, a/(1 + a) is below both limits. `limit`: the law is stable if
+    `effective_slope` is below it. `oscillation_limit`: the law does not oscillate if `effective_slope` is below it.
     """
 
     stage: str
