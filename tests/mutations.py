@@ -1126,6 +1126,20 @@ SEARCH = [
         "tests/test_tuning_outcome.py::test_all_outputs_give_the_same_verdict",
     ),
     M(
+        "an excess of an earlier round ends the updates of the multipliers",
+        "tuning/search/multipliers.py",
+        "if stuck and update:",
+        "if stuck:",
+        "tests/test_tuning_limits.py::test_an_excess_of_an_earlier_round_does_not_end_the_updates",
+    ),
+    M(
+        "an answer of less error that exceeds a limit is preferred to one within the limits",
+        "tuning/search/rounds.py",
+        "one.lost, not one.within, one.validation_error",
+        "one.lost, one.validation_error",
+        "tests/test_tuning_limits.py::test_an_answer_within_the_limits_is_preferred_to_one_of_less_error",
+    ),
+    M(
         "the log of the search states that a limit cannot be held",
         "tuning/search/multipliers.py",
         "a larger penalty makes no progress towards the limit of {names}; its multiplier is no longer updated",

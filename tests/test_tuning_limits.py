@@ -15,6 +15,7 @@ from texts import case_and_tune, problem_from
 from tomlkit import dumps
 
 import tuning.command
+import tuning.search.rounds
 from ambjax import rollout
 from ambjax.numerics.records import is_traced
 from ambjax.simulation.folds import Named
@@ -32,6 +33,7 @@ from tuning.report.pictures import amplitudes
 from tuning.search.course import Course, training
 from tuning.search.multipliers import search_within_limits
 from tuning.search.rounds import rounds
+from tuning.search.validation import Validation
 
 # The voltage of a Bowl is proportional to k: 20 V at the best k, 60, and 10 V at k = 30.
 TEN = {"limits": {"rms_u_V": 10.0, "margin": 0.002}}
@@ -331,7 +333,9 @@ def test_a_search_that_does_not_move_and_holds_the_limits_ends(monkeypatch):
     course.past.append(SimpleNamespace(interrupted=False))
     monkeypatch.setattr(course, "search", lambda points: (starts.append(points) or points[0], 0.0))
     best = np.asarray(problem.objective.space.encode(np.array(World.best)))
-    np.testing.assert_array_equal(search_within_limits(course, best), best)
+    x, within = search_within_limits(course, best)
+    np.testing.assert_array_equal(x, best)
+    assert within
     assert len(starts) == 1
 
 
@@ -352,8 +356,41 @@ def test_the_best_answer_within_the_limits_is_taken_if_the_multipliers_do_not_co
     }
     found = iter(ends[1:])
     monkeypatch.setattr(course, "search", lambda points: (at[next(found)], 0.0))
-    np.testing.assert_array_equal(search_within_limits(course, at[ends[0]]), at[25.0])
+    x, within = search_within_limits(course, at[ends[0]])
+    np.testing.assert_array_equal(x, at[25.0])
+    assert within
     assert next(found, None) is None
+
+
+def test_an_excess_of_an_earlier_round_does_not_end_the_updates(monkeypatch):
+    """The limit was missed by less in an earlier round, with a penalty that has grown since."""
+    problem = study(monkeypatch, World(), **TEN)
+    (limit,) = problem.limits
+    problem = problem.limited((dataclasses.replace(limit, penalty=4 * PENALTY, missed=0.01),))
+    course = Course(problem, training(problem), 1)
+    course.past.append(SimpleNamespace(interrupted=False))
+    at = {k: np.asarray(problem.objective.space.encode(np.array([World.best[0], k]))) for k in (29.9, 60.0)}
+    found = iter([at[29.9]])
+    monkeypatch.setattr(course, "search", lambda points: (next(found), 0.0))
+    x, within = search_within_limits(course, at[60.0])
+    np.testing.assert_array_equal(x, at[29.9])
+    assert within
+
+
+def test_an_answer_within_the_limits_is_preferred_to_one_of_less_error(monkeypatch, tmp_path):
+    """The first round ends within the limits, but members of large errors join; the second exceeds a limit."""
+    monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 2)
+    problem = study(monkeypatch, World(), **TEN)
+    start = problem.tune.space.values(problem.case.cascade)
+    errors, within = iter([4e-3, 2e-3]), iter([True, False])
+
+    def validated(course, x, error):
+        return Validation(course.answer(x, error, 0, next(errors)), error, np.zeros(0, int), np.arange(1))
+
+    monkeypatch.setattr(tuning.search.rounds, "search_within_limits", lambda course, x: (x, next(within)))
+    monkeypatch.setattr(tuning.search.rounds, "validated", validated)
+    assert rounds(problem, start, tmp_path, {"of": "ten"}, False).validation_error == 4e-3
+    assert next(errors, None) is None
 
 
 def test_a_resumed_search_with_limits_gives_the_same_result(monkeypatch, tmp_path):

@@ -57,6 +57,8 @@ class SearchResult:
     """duration of all searches, s, including the time before the search was resumed"""
     validation_error: float = math.inf
     """rms error of the validation members that are held, relative to s_0; inf if it was not computed"""
+    within: bool = True
+    """whether the answer is within all limits on the validation members"""
     front: tuple[Any, ...] = ()
     """points of the front of error against voltage (`front.FrontPoint`); empty if it was not traced"""
 

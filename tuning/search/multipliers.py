@@ -31,14 +31,15 @@ INJECTED_FROM = 0.2
 AVERAGING_MEMBERS = 256
 
 
-def search_within_limits(course: Course, x: np.ndarray) -> np.ndarray:
-    """Update the multipliers at x [m] and search again until every limit is met. Return the last optimum [m].
+def search_within_limits(course: Course, x: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Update the multipliers at x [m] and search again until every limit is met.
 
-    Returns x itself if no search was needed. There are at most MOST_UPDATES updates. They end early after Ctrl-C, and
-    if a search ends where it began, within all limits. They also end early if a larger penalty makes no progress
-    towards a limit; the held-out members then show whether the limit holds. If the updates do not converge, the optimum
-    of least goal within all limits is returned, if there is one: the judge may measure very different values on either
-    side of a limit, and the searches then alternate between them. `course.problem` receives the updated limits.
+    Returns the last optimum [m], or x itself if no search was needed, and whether it is within all limits. There are at
+    most MOST_UPDATES updates. They end early after Ctrl-C, and if a search ends where it began, within all limits. They
+    also end early if a larger penalty makes no progress towards a limit; the held-out members then show whether the
+    limit holds. If the updates do not converge, the optimum of least goal within all limits is returned, if there is
+    one: the judge may measure very different values on either side of a limit, and the searches then alternate between
+    them. `course.problem` receives the updated limits.
     """
     within, moved = list[np.ndarray](), True
     for update in range(MOST_UPDATES + 1):
@@ -48,20 +49,20 @@ def search_within_limits(course: Course, x: np.ndarray) -> np.ndarray:
             within.append(x)
         limits = tuple(limit.updated(*found) for limit, found in zip(before, numbers, strict=True))
         stuck = [limit for limit, (_, judged) in zip(before, numbers, strict=True) if _stuck(limit, judged)]
-        if stuck:
+        if stuck and update:  # an excess of an earlier round belongs to other members
             names = ", ".join(limit.name for limit in stuck)
             say(f"a larger penalty makes no progress towards the limit of {names}; its multiplier is no longer updated")
             break
         course.problem = course.problem.limited(limits)
         if _all_met(before, limits, numbers) or course.interrupted or (not moved and holds):
-            return x
+            return x, holds
         if update == MOST_UPDATES:
             break
         course.limit_searches += 1
         start = x
         x, _ = course.search(start[None])
         moved = not np.array_equal(x, start)
-    return _least(course, within) if within else x
+    return (_least(course, within), True) if within else (x, False)
 
 
 def _all_met(before: Sequence[Limit], after: Sequence[Limit], numbers: Sequence[tuple[float, float]]) -> bool:

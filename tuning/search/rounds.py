@@ -34,10 +34,10 @@ def rounds(
     """Tune from the gains `start` [m], SI units, and return the result.
 
     `out`: directory of the checkpoints. `facts`: settings that a checkpoint must match. `resume`: whether to continue
-    from the checkpoints. The result is the confirmed answer that loses the fewest members; of several such answers, the
-    one of least error on the validation ensemble. If no answer is confirmed, the result is an earlier point of the
-    searches that accurate steps confirm, or, without such a point, the answer that loses the fewest members. If a front
-    is traced, the result is the answer that `trace_front` selects.
+    from the checkpoints. The result is the confirmed answer that loses the fewest members; of several such answers, one
+    within all limits, and of those the one of least error on the validation ensemble. If no answer is confirmed, the
+    result is an earlier point of the searches that accurate steps confirm, or, without such a point, the answer that
+    loses the fewest members. If a front is traced, the result is the answer that `trace_front` selects.
 
     Raises ValueError if the goal is not finite at any starting point, or if a checkpoint belongs to another search.
     """
@@ -48,11 +48,11 @@ def rounds(
         if course.all_lost:  # no gains hold any member
             break
         x, error = with_fine_steps(course, x)
-        held = search_within_limits(course, x)
-        if held is not x:
-            x, error = held, None
+        limited, within = search_within_limits(course, x)
+        if limited is not x:
+            x, error = limited, None
         answer, error, lost, large = validated(course, x, error)
-        answers.append(answer)
+        answers.append(dataclasses.replace(answer, within=within))
         if (answer.good and not large.size) or course.interrupted or _is_exhausted(course):
             break
         if answer.good:
@@ -65,7 +65,7 @@ def rounds(
         x, _ = course.search(course.around(x))
     if not answers:
         return course.answer(x, None, budget.validation)
-    best = min(answers, key=lambda one: (not one.confirmed, one.lost, one.validation_error))
+    best = min(answers, key=lambda one: (not one.confirmed, one.lost, not one.within, one.validation_error))
     if not best.confirmed and not course.interrupted:
         best = earlier_confirmed(course, best)
     if problem.front and best.good and not course.interrupted:
