@@ -27,7 +27,7 @@ CLEARLY_BELOW = 0.1
 # A quantity whose linear value has g above -INJECTED_FROM is also measured by injection, because the measured value may
 # exceed the linear one by up to a fifth.
 INJECTED_FROM = 0.2
-# Largest number of members on which averages are judged; limits of worst members need the whole ensemble.
+# Largest number of members on which averages are judged. Limits on worst members need the whole ensemble.
 AVERAGING_MEMBERS = 256
 
 
@@ -148,8 +148,8 @@ def judged_values(
 
     `columns` [N]: result of `judge` for the ensemble with this `seed`. `tuned`: the search's value of each limit.
 
-    On a processor, the member with the largest linear peak may break a limit. It is then measured by one injection, as
-    the held-out members are. So it is if the search's value, corrected by an earlier injection, may break the limit. If
+    On a processor, the member with the largest linear peak is measured by one injection, as the held-out members are,
+    if its linear peak may break a limit, or if the search's value, corrected by an earlier injection, may break it. If
     only injections decide (`measured_peaks.decides`), there is no new injection while these corrected values are
     clearly within their limits.
     """
@@ -162,7 +162,7 @@ def judged_values(
         )
         known = {limit.name: limit.ratio * ours for limit, ours in pairs}
     else:
-        # the ratio of an earlier injection counts too, or the searches alternate between a measured and a linear value
+        # with the ratio of an earlier injection, the searches do not alternate between a measured and a linear value
         near = any(
             limit.log_excess(max(limit.reached(columns), limit.ratio * ours)) > -INJECTED_FROM for limit, ours in pairs
         )
