@@ -88,11 +88,11 @@ BAD = {
     "not TOML": ("[plant\nm = 1\n", ["not valid TOML", "line 1"]),
     "a second load in double brackets": (
         "[disturbance.q_z]\nkind = 'step'\n[[disturbance.q_z]]\nkind = 'sine'\n",
-        ["The line is: [[disturbance.q_z]]. ", "write [[disturbance.q_z]] above each, the first too."],
+        ["The line is: [[disturbance.q_z]]. ", "put [[disturbance.q_z]] above each, also the first."],
     ),
     "a second load in single brackets": (
         "[disturbance.q_z]\nkind = 'step'\n[disturbance.q_z]\nkind = 'sine'\n",
-        ["write [[disturbance.q_z]] above each, the first too."],
+        ["put [[disturbance.q_z]] above each, also the first."],
     ),
     "a number twice": ("[plant]\nm = 1\nm = 2\n", ["The line is: m = 2. Write each key once."]),
 }  # fmt: skip

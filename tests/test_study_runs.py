@@ -300,8 +300,8 @@ def test_a_chunk_damaged_after_a_kill_is_computed_again(no_pictures, capsys):
         assert main([*RUN[:4], *RUN[6:], "--out", "out", "--resume"]) == 0  # the chunk is the directory's
     err = capsys.readouterr().err
     assert (
-        f"{kept[1]}: it is of another chunk or study: first is 0 in the file and 32 in this run; members 32 to 63 are "
-        "computed again" in err
+        f"{kept[1]}: it belongs to another chunk or study: first is 0 in the file and 32 in this run; members 32 to 63 "
+        "are computed again" in err
     )
     assert f"{kept[3]}: it is an incomplete archive; members 96 to 127 are computed again" in err
     assert {(32, 64), (96, 128)} <= set(seen)

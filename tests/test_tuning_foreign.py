@@ -103,7 +103,7 @@ def test_sources_name_the_pole_and_the_cap():
     assert f"w = {w:.3g} 1/s: pole of the unstable plant" in c.source
     assert "1/(5 T)" in c.source
     assert c.high == c.most == pytest.approx(1 / (5 * 1e-4))
-    assert f"may end at up to {k.most:.3g}" in k.source
+    assert f"tuned gain at most {k.most:.3g}" in k.source
     # where the clock is fast enough, the plant sets the end
     c = problem_from(BEARINGS["rotor"] + "[clock]\nsample_period = 1e-5\nduration = 0.1\n").ranges[0]
     assert c.high == pytest.approx(10 * w)

@@ -452,13 +452,14 @@ def test_gains_stay_within_the_documented_bounds(monkeypatch):
     assert "the cap 1/(5 T)" in c[1].source
     for gain, found, value in others:
         assert gain.high == found.most == pytest.approx(END_FACTOR * max(found.high, value))
-        assert f"may end at up to {found.most:.3g}" in found.source
+        assert f"tuned gain at most {found.most:.3g}" in found.source
     least = np.array(space.gains_at(jnp.full(len(space), 100.0)))
     np.testing.assert_allclose(least, [gain.high for gain in space.gains], rtol=1e-9)
     beyond = study(monkeypatch, World(), {"controller": {"position": {"c": 3000.0}}}, gains=paths, bounds={})
     assert beyond.objective.space.gains[0].high == 3000.0
     words = " ".join(template("tracking").replace("#", " ").split())
-    assert f"c is then at most a fifth of the sampling rate, others {END_FACTOR:g} times their range or start" in words
+    bounds = f"c is at most a fifth of the sampling rate, others {END_FACTOR:g} times the end of their range or start"
+    assert bounds in words
 
 
 def test_the_pictures_show_the_case_and_the_tuned_laws(monkeypatch):

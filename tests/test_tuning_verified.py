@@ -85,7 +85,7 @@ def test_the_reasons_that_refute_an_answer(small):
     assert "cannot decide 2 of 4" in stalled.refuted
     assert "lose" not in stalled.refuted
     nothing = error_of(small, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
-    assert nothing.refuted == describe(nothing) == "no member compared is held by both"
+    assert nothing.refuted == describe(nothing) == "no member compared is held with both steps"
     assert not nothing.resolved
     coarse = error_of(small, search_m=1.2e-6, relative=0.2)
     assert "off by 20 %" in coarse.refuted
@@ -101,7 +101,7 @@ def test_a_negligible_error_is_that_of_the_reference_relative_to_the_gap(small):
     assert error.negligible_m == NEGLIGIBLE * 4e-4
     # these gains lose the rotor with both kinds of steps, so no member is held or lost in accurate steps alone
     assert (error.members, error.lost, error.stalled, error.tried) == (0, 0, 0, 4)
-    assert error.refuted == "no member compared is held by both"
+    assert error.refuted == "no member compared is held with both steps"
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ PROGRAM = "ambjax-tune"
 
 def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
     """Return the parser of the command line for the program name `program`."""
-    about = "Tune the gains of a case on an ensemble of rotors and judge them on others: tuned.toml, report.html."
+    about = "Tune the gains of a case on an ensemble, judge them on other members, and write tuned.toml and a report."
     top = Parser(prog=program, description=about)
     top.add_argument(
         "case", metavar="CASE.toml", help="a case file; its optional table [tune] sets gains, limits and budget"
@@ -22,7 +22,7 @@ def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
     top.add_argument("--resume", action="store_true", help="continue the interrupted search in --out")
     top.add_argument("--force", action="store_true", help="overwrite the files of an earlier search in --out")
     top.add_argument(
-        "--gradients", action="store_true", help="compare forward mode, reverse mode and differences in the report"
+        "--gradients", action="store_true", help="report the gradient by forward mode, reverse mode and differences"
     )
     top.add_argument(
         "--pareto", action="store_true", help="write each point of the front of error against voltage as a case file"

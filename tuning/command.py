@@ -193,7 +193,7 @@ def _pictures(
 def _laws(problem: TuningProblem, tuned: dict[str, float]) -> dict[str, float]:
     """Return every gain of the laws by path: `tuned` where given, else that of the case.
 
-    tuned.toml lists all gains, because the default of a p depends on the plant.
+    tuned.toml lists all gains, because the default of a steepness p depends on the plant.
     """
     everything = Space(tuple(Gain(path) for path in tunable(problem.case.cascade, idle=True)))
     return dict(zip(everything.paths, everything.values(problem.case.cascade).tolist(), strict=True)) | tuned

@@ -1,4 +1,4 @@
-"""Test of the limit on the delay margin: members run with the limit as an additional delay."""
+"""Test of the limit on the delay margin: members are simulated with the limit as an additional delay."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from tuning.objective.limits import PREFIX
 from tuning.problem import TuningProblem
 
 DELAY_MARGIN = "delay_margin_s"
-# Members tested, those with the smallest linear margins.
+# Number of members tested: those with the smallest linear margins.
 TESTED = 16
 
 

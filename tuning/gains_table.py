@@ -42,9 +42,10 @@ def space_from(table: Table, case: Case) -> Space:
 
 
 def _default_gains(case: Case) -> list[str]:
-    """Return the default of tune.gains: all gains except steepnesses, and on a processor the finite steepnesses too.
+    """Return the default of tune.gains: all gains, but without the steepnesses in continuous time.
 
-    In continuous time a steeper sign makes the equations stiffer, so a steepness is tuned only if tune.gains names it.
+    In continuous time, a steeper sign makes the equations stiffer, so a steepness is tuned only if tune.gains names it.
+    On a processor, gains that are not finite (p = inf) are left out.
     """
     cascade = case.cascade
     if cascade.processor is None:

@@ -16,9 +16,11 @@ from tuning.problem import REFERENCE_MEMBERS, TuningProblem
 
 # Members of one simulation when an ensemble is judged.
 CHUNK = 1024
-# Largest relative error of the settled rms error. Above it the steps are refined and the search continues,
+# Largest relative difference of the settled rms errors with the search's steps and with accurate ones. Above it, the
+# steps are refined and the search continues.
 RESOLVED = 0.1
-# unless both errors differ by less than this share of the gap, the accuracy of the reference.
+# Share of the gap. A difference of the errors below it does not count, because it is within the accuracy of the
+# reference.
 NEGLIGIBLE = 1e-6
 
 
@@ -89,11 +91,11 @@ class StepError(NamedTuple):
     def refuted(self) -> str:
         """The reason why accurate steps do not confirm the result; '' if they confirm it."""
         if self.lost:
-            return f"accurate steps lose {self.lost} of {self.tried} members tried, which coarser ones hold"
+            return f"accurate steps lose {self.lost} of {self.tried} members tried, which coarser steps hold"
         if self.stalled:
             return f"accurate steps cannot decide {self.stalled} of {self.tried} members tried (they stall)"
         if not self.members:
-            return "no member compared is held by both"
+            return "no member compared is held with both steps"
         return "" if self.resolved else f"coarser steps give a settled rms error {self.difference_text}"
 
     @property
@@ -157,7 +159,7 @@ def compare_metrics(
 
 
 def held(metrics: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return which members [N] run to the end, neither lost nor stalled."""
+    """Return which members [N] are held: neither lost nor stalled."""
     return ~np.isfinite(metrics["lost_at_s"])
 
 

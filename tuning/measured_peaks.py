@@ -22,7 +22,7 @@ from tuning.problem import TuningProblem
 # measurement with different noise.
 INJECTED, REPETITIONS = 3, 8
 # If only injections decide, the linear peaks do not show which members have the largest peaks. The first SCREENED
-# members are then measured once each. One call measures all of them in the time of one member.
+# members are then measured once each. One call measures all of them in the time that it takes for one member.
 SCREENED = 64
 # Limited quantities that an injection measures.
 MEASURED = {"sensitivity": "S", "complementary": "T", "control_sensitivity": "KS"}
@@ -64,7 +64,7 @@ def injects(problem: TuningProblem) -> bool:
 
 
 def decides(problem: TuningProblem) -> bool:
-    """Return whether only injections decide: if a sign is set-valued, no linear loop describes its chattering."""
+    """Return whether only injections decide: a sign is set-valued, and no linear loop describes its chattering."""
     return injects(problem) and any(set_valued_signs(getattr(problem.case.cascade, stage)) for stage in DEFAULT_LAWS)
 
 
@@ -102,7 +102,7 @@ def injections(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[s
 def reached_of(limit: Limit, columns: Mapping[str, np.ndarray], measured: Sensitivity | None) -> float:
     """Return the judge's value of a limit: the linear one or, if that is larger or decides, the injected one.
 
-    A member that the injection loses counts as infinite.
+    The value of a member that is lost during its injection is infinite.
     """
     linear = limit.reached(columns)
     if limit.name not in MEASURED or measured is None:

@@ -29,8 +29,8 @@ FIRST_ORDER: dict[str, Callable[[float], optax.GradientTransformation]] = {
 }
 NAMES = (BFGS, *FIRST_ORDER)
 
-# Trust radius of the BFGS: the largest (1: a factor e of one gain), and that of the first step, which is taken without
-# an estimate of the curvature.
+# Trust radius of the BFGS: its largest value (1: a factor e of one gain), and its value for the first step, which has
+# no estimate of the curvature.
 LARGEST_RADIUS, FIRST_RADIUS = 1.0, 0.3
 # After a rejected trial, the trust radius is the length of its step times CONTRACTION, or times CONTRACTION_AT_JUMP if
 # the trial lies beyond a jump of the function.

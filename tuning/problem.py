@@ -60,15 +60,19 @@ class TuningProblem:
 
     @functools.cached_property
     def reference(self) -> Engine:
-        """Engine with accurate steps: adaptive RODAS3, or on a processor REFINEMENT times as many steps."""
+        """Engine with accurate steps.
+
+        Adaptive RODAS3 or, on a processor, REFINEMENT times as many steps as in the search.
+        """
         accurate = AdaptiveRodas3(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS)
         return self._stepping(self._fine if self.sampled else accurate, lanes=REFERENCE_MEMBERS)
 
     @functools.cached_property
     def judging(self) -> Engine:
-        """Engine of the judge: REFINEMENT times as many steps.
+        """Engine of the judge.
 
-        On a processor, the steps of the case, or the finer ones of the search.
+        In continuous time, it makes REFINEMENT times as many steps as the search. On a processor, it makes the steps of
+        the case, or those of the search if the search has refined its steps.
         """
         if not self.sampled:
             return self._stepping(self._fine, threads=self.engine.threads)
@@ -129,7 +133,8 @@ class TuningProblem:
     def steps(self) -> tuple[Engine, Engine]:
         """Engines with the search's steps and with accurate ones, both without the sensor's converter.
 
-        Quantisation turns a rounding difference into one of a whole quantum, which would hide the step error.
+        The converter turns a rounding difference into a difference of a whole converter step, which would hide the
+        error of the integration steps.
         """
         scenario = self.objective.scenario
         if scenario.sensor is None or scenario.sensor.bits is None:

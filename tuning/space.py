@@ -1,7 +1,7 @@
 """Search space: the gains to tune, their bounds, and a map from unbounded coordinates to gains.
 
-A coordinate is the logarithm of a gain, bent at its bounds by softplus functions: one unit is about a factor e. Gains
-outside of the space stay the same objects in `Space.decode`.
+A coordinate is the logarithm of a gain, bent at its bounds by softplus functions. One unit is about a factor e.
+`Space.decode` does not copy gains that are not in the space.
 """
 
 import dataclasses
@@ -64,11 +64,11 @@ class Gain:
             return self.low + jnp.exp(x)
         high = math.log(self.high)
         if self.low == 0.0:
-            return jnp.minimum(jnp.exp(high - jax.nn.softplus(SHARP * (high - x)) / SHARP), self.high)  # of rounding
+            return jnp.minimum(jnp.exp(high - jax.nn.softplus(SHARP * (high - x)) / SHARP), self.high)  # rounding
         below = jax.nn.softplus(SHARP * (x - math.log(self.low))) / SHARP
         above = jax.nn.softplus(SHARP * (x - high)) / SHARP
         gain = jnp.exp(math.log(self.low) + (below - above))
-        return jnp.clip(gain, self.low, self.high)  # of rounding, at either end
+        return jnp.clip(gain, self.low, self.high)  # rounding
 
     @property
     def inner(self) -> tuple[float, float]:
@@ -124,8 +124,8 @@ class Space:
         for gain, value in zip(self.gains, gains, strict=True):
             if not gain.low < value < gain.high:
                 raise ValueError(
-                    f"{gain.path} = {value:g}: it must lie between tune.bounds {gain.low:g} and {gain.high:g} to start "
-                    "from. Change the gain or widen its bounds."
+                    f"{gain.path} = {value:g}: it must lie between tune.bounds {gain.low:g} and {gain.high:g}, because "
+                    "the search starts there. Change the gain or widen its bounds."
                 )
         return np.array([gain.encode(value) for gain, value in zip(self.gains, gains, strict=True)])
 

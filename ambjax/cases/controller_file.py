@@ -24,14 +24,15 @@ class ControllerFile(NamedTuple):
     contents: Realisation
 
     def relocated(self, out: pathlib.Path) -> dict[str, str]:
-        """Return `file` by dotted path as a case file in the folder `out` must write it."""
+        """Return the value of the key `file` for a case file in the folder `out`, by dotted path."""
         return {KEY: path_from(self.written, self.path, out)}
 
 
 def controller_file(table: Table, folder: pathlib.Path) -> ControllerFile:
     """Read the controller that the key `file` names; a relative path starts at `folder`, that of the case file.
 
-    Raises ValueError, one line with the dotted path, the file and the array, for anything that is no controller.
+    Raises ValueError if the file does not contain a controller. The message is one line, with the dotted path, the file
+    and the array.
     """
     written = table.raw.get("file")
     if written is None:
@@ -69,8 +70,8 @@ def _of_npz(path: pathlib.Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path) as file:
             return {name: file[name] for name in file.files}
-    except (ValueError, EOFError, AttributeError, zipfile.BadZipFile):  # not an archive, or with pickled objects
-        raise ValueError("not an .npz file of plain numbers. Write it by save_controller, or numpy.savez.") from None
+    except (ValueError, EOFError, AttributeError, zipfile.BadZipFile):  # not an archive, or it contains pickled objects
+        raise ValueError("not an .npz file of plain numbers. Write it with save_controller or numpy.savez.") from None
 
 
 def _of_mat(path: pathlib.Path) -> dict[str, np.ndarray]:
@@ -84,7 +85,7 @@ def _of_mat(path: pathlib.Path) -> dict[str, np.ndarray]:
         raise
     except Exception:  # SciPy raises errors of many types for a damaged file
         raise ValueError("not a .mat file. Save the arrays with: save FILE.mat A B C D dt -v7.") from None
-    with contextlib.suppress(KeyError):  # MATLAB has matrices only
+    with contextlib.suppress(KeyError):  # MATLAB stores a number as a matrix
         arrays[OPTIONAL] = arrays[OPTIONAL].squeeze()
     return arrays
 

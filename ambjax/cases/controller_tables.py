@@ -60,7 +60,7 @@ DISCRETISATIONS = ["implicit", "explicit"]
 
 
 class Files(NamedTuple):
-    """The folder of a case file, and what was read already of the files that it names."""
+    """The folder of a case file, and those of the files it names that were read earlier."""
 
     folder: pathlib.Path
     own: tuple[OwnLaw, ...]
@@ -110,7 +110,7 @@ def cascade_from(
 
 
 def _check_default(law: Table, kind: type[Law], kinds: dict[str, type[Law]]) -> None:
-    """Raise ValueError if `kind` is left out and the keys are those of another law than the default, `kind`."""
+    """Raise ValueError if the table omits its kind, and its keys fit other laws but not the default law, `kind`."""
     others = [word for word, one in kinds.items() if law.raw.keys() <= _gains(one)]
     unknown = next((key for key in law.raw if key not in _gains(kind)), None)
     if "kind" not in law.raw and unknown is not None and others:
@@ -127,10 +127,10 @@ def _gains(kind: type[Law]) -> set[str]:
 
 
 def _usual(kinds: dict[str, type[Law]], demanding: Any, command: str) -> str:
-    """Return the kind of a law that is left out.
+    """Return the default kind of a stage.
 
-    It is the first that accepts the demand of the position law, if that is known, and commands what the amplifier
-    follows, a "voltage" or a "current". If there is none, it is the first that commands this.
+    It is the first law that commands the quantity that the amplifier controls, `command`: "voltage" or "current". If
+    the position law, `demanding`, is known, laws that accept its demand take precedence.
     """
     fitting = [kind for kind, law in kinds.items() if getattr(law, "commands", command) == command]
     if demanding is None:
@@ -140,7 +140,7 @@ def _usual(kinds: dict[str, type[Law]], demanding: Any, command: str) -> str:
 
 
 def _nominal(law: Table, kind: type[Law], actuator: Table) -> Table:
-    """Return the table of a law; one that commands a current has the amplifier's bandwidth by default."""
+    """Return the table of a law. The default bandwidth of a law that commands a current is that of the amplifier."""
     if getattr(kind, "commands", "") != "current" or "bandwidth" not in actuator.raw:
         return law
     return Table({"bandwidth": actuator.raw["bandwidth"], **law.raw}, law.path)

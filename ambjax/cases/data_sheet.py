@@ -1,10 +1,10 @@
-"""Annotated case file of a bearing from a data sheet: the numbers an engineer is given, and those to be assumed."""
+"""Annotated case file of a bearing from a data sheet, with the numbers that it gives and those that it omits."""
 
 BEARING = """\
 # A case for ambjax: a radial magnetic bearing from a data sheet, on a 16 kHz processor, its rotor at rest.
 # Units are SI. 'ambjax template' lists every other key. Run it with 'ambjax simulate', tune it with 'ambjax tune'.
 # "Data sheet": the number is usually specified. "Assumed": the data sheet omits the number; it is chosen so that the
-# magnet is plausible: a bias flux of 0.75 T, a force of 15 times the weight, 23 mH. 'ambjax check' prints these.
+# magnet is plausible: a bias flux of 0.75 T, a force of 15 times the weight ('ambjax check' prints both), 23 mH.
 
 [plant]
 # kind = "two-coil"           # each coil has its own current: use it for your own machine, and tune the gains on it
@@ -62,7 +62,7 @@ bits = 14                     # data sheet; over +-s_0 and +-2 i_0, so 61 nm a s
 
 [actuator]
 u_max = 72.0                  # V; data sheet
-i_max = 2.0                   # A; with the bias, the 4 A of an amplifier; assumed
+i_max = 2.0                   # A; assumed: an amplifier of 4 A, less the bias
 
 [initial]
 z = 5e-5                      # m; off centre, at rest

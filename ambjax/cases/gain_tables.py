@@ -1,4 +1,4 @@
-"""The table of a law: a number for each gain, or a table in its place, the schedule of the gain."""
+"""The table of a law: each gain is a number, or a table that contains the schedule of the gain."""
 
 import dataclasses
 from typing import Any
@@ -11,7 +11,7 @@ EXAMPLE = '{ over = "error", at = [0.0, 1e-5], values = [100.0, 200.0] }'
 
 
 def law_from(table: Table, kind: type[Law], base: Law | None) -> Any:
-    """Return a law of this kind whose gains are this table's keys. `base` gives the defaults, or else `kind`.
+    """Return a law of this kind with the gains of this table. `base`: law with the defaults; None: those of `kind`.
 
     Raises ValueError with the dotted path, the value, what is allowed and the fix.
     """

@@ -19,7 +19,7 @@ from ambjax.world.plant import Plant
 
 FORM = '"FILE.py:CLASS" or "MODULE:CLASS", a custom law'
 
-# Makes the error of a law with this reason.
+# Function that returns the error of a law for a given reason.
 Refuse = Callable[[str], ValueError]
 
 
@@ -48,8 +48,8 @@ def is_own(kind: object) -> bool:
 def own_law(stage: str, kind: str, folder: pathlib.Path, model: Plant) -> OwnLaw:
     """Import the law that `kind` names; a path is relative to `folder`, that of the case file.
 
-    Raises ValueError, with the dotted path, the value and the reason, if there is no such class, if its import raises,
-    or if the class is no law of this stage that can be called with `model`.
+    Raises ValueError, with the dotted path, the value and the reason, if there is no such class, if the import fails,
+    if the class is not a law of this stage, or if it cannot be called with `model`.
     """
     source, _, name = kind.rpartition(":")
     file = (folder / source).resolve() if source.endswith(".py") else None
@@ -71,9 +71,9 @@ def own_law(stage: str, kind: str, folder: pathlib.Path, model: Plant) -> OwnLaw
 
 
 def relocated(laws: Iterable[OwnLaw], out: pathlib.Path) -> dict[str, str]:
-    """Return `kind` of each law by dotted path as a case file in the folder `out` must write it.
+    """Return the value of the key `kind` of each law for a case file in the folder `out`, by dotted path.
 
-    It is as written unless its relative path leads elsewhere from `out`.
+    The value is as written, unless its relative path does not lead to the same file from `out`.
     """
     kinds = {}
     for law in laws:
@@ -85,7 +85,7 @@ def relocated(laws: Iterable[OwnLaw], out: pathlib.Path) -> dict[str, str]:
 
 
 def path_from(written: str, file: pathlib.Path, folder: pathlib.Path) -> str:
-    """Return the path of a file for a case file in `folder`: as `written` if that leads to the file from there too."""
+    """Return the path of `file` for a case file in `folder`: `written` if it leads there, else a new one."""
     if (folder / written).resolve() == file:
         return written
     try:
@@ -116,7 +116,7 @@ def _said(error: BaseException, file: pathlib.Path | None) -> str:
         words = error.msg  # str(error) contains the line too
     fix = ""
     if isinstance(error, (jax.errors.TracerBoolConversionError, jax.errors.TracerArrayConversionError)):
-        fix = ". A law computes with jax.numpy, and selects with jnp.where in place of `if`, `and`, `or`"
+        fix = ". Compute with jax.numpy, and use jnp.where in place of `if`, `and` and `or`"
     return f"raised {type(error).__name__}: {words.rstrip('.')}{'' if line is None else f' (line {line})'}{fix}"
 
 
@@ -143,7 +143,7 @@ def _named(base: type[Law]) -> str:
 
 
 def _check_record(found: type[Law], name: str, stage: str, refuse: Refuse) -> None:
-    """Raise ValueError unless the class is a record whose fields all have defaults and names of their own."""
+    """Raise ValueError unless the class is a record, each field has a default, and no field has the name `kind`."""
     try:
         law = found()
     except TypeError as error:  # abstract methods, or fields without a default
@@ -159,4 +159,4 @@ def _check_record(found: type[Law], name: str, stage: str, refuse: Refuse) -> No
         if not (field.metadata.get("leaf") or field.metadata.get("static")):
             raise refuse(f"{name}.{field.name}: declare it by gain(...), leaf(...) or static(...) of ambjax.extend.")
         if field.name == "kind":
-            raise refuse(f"{name}.kind: this name is that of the law in [controller.{stage}]. Choose another.")
+            raise refuse(f"{name}.kind: the key kind of [controller.{stage}] selects the law. Choose another name.")

@@ -20,24 +20,24 @@ MOST_CORNERS = 64
 
 
 def reach(scenario: Scenario, clock: Clock) -> float:
-    """Return a bound on |r| over the run and over all members, m. A sum or noise may stay below the bound."""
+    """Return a bound on |r| over the run and over all members, m. A sum or a noise need not reach the bound."""
     return max(map(abs, scenario.reference.span(float(clock.duration))))
 
 
 def widest(spread: Spread, cascade: Cascade, scenario: Scenario) -> Scenario:
-    """Return the scenario with the ends of every spread of reference and clearance, each on its own array axis."""
+    """Return the scenario with the two ends of each spread of reference and clearance, on one array axis per spread."""
     return ends(spread, cascade, scenario, ("reference.", "plant.s_0", "run.clearance"))[1]
 
 
 def check_reference(spread: Spread, cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
     """Raise ValueError, with the largest |r| and the fix, if the reference leaves the clearance.
 
-    A sum or noise may never reach its bound, so its samples decide: those of the case, and those of all combinations of
-    the ends of its spread if there are at most MOST_CORNERS.
+    A sum or a noise need not reach its bound, so its values at the samples decide. They are computed for the case and,
+    if there are at most MOST_CORNERS combinations of the ends of its spread, for each combination.
     """
     _compare("reference", scenario, clock)
     wide = widest(spread, cascade, scenario)
-    what = "spread.reference: with the ends of its [spread] it"
+    what = "spread.reference: at the ends of its [spread], the reference"
     if not isinstance(scenario.reference, (Sum, BandNoise)):
         _compare(what, wide, clock)
     elif reach(wide, clock) >= np.min(wide.touchdown):

@@ -1,6 +1,6 @@
 """Reader of case files: from TOML to a cascade, a scenario and a clock.
 
-The reader is strict. An unknown key, a wrong type, a number out of bounds or a contradiction of two settings raises a
+The reader is strict. An unknown key, a wrong type, a number out of bounds or two contradictory settings raise a
 ValueError with one line: the dotted path, the value, what is allowed and the fix.
 """
 
@@ -49,7 +49,8 @@ TABLES = [
     "sensitivity",
 ]
 OTHERS = ["tune"]  # read by the tuner, ignored by the other commands
-# A case name appears in titles, paths, tables and pages: characters that are replaced, and the largest length.
+# A case name appears in titles, paths, tables and pages. UNSAFE: characters that are replaced in it. LONGEST_NAME: its
+# largest length.
 UNSAFE, LONGEST_NAME = re.compile(r"[^\w.+() -]+"), 80
 
 
@@ -85,7 +86,7 @@ class Case:
 def read_case(path: str | pathlib.Path) -> Case:
     """Read and check the case file at `path`, and return the case.
 
-    Raises ValueError, one line, if the file cannot be read or any part of it is invalid, or if `path` is no path.
+    Raises ValueError, one line, if `path` is not a path, if the file cannot be read, or if any part of it is invalid.
     """
     require_file("path", path)
     path = pathlib.Path(path)
@@ -109,7 +110,7 @@ def require_case(case: object) -> None:
 
 
 def safe_name(text: str) -> str:
-    """Return the text with unsafe characters of paths, titles, tables and pages replaced, cut to LONGEST_NAME."""
+    """Return the text as a case name: with unsafe characters replaced, and cut to LONGEST_NAME characters."""
     return UNSAFE.sub("_", text)[:LONGEST_NAME].strip() or "case"
 
 

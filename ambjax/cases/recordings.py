@@ -17,7 +17,7 @@ from ambjax.world.recorded import Recorded, Samples
 INTERPOLATIONS = ["linear", "held"]
 KEYS = ["file", "columns", "interpolation", "scale", "start"]
 FIELDS = {field.name: field for field in dataclasses.fields(Recorded)}
-# Largest number of rows; they are constants of the compiled program.
+# Largest number of rows. The rows are constants of the compiled program.
 MOST_ROWS = 200_000
 
 
@@ -133,7 +133,7 @@ def _checked(times: np.ndarray, values: np.ndarray) -> Samples:
 
 
 def _csv(file: pathlib.Path) -> dict[str, np.ndarray]:
-    """Read columns separated by commas; the first line may have their names, and # begins a comment."""
+    """Read columns separated by commas. The first line may give their names. Lines that begin with # are comments."""
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:

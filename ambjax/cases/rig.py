@@ -57,7 +57,7 @@ range_i = 10.0                # A; limit of the amplifiers of [2]
 
 [actuator]
 u_max = 48.0                  # V; a DC link of 50 V [2]
-i_max = 2.5                   # A; with the bias, the 5 A of an amplifier [1]
+i_max = 2.5                   # A; an amplifier of 5 A [1], less the bias
 
 [initial]
 z = 5e-5                      # m; off centre, at rest

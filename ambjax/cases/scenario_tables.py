@@ -41,7 +41,7 @@ SIGNALS: dict[str, type] = {
 FIXED_UNITS = {kind: signal.unit for kind, signal in SIGNALS.items() if hasattr(signal, "unit")}
 # The units of each disturbance, and the field of the scenario for each unit; the first unit is the default.
 UNITS = {"q_z": {"m/s^2": "q_z", "N": "q_f", "A^2/m^2": "q_v"}, "q_i": {"A/s": "q_i"}, "base": {"m/s^2": "base"}}
-# Largest number of terms of a sum, and of signals that disturb the same quantity; each is compiled.
+# Largest number of terms of a sum, and of signals that disturb the same quantity. Each of them is compiled.
 MOST_TERMS = 100
 # The amplifiers by actuator.mode, the default first.
 AMPLIFIERS: dict[str, type] = {kind.mode: kind for kind in (Amplifier, CurrentAmplifier)}
@@ -72,7 +72,7 @@ def _signal(table: Table, unit: str, recordings: Recordings, extra: tuple[str, .
 
 
 def _disturbances(table: Table, recordings: Recordings) -> dict[str, Any]:
-    """Return the disturbances by field of the scenario. Signals of one unit that act together become their sum."""
+    """Return the disturbances by field of the scenario. Several signals of the same field become a sum."""
     table.only(list(UNITS))
     found: dict[str, list[Any]] = {}
     for name, slots in UNITS.items():
@@ -204,7 +204,8 @@ def _seed(run: Table) -> int:
 def check_start(scenario: Scenario) -> None:
     """Raise ValueError unless the rotor starts within its clearance, and the clearance within the gap.
 
-    With a stop it may start on the stop, short of the pole. Limits of the coils must contain their currents.
+    With an elastic stop, the rotor may also start in contact with it. The limits of a coil must contain its bias and
+    its initial current.
     """
     _check_coils(scenario)
     gap, stop, z = scenario.plant.s_0, scenario.touchdown, scenario.initial.z
@@ -215,8 +216,8 @@ def check_start(scenario: Scenario) -> None:
             raise ValueError(f"run.clearance = {stop:g} m: with a stop it must be below {scenario.limit:g} m.")
         if not abs(z) < scenario.limit:
             raise ValueError(
-                f"initial.z = {z:g} m: the rotor would touch a magnet; |z| must be below {scenario.limit:g} m. On its "
-                f"stop it stands at {math.copysign(stop, z):g} m."
+                f"initial.z = {z:g} m: the rotor would touch a magnet; |z| must be below {scenario.limit:g} m. Its "
+                f"stop begins at {math.copysign(stop, z):g} m."
             )
         return
     if not abs(z) < stop:

@@ -12,7 +12,7 @@ from ambjax.host.words import one_line
 from ambjax.numerics.declared import check_number, numbers, within
 from ambjax.numerics.records import check_leaf
 
-# Characters of a key or a value that a message shows.
+# Largest number of characters of a key or a value in a message.
 LONGEST = 60
 # Largest depth of nested tables and lists. A sum of sums needs less; the readers rely on the limit.
 DEEPEST = 32
@@ -61,7 +61,7 @@ def _place(text: str, error: str) -> str:
     if re.match(r"[^#\[\"']*=\s*[-+]?\d+,\d", line):
         return f"{shown} Write a decimal number with a point."
     if "twice" in error or ("overwrite" in error and line.lstrip().startswith("[")):
-        return f"{shown} Write each table once; for several loads, write [[disturbance.q_z]] above each, the first too."
+        return f"{shown} Write each table once. For several loads, put [[disturbance.q_z]] above each, also the first."
     if "overwrite" in error:
         return f"{shown} Write each key once."
     return f"{shown} See 'ambjax template' for a file to start from."
@@ -138,7 +138,7 @@ class Table:
     def choice(self, key: str, allowed: list[str], default: str | None = None, other: str = "") -> str:
         """Return one of the `allowed` words, or the default if left out. Raises ValueError for any other.
 
-        `other`: what else the key may have, for the message; the caller has read it.
+        `other`: description of the other values that the caller accepts, for the message.
         """
         value = self.raw.get(key, default)
         words = quoted(allowed) + (f"; or {other}" if other else "")
@@ -155,7 +155,7 @@ class Table:
     def record(self, kind: type, extra: tuple[str, ...] = (), base: object = None) -> Any:
         """Return a record of type `kind` whose leaves are this table's keys.
 
-        `extra`: further keys that the table may have. `base`: a record that gives the defaults, else `kind`. Raises
+        `extra`: further keys that the table may have. `base`: a record that gives the defaults; None: `kind`. Raises
         ValueError for an unknown or missing key, or a value out of bounds.
         """
         fields = [field for field in dataclasses.fields(kind) if field.metadata.get("leaf")]

@@ -42,7 +42,7 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 # stop_damping = 500.0        # N s/m; damping of the touchdown bearing (left out: 0)
 
 # [sensor]                    # Gaussian noise, held for a sample period, without delay (left out: none)
-# std = {paper_std:.3e}          # m; as in the paper, whose printed gains lose the rotor under it
+# std = {paper_std:.3e}          # m; the value of the paper; with the paper's printed gains, the rotor is then lost
 # std_z_dot = 0.0             # m/s
 # std_i = 0.0                 # A
 # offset = 0.0                # m; offset of the position sensor
@@ -83,7 +83,7 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 # i = 25.0                    # A; largest |i| (left out: 100 i_0)
 # noise = 1.4e-5              # m; largest difference of two readings of one z (left out: from the sensor's errors)
 # speed = 1e-3                # m/s; error of the predicted velocity (left out: from the sensor or the observer)
-# samples = 18                # largest number of successive predictions (left out: until an error grows e times)
+# samples = 18                # largest number of successive predictions (left out: until an error grows by a factor e)
 
 # [actuator]
 # mode = "voltage"            # the controller commands a voltage; or "current", with bandwidth and i_max only
@@ -95,7 +95,7 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 # i_max = 1.0                 # A; above it, the voltage does not increase |i| (left out: no limit)
 #
 # [actuator.coil]             # limits of each coil, for plant.kind = "two-coil" and [processor] (left out: none)
-# u_max = 200.0               # V; limit of the |voltage| of a coil, which contains R i_0 (left out: no limit)
+# u_max = 200.0               # V; limit of the |voltage| of a coil, R i_0 included (left out: no limit)
 # i_max = 0.5                 # A; above it, the voltage does not increase the current of a coil (left out: no limit)
 # unidirectional = true       # the current of a coil cannot become negative (left out: false)
 
@@ -133,7 +133,7 @@ def _lines(kind: type, values: object) -> list[str]:
 
 
 IRON = """\
-# [plant.iron]                # iron of the true plant; a key that is left out: ideal in this respect (left out: ideal)
+# [plant.iron]                # iron of the true plant (left out: ideal iron); without a key, its effect is left out
 # saturation = 1.4            # T; flux density limit of the core
 # leakage = 1.1               # flux of a coil over the flux of its gap, at z = 0
 # eddy = 5e-5                 # s; lag of the flux behind the current by eddy currents
@@ -141,7 +141,7 @@ IRON = """\
 
 
 def _law(kind: type) -> list[str]:
-    """Return the lines of a law; a steepness p that scales with the plant becomes a comment."""
+    """Return the lines of a law. If its steepness p scales with the plant, the line of p is a comment."""
     law = kind()
     scaled, lines = law.size(Plant()) is not None, _lines(kind, law)
     return [

@@ -17,9 +17,9 @@ METHODS: dict[str, type] = {"rk4": RK4, "dop853": DOP853, "euler": Euler, "rodas
 SLIDING_SUBSTEPS = 3
 # Largest number of rows of a run; with 16 numbers a row, about 2.5 GB.
 MOST_SAMPLES = 20_000_000
-# Samples that the metrics need; relative rounding error within which two times are equal.
+# Smallest number of samples for the metrics; relative rounding error within which two times are equal.
 FEWEST_SAMPLES, ROUNDING = 2, 1e-9
-# Largest number of steps of a run with a given dt: hours of computation.
+# Largest number of steps of a run with a given dt. A run of so many steps takes hours.
 MOST_STEPS = 10_000_000_000
 DURATION = leaf(default=2.0, unit="s", at_least=1e-9, at_most=1e6, doc="simulated time")
 DT = leaf(default=1e-6, unit="s", at_least=1e-15, at_most=1e6, doc="integration step")
@@ -27,7 +27,7 @@ DT = leaf(default=1e-6, unit="s", at_least=1e-15, at_most=1e6, doc="integration 
 
 
 def clock_from(table: Table) -> tuple[Clock, float]:
-    """Return the clock and clock.duration in s. The clock's method is None if the reader is to choose it.
+    """Return the clock and clock.duration in s. The clock's method is None if the reader must choose it later.
 
     Raises ValueError as `read_case` does.
     """

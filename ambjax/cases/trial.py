@@ -21,10 +21,10 @@ OUTPUTS = {
 
 
 def try_law(law: Law, stage: str, model: Plant) -> None:
-    """Trace the methods of a law at rest.
+    """Trace the methods of a law.
 
-    Raises TypeError if an output, a rate, a scale or a next state has another structure or shape than it must have, and
-    whatever the methods raise.
+    Raises TypeError if an output, a rate, a scale or a next state has a wrong structure or shape. Exceptions that the
+    methods raise are passed on.
     """
     one: Any = law
     motion, reference = Measurement(*_zeros(3)), Reference(*_zeros(3))
@@ -46,7 +46,7 @@ def try_law(law: Law, stage: str, model: Plant) -> None:
         return state, one(model, inputs, state), one.scale(model), kept, after, one.slope(model), begun
 
     state, (output, rate), scale, kept, after, slope, begun = jax.eval_shape(everything, inputs)
-    _same(output, wanted, f"{type(law).__name__} must return {OUTPUTS[stage]} and the rate of its state; the first is")
+    _same(output, wanted, f"{type(law).__name__} must return {OUTPUTS[stage]} and the rate of its state; the output is")
     _same(rate, state, "the rate of the state must be like init(model); it is")
     _same(scale, state, "scale(model) must be like init(model); it is")
     _same(after, (wanted, kept), "on a processor, a step must return the output and the next state; they are")

@@ -16,14 +16,15 @@ VOLTAGE_SHARE = 0.6
 SURVIVING = 1.0
 # Default band of the settling time, as a share of the clearance.
 SETTLING_BAND = 0.01
-# Default margins of limits on means over members and on worst members: the relative difference between two ensembles.
-# LOOP_MARGIN: of the sensitivity of the worst member, which an injection measures with an error of a few per cent.
+# Default margins of limits. MEAN_MARGIN, WORST_MARGIN: for means over members, and for worst members; each is the
+# relative difference between two ensembles. LOOP_MARGIN: for the sensitivity of the worst member, which an injection
+# measures with an error of a few per cent.
 MEAN_MARGIN, WORST_MARGIN, LOOP_MARGIN = 0.005, 0.03, 0.05
 
 # The numbers of [tune]. The bounds are decades wider than useful values.
 NUMBERS: dict[str, dataclasses.Field] = {
     "conditions_margin": leaf(
-        0.1, at_least=0, at_most=1e3, doc="share by which each gain is to exceed its condition of Theorem 1"
+        0.1, at_least=0, at_most=1e3, doc="share by which each gain should exceed its lower bound in Theorem 1"
     ),
     "early": leaf(0.0, at_least=0, at_most=1e6, doc="weight of errors before run.settle; after it, the weight is 1"),
     "stress": leaf(1.2, above=0, at_most=1e6, doc="factor on the noise of the stressed members"),
@@ -49,7 +50,7 @@ WEIGHTS: dict[str, dataclasses.Field] = {
     "conditions": _weight(1.0, "conditions of Theorem 1 that fail, or hold by less than the margin"),
 }
 SURVIVAL: dataclasses.Field = leaf(SURVIVING, above=0, at_most=1, doc="share of the held-out members that must survive")
-# Largest whole numbers; smaller for members and points, which are in memory at once.
+# Largest whole numbers. That of members and points is smaller, because all of them are in memory at once.
 MOST_WHOLE, MOST_MEMBERS = 2**31 - 1, 2**20
 
 
@@ -109,9 +110,9 @@ def template_lines() -> Iterator[Line]:
     )
     yield Line(
         "bounds.controller.position.c = [1.0, 500.0]",
-        "bounds of one gain; left out: from plant and theory, see the report; c",
+        "bounds of one gain; left out: from plant and theory, see the report; by default, c",
     )
-    yield Line("", "is then at most a fifth of the sampling rate, others 3 times their range or start")
+    yield Line("", "is at most a fifth of the sampling rate, others 3 times the end of their range or start")
     yield from _defaults("weights.", WEIGHTS)
     yield from _limits()
     yield from _defaults("", {name: NUMBERS[name] for name in ("conditions_margin", "early")})

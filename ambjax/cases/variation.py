@@ -1,4 +1,4 @@
-"""The table [spread] of a case file: each dotted path is given a distribution."""
+"""The table [spread] of a case file: a distribution for each dotted path."""
 
 from collections.abc import Callable
 from typing import Any
@@ -90,7 +90,10 @@ def _distribution(raw: object, path: str) -> Distribution:
 
 
 def _refuse_nothing_in_two_units(spread: Spread, top: Table) -> None:
-    """Raise ValueError for a spread of a constant force of 0: it reads as no disturbance, in another unit."""
+    """Raise ValueError for a spread of a constant q_z of 0 in another unit than m/s^2.
+
+    A constant 0 counts as no disturbance, so the spread would be in m/s^2.
+    """
     path = "disturbance.q_z.value"
     signal = top.raw.get("disturbance", {}).get("q_z", {})
     unit = signal.get("unit", "m/s^2") if isinstance(signal, dict) else "m/s^2"

@@ -34,7 +34,7 @@ from ambjax.host.arguments import names_arguments
 VERIFIED = ("verify.md", "verify.json")
 # Names of the files of an FMU export, with the prefix p: the FMU, and its reference input, output and options.
 FMU_NAMES = ("{p}.fmu", "{p}_in.csv", "{p}_ref.csv", "{p}_ref.opt")
-# Names of the standard C headers, which a prefix must not repeat: the package contains PREFIX.h.
+# Names of the standard C headers. A prefix must not be one of them, because the package contains PREFIX.h.
 HEADER_NAMES = {
     *("assert", "complex", "ctype", "errno", "fenv", "inttypes", "iso646", "limits", "locale", "math", "setjmp"),
     *("signal", "stdarg", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath", "time", "wchar"),
@@ -199,7 +199,7 @@ def destination(out: str | None, name: str, plan: Plan) -> Iterator[tuple[pathli
     """Yield the output directory and a folder whose files move into it at the end of the block, as `files` does.
 
     `out` and `name` are those of `directory`. Without verification, the verification of an earlier export is removed,
-    because it does not apply to the new files. Raises ValueError if a file that is not of an export would be replaced.
+    because it does not apply to the new files. Raises ValueError if it would replace a file that is not from an export.
     """
     path = directory(out, name)
     names = FMU_NAMES[: 1 if _holds_fmu(path, plan) else None] if plan.fmi else package.NAMES
@@ -235,12 +235,12 @@ def _prefix(option: str | None, name: str) -> str:
     if not isinstance(option, str) or not _is_name(option):
         raise ValueError(
             f"--prefix {option}: it must be a C identifier (a letter, then letters, digits or '_'), and neither a C "
-            "keyword nor the name of a C header, such as controller."
+            "keyword nor the name of a C header. For example: controller."
         )
     return option
 
 
 def _is_name(text: str) -> bool:
-    """Return whether a text can be the prefix: a C identifier that is no keyword and no name of a C header."""
+    """Return whether a text can be the prefix: a C identifier that is neither a keyword nor the name of a C header."""
     words = RESERVED | HEADER_NAMES | {"break", "continue", "else", "for", "if", "return", "while"}
     return re.fullmatch(r"[A-Za-z]\w{0,60}", text, flags=re.ASCII) is not None and text not in words

@@ -19,10 +19,10 @@ from ambjax.numerics.declared import numbers, within
 
 COUNT = 21
 MOST_CELLS = 1_000_000
-# Most samples of all runs in a map over clock.sample_period, some hours of computation.
+# Largest number of samples of all runs together, in a map over clock.sample_period: some hours of computation.
 MOST_TOTAL = 10_000_000_000
 FORM = "PATH=LOW:HIGH[:COUNT][:log], as in initial.z=-1e-3:1e-3:41 or plant.m=-20%:20%"
-# Unit and meaning of each grid of a map.
+# Unit and meaning of each array of a map.
 MEANINGS = {
     "survival": ("1", "share of survivors"),
     "low": ("1", "lower end of the 95 % interval of the survival"),
@@ -80,8 +80,8 @@ def survival_map(case: Case, x: str, y: str, *, members: int = 1, seed: int | No
     """Return survival and error over a grid of two quantities of a case, as `ambjax map` computes them.
 
     - `case`: from `read_case`.
-    - `x`, `y`: quantity and range of each axis, as the options of the command: "PATH=LOW:HIGH[:COUNT][:log]", in SI
-      units or per cent of the case's value; 21 values by default.
+    - `x`, `y`: quantity and range of each axis, in the form of the command's options: "PATH=LOW:HIGH[:COUNT][:log]".
+      LOW and HIGH are in SI units, or in per cent relative to the value in the case. COUNT is 21 by default.
     - `members`: number of members in each cell; 1 is the nominal case, and 2 or more draw the spread of the case.
     - `seed`: of the spread and the noise; None: `run.seed` of the case.
 
@@ -101,7 +101,7 @@ def study_and_axes(case: Case, x: str, y: str, members: int, seed: int | None) -
     first, second = _axis("--x", x, case), _axis("--y", y, case)
     cells = len(first.values) * len(second.values)
     if cells * members > MOST_CELLS:
-        raise ValueError(f"--members {members}: times {cells} cells, it exceeds {MOST_CELLS:,} runs. Reduce either.")
+        raise ValueError(f"--members {members}: with {cells} cells, more than {MOST_CELLS:,} runs. Reduce either.")
     _check_samples(case, first, second, members)
     return with_method_for_axes(study, first, second), first, second
 

@@ -117,7 +117,10 @@ def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
 
 
 def _clearance(case: Case, args: argparse.Namespace, largest: float | None) -> Summary:
-    """Print and return the clearance zone for the largest |z| after run.settle, m; None: zone D, not printed."""
+    """Print and return the clearance zone.
+
+    `largest`: largest |z| after run.settle, m. None: the zone is D, and nothing is printed.
+    """
     if largest is None:
         return {"clearance_used": None, "clearance_zone": "D"}
     used = largest / float(np.min(np.asarray(case.scenario.touchdown)))

@@ -29,9 +29,9 @@ from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks, opera
 WRITTEN = ("compare.html", "compare.json", "compare.png")
 # Largest number of cases in a table and a picture.
 MOST_CASES = 8
-# Members per call, a whole number of calls of the compiled program.
+# Members that are simulated between two updates of the progress bar: a whole number of calls of the compiled program.
 CHUNK = 16 * CALL
-# Prefixes in a study's fingerprint that may differ between cases: the controller, and the integration method.
+# Beginnings of the names in a study's fingerprint whose values may differ: the controller, and the integration method.
 MAY_DIFFER = ("controller.", "clock.method")
 
 

@@ -17,9 +17,11 @@ from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks
 
 @dataclasses.dataclass(frozen=True)
 class Compared:
-    """A case and its results: the members' columns [N], the nominal loop, its members' peaks, the flops of a step.
+    """A case and its results.
 
-    `point`, `peaks`, `flops`: None if there is no equilibrium, no spread, or no step on a processor.
+    `columns`: of the members, [N] each. `point`: the nominal loop; None without an equilibrium. `peaks`: of the members
+    of the spread; None without a spread. `flops`: operations of a step of the controller; None without a processor, or
+    if a law cannot be exported.
     """
 
     case: Case
@@ -64,7 +66,7 @@ QUANTITIES = (
     Quantity("clearance_used", "largest settled share of the clearance", "1"),
     Quantity("clearance_zone", "its zone (ISO 14839-2)", "", None),
     Quantity("peak", "peak of |S|", "1"),
-    Quantity("frequency_hz", "at", "Hz", None),
+    Quantity("frequency_hz", "its frequency", "Hz", None),
     Quantity("zone", "its zone (ISO 14839-3)", "", None),
     Quantity("unstable", f"members not stable at rest, of the first {MEMBERS}", "1"),
     Quantity("worst_peak", "peak of |S|, worst member", "1"),
@@ -113,7 +115,7 @@ def _values(one: Compared, first: Compared) -> dict[str, object]:
 
 
 def _better(one: Compared, first: Compared) -> int:
-    """Return the number of members that the first case loses or holds with a larger rms error, and this one holds."""
+    """Return how many members this case holds that the first case loses, or holds with a larger rms error."""
     ours, theirs = (np.where(x.held, x.columns["settled_rms_error_m"], math.inf) for x in (one, first))
     return int(np.sum(ours < theirs))
 
@@ -178,15 +180,16 @@ def comparison_markdown(summary: Mapping[str, Any]) -> str:
 
 def _words(summary: Mapping[str, Any]) -> str:
     poor = [case["case"] for case in summary["cases"] if case["lost"] or case["peak"] is None]
-    why = f" Lost members, or a loop not stable at rest: {', '.join(poor)}; 'ambjax check' says why." if poor else ""
+    why = f" Lost members, or a loop not stable at rest: {', '.join(poor)}; see 'ambjax check'." if poor else ""
     return (
         f"{summary['members']} members, seed {summary['seed']}, the same in all cases. Errors, voltages, currents and "
-        f"losses are of the members that are held. Sensitivity and margins are of the linearised loop at rest.{why}"
+        f"losses are those of the members that are held. Sensitivity and margins are those of the linearised loop at "
+        f"rest.{why}"
     )
 
 
 def _shown(summary: Mapping[str, Any]) -> list[Quantity]:
-    """Return the quantities that at least one case has; stalled members only if there are some."""
+    """Return the quantities that at least one case has. The row of stalled members is left out if there are none."""
     return [
         q
         for q in QUANTITIES

@@ -20,7 +20,7 @@ from ambjax.host.interrupts import reporting, uninterrupted
 from ambjax.host.lock import locked
 from ambjax.simulation.sliding import Slide
 
-# Above the core count of any machine; each process needs its own memory.
+# Largest number of worker processes: above the number of cores of any machine.
 MOST_PROCESSES = 1024
 
 
@@ -82,8 +82,10 @@ def _check(study: Study, store: Store, args: argparse.Namespace) -> None:
 
 
 def _pilot(study: Study, store: Store, executor: tuple[Executor, int] | None) -> None:
-    """Time the first members, print how long the study may take, choose the chunk size if none is set, and keep the
-    chunks that the timing has computed."""
+    """Time the simulation of the first members, and keep their chunks.
+
+    Prints how long the study may take, and chooses the chunk size if none is set.
+    """
     columns, seconds = pilot(study)
     first = len(columns["index"])
     pace = Pace(first / seconds, None if executor is None else executor[1] // AHEAD)

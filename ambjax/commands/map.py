@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
         for case, (study, x, y) in zip(cases, ready, strict=True):
             say(f"{case.name}: {len(x.values) * len(y.values)} cells of {args.members}; method: {study.clock.method}")
             if args.members == 1 and case.spread.entries:
-                say(f"{case.name}: nominal: one member does not draw the [spread]; --members 2 or more does.")
+                say(f"{case.name}: nominal, because one member does not draw the [spread]; --members 2 or more do.")
             maps.append(grid(study, x, y))
         summary = {"cases": [_summary(case, one) for case, one in zip(cases, maps, strict=True)], "out": str(out)}
         _draw(cases, maps, part / "map.png")
@@ -68,7 +68,7 @@ def _text(cases: list[Case], maps: list[Map]) -> str:
 def _confidence_note(one: Map) -> str:
     """Explain why a map gives no confidence statement for its cells."""
     if not one.varied:
-        return "without noise and [spread], all runs of a cell are the same, and one decides it"
+        return "without noise and [spread], all runs of a cell are the same, so one run decides the cell"
     enough = next(n for n in itertools.count(1) if wilson(n, n).low >= CERTAIN)
     runs = f"{one.members} run{'s' * (one.members > 1)} a cell"
     return f"{runs}: too few for a confidence statement about a cell; give --members {enough} or more"

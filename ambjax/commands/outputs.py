@@ -54,7 +54,7 @@ def check_new(out: pathlib.Path, names: Iterable[str]) -> None:
 
 
 def check_places(out: pathlib.Path, names: Iterable[str | pathlib.PurePath]) -> None:
-    """Raise ValueError if a folder in `out` has one of these file names, or a file the name of a needed folder."""
+    """Raise ValueError if a folder in `out` has one of these file names, or a file has the name of a needed folder."""
     for name in map(pathlib.PurePath, names):
         blocking = [
             parent for parent in name.parents[:-1] if os.path.lexists(out / parent) and not (out / parent).is_dir()

@@ -93,8 +93,8 @@ def duration(seconds: float) -> str:
 def sliding_error(study: Study) -> dict[str, Any]:
     """Compute the largest relative difference of each metric in COMPARED between this study's steps and adaptive steps.
 
-    The comparison uses those of the first COMPARISON members whose rotor survives with both (None: no such member).
-    `lost_by_one` counts members that are lost or not decided with exactly one of the two.
+    Of the first COMPARISON members, the differences include those whose rotor survives with both kinds of steps. They
+    are None if there is no such member. `lost_by_one` counts members that survive with only one kind of steps.
     """
     tolerance = max(TOLERANCE, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps))
     accurate = dataclasses.replace(study, clock=dataclasses.replace(study.clock, method=AdaptiveRodas3(tolerance)))
@@ -114,7 +114,7 @@ def error_words(error: dict[str, Any]) -> str:
     """Return the error of the sliding step as text."""
     words = f"sliding step against adaptive steps, {error['members']} members: "
     if error[COMPARED[0]] is None:
-        words += "none survives with both"
+        words += "no member survives with both"
     else:
         words += ", ".join(f"{name} off by {100 * error[name]:.2g} %" for name in COMPARED) + " at most"
     return f"{words}; {error['lost_by_one']} survive with only one"

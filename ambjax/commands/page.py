@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
 
 def _target(given: str | None, force: bool) -> pathlib.Path | None:
-    """Return the file that --out names, or None. Raises ValueError if it is in use."""
+    """Return the file that --out names, or None. Raises ValueError if it is no HTML file, or if it exists."""
     if given is None:
         return None
     out = pathlib.Path(given)

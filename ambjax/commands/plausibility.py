@@ -107,7 +107,7 @@ def _converter(case: Case) -> Iterator[str]:
     if step > MOST_STEP * float(sensor.std):
         yield (
             f"sensor.bits = {float(sensor.bits):g}: a step of {step:.3g} m is {step / float(sensor.std):.3g} times the "
-            "noise sensor.std, so the reading stays at one step. Give more bits, or a smaller range_z."
+            "noise sensor.std, so the noise does not dither the converter. Give more bits, or a smaller range_z."
         )
 
 

@@ -64,7 +64,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
             bar.set_description_str(f"{text:<34}")
             bar.update()
 
-        # JAX tracing holds the GIL, so readings that compile other programs run in a second process, plots in a thread.
+        # JAX holds the GIL while it traces. The readings that need other programs therefore run in a second process.
+        # The figures are drawn in a thread.
         evidence, jobs = {}, []
         with _alive(), ThreadPoolExecutor(1) as artist, processes(1) as other:
             theirs = {reading: other.submit(gather, reading) for reading in paper.NOISY}
@@ -81,7 +82,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
                 job.result()
         std = paper.TABLE_2.noise_std
         words = f"the paper's noise (std {std:.2g} m on z), {paper.SUPPLY:g} V"
-        words = f"Tracking on a 10 kHz processor, a sample late, under {words}"
+        words = f"Tracking on a 10 kHz processor with a delay of one sample, under {words}"
         shown = {str(SHOWN_AS.get(name, name)): one.on_processor[True].trajectory for name, one in evidence.items()}
         figures.readings(shown, words, paper.SETTLE, part / "readings.png")
         claims, noise = ledger.judge_claims(evidence), ledger.noise_table(evidence)

@@ -67,7 +67,7 @@ def _injections(case: Case, point: OperatingPoint) -> Injections:
 
 
 def _injected(case: Case, peak: float, reading: Reading) -> Injection:
-    """Inject at one sensor, over one period of the lines, which are denser near `peak` (Hz)."""
+    """Inject one period of a multi-sine at one sensor. Its frequency lines are denser near `peak` (Hz)."""
     clock, members = one_period(case), INJECTED if case.scenario.random else 1
     at = frequency_lines(case.zones, clock, peak)
     amplitude = case.zones.amplitude

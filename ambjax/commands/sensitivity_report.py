@@ -20,7 +20,10 @@ class Injections(NamedTuple):
 
 
 def set_valued(case: Case) -> list[str]:
-    """Return the tables of the laws with set-valued signs on a processor, whose linear loops do not describe them."""
+    """Return the tables of the laws with set-valued signs on a processor.
+
+    The linear loop describes these laws only inside their bands.
+    """
     if case.cascade.processor is None:
         return []
     return [f"controller.{stage}" for stage in DEFAULT_LAWS if set_valued_signs(getattr(case.cascade, stage))]
@@ -139,8 +142,9 @@ def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None
     if one.S_velocity is not None:
         larger = "velocity" if one.S_velocity.height > one.S.height else "position"
         rows += [
-            "The velocity has its own sensor, whose errors |S| of the position sensor leaves out: for them |S| peaks "
-            f"at {one.S_velocity.height:.4g}. The {larger} sensor gives the larger peak."
+            "The velocity has its own sensor. |S| at the position sensor does not include the errors of the velocity "
+            f"sensor; |S| at the velocity sensor peaks at {one.S_velocity.height:.4g}. The {larger} sensor gives the "
+            "larger peak."
         ]
     return "\n".join(rows)
 

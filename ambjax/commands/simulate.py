@@ -113,7 +113,7 @@ def _window(case: Case, args: argparse.Namespace) -> tuple[float, float] | None:
 
 
 def _study(case: Case, args: argparse.Namespace) -> Study | None:
-    """Return the study that contains member --member, or None without that option. Raises ValueError."""
+    """Return the study that contains member --member, or None without it. Raises ValueError for invalid options."""
     if args.member is None:
         if args.seed is not None or args.members is not None:
             raise ValueError("--seed and --members need --member: add --member K, or set run.seed in the case file.")

@@ -129,8 +129,8 @@ def _currents(case: Case) -> Iterator[str]:
 def _coil_voltage(scenario: Scenario, least: float) -> Iterator[str]:
     """Yield warnings about the voltage limit of the coils.
 
-    They are that the limit is below the voltage that holds the rotor, `least` (V), and that the command may exceed the
-    voltage at which the coils reach the limit.
+    The limit may be below the voltage that holds the rotor, `least` (V). The command may exceed the voltage at which
+    both coils are at the limit.
     """
     coil = None if scenario.amplifier is None else scenario.amplifier.coil
     if coil is None or coil.u_max is None:

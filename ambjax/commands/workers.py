@@ -40,7 +40,7 @@ def executor_of(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | Non
                 yield client.get_executor(), AHEAD * max(len(client.scheduler_info()["workers"]), 1)
         except (KilledWorker, CancelledError):
             raise ValueError(
-                f"--cluster {args.cluster}: the cluster, or its workers repeatedly, died. {CONTINUE}"
+                f"--cluster {args.cluster}: the cluster died, or its workers died repeatedly. {CONTINUE}"
             ) from None
     elif args.processes is not None:
         try:

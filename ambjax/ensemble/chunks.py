@@ -60,7 +60,7 @@ class Chunks:
         columns, facts = unseal(self.path(span))
         differs = difference(facts, self._facts(span))
         if differs:
-            raise DamagedError(f"it is of another chunk or study: {differs}")
+            raise DamagedError(f"it belongs to another chunk or study: {differs}")
         _check_rows(columns, *span)
         return columns
 
@@ -78,7 +78,7 @@ class Chunks:
                 raise DamagedError(f"{self.path(span)}: {why}") from None
             kinds = kinds or kinds_of(part)
             if kinds != kinds_of(part):
-                raise DamagedError(f"{self.path(span)}: its columns are not those of the others")
+                raise DamagedError(f"{self.path(span)}: its columns are not those of the other chunks")
             for name, column in part.items():
                 digests[name].update(np.ascontiguousarray(column).data)
         return {name: Column(kind, digests[name].hexdigest()) for name, kind in kinds.items()}

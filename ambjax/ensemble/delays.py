@@ -13,9 +13,9 @@ from ambjax.simulation.trajectory import STALLED
 from ambjax.theorem.sampled_report import Delays
 from ambjax.world.scenario import Scenario
 
-# Delays of one pass, simulated together in one ensemble. The first pass has steps of 1/128 sample or less, because the
-# rotor may be lost in a narrow interval of delays only; an interval between two neighbouring delays is not found.
-# The second pass divides one step of the first by 256.
+# Number of delays of one pass, which are simulated together in one ensemble. The first pass has steps of 1/128 sample
+# or less, because the rotor may be lost only in a narrow interval of delays. An interval that lies between two
+# neighbouring delays is not found. The second pass divides one step of the first by 256.
 DELAYS = 257
 
 

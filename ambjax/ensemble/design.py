@@ -43,7 +43,8 @@ def design_points(design: str, seed: int, dims: int, members: np.ndarray, total:
     if not 1 <= total <= MOST_MEMBERS:
         raise ValueError(f"members = {total}: there must be 1 to {MOST_MEMBERS:,} of them.")
     if members.size and not 0 <= members.min() <= members.max() < total:
-        raise ValueError(f"member {members.max() if members.min() >= 0 else members.min()}: of {total} members.")
+        wrong = members.max() if members.min() >= 0 else members.min()
+        raise ValueError(f"member {wrong}: it must be from 0 to {total - 1}.")
     if not members.size or not dims:
         return np.empty((members.size, dims))
     return DESIGNS[design](int(seed), dims, members, int(total))
@@ -93,7 +94,7 @@ def _latin_hypercube(seed: int, dims: int, members: np.ndarray, total: int) -> n
     if total * dims > MOST_LATIN:
         raise ValueError(
             f'design = "latin-hypercube": {total:,} members of {dims} quantities exceed the {MOST_LATIN:,} '
-            'numbers that it holds in memory. Use design = "sobol", which needs none.'
+            'numbers that it can hold in memory. Use design = "sobol", which does not hold them.'
         )
     return _latin_table(seed, dims, total)[members]
 

@@ -1,8 +1,8 @@
 """Distributions of a number of the case that varies between members.
 
-Each is a record with `quantile(u, nominal)`, the inverse cumulative distribution, so that it works with every design of
-points u in the unit cube; and `support(nominal)`, the interval that contains all values. Normal shapes are truncated at
-6 standard deviations, which excludes a probability of 2e-9, so they have finite bounds too.
+Each is a record with two functions. `quantile(u, nominal)` is the inverse cumulative distribution, which maps the
+points u of any design in the unit cube to values. `support(nominal)` is the interval that contains all values. Normal
+shapes are truncated at 6 standard deviations, which excludes a probability of 2e-9, so they have finite bounds too.
 """
 
 import math

@@ -22,7 +22,7 @@ import numpy as np
 
 # Number of cosines fitted to a metric. Six of them explain a V-shaped relation, or one period of a sine, to 1 %.
 TERMS = 6
-# Minimum number of members per cosine, not counting those that have the commonest value.
+# Minimum number of members per cosine. Members that have the commonest value do not count.
 PER_TERM = 4
 # Number of cosines of each quantity of a pair, and number of members used to find pairs.
 PAIR_TERMS, PAIR_MEMBERS = 2, 16_384
@@ -132,7 +132,7 @@ def _pairs(
 
 
 def _explanation(waves: np.ndarray, Y: np.ndarray, terms: Sequence[int], confidence: float) -> tuple[np.ndarray, ...]:
-    """Return share, low, high and p of each row of Y [columns, N], in standard form.
+    """Return share, low, high and p of each row of Y [columns, N], which has mean 0 and mean square 1.
 
     Row k is fitted with the first terms[k] rows of `waves` [., N].
     """
@@ -151,8 +151,8 @@ def _explanation(waves: np.ndarray, Y: np.ndarray, terms: Sequence[int], confide
         fit = min(fit, 1.0)
         share = fit - rank / rest * (1 - fit)
         f, y = gain @ waves[:count], Y[column]
-        # Influence of a member on the fit: 2 f y - fit y^2 - fit. The term with rank is the noise of the coefficients,
-        # which dominates if the true share is 0.
+        # The influence of a member on the fit is 2 f y - fit y^2 - fit. The term of `half` that contains `rank` is the
+        # noise of the coefficients, which dominates if the true share is 0.
         influence = np.mean((2 * f * y - fit * y**2 - fit) ** 2) / n
         half = ndtri((1 + confidence) / 2) * np.sqrt(influence + 2 * rank * (1 - fit) ** 2 / n**2)
         p = fdtrc(rank, rest, fit / rank / max((1 - fit) / rest, np.finfo(float).tiny))
@@ -161,7 +161,7 @@ def _explanation(waves: np.ndarray, Y: np.ndarray, terms: Sequence[int], confide
 
 
 def _terms(columns: Sequence[np.ndarray], most: int = TERMS) -> list[int]:
-    """Return the number of cosines to fit to each column, by the members that differ from its commonest value."""
+    """Return the number of cosines to fit to each column, from the number of members without its commonest value."""
     differing = [len(column) - int(np.unique(column, return_counts=True)[1].max()) for column in columns]
     return [min(most, count // PER_TERM) for count in differing]
 

@@ -58,7 +58,7 @@ class Map(NamedTuple):
 
     @property
     def decisive(self) -> bool:
-        """Whether members differ, and are so many that the interval of a cell lies above CERTAIN if all survive."""
+        """Whether the members differ, and suffice to make a cell certain (CERTAIN) if all of them survive."""
         return self.varied and bool(wilson(self.members, self.members).low >= CERTAIN)
 
     @property
@@ -137,7 +137,7 @@ def _entries(study: Study, axes: tuple[str, ...]) -> tuple[tuple[str, Distributi
 
 
 def _check(study: Study, x: Axis, y: Axis) -> None:
-    """Raise ValueError for axes whose path is not in the case, or whose values are not valid as a spread."""
+    """Raise ValueError for axes whose path is not in the case, or whose values the case does not allow."""
     known = [*places(study.cascade, study.scenario), PERIOD]
     for name, axis in (("x", x), ("y", y)):
         if axis.path not in known:

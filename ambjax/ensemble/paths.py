@@ -36,8 +36,7 @@ def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
     The paths plant.* refer to the true plant, and controller.model.* to the nominal one. A disturbance of z is
     disturbance.q_z.* if all disturbances of z have the same unit. Otherwise those in m/s^2 are disturbance.q_z.*,
     scaled forces are disturbance.q_v.*, and forces are disturbance.q_f.*. The path *.shift moves start and stop of a
-    signal together in time; its value is 0. The values of a schedule have the number of the knot as the last part of
-    the path, from 0.
+    signal together in time; its value is 0. The path of a value of a schedule ends with the number of its knot, from 0.
     """
     table: dict[str, Place] = {}
     for stage in ("model", "observer", "position", "inversion", "current"):
@@ -91,9 +90,8 @@ def _below(node: object, path: str, route: tuple[int | str, ...]) -> Iterator[tu
 def kinds(node: object, path: str = "") -> Iterator[tuple[str, str]]:
     """Yield what is not a number in a record and its nested records: the type and the static fields, by dotted path.
 
-    Of a law that a case file imports, also the digest of its source.
-
-    `path`: prefix of the dotted paths, which ends with a dot or is empty.
+    For a custom law, the digest of its source is yielded too. `path`: prefix of the dotted paths, which ends with a dot
+    or is empty.
     """
     if isinstance(node, tuple):
         for index, item in enumerate(node):
@@ -105,7 +103,7 @@ def kinds(node: object, path: str = "") -> Iterator[tuple[str, str]]:
         yield f"{path}source", digest
     for field in dataclasses.fields(node):
         value, at = getattr(node, field.name), f"{path}{field.name}"
-        if field.metadata.get("static"):  # samples by their digest, other objects by their type
+        if field.metadata.get("static"):  # samples appear as their digest, other objects as their name or type
             named = isinstance(value, (str, int, float, bool, tuple, type(None)))
             other = getattr(value, "digest", None) or getattr(value, "__qualname__", type(value).__name__)
             yield at, str(value) if named else other

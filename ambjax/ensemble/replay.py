@@ -2,8 +2,8 @@
 
 XLA compiles a rollout of one member into scalar code, and a block of members into vector code. The two contract
 products and sums into fused operations at different places, so their results differ in the last bit. In a loop with a
-converter, or with a set-valued sign, that difference grows until the two runs are unrelated. A member
-that is simulated alone therefore runs in a block of the same size as in an ensemble, and fills every lane of the block.
+converter, or with a set-valued sign, that difference grows until the two runs are unrelated. A member that is simulated
+alone therefore runs in a block of the same size as in an ensemble, and fills every lane of the block.
 """
 
 import dataclasses
@@ -93,8 +93,8 @@ def record_system(
 def replay(study: Study, index: int, tell: Callable[[int], object] = lambda _: None) -> Replay:
     """Simulate one member of a study again.
 
-    The metrics come from the compiled program of the study, the trajectory from `record_member`. `tell`: see there.
-    Raises ValueError as `rollout` does.
+    The metrics come from the compiled program of the study, the trajectory from `record_member`. `tell`: as in
+    `record_member`. Raises ValueError as `rollout` does.
     """
     columns = chunk(study, index, index + 1, CALL, threads=1)
     cascade, scenario = study.batch(np.array([index]))

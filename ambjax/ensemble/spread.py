@@ -171,7 +171,7 @@ def _check_one(path: str, kind: Distribution, place: Place) -> None:
 def _check_together(
     kinds: dict[str, Distribution], known: dict[str, Place], cascade: Cascade, scenario: Scenario
 ) -> None:
-    """Check conditions between two numbers: start before stop, and the rotor inside its clearance.
+    """Check the conditions that involve two numbers: start before stop, and the rotor inside its clearance.
 
     Raises SpreadError with the path of the number that is spread.
     """
@@ -198,7 +198,7 @@ def _check_together(
             f"run.clearance reaches {stops[1]:g} m, but must stay below plant.s_0. Narrow the range.",
         )
     far = max(map(abs, reach("initial.z")))
-    what, limit = ("the clearance", stops[0]) if scenario.stop is None else ("the pole", POLE * reach(gap)[0])
+    what, limit = ("the clearance", stops[0]) if scenario.stop is None else (f"{POLE} of s_0", POLE * reach(gap)[0])
     if not far < limit:
         text = f"|initial.z| reaches {far:g} m, but must stay below {what}, {limit:g} m. Narrow the range."
         refuse(("initial.z", "run.clearance", gap), text)
@@ -207,7 +207,7 @@ def _check_together(
 
 
 def _check_coils(reach: Callable[[str], tuple[float, float]], refuse: Callable[[tuple[str, ...], str], None]) -> None:
-    """Check that the limits of each coil contain its bias. `reach`: ends of the number at a path. NaN: no limit."""
+    """Check that the limits of each coil contain its bias. `reach`: ends of the number at a path; NaN: no limit."""
     i_max, u_max, i_0, R = "actuator.coil.i_max", "actuator.coil.u_max", "plant.i_0", "plant.R"
     least, most = reach(i_max)[0], reach(i_0)[1]
     if least <= most:

@@ -185,7 +185,7 @@ class Store:
         if need > free:
             most = free // (2 * 8 * columns)
             raise ValueError(
-                f"--members {self.members}: their results need {need / 1e9:.3g} GB and {where} has "
+                f"--members {self.members}: the results need {need / 1e9:.3g} GB, but {where} has "
                 f"{free / 1e9:.3g} GB free. At most {most:,} members fit; or choose another --out."
             )
 

@@ -14,9 +14,9 @@ from ambjax.simulation.trajectory import STALLED, Row, Trajectory
 
 # Okabe and Ito's colours: distinct in print and to colour-blind readers.
 INK, BLUE, ORANGE, GREEN, RED = "#222222", "#0072B2", "#E69F00", "#009E73", "#D55E00"
-# Columns into which a panel of a stretch is divided where it has more than four times as many samples.
+# A panel of a stretch with more than 4 PIXELS samples is divided into PIXELS columns.
 PIXELS = 500
-# Share of the whole run's range that an enlarged panel shows at least.
+# Smallest vertical range of an enlarged panel, as a share of the range over the whole run.
 FLAT = 0.005
 
 
@@ -71,7 +71,7 @@ def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.
     height = 1.6 * len(panels) + 0.9
     figure = Figure(figsize=(7.0, height))
     axes = figure.subplots(len(panels), 1, sharex=True)
-    # Fixed margins (in inches over the height): because a layout engine draws everything twice.
+    # The margins are fixed (in inches over the height), because a layout engine draws everything twice.
     figure.subplots_adjust(0.15, 0.5 / height, 0.97, 1 - 0.5 / height, hspace=0.2)
     for ax, panel in zip(axes, panels, strict=True):
         draw_panel(ax, panel, trajectory)
@@ -109,7 +109,7 @@ def draw_panel(
     first: bool = False,
     stretch: tuple[float, float] | None = None,
 ) -> None:
-    """Draw a panel of the whole run, or of the stretch from one time to another (s).
+    """Draw a panel of the whole run, or of `stretch`: its begin and end, s.
 
     If a stretch has more samples than pixels, the panel shows the mean of each pixel column over a band of extremes.
     """
@@ -153,7 +153,7 @@ def _keep_scale(ax: Axes, whole: list[np.ndarray]) -> None:
 
 
 def _band(ax: Axes, t: np.ndarray, y: np.ndarray, colour: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the curve to draw: y itself; with many samples, the mean of each column, over a band of the extremes."""
+    """Return the curve to draw: y or, with many samples, the mean in each column. Draw the extremes as a band."""
     if len(t) <= 4 * PIXELS:
         return t, y
     x, low, high = envelope(t, y, y, PIXELS)

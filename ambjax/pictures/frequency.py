@@ -64,8 +64,8 @@ def frequency_figure(
 ) -> Figure:
     """Return a picture: |S| with zones, |T|, |KS|, dynamic stiffness, Nyquist curve with the disk, Bode plot of L.
 
-    `limits`: upper limits of the zones A, B and C. `span`: lowest and highest frequency, Hz. `measured`: points that
-    are drawn with the curves, of the nominal loop.
+    `limits`: upper limits of the zones A, B and C. `span`: lowest and highest frequency, Hz. `measured`: points
+    measured on the nominal loop, which are drawn with the curves.
     """
     figure = Figure(figsize=(12, 11), layout="constrained")
     left = figure.add_gridspec(4, 2)
@@ -117,7 +117,7 @@ def frequency_figure(
 
 
 def _near(phase: np.ndarray, f: np.ndarray, ax: Axes) -> np.ndarray:
-    """Return phases [L] (degrees), shifted by whole turns to the first curve of the axes if it has one."""
+    """Return phases [L] (degrees), shifted by whole turns to be near the first curve of the axes, if there is one."""
     if not (curves := ax.get_lines()):
         return phase
     there = np.interp(f, *np.asarray(curves[0].get_xydata()).T)
@@ -131,7 +131,7 @@ def shade_zones(ax: Axes, limits: Sequence[float]) -> None:
     for (name, colour), bottom, top in zip(ZONES, edges, edges[1:], strict=False):
         ax.axhspan(bottom, top, color=colour, zorder=0)
         middle = np.sqrt(max(bottom, top / 2) * top)
-        x = 1.01 if name in "AC" else 1.03  # two columns, because zones may be lower than a letter
+        x = 1.01 if name in "AC" else 1.03  # two columns, because a zone may be less high than a letter
         ax.text(x, middle, name, transform=ax.get_yaxis_transform(), fontsize=8, va="center", color=INK)
     ax.set_ylim(low, high)
 

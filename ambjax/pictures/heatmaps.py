@@ -169,7 +169,7 @@ def _outline(ax: Axes, x_edges: np.ndarray, y_edges: np.ndarray, inside: np.ndar
 
 
 def _contour_words(panels: Sequence[MapPanel]) -> str:
-    """Return what the contour of survival shows: too few runs a cell say nothing about 95 %."""
+    """Return what the contour of survival shows. With too few runs in a cell, it cannot show a survival of 95 %."""
     decisive = [panel.low is not None for panel in panels]
     if all(decisive):
         return "95 % survival"
@@ -177,7 +177,7 @@ def _contour_words(panels: Sequence[MapPanel]) -> str:
 
 
 def _range(panel: MapPanel) -> str:
-    """Return in words how much of the grid survives, because a missing contour means all of it or none."""
+    """Return in words how much of the grid survives. If there is no contour, all or none of it survives."""
     share = np.asarray(panel.survival, float)
     cells = share[np.isfinite(share)]
     if not cells.size:

@@ -45,7 +45,7 @@ def histograms(columns: Mapping[str, np.ndarray], path: pathlib.Path, metrics: S
 
 @own_style
 def histogram_figure(columns: Mapping[str, np.ndarray], metrics: Sequence[str] = CHIEF) -> Figure:
-    """Return histograms of the `metrics` in `columns` (of members.npz, each [N]), with survivors and lost apart.
+    """Return histograms of the `metrics` in `columns` (of members.npz, each [N]). Lost members have another colour.
 
     A member with a finite `lost_at` or `lost_at_s` does not survive; without these columns all survive. `stalled` marks
     members at which the integrator stalled. Raises ValueError if `columns` has none of the metrics.

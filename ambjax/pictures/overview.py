@@ -28,7 +28,7 @@ from ambjax.pictures.scales import prefix_of
 from ambjax.pictures.style import own_style
 from ambjax.simulation.trajectory import STALLED, Trajectory
 
-# Largest number of turns of a chattering voltage in the enlarged end of a run.
+# Largest number of reversals of a chattering voltage in the enlarged end of a run.
 TURNS = 40
 
 
@@ -50,8 +50,8 @@ def overview_figure(
 ) -> Figure:
     """Return one page with every signal of a run, over the whole run, and enlarged at its start and at its end.
 
-    `window`: begin and end, s; the page then shows only this stretch. `settle`: time (s) from which the vertical scales
-    of the whole run are those of its signals, unless the rotor is lost: the lift-off has panels of its own.
+    `window`: begin and end, s; the page then shows only this stretch. `settle` (s): the vertical scales of the panels
+    of the whole run fit the signals from this time on, unless the rotor is lost. The lift-off has panels of its own.
     """
     panels = _panels(trajectory)
     if window is None:
@@ -63,7 +63,7 @@ def overview_figure(
     # the whole run is as wide as the two enlargements together
     width, height = 13.0, 1.55 * len(grid) + 1.2
     figure = Figure(figsize=(width, height))
-    # Fixed margins, in inches: a layout engine would double the time.
+    # The margins are fixed, in inches, because a layout engine would double the time.
     figure.subplots_adjust(1.25 / width, 0.5 / height, 1 - 0.2 / width, 1 - 0.85 / height, wspace=0.24, hspace=0.24)
     ratios = [2, 1, 1] if window is None else [1, 1]
     axes = figure.subplots(len(grid), len(columns), sharex="col", squeeze=False, width_ratios=ratios)
@@ -159,7 +159,7 @@ def _short(seconds: float) -> str:
 
 
 def _last_moments(trajectory: Trajectory, end: float) -> float:
-    """Return the length of the enlarged end, s: 20 ms, but at most a fifth of the run, and TURNS of the voltage."""
+    """Return the length of the enlarged end, s: the shortest of 20 ms, a fifth of the run, and TURNS reversals of u."""
     t = np.asarray(trajectory.rows.t, float)
     longest = min(0.02, (end - t[0]) / 5)
     late = (t >= end - longest) & (t < end)

@@ -50,7 +50,7 @@ def tornado(drivers: Sequence[Bar], metric: str, says: str, path: pathlib.Path) 
     ax.set_xlim(0, 112)
     ax.set_xticks(np.linspace(0, 100, 6))
     more = len(ranking) - len(bars)
-    words = "share of the members' ranking explained alone, %; whiskers: 95 % interval"
+    words = "share of the variation of the rank explained alone, %; whiskers: 95 % interval"
     ax.set_xlabel(words + (f"; {more} weaker not shown" if more else ""), fontsize=9)
     figure.suptitle(f"Drivers of {axis_of(metric, 0.0)[1]}", fontsize=11)
     ax.set_title(textwrap.fill(says, 95), fontsize=8)

@@ -60,8 +60,8 @@ def operating_point(case: Case, name: str, r: float) -> OperatingPoint:
 def sensitivity(case: Case, r: float = 0.0) -> Analysis:
     """Return peaks of |S|, |T|, |KS|, zone, margins and stiffness of a case, linearised at a constant reference r (m).
 
-    `ambjax.linear` contains the single steps, and the injection into the simulation. Returns the `Analysis`. Raises
-    ValueError as `linearise` does.
+    `ambjax.linear` contains functions for the single steps, and for the injection into the simulation. Returns the
+    `Analysis`. Raises ValueError as `linearise` does.
     """
     require_case(case)
     if np.ndim(r) or np.asarray(r).dtype.kind not in "iuf":
@@ -108,7 +108,7 @@ def measured_peaks(case: Case, study: Study, peak: float) -> MemberPeaks:
 
 
 def one_period(case: Case) -> Clock:
-    """Return the clock of one period of the multi-sine of an injection: it contains the lowest frequency once."""
+    """Return the clock of one period of the multi-sine of an injection: the period of its lowest frequency."""
     period = float(case.clock.sample_period)
     return dataclasses.replace(case.clock, samples=math.ceil(1 / (float(case.zones.f_low) * period)))
 

@@ -16,8 +16,8 @@ from ambjax.simulation.loop import ClosedLoop, LoopState
 class VectorField(NamedTuple):
     """The equations y' = f(t, y) of a closed loop in continuous time.
 
-    - `f`: returns the rate [N] of the state at time t (s) in the state y [N]; a third argument is ignored, as diffrax
-      passes one. It is compiled, and can be differentiated.
+    - `f`: returns the rate [N] of the state at time t (s) in the state y [N]. It ignores a third argument, which
+      diffrax passes. It is compiled, and can be differentiated.
     - `y_0`: state at t = 0 [N].
     - `named`: returns the state as a tree: `plant` with z (m), z_dot (m/s) and the currents (A), and `control`.
     """

@@ -12,7 +12,10 @@ from ambjax.world.coil_limits import CoilLimits
 
 
 class CoilResponse(NamedTuple):
-    """Rate of the measured current at an instant: i' = still + per_volt u, in A/s and A/(V s)."""
+    """Rate of the measured current at an instant under the voltage u (V): i' = still + per_volt u.
+
+    `still`: A/s. `per_volt`: A/(V s).
+    """
 
     still: Array
     per_volt: Array
@@ -24,11 +27,12 @@ class CoilResponse(NamedTuple):
 
 @record
 class Amplifier:
-    """Response of an amplifier to a held voltage: u_a' = w (u - u_a), w = 2 pi bandwidth, |u_a'| at most `slew`.
+    """An amplifier that applies a voltage u_a: u_a' = w (u - u_a), w = 2 pi bandwidth, |u_a'| at most `slew`.
 
-    The dead band (from the dead time of a bridge) is subtracted from |u_a|. At the current limit, a voltage that would
-    increase |i| is replaced by the voltage that holds i. If the supply cannot provide that voltage, its limit acts, and
-    |i| exceeds `i_max`. The limits of each coil act last, and exclude `i_max`. The default of each parameter is ideal.
+    The command u is held: it acts for one sample. The dead band (from the dead time of a bridge) is subtracted from
+    |u_a|. At the current limit, a voltage that would increase |i| is replaced by the voltage that holds i constant. If
+    the supply cannot provide that voltage, it provides its largest voltage, and |i| exceeds `i_max`. The limits of each
+    coil act last; `i_max` and `coil` cannot be given together. With its default, a parameter has no effect.
     """
 
     bandwidth: Scalar | None = leaf(
@@ -62,7 +66,7 @@ class Amplifier:
 
     @property
     def slow(self) -> bool:
-        """Whether the output voltage is a state: bandwidth or slew rate is limited."""
+        """Whether the output voltage is a state, because the bandwidth or the slew rate is limited."""
         return self.bandwidth is not None or self.slew is not None
 
     def slope(self) -> Scalar:
@@ -76,7 +80,7 @@ class Amplifier:
         return jnp.maximum(jnp.abs(u - u_a) / self.slew - self._tail(), 0.0)
 
     def followed(self, u_a: Array, u: Array, time: Scalar) -> Array:
-        """Return the output voltage (V) after `time` (s), from u_a (V), under a constant command u (V). Exact."""
+        """Return the exact output voltage (V) after `time` (s), from u_a (V), under a constant command u (V)."""
         left, ramp = jnp.abs(u_a - u), self.ramp(u_a, u)
         if self.slew is not None:
             left = left - self.slew * jnp.minimum(ramp, time)
@@ -107,9 +111,9 @@ class Amplifier:
 class CurrentAmplifier:
     """An amplifier that controls the current: i' = w (i_command - i), w = 2 pi bandwidth, within the supply's voltage.
 
-    Its current loop measures the true current and applies the voltage for this rate: u is the sum of R i, of the
-    voltage that the motion induces, and of the inductive voltage of w (i_command - i), limited to the supply's u_max.
-    While the supply limits u, the current follows more slowly. In the two-coil plant i is half the difference of both
+    Its current loop measures the true current and applies the voltage u that gives this rate. u is the sum of R i, the
+    voltage that the motion induces, and the inductive voltage for the rate w (i_command - i). The supply limits |u| to
+    u_max; while it does, the current follows more slowly. In the two-coil plant, i is half the difference of the two
     currents.
     """
 

@@ -11,13 +11,14 @@ from jax import Array
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.numerics.smooth import TWO_PI, sine
 
-# Sines in one realisation of band-limited noise. Its fourth moment falls short of a Gaussian's by 1.5/LINES of std^4.
+# Number of sines in one realisation of band-limited noise. Its fourth moment is less than that of a Gaussian signal by
+# (1.5/LINES) std^4.
 LINES = 32
 
 
 @record
 class Lines:
-    """std sqrt(2/n) sum of sin(2 pi frequencies t + phases), n of each: Hz and rad."""
+    """Sum of n sines: std sqrt(2/n) sum(sin(2 pi frequencies t + phases)), with frequencies in Hz and phases in rad."""
 
     std: Scalar
     frequencies: Array
@@ -32,9 +33,10 @@ class Lines:
 class BandNoise:
     """Stationary band-limited noise: constant power density over f_low..f_high (Hz), standard deviation `std`.
 
-    A sum of sines: one at a random frequency in each of LINES equal parts of the band, with random phase (after
-    Shinozuka and Deodatis, Appl. Mech. Rev. 44, 1991). The autocovariance over members is exactly std^2 times the mean
-    of cos(2 pi f tau) over the band. The signal is smooth, so integrators keep their order.
+    The signal of a member is a sum of LINES sines. Each sine has a random phase, and a random frequency in one of LINES
+    equal parts of the band (after Shinozuka and Deodatis, Appl. Mech. Rev. 44, 1991). The autocovariance over members
+    is exactly std^2 times the mean of cos(2 pi f tau) over the frequencies f of the band. The signal is smooth, so
+    integrators keep their order.
     """
 
     std: Scalar = leaf(at_least=0, at_most=1e20, doc="standard deviation")
@@ -50,7 +52,8 @@ class BandNoise:
 
     def __call__(self, t: Scalar) -> Array:
         raise ValueError(
-            "band-noise is a function of time only for one member: use scenario.realised(), as a rollout does."
+            "band-noise: the signal of one member is a function of time, but it is not drawn yet. Call "
+            "scenario.realised() first, as a rollout does."
         )
 
     def span(self, end: float) -> tuple[float, float]:

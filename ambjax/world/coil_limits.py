@@ -26,8 +26,8 @@ class CoilLimits:
     """Limits of the amplifier of each coil; both coils have the same.
 
     The voltage of a coil is limited to +-u_max. At a limit of its current, a voltage that would move the current
-    further beyond the limit is replaced by the voltage that holds the current. If that voltage is outside +-u_max, its
-    limit acts, and the current moves beyond the limit.
+    further beyond the limit is replaced by the voltage that holds the current constant. If that voltage is outside
+    +-u_max, it is limited too, and the current moves beyond its limit.
     """
 
     u_max: Scalar | None = leaf(
@@ -36,7 +36,7 @@ class CoilLimits:
         at_least=1e-9,
         at_most=1e12,
         optional=True,
-        doc="limit of the |voltage| of a coil, which contains R i_0; none: no limit",
+        doc="limit of the |voltage| of a coil, R i_0 included; none: no limit",
     )
     i_max: Scalar | None = leaf(
         default=None,
@@ -44,7 +44,7 @@ class CoilLimits:
         at_least=1e-9,
         at_most=1e6,
         optional=True,
-        doc="limit of the |current| of a coil, which contains i_0; none: no limit",
+        doc="limit of the |current| of a coil, i_0 included; none: no limit",
     )
     unidirectional: bool = static(default=False, doc="whether the current of a coil cannot become negative")
 
@@ -57,7 +57,7 @@ class CoilLimits:
         return jnp.inf if self.u_max is None else self.u_max - bias
 
     def applied(self, plant: Any, state: Any, u: Array, q_i: Scalar = 0.0) -> CoilVoltages:
-        """Return the voltages at the coils for the voltages R i_0 + u and R i_0 - u (V).
+        """Return the voltages at the coils for the commanded voltages R i_0 + u and R i_0 - u (V).
 
         `plant`: a `TwoCoil`. `state`: of the plant. `q_i`: disturbance of the current's rate, A/s.
         """
@@ -78,13 +78,16 @@ class CoilLimits:
         return CoilVoltages(self._limited(u, bias), -self._limited(-u, bias))
 
     def _limited(self, volt: Array, bias: Scalar) -> Array:
-        """Return the voltage of a coil less `bias`, its R i_0 (V), limited so that the whole is within +-u_max."""
+        """Return `volt` (V), limited so that the coil's voltage, volt + bias, is within +-u_max. `bias`: R i_0, V."""
         if self.u_max is None:
             return volt
         return jnp.where(jnp.abs(volt + bias) > self.u_max, limited(volt + bias, self.u_max) - bias, volt)
 
     def _current_limited(self, volt: Array, kept: Array, i: Array) -> Array:
-        """Return the voltage of a coil with a current i (A). `kept`: voltage that holds the current, V."""
+        """Return `volt` (V), or `kept` if the current i (A) of the coil is at a limit and `volt` would move it beyond.
+
+        `kept`: voltage that holds the current constant, V.
+        """
         if self.i_max is not None:
             volt = jnp.where((i >= self.i_max) & (volt > kept), kept, volt)
         least = 0.0 if self.unidirectional else -self.i_max if self.i_max is not None else -jnp.inf

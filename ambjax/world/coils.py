@@ -32,7 +32,8 @@ class TwoCoil(Bearing[Currents]):
 
     The upper coil (gap s_0 - z) has the voltage R i_0 + u, the lower one (gap s_0 + z) R i_0 - u. The measured i is
     half the difference of the currents. The flux linkage kappa i_1 / (2 (s_0 - z)) of the upper coil has the rate
-    u + R (i_0 - i_1); the lower coil likewise. Deviation: Eq. (2) has one current, that of the lower gap.
+    u + R (i_0 - i_1); that of the lower coil, kappa i_2 / (2 (s_0 + z)), has the rate R (i_0 - i_2) - u. In the paper,
+    Eq. (2) has a single current and contains only the lower gap.
     """
 
     two_voltages = True
@@ -45,7 +46,7 @@ class TwoCoil(Bearing[Currents]):
     def rates(self, state: Currents, u: Scalar | CoilVoltages, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Currents:
         """Return the rates as `Plant.rates` does; q_i (A/s) disturbs the measured current.
 
-        `u`: one voltage for both coils, or those of `CoilVoltages`, V.
+        `u`: one number (V) for both coils, or the `CoilVoltages`.
         """
         z, z_dot, i_1, i_2, delayed = state
         gaps = self.gaps(z)

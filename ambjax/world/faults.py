@@ -8,7 +8,7 @@ from jax import Array
 from ambjax.numerics.gaussian import threefry
 from ambjax.numerics.records import Scalar, leaf, record, static
 
-# Streams of a member's key, beside those of `numerics.gaussian`.
+# Random streams of a member's key, in addition to those of `numerics.gaussian`.
 OUTLIERS, DROPOUTS = 3, 4
 VALUES = ("hold", "nan", "zero", "full-scale")
 
@@ -64,9 +64,9 @@ class Outliers:
 
 @record
 class Dropouts:
-    """Intervals without a reading of z. `value` is read instead.
+    """Intervals without a reading of z. `value` selects what is read instead.
 
-    "hold": the last reading; "nan": NaN; "zero": 0 m; "full-scale": the end of the converter.
+    "hold": the last reading; "nan": NaN; "zero": 0 m; "full-scale": the end of the converter's range.
     """
 
     rate: Scalar = _rate()
@@ -93,7 +93,7 @@ class Dropouts:
 def _begins(
     fault: Outliers | Dropouts, stream: int, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar
 ) -> tuple[Array, Array]:
-    """Return whether a fault begins at a sample (with probability rate T, or at a set time), and a random sign."""
+    """Return whether a fault begins at a sample (with probability rate x period, or at `at`), and a random sign."""
     first, second = threefry(key, (stream, sample))
     dtype = jnp.result_type(float)
     begins = first.astype(dtype) * 2.0**-32 < fault.rate * period

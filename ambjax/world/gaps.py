@@ -29,7 +29,7 @@ class Gaps(NamedTuple):
 
 
 def _product(z: Array, s_0: Array) -> Array:
-    """Return the product of the gaps (m^2), at least that for which one gap is about GAP_FLOOR s_0."""
+    """Return the product of the gaps (m^2), at least its value where one gap is about GAP_FLOOR s_0."""
     product, least = s_0 * s_0 - z * z, 2 * GAP_FLOOR * s_0 * s_0
     return jnp.where(product > least, product, least)
 
@@ -56,8 +56,9 @@ def _inverse_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) ->
 def distance_to_C(zeta: Array, iota: Array) -> Array:
     """Return the distance from (zeta, iota) = (z/s_0, i/i_0) to the singular curve C, dimensionless. Eq. (9).
 
-    In these coordinates C is i = -(z + 1/z)/2 with two branches. Newton steps on the derivative of the squared
-    distance refine starting points on both branches; the nearest result is returned.
+    In these coordinates C is iota = -(zeta + 1/zeta)/2, which has two branches. Newton's method finds zeros of the
+    derivative of the squared distance from starting points on both branches. The distance to the nearest of these
+    points is returned.
     """
     x = jnp.exp(jnp.linspace(-5.0, 5.0, 41))
     x = jnp.concatenate([x, -x])

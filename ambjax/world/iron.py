@@ -16,18 +16,20 @@ AIR = 0.02
 
 @record
 class Iron:
-    """Saturation, leakage and eddy currents of the iron. The default of each, None, is ideal iron in this respect.
+    """Saturation, leakage and eddy currents of the iron. An effect whose parameter is None is left out.
 
     - Saturation. With the flux density b of ideal iron and x = b / saturation, the flux density of the core is
-      b (AIR + (1 - AIR) (1 + x^4)^(-1/4)): 3 % below b at x = 0.6, 16 % at x = 1, and close to `saturation` above.
+      b (AIR + (1 - AIR) (1 + x^4)^(-1/4)). It is 3 % below b at x = 0.6, 16 % at x = 1, and close to `saturation` for
+      larger x.
       This smooth minimum of b and `saturation` replaces the measured curve of a material (Schweitzer and Maslen,
       Magnetic Bearings, 2009, section 3.1). Saturation reduces the flux of the gap by the same factor.
-    - Leakage. A part of a coil's flux does not cross the gap, in a path of constant reluctance. `leakage` is the ratio
-      of the flux of the coil to that of the gap at z = 0 (Meeker, Maslen and Noh, IEEE Trans. Magn. 32(5), 1996). It
-      increases the inductance and the flux of the core. It changes the force of a current only by saturation.
-    - Eddy currents. The flux of a coil follows its current with the time constant `eddy`: the first-order term of the
-      diffusion of flux into a lamination of thickness d, d^2 sigma mu / 12 (Zmood, Anand and Kirk, 1987). The voltage
-      equations do not change.
+    - Leakage. A part of a coil's flux does not cross the gap, but takes a path of constant reluctance. `leakage` is the
+      ratio of the flux of the coil to that of the gap at z = 0 (Meeker, Maslen and Noh, IEEE Trans. Magn. 32(5), 1996).
+      Leakage increases the inductance and the flux of the core. It changes the force of a given current only through
+      saturation, because the flux density of the core is higher.
+    - Eddy currents. The flux of a coil follows its current with the time constant `eddy`. For a lamination of thickness
+      d, it is d^2 sigma mu / 12, the first-order term of the diffusion of the flux (Zmood, Anand and Kirk, 1987). The
+      voltage equations do not change.
     """
 
     saturation: Scalar | None = leaf(
@@ -58,7 +60,7 @@ class Iron:
         )
 
     def slope(self, b: Array) -> Array:
-        """Return the derivative of the flux density with respect to b (T), that without saturation. Dimensionless."""
+        """Return the derivative of the flux density with respect to b (T), the flux density without saturation."""
         if self.saturation is None:
             return jnp.ones_like(b)
         r = _inverse_root(b * (1 / self.saturation))

@@ -1,4 +1,4 @@
-"""The plant of the paper: both coils under one current deviation, Eqs. (1) and (2)."""
+"""The plant of the paper: one current deviation for both coils, Eqs. (1) and (2)."""
 
 from typing import NamedTuple
 

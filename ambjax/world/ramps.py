@@ -1,4 +1,4 @@
-"""Signals of straight lines: ramp and trapezoid."""
+"""Signals that consist of straight lines: ramp and trapezoid."""
 
 import dataclasses
 

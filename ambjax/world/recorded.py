@@ -1,4 +1,4 @@
-"""A signal that was recorded: values at instants, as a file gives them."""
+"""Recorded signals: values at given times, read from a file."""
 
 import dataclasses
 import functools
@@ -13,7 +13,7 @@ from ambjax.numerics.records import Scalar, leaf, record, static
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Samples:
-    """Values [n] at increasing times [n] (s), float64, n >= 2. Two of them are equal if their numbers are."""
+    """Values [n] at increasing times [n] (s), float64, n >= 2. Two `Samples` are equal if their numbers are."""
 
     times: np.ndarray
     values: np.ndarray
@@ -32,11 +32,11 @@ class Samples:
 
 @record
 class Recorded:
-    """The values of a file, scale times value(t - start): straight lines between them, or each held until the next.
+    """A recorded signal: scale times value(t - start). Between two times, the value is interpolated linearly or held.
 
-    Before the first time the value is the first one, after the last time the last one. The samples are a part of the
-    compiled program, so that another file compiles again. On a processor a step of the integrator does not end at a
-    held value; jumps at sample instants are exact.
+    Before the first time the value is the first one, and after the last time it is the last one. The samples are
+    constants of the compiled program, so another file needs another compilation. The integrator does not end a substep
+    where a held value changes. On a processor, such a jump is resolved exactly only if it is at a sample.
     """
 
     samples: Samples = static(doc="times and values")

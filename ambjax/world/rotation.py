@@ -1,4 +1,4 @@
-"""Unbalance and runout of a turning rotor: functions of its angle, which is the integral of its speed."""
+"""Unbalance and runout of a turning rotor, as functions of the angle, which is the integral of the speed."""
 
 from typing import Any, ClassVar, Protocol
 
@@ -76,10 +76,11 @@ def _bound(rotor: Turning, size: Scalar) -> tuple[float, float]:
 
 @record
 class Unbalance:
-    """Force of an unbalance U = m_u e, in N: U omega^2 sin(angle + phase).
+    """Force of an unbalance U, in N: U omega^2 sin(angle + phase).
 
-    omega is the speed in rad/s, and the angle is its integral. The speed is constant, or rises linearly from `speed` to
-    `speed_end` in `duration`. The force from the angular acceleration is neglected.
+    U is the unbalance mass times its distance from the axis. omega is the speed in rad/s; the angle is its integral.
+    The speed is constant, or changes linearly from `speed` to `speed_end` in `duration`. The force due to the angular
+    acceleration is neglected.
     """
 
     unbalance: Scalar = leaf(

@@ -17,12 +17,14 @@ from ambjax.world.sensor import Measurement, Sensor
 from ambjax.world.signals import Constant, Signal, edges_of, is_random, realised
 from ambjax.world.touchdown import Stop
 
-# Numbers folded into a member's key for the other streams. Sensors fold in the sample number, which is smaller.
+# Numbers that are folded into a member's key, for the random streams of the design and of the signals. The sensors fold
+# in the sample number, which is smaller.
 DESIGN_STREAM, SIGNAL_STREAM = np.uint32(2**32 - 1), np.uint32(2**32 - 2)
-# Fields that are signals. A new one goes to the end: the position in this list selects the random key of a signal.
+# Fields that are signals. The position in this list selects the random key of a signal, so add new fields at the end.
 SLOTS = ("reference", "q_z", "q_v", "q_i", "q_f", "base")
 
-# |z| at which a rotor on a stop is lost, as a share of s_0. The gaps of a plant are floored a little further.
+# |z| at which a rotor with an elastic stop is lost, as a share of s_0. The lower bound of the gaps (GAP_FLOOR) acts
+# only at a larger |z|.
 POLE = 0.99
 
 
@@ -41,7 +43,7 @@ class Initial:
 
 @record
 class Scenario:
-    """All inputs of a rollout besides the controller. Member k of seed s always draws the same noise."""
+    """All inputs of a rollout except the controller and the clock. Member k of seed s always draws the same noise."""
 
     plant: Bearing = part(default=Plant(), doc="the true plant")
     reference: Signal = part(default=Constant(), doc="position that the rotor must follow, m")
@@ -86,7 +88,7 @@ class Scenario:
 
     @property
     def limit(self) -> Scalar:
-        """|z| at which the rotor is lost, m: `touchdown`; with a stop, the pole of the magnet."""
+        """|z| at which the rotor is lost, m: `touchdown`, or POLE s_0 with an elastic stop."""
         return self.touchdown if self.stop is None else POLE * self.plant.s_0
 
     @property
@@ -100,9 +102,10 @@ class Scenario:
         return self.u_max if self.amplifier is None else self.amplifier.command_limit(self.u_max)
 
     def coil_voltage(self, command: Array, state: Any, q_i: Scalar = 0.0) -> Array:
-        """Return the voltage (V) at the coils for the output of the amplifier's lag, or the commanded current.
+        """Return the voltage at the coils, V.
 
-        `command`: V or A. `state`: of the plant. `q_i`: disturbance of the current's rate, A/s.
+        `command`: output voltage of the amplifier's lag (V), or the commanded current (A). `state`: of the plant.
+        `q_i`: disturbance of the current's rate, A/s.
         """
         plant = self.plant
         if self.amplifier is None:
@@ -115,7 +118,7 @@ class Scenario:
         return self.amplifier.at_coil(command, plant.measurement(state).i, self.u_max, response)
 
     def applied(self, u: Array, state: Any, q_i: Scalar = 0.0) -> Array | CoilVoltages:
-        """Return the result of `coil_voltage`; with limits of each coil, the voltages of both coils within these."""
+        """Return the result of `coil_voltage` or, if each coil has limits, the limited voltages of both coils."""
         u = self.coil_voltage(u, state, q_i)
         coil = None if self.amplifier is None else self.amplifier.coil
         return u if coil is None else coil.applied(self.plant, state, u, q_i)
@@ -130,7 +133,7 @@ class Scenario:
     @property
     @jax.jit  # compiles one program instead of one for each operation
     def largest_force(self) -> Scalar:
-        """The magnetic force (N) at z = 0 for i = i_0, where one coil is off, or for the limit of |i| if it is less."""
+        """The magnetic force (N) at z = 0 for i = i_0, where one coil is off, or for a limit of |i| below i_0."""
         return self.plant.largest_force(self.amplifier and self.amplifier.current_limit(self.plant.i_0))
 
     @property

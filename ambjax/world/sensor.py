@@ -13,7 +13,8 @@ from ambjax.numerics.smooth import polynomial
 from ambjax.world.faults import Dropouts, FaultOnsets, Outliers, Sensed
 from ambjax.world.rotation import Runout
 
-# m_3 of a low-pass over b = w h < 1 is b times the sum of 3! (-b)^j / (j + 4)!; the next term is below 1e-18.
+# Coefficients of a series for m_3 (`_moments`), used for b < 1: m_3 is b times the sum of 3! (-b)^j / (j + 4)!. The
+# first omitted coefficient is below 3e-18.
 SERIES = tuple(math.factorial(3) * (-1) ** j / math.factorial(j + 4) for j in range(16))
 
 
@@ -44,11 +45,11 @@ class Measurement(NamedTuple):
 
 @record
 class Sensor:
-    """Gaussian noise on each measurement, drawn once per sample period and held constant in it.
+    """The sensors, with Gaussian noise on each measurement, drawn once per sample period and held constant in it.
 
-    The runout of the rotor adds to its position. A reading is low-passed (`bandwidth`), scaled, offset, disturbed by
-    noise, rounded by the converter, and then replaced by faults, in this order. Low-pass, converter and faults require
-    a processor. In continuous time the measurement is continuous.
+    The runout of the rotor is added to the position. A reading of the position then passes the low-pass (`bandwidth`),
+    the gain, the offset, the noise, the converter and the faults, in this order. Low-pass, converter and faults require
+    a processor. Without a processor, the laws receive the measurement at every instant, not only at the samples.
     """
 
     std: Scalar = leaf(default=0.0, unit="m", at_least=0, at_most=1.0, doc="standard deviation of the noise of z")
@@ -105,12 +106,12 @@ class Sensor:
         return self.outliers is not None or self.dropouts is not None
 
     def noise(self, key: tuple[Scalar, Scalar], sample: Scalar) -> Errors:
-        """Return the errors of sample number `sample` for the member with the key `words` (`Scenario.words`)."""
+        """Return the errors at sample number `sample`. `key`: random key of the member (`Scenario.words`)."""
         w = normals(key, sample)
         return Errors(self.std * w[0], self.std_z_dot * w[1], self.std_i * w[2])
 
     def fault_onsets(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> FaultOnsets:
-        """Return the faults that begin at a sample of length `period` (s), for the member with the key `words`."""
+        """Return the faults that begin at sample number `sample`. `key`: as in `noise`. `period`: sample period, s."""
         none = jnp.zeros(())
         outlier = none if self.outliers is None else self.outliers.onset(key, sample, period)
         return FaultOnsets(outlier, none > 0 if self.dropouts is None else self.dropouts.onset(key, sample, period))
@@ -133,7 +134,10 @@ class Sensor:
         return dataclasses.replace(self, **{name: std * factor for name, std in stds.items()})
 
     def reading(self, motion: Measurement, errors: Errors | FaultyErrors) -> Measurement:
-        """Return the readings of a motion with these errors. `motion.z`: after the low-pass; z_dot = 0 if not read."""
+        """Return the readings of a motion with these errors. `motion.z`: after the low-pass.
+
+        z_dot is 0 if it is not measured.
+        """
         z_dot = motion.z_dot + errors.z_dot if self.velocity else jnp.zeros_like(motion.z_dot)
         return Measurement(self.gain * motion.z + self.offset + errors.z, z_dot, motion.i + errors.i)
 
@@ -149,7 +153,7 @@ class Sensor:
     def lagged(self, y: Array, before: Measurement, after: Measurement, h: Scalar) -> Array:
         """Return the output of the low-pass after h (s), from y (m): y' = w (z - y), w = 2 pi bandwidth.
 
-        Exact, for any w h, for the cubic z(t) with the positions and velocities of both ends.
+        The result is exact for any w h, if z(t) is the cubic with the positions and velocities at both ends.
         """
         assert self.bandwidth is not None
         # z = z_0 + s c_1 + s^2 c_2 + s^3 c_3, 0 <= s <= 1
@@ -162,10 +166,11 @@ class Sensor:
 def _moments(b: Array) -> tuple[Array, Array, Array, Array]:
     """Return y(1) of y' = b (s^k - y), y(0) = 0, for k = 0 to 3 and b >= 0.
 
-    m_0 = 1 - exp(-b), and k m_{k-1} = b (1 - m_k). The upward recursion loses digits for b < 1, the downward one not.
+    The result is (m_0, m_1, m_2, m_3), with m_0 = 1 - exp(-b) and k m_{k-1} = b (1 - m_k). For b < 1, the recursion
+    from m_0 upwards loses digits, so the recursion from m_3 downwards is used.
     """
     short = b < 1
-    few, many = jnp.where(short, b, 0.0), jnp.where(short, 1.0, b)  # both branches stay finite where they are unused
+    few, many = jnp.where(short, b, 0.0), jnp.where(short, 1.0, b)  # keeps each branch finite where it is not used
     m_3 = few * polynomial(few, SERIES)
     m_2 = few * (1 - m_3) / 3
     m_1 = few * (1 - m_2) / 2
@@ -184,7 +189,7 @@ def converted(x: Array, bits: Scalar, limit: Scalar) -> Array:
     The step is 2 limit / 2^bits; the largest value is one step below limit. The derivative is that of the saturation
     alone.
     """
-    half = jnp.round(jnp.exp2(jnp.asarray(bits) - 1))  # XLA's is off by rounding
+    half = jnp.round(jnp.exp2(jnp.asarray(bits) - 1))  # XLA's exp2 has a rounding error
     step = limit / half
     held = jnp.where(x > limit - step, limit - step, jnp.where(x < -limit, -limit, x))
     return held + lax.stop_gradient(step * jnp.round(held / step) - held)

@@ -19,8 +19,8 @@ from ambjax.numerics.smooth import TWO_PI, sine
 class Signal(Protocol):
     """Protocol of a signal: maps a time (s) to a value. `span` returns bounds of its values for times in 0..end (s).
 
-    A signal with jumps also has `edges() -> tuple`, the times of its jumps (s). On a processor, a step of the
-    integrator ends there.
+    A signal with jumps also has `edges() -> tuple`, the times of its jumps (s). On a processor, a substep of
+    the integrator ends there.
     """
 
     def __call__(self, t: Scalar, /) -> Array: ...
@@ -121,7 +121,11 @@ class Sine:
 
 @record
 class SmoothStep:
-    """0 until `start`, then amplitude (10 s^3 - 15 s^4 + 6 s^5) with s = (t - start)/duration, then amplitude (C2)."""
+    """0 until `start`, a smooth rise over `duration`, then `amplitude`.
+
+    During the rise, the value is amplitude (10 s^3 - 15 s^4 + 6 s^5) with s = (t - start)/duration. The signal has
+    continuous first and second derivatives.
+    """
 
     amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="final value")
     start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="start of the rise")
@@ -212,7 +216,7 @@ class Reference(NamedTuple):
     r_dddot: Scalar = 0.0
 
     def rate(self) -> "Reference":
-        """The time derivative; the rate of the third derivative is taken as 0."""
+        """Return the time derivative. The fourth derivative of the reference is taken as 0."""
         return Reference(self.r_dot, self.r_ddot, jnp.asarray(self.r_dddot), jnp.zeros_like(self.r))
 
 

@@ -14,9 +14,9 @@ DAMPING_DEPTH = 1e-3
 class Stop:
     """An elastic, damped stop at |z| = gap. It pushes the rotor back and never pulls it.
 
-    With the penetration d = |z| - gap > 0 its force is max(0, k d + c s d'). The share s of the damping rises from 0 to
-    1 as 3 x^2 - 2 x^3, x = d / (DAMPING_DEPTH gap), so that the force is continuous at the first contact. This is a
-    Kelvin-Voigt contact force whose damping rises as in the multibody code ADAMS (Ryan, 1990).
+    With the penetration d = |z| - gap > 0, the stiffness k and the damping c, its force is max(0, k d + c s d'). The
+    share s rises from 0 to 1 as 3 x^2 - 2 x^3 with x = d / (DAMPING_DEPTH gap), so the force is continuous at the first
+    contact. This is a Kelvin-Voigt contact force whose damping rises as in the multibody code ADAMS (Ryan, 1990).
     """
 
     stiffness: Scalar = leaf(unit="N/m", at_least=1.0, at_most=1e12, doc="stiffness of the touchdown bearing")

@@ -1,4 +1,4 @@
-"""The goal: one number, minimised by the search, from the losses of the members and the gains."""
+"""The goal: the number that the search minimises, computed from the losses of the members and from the gains."""
 
 from functools import partial
 
@@ -21,7 +21,7 @@ MOST = 700.0
 
 
 def shown(goal: np.ndarray | float) -> np.ndarray:
-    """Return the number whose logarithm is `goal`, for a text or a picture. A limit far from met makes it huge."""
+    """Return the number whose logarithm is `goal`, for a text or a picture. If a limit is far from met, it is huge."""
     return np.exp(np.minimum(goal, MOST))
 
 
@@ -31,8 +31,8 @@ class Goal:
 
     goal = log(risk(losses) + mean(losses of stressed members)) + weight * shortfall(conditions) + sum(limits).
     The risk and the limits include ordinary members only. `margin` is the relative margin of the conditions.
-    `measured`: names of the quantities beside the losses, in order. If one of them is `minimised`, the square of its
-    value times `unit` is added to the risk; the losses are then without errors and costs.
+    `measured`: names of the quantities beside the losses, in order. `minimised`: one of these names, or empty. If it is
+    given, (`unit` times its value)^2 is added to the risk; the losses then contain no errors and no costs.
     """
 
     space: Space = static()
@@ -57,7 +57,7 @@ class Goal:
         return jnp.log(loss + 1e-30) + self.weight * self.penalty(x) + self.pull(outcomes[:ordinary, 1:])
 
     def ordinary_risk(self, outcomes: Array) -> Array:
-        """Return the risk of the ordinary members' `outcomes` [N, 1 + L], and the square of the minimised quantity."""
+        """Return the risk of the ordinary members' `outcomes` [N, 1 + L], plus the square of the minimised quantity."""
         risk = self.risk(outcomes[:, 0])
         if not self.minimised:
             return risk

@@ -1,10 +1,10 @@
 """The engine: evaluates an objective and its derivatives for many gains and members, with common random numbers.
 
 A lane is one rollout of one member under one vector of gains. A kernel processes a fixed number of lanes and is
-compiled once. There are three kernels: for the terms of the loss, for their derivatives (with fewer lanes), and for
-metrics. A new number of starts or members does not recompile them. The number of lanes does not depend on the number of
-cores, because it can change the last digit of a result. Another integration method, such as that of the judge, needs
-another engine.
+compiled once. There are three kernels: one for the terms of the loss, one for their derivatives (with fewer lanes), and
+one for metrics. A new number of starts or members does not recompile them. The number of lanes does not depend on the
+number of cores, because it can change the last digit of a result. Another integration method, such as that of the
+judge, needs another engine.
 """
 
 import dataclasses
@@ -86,7 +86,7 @@ class LaneGradient:
             return jax.vmap(self._pulled, (axes,))(lanes)
         each = jax.vmap(self._outcomes, (0, axes))
 
-        # Map over directions outside and lanes inside, so that the contiguous axis in memory is that of the lanes.
+        # The outer map is over directions and the inner one over lanes, so the lanes are contiguous in memory.
         def along(direction: Array) -> Any:
             every = jnp.broadcast_to(direction, lanes.x.shape)
             return jax.jvp(lambda x: each(x, lanes), (lanes.x,), (every,), has_aux=True)

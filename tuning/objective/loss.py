@@ -25,7 +25,7 @@ Values = TypeVar("Values", Array, np.ndarray)
 TERMS = ("tracking", "peak", "effort", "chatter", "clearance", "survival")
 # Terms that measure the distance from touchdown and the loss of the rotor.
 HELD = ("clearance", "survival")
-# Terms that count relative to the error (`weigh`).
+# Terms that are factors of the error (`weigh`).
 COSTS = ("effort", "chatter")
 
 
@@ -68,7 +68,7 @@ class Loss:
     chatter: mean over samples of ((u_k - u_{k-1}) / u_scale)^2, where u_k is the average of u over sample k.
     clearance: mean of max(0, (|z| - h) / (stop - h))^2, where h = (|r| + stop) / 2.
     survival: share of the run after the loss of the rotor. Its derivative is that of the time at which |z| would reach
-    the stop with the speed at the last sample. So a descent step delays the loss.
+    the stop with the speed at the last sample, so that a descent step delays the loss.
 
     The result also contains the result of each fold in `measures`, with PREFIX before its name.
     """

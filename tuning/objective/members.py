@@ -18,12 +18,12 @@ from tuning.objective.loss import Loss
 from tuning.objective.quantities import LOOPS
 from tuning.space import Space
 
-# Fewest ordinary, and fewest stressed, members of a part.
+# Smallest number of ordinary members, and of stressed members, in a part.
 LEAST_PART = 4
 
 
 class LoopRange(NamedTuple):
-    """What `loop_quantities` needs beside a loop: `names` of the limited quantities, and its other arguments."""
+    """Names of the limited quantities of linearised loops, and the arguments of `loop_quantities` besides the loop."""
 
     names: tuple[str, ...]
     low: float
@@ -63,14 +63,14 @@ class Members(NamedTuple):
         return jax.tree.map(lambda a: a[: self.ordinary], self)
 
     def joined(self, others: "Members", stressed: bool = True) -> "Members":
-        """Return these members and `others`, which become `stressed` or not, and come before the stressed ones here."""
+        """Return these members with `others` before the stressed ones. `stressed`: whether `others` become stressed."""
         more, n = others._replace(stressed=np.full(len(others.stressed), stressed)), self.ordinary
         return jax.tree.map(lambda a, b: np.concatenate([a[:n], b, a[n:]]), self, more)
 
     def part(self, share: int, held: int | None = None) -> "Members":
-        """Return one ordinary member in `share` and one stressed member in `held` (default: `share`), the first ones.
+        """Return the first 1/`share` of the ordinary members, and the first 1/`held` of the stressed ones.
 
-        At least LEAST_PART of either kind are kept, or all of them if there are fewer.
+        `held`: default `share`. Of each kind, at least LEAST_PART members are kept, or all if there are fewer.
         """
         kinds = (self.ordinary, share), (len(self.stressed) - self.ordinary, held or share)
         few, some = (max(count // each, min(LEAST_PART, count)) for count, each in kinds)

@@ -91,7 +91,7 @@ def worst_loop(values: Array) -> Array:
 
 
 def smallest_loop(values: Array) -> Array:
-    """Return the inverse of the 16-norm of the inverses over the members whose loops the search linearises."""
+    """Return a smooth minimum over the members whose loops the search linearises: 1 / (16-norm of the inverses)."""
     return 1 / largest(1 / values[:LOOPS])
 
 
@@ -107,10 +107,11 @@ def largest(values: Array) -> Array:
 class Kind:
     """A quantity that may be limited.
 
-    `words` describes the quantity of one member, `over` its reduction over members, both for the report. `fold` returns
-    the fold that measures it in the search, of a LimitContext and the limit; None: it is a field of LoopQuantities, of
-    the linearised loop. `exact` is the column of its exact value in the judge's metrics; None: the value of the search.
-    `tuned` reduces the members for the search, `judged` for the judge.
+    `words` describes the quantity of one member, `over` its reduction over members, both for the report. `fold`:
+    function of a LimitContext and the limit, which returns the fold that measures the quantity in the search; None: the
+    quantity is a field of LoopQuantities, computed from the linearised loop. `exact`: the column of the judge's metrics
+    with the exact value; None: the judge uses the value of the search. `tuned`, `judged`: the reduction over members in
+    the search and by the judge.
     """
 
     unit: str

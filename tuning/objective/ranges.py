@@ -13,7 +13,7 @@ from tuning.space import Gain, Space
 
 # Least displacement assumed for a rotor that starts at rest, as a share of the clearance.
 LEAST_DISPLACEMENT = 0.01
-# Upper bound of a gain without one: this factor times the larger of the end of its range and its initial value.
+# Default upper bound of a gain: this factor times the larger of the end of its range and its initial value.
 END_FACTOR = 3.0
 # Range of a gain for which the law defines none: its value divided and multiplied by this factor.
 DEFAULT_FACTOR = 30.0
@@ -23,7 +23,7 @@ OPEN_RATIO = 1e3
 
 @dataclasses.dataclass(frozen=True)
 class Range:
-    """Initial search range [low, high] of a gain, its upper bound `most`, and a text that names their source.
+    """Initial search range [low, high] of a gain, its upper bound `most`, and a text that describes their source.
 
     `product`: path of another gain of the space, and the range of the product of both gains. None: no such range.
     """
@@ -114,7 +114,7 @@ def _quotient(gain: Gain, value: float, interval: Interval, cascade: Cascade, fo
     """Return the range of a gain whose law defines the interval of its product with another gain."""
     root, stage, _, *knot = gain.path.split(".")
     stem = f"{root}.{stage}.{interval.times}"
-    # with schedules of both gains: the other one at the same knot
+    # if both gains have schedules: the other gain at the same knot
     other = next((path for path in (".".join([stem, *knot]), stem) if path in found), None)
     if other is None:
         size = float(getattr(extremes(getattr(cascade, stage))[0], interval.times))
@@ -138,4 +138,4 @@ def _range(gain: Gain, value: float, interval: Interval) -> Range:
     if np.isfinite(gain.high):
         return Range(low, high, gain.high, source)
     most = max(high, value) * (1 if interval.firm else END_FACTOR)
-    return Range(low, high, most, f"{source}; may end at up to {most:.3g}")
+    return Range(low, high, most, f"{source}; tuned gain at most {most:.3g}")

@@ -45,7 +45,7 @@ def bounds(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Bound, .
 
 
 def shortfall(gains: Mapping[str, Array], bounds: tuple[Bound, ...], margin: Scalar) -> Array:
-    """Return the sum of max(0, log((1 + margin) bound / gain))^2 over `gains` by path with a bound.
+    """Return the sum of max(0, log((1 + margin) bound / gain))^2 over the gains that have a bound. `gains`: by path.
 
     The bound of a scheduled gain applies to each of its knots. The sum is 0 if every condition holds with the
     relative margin `margin`.

@@ -1,6 +1,6 @@
-"""The error of the report's fixed steps in each of its numbers, and nominal runs for its pictures.
+"""The errors of the report's numbers due to its fixed integration steps, and nominal runs for its pictures.
 
-A few members are simulated again by adaptive RODAS3 and compared.
+To find these errors, a few members are simulated again by adaptive RODAS3.
 """
 
 import dataclasses
@@ -26,10 +26,10 @@ def compare_steps(
 ) -> dict[str, Any]:
     """Compare the report's steps with accurate steps on the first members of an ensemble, at coordinates x [m].
 
-    Returns plain data. `members`: number of members simulated. `held`: number that survive with both steps; over these,
-    the summaries (`summarise`) of `names` with the report's steps, with accurate steps, and the relative error.
-    `lost`, `stalled`: numbers with either steps. `refuted`: why accurate steps contradict the report; '' if not,
-    or if no member survives in the report.
+    Returns plain data. `members`: number of members simulated. `held`: number of members that survive with both steps.
+    `metrics`: for each of `names`, the summary over these members (`summarise`) with the report's steps and with
+    accurate steps, and the relative error. `lost`, `stalled`: numbers of members with each of the steps. `refuted`: why
+    accurate steps contradict the report; '' if they do not, or if no member survives in the report.
     """
     numbers = np.arange(min(COMPARED, count))
     members = problem.objective.chosen(seed, numbers, count)

@@ -8,7 +8,7 @@ from tuning.report.limit_table import broken, prices
 
 
 def answer_lines(facts: TuningFacts) -> list[str]:
-    """Return the list of five items: held or not, error and voltage, sensitivity, what limits it, the next command."""
+    """Return a list of five items: held or not, error and voltage, sensitivity, limiting quantities, next command."""
     items = [_held(facts), _sizes(facts), _sensitivity(facts), _limiting(facts), _next(facts)]
     return [*(f"- {item}" for item in items), ""]
 
@@ -61,7 +61,7 @@ def _sensitivity(facts: TuningFacts) -> str:
 
 
 def _peak(row: Row, found: Row) -> float:
-    """Return the peak of a member that decides: the injected one, or the larger of both."""
+    """Return the decisive peak of a member: the injected one, or the larger of the linear and the injected one."""
     if row["repetitions"] and row["peak"] is None:
         return math.inf
     if row["peak"] is None:

@@ -11,7 +11,7 @@ from tuning.objective.loss import COSTS, HELD, TERMS, outcomes, weigh
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
 
-# The loss of one member as a formula. Costs are factors: they count relative to the error.
+# The loss of one member as a formula. The costs are factors of the error.
 FORMULA = f"{' + '.join(HELD)} + (tracking + peak) x (1 + {' + '.join(COSTS)})"
 Facts = dict[str, Any]
 

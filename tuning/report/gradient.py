@@ -12,12 +12,12 @@ from tuning.problem import TuningProblem
 
 Number = TypeVar("Number", float, np.ndarray)
 
-# Samples over which the three ways are compared, members that take part, and the step of the differences.
+# Number of samples over which the three ways are compared, number of members, and step of the differences.
 SAMPLES, FEW, STEP = 500, 4, 1e-3
 # Largest relative differences at which two ways agree: forward and reverse mode; central differences with the steps
 # STEP and STEP / 2 (beyond it the step does not resolve the slope); their extrapolation and the modes.
 MODES, STEADY, AGREE = 1e-6, 0.05, 1e-3
-# Differences below these shares of the largest derivative and of the loss are rounding.
+# Differences below these shares of the largest derivative and of the loss count as rounding errors.
 NOTHING, ROUNDING = 1e-6, 1e-9
 AGREED = "agree"
 HORIZONS = (0.125, 0.25, 0.5)
@@ -129,7 +129,10 @@ def signal_to_noise(problem: TuningProblem, x: np.ndarray, members: Members) -> 
 
 
 def gradient_report(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, object]:
-    """Return the data of the whole gradient report at coordinates x [m]: of the loss, also if the answer is a knee."""
+    """Return the data of the whole gradient report at coordinates x [m].
+
+    The gradient is that of the loss, also if the search minimised the voltage.
+    """
     return {
         "gains": problem.objective.space.paths,
         "three_ways": three_ways(problem, x),

@@ -22,7 +22,7 @@ from tuning.search.course import SearchResult
 
 
 def examined(answer: SearchResult, gradients: bool, front_written: bool) -> tuple[TuningFacts, explore.Slices]:
-    """Return the facts of an answer, and the slices of the goal through it. [m]: one value for each of the m gains.
+    """Return the facts of an answer, and the slices of the goal through it. Arrays [m] have one value per gain.
 
     `gradients`: whether to compute derivatives in three ways. `front_written`: whether each point of the front has a
     case file.
@@ -150,7 +150,7 @@ def _neighbourhood(problem: TuningProblem, x: np.ndarray, slices: explore.Slices
 def _checked(
     answer: SearchResult, judged: dict[str, np.ndarray] | None, held_out: int
 ) -> tuple[StepError | None, dict[str, Any] | None, str]:
-    """Repeat the simulation of the worst and the first of the held-out members `judged` [N] with accurate steps.
+    """Simulate the worst and the first of the held-out members `judged` [N] again, with accurate steps.
 
     Returns the step error on the worst members, the comparison on the first ones, and the reason why accurate steps do
     not confirm the answer ('' if they confirm it).

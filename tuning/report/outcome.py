@@ -1,4 +1,4 @@
-"""The outcome of tuning, which determines exit code, log, report and report.json, and the advice."""
+"""The outcome of tuning, from which the exit code, the log and the reports follow, and the advice."""
 
 import dataclasses
 
@@ -172,7 +172,7 @@ def _causes_of_loss(problem: TuningProblem, facts: TuningFacts, x: np.ndarray, m
     if np.isfinite(u_max) and effort > 0.25:
         words.append(
             f"The voltage is at {100 * np.sqrt(effort):.0f} % of its limit (rms): a supply above {u_max:g} V, less "
-            "sensor noise, or an observer ([controller.observer] kind = 'complementary', its l tuned) would help."
+            "sensor noise, or an observer ([controller.observer] kind = 'complementary', with a tuned l) would help."
         )
     bound = [row["path"] for row in facts.gains if row["at_bound"]]
     if bound:

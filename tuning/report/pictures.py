@@ -153,7 +153,7 @@ def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
     for s in range(cut.shape[1]):
         left.plot(steps, shown(cut[:, s]), "0.75", lw=1)
     left.plot(steps, shown(cut.min(axis=1)), "C0", lw=1.8)
-    title = "blue: best start; dotted: other members"
+    title = "blue: best start; dotted: the members change"
     label = "objective" if (cut == value).all() else f"objective (cut at {LARGEST_GOAL:.0e} times the least)"
     left.set(xlabel="iteration", ylabel=label, yscale="log", title=title)
     for j, path in enumerate(paths):
@@ -228,7 +228,7 @@ def front(rows: list[dict[str, Any]]) -> bytes:
             ax.plot([volts[n] for n in those], [errors[n] for n in those], style, ms=8, label=label)
     if ax.get_legend_handles_labels()[0]:
         ax.legend(fontsize=8)
-    # at least half a decade, for a front of a single point
+    # the axis has at least half a decade, also for a front of a single point
     ends = min(min(errors) / 1.2, max(errors) / 2), max(max(errors) * 1.2, min(errors) * 2)
     ax.set(xlabel="settled rms voltage (V)", ylabel=f"settled rms error ({unit})", yscale="log", ylim=ends)
     log_ticks(ax.yaxis, *ends)

@@ -15,7 +15,7 @@ from ambjax.cases.reader import Case, case_from
 from ambjax.cases.recordings import relocated_files
 
 FIRST = "Tuned by ambjax tune from the case"
-# First line of such a file. It is removed when the file is tuned again.
+# First lines of tuned.toml. They are removed when the file is tuned again.
 HEAD = re.compile(rf"\A# {FIRST} [^\n]*\n(#[^\n]*\n)?\n?")
 # Characters that a comment must not contain; surrogates come from file names that are not UTF-8.
 CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
@@ -130,7 +130,7 @@ def _put(table: Any, name: str | int, value: float | str) -> None:
 
 
 def _behind(last: Table | None) -> Table:
-    """Return a new table with the comments at the end of the preceding table, because these refer to what follows."""
+    """Return a new table. It takes over the comments at the end of the preceding table, which refer to what follows."""
     table = tomlkit.table()
     rest = [] if last is None else _cut(last)
     table.value.body.extend(rest or [(None, tomlkit.nl())])

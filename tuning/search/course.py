@@ -31,10 +31,10 @@ MOST_SEARCHES = 5
 # Restarts end after two successive searches that each lower the goal, a logarithm, by less than this. One such search
 # is not enough, because its points may miss a better optimum by chance.
 LEAST_IMPROVEMENT = 0.01
-# Number of earlier points of the searches that are checked with accurate steps if these confirm none of the answers.
+# If accurate steps confirm none of the answers, this number of earlier points of the searches is checked with them.
 FALLBACK_POINTS = 12
-# After PACED iterations of the first search, the time of all searches is estimated from the usual number of iterations:
-# 22 to 120 in benchmarks/tasks; and more if |S| is measured while the supply limits the voltage.
+# After PACED iterations of the first search, the time of all searches is estimated from the usual number of iterations.
+# It is 22 to 120 in benchmarks/tasks, and larger if |S| is measured while the supply limits the voltage.
 PACED, USUAL_ITERATIONS = 4, (20, 450)
 
 
@@ -187,7 +187,7 @@ def training(problem: TuningProblem) -> Members:
 
 
 def points_of(past: list[SearchState]) -> np.ndarray:
-    """Return at most FALLBACK_POINTS points [K, m] that the searches visited, best first, more of the better ones."""
+    """Return at most FALLBACK_POINTS points [K, m] that the searches visited, best first, more of the good ones."""
     x = np.concatenate([np.asarray(one.history["x"]).reshape(-1, one.starts.best.shape[-1]) for one in past])
     value = np.concatenate([np.asarray(one.history["value"]).ravel() for one in past])
     _, first = np.unique(np.where(np.isfinite(value), value, np.inf), return_index=True)

@@ -8,7 +8,7 @@ import numpy as np
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
 
-# Coordinates of the slices: factors of about e^-1.5 to e^1.5 of a gain.
+# Coordinates of the points of a slice: a gain times about e^-1.5 to e^1.5.
 REACH = np.linspace(-1.5, 1.5, 13)
 
 

@@ -106,8 +106,8 @@ def chosen(seen: Sequence[FrontPoint], factor: float) -> FrontPoint:
 def _admissible(seen: Sequence[FrontPoint]) -> list[FrontPoint]:
     """Return the points that lose no more members than the first point, and meet all limits if the first point does.
 
-    If the first point is within all limits by half of their margins, so are they: the held-out members may exceed the
-    values of the judged members by a few percent.
+    If the first point keeps half of the margin of each limit, the returned points do so too, because the values of the
+    held-out members may exceed those of the judged members by a few per cent.
     """
     first = seen[0]
     return [
@@ -147,7 +147,7 @@ def _search_least_voltage(course: Course, factor: float, seen: Sequence[FrontPoi
         if more is None:
             course.problem = course.problem.limited(limits)
         else:
-            say("validation members of large errors join the training ensemble; the search is repeated")
+            say("validation members with large errors join the training ensemble; the search is repeated")
             course.members = course.members.joined(more, stressed=False)
             x = chosen([*seen, *points], factor).x
     return points
@@ -156,7 +156,7 @@ def _search_least_voltage(course: Course, factor: float, seen: Sequence[FrontPoi
 def _members_to_join(
     course: Course, numbers: Sequence[tuple[float, float]], columns: Mapping[str, np.ndarray]
 ) -> Members | None:
-    """Return the validation members of the largest errors, which join the training ensemble; None if none should join.
+    """Return the validation members with the largest errors, which join the training ensemble; None if none joins.
 
     `numbers`: the values of the search and of the judge for each limit. `columns` [N]: metrics of the judged members.
     """

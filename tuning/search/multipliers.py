@@ -27,7 +27,7 @@ CLEARLY_BELOW = 0.1
 # A quantity whose linear value has g above -INJECTED_FROM is also measured by injection, because the measured value may
 # exceed the linear one by up to a fifth.
 INJECTED_FROM = 0.2
-# Largest number of members on which averages are judged; limits of worst members need the whole ensemble.
+# Largest number of members on which averages are judged. Limits on worst members need the whole ensemble.
 AVERAGING_MEMBERS = 256
 
 
@@ -149,9 +149,9 @@ def judged_values(
 
     `columns` [N]: result of `judge` for the ensemble with this `seed`. `tuned`: the search's value of each limit.
 
-    If on a processor a linear peak, or the search's value corrected by an earlier injection, may break a limit, members
-    are measured by injection as the held-out members are. If only injections decide (`measured_peaks.decides`), there
-    is no new injection while these corrected values are clearly within their limits.
+    On a processor, members are measured by injection, as the held-out members are, if a linear peak may break a limit,
+    or if the search's value, corrected by an earlier injection, may break it. If only injections decide
+    (`measured_peaks.decides`), there is no new injection while these corrected values are clearly within their limits.
     """
     if not injects(problem):
         return [limit.reached(columns) for limit in problem.limits]
@@ -162,7 +162,7 @@ def judged_values(
         )
         known = {limit.name: limit.ratio * ours for limit, ours in pairs}
     else:
-        # the ratio of an earlier injection counts too, or the searches alternate between a measured and a linear value
+        # with the ratio of an earlier injection, the searches do not alternate between a measured and a linear value
         near = any(
             limit.log_excess(max(limit.reached(columns), limit.ratio * ours)) > -INJECTED_FROM for limit, ours in pairs
         )

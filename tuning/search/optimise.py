@@ -23,16 +23,16 @@ from tuning.search.screen import screen
 SHORTEST = 1e-3
 # Numbers of iterations of a phase after which only the better half of the starts continues.
 HALVINGS = (4, 10)
-# Number of points that the first phase visited and that are then evaluated on all members.
+# Number of points of the first phase that are then evaluated on all members.
 PATH_POINTS = 12
 
 
 class Phase(NamedTuple):
     """A phase of the search.
 
-    It simulates one in `part` of the ordinary members. It simulates all stressed members, because the goal jumps where
-    one of these is lost. A descent has converged if the goal falls by less than `stall` over `patience` iterations. If
-    the norm of its gradient then exceeds `gradient_limit`, the start continues with CMA-ES.
+    It simulates 1/`part` of the ordinary members. It simulates all stressed members, because the goal jumps where one
+    of these is lost. A descent has converged if the goal falls by less than `stall` over `patience` iterations. If the
+    norm of its gradient then exceeds `gradient_limit`, the start continues with CMA-ES.
     """
 
     part: int

@@ -3,8 +3,9 @@
 The first round searches with restarts. If the error of the integration steps at the optimum is too large, the search
 continues with finer steps. If a limit is not met, it continues with other multipliers. The answer is then validated.
 These members join the training ensemble for the next round: validation members that are lost, members that are lost
-with accurate steps, and validation members with errors that the training members do not have. If tune.objective or
---pareto requires it, the front of error against voltage is traced at the end.
+with accurate steps and, if the rms error of the validation members is much larger than that of the training members,
+the validation members with the largest errors. If tune.objective or --pareto requires it, the front of error against
+voltage is traced at the end.
 """
 
 import dataclasses
@@ -58,7 +59,7 @@ def rounds(
         if answer.good:
             more = course.problem.objective.chosen(seeds(budget)[1], large, budget.validation)
             course.members = course.members.joined(more, stressed=False)
-            say("validation members of large errors join the training ensemble; the search continues")
+            say("validation members with large errors join the training ensemble; the search continues")
         else:
             course.members = course.members.joined(joining(course.problem, lost, error, number))
             say("lost members, and members lost with accurate steps, join the training ensemble; the search continues")
@@ -83,7 +84,7 @@ def with_fine_steps(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepErro
     """Return coordinates [m] whose step error is small enough, and this error.
 
     The first candidate is `x`; the others are the results of searches that continue from it in finer steps. There are
-    at most MOST_HALVINGS such searches. If the last step error is still too large, it is returned all the same.
+    at most MOST_HALVINGS such searches. The last step error is returned even if it is still too large.
     """
     while True:
         error = step_error(course.problem, x)

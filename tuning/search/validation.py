@@ -13,10 +13,10 @@ from tuning.objective.members import Members
 from tuning.problem import TuningProblem
 from tuning.search.course import Course, SearchResult
 
-# Largest numbers of lost members, and of members of large errors, that join at once.
+# Largest numbers of lost members, and of members with large errors, that join at once.
 MOST_LOST, MOST_LARGE = 16, 8
 # If the rms error of the validation members exceeds that of the training members by more than this factor, the training
-# ensemble lacks the members of large errors.
+# ensemble lacks members with large errors.
 LARGER = 1.5
 # Members that are lost with accurate steps are held with the steps of the search. They therefore join with more noise,
 # by the factor NOISE_GROWTH**number in round number `number`.
@@ -61,7 +61,7 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
 
 
 def largest_unseen(course: Course, errors: np.ndarray) -> np.ndarray:
-    """Return the numbers of the validation members of the largest errors that are not in the training ensemble.
+    """Return the numbers of the validation members with the largest errors that are not in the training ensemble.
 
     `errors` [N]: of the validation members; -inf for a member that is lost. At most MOST_LARGE numbers.
     """
