@@ -946,8 +946,8 @@ SEARCH = [
     M(
         "the last answer is taken although an earlier one is within the limits",
         "tuning/search/multipliers.py",
-        "return _least(course, within) if within else x",
-        "return x",
+        "return (_least(course, within), True) if within else (x, False)",
+        "return x, False",
         "tests/test_tuning_limits.py::test_the_best_answer_within_the_limits_is_taken_if_the_multipliers_do_not_converge",
     ),
     M(
