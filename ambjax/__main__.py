@@ -129,13 +129,18 @@ def parser() -> Parser:
         "--against", metavar="OTHER.toml", action="append", help="another case, mapped over the same grid (repeatable)"
     )
     _seed_option(grid)
-    summary = "check sensitivity, margins and the stability conditions of a case; exit code 1 if one that applies fails"
+    summary = (
+        "check sensitivity, margins and the stability conditions of a case; exit code 1 if a condition that applies "
+        "fails"
+    )
     command("check", summary, case=True)
     summary = "sensitivity peaks with ISO 14839-3 zones, margins, stiffness: sensitivity.json, sensitivity.png"
     sensitivity = command("sensitivity", summary, case=True, out=True)
     sensitivity.add_argument("--members", type=int, metavar="N", help="members of [spread] to analyse (default: 100)")
     sensitivity.add_argument(
-        "--inject", action="store_true", help="inject a multi-sine also in continuous time; always done on a processor"
+        "--inject",
+        action="store_true",
+        help="inject a multi-sine also in continuous time; on a processor this is always done",
     )
     _seed_option(sensitivity)
     summary = "compare cases on the same members: compare.html, compare.json, compare.png"

@@ -1,4 +1,4 @@
-"""Run CMA-ES from the tuner's answer, to check whether the search stopped short.
+"""Run CMA-ES from the tuner's answer, to check whether the search stopped before the optimum.
 
 Each task is tuned as in tasks.py. CMA-ES then makes `--evaluations` evaluations of the tuner's objective, on the
 training ensemble and the 16 validation members with the least clearance. Limits are penalties on the values of the

@@ -24,7 +24,8 @@ from ambjax.ensemble.gpu_kernel import run_whole
 MEMBERS = (4_096, 65_536, 262_144, 1_048_576)
 BLOCKS = (32, 64, 128, 256)
 SAMPLES = 100
-# Rounding over 1,000 steps in z, a hundredth of the largest state; the noise has other rounding, too
+# Largest relative difference due to rounding over 1,000 steps. z is a hundredth of the largest state, and the noise is
+# rounded differently, too.
 ALLOWED = {"float64": 1e-9, "float32": 1e-2}
 
 
@@ -32,7 +33,7 @@ def measure(dtype: str, members: tuple[int, ...], samples: int) -> list[dict[str
     rows = []
     for noise, n in itertools.product((False, True), members):
         work = workload.workload(n, samples, noise=noise)
-        # one call of the engine for all members: its scan launches kernels per step whatever their number
+        # one call of the engine: the scan launches as many kernels per step for one member as for all of them
         runs: dict[str, Any] = {"scan": functools.partial(workload.by_ambjax, work, call=n)}
         for block in BLOCKS:
             kernel = functools.partial(run_whole, *work, fold=workload.FOLD, block=block)

@@ -1,4 +1,4 @@
-"""Held noise on smooth gains: time of a higher-order method per hold at 1e-6 relative error in z.
+"""Held noise with smooth gains: time of DOP853 relative to RK4, at a relative error in z of at most 1e-6.
 
 The common ensemble workload with held noise (100 us), 64 members, one core. Error: the largest |z - reference|
 over all members and samples, relative to the largest |z|; reference: RK4 with 100 substeps.

@@ -104,10 +104,10 @@ def title(name: str) -> str:
 
 
 def structures(laws: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the tables [controller] of all structures. `laws`: that of the case. All structures have its observer.
+    """Return the tables [controller] of all structures. `laws`: the table of the case.
 
-    LQG is state feedback with a Kalman filter, which is that of the case if it has one. The laws that the case does not
-    have start with their default gains for its plant.
+    All structures have the observer of the case, except LQG. LQG is state feedback with a Kalman filter, which is that
+    of the case if it has one. The laws that the case does not have start with their default gains for its plant.
     """
     drive = {"kind": "pi"}
     soft = {stage: _without(laws.get(stage, {}), "p") for stage in ("position", "inversion", "current")}
@@ -196,7 +196,10 @@ def command(*words: str) -> None:
 
 
 def summary(seeds: list[list[dict[str, Any]]]) -> dict[str, Any]:
-    """Return for each structure the median, least and largest of each number over seeds; None where one has none."""
+    """Return for each structure the median, least and largest of each number over seeds.
+
+    The entry of a number is None if one of the seeds does not have it.
+    """
     found = {}
     for rows in zip(*seeds, strict=True):
         row: dict[str, Any] = {"lost": [one["lost"] + one["stalled"] for one in rows], "flops": rows[0]["flops"]}

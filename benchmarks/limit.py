@@ -134,12 +134,13 @@ def agreement() -> dict[str, float]:
     odd, quiet, noisy = workload.workload(37, 300), workload.workload(256, 60), workload.workload(256, 60, noise=True)
     expected, moved = by_ambjax(odd), np.std(by_ambjax(noisy)[1] - by_ambjax(quiet)[1])
     found = {}
-    # float32: 6000 steps of rounding at 6e-8 relative to the largest state, in a z of a hundredth of that
+    # float32: each of 6000 steps is rounded to 6e-8 of the largest state, and z is a hundredth of that state
     for dtype, allowed in (("float64", 1e-9), ("float32", 1e-3)):
         error = max(np.abs(a / b - 1).max() for a, b in zip(run(odd, dtype), expected, strict=True))
         assert error <= allowed, f"limit.c in {dtype} is off by {error:.1e}"
         ratio = np.std(run(noisy, dtype)[1] - run(quiet, dtype)[1]) / moved
-        # a standard deviation of 256 has a relative error of 1/sqrt(512) = 4.4 %, two of them 6.3 %: four times that
+        # The relative error of a standard deviation of 256 values is 1/sqrt(512) = 4.4 %, and that of a ratio of two
+        # is 6.3 %. The tolerance is four times as large.
         assert abs(ratio - 1) <= 0.25, (
             f"limit.c in {dtype}: its noise moves the rotor {ratio:.2f} times as far as that of ambjax"
         )

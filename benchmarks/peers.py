@@ -264,7 +264,7 @@ def main() -> None:
 
 
 def compare(rows: dict[str, dict[str, Any]], largest: float, ratio: Callable[[str, str], float]) -> None:
-    """Return the speed ratio at the same step, or at no larger error; and at 1e-6 for adaptive peers."""
+    """Add the speed ratio to each row: at the same step, or, for an adaptive peer, at a similar error and at 1e-6."""
     steps = [ours_named(*each) for each in OURS]
 
     def fastest(error: float) -> str:

@@ -19,12 +19,12 @@ import workload
 
 MEMBERS, FULL = (1_000, 10_000, 100_000), 1_000_000
 SAMPLES = (20, 200, 2_000)
-# Held fixed while the other is varied.
+# Number of samples while the members are varied, and number of members while the samples are varied.
 FIXED_SAMPLES, FIXED_MEMBERS = 200, 4_096
-# The reference, short enough to run under the same load as the shortest point; with a long point it runs for a tenth
-# of its time.
+# REFERENCE: members and samples of the reference, which is so short that it meets the same load as the shortest point.
+# SHARE: with a long point, the reference is repeated until it takes 1/SHARE of the time of the point.
 REFERENCE, SHARE = (1_024, 200), 10
-# Rounds of a point: as many as run this many member-samples, but 3 at least and this many at most.
+# A point has WORK / (its member-samples) rounds, but at least 3 and at most MOST_ROUNDS.
 WORK, MOST_ROUNDS = 60_000_000, 45
 
 

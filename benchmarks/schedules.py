@@ -1,14 +1,14 @@
 """Twenty-four scheduled gains: the tuner's search against CMA-ES, and the cost of their gradient.
 
 The task is G20 (two coils, plant varied by 10 %, 20 kHz, one sample of delay), cut to SECONDS s and to few members, so
-that a search takes less than a minute. Each of its eight gains is a schedule with three knots: those of the observer
-and of the position law over the error, the others over the reference. Both searches have the loss, the members, the
-coordinates and the ranges of `search.py`. CMA-ES starts in the middle of the ranges; the tuner's search with a screen,
-in which every schedule is constant. Both start with gains that lose the rotor.
+that a search takes less than a minute. Each of its eight gains is a schedule with three knots. The signal of the
+schedules is the error in the observer and the position law, and the reference in the other laws. Both searches have the
+loss, the members, the coordinates and the ranges of `search.py`. CMA-ES starts in the middle of the ranges. The tuner's
+search starts with a screen, in which every schedule is constant. Both start with gains that lose the rotor.
 
-Each search runs until it has used `--seconds` of processor time on one core, without compilation. Its trace gives the
-least loss of each method at equal processor seconds, and at equal rollouts. There a gradient counts as many rollouts as
-its measured processor time (`cost`); beside it, as in `search.py`, m + 1 for m gains.
+Each search runs until it has used `--seconds` of processor time on one core, without compilation. The traces give the
+least loss of each method at equal processor seconds, and at equal rollouts. A gradient counts as its measured processor
+time relative to a rollout (`cost`), not as m + 1 rollouts for m gains, as in `search.py`.
 Run: python benchmarks/schedules.py [--seeds 5] [--seconds 30] [--processes 2]
 """
 
@@ -42,7 +42,7 @@ REST = "reference", REFERENCES
 
 
 def problem(mode: str | None = None) -> tuple[TuningProblem, Any]:
-    """Return the problem and its members, on one core. `mode`: of differentiation; None: the one the tuner takes."""
+    """Return the problem and its members, on one core. `mode`: of differentiation; None: that of the tuner."""
     raw = copy.deepcopy(load(search.TASKS / "sampled" / "G20.toml")[0])
     raw["controller"]["observer"].setdefault("w", 800.0)
     for path in raw["tune"]["gains"]:

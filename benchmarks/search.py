@@ -7,10 +7,11 @@ search stays inside. The gradient search starts with a screen of the ranges and 
 rotor in all these tasks. A seed changes the random numbers of a method, not the members.
 
 The budget is the median number of rollouts of the gradient search; longer gradient searches are cut there. `--times`
-multiplies the budget of the other methods. The reported loss is the best over the training members, stressed members
-included, at the integration steps of the search. Rollouts do not measure cost: padded lanes are computed too, and a
-derivative costs less than a run. The results therefore include processor seconds of the search on one core, with two
-searches at a time. Existing results of other tasks and methods are kept.
+multiplies the budget of the other methods. The reported loss is the lowest that a method found. It is computed from
+all training members, stressed members included, with the integration steps of the search. The number of rollouts does
+not measure the cost: padded lanes are computed too, and a derivative costs less than a rollout. The results therefore
+include processor seconds of the search on one core, with two searches at a time. Existing results of other tasks and
+methods are kept.
 Run: python benchmarks/search.py [--tasks A B C D E] [--seeds 5] [--times 1] [--methods CMA-ES ...] [--processes 2]
 """
 

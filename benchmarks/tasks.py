@@ -1,5 +1,6 @@
-"""The five tuning tasks, each by `ambjax tune` with its defaults from the gains as printed, which lose the rotor.
+"""Run the five tuning tasks by `ambjax tune` with its defaults.
 
+Each task starts from the printed gains of the paper's laws, which lose the rotor.
 Every task is a case file in tasks/. Its report is written to DIR/TASK, and a task with an existing report is not run
 again. The figures are those of 1,000 held-out members. Results of other tasks are kept.
 Run: python benchmarks/tasks.py [--out DIR] [TASK ...]

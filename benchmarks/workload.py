@@ -93,9 +93,9 @@ def by_ambjax(work: Workload, threads: int = 1, **options: Any) -> Any:
 
 
 def right_side(gamma: float, p_v: float, xp: Any) -> Callable[..., Any]:
-    """The noise-free closed loop f(t, (z, z_dot, i, i_ref), q) -> rates, q the scaled force in A^2/m^2.
+    """Return the right-hand side f(t, (z, z_dot, i, i_ref), q) -> rates of the noise-free closed loop.
 
-    For `math`, `numpy` or `jax.numpy` as `xp`; with `math` Numba compiles it.
+    q: disturbance as scaled force, A^2/m^2. `xp`: `math`, `numpy` or `jax.numpy`; Numba can compile f if it is `math`.
     """
     sin, cos, atan, pi = xp.sin, xp.cos, xp.atan, math.pi
     plant = Plant()

@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     if replayed is not None and replayed.deviation > replayed.rounding:
         say(
             f"trajectory.npz and overview.png reproduce this member only approximately: their metrics differ by up to "
-            f"{100 * replayed.deviation:.2g} % from those of the ensemble. metrics.json has the latter."
+            f"{100 * replayed.deviation:.2g} % from those in the ensemble, which metrics.json contains."
         )
     for warning in reversal(case, float(numbers["max_abs_i_A"])):
         say(warning)

@@ -91,7 +91,7 @@ class Cascade:
         return CascadeState(*(extremes(law)[0].scale_sampled(self.model) for law in self.laws))
 
     def layer(self) -> CascadeState:
-        """Return the largest integration error of each state with which it stays in the boundary layer of its sign."""
+        """Return, for each state, the largest integration error that keeps it in the boundary layer of its sign."""
         layers = ([one.layer(self.model) for one in extremes(law)] for law in self.laws)
         return CascadeState(*(jax.tree.map(lambda *x: functools.reduce(jnp.minimum, x), *each) for each in layers))
 
@@ -120,9 +120,9 @@ class Cascade:
 
         `measured`: readings of z (m), z_dot (m/s) and i (A). `state`: states of all laws. `reference`: r and its rates.
         The rates of z and v_star in the demanded force are total derivatives in time: they include the rates of the
-        reference, z_dot, the nominal z_ddot and the rates of the states of the laws. Only inversion laws without a
-        state use them, to compute i_ref'; XLA removes them for other laws. If the observer estimates the velocity,
-        z_dot is its estimate.
+        reference, z_dot, the nominal z_ddot and the rates of the states of the laws. Static inversions and the adaptive
+        inversion with feed-forward use them to compute i_ref'; XLA removes them for other laws. If the observer
+        estimates the velocity, z_dot is its estimate.
 
         The returned rates of the inversion and current laws are ().
         """
@@ -228,7 +228,7 @@ class Cascade:
 
         point = (sample.reference, measured.z, measured.z_dot, state.observer, state.position)
         (z, v_star), (now, estimate, observed, positioned) = demanded(*point)
-        # Only inversion laws without a state use these rates, to compute i_ref'; XLA removes them for other laws.
+        # The adaptive inversion with feed-forward uses these rates to compute i_ref'; XLA removes them for other laws.
         z_ddot = self.model.z_ddot(estimate.z, estimate.i)
         rates = jax.tree.map(
             lambda a, b: (b - a) / sample.period, (state.observer, state.position), (observed, positioned)

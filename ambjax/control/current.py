@@ -74,9 +74,9 @@ class ProportionalIntegral(CurrentLaw[Array]):
 
     This linear law uses the inductance L at z = 0 and has no motional term. While the supply limits u to clip(u),
     back-calculation limits the integral x at the rate k_aw (Astrom and Murray, Feedback Systems, 2008, 10.4). The
-    default gains for a model give the current loop the bandwidth w = 10 w_m, w_m the pole of the magnets, but at most
-    1/(4 T) on a processor with sample period T: with a sample of delay the phase margin is then above 50 degrees. In
-    the paper's tracking scenario, the default gains hold the rotor, and much lower gains lose it.
+    default gains for a model give the current loop the bandwidth w = 10 w_m, where w_m is the pole of the magnets. On a
+    processor with sample period T, w is at most 1/(4 T): the phase margin is then above 50 degrees with one sample of
+    delay. In the paper's tracking scenario, the default gains hold the rotor, and much lower gains lose it.
     """
 
     k_p: Scalar = gain(default=1.76e5, unit="V/A", doc="proportional gain; left out: w L")
@@ -116,8 +116,7 @@ class ProportionalIntegral(CurrentLaw[Array]):
 
 @record
 class DeadBeat(CurrentLaw[tuple[()]]):
-    """i' = i_ref' - w (i - i_ref) by inversion of Eq. (2); each sample of a processor multiplies i - i_ref by 1 -
-    share.
+    """i' = i_ref' - w (i - i_ref), from Eq. (2). With implicit steps, each sample multiplies i - i_ref by 1 - share.
 
     In continuous time u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - w (i - i_ref)) + R i. On a processor with
     implicit steps u is the constant voltage that, for constant z and z_dot, changes the current in one sample from i to
@@ -150,7 +149,7 @@ class DeadBeat(CurrentLaw[tuple[()]]):
         return (model.kappa / 2) * inverse * wanted + model.R * measured.i, ()
 
     def step(self, model: Plant, inputs: CurrentInputs, state: tuple[()], period: Scalar) -> tuple[Array, tuple[()]]:
-        """Return the voltage for the wanted current at the end, from i' = b u - decay i with b = 2 (s_0+z)/kappa."""
+        """Return the voltage that moves i to its wanted value in a sample: i' = b u - decay i, b = 2 (s_0+z)/kappa."""
         measured, demand = inputs.measured, inputs.demand
         gaps = inputs.gaps or model.gaps(measured.z)
         per_volt = (2 / model.kappa) * gaps.lower
@@ -233,8 +232,9 @@ class AmplifierCurrent(CurrentLaw[tuple[()]]):
 
 
 def _mean_decay(x: Array) -> Array:
-    """Return (1 - exp(-x))/x with |x| limited to 30; near 0, where the difference loses digits, a series replaces the
-    formula.
+    """Return (1 - exp(-x))/x with |x| limited to 30.
+
+    Near 0, where the difference loses digits, a series replaces the formula.
     """
     x = limited(x, 30.0)
     near = jnp.abs(x) < 1e-3

@@ -69,7 +69,7 @@ def run_ensemble(
 
 @functools.cache
 def _rollout(every: int) -> Callable[[tuple[System, Clock, Fold | None]], Outcome]:
-    """Return the rollout of one member. The function is cached, so that it compiles once."""
+    """Return the function that simulates one member. It is cached, so that JAX compiles it once."""
 
     def one(tree: tuple[System, Clock, Fold | None]) -> Outcome:
         system, clock, fold = tree

@@ -51,7 +51,7 @@ def wilson(successes: ArrayLike, n: ArrayLike, confidence: float = 0.95) -> Esti
 
     k, n = np.asarray(successes, float), np.asarray(n, float)
     if not (np.all(n >= 1) and np.all(k >= 0) and np.all(k <= n)):
-        raise ValueError(f"successes = {successes}, n = {n}: there must be at least 1 trial and no more successes.")
+        raise ValueError(f"successes = {successes}, n = {n}: n must be at least 1, and successes from 0 to n.")
     z2, share = ndtri((1 + confidence) / 2) ** 2, k / n
     centre = (share + z2 / (2 * n)) / (1 + z2 / n)
     half = np.sqrt(z2 / n * (share * (1 - share) + z2 / (4 * n))) / (1 + z2 / n)

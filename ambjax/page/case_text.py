@@ -70,7 +70,7 @@ def editable_lines(text: str, given: Sequence[Slider]) -> tuple[list[TemplateLin
 
 
 def _insert(lines: list[TemplateLine], table: str, there: bool, rows: Sequence[tuple[Any, list[int]]]) -> None:
-    """Insert optional lines below the header of a table. If the file lacks the table (`there`), add it at the end."""
+    """Insert optional lines below the header of a table. `there`: whether the file has it; else add it at the end."""
     new = [TemplateLine(*row) for row in rows]
     if there:
         at = next(

@@ -158,7 +158,7 @@ def _name(program: Program, x: Ref) -> str:
 
 
 def _truth(program: Program, x: Ref) -> str:
-    """Return the text after a number of an array that makes it a boolean if the input `x` is one."""
+    """Return the text that converts a number of an array to a boolean if the input `x` is boolean; else ''."""
     return " !== 0" if program.nodes[x.node].dtype.kind == "b" else ""
 
 

@@ -205,7 +205,7 @@ def _alike(case: Case, other: Case) -> bool:
 
 
 def _finest(case: Case, others: list[Case]) -> Case:
-    """Return the case with the integrator of smallest step among all cases."""
+    """Return the case with the integrator that has the smallest step among all cases."""
     period = float(case.clock.sample_period)
     steps = [one.clock for one in (case, *others) if one.clock.integrator.step_size(period) is not None]
     clock = min(steps, key=lambda clock: clock.integrator.step_size(period) or 0.0, default=case.clock)

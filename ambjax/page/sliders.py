@@ -12,7 +12,8 @@ from ambjax.cases.reader import Case
 from ambjax.ensemble.paths import SHIFT, Place, places, with_values
 from ambjax.page.loop_functions import loop_parameters
 
-# The slider of a gain covers its value divided and multiplied by FACTOR; that of the plant's numbers, +-SHARE of them.
+# The slider of a gain ranges from the gain divided by FACTOR to the gain times FACTOR. The slider of a number of the
+# plant ranges from 1 - SHARE to 1 + SHARE times the number.
 FACTOR, SHARE = 30.0, 0.5
 # The slider of another number ends at this multiple of its value.
 TIMES = 5.0

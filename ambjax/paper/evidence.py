@@ -50,7 +50,8 @@ class Survival(NamedTuple):
     """Result of a scan of ascending values.
 
     `upto`: the largest value up to which every member survives; 0 if there is none. `undecided`: the next value, if no
-    member is lost there but the integrator stalled; None if a member is lost there, or if all values are survived.
+    member is lost there but the integrator stalled; None if a member is lost there, or if every member survives all
+    values.
     """
 
     upto: float
@@ -69,7 +70,7 @@ def survival_of(tried: np.ndarray, lost: np.ndarray, stalled: np.ndarray) -> Sur
 
 
 class Noise(NamedTuple):
-    """The noise scan at one sample period (s); each run takes `horizon` (s).
+    """The noise scan at one sample period (s). `horizon`: simulated duration of each run, s.
 
     Arrays with one entry for each of NOISE_STDS: whether a member is lost, whether a member is stalled, and the mean
     over the seeds of the largest settled |sigma|, m/s.

@@ -1,4 +1,4 @@
-"""Findings: the result of one claim in one reading, and what several judges compute."""
+"""Findings: the result of one claim in one reading, and functions that several judges use."""
 
 import dataclasses
 import math

@@ -27,7 +27,8 @@ DIVERGENCE = 1e6
 class ExternalInputs(NamedTuple):
     """External inputs of the loop at one instant.
 
-    The reference, the disturbances q_z (m/s^2) and q_i (A/s), and the runout (m); () if the sensor has none.
+    The reference, the disturbances q_z (m/s^2) and q_i (A/s), and the runout (m). The runout is () if the sensor has
+    none.
     """
 
     reference: Reference
@@ -108,9 +109,9 @@ class ClosedLoop:
         return jax.tree.map(jnp.asarray, LoopState(self.scenario.plant.scale(), self.cascade.scale()))
 
     def layer(self) -> LoopState:
-        """Return the largest integration error of each state with which it stays in the boundary layer of its sign.
+        """Return, for each state, the largest integration error that keeps it in the boundary layer of its sign.
 
-        It is inf for the states of the plant.
+        The value is inf for the states of the plant.
         """
         plant = jax.tree.map(lambda _: jnp.inf, self.scenario.plant.scale())
         return jax.tree.map(jnp.asarray, LoopState(plant, self.cascade.layer()))

@@ -80,8 +80,11 @@ class System(Protocol[S, E, R]):
 
 
 class RolloutState(NamedTuple):
-    """State of a rollout between two samples: the states of the system, the integrator (`memory`) and the fold, and
-    `ending`.
+    """State of a rollout between two samples.
+
+    - `state`: state of the system.
+    - `ending`: the result so far: status of the rotor, and the times of its loss and of the first crossing of C.
+    - `memory`, `fold`: states of the integrator and of the fold.
     """
 
     state: Any
@@ -119,7 +122,7 @@ def prepare(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[ClosedL
 
 
 def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
-    """Raise ValueError for an invalid value that is not traced. The message has its path and a correction.
+    """Raise ValueError for an invalid value that is not traced. The message gives its path and a correction.
 
     Traced values are not checked.
     """

@@ -113,7 +113,7 @@ class Sampled:
         )
 
     def measured(self, plant: object, z_filtered: Array | tuple[()], errors: Errors | FaultyErrors) -> Measurement:
-        """Return the readings of the sensors before faults.
+        """Return the readings of the sensors, before the faults of the position sensor are applied.
 
         `z_filtered`: output of the low-pass of the position sensor, m.
         """

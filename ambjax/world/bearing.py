@@ -115,8 +115,9 @@ class Bearing(Generic[S]):
         return self.i_0 + i, self.i_0 - i
 
     def flux_currents(self, state: S) -> tuple[Array, Array]:
-        """Return the currents (A) that determine the fluxes of the two coils; if the flux has a lag, the delayed
-        currents.
+        """Return the currents (A) that determine the fluxes of the two coils.
+
+        They are the delayed currents if the flux has a lag.
         """
         return self.currents(state)
 

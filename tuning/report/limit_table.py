@@ -124,8 +124,8 @@ def _by_injection(limit: Limit, measured: Sensitivity | None) -> str:
     """Return the text about the injection; '' if injections do not measure the quantity."""
     if limit.name not in MEASURED or measured is None or not measured.peaks[0].repetitions:
         return ""
-    those = f"injected into {len(measured.peaks)} of the worst members"
-    return f"; {those}" if measured.decides else f", or {those} if that is larger"
+    those = f"measured by injection into {len(measured.peaks)} of the worst members"
+    return f"; {those}" if measured.decides else f", or the value {those}, if that is larger"
 
 
 def _saturated(limit: Limit, reached: float | None, measured: Sensitivity | None) -> float | None:

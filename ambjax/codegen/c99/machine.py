@@ -28,7 +28,7 @@ TIME_LIMIT = 60
 def compiler(option: str = "--verify", fix: str = "Install one, set CC, or omit --verify") -> str:
     """Return the C compiler: $CC, or cc, gcc or clang.
 
-    Raises ValueError, with the `option` that needs it and the `fix`, if there is none.
+    Raises ValueError if there is none. The message names the `option` that needs a compiler, and the `fix`.
     """
     requested = os.environ.get("CC")
     for name in [requested] if requested else ["cc", "gcc", "clang"]:

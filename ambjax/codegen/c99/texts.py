@@ -26,9 +26,11 @@ typedef {real} {p}_real;
 /* bits of the status that a step returns */
 {bits}
 
-/* gains, parameters of the model, and limits; each comment: [unit, allowed values] meaning */ {params}
+/* gains, parameters of the model, and limits; each comment: [unit, allowed values] meaning */
+{params}
 
-/* state that one step passes to the next */ {state}
+/* state that one step passes to the next */
+{state}
 
 /* {about.inputs} */
 {input}
@@ -147,7 +149,8 @@ static int differs({p}_real is, {p}_real should)
         }}
     }}
 {start_test}    printf("%d of %d steps agree with JAX, ", count - failed, count);
-    printf("%d failed checks of the start and of bad inputs\\n", faults); return failed > 0 || faults > 0;
+    printf("%d failed checks of the start and of bad inputs\\n", faults);
+    return failed > 0 || faults > 0;
 }}
 """
 

@@ -32,7 +32,7 @@ MODEL = """/* The block of this FMU, for fmu_core.h. */
 #define MODEL_PARAMETERS {parameters}
 #define MODEL_STATES {states}
 #define MODEL_PERIOD {p}_SAMPLE_PERIOD
-/* whether the outputs at the start time are those of a step: a plant reads its sensors */
+/* 1 if the block computes outputs at the start time: a plant and a loop read their sensors there */
 #define MODEL_READS_AT_START {reads}
 
 typedef {p}_params model_params;

@@ -43,7 +43,7 @@ def script_of(block: Block, name: str) -> str:
 
 
 def script(traced: Trace, name: str) -> str:
-    """Return JavaScript that defines this constant for a step that is traced in double precision."""
+    """Return JavaScript that defines the constant `name` as in `script_of`. `traced`: a trace in double precision."""
     body = Body(traced)
     block = traced.block
     lists = {
