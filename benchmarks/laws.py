@@ -25,6 +25,7 @@ import tomlkit
 from ambjax.__main__ import main as ambjax
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
+from tuning.search.checkpoint import checkpoints
 from tuning.space import Gain, Space, tunable
 
 SAMPLED = tasks.TASKS / "sampled"
@@ -182,7 +183,7 @@ def tuned(path: pathlib.Path, folder: pathlib.Path) -> pathlib.Path:
     """Tune a case file unless this was done, and return the path of the tuned case, which has the name of the law."""
     answer, search = folder / path.name, folder / path.stem
     if not answer.exists():
-        command("tune", str(path), "--out", str(search), *["--resume"] * any(search.glob("checkpoint-*.npz")))
+        command("tune", str(path), "--out", str(search), *["--resume"] * bool(checkpoints(search)))
         folder.mkdir(exist_ok=True)
         answer.write_text((search / "tuned.toml").read_text())
     return answer

@@ -65,7 +65,7 @@ class Law:
         return None
 
     def layer(self, model: Plant) -> object:
-        """Return the largest integration error of each state with which it stays in the boundary layer of its sign.
+        """Return, for each state, the largest integration error that keeps it in the boundary layer of its sign.
 
         The default is inf, which is the value for a state that no sign moves.
         """
