@@ -2589,7 +2589,7 @@ SURROUNDINGS = [
     ),
     M(
         "a reader that closes stdout changes the exit code of a negative verdict",
-        "ambjax/__main__.py",
+        "ambjax/host/command_line.py",
         "if failure is None or isinstance(failure, BrokenPipeError):",
         "if failure is None:",
         "tests/test_surroundings.py::test_the_exit_code_does_not_change_if_the_reader_closes_stdout",

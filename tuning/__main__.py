@@ -4,7 +4,7 @@ import argparse
 import sys
 
 from ambjax import __version__
-from ambjax.__main__ import Parser, run_command
+from ambjax.host.command_line import Parser, run_command
 from ambjax.host.interrupts import exit_on_interrupt
 from ambjax.host.streams import open_streams
 

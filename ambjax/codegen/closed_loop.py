@@ -15,7 +15,8 @@ from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.rollout import begin, segment
-from ambjax.simulation.sampled import Sampled, SampledState
+from ambjax.simulation.sampled import Sampled
+from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.system import system_of
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference

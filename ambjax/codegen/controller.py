@@ -23,7 +23,8 @@ from ambjax.control.guard import GAPS, Watch, guarded
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.simulation.integrate import choose
 from ambjax.simulation.loop import ClosedLoop
-from ambjax.simulation.sampled import Sampled, SampledState
+from ambjax.simulation.sampled import Sampled
+from ambjax.simulation.sampled_state import SampledState
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference

@@ -34,7 +34,8 @@ from ambjax.numerics.smooth import limited
 from ambjax.simulation.between import lags, plant_status
 from ambjax.simulation.integrate import FixedSteps, choose
 from ambjax.simulation.loop import ClosedLoop
-from ambjax.simulation.sampled import Sampled, SampledState
+from ambjax.simulation.sampled import Sampled
+from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED
 from ambjax.world.amplifier import Amplifier, CurrentAmplifier
 from ambjax.world.bearing import Bearing

@@ -23,7 +23,8 @@ from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.integrate import Advanced, Integrator
 from ambjax.simulation.rollout import run
-from ambjax.simulation.sampled import Sampled, SampledState
+from ambjax.simulation.sampled import Sampled
+from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.system import system_of
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, FaultyErrors

@@ -10,7 +10,8 @@ from ambjax.control.cascade_state import Command
 from ambjax.numerics.records import Scalar, leaf, part, record, static
 from ambjax.simulation.folds import Ending
 from ambjax.simulation.loop import ClosedLoop, Realised
-from ambjax.simulation.sampled import Sampled, SampledState
+from ambjax.simulation.sampled import Sampled
+from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.trajectory import Row
 from ambjax.world.sensor import Errors, FaultyErrors, Measurement
 from ambjax.world.signals import Reference

@@ -7,14 +7,14 @@ under one voltage, or under two if the delay is not a whole number of samples.
 
 import dataclasses
 import itertools
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from ambjax.compiler.barrier import materialised
-from ambjax.control.cascade_state import CascadeState, Command, Sample
+from ambjax.control.cascade_state import Command, Sample
 from ambjax.control.guard import GuardResult, Watch, expected
 from ambjax.control.processor import Processor
 from ambjax.numerics.records import Scalar, record, static
@@ -22,38 +22,12 @@ from ambjax.numerics.smooth import limited
 from ambjax.simulation.between import acting, amplified, lags, plant_status, sensed_motion, subproblems
 from ambjax.simulation.integrate import Advanced, Integrator, choose, in_turn
 from ambjax.simulation.loop import ClosedLoop, LoopState
+from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import DIVERGED, Row
 from ambjax.world.faults import Sensed
 from ambjax.world.sensor import Errors, FaultyErrors, Measurement
 from ambjax.world.signals import Reference, reference_at
-
-
-class SampledState(NamedTuple):
-    """State of the closed loop on a processor. A field is () if the loop has no such part.
-
-    - `plant`, `control`: states of the plant and of the laws.
-    - `command`: last command, with u within the limit of the supply.
-    - `past`: the two voltages before that of `command`, V, the most recent first.
-    - `finite`: 1 at the start; 0 after a law or the sensor has returned NaN or infinity.
-    - `z_filtered`: output of the low-pass of the position sensor, m.
-    - `u_a`: output voltage of the amplifier, V.
-    - `watch`: state of the guard.
-    - `started`: 0 until the guard has accepted all readings of one sample; then 1. Until then, each sample initialises
-      the laws.
-    - `sensed`: state of a sensor with faults.
-    """
-
-    plant: Any
-    control: CascadeState
-    command: Command
-    past: tuple[Array, Array]
-    finite: Array
-    z_filtered: Array | tuple[()]
-    u_a: Array | tuple[()]
-    watch: Any = ()
-    started: Array | tuple[()] = ()
-    sensed: Sensed | tuple[()] = ()
 
 
 @record

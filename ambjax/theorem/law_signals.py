@@ -8,7 +8,8 @@ from jax import Array
 from ambjax.control.cascade_state import Sample
 from ambjax.numerics.records import Scalar, record
 from ambjax.simulation.integrate import Advanced, Integrator
-from ambjax.simulation.sampled import Sampled, SampledState
+from ambjax.simulation.sampled import Sampled
+from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.span import Span
 from ambjax.world.sensor import Errors, FaultyErrors
 

@@ -1,0 +1,107 @@
+"""Command lines: arguments, errors on one line, a summary as JSON, and exit codes."""
+
+import argparse
+import contextlib
+import difflib
+import errno
+import json
+import re
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
+from typing import Any, NoReturn
+
+from ambjax.host.streams import lenient
+from ambjax.host.words import one_line
+
+# Errors of a file system that another folder or free space may resolve.
+UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO)
+
+
+class Parser(argparse.ArgumentParser):
+    """Argument parser that prints an error on one line and exits with code 2.
+
+    `commands`: the parsers of the commands by name.
+    """
+
+    commands: Mapping[str, argparse.ArgumentParser] = MappingProxyType({})
+
+    def error(self, message: str) -> NoReturn:
+        end = "" if message.endswith("?") else "."
+        sys.exit(complain(f"{message}{end} See '{self.prog} --help'.", self.prog.split()[0]))
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Parse the arguments. For an unknown command or option, the error names the most similar one."""
+        words = list(sys.argv[1:] if args is None else args)
+        if self.commands and words and not words[0].startswith("-") and words[0] not in self.commands:
+            known = f"It must be one of {', '.join(self.commands)}"
+            self.error(f"{words[0]!r} is no command. {known}.{_similar(words[0], self.commands)}".rstrip("."))
+        parsed, unknown = self.parse_known_args(words, namespace)
+        if unknown:
+            used = self.commands.get(getattr(parsed, "command", ""), self)
+            options = re.findall(r"--[a-z-]+", used.format_usage())
+            used.error(f"unrecognized arguments: {' '.join(unknown)}.{_similar(unknown[0], options)}".rstrip("."))
+        return parsed
+
+
+def _similar(word: str, names: Iterable[str]) -> str:
+    """Return ' Did you mean NAME?' with the most similar name, or ''."""
+    close = difflib.get_close_matches(word.partition("=")[0], list(names), n=1, cutoff=0.7)
+    return f" Did you mean {close[0]!r}?" if close else ""
+
+
+def complain(message: str, program: str = "ambjax") -> int:
+    """Print an error message on one line of stderr and return exit code 2. A failure of stderr is ignored."""
+    with contextlib.suppress(OSError):
+        print(one_line(f"{program}: {message}"), file=sys.stderr)
+    return 2
+
+
+Run = Callable[[argparse.Namespace], tuple[int, object]]
+
+
+def run_command(parser: argparse.ArgumentParser, words: list[str] | None, run: Run) -> int:
+    """Parse the arguments `words`, call `run`, print its summary if --json is given, and return the exit code.
+
+    `run` returns an exit code and a summary. An error is printed on one line of stderr. The command continues if stdout
+    cannot be written. A closed pipe (`| head`) is not an error; any other failure of stdout gives exit code 2. Raises
+    SystemExit for --help, --version and wrong arguments, as argparse does.
+    """
+    with lenient() as stdout:
+        try:
+            args = parser.parse_args(words)
+        except SystemExit as end:  # wrong arguments, or the output of --help and --version
+            if end.code or stdout.failure() is None:
+                raise
+            code = 0
+        else:
+            code = _code(lambda: run(args), getattr(args, "json", False), parser.prog)
+        failure = stdout.failure()
+        if failure is None or isinstance(failure, BrokenPipeError):
+            return code
+        why = getattr(failure, "strerror", None) or failure
+        return complain(f"cannot write to stdout: {why}. Free disk space, or redirect the output.", parser.prog)
+
+
+def _code(run: Callable[[], tuple[int, object]], as_json: bool, program: str) -> int:
+    """Call `run` and return its exit code. Print an error that a user can correct as one line, and return 2."""
+    try:
+        code, summary = run()
+        if as_json:
+            print(json.dumps(summary, indent=2))
+    except ValueError as error:
+        return complain(str(error), program)
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        fix = " Free disk space, or write elsewhere." if error.errno in UNWRITABLE else ""
+        return complain(f"{where}{error.strerror or error}.{fix}", program)
+    except MemoryError:
+        return complain("not enough memory. Use fewer members or samples.", program)
+    except (NotImplementedError, RecursionError):  # these subclasses of RuntimeError are bugs of ambjax
+        raise
+    except RuntimeError as error:  # JAX: a device is missing, or its memory is full
+        return complain(str(error).strip().partition("\n")[0] or type(error).__name__, program)
+    except KeyboardInterrupt as stop:
+        complain(f"interrupted{f': {stop}' if str(stop) else ''}.", program)
+        return 130
+    return code

@@ -1,0 +1,35 @@
+"""State of the closed loop of a cascade on a processor."""
+
+from typing import Any, NamedTuple
+
+from jax import Array
+
+from ambjax.control.cascade_state import CascadeState, Command
+from ambjax.world.faults import Sensed
+
+
+class SampledState(NamedTuple):
+    """State of the closed loop on a processor. A field is () if the loop has no such part.
+
+    - `plant`, `control`: states of the plant and of the laws.
+    - `command`: last command, with u within the limit of the supply.
+    - `past`: the two voltages before that of `command`, V, the most recent first.
+    - `finite`: 1 at the start; 0 after a law or the sensor has returned NaN or infinity.
+    - `z_filtered`: output of the low-pass of the position sensor, m.
+    - `u_a`: output voltage of the amplifier, V.
+    - `watch`: state of the guard.
+    - `started`: 0 until the guard has accepted all readings of one sample; then 1. Until then, each sample initialises
+      the laws.
+    - `sensed`: state of a sensor with faults.
+    """
+
+    plant: Any
+    control: CascadeState
+    command: Command
+    past: tuple[Array, Array]
+    finite: Array
+    z_filtered: Array | tuple[()]
+    u_a: Array | tuple[()]
+    watch: Any = ()
+    started: Array | tuple[()] = ()
+    sensed: Sensed | tuple[()] = ()
