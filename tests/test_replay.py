@@ -171,7 +171,7 @@ def test_a_deviation_is_reported(monkeypatch, capsys):
     answer = capsys.readouterr()
     assert json.loads(answer.out)["trajectory_deviation"] == 0.125
     (line,) = [line for line in answer.err.splitlines() if "trajectory.npz" in line]
-    assert "from those of the ensemble" in line
+    assert "from those in the ensemble" in line
     assert "12 %" in line
 
 
