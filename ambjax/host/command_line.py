@@ -46,7 +46,7 @@ class Parser(argparse.ArgumentParser):
 
 def _similar(word: str, names: Iterable[str]) -> str:
     """Return ' Did you mean NAME?' with the most similar name, or ''."""
-    close = difflib.get_close_matches(word.partition("=")[0], list(names), n=1, cutoff=0.7)
+    close = difflib.get_close_matches(word.partition("=")[0], list(names), n=1, cutoff=0.75)
     return f" Did you mean {close[0]!r}?" if close else ""
 
 
