@@ -15,11 +15,10 @@ LARGEST = 512 * 2**20
 # Resident memory above which the programs of a module are released when it ends (bytes).
 MUCH = 700 * 2**20
 
-# Each worker has a core of its own: workers whose threads share the cores take an eighth more time.
+# Workers whose threads share the cores take an eighth more time.
 _worker = os.environ.get("PYTEST_XDIST_WORKER", "")
-if _worker.startswith("gw") and hasattr(os, "sched_setaffinity"):
-    _cores = sorted(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, {_cores[int(_worker[2:]) % len(_cores)]})
+if _worker.startswith("gw"):
+    quick.take_core(int(_worker[2:]))
 
 # Compilation takes most of the tests' time. The thorough profile compiles as users do.
 if not THOROUGH:

@@ -2588,6 +2588,20 @@ SURROUNDINGS = [
         "tests/test_surroundings.py::test_a_study_that_another_run_has_started_meanwhile_is_refused",
     ),
     M(
+        "every error of a file is answered by advice on the disk space",
+        "ambjax/host/command_line.py",
+        "if error.errno in UNWRITABLE else",
+        "if True else",
+        "tests/test_cli.py::test_only_an_error_of_writing_is_answered_by_advice_on_the_disk",
+    ),
+    M(
+        "an error suggests an option that is not similar",
+        "ambjax/host/command_line.py",
+        "n=1, cutoff=0.75)",
+        "n=1, cutoff=0.7)",
+        "tests/test_cli.py::test_bad_flags",
+    ),
+    M(
         "a reader that closes stdout changes the exit code of a negative verdict",
         "ambjax/host/command_line.py",
         "if failure is None or isinstance(failure, BrokenPipeError):",

@@ -1,6 +1,8 @@
 """The command line: outputs, exit codes, and messages for bad input."""
 
+import errno
 import json
+import os
 import pathlib
 import re
 
@@ -8,13 +10,14 @@ import numpy as np
 import pytest
 from texts import write
 
-from ambjax.__main__ import main
+from ambjax.__main__ import main, parser
 from ambjax.cases.controller_tables import KINDS
 from ambjax.cases.reader import case_from, read_case
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.template_text import template
 from ambjax.commands.outputs import directory
 from ambjax.ensemble import replay
+from ambjax.host.command_line import run_command
 from ambjax.paper.readings import CLOCK, SETTLE, cascade, scenario
 
 SHORT = "[clock]\nduration = 0.05\n"
@@ -141,6 +144,7 @@ def test_bad_files_and_folders(capsys):
         (["levitate"], "'levitate' is no command. It must be one of reproduce, "),
         (["simulate", "case.toml", "--ouput=x"], ": --ouput=x. Did you mean '--out'? See 'ambjax simulate --help'.\n"),
         (["export", "case.toml", "--to", "x"], "unrecognized arguments: --to x. See 'ambjax export --help'.\n"),
+        (["tune", "case.toml", "--iteration", "3"], "arguments: --iteration 3. See 'ambjax tune --help'.\n"),
         (["simulate"], "CASE.toml"),
         (["simulate", "case.toml", "--outt", "x"], "--outt"),
         (["template", "levitation"], "invalid choice"),
@@ -154,6 +158,17 @@ def test_bad_flags(argv, words, capsys):
     err = capsys.readouterr().err
     assert words in err
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("number", "advice"), [(errno.ENOSPC, " Free disk space, or write elsewhere."), (errno.ENOENT, "")]
+)
+def test_only_an_error_of_writing_is_answered_by_advice_on_the_disk(number, advice, capsys):
+    def run(args):
+        raise OSError(number, os.strerror(number), "x.csv")
+
+    assert run_command(parser(), ["simulate", "case.toml"], run) == 2
+    assert capsys.readouterr().err == f"ambjax: x.csv: {os.strerror(number)}.{advice}\n"
 
 
 def test_without_a_command_the_help_lists_the_first_commands(capsys):

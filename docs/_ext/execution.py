@@ -20,6 +20,7 @@ from jupyter_cache import get_cache
 from jupyter_cache.base import CacheBundleIn
 from jupyter_cache.executors.utils import ExecutionResult, single_nb_execution
 from myst_nb.core.read import create_nb_reader
+from quick import take_core
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 from sphinx.util import logging as sphinx_logging
@@ -54,7 +55,7 @@ def execute(app: Sphinx, env: Any, docnames: list[str]) -> None:
     # Searches take longest. The pages that contain them start first, so that no core is idle at the end.
     paths.sort(key=lambda path: -path.read_text(encoding="utf-8").count("\nambjax tune "))
     places = itertools.count()
-    with concurrent.futures.ThreadPoolExecutor(AT_ONCE, initializer=lambda: _take_core(next(places))) as pool:
+    with concurrent.futures.ThreadPoolExecutor(AT_ONCE, initializer=lambda: take_core(next(places))) as pool:
         running = {}
         for path in paths:
             reader = create_nb_reader(str(path), env.myst_config, env.mystnb_config, path.read_text(encoding="utf-8"))
@@ -72,13 +73,6 @@ def execute(app: Sphinx, env: Any, docnames: list[str]) -> None:
             logger.info("executed %s in %.1f s", path.name, result.time)
             bundle = CacheBundleIn(result.nb, str(path), data={"execution_seconds": result.time})
             cache.cache_notebook_bundle(bundle, check_validity=False, overwrite=True)
-
-
-def _take_core(place: int) -> None:
-    """Restrict this thread, and the processes that it starts, to one core: threads that share cores take longer."""
-    if hasattr(os, "sched_setaffinity"):
-        cores = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {cores[place % len(cores)]})
 
 
 def _run(notebook: Any, timeout: int) -> ExecutionResult:
