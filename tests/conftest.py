@@ -9,6 +9,8 @@ import pytest
 import quick
 from profiles import THOROUGH
 
+from ambjax.host.command_line import GC_THRESHOLDS
+
 # One cache of compiled programs for all processes of a run, kept for the next run; removed when it is larger (bytes).
 CACHE = pathlib.Path(__file__).parent.parent / ".pytest_cache" / "programs"
 LARGEST = 512 * 2**20
@@ -31,8 +33,8 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 
-# Tracing allocates millions of long-lived objects, which the garbage collector would visit repeatedly.
-gc.set_threshold(100_000, 20, 20)
+# As in the commands.
+gc.set_threshold(*GC_THRESHOLDS)
 
 
 def pytest_configure(config):

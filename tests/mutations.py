@@ -1887,6 +1887,20 @@ SAMPLED = [
 ]
 CHECK = [
     M(
+        "an option that this version of XLA does not know stops the linearisation",
+        "ambjax/compiler/short_compilation.py",
+        "in options.items() if _knows(name, value)}",
+        "in options.items()}",
+        "tests/test_linear.py::test_options_that_this_version_of_xla_does_not_know_are_left_out",
+    ),
+    M(
+        "a command leaves the thresholds of the garbage collector",
+        "ambjax/host/command_line.py",
+        "    gc.set_threshold(*GC_THRESHOLDS)\n",
+        "",
+        "tests/test_cli.py::test_a_command_collects_garbage_rarely",
+    ),
+    M(
         "a delay that is probably in seconds does not cause a warning",
         "ambjax/commands/plausibility.py",
         "0 < float(processor.delay) < LEAST_DELAY",

@@ -1,6 +1,7 @@
 """The command line: outputs, exit codes, and messages for bad input."""
 
 import errno
+import gc
 import json
 import os
 import pathlib
@@ -17,7 +18,7 @@ from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.template_text import template
 from ambjax.commands.outputs import directory
 from ambjax.ensemble import replay
-from ambjax.host.command_line import run_command
+from ambjax.host.command_line import GC_THRESHOLDS, run_command
 from ambjax.paper.readings import CLOCK, SETTLE, cascade, scenario
 
 SHORT = "[clock]\nduration = 0.05\n"
@@ -169,6 +170,16 @@ def test_only_an_error_of_writing_is_answered_by_advice_on_the_disk(number, advi
 
     assert run_command(parser(), ["simulate", "case.toml"], run) == 2
     assert capsys.readouterr().err == f"ambjax: x.csv: {os.strerror(number)}.{advice}\n"
+
+
+def test_a_command_collects_garbage_rarely(capsys):
+    before = gc.get_threshold()
+    gc.set_threshold(700, 10, 10)  # Python's own
+    try:
+        assert main([]) == 0
+        assert gc.get_threshold() == GC_THRESHOLDS
+    finally:
+        gc.set_threshold(*before)
 
 
 def test_without_a_command_the_help_lists_the_first_commands(capsys):

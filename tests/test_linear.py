@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from ambjax import Cascade, Clock, Plant, Scenario, Sensor
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
+from ambjax.compiler.short_compilation import SHORTEST, known
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.processor import Processor
 from ambjax.linear import (
@@ -35,7 +36,7 @@ from ambjax.world.coils import TwoCoil
 from ambjax.world.sensor import Errors
 
 T = 1e-4
-QUICK = {"xla_backend_optimization_level": 0}  # each program runs once
+QUICK = known(SHORTEST)  # each program runs once
 CLOCK = Clock(samples=10, sample_period=T)
 SMOOTH = {
     "position": position.SlidingMode(c=200.0, k=63.0, p=5.0),
@@ -53,6 +54,11 @@ LOOPS = {
     "lags": (Processor(1.0), {"observer": observer.Kalman(w=1000.0)},
              Scenario(sensor=SLUGGISH, amplifier=Amplifier(bandwidth=1500.0, slew=1e6, dead_band=0.1)), 5e-4),
 }  # fmt: skip
+
+
+def test_options_that_this_version_of_xla_does_not_know_are_left_out():
+    level = {"xla_backend_optimization_level": 0}
+    assert known(level | {"xla_no_such_option": True}) == level
 
 
 def loop_of(name):

@@ -16,6 +16,7 @@ from jax import Array, lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from ambjax.compiler.fast_path import block_length, one_kernel
+from ambjax.compiler.short_compilation import compiled_quickly
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
@@ -209,7 +210,7 @@ def _blocks(
 
 STATIC = ("function", "moves", "tree", "block", "vectorised")
 _fast = one_kernel(_blocks, static_argnames=STATIC)
-_plain = jax.jit(_blocks, static_argnames=STATIC)
+_plain = compiled_quickly(_blocks, static_argnames=STATIC)
 
 
 @functools.cache
@@ -226,7 +227,7 @@ def _program(devices: int, plain: bool) -> Callable[..., Any]:
         where = {"mesh": mesh, "in_specs": (Parts(by_member, replicated),), "out_specs": by_member, "check_vma": False}
         return jax.shard_map(one, **where)(parts)
 
-    compiled = jax.jit if plain else one_kernel
+    compiled = compiled_quickly if plain else one_kernel
     kernel = compiled(sharded, static_argnames=STATIC)
 
     def placed(parts: Parts, **static: object) -> object:

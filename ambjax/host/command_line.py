@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import difflib
 import errno
+import gc
 import json
 import re
 import sys
@@ -16,6 +17,9 @@ from ambjax.host.words import one_line
 
 # Errors of a file system that another folder or free space may resolve.
 UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO)
+# Thresholds of the garbage collector. Imports and tracing allocate millions of objects that live until the end of a
+# command; with Python's own thresholds, repeated visits to them take an eighth of the time of `simulate`.
+GC_THRESHOLDS = (100_000, 20, 20)
 
 
 class Parser(argparse.ArgumentParser):
@@ -67,6 +71,7 @@ def run_command(parser: argparse.ArgumentParser, words: list[str] | None, run: R
     cannot be written. A closed pipe (`| head`) is not an error; any other failure of stdout gives exit code 2. Raises
     SystemExit for --help, --version and wrong arguments, as argparse does.
     """
+    gc.set_threshold(*GC_THRESHOLDS)
     with lenient() as stdout:
         try:
             args = parser.parse_args(words)

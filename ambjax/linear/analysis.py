@@ -3,9 +3,9 @@
 import dataclasses
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
+from ambjax.compiler.short_compilation import SHORTEST, compiled_quickly
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
 from ambjax.linear.margins import STATIC, Margins, ResponsePeak, margins_of, noise_gain, peak, poles_in_s
@@ -16,8 +16,7 @@ from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import prepare
 from ambjax.world.scenario import Scenario
 
-# The program runs only a few times. Most optimisations of XLA would therefore cost more time than they save.
-_matrices = jax.jit(loop_matrices, compiler_options={"xla_backend_optimization_level": 0})
+_matrices = compiled_quickly(loop_matrices, options=SHORTEST)
 
 
 @record
