@@ -1,4 +1,4 @@
-"""Time of whole commands: new processes of `ambjax` with a warm compilation cache, against `import jax` alone.
+"""Time of whole commands in new processes, with an empty and with a filled cache of programs, against `import jax`.
 
 The commands run in turn, so that all of them meet the same load. CPU seconds (user and system) depend least on other
 load; wall seconds are the waiting time on an idle machine. Run: python benchmarks/startup.py
@@ -6,6 +6,7 @@ load; wall seconds are the waiting time on an idle machine. Run: python benchmar
 
 import os
 import pathlib
+import shutil
 import statistics
 import subprocess
 import sys
@@ -15,12 +16,14 @@ import time
 import _measure
 
 RUNS = 5
+FIRST_RUNS = 3
 
 
-def spent(command: list[str]) -> tuple[float, float]:
-    """Return the wall and CPU seconds of one process; its output is discarded."""
+def spent(command: list[str], cache: pathlib.Path) -> tuple[float, float]:
+    """Return the wall and CPU seconds of one process; its output is discarded. `cache`: folder for the programs."""
+    environment = os.environ | {"XDG_CACHE_HOME": str(cache)}
     before, began = os.times(), time.perf_counter()
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     wall, after = time.perf_counter() - began, os.times()
     if done.returncode not in (0, 1):
         raise RuntimeError(f"{' '.join(command)}: {done.stderr}")
@@ -28,33 +31,48 @@ def spent(command: list[str]) -> tuple[float, float]:
     return wall, children
 
 
+def commands(folder: pathlib.Path) -> dict[str, list[str]]:
+    """Return the measured commands by name."""
+    ambjax = [sys.executable, "-m", "ambjax"]
+    found = {
+        "import jax": [sys.executable, "-c", "import jax"],
+        "ambjax --version": [*ambjax, "--version"],
+        "ambjax-tune --version": [sys.executable, "-m", "tuning", "--version"],
+    }
+    for name in ("tracking", "rig"):
+        case = folder / f"{name}.toml"
+        case.write_text(subprocess.run([*ambjax, "template", name], capture_output=True, text=True, check=True).stdout)
+        found[f"ambjax check {name}.toml"] = [*ambjax, "check", str(case)]
+        out = ["--out", str(folder / name), "--force"]
+        found[f"ambjax simulate {name}.toml"] = [*ambjax, "simulate", str(case), *out]
+    return found | {"ambjax reproduce": [*ambjax, "reproduce", "--out", str(folder / "reproduce"), "--force"]}
+
+
 def main() -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        ambjax = [sys.executable, "-m", "ambjax"]
-        case = pathlib.Path(folder) / "tracking.toml"
-        case.write_text(subprocess.run([*ambjax, "template"], capture_output=True, text=True, check=True).stdout)
-        commands = {
-            "import jax": [sys.executable, "-c", "import jax"],
-            "ambjax --version": [*ambjax, "--version"],
-            "ambjax-tune --version": [sys.executable, "-m", "tuning", "--version"],
-            "ambjax check": [*ambjax, "check", str(case)],
-            "ambjax simulate": [*ambjax, "simulate", str(case), "--out", folder, "--force"],
-        }
-        found: dict[str, list[tuple[float, float]]] = {name: [] for name in commands}
+    with tempfile.TemporaryDirectory() as name:
+        folder = pathlib.Path(name)
+        tasks, cache = commands(folder), folder / "cache"
+        firsts: dict[str, list[float]] = {name: [] for name in tasks}
+        found: dict[str, list[tuple[float, float]]] = {name: [] for name in tasks}
+        for _ in range(FIRST_RUNS):
+            for name, command in tasks.items():
+                shutil.rmtree(cache, ignore_errors=True)
+                firsts[name].append(spent(command, cache)[0])
         for turn in range(RUNS + 1):
-            for name, command in commands.items():
-                times = spent(command)
+            for name, command in tasks.items():
+                times = spent(command, cache)
                 if turn:  # the first compiles
                     found[name].append(times)
     rows = {}
     for name, times in found.items():
         wall, cpu = (statistics.median(column) for column in zip(*times, strict=True))
-        rows[name] = {"wall_s": wall, "cpu_s": cpu, "least_wall_s": min(w for w, _ in times)}
+        least, first = min(w for w, _ in times), statistics.median(firsts[name])
+        rows[name] = {"first_wall_s": first, "wall_s": wall, "least_wall_s": least, "cpu_s": cpu}
     base = rows["import jax"]["cpu_s"]
     for name, row in rows.items():
         row["cpu_over_import_jax"] = row["cpu_s"] / base
-        print(f"{name:24s} wall {row['wall_s']:.2f} s (least {row['least_wall_s']:.2f}), CPU {row['cpu_s']:.2f} s")
-    _measure.write("startup", {"runs": RUNS, "rows": rows})
+        print(f"{name:30s} first {row['first_wall_s']:.2f} s, later {row['wall_s']:.2f} s, CPU {row['cpu_s']:.2f} s")
+    _measure.write("startup", {"runs": RUNS, "first_runs": FIRST_RUNS, "rows": rows})
 
 
 if __name__ == "__main__":

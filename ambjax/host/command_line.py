@@ -1,6 +1,7 @@
 """Command lines: arguments, errors on one line, a summary as JSON, and exit codes."""
 
 import argparse
+import atexit
 import contextlib
 import difflib
 import errno
@@ -72,6 +73,7 @@ def run_command(parser: argparse.ArgumentParser, words: list[str] | None, run: R
     SystemExit for --help, --version and wrong arguments, as argparse does.
     """
     gc.set_threshold(*GC_THRESHOLDS)
+    atexit.register(gc.freeze)  # at exit, Python would visit all objects once more
     with lenient() as stdout:
         try:
             args = parser.parse_args(words)
