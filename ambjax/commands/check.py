@@ -4,6 +4,8 @@ import argparse
 import dataclasses
 import math
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +13,7 @@ from ambjax.cases.reader import Case
 from ambjax.commands.acceptance import acceptance, forces
 from ambjax.commands.outputs import plain, say, table
 from ambjax.commands.warnings import idealised, read_with_warnings
-from ambjax.theorem.conditions import Condition, check
+from ambjax.theorem.conditions import Condition, Report, check
 from ambjax.theorem.sampled_report import Delays, SampledReport
 
 Summary = dict[str, object]
@@ -38,9 +40,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     from ambjax.theorem import advice
 
     case = read_with_warnings(args.case)
-    duration = float(case.clock.duration)
-    say(f"checking Theorem 1: simulating {duration:g} s in continuous time")
-    report = check(case.cascade, case.scenario, case.clock, case.settle)
+    report, (loop, text), on_processor = _results(case)
     summary = {
         "holds": report.holds,
         "lost_at_s": report.lost_at,
@@ -49,10 +49,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         "method": report.method,
         "conditions": [_condition(c) for c in report.conditions],
         "proof": [_condition(c) for c in report.proof],
+        "loop": loop,
     }
-    say("linearising the loop")
-    loop, text = acceptance(case)
-    summary |= {"loop": loop}
     if not args.json:
         print(text)
         if ideal := idealised(case):
@@ -61,37 +59,68 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     if not args.json and largest < weight:
         words = f"their largest force is {largest:.4g} N, below its weight of {weight:.4g} N"
         print(f"\nThe magnets cannot carry the rotor: {words}.")
-    if case.cascade.processor is not None:
-        summary |= _on_processor(case, args)
+    if on_processor is not None:
+        summary |= _processor_summary(case, args, on_processor)
     else:
         summary |= _clearance(case, args, report.largest_z)
     if not args.json:
         print("\nTheorem 1:\n")
         _print_check(report.conditions, report.proof)
         print("\n" + "\n".join(advice.theorem_lines(report, args.case)))
-        if case.cascade.processor is not None:
+        if on_processor is not None:
             print(CONTINUOUS)
     summary["holds"] = bool(summary["holds"]) and largest >= weight
     return int(not summary["holds"]), plain(summary)
 
 
-def _on_processor(case: Case, args: argparse.Namespace) -> Summary:
-    """Check and print the conditions on the processor of the case.
+class _OnProcessor(NamedTuple):
+    """Results of the loop on the case's processor; `unknown`: the delay margin if the prediction uses its delay."""
 
-    Return their summary; "holds" is True if all conditions hold.
+    sampled: SampledReport
+    margin: Delays
+    unknown: Delays | None
+
+
+def _results(case: Case) -> tuple[Report, tuple[Summary, str], _OnProcessor | None]:
+    """Return the report of Theorem 1, the summary and text of the linearised loop, and the results on the processor.
+
+    Theorem 1 is checked in a second thread: compiling and simulating release the GIL.
     """
-    from ambjax.ensemble.delays import DELAYS, delay_margin
+    with ThreadPoolExecutor(1) as pool:
+        say(f"checking Theorem 1: simulating {float(case.clock.duration):g} s in continuous time")
+        theorem = pool.submit(check, case.cascade, case.scenario, case.clock, case.settle)
+        say("linearising the loop")
+        loop, on_processor = acceptance(case), None
+        if case.cascade.processor is not None:
+            on_processor = _OnProcessor(_sampled(case), *_margins(case))
+        return theorem.result(), loop, on_processor
+
+
+def _sampled(case: Case) -> SampledReport:
     from ambjax.ensemble.replay import as_member, record_system
-    from ambjax.theorem import advice, sampled_report
+    from ambjax.theorem.sampled_report import check_sampled
 
     say("simulating on the processor, with and without noise")
-    scenario = as_member(case.scenario)
-    sampled = sampled_report.check_sampled(case.cascade, scenario, case.clock, case.settle, record_system)
+    return check_sampled(case.cascade, as_member(case.scenario), case.clock, case.settle, record_system)
+
+
+def _margins(case: Case) -> tuple[Delays, Delays | None]:
+    """Return the delay margin if the prediction uses the actual delay, and if it uses the case's (None: without it)."""
+    from ambjax.ensemble.delays import DELAYS, delay_margin
+
     say(f"finding the delay margin: simulating {DELAYS} delays, twice if the rotor is lost at one of them")
-    margin, unknown = delay_margin(case.cascade, case.scenario, case.clock), None
-    if (processor := case.cascade.processor) is not None and processor.predict is not False:
-        say("finding the delay margin again: the prediction uses the delay of the case")
-        unknown = delay_margin(case.cascade, case.scenario, case.clock, known=False)
+    margin = delay_margin(case.cascade, case.scenario, case.clock)
+    if (processor := case.cascade.processor) is None or processor.predict is False:
+        return margin, None
+    say("finding the delay margin again: the prediction uses the delay of the case")
+    return margin, delay_margin(case.cascade, case.scenario, case.clock, known=False)
+
+
+def _processor_summary(case: Case, args: argparse.Namespace, results: _OnProcessor) -> Summary:
+    """Print the results on the processor, and return their summary; "holds" is True if all conditions hold."""
+    from ambjax.theorem import advice
+
+    sampled, margin, unknown = results
     if not args.json:
         print(f"\nOn the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s.\n")
         _print_sampled(sampled)
