@@ -1887,11 +1887,11 @@ SAMPLED = [
 ]
 CHECK = [
     M(
-        "an option that this version of XLA does not know stops the linearisation",
+        "an option that this version of XLA does not support stops the linearisation",
         "ambjax/compiler/short_compilation.py",
-        "in options.items() if _knows(name, value)}",
+        "in options.items() if _supports(name, value)}",
         "in options.items()}",
-        "tests/test_linear.py::test_options_that_this_version_of_xla_does_not_know_are_left_out",
+        "tests/test_linear.py::test_options_that_this_version_of_xla_does_not_support_are_left_out",
     ),
     M(
         "a command leaves the thresholds of the garbage collector",

@@ -142,7 +142,7 @@ def test_bad_files_and_folders(capsys):
     ("argv", "words"),
     [
         (["simulat"], "page, tune. Did you mean 'simulate'? See 'ambjax --help'.\n"),
-        (["levitate"], "'levitate' is no command. It must be one of reproduce, "),
+        (["levitate"], "'levitate' is not a command. It must be one of reproduce, "),
         (["simulate", "case.toml", "--ouput=x"], ": --ouput=x. Did you mean '--out'? See 'ambjax simulate --help'.\n"),
         (["export", "case.toml", "--to", "x"], "unrecognized arguments: --to x. See 'ambjax export --help'.\n"),
         (["tune", "case.toml", "--iteration", "3"], "arguments: --iteration 3. See 'ambjax tune --help'.\n"),

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from ambjax import Cascade, Clock, Plant, Scenario, Sensor
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
-from ambjax.compiler.short_compilation import SHORTEST, known
+from ambjax.compiler.short_compilation import QUICKEST, supported
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.processor import Processor
 from ambjax.linear import (
@@ -36,7 +36,7 @@ from ambjax.world.coils import TwoCoil
 from ambjax.world.sensor import Errors
 
 T = 1e-4
-QUICK = known(SHORTEST)  # each program runs once
+QUICK = supported(QUICKEST)  # each program runs once
 CLOCK = Clock(samples=10, sample_period=T)
 SMOOTH = {
     "position": position.SlidingMode(c=200.0, k=63.0, p=5.0),
@@ -56,9 +56,9 @@ LOOPS = {
 }  # fmt: skip
 
 
-def test_options_that_this_version_of_xla_does_not_know_are_left_out():
+def test_options_that_this_version_of_xla_does_not_support_are_left_out():
     level = {"xla_backend_optimization_level": 0}
-    assert known(level | {"xla_no_such_option": True}) == level
+    assert supported(level | {"xla_no_such_option": True}) == level
 
 
 def loop_of(name):

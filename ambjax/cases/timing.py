@@ -13,11 +13,12 @@ from ambjax.simulation.rosenbrock import AdaptiveRodas3, Rodas3
 from ambjax.simulation.sliding import Slide
 
 METHODS: dict[str, type] = {"rk4": RK4, "dop853": DOP853, "euler": Euler, "rodas3": Rodas3, "sliding": Slide}
-# Substeps of the sliding step where dt = "auto".
+# Substeps per sample of method = "sliding" with dt = "auto".
 SLIDING_SUBSTEPS = 3
 # Largest number of rows of a run; with 16 numbers a row, about 2.5 GB.
 MOST_SAMPLES = 20_000_000
-# Smallest number of samples for the metrics; relative rounding error within which two times are equal.
+# FEWEST_SAMPLES: smallest number of samples for the metrics. ROUNDING: relative difference of two times that are taken
+# as equal.
 FEWEST_SAMPLES, ROUNDING = 2, 1e-9
 # Largest number of steps of a run with a given dt. A run of so many steps takes hours.
 MOST_STEPS = 10_000_000_000
@@ -65,14 +66,14 @@ def settled(settle: float, clock: Clock) -> float:
     last = (clock.samples - 1) * float(clock.sample_period)
     if settle > (1 + ROUNDING) * last:
         raise ValueError(
-            f"run.settle = {settle:g} s: it must be at most {last:.12g} s, the last sample of clock.duration = "
-            f"{clock.duration:g} s. Lower run.settle, or lengthen clock.duration."
+            f"run.settle = {settle:g} s: it must be at most {last:.12g} s, the time of the last sample "
+            f"(clock.duration = {clock.duration:g} s). Lower run.settle, or lengthen clock.duration."
         )
     return min(settle, last)
 
 
 def _whole(ratio: float) -> int | None:
-    """Return `ratio` as an integer of at least 1 if it is one within rounding, else None."""
+    """Return the integer that `ratio` equals within ROUNDING; None if there is none or if it is below 1."""
     nearest = round(ratio) if math.isfinite(ratio) else 0
     return nearest if nearest >= 1 and abs(ratio - nearest) <= ROUNDING * nearest else None
 

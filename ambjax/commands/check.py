@@ -1,4 +1,4 @@
-"""`ambjax check`: sensitivity and margins, the conditions on the case's processor, and those of Theorem 1."""
+"""`ambjax check`: sensitivity and margins, the conditions of the sampled loop, and those of Theorem 1."""
 
 import argparse
 import dataclasses
@@ -24,18 +24,19 @@ CONTINUOUS = (
 )
 
 BAND = (
-    "Evaluated at the samples after run.settle. Disturbance: largest difference between the rate of the law's signal "
-    "and the rate that its sign commands. Band: largest |signal| that such disturbances can cause. Difference: largest "
-    "difference between the signal that the law computes and that of the plant. Bound: band plus difference; it bounds "
-    "the signal of the plant. Largest: largest |signal| of the plant."
+    "Evaluated at the samples after run.settle. Signal: the quantity that the law drives to zero. Disturbance: largest "
+    "difference between the rate of the computed signal and the rate that the sign function of the law commands. Band: "
+    "largest |computed signal| that such disturbances can cause. Difference: largest difference between the computed "
+    "signal and that of the plant. Bound: band plus difference; it bounds the signal of the plant. Largest: largest "
+    "|signal| of the plant."
 )
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
-    """Check a case. Print the results of the loop with its processor first, then those of Theorem 1.
+    """Check a case. Print the results of the linearised loop, then those on the processor, then those of Theorem 1.
 
-    Returns the exit code and the summary. The exit code is 1 if a condition fails or the magnets cannot carry the
-    rotor.
+    Returns the exit code and the summary. The exit code is 1 if a condition fails, if the rotor is lost or
+    stalled, or if the magnets cannot carry it. On a processor, the conditions of Theorem 1 do not count.
     """
     from ambjax.theorem import advice
 
@@ -74,7 +75,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
 
 class _OnProcessor(NamedTuple):
-    """Results of the loop on the case's processor; `unknown`: the delay margin if the prediction uses its delay."""
+    """Results on the processor. `margin`, `unknown`: delay margins, see `_margins`."""
 
     sampled: SampledReport
     margin: Delays
@@ -84,7 +85,7 @@ class _OnProcessor(NamedTuple):
 def _results(case: Case) -> tuple[Report, tuple[Summary, str], _OnProcessor | None]:
     """Return the report of Theorem 1, the summary and text of the linearised loop, and the results on the processor.
 
-    Theorem 1 is checked in a second thread: compiling and simulating release the GIL.
+    Theorem 1 is checked in a second thread. Compilation and simulation release the GIL, so both threads run at once.
     """
     with ThreadPoolExecutor(1) as pool:
         say(f"checking Theorem 1: simulating {float(case.clock.duration):g} s in continuous time")
@@ -105,7 +106,7 @@ def _sampled(case: Case) -> SampledReport:
 
 
 def _margins(case: Case) -> tuple[Delays, Delays | None]:
-    """Return the delay margin if the prediction uses the actual delay, and if it uses the case's (None: without it)."""
+    """Return the delay margins with prediction over the actual delay, and over the case's (None: no prediction)."""
     from ambjax.ensemble.delays import DELAYS, delay_margin
 
     say(f"finding the delay margin: simulating {DELAYS} delays, twice if the rotor is lost at one of them")
@@ -228,4 +229,4 @@ def _print_sampled(sampled: SampledReport) -> None:
         values = ("gain, per s", "disturbance", "band", "difference", "bound", "largest")
         print("\n" + table(("signal", "unit", "noise", *values, "note"), bands) + "\n" + BAND)
     else:
-        print("\nNo bands: every run ends early, with and without noise.")
+        print("\nNo bands, because every run ends early.")

@@ -20,7 +20,7 @@ from ambjax.host.interrupts import reporting, uninterrupted
 from ambjax.host.lock import locked
 from ambjax.simulation.sliding import Slide
 
-# Largest number of worker processes: above the number of cores of any machine.
+# Largest number of worker processes that --processes accepts.
 MOST_PROCESSES = 1024
 
 
@@ -35,15 +35,15 @@ def study_of(case: Case, seed: int | None, members: int) -> Study:
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
-    """Run or resume a study and report it. Exit code 1 if a member does not survive."""
+    """Run or resume a study and report it. Return the exit code, 1 if a member is lost or stalled, and the summary."""
     case = read_with_warnings(args.case)
     study, store = _study_and_store(case, args)
     out = store.directory
-    with reporting(lambda: _state_words(store)), contextlib.ExitStack() as held:
+    with reporting(lambda: _state_words(store)), contextlib.ExitStack() as stack:
         error = None
         with contextlib.nullcontext() if store.finished() else executor_of(args) as executor:
             make(out)  # only after all options are checked
-            held.enter_context(locked(out))
+            stack.enter_context(locked(out))
             _check(study, store, args)  # again, under the lock: another run may have changed the directory
             fresh = not store.begun()
             store.begin()
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
 
 
 def _study_and_store(case: Case, args: argparse.Namespace) -> tuple[Study, Store]:
-    """Return the study and its store without writing anything. Raises ValueError for options that cannot be met."""
+    """Return the study and its store without writing anything. Raises ValueError for an invalid option."""
     study = study_of(case, args.seed, args.members)
     if args.chunk is not None and args.chunk < 1:
         raise ValueError(f"--chunk {args.chunk}: it must be a whole number of members, at least 1.")
@@ -82,12 +82,13 @@ def _check(study: Study, store: Store, args: argparse.Namespace) -> None:
 
 
 def _pilot(study: Study, store: Store, executor: tuple[Executor, int] | None) -> None:
-    """Time the simulation of the first members, and keep their chunks.
+    """Time the simulation of the first members, and write the chunks that they fill.
 
-    Prints how long the study may take, and chooses the chunk size if none is set.
+    Prints the expected duration of a long study, and chooses the chunk size if none is set.
     """
     columns, seconds = pilot(study)
     first = len(columns["index"])
+    # executor[1]: chunks submitted at a time, AHEAD for each worker
     pace = Pace(first / seconds, None if executor is None else executor[1] // AHEAD)
     print_estimate(study, pace)
     with uninterrupted():

@@ -16,10 +16,11 @@ from ambjax.simulation.method import TOLERANCE
 from ambjax.simulation.rosenbrock import AdaptiveRodas3
 from ambjax.simulation.sliding import slides
 
-# Target duration of a chunk, s: the work lost by an interruption, and the interval of the progress bar.
+# Target duration of a chunk, s. It is the largest time lost by an interruption, and the interval of the progress bar.
 CHUNK_SECONDS = 2.0
+# Largest number of members per chunk.
 MOST_CHUNK = 65_536
-# Members per chunk and in the pilot on an accelerator.
+# Members per chunk, and members that `pilot` times, on an accelerator.
 ACCELERATOR_CHUNK = 1024
 # The expected duration is printed above SHORT, and a faster method suggested above LONG, both in s.
 SHORT, LONG = 3.0, 60.0
@@ -39,9 +40,9 @@ class Pace(NamedTuple):
         return self.rate if self.workers is None else self.rate / cores() * self.workers
 
     def chunk(self, members: int) -> int:
-        """Return the members per chunk: a multiple of a call, and about CHUNK_SECONDS of work.
+        """Return the members per chunk: about CHUNK_SECONDS of work, at most half of a worker's members.
 
-        There are at least two chunks per worker.
+        The number is rounded up to a multiple of CALL per core, and is at most `members`.
         """
         if jax.default_backend() != "cpu":
             return min(ACCELERATOR_CHUNK, members)
@@ -52,7 +53,7 @@ class Pace(NamedTuple):
 
 
 def pilot(study: Study) -> tuple[dict[str, np.ndarray], float]:
-    """Simulate the first members, one call on all cores. Return their columns and the duration in s.
+    """Simulate the first members: one call of CALL members on each core. Return their columns and the duration in s.
 
     A first run, in which all rotors are lost at the start, compiles the program at little cost. A message is printed
     before the timed run, because one call of slow members may take a minute.
@@ -67,7 +68,7 @@ def pilot(study: Study) -> tuple[dict[str, np.ndarray], float]:
 
 
 def print_estimate(study: Study, pace: Pace) -> None:
-    """Print the expected duration of a longer run, and suggest the sliding step if it applies."""
+    """Print a duration of at least SHORT. Above LONG, suggest the sliding step if it applies."""
     seconds = study.members / pace.whole
     if seconds < SHORT:
         return
@@ -83,7 +84,7 @@ def print_estimate(study: Study, pace: Pace) -> None:
 
 
 def duration(seconds: float) -> str:
-    """Return a time as text with two digits and a unit."""
+    """Return a duration as text, in s, min or h."""
     for size, unit in ((3600.0, "h"), (60.0, "min")):
         if seconds >= 2 * size:
             return f"{seconds / size:.2g} {unit}" if seconds < 10 * size else f"{seconds / size:.0f} {unit}"
@@ -93,8 +94,9 @@ def duration(seconds: float) -> str:
 def sliding_error(study: Study) -> dict[str, Any]:
     """Compute the largest relative difference of each metric in COMPARED between this study's steps and adaptive steps.
 
-    Of the first COMPARISON members, the differences include those whose rotor survives with both kinds of steps. They
-    are None if there is no such member. `lost_by_one` counts members that survive with only one kind of steps.
+    The comparison uses the first COMPARISON members, without those that are lost or stalled with either kind of steps.
+    The differences are None if no member remains. `lost_by_one` counts members that survive with only one kind of
+    steps.
     """
     tolerance = max(TOLERANCE, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps))
     accurate = dataclasses.replace(study, clock=dataclasses.replace(study.clock, method=AdaptiveRodas3(tolerance)))

@@ -19,7 +19,7 @@ from ambjax.world.signals import Reference
 
 
 class ChainState(NamedTuple):
-    """State of `FilterChain`: the filter of the derivative and the integral (A), and the two states of each biquad."""
+    """State of `FilterChain`, in A: derivative filter, integral, and the two states of each biquad."""
 
     derivative: Array
     integral: Array
@@ -34,8 +34,10 @@ class FilterChain(PositionLaw[ChainState]):
     """v_star = dv/dz z + dv/di i_star, i_star = i_r - H e: PID, lead-lag, two notches and a low-pass in series.
 
     H(s) = (k_p + k_int/s + k_d s/(1 + s/w_f)) (1 + s/w_z)/(1 + s/w_p) N_1(s) N_2(s) w_lp^2/(s^2 + sqrt(2) w_lp s +
-    w_lp^2) with N(s) = (s^2 + depth width w s + w^2)/(s^2 + width w s + w^2), and e = z - r. The law uses the position
-    only. i_star and i_r are those of `state_feedback.StateFeedback`. With inversion.Linearised, i_ref is i_star.
+    w_lp^2), e = z - r, with the notches N_k(s) = (s^2 + depth_k width_k w_k s + w_k^2)/(s^2 + width_k w_k s + w_k^2).
+    The law does not use the velocity. As in `state_feedback.StateFeedback`, i_star is the demanded current, and i_r
+    keeps the linearised rotor on the reference. With inversion.Linearised, i_ref is i_star. In the default values, w is
+    the pole of the magnets.
     Schweitzer and Maslen, Magnetic Bearings (2009), 8.2. The rate of the integral includes k_aw (i_star - i), which
     limits the integral while the supply limits u.
 
@@ -44,10 +46,10 @@ class FilterChain(PositionLaw[ChainState]):
     its depth is 1. By default, all of them are off.
     """
 
-    k_p: Scalar = gain(default=135.0, unit="A/m", doc="proportional gain; left out: as state-feedback")
-    k_int: Scalar = gain(default=5310.0, unit="A/m/s", doc="integral gain; left out: as state-feedback")
-    k_d: Scalar = gain(default=0.219, unit="A s/m", doc="derivative gain; left out: as state-feedback")
-    w_f: Scalar = gain(default=1.06e4, unit="1/s", doc="bandwidth of the derivative; left out: 20 w")
+    k_p: Scalar = gain(default=135.0, unit="A/m", doc="proportional gain; left out: LQR in continuous time")
+    k_int: Scalar = gain(default=5310.0, unit="A/m/s", doc="integral gain; left out: LQR in continuous time")
+    k_d: Scalar = gain(default=0.219, unit="A s/m", doc="derivative gain; left out: LQR in continuous time")
+    w_f: Scalar = gain(default=1.06e4, unit="1/s", doc="bandwidth of the derivative filter; left out: 20 w")
     k_aw: Scalar = gain(default=10.6, unit="1/s", doc="anti-windup rate; left out: w/50")
     w_z: Scalar = gain(default=2650.0, unit="1/s", doc="zero of the lead-lag; left out: 5 w")
     w_p: Scalar = gain(default=2650.0, unit="1/s", doc="pole of the lead-lag; left out: 5 w")
@@ -89,7 +91,7 @@ class FilterChain(PositionLaw[ChainState]):
         )  # fmt: skip
 
     def slope(self, model: Plant) -> Scalar:
-        """Return the largest of k_aw, the poles of all parts, and the rate of e_ddot = -b (k_p e + k_d e_dot), 1/s."""
+        """Return the largest of k_aw, the poles of all parts, and `explicit_rate`, 1/s."""
         corners = (self.w_f, self.k_aw, self.w_p, self.w_1, self.w_2, self.w_lp, self.explicit_rate(model))
         return jnp.max(jnp.stack([jnp.asarray(x) for x in corners]))
 
@@ -123,11 +125,14 @@ class FilterChain(PositionLaw[ChainState]):
     def step(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: ChainState, period: Scalar
     ) -> tuple[Array, ChainState]:
-        """Step each part by the bilinear transform; the anti-windup adds less than i_star - i to the integral."""
+        """Step each part by the bilinear transform.
+
+        The anti-windup adds h (i_star - i)/(1 + h) to the integral, h = k_aw T.
+        """
         motion, reference = inputs
         e = motion.z - reference.r
         half, leak = self.w_f * period / 2, self.k_aw * period
-        # derivative: k_d w_f (1 - q)/(1 + half - (1 - half) q), q the backward shift
+        # derivative: k_d w_f (1 - q)/(1 + half - (1 - half) q), with the backward shift q
         differentiated = self.k_d * self.w_f / (1 + half) * e + state.derivative
         derivative = -self.k_d * self.w_f / (1 + half) * e + (1 - half) / (1 + half) * differentiated
         y = self.k_p * e + state.integral + self.k_int * period / 2 * e + differentiated
@@ -140,7 +145,7 @@ class FilterChain(PositionLaw[ChainState]):
         return force_of_current(model, motion.z, i_star), ChainState(derivative, integral, *after)
 
     def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of b k_d and sqrt(b k_p), because their terms are evaluated at the start of a sample."""
+        """Return the larger of b k_d and sqrt(b k_p), 1/s. `step` evaluates both terms at the start of a sample."""
         b = linear_mechanics(model).b
         return jnp.maximum(b * self.k_d, jnp.sqrt(b * self.k_p))
 
@@ -150,7 +155,7 @@ class FilterChain(PositionLaw[ChainState]):
         corners |= {name: rate(context, 1, 50, "corner from w to 50 w") for name in ("w_z", "w_p")}
         corners |= {name: rate(context, 2, 50, "centre from 2 w to 50 w") for name in ("w_1", "w_2")}
         shares = {f"width_{k}": Interval(0.1, 2.0, "a tenth to twice the centre") for k in (1, 2)}
-        shares |= {f"depth_{k}": Interval(0.03, 1.0, "30 dB to no notch", True) for k in (1, 2)}
+        shares |= {f"depth_{k}": Interval(0.03, 1.0, "a depth of 30 dB to no notch", True) for k in (1, 2)}
         return {
             "k_p": rate(context, 1, 5, "corner sqrt(b k_p) from w to 5 w", b, 2),
             "k_d": rate(context, 1 / 3, 10, "rate b k_d from w/3 to 10 w", b),

@@ -12,12 +12,12 @@ from jax import Array
 
 from ambjax.numerics.records import Scalar
 
-# Largest number of states. In continuous time an implicit step eliminates all of them by scalar operations.
+# Largest number of states. In continuous time an implicit step solves for all of them with scalar operations.
 MOST_STATES = 30
 # The states are scaled by their largest response to the inputs at these angular frequencies (1/s). The response is
 # evaluated at s = w (j + DAMPED), to the right of the imaginary axis, because an undamped pole may lie on it.
 FREQUENCIES, DAMPED = np.geomspace(10.0, 1e5, 81), 0.05
-# Largest condition number of A + 1 of a discrete controller: above it, a pole is too close to z = -1.
+# Largest condition number of A + I of a discrete controller. Above it, a pole is too close to z = -1.
 MOST_CONDITION = 1e8
 
 Row = tuple[float, ...]
@@ -38,8 +38,8 @@ class Realisation:
 
     `A` [n, n]: upper quasi-triangular (real Schur form). `B` [n, m], `C` [n], `D` [m]. The states are scaled, so that
     for inputs w of amplitude 1 their amplitudes are about 1 or less. `dt`: sample period of a discrete controller, s;
-    0: continuous. A discrete controller is stored as a continuous one, from which the bilinear transform with period dt
-    computes it. `realisation` constructs it from arrays.
+    0: continuous. A discrete controller is stored as the continuous one that the bilinear transform with period dt
+    turns into it. `realisation` constructs a `Realisation` from arrays.
     """
 
     A: tuple[Row, ...]
@@ -80,7 +80,7 @@ class Realisation:
     def step(self, x: Sequence[Array], w: Sequence[Array], period: Scalar) -> tuple[Array, tuple[Array, ...]]:
         """Return y and the next state of the bilinear (Tustin) transform of the controller.
 
-        `x`: n states. `w`: inputs, in metres. `period`: T, s. With h = T/2 and the solution p of (1 - h A) p = x + h B
+        `x`: n states. `w`: inputs, in metres. `period`: T, s. With h = T/2 and the solution p of (I - h A) p = x + h B
         w: y = C p + D w, x+ = 2 p - x. Back substitution solves for p, in blocks of one row, or two rows for a pair of
         complex poles.
         """
@@ -99,7 +99,7 @@ class Realisation:
         return self.output(p, w), tuple(2 * q - y for q, y in zip(p, x, strict=True))
 
     def _blocks(self) -> list[tuple[int, ...]]:
-        """Return the rows of each diagonal block of A."""
+        """Return the row indices of each diagonal block of A."""
         blocks, k = [], 0
         while k < len(self.A):
             size = 2 if k + 1 < len(self.A) and self.A[k + 1][k] else 1
@@ -122,8 +122,9 @@ def realisation(
 ) -> Realisation:
     """Return the realisation of a state space: A [n, n], B [n, m], C [1, n], D [1, m] with m = 1 or 2 inputs.
 
-    `dt`: sample period, s; 0 or None: continuous. Raises ValueError, with the name of the array, if the shapes of
-    the matrices do not match, if a number is not finite or if a discrete controller has a pole at z = -1.
+    `dt`: sample period, s; 0 or None: continuous. Raises ValueError if the shapes of the matrices do not match,
+    if a number is not finite, if n exceeds MOST_STATES, if `dt` is invalid, or if a discrete controller has a pole near
+    z = -1.
     """
     step = _period(dt)
     a, b, c, d = _shaped(*(_numbers(name, x) for name, x in zip("ABCD", (A, B, C, D), strict=True)))
@@ -138,10 +139,10 @@ def realisation(
 
 
 def _period(dt: npt.ArrayLike | None) -> float:
-    """Return the sample period, s; 0: continuous. Raises ValueError for any other value."""
+    """Return the sample period, s; 0: continuous. Raises ValueError if `dt` is not a sample period, 0 or None."""
     x = np.zeros(()) if dt is None else np.asarray(dt)
     if x.dtype == bool:
-        raise ValueError("dt = True: a discrete controller needs a sample period. Give dt in seconds; 0: continuous.")
+        raise ValueError(f"dt = {dt}: a discrete controller needs a sample period. Give dt in seconds; 0: continuous.")
     if x.size != 1 or x.dtype.kind not in "iuf" or not 0 <= x.item() < np.inf:
         raise ValueError(f"dt = {dt}: it must be the sample period in seconds, or 0 for a continuous controller.")
     return float(x.item())
@@ -170,7 +171,9 @@ def _shaped(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> tuple
     made = []
     for name, x, shape in (("A", A, (n, n)), ("B", B, (n, D.shape[1])), ("C", C, (1, n))):
         if x.shape != shape and (x.size != shape[0] * shape[1] or (x.ndim == 2 and x.size)):
-            raise ValueError(f"{name} has the shape {x.shape}: with D {D.shape} and {n} rows of A it must be {shape}.")
+            raise ValueError(
+                f"{name} has the shape {x.shape}: with {n} rows of A and D of shape {D.shape} it must be {shape}."
+            )
         made.append(x.reshape(shape))
     return (*made, D)
 

@@ -19,7 +19,8 @@ from ambjax.host.words import one_line
 # Errors of a file system that another folder or free space may resolve.
 UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO)
 # Thresholds of the garbage collector. Imports and tracing allocate millions of objects that live until the end of a
-# command; with Python's own thresholds, repeated visits to them take an eighth of the time of `simulate`.
+# command. With Python's own thresholds, the collector scans them again and again, for an eighth of the time of
+# `simulate`.
 GC_THRESHOLDS = (100_000, 20, 20)
 
 
@@ -36,11 +37,11 @@ class Parser(argparse.ArgumentParser):
         sys.exit(complain(f"{message}{end} See '{self.prog} --help'.", self.prog.split()[0]))
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Parse the arguments. For an unknown command or option, the error names the most similar one."""
+        """Parse the arguments. For an unknown command or option, the error names a similar one, if there is one."""
         words = list(sys.argv[1:] if args is None else args)
         if self.commands and words and not words[0].startswith("-") and words[0] not in self.commands:
             known = f"It must be one of {', '.join(self.commands)}"
-            self.error(f"{words[0]!r} is no command. {known}.{_similar(words[0], self.commands)}".rstrip("."))
+            self.error(f"{words[0]!r} is not a command. {known}.{_similar(words[0], self.commands)}".rstrip("."))
         parsed, unknown = self.parse_known_args(words, namespace)
         if unknown:
             used = self.commands.get(getattr(parsed, "command", ""), self)
@@ -73,7 +74,7 @@ def run_command(parser: argparse.ArgumentParser, words: list[str] | None, run: R
     SystemExit for --help, --version and wrong arguments, as argparse does.
     """
     gc.set_threshold(*GC_THRESHOLDS)
-    atexit.register(gc.freeze)  # at exit, Python would visit all objects once more
+    atexit.register(gc.freeze)  # without this, the collector would scan all objects once more at exit
     with lenient() as stdout:
         try:
             args = parser.parse_args(words)
@@ -91,7 +92,7 @@ def run_command(parser: argparse.ArgumentParser, words: list[str] | None, run: R
 
 
 def _code(run: Callable[[], tuple[int, object]], as_json: bool, program: str) -> int:
-    """Call `run` and return its exit code. Print an error that a user can correct as one line, and return 2."""
+    """Call `run` and return its exit code. If a user can correct an error, print it as one line and return 2."""
     try:
         code, summary = run()
         if as_json:
@@ -104,7 +105,7 @@ def _code(run: Callable[[], tuple[int, object]], as_json: bool, program: str) ->
         return complain(f"{where}{error.strerror or error}.{fix}", program)
     except MemoryError:
         return complain("not enough memory. Use fewer members or samples.", program)
-    except (NotImplementedError, RecursionError):  # these subclasses of RuntimeError are bugs of ambjax
+    except (NotImplementedError, RecursionError):  # these subclasses of RuntimeError indicate a bug of ambjax
         raise
     except RuntimeError as error:  # JAX: a device is missing, or its memory is full
         return complain(str(error).strip().partition("\n")[0] or type(error).__name__, program)

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ambjax.compiler.short_compilation import SHORTEST, compiled_quickly
+from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
 from ambjax.linear.margins import STATIC, Margins, ResponsePeak, margins_of, noise_gain, peak, poles_in_s
@@ -16,7 +16,7 @@ from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import prepare
 from ambjax.world.scenario import Scenario
 
-_matrices = compiled_quickly(loop_matrices, options=SHORTEST)
+_matrices = compiled_quickly(loop_matrices, options=QUICKEST)
 
 
 @record

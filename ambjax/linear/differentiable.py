@@ -1,6 +1,6 @@
 """Peaks, delay margin and growth rate of a linearised loop as differentiable functions, for limits of the tuner.
 
-They work under jit and vmap. `analyse` computes the same numbers with NumPy, for reports.
+The functions work under jit and vmap. `linear.analysis.analyse` computes the same numbers with NumPy, for reports.
 """
 
 from typing import NamedTuple
@@ -14,28 +14,29 @@ from ambjax.numerics.records import Scalar
 
 # Numbers of frequencies in the first scan, on a logarithmic axis: for peaks, and for crossings of |L| = 1.
 POINTS, CROSSING_POINTS = 120, 240
-# Rounds in which a frequency is refined, and points of a round. A round divides the spacing by half of LOCAL - 1.
+# Rounds in which a frequency is refined, and points of a round. A round divides the spacing by (LOCAL - 1)/2 at a peak,
+# and by LOCAL - 1 at a crossing.
 ROUNDS, LOCAL = 4, 17
-# Upper bound of the quantities of a stable loop, in the unit of each. Those of an unstable loop are at least as large.
+# Upper bound of the peaks of a stable loop, in the unit of each, and of 1/(pole times delay margin). The values of an
+# unstable loop are at least as large.
 MOST = 1e3
-# Quantities of a loop without an equilibrium, relative to MOST.
+# The same values for a loop without an equilibrium, relative to MOST.
 NO_EQUILIBRIUM = 100.0
 # Step of the logarithm of the frequency in the difference quotient for the slope of L at a crossing.
 SLOPE_STEP = 1e-4
 
 
 class LoopQuantities(NamedTuple):
-    """Quantities of a linearised loop, with finite values and derivatives for every loop.
+    """Quantities of a linearised loop. Values and derivatives are finite, except `growth` without an equilibrium.
 
     - `sensitivity`, `complementary`: peaks of |S| and |T|.
     - `control_sensitivity`: peak of |KS|, V/m.
     - `delay_margin_s`: smallest additional delay that makes the loop unstable, s.
     - `growth`: largest real part of a pole, 1/s; negative if the loop is stable, inf without an equilibrium.
 
-    For a stable loop, the peaks are those of `analyse`, smoothly limited to MOST times their unit, which is 1 for |S|
-    and |T| and `volts_per_metre` for |KS|. For an unstable loop they are MOST (1 + growth/pole) times their unit, so
-    that a descent leads to a stable loop. The inverse of the delay margin, in units of the plant's pole, is treated in
-    the same way.
+    The unit of |S| and |T| is 1, that of |KS| is `volts_per_metre`. For a stable loop, the peaks are those of
+    `analyse`, smoothly limited to MOST times their unit. For an unstable loop they are MOST (1 + growth/pole) times
+    their unit, so that a descent leads to a stable loop. The same holds for 1/(pole times delay margin).
     """
 
     sensitivity: Array
@@ -138,8 +139,8 @@ def _growth(system: StateSpace) -> tuple[Array, Array]:
     """Return the largest real part of the poles in 1/s, and the poles [N] without derivatives.
 
     The derivative of the dominant pole is that of a simple eigenvalue, from its left and right eigenvectors. JAX's
-    derivative of `eig` requires independent eigenvectors of all poles. A delay has a defective pole at 0 and no such
-    eigenvectors.
+    derivative of `eig` requires independent eigenvectors of all poles. A delay adds a defective pole at
+    z = 0, whose eigenvectors are dependent.
     """
     A = lax.stop_gradient(system.A)
     poles, left, right = lax.linalg.eig(A, compute_left_eigenvectors=True, compute_right_eigenvectors=True)
@@ -153,7 +154,7 @@ def _growth(system: StateSpace) -> tuple[Array, Array]:
 
 
 def _loop(system: StateSpace, poles: Array, unit: Array) -> _Loop:
-    """Return the poles and zeros of a scaled system, with det(zI - A + b c)/det(zI - A) = 1 + c (zI - A)^-1 b."""
+    """Return the poles and zeros of a scaled system, from det(zI - A + b c)/det(zI - A) = 1 + c (zI - A)^-1 b."""
     A, b = system.A, system.B[:, :1]
     zeros, zeros_u = (
         lax.linalg.eig(A - b * row[None], compute_left_eigenvectors=False, compute_right_eigenvectors=False)[0]
@@ -164,7 +165,7 @@ def _loop(system: StateSpace, poles: Array, unit: Array) -> _Loop:
 
 
 def _frequencies(loop: _Loop, low: Scalar, high: Scalar) -> Array:
-    """Return the frequencies (Hz) of the first scan: STATIC * low, which stands for 0, a grid, and those of poles."""
+    """Return the frequencies (Hz) of the first scan: STATIC * low (for 0), a grid, and the frequencies of poles."""
     grid = jnp.geomspace(low, high, POINTS)
     own = jnp.clip(jnp.abs(jnp.imag(loop.poles_in_s)) / (2 * jnp.pi), low, high)
     return jnp.concatenate([jnp.asarray([STATIC * low]), grid, own])
@@ -178,7 +179,7 @@ def _refined(loop: _Loop, f: Array, size: Array, low: Scalar, high: Scalar, whic
     best, reach = f[jnp.argmax(size)], jnp.log(high / low) / (POINTS - 1)
     for _ in range(ROUNDS):
         near = best * jnp.exp(reach * jnp.linspace(-1, 1, LOCAL))
-        # the static response has no neighbours
+        # the frequency that stands for 0 is not refined
         near = jnp.where(best < low, best, jnp.clip(near, low, high))
         S, KS = loop.responses(near)
         best = near[jnp.argmax(jnp.abs((S, S - 1, KS)[which]))]

@@ -1,7 +1,7 @@
 """Records: frozen dataclasses that are JAX pytrees and whose fields declare their unit, bounds and meaning.
 
 The leaves of a record are numbers that may be traced, batched and differentiated. Its type and its static fields are
-part of the tree structure. The case-file reader, the template, the reference and `validate` use the declarations.
+part of the tree structure. The case-file reader, the template, the reference pages and `validate` use the declarations.
 """
 
 import dataclasses
@@ -102,7 +102,8 @@ def record(cls: type[T]) -> type[T]:
     static fields compare equal, so that JAX could run the compiled program of one law for another.
 
     The constructor checks each leaf that is a plain number. It skips traced values and arrays; `validate` checks arrays
-    before a rollout. JAX rebuilds records without the constructor. The docstring lists the fields.
+    before a rollout. JAX rebuilds records without the constructor. `record` appends a list
+    of the fields to the docstring.
     """
     _check_at_construction(cls)
     record_type = dataclasses.dataclass(frozen=True)(cls)
@@ -136,7 +137,7 @@ def record(cls: type[T]) -> type[T]:
 
 
 def _check_at_construction(cls: type) -> None:
-    """Give a class, before it becomes a dataclass, a `__post_init__` that checks its plain numbers.
+    """Add a `__post_init__` that checks the plain numbers. Call this before the class becomes a dataclass.
 
     A `__post_init__` in the body of the class runs first.
     """
@@ -152,7 +153,7 @@ def _check_at_construction(cls: type) -> None:
         for field, low, high in _leaves(type(self)):
             value = given[field.name]
             if value is field.default or (type(value) is float and low < value < high):
-                continue  # fast, because tracing constructs many records
+                continue  # skips `check_leaf`, because tracing constructs many records
             if isinstance(value, (int, float, str, np.number)) or value is None:
                 check_leaf(field, f"{type(self).__name__}.{field.name}", value)
 
@@ -183,9 +184,9 @@ def is_traced(x: object) -> bool:
 
 
 def validate(node: object, path: str = "") -> None:
-    """Check every leaf of the records in `node` against the bounds of its field. Traced leaves are not checked.
+    """Check every leaf of the records in `node` against the bounds of its field, and the order of the pair `ordered`.
 
-    `path`: dotted path of `node`, for messages. Raises ValueError as `check_number` does.
+    Traced leaves are not checked. `path`: dotted path of `node`, for messages. Raises ValueError for an invalid value.
     """
     if isinstance(node, (tuple, list)):
         for index, item in enumerate(node):
@@ -204,10 +205,10 @@ def validate(node: object, path: str = "") -> None:
 
 
 def check_leaf(field: dataclasses.Field, name: str, value: object) -> None:
-    """Raise ValueError if the leaf `field` does not allow `value`, as `check_number` does. Traced values are allowed.
+    """Raise the ValueError of `check_number` if the leaf `field` does not allow `value`. Traced values are allowed.
 
-    `name`: dotted name, for messages. A value may also be a `GainFunction`, and None for an optional field or a
-    steepness.
+    `name`: dotted name, for messages. `value` may be a `GainFunction`, which checks itself. None is
+    allowed for an optional field and for a steepness.
     """
     if isinstance(value, GainFunction):
         value.check(field, name)
@@ -224,7 +225,7 @@ def _fields(kind: type) -> tuple[tuple[dataclasses.Field, bool], ...]:
 
 @functools.cache
 def _leaves(kind: type) -> tuple[tuple[dataclasses.Field, float, float], ...]:
-    """Return the leaves among the fields of a record type, each with an open interval of allowed numbers. Cached."""
+    """Return the leaves of a record type, each with an open interval of allowed floats (empty: `whole`). Cached."""
     found = []
     for field in (field for field, is_leaf in _fields(kind) if is_leaf):
         lows = [x for x in (field.metadata["above"], field.metadata["at_least"]) if x is not None]

@@ -16,7 +16,7 @@ S = TypeVar("S")
 
 
 class Signals(NamedTuple):
-    """Signals of a plant besides motion and current: scaled force v (A^2/m^2), copper loss (W)."""
+    """Signals of a plant besides motion and current: scaled force v of Eq. (3) (A^2/m^2), and copper loss (W)."""
 
     v: Array
     heat: Array
@@ -24,7 +24,7 @@ class Signals(NamedTuple):
 
 @record
 class Bearing(Generic[S]):
-    """Parameters of rotor and magnets (Table 1), and the force of given currents. Scalars of one member, SI units.
+    """Parameters of rotor and magnets (Table 1), and the force of given currents. All parameters are in SI units.
 
     A plant is a subclass of this record, and its state is a NamedTuple of scalars. The subclass implements `start`,
     `rates`, `rest`, `scale`, `measurement` and `signals`; it inherits the other methods.
@@ -41,7 +41,7 @@ class Bearing(Generic[S]):
         doc="axial stiffness of one passive bearing; negative: restoring",
     )
     mu_0: Scalar = leaf(
-        default=1.25e-6, unit="N/A^2", at_least=1e-8, at_most=1e-4, doc="vacuum permeability, as printed"
+        default=1.25e-6, unit="N/A^2", at_least=1e-8, at_most=1e-4, doc="vacuum permeability, as the paper prints it"
     )
     n: Scalar = leaf(default=1480.0, unit="1", at_least=1, at_most=1e6, doc="turns of each coil")
     A: Scalar = leaf(default=0.121, unit="m^2", at_least=1e-9, at_most=100.0, doc="area of a pole")
@@ -57,7 +57,7 @@ class Bearing(Generic[S]):
     )
 
     one_current: ClassVar[bool] = False
-    """Whether the state is (z, z_dot, i), as in `Plant`."""
+    """Whether one current deviation describes both coils, as in `Plant`."""
 
     two_voltages: ClassVar[bool] = False
     """Whether `rates` also takes the voltage of each coil, `CoilVoltages`, as in `TwoCoil`."""
@@ -69,7 +69,7 @@ class Bearing(Generic[S]):
 
     @property
     def lumped(self) -> bool:
-        """Whether the state is (z, z_dot, i) and i_dot is linear in u, as the sliding step requires."""
+        """Whether Eqs. (1) and (2) hold: one current, and ideal iron. `simulation.sliding` requires it."""
         return self.one_current and self.iron is None
 
     def start(self, measurement: Measurement) -> S:
@@ -105,7 +105,10 @@ class Bearing(Generic[S]):
         return 0.0 if self.iron is None or self.iron.eddy is None else 1 / self.iron.eddy
 
     def coil_slope(self, z: Scalar) -> Scalar:
-        """Return the fastest rate R/L of a coil's current (1/s) for |z| <= `z` (m): 2 R (s_0 + z)/kappa. Eq. (2)."""
+        """Return the fastest rate R/L of a coil's current (1/s) for displacements up to z (m). Eq. (2).
+
+        It is 2 R (s_0 + z)/kappa with ideal iron. Saturation multiplies it by `Iron.fastest`.
+        """
         slope = 2 * self.R * (self.s_0 + z) / self.kappa
         return slope if self.iron is None else self.iron.fastest() * slope
 
@@ -124,8 +127,8 @@ class Bearing(Generic[S]):
     def pull(self, flux_currents: tuple[Array, Array], z: Scalar, gaps: Gaps | None = None) -> Array:
         """Return the scaled force of the two coils (A^2/m^2): the difference of (i/gap)^2, with saturation if any.
 
-        `flux_currents`: result of the method of this name, A. `z`: displacement, m. `gaps`: those at z; None: not
-        computed yet.
+        `flux_currents`: result of the method of this name, A. `z`: displacement, m. `gaps`: those at z; None:
+        computed here.
         """
         pulls = []
         for i, inverse in zip(flux_currents, (gaps or self.gaps(z)).inverses, strict=True):
@@ -141,7 +144,7 @@ class Bearing(Generic[S]):
         return jnp.maximum(upper, lower)
 
     def largest_force(self, i_max: Scalar | None = None) -> Scalar:
-        """Return the magnetic force (N) at z = 0 for i = i_0, where one coil is off, or for i_max (A) if it is less."""
+        """Return the magnetic force (N) at z = 0 for i = min(i_0, i_max). At i = i_0 the lower coil is off."""
         most = jnp.asarray(self.i_0) if i_max is None else jnp.minimum(self.i_0, i_max)
         return self.m * self.a * self.pull((self.i_0 + most, self.i_0 - most), 0.0 * most)
 
@@ -167,7 +170,7 @@ class Bearing(Generic[S]):
 
     @property
     def k_s(self) -> Scalar:
-        """Negative stiffness of the magnets at the origin: kappa i_0^2 / s_0^3, in N/m."""
+        """Magnitude of the negative stiffness of the magnets at the origin: kappa i_0^2 / s_0^3, in N/m."""
         return self.kappa * self.i_0**2 / self.s_0**3
 
     @property
@@ -191,7 +194,7 @@ class Bearing(Generic[S]):
         return (self.i_0 / self.s_0) * (self.i_0 / self.s_0)
 
     def gaps(self, z: Scalar) -> Gaps:
-        """Return the gaps s_0 - z and s_0 + z (m). The gaps are not bounded; their inverses are (GAP_FLOOR)."""
+        """Return the gaps s_0 - z and s_0 + z (m). Only their inverses are bounded (`world.gaps.GAP_FLOOR`)."""
         return gaps(z, self.s_0)
 
     def v(self, z: Scalar, i: Scalar) -> Array:
@@ -199,12 +202,12 @@ class Bearing(Generic[S]):
         return self.v_and_dv_di(z, i)[0]
 
     def dv_dz(self, z: Scalar, i: Scalar) -> Array:
-        """Partial derivative of v in z, in A^2/m^3: 2 (i_0+i)^2/(s_0-z)^3 + 2 (i_0-i)^2/(s_0+z)^3."""
+        """Partial derivative of v with respect to z, in A^2/m^3: 2 (i_0+i)^2/(s_0-z)^3 + 2 (i_0-i)^2/(s_0+z)^3."""
         upper, lower = self.gaps(z).inverses
         return 2 * (self.i_0 + i) ** 2 * upper**3 + 2 * (self.i_0 - i) ** 2 * lower**3
 
     def dv_di(self, z: Scalar, i: Scalar) -> Array:
-        """Partial derivative of v in i, in A/m^2: 2 (i_0+i)/(s_0-z)^2 + 2 (i_0-i)/(s_0+z)^2.
+        """Partial derivative of v with respect to i, in A/m^2: 2 (i_0+i)/(s_0-z)^2 + 2 (i_0-i)/(s_0+z)^2.
 
         It vanishes exactly on the singular curve C, Eq. (9).
         """
@@ -218,7 +221,7 @@ class Bearing(Generic[S]):
         return 4 * along * across, 4 * gaps.inverse * (self.s_0 * across + z * along)
 
     def current_for(self, z: Scalar, v: Scalar) -> Array:
-        """Return the current (A) with scaled force v at z: the root of Eq. (3) that is continuous at i = 0.
+        """Return the current (A) with scaled force v at z: the root of Eq. (3) that stays finite at z = 0.
 
         At z = 0 the quadratic becomes linear. The formula has no cancellation there and is smooth. If no current gives
         the force v at z, the result is the current on C at this z: its force is the closest to v.

@@ -8,13 +8,13 @@ from tuning.report.limit_table import broken, prices
 
 
 def answer_lines(facts: TuningFacts) -> list[str]:
-    """Return a list of five items: held or not, error and voltage, sensitivity, limiting quantities, next command."""
+    """Return five list items and an empty line: held or not, error and voltage, sensitivity, limits, next command."""
     items = [_held(facts), _sizes(facts), _sensitivity(facts), _limiting(facts), _next(facts)]
     return [*(f"- {item}" for item in items), ""]
 
 
 def _held(facts: TuningFacts) -> str:
-    """Return whether the rotors are held and the requirements met."""
+    """Return the item on the rotors that are held, and on the requirements."""
     outcome, after = facts.outcome, facts.after
     word = "NOT held" if not outcome["rotors_held"] else "Not verified" if facts.refuted else "Held"
     which = "held-out members" if after["members"] else "training members"
@@ -27,7 +27,7 @@ def _held(facts: TuningFacts) -> str:
 
 
 def _sizes(facts: TuningFacts) -> str:
-    """Return the error and the voltage after tuning, and before it."""
+    """Return the item on the error and the voltage after tuning, and before it."""
     after, before = facts.after, facts.before
     if not after["members"]:
         return "**Error and voltage:** not measured on held-out members (tune.held_out = 0)."
@@ -50,7 +50,7 @@ def _sensitivity(facts: TuningFacts) -> str:
     """Return the largest peak of |S| of the held-out members and its zone."""
     found = facts.sensitivity
     if not found or not found["members"]:
-        return "**Sensitivity:** not limited here; `ambjax sensitivity tuned.toml` computes |S| and the zone."
+        return "**Sensitivity:** not computed here; `ambjax sensitivity tuned.toml` computes |S| and the zone."
     rows = [(_peak(row, found), row) for row in found["members"]]
     peak, row = max(rows, key=lambda one: one[0])
     zone = max(one["injected_zone"] or one["zone"] for one in found["members"])
@@ -61,7 +61,7 @@ def _sensitivity(facts: TuningFacts) -> str:
 
 
 def _peak(row: Row, found: Row) -> float:
-    """Return the decisive peak of a member: the injected one, or the larger of the linear and the injected one."""
+    """Return the peak that counts: the injected one if only it decides, else the larger one; inf if a rotor is lost."""
     if row["repetitions"] and row["peak"] is None:
         return math.inf
     if row["peak"] is None:
@@ -70,7 +70,7 @@ def _peak(row: Row, found: Row) -> float:
 
 
 def _limiting(facts: TuningFacts) -> str:
-    """Return the limits that are broken or active and the gains at a bound."""
+    """Return the item on the limits that are not held or active, and on the gains at a bound."""
     words = [escape_markdown(line) for line in (*broken(facts.limits), *prices(facts.limits))]
     if ends := [row["path"] for row in facts.gains if row["at_bound"]]:
         words.append(f"gains at a bound of `[tune.bounds]`: {', '.join(ends)}")

@@ -14,21 +14,22 @@ from tuning.objective.goal import shown
 from tuning.report.front_table import letter
 from tuning.search.explore import Slices
 
-# Largest plotted risk. A lost member raises the risk by about 1e6, which would hide the other values.
+# Largest plotted goal along a gain, relative to that of the answer. A lost member raises the goal by about 1e6, which
+# would hide the other values.
 HIGHEST = 30.0
-# Largest number of panels in a row of the picture of the objective along each gain.
+# Largest number of panels in a row of `landscape`.
 GAINS_PER_ROW = 5
-# Largest plotted value of the goal, relative to the least. Strongly violated limits give values above 1e300.
+# Largest value of the goal in `convergence`, relative to the least. Strongly violated limits give values above 1e300.
 LARGEST_GOAL = 1e9
 # Length (s) of the enlarged start and end of a run; at most a quarter of the run.
 ZOOM = 0.02
-# Time shown after the loss of a rotor, as a share of the time before it.
+# Time shown after the loss of a rotor, as a share of the time shown before it.
 SHOWN_AFTER_LOSS = 0.15
-# Variations below this share of a signal's largest value are shown flat.
+# Smallest height of a vertical axis, as a share of the signal's largest value.
 FLAT = 1e-2
 # Margin above and below the values of a panel, as a share of their range.
 MARGIN = 0.12
-# Smallest amplitude shown, as a share of the largest; smallest number of samples for a spectrum.
+# FAINTEST: smallest plotted amplitude, as a share of the largest. FEWEST: smallest number of samples of a spectrum.
 FAINTEST, FEWEST = 1e-5, 16
 
 
@@ -36,8 +37,9 @@ FAINTEST, FEWEST = 1e-5, 16
 def before_after(runs: dict[str, Trajectory], settle: float = 0.0) -> bytes:
     """Draw z - r and u (averaged over each sample) of runs by name, as PNG. Columns: the whole run, its start, its end.
 
-    A lost run is cut shortly after the loss. If the run "before" is lost, a line of text replaces its panels. In the
-    first column, the axis of a run without loss is scaled to its values from `settle` (s) on.
+    A lost run is cut shortly after the loss. If the run "before" is lost and there is another run, the title of the
+    figure replaces its panels. In the first column, the vertical axis of a run that is not lost shows the range of its
+    values from `settle` (s) on.
     """
     from matplotlib.figure import Figure
 
@@ -79,13 +81,13 @@ def before_after(runs: dict[str, Trajectory], settle: float = 0.0) -> bytes:
                 ax.axvspan(max(ended, low), high, color=RED, alpha=0.12, lw=0)
         if np.isfinite(ended) and signal == "z - r":
             words = _ended(run)
-            paper = {
+            box = {
                 "facecolor": "white",
                 "alpha": 0.7,
                 "edgecolor": "none",
                 "pad": 1,
             }  # a curve may run behind the words
-            line[0].annotate(words, (0.04, 0.06), xycoords="axes fraction", fontsize=8, bbox=paper)
+            line[0].annotate(words, (0.04, 0.06), xycoords="axes fraction", fontsize=8, bbox=box)
         line[0].set_ylabel(f"{name}\n{signal} ({unit})", fontsize=9)
     whole = f"whole run (axis: values after {settle:g} s)" if settle > 0 else "whole run"
     for ax, words in zip(axes[0], (whole, "start", "end"), strict=True):
@@ -125,9 +127,9 @@ def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
 
 
 def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return frequencies (Hz) above 0 and amplitudes of a signal with this sample period (s), under a Hann window.
+    """Return frequencies (Hz) above 0 and amplitudes of `values`, with the sample period (s) and a Hann window.
 
-    The amplitude of a sine is that of its peak, also at half the sampling rate. Both arrays are empty for fewer than
+    A sine of amplitude a gives a peak of height a, also at half the sampling rate. Both arrays are empty for fewer than
     FEWEST samples.
     """
     n = len(values)
@@ -136,13 +138,13 @@ def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarra
     window = np.hanning(n)
     lines = 2 * np.abs(np.fft.rfft(window * (values - values.mean()))) / window.sum()
     if n % 2 == 0:
-        lines[-1] /= 2  # half the sampling rate is the only line without a mirror image
+        lines[-1] /= 2  # above 0, only the line at half the sampling rate has no mirror image
     return np.fft.rfftfreq(n, period)[1:], lines[1:]
 
 
 @own_style
 def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
-    """Draw the minimised goal and the gains of the best start over the iterations, as PNG."""
+    """Draw the goal of each starting point, and the gains of the best one, over the iterations, as PNG."""
     from matplotlib.figure import Figure
 
     value, gains, members = (np.asarray(history[name]) for name in ("value", "gains", "members"))
@@ -153,7 +155,7 @@ def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
     for s in range(cut.shape[1]):
         left.plot(steps, shown(cut[:, s]), "0.75", lw=1)
     left.plot(steps, shown(cut.min(axis=1)), "C0", lw=1.8)
-    title = "blue: best start; dotted: the members change"
+    title = "blue: best starting point; grey: the others; dotted: the training ensemble changes"
     label = "objective" if (cut == value).all() else f"objective (cut at {LARGEST_GOAL:.0e} times the least)"
     left.set(xlabel="iteration", ylabel=label, yscale="log", title=title)
     for j, path in enumerate(paths):
@@ -170,7 +172,7 @@ def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
 
 @own_style
 def landscape(slices: Slices, paths: list[str]) -> bytes:
-    """Draw the goal as a function of each gain, with the other gains of the answer, as PNG."""
+    """Draw the goal as a function of each gain as PNG. The other gains have their values in the answer."""
     from matplotlib.figure import Figure
 
     m = len(paths)
@@ -207,7 +209,7 @@ def landscape(slices: Slices, paths: list[str]) -> bytes:
 def front(rows: list[dict[str, Any]]) -> bytes:
     """Draw settled rms error against settled rms voltage, as PNG. A cross marks a point with lost or stalled members.
 
-    Each point has its letter of the table, its error and its voltage.
+    The label of each point contains its letter in the table, its error and its voltage.
     """
     from matplotlib.figure import Figure
 
@@ -228,7 +230,7 @@ def front(rows: list[dict[str, Any]]) -> bytes:
             ax.plot([volts[n] for n in those], [errors[n] for n in those], style, ms=8, label=label)
     if ax.get_legend_handles_labels()[0]:
         ax.legend(fontsize=8)
-    # the axis has at least half a decade, also for a front of a single point
+    # the axis spans a factor of at least 2.4, also for a front of a single point
     ends = min(min(errors) / 1.2, max(errors) / 2), max(max(errors) * 1.2, min(errors) * 2)
     ax.set(xlabel="settled rms voltage (V)", ylabel=f"settled rms error ({unit})", yscale="log", ylim=ends)
     log_ticks(ax.yaxis, *ends)
