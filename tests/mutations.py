@@ -676,10 +676,10 @@ ENSEMBLE = [
         "tests/test_ensemble.py::test_members_npz_has_a_row_per_member_and_every_metric",
     ),
     M(
-        "a member that runs alone uses another number of lanes",
+        "a member that runs alone is compiled in another way",
         "ambjax/ensemble/replay.py",
         "(*tree, progress, first), threads=1, call=CALL)",
-        "(*tree, progress, first), threads=1, call=1)",
+        "(*tree, progress, first), threads=1, call=CALL, plain=True)",
         "tests/test_replay.py::test_the_printed_command_replays_the_worst_member",
     ),
     M(

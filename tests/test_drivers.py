@@ -59,9 +59,10 @@ def test_an_effect_of_noise_only_is_reported_as_noise():
     for _ in range(200):
         x = RNG.uniform(-1, 1, (5, 100))
         _, explained = drivers({str(k): column for k, column in enumerate(x)}, {"error": RNG.lognormal(size=100)})
-        said.append(explained["error"]["says"] == "no quantity and no pair of quantities explains it; it is noise")
+        said.append(explained["error"]["says"])
     # 95 %, and three times the error of 200 trials
-    assert np.mean(said) > 0.95 - 0.047
+    noise = [one.startswith("no quantity and no pair of quantities explains it; it is noise") for one in said]
+    assert np.mean(noise) > 0.95 - 0.047
 
 
 def test_the_interaction_of_two_quantities_is_found():

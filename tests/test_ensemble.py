@@ -162,7 +162,7 @@ np.save(sys.argv[2], run_ensemble(SMOOTH, members(70), SHORT, fold=Rms("e_z")).m
 
 def test_lengths_that_differ_or_are_missing_are_named():
     assert size(members(5)) == 5
-    for scenario, words in ((NOISY, "lengths none"), (members(3, u_max=np.full(4, 200.0)), "lengths 3 and 4")):
+    for scenario, words in ((NOISY, "leaves: none"), (members(3, u_max=np.full(4, 200.0)), "leaves: 3 and 4")):
         with pytest.raises(ValueError, match=words):
             run_ensemble(SMOOTH, scenario, SHORT, fold=FOLD)
 
@@ -190,7 +190,7 @@ def test_any_function_of_a_member_is_mapped_over_all_and_compiled_once(plain):
             np.testing.assert_array_equal(found["sum"], scale * x.sum(axis=1) ** 2)  # whole numbers
             seen.append(Scaled.traces)
         assert seen[0] == seen[1]
-    with pytest.raises(ValueError, match="lengths 69 and 70"):
+    with pytest.raises(ValueError, match="leaves: 69 and 70"):
         map_members(Scaled(2), {"x": x, "scale": np.arange(69.0)})
 
 

@@ -81,8 +81,8 @@ def test_the_kernel_compiles_for_a_gpu(laws, x64, monkeypatch):
     [
         ({"clock": Clock(6, 1e-4, AdaptiveRodas3())}, "RK4 only"),
         ({"block": 48}, "block = 48: it must be a power of two"),
-        ({"scenario": dataclasses.replace(SCENARIO, seed=np.arange(5))}, "lengths 5 and 37"),
-        ({"scenario": Scenario(), "cascade": Cascade(), "clock": Clock(6, 1e-4, RK4(50))}, "lengths none"),
+        ({"scenario": dataclasses.replace(SCENARIO, seed=np.arange(5))}, "leaves: 5 and 37"),
+        ({"scenario": Scenario(), "cascade": Cascade(), "clock": Clock(6, 1e-4, RK4(50))}, "leaves: none"),
         ({"clock": Clock(0, 1e-4, RK4(1))}, "clock.samples = 0"),
     ],
 )

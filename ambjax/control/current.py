@@ -63,7 +63,7 @@ class SlidingMode(CurrentLaw[tuple[()]]):
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         if context.stepped or self.p is None:
             fast = context.w * float(context.model.i_0)
-            k_i = authority(context, fast, (0.1, 1e3), "w i_0: the bias current at the pole", "Q_i")
+            k_i = authority(context, fast, (0.1, 1e3), "w i_0 in A/s: pole times bias current", "Q_i")
             return {"k_i": k_i, **steepness(context, "k_i")}
         return {"k_i": switch(context, "k_i", self.p, 200, "Q_i")}
 
@@ -73,15 +73,16 @@ class ProportionalIntegral(CurrentLaw[Array]):
     """u = k_p (i_ref - i) + L i_ref' + x, x' = k_int (i_ref - i) + k_aw (clip(u) - u), with x in V.
 
     This linear law uses the inductance L at z = 0 and has no motional term. While the supply limits u to clip(u),
-    back-calculation limits the integral x at the rate k_aw (Astrom and Murray, Feedback Systems, 2008, 10.4). The
-    default gains for a model give the current loop the bandwidth w = 10 w_m, where w_m is the pole of the magnets. On a
-    processor with sample period T, w is at most 1/(4 T): the phase margin is then above 50 degrees with one sample of
-    delay. In the paper's tracking scenario, the default gains hold the rotor, and much lower gains lose it.
+    back-calculation changes the integral x so that u returns to clip(u) at the rate k_aw (Astrom and Murray, Feedback
+    Systems, 2008, 10.4). The default gains for a model give the current loop the bandwidth w_c = 10 w, where w is the
+    unstable pole of the magnets. On a processor with sample period T, w_c is at most 1/(4 T). The phase margin is then
+    above 50 degrees with one sample of delay. In the paper's tracking scenario, the default gains hold the rotor, and
+    much lower gains lose it.
     """
 
-    k_p: Scalar = gain(default=1.76e5, unit="V/A", doc="proportional gain; left out: w L")
-    k_int: Scalar = gain(default=2.33e8, unit="V/A/s", doc="integral gain; left out: w^2 L/4")
-    k_aw: Scalar = gain(default=1330.0, unit="1/s", doc="anti-windup rate; left out: w/4")
+    k_p: Scalar = gain(default=1.76e5, unit="V/A", doc="proportional gain; left out: w_c L")
+    k_int: Scalar = gain(default=2.33e8, unit="V/A/s", doc="integral gain; left out: w_c^2 L/4")
+    k_aw: Scalar = gain(default=1330.0, unit="1/s", doc="anti-windup rate; left out: w_c/4")
     memory = (("x", "V", "integral of the current error"),)
 
     def init(self, model: Plant) -> Array:
@@ -116,14 +117,14 @@ class ProportionalIntegral(CurrentLaw[Array]):
 
 @record
 class DeadBeat(CurrentLaw[tuple[()]]):
-    """i' = i_ref' - w (i - i_ref), from Eq. (2). With implicit steps, each sample multiplies i - i_ref by 1 - share.
+    """Law that inverts Eq. (2) for i' = i_ref' - w (i - i_ref). Each implicit step multiplies i - i_ref by 1 - share.
 
     In continuous time u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - w (i - i_ref)) + R i. On a processor with
     implicit steps u is the constant voltage that, for constant z and z_dot, changes the current in one sample from i to
-    i_ref + T i_ref' + (1 - share) (i - i_ref). With share = 1, dead-beat, the current is at its reference one sample
-    after u acts, unless the supply limits u (Astrom and Wittenmark, Computer-Controlled Systems, 1997, 4.3). These
-    steps do not use w; continuous time and explicit steps do not use share. There is no integral: a wrong resistance of
-    the model leaves an offset.
+    i_ref + T i_ref' + (1 - share) (i - i_ref). With share = 1 (dead-beat), the current is at its reference one sample
+    after u begins to act, unless the supply limits u (Astrom and Wittenmark, Computer-Controlled Systems, 1997, 4.3).
+    Implicit steps do not use w. Explicit steps and the law in continuous time do not use share. There is no integral,
+    so a wrong resistance of the model leaves an offset.
     """
 
     w: Scalar = gain(default=1e4, unit="1/s", doc="decay rate of the current error in continuous time")
@@ -149,7 +150,10 @@ class DeadBeat(CurrentLaw[tuple[()]]):
         return (model.kappa / 2) * inverse * wanted + model.R * measured.i, ()
 
     def step(self, model: Plant, inputs: CurrentInputs, state: tuple[()], period: Scalar) -> tuple[Array, tuple[()]]:
-        """Return the voltage that moves i to its wanted value in a sample: i' = b u - decay i, b = 2 (s_0+z)/kappa."""
+        """Return the voltage that moves i to its wanted value in one sample.
+
+        The model is i' = b u - decay i with constant b = 2 (s_0+z)/kappa and decay.
+        """
         measured, demand = inputs.measured, inputs.demand
         gaps = inputs.gaps or model.gaps(measured.z)
         per_volt = (2 / model.kappa) * gaps.lower
@@ -159,12 +163,12 @@ class DeadBeat(CurrentLaw[tuple[()]]):
         return (change * (1 / period) / _mean_decay(decay * period) + decay * i) / per_volt, ()
 
     def idle_gains(self, implicit: bool | None) -> tuple[str, ...]:
-        """Return w for implicit steps of a processor, otherwise share: explicit steps use the continuous-time law."""
+        """Return the gain without effect: w with implicit steps; share with explicit steps and in continuous time."""
         return ("w",) if implicit else ("share",)
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         return {
-            "w": rate(context, 1, 100, "rate from w to 100 w"),
+            "w": rate(context, 1, 100, "decay rate from 1 to 100 times the pole"),
             "share": Interval(0.1, 1.0, "a tenth of the error to all of it", True),
         }
 
@@ -173,8 +177,9 @@ class DeadBeat(CurrentLaw[tuple[()]]):
 class OpenLoop(CurrentLaw[tuple[()]]):
     """u = R i_ref: the voltage that holds the reference current. The current is not fed back.
 
-    It is for a position law that demands a voltage, such as position.LinearController: with inversion.Linearised, u is
-    the demanded voltage. On a processor u = R (i_ref + T i_ref'), from the reference computed at this sample.
+    Use it with a position law that demands a voltage, such as position.LinearController. With inversion.Linearised, u
+    is then the demanded voltage. On a processor u = R (i_ref + T i_ref'), where i_ref + T i_ref' is the reference that
+    the inversion computes at this sample.
     """
 
     accepts: ClassVar = ("voltage",)

@@ -21,11 +21,12 @@ MOST_DELAY = 2.0
 
 @record
 class Processor:
-    """How a sampled cascade runs. The period T is that of the clock.
+    """Delay, discretisation, prediction and guard of a sampled cascade. The clock gives the sample period T.
 
-    At t_n = n T the sensors are read and every law steps. The voltage acts from t_n + delay T to t_{n+1} + delay T;
-    before the first sample acts, u = 0. With `predict` the laws use the nominal model's prediction for the end of the
-    delay and the reference at that instant. `assumed` is the delay of the prediction if it differs from the true one.
+    At t_n = n T the sensors are read and every law makes one step. The resulting voltage acts from t_n + delay T to
+    t_{n+1} + delay T. Before t_0 + delay T, u = 0. With `predict`, all laws except the observer use the state that the
+    nominal model predicts for the end of the delay, and the reference at that instant. `assumed` is the delay over
+    which the model predicts, if it differs from the true delay.
     """
 
     delay: Scalar = leaf(
@@ -36,10 +37,10 @@ class Processor:
         doc="time from the measurement until the voltage acts",
     )
     implicit: bool = static(
-        default=True, doc="implicit steps, with the signs at the end of the step; otherwise explicit Euler steps"
+        default=True, doc="implicit steps, which evaluate signs at the end of the step; otherwise explicit Euler steps"
     )
     predict: bool | None = static(
-        default=None, doc="the laws use the estimate predicted over the delay; None: if there is a delay"
+        default=None, doc="whether the laws use the estimate predicted over the delay; None: True if there is a delay"
     )
     assumed: Scalar | None = leaf(
         default=None,
@@ -72,17 +73,17 @@ class Processor:
         return bool(self.resolved().most) if self.predict is None else self.predict
 
     def resolved(self, *others: Scalar, between: bool = False) -> "Processor":
-        """Return this processor with `whole` and `most` set, which determine its compiled program.
+        """Return this processor with `whole` and `most` set. These two fields select the compiled program.
 
         The program supports the processor's own delay and the delays `others`; with `between`, also every delay between
-        them. If the processor already supports longer delays, it keeps them, so that a part of an ensemble runs the
-        program of the whole ensemble. Raises ValueError if the delay is traced and `most` is None.
+        them. A larger `most`, and a `whole` that is False, are not changed. A part of an ensemble thus runs the same
+        program as the whole ensemble. Raises ValueError if the delay is traced and `most` is None.
         """
         if is_traced(self.delay):
             if self.most is None:
                 raise ValueError(
-                    "processor.delay: inside jit, grad or vmap it is traced, and no program can be chosen. Call "
-                    "cascade.on_processor() outside."
+                    "processor.delay is traced (jit, grad or vmap), so its value cannot select the compiled program. "
+                    "Call cascade.on_processor() before the transformation."
                 )
             return self
         delay = np.concatenate([np.ravel(np.asarray(x, float)) for x in (self.delay, *others)])
@@ -92,7 +93,7 @@ class Processor:
         return dataclasses.replace(self, whole=whole, most=most)
 
     def prediction_steps(self, period: Scalar) -> tuple[Array, ...]:
-        """Return the times (s) for which u_{n-1} and u_{n-2} act in the prediction; u_{n-2} acts first."""
+        """Return the durations (s) for which u_{n-1} and u_{n-2} act in the prediction; u_{n-2} acts first."""
         ahead = jnp.asarray(self.ahead)
         return (jnp.minimum(ahead, 1.0) * period, jnp.maximum(ahead - 1.0, 0.0) * period)[: self.most]
 
@@ -104,9 +105,9 @@ def predicted_over_delay(
     past: tuple[Array, Array],
     lengths: tuple[Array, ...],
 ) -> Measurement:
-    """Predict the estimate by one RK4 step of the model for each command of `past`, the earliest first.
+    """Return the estimate at the end of the delay. The model makes one RK4 step per command, the earliest first.
 
-    `driven`: `Cascade.driven`. `past`: the commands u_{n-1} and u_{n-2}. `lengths`: time for which each acts, s.
+    `driven`: `Cascade.driven`. `past`: the commands u_{n-1} and u_{n-2}. `lengths`: durations for which they act, s.
     """
     x = model.start(estimate)
     for u, h in reversed(list(zip(past, lengths, strict=False))):

@@ -24,15 +24,15 @@ from ambjax.simulation.folds import Fold
 from ambjax.simulation.rollout import Outcome, System, prepare, run
 from ambjax.world.scenario import Scenario
 
-# Largest number of members in one call of the compiled program, unless the caller gives it.
+# Largest number of members in one call of the compiled program, if the argument `call` is None.
 MOST_CALL = 4096
-# If an ensemble is split into several calls, the array of each number has at least this size (bytes) in a call. Two
-# smaller calls on two cores are not faster than one call on one core.
+# If an ensemble is split into several calls, each call has at least so many members that an array with one number per
+# member has this size (bytes). Two smaller calls on two cores are not faster than one call on one core.
 LEAST_BYTES = 256
 # Name of the mesh axis over which members are distributed.
 MEMBERS = "members"
 
-# A pytree of an ensemble or of one member, and the result of a function of a member.
+# Result of the mapped function: a pytree, of one member, of a block or of the whole ensemble.
 Result = TypeVar("Result")
 
 
@@ -62,7 +62,7 @@ def run_ensemble(
 
     Returns an Outcome in member order: every leaf has a leading axis [N], rows have shape [N, rows].
 
-    Raises ValueError as `rollout` does, and if the lengths of two leaves differ.
+    Raises ValueError as `rollout` does, if the lengths of two leaves differ, and if no leaf is an array.
     """
     tree = canonical((*prepare(cascade, scenario, clock), fold))
     return map_members(_rollout(every), tree, threads=threads, call=call)
@@ -94,18 +94,18 @@ def map_members(
     Each leaf of `tree` is a number, shared by all members, or an array [N, ...] with one entry per member. At least one
     leaf must be an array. Members run on all devices of the default backend.
 
-    - `function`: maps a tree with the leaves of one member to a pytree of arrays. JAX traces it. It compiles again if
-      the function is not equal (==) to that of an earlier call: use a named function or a frozen dataclass, not a new
-      lambda.
+    - `function`: maps a tree with the leaves of one member to a pytree of arrays. JAX traces it, and compiles it again
+      unless an equal (==) function was mapped before. Use a named function or a frozen dataclass, not a new lambda.
     - `threads`: CPU cores to use (None: all cores that this process may use).
     - `call`: members in one call of the compiled program, rounded up to whole blocks (None: equal shares for all cores,
-      at most 4096 members each). Memory grows with `call`, not with N. A new value of `call` compiles again. If there
-      are fewer blocks than cores, some cores are idle.
+      at most 4096 members each). The memory of the simulation grows with `call`, not with N. A new value of `call`
+      requires a new compilation. Each core runs one call at a time. If there are fewer calls than cores, some cores are
+      idle.
     - `block`: members that run together in vector instructions (None: as many as fit the first-level cache,
       fewer in a small ensemble).
     - `plain`: compile without the fast path, which does not support the functions of LAPACK, such as eigenvalues.
-    - `vectorised`: the function is vectorised already. It receives the tree of a block of members, and the tree
-      `in_axes` of `jax.vmap` (0 or None for each leaf). Each leaf of its result has a leading axis of the block.
+    - `vectorised`: whether the function is vectorised already. It then receives the tree of a block of members, and the
+      tree `in_axes` of `jax.vmap` (0 or None for each leaf). Each leaf of its result has a leading axis of the block.
 
     Returns NumPy arrays in member order, every leaf with a leading axis [N].
 
@@ -123,14 +123,14 @@ def size(tree: object) -> int:
     if len(lengths) != 1:
         listing = " and ".join(str(n) for n in sorted(lengths)) or "none"
         raise ValueError(
-            f"ensemble: leaves have lengths {listing}; there must be one length. Give scenario.member = np.arange(N), "
-            "and every other leaf that varies as an array of the same N."
+            f"ensemble: lengths of the array leaves: {listing}. There must be exactly one length. Give "
+            "scenario.member = np.arange(N), and every other leaf that varies as an array with N entries."
         )
     return lengths.pop()
 
 
 class _Engine(Generic[Result]):
-    """One ensemble, split into calls of the compiled program. All calls have the same shape, so it compiles once."""
+    """One ensemble, split into calls of one program. All calls have the same shape, so JAX compiles it once."""
 
     def __init__(
         self,

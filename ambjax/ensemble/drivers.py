@@ -1,17 +1,17 @@
-"""Sensitivity of a metric: the share of its variation that each spread quantity explains.
+"""Global sensitivity of a metric: the share of its variation that each number of [spread] (spread quantity) explains.
 
-The share is Sobol's first-order index Var(E[y | x])/Var(y), where y is the rank of the metric. The relation may have
-any shape, for example that of a line or of a V. Ranks limit the influence of a few lost rotors and of times that are
-never reached (+inf).
+The share is Sobol's first-order index Var(E[y | x])/Var(y), where x is the quantity and y the rank of the metric. The
+relation of y to x may have any shape, for example a line or a V. Ranks limit the influence of a few lost rotors and of
+times that are never reached (+inf).
 
-E[y | x] is a least-squares fit of cosines of the rank of x, as in Plischke's EASI (Reliab. Eng. Syst. Saf. 95, 2010,
-354-360). Its bias is removed as in Tissot and Prieur (Reliab. Eng. Syst. Saf. 107, 2012, 205-213). Spearman's rank
-correlation gives the sign of the trend.
+E[y | x] is estimated by a least-squares fit of cosines of the rank of x, as in Plischke's EASI (Reliab. Eng. Syst. Saf.
+95, 2010, 354-360). The bias of the share is removed as in Tissot and Prieur (Reliab. Eng. Syst. Saf. 107, 2012,
+205-213). Spearman's rank correlation gives the sign of the trend.
 
-Existing implementations are not suitable. SALib's `rbd_fast` is the same estimator, but it ranks ties in member order,
-so that a choice of two values becomes a ramp and a constant appears to have an influence. `rbd_fast` computes its
-intervals from half the members, and computes neither p-values nor shares of pairs. SciPy's `sobol_indices` evaluates
-the model at its own points.
+Existing implementations are not suitable. SALib's `rbd_fast` is the same estimator, but it ranks equal values in member
+order. A quantity with only two values is then treated as a ramp, and a constant appears to have an influence.
+`rbd_fast` computes its intervals from half the members. It computes neither p-values nor shares of pairs. SciPy's
+`sobol_indices` evaluates the model at its own points, so it cannot use the members of an ensemble.
 """
 
 import itertools
@@ -22,14 +22,17 @@ import numpy as np
 
 # Number of cosines fitted to a metric. Six of them explain a V-shaped relation, or one period of a sine, to 1 %.
 TERMS = 6
-# Minimum number of members per cosine. Members that have the commonest value do not count.
+# Minimum number of members per cosine. Members with the most frequent value of the metric do not count.
 PER_TERM = 4
-# Number of cosines of each quantity of a pair, and number of members used to find pairs.
+# Number of cosines of each quantity of a pair, and largest number of members used to find pairs.
 PAIR_TERMS, PAIR_MEMBERS = 2, 16_384
 
 
 class Shares(NamedTuple):
-    """Shares of variation, ends of their intervals, and p, the probability of such a share for unrelated columns."""
+    """Shares of variation, and the ends of their intervals.
+
+    `p`: probability of a share of at least this size if x and y are unrelated.
+    """
 
     share: np.ndarray
     low: np.ndarray
@@ -42,16 +45,17 @@ def _correlation(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def shares(x: Sequence[np.ndarray], y: Sequence[np.ndarray], confidence: float = 0.95) -> Shares:
-    """Compute the share of the variation of every column of y that each column of x alone explains, columns [N].
+    """Compute the share of the variation of each column of y [N] that each column of x [N] explains alone.
 
-    The values of y are used as they are; pass ranks to get the share of ranks. Intervals come from the delta method. A
-    column that is constant, or constant for all but a few members, has share 0, interval (0, 1) and p = 1.
+    The values of y are used as they are; pass ranks to get shares of the variation of the rank. Intervals come from the
+    delta method. The share is 0, with interval (0, 1) and p = 1, if the column of x or of y is constant, or if fewer
+    than PER_TERM members differ from the most frequent value of y.
 
     Returns arrays [len(x), len(y)]. Raises ValueError if a column of y is not finite.
     """
     columns = [np.asarray(column, float) for column in y]
     if not all(np.isfinite(column).all() for column in columns):
-        raise ValueError("a column is not finite: there is no variation to share. Give its ranks.")
+        raise ValueError("a column of y is not finite, so its variance is undefined. Pass its ranks instead.")
     Y = np.stack([_standard(column) for column in columns])
     terms = _terms(columns)
     results = [_explanation(_cosines(column, TERMS), Y, terms, confidence) for column in x]
@@ -61,15 +65,15 @@ def shares(x: Sequence[np.ndarray], y: Sequence[np.ndarray], confidence: float =
 def drivers(
     spread: Mapping[str, np.ndarray], metrics: Mapping[str, np.ndarray], confidence: float = 0.95
 ) -> tuple[dict[str, list[dict[str, object]]], dict[str, dict[str, object]]]:
-    """Rank the spread quantities by the share of each metric that they explain, and summarise what is explained.
+    """Rank the spread quantities by the share of the variation of each metric that they explain, with a summary.
 
     - `spread`: columns [N] of the spread quantities, by dotted path.
     - `metrics`: columns [N] of the metrics, by name.
 
     Returns two dicts by metric. The first holds a list of quantities in descending order of their share, each with
     "path", "share", "low", "high", "p" and "rho" (the rank correlation, which gives the sign of the trend). The second
-    holds "alone", the sum of the significant shares; "pair", the two quantities with the largest significant share
-    beyond their own (None: no pair is significant); and "says", a sentence. Significance is at the level
+    holds "alone", the sum of the significant shares; "pair", the pair of quantities whose interaction has the largest
+    significant share (None: no pair is significant); and "says", a sentence. Significance is at the level
     1 - confidence for all tests of a metric together (Bonferroni's correction).
     """
     if not spread:
@@ -95,18 +99,18 @@ def _account(alone: float, pair: dict[str, Any] | None, says: str) -> dict[str, 
 
 
 def _words(ranks: np.ndarray, alone: float, pair: dict[str, Any] | None, unknown: bool) -> str:
-    """Describe in words what is explained of one metric."""
+    """Return a sentence about the explained share of the variation of one metric."""
     if np.ptp(ranks) == 0:
         return "it is the same for all members"
     if unknown:
         return "too few members differ to identify its causes"
     if not alone and pair is None:
-        return "no quantity and no pair of quantities explains it; it is noise"
+        return "no quantity and no pair of quantities explains it; it is noise or an effect of three or more quantities"
     together = ""
     if pair is not None:  # the sum of the estimates may exceed 1
         more = 100 * min(pair["share"], 1.0 - alone)
         amount = f"{more:.0f} % more" if more >= 1 else "a little more"
-        together = f", {' with '.join(pair['paths'])} together {amount}"
+        together = f"; {' with '.join(pair['paths'])} together explain {amount}"
     left = alone + (0.0 if pair is None else pair["share"]) < 0.995
     rest = "; the rest is noise or an effect of three or more quantities" * left
     return f"single quantities explain {100 * alone:.0f} % of the variation of its rank{together}{rest}"
@@ -115,7 +119,7 @@ def _words(ranks: np.ndarray, alone: float, pair: dict[str, Any] | None, unknown
 def _pairs(
     spread: dict[str, np.ndarray], ranks: Sequence[np.ndarray], confidence: float
 ) -> list[dict[str, Any] | None]:
-    """Return, for each column, the pair with the largest significant share beyond the two alone; None without one."""
+    """Return, for each metric, the pair whose interaction has the largest significant share; None: there is none."""
     sample = slice(0, PAIR_MEMBERS)
     Y = np.stack([_standard(column[sample]) for column in ranks])
     waves = {path: _cosines(x[sample], PAIR_TERMS) for path, x in spread.items()}
@@ -161,7 +165,10 @@ def _explanation(waves: np.ndarray, Y: np.ndarray, terms: Sequence[int], confide
 
 
 def _terms(columns: Sequence[np.ndarray], most: int = TERMS) -> list[int]:
-    """Return the number of cosines to fit to each column, from the number of members without its commonest value."""
+    """Return the number of cosines to fit to each column.
+
+    It follows from the number of members that differ from the most frequent value of the column.
+    """
     differing = [len(column) - int(np.unique(column, return_counts=True)[1].max()) for column in columns]
     return [min(most, count // PER_TERM) for count in differing]
 

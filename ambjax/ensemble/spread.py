@@ -1,8 +1,8 @@
 """Spreads: which numbers of a case vary between the members of an ensemble, and their distributions.
 
-Every distribution has bounds. If they exceed the allowed range of the number, a ValueError is raised; a distribution is
-never truncated. Examples of refused spreads: those that allow a negative mass, a pulse that ends before it starts, or a
-rotor that starts outside its clearance.
+Every distribution has bounds. If they exceed the allowed range of the number, a ValueError is raised. The distribution
+is not truncated to the allowed range. Examples of refused spreads: those that allow a negative mass, a pulse that ends
+before it starts, or a rotor that starts outside its clearance.
 """
 
 import dataclasses
@@ -19,8 +19,8 @@ from ambjax.host.synonyms import hint_of_path
 from ambjax.numerics.declared import numbers, within
 from ambjax.world.scenario import POLE, Scenario
 
-# Prefixes of the paths whose values affect the choice of the integration step. A disturbance is among them because
-# steps end at its edges. Sensors, and amplifiers apart from their bandwidth, are solved exactly.
+# Prefixes of the paths whose values affect the choice of the integration step. Disturbances are among them because
+# steps end at their jumps. Sensors and the other numbers of amplifiers are solved exactly, without integration steps.
 STEP_PATHS = ("plant.", "controller.", "actuator.bandwidth", "run.clearance", "run.stop", "disturbance.")
 
 
@@ -70,8 +70,8 @@ def apply(cascade: Cascade, scenario: Scenario, values: Mapping[str, object]) ->
 def corners(spread: Spread, cascade: Cascade, scenario: Scenario) -> tuple[Cascade, Scenario]:
     """Return the cascade and scenario at every combination of the ends of the spreads that affect the step.
 
-    Each such number gets an array axis of length 2. An integration method chosen for the largest slope of this ensemble
-    then holds for every member. Raises ValueError as `check_spread` does.
+    Each such number gets an array axis of length 2. An integration method chosen for the largest slope (rate, 1/s) of
+    this ensemble is then valid for every member. Raises ValueError as `check_spread` does.
     """
     check_spread(spread, cascade, scenario)
     return ends(spread, cascade, scenario, STEP_PATHS)
@@ -102,10 +102,10 @@ class SpreadError(ValueError):
 
 
 def check_spread(spread: Spread, cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
-    """Return all numbers of this cascade and scenario by dotted path.
+    """Check a spread, and return all numbers of this cascade and scenario by dotted path.
 
-    Raises ValueError, one line, if the spread is not valid for them: the path, the value, the allowed range and the
-    fix.
+    Raises ValueError if the spread is not valid for them. The message is one line with the path, the value, the allowed
+    range and the fix.
     """
     if spread.design not in DESIGNS:
         raise ValueError(f"spread.design = {spread.design!r}: it must be one of {', '.join(map(repr, DESIGNS))}.")
@@ -195,7 +195,7 @@ def _check_together(
     if not stops[1] < reach(gap)[0] and explicit:
         refuse(
             ("run.clearance", gap),
-            f"run.clearance reaches {stops[1]:g} m, but must stay below plant.s_0. Narrow the range.",
+            f"run.clearance reaches {stops[1]:g} m, but must stay below {gap}, {reach(gap)[0]:g} m. Narrow the range.",
         )
     far = max(map(abs, reach("initial.z")))
     what, limit = ("the clearance", stops[0]) if scenario.stop is None else (f"{POLE} of s_0", POLE * reach(gap)[0])
@@ -207,13 +207,16 @@ def _check_together(
 
 
 def _check_coils(reach: Callable[[str], tuple[float, float]], refuse: Callable[[tuple[str, ...], str], None]) -> None:
-    """Check that the limits of each coil contain its bias. `reach`: ends of the number at a path; NaN: no limit."""
+    """Check that the limits of each coil exceed its bias: i_max > i_0 and u_max > R i_0.
+
+    `reach`: ends of the number at a path; NaN: no limit.
+    """
     i_max, u_max, i_0, R = "actuator.coil.i_max", "actuator.coil.u_max", "plant.i_0", "plant.R"
     least, most = reach(i_max)[0], reach(i_0)[1]
     if least <= most:
-        text = f"{i_max} can be as small as {least:g} A, and {i_0} reaches {most:g} A, but must stay below it."
+        text = f"{i_max} can be as small as {least:g} A, but must stay above {i_0}, which reaches {most:g} A."
         refuse((i_max, i_0), f"{text} Narrow the range.")
     least, most = reach(u_max)[0], reach(R)[1] * reach(i_0)[1]
     if least <= most:
-        text = f"{u_max} can be as small as {least:g} V, and R i_0 reaches {most:g} V, but must stay below it."
+        text = f"{u_max} can be as small as {least:g} V, but must stay above R i_0, which reaches {most:g} V."
         refuse((u_max, R, i_0), f"{text} Narrow the range.")

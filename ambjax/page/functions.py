@@ -11,12 +11,12 @@ from ambjax.codegen.javascript.script import HELPERS, js_constant
 from ambjax.codegen.primitives import OPS
 from ambjax.codegen.program import Location, Operand, Program, Ref
 
-# Definitions of the functions that the statements use and JavaScript lacks.
+# JavaScript definitions of the functions that the generated code calls, and that `Math` lacks or defines differently.
 PRELUDE = "\n".join(f"const {name} = {text};" for name, text in HELPERS.items())
 
 
 class Script:
-    """The nodes of a program as JavaScript. The name of an input is that of its location; node n is `vN`."""
+    """The nodes of a program as JavaScript. An input has the name of its location. Node 7, if not an input, is `v7`."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -32,13 +32,13 @@ class Script:
         return f"({text})" if text.startswith("-") else text
 
     def statements(self, order: Sequence[int]) -> list[str]:
-        """Return the declarations of the values of the nodes `order`."""
+        """Return one `const` declaration for each node number in `order`."""
         nodes = self.program.nodes
         return [f"const v{n} = {OPS[nodes[n].op].javascript.format(*map(self.operand, nodes[n].args))};" for n in order]
 
 
 class Piece(NamedTuple):
-    """A traced function: its program, and the pytrees of the operands of its arguments and of its results."""
+    """A traced function: its program, and its arguments and results as pytrees whose leaves are operands."""
 
     program: Program
     arguments: Any
@@ -91,7 +91,7 @@ def _fixed(program: Program, order: Sequence[int], given: Sequence[Operand]) -> 
 def function_source(piece: Piece, name: str, arrays: Sequence[str], results: object) -> str:
     """Return a JavaScript function `name(ARRAYS..., out)` that writes results into the array `out` and returns it.
 
-    - `arrays`: for each argument of the traced function, the name of the array with its leaves.
+    - `arrays`: for each argument of the traced function, the name of the JavaScript array that holds its leaves.
     - `results`: pytree of the operands to write.
     """
     script, roots = Script(piece.program), operands_of(results)
@@ -106,7 +106,7 @@ def function_source(piece: Piece, name: str, arrays: Sequence[str], results: obj
 
 
 def _loads(program: Program, array: str, refs: Sequence[Ref], needed: set[int]) -> list[str]:
-    """Return declarations that read the inputs `refs`, as far as they are needed, from an array."""
+    """Return declarations that read inputs from a JavaScript array: those of `refs` that are in `needed`."""
     lines = []
     for k, ref in enumerate(refs):
         if ref.node in needed:
@@ -119,12 +119,12 @@ def loop_source(piece: Piece, name: str, shown: Sequence[Operand], always: Seque
 
     - `piece`: the traced `LoopFunctions.step`.
     - `shown`: the operands that a row contains.
-    - `always`: results of the step whose states are kept although no row needs them. `run` updates only the states on
-      which an operand in `shown` or `always` depends, in the same sample or in a later one.
+    - `always`: further results of the step, which no row contains. `run` updates a state only if an operand in `shown`
+      or `always` depends on it, in the same sample or in a later one.
 
-    `run` computes the samples `from` <= n < `to`. P: parameters; S: the state, which `run` updates; W: three normal
-    numbers per sample. `run` writes one row per sample into `rows`, unless that is null. Values that depend only on
-    parameters are computed once, in `name(P)`.
+    `run` computes the samples `from` <= n < `to`. P: parameters. S: the state, which `run` updates. W: three standard
+    normal random numbers per sample. `run` writes one row per sample into `rows`, unless `rows` is null. `name(P)`
+    computes the values that depend only on parameters, once.
     """
     program, script = piece.program, Script(piece.program)
     parameters, before = operands_of(piece.arguments[0]), operands_of(piece.arguments[1])

@@ -11,13 +11,13 @@ from tuning.objective.members import Objective
 from tuning.objective.shortfalls import Bound
 from tuning.space import Gain, Space
 
-# Least displacement assumed for a rotor that starts at rest, as a share of the clearance.
+# Least initial displacement that is assumed, as a share of the clearance, even if the rotor starts closer to z = 0.
 LEAST_DISPLACEMENT = 0.01
-# Default upper bound of a gain: this factor times the larger of the end of its range and its initial value.
+# Default upper bound of a gain: this factor times the larger of the upper end of its range and its value in the case.
 END_FACTOR = 3.0
 # Range of a gain for which the law defines none: its value divided and multiplied by this factor.
 DEFAULT_FACTOR = 30.0
-# Ratio of the ends of a range of which only one end is known.
+# Ratio of the ends of a range if the law's range lies beyond the only bound of [tune.bounds]; it then begins there.
 OPEN_RATIO = 1e3
 
 
@@ -38,9 +38,10 @@ class Range:
 def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarray) -> list[Range]:
     """Return a range for each gain of the space, from the gains `start` [m] of the case.
 
-    The range is that of tune.bounds if both bounds are given, else that of the law, else DEFAULT_FACTOR around the
-    value. Without an upper bound a gain may reach END_FACTOR times the larger of the end of its range and `start`; if
-    the law's interval is firm, the factor is 1.
+    The range is that of [tune.bounds] if both bounds are given. Otherwise it is the range of the law or, if the law
+    defines none, the value divided and multiplied by DEFAULT_FACTOR. A single bound limits this range. Without an upper
+    bound, the upper bound is END_FACTOR times the larger of the upper end of the range and the value. The factor is 1
+    if the interval of the law is firm (`Interval.firm`).
     """
     context, gains = _context(objective, conditions), objective.space.gains
     interval = [_interval(context, objective.cascade, *one) for one in zip(gains, start, strict=True)]
@@ -55,7 +56,7 @@ def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarra
 def from_unit_cube(space: Space, box: list[Range], cube: np.ndarray) -> np.ndarray:
     """Map points of the unit cube [n, m] to gains [n, m], log-uniform over the ranges `box`.
 
-    All knots of a schedule have the value of the first: the search begins at constant gains.
+    All knots of a schedule use the coordinate of the first, so with equal ranges the search begins at constant gains.
     """
     stems = [".".join(path.split(".")[:3]) for path in space.paths]
     cube = cube[:, [stems.index(stem) for stem in stems]]
@@ -70,8 +71,8 @@ def from_unit_cube(space: Space, box: list[Range], cube: np.ndarray) -> np.ndarr
 def bounded(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarray) -> tuple[Space, list[Range]]:
     """Return the space with an upper bound for every gain, and the ranges that the bounds come from.
 
-    Without an upper bound, a gain along which the loss is flat (gamma, above all) drifts to values at which the
-    integration step is too coarse.
+    The loss hardly depends on some gains, gamma in particular. Without an upper bound, the search moves such a gain to
+    values for which the integration step is too large.
     """
     gains, box = objective.space.gains, ranges(objective, conditions, start)
     return Space(tuple(dataclasses.replace(gain, high=at.most) for gain, at in zip(gains, box, strict=True))), box
@@ -93,7 +94,9 @@ def _context(objective: Objective, conditions: tuple[Bound, ...]) -> SearchConte
     needed = (
         LowerBound(delta, "Delta_1", f"Delta_1 = {delta:.3g} A^2/m^2/s along the reference, Eq. (7)")
         if delta >= fall
-        else LowerBound(fall, "D", f"D = dv/dz w z = {fall:.3g} A^2/m^2/s, required by Eq. (7) for a fall from {where}")
+        else LowerBound(
+            fall, "D", f"D = dv/dz w z = {fall:.3g} A^2/m^2/s, required by Eq. (7) if the rotor falls from z = {where}"
+        )
     )
     processor = objective.cascade.processor
     stepped = processor is not None and processor.implicit
@@ -105,7 +108,9 @@ def _interval(context: SearchContext, cascade: Cascade, gain: Gain, value: float
         return Interval(gain.low, gain.high, "tune.bounds", True)
     _, stage, name, *_ = gain.path.split(".")
     about = Interval(
-        value / DEFAULT_FACTOR, value * DEFAULT_FACTOR, f"a factor of {DEFAULT_FACTOR:g} about the case's value"
+        value / DEFAULT_FACTOR,
+        value * DEFAULT_FACTOR,
+        f"1/{DEFAULT_FACTOR:g} to {DEFAULT_FACTOR:g} times the case's value",
     )
     return extremes(getattr(cascade, stage))[0].ranges(context).get(name, about)
 

@@ -1,4 +1,7 @@
-"""One iteration of a search: a step of each descending start, and a population of each start that uses CMA-ES."""
+"""One iteration of a search: one descent step, or one CMA-ES population, of each start.
+
+A start is a point that the search refines, with the state of its optimiser.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +27,8 @@ def iterate(
 ) -> None:
     """Run one iteration of all active starts and update `progress`.
 
-    `weights` [S, 6]: of the terms for each start; None: those of the goal. `seed`: of the populations.
+    `weights` [S, 6]: weights of the loss terms for the descent of each start; None: those of the goal. `seed`: seed of
+    the populations of CMA-ES.
     """
     fresh = progress.iteration == progress.since
     better = _descended(engine, goal, members, progress, descent, weights) | _evolved(
@@ -41,7 +45,7 @@ def _descended(
     descent: Descent,
     weights: np.ndarray | None,
 ) -> dict[int, dict[str, np.ndarray]]:
-    """Run one step of the descending starts. Return the terms [N] by name of each start that improves."""
+    """Run one step of each start that descends. Return the loss terms of the starts that improve, by index and name."""
     starts, on = progress.starts, progress.active & ~progress.evolving
     active = np.flatnonzero(on)
     if not active.size:
@@ -61,7 +65,7 @@ def _descended(
 def _evolved(
     engine: Engine, goal: Goal, members: Members, progress: SearchState, seed: int
 ) -> dict[int, dict[str, np.ndarray]]:
-    """Evaluate one population of each start that uses CMA-ES. Return the same as `_descended`."""
+    """Evaluate one population of each start that uses CMA-ES and update its distribution. Returns as `_descended`."""
     active = np.flatnonzero(progress.active & progress.evolving)
     if not active.size:
         return {}
@@ -92,9 +96,10 @@ def append_history(
     *,
     fresh: bool = False,
 ) -> None:
-    """Add a row to the history with the best point of each start.
+    """Add a row with the best point of each start to the history, and increment `progress.iteration`.
 
-    `better`: terms [N] by name of each start that improved. `fresh`: whether the previous row belongs to other members.
+    `better`: loss terms [N] by name, by index of each start that improved. `fresh`: whether this is the first row of a
+    phase; an earlier row then belongs to other members.
     """
     past, count = progress.history, len(progress.active)
     lost = np.full(count, len(members.member)) if fresh else np.array(past["lost"][-1])
