@@ -51,22 +51,24 @@ def _sensitivity(facts: TuningFacts) -> str:
     found = facts.sensitivity
     if not found or not found["members"]:
         return "**Sensitivity:** not computed here; `ambjax sensitivity tuned.toml` computes |S| and the zone."
-    rows = [(_peak(row, found), row) for row in found["members"]]
-    peak, row = max(rows, key=lambda one: one[0])
+    peak, at = max((_peak(row, found) for row in found["members"]), key=lambda one: one[0])
     zone = max(one["injected_zone"] or one["zone"] for one in found["members"])
     if not math.isfinite(peak):
         return f"**Sensitivity:** a member is lost when a test signal is injected: zone {zone}."
-    at = row["frequency_hz"] if row["peak"] is None else row["at_hz"]
     return f"**Sensitivity:** |S| is at most {peak:.3g} (at {at:.3g} Hz) over the worst members: zone {zone}."
 
 
-def _peak(row: Row, found: Row) -> float:
-    """Return the peak that counts: the injected one if only it decides, else the larger one; inf if a rotor is lost."""
+def _peak(row: Row, found: Row) -> tuple[float, float]:
+    """Return the peak that counts and its frequency, Hz; inf if a rotor is lost.
+
+    It is the injected peak if only injected peaks decide, otherwise the larger one.
+    """
     if row["repetitions"] and row["peak"] is None:
-        return math.inf
+        return math.inf, math.nan
+    linear, injected = (row["linear"], row["frequency_hz"]), (row["peak"], row["at_hz"])
     if row["peak"] is None:
-        return row["linear"]
-    return row["peak"] if found["decides"] else max(row["peak"], row["linear"])
+        return linear
+    return injected if found["decides"] else max(injected, linear)
 
 
 def _limiting(facts: TuningFacts) -> str:

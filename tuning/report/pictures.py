@@ -9,7 +9,7 @@ from ambjax.pictures.figures import BLUE, ORANGE, RED
 from ambjax.pictures.scales import digits, log_ticks, prefix_of
 from ambjax.pictures.style import own_style
 from ambjax.pictures.thinning import stretch_of, thin
-from ambjax.simulation.trajectory import STALLED, Trajectory
+from ambjax.simulation.trajectory import ALIVE, STALLED, Trajectory
 from tuning.objective.goal import shown
 from tuning.report.front_table import letter
 from tuning.search.explore import Slices
@@ -115,8 +115,8 @@ def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
     for name, run in runs.items():
         t, alive = np.asarray(run.rows.t), np.asarray(run.rows.alive)
         frequency, amplitude = amplitudes(np.asarray(run.rows.u_mean)[alive & (t >= settle)], t[1] - t[0])
-        status = "not decided" if run.lost_code == STALLED else "lost"
-        label = name if len(amplitude) else f"{name}: {status} before {settle:g} s"
+        why = {ALIVE: f"fewer than {FEWEST} samples after", STALLED: "stalled before"}
+        label = name if len(amplitude) else f"{name}: {why.get(int(run.lost_code), 'lost before')} {settle:g} s"
         ax.plot(frequency, amplitude, color=ORANGE if name == "before" else BLUE, lw=0.8, label=label)
         top = max(top, amplitude.max(initial=0.0))
     ax.set(xlabel="frequency (Hz)", ylabel="amplitude of u (V)", xscale="log", yscale="log")
