@@ -72,12 +72,13 @@ class Tune:
       Theorem 1.
     - `margin`: share by which each gain should exceed its lower bound in Theorem 1.
     - `early`: weight of errors before run.settle. Errors after it have the weight 1.
-    - `stress`, `gain_margin`: factors on the noise and on each gain of the stressed members.
+    - `stress`: factor on the sensor noise of the stressed members (`Budget.stressed`).
+    - `gain_margin`: each gain of a stressed member is multiplied or divided by this factor.
     - `learning_rate`: step size of an optimiser of optax.
     """
 
     objective: str
-    """"knee" or "least_error" """
+    """one of OBJECTIVES: "knee" or "least_error" """
     space: Space
     weights: tuple[float, ...]
     limits: LimitSettings
@@ -146,7 +147,7 @@ def _weights(table: Table) -> tuple[tuple[float, ...], float]:
     if not any(given[name] > 0 for name in ("tracking", "peak")):
         raise ValueError(
             f"{table.path}.tracking = 0 and {table.path}.peak = 0: no term of the loss depends on the error, "
-            "so all gains that hold the rotor are equally good. Give one of them a weight above 0."
+            "and effort and chatter, which multiply the error, have no effect. Give one of the two a weight above 0."
         )
     if given["survival"] == 0:
         raise ValueError(f"{table.path}.survival = 0: losing the rotor would cost nothing. Give it a weight above 0.")
@@ -188,7 +189,7 @@ def _risk(table: Table) -> Risk:
     name = table.choice("risk", ["mean", "cvar", "soft-worst"], RISK)
     if name != "cvar":
         if "alpha" in table.raw:
-            raise ValueError(f'{table.at("alpha")} applies to risk = "cvar" only; risk is "{name}". Remove one.')
+            raise ValueError(f'{table.at("alpha")} applies to risk = "cvar" only; risk is "{name}". Remove alpha.')
         return Mean() if name == "mean" else SoftWorst()
     alpha = table.number("alpha", ALPHA, "a number from 0 to below 1")
     if not 0 <= alpha < 1:

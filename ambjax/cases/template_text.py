@@ -1,4 +1,4 @@
-"""Annotated case files, generated from the records of the code so that the two always agree."""
+"""Annotated case files. Numbers of the plant, the laws, the signals and [tune] come from the code's records."""
 
 import dataclasses
 import math
@@ -29,10 +29,10 @@ i = 0.0                       # A
 
 [clock]
 duration = 2.0                # s; a whole number of sample periods
-sample_period = 1e-4          # s; period of the recorded rows, for which each measurement error is held
+sample_period = 1e-4          # s; period of the recorded rows, of the held measurement errors and of [processor]
 dt = "auto"                   # s, or "auto": method and step are chosen from the loop's slopes
-# method = "rk4"              # with a number for dt: "rk4", "dop853", "euler", "rodas3" (L-stable) or "sliding", which
-#                               is fast under noise if gamma p is large; with dt = "auto": "adaptive" or "sliding"
+# method = "rk4"              # with a number for dt: "rk4", "dop853", "euler", "rodas3" (L-stable) or "sliding" (fast
+#                               under noise if gamma p is large); with dt = "auto": "adaptive" or "sliding"
 
 [run]
 seed = 0                      # seed of all random numbers
@@ -42,25 +42,25 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 # stop_damping = 500.0        # N s/m; damping of the touchdown bearing (left out: 0)
 
 # [sensor]                    # Gaussian noise, held for a sample period, without delay (left out: none)
-# std = {paper_std:.3e}          # m; the value of the paper; with the paper's printed gains, the rotor is then lost
+# std = {paper_std:.3e}          # m; the paper's value, with which its printed gains lose the rotor (left out: 0)
 # std_z_dot = 0.0             # m/s
 # std_i = 0.0                 # A
 # offset = 0.0                # m; offset of the position sensor
 # gain = 1.0                  # 1; gain of the position sensor
 # velocity = true             # whether z_dot is measured too; if false, an observer must estimate it
-#                             # and with [processor]:
+#                             # the next keys require [processor]:
 # bandwidth = 1e4             # Hz; first-order low-pass of the position sensor (left out: none)
 # bits = 14                   # resolution of the converter of z and i (left out: not rounded)
 # range_z = 5e-3              # m; the converter reads z from -range_z to range_z (left out: plant.s_0)
 # range_i = 0.5               # A; the converter reads i from -range_i to range_i (left out: 2 plant.i_0)
 #
 # [sensor.outliers]           # faults of the position sensor, with [processor]: single readings (left out: none)
-# rate = 1.0                  # 1/s; mean number of outliers per second
-# size = 5e-3                 # m; error of an outlier, of either sign
+# rate = 1.0                  # 1/s; mean number of outliers per second (left out: 0)
+# size = 5e-3                 # m; error of an outlier, of either sign (left out: 1e-3)
 # at = 0.1                    # s; time of an additional outlier (left out: none)
 #
 # [sensor.dropouts]           # intervals without a reading (left out: none)
-# rate = 1.0                  # 1/s; mean number of dropouts per second
+# rate = 1.0                  # 1/s; mean number of dropouts per second (left out: 0)
 # duration = 5e-4             # s; duration of each dropout
 # at = 0.1                    # s; time of an additional dropout (left out: none)
 # value = "hold"              # reading during a dropout: the last one ("hold"), "nan", "zero" or "full-scale"
@@ -88,11 +88,11 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 # [actuator]
 # mode = "voltage"            # the controller commands a voltage; or "current", with bandwidth and i_max only
 # u_max = 200.0               # V; limit of the supply (left out: none)
-#                             # and with [processor], or with mode = "current" (bandwidth: of the current loop):
+#                             # keys for [processor] or mode = "current" (then bandwidth is that of the current loop):
 # bandwidth = 1e3             # Hz; bandwidth of the amplifier, first order (left out: no lag)
 # slew = 1e7                  # V/s; largest rate of its voltage (left out: no limit)
 # dead_band = 0.5             # V; subtracted from the absolute value of its voltage (left out: none)
-# i_max = 1.0                 # A; above it, the voltage does not increase |i| (left out: no limit)
+# i_max = 1.0                 # A; above it, the voltage does not increase |i|; bounds a commanded i (left out: none)
 #
 # [actuator.coil]             # limits of each coil, for plant.kind = "two-coil" and [processor] (left out: none)
 # u_max = 200.0               # V; limit of the |voltage| of a coil, R i_0 included (left out: no limit)
@@ -160,7 +160,7 @@ def _with_note(text: str, comment: str) -> str:
 
 def _tune() -> list[str]:
     """Return the lines of [tune], all of them comments."""
-    head = ("# [tune]", "for 'ambjax tune', which starts at the gains above. Each key has its default here")
+    head = ("# [tune]", "for 'ambjax tune', which starts at the gains above. Values are defaults unless noted")
     rows = [(f"# {line.text}" if line.text else "#", line.comment) for line in tune_table.template_lines()]
     return [_with_note(*row) if len(row[0]) < 30 else f"{row[0]}  # {row[1]}" for row in [head, *rows]]
 

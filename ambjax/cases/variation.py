@@ -39,7 +39,8 @@ def _number(table: Table, key: str) -> float:
     return table.number(key, None)
 
 
-# The distributions by their key in the table of a path. A new distribution needs one row here.
+# Constructors of the distributions, by the key in the case file: `percent` in plant.m = { percent = 10 }. A new
+# distribution needs one row here.
 DISTRIBUTIONS: dict[str, Callable[[Table], Distribution]] = {
     "percent": lambda t: Percent(_number(t, "percent"), t.choice("shape", list(SHAPES), SHAPES[0])),
     "normal": lambda t: Normal(_number(t, "normal")),
@@ -50,9 +51,9 @@ DISTRIBUTIONS: dict[str, Callable[[Table], Distribution]] = {
 
 
 def spread_from(top: Table, cascade: Cascade, scenario: Scenario) -> Spread:
-    """Return the [spread] of a case with this cascade and scenario; empty if left out.
+    """Return the spread of a case with this cascade and scenario; empty if the table [spread] is left out.
 
-    Raises ValueError with the dotted path, the value, what is allowed and the fix.
+    Raises ValueError for an invalid table. The message names the dotted path, the value, what is allowed and the fix.
     """
     table = top.table("spread")
     design = table.choice("design", list(DESIGNS), Spread.design)
@@ -90,9 +91,9 @@ def _distribution(raw: object, path: str) -> Distribution:
 
 
 def _refuse_nothing_in_two_units(spread: Spread, top: Table) -> None:
-    """Raise ValueError for a spread of a constant q_z of 0 in another unit than m/s^2.
+    """Raise ValueError if the value of a constant q_z is spread, is 0, and has another unit than m/s^2.
 
-    A constant 0 counts as no disturbance, so the spread would be in m/s^2.
+    A constant 0 counts as no disturbance, so its unit is ignored, and the spread values would be taken in m/s^2.
     """
     path = "disturbance.q_z.value"
     signal = top.raw.get("disturbance", {}).get("q_z", {})

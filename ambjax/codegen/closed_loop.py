@@ -26,7 +26,10 @@ FAULTS = [1 << k for k, name in enumerate(BITS) if name in ("invalid", "failed")
 
 
 class ControllerState(NamedTuple):
-    """State of the C, and the number of samples with an invalid input or a law without a finite result."""
+    """State of the compiled controller: its numbers, whether it has started, and its faulty samples so far.
+
+    A faulty sample has an invalid input, or a law whose result is not finite.
+    """
 
     numbers: Array
     started: Array
@@ -43,7 +46,7 @@ class Machines:
     def step(
         self, which: np.ndarray, numbers: np.ndarray, started: np.ndarray, inputs: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute one sample of controller `which`. Return its state, padded, and started, bits and outputs."""
+        """Step controller `which`. Return its state, padded with zeros to `room`, and [started, bits, *outputs]."""
         machine = self.machines[int(which)]
         count = len(machine.trace.state)
         machine.state["numbers"], machine.state["started"] = np.asarray(numbers)[:count], int(started)
@@ -78,16 +81,16 @@ class CompiledLoop(Sampled):
         after: Any = ControllerState(numbers, rest[0], memory.faults + faulty)
         past, finite = (state.command.u, state.past[0]), jnp.where(faulty, 0.0, state.finite)
         watch, guard = state.watch, self.processor.guard
-        if watch and guard:  # a row reads whether the guard refused a reading
+        if watch and guard:  # from `left`, `Sampled.row` finds whether a reading was refused
             watch = watch._replace(left=jnp.where(rest[1].astype(int) & REFUSED, 0.0, jnp.asarray(guard.samples)))
         return state._replace(control=after, command=command, past=past, finite=finite, watch=watch)
 
 
 class LoopComparison(NamedTuple):
-    """Comparison of the closed loop with compiled C and that of JAX, over the horizon.
+    """Comparison of two closed loops over the horizon of the twins: one with the compiled C, and JAX's.
 
-    `times`: distance of z from JAX's divided by the distance of the farthest twin, the largest over the samples; NaN if
-    the horizon is too short for a verdict.
+    `times`: largest ratio, over the samples, of two distances from JAX's z: that of the compiled loop and that of the
+    farthest twin, each the largest so far. NaN if the horizon is too short for a verdict.
     """
 
     horizon: Horizon
@@ -103,7 +106,7 @@ begin_jit, segment_jit = jax.jit(begin), jax.jit(segment, static_argnames=("coun
 
 
 def compare_loops(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, LoopComparison]:
-    """Compare the closed loop with each compiled controller with that of JAX. Keys: the precisions."""
+    """Compare the loop of each compiled controller to JAX's loop. Returns one comparison for each precision."""
     given: Any = system_of(case.cascade, case.scenario, case.clock)
     host, found = Machines(*machines.values()), {}
     for which, (precision, horizon) in enumerate(horizons(case, list(machines)).items()):
@@ -115,7 +118,7 @@ def compare_loops(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, Lo
 
 
 def times_of(z: np.ndarray, horizon: Horizon) -> float:
-    """Return the largest ratio, over the horizon, of the distance of z from JAX's to that of the farthest twin."""
+    """Return `LoopComparison.times` for z [samples]: inf if z has a NaN or differs where no twin does."""
     n = horizon.samples
     if not horizon.decisive:
         return np.nan

@@ -1,9 +1,9 @@
 """The horizon within which two closed loops can be compared despite rounding errors.
 
 A closed loop with hard signs or converters amplifies rounding errors until two correct programs agree only in their
-statistics. Twins of JAX's loop measure this growth: in each, every state of the plant and of the laws, and the voltage,
-is changed by one unit in the last place, up or down at random, at every sample. While the twins stay close to JAX's
-loop, a correct program does too.
+statistics. Twins of JAX's loop measure this growth. A twin is the loop that JAX simulates, with every state of the
+plant and of the laws, and the command, changed at every sample by one unit in the last place, up or down at random.
+While the twins stay close to JAX's loop, a correct program does too.
 """
 
 import dataclasses
@@ -32,10 +32,10 @@ from ambjax.world.signals import Constant
 
 T = TypeVar("T")
 
-# TWINS: number of twins of each precision. PARTED: difference of a twin, as a share of a signal's rms, that ends the
-# horizon. LEAST: smallest number of samples for a verdict.
+# TWINS: number of twins of each precision. PARTED: difference of a twin that ends the horizon, as a share of the rms of
+# z - r or u (`Horizon.sizes`). LEAST: smallest number of samples for a verdict.
 TWINS, PARTED, LEAST = 8, 1e-2, 20
-# Signals in which a difference of a twin ends the horizon.
+# Signals that are compared. A large difference of a twin in any of them ends the horizon.
 SIGNALS = ("z", "u")
 
 
@@ -52,7 +52,8 @@ class Horizon(NamedTuple):
     """JAX's loop, and the distance of the twins of one precision from it.
 
     `signals`: z (m) and u (V) of JAX's loop, [samples]. `parted`: the largest distance of any twin up to each sample,
-    [samples]. `sizes`: the rms of z - r and of u, after the settling time. `samples`: number of samples before a twin
+    [samples]. `sizes`: the rms of z - r and of u in JAX's loop while the rotor is held, after the settling time (from
+    the start, if the rotor is lost earlier). `samples`: number of samples before a twin
     differs by more than PARTED of a size, or the rotor is lost.
     """
 
@@ -69,14 +70,17 @@ class Horizon(NamedTuple):
 
 @record
 class Twin(Sampled):
-    """The sampled loop with every state changed by `unit` times its scale at every sample; `seed` draws the signs."""
+    """The sampled loop with every state changed at every sample. `seed` draws the signs.
+
+    The change of a number is `unit` times its magnitude or its scale, whichever is larger.
+    """
 
     seed: Scalar
     unit: Scalar
     held: bool = static(default=False, doc="disturbances are constant over each sample")
 
     def jump(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors) -> SampledState:
-        """Compute the laws' step from the changed states, and change its command."""
+        """Change the states, compute the laws' step from them, and change the resulting command."""
         sample = jnp.rint(t / self.period).astype(jnp.int32)
         key = jax.random.fold_in(jax.random.key(jnp.asarray(self.seed, jnp.int32)), sample)
         before, after = jax.random.split(key)
@@ -107,7 +111,7 @@ class Twin(Sampled):
         return after._replace(t=t + after.t)
 
     def _moved(self, key: Array, state: T, sizes: T) -> T:
-        """Return every number changed by one unit of its scale, up or down."""
+        """Return every number x changed by `unit` max(|x|, its scale), up or down."""
         leaves, tree = jax.tree.flatten(state)
         signs = jax.random.rademacher(key, (len(leaves),), float)
         steps = [jnp.maximum(jnp.abs(x), size) for x, size in zip(leaves, jax.tree.leaves(sizes), strict=True)]
@@ -142,7 +146,7 @@ class Twin(Sampled):
 def horizons(case: LoopCase, precisions: list[str], *, held: bool = False) -> dict[str, Horizon]:
     """Simulate JAX's loop and its twins. Return the horizon of each precision.
 
-    `held`: hold the disturbances over each sample.
+    `held`: hold the disturbances over each sample, as an exported plant does.
     """
     given: Any = system_of(case.cascade, case.scenario, case.clock)
     twin, clock = canonical((Twin(given.loop, given.period, given.cuts, 0.0, 0.0, held), case.clock))

@@ -44,7 +44,7 @@ class CaseMap:
     map: Map
 
     def to_xarray(self) -> Any:
-        """Return the arrays as an xarray Dataset over both quantities, by their dotted paths, with units in `attrs`.
+        """Return the arrays as an xarray Dataset, with the dotted paths of y and x as dimensions and units in `attrs`.
 
         Raises ValueError if xarray is not installed.
         """
@@ -81,7 +81,8 @@ def survival_map(case: Case, x: str, y: str, *, members: int = 1, seed: int | No
 
     - `case`: from `read_case`.
     - `x`, `y`: quantity and range of each axis, in the form of the command's options: "PATH=LOW:HIGH[:COUNT][:log]".
-      LOW and HIGH are in SI units, or in per cent relative to the value in the case. COUNT is 21 by default.
+      LOW and HIGH are in SI units, or changes of the value in the case in per cent: -20% is 0.8 times this value.
+      COUNT is 21 by default.
     - `members`: number of members in each cell; 1 is the nominal case, and 2 or more draw the spread of the case.
     - `seed`: of the spread and the noise; None: `run.seed` of the case.
 
@@ -177,7 +178,7 @@ def _axis(flag: str, text: str, case: Case) -> Axis:
 
 
 def _check_samples(case: Case, x: Axis, y: Axis, members: int) -> None:
-    """Raise ValueError for sample periods too long for the run, or a map with too many samples."""
+    """Raise ValueError if a sample period is too long for the run, or if a run or the map has too many samples."""
     for flag, axis, other in (("--x", x, y), ("--y", y, x)):
         if axis.path != PERIOD:
             continue

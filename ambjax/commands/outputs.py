@@ -1,6 +1,6 @@
 """Output of the commands: directories, files, JSON, tables, and remarks on stderr.
 
-Commands write all files through `files`, which moves them into the output directory together, or none if one fails.
+Commands write their results through `files`. If writing a file fails, no file is moved into the output directory.
 """
 
 import contextlib
@@ -26,8 +26,8 @@ def directory(out: str | None, name: str, names: Iterable[str] = (), force: bool
 
     `names`: files that the command writes. `force`: whether it may overwrite them.
 
-    Raises ValueError if the directory cannot be made or written, if it holds the study of an ensemble or, without
-    `force`, one of `names`, or if a folder has one of `names`.
+    Raises ValueError in these cases: the directory cannot be made or written; it holds the study of an ensemble; it has
+    one of `names`, without `force`; `check_places` refuses one of `names`.
     """
     path, names = target(out, name), list(names)
     while out is None and not _make_new(path):  # another run has made it meanwhile
@@ -68,7 +68,10 @@ def check_places(out: pathlib.Path, names: Iterable[str | pathlib.PurePath]) -> 
 
 
 def spare(out: pathlib.Path, names: Iterable[str], mark: str) -> None:
-    """Raise ValueError if a file in `out` has one of these names but not this mark: it is the user's own file."""
+    """Raise ValueError if a file in `out` has one of these names but lacks `mark`: it is the user's own file.
+
+    `mark`: text that every file of an export with this prefix contains.
+    """
     for name in names:
         if os.path.lexists(out / name) and not _holds(out / name, mark):
             raise ValueError(

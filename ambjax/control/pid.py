@@ -26,17 +26,17 @@ class PID(PositionLaw[PIDState]):
     """v_star = (-2 k_z z/m + r_ddot + g - k_p e - k_d d - x)/a, e = z - r, d' = w_f (e_dot - d), x' = k_int e + ...
 
     A PID controller with a filtered derivative (Astrom and Murray, Feedback Systems, 2008, 10.1 and 10.4). As in Eq.
-    (5), the stiffness and the weight of the nominal plant are fed forward. If v = v_star, e_ddot = -k_p e - k_d d - x,
-    so the gains do not depend on the plant. e_dot contains the observer's estimate of the velocity. With the observer
-    "difference", d is the textbook's filtered derivative of the position.
+    (5), v_star cancels the stiffness and the weight of the nominal plant. If v = v_star, e_ddot = -k_p e - k_d d - x,
+    so the gains do not depend on the plant. d is e_dot after a low-pass of bandwidth w_f, where e_dot contains the
+    observer's estimate of the velocity.
 
     With back-calculation as anti-windup, the integral is x' = k_int e + k_aw (a v_star - a v(z, i)). While the supply
-    limits u, the force v(z, i) of the measured current differs from v_star, and x moves v_star towards it at the rate
-    k_aw.
+    limits u, the force v(z, i) of the measured current differs from v_star, and x moves v_star towards v(z, i) at the
+    rate k_aw. The term also acts, for a shorter time, while the current follows its reference without a limit.
 
     k_d = 2 w, k_p = 2 w^2, k_int = w^3 are the optimal gains (LQR) for the cost w^6 (int e)^2 + e_ddot^2. The closed
     loop then has the poles of a Butterworth filter of bandwidth w. The default gains for a model have w = w_m/2, where
-    w_m is the pole of the magnets.
+    w_m is the unstable pole of the magnets.
     """
 
     k_p: Scalar = gain(default=1.41e5, unit="1/s^2", doc="proportional gain; left out: w_m^2/2")
@@ -113,7 +113,7 @@ class FeedbackLinearisation(PositionLaw[tuple[()]]):
     The demanded force cancels stiffness and weight. With inversion.ClosedForm, which cancels the nonlinear magnet, the
     nominal mechanics become e_ddot = -k_p e - k_d e_dot at any z (H. Khalil, Nonlinear Systems, 2002, 13.2 and 13.3).
     There is no integral: a disturbance q_z leaves the offset q_z/k_p. The default gains for a model place a double pole
-    at w/3, w the pole of the magnets.
+    at -w/3, where w is the unstable pole of the magnets.
     """
 
     k_p: Scalar = gain(default=3.1e4, unit="1/s^2", doc="proportional gain; left out: (w/3)^2")

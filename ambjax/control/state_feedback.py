@@ -22,11 +22,11 @@ class StateFeedback(PositionLaw[Array]):
     The linear controller of the textbooks (Schweitzer and Maslen, Magnetic Bearings, 2009, 8.3) demands a current
     i_star; e = z - r. With inversion.Linearised, i_ref is i_star. With an exact inversion, the mechanics are linear.
     i_r keeps the linearised rotor on the reference. dv/dz and dv/di are those at z = 0, i = 0. While the supply limits
-    u, the integral follows the measured current i at the rate k_aw.
+    u, x moves i_star towards the measured current i at the rate k_aw.
 
     The default gains k_p, k_d and k_int for a model are optimal (LQR) for the linearised mechanics
-    e_ddot = s e + b (i_star - i_r): they minimise the integral of (e/0.1 s_0)^2 + (0.2 w int e/0.1 s_0)^2 +
-    ((i_star - i_r)/0.1 i_0)^2, or on a processor the sum over samples; w is the pole of the magnets.
+    e_ddot = s e + b (i_star - i_r). They minimise the integral of (e/(0.1 s_0))^2 + (0.2 w int e/(0.1 s_0))^2 +
+    ((i_star - i_r)/(0.1 i_0))^2; on a processor, the sum over the samples. w is the pole of the magnets.
     """
 
     k_p: Scalar = gain(default=135.0, unit="A/m", doc="proportional gain; left out: LQR")
@@ -42,7 +42,7 @@ class StateFeedback(PositionLaw[Array]):
         return model.i_0 / 25
 
     def designed(self, model: Plant, period: float | None) -> "StateFeedback":
-        """Return the law with the gains of `regulator.optimal_gains`. Raises ValueError as it does."""
+        """Return the law with k_aw = w/50 and the gains of `optimal_gains`. Raises ValueError as that does."""
         k_int, k_p, k_d = map(float, optimal_gains(model, period))
         return dataclasses.replace(self, k_p=k_p, k_d=k_d, k_int=k_int, k_aw=model.pole / 50)
 

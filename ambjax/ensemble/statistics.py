@@ -9,7 +9,7 @@ import numpy as np
 from ambjax.ensemble.drivers import drivers
 from ambjax.ensemble.intervals import STATISTICS, TAIL, Estimate, bootstrap, column_of, quantile, wilson
 
-# Level of the CVaR, which is the mean of the largest share 1 - ALPHA.
+# Level of the CVaR, which is the mean over the largest values, a share 1 - ALPHA of all.
 ALPHA = 0.95
 # HEAVY: kurtosis above which a tail counts as heavy. An exponential distribution has 9, a normal one 3.
 # COVERED: coverage, in per cent, of the 95 % interval of the standard deviation of a lognormal distribution, by number
@@ -33,7 +33,7 @@ def summary(
     deciding: str = DECIDING,
     worst: int = 10,
 ) -> dict[str, Any]:
-    """Compute the statistics of an ensemble, as a dict that JSON can hold: no arrays; None if infinite or unknown.
+    """Compute the statistics of an ensemble, as a dict without arrays, for JSON. Infinite and unknown numbers are None.
 
     - `columns`: the columns of members.npz, arrays [N]: index, lost_at (s; +inf if the run reached its end), stalled,
       the metrics, and "spread." + path for each path in `spread_names`.
@@ -42,17 +42,20 @@ def summary(
     - `deciding`: metric that ranks the survivors in the list of the worst members.
     - `worst`: length of that list.
 
-    A member survives, is lost, or is stalled (its integration stopped early, so that its status is not known). Metrics
-    and their drivers (the spread numbers that explain them) are computed from the survivors (`metrics_of`), because a
-    lost rotor is frozen: its voltage, current and chatter are 0 from then on. Lost and stalled members count in
+    A member survives, is lost, or is stalled (its integration stopped early, so it is neither held nor lost). Metrics
+    and their drivers (the spread quantities that explain them) are computed from the survivors, as the key `metrics_of`
+    states: a lost rotor is frozen, so its voltage, current and chatter are 0 from then on. Lost and stalled members
+    count in
     `survival`, in the drivers of lost_at_s and in `worst`.
 
     A metric that is infinite for some survivors (a time never reached) has quantiles, but no mean, standard deviation
-    or CVaR; `finite` counts its finite values. Without survivors every statistic is None. `drivers` and `explained` are
+    or CVaR; `finite` counts its finite values. Without survivors all its statistics are None. `drivers` and
+    `explained` are
     the results of `ensemble.drivers.drivers`. `worst` lists lost and stalled members by time, then survivors by
-    `deciding` in descending order. `notes` names the statistics for which the ensemble is too small.
+    `deciding` in descending order. `notes` names the statistics whose intervals are not reliable.
 
-    Raises ValueError if there is no column `deciding`, or if a column is not one number for each member.
+    Raises ValueError if there is no column `deciding`, and as `column_of` does: for a column that is empty, contains
+    NaN or is not one-dimensional.
     """
     lost_at = column_of(columns["lost_at"])
     others = {*STATUS_COLUMNS, *(SPREAD + path for path in spread_names)}
@@ -99,7 +102,7 @@ def _drivers(
 
 
 def _notes(n: int, metrics: Mapping[str, np.ndarray], confidence: float) -> list[str]:
-    """Return notes on the intervals for which n survivors are too few: of a CVaR, and of a heavy-tailed deviation."""
+    """Return notes on intervals that may be wrong with n survivors: of the CVaR, and of the std of heavy tails."""
     if not n:
         return ["no member survives: there are no statistics of the metrics"]
     notes, level, tail = [], f"{100 * confidence:g} %", (1 - ALPHA) * n

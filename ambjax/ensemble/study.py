@@ -22,7 +22,7 @@ from ambjax.world.scenario import Scenario
 SPREAD = "spread."
 # Largest number of columns of members.npz besides those of the spread, to estimate the disk space of a study.
 COLUMNS = 34
-# Number of equal parts of a run. The variation of the voltage is computed in each part.
+# Largest number of parts of a fan chart's time. The variation of the voltage is computed in each part.
 WINDOWS = 25
 # Signals of a fan chart, and the corresponding fields of a Row.
 FAN_SIGNALS = {"z - r": "e_z", "u": "u_mean", "sigma": "sigma"}
@@ -34,8 +34,8 @@ class Bands(NamedTuple):
     - `t`: instants [T], s.
     - `trajectory`: trajectories of the members.
     - `signals`: signals by name [members, T]; NaN from the instant at which a member is lost. "variation of u" is the
-      total variation of the voltage per second, V/s, in each of WINDOWS equal parts of the run; NaN from the part in
-      which a member is lost.
+      total variation of `u_mean` per second, V/s, in each of WINDOWS nearly equal parts of the time shown (fewer in a
+      short run); NaN from the part in which a member is lost.
     - `extremes`: for each other signal, the minimum and the maximum, each [T], over the members that are alive and over
       the samples between the previous and the next instant; NaN if there is no such sample.
     """
@@ -99,8 +99,8 @@ class Study:
         """Simulate members start <= k < stop and return their columns, each [stop - start], by name.
 
         The columns are index, lost_at (s), every metric, and spread.PATH for each spread quantity. `call` and `threads`
-        are those of `map_members`. With `lost`, every rotor starts outside its clearance and is lost at once. This
-        compiles the program of the study without the cost of a run.
+        are those of `map_members`. `lost`: start every rotor outside its clearance, so that it is lost at once. Such a
+        call compiles the program of the study without the cost of a run.
         """
         members = np.arange(start, stop)
         cascade, scenario = self.batch(members)

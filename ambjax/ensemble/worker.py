@@ -14,8 +14,8 @@ import numpy as np
 
 from ambjax.ensemble.study import Study
 
-# Members in one call of the compiled program on a CPU. Fixed, because the last digit of a result may depend on it: the
-# results of a study must not depend on the number of cores, nor on the process that computes a chunk.
+# Members in one call of the compiled program on a CPU. The last digit of a result may depend on it. It is fixed, so
+# that no result depends on the number of cores or on the process that computes a chunk.
 CALL = 64
 # Size of the cache of compiled programs, in bytes. JAX removes the least recently used entries.
 CACHE_SIZE = 256 * 2**20
@@ -24,7 +24,8 @@ CACHE_SIZE = 256 * 2**20
 def configure_jax() -> None:
     """Configure JAX for a command: float64 unless JAX_ENABLE_X64 is set, and a cache of compiled programs.
 
-    Processes share the cache, and its size is bounded. JAX_COMPILATION_CACHE_DIR sets another directory.
+    Processes share the cache, and its size is at most CACHE_SIZE. If JAX_COMPILATION_CACHE_DIR is set, JAX uses that
+    directory with its own settings instead, and CACHE_SIZE does not apply.
 
     Raises ValueError if JAX has no device of the kind in JAX_PLATFORMS.
     """
@@ -53,9 +54,10 @@ def configure_jax() -> None:
 def chunk(
     study: Study, start: int, stop: int, size: int, threads: int | None = None, *, lost: bool = False
 ) -> dict[str, np.ndarray]:
-    """Simulate members start <= k < stop of a study with chunks of `size` members, and return their columns.
+    """Simulate members start <= k < stop of a study, and return their columns.
 
-    `threads`: CPU cores to use (None: all). `lost` is that of `Study.columns`.
+    `size`: members in one call of the program on an accelerator; on a CPU, a call has CALL members. `threads`: CPU
+    cores to use (None: all). `lost` is that of `Study.columns`.
     """
     import jax
 
@@ -87,7 +89,10 @@ def processes(count: int) -> Iterator[Executor]:
 
 @contextlib.contextmanager
 def ignore_sigint() -> Iterator[None]:
-    """Block SIGINT in the processes that are started in this block, so that only their parent handles Ctrl-C."""
+    """Block SIGINT in this thread within the block, and permanently in the processes that it starts there.
+
+    Only their parent then handles Ctrl-C. On Windows, there is no effect.
+    """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return

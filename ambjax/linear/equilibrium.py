@@ -1,7 +1,8 @@
 """Equilibrium of the closed loop under a constant reference.
 
 In equilibrium no state changes: the plant rests under a constant command, and the laws return this command. Noise,
-disturbances, converters, faults, the guard, the limits of supply and amplifier, and the dead band are left out.
+runout, disturbances, converters, faults, the guard, the stop, the limits of supply and amplifier, and the dead band are
+left out.
 """
 
 import dataclasses
@@ -23,7 +24,8 @@ from ambjax.world.signals import Constant, Reference, reference_at
 # Largest number of Newton trials. Near the equilibrium, five suffice. Far outside the boundary layer of a smoothed
 # sign, more are necessary.
 STEPS = 60
-# A step is halved until the residual decreases. The iteration ends if the fraction of the full step is below this.
+# A Newton step is halved until the residual decreases. The iteration ends if the remaining fraction of the full step is
+# below SMALLEST.
 SMALLEST = 1e-4
 # Largest residual that counts as 0, relative to the sizes of the states, in units of the rounding error.
 TOLERANCE = 1e7
@@ -38,14 +40,14 @@ class Point(NamedTuple):
 
 
 class Equilibrium(NamedTuple):
-    """An equilibrium. `found`: whether Newton's method converged to it."""
+    """An equilibrium. `found`: whether Newton's method converged; if not, `point` is not an equilibrium."""
 
     point: Point
     found: Array
 
 
 def ideal(scenario: Scenario) -> Scenario:
-    """Return the scenario without noise, disturbances, converter, faults, limits and dead band.
+    """Return the scenario without noise, runout, disturbances, converter, faults, limits and dead band.
 
     The sensor keeps its gain, offset and bandwidth, the amplifier its bandwidth.
     """
@@ -62,7 +64,10 @@ def ideal(scenario: Scenario) -> Scenario:
 
 
 def reading(scenario: Scenario, motion: Measurement, injected: tuple[Scalar, Scalar]) -> Measurement:
-    """Return the readings of a motion without noise, plus `injected`: test signals on z (m) and z_dot (m/s)."""
+    """Return the noise-free readings of a motion plus the test signals `injected` on z (m) and z_dot (m/s).
+
+    The signal on z_dot has no effect if the velocity is not measured.
+    """
     zero = jnp.zeros(())
     if scenario.sensor is not None:
         motion = scenario.sensor.reading(motion, Errors(zero, zero, zero))
@@ -84,8 +89,8 @@ def equilibrium(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar)
     - `scenario`: a result of `ideal`.
     - `period`: sample period, s; not used in continuous time.
 
-    The derivatives with respect to gains and parameters are those of the implicit function. The function is pure and
-    works under jit and vmap.
+    If the equilibrium is found, its derivatives with respect to gains and parameters are those of the implicit
+    function; otherwise they have no meaning. The function is pure and works under jit and vmap.
     """
     start = start_of(cascade, scenario, period, r)
     flat, restore = ravel_pytree(start)

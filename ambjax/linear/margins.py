@@ -12,7 +12,7 @@ import numpy as np
 
 from ambjax.linear.state_space import StateSpace
 
-# Number of frequencies in the first scan on a logarithmic axis, in addition to those near poles.
+# Number of logarithmically spaced frequencies in a scan, in addition to those near poles.
 POINTS = 600
 # Relative width of the bracket of a peak's frequency at which its refinement ends.
 NARROW = 1e-6
@@ -32,7 +32,7 @@ class Margins(NamedTuple):
     """Margins of the loop transfer L = 1/S - 1, broken at the reading of the position sensor.
 
     - `gain_low`, `gain_high`: the loop stays stable for every factor on L between these two (0, inf: no such limit).
-    - `gain`: `gain_low` or `gain_high`, whichever is nearer to 1 on a logarithmic scale.
+    - `gain`: `gain_low` or `gain_high`, whichever is nearer to 1 on a logarithmic scale (inf: no limit).
     - `phase_deg`: smallest phase change, lag or lead, that makes the loop unstable, degrees (inf: |L| is never 1).
     - `delay`: smallest additional delay that makes the loop unstable, s (inf: none).
     - `disk`: disk margin 1/max|S - 1/2| (P. Seiler, A. Packard and P. Gahinet, IEEE Control Systems 40:5 (2020)). The
@@ -71,7 +71,7 @@ def peak(system: StateSpace, magnitude: Magnitude, low: float, high: float) -> R
 
 
 def scan(system: StateSpace, low: float, high: float) -> np.ndarray:
-    """Return frequencies (Hz): STATIC * low, which stands for 0, then `low` to `high`, dense near those of poles."""
+    """Return frequencies (Hz): STATIC * low, which stands for 0, then `low` to `high`, dense near poles."""
     grid = np.geomspace(low, high, POINTS)
     s = poles_in_s(system)
     own = np.abs(np.imag(s)) / (2 * np.pi)
@@ -90,7 +90,10 @@ def poles_in_s(system: StateSpace) -> np.ndarray:
 
 
 def margins_of(system: StateSpace) -> Margins:
-    """Return the margins of a stable loop. The scan ends at half the sampling rate, or far above all poles."""
+    """Return the margins of a stable loop.
+
+    The scan ends at half the sampling rate or, in continuous time, far above all poles.
+    """
     fastest = float(np.max(np.abs(poles_in_s(system)), initial=1.0)) / (2 * math.pi)
     high = 100 * fastest if system.period is None else 0.5 / float(system.period)
     low = min(1e-3, 1e-6 * high)
@@ -106,7 +109,7 @@ def margins_of(system: StateSpace) -> Margins:
     real = [L(np.array([x]))[0].real for x in _crossings(lambda x: np.imag(L(x)), f, np.imag(along))]
     if system.period is not None:
         real.append(along[-1].real)  # L is real at half the sampling rate
-    real.append(along[0].real)  # and at 0
+    real.append(along[0].real)  # and at 0, which the lowest frequency stands for here
     # L is exactly 0 at half the sampling rate if the controller has a zero there, as after a bilinear transform
     gains = [float(-1 / x) for x in real if x and math.isfinite(x) and -1 / x > 1e-9]
     phases, delays = [], []
@@ -126,7 +129,7 @@ def margins_of(system: StateSpace) -> Margins:
 
 
 def _crossings(function: Magnitude, f: np.ndarray, values: np.ndarray) -> list[float]:
-    """Return the frequencies (Hz) at which a continuous function changes sign, from its values at the scan f."""
+    """Return the frequencies (Hz) at which a function crosses 0. `values`: its values at the scan f."""
     from scipy.optimize import brentq
 
     def one(x: float) -> float:
@@ -139,7 +142,10 @@ def _crossings(function: Magnitude, f: np.ndarray, values: np.ndarray) -> list[f
 
 
 def noise_gain(system: StateSpace, period: float) -> float:
-    """Return the rms of z per rms of white noise on the reading of z. Each noise value is held for `period` (s)."""
+    """Return the rms of z per rms of white noise on the reading of z, for a stable loop.
+
+    Each noise value is held for `period` (s); on a processor, for the system's own sample period.
+    """
     from scipy.linalg import expm, solve_discrete_lyapunov
 
     scaled = system.scaled()

@@ -1,4 +1,4 @@
-"""Operating points: the linearised loop of a case at an equilibrium, and those of the members of its spread."""
+"""Operating points: linearised loops of a case at its equilibria, and of the members of its spread."""
 
 import dataclasses
 import math
@@ -20,7 +20,7 @@ from ambjax.linear import (
 )
 from ambjax.simulation.clock import Clock
 
-# Members of [spread] that are analysed unless another number is given.
+# Number of members of [spread] that `ambjax compare` analyses, and `ambjax sensitivity` without --members.
 MEMBERS = 100
 
 
@@ -38,8 +38,9 @@ class SpreadPeaks(NamedTuple):
     """Result of `spread_peaks`.
 
     `members`: number of members analysed. `stable`, `zone_a`: how many of them are stable, and stable in zone A.
-    `worst`: index of the member with the largest peak, or of the first one that is not stable. `point`: its loop; None
-    if it has no equilibrium. `measured`: the peaks of all members by injection; None if they were not measured.
+    `worst`: index of the member with the largest peak, or of the first one that is not stable. `point`: the loop of
+    this member; None if it has no equilibrium. `measured`: the peaks of all members by injection; None from
+    `spread_peaks` itself.
     """
 
     members: int
@@ -58,10 +59,11 @@ def operating_point(case: Case, name: str, r: float) -> OperatingPoint:
 
 
 def sensitivity(case: Case, r: float = 0.0) -> Analysis:
-    """Return peaks of |S|, |T|, |KS|, zone, margins and stiffness of a case, linearised at a constant reference r (m).
+    """Return the `Analysis` of a case, linearised at a constant reference r (m).
 
-    `ambjax.linear` contains functions for the single steps, and for the injection into the simulation. Returns the
-    `Analysis`. Raises ValueError as `linearise` does.
+    It contains the peaks of |S|, |T| and |KS|, the zone, the margins and the stiffness.
+    `ambjax.linear` contains functions for the single steps, and for the measurement of S by injection of a test signal.
+    Raises ValueError as `linearise` does.
     """
     require_case(case)
     if np.ndim(r) or np.asarray(r).dtype.kind not in "iuf":
@@ -76,7 +78,7 @@ def _analysis(case: Case, system: StateSpace, m: float) -> Analysis:
 
 
 def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPeaks:
-    """Analyse the members of the study, and return the counts and the member with the largest peak.
+    """Analyse the members of the study at r = 0, and return the counts and the member with the largest peak.
 
     `most`: number of members to analyse, the first of the study (None: all).
     """
@@ -100,7 +102,10 @@ def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPea
 
 
 def measured_peaks(case: Case, study: Study, peak: float) -> MemberPeaks:
-    """Measure the peak of |S| of each member of the study by injection, at lines denser near `peak` (Hz)."""
+    """Measure the peak of |S| of each member of the study by injection of a multi-sine.
+
+    The frequencies of the multi-sine are denser near `peak` (Hz).
+    """
     cascade, scenario = study.batch(np.arange(study.members))
     clock = one_period(case)
     lines = frequency_lines(case.zones, clock, peak)

@@ -16,9 +16,9 @@ from ambjax.simulation.span import Span
 
 @functools.cache
 def _combination(weights: tuple[float, ...]) -> Callable[..., Array]:
-    """Return the function x + h sum of weight * rate, compiled as a separate loop.
+    """Return the function (x, h, rates) -> x + h sum(weight * rate), on CPUs compiled as a separate loop.
 
-    Its inputs and outputs are stored in memory, so that XLA's fusion cannot compute them again.
+    On CPUs its inputs and outputs are stored in memory, so that XLA's fusion cannot compute them again.
     """
 
     def plain(x: Array, h: Array, rates: tuple[Array, ...]) -> Array:
@@ -45,10 +45,11 @@ class _Explicit(FixedSteps):
     """Base class of explicit Runge-Kutta methods.
 
     - `TIMES`: times of the stages, as fractions of the step.
-    - `ROWS`: weights of the rates in the state after each stage; the last row gives the new state.
+    - `ROWS`: Butcher tableau: row k has the weights of the first k rates in the state at stage k + 1; the last row
+      gives the new state.
 
-    The state at the start of each stage is excluded from XLA's fusion. With fusion, shared terms of the right-hand side
-    would be computed again for every component of every stage.
+    On CPUs, the rates and the state of each stage are excluded from XLA's fusion. With fusion, shared terms of the
+    right-hand side would be computed again for every component of every stage.
     """
 
     TIMES: ClassVar[tuple[float, ...]]
@@ -100,7 +101,9 @@ class RK4(_Explicit):
 
 @record
 class DOP853(_Explicit):
-    """Dormand and Prince's method of order 8, in 12 stages: for held noise, with one or two steps per sample.
+    """Dormand and Prince's method of order 8, with 12 stages.
+
+    Suitable if the noise is held over each sample: one or two steps per sample are then sufficient.
 
     Coefficients: Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I (2nd ed., 1993), II.10. The
     error estimates are omitted, because the steps are fixed.

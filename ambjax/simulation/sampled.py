@@ -1,8 +1,8 @@
 """The closed loop of a cascade on a processor: sampled measurements, discrete laws, and a held voltage.
 
-At t_n the sensors measure the plant, and then the laws make a step. The voltage u_n, within the limit of the supply,
-acts from t_n + delay T until t_{n+1} + delay T; before t_0 + delay T, u = 0. Then the plant is integrated to t_{n+1},
-under one voltage, or under two if the delay is not a whole number of samples.
+At t_n the sensors measure the plant, the laws make a step, and then the plant is integrated to t_{n+1}. The voltage
+u_n, within the limit of the supply, acts from t_n + delay T until t_{n+1} + delay T. Before t_0 + delay T, u = 0. One
+voltage acts during a sample, or two if the delay is not a whole number of samples.
 """
 
 import dataclasses
@@ -55,7 +55,10 @@ class Sampled:
         return dataclasses.replace(self, loop=self.loop.realised())
 
     def sensor_errors(self, sample: Scalar) -> Errors | FaultyErrors:
-        """Return the errors of all sensors in sample number `sample`: noise, runout and the onsets of faults."""
+        """Return the errors of all sensors in sample number `sample`: noise, runout and the onsets of faults.
+
+        With a low-pass, the runout is not included: the low-pass receives it (`sensed_motion`).
+        """
         drawn, sensor = self.loop.sensor_errors(sample), self.loop.scenario.sensor
         if sensor is not None and sensor.runout is not None and not lags(self.loop):
             runout = sensor.runout(jnp.asarray(sample, jnp.result_type(float)) * self.period)
@@ -123,7 +126,7 @@ class Sampled:
         sensed = sensor.sensed(measured.z, sensed, errors.onsets, self.period, self.loop.scenario.plant.s_0)
         z = jnp.where(jnp.isnan(sensed.z), 0.0, sensed.z)
         state = state._replace(sensed=sensed._replace(z=z))
-        if self.processor.guard is None:  # NaN ends the run; 0 keeps derivatives finite
+        if self.processor.guard is None:  # a NaN reading ends the run; z = 0 instead keeps derivatives finite
             state = state._replace(finite=jnp.where(jnp.isnan(sensed.z), 0.0, state.finite))
             return state, measured._replace(z=z)
         return state, measured._replace(z=sensed.z)

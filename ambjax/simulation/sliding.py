@@ -1,16 +1,17 @@
 """The sliding step: an integration step for a closed loop whose only stiff part is a sliding inversion law.
 
-The adaptive inversion law is such a law: w' = d - gamma sgn(w) for w = v_star - v(z, i_ref), Eq. (14a). When the
+The adaptive inversion law is such a law: w' = d - gamma sgn(w) for w = v_star - v(z, i_ref), Eq. (14a). d is the rate
+of w at constant i_ref, and p the steepness of the smoothed sign. When the
 measurements jump at a sample, i_ref slides to its new value within microseconds, and then follows that value.
 General methods are not suitable. A linearised implicit step has no stiffness in its Jacobian while the sign is
 saturated, and overshoots by gamma h. An explicit step must be shorter than 1/(gamma p).
 
 This step is divided at the end of the slide. The second part is solved implicitly with the full arctan, not with its
-slope. The supply's limit applies to each part: during the slide the voltage is at its limit, so that the current
-receives a bounded impulse instead of the whole jump.
+slope. The supply's limit applies to each part. A fast slide saturates the voltage, so the current receives a
+bounded impulse instead of the whole jump.
 
-The motion of the rotor and the states of the other laws are integrated by Heun's method, the current by an exponential
-step.
+The motion of the rotor and the states of the observer and of the position law are integrated by Heun's method. In each
+part, the current is integrated by an exponential step, the state of the current law by an explicit Euler step.
 """
 
 from typing import Any, NamedTuple, TypeVar
@@ -35,7 +36,7 @@ S = TypeVar("S")
 
 
 def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
-    """Advance the state of a ClosedLoop, for which `slides` is true, by h (s).
+    """Advance the state of a ClosedLoop by h (s). `slides` must be true for its cascade and its plant.
 
     `begin`, `end`: external inputs at the start and at the end of the step. Returns the new state and span.
     """
@@ -60,7 +61,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     def current(
         plant: State, estimate: Measurement, i_ref: Array, rate: Array, inner: S, outside: Any, h: Array
     ) -> tuple[Array, S, _Voltage]:
-        """Return i - i_ref and the current law's state after h (s), and the voltage, at constant i_ref' = rate."""
+        """Integrate the current over h (s) at constant i_ref' = rate. Return i - i_ref, the law's state, and u."""
         law = with_gains_at(cascade.current, estimate.z, outside.reference)
 
         def rate_of(i: Array) -> tuple[Array, tuple[S, Array]]:
@@ -79,7 +80,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     i_ref_0, i_ref = i_ref, i_ref + tau * sliding
     middle = State((z + ahead.z) / 2, (z_dot + ahead.z_dot) / 2, i_ref + e)
     estimate = jax.tree.map(lambda a, b: (a + b) / 2, estimate_0, estimate_1)
-    # During the slide the current changes fast; the second part starts with the acceleration at the final current.
+    # The current changes fast during the slide. The accelerations before and after it are weighted by the durations.
     z_ddot_0 += (1 - tau * per_h) * (scenario.plant.z_ddot(z, middle.i, begin.q_z) - z_ddot_0)
     e, inner, second = current(middle, estimate, i_ref, slaved, inner, end, h - tau)
     e, inner = materialised((e, inner))
@@ -88,7 +89,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     plant = State(
         z + h * z_dot + h * h / 6 * (2 * z_ddot_0 + z_ddot_1), z_dot + h / 2 * (z_ddot_0 + z_ddot_1), i_ref + e
     )
-    # tau = 0: no slide, because w was within the boundary layer of the sign.
+    # tau = 0: no slide, because w was within the boundary layer of the sign, or would not approach it.
     instants = (
         loop.instant(begin.reference, state.plant, i_ref_0, w, jnp.where(tau > 0, first.u, second.u)),
         loop.instant(begin.reference, state.plant._replace(i=middle.i), i_ref - (h - tau) * slaved, w_1, second.u),
@@ -164,9 +165,9 @@ def slides(cascade: Cascade, plant: Bearing) -> bool:
 class Slide(FixedSteps):
     """The sliding step (`ambjax.simulation.sliding`) with equal substeps, for stiff gains under held noise.
 
-    The step is of second order in the slow motion of the loop, for any stiffness of the inversion law. It requires an
-    inversion law with a method `slide`, such as `inversion.Adaptive`, and a lumped plant; otherwise a simulation raises
-    ValueError.
+    The step is of second order in the slow motion of the loop, for any stiffness of the inversion law. It requires
+    continuous time, an inversion law with a method `slide`, such as `inversion.Adaptive`, a lumped plant, an observer
+    that is not `stiff`, and a scenario without an elastic stop; otherwise a simulation raises ValueError.
     """
 
     limit = None
@@ -176,7 +177,8 @@ class Slide(FixedSteps):
     ) -> tuple[S, Span]:
         if problem.slide is None:
             raise ValueError(
-                "clock.method = Slide(...): it requires a lumped plant and the 'adaptive' inversion law. Use Rodas3."
+                "clock.method = Slide(...): it requires continuous time, a lumped plant without iron, the 'adaptive' "
+                "inversion law, an observer other than IRED1 and IRED2, and no elastic stop. Use Rodas3."
             )
         return problem.slide(problem.inputs(at(0.0)), problem.inputs(at(1.0)), h, state, span)
 

@@ -20,7 +20,7 @@ def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> 
         if (path := scenario.on_processor) is not None:
             raise ValueError(
                 f"{path} is for a controller on a processor, and this one runs in continuous time. Add [processor], or "
-                "leave it out."
+                f"leave out {path}."
             )
     if cascade.current.commands != scenario.drive:
         raise ValueError(
@@ -38,7 +38,7 @@ def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> 
 
 
 def _check_coils(scenario: Scenario) -> None:
-    """Raise ValueError if each coil has limits, and the plant has one current for both or |i| is limited too."""
+    """Raise ValueError for limits of each coil if both coils have one current, or if |i| is limited too."""
     amplifier = scenario.amplifier
     if amplifier is None or amplifier.coil is None:
         return
@@ -55,7 +55,7 @@ def _check_coils(scenario: Scenario) -> None:
 
 
 def _check_laws(cascade: Cascade, sample_period: Scalar) -> None:
-    """Raise ValueError for laws that cannot run on the processor, or not together."""
+    """Raise ValueError for a law that does not fit the model, the sample period, or the demand of the position law."""
     known = cascade.processor is not None and not is_traced(sample_period)
     period = float(np.max(np.asarray(sample_period))) if known else None
     for stage, law in zip(CascadeState._fields, cascade.laws, strict=True):

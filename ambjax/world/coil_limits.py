@@ -10,7 +10,7 @@ from ambjax.numerics.smooth import limited
 
 
 class CoilVoltages(NamedTuple):
-    """The voltages of the coils, in V: R i_0 + `upper` at the upper coil, R i_0 - `lower` at the lower coil."""
+    """Voltages of the coils relative to the bias, V. Upper coil: R i_0 + `upper`. Lower coil: R i_0 - `lower`."""
 
     upper: Scalar
     lower: Scalar
@@ -49,7 +49,7 @@ class CoilLimits:
     unidirectional: bool = static(default=False, doc="whether the current of a coil cannot become negative")
 
     def differential(self, i_0: Scalar) -> Scalar | None:
-        """Return the |i| (A) at which the current of a coil, i_0 + |i|, is at its limit; None: no limit."""
+        """Return the |i| (A) at which the current of a coil, i_0 + |i|, reaches i_max; None: no limit."""
         return None if self.i_max is None else self.i_max - i_0
 
     def reserve(self, bias: Scalar) -> Scalar:
@@ -64,7 +64,7 @@ class CoilLimits:
         bias = plant.R * plant.i_0
         voltages = self._limited(u, bias), self._limited(-u, bias)
         if self.i_max is not None or self.unidirectional:
-            # the rate of each current is linear in its own voltage
+            # the rate of each current is an affine function of its own voltage, and independent of the other voltage
             still, driven = (
                 plant.currents(plant.rates(state, CoilVoltages(volt, -volt), 0.0, q_i)) for volt in (0.0, 1.0)
             )
@@ -86,7 +86,7 @@ class CoilLimits:
     def _current_limited(self, volt: Array, kept: Array, i: Array) -> Array:
         """Return `volt` (V), or `kept` if the current i (A) of the coil is at a limit and `volt` would move it beyond.
 
-        `kept`: voltage that holds the current constant, V.
+        Both are voltages in excess of R i_0. `kept` (V) holds the current constant, as far as +-u_max allows.
         """
         if self.i_max is not None:
             volt = jnp.where((i >= self.i_max) & (volt > kept), kept, volt)

@@ -19,8 +19,8 @@ from ambjax.numerics.smooth import TWO_PI, sine
 class Signal(Protocol):
     """Protocol of a signal: maps a time (s) to a value. `span` returns bounds of its values for times in 0..end (s).
 
-    A signal with jumps also has `edges() -> tuple`, the times of its jumps (s). On a processor, a substep of
-    the integrator ends there.
+    A signal with jumps also has `edges() -> tuple`, the times of its jumps (s). On a processor, a step of the
+    integrator ends at each jump of a disturbance.
     """
 
     def __call__(self, t: Scalar, /) -> Array: ...

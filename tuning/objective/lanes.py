@@ -2,9 +2,9 @@
 
 A lane is one rollout of one member under one vector of gains. A kernel processes a fixed number of lanes and is
 compiled once. There are three kernels: one for the terms of the loss, one for their derivatives (with fewer lanes), and
-one for metrics. A new number of starts or members does not recompile them. The number of lanes does not depend on the
-number of cores, because it can change the last digit of a result. Another integration method, such as that of the
-judge, needs another engine.
+one for metrics. A new number of starts (vectors of gains) or members does not recompile them. The number of lanes can
+change the last digit of a result, so it does not depend on the number of cores. An engine has one integration method;
+where `tuning.judge` uses another, it has its own engine.
 """
 
 import dataclasses
@@ -32,9 +32,9 @@ from tuning.space import Space
 
 # Lanes of one kernel call. With 32 lanes XLA unrolls the loops into scalar code, which takes 1.5 times as long.
 LANES = 64
-# Lanes of one kernel call with derivatives. Most iterations need 16 to 64 lanes, so 32 keep two cores busy, although
-# two calls of 32 lanes take 14 % longer than one of 64. A call of 16 lanes takes 0.63 of the time of one of 32; a
-# second kernel for few lanes would take longer to compile than it saves in a search.
+# Lanes of one kernel call with derivatives. Most iterations need 16 to 64 lanes. With calls of 32 lanes, two cores can
+# share 64. In sequence, two such calls take 14 % longer than one of 64 lanes. A call of 16 lanes takes 0.63 of the time
+# of one of 32; a second kernel for few lanes would take longer to compile than it saves in a search.
 GRADIENT_LANES = 32
 
 
@@ -109,8 +109,8 @@ class Engine:
     """Compiled evaluation of an objective on `threads` cores (None: all). Each call blocks until its result is ready.
 
     `settle` (s): start of the settled part of the metrics. `mode`: "forward" or "reverse" differentiation. `lanes`:
-    lanes of one kernel call. `rollouts` counts the rollouts so far; `gradient` counts as 1 + m for each start and
-    member.
+    lanes of one kernel call; with derivatives at most GRADIENT_LANES. `rollouts` counts the rollouts so far; `gradient`
+    counts as 1 + m for each start and member.
     """
 
     def __init__(
@@ -128,7 +128,10 @@ class Engine:
         self._standard = canonical(Named({"loss": objective.loss, "metrics": standard_for(settle, objective.scenario)}))
 
     def terms(self, x: np.ndarray, members: Members) -> dict[str, np.ndarray]:
-        """Return the terms of the loss by name, each [S, N], at coordinates x [S, m] for members [N]."""
+        """Return the terms of the loss by name, each [S, N], at coordinates x [S, m] for members [N].
+
+        If a limit needs linearised loops, their quantities are included. They are 1 for members not in `searched`.
+        """
         self.rollouts += len(x) * len(members.member)
         terms = self._lanes(LaneFold(self.objective.space), x, members, self.lanes, fold=self._world[-1])
         if self.objective.loop is not None:
@@ -139,7 +142,7 @@ class Engine:
     def metrics(self, x: np.ndarray, members: Members) -> dict[str, Any]:
         """Return {"loss": terms, "metrics": the metrics of metrics.json}, each [S, N], at x [S, m] for members [N].
 
-        The gains are constants of the compiled program, as in `ambjax ensemble`. With LANES lanes, the same integration
+        The gains are numbers shared by all lanes, as in `ambjax ensemble`. With LANES lanes, the same integration
         method and members that are not stressed, the metrics therefore equal those of members.npz bit by bit.
         """
         self.rollouts += len(x) * len(members.member)
@@ -170,7 +173,10 @@ class Engine:
     def _with_loops(
         self, found: tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]], x: np.ndarray, members: Members
     ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        """Insert the quantities of the linearised loops into the results of `gradient`, in the order of the names."""
+        """Insert the quantities of the linearised loops into the results of `gradient`, in the order of the names.
+
+        For members not in `members.searched`, the quantities are 1 and their derivatives 0.
+        """
         outcomes, slopes, terms = found
         names = sorted(self.objective.loss.measures)
         values, moves = loops(self.objective, x, members.searched)
@@ -193,9 +199,9 @@ class Engine:
         fold: Any = None,
         vectorised: bool = False,
     ) -> Any:
-        """Apply the function to every start x [S, m], with its weights [S, 6], and member [N]: leaves [S, N, ...].
+        """Apply the function to each pair of a start x [S, m], with its weights [S, 6], and a member [N].
 
-        `vectorised`: as in `map_members`.
+        Returns leaves [S, N, ...]. `width`: lanes of one kernel call. `vectorised`: as in `map_members`.
         """
         start, member = np.divmod(np.arange(len(x) * len(members.member)), len(members.member))
         at = np.asarray(x, jnp.result_type(float))[start]

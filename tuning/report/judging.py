@@ -58,7 +58,8 @@ def examined(answer: SearchResult, gradients: bool, front_written: bool) -> tupl
 def _judged(problem: TuningProblem, x: np.ndarray, held_out: int) -> dict[str, dict[str, np.ndarray]]:
     """Return the metrics of the held-out members [N] with the gains of the case (`before`) and at x [m] (`after`).
 
-    Both are empty if there are no held-out members.
+    Gains of the case outside the bounds, or close to one, are clipped. Both are empty if there are no held-out members.
+    `held_out`: seed of these members.
     """
     space, count = problem.objective.space, problem.tune.budget.held_out
     say(f"judging on {count} held-out members ...")
@@ -71,7 +72,8 @@ def _judged(problem: TuningProblem, x: np.ndarray, held_out: int) -> dict[str, d
 def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_out: int) -> Row:
     """Return the fields on the training members and on the held-out members.
 
-    `judged`: from `_judged`. `refuted`: why accurate steps do not confirm the answer; '' if they do.
+    `judged`: from `_judged`. `refuted`: why accurate steps do not confirm the answer; '' if they do. `held_out`: seed
+    of the held-out members.
     """
     problem = answer.problem
     none = {"members": 0, "held": 0, "lost": 0, "stalled": 0}
@@ -150,10 +152,11 @@ def _neighbourhood(problem: TuningProblem, x: np.ndarray, slices: explore.Slices
 def _checked(
     answer: SearchResult, judged: dict[str, np.ndarray] | None, held_out: int
 ) -> tuple[StepError | None, dict[str, Any] | None, str]:
-    """Simulate the worst and the first of the held-out members `judged` [N] again, with accurate steps.
+    """Simulate the worst and the first of the held-out members again, with accurate steps, in continuous time only.
 
-    Returns the step error on the worst members, the comparison on the first ones, and the reason why accurate steps do
-    not confirm the answer ('' if they confirm it).
+    `judged`: metrics of these members [N]. `held_out`: their seed. Returns the step error on the worst members, the
+    comparison on the first ones (None each if it was not made), and the reason why accurate steps do not confirm the
+    answer ('' if they confirm it).
     """
     problem, again, error = answer.problem, None, None
     if judged and not problem.sampled:

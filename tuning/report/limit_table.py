@@ -36,7 +36,8 @@ def facts(
     - `held`: whether the limit is held; None if no member was judged, or if the limit is held but accurate steps do not
       confirm the answer. `verdict`: the same in words.
     - `price`: decrease of the minimised settled rms error (m) or voltage (V) for a limit 10 % looser
-      (`Limit.error_reduction`); None if the limit is not held.
+      (`Limit.error_reduction`). It is 0 if the limit is not active, and None for survival and if the members' values do
+      not give the verdict "held".
     """
     members, held, settings = summary["members"], summary["held"], problem.tune.limits
     share = held / members if members else None
@@ -105,7 +106,7 @@ def _row(
 
 
 def _tested(row: Facts, delayed: DelayTest | None, refuted: str) -> Facts:
-    """Return the row with the result of the test of the delay margin; unchanged if it belongs to another limit."""
+    """Return the row of the delay margin with the result of its test; any other row, or without a test, unchanged."""
     if row["name"] != DELAY_MARGIN or delayed is None:
         return row
     words = (

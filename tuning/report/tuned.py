@@ -34,7 +34,9 @@ def tuned_case(case: Case, gains: Mapping[str, float], verdict: str, out: pathli
 
 
 def tuned(text: str, gains: Mapping[str, float | str], case: str, verdict: str) -> str:
-    """Return the text of a case file with the given gains and kinds at these dotted paths; missing tables are added.
+    """Return the text of a case file with each value of `gains` at its dotted path. Missing tables are added.
+
+    A value is a gain, the kind of a law, or the path of a file.
 
     The text begins with a comment: the name of the case and the verdict. Raises ValueError if the text cannot be
     changed in this way.
@@ -56,7 +58,7 @@ def tuned(text: str, gains: Mapping[str, float | str], case: str, verdict: str) 
 def _words(path: str) -> list[Any]:
     """Return the words of a dotted path; the index of a list is a word, as in disturbance.q_z[1].file.
 
-    A knot leads to the list `values` of its schedule and an index.
+    A last word that is an index denotes a knot of a schedule: k[2] gives the words k, values, 2.
     """
     *words, last = path.replace("[", ".").replace("]", "").split(".")
     return [*words, "values", int(last)] if last.isdigit() else [*words, last]
@@ -81,8 +83,8 @@ def _escaped(character: re.Match[str]) -> str:
 def _table(table: Any, path: list[str]) -> Any:
     """Return the table at this path; add it if it is missing.
 
-    A table inside an inline table is inline. Other tables follow the last table of the same kind. If root keys follow
-    there, which would become keys of the new table, it is added at the end of the document.
+    A new table in an inline table is inline. Any other new table follows the last table of its parent. Root keys that
+    follow there would become keys of the new table, so it is then added at the end of the document.
     """
     document = table
     for depth, word in enumerate(path):
@@ -130,7 +132,7 @@ def _put(table: Any, name: str | int, value: float | str) -> None:
 
 
 def _behind(last: Table | None) -> Table:
-    """Return a new table. It takes over the comments at the end of the preceding table, which refer to what follows."""
+    """Return a new table. The comments at the end of the table `last` move into it: they describe what follows both."""
     table = tomlkit.table()
     rest = [] if last is None else _cut(last)
     table.value.body.extend(rest or [(None, tomlkit.nl())])
@@ -138,7 +140,7 @@ def _behind(last: Table | None) -> Table:
 
 
 def _last(table: object) -> Table | None:
-    """Return the innermost table at the end of a table of tables; None if there is none, or it has separate parts."""
+    """Return the table that ends `table`, possibly itself; None if `table` is the document or is in separate parts."""
     last = None
     while isinstance(table, Table):
         last = table

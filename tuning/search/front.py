@@ -1,9 +1,9 @@
-"""The front of error against voltage, and its knee: the answer of least voltage whose error is near the least error.
+"""The front of error against voltage, and its knee: of the answers near the least error, the one of least voltage.
 
 After the search for the least error e, further searches minimise the rms voltage. Each limits the rms error to a factor
 times e, and starts at the best answer so far. The factor of the knee is KNEE. At a low voltage, a few members may have
-errors many times those of the others. Such members of the validation ensemble join the training ensemble, and the
-search is repeated.
+errors many times those of the others. Validation members with such errors join the training ensemble, and the search
+is repeated.
 """
 
 import dataclasses
@@ -30,19 +30,19 @@ FACTORS = (KNEE, 1.1, 1.5, 1.05, 2.0)
 # are updated or members join. MOST_VALIDATIONS: largest number of answers that are validated.
 MOST_SEARCHES_PER_POINT, MOST_VALIDATIONS = 6, 4
 # If the judge's error exceeds the error that the search expects by more than the share UNEXPECTED, the training
-# ensemble lacks members with large errors. The share is smaller than `validation.LARGER`, because the error is limited
-# here.
+# ensemble lacks members with large errors. The share is below that of the validation, `validation.LARGER` - 1, because
+# the error is limited here.
 UNEXPECTED = 0.1
 
 
 class FrontPoint(NamedTuple):
-    """An answer, judged on members of another seed than the training ensemble.
+    """An answer, judged on the validation members, or on the training members if tune.validation is 0.
 
     `factor`: limit of the rms error relative to the least error; 1: the answer of least error. `x` [m]: coordinates.
     `error_m`, `volts`: settled rms error (m) and settled rms voltage (V) of the members that are held; NaN if none is
     held. `sensitivity`: the limited peak of |S|; None if it has no limit. `lost`, `stalled`: number of lost and of
-    stalled members among `members`. `within`, `reserve`: whether all limits except that of the error are met; whether
-    they are met with half of their margins.
+    stalled members among `members`. `within`: whether all limits are met, except that of the front on the error.
+    `reserve`: whether they are met with half of their margins.
     """
 
     factor: float
@@ -60,9 +60,12 @@ class FrontPoint(NamedTuple):
 def trace_front(course: Course, answer: SearchResult) -> SearchResult:
     """Trace the front from the answer of least error. Return the answer that tune.objective selects.
 
-    The result contains the points of the front in the order of their limits of the error: for each limit, the judged
-    answer of least voltage. If a search for a lower voltage finds a smaller error than that of `answer`, this error is
-    taken as the least error. Raises ValueError as `Course.search` does.
+    The result contains the point of least error, and then, for each limit of the error in ascending order, the judged
+    point of least voltage. Equal points appear once. If `answer` is returned and is not among them, it comes last. If a
+    search for a lower voltage finds a smaller error than that of `answer`, this error is taken as the least error.
+
+    There is no front if `answer` holds no member, or if its error or voltage is 0. Raises ValueError as `Course.search`
+    does.
     """
     course.problem, x = answer.problem, answer.x
     first, *_ = _judged(course, 1.0, x)
@@ -104,10 +107,11 @@ def chosen(seen: Sequence[FrontPoint], factor: float) -> FrontPoint:
 
 
 def _admissible(seen: Sequence[FrontPoint]) -> list[FrontPoint]:
-    """Return the points that lose no more members than the first point, and meet all limits if the first point does.
+    """Return the points that hold at least as many members as the first point, and meet all limits if it does.
 
-    If the first point keeps half of the margin of each limit, the returned points do so too, because the values of the
-    held-out members may exceed those of the judged members by a few per cent.
+    The limit of the front does not count. If the first point keeps half of the margin of each limit, the returned
+    points do so too. They need this reserve: the values of the held-out members may exceed those of the judged members
+    by a few per cent.
     """
     first = seen[0]
     return [
@@ -121,10 +125,11 @@ def _admissible(seen: Sequence[FrontPoint]) -> list[FrontPoint]:
 
 
 def _search_least_voltage(course: Course, factor: float, seen: Sequence[FrontPoint]) -> list[FrontPoint]:
-    """Search for the least voltage within the limits, from the best point in `seen`. Return the answer of each search.
+    """Search for the least voltage within the limits, from the best point in `seen`. Return the judged answers.
 
-    After each search, either the multipliers are updated and the next search starts at the answer, or members join the
-    training ensemble and the next search starts at the best point so far.
+    The searches end when all limits are met. Otherwise the multipliers are updated, and the next search starts at the
+    last answer. If validation members have large errors, they join the training ensemble instead, and the next search
+    starts at the best point so far.
     """
     points, x = list[FrontPoint](), chosen(seen, factor).x
     for _ in range(MOST_SEARCHES_PER_POINT):
@@ -156,7 +161,10 @@ def _search_least_voltage(course: Course, factor: float, seen: Sequence[FrontPoi
 def _members_to_join(
     course: Course, numbers: Sequence[tuple[float, float]], columns: Mapping[str, np.ndarray]
 ) -> Members | None:
-    """Return the validation members with the largest errors, which join the training ensemble; None if none joins.
+    """Return the validation members that join the training ensemble; None if none joins.
+
+    They join if the judge's rms error breaks its limit and exceeds the expected error by more than UNEXPECTED: those
+    with the largest errors that are not in the training ensemble.
 
     `numbers`: the values of the search and of the judge for each limit. `columns` [N]: metrics of the judged members.
     """

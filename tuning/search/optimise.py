@@ -31,8 +31,8 @@ class Phase(NamedTuple):
     """A phase of the search.
 
     It simulates 1/`part` of the ordinary members. It simulates all stressed members, because the goal jumps where one
-    of these is lost. A descent has converged if the goal falls by less than `stall` over `patience` iterations. If the
-    norm of its gradient then exceeds `gradient_limit`, the start continues with CMA-ES.
+    of these is lost. A descent ends if the goal falls by less than `stall` over `patience` iterations. If the norm of
+    its gradient is then `gradient_limit` or more, the start continues with CMA-ES.
     """
 
     part: int
@@ -41,12 +41,12 @@ class Phase(NamedTuple):
     gradient_limit: float
 
 
-# A start with a gradient above STEEP uses CMA-ES at once. Such a gradient predicts that the goal changes by a factor e
-# within the shortest step.
+# A start with a gradient above STEEP uses CMA-ES at once. Such a gradient predicts that the goal, a logarithm, changes
+# by more than 1 within the shortest step.
 STEEP = 1 / SHORTEST
-# The first phase uses few members: their optimum is close to that of all members, at less than half of the cost. The
-# gradient vanishes at a minimum of the goal, a logarithm. In benchmarks/tasks, converged descents end with norms of
-# 0.001 to 0.02 per factor e of a gain, and descents that stop early with norms of 0.36 to 1e127.
+# The first phase uses few members: their optimum is close to that of all members, at less than half of the cost. At a
+# minimum of the goal, the gradient vanishes. In benchmarks/tasks, converged descents end with norms of 0.001 to 0.02,
+# and descents that stop early with norms of 0.36 to 1e127: change of the goal, a logarithm, per factor e of a gain.
 FEW, ALL = Phase(4, 0.02, 3, STEEP), Phase(1, 1e-3, 4, 0.1)
 # Message at the first Ctrl-C.
 INTERRUPT_MESSAGE = "the search ends after this iteration; its best gains are then judged and written."
@@ -70,14 +70,15 @@ def search(
 ) -> SearchState:
     """Refine the best `keep` of these points, coordinates [K, m]. Ctrl-C ends the search early.
 
-    If there are more than `keep` points, they are first screened and refined on a part of the members. The best point
-    that this phase visited, or the first of `points` if it is better, is then refined on all members. Each phase has at
-    most `iterations`. A start descends by the optimiser `name` with the learning rate `rate`. If its gradient does not
-    lead to a minimum, it continues with CMA-ES.
+    With at most `keep` points, all are refined on all members. With more, they are screened, and the best `keep` are
+    refined on a part of the members. At most PATH_POINTS points of this phase, and the first of `points`, are then
+    evaluated on all members, and the best of them is refined further. Each phase has at most `iterations`. A start
+    descends by the optimiser `name` with the learning rate `rate`. If its gradient does not lead to a minimum, it
+    continues with CMA-ES.
 
-    `at_optimum`: whether an earlier search on all members ended at the first point; the point is then not refined
-    again. `seed`: of the populations. `on_iteration`: called after each iteration with the search and the duration of
-    the iteration in s.
+    `at_optimum`: whether an earlier search on all members ended at the first point. If this point is the best after the
+    first phase, it is then not refined again. `seed`: seed of the populations of CMA-ES. `on_iteration`: called after
+    each iteration with the search and the duration of the iteration in s.
     """
     descent = Descent(goal, name, rate)
     checkpoint_file = checkpoint_file or CheckpointFile(None, {})
@@ -116,9 +117,11 @@ def search(
 def _switch(progress: SearchState, phase: Phase) -> None:
     """Select the starts that continue, and those that switch to CMA-ES.
 
-    A start ends if its step is shorter than SHORTEST or its goal stalls. The worse half ends after the iterations
-    HALVINGS. A descent with a large gradient switches to CMA-ES: the derivatives of a chaotic loop grow with time and
-    do not describe the goal, and a descent stops early at a jump of the goal, beyond which members are lost.
+    A start ends if its step is at most SHORTEST. A descent also ends if its goal stalls, and CMA-ES if it has
+    converged. The worse half ends after the iterations HALVINGS. A descent switches to CMA-ES at once if its gradient
+    is STEEP or more, and instead of ending if its gradient is `gradient_limit` or more. In a chaotic loop the
+    derivatives grow with time and do not describe the goal. At a jump of the goal, beyond which members are lost, a
+    descent stops early.
     """
     starts, count = progress.starts, progress.iteration - progress.since
     value, norm, active = np.asarray(starts.value), np.asarray(starts.gradient_norm), progress.active
@@ -157,15 +160,15 @@ def _begin_full_phase(
 ) -> None:
     """Begin the phase on all members.
 
-    It starts at the best of `given` and some of the points that the first phase visited. The optimum of the first phase
-    may lose members that the phase did not simulate; an earlier point is then better. If `given` is the best point and
-    `at_optimum` is true, the phase ends at once.
+    It has one start: the best of `given` and of at most PATH_POINTS points that the first phase visited. The optimum of
+    the first phase may lose members that the phase did not simulate; an earlier point is then better. If `given` is the
+    best point and `at_optimum` is true, the phase ends at once.
     """
     x, value = (np.array(progress.history[name][progress.since :]) for name in ("x", "value"))
     starts = value.shape[1]
     x, value = x.reshape(-1, x.shape[-1]), value.ravel()
     _, first = np.unique(np.where(np.isfinite(value), value, np.inf), return_index=True)
-    # denser among the better points
+    # the spacing of the ranks increases, so most of the chosen points are good ones
     chosen = first[np.unique((np.linspace(0, np.sqrt(len(first) - 1), PATH_POINTS).round(6) ** 2).astype(int))]
     tried = np.concatenate([x[chosen], given[None]])
     terms = engine.terms(tried, members)

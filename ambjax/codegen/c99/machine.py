@@ -26,7 +26,7 @@ TIME_LIMIT = 60
 
 
 def compiler(option: str = "--verify", fix: str = "Install one, set CC, or omit --verify") -> str:
-    """Return the C compiler: $CC, or cc, gcc or clang.
+    """Return the C compiler: $CC if it is set, else the first of cc, gcc and clang that exists.
 
     Raises ValueError if there is none. The message names the `option` that needs a compiler, and the `fix`.
     """
@@ -96,8 +96,8 @@ def scratch() -> Iterator[pathlib.Path]:
             yield pathlib.Path(folder)
     except OSError as error:
         raise ValueError(
-            f"--verify: cannot write to the folder for temporary files ({error.strerror or error}). Free space, set "
-            "TMPDIR to another folder, or omit --verify."
+            f"cannot write to the folder for temporary files ({error.strerror or error}). Free space, or set TMPDIR to "
+            "another folder."
         ) from None
 
 
@@ -129,7 +129,7 @@ def check_compiler() -> None:
 
 
 def short(text: str) -> str:
-    """Return one line of a compiler's output: a missing library, else the first error, else the last line."""
+    """Return at most 160 characters: a missing library, else the first error, else the last line of the output."""
     lines = [line for line in text.strip().splitlines() if line]
     found = [line[line.index("cannot find") :] for line in lines if "cannot find" in line]
     found += [line.partition("error:")[2].strip() for line in lines if "error:" in line]
@@ -162,7 +162,7 @@ class Compiled:
         return self._step(*self._at)
 
     def results(self, at: Points) -> Results:
-        """Return the results of one step from each point. The own parameters are restored afterwards."""
+        """Return the results of one step from each point. Only `parameters` is restored afterwards."""
         count = at.started.size
         state, started = np.empty_like(at.state), np.empty(count, bool)
         outputs, bits = np.empty((len(self.outputs), count), at.state.dtype), np.empty(count, np.int64)

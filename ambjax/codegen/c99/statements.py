@@ -28,7 +28,7 @@ SAMPLE_PERIOD = "SAMPLE_PERIOD"
 
 
 def word(name: str) -> str:
-    """Return a dotted name as a valid C name: in ASCII, and not a keyword."""
+    """Return a dotted name whose parts are valid C names: in ASCII, and no keywords. The dots are kept."""
     parts = [part + "_" if part in RESERVED else part for part in name.split(".")]
     return ".".join(re.sub(r"[^\x00-\x7f]", lambda found: f"_u{ord(found[0]):04x}", part) for part in parts)
 
@@ -46,7 +46,7 @@ def c_constant(x: SupportsFloat, precision: str) -> str:
 
 
 class Statements:
-    """The nodes `order` of a program as C statements.
+    """C statements for some nodes of a program. `order`: the numbers of these nodes, in order.
 
     `precision`: type of the numbers. `prefix`: prefix of the names of types and functions.
     """
