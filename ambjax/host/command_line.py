@@ -19,8 +19,7 @@ from ambjax.host.words import one_line
 # Errors of a file system that another folder or free space may resolve.
 UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO)
 # Thresholds of the garbage collector. Imports and tracing allocate millions of objects that live until the end of a
-# command. With Python's own thresholds, the collector scans them again and again, for an eighth of the time of
-# `simulate`.
+# command. With Python's own thresholds, the collector scans them again and again.
 GC_THRESHOLDS = (100_000, 20, 20)
 
 
