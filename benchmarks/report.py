@@ -26,7 +26,7 @@ Smooth gains are gamma = 1e9 and p = 25e-6 in the inversion; repaired gains are 
     .venv/bin/python benchmarks/sampled.py           # the cascade on a processor against C
     .venv/bin/python benchmarks/peers.py             # ensembles against other libraries
     .venv/bin/python benchmarks/scaling.py --full    # cost and memory against members and horizon
-    .venv/bin/python benchmarks/gpu.py               # ensembles on an accelerator
+    .venv/bin/python benchmarks/gpu.py               # ensembles on a GPU
     .venv/bin/python benchmarks/held_noise.py        # integration methods under held noise
     .venv/bin/python benchmarks/gradients.py         # time and memory of a gradient
     .venv/bin/python benchmarks/workarounds.py       # effect of each workaround for XLA
@@ -50,6 +50,7 @@ SECTIONS = {
     "sampled": simulated.sampled,
     "peers": simulated.peers,
     "scaling": simulated.scaling,
+    "gpu": simulated.gpu,
     "held_noise": simulated.held_noise,
     "gradients": simulated.gradients,
     "startup": simulated.startup,
@@ -61,7 +62,6 @@ SECTIONS = {
     "laws": tuned.laws,
     "schedules": tuned.schedules,
     "from_answer": tuned.from_answer,
-    "gpu": simulated.gpu,
     "export": simulated.export,
     "page": simulated.sliders,
 }

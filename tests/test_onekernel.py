@@ -1,4 +1,4 @@
-"""The kernel of a whole rollout against the rollout, in interpret mode; its compilation for a GPU, without a GPU."""
+"""run_on_gpu against the rollout, in Pallas's interpreter; lowering of its kernel for CUDA, without a GPU."""
 
 import dataclasses
 
@@ -12,7 +12,11 @@ from ambjax import (
     AdaptiveRodas3,
     Cascade,
     Clock,
+    Constant,
     Initial,
+    Pulse,
+    Recorded,
+    Samples,
     Scenario,
     Sensor,
     Sine,
@@ -22,8 +26,7 @@ from ambjax import (
     position,
 )
 from ambjax.control.processor import Processor
-from ambjax.ensemble import run_ensemble
-from ambjax.ensemble.gpu_kernel import run_whole
+from ambjax.ensemble import run_ensemble, run_on_gpu
 from ambjax.simulation.folds import Named, Peak, Variation
 from ambjax.world.band_noise import BandNoise
 
@@ -43,7 +46,7 @@ SCENARIO = Scenario(
 @pytest.mark.slow
 def test_the_kernel_equals_the_rollout():
     fold = Named({"peak": Peak("e_z", 1e-4, timed=True), "chatter": Variation()})
-    found = run_whole(CASCADE, SCENARIO, CLOCK, fold=fold, block=32, interpret=True)
+    found = run_on_gpu(CASCADE, SCENARIO, CLOCK, fold=fold, block=32, interpret=True)
     expected = run_ensemble(CASCADE, SCENARIO, CLOCK, fold=fold, threads=1)
     assert 0 < int(jnp.isfinite(expected.trajectory.lost_at).sum()) < MEMBERS
     for ours, theirs in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
@@ -52,6 +55,7 @@ def test_the_kernel_equals_the_rollout():
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=0)
 
 
+RECORDED = Recorded(Samples(np.array([0.0, 1.0]), np.array([0.0, 1e-5])))
 LAWS = {
     "paper": CASCADE,
     "others": Cascade(
@@ -63,16 +67,25 @@ LAWS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("laws", "x64"), [("paper", True), ("others", False)])
-def test_the_kernel_compiles_for_a_gpu(laws, x64, monkeypatch):
-    # No GPU is needed to make its program: a primitive that kernels cannot have would raise here. What is done for
-    # CPUs alone must be left out, as it is where JAX runs on a GPU.
+@pytest.mark.parametrize(
+    ("laws", "x64", "changes"),
+    [
+        ("paper", True, {}),
+        ("others", False, {}),
+        # without random signals, members share the reference, so the kernel computes its sine with scalars
+        ("paper", False, {"q_z": Constant(0.0), "q_v": Pulse(1.0, 1e-4, 2e-4), "sensor": None}),
+    ],
+    ids=("paper", "others", "shared"),
+)
+def test_the_kernel_compiles_for_a_gpu(laws, x64, changes, monkeypatch):
+    # Lowering for CUDA needs no GPU. A primitive that Triton lacks raises here.
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    scenario = dataclasses.replace(SCENARIO, **changes)
     with jax.enable_x64(x64):
         run = jax.jit(
-            lambda z: run_whole(LAWS[laws], dataclasses.replace(SCENARIO, initial=z), CLOCK, fold=Standard(2e-4))
+            lambda z: run_on_gpu(LAWS[laws], dataclasses.replace(scenario, initial=z), CLOCK, fold=Standard(2e-4))
         )
-        lowered = run.trace(SCENARIO.initial).lower(lowering_platforms=("cuda",)).as_text()
+        lowered = run.trace(scenario.initial).lower(lowering_platforms=("cuda",)).as_text()
     assert lowered.count("custom_call @__gpu$xla.gpu.triton") == 1
 
 
@@ -84,15 +97,17 @@ def test_the_kernel_compiles_for_a_gpu(laws, x64, monkeypatch):
         ({"scenario": dataclasses.replace(SCENARIO, seed=np.arange(5))}, "leaves: 5 and 37"),
         ({"scenario": Scenario(), "cascade": Cascade(), "clock": Clock(6, 1e-4, RK4(50))}, "leaves: none"),
         ({"clock": Clock(0, 1e-4, RK4(1))}, "clock.samples = 0"),
+        ({}, "run_on_gpu needs a GPU, and JAX runs on this backend: cpu. Use run_ensemble."),
+        ({"scenario": dataclasses.replace(SCENARIO, reference=RECORDED), "interpret": True}, "a recorded signal"),
     ],
 )
 def test_bad_input_is_refused(change, message):
     arguments = {"cascade": CASCADE, "scenario": SCENARIO, "clock": CLOCK, "fold": Peak("e_z")} | change
     with pytest.raises(ValueError, match=message):
-        run_whole(**arguments)
+        run_on_gpu(**arguments)
 
 
 def test_a_processor_is_refused():
     cascade = Cascade(processor=Processor())
-    with pytest.raises(ValueError, match="the whole-rollout kernel runs cascades in continuous time only"):
-        run_whole(cascade, Scenario(member=np.arange(2)), Clock(10, 1e-4, RK4(2)), fold=None, interpret=True)
+    with pytest.raises(ValueError, match="run_on_gpu simulates cascades in continuous time only"):
+        run_on_gpu(cascade, Scenario(member=np.arange(2)), Clock(10, 1e-4, RK4(2)), fold=None, interpret=True)

@@ -12,11 +12,11 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
-from ambjax.codegen.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal
+from ambjax.codegen.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal, split_scan
 from ambjax.codegen.program import Operand, Program, Ref, of
 
 LOOPS = ("scan", "while")
-COMPOSED = ("rsqrt", "exp2", "logistic")
+COMPOSED = ("rsqrt", "exp2", "logistic", "one_minus_square")
 # Primitives whose operands may be whole numbers that depend on data.
 CODES = ("select_n", "eq", "ne", "lt", "le", "gt", "ge")
 
@@ -102,6 +102,8 @@ class _Reader:
         apply, one = self.program.apply, np.ones((), dtype)[()]
         if name == "rsqrt":
             return apply("div", (one, apply("sqrt", (x,), dtype, law)), dtype, law)
+        if name == "one_minus_square":
+            return apply("mul", (apply("add", (one, x), dtype, law), apply("sub", (one, x), dtype, law)), dtype, law)
         if name == "exp2":
             return apply("exp", (apply("mul", (x, np.log(2 * one)), dtype, law),), dtype, law)
         grown = apply("exp", (apply("neg", (x,), dtype, law),), dtype, law)
@@ -144,7 +146,7 @@ class _Reader:
         ]
 
     def _scan(self, params: Any, args: list[Operand], law: str) -> list[Operand]:
-        consts, carry = args[: params["num_consts"]], args[params["num_consts"] :]
+        consts, carry = split_scan(params, args)
         for _ in range(params["length"]):
             carry = self.closed(params["jaxpr"], consts + carry, law)
         return carry

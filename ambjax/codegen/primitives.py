@@ -5,7 +5,7 @@ with JAX, not with NumPy.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from jax.extend.core import JaxprEqn, Literal, Var
@@ -97,6 +97,7 @@ COUNTED = ("add", "multiply", "divide", "root", "call")
 
 # A variable of a trace, or a constant in it.
 Atom: TypeAlias = Var | Literal
+Argument = TypeVar("Argument")
 
 
 def dtype_of(x: Atom) -> np.dtype:
@@ -108,3 +109,13 @@ def dtype_of(x: Atom) -> np.dtype:
 def is_reciprocal(eqn: JaxprEqn) -> bool:
     """Return whether a call computes 1/x by refining a float32 quotient. Exported code divides once instead."""
     return eqn.params.get("name") == RECIPROCAL and len(eqn.invars) == len(eqn.outvars) == 1
+
+
+def split_scan(params: dict[str, Any], args: list[Argument]) -> tuple[list[Argument], list[Argument]]:
+    """Return the constants and the carry of a scan over scalars, from all its arguments.
+
+    Such a scan has no inputs or results per step. Its results are therefore the carry, which comes last in `args`. The
+    parameter of the scan that gives the number of constants has another name in newer versions of JAX.
+    """
+    first = len(args) - len(params["jaxpr"].out_avals)
+    return args[:first], args[first:]

@@ -16,7 +16,7 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
 from jax.typing import ArrayLike
 
 from ambjax.codegen.points import Points
-from ambjax.codegen.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal
+from ambjax.codegen.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal, split_scan
 from ambjax.codegen.trace import Trace, arguments, precision
 
 
@@ -78,7 +78,7 @@ def _one(eqn: JaxprEqn, args: list[ArrayLike], count: int) -> list[ArrayLike]:
         at = np.asarray(args[0], int)
         return [np.choose(at, [np.broadcast_to(x, count) for x in xs]) for xs in zip(*sides, strict=True)]
     if name == "scan":
-        fixed, carry = args[: params["num_consts"]], args[params["num_consts"] :]
+        fixed, carry = split_scan(params, args)
         for _ in range(params["length"]):
             carry = one_by_one(params["jaxpr"], fixed + carry, count)
         return carry

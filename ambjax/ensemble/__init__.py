@@ -3,6 +3,7 @@
 from ambjax.ensemble.batching import map_members, run_ensemble
 from ambjax.ensemble.distributions import Choice, LogUniform, Normal, Percent, Uniform
 from ambjax.ensemble.drivers import shares
+from ambjax.ensemble.gpu_kernel import run_on_gpu
 from ambjax.ensemble.intervals import cvar, quantile, wilson
 from ambjax.ensemble.spread import Spread, apply, draw
 from ambjax.ensemble.statistics import summary
@@ -20,6 +21,7 @@ __all__ = [
     "map_members",
     "quantile",
     "run_ensemble",
+    "run_on_gpu",
     "shares",
     "summary",
     "wilson",

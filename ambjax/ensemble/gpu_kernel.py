@@ -1,9 +1,9 @@
-"""Whole rollouts in one kernel, for accelerators: the kernel contains the time loop, and each lane runs one member.
+"""Whole rollouts in one GPU kernel: the kernel contains the time loop, and each thread simulates one member.
 
-If the time loop is outside the kernel, every step launches several kernels, and each launch takes longer than the
-arithmetic. Here Pallas (through Triton) compiles one program that loads the numbers of its members, loops over all
-samples in registers, and stores the result of the fold. The kernel traces the code of the ordinary rollout; only the
-random numbers of jax.random are drawn before the kernel starts.
+If the time loop is outside the kernel, every step launches several kernels, and all states pass through the memory of
+the GPU. Here Pallas (through Triton) compiles one program that loads the numbers of its members, loops over all samples
+in registers, and stores the result of the fold. The kernel contains the code of the ordinary rollout; only the random
+numbers of jax.random are drawn before the kernel starts.
 """
 
 import dataclasses
@@ -13,7 +13,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import size
@@ -30,7 +32,7 @@ WARP, MOST_WARPS = 32, 32
 BLOCK = 128
 
 
-def run_whole(
+def run_on_gpu(
     cascade: Cascade,
     scenario: Scenario,
     clock: Clock,
@@ -39,7 +41,7 @@ def run_whole(
     block: int = BLOCK,
     interpret: bool = False,
 ) -> Outcome:
-    """Simulate every member of an ensemble in one kernel on an accelerator.
+    """Simulate every member of an ensemble on a GPU, in one kernel.
 
     Arguments and results are those of `run_ensemble`, without rows: each leaf of `cascade`, `scenario` and `fold` is a
     number, shared by all members, or an array [N]. Noise is that of `rollout`.
@@ -50,42 +52,57 @@ def run_whole(
 
     Returns an Outcome whose leaves have shape [N], in member order.
 
-    Raises ValueError as `run_ensemble` does, and for another method, a cascade on a processor, or an invalid `block`.
+    Raises ValueError as `run_ensemble` does, and if there is no GPU, for another method, a cascade on a processor, a
+    recorded signal, or an invalid `block`.
     """
     _, clock = prepare(cascade, scenario, clock)
     if not isinstance(clock.method, RK4):
-        raise ValueError(f"clock.method = {clock.method}: the whole-rollout kernel integrates with RK4 only.")
+        raise ValueError(f"clock.method = {clock.method}: run_on_gpu integrates with RK4 only. Use RK4(substeps).")
     if cascade.processor is not None:
-        raise ValueError("processor: the whole-rollout kernel runs cascades in continuous time only. Use run_ensemble.")
+        raise ValueError("processor: run_on_gpu simulates cascades in continuous time only. Use run_ensemble.")
     if block < WARP or block & (block - 1):
         raise ValueError(f"block = {block}: it must be a power of two, at least {WARP}. Use {BLOCK}, for example.")
     cascade, scenario, clock, fold = canonical((cascade, scenario, clock, fold))
     members = size((cascade, scenario, clock, fold))
-    return _whole(cascade, scenario, clock, fold, members=members, block=block, interpret=interpret)
+    if not interpret and (backend := jax.default_backend()) != "gpu":
+        raise ValueError(f"run_on_gpu needs a GPU, and JAX runs on this backend: {backend}. Use run_ensemble.")
+    return _in_one_kernel(cascade, scenario, clock, fold, members=members, block=block, interpret=interpret)
 
 
 @functools.partial(jax.jit, static_argnames=("members", "block", "interpret"))
-def _whole(
+def _in_one_kernel(
     cascade: Cascade, scenario: Scenario, clock: Clock, fold: Fold | None, *, members: int, block: int, interpret: bool
 ) -> Outcome:
     """Build the kernel, run it on all members, and return their outcomes [N]."""
     scenario, key = _with_draws(scenario, members)
     leaves, tree = jax.tree.flatten((Realised(cascade, scenario, key), clock, fold))
     axes = [0 if x.ndim else None for x in leaves]
-    member = jax.vmap(lambda *leaves: run(*jax.tree.unflatten(tree, leaves), every=0), in_axes=axes)
-    results, result_tree = jax.tree.flatten(jax.eval_shape(member, *leaves))
+    traced, results = _traced(leaves, tree, axes, block)
     programs = -(-members // block)
-    # The last program fills its unused lanes with copies of the last member.
+    # The last program fills its unused threads with copies of the last member.
     index = jnp.minimum(jnp.arange(programs * block), members - 1)
     operands = [x[index] if x.ndim else x[None] for x in leaves]
 
     def kernel(*refs: Any) -> None:
         numbers = [ref[0] if axis is None else ref[...] for ref, axis in zip(refs, axes, strict=False)]
-        for ref, value in zip(refs[len(axes) :], jax.tree.leaves(member(*numbers)), strict=True):
+        for ref, value in zip(refs[len(axes) :], jaxpr_as_fun(traced)(*numbers), strict=True):
             ref[...] = value
 
-    outputs = _launch(kernel, operands, axes, results, programs, block, interpret)
-    return jax.tree.unflatten(result_tree, [x[:members] for x in outputs])
+    outputs = _launch(kernel, operands, axes, jax.tree.leaves(results), programs, block, interpret)
+    return jax.tree.unflatten(jax.tree.structure(results), [x[:members] for x in outputs])
+
+
+def _traced(leaves: Sequence[Array], tree: Any, axes: Sequence[int | None], block: int) -> tuple[ClosedJaxpr, Any]:
+    """Trace the rollouts of `block` members. Return the trace, and the shapes of the Outcome.
+
+    Raises ValueError for a recorded signal: a kernel cannot contain its samples.
+    """
+    member = jax.vmap(lambda *leaves: run(*jax.tree.unflatten(tree, leaves), every=0), in_axes=axes)
+    shapes = [jax.ShapeDtypeStruct((block, *x.shape[1:]) if x.ndim else (), x.dtype) for x in leaves]
+    traced, results = jax.make_jaxpr(member, return_shape=True)(*shapes)
+    if any(np.ndim(constant) for constant in traced.consts):
+        raise ValueError("scenario: run_on_gpu cannot simulate a recorded signal (Recorded). Use run_ensemble.")
+    return traced, results
 
 
 def _launch(
@@ -101,16 +118,16 @@ def _launch(
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    def lanes(x: Array | jax.ShapeDtypeStruct) -> pl.BlockSpec:
+    def own(x: Array | jax.ShapeDtypeStruct) -> pl.BlockSpec:
         return pl.BlockSpec((block, *x.shape[1:]), lambda n: (n, *(0 for _ in x.shape[1:])))
 
     shared = pl.BlockSpec((1,), lambda n: (0,))
     return pl.pallas_call(
         kernel,
         grid=(programs,),
-        in_specs=[shared if axis is None else lanes(x) for x, axis in zip(operands, axes, strict=True)],
-        out_specs=[lanes(x) for x in results],
-        out_shape=[jax.ShapeDtypeStruct((programs * block, *x.shape[1:]), x.dtype) for x in results],
+        in_specs=[shared if axis is None else own(x) for x, axis in zip(operands, axes, strict=True)],
+        out_specs=[own(x) for x in results],
+        out_shape=[jax.ShapeDtypeStruct((programs * x.shape[0], *x.shape[1:]), x.dtype) for x in results],
         compiler_params=triton.CompilerParams(num_warps=min(block // WARP, MOST_WARPS)),
         interpret=interpret,
     )(*operands)

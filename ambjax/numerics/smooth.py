@@ -190,7 +190,7 @@ def sine(x: Array) -> Array:
     The reduction of x is exact. The function vectorises, whereas XLA's sine is a library call on CPUs.
     """
     y = _reduced_angle(x)
-    return _quarter(jnp.where(jnp.abs(y) > 0.25, jnp.where(y < 0, -0.5, 0.5) - y, y))
+    return _quarter(jnp.maximum(jnp.minimum(y, 0.5 - y), -0.5 - y))
 
 
 @jax.custom_jvp
