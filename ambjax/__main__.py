@@ -140,7 +140,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run a command and return its exit code. Without a command, print the commands that a new user runs first.
 
     `argv`: the arguments; None: those of the process. Exit codes: 0 done; 1 done with a negative result (a rotor is
-    lost, a condition fails); 2 bad input; 130 interrupted.
+    lost, a condition fails); 2 an error that the user can correct, such as bad input; 130 interrupted.
     """
     words = sys.argv[1:] if argv is None else argv
     if words[:1] == ["tune"]:

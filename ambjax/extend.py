@@ -1,7 +1,7 @@
 """Names for custom laws and plants, in addition to those of `ambjax`.
 
 Laws subclass `Observer`, `PositionLaw`, `InversionLaw` or `CurrentLaw`; plants subclass `Bearing`. Both are records:
-frozen dataclasses whose leaves are declared by `gain`, `leaf` or `static`.
+frozen dataclasses whose fields are declared by `gain`, `leaf` or `static`.
 """
 
 from ambjax.compiler.fast_path import one_kernel

@@ -43,9 +43,9 @@ def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None, program: str = PROGRAM) -> int:
     """Tune a case. Return 0 if accurate steps confirm that the gains meet [tune.limits], 1 if not, 2 for bad input.
 
-    `argv`: the arguments; None: those of the process. `program`: name of the command in messages. Ctrl-C during the
-    search ends the search, and its result is judged. A second Ctrl-C, or one at another time, ends the process with
-    exit code 130.
+    `argv`: the arguments; None: those of the process. `program`: name of the command in messages. Ctrl-C after the
+    first iteration of the search ends the search, and its result is judged. A second Ctrl-C, or one at another time,
+    ends the process with exit code 130.
     """
     open_streams()
     with exit_on_interrupt(program):

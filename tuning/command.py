@@ -52,7 +52,7 @@ class TuningPlan(NamedTuple):
 def run(args: argparse.Namespace) -> tuple[int, Row]:
     """Run `ambjax tune` with parsed arguments. Return the exit code and the content of report.json.
 
-    Raises ValueError for bad input, before anything is written.
+    Raises ValueError for bad input before anything is written, and in the search as `rounds` does.
     """
     plan = _plan(args)
     with locked(plan.out):
@@ -191,7 +191,7 @@ def _pictures(
 
 
 def _laws(problem: TuningProblem, tuned: dict[str, float]) -> dict[str, float]:
-    """Return every gain of the laws by path: `tuned` where given, else that of the case.
+    """Return every gain of the laws by path: the value in `tuned` if there is one, else that of the case.
 
     tuned.toml lists all gains, because the default of a steepness p depends on the plant.
     """

@@ -46,11 +46,11 @@ def tune(
     - `force`: overwrite the files of an earlier search in `out`.
     - `gradients`: also report the gradient of the loss.
     - `pareto`: write each point of the front of error against voltage as a case file.
-    - `page`: also write page.html, in which sliders move the tuned gains (extra `[page]`).
+    - `page`: also write page.html, with sliders and presets; the case needs [processor] (extra `[page]`).
     - `settings_of`: path of another case file, whose limits, loss and budget replace those of `case`.
 
-    Prints progress to stderr and returns a `TunedCase`. Raises ValueError for an invalid case or option, before any
-    search.
+    Prints progress to stderr and returns a `TunedCase`. Raises ValueError for an invalid case or option before any
+    search, and in the search if the loss is not finite at any starting point.
     """
     from tuning.command import run
 

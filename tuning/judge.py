@@ -14,7 +14,7 @@ from tuning.objective.lanes import Engine
 from tuning.objective.members import Members
 from tuning.problem import REFERENCE_MEMBERS, TuningProblem
 
-# Members of one simulation when an ensemble is judged.
+# Largest number of members that the judge simulates in one call.
 CHUNK = 1024
 # Largest relative difference of the settled rms errors with the search's steps and with accurate ones. Above it, the
 # steps are refined and the search continues.
@@ -25,7 +25,11 @@ NEGLIGIBLE = 1e-6
 
 
 def judge(problem: TuningProblem, x: np.ndarray, seed: int, count: int) -> dict[str, np.ndarray]:
-    """Return the metrics and the terms of the loss ("loss.NAME"), each [count], of an ensemble at coordinates x [m]."""
+    """Return the metrics and the terms of the loss ("loss.NAME"), each [count], of an ensemble at coordinates x [m].
+
+    `TuningProblem.judging` defines the steps. In continuous time they are finer than those of the search; on a
+    processor they are those of the case, unless the search has refined its steps.
+    """
     parts = []
     for first in range(0, count, CHUNK):
         members = problem.objective.chosen(seed, np.arange(first, min(first + CHUNK, count)), count)
@@ -61,9 +65,9 @@ class StepError(NamedTuple):
     """Comparison of coarse steps, those of the search or of the judge, with accurate ones.
 
     `search_m`, `reference_m` (m): settled rms errors with coarse and with accurate steps, over the `members` that are
-    held with both. `relative`: relative difference of these errors, NaN without such members. `tried`: number of
-    members compared. `lost`, `stalled`: number of members that are held with coarse steps, but lost or stalled with
-    accurate ones. `unheld`: these members.
+    held with both. `relative`: relative difference of these errors; NaN without such members or for `reference_m` = 0.
+    `tried`: number of members compared. `lost`, `stalled`: number of members that are held with coarse steps, but lost
+    or stalled with accurate ones. `unheld`: these members.
     """
 
     search_m: float

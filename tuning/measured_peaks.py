@@ -32,9 +32,11 @@ MEASURED = {"sensitivity": "S", "complementary": "T", "control_sensitivity": "KS
 class MeasuredPeak:
     """The linear and the injected peak of |S| of one member.
 
-    `linear`, `frequency_hz`, `zone`: of the linearised loop. `peak`, `low`, `high`, `at_hz`: injected, with the 95 %
-    interval; None if the rotor is lost or the laws run in continuous time. `saturated`: share of samples with the
-    supply at its limit. `largest`: peaks of |S|, |T| and |KS| by the name of the limit.
+    `linear`, `frequency_hz`, `zone`: of the linearised loop; None, None and "D" if it is not stable or has no
+    equilibrium. `peak`, `low`, `high`, `at_hz`: injected, with the 95 % interval; None if all injections lose the rotor
+    or the laws run in continuous time. `saturated`: share of samples with the supply at its limit. `repetitions`:
+    number of injections; 0 in continuous time. `lost`: in how many of them the rotor is lost. `largest`: injected peaks
+    of |S|, |T| and |KS| by the name of the limit; empty without injections, or if one of them loses the rotor.
     """
 
     member: int
@@ -59,20 +61,24 @@ class Sensitivity(NamedTuple):
 
 
 def injects(problem: TuningProblem) -> bool:
-    """Return whether a limit concerns a quantity that injections measure. The laws must run on a processor."""
+    """Return whether the laws run on a processor and a limit concerns a quantity that injections measure."""
     return problem.sampled and any(limit.name in MEASURED for limit in problem.limits)
 
 
 def decides(problem: TuningProblem) -> bool:
-    """Return whether only injections decide: a sign is set-valued, and no linear loop describes its chattering."""
+    """Return whether only injected peaks are compared with the limits.
+
+    This holds if injections measure a limit and a sign is set-valued: no linear loop describes its chattering.
+    """
     return injects(problem) and any(set_valued_signs(getattr(problem.case.cascade, stage)) for stage in DEFAULT_LAWS)
 
 
 def injections(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray]) -> Sensitivity | None:
-    """Analyse and measure the INJECTED members with the largest peak at coordinates x [m], of judged `columns` [N].
+    """Analyse the INJECTED held members with the largest peaks at coordinates x [m]; on a processor, also inject.
 
-    The members are those with the largest linear peak or, if injections decide, with the largest peak of one
-    measurement each. Returns None if no limit needs it, or no member is held.
+    `columns` [N]: result of `judge` for the ensemble with this `seed`. The members are those with the largest linear
+    peak or, if only injections decide, with the largest peak in one injection into each of the first SCREENED members.
+    Returns None if no limit concerns such a peak, or if no member is held.
     """
     name = next((name for name in MEASURED if f"loss.{PREFIX}{name}" in columns), None)
     alive = np.flatnonzero(~np.isfinite(columns["lost_at_s"]))
@@ -100,7 +106,9 @@ def injections(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[s
 
 
 def reached_of(limit: Limit, columns: Mapping[str, np.ndarray], measured: Sensitivity | None) -> float:
-    """Return the judge's value of a limit: the linear one or, if that is larger or decides, the injected one.
+    """Return the judge's value of a limit: the larger of the linear and the injected one, or the injected one alone.
+
+    The injected value counts alone if `measured.decides`. Without an injection, the value is the linear one.
 
     The value of a member that is lost during its injection is infinite.
     """
@@ -135,7 +143,7 @@ class _Judged(NamedTuple):
         return analyse(system, scenario.plant.m, float(case.clock.sample_period), case.zones)
 
     def responses(self, numbers: np.ndarray, repetitions: int, peak: float | None) -> Responses:
-        """Inject into the members `numbers` [n], each `repetitions` times with other noise.
+        """Inject a test signal into the members `numbers` [n], each `repetitions` times with different noise.
 
         The lines are denser near `peak` (Hz). The results are in the order of the members.
         """

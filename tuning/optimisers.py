@@ -35,7 +35,8 @@ LARGEST_RADIUS, FIRST_RADIUS = 1.0, 0.3
 # After a rejected trial, the trust radius is the length of its step times CONTRACTION, or times CONTRACTION_AT_JUMP if
 # the trial lies beyond a jump of the function.
 CONTRACTION, CONTRACTION_AT_JUMP = 0.5, 0.25
-# A trial lies beyond a jump if its value, a logarithm, exceeds the best value by more than this.
+# A trial lies beyond a jump if its value, a logarithm, exceeds the best value by this or more, or if its value or
+# gradient is not finite.
 JUMP = 1.0
 # A first-order optimiser repeats a rejected step with its length multiplied by this factor.
 BACKTRACK = 0.25
@@ -52,7 +53,10 @@ class BFGSState(NamedTuple):
     trials: Array
 
     def restarted(self, fresh: "BFGSState") -> "BFGSState":
-        """Return the state `fresh` with the inverse Hessian of this state, for a function of similar curvature."""
+        """Return the state `fresh` with the inverse Hessian of this state, for a function of similar curvature.
+
+        The trust radius is LARGEST_RADIUS.
+        """
         return fresh._replace(inverse=self.inverse, radius=jnp.full_like(self.radius, LARGEST_RADIUS))
 
 
@@ -76,8 +80,8 @@ def optimiser(name: str, learning_rate: float) -> optax.GradientTransformationEx
 def bfgs() -> optax.GradientTransformationExtraArgs:
     """Return a dense BFGS (Nocedal and Wright, Numerical Optimization, 2006, 6.1) with a trust region.
 
-    A trial is rejected if its value is not below the best value. A rejected trial still updates the inverse Hessian,
-    unless it lies beyond a jump of the function (JUMP). Values are logarithms.
+    A trial is rejected if its value is not below the best value, or if its value or gradient is not finite. A rejected
+    trial still updates the inverse Hessian, unless it lies beyond a jump of the function (JUMP). Values are logarithms.
     """
 
     def init(x: Array) -> BFGSState:

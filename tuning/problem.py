@@ -21,14 +21,16 @@ from tuning.objective.quantities import KINDS, LimitContext
 from tuning.objective.ranges import Range, bounded
 from tuning.objective.shortfalls import bounds
 
-# Ratio of the number of steps of the judge to that of the search. On the tuned loops of tests/test_metrics_dense.py, 24
-# steps a sample have an error of at most 0.8 % in the settled rms voltage, 12 steps 4.6 %, 3 steps 56 %.
+# Ratio of the number of steps of the judge to that of the search, in continuous time. On a processor, it is the ratio
+# for the accurate steps, and the judge makes the steps of the case. On the tuned loops of tests/test_metrics_dense.py,
+# 24 steps a sample have an error of at most 0.8 % in the settled rms voltage, 12 steps 4.6 %, 3 steps 56 %.
 REFINEMENT = 8
-# Accurate reference: number of members, relative tolerance, largest number of attempted steps.
+# Accurate reference: number of members, relative tolerance, largest number of attempted steps in a sample.
 REFERENCE_MEMBERS, REFERENCE_TOLERANCE, MOST_TRIALS = 4, 1e-6, 10_000
 # Quantities that the front of error against voltage needs.
 TRACED = ("rms_error_m", "rms_u_V")
-# Initial multiplier of the limit on the error. It corresponds to 1.5 % more voltage for 1 % less error.
+# Initial multiplier of the limit on the error in the searches for the front, which minimise the voltage. It corresponds
+# to 1.5 % more voltage for 1 % less error.
 EXCHANGE = 3.0
 # Cost of a gradient in plain rollouts: 1 + m in forward mode for m gains, RERUN + SWEEP q in reverse mode for q
 # differentiated quantities (benchmarks/schedules.py, gradients.py).
@@ -46,7 +48,7 @@ class TuningProblem:
     goal: Goal
     ranges: list[Range]
     finer: int = 1
-    """factor by which the search multiplies tune.substeps"""
+    """factor on the number of integration steps of the search (`method_for`)"""
     limits: tuple[Limit, ...] = ()
     """the limits, and the state of their augmented Lagrangian"""
 
@@ -106,9 +108,10 @@ class TuningProblem:
         )
 
     def towards_voltage(self, error_m: float, volts: float, factor: float) -> "TuningProblem":
-        """Return the problem: least rms voltage, subject to an rms error of at most `factor` times `error_m` (m).
+        """Return the problem of least rms voltage, subject to an rms error of at most `factor` times `error_m` (m).
 
-        The other limits are kept. `volts` (V): rms voltage at `error_m`. The voltage is scaled so that (unit volts)^2
+        If the case has a smaller limit on the rms error, that limit applies. The other limits are kept. `volts` (V):
+        rms voltage at `error_m`. The voltage is scaled so that (unit volts)^2
         equals (error_m/s_0)^2. A lost rotor then costs as much, relative to the rest, as before.
         """
         weights = tuple(weight if name in HELD else 0.0 for name, weight in zip(TERMS, self.tune.weights, strict=True))
@@ -160,10 +163,10 @@ def method_for(case: Case, substeps: int, finer: int) -> Integrator:
 def problem_of(
     case: Case, tune: Tune, *, finer: int = 1, threads: int | None = None, front: bool = False
 ) -> TuningProblem:
-    """Return the tuning problem of a case, with `finer` times as many steps as tune.substeps.
+    """Return the tuning problem of a case.
 
-    `threads`: number of cores; None: all. `front`: whether to trace the front of error against voltage even if
-    tune.objective does not need it.
+    `finer`: factor on the number of integration steps of the search (`method_for`). `threads`: number of cores; None:
+    all. `front`: whether to trace the front of error against voltage even if tune.objective does not need it.
     """
     clock = case.clock.with_method(method_for(case, tune.budget.substeps, finer))
     limits = tune.limits

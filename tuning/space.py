@@ -87,7 +87,7 @@ class Gain:
 
 @dataclasses.dataclass(frozen=True)
 class Space:
-    """The gains to tune. Raises ValueError if it is empty, a path occurs twice or low >= high for a gain."""
+    """The gains to tune. Raises ValueError if it is empty, a path occurs twice or not 0 <= low < high for a gain."""
 
     gains: tuple[Gain, ...]
 
@@ -125,7 +125,7 @@ class Space:
             if not gain.low < value < gain.high:
                 raise ValueError(
                     f"{gain.path} = {value:g}: it must lie between tune.bounds {gain.low:g} and {gain.high:g}, because "
-                    "the search starts there. Change the gain or widen its bounds."
+                    "the search starts at this gain. Change the gain or widen its bounds."
                 )
         return np.array([gain.encode(value) for gain, value in zip(self.gains, gains, strict=True)])
 

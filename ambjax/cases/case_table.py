@@ -16,7 +16,10 @@ UNITS = {"reference": "m", "q_z": "m/s^2", "q_v": "A^2/m^2", "q_i": "A/s", "q_f"
 
 
 def parts_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> dict[str, str]:
-    """Return the numbers of each part by its name, with units; parts that are absent, and zero signals, are omitted."""
+    """Return the type and the numbers of each part, with units, by its name.
+
+    Absent parts, zero signals, an unlimited supply, and a model with the numbers of the plant are omitted.
+    """
     laws = {stage: getattr(cascade, stage) for stage in ("observer", "position", "inversion", "current")}
     given = {slot: getattr(scenario, slot) for slot in SLOTS}
     signals = {f"{slot} ({UNITS[slot]})": one for slot, one in given.items() if one != Constant()}
@@ -36,7 +39,10 @@ def _described(part: object) -> str:
 
 
 def _numbers_of(part: object) -> str:
-    """Return the numbers of a record with their units, separated by commas; nested records in parentheses."""
+    """Return the numbers of a record with their units, separated by commas; nested records are in parentheses.
+
+    A schedule is shown as "scheduled", an array as the number of its values.
+    """
     words = []
     for field in dataclasses.fields(part) if dataclasses.is_dataclass(part) else ():
         value, unit = getattr(part, field.name), field.metadata.get("unit", "")

@@ -1,4 +1,4 @@
-"""Linear controllers in files: the keys of a position law that a case file takes from a file beside it."""
+"""Linear controllers in files: the matrices of a position law, in an .npz or .mat file that a case file names."""
 
 import contextlib
 import pathlib
@@ -31,8 +31,8 @@ class ControllerFile(NamedTuple):
 def controller_file(table: Table, folder: pathlib.Path) -> ControllerFile:
     """Read the controller that the key `file` names; a relative path starts at `folder`, that of the case file.
 
-    Raises ValueError if the file does not contain a controller. The message is one line, with the dotted path, the file
-    and the array.
+    Raises ValueError, one line, if the key is missing or the file does not contain a controller. The message gives the
+    dotted path and, if known, the file and the array.
     """
     written = table.raw.get("file")
     if written is None:
@@ -93,7 +93,8 @@ def _of_mat(path: pathlib.Path) -> dict[str, np.ndarray]:
 def save_controller(path: str | pathlib.Path, system: Matrices) -> None:
     """Write a state space of python-control or SciPy into an .npz file that a case file may name.
 
-    `system`: an object with the matrices A, B, C, D and the period dt (s). Raises ValueError as `realisation` does.
+    `system`: an object with the matrices A, B, C, D and the period dt (s); dt absent, None or 0: continuous. Raises
+    ValueError if a matrix is absent, if the path does not end in .npz, or as `realisation` does.
     """
     if lacking := [name for name in NAMES if not hasattr(system, name)]:
         raise ValueError(

@@ -19,7 +19,8 @@ from ambjax.numerics.records import Scalar
 from ambjax.world.bearing import Bearing
 from ambjax.world.plant import Plant
 
-# The laws by stage and kind; the first of a stage is the default. A new law is one row here.
+# The laws by stage and kind. The default of a stage is its first law that fits the amplifier and the position law
+# (`_usual`). A new law is one row here.
 KINDS: dict[str, dict[str, type[Law]]] = {
     "observer": {
         "direct": observer.Direct,
@@ -60,7 +61,7 @@ DISCRETISATIONS = ["implicit", "explicit"]
 
 
 class Files(NamedTuple):
-    """The folder of a case file, and those of the files it names that were read earlier."""
+    """The folder of a case file; the custom laws and the linear controller, if they were read earlier."""
 
     folder: pathlib.Path
     own: tuple[OwnLaw, ...]
@@ -85,8 +86,8 @@ def cascade_from(
 ) -> tuple[Cascade, tuple[OwnLaw, ...], ControllerFile | None]:
     """Return the cascade of the [controller] tables, its custom laws, and the file of its linear controller or None.
 
-    `top`: the whole case. `period`: sample period of the processor, s; None in continuous time. Raises ValueError, one
-    line, for an invalid entry.
+    `top`: the whole case. `plant`: the true plant; its numbers are the defaults of the model. `period`: sample period
+    of the processor, s; None in continuous time. Raises ValueError, one line, for an invalid entry.
     """
     table, actuator = top.table("controller"), top.table("actuator")
     command = drive(actuator)
@@ -129,8 +130,9 @@ def _gains(kind: type[Law]) -> set[str]:
 def _usual(kinds: dict[str, type[Law]], demanding: Any, command: str) -> str:
     """Return the default kind of a stage.
 
-    It is the first law that commands the quantity that the amplifier controls, `command`: "voltage" or "current". If
-    the position law, `demanding`, is known, laws that accept its demand take precedence.
+    It is the first law that fits the amplifier: if the law has an attribute `commands`, this must equal `command`,
+    "voltage" or "current". Among these laws, those that accept the demand of the position law `demanding` come first.
+    `demanding` is None until the position law is known.
     """
     fitting = [kind for kind, law in kinds.items() if getattr(law, "commands", command) == command]
     if demanding is None:

@@ -4,7 +4,7 @@ BEARING = """\
 # A case for ambjax: a radial magnetic bearing from a data sheet, on a 16 kHz processor, its rotor at rest.
 # Units are SI. 'ambjax template' lists every other key. Run it with 'ambjax simulate', tune it with 'ambjax tune'.
 # "Data sheet": the number is usually specified. "Assumed": the data sheet omits the number; it is chosen so that the
-# magnet is plausible: a bias flux of 0.75 T, a force of 15 times the weight ('ambjax check' prints both), 23 mH.
+# magnet is plausible: a bias flux density of 0.75 T, a force of 15 weights ('ambjax check' prints both), 23 mH.
 
 [plant]
 # kind = "two-coil"           # each coil has its own current: use it for your own machine, and tune the gains on it

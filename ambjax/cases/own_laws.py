@@ -73,7 +73,7 @@ def own_law(stage: str, kind: str, folder: pathlib.Path, model: Plant) -> OwnLaw
 def relocated(laws: Iterable[OwnLaw], out: pathlib.Path) -> dict[str, str]:
     """Return the value of the key `kind` of each law for a case file in the folder `out`, by dotted path.
 
-    The value is as written, unless its relative path does not lead to the same file from `out`.
+    A module, and a path that leads to the same file from `out`, are kept as written.
     """
     kinds = {}
     for law in laws:
@@ -143,7 +143,10 @@ def _named(base: type[Law]) -> str:
 
 
 def _check_record(found: type[Law], name: str, stage: str, refuse: Refuse) -> None:
-    """Raise ValueError unless the class is a record, each field has a default, and no field has the name `kind`."""
+    """Raise ValueError unless the class is a record that defines every method.
+
+    Each field must have a default, be declared by gain, leaf or static, and have another name than `kind`.
+    """
     try:
         law = found()
     except TypeError as error:  # abstract methods, or fields without a default

@@ -20,20 +20,24 @@ MOST_CORNERS = 64
 
 
 def reach(scenario: Scenario, clock: Clock) -> float:
-    """Return a bound on |r| over the run and over all members, m. A sum or a noise need not reach the bound."""
+    """Return a bound on |r| over the run and over all members, m.
+
+    Not every signal reaches it: a sum or a noise need not, nor a recorded signal or a trapezoid whose largest value is
+    after the run.
+    """
     return max(map(abs, scenario.reference.span(float(clock.duration))))
 
 
 def widest(spread: Spread, cascade: Cascade, scenario: Scenario) -> Scenario:
-    """Return the scenario with the two ends of each spread of reference and clearance, on one array axis per spread."""
+    """Return the scenario at the two ends of each spread of the reference or clearance, one array axis per spread."""
     return ends(spread, cascade, scenario, ("reference.", "plant.s_0", "run.clearance"))[1]
 
 
 def check_reference(spread: Spread, cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
     """Raise ValueError, with the largest |r| and the fix, if the reference leaves the clearance.
 
-    A sum or a noise need not reach its bound, so its values at the samples decide. They are computed for the case and,
-    if there are at most MOST_CORNERS combinations of the ends of its spread, for each combination.
+    A sum or a noise need not reach its bound, so its values at the samples decide. They are computed for the case and
+    for each combination of the ends of its spread. More than MOST_CORNERS combinations are not checked.
     """
     _compare("reference", scenario, clock)
     wide = widest(spread, cascade, scenario)

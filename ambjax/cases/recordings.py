@@ -113,7 +113,11 @@ def _chosen(found: dict[str, np.ndarray], columns: tuple[str, str] | None) -> tu
 
 
 def _checked(times: np.ndarray, values: np.ndarray) -> Samples:
-    """Return the samples. Raises ValueError for a wrong shape, a number that is not finite, or times out of order."""
+    """Return the samples.
+
+    Raises ValueError for a wrong shape or number of rows, a value that is not a finite real number, or times that do
+    not increase.
+    """
     shapes = np.shape(times), np.shape(values)
     if any(len(shape) != 1 for shape in shapes) or shapes[0] != shapes[1]:
         raise ValueError(
@@ -133,7 +137,10 @@ def _checked(times: np.ndarray, values: np.ndarray) -> Samples:
 
 
 def _csv(file: pathlib.Path) -> dict[str, np.ndarray]:
-    """Read columns separated by commas. The first line may give their names. Lines that begin with # are comments."""
+    """Read columns separated by commas. The first line may give their names; otherwise they are "1", "2" and so on.
+
+    Lines that begin with # are comments.
+    """
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
@@ -162,7 +169,7 @@ def _csv(file: pathlib.Path) -> dict[str, np.ndarray]:
 
 
 def _float(cell: str) -> float | None:
-    """Return the number in a cell; NaN if it is empty, None if it is not a number."""
+    """Return the number in a cell; NaN if the cell is empty, None if its text is not a number."""
     try:
         return float(cell) if cell.strip() else math.nan
     except ValueError:

@@ -39,9 +39,11 @@ SIGNALS: dict[str, type] = {
 }
 # Units of the signals that fix their unit.
 FIXED_UNITS = {kind: signal.unit for kind, signal in SIGNALS.items() if hasattr(signal, "unit")}
-# The units of each disturbance, and the field of the scenario for each unit; the first unit is the default.
+# The units of each disturbance, and the field of the scenario for each unit. The default is the unit that the signal
+# fixes (FIXED_UNITS), or else the first.
 UNITS = {"q_z": {"m/s^2": "q_z", "N": "q_f", "A^2/m^2": "q_v"}, "q_i": {"A/s": "q_i"}, "base": {"m/s^2": "base"}}
-# Largest number of terms of a sum, and of signals that disturb the same quantity. Each of them is compiled.
+# Largest number of terms of a sum, of signals that disturb the same quantity, and of harmonics of a runout. Each of
+# them is compiled.
 MOST_TERMS = 100
 # The amplifiers by actuator.mode, the default first.
 AMPLIFIERS: dict[str, type] = {kind.mode: kind for kind in (Amplifier, CurrentAmplifier)}
@@ -84,7 +86,7 @@ def _disturbances(table: Table, recordings: Recordings) -> dict[str, Any]:
 
 
 def _each(table: Table, name: str) -> list[Table]:
-    """Return the tables of a key that has one table, or a list of tables as [[disturbance.q_z]] writes it."""
+    """Return the tables of a key: its one table, or its list of tables, written as [[disturbance.q_z]]."""
     raw = table.raw[name]
     if not isinstance(raw, list):
         return [table.table(name)]
@@ -202,10 +204,10 @@ def _seed(run: Table) -> int:
 
 
 def check_start(scenario: Scenario) -> None:
-    """Raise ValueError unless the rotor starts within its clearance, and the clearance within the gap.
+    """Raise ValueError unless the rotor starts within its clearance, and the clearance is less than the gap.
 
-    With an elastic stop, the rotor may also start in contact with it. The limits of a coil must contain its bias and
-    its initial current.
+    With an elastic stop, the rotor may also start in contact with it, and both must be below `Scenario.limit`. The
+    limits of a coil must contain its bias and its initial current.
     """
     _check_coils(scenario)
     gap, stop, z = scenario.plant.s_0, scenario.touchdown, scenario.initial.z

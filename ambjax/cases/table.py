@@ -21,9 +21,10 @@ MOST_BYTES = 10_000_000
 
 
 def load(path: str | pathlib.Path) -> tuple[dict[str, Any], str]:
-    """Return a case file as parsed TOML, not yet checked, and its text. Raises ValueError, one line, if it is not TOML.
+    """Return a case file as parsed TOML, not yet checked, and its text.
 
-    The file is read only once, because it may be a pipe.
+    The file is read only once, because it may be a pipe. Raises ValueError, one line, if it cannot be read, is larger
+    than MOST_BYTES, or is not TOML.
     """
     path = pathlib.Path(path)
 
@@ -115,7 +116,7 @@ class Table:
             raise ValueError(f"{self.at(key)} = {show(value)}: it must be {allowed}.") from None
 
     def leaf(self, key: str, field: dataclasses.Field, default: object = None) -> Any:
-        """Return a number within the bounds of `field`, or the default if left out. Raises ValueError out of bounds."""
+        """Return a number within the bounds of `field`, or the default if left out. Raises ValueError otherwise."""
         value = self.number(key, default, numbers(field))
         if key in self.raw:
             check_number(field, self.at(key), value)
@@ -153,7 +154,7 @@ class Table:
         return value
 
     def record(self, kind: type, extra: tuple[str, ...] = (), base: object = None) -> Any:
-        """Return a record of type `kind` whose leaves are this table's keys.
+        """Return a record of type `kind` whose leaves have the values of this table's keys.
 
         `extra`: further keys that the table may have. `base`: a record that gives the defaults; None: `kind`. Raises
         ValueError for an unknown or missing key, or a value out of bounds.

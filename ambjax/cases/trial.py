@@ -1,4 +1,4 @@
-"""Trial of a custom law: trace each method once, to find mistakes before the simulation."""
+"""Trial of a custom law: trace its main methods once, to find mistakes before the simulation."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ OUTPUTS = {
 
 
 def try_law(law: Law, stage: str, model: Plant) -> None:
-    """Trace the methods of a law.
+    """Trace `init`, `init_sampled`, the call, `step`, `begin`, `scale` and `slope` of a law, as far as it has them.
 
     Raises TypeError if an output, a rate, a scale or a next state has a wrong structure or shape. Exceptions that the
     methods raise are passed on.

@@ -8,7 +8,7 @@ from ambjax.numerics.records import leaf
 
 # Default optimiser, risk, and alpha of the risk "cvar".
 OPTIMISER, RISK, ALPHA = "bfgs", "mean", 0.9
-# Objectives, the default first: least voltage at 1.25 times the least error, or the least error itself.
+# Objectives, the default first: least voltage with at most 1.25 times the least error, or the least error itself.
 OBJECTIVES = ("knee", "least_error")
 # Default limit of the rms voltage, as a share of actuator.u_max.
 VOLTAGE_SHARE = 0.6
@@ -50,7 +50,8 @@ WEIGHTS: dict[str, dataclasses.Field] = {
     "conditions": _weight(1.0, "conditions of Theorem 1 that fail, or hold by less than the margin"),
 }
 SURVIVAL: dataclasses.Field = leaf(SURVIVING, above=0, at_most=1, doc="share of the held-out members that must survive")
-# Largest whole numbers. That of members and points is smaller, because all of them are in memory at once.
+# Largest whole numbers. MOST_MEMBERS, for members and starting points, is smaller, because all of them are in memory
+# at once.
 MOST_WHOLE, MOST_MEMBERS = 2**31 - 1, 2**20
 
 
@@ -99,14 +100,14 @@ class Line(NamedTuple):
 
 
 def template_lines() -> Iterator[Line]:
-    """Yield the lines of [tune] for the template: each default, or an example of a key that has none."""
+    """Yield the lines of [tune] for the template: each key with its default, or with an example and a comment."""
     yield Line(
         f'objective = "{OBJECTIVES[0]}"',
         'least rms voltage within 25 % of the least error; or "least_error"',
     )
     yield Line(
         'gains = ["controller.position.c", "controller.position.k"]',
-        "gains to tune; left out: all, p only where it is finite on a processor",
+        "gains to tune; left out: all, but p only on a processor and only if it is finite",
     )
     yield Line(
         "bounds.controller.position.c = [1.0, 500.0]",
@@ -133,7 +134,11 @@ def _defaults(prefix: str, fields: dict[str, dataclasses.Field]) -> Iterator[Lin
 
 
 def _limits() -> Iterator[Line]:
-    """Yield the lines of [tune.limits]. Only those of the rms voltage and of the sensitivity have defaults."""
+    """Yield the lines of [tune.limits].
+
+    Only the limits of the rms voltage, the sensitivity and the survival have defaults, and the keys settling_band_m and
+    margin.
+    """
     shares = (100 * VOLTAGE_SHARE, MEAN_MARGIN, WORST_MARGIN, LOOP_MARGIN)
     voltage, means, worst, loops = (f"{x:g}" for x in shares)
     examples = [

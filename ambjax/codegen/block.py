@@ -12,7 +12,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import schedules
 from ambjax.numerics.records import Scalar
 
-# Input or output: name, then unit and meaning.
+# Inputs or outputs: unit and meaning by name.
 Ports = Mapping[str, tuple[str, str]]
 
 
@@ -44,7 +44,7 @@ class Block:
 
         - `parameters`: a pytree like the field `parameters`.
         - `memory`: the states before the step, real numbers; its last leaf is the flag `started`.
-        - `inputs`: an instance of `ports`, in the units of `inputs`.
+        - `inputs`: an instance of `ports`, in the units of the class attribute `inputs`.
         - `period`: sample period, s.
         - `read`: names of the inputs that the step uses; the step checks only these.
         """

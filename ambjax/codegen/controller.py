@@ -1,7 +1,7 @@
 """The exported controller: the simulator's step, with names for its inputs, states, parameters and outputs.
 
-`Controller.step` first checks the reference and the parameters. Then it runs `Sampled.with_command`, which includes the
-guard of the readings.
+`Controller.step` first checks the reference, the delay and the steepnesses. Then it runs `Sampled.with_command`, which
+includes the guard of the readings.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ from ambjax.world.signals import Reference
 T = TypeVar("T")
 
 (U_MAX,) = (field for field in dataclasses.fields(Scenario) if field.name == "u_max")
-# A step sets the bit `singular` if the function of Eq. (9) is below this value (1 at rest, 0 on the singular curve).
+# A step sets the bit `singular` if the function of Eq. (9) is at most this value (1 at rest, 0 on the singular curve).
 NEAR = 0.1
 
 
@@ -42,7 +42,7 @@ def _end(of: str, unit: str) -> Any:
 
 @record
 class StepLimits:
-    """The limit of the supply, and the limits of the reference.
+    """The limit of the command, the threshold of the bit `singular`, and the limits of the reference.
 
     The largest |r| is GAPS gaps. The limit of each derivative is the previous limit divided by the sample period.
     """
@@ -73,7 +73,7 @@ class Memory(NamedTuple):
 
 
 class Parameters(NamedTuple):
-    """All numbers that a user of the C may change: the parameters of the cascade, and the limits."""
+    """All numbers that a user of the exported code may change: the parameters of the cascade, and the limits."""
 
     controller: Cascade
     limits: StepLimits
@@ -105,7 +105,8 @@ class Controller(Block):
     ) -> tuple[Memory, StepOutputs, Status]:
         """Compute one sample. Return the memory for the next one, the outputs and the status.
 
-        Only the inputs named in `read` are checked, and the delay only if the step predicts a reading.
+        The step checks the reference inputs named in `read`, the steepnesses and, if the laws or the guard use a
+        prediction, the delay. The guard checks the readings.
         """
         cascade, limits = parameters
         measured = Measurement(*inputs[:3])
@@ -140,7 +141,7 @@ class Controller(Block):
         return kept, StepOutputs(last.u, last.i_ref, last.v_star, last.v_tilde), status
 
     def start(self) -> Memory:
-        """Return the memory before the first step: zero voltage, zero states of the laws, no predicted readings."""
+        """Return the memory before the first step: zero commands, zero states of the laws, no predicted readings."""
         cascade, zero = self.parameters.controller, jnp.zeros(())
         laws = jax.tree.map(jnp.zeros_like, cascade.init(Measurement(zero, zero, zero)))
         guard = cascade.processor.guard if cascade.processor else None

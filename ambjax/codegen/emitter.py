@@ -1,7 +1,7 @@
 """Translate a JAX trace to straight-line scalar code: inline calls, unroll loops, turn branches into selections.
 
-The order of operations stays that of the trace, so that exported code (C without contraction) rounds as JAX does
-operation by operation.
+The order of operations stays that of the trace. Exported code (C without contraction) therefore rounds as JAX does when
+it executes one operation at a time.
 """
 
 import re
@@ -98,7 +98,7 @@ class _Reader:
         return apply(name, args, dtype, law)
 
     def _composed(self, name: str, x: Operand, dtype: np.dtype, law: str) -> Operand:
-        """Compose a primitive that the languages lack from others, as XLA does."""
+        """Compose a primitive that not every target language has from others, as XLA does."""
         apply, one = self.program.apply, np.ones((), dtype)[()]
         if name == "rsqrt":
             return apply("div", (one, apply("sqrt", (x,), dtype, law)), dtype, law)
@@ -170,6 +170,6 @@ def refusal(name: str, law: str, how: str = "") -> str:
 
 
 def _law(stack: str) -> str:
-    """Return the innermost law in a stack of JAX's name scopes, which transformations such as jvp(...) wrap."""
+    """Return the innermost law in a stack of JAX's name scopes; '' if none. jvp(...), for example, may wrap a scope."""
     found = re.findall(r"law:([^/()]+)", stack)
     return found[-1] if found else ""

@@ -44,7 +44,7 @@ INPUTS = {
     "z": ("m", "rotor displacement, measured"),
     "z_dot": ("m/s", "rotor velocity, measured"),
     "i": ("A", "current deviation, measured"),
-    "r": ("m", "reference of z, at the instant given at the top of this file"),
+    "r": ("m", "reference of z; with prediction at the end of the delay, otherwise at the instant of the readings"),
     "r_dot": ("m/s", "first derivative of r"),
     "r_ddot": ("m/s^2", "second derivative of r"),
     "r_dddot": ("m/s^3", "third derivative of r"),
@@ -71,8 +71,8 @@ def outputs_of(commands: str) -> dict[str, tuple[str, str]]:
 
 BITS = {
     "saturated": "u is at its limit",
-    "refused": "a reading is NaN, beyond its limit or too far from the prediction, which replaces it",
-    "failed": "a law returned a value that is not finite: its state is kept, u is held",
+    "refused": "a reading is NaN, beyond its limit or too far from its prediction: the prediction replaces it",
+    "failed": "a law returned a value that is not finite: all laws keep their states, u is held",
     "singular": "(z, i_ref) is near the singular curve of Eq. (9)",
     "safe": "more than guard.samples readings in a row, or all so far, are refused: u is 0, the laws keep their states",
     "invalid": "the reference, params->processor.delay or a steepness p is NaN or out of range: u is held",

@@ -20,7 +20,7 @@ REFERENCES = {name: port for name, port in INPUTS.items() if name not in READING
 
 
 class LoopInputs(NamedTuple):
-    """Inputs of a step: those of the plant except u, over the sample that ends with the step, and the reference."""
+    """Inputs of a step: disturbances over the sample before it, random numbers of the sensors, and the reference."""
 
     q_z: Array
     q_i: Array
@@ -76,7 +76,10 @@ class LoopStep(Block):
     outputs: ClassVar[Ports] = OUTPUTS | READINGS
     bits = (
         BITS
-        | {"invalid": "an input or a parameter is NaN or out of range: u is held, or 0 replaces a disturbance"}
+        | {
+            "invalid": "the reference or a parameter of the controller is NaN or out of range: u is held; or an input "
+            "of the plant is not finite: 0 replaces it; or the plant's delay is out of range"
+        }
         | LOSSES
     )
     crowded = ("saturated", "refused", "touched", "diverged")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from ambjax.control.schedule import OVER, Schedule, finite
 from ambjax.numerics.declared import allowed
 
-# Exported code is compared with JAX also at each parameter's value divided and multiplied by this factor.
+# The verification also sets each parameter to its value divided by this factor, and to its value times this factor.
 SPAN = 100.0
 # Text in place of the allowed values of a number that the step does not use.
 UNREAD = "not read"
@@ -70,8 +70,8 @@ def _number(name: str, field: dataclasses.Field, value: float) -> Number:
 def _ends(meta: Mapping[str, Any], value: float) -> tuple[float, ...]:
     """Return the further values of a parameter for the comparison: 1/SPAN and SPAN times `value`, within its bounds.
 
-    For a parameter that is 0 they are -1 and 1 in its unit; for one that is inf, 1 and SPAN. NaN, and inf if it is
-    allowed, follow.
+    For a parameter that is 0 they are -1 and 1 in its unit; for one that is inf, 1 and SPAN. Then follow inf, if it is
+    allowed, and NaN.
     """
     low, high = sorted((value / SPAN, value * SPAN)) if value else (-1.0, 1.0)
     if math.isinf(value):

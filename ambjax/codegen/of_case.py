@@ -16,7 +16,7 @@ WHAT = ("controller", "plant", "loop")
 def block_of(what: str, cascade: Cascade, scenario: Scenario, clock: Clock) -> Block:
     """Return a block of a case. `what`: the block, one of WHAT.
 
-    If the clock's method has no fixed number of steps, `choose_method` selects one for the plant.
+    If the clock's method has no fixed number of steps, the plant uses the method that `choose_method` selects instead.
 
     Raises ValueError for a case that cannot be exported.
     """

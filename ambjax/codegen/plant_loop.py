@@ -18,12 +18,12 @@ from ambjax.codegen.series import series
 from ambjax.codegen.trace import arguments
 from ambjax.codegen.twins import LoopCase, horizons
 
-# Computes the controller's voltage (V) from readings and reference, [7], and keeps its state.
+# Function that returns the controller's voltage (V) for readings and reference, [7], and stores the controller's state.
 Law = Callable[[np.ndarray], float]
 
 
 def compare_blocks(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, LoopComparison]:
-    """Compare the loop with each compiled plant, or each compiled loop, with that of JAX. Keys: the precisions."""
+    """Compare the loop of each compiled plant, or each compiled loop, to JAX's loop. Keys: the precisions."""
     block: Any = next(iter(machines.values())).trace.block
     plant = block if block.noun == "plant" else block.plant
     case = case._replace(clock=case.clock.with_method(plant.method))

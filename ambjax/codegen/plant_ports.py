@@ -6,7 +6,7 @@ from jax import Array
 
 
 class PlantInputs(NamedTuple):
-    """Inputs of a step of the plant, constant over the sample that it advances."""
+    """Inputs of a step of the plant: u, disturbances over one sample, and random numbers of the readings at its end."""
 
     u: Array
     q_z: Array
@@ -51,7 +51,7 @@ READINGS = {
     "i_true": ("A", "current deviation"),
 }
 LOSSES = {
-    "touched": "the rotor has reached the clearance: it is frozen there",
+    "touched": "the rotor has reached the clearance, or with a stop 0.99 s_0: it is frozen there",
     "diverged": "a state has left the range of the model: the plant is frozen",
 }
 COORDINATES = {

@@ -1,7 +1,7 @@
 """The exported plant: motion, coils, amplifier and sensors over one sample period, in the simulator's own steps.
 
 A step advances the plant from the last sample to the next under the voltages commanded so far, and then reads the
-sensors. The first step only reads the sensors, in the initial state. The steps are those of the simulator's functions
+sensors. The first step only reads the sensors, in the initial state. The code is that of the simulator's functions
 `Sampled.advance` and `Sampled.measured`. The inputs are the voltage commanded at the last sample, the disturbances,
 which are constant over the sample, and the random numbers of the sensors.
 """
@@ -51,7 +51,7 @@ class PlantMemory(NamedTuple):
     """State that one step passes to the next: that of a `SampledState`, without the laws.
 
     - `motion`: state of the plant, in its units.
-    - `last`, `before`: voltages commanded at the last two samples, the later one first, V.
+    - `last`, `before`: inputs u of the last two steps, limited to u_max, the later one first, V; 0 for the first step.
     - `z_filtered`: output of the position sensor's low-pass, m; () without one.
     - `u_a`: output voltage of a slow amplifier, V; () without one.
     - `lost`: 0, or the status code with which the rotor is lost.
@@ -71,7 +71,8 @@ class PlantMemory(NamedTuple):
 class Machine:
     """Parameters of the exported plant: true plant, sensors, amplifier, stop, initial state, limits and delay.
 
-    Their names and units are those of the case file; None: the case has no such part.
+    Names and units are those of the case file, except that the file has actuator.u_max, run.clearance, run.stop_* and
+    processor.delay for `u_max`, `clearance`, `stop.*` and `delay`. None: the case has no such part.
     """
 
     plant: Bearing
@@ -104,7 +105,7 @@ class Machine:
 class PlantStep(Block):
     """The plant of a case as it is exported.
 
-    - `cascade`: the controller, on a processor; it determines how many samples the delay spans.
+    - `cascade`: the controller, on a processor; the plant takes from it whether the delay is a whole number of samples.
     - `method`: integrator between samples, with a fixed number of steps.
     """
 
@@ -213,7 +214,7 @@ class PlantStep(Block):
 
 
 def _given(part: Any) -> str:
-    """Return the names of the parameters that a case sets for a part, separated by commas."""
+    """Return the names of all parameters of a part, separated by commas, without those that are None."""
     return ", ".join(x.name for x in numbers_of(part))
 
 
@@ -250,8 +251,8 @@ def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object
             )
     if not isinstance(method, FixedSteps):
         raise ValueError(
-            f"clock: {method} has no fixed number of steps, and exported code needs one. Set clock.dt: its "
-            "method is RK4 unless clock.method names another."
+            f"clock: {method} has no fixed number of steps, and exported code needs one. Set clock.dt; the "
+            "method is then RK4, unless clock.method names another."
         )
     resolved = cascade.on_processor()
     machine = Machine(

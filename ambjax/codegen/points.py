@@ -1,6 +1,6 @@
 """The points at which the exported step is compared with JAX: parameters, states and inputs.
 
-`verification_points` keeps the case's parameters; `varied` sets each of them to the ends of its range.
+`verification_points` keeps the case's parameters; `varied` sets each of them to its `Number.ends`.
 """
 
 from typing import Any, NamedTuple
@@ -15,19 +15,19 @@ from ambjax.codegen.trace import Trace
 # tiny, or at or near a limit. FIRST: probability that a point is a first step.
 DECADES, EDGY, FIRST = (-7.0, 1.7), 0.02, 0.05
 # POOL: number of random points between which thresholds are searched. DRAWS: random points per selected point. CALM:
-# share of points that set no bit of `Block.crowded`, if there are enough.
+# least share of points that set no bit of `Block.crowded`, if there are enough.
 POOL, DRAWS, CALM = 3000, 4, 0.4
 # PAIRS: pairs of points on both sides of the threshold of each comparison. HALVINGS: bisections of each pair.
 PAIRS, HALVINGS = 4, 64
 # ALONE: share of the varied points in which one parameter is changed; in the others, all are drawn at random.
 ALONE = 0.7
-# AT_LIMIT: share of the points with a changed limit whose input is set near this limit. BESIDE: relative distances from
-# the limit.
+# AT_LIMIT: share of the points with a changed limit at which the limited input is set near this limit. BESIDE: relative
+# distances from the limit.
 AT_LIMIT, BESIDE = 0.5, (-1e-6, 1e-6)
 
 
 class Points(NamedTuple):
-    """Parameters, states and inputs, [numbers, points], and whether each point's state was started."""
+    """Parameters, states and inputs, [numbers, points], and the flag `started` [points]: False for a first step."""
 
     parameters: np.ndarray
     state: np.ndarray
@@ -56,9 +56,10 @@ def verification_points(trace: Trace, count: int, seed: int = 0) -> Points:
 
 
 def varied(trace: Trace, count: int, seed: int = 2) -> Points:
-    """Return points with other parameters: each alone at every end of its range, then all at random ends.
+    """Return points with other parameters: first each alone at each of its `Number.ends`, then all drawn at random.
 
-    The ends are `Number.ends`. They include values that a step must reject.
+    The ends include values that a step must reject. A random parameter has its value in the case, or one of its first
+    two ends.
     """
     random, dtype = np.random.default_rng(seed), PRECISIONS[trace.precision]
     cases = [(k, end) for k, x in enumerate(trace.parameters) if x.allowed != UNREAD for end in x.ends]
@@ -102,9 +103,9 @@ def _seen(trace: Trace, x: np.ndarray, started: np.ndarray) -> tuple[np.ndarray,
 
 
 def _drawn(trace: Trace, random: np.random.Generator, parameters: np.ndarray) -> np.ndarray:
-    """Return random states and inputs of either sign, over decades, with zeros, limits and non-finite numbers."""
+    """Return random states and inputs of either sign, over decades, with zeros, limits and some non-finite inputs."""
     sizes, count = np.array(_sizes(trace)), parameters.shape[1]
-    limits = np.ones((sizes.size, count))  # without a guard, readings have no limit
+    limits = np.ones((sizes.size, count))  # 1 for numbers without a limit: states, and readings without a guard
     bounds = trace.block.bounds()
     for k, x in enumerate(trace.parameters):
         if x.name in bounds:

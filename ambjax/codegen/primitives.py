@@ -1,7 +1,7 @@
 """Scalar primitives: one row each, with its text in every language, its NumPy function and its cost.
 
-The NumPy function folds constants and finds the thresholds of comparisons; the verification compares the exported code
-with JAX, not with NumPy.
+The NumPy functions are used to fold constants and to choose the points of the verification. The verification compares
+the exported code with JAX, not with NumPy.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ class Op(NamedTuple):
 
     In both texts `{0}`, `{1}`, `{2}` are the operands. In C, `{f}` is the suffix of float functions, `{name}` the
     prefix of all names, `{to}` the type of the result, `{one}` and `{zero}` are numbers of that type. A function of
-    JavaScript that is not of `Math` or `Number` is one of `HELPERS` of the back end.
+    JavaScript that is not of `Math` or `Number` is one of `javascript.script.HELPERS`.
     """
 
     c99: str
@@ -44,7 +44,7 @@ def _compare(sign: str, numpy: Callable[..., object]) -> Op:
     return Op(f"{{0}} {sign} {{1}}", f"{{0}} {strict} {{1}}", numpy, "comparison", sign in ("==", "!="), True)
 
 
-# For bools, `&` and `|` give the same result as `&&` and `||`, because both operands are computed already.
+# JAX's `&` and `|` on bools become `&&` and `||`. The result is the same, because both operands are computed already.
 OPS: dict[str, Op] = {
     "add": Op("{0} + {1}", "{0} + {1}", np.add, "add", True),
     "sub": Op("{0} - {1}", "{0} - {1}", np.subtract, "add"),

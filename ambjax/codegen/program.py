@@ -67,7 +67,10 @@ class Program:
         return self.nodes[x.node].dtype if isinstance(x, Ref) else x.dtype
 
     def apply(self, op: str, args: Sequence[Operand], dtype: npt.DTypeLike, law: str) -> Operand:
-        """Return the operand of an operation: a constant, an existing equal node, or a new node."""
+        """Return the result of an operation: one of `args`, a constant, an existing equal node, or a new node.
+
+        Raises ValueError if the program would have more than MOST nodes.
+        """
         dtype, args = np.dtype(dtype), tuple(args)
         if (known := _simpler(op, args)) is not None:
             return known

@@ -1,9 +1,9 @@
 """Results of a step computed with JAX operation by operation: the reference of the exported code.
 
-If XLA compiles a whole step, it may round a product and a sum only once. Operation by operation it does not, so two
-programs with the same operations in the same order agree to the last bits. `closed_loop` compares the C with the
-compiled simulator. Functions of <math.h> come from the C library, because XLA's own functions differ: its log1p is off
-by 1e2 units in the last place.
+If XLA compiles a whole step, it may round a product and a sum only once. If it compiles one operation at a time, it
+rounds each result, so two programs with the same operations in the same order agree to the last bits. `closed_loop`
+compares the C with the compiled simulator. Functions of <math.h> come from the C library, because XLA's own functions
+differ: its log1p is off by 1e2 units in the last place.
 """
 
 import ctypes
@@ -21,7 +21,7 @@ from ambjax.codegen.trace import Trace, arguments, precision
 
 
 class Results(NamedTuple):
-    """Results of a step at some points: next states, whether the laws have started, outputs, and status bits."""
+    """Results of a step at some points: next states and flag `started`, outputs, and status bits."""
 
     state: np.ndarray
     started: np.ndarray
@@ -49,7 +49,7 @@ def results(trace: Trace, at: Points) -> Results:
 def one_by_one(closed: ClosedJaxpr, args: list[ArrayLike], count: int) -> list[ArrayLike]:
     """Evaluate a trace for scalars or rows of `count`, one primitive at a time.
 
-    Scalars are broadcast to rows, because XLA divides a row by a scalar by multiplication with the reciprocal.
+    Scalars are broadcast to rows, because XLA multiplies by the reciprocal if it divides a row by a scalar.
     """
     jaxpr = closed.jaxpr
     known: dict[Any, ArrayLike] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *args], strict=True))

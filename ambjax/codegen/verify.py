@@ -45,7 +45,7 @@ class Check(NamedTuple):
 class Draft:
     """The files of a block in one precision, and JAX's results of its step.
 
-    `steps`: points and results of each check, by its name. One check uses the case's parameters, the other varied ones.
+    `steps`: points and results by the name of a check. One check uses the case's parameters, the other varied ones.
     """
 
     trace: Trace
@@ -64,6 +64,8 @@ def draft(block: Block, precision: str, prefix: str, origin: Origin, count: int 
 
 def verify(drafts: Mapping[str, Draft], case: LoopCase | None) -> list[Check]:
     """Run and return all checks, in every precision of `drafts`. `case` None: without those of the closed loop.
+
+    If a library cannot be built, the steps in its precision and all closed loops are left out.
 
     Raises ValueError if there is no compiler, or if this machine cannot run the compiled programs.
     """
@@ -128,7 +130,7 @@ def deviation(found: np.ndarray, should: np.ndarray, tiny: float) -> np.ndarray:
 
 
 def _looped(precision: str, found: closed_loop.LoopComparison) -> Check:
-    """Compare the closed loop over its horizon."""
+    """Return the check of the closed loop over its horizon."""
     name, horizon = "closed loop, dz", found.horizon
     count, samples = horizon.samples, horizon.signals["z"].size
     if not horizon.decisive:
@@ -173,10 +175,10 @@ a product and a sum once where the C ({EXACT}) rounds twice. The tolerance of a 
 at which an intermediate number is subnormal are omitted, because XLA replaces it by 0.
 
 Parameters: one step with other parameters. This check finds a gain or a limit that the C has as a constant. Every
-parameter that the step reads is set to {1 / SPAN:g} and {SPAN:g} times the case's value, within the range in the
-header, first alone, then with the others at random ends of their ranges. When changed alone, a parameter is also
-set to NaN; u_max and a steepness p are also set to inf, and processor.delay to values outside its range. The C must
-reject what JAX rejects.
+parameter that the step reads is set to {1 / SPAN:g} and {SPAN:g} times the case's value (0: to -1 and 1; inf: to 1
+and {SPAN:g}), within the range in the header. First it is changed alone, then all are drawn at random from the case's
+value and these two. When changed alone, a parameter is also set to NaN; u_max and a steepness p are also set to inf,
+and a delay to values outside its range. The C must reject what JAX rejects.
 
 Closed loop: the compiled C with the rest of the loop in JAX (a controller with JAX's plant and sensors, a plant with
 JAX's controller), compared with the same loop in JAX in double precision. An exported plant or loop has disturbances

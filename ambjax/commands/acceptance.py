@@ -52,7 +52,10 @@ def bias_flux(case: Case) -> float:
 
 
 def acceptance(case: Case) -> tuple[dict[str, object], str]:
-    """Return the JSON summary and the text: zone and margins of the loop linearised at r = 0, and the machine."""
+    """Return the JSON summary and the text: zone and margins of the loop linearised at r = 0, and the machine.
+
+    If the loop cannot be linearised, the zone is None, and only the text has the numbers of the machine.
+    """
     try:
         system = linearise(case.cascade, case.scenario, case.clock)
         loop = analyse(system, case.scenario.plant.m, case.clock.sample_period, case.zones)
@@ -115,7 +118,7 @@ def machine(case: Case) -> list[Fact]:
 
 
 def _voltages(case: Case) -> tuple[float | None, float | None]:
-    """Return the largest u at the bias, and the voltage of a coil above the bias, V; None: no limit.
+    """Return the largest u, and the largest voltage of a coil in excess of R i_0, V; None: no limit.
 
     The largest u is half the difference of the voltages of the coils, each within its limit, for a command of u_max.
     """

@@ -94,8 +94,9 @@ class ExportedCase:
     def write(self, folder: str | pathlib.Path) -> pathlib.Path:
         """Write all files into a folder, which is made if it does not exist, and return the folder.
 
-        Files of an earlier export with the same prefix are overwritten. Raises ValueError, and writes nothing, if the
-        folder cannot be written, or if another file in it has one of the names.
+        Files of an earlier export with the same prefix are overwritten. Without verification, its verify.md and
+        verify.json are removed. Raises ValueError, and writes nothing, if the folder cannot be written, or if another
+        file in it has one of the names.
         """
         with destination(str(folder), "", self.plan) as (out, part):
             self.put(part)
@@ -135,7 +136,7 @@ def export(
     - `format`: "c" for a C package, "fmu" for an FMU.
     - `fmi`: version of FMI of an FMU, 2 or 3; None: 3.
     - `precision`: C type of all numbers of a C package, "float" or "double"; None: "float". An FMU has double.
-    - `prefix`: prefix of all names in the C code, a C identifier; None: the name of the case.
+    - `prefix`: prefix of all names in the C code, a C identifier; None: the case's name, made a C identifier.
     - `verify`: compile the C in both precisions and compare it with JAX. Takes about a minute; needs a C compiler.
 
     Writes no files: see `ExportedCase.write`. Returns an `ExportedCase`; a failed check is a result, see its `ok`.
@@ -196,7 +197,7 @@ def _built(plan: Plan) -> dict[str, str | bytes]:
 
 @contextlib.contextmanager
 def destination(out: str | None, name: str, plan: Plan) -> Iterator[tuple[pathlib.Path, pathlib.Path]]:
-    """Yield the output directory and a folder whose files move into it at the end of the block, as `files` does.
+    """Yield the output directory, and a folder whose files move into it at the end of the `with` block, as in `files`.
 
     `out` and `name` are those of `directory`. Without verification, the verification of an earlier export is removed,
     because it does not apply to the new files. Raises ValueError if it would replace a file that is not from an export.
@@ -218,7 +219,7 @@ def _holds_fmu(out: pathlib.Path, plan: Plan) -> bool:
 
 
 def guarded_for(case: Case) -> Cascade:
-    """Return the cascade of a case whose guard limits are wide enough for the sensor at both ends of every spread."""
+    """Return the cascade of a case, with guard limits wide enough for the sensor at both ends of every spread."""
     widest = ends(case.spread, case.cascade, case.scenario, ("sensor.", "run.clearance", "plant.s_0"))[1]
     cascade = guarded(case.cascade, widest, float(case.clock.sample_period))
     if cascade.processor is None or cascade.processor.guard is None:
@@ -228,7 +229,7 @@ def guarded_for(case: Case) -> Cascade:
 
 
 def _prefix(option: str | None, name: str) -> str:
-    """Return the prefix of all C names: the option, or the case's name. Raises ValueError for an invalid C name."""
+    """Return the prefix of all C names: the option, or one from `name`. Raises ValueError for an invalid option."""
     if option is None:
         derived = re.sub(r"\W", "_", name, flags=re.ASCII)
         return derived if _is_name(derived) else f"amb_{derived}"

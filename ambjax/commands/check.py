@@ -18,9 +18,9 @@ from ambjax.theorem.sampled_report import Delays, SampledReport
 
 Summary = dict[str, object]
 CONTINUOUS = (
-    "The tables of Theorem 1 are computed in continuous time, without the case's [processor], converters and "
-    "amplifier; a set-valued sign is replaced by a sign with a boundary layer. These tables do not affect the verdict "
-    "on this case."
+    "The tables of Theorem 1 are computed in continuous time, without the case's [processor] and without the low-pass, "
+    "the converters and the faults of the sensor. An amplifier is included only if it controls the current. A "
+    "set-valued sign is replaced by a sign with a boundary layer. These tables do not affect the verdict on this case."
 )
 
 BAND = (
@@ -35,8 +35,9 @@ BAND = (
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """Check a case. Print the results of the linearised loop, then those on the processor, then those of Theorem 1.
 
-    Returns the exit code and the summary. The exit code is 1 if a condition fails, if the rotor is lost or
-    stalled, or if the magnets cannot carry it. On a processor, the conditions of Theorem 1 do not count.
+    Returns the exit code and the summary. The exit code is 1 if a condition fails, if the rotor is lost, if the
+    integrator stalls, or if the magnets cannot carry the rotor. On a processor, the conditions of Theorem 1 do not
+    count. The zones and the margins of the linearised loop never count.
     """
     from ambjax.theorem import advice
 
@@ -106,7 +107,10 @@ def _sampled(case: Case) -> SampledReport:
 
 
 def _margins(case: Case) -> tuple[Delays, Delays | None]:
-    """Return the delay margins with prediction over the actual delay, and over the case's (None: no prediction)."""
+    """Return two delay margins: with prediction over the delay of each run, and over the delay of the case.
+
+    If the processor does not predict, the first is the margin without prediction, and the second is None.
+    """
     from ambjax.ensemble.delays import DELAYS, delay_margin
 
     say(f"finding the delay margin: simulating {DELAYS} delays, twice if the rotor is lost at one of them")

@@ -19,9 +19,9 @@ from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks
 class Compared:
     """A case and its results.
 
-    `columns`: of the members, [N] each. `point`: the nominal loop; None without an equilibrium. `peaks`: of the members
-    of the spread; None without a spread. `flops`: operations of a step of the controller; None without a processor, or
-    if a law cannot be exported.
+    `columns`: metrics of the members by name, [N] each. `point`: the nominal loop; None without an equilibrium.
+    `peaks`: sensitivity peaks of the members; None without a spread or without an equilibrium. `flops`: operations of a
+    step of the controller; None without a processor, or if a law cannot be exported.
     """
 
     case: Case
@@ -115,13 +115,13 @@ def _values(one: Compared, first: Compared) -> dict[str, object]:
 
 
 def _better(one: Compared, first: Compared) -> int:
-    """Return how many members this case holds that the first case loses, or holds with a larger rms error."""
+    """Return the number of members that this case holds and the first case loses, or holds with a larger rms error."""
     ours, theirs = (np.where(x.held, x.columns["settled_rms_error_m"], math.inf) for x in (one, first))
     return int(np.sum(ours < theirs))
 
 
 def _loop(one: Compared) -> dict[str, object]:
-    """Return the numbers of the linearised loop; None each if it is not stable."""
+    """Return the numbers of the linearised loop. If it is not stable, its zone is D and its other numbers are None."""
     keys = ("peak", "frequency_hz", "t_peak", "ks_peak", "gain_margin_low", "gain_margin_high", "phase_margin_deg")
     keys += ("delay_margin_s", "disk_margin", "stiffness_N_per_m")
     worst: dict[str, object] = {"unstable": None, "worst_peak": None}

@@ -10,7 +10,7 @@ from ambjax.commands.warnings import print_warnings
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
-    """Export a block of a case. Exit code 1 if --verify finds a difference between the C and JAX."""
+    """Export a block of a case. Exit code 1 if a check of --verify fails."""
     case = read_case(args.case)
     plan = planned(case, args.what, args.format, args.fmi, args.precision, args.prefix, args.verify)
     with destination(args.out, f"export-{case.name}", plan) as (out, part):

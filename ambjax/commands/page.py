@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
 
 def _target(given: str | None, force: bool) -> pathlib.Path | None:
-    """Return the file that --out names, or None. Raises ValueError if it is no HTML file, or if it exists."""
+    """Return the file of --out, or None. Raises ValueError if it is no HTML file, or if it exists and not `force`."""
     if given is None:
         return None
     out = pathlib.Path(given)

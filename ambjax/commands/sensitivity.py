@@ -29,7 +29,7 @@ INJECTED = 8
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
-    """Analyse the loop of a case. Exit code 1 if the nominal loop, or one of its members, is not stable."""
+    """Analyse the loop of a case. Exit code 1 if it is not stable at an equilibrium, or if a member is not stable."""
     case = read_with_warnings(args.case)
     study = _study(case, args)
     points = [operating_point(case, name, r) for name, r in references(case)]
@@ -67,7 +67,7 @@ def _injections(case: Case, point: OperatingPoint) -> Injections:
 
 
 def _injected(case: Case, peak: float, reading: Reading) -> Injection:
-    """Inject one period of a multi-sine at one sensor. Its frequency lines are denser near `peak` (Hz)."""
+    """Inject a multi-sine at one sensor, and measure over one period. Its frequencies are denser near `peak` (Hz)."""
     clock, members = one_period(case), INJECTED if case.scenario.random else 1
     at = frequency_lines(case.zones, clock, peak)
     amplitude = case.zones.amplitude
@@ -80,7 +80,9 @@ def _study(case: Case, args: argparse.Namespace) -> Study | None:
     """Return the study of the case's spread; None without one. Raises ValueError for --members without [spread]."""
     if not case.spread.entries:
         if args.members is not None:
-            raise ValueError("--members: all members of this case are the same. Add [spread] to the case, or omit it.")
+            raise ValueError(
+                "--members: all members of this case are the same. Add [spread] to the case, or omit --members."
+            )
         return None
     return study_of(case, args.seed, MEMBERS if args.members is None else args.members)
 

@@ -26,7 +26,10 @@ METRICS = ("settled_max_abs_error_m", "settled_rms_error_m", "max_abs_error_m", 
 def write_report(
     case: Case, study: Study, args: argparse.Namespace, out: pathlib.Path, error: dict[str, Any] | None
 ) -> tuple[int, dict[str, object]]:
-    """Write and print the results of a finished study. `error`: result of `sliding_error`, or None."""
+    """Write and print the results of a finished study. Return the exit code and the summary.
+
+    The exit code is 0 if every member survives. `error`: result of `sliding_error`, or None.
+    """
     with np.load(out / "members.npz") as file:
         columns = {name: file[name] for name in file.files}
     summary = _summary(case, study, columns, str(args.case))

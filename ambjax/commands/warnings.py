@@ -26,7 +26,7 @@ def read_with_warnings(path: str | pathlib.Path) -> Case:
     """Read a case file and print its warnings on stderr. Raises ValueError as `read_case` does."""
     case = read_case(path)
     if not case.text.strip():
-        say(one_line(f"{path}: the file is empty, so every number is the paper's. 'ambjax template' prints a case."))
+        say(one_line(f"{path}: the file is empty, so every number has its default. 'ambjax template' prints a case."))
     print_warnings(case, path)
     return case
 
@@ -97,8 +97,8 @@ def idealised(case: Case) -> str:
 def reversal(case: Case, most_i: float) -> Iterator[str]:
     """Yield a warning if the largest |i| of a run, `most_i` in A, reverses the current of one coil.
 
-    It applies to the paper's plant only. With two coils, i is half the difference of their currents and does not
-    determine either of them.
+    It applies to the paper's plant with ideal iron only. With two coils, i is half the difference of their currents and
+    does not determine either of them.
     """
     if case.scenario.plant.lumped and most_i > case.scenario.plant.i_0:
         yield f"|i| reaches {most_i:.4g} A, {_beyond(case)} plant.kind = 'two-coil' simulates each coil's current."
@@ -129,8 +129,8 @@ def _currents(case: Case) -> Iterator[str]:
 def _coil_voltage(scenario: Scenario, least: float) -> Iterator[str]:
     """Yield warnings about the voltage limit of the coils.
 
-    The limit may be below the voltage that holds the rotor, `least` (V). The command may exceed the voltage at which
-    both coils are at the limit.
+    There are two: the limit minus the bias voltage is below the voltage that holds the rotor, `least` (V); the command
+    may exceed the voltage at which both coils are at the limit.
     """
     coil = None if scenario.amplifier is None else scenario.amplifier.coil
     if coil is None or coil.u_max is None:

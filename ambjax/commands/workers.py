@@ -23,7 +23,7 @@ CONTINUE = "Finished chunks are kept: repeat the command with --out and --resume
 
 @contextlib.contextmanager
 def executor_of(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | None]:
-    """Yield an executor and the number of chunks to submit at a time, or None to run in this process."""
+    """Yield an executor and the largest number of its unfinished chunks, or None to run in this process."""
     if args.cluster is not None:
         try:
             from distributed import Client, KilledWorker

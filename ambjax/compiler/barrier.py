@@ -1,8 +1,9 @@
 """Barriers against fusion: XLA's CPU backend compiles a function as a separate loop.
 
 XLA fuses elementwise arithmetic into large loops, and repeats divisions in every fusion that uses them. An iteration
-with several divisions in sequence is a long dependency chain, of which the processor overlaps hardly two. Shorter loops
-overlap better. JAX's optimisation barriers are removed before fusion; a call that XLA must not inline is kept.
+with several divisions in sequence is a long dependency chain, and the processor hardly overlaps two such iterations.
+Iterations of shorter loops overlap better. XLA removes JAX's optimisation barriers before fusion, but keeps a call that
+it must not inline.
 """
 
 import functools
@@ -18,8 +19,8 @@ Result = TypeVar("Result")
 def compiled_alone(function: Callable[..., Result]) -> Callable[..., Result]:
     """Return a version of `function` that XLA neither fuses nor repeats on CPUs. On other devices it is unchanged.
 
-    Use it below a custom_jvp. The rule may apply it to tangents if it is linear in them; reverse mode then transposes
-    it.
+    Put custom_jvp above this decorator. The JVP rule may call the result on tangents if `function` is linear; reverse
+    mode then transposes the call.
     """
     inner = jax.jit(function)
 
@@ -49,8 +50,8 @@ def _kept_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arr
 def materialised(tree: Result, beside: object = ()) -> Result:
     """Return the same values, with the same derivatives, stored in memory.
 
-    Otherwise XLA computes an intermediate value and its derivatives again in every loop that uses it. Leaves of
-    `beside` are stored already, and are not stored again.
+    Otherwise XLA computes an intermediate value and its derivatives again in every loop that uses it. A leaf of
+    `tree` that is also a leaf of `beside` is stored already, and is returned unchanged.
     """
     there = set(map(id, jax.tree.leaves(beside)))
     return jax.tree.map(lambda x: x if id(x) in there else _barrier(x), tree)

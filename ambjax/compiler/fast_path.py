@@ -5,7 +5,8 @@ a few hundred floating-point operations that is nearly all the time. A call with
 one function, loops included. On processors with AVX-512 a compiler option also selects vectors of 512 bits.
 
 Neither feature is documented, so both are tested once per process. If one is not available or changes a result, the
-program runs without it, correct but slower, and logs one line. AMBJAX_PLAIN=1 in the environment disables both.
+program runs without it, correct but slower. It logs one line if it runs without the mark. AMBJAX_PLAIN=1 in the
+environment disables both.
 """
 
 import functools
@@ -39,10 +40,10 @@ def _mark(tree: object) -> Any:
 def one_kernel(function: Callable[..., Result], static_argnames: tuple[str, ...] = ()) -> Callable[..., Result]:
     """Return jit(`function`), compiled as one kernel if that is possible.
 
-    Only an outermost call is marked. Inside another jit, grad or vmap the function is compiled as a part of that
-    transformation, and reverse mode through a marked call aborts XLA's compiler. Apply it to the outermost function:
-    one_kernel(vmap(f)), one_kernel(value_and_grad(f)). Every array must be an argument, because a large constant in a
-    marked function can abort the compiler too.
+    Only an outermost call is marked. Inside another jit, grad or vmap the function is compiled unmarked, as a part of
+    that transformation; reverse mode through a marked call would abort XLA's compiler. Apply `one_kernel` to the
+    outermost function: one_kernel(vmap(f)), one_kernel(value_and_grad(f)). Every array must be an argument, because a
+    large constant in a marked function can abort the compiler too.
 
     With many hundred members at once XLA may split an operation over threads, which is not possible inside one
     function. Such a call is compiled in the ordinary way, with a line in the log. jax.lax.map with a batch_size keeps
@@ -89,10 +90,11 @@ def _has_avx512() -> bool:
 def block_length(members: int) -> int:
     """Return the number of members in a block, for `members` members on one core.
 
-    A block must fit the first-level cache, and be large enough to outweigh the start of each loop over it. Twice the
-    size is slower on Intel's cores with AVX-512. It is faster on AMD's, unless much of the last block is padding. Few
-    members have a shorter block, so that little of it is padding: a step of 16 members takes half as long in a block of
-    16 as in a block of 64. Blocks of 8 are hardly faster than blocks of 16.
+    A block must fit the first-level cache, and be large enough to outweigh the start of each loop over it. In float64
+    it usually has at most 64 members. Blocks of 128 are slower on Intel's cores with AVX-512. On AMD's they are faster,
+    unless much of the last block is padding; they are used from 256 members on. Few members have a shorter block, so
+    that little of it is padding: a step of 16 members takes half as long in a block of 16 as in a block of 64. Blocks
+    of 8 are hardly faster than blocks of 16.
     """
     number = jnp.result_type(float).itemsize
     longest = (1024 if members >= 256 and _has_avx512() and "AuthenticAMD" in _cpuinfo() else 512) // number

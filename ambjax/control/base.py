@@ -35,8 +35,9 @@ class Law:
     - `estimates_velocity`: whether the law is an observer that does not use the measured velocity.
     - `memory`: name, unit and meaning of each leaf of the state on a processor; None: the names are derived from the
       structure of the state.
-    - `own_steps`: the discretisations, "implicit" or "explicit", for which a processor calls the method `step`. For the
-      others it makes an explicit Euler step. The default is ("implicit",) for a class that defines `step`.
+    - `own_steps`: the discretisations, "implicit" or "explicit", for which a processor calls the method `step`. With
+      the others, the processor makes an explicit Euler step. The default is ("implicit",) for a class that defines
+      `step`.
     - `stiff`: whether a smoothed sign keeps a state of the law inside its boundary layer, so that this state changes
       fast; True for a class that defines `layer`.
     - `slides`: whether an inversion law has the method `slide`, which integrates across the boundary layer
@@ -65,9 +66,9 @@ class Law:
         return None
 
     def layer(self, model: Plant) -> object:
-        """Return, for each state, the largest integration error that keeps it in the boundary layer of its sign.
+        """Return, for each state, the largest integration error with which it stays in the boundary layer of its sign.
 
-        The default is inf, which is the value for a state that no sign moves.
+        The default, inf, is for a state that no sign moves.
         """
         scale: Any = self
         return jax.tree.map(lambda _: jnp.inf, scale.scale(model))
@@ -75,12 +76,13 @@ class Law:
     def robust(self, error: Array, /) -> Array:
         """Return the term that the sign adds to the rate of the stage's error: -k sgn(sigma) in Eq. (12), for example.
 
-        `error`: sigma (m/s), v_tilde (A^2/m^2) or e (A). The default, for a law without a sign, is 0.
+        `error`: sigma (m/s), v_tilde (A^2/m^2) or e (A). The default is 0, also for
+        a law that has a sign but does not define this method.
         """
         return 0.0 * error
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        """Return the range in which the tuner searches each gain, by the name of the gain.
+        """Return the range of the initial values of each gain in the tuner's search, by the name of the gain.
 
         A gain that is not in the dict is searched around its value.
         """
@@ -95,7 +97,7 @@ class Law:
         return 0.0
 
     def init_sampled(self, model: Plant) -> object:
-        """Return the state at t = 0 on a processor. Observers do not use it."""
+        """Return the state at t = 0 on a processor. For an observer, `init` is called instead."""
         law: Any = self
         return law.init(model)
 
@@ -139,8 +141,8 @@ def default_law(kind: type[L], model: Plant, period: float | None = None) -> L:
     """Return the law of type `kind` with its default gains (`Law.designed`), and with steepnesses scaled to `model`.
 
     The default of a steepness p is for the plant of Table 1. It is scaled by the inverse size of the sign's argument,
-    so that the boundary layer 1/p is the same share of this size for every plant. With p = 25 m^2/A^2, for example, the
-    boundary layer of v_tilde is 1.6e-5 of the size of v for Table 1, which is 2500 A^2/m^2.
+    so that the boundary layer 1/p is the same share of this size for every plant. The size of v for Table 1, for
+    example, is 2500 A^2/m^2; with p = 25 m^2/A^2 the boundary layer of v_tilde is 1.6e-5 of it.
     """
     law: Any = kind().designed(model, period)
     size = law.size(model)
@@ -167,7 +169,9 @@ def memory_of(law: Law, state: object) -> list[tuple[str, str, str]]:
 def set_valued_signs(law: Law) -> list[str]:
     """Return the names of the steepnesses that are inf or None, which make a sign set-valued.
 
-    Traced steepnesses are left out. Raises ValueError if a steepness is inf for some members only.
+    Steepnesses that are traced or have a schedule are left out.
+
+    Raises ValueError if a steepness is inf for some members only.
     """
     names = []
     for name in _steepnesses(law):
@@ -192,7 +196,7 @@ def with_set_valued_signs(law: L) -> L:
 
 
 def with_infinite_steepness(law: L) -> L:
-    """Return the law with inf for every steepness that is None, so that its slope is a number."""
+    """Return the law with inf for every steepness that is None, because the method `slope` cannot compute with None."""
     given: Any = law
     return dataclasses.replace(given, **dict.fromkeys(set_valued_signs(law), np.inf))
 

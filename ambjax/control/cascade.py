@@ -70,8 +70,8 @@ class Cascade:
     def init(self, measured: Measurement, reference: Reference | None = None) -> CascadeState:
         """Return the states of all laws at t = 0, in continuous time or on the processor.
 
-        `measured`: the first measurement, from which the observer starts. `reference`: the reference and its rates at t
-        = 0. In continuous time, they may determine the initial state of the position law (`PositionLaw.begin`).
+        `measured`: the first measurement, from which the observer starts. `reference`: the reference and its rates at
+        t = 0; in continuous time, the initial state of the position law may depend on them (`PositionLaw.begin`).
         """
         observed = extremes(self.observer)[0].init(self.model, measured)
         rest = [extremes(law)[0] for law in self.laws[1:]]
@@ -91,7 +91,7 @@ class Cascade:
         return CascadeState(*(extremes(law)[0].scale_sampled(self.model) for law in self.laws))
 
     def layer(self) -> CascadeState:
-        """Return, for each state, the largest integration error that keeps it in the boundary layer of its sign."""
+        """Return `Law.layer` of all laws; with schedules, the smaller of the two values of `extremes`."""
         layers = ([one.layer(self.model) for one in extremes(law)] for law in self.laws)
         return CascadeState(*(jax.tree.map(lambda *x: functools.reduce(jnp.minimum, x), *each) for each in layers))
 
@@ -122,7 +122,7 @@ class Cascade:
         The rates of z and v_star in the demanded force are total derivatives in time: they include the rates of the
         reference, z_dot, the nominal z_ddot and the rates of the states of the laws. Static inversions and the adaptive
         inversion with feed-forward use them to compute i_ref'; XLA removes them for other laws. If the observer
-        estimates the velocity, z_dot is its estimate.
+        estimates the velocity, this estimate is the rate of z, and the rates of the observer's states are not included.
 
         The returned rates of the inversion and current laws are ().
         """
@@ -191,7 +191,7 @@ class Cascade:
     def estimate(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State, Measurement]:
         """Step the observer on a processor.
 
-        `measured`: the readings. `state`: state of the observer. `sample`: reference, period and delayed voltages.
+        `measured`: the readings. `state`: state of the observer. `sample`: reference, period and past commands.
         Returns the estimate for the other laws (with prediction: at the end of the delay), the next state of the
         observer, and the estimate at the sample itself.
         """
@@ -209,7 +209,7 @@ class Cascade:
     ) -> tuple[Command, CascadeState, Measurement]:
         """Step all laws on a processor.
 
-        `measured`: the readings. `state`: states of all laws. `sample`: reference, period, supply and delayed voltages.
+        `measured`: the readings. `state`: states of all laws. `sample`: reference, period, limit of u, past commands.
         With prediction, all laws except the observer use the estimate at the end of the delay. Returns the command, the
         next states of the laws, and the observer's estimate at the sample itself.
         """
@@ -228,7 +228,7 @@ class Cascade:
 
         point = (sample.reference, measured.z, measured.z_dot, state.observer, state.position)
         (z, v_star), (now, estimate, observed, positioned) = demanded(*point)
-        # The adaptive inversion with feed-forward uses these rates to compute i_ref'; XLA removes them for other laws.
+        # The adaptive inversion with feed-forward needs the rates of z and v_star; XLA removes them for other laws.
         z_ddot = self.model.z_ddot(estimate.z, estimate.i)
         rates = jax.tree.map(
             lambda a, b: (b - a) / sample.period, (state.observer, state.position), (observed, positioned)
@@ -254,7 +254,7 @@ class Cascade:
         """Return the command in continuous time and the rates of the states of all laws.
 
         `measured`: readings of z (m), z_dot (m/s) and i (A). `state`: states of all laws. `reference`: r and its rates.
-        `u_max`: limit of the supply, V; inf: none.
+        `u_max`: limit of u: of the supply, V, or of the commanded current, A; inf: none.
         """
         force, estimate, rates = self.demand(measured, state, reference)
         inversion = with_gains_at(self.inversion, force.z, reference)

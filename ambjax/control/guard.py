@@ -15,7 +15,7 @@ from ambjax.world.plant import Plant, State
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement, Sensor
 
-# A cascade: its module imports this one.
+# Type of a cascade. Its class cannot be imported here, because its module imports this one.
 C = TypeVar("C")
 
 # Largest simulated noise in standard deviations: the bound of `numerics.gaussian.normals`.
@@ -32,7 +32,7 @@ class Watch(NamedTuple):
     """State of a guard.
 
     `expected`: predicted readings of the next sample (m, m/s, A). `left`: number of successive samples for which a
-    reading may still be replaced; 0 before the first accepted reading.
+    reading may still be replaced; 0 at the start, and after `Guard.samples` refused samples.
     """
 
     expected: Measurement
@@ -54,10 +54,10 @@ class GuardResult(NamedTuple):
 
 @record
 class Guard:
-    """Refuse a reading that is NaN, beyond its limit, or farther from the prediction than the rotor can have moved.
+    """Refuse a reading that is NaN or beyond its limit, or a z farther from its prediction than the rotor can move.
 
     The nominal model's prediction replaces a refused reading for up to `samples` successive samples. After that u = 0
-    until a reading is within its limits. `with_limits` derives each number that is left out (None).
+    until all readings are within their limits. `with_limits` derives each number that is left out (None).
     """
 
     z: Scalar | None = _limit(
@@ -89,7 +89,11 @@ class Guard:
 
     @property
     def derived(self) -> bool:
-        """Whether every number is left out. Derived limits accept every reading of a sensor without faults."""
+        """Whether every number is left out.
+
+        Derived limits accept every reading of a sensor without faults, if the error of the model's force is below the
+        full pull of one magnet.
+        """
         return all(getattr(self, field.name) is None for field in dataclasses.fields(type(self)))
 
     def with_limits(self, model: Plant, scenario: Scenario, period: Scalar, estimated: bool) -> "Guard":
@@ -97,7 +101,8 @@ class Guard:
 
         `period`: sample period, s. `estimated`: whether an observer estimates the velocity.
 
-        The derivation uses the gap and the pole of `model`, and the share of the gap at which the rotor is lost.
+        The derivation uses the gap, the pole and the bias current of `model`, and the sensor, the gap and the |z| of a
+        lost rotor of `scenario`.
         """
         sensor = Sensor() if scenario.sensor is None else scenario.sensor
         limit, clearance = scenario.limit, scenario.limit / scenario.plant.s_0 * model.s_0

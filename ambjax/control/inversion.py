@@ -59,7 +59,7 @@ class AdaptiveReference(InversionLaw[Array]):
         return model.v_size
 
     def layer(self, model: Plant) -> Scalar:
-        """Return 0.3 of the boundary layer in i_ref (A), which is that in v_tilde, 1/p, divided by dv/di(0, 0)."""
+        """Return 0.3 of the boundary layer in i_ref (A): its width in v_tilde is 1/p, in i_ref 1/(p dv/di(0, 0))."""
         return 0.3 / (self.p * model.dv_di(0.0, 0.0))
 
 
@@ -111,7 +111,7 @@ class FeedForwardAdaptive(AdaptiveReference):
 
     The feed-forward of the rates of v_star and z cancels d, so that w' = -gamma sgn(w) on a known plant. gamma must
     therefore exceed only the error of these rates, not Delta_1 of Eq. (7). The rates are those of the nominal model.
-    They contain the noise of the velocity; Eq. (6) does not.
+    They add the noise of the velocity to i_ref'. In Eq. (6) this noise acts only inside the sign, through v_star.
     """
 
     gamma: Scalar = gain(default=7.5e4, unit="A^2/m^2/s", doc="adaptation gain; above the error of the rates")
@@ -129,7 +129,7 @@ class FeedForwardAdaptive(AdaptiveReference):
         return {"gamma": gamma, **steepness(context, "gamma")}
 
     def step(self, model: Plant, inputs: ForceDemand, state: Array, period: Scalar) -> tuple[CurrentDemand, Array]:
-        """Step v towards v_star, both at the end of the sample, with the sign at the end of the step."""
+        """Step v towards v_star, with z and v_star extrapolated to the end of the sample, and the sign at its end."""
         w = inputs.v_star - model.v_and_dv_di(inputs.z, state, inputs.gaps)[0]
         z, v_star = inputs.z + period * inputs.z_rate, inputs.v_star + period * inputs.v_star_rate
         after = model.current_for(z, v_star - relax(w, period * self.gamma, self.p))
@@ -144,7 +144,9 @@ class StaticInversionState(NamedTuple):
 
 
 class StaticInversion(InversionLaw[tuple[()]]):
-    """Base class of a law whose i_ref is a function of z and v_star, with its exact rate; no state in continuous time.
+    """Base class of a law whose i_ref is a function of z and v_star.
+
+    In continuous time the law has no state, and i_ref' is exact.
 
     On a processor, the law returns the i_ref that it computed at the last sample, and the rate i_ref' that moves i_ref
     to the new value in one period. The new value is the state of the law. Without this state, the current law would
@@ -192,7 +194,7 @@ class ClosedForm(StaticInversion):
 
     The paper argues against this law (Mouille and Lottin 1992): it is exact on a known plant, but passes every jump of
     v_star, such as noise, directly to i_ref. It has no state in continuous time. On a processor it equals the adaptive
-    law with gamma = inf.
+    law with gamma = inf after the first sample.
     """
 
     def inverse(self, model: Plant, z: Array, v_star: Array) -> Array:

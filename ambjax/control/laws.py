@@ -111,7 +111,11 @@ class PositionLaw(Law, Generic[State], abc.ABC):
 
     @property
     def demand(self) -> str:
-        """The demanded quantity: "force" or "voltage". The inversion and current laws pass on a voltage unchanged."""
+        """The demanded quantity: "force" or "voltage".
+
+        With "voltage", v_star is the linearised force of the current u/R for the demanded voltage u.
+        `inversion.Linearised` and `current.OpenLoop` compute u from it.
+        """
         return "force"
 
     @abc.abstractmethod

@@ -69,8 +69,9 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
         return tuple((f"x_{k + 1}", "m", "state of the controller") for k in range(len(self.realisation.A)))
 
     def check_use(self, model: Plant, period: float | None) -> None:
-        """Raise ValueError if a discrete controller has another period, or if the output is a voltage and R = 0.
+        """Raise ValueError if the law cannot run with this nominal model, or at this sample period.
 
+        A discrete controller requires a processor with its own period. An output that is a voltage requires R > 0.
         `period`: sample period of the processor, s; None in continuous time.
         """
         dt = self.realisation.dt
@@ -102,7 +103,7 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
         return jnp.maximum(self.realisation.fastest, self.explicit_rate(model))
 
     def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the crossover frequency w of the loop, 1/s: the largest at which its gain is 1 or more.
+        """Return the crossover frequency w of the loop, 1/s: the largest frequency at which the loop gain is 1 or more.
 
         With the inertia of the linearised mechanics alone, the loop gain is b gain |K|/w^2; for a voltage, it is
         b gain |K|/(L w^3).

@@ -36,9 +36,11 @@ class UtkinSlidingMode(PositionLaw[Array]):
 
     Integral sliding mode: feedback linearisation, and a sign that cancels the disturbance (V. Utkin and J. Shi, Proc.
     35th IEEE Conf. Decision and Control, 1996, 4591-4596). x starts at -(e_dot + k_d e), so that s = 0 from the
-    beginning: there is no reaching phase, and for |q_z| < k the error follows e_ddot = -k_p e - k_d e_dot at all times.
+    beginning: there is no reaching phase, and for |q_z| < k the error follows e_ddot = -k_p e - k_d e_dot at all times,
+    up to the smoothing of the sign.
     `integral_sliding.IntegralSlidingMode` starts its integral at 0 instead. A trajectory does not contain s; it reports
-    e_dot + (k_p/k_d) e as sigma. The default k_p and k_d for a model place a double pole at w/3.
+    e_dot + (k_p/k_d) e as sigma. The default k_p and k_d for a model place a double pole at -w/3, where w is
+    the unstable pole of the magnets.
     """
 
     k_p: Scalar = gain(default=3.1e4, unit="1/s^2", doc="proportional gain; left out: (w/3)^2")

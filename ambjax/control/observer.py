@@ -74,8 +74,8 @@ class Difference(Observer[Array]):
     """Filtered difference: the estimated velocity is w (z - z_f) with z_f' = w (z - z_f). z itself is not filtered.
 
     With implicit steps on a processor, it is the backward difference (z_n - z_{n-1})/T through a low-pass with the pole
-    exp(-w T). It is exact on a ramp after the initial transient, and lags by 1/w. Noise of the position is amplified by
-    w.
+    exp(-w T). The estimate is exact on a ramp after the initial transient, and lags by 1/w. It amplifies noise of the
+    position by w.
     """
 
     w: Scalar = gain(default=2000.0, unit="1/s", doc="corner of the low-pass on the differenced position")
@@ -186,7 +186,7 @@ class Kalman(Observer[Predicted]):
 
 @record
 class IRED1(ExactDifferentiator):
-    """Robust exact differentiator of order 1: without noise, z_dot is exact while |z_ddot| <= L.
+    """Robust exact differentiator of order 1: without noise, z_dot is exact after a finite time if |z_ddot| <= L.
 
     `ambjax.numerics.differentiator` has the equations. z itself is not filtered. In continuous time, the sign is
     smoothed. With implicit steps on a processor, it is evaluated at the end of the step.

@@ -79,7 +79,7 @@ class SlidingMode(PositionLaw[tuple[()]]):
     def step(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[()], period: Scalar
     ) -> tuple[Array, tuple[()]]:
-        """Step with the sign of sigma at the end of the step: without disturbance sigma reaches 0 and stays there."""
+        """Step with the sign of sigma at the end of the step: without disturbance sigma does not overshoot 0."""
         motion, reference = inputs
         robust = -self.k * share(self.sigma(motion, reference), period * self.k, self.p)
         return force_for(self.c, model, motion, reference, robust), ()
@@ -153,7 +153,8 @@ class SuperTwisting(PositionLaw[Array]):
     ) -> tuple[Array, Array]:
         """Step with both terms at the end of the step (R. Seeber and B. Andritsch, Automatica 173 (2025) 112027).
 
-        The robust term is -k_1 root(y) + 2 w+ - w, where y solves y + T k_1 root(y) + T^2 k_2 sgn(y) = sigma.
+        The robust term is -k_1 root(y) + 2 w+ - w, where w+ = w - T k_2 sgn(y), and y solves
+        y + T k_1 root(y) + T^2 k_2 sgn(y) = sigma.
         """
         motion, reference = inputs
         sigma = self.sigma(motion, reference)

@@ -2,7 +2,7 @@
 
 A sign law drives x' = -k sgn_p(x) + w with |w| <= W < k. Steps of length T bring x into a band around 0. Explicit steps
 of the set-valued sign give |x| <= T (k + W), implicit steps |x| <= T W (V. Acary and B. Brogliato, Syst. Control Lett.
-59 (2010) 284-293). A smoothed sign adds the |x| at which k sgn_p(x) balances W.
+59 (2010) 284-293). A smoothed sign adds to the implicit bound the |x| at which k sgn_p(x) balances W.
 """
 
 import functools
@@ -84,7 +84,7 @@ def band(relay: Relay, W: float, period: float, implicit: bool) -> float:
 
     Implicit steps: b = T W + x_W with k sgn_p(x_W) = W, because without the disturbance a step from |x| <= b ends at
     |x| <= x_W. Explicit steps: the same if the slope of T k sgn_p is at most 1, so that x does not change sign;
-    otherwise at least T (k + W). Every larger bound is invariant too.
+    otherwise the larger of this b and T (k + W). Every larger bound is invariant too.
     """
     k, p = float(relay.gain), math.inf if relay.steepness is None else float(relay.steepness)
     if not k > W:

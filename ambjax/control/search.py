@@ -57,33 +57,37 @@ def manifold(context: SearchContext) -> Interval:
     cap = max(1 / (5 * context.period), context.w / 10)
     if cap >= 10 * context.w:
         return Interval(context.w / 30, 10 * context.w, f"w/30 to 10 w, {context.pole}", True)
-    words = f"w/30 to the cap 1/(5 T), T = {context.period:g} s: the sampled loop cannot slide faster; {context.pole}"
+    words = (
+        f"w/30 to the cap 1/(5 T), but at least w/10, T = {context.period:g} s: the sampled loop cannot slide faster; "
+        f"{context.pole}"
+    )
     return Interval(context.w / 30, cap, words, True)
 
 
 def switch(context: SearchContext, name: str, p: Scalar, times: float, over: str) -> Interval:
     """Return the range of a switching gain from the slope 2/pi gain p of its smoothed sign.
 
-    The range starts at twice the bound named `over`, or higher.
+    The range starts at twice the bound named `over`, or higher, and ends at 200 times this bound, or higher.
     """
     per, below = TWO_OVER_PI * float(p), context.bounds.get(over, 0.0)
     low, high = context.w / 3 / per, times * context.w / per
     words = f"slope 2/pi {name} p from w/3 to {times:g} w, {context.pole}"
     if 2 * below > low:
-        words += f"; at least twice the disturbance, {below:.3g}"
+        words += f"; at least twice the disturbance bound {over} = {below:.3g}"
     return Interval(max(low, 2 * below), max(high, 200 * below), words)
 
 
 def authority(context: SearchContext, size: Scalar, share: tuple[float, float], what: str, over: str = "") -> Interval:
     """Return the range of a switching gain on a processor, where no slope limits it.
 
-    `share`: ends of the range as shares of `size`; `what` describes `size`.
+    `share`: ends of the range as shares of `size`; `what` describes `size`. The range starts at twice the bound named
+    `over`, or higher, and ends at 200 times this bound, or higher.
     """
     below = context.bounds.get(over, 0.0)
     low, high = (part * float(size) for part in share)
     words = f"{share[0]:g} to {share[1]:g} of {float(size):.3g}, {what}"
     if 2 * below > low:
-        words += f"; at least twice the disturbance, {below:.3g}"
+        words += f"; at least twice the disturbance bound {over} = {below:.3g}"
     return Interval(max(low, 2 * below), max(high, 200 * below), words)
 
 
@@ -98,7 +102,7 @@ def position_switch(context: SearchContext, p: Scalar | None) -> Interval:
 
 
 def steepness(context: SearchContext, name: str) -> dict[str, Interval]:
-    """Return the range of the steepness p of a sign with the gain `name`; {} unless the signs are implicit."""
+    """Return {"p": range of the product of the gain `name` and the steepness p}; {} unless the signs are implicit."""
     if not context.stepped:
         return {}
     low, high = (slope / TWO_OVER_PI for slope in (context.w / 3, 10 / context.period))

@@ -1,6 +1,6 @@
 """The fold behind the fan chart: extremes of signals and the variation of the voltage, block by block.
 
-A fan chart records a long run at a few instants only. This fold reduces the samples between two instants, a block,
+A fan chart records a long run at a few instants only. This fold reduces a block, the samples between two instants,
 to the smallest and largest value of each signal and the total variation of the voltage.
 """
 

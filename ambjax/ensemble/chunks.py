@@ -1,4 +1,4 @@
-"""The chunks of a study: one sealed file for each, and their merge into one archive."""
+"""The chunks of a study: one file with a checksum for each (`host.sealed`), and their merge into one archive."""
 
 import collections
 import dataclasses
@@ -29,8 +29,8 @@ class Column(NamedTuple):
 class Chunks:
     """The chunks of a study in a directory.
 
-    `members`: of the study. `size`: members of a chunk; 0 if it is not known yet. `study`: checksum of the facts of the
-    study, which every chunk records.
+    `members`: number of members of the study. `size`: that of a chunk; 0 if it is not known yet. `study`: checksum of
+    the facts of the study, which every chunk records.
     """
 
     directory: pathlib.Path

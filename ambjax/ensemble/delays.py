@@ -1,4 +1,4 @@
-"""The delay margin of a cascade on a processor: the largest delay at which the rotor survives."""
+"""The delay margin of a cascade on a processor: the largest delay up to which the rotor survives."""
 
 import dataclasses
 from typing import Any
@@ -20,11 +20,12 @@ DELAYS = 257
 
 
 def delay_margin(cascade: Cascade, scenario: Scenario, clock: Clock, *, known: bool = True) -> Delays:
-    """Compute the largest delay at which the rotor survives the clock's horizon with a cascade on a processor.
+    """Compute the largest delay up to which the rotor survives the clock's horizon with a cascade on a processor.
 
     The search scans `DELAYS` delays, from the case's own delay to the longest one allowed, in one ensemble. A second
-    pass divides the first step in which the rotor is lost. If the rotor is lost at the case's own delay, the search
-    scans from 0 to that delay. A run that diverges counts as lost. All other inputs stay as in the case.
+    pass divides the step that ends at the first delay at which the rotor is lost or the integrator stalls. If this is
+    the case's own delay, the search scans from 0 to that delay. A run that diverges counts as lost; a run that stalls
+    is undecided. All other inputs stay as in the case.
 
     The controller predicts over the delay unless the processor's `predict` is False, as in a map over delays.
 

@@ -14,8 +14,8 @@ from jax import Array
 
 from ambjax.world.scenario import DESIGN_STREAM, Scenario
 
-# Bits of a coordinate. Points are centres of cells of that size, so they are never 0 or 1. SciPy's Sobol generator
-# cannot fast-forward with more than 32 bits.
+# Bits of a coordinate. Random and Sobol points are centres of cells of that size, so they are never 0 or 1; those
+# of a Latin hypercube are clipped. SciPy's Sobol generator cannot fast-forward with more than 32 bits.
 BITS = 52
 SOBOL_BITS = 32
 # Random numbers are generated in blocks of this size, so that the generator is compiled once.
@@ -24,7 +24,7 @@ BLOCK = 2**14
 MOST_LATIN = 30_000_000
 # A member's number is a signed 32-bit integer when JAX computes in float32.
 MOST_MEMBERS = 2**31
-# Added to the seed, so that a design shares no random numbers with another NumPy generator of the same seed.
+# Combined with the seed, so that a design shares no random numbers with another NumPy generator of the same seed.
 DOMAIN = 0x616D626A
 
 

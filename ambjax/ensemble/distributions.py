@@ -43,7 +43,7 @@ def cut_normal(u: np.ndarray) -> np.ndarray:
 
 @record
 class Normal:
-    """Normal distribution: nominal + std z, z standard normal."""
+    """Normal distribution: nominal + std x, with x standard normal and truncated at +-6."""
 
     std: float = part(doc="standard deviation, in the unit of the number")
     relative = True
@@ -67,7 +67,7 @@ class Normal:
 
 @record
 class Percent:
-    """Relative distribution: nominal + |nominal| percent/100 x, with x uniform in -1..1 or standard normal."""
+    """Relative distribution: nominal + |nominal| percent/100 x, with x uniform in -1..1, or normal as in `Normal`."""
 
     percent: float = part(doc="half width, or standard deviation, in per cent of nominal")
     shape: str = static(default="uniform")

@@ -1,14 +1,14 @@
 """Estimates from an ensemble, with confidence intervals.
 
 - Probability: Wilson's interval (J. Am. Stat. Assoc. 22, 1927).
-- Quantile: the interval between two order statistics, whose ranks follow from the binomial distribution. It is exact
-  for every distribution of the values. An end is infinite if the ensemble is too small (David and Nagaraja, Order
-  Statistics, section 7.1).
+- Quantile: the interval between two order statistics, whose ranks follow from the binomial distribution. Its
+  coverage is at least the confidence for every distribution of the values. An end is infinite if the ensemble is too
+  small (David and Nagaraja, Order Statistics, section 7.1).
 - Mean, standard deviation, CVaR: the studentised bootstrap (Efron and Tibshirani, An Introduction to the Bootstrap,
   section 12.5), which divides the deviation of each resample by the standard error of that resample. The simpler
   percentile intervals omit this division, and end too low if the values have a heavy upper tail.
 
-The cost of the bootstrap grows only with log N. The sorted values are divided into groups. The width of a group is
+The cost of a resample grows only with log N. The sorted values are divided into groups. The width of a group is
 about 1/512 of its rank, counted from the nearer end: each value is a group of its own up to N = 2,048, and there are
 about 1,024 (2 + log(N/2,048)) groups for larger N. The numbers of values of a resample in the groups are multinomial.
 The same draw is used for all columns, and sums over a resample are matrix products.
@@ -30,7 +30,7 @@ WIDTH = 512
 TAIL = 10
 # Largest number of counts in one array: 16 MB.
 MOST_COUNTS = 2_000_000
-# Variance, relative to the square of the largest deviation, below which all values are treated as equal.
+# Variance in the tail, relative to the square of the largest deviation, below which the standard error of a CVaR is 0.
 ROUNDING = 1e-13
 
 
@@ -100,7 +100,7 @@ def bootstrap(
 
     The upper end of a CVaR is never a finite number above the largest value of the column. With TAIL or more values in
     the tail, the end is at most the largest value; slow tests check the coverage. With fewer values the true CVaR
-    exceeds the largest value too often (for 37 % of samples of 50 normal values), and such an end is infinite.
+    exceeds the largest value too often (for 37 % of samples of 50 normal values). An end above that value is then inf.
 
     Raises ValueError for a column that is empty or not finite, and unless 0 <= alpha < 1.
     """
@@ -149,8 +149,8 @@ def _moments(counts: np.ndarray, G: np.ndarray, n: int, tail: float) -> dict[str
     """Return mean, log of the standard deviation, and CVaR, each with its standard error: [replicates, columns].
 
     `G` [4, groups, columns] holds the mean of the powers 1 to 4 in each group. Standard errors come from influence
-    functions: (x - q)/(1 - alpha) for the CVaR, of values x above the threshold q; that of the second moment for the
-    standard deviation.
+    functions: (x - q)/(1 - alpha) for the CVaR, of values x above the threshold q; for the
+    standard deviation, that of the second moment.
     """
     mean, r2, r3, r4 = (counts @ power / n for power in G)
     m2 = np.maximum(r2 - mean**2, 0)

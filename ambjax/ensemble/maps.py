@@ -38,10 +38,10 @@ class Map(NamedTuple):
     - `survival`, `low`, `high`: share of survivors, and the ends of its 95 % interval.
     - `error`: median over the survivors of the largest settled |z - r|, m; NaN in cells without a survivor.
     - `lost`: number of members whose rotor is lost.
-    - `stalled`: number of members whose integration stopped early, so that their status is not known.
+    - `stalled`: number of members whose integration stopped early; `survival` counts them as not surviving.
     - `members`: number of members in each cell.
     - `varied`: whether the members of a cell differ, by noise or by the case's spread.
-    - `drawn`: dotted paths of the spread quantities.
+    - `drawn`: dotted paths of the spread quantities that are not axes; empty for one member.
     """
 
     x: Axis
@@ -67,7 +67,7 @@ class Map(NamedTuple):
         return int(np.argmin(np.abs(self.y.values - (self.y.values[0] + self.y.values[-1]) / 2)))
 
     def reach(self) -> tuple[float, float] | None:
-        """Return the ends of the longest interval of x in which all members survive, on the middle row, or None."""
+        """Return the ends of the longest run of x values at which all members survive, on the middle row, or None."""
         held = np.concatenate([[False], self.survival[self.middle] == 1, [False]])
         begin, end = np.flatnonzero(held[1:] & ~held[:-1]), np.flatnonzero(held[:-1] & ~held[1:]) - 1
         if not begin.size:
@@ -79,12 +79,13 @@ class Map(NamedTuple):
 def grid(study: Study, x: Axis, y: Axis) -> Map:
     """Compute a map with `study.members` members in every cell.
 
-    All cells run in one ensemble, and member k has the same noise in each cell. An axis may be any number of the case,
-    or clock.sample_period. The sample periods run one after the other, each for the duration of the case. With one
-    member the case is nominal: no spread, and the noise of member 0. With more members, the case's spread applies to
-    all quantities that are not axes.
+    An axis may be any number of the case, or clock.sample_period. All cells with the same sample period run in one
+    ensemble. Sample periods run one after the other, each for the duration of the case. Member k has the same noise in
+    each cell. With one member the case is nominal: no spread, and the noise of member 0. With more members, the case's
+    spread applies to all quantities that are not axes.
 
-    Raises ValueError for a path that does not exist, and for values of an axis that the case does not allow.
+    Raises ValueError for a path that does not exist, for two equal paths, and for values of an axis that the case does
+    not allow.
     """
     if x.path == PERIOD:
         transpose = grid(study, y, x)
@@ -113,10 +114,10 @@ def grid(study: Study, x: Axis, y: Axis) -> Map:
 
 
 def with_method_for_axes(study: Study, x: Axis, y: Axis) -> Study:
-    """Return the study with an integration method that holds for all values of the axes.
+    """Return the study with an integration method that is valid for all values of the axes.
 
-    Applies to a cascade on a processor whose method is the automatic choice for the spread; any other study is returned
-    unchanged. Raises ValueError as `grid` does.
+    The method is replaced only if the case has a processor and the method is the automatic choice for the spread.
+    Raises ValueError as `grid` does.
     """
     _check(study, x, y)
     cascade, scenario, clock = study.cascade, study.scenario, study.clock
@@ -137,7 +138,7 @@ def _entries(study: Study, axes: tuple[str, ...]) -> tuple[tuple[str, Distributi
 
 
 def _check(study: Study, x: Axis, y: Axis) -> None:
-    """Raise ValueError for axes whose path is not in the case, or whose values the case does not allow."""
+    """Raise ValueError for an axis whose path or values the case does not allow, and for two equal paths."""
     known = [*places(study.cascade, study.scenario), PERIOD]
     for name, axis in (("x", x), ("y", y)):
         if axis.path not in known:

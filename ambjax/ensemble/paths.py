@@ -31,7 +31,7 @@ class Place(NamedTuple):
 
 
 def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
-    """Return every number of the cascade and the scenario, by dotted path.
+    """Return every number of the cascade and the scenario but the seed and the member, by dotted path.
 
     The paths plant.* refer to the true plant, and controller.model.* to the nominal one. A disturbance of z is
     disturbance.q_z.* if all disturbances of z have the same unit. Otherwise those in m/s^2 are disturbance.q_z.*,
@@ -103,7 +103,7 @@ def kinds(node: object, path: str = "") -> Iterator[tuple[str, str]]:
         yield f"{path}source", digest
     for field in dataclasses.fields(node):
         value, at = getattr(node, field.name), f"{path}{field.name}"
-        if field.metadata.get("static"):  # samples appear as their digest, other objects as their name or type
+        if field.metadata.get("static"):  # recorded signals appear as their digest, other objects as their name or type
             named = isinstance(value, (str, int, float, bool, tuple, type(None)))
             other = getattr(value, "digest", None) or getattr(value, "__qualname__", type(value).__name__)
             yield at, str(value) if named else other

@@ -1,9 +1,9 @@
 """Replay of one member of an ensemble, with the same rounding as in the ensemble.
 
-XLA compiles a rollout of one member into scalar code, and a block of members into vector code. The two contract
+XLA compiles a rollout of one member into scalar code, and a block of members into vector code. These codes contract
 products and sums into fused operations at different places, so their results differ in the last bit. In a loop with a
-converter, or with a set-valued sign, that difference grows until the two runs are unrelated. A member that is simulated
-alone therefore runs in a block of the same size as in an ensemble, and fills every lane of the block.
+converter, or with a set-valued sign, that difference grows until the two runs are unrelated. Here a single member is
+therefore simulated in a block of the same size as in an ensemble, and copies of it fill the other lanes of the block.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ class Replay(NamedTuple):
     """One member of a study: its trajectory and its metrics.
 
     - `trajectory`: the member's trajectory, with every sample recorded.
-    - `metrics`: the member's metrics by name, bit for bit equal to its row in the study.
+    - `metrics`: the member's metrics by name. On a CPU they equal its row in the study, bit for bit.
     - `deviation`: largest relative difference between `metrics` and the metrics of `trajectory`.
     - `rounding`: bound on `deviation` if the trajectory is that of the study.
     """
@@ -106,7 +106,7 @@ def replay(study: Study, index: int, tell: Callable[[int], object] = lambda _: N
 
 
 def _relative(a: SupportsFloat, b: SupportsFloat) -> float:
-    """Return |a - b|/max(|a|, |b|); 1 if only one of the two is finite."""
+    """Return |a - b|/max(|a|, |b|); 0 if a = b, and 1 if they differ and are not both finite (two NaN differ)."""
     a, b = float(a), float(b)
     if a == b:
         return 0.0

@@ -46,7 +46,7 @@ class Store:
         """Check that the directory is unused, or holds a part of this study. The directory is not changed.
 
         Raises ValueError if the directory holds another study, if it holds a study and `resume` is False, if it holds
-        none and `resume` is True, or if the disk has no room for `columns` numbers per member.
+        none and `resume` is True, or if the disk has no room for twice `columns` numbers per member.
         """
         if self.begun() and not resume:
             raise ValueError(
@@ -63,9 +63,10 @@ class Store:
             self._check_room(columns)
 
     def begin(self) -> None:
-        """Write the manifest, so that a run that is killed from now on can be resumed.
+        """Create the directory and write the manifest, so that a run that is killed from now on can be resumed.
 
-        Call `check` first. Raises ValueError if the directory cannot be written.
+        Remove unfinished files of earlier runs. Call `check` first. Raises ValueError if the directory cannot be
+        written.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         self._write_manifest()
@@ -126,8 +127,8 @@ class Store:
     def finish(self) -> pathlib.Path:
         """Merge all chunks into members.npz, column by column, read it back, and then remove the chunks.
 
-        Returns the path of members.npz. Raises ValueError, and keeps the chunks, if a chunk is damaged or if the data
-        read back differ from the data written.
+        Returns the path of members.npz. Raises ValueError, and keeps the chunks, if a chunk is damaged, if the file
+        cannot be written, or if the data read back differ from the data written.
         """
         if not self.finished():
             try:

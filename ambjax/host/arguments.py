@@ -16,7 +16,8 @@ def names_arguments(**others: str) -> Callable[[Callable[P, R]], Callable[P, R]]
     """Return a decorator for the function of a command: its ValueErrors name arguments instead of options.
 
     `--settings-of X: ...` becomes `settings_of = X: ...`, and `--resume`, whose argument has the default False, becomes
-    `resume=True`. An option without an argument stays. `others`: names of the arguments that differ from the option's.
+    `resume=True`. An option that is no argument of the function stays. `others`: names of arguments
+    by name of their option, where the two differ.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:

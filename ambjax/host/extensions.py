@@ -8,7 +8,9 @@ GROUP = "ambjax.commands"
 
 
 def extension(name: str) -> Callable[[list[str], str], int]:
-    """Return the command declared under `name`: a function of its arguments and of the program's name.
+    """Return the command declared under `name`.
+
+    The command maps its words and the program's name to an exit code.
 
     Raises ValueError if no installed package declares it.
     """

@@ -1,7 +1,7 @@
 """Import of a custom class, from a file or from an installed module, so that its instances can be pickled.
 
-A file is no module that other processes find by name. An instance of its class is pickled with the text of the file, so
-that a worker process, or a machine of a cluster without that file, executes the same text.
+Other processes cannot import such a file by name. An instance of a class of the file is therefore pickled with the text
+of the file. A worker process, or a machine of a cluster without that file, then executes the same text.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ def module_of_name(name: str) -> types.ModuleType:
 
 
 def digest_of(kind: type) -> str:
-    """Return the SHA-256 of the source of a class that was imported here; '' for any other class."""
+    """Return the SHA-256 of the source of the module of a class, if it was imported here; otherwise ''."""
     return _DIGESTS.get(kind.__module__, "")
 
 
@@ -82,7 +82,7 @@ def _reduced(instance: Any) -> tuple[Any, ...]:
 
 
 def _blank(path: str, text: bytes, name: str) -> Any:
-    """Return an instance without attributes of a class of this text. Unpickling then sets the attributes."""
+    """Return an instance of the class `name` of this text. It has no attributes; unpickling sets them."""
     kind = getattr(_executed(path, text), name)
     pickle_with_source(kind)
     return object.__new__(kind)

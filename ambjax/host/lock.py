@@ -1,4 +1,4 @@
-"""A lock on a directory: one process at a time, which the system releases when the process ends."""
+"""A lock on a directory, for one process at a time. The system releases it when the process ends."""
 
 import contextlib
 import errno

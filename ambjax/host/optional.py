@@ -5,7 +5,7 @@ from typing import Any
 
 
 def extra(name: str, group: str = "tables") -> Any:
-    """Import an optional package by its dotted name. Raises ValueError, with the extra `group`, if it is missing."""
+    """Import an optional package by its dotted name. Raises ValueError, naming the extra `group`, if it is missing."""
     try:
         return importlib.import_module(name)
     except ImportError:

@@ -37,7 +37,7 @@ class Lenient:
 
 
 def open_streams() -> None:
-    """Open the null device for each standard stream that the caller has closed.
+    """Open the null device for each standard stream that was closed when the process started.
 
     Streams are opened in the order of their file numbers, so that no later file takes the number of a standard stream.
     Characters that the encoding of stdout or stderr lacks are written as escapes.

@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Iterable
 
 # Other words for the names of the case file, in lower case, without '_' and '-'. A key with a dot is the full path of a
-# name. It is suggested where that name is not allowed, if no allowed name has the same other word.
+# name. `meant` returns this path if no allowed name has the other word.
 OTHER_WORDS = {
     "plant": "rotor machine magnet magnets bearing system motor",
     "controller": "control gains regulator",
@@ -126,7 +126,7 @@ def hint(word: str, allowed: Iterable[str]) -> str:
 
 
 def hint_of_path(path: str, known: Iterable[str]) -> str:
-    """Return the hint for a dotted path: the same table and another word for its last name, or a similar spelling."""
+    """Return the hint for a path: a name of its table for which its last name is another word, or a similar path."""
     known = list(known)
     table, _, name = path.rpartition(".")
     inside = [one.rpartition(".")[2] for one in known if one.rpartition(".")[0] == table]

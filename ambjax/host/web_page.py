@@ -10,8 +10,8 @@ from markdown_it.renderer import RendererHTML
 from markdown_it.token import Token
 from markdown_it.utils import EnvType, OptionsDict
 
-# Elements that are wider than a narrow screen scroll in a box, so that pictures stay legible. The first column of a
-# table, its labels, is narrow and stays in view.
+# An element that is wider than the screen scrolls in a box, so that pictures stay legible. On a narrow screen the first
+# column of a table, which holds its labels, is narrow and stays in view.
 STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:72rem;margin:2rem auto;padding:0 1rem;color:#222}
 body{overflow-wrap:anywhere}p,li{max-width:60rem}.wide{display:block;overflow-x:auto;margin:.6rem 0}
 table{border-collapse:collapse;overflow-wrap:normal}td,th{border:1px solid #ccc;padding:.2rem .6rem;text-align:left}

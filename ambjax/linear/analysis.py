@@ -103,7 +103,7 @@ class Zones:
 def _stiffness(system: StateSpace, m: float, f: float) -> float:
     """Return the static stiffness, N/m. `f`: a small frequency (Hz) at which the static response is computed.
 
-    It is infinite if the response to a force vanishes at frequency 0, as with integral action.
+    The stiffness is infinite if the response to a force vanishes at frequency 0, as with integral action.
     """
     static, above = np.abs(system.response(np.array([f, 10 * f]))[:, 3, 2])
     return m / float(static) if static > 0.5 * above else np.inf
@@ -146,11 +146,11 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
     not contain noise, disturbances, converters, faults, the guard, the limits of supply and amplifier, or the dead
     band. On a processor it is the exact map of one sample period.
 
-    Returns the state space with NumPy arrays. Raises ValueError as `rollout` does, and if there is no equilibrium at r.
+    Returns the state space with NumPy arrays. Raises ValueError as `rollout` does, and if no equilibrium is found at r.
     """
     system, found = _matrices(*canonical((*linearisation_inputs(cascade, scenario, clock), r)))
     if not found:
-        raise ValueError(f"no equilibrium at r = {float(r):g} m: the laws cannot hold the rotor there.")
+        raise ValueError(f"no equilibrium at r = {float(r):g} m was found: the laws probably cannot hold the rotor.")
     return StateSpace(*(None if x is None else np.asarray(x) for x in system))  # pyright: ignore[reportArgumentType]
 
 
@@ -159,8 +159,8 @@ def linearise_members(
 ) -> tuple[StateSpace, np.ndarray]:
     """Linearise the loop of every member of an ensemble, whose varying leaves are arrays [N], at the reference r (m).
 
-    Returns the matrices, each with a leading axis [N], and whether each member has an equilibrium [N]. Raises
-    ValueError as `rollout` does.
+    Returns the matrices, each with a leading axis [N], and whether an equilibrium was found for each
+    member [N]; if not, the matrices of the member have no meaning. Raises ValueError as `rollout` does.
     """
     # one call at a time: XLA runs LAPACK on its own threads, and two calls may deadlock
     return map_members(_member, canonical((*linearisation_inputs(cascade, scenario, clock), r)), threads=1, plain=True)
@@ -188,7 +188,7 @@ def analyse(
     """Analyse a linearised loop.
 
     - `m`: mass of the rotor, kg.
-    - `period`: time for which a value of the noise is held, s.
+    - `period`: time for which a value of the noise is held in continuous time, s; not used on a processor.
     - `zones`: frequency range and zones; None: the defaults.
     - `velocity`: whether the velocity has its own sensor.
 

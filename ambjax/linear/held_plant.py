@@ -21,7 +21,7 @@ class HeldPlant(NamedTuple):
     """Linear map of one sample, x_{n+1} = transition x_n + now u_n + before u_{n-1} + first u_{n-2} + disturbed q_z.
 
     x [N] is the state of the plant, of the sensor's low-pass (m) and of the amplifier (V), `transition` is [N, N], and
-    the others are [N]. q_z (m/s^2) is constant during the sample.
+    the others are [N]. x and u are deviations from the equilibrium. q_z (m/s^2) is constant during the sample.
     """
 
     transition: Array
@@ -99,7 +99,7 @@ def _at(lag: Array, number: int) -> Array:
 
 
 def _integrated(A: Array, B: Array, h: Scalar) -> tuple[Array, Array]:
-    """Return exp(A h), and the integral of exp(A s) B over s from 0 to h (s)."""
+    """Return exp(A h), and the integral of exp(A t) B over t from 0 to h (s)."""
     n, inputs = B.shape
     table: Any = jnp.zeros((n + inputs, n + inputs), A.dtype).at[:n].set(jnp.concatenate([A, B], 1) * h)
     whole = expm(table)

@@ -29,13 +29,13 @@ class Injection(NamedTuple):
     """Measured sensitivity of a loop. The frequencies of the multi-sine are called lines.
 
     - `frequency` [L]: lines, Hz.
-    - `S`, `T`, `KS` [L]: complex means over the members that hold the rotor; None if no member holds it. S = reading/e
-      (1), T = S - 1 (1), KS = u/e (V/m, or V s/m at the velocity sensor).
+    - `S`, `T`, `KS` [L]: complex means over the members that hold the rotor; None if no member holds it. T = reading/e
+      (1), S = 1 + T (1), KS = u/e (V/m, or V s/m at the velocity sensor).
     - `peak`: largest |S| over the lines; None without S.
     - `peak_low`, `peak_high`: confidence interval of |S| at the line of the peak, from the members. Equal to `peak` if
-      the scenario is not random; None with one member.
+      the scenario is not random; otherwise None if fewer than two members hold the rotor. None without S.
     - `peak_frequency`: line of the peak, Hz; None without S.
-    - `lost`, `members`: number of members that lost the rotor, and of all members.
+    - `lost`, `members`: number of members that lost the rotor or stalled, and of all members.
     - `amplitude`: largest |e|, m, or m/s at the velocity sensor.
     - `saturated`: share of the samples with |u| at the limit of the supply; None without S.
     """
@@ -96,7 +96,7 @@ def injected(
     - `confidence`: level of the confidence interval of the peak.
 
     In continuous time e(t) is a continuous function of time. It is added to one reading only: an e at the position
-    sensor does not change the velocity reading. The Fourier sums use its values at the samples.
+    sensor does not change the velocity reading. The Fourier sums use the values of the signals at the samples.
 
     Returns an `Injection`. Raises ValueError as `rollout` does, for a frequency that the period or the samples cannot
     resolve, and for `reading` = "z_dot" if the observer does not use the velocity reading.
@@ -114,7 +114,10 @@ def injected(
 
 
 class MemberPeaks(NamedTuple):
-    """Measured peaks of |S| of the members of an ensemble [N]: `peak` (inf if lost), `frequency` (Hz), `lost`."""
+    """Measured peaks of |S| of the members of an ensemble [N]: `peak` (inf if lost), `frequency` (Hz), `lost`.
+
+    A stalled member counts as lost. The frequency of a lost member has no meaning.
+    """
 
     peak: np.ndarray
     frequency: np.ndarray

@@ -24,7 +24,8 @@ from ambjax.world.signals import Constant
 AMPLITUDE = 0.01
 # The compiled program has a multiple of PADDED lines, so that measurements with a few lines more or less share it.
 PADDED = 16
-# Largest number of members that run in calls of SHORTEST members. These calls share one program and use all cores.
+# An ensemble of at most this many members runs in calls of SHORTEST members. These calls share one program and use all
+# cores.
 FEW = 4 * SHORTEST
 
 
@@ -32,7 +33,7 @@ class Responses(NamedTuple):
     """Measured responses of the members of an ensemble [N] at L lines.
 
     - `frequency` [L]: lines, Hz.
-    - `S`, `KS` [N, L]: complex; meaningless for members that lost the rotor.
+    - `S`, `KS` [N, L]: complex; meaningless for members that do not hold the rotor.
     - `saturated` [N]: share of the samples with |u| at the limit of the supply.
     - `held` [N]: whether the rotor was held.
     - `amplitude`: largest |e|, m or m/s.
@@ -114,7 +115,8 @@ def _at_rest(cascade: Cascade, scenario: Scenario, r: float) -> tuple[Cascade, S
     initial = Initial(r, 0.0, float(i) if np.ndim(i) == 0 else i)
     scenario = dataclasses.replace(scenario.undisturbed(), reference=Constant(r), initial=initial)
     inversion = cascade.inversion.started(cascade.model.equilibrium(r)[0])
-    # The observer does not start at the first measurement: a slow observer would keep its noise as an initial error.
+    # The observer does not start at the first measurement: a slow observer would keep the noise of this measurement as
+    # an initial error.
     rest = initial.measurement()
     z = reading(ideal(scenario), rest, (0.0, 0.0)).z
     return dataclasses.replace(cascade, inversion=inversion, observer=cascade.observer.started(z)), scenario
@@ -126,7 +128,7 @@ def _harmonics(frequencies: Sequence[float] | np.ndarray, clock: Clock) -> np.nd
     harmonics = np.unique(np.round(f / base))
     if not harmonics.size or not np.isfinite(f).all() or harmonics[0] < 1 or harmonics[-1] >= clock.samples / 2:
         raise ValueError(
-            f"injection.frequencies: they must be at least {base:g} Hz, one period of {clock.samples} samples, "
+            f"injection.frequencies: they must be at least {base:g} Hz, the inverse of {clock.samples} samples, "
             f"and below {0.5 / float(clock.sample_period):g} Hz, half the sampling rate. Change them or clock.samples."
         )
     if harmonics[-1] * clock.samples > np.iinfo(jnp.result_type(int)).max:

@@ -86,8 +86,8 @@ def _added(measured: Measurement, reading: Reading, e: Array) -> Measurement:
 class InjectedLoop(Realised):
     """The closed loop of one member in continuous time, with e(t) added to a reading.
 
-    `z_measured` of its rows is that reading. The integrator `Slide` does not apply, because it evaluates the laws
-    without e.
+    `z_measured` of its rows is the sum of that reading and e, also at the velocity sensor. The integrator `Slide` does
+    not apply, because it evaluates the laws without e.
     """
 
     wave: MultiSine
@@ -109,7 +109,7 @@ class InjectedLoop(Realised):
 class InjectedSampled(Sampled):
     """The closed loop on a processor, with e_n added to a reading after the converter and the faults.
 
-    `z_measured` of its rows is that reading.
+    `z_measured` of its rows is the sum of that reading and e_n, also at the velocity sensor.
     """
 
     wave: MultiSine
@@ -161,8 +161,8 @@ class Response:
     - `u_max`: limit of the supply, V.
     - `skip`: number of the first sample that counts. The samples from there on are whole periods of the wave.
 
-    The result is a `FourierSums` with the coefficients instead of the sums, and with `saturated` as a share of the
-    samples.
+    The result is a `FourierSums` with the coefficients instead of the sums, with `sample` as the number of samples that
+    count, and with `saturated` as their share.
     """
 
     wave: MultiSine

@@ -13,10 +13,10 @@ NYQUIST_SHARE = 0.98
 
 
 class Biquad(NamedTuple):
-    """d + (c_1 s + c_0)/(s^2 + a_1 s + a_0), coefficients in powers of 1/s; a filter that is off has c = 0 exactly.
+    """d + (c_1 s + c_0)/(s^2 + a_1 s + a_0). A filter without effect has d = 1 and c_1 = c_0 = 0 exactly.
 
-    `centre`: angular frequency (1/s) at which the sampled filter has exactly this response; None: 0. It is limited to
-    NYQUIST_SHARE of the Nyquist frequency.
+    Units: 1/s for c_1 and a_1, 1/s^2 for c_0 and a_0. `centre`: angular frequency (1/s) at which the sampled filter has
+    exactly this response; None: 0. It is limited to NYQUIST_SHARE of the Nyquist frequency.
     """
 
     d: Scalar

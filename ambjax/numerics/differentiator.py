@@ -1,8 +1,8 @@
 """The robust exact differentiator of order m = 1 or 2.
 
 If |f^(m+1)| <= L, its estimate of f' is exact after a finite time (A. Levant, Int. J. Control 76 (2003) 924-941):
-x_k' = x_{k+1} + lam_k L^((k+1)/(m+1)) |e|^((m-k)/(m+1)) sgn e, e = f - x_0, k = 0 .. m. On a processor it is
-discretised by backward Euler, so that the outputs have neither chatter nor bias (R. Seeber, Proper implicit
+x_k' = x_{k+1} + lam_k L^((k+1)/(m+1)) |e|^((m-k)/(m+1)) sgn e, e = f - x_0, k = 0 .. m, x_{m+1} = 0. On a processor it
+is discretised by backward Euler, so that the outputs have neither chatter nor bias (R. Seeber, Proper implicit
 discretization of arbitrary-order robust exact differentiators, arXiv 2404.02770).
 """
 
@@ -22,7 +22,7 @@ NEWTON = 5
 def smooth_rates(x: tuple[Array, ...], f: Array, L: Scalar, width: Scalar) -> tuple[Array, ...]:
     """Return x' in continuous time, with the powers of |e| smoothed over `width`.
 
-    For |e| below `width` (in the unit of f) it is a linear observer of rate (L/width)^(1/(m+1)).
+    For |e| far below `width` (in the unit of f), x' is that of a linear observer of rate (L/width)^(1/(m+1)).
     """
     m, e = len(x) - 1, f - x[0]
     fast, near = (L / width) ** (1 / (m + 1)), e * e + width * width
@@ -35,7 +35,7 @@ def smooth_rates(x: tuple[Array, ...], f: Array, L: Scalar, width: Scalar) -> tu
 
 
 def slope(m: int, L: Scalar, width: Scalar) -> Scalar:
-    """Return the largest slope of `smooth_rates` of order m, 1/s."""
+    """Return the largest slope of x_0' of `smooth_rates` with respect to e, for order m, 1/s."""
     return LAM[m][0] * (L / width) ** (1 / (m + 1))
 
 

@@ -36,8 +36,9 @@ def editable_lines(text: str, given: Sequence[Slider]) -> tuple[list[TemplateLin
     - `text`: the case file.
     - `given`: the sliders, with the values of this case.
 
-    For a number that the file does not contain, a line is added that is present only if its slider has moved. If a
-    number of the plant changes, a further line in [controller.model] keeps the old value for the controller.
+    For a number that the file does not contain, a line is added that is present only if its slider has moved. For a
+    number of the plant that [controller.model] does not give, a further line, present under the same condition, keeps
+    the old value there for the controller.
     """
     document, written = tomlkit.parse(text), {}
     added: dict[str, dict[str, int]] = {}

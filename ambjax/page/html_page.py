@@ -64,7 +64,7 @@ def page(case: Case, others: Sequence[Case] = (), path: str = "case.toml") -> st
 def pages(cases: Sequence[Case], paths: Sequence[str]) -> dict[str, str]:
     """Return the pages of several cases by file name: page.html, page-2.html, ...
 
-    Cases can share a page if they differ only in their numbers. `paths`: names of the case files. Raises ValueError as
+    Cases that differ only in their numbers share a page. `paths`: names of the case files. Raises ValueError as
     `page` does.
     """
     groups: list[list[int]] = []
@@ -158,7 +158,7 @@ def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str,
 def _written(case: Case, others: list[Case]) -> tuple[list[Slider], list[list[TemplateLine]]]:
     """Return the sliders that have a place in all case files, and the template of each file.
 
-    If a file becomes invalid by added lines, only numbers that it already contains have sliders. If it is still
+    If added lines make a file invalid, only numbers that the file of `case` contains have sliders. If a file is still
     invalid, there are no sliders.
     """
     cases, given = (case, *others), sliders(case, others)
@@ -205,7 +205,7 @@ def _alike(case: Case, other: Case) -> bool:
 
 
 def _finest(case: Case, others: list[Case]) -> Case:
-    """Return the case with the integrator that has the smallest step among all cases."""
+    """Return `case` with the integrator of the smallest step among all cases."""
     period = float(case.clock.sample_period)
     steps = [one.clock for one in (case, *others) if one.clock.integrator.step_size(period) is not None]
     clock = min(steps, key=lambda clock: clock.integrator.step_size(period) or 0.0, default=case.clock)
@@ -213,8 +213,9 @@ def _finest(case: Case, others: list[Case]) -> Case:
 
 
 def _members(case: Case) -> dict[str, Any]:
-    """Return the members of the ensemble for JSON: their number, and a row for each parameter that varies.
+    """Return the members of the ensemble for JSON: their number, and rows for the parameters that vary.
 
+    Each spread number has one row for each parameter that it changes.
     A row is the index of the parameter, whether its values are factors of the page's value, and its values [members].
     """
     study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, MEMBERS)

@@ -22,7 +22,7 @@ from ambjax.world.scenario import Scenario
 
 
 class LagState(NamedTuple):
-    """State of the plant, of the sensor's low-pass (m, or ()) and of the amplifier (V, or ())."""
+    """State of the plant, of the sensor's low-pass (m) and of the amplifier (V); () for a missing lag."""
 
     plant: Any
     z_filtered: Array | tuple[()]

@@ -74,7 +74,7 @@ class LoopFunctions:
     def step(
         self, numbers: Numbers, progress: RolloutState, normals: Any, k: Array
     ) -> tuple[RolloutState, Row, tuple[Array, Array]]:
-        """Return the state after sample k, its row, and the currents of both coils at its start, A."""
+        """Return the state after sample k, the row of this sample, and the currents of both coils at its start, A."""
         system, clock, fold = self._system(numbers, normals)
         after, row = one_sample(system, clock, fold, progress, k)
         return after, row, numbers.scenario.plant.currents(progress.state.plant)

@@ -23,6 +23,8 @@ class LoopScript(NamedTuple):
     """The loop as JavaScript.
 
     - `source`: the functions `startLoop(P, W, out)`, `makeLoop(P)`, `makeMember(P)` and `loopMetrics(P, S, out)`.
+      W: normal random numbers. `out`: array of the result. See `functions.loop_source` for the functions that
+      `makeLoop` and `makeMember` return. That of a member does not update the metrics in S.
     - `parameters`: the case's values of the parameters P.
     - `metrics`: names of the metrics, in the order of `out` of `loopMetrics`.
     - `states`: number of states S.
@@ -37,7 +39,8 @@ class LoopScript(NamedTuple):
 
 
 def loop_script(case: Case, any_delay: bool = False) -> LoopScript:
-    """Return the loop of a case as JavaScript. `any_delay`: for any delay, not only that of the case.
+    """Return the loop of a case on a processor as JavaScript. `any_delay`: for every delay up to MOST_DELAY, not
+    only that of the case.
 
     Raises ValueError for a part of the case that scalar code cannot express.
     """

@@ -12,10 +12,11 @@ from ambjax.cases.reader import Case
 from ambjax.ensemble.paths import SHIFT, Place, places, with_values
 from ambjax.page.loop_functions import loop_parameters
 
-# The slider of a gain ranges from the gain divided by FACTOR to the gain times FACTOR. The slider of a number of the
-# plant ranges from 1 - SHARE to 1 + SHARE times the number.
+# The slider of a gain, a number of [actuator], a bandwidth or a sensor's range goes from the number divided by FACTOR
+# to the number times FACTOR. The slider of a number of the plant, or of the sensor's gain, goes from 1 - SHARE to
+# 1 + SHARE times the number.
 FACTOR, SHARE = 30.0, 0.5
-# The slider of another number ends at this multiple of its value.
+# The slider of any other number without a rule in `_range` ends at this multiple of its value (of `_size` if it is 0).
 TIMES = 5.0
 SEED = "run.seed"
 # Unit of a signal's values, by the field of the scenario, for fields of signals that declare no unit.
@@ -44,7 +45,7 @@ class Slider(NamedTuple):
     - `log`: whether the slider is logarithmic.
     - `least`, `most`: smallest and largest allowed value; `open`: whether `least` itself is excluded.
     - `whole`: whether only whole numbers are allowed.
-    - `grid`: whether the number is a time at which a disturbance jumps, which the page rounds to a whole sample.
+    - `grid`: whether the number is a time at which a disturbance jumps. The page rounds such a time to a whole sample.
     """
 
     path: str
@@ -104,7 +105,7 @@ def _places(case: Case) -> dict[str, Place]:
 
 
 def parameters(case: Case, paths: list[str]) -> dict[str, int]:
-    """Return, by path, the index of the parameter that a number sets: the only one that changes with the number."""
+    """Return, by path, the index of the parameter that a number sets. Each number changes exactly one parameter."""
     own, found = parameter_values(case), {}
     for path in paths:
         (found[path],) = np.flatnonzero(parameter_values(changed(case, {path: np.array(math.pi)})) != own)

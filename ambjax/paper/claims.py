@@ -1,7 +1,8 @@
 """The claims of the paper's Section 4 and abstract, each with the function that evaluates it.
 
-The function of a claim takes the evidence of one reading and returns a number, a verdict and its cause. Every verdict
-is computed from the runs in `ambjax.paper.evidence`.
+The function of a claim takes the evidence of one reading, and returns a number, a verdict and the cause of the verdict.
+Verdicts are computed from the runs and checks in `ambjax.paper.evidence`; only that on the share of the noise in the
+gap is computed from printed numbers.
 """
 
 import dataclasses
@@ -20,9 +21,9 @@ GAP = float(Plant().s_0)
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
-    """A claim: its statement, its section in the paper, the paper's number, the criterion, and its judge.
+    """A claim: its statement, its section in the paper, the paper's number, the criterion, and the function `judge`.
 
-    `judge`: the function that computes the finding from the evidence of a reading.
+    `judge` computes the finding from the evidence of a reading.
     """
 
     says: str
@@ -120,7 +121,7 @@ def _radius(evidence: Evidence) -> Finding:
     rows = evidence.regulation.trajectory.rows
     quiet, pulse = largest_in(rows, "sigma", SETTLE, PULSE.start), largest_in(rows, "sigma", PULSE.start, PULSE.stop)
     worst = max(quiet, pulse)
-    cause = f"{quiet:.1e} m/s before the pulse, {pulse:.1e} in it; no noise, finite p: k 2/pi arctan(p sigma) = q_z"
+    cause = f"{quiet:.1e} m/s before the pulse, {pulse:.1e} in it; for no noise, finite p: k 2/pi arctan(p sigma) = q_z"
     ended = finding_if_lost(evidence.regulation, evidence)
     return ended or finding(f"{worst:.1e} m/s", worst, worst <= 1.05 * SIGMA_RADIUS, cause)
 
@@ -221,7 +222,7 @@ def _noise(evidence: Evidence) -> Finding:
 def _specification(evidence: Evidence) -> Finding:
     if not any(n.survived for n in evidence.noise):
         return Finding(
-            "always lost", None, OPEN, "the rotor is lost at every noise level, so the radii cannot be compared"
+            "never held", None, OPEN, "the rotor is not held at the smallest noise, so the radii cannot be compared"
         )
     if len(evidence.noise) == 1:
         words = f"period {evidence.noise[0].sample_period:g} s"

@@ -25,7 +25,8 @@ from ambjax.world.plant import Plant
 from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Sensor
 
-# The noise scan: standard deviations, from 10 nm to the paper's 0.316 mm; sample periods, s; samples and seeds of each.
+# The noise scan: standard deviations, from 10 nm to the paper's 0.316 mm, m; sample periods in continuous time, s;
+# samples of a run; seeds for each std and period. On a processor, the only sample period is that of the clock.
 NOISE_STDS = np.logspace(-8, -3.5, 10)
 NOISE_PERIODS = (1e-5, 1e-4, 1e-3)
 NOISE_SAMPLES = 3000
@@ -34,7 +35,8 @@ SEEDS = 2
 BASIN = np.logspace(-7, -3, 10)
 # The plant's parameters that are varied, one at a time.
 UNCERTAIN = ("m", "k_z", "R", "A")
-# Fixed steps of a reading under held noise. They cost half as much as adaptive steps and agree to 4e-9 m (tested).
+# Fixed steps for a reading under held noise. They cost half as much as adaptive steps; z differs by at most 4e-9 m
+# (tested).
 STEPS = {"tuned": Slide(16)}
 
 
@@ -93,9 +95,9 @@ class Noise(NamedTuple):
         return survival_of(NOISE_STDS, self.lost, self.stalled).undecided
 
     def std_for(self, radius: float) -> float | None:
-        """Return the std, m, at which sigma's neighbourhood has this radius, m/s; None if the scan does not reach it.
+        """Return the std, m, at which sigma's neighbourhood has this radius, m/s. None: not within the scan.
 
-        The std is interpolated linearly on logarithmic scales.
+        The std is interpolated linearly on logarithmic scales, between the stds up to which every member survives.
         """
         count = int(np.sum(self.survived >= NOISE_STDS))
         if count < 2 or not self.sigma[0] <= radius <= self.sigma[count - 1]:
@@ -105,7 +107,10 @@ class Noise(NamedTuple):
 
 
 class Uncertain(NamedTuple):
-    """Tracking with one parameter of the plant changed: lost cases, stalled cases, and the largest settled error, m."""
+    """Tracking with one parameter of the plant changed: lost cases, stalled cases, and the largest settled error, m.
+
+    The largest error includes that of lost cases, whose state is frozen.
+    """
 
     lost: list[str]
     stalled: list[str]
@@ -113,7 +118,7 @@ class Uncertain(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """All runs of one reading."""
+    """All runs and checks of one reading."""
 
     regulation: Run
     tracking: Run
@@ -133,7 +138,7 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
     """Run all simulations and checks of a reading and return the evidence. `say` receives the name of each stage."""
     cascade = paper.cascade(reading)
     runs, checks = {}, {}
-    with ThreadPoolExecutor() as pool:  # compiling and running release the interpreter
+    with ThreadPoolExecutor() as pool:  # compilation and compiled programs release the GIL
         say(f"{reading}: noise")
         periods = (float(paper.CLOCK.sample_period),) if cascade.processor else NOISE_PERIODS
         first = pool.submit(_noise, cascade, reading, periods[0])

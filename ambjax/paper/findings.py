@@ -1,4 +1,4 @@
-"""Findings: the result of one claim in one reading, and functions that several judges use."""
+"""Findings: the result of one claim in one reading, and functions that several claims use."""
 
 import dataclasses
 import math
@@ -10,7 +10,7 @@ from ambjax.paper.evidence import Evidence, Run
 from ambjax.simulation.trajectory import Row
 
 HOLDS, FAILS, OPEN = "holds", "does not hold", "not determined by the paper"
-# Verdict on a claim about stalled runs, of which it is not known whether the rotor survives.
+# Verdict if a run stalled, so that it is not known whether the rotor survives.
 UNDECIDED = "not decided"
 STALLED = "the integrator could not meet its tolerance, so whether the rotor survives is not known"
 
@@ -31,7 +31,10 @@ def finding(ours: str, value: float, condition: bool, cause: str) -> Finding:
 
 
 def finding_if_lost(run: Run, evidence: Evidence) -> Finding | None:
-    """Return the finding on a claim about a run that is lost or stalled; None if the run reached its end."""
+    """Return the finding on a claim about a run that is lost or stalled; None if the run reached its end.
+
+    The cause of a loss is Eq. (7), if it is violated in the tracking scenario; otherwise it is the status of the run.
+    """
     if math.isinf(run.metrics["lost_at_s"]):
         return None
     if run.metrics["stalled"]:

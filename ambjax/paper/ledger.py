@@ -59,7 +59,7 @@ def noise_table(evidence: dict[str, Evidence]) -> list[dict[str, object]]:
 def processor_table(evidence: dict[str, Evidence]) -> list[dict[str, object]]:
     """Return the status and metrics of each reading, tracking, on the processor of `sampled`, as plain data.
 
-    `lost_at_s` is inf if the rotor survives.
+    `lost_at_s` is the time of the loss or, if `stalled`, of the stall; inf if the rotor survives.
     """
     return [
         {
@@ -79,7 +79,7 @@ def sensitivity_table(readings: Iterable[str]) -> list[dict[str, object]]:
     """Return the linear sensitivity of each reading at rest at r = 0, as plain data.
 
     A row has the peak of |S| of the position sensor, its frequency (Hz) and its ISO 14839-3 zone; the same of the
-    velocity sensor, which all readings have; and the static stiffness, N/m. See `ambjax.linear.analyse`.
+    velocity sensor, as every reading measures the velocity; and the static stiffness, N/m. See `ambjax.linear.analyse`.
     """
     rows, zones = [], Zones()
     for name in readings:

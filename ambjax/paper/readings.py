@@ -2,16 +2,16 @@
 
 D. Papageorgiou and I. Santos, "Sliding Mode Control of Active Magnetic Bearings - A Cascaded Architecture".
 
-literal: Table 2 as printed, the disturbance an acceleration q_z = Q_z = 1 m/s^2 as in Eq. (1).
-repaired: gamma = 7.5e4 instead of 1000, so that Eq. (7) holds, and the disturbance a scaled magnetic
-force of 1 A^2/m^2, as the text words it, so q_z = a Q_z = 0.141 m/s^2.
+literal: Table 2 as printed; the disturbance is an acceleration q_z = Q_z = 1 m/s^2, as in Eq. (1).
+repaired: gamma = 7.5e4 instead of 1000, so that Eq. (7) holds. The disturbance is a scaled magnetic force of 1 A^2/m^2,
+as in the text of the paper, so q_z = a Q_z = 0.141 m/s^2.
 tuned: the disturbance of `repaired`, the paper's noise on z (held for 100 us), and a supply of 200 V. The observer and
 the gains are those that `ambjax tune benchmarks/tasks/C.toml` found; a search today may find others.
 sampled: as `tuned`, on a processor of 10 kHz whose voltage acts one sample late, with set-valued signs.
 `ambjax tune benchmarks/tasks/sampled/C10-robust.toml` found the gains, for plants off by up to 10 %.
 
 The paper does not give the times of the pulse, the initial state or the sample time of the noise. Here the pulse acts
-from 0.8 s to 1.3 s of 2 s, the initial state is zero, and the sample time is a parameter.
+from 0.8 s to 1.3 s of 2 s, the initial state is zero, and the sample time is that of the clock (CLOCK: 100 us).
 """
 
 import dataclasses
@@ -42,7 +42,7 @@ class Table2(NamedTuple):
 
     @property
     def noise_std(self) -> float:
-        """Standard deviation of the printed variance, m (the paper prints its unit as m; it is m^2)."""
+        """Standard deviation, m, from the printed variance. The paper prints the variance in m; its unit is m^2."""
         return self.noise_variance**0.5
 
 
@@ -60,7 +60,7 @@ SUPPLY = 200.0
 
 
 class Tuned(NamedTuple):
-    """Gains that `ambjax tune` found for benchmarks/tasks/C.toml, to four digits."""
+    """Gains that `ambjax tune` found, to four digits. The defaults are those for benchmarks/tasks/C.toml."""
 
     c: float = 1743.0
     k: float = 291.6
@@ -70,7 +70,7 @@ class Tuned(NamedTuple):
 
 
 TUNED = Tuned()
-# The same for benchmarks/tasks/sampled/C10-robust.toml; c and l end at their bounds.
+# The gains for benchmarks/tasks/sampled/C10-robust.toml; c and l are at bounds of the search.
 SAMPLED = Tuned(c=2000.0, k=3.918, gamma=1.552e6, k_i=1.325e4, l=0.05)
 PROCESSOR = Processor(delay=1.0)
 

@@ -23,7 +23,7 @@ class Contender(NamedTuple):
 
     - `held`: whether each member keeps its rotor [N].
     - `error`, `voltage`: settled rms error (m) and settled rms voltage (V) of each member [N].
-    - `system`: the linearised loop; None if it is not stable.
+    - `system`: the linearised loop; None: not stable, or no equilibrium. Then |S| and |KS| are not drawn.
     """
 
     name: str
@@ -46,7 +46,7 @@ def comparison_figure(cases: Sequence[Contender], limits: Sequence[float], span:
     """Return a picture: |S| with zones, |KS|, share of members below an rms error, rms error against rms voltage.
 
     `limits`: upper limits of the zones A, B and C. `span`: lowest and highest frequency, Hz. A member that is lost has
-    no error: the curve of a case that loses members ends below 1.
+    no error: the curve of a case that loses members ends below 1. At most 8 cases are drawn.
     """
     figure = Figure(figsize=(12, 8.5), layout="constrained")
     (S_axes, error_axes), (KS_axes, effort_axes) = figure.subplots(2, 2)

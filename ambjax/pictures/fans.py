@@ -25,7 +25,7 @@ QUANTITIES = {
     "variation of u": ("variation of $u$", "V/s"),
     "v_tilde": (r"force error $\tilde v$", "A²/m²"),
 }
-# Number of parts of the run over each of which a chattering median is averaged.
+# A chattering median is averaged over each of this many parts of the run.
 SMOOTHED = 50
 
 
@@ -83,7 +83,7 @@ def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float,
     if len(percents) % 2:
         middle, words = _median(t, factor * curves[pairs])
         ax.plot(*middle, color=INK, linewidth=1.0, label=words)
-    # near: the data come within a quarter of the limit
+    # near: the largest value is at least three quarters of the limit
     near = [value for value, peak in ((limit, high), (-limit, -low)) if limit <= 1.33 * peak]
     margin = 0.08 * (high - low) or 0.1 * abs(high) or 1.0
     low, high = min([low - margin, *(1.08 * value for value in near)]), max([high + margin, *(1.08 * v for v in near)])
@@ -117,7 +117,8 @@ def _tint(k: int, pairs: int) -> tuple[float, ...]:
 def _reach(curves: Sequence[np.ndarray]) -> tuple[float, float, float]:
     """Return the lowest and highest value to show, and the largest |value| if it lies far beyond them (else 0).
 
-    If brief or rare extremes exceed the inner bands by far, the range covers the inner bands for 90 % of the time.
+    The inner bands are all but the outermost. If extremes exceed them by far, the range covers the inner bands for at
+    least 90 % of the time.
     """
     values, inner = np.concatenate(curves), curves[1:-1] or curves
     lower, upper = inner[0][np.isfinite(inner[0])], inner[-1][np.isfinite(inner[-1])]

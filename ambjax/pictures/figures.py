@@ -109,9 +109,10 @@ def draw_panel(
     first: bool = False,
     stretch: tuple[float, float] | None = None,
 ) -> None:
-    """Draw a panel of the whole run, or of `stretch`: its begin and end, s.
+    """Draw a panel of the whole run, or of `stretch` (begin and end, s), up to the loss of the rotor.
 
-    If a stretch has more samples than pixels, the panel shows the mean of each pixel column over a band of extremes.
+    If a stretch has more than 4 PIXELS samples, the panel shows the mean of each column over a band of extremes.
+    `first`: write the cause of a loss into this panel, as into POSITION and FORCE of a whole run.
     """
     rows, lost_at = trajectory.rows, float(trajectory.lost_at)
     t = np.asarray(rows.t)
@@ -172,7 +173,7 @@ def _first_moments(ax: Axes, trajectory: Trajectory, until: float = 0.01) -> Non
 
 
 def _mark_loss(ax: Axes, trajectory: Trajectory, first: bool) -> None:
-    """Shade the time after the loss, and write its cause."""
+    """Shade the time after the loss or the stall. `first`: write the cause too."""
     lost_at, end = float(trajectory.lost_at), float(np.asarray(trajectory.rows.t)[-1])
     ax.axvspan(lost_at, max(end, ax.get_xlim()[1]), color=RED, alpha=0.12, linewidth=0)
     ax.axvline(lost_at, color=RED, linewidth=1.0)

@@ -65,7 +65,7 @@ def frequency_figure(
     """Return a picture: |S| with zones, |T|, |KS|, dynamic stiffness, Nyquist curve with the disk, Bode plot of L.
 
     `limits`: upper limits of the zones A, B and C. `span`: lowest and highest frequency, Hz. `measured`: points
-    measured on the nominal loop, which are drawn with the curves.
+    measured on the nominal loop, which are drawn with the curves. Only the first len(LINES) loops are drawn.
     """
     figure = Figure(figsize=(12, 11), layout="constrained")
     left = figure.add_gridspec(4, 2)
@@ -137,7 +137,7 @@ def shade_zones(ax: Axes, limits: Sequence[float]) -> None:
 
 
 def _nyquist(ax: Axes, loops: Sequence[NamedLoop]) -> None:
-    """Mark -1 and the disk that the Nyquist curve of the first loop must not enter."""
+    """Mark -1, and shade the disk of the disk margin of the first loop, which its Nyquist curve touches."""
     if loops:
         # the disk with the diameter from -(2 + d)/(2 - d) to its inverse
         d = min(loops[0].disk, 1.999)

@@ -30,7 +30,8 @@ class MapPanel(NamedTuple):
 
     - `x` [nx], `y` [ny]: values of the axes, ascending.
     - `survival` [ny, nx]: shares 0 to 1; NaN: not run.
-    - `low`, `high` [ny, nx]: bounds of the confidence interval of the survival; None: not drawn.
+    - `low`, `high` [ny, nx]: bounds of the confidence interval of the survival. None: not drawn, and the contour
+      encloses the cells in which all runs survive, instead of a share of CONTOUR.
     - `error` [ny, nx]: in the unit of the error metric; not finite: no survivor. None: no map of errors.
     """
 
@@ -169,7 +170,7 @@ def _outline(ax: Axes, x_edges: np.ndarray, y_edges: np.ndarray, inside: np.ndar
 
 
 def _contour_words(panels: Sequence[MapPanel]) -> str:
-    """Return what the contour of survival shows. With too few runs in a cell, it cannot show a survival of 95 %."""
+    """Return what the contour of survival shows. With too few runs in a cell, it shows where all runs survive."""
     decisive = [panel.low is not None for panel in panels]
     if all(decisive):
         return "95 % survival"
@@ -177,7 +178,7 @@ def _contour_words(panels: Sequence[MapPanel]) -> str:
 
 
 def _range(panel: MapPanel) -> str:
-    """Return in words how much of the grid survives. If there is no contour, all or none of it survives."""
+    """Return in words in how many cells enough runs survive: in all or in none if no contour is drawn."""
     share = np.asarray(panel.survival, float)
     cells = share[np.isfinite(share)]
     if not cells.size:

@@ -1,4 +1,4 @@
-"""The overview of a run: every signal, over the whole run, and enlarged at its start and at its end."""
+"""The overview of a run: its main signals, over the whole run, and enlarged at its start and at its end."""
 
 import itertools
 import pathlib
@@ -48,10 +48,10 @@ def overview(
 def overview_figure(
     trajectory: Trajectory, title: str, window: tuple[float, float] | None = None, settle: float = 0.0
 ) -> Figure:
-    """Return one page with every signal of a run, over the whole run, and enlarged at its start and at its end.
+    """Return one page with the main signals of a run, over the whole run, and enlarged at its start and at its end.
 
     `window`: begin and end, s; the page then shows only this stretch. `settle` (s): the vertical scales of the panels
-    of the whole run fit the signals from this time on, unless the rotor is lost. The lift-off has panels of its own.
+    of the whole run fit the signals from this time on, unless the rotor is lost. The start has panels of its own.
     """
     panels = _panels(trajectory)
     if window is None:

@@ -48,14 +48,14 @@ LABELS = {
     "lost_at_s": "lost at",
     "singular_at_s": "singular at",
 }
-# Metrics that an axis shows in another unit than `UNITS`: the factor and this unit.
+# Metrics that are shown in another unit than that of `UNITS`: the factor to this unit, and the unit.
 AXIS_UNITS = {
     "clearance_used": (100.0, "%"),
     "settled_clearance_used": (100.0, "%"),
     "force_used": (100.0, "%"),
     "refused": (1.0, "samples"),
 }
-# Units that take an SI prefix if they begin a compound unit; lengths and times take none above 1.
+# Units that take an SI prefix, alone or at the start of a quotient; lengths and times take no prefix above 1.
 PREFIXED = re.compile(r"(?P<length>m|s)(/.*)?|(V|A|W|N|H|T|Hz|Ω)(/.*)?")
 LEAST_POWER, MOST_POWER = -9, 9
 

@@ -1,4 +1,4 @@
-"""Reduction of curves with many samples to few points that keep the ends, extremes and gaps of the data."""
+"""Reduction of curves with many samples to few points: thinned curves, means over bins, and envelopes."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Named numbers of a case: read and replaced by their dotted paths, for derivatives with respect to a few of them."""
+"""Numbers of a cascade by dotted path: read and replaced, for derivatives with respect to a few of them."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any

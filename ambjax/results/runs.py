@@ -78,7 +78,7 @@ class CaseRun:
             raise ValueError(f"save: {path}: the file must end in .npz, .mat, .csv or .parquet.")
 
     def plot(self) -> Any:
-        """Return a matplotlib Figure with every signal: the whole run, its start and its end."""
+        """Return a matplotlib Figure with the main signals: the whole run, its start and its end."""
         from ambjax.pictures.overview import overview_figure
 
         return overview_figure(self.trajectory, f"{self.case.name}: {self.case.clock.method}", settle=self.case.settle)
@@ -111,7 +111,7 @@ def simulate(case: Case, progress: Callable[[int], object] = lambda samples: Non
     - `progress`: called with the number of new samples after each part of the run.
 
     Returns a `CaseRun`. Raises ValueError for anything but a case, and as `rollout` does. A lost rotor is no error: see
-    `CaseRun.lost`.
+    `CaseRun.lost`. Nor is a stalled run: see the metric `stalled`.
     """
     require_case(case)
     if not callable(progress):

@@ -45,7 +45,7 @@ class MembersRun:
         return frame
 
     def _repr_html_(self) -> str:
-        """Return the table of the main metrics over the members that are held, for notebooks."""
+        """Return the table of the metrics that have a unit and are finite for all held members, for notebooks."""
         held = np.isposinf(self.columns["lost_at"])
         head = f"{self.survivors} of {held.size} members are held (seed {self.study.seed})"
         rows = "".join(
@@ -60,7 +60,7 @@ class MembersRun:
     def plot(self, *metrics: str) -> Any:
         """Return a matplotlib Figure with histograms of these metrics over the members. Default: the main ones.
 
-        Raises ValueError if no metric has one of the names.
+        Raises ValueError if none of these names is a column.
         """
         from ambjax.pictures.histograms import CHIEF, histogram_figure
 

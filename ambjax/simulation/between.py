@@ -43,8 +43,9 @@ def amplified(
     u_a: Array | tuple[()],
     commanded: Sequence[tuple[Array, Scalar]],
 ) -> tuple[list[tuple[Voltage, Scalar]], Array | tuple[()]]:
-    """Return the amplifier's voltage as functions of time with their durations (s), and the voltage at the end.
+    """Return the amplifier's voltage as functions of time with their durations (s), and its output voltage at the end.
 
+    `u_a`: output voltage at t (V). For an amplifier that applies the command at once it is (), also in the result.
     `commanded`: voltages (V) from t on, each with its duration (s). With a slew-rate limit, each interval is divided at
     the end of its ramp, where the slope of the voltage jumps.
     """

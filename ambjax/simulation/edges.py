@@ -1,4 +1,6 @@
-"""Edges: instants at which the rates of a problem jump. Integrators end a step at each edge.
+"""Edges: instants at which the rates of a problem jump. Integrators end a step at each edge of the problem.
+
+Only problems of loops on a processor have edges (`simulation.between`). In continuous time a step may contain a jump.
 
 A method has its nominal order only on steps in which the rates are smooth. A jump inside a step causes an error of
 first order in the step length for every method.
@@ -83,11 +85,12 @@ def _rounding() -> float:
 
 
 def most_inside(scenario: Scenario, period: Scalar) -> int | None:
-    """Return the largest number of edges of the disturbances strictly inside one sample; None if one is traced.
+    """Return the largest number of edges of the disturbances strictly inside one sample; None if an
+    edge or the period is traced.
 
     `period`: one sample period or several, s. The number is an upper bound for an ensemble. An edge that differs
-    between members counts as inside a sample. Two edges count as inside the same sample if the distance between them
-    may be shorter than the period, for any member whose edges lie between those of the given members.
+    between members counts as inside a sample. Two edges count as inside the same sample if their distance can be
+    shorter than the longest period. The distance can have every value between its extremes over the members.
     """
     edges = scenario.edges()
     if any(map(is_traced, (*edges, period))):

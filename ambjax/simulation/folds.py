@@ -1,4 +1,4 @@
-"""Folds, which accumulate metrics sample by sample and store a few numbers only, whatever the length of a run.
+"""Folds: accumulators of metrics, updated sample by sample. They store few numbers, whatever the length of a run.
 
 A fold is a record with `init() -> carry`, `update(carry, row, span) -> carry` and `result(carry, ending) -> numbers`.
 `row` contains the signals at the start of a sample; `span` contains extremes and integrals of signals from there to the
@@ -25,7 +25,7 @@ class Ending(NamedTuple):
     """The end of a rollout.
 
     - `lost_code`: status code; 0 if the rotor survives.
-    - `lost_at`: time of the loss, s; +inf: never.
+    - `lost_at`: time of the loss or of the stall, s; +inf: never.
     - `singular_at`: time of the first crossing of the singular curve C, s; +inf: never.
     - `duration`: horizon of the run, s.
     """
@@ -73,7 +73,7 @@ class Peak:
 
 @record
 class Lowest:
-    """Smallest value of the signal `of` over the samples at which the rotor is alive, with its time: (value, s)."""
+    """Smallest value of the signal `of` over the samples at which the rotor is held. Result: (value, time in s)."""
 
     of: str = static(doc="name of the signal, a field of a Row")
 
@@ -94,7 +94,7 @@ class Lowest:
 class Rms:
     """Root mean square of the signal `of` over the samples from `after` (s) on.
 
-    `driven`: only over the samples at which the drive is on, which is until the rotor is lost.
+    `driven`: only over the samples before the rotor is lost, while the drive is on.
     """
 
     of: str = static(doc="name of the signal, a field of a Row")

@@ -38,8 +38,8 @@ class InitialValueProblem(NamedTuple, Generic[Inputs, State]):
     - `rates`: right-hand side rates(inputs, state).
     - `scale`: a state with the characteristic size of each component; integration errors are relative to it.
     - `status`: status(state) -> code, 0 while the state is valid.
-    - `layer`: a state with the largest integration error with which each component stays in the boundary layer of a
-      smoothed sign; None: no such signs.
+    - `layer`: for each component, the largest integration error that keeps it in the boundary layer of its smoothed
+      sign; inf: no sign. None: no such signs in the problem.
     - `observed`: observed(inputs, state) -> (rates, Instant), the rates and the signals to record; None: no signals.
     - `instant_structure`: any Instant, which defines the structure of those signals.
     - `jumps`: whether the rates jump at the start of a sample.
@@ -118,7 +118,7 @@ def in_turn(
 
     `parts`: pairs of a problem and its duration, s; the duration may be 0.
 
-    Returns the results after each problem, accumulated from the start of the first.
+    Returns one result for each problem. The span of a result begins at the start of the first problem.
     """
     (problem, time), *others = parts
     reached = [method.advance(problem, t, time, state, memory, code)]
@@ -150,7 +150,7 @@ def stage_times(t: Scalar, h: Scalar) -> Times:
 
 @record
 class FixedSteps:
-    """Equal substeps, divided at edges, in a loop of fixed length: supports forward and reverse mode."""
+    """Equal substeps, divided at edges. The loop has a fixed length, so JAX can differentiate it in both modes."""
 
     substeps: int = static(default=1, doc="steps per sample period")
 

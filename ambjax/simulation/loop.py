@@ -186,9 +186,9 @@ class ClosedLoop:
         ).astype(jnp.int32)
 
     def rest(self, state: LoopState, code: Array) -> LoopState:
-        """Return the state in which a lost rotor is frozen: at rest, at the stop that it touched.
+        """Return the state in which a lost rotor is frozen: at rest, at the stop that it touched or else at its last z.
 
-        The state of the controller does not change.
+        The currents and the state of the controller do not change.
         """
         plant = self.scenario.plant
         z = plant.measurement(state.plant).z
@@ -207,7 +207,7 @@ class ClosedLoop:
         )
 
     def row(self, t: Scalar, state: LoopState, errors: Errors, alive: Array) -> Row:
-        """Return all signals at time t (s). The drive of a lost rotor is off: u = 0."""
+        """Return the signals at time t (s), with u_mean = u_peak = 0. The drive of a lost rotor is off: u = 0."""
         inputs = self.inputs(t)
         command, _, u = self.command(inputs, state, errors)
         measured = self.received(inputs, state.plant, errors)

@@ -18,20 +18,20 @@ from ambjax.world.scenario import Scenario
 
 # Product of step and slope at which RK4 is accurate to about 1e-9 m on smooth gains (benchmarks/work_precision.py).
 ACCURATE = 1.0
-# On a processor: product of step and plant pole at which the error of RK4 is below 1e-11 m. The plant under a held
+# On a processor: product of step and plant pole at which the error of RK4 is below 1e-11 m. The motion under a held
 # voltage is not stiff.
 SAMPLED = 0.02
 # The coils may be stiff. SETTLED: product of step and R/L at which the error of RK4 is below 1e-11 m and 1e-6 A in a
 # sample in which the current settles. MOST_SETTLED: number of substeps above which an L-stable method is cheaper.
 SETTLED, MOST_SETTLED = 0.5, 64
 # The same for the lag of the flux due to eddy currents. The force depends on it, so the error of z limits the step:
-# 1.3e-11 m in the first 30 samples of the rig.
+# 1.3e-11 m in the first 30 samples of the rig (`ambjax template rig`).
 LAGGED = 0.5
 # The same for the slope of the stop. A contact begins and ends inside a step, which changes the velocity after an
 # elastic contact by up to 1.1e-4 of its value, and by up to 1.2e-3 with damping (tests/test_touchdown.py).
 TOUCHED = 0.05
-# Product of step and amplifier rate at which RK4 integrates the amplifier's voltage, a known function of time, to 1e-9
-# A.
+# Product of step and amplifier rate at which the error of RK4 in the current is 1e-9 A. The amplifier's voltage is a
+# known function of time.
 DRIVEN = 0.5
 # Names of the plant's slopes in messages.
 PLANT, COILS, FLUX, STOP = "plant", "current in the coils", "flux behind the current", "rotor on its stop"
@@ -44,13 +44,13 @@ CORNER = 7.5e-6
 # Relative error per step of the adaptive method, with and without noise. The error of z is proportional to the response
 # of the loop to an impulse: the largest later change of z, m, after a velocity change of 1 m/s. At QUIET_TOLERANCE, z
 # is within 1e-8 m if that response is at most 0.1 m. The response is unbounded for a loop that nearly loses its rotor,
-# so that no error in metres holds for every loop (tests/test_tolerance.py). Under noise every sample begins with a
+# so that no bound in metres holds for every loop (tests/test_tolerance.py). Under noise every sample begins with a
 # jump, and QUIET_TOLERANCE would take up to twice the steps.
 TOLERANCE, QUIET_TOLERANCE = 1e-6, 1e-7
 
 
 def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
-    """Return the largest slope of each law, the unstable plant, its coils and its flux, 1/s; the maximum over members.
+    """Return the largest slope, 1/s, of each law, the plant, its coils, its flux and its stop, over the members.
 
     Raises ValueError if a slope is traced, because a step can be chosen only from numbers.
     """
@@ -71,10 +71,10 @@ def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
 def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *, reverse: bool = False) -> Integrator:
     """Choose RK4, adaptive RODAS3, or RODAS3 with equal substeps.
 
-    RK4 is chosen for held noise if a few substeps resolve the slopes, and for a cascade on a processor if at most
+    RK4 is chosen with a sensor model if MOST_SUBSTEPS substeps resolve the slopes, and for a cascade on a processor if
     MOST_SETTLED substeps resolve current and flux. Otherwise the choice is adaptive RODAS3. Without noise, adaptive
-    steps can be much longer than the slopes suggest. Under noise, which jumps at every sample, they cannot, and the
-    explicit method is cheaper.
+    steps can be much longer than the slopes suggest. Noise jumps at every sample and prevents such steps, so the
+    explicit method is then cheaper.
 
     `reverse`: choose a method with a fixed number of steps, which supports reverse mode: RK4, or RODAS3 with equal
     substeps. A jump of a disturbance inside such a step causes an error of about 3e-8 m per m/s^2 on smooth gains. An
@@ -121,7 +121,8 @@ def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: 
     inside one sample. A larger `cuts` of the clock is kept, so that a part of an ensemble runs the compiled program of
     the whole.
 
-    Raises ValueError for an explicit step above the stability limit; the message names both and the fix.
+    Raises ValueError for an explicit step above the stability limit; the message names both and the fix. Raises
+    ValueError also for adaptive steps if an amplifier controls the current in continuous time, and as `slopes` does.
     """
     if clock.method is None:
         clock = clock.with_method(choose_method(cascade, scenario, float(clock.sample_period), reverse=reverse))

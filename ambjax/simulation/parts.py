@@ -1,4 +1,4 @@
-"""A rollout in parts, for reverse mode: with about sqrt(N) parts, its memory grows with sqrt(N) for N samples."""
+"""A rollout in parts, for reverse mode: if N samples have a divisor near sqrt(N), its memory grows with sqrt(N)."""
 
 import functools
 import math

@@ -35,8 +35,8 @@ class Crossing(NamedTuple):
 class Settling:
     """Settling time, s: the time at which |z - r| last comes within `band` (m), interpolated between samples.
 
-    It is 0 if |z - r| never leaves the band. If |z - r| is outside at the end, it is the duration times |z - r|/band
-    there, and therefore longer than the run.
+    It is 0 if |z - r| never leaves the band. If |z - r| is outside the band at the end of the run, the settling time is
+    the duration of the run times the final |z - r|/band, so it is longer than the run.
     """
 
     band: Scalar = leaf(unit="m", above=0, at_most=1.0, doc="the band")
@@ -58,7 +58,7 @@ class Settling:
 
 
 class Reach(NamedTuple):
-    """State of `Overshoot`: extremes of the initial z and of r so far, and the excursion of z beyond them, m."""
+    """State of `Overshoot`: extremes of the initial z and of r so far, and the largest excursion of z beyond, m."""
 
     low: Array
     high: Array
@@ -67,7 +67,7 @@ class Reach(NamedTuple):
 
 @record
 class Overshoot:
-    """Overshoot, m: the largest excursion of z beyond the range spanned by its initial value and the reference so far.
+    """Overshoot, m: the largest excursion of z beyond the range of its initial value and of all earlier references.
 
     For a step of r it is the usual overshoot; for a rotor that is lifted to r = 0, the excursion beyond 0.
     """

@@ -1,4 +1,4 @@
-"""Rollout: the simulation of a cascade in a scenario, sample by sample, which returns a trajectory, a fold, or both."""
+"""Rollout: the simulation of a cascade in a scenario. It returns a trajectory, the result of a fold, or both."""
 
 import dataclasses
 import functools
@@ -57,12 +57,12 @@ class System(Protocol[S, E, R]):
 
         jump(t, state, errors) -> state
 
-    It is called at the start of a sample: the row and the integrator use the state that it returns. The state of a lost
-    rotor does not jump. A system whose rates are smooth within a sample has
+    `jump` is called at the start of a sample. The row and the integrator use its result. The state of a lost
+    rotor does not jump. A system that integrates its whole state, as one problem per sample, has
 
         problem(errors) -> InitialValueProblem
 
-    A system that integrates only a part of its state, or whose rates jump within a sample, has instead
+    A system that integrates only a part of its state, or several problems per sample, has instead
 
         advance(method, errors, t, period, state, memory, code) -> Advanced
 
@@ -99,8 +99,8 @@ def rollout(cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | 
     - `fold`: accumulated at every sample, so that metrics need no stored trajectory; None: no metrics.
     - `every`: a row is recorded at the start of every `every`-th sample; 0: no rows.
 
-    Returns an `Outcome`. If the rotor touches down, or a state leaves the range of the model (`loop.DIVERGENCE`), the
-    state is frozen and the trajectory reports the loss. Values and derivatives stay finite.
+    Returns an `Outcome`. If |z| reaches `Scenario.limit`, a state leaves the range of the model (`loop.DIVERGENCE`), or
+    the integrator stalls, the state is frozen and the trajectory has the status. Values and derivatives stay finite.
 
     The function is pure and jitted. It works under vmap, jvp and grad; reverse mode requires a method with fixed steps.
 
@@ -201,7 +201,7 @@ def recorded_segment(
     """Simulate `count` samples from number `first` on, and record every row. Returns the new state and the rows.
 
     Samples after the last sample of the clock do not change the state. One compiled program with a fixed `count` can
-    therefore simulate every part of a run.
+    therefore simulate every part of a run. The caller must discard the rows of these samples.
     """
     step = functools.partial(one_sample, system.realised(), clock, fold)
 

@@ -70,24 +70,26 @@ class Rodas3(FixedSteps):
         return f"RODAS3 (L-stable Rosenbrock), {self.substeps} substeps"
 
 
-# Carry of the adaptive method: state, step, elapsed time, status code, trials, the step before, and span.
+# Carry of the adaptive method: state, trial step, elapsed time, status code, number of trials, previous step, and span.
 _Trial = tuple[State, Array, Array, Array, Array, Array, Span]
 
 
 @record
 class AdaptiveRodas3:
-    """RODAS3 with adaptive steps: the estimated error of each step stays below `tolerance` (scale + |state|).
+    """RODAS3 with adaptive steps: the rms of error / allowed error over the state is at most 1 in each step.
 
-    The error also stays within the boundary layer of each smoothed sign. With a larger error, one step would move the
-    state to the other side of the sign, and the next step would move it back. The steps would then shrink until the run
-    stalls. When a stiff smoothed sign leaves saturation, the steps shrink for a few microseconds and then grow again.
-    The last step of a sample is the first trial step of the next.
+    The error is the estimate of `rodas3_step`. The allowed error of a component is `tolerance` (scale + |state|), but
+    at most the boundary layer of its smoothed sign. With a larger error, one step would move the state to the other
+    side of the sign, and the next step would move it back. The steps would then shrink until the run stalls. When a
+    stiff smoothed sign leaves saturation, the steps shrink for a few microseconds and then grow again. The trial step
+    at the end of a sample is the first trial step of the next.
 
     Forward mode and vmap work. Reverse mode does not, because JAX cannot reverse a while loop.
 
-    The tolerance bounds the error of a step, not the error of z at the end, which is proportional to the response of
-    the loop to a disturbance. At a tolerance of 1e-7, the error of z is at most 1e-8 m if a velocity change of 1 m/s
-    moves z by at most 0.1 m. The response of a rotor that is nearly lost is larger.
+    The tolerance bounds the error of each step. The error of z over a run is proportional to the response of the loop
+    to an impulse: the largest later change of z after a change of the velocity. At a tolerance of 1e-7, the error of z
+    is at most 1e-8 m if a velocity change of 1 m/s moves z by at most 0.1 m. The response of a rotor that is nearly
+    lost is larger.
     """
 
     tolerance: Scalar = leaf(default=1e-6, unit="1", above=0, at_most=1.0, doc="relative error allowed per step")

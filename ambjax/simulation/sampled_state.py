@@ -12,9 +12,9 @@ class SampledState(NamedTuple):
     """State of the closed loop on a processor. A field is () if the loop has no such part.
 
     - `plant`, `control`: states of the plant and of the laws.
-    - `command`: last command, with u within the limit of the supply.
-    - `past`: the two voltages before that of `command`, V, the most recent first.
-    - `finite`: 1 at the start; 0 after a law or the sensor has returned NaN or infinity.
+    - `command`: last command, with u (V, or A for a current) within `Scenario.command_limit`.
+    - `past`: the two commands u before that of `command`, the most recent first.
+    - `finite`: 1 at the start; 0 after a law or, without a guard, the sensor has returned a number that is not finite.
     - `z_filtered`: output of the low-pass of the position sensor, m.
     - `u_a`: output voltage of the amplifier, V.
     - `watch`: state of the guard.

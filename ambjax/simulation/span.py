@@ -1,8 +1,8 @@
 """Spans: extremes and integrals of signals between two samples, accumulated by the integrator.
 
-Under held noise the current reference jumps at every sample and settles within microseconds, while the voltage is at
-its limit. Values at the samples show only that jump. The integrator therefore evaluates the signals at every substep,
-and returns their extremes and integrals.
+Under held noise, i_ref moves to a new value within microseconds after every sample, and the voltage is then at its
+limit. Values at the samples show only the start of this transient. The integrator therefore evaluates the signals at
+every substep, and returns their extremes and integrals.
 """
 
 from typing import Any, NamedTuple

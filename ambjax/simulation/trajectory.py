@@ -14,8 +14,8 @@ ALIVE, TOUCHED, DIVERGED, STALLED = range(4)
 EVENTS = ("", "touched down", "diverged", "stalled")
 REASONS = (
     "",
-    "|z| reached the clearance",
-    "a state left the range in which the model is valid",
+    "|z| reached the clearance, or 0.99 s_0 with an elastic stop",
+    "a state left the range in which the model is valid, or a command or reading was not finite",
     "the integrator could not meet its tolerance",
 )
 STATUSES = tuple(f"{event}: {reason}" if event else "" for event, reason in zip(EVENTS, REASONS, strict=True))
@@ -35,7 +35,7 @@ class Row(NamedTuple):
     i_ref: Array
     """reference of the current deviation, A"""
     u: Array
-    """applied voltage (after the supply's limit; 0 after the rotor is lost), V"""
+    """voltage within the supply's limit (on a processor: the command, which acts after the delay; 0 once lost), V"""
     u_mean: Array
     """mean of the applied voltage over the sample that begins at t, including spikes shorter than a sample, V"""
     u_peak: Array
@@ -59,7 +59,7 @@ class Row(NamedTuple):
     r: Array
     """reference, m"""
     q_z: Array
-    """disturbance acceleration, including the scaled force, m/s^2"""
+    """total disturbance acceleration of Eq. (1): q_z, q_v, q_f and base, without the stop, m/s^2"""
     q_i: Array
     """disturbance of the current derivative, A/s"""
     z_measured: Array
@@ -99,8 +99,8 @@ class Trajectory:
     """The recorded rows of a rollout, and the status of the rotor.
 
     - `rows`: a Row whose fields have a leading axis of recorded samples; None if no rows were recorded.
-    - `lost_at`: time at which the rotor was lost, s; +inf: never.
-    - `lost_code`: status code, an index of STATUSES; 0 if the rotor survives.
+    - `lost_at`: time at which the rotor was lost or the integrator stalled, s; +inf: never.
+    - `lost_code`: status code, an index of STATUSES; 0 if the rotor is held.
     - `singular_at`: time at which the singular curve C was first crossed, s; +inf: never.
     """
 

@@ -10,7 +10,7 @@ from ambjax.theorem.sampled_report import Delays, SampledReport
 QUESTION = "Do the conditions of Theorem 1 hold along this run?"
 # Ratio of an advised gain to the number that it must exceed; the result is rounded up to two digits.
 MARGIN = 1.1
-# The rotor of a lost run counts as falling after this share of the time to its loss.
+# Share of the time until the rotor is lost, after which it counts as falling.
 FALL_SHARE = 0.9
 # Ratio of gamma to Delta_1 along the reference that leaves room for transients.
 TRANSIENT_FACTOR = 2.0
@@ -42,10 +42,10 @@ def theorem_lines(report: Report, case: str) -> list[str]:
 
 
 def advice(report: Report) -> list[str]:
-    """Return, for each failing gain, the number that it must exceed and a value to set; then the other failures.
+    """Return a line for each gain whose condition fails, with its bound and a value to set; then the other failures.
 
     While a rotor falls, its motion increases Delta_1 beyond any gain. Therefore a worst value in the last tenth of a
-    lost run is not used to advise a gain, and is reported only if nothing else fails.
+    lost run is not used to advise a gain, and is reported only if no other condition on a gain fails.
     """
     fails = [line for line in report.conditions if line.holds is False]
     fall = FALL_SHARE * report.lost_at if report.lost else math.inf
@@ -70,8 +70,8 @@ def processor_lines(sampled: SampledReport, margin: Delays, unknown: Delays | No
     """Return the lines below the tables of a cascade on a processor.
 
     They report the slopes, the distance to C, the status of the rotor, an alternating voltage, and the delay margins.
-    `margin`: the prediction of the controller uses the actual delay. `unknown`: it uses the delay of the case (None:
-    the controller does not predict).
+    `margin`: delay margin if the controller predicts over the actual delay. `unknown`: delay margin if it predicts over
+    the delay of the case; None: it does not predict.
     """
     lines = [
         f"- {slope.stage}: slope T of the step is {number(slope.effective_slope)} and must be less than "
@@ -107,9 +107,9 @@ def _curve(distance: float, at: float) -> str:
 
 def _alternates(share: float) -> str:
     return (
-        f"The voltage alternates: without noise, {100 * share:.0f} % of its rms value changes sign from sample to "
-        "sample. A law corrects more than its whole error in one sample, or its output acts with a delay that it does "
-        "not take into account. Lower "
+        f"The voltage alternates: without noise, the part that changes sign from sample to sample is {100 * share:.0f} "
+        "% of its rms value. One step of a law changes its error by more than this error, or the output of a law acts "
+        "with a delay that the law does not include. Lower "
         f"the gain or p of this law, set {IMPLICIT} or predict = true, or shorten clock.sample_period."
     )
 
@@ -175,7 +175,10 @@ def _sides(line: Condition) -> tuple[str, str, str]:
 def _status(report: Report, fails: bool) -> str:
     words = status(report.lost_at, report.lost_why, report.stalled)
     if report.lost and not fails:
-        return f"{words} The theorem assumes no noise, no voltage limit and no sampling: one of them is the cause."
+        return (
+            f"{words} The theorem assumes an exact model, no noise, no voltage limit and no sampling: a violated "
+            "assumption is the cause."
+        )
     if math.isinf(report.lost_at) and fails:
         return "The rotor is held nevertheless: the conditions are sufficient, not necessary."
     return words

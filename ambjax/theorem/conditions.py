@@ -129,7 +129,9 @@ def _monitors(settle: float) -> Named:
 def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float = 0.0) -> Report:
     """Simulate the loop once in continuous time and evaluate the conditions of Theorem 1 along the run.
 
-    A processor is ignored. `settle`: start of the evaluation of |z|, s. Raises ValueError as `rollout` does.
+    A processor is ignored, with the parts of the scenario that require one (`Scenario.in_continuous_time`); set-valued
+    signs then get the default steepness. `settle`: start of the evaluation of |z|, s. Raises ValueError as `rollout`
+    does.
     """
     check_inputs(cascade, scenario, clock)
     if cascade.processor is not None:
@@ -151,7 +153,7 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float = 0.
 def delta_1_on_reference(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[float, float]:
     """Return the largest |v_star' - (dv/dz) r_dot| on the ideal motion z = r (A^2/m^2/s), and its time (s).
 
-    This is Eq. (7) without disturbance and transients: the lower bound of gamma for following the reference.
+    This is Eq. (7) without disturbances and transients. To follow the reference, gamma must exceed this number.
     """
     count = min(clock.samples, 20_000)
     times = np.arange(count) * (float(clock.duration) / count)
@@ -228,7 +230,7 @@ def _conditions(
 
 
 def constant_sigma(law: PositionLaw) -> list[Condition]:
-    """Return a condition for each schedule that changes the sliding variable; the theorem requires a constant one."""
+    """Return a condition for each scheduled gain on which sigma depends; the theorem holds for constant ones only."""
     plain: Any
     one: Any
     zero: Any
@@ -246,12 +248,12 @@ def constant_sigma(law: PositionLaw) -> list[Condition]:
 
 def _proof(worst: dict[str, tuple[float, float]]) -> list[Condition]:
     lines = [
-        ("Eq. (12)", "sigma follows -k sgn(sigma) + q_z + h", "sigma_residual", "m/s"),
-        ("Eq. (14a)", "v_tilde follows -gamma sgn(v_tilde) + d", "v_tilde_residual", "A^2/m^2"),
-        ("Eq. (14b)", "e follows -k_i sgn(e) + q_i", "e_residual", "A"),
+        ("Eq. (12)", "sigma' = -k sgn(sigma) + q_z + h", "sigma_residual", "m/s"),
+        ("Eq. (14a)", "v_tilde' = -gamma sgn(v_tilde) + d", "v_tilde_residual", "A^2/m^2"),
+        ("Eq. (14b)", "e' = -k_i sgn(e) + q_i", "e_residual", "A"),
     ]
     rows = [Condition(name, says, None, *worst[key], unit, None, "largest residual") for name, says, key, unit in lines]
     margin, at = worst["V_margin"]
-    bound = "V' <= -2 (k |sgn(sigma)| - Q_z) |sigma| + 2 a |sigma| (L_v |e| + |v_tilde|)"
+    bound = "V' <= -2 (k |sgn(sigma)| - |q_z|) |sigma| + 2 a |sigma| (L_v |e| + |v_tilde|)"
     rows.append(Condition("V = sigma^2", bound, None, margin, at, "m^2/s^3", None, "smallest distance below the bound"))
     return rows

@@ -1,4 +1,4 @@
-"""The loop on a processor with rows that record the sigma, v_tilde and e that the laws compute at every sample."""
+"""The loop on a processor, with rows that also contain sigma, v_tilde and e as computed from the estimate."""
 
 from typing import NamedTuple
 
@@ -25,8 +25,8 @@ class LawSignals(NamedTuple):
 class LawSignalsRow(NamedTuple):
     """One sample: time (s), limited voltage (V), z (m), i_ref (A), and signals.
 
-    `computed`: signals that the laws compute from the estimate (with prediction: at the end of the delay). `true`:
-    signals of the plant at the sample.
+    `computed`: signals computed from the estimate (with prediction: at the end of the delay); the estimate follows from
+    the readings before faults and guard. `true`: sigma and e of the plant at the sample; v_tilde is the computed one.
     """
 
     t: Array

@@ -1,9 +1,9 @@
 """The closed loop together with the steps of the stability proof, Section 3.5.
 
-The right-hand sides of the proof's identities, Eqs. (12)-(14), are integrated together with the loop and compared with
-its sigma, v_tilde and e. Where the proof's assumptions hold (exact model, measured state, no limit on u), the
-difference is the integration error; elsewhere it shows the effect of a violated assumption. V = sigma^2 is compared
-with its bound at every sample.
+The right-hand sides of the proof's identities, Eqs. (12)-(14), are integrated together with the loop. The integrals are
+compared with sigma, v_tilde and e of the loop. If the proof's assumptions hold (exact model, measured state, no limit
+on u), the difference is the integration error; otherwise it shows the effect of a violated assumption. V = sigma^2 is
+compared with its bound at every sample.
 """
 
 from typing import NamedTuple

@@ -44,9 +44,11 @@ class Band:
 
     `noise`: whether the run has the case's noise. `computed`: largest magnitude of the signal that the law computes,
     from the estimate (with prediction: at the end of the delay). `largest`: largest magnitude of the plant's signal.
-    `difference`: largest difference of the two signals. `gain`: that of the law's sign. `disturbance`: W, the largest
-    disturbance of the rate of the computed signal, per s. `band`: bound of `computed` for disturbances up to W; inf if
-    the gain does not exceed W. `gain`, `disturbance` and `band` are None for a law that is not a single sign.
+    `difference`: largest difference of the two signals; 0 for v_tilde, because `LawSignalsRow.true` contains the
+    computed one. `gain`: that of the law's sign. `disturbance`: W, the largest disturbance of the rate of the computed
+    signal, per s. `band`: bound of `computed` for disturbances up to W; inf if the gain does not exceed W; the
+    magnitude at `settle` if the signal is outside its band there. `gain`, `disturbance` and `band` are None for a law
+    that is not a single sign or has a schedule.
     """
 
     signal: str
@@ -73,8 +75,8 @@ class SampledReport:
     `bands`: of the runs that do not end early. `lost_at`: time at which the run with noise ends early, s; inf if it
     does not. `lost_why`: the reason. `stalled`: whether the integrator stalled at `lost_at`; the rotor's status is then
     unknown. `distance`: smallest distance of (z/s_0, i_ref/i_0) to the singular curve C at the samples (negative beyond
-    C), and its time (s). `alternating`: share of the voltage's rms that changes sign from sample to sample after
-    `settle`, in the run without noise; None if that run ends early. `largest_z`: largest |z| (m) at the samples after
+    C), and its time (s). `alternating`: result of `alternation` for the voltage after `settle`, in the run without
+    sensor noise; None if that run ends early. `largest_z`: largest |z| (m) at the samples after
     `settle`, in the run with noise; None if that run ends early.
     """
 
@@ -102,9 +104,9 @@ class Delays(NamedTuple):
     """Result of runs whose delays increase in steps of `step` (samples), from the delay of the case on.
 
     `held`: the largest delay up to which the rotor is held at every delay of the runs. `lost`: the smallest delay at
-    which it is lost; None if there is none. `undecided`: the smallest delay above `held` at which the integrator
-    stalled, or None. If the rotor is lost at the delay of the case, the delays start at 0; if it is lost there too,
-    `held` is None.
+    which it is lost; None if there is none. `undecided`: the delay that follows `held`, if the integrator stalled
+    there; else None. A second pass divides the step that follows `held`. If the rotor is not held at the delay of the
+    case, the delays go from 0 to that delay; if it is not held at 0 either, `held` is None.
     """
 
     held: float | None
@@ -130,7 +132,7 @@ def check_sampled(
     settle: float,
     run: Callable[[System, Clock], Outcome] = rolled,
 ) -> SampledReport:
-    """Return the report on a cascade with a processor, from two runs: without noise and with it.
+    """Return the report on a cascade with a processor, from a run without sensor noise and, if it differs, one with.
 
     `run`: function that simulates a system; `ensemble.replay.record_system` rounds as `ambjax simulate` does. `settle`:
     start of the evaluation, s. Raises ValueError as `rollout` does.
@@ -181,13 +183,13 @@ def _distances(plant: Bearing, z: jax.Array, i_ref: jax.Array) -> jax.Array:
 
 
 def alternation(u: np.ndarray) -> float:
-    """Return the share of the rms of u [N] that changes sign from sample to sample: sin(pi f T)^2 at a frequency f."""
+    """Return rms((u_{n+1} - 2 u_n + u_{n-1})/4) / rms(u) for u [N]: sin(pi f T)^2 for a sine of frequency f."""
     size = float(np.sqrt(np.mean(u * u)))
     return float(np.sqrt(np.mean(np.diff(u, 2) ** 2))) / (4 * size) if len(u) > 2 and size else 0.0
 
 
 def _without_noise(scenario: Scenario) -> Scenario:
-    """Return the scenario without noise; the same object if it has none."""
+    """Return the scenario without sensor noise; the same object if it has none. Faults and random signals remain."""
     quiet = None if scenario.sensor is None else scenario.sensor.louder(0.0)
     return scenario if quiet in (None, scenario.sensor) else dataclasses.replace(scenario, sensor=quiet)
 

@@ -12,7 +12,7 @@ from ambjax.world.coil_limits import CoilLimits
 
 
 class CoilResponse(NamedTuple):
-    """Rate of the measured current at an instant under the voltage u (V): i' = still + per_volt u.
+    """Rate of the current i at an instant, as a function of the voltage u (V): i' = still + per_volt u.
 
     `still`: A/s. `per_volt`: A/(V s).
     """
@@ -29,10 +29,10 @@ class CoilResponse(NamedTuple):
 class Amplifier:
     """An amplifier that applies a voltage u_a: u_a' = w (u - u_a), w = 2 pi bandwidth, |u_a'| at most `slew`.
 
-    The command u is held: it acts for one sample. The dead band (from the dead time of a bridge) is subtracted from
-    |u_a|. At the current limit, a voltage that would increase |i| is replaced by the voltage that holds i constant. If
-    the supply cannot provide that voltage, it provides its largest voltage, and |i| exceeds `i_max`. The limits of each
-    coil act last; `i_max` and `coil` cannot be given together. With its default, a parameter has no effect.
+    The command u is constant for one sample. The dead band (from the dead time of a bridge) is subtracted from |u_a|.
+    At the limit `i_max`, a voltage that would increase |i| is replaced by the voltage that keeps i constant. If the
+    supply cannot provide that voltage, it provides its largest voltage, and |i| exceeds `i_max`. The limits `coil` of
+    each coil act last; `i_max` and `coil` cannot be given together. A parameter that is None has no effect.
     """
 
     bandwidth: Scalar | None = leaf(
@@ -111,9 +111,9 @@ class Amplifier:
 class CurrentAmplifier:
     """An amplifier that controls the current: i' = w (i_command - i), w = 2 pi bandwidth, within the supply's voltage.
 
-    Its current loop measures the true current and applies the voltage u that gives this rate. u is the sum of R i, the
+    The amplifier measures the true current and applies the voltage u that gives this rate. u is the sum of R i, the
     voltage that the motion induces, and the inductive voltage for the rate w (i_command - i). The supply limits |u| to
-    u_max; while it does, the current follows more slowly. In the two-coil plant, i is half the difference of the two
+    u_max; at this limit, the current follows more slowly. In the two-coil plant, i is half the difference of the two
     currents.
     """
 

@@ -30,10 +30,10 @@ class Currents(NamedTuple):
 class TwoCoil(Bearing[Currents]):
     """The plant with two circuits, with the parameters of Table 1. Its state is (z, z_dot, i_1, i_2).
 
-    The upper coil (gap s_0 - z) has the voltage R i_0 + u, the lower one (gap s_0 + z) R i_0 - u. The measured i is
-    half the difference of the currents. The flux linkage kappa i_1 / (2 (s_0 - z)) of the upper coil has the rate
-    u + R (i_0 - i_1); that of the lower coil, kappa i_2 / (2 (s_0 + z)), has the rate R (i_0 - i_2) - u. In the paper,
-    Eq. (2) has a single current and contains only the lower gap.
+    The upper coil (gap s_0 - z) has the voltage R i_0 + u, the lower one (gap s_0 + z) R i_0 - u. The current deviation
+    i is half the difference of the currents. With ideal iron, the flux linkage kappa i_1 / (2 (s_0 - z)) of the upper
+    coil has the rate u + R (i_0 - i_1); that of the lower coil, kappa i_2 / (2 (s_0 + z)), has the rate
+    R (i_0 - i_2) - u. In the paper, Eq. (2) has a single current and contains only the lower gap.
     """
 
     two_voltages = True

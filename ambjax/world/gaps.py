@@ -56,9 +56,9 @@ def _inverse_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) ->
 def distance_to_C(zeta: Array, iota: Array) -> Array:
     """Return the distance from (zeta, iota) = (z/s_0, i/i_0) to the singular curve C, dimensionless. Eq. (9).
 
-    In these coordinates C is iota = -(zeta + 1/zeta)/2, which has two branches. Newton's method finds zeros of the
-    derivative of the squared distance from starting points on both branches. The distance to the nearest of these
-    points is returned.
+    In these coordinates C is iota = -(zeta + 1/zeta)/2, which has two branches. From starting points on both branches,
+    Newton's method finds zeros of the derivative of the squared distance along C. The function returns the distance to
+    the nearest of these zeros.
     """
     x = jnp.exp(jnp.linspace(-5.0, 5.0, 41))
     x = jnp.concatenate([x, -x])

@@ -19,8 +19,8 @@ class Iron:
     """Saturation, leakage and eddy currents of the iron. An effect whose parameter is None is left out.
 
     - Saturation. With the flux density b of ideal iron and x = b / saturation, the flux density of the core is
-      b (AIR + (1 - AIR) (1 + x^4)^(-1/4)). It is 3 % below b at x = 0.6, 16 % at x = 1, and close to `saturation` for
-      larger x.
+      b (AIR + (1 - AIR) (1 + x^4)^(-1/4)). It is 3 % below b at x = 0.6 and 16 % at x = 1. At x = 2 it is about
+      `saturation`; for larger x it increases with the slope AIR.
       This smooth minimum of b and `saturation` replaces the measured curve of a material (Schweitzer and Maslen,
       Magnetic Bearings, 2009, section 3.1). Saturation reduces the flux of the gap by the same factor.
     - Leakage. A part of a coil's flux does not cross the gap, but takes a path of constant reluctance. `leakage` is the

@@ -143,7 +143,7 @@ class Harmonic:
 class Runout:
     """Runout of the surface that a position sensor reads, in m: a sum of harmonics of the rotor's angle.
 
-    It is added to the reading of the sensor, before low-pass and gain. The true position does not contain it.
+    The sensor reads the position plus the runout; low-pass and gain follow. The true position does not contain it.
     """
 
     speed: Scalar = _speed()

@@ -17,8 +17,8 @@ from ambjax.world.sensor import Measurement, Sensor
 from ambjax.world.signals import Constant, Signal, edges_of, is_random, realised
 from ambjax.world.touchdown import Stop
 
-# Numbers that are folded into a member's key, for the random streams of the design and of the signals. The sensors fold
-# in the sample number, which is smaller.
+# Numbers that are folded into a member's key, for the random streams of the design and of the signals. The sensors use
+# other streams of this key (`numerics.gaussian.STREAMS`, `faults`), with the sample number as counter.
 DESIGN_STREAM, SIGNAL_STREAM = np.uint32(2**32 - 1), np.uint32(2**32 - 2)
 # Fields that are signals. The position in this list selects the random key of a signal, so add new fields at the end.
 SLOTS = ("reference", "q_z", "q_v", "q_i", "q_f", "base")
@@ -133,7 +133,7 @@ class Scenario:
     @property
     @jax.jit  # compiles one program instead of one for each operation
     def largest_force(self) -> Scalar:
-        """The magnetic force (N) at z = 0 for i = i_0, where one coil is off, or for a limit of |i| below i_0."""
+        """The magnetic force (N) at z = 0 for i = i_0, or for the limit of |i| if it is below i_0."""
         return self.plant.largest_force(self.amplifier and self.amplifier.current_limit(self.plant.i_0))
 
     @property
@@ -150,7 +150,7 @@ class Scenario:
 
     @property
     def random(self) -> bool:
-        """Whether two members differ: the scenario has sensor noise or a random signal."""
+        """Whether two members differ: the scenario has sensor noise, random sensor faults or a random signal."""
         sensor = self.sensor
         noisy = sensor is not None and any(np.any(std) for std in (sensor.std, sensor.std_z_dot, sensor.std_i))
         if sensor is not None:
@@ -168,9 +168,9 @@ class Scenario:
         return f"sensor.{named[0]}" if named else None
 
     def in_continuous_time(self) -> "Scenario":
-        """Return the scenario without the parts that require a processor: low-pass, converter, faults, amplifier.
+        """Return the scenario without the parts that require a processor.
 
-        An amplifier that controls the current remains.
+        They are the low-pass, the converter and the faults of the sensor, and an amplifier that applies a voltage.
         """
         none = {"bits": None, "bandwidth": None, "outliers": None, "dropouts": None}
         sensor = self.sensor and dataclasses.replace(self.sensor, **none)

@@ -47,9 +47,10 @@ class Measurement(NamedTuple):
 class Sensor:
     """The sensors, with Gaussian noise on each measurement, drawn once per sample period and held constant in it.
 
-    The runout of the rotor is added to the position. A reading of the position then passes the low-pass (`bandwidth`),
-    the gain, the offset, the noise, the converter and the faults, in this order. Low-pass, converter and faults require
-    a processor. Without a processor, the laws receive the measurement at every instant, not only at the samples.
+    The runout of the rotor is added to the position. The low-pass (`bandwidth`), the gain, the offset, the noise, the
+    converter and the faults then act on the sum, in this order; the result is the reading. Low-pass, converter and
+    faults require a processor. Without a processor, the laws receive the measurement at every instant, not only at the
+    samples.
     """
 
     std: Scalar = leaf(default=0.0, unit="m", at_least=0, at_most=1.0, doc="standard deviation of the noise of z")
@@ -117,7 +118,7 @@ class Sensor:
         return FaultOnsets(outlier, none > 0 if self.dropouts is None else self.dropouts.onset(key, sample, period))
 
     def sensed(self, z: Array, before: Sensed, onsets: FaultOnsets, period: Scalar, s_0: Scalar) -> Sensed:
-        """Return the reading of z (m, converted) with faults, and the next state of the faulty sensor."""
+        """Return the next state of the faulty sensor, whose z is the reading with faults. `z`: converted reading, m."""
         z = z + onsets.outlier
         if self.dropouts is None:
             return Sensed(z, before.left)
@@ -184,7 +185,7 @@ def _moments(b: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def converted(x: Array, bits: Scalar, limit: Scalar) -> Array:
-    """Return x as a converter with this number of bits over -limit..limit outputs it: rounded and saturated.
+    """Return the output of a converter of `bits` bits over -limit..limit for the input x: x rounded and saturated.
 
     The step is 2 limit / 2^bits; the largest value is one step below limit. The derivative is that of the saturation
     alone.

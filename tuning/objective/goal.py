@@ -16,12 +16,12 @@ from tuning.objective.risk import Risk
 from tuning.objective.shortfalls import Bound, shortfall
 from tuning.space import Space
 
-# Largest logarithm of a goal that is shown; larger ones overflow.
+# Largest goal, a logarithm, that is shown; exp overflows above 709.
 MOST = 700.0
 
 
 def shown(goal: np.ndarray | float) -> np.ndarray:
-    """Return the number whose logarithm is `goal`, for a text or a picture. If a limit is far from met, it is huge."""
+    """Return exp(`goal`), at most exp(MOST), for a text or a picture. It is huge if a limit is far from met."""
     return np.exp(np.minimum(goal, MOST))
 
 
@@ -31,8 +31,9 @@ class Goal:
 
     goal = log(risk(losses) + mean(losses of stressed members)) + weight * shortfall(conditions) + sum(limits).
     The risk and the limits include ordinary members only. `margin` is the relative margin of the conditions.
-    `measured`: names of the quantities beside the losses, in order. `minimised`: one of these names, or empty. If it is
-    given, (`unit` times its value)^2 is added to the risk; the losses then contain no errors and no costs.
+    `measured`: names of the quantities, in the order of their columns in `outcomes`. `minimised`: one of these names,
+    or empty. If it is not empty, the square of `unit` times this quantity is added to the risk. The caller then sets
+    the weights of errors and costs to 0 (`TuningProblem.towards_voltage`).
     """
 
     space: Space = static()
@@ -49,8 +50,8 @@ class Goal:
     def __call__(self, outcomes: Array, x: Array, ordinary: int) -> Array:
         """Return the goal at coordinates x [m].
 
-        `outcomes` [N, 1 + L]: the weighted loss and the limited quantities of each member. The first `ordinary` members
-        are not stressed.
+        `outcomes` [N, 1 + L]: the weighted loss and the quantities `measured` of each member. The first `ordinary`
+        members are not stressed.
         """
         stressed = outcomes[ordinary:, 0]
         loss = self.ordinary_risk(outcomes[:ordinary]) + (jnp.mean(stressed) if stressed.size else 0.0)

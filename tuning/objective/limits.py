@@ -1,7 +1,7 @@
 """Limits on quantities of an ensemble, and their terms in the goal.
 
 A search minimises the error subject to the limits by an augmented Lagrangian (Nocedal and Wright, Numerical
-Optimization, 2006, 17.3). With g = log(reached / allowed), a limit adds
+Optimization, 2006, 17.3). With g = log(reached / allowed), or log(allowed / reached) for a lower limit, a limit adds
 
     (max(0, multiplier + penalty g)^2 - multiplier^2) / (2 penalty)
 
@@ -29,8 +29,8 @@ PENALTY, PENALTY_GROWTH, SUFFICIENT_DECREASE, MOST_PENALTY = 30.0, 4.0, 0.3, 200
 PREFIX = "limit."
 # A limit with a multiplier above 0 is met if g lies between minus this number and half of the margin.
 TOLERANCE_BELOW = 0.01
-# Smallest margin. The search accepts a judged value up to half of the margin above its bound, so a smaller margin would
-# leave too little reserve for the held-out ensemble.
+# Smallest margin. The search accepts a judged value beyond `Limit.allowed` by up to half of the margin. The other half
+# is the reserve for the held-out ensemble; with a smaller margin it would be too small.
 LEAST_MARGIN = 0.002
 # Value of `Limit.source` for the limit on the rms error that traces the front of error against voltage.
 FRONT = "the front"
@@ -121,7 +121,7 @@ class Limit:
     def active(self, reached: float | None) -> bool:
         """Return whether the limit is active: its multiplier is above 0, and `reached` (judged) is near the limit.
 
-        The tolerance is TOLERANCE_BELOW plus the margin. `reached`: None if no member is judged; then only the
+        It is near if g is at least -(TOLERANCE_BELOW + margin). `reached`: None if no member is judged; then only the
         multiplier decides.
         """
         near = reached is None or self.log_excess(reached) >= -(TOLERANCE_BELOW + self.margin)
@@ -152,8 +152,8 @@ class Limit:
         """Return the relative decrease of the minimised rms value if the limit is looser by the share `more`.
 
         The decrease is 1 - exp(-I/2), where I is the integral of the multiplier over the logarithm of the limit. The
-        optima of earlier updates exceed the limit, so they are optima of looser limits. The multiplier is interpolated
-        linearly between them, and is constant beyond them.
+        optimum of an earlier update that exceeds the limit is the optimum of a looser limit. The multiplier is
+        interpolated linearly between the optima of all updates, and is constant beyond them.
         """
         if not self.multiplier:
             return 0.0

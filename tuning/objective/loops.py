@@ -21,7 +21,7 @@ LANES = 8
 
 
 class LoopLane(NamedTuple):
-    """One linearisation: coordinates `x` [m], the resolved cascade, the scenario of one member, the sample period."""
+    """One linearisation: coordinates `x` [m], and the results of `linearisation_inputs` for one member."""
 
     x: Any
     cascade: Cascade

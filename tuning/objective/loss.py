@@ -16,7 +16,8 @@ from ambjax.simulation.trajectory import ALIVE, Row
 from ambjax.world.scenario import Scenario
 from tuning.objective.limits import PREFIX
 
-# Exponent of the norm that approximates a maximum. Over 1e4 samples of noise, the maximum is 1.2 to 1.6 times the norm.
+# Exponent of the power mean that approximates a maximum. Over 1e4 samples of noise, the maximum is 1.2 to 1.6 times the
+# power mean.
 NORM = 16
 # Weights of the terms, in the order of TERMS; values of a term, for one member or for many [N].
 Weights = Sequence[float] | np.ndarray | Array
@@ -63,12 +64,13 @@ class Loss:
     With e_z = z - r:
 
     tracking: mean of (e_z / s_0)^2 from `settle` on; earlier samples have the weight `early`.
-    peak: square of the 16-norm of e_z / s_0 over the same samples, a smooth maximum.
+    peak: square of the power mean of |e_z| / s_0 with exponent 16, with the same weights: a smooth maximum.
     effort: mean over time of (u / u_scale)^2 while the drive is on.
     chatter: mean over samples of ((u_k - u_{k-1}) / u_scale)^2, where u_k is the average of u over sample k.
-    clearance: mean of max(0, (|z| - h) / (stop - h))^2, where h = (|r| + stop) / 2.
-    survival: share of the run after the loss of the rotor. Its derivative is that of the time at which |z| would reach
-    the stop with the speed at the last sample, so that a descent step delays the loss.
+    clearance: sum over all samples of max(0, (|z| - h) / (stop - h))^2, where h = (|r| + stop) / 2, divided by the
+    number of samples with the rotor held.
+    survival: share of the run after the loss of the rotor. In its derivative, the time of the loss is replaced by the
+    time at which |z| would reach the stop with the speed at the last sample. A descent step then delays the loss.
 
     The result also contains the result of each fold in `measures`, with PREFIX before its name.
     """

@@ -37,7 +37,7 @@ class Members(NamedTuple):
 
     `member` [n]: their numbers. `seed` [n]: of their ensembles. `values`: the spread values [n] by path.
     `noise_factor` [n]: factor on the sensor noise. `shift` [n, m]: offset of the coordinates of the gains.
-    `stressed` [n]: whether only the loss of the rotor counts for a member; stressed members come last.
+    `stressed` [n]: whether only clearance and survival count for a member (`weigh`); stressed members come last.
     """
 
     member: Any
@@ -99,8 +99,8 @@ class Objective:
         """Return `count` ordinary and `extra` stressed members.
 
         A stressed member has `noise` times the sensor noise, and each of its gains is multiplied or divided by
-        `gains`. The first stressed member has all gains multiplied, the second all divided. The signs of the others
-        are drawn from the seed.
+        `gains`. All gains of the first stressed member are multiplied, all of the second are divided. For each gain of
+        the others, a random number from the seed decides.
         """
         members = self.members(seed, count + extra)
         stressed = members.member >= count

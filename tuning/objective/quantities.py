@@ -16,7 +16,7 @@ from ambjax.simulation.response import Overshoot, Settling
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import Row
 
-# Largest number of members whose loops the search linearises. The judge linearises all of them.
+# Largest number of members whose loops the search linearises. The judge linearises the loops of all its members.
 LOOPS = 8
 # Exponent of the norms that approximate maxima.
 NORM = 16
@@ -26,9 +26,10 @@ TINY = 1e-30
 
 @record
 class Typical:
-    """Fold: the 16-norm over samples of |row.`of`| in units of `size`, a smooth maximum.
+    """Fold: the power mean with exponent 16 of |row.`of`| over the samples with the rotor held, a smooth maximum.
 
-    The derivative of a saturated voltage is 0. The norm also includes unsaturated samples, whose derivatives are not 0.
+    `size`: unit of the signal in the powers. The derivative of a saturated voltage is 0. The power mean also depends on
+    unsaturated samples, whose derivatives are not 0.
     """
 
     of: str = static()
@@ -110,8 +111,8 @@ class Kind:
     `words` describes the quantity of one member, `over` its reduction over members, both for the report. `fold`:
     function of a LimitContext and the limit, which returns the fold that measures the quantity in the search; None: the
     quantity is a field of LoopQuantities, computed from the linearised loop. `exact`: the column of the judge's metrics
-    with the exact value; None: the judge uses the value of the search. `tuned`, `judged`: the reduction over members in
-    the search and by the judge.
+    with the exact value; None: the judge evaluates the same fold or loop quantity as the search, on its own members.
+    `tuned`, `judged`: the reduction over members in the search and by the judge.
     """
 
     unit: str

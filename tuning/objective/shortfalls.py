@@ -17,7 +17,7 @@ from ambjax.world.scenario import Scenario
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """Condition: the gain at `path` exceeds `value` (in `unit`), which the paper calls `symbol`."""
+    """Condition: the gain at `path` exceeds `value`. `symbol`: name of the value in the paper. `unit`: unit of both."""
 
     path: str
     value: float

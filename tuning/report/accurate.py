@@ -1,6 +1,7 @@
 """The errors of the report's numbers due to its fixed integration steps, and nominal runs for its pictures.
 
-To find these errors, a few members are simulated again by adaptive RODAS3.
+To find these errors, a few members are simulated again with accurate steps. The report does so in continuous time
+only, where these are the steps of adaptive RODAS3.
 """
 
 import dataclasses

@@ -51,7 +51,8 @@ def _gains(facts: TuningFacts) -> list[str]:
     lines = ["## Gains", "", *markdown_table(head, rows), ""]
     words = (
         "Last column: increase of the risk if this gain alone is larger or smaller by a factor of e^0.25 = 1.28. The "
-        "larger of the two increases is shown. A gain with a large increase must be set accurately. If this change "
+        "larger of the two increases is shown. Here the risk includes the stressed members and the penalty of the "
+        "theorem's conditions. A gain with a large increase must be set accurately. If this change "
         "loses members of the training ensemble, the column shows how many more are lost than with the answer. "
         "`tune.bounds` sets other bounds."
     )

@@ -20,6 +20,7 @@ MODES, STEADY, AGREE = 1e-6, 0.05, 1e-3
 # Differences below these shares of the largest derivative and of the loss count as rounding errors.
 NOTHING, ROUNDING = 1e-6, 1e-9
 AGREED = "agree"
+# Horizons, as shares of the run, for which the norm of the gradient is computed; the whole run is added.
 HORIZONS = (0.125, 0.25, 0.5)
 
 
@@ -95,7 +96,8 @@ def agreement(forward: float, reverse: float, coarse: float, fine: float, floor:
 def against_horizon(problem: TuningProblem, x: np.ndarray, members: Members) -> list[dict[str, float]]:
     """Return, by horizon (s), the norm of the gradient of the log of the mean loss, and the share of lost members.
 
-    A horizon with a loss of 0, possible over one or two samples, has no row.
+    Only a part of the members is simulated (`Members.part(4)`). A horizon with a loss of 0, possible over one or two
+    samples, has no row.
     """
     rows, all_ = [], problem.objective.clock.samples
     for samples in sorted({max(round(share * all_), 1) for share in (*HORIZONS, 1.0)}):
@@ -116,7 +118,10 @@ def against_horizon(problem: TuningProblem, x: np.ndarray, members: Members) -> 
 
 
 def signal_to_noise(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, object]:
-    """Return the mean of the members' gradients divided by its standard error, by gain."""
+    """Return the mean gradient of the log loss over members, its standard error, and their ratio, by gain.
+
+    `lost`: share of lost members.
+    """
     outcomes, slopes, terms = problem.engine.gradient(x[None], members, problem.error_goal.weights)
     relative = slopes[0, :, 0] / outcomes[0, :, 0].mean()
     error = relative.std(axis=0, ddof=1) / np.sqrt(len(relative)) if len(relative) > 1 else np.full(len(x), np.nan)

@@ -1,4 +1,4 @@
-"""The outcome of tuning, from which the exit code, the log and the reports follow, and the advice."""
+"""The outcome of tuning, which determines the exit code, the log and the reports; and the advice if it is not good."""
 
 import dataclasses
 

@@ -11,7 +11,7 @@ Facts = dict[str, Any]
 
 
 def facts(problem: TuningProblem, measured: Sensitivity) -> Facts:
-    """Return plain data: a row for each member, and the limits of the zones.
+    """Return plain data: a row for each member of `measured`, and the limits of the zones.
 
     `zone` of a row is that of the linear peak, `injected_zone` that of the injected one.
     """
@@ -53,7 +53,10 @@ def section(found: Facts | None) -> list[str]:
     elif found["injected"]:
         words.append("The larger of the linear and the injected peak decides.")
     else:
-        words.append("In continuous time the linear peak decides; `ambjax sensitivity --inject` measures it.")
+        words.append(
+            "In continuous time the linear peak decides. `ambjax sensitivity --inject` measures the peak in a "
+            "simulation."
+        )
     if any(row["saturated"] for row in found["members"]):
         words.append(
             "The supply limits the voltage during the injection, so the measured peak describes the limited loop. A "

@@ -71,9 +71,10 @@ class SearchState:
 
 
 class CheckpointFile:
-    """Reads and writes the checkpoint of round number `round`. A new checkpoint replaces the old one atomically.
+    """Reads and writes the checkpoint of a search. A new checkpoint replaces the old one atomically.
 
     `path`: of the file; None: no checkpoint. `facts`: nested settings that a checkpoint must match to be resumed.
+    `round`: number of the search in its `Course`, from 1; a round of `rounds` may have several searches.
     """
 
     def __init__(self, path: pathlib.Path | None, facts: dict[str, Any], round: int = 1) -> None:
@@ -144,7 +145,7 @@ def can_resume(directory: pathlib.Path) -> bool:
 
 
 def checkpoint(number: int) -> str:
-    """Return the path of the checkpoint of this round, relative to the output directory."""
+    """Return the path of the checkpoint of this search of a `Course`, relative to the output directory."""
     return f"{FOLDER}/round-{number}.npz"
 
 
@@ -155,7 +156,10 @@ def checkpoints(directory: pathlib.Path) -> list[pathlib.Path]:
 
 
 def has_unfinished_search(directory: pathlib.Path, report: str) -> bool:
-    """Return whether a directory contains an unfinished search, with checkpoints newer than the file `report`."""
+    """Return whether a directory contains an unfinished search.
+
+    It has checkpoints, and they are newer than the file `report`, or this file does not exist.
+    """
     left, ended = checkpoints(directory), directory / report
     return bool(left) and not (
         ended.exists() and ended.stat().st_mtime_ns >= max(path.stat().st_mtime_ns for path in left)

@@ -1,4 +1,4 @@
-"""A sequence of searches. Each starts from the results of earlier ones. Restarts begin around the best point.
+"""A sequence of searches. Each later search starts from the results of earlier ones.
 
 A search can stop at a jump of the goal, although the goal is lower on the other side. A restart therefore tries
 quasi-random points around the best point so far.
@@ -52,9 +52,9 @@ class SearchResult:
     error: StepError | None
     history: dict[str, np.ndarray]
     lost: int
-    """number of lost validation members, plus the number of members that are lost with accurate steps"""
+    """number of lost validation members, plus the number of members that are lost or stall with accurate steps"""
     seconds: float
-    """duration of all searches, s, including the time before the search was resumed"""
+    """duration of all searches and validations, s, including the searches before a checkpoint was resumed"""
     validation_error: float = math.inf
     """rms error of the validation members that are held, relative to s_0; inf if it was not computed"""
     within: bool = True
@@ -94,7 +94,7 @@ class Course:
     past: list[SearchState] = dataclasses.field(default_factory=list)
     """the searches so far"""
     limit_searches: int = 0
-    """number of searches that follow an update of the limits' multipliers; they do not count towards
+    """number of searches after an update of the limits' multipliers, and for the front; they do not count towards
     `rounds.MOST_ROUNDS`
     """
     began: float = dataclasses.field(default_factory=time.perf_counter)
@@ -105,7 +105,7 @@ class Course:
 
         `at_optimum`: whether an earlier search on all members ended at the first point, so that this point need not be
         refined again. Raises KeyboardInterrupt if Ctrl-C ends the first search before its first iteration, and
-        ValueError if the goal is not finite at any point.
+        ValueError if the goal is finite at none of the points.
         """
         tune, number = self.problem.tune, len(self.past) + 1
         path = self.out / checkpoint(number) if self.out else None
@@ -187,7 +187,10 @@ def training(problem: TuningProblem) -> Members:
 
 
 def points_of(past: list[SearchState]) -> np.ndarray:
-    """Return at most FALLBACK_POINTS points [K, m] that the searches visited, best first, more of the good ones."""
+    """Return at most FALLBACK_POINTS points [K, m] that the searches visited, best first.
+
+    The spacing of their ranks increases, so most of them are good ones.
+    """
     x = np.concatenate([np.asarray(one.history["x"]).reshape(-1, one.starts.best.shape[-1]) for one in past])
     value = np.concatenate([np.asarray(one.history["value"]).ravel() for one in past])
     _, first = np.unique(np.where(np.isfinite(value), value, np.inf), return_index=True)
@@ -200,14 +203,17 @@ def _best(progress: SearchState) -> tuple[np.ndarray, float]:
     x, value = best_of(progress)
     if not np.isfinite(value):
         raise ValueError(
-            "tune: the loss or its derivative is not finite at any starting point. Check the case with 'ambjax "
+            "tune: at every starting point, the loss or its derivative is not finite. Check the case with 'ambjax "
             "simulate' (for chattering of u), or change tune.screen and tune.bounds."
         )
     return x, value
 
 
 def _joined(past: list[SearchState]) -> dict[str, np.ndarray]:
-    """Concatenate the histories of all searches by name. If a search has fewer starts, its first start is repeated."""
+    """Concatenate the histories of all searches by name.
+
+    If a search has fewer starts than another, only its first start is kept, and is repeated.
+    """
     width = max(len(one.active) for one in past)
 
     def wide(rows: npt.ArrayLike) -> np.ndarray:

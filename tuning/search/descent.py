@@ -1,4 +1,7 @@
-"""Descent: computes the next trial of each start from the members' losses and derivatives at the last trial."""
+"""Descent: the next trial of each start, computed from the members' losses and derivatives at the last trial.
+
+A start is a point that the search refines, with the state of its optimiser.
+"""
 
 import functools
 from typing import Any, NamedTuple

@@ -45,7 +45,11 @@ class CmaState(NamedTuple):
 
 
 class Rates(NamedTuple):
-    """Parameters in m dimensions: weights of the better half [h], their effective number, and the learning rates."""
+    """Parameters in m dimensions: `weights` of the better half [h], and their `effective` number.
+
+    `size`, `drift`: learning rates of the evolution paths `path` and `drift`. `damping`: of the step size. `one`,
+    `many`: learning rates of the rank-one and the rank-many (rank-mu) update of the covariance.
+    """
 
     weights: np.ndarray
     effective: float

@@ -8,7 +8,7 @@ import numpy as np
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
 
-# Coordinates of the points of a slice: a gain times about e^-1.5 to e^1.5.
+# Coordinates of the points of a slice, relative to the optimum: a gain times about e^-1.5 to e^1.5.
 REACH = np.linspace(-1.5, 1.5, 13)
 
 
@@ -20,10 +20,10 @@ class Slices:
     goals: np.ndarray
     lost: np.ndarray
     risks: np.ndarray
-    """logarithms of the risk of the errors, without the terms of the limits"""
+    """logarithms of the goal of least error (`TuningProblem.error_goal`), without the terms of the limits"""
 
     def sensitivity(self) -> np.ndarray:
-        """Return the increase of the risk, in per cent, if one gain changes by a factor of e^0.25, for each gain [m].
+        """Return the increase of exp(`risks`), in per cent, if one gain changes by a factor of e^0.25, by gain [m].
 
         The gain is multiplied or divided by this factor, whichever is worse. The number has no meaning if `more_lost`
         is above 0: the loss of a rotor costs about 1e6 times as much as an error.

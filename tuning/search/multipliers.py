@@ -18,11 +18,12 @@ from tuning.objective.limits import PENALTY, PREFIX, TOLERANCE_BELOW, Limit
 from tuning.problem import TuningProblem
 from tuning.search.course import Course
 
-# Largest number of updates of the multipliers in one round.
+# Largest number of searches after updates of the multipliers in one round.
 MOST_UPDATES = 6
 # Smallest decrease of g that counts as progress towards a limit.
 LEAST_DECREASE = 1e-3
-# A limit with g below -CLEARLY_BELOW is clearly met and is not judged again: two ensembles differ by far less.
+# A limit with g below -CLEARLY_BELOW is clearly met, because two ensembles differ by far less. The limits are not
+# judged again if all are clearly met and none concerns the worst member.
 CLEARLY_BELOW = 0.1
 # A quantity whose linear value has g above -INJECTED_FROM is also measured by injection, because the measured value may
 # exceed the linear one by up to a fifth.
@@ -34,12 +35,16 @@ AVERAGING_MEMBERS = 256
 def search_within_limits(course: Course, x: np.ndarray) -> tuple[np.ndarray, bool]:
     """Update the multipliers at x [m] and search again until every limit is met.
 
-    Returns the last optimum [m], or x itself if no search was needed, and whether it is within all limits. There are at
-    most MOST_UPDATES updates. They end early after Ctrl-C, and if a search ends where it began, within all limits. They
-    also end early if a larger penalty makes no progress towards a limit; the held-out members then show whether the
-    limit holds. If the updates do not converge, the optimum of least goal within all limits is returned, if there is
-    one: the judge may measure very different values on either side of a limit, and the searches then alternate between
-    them. `course.problem` receives the updated limits.
+    Returns the last optimum [m], or x itself if no search was needed, and whether it is within all limits.
+    `course.problem` receives the updated limits.
+
+    There are at most MOST_UPDATES searches. The loop ends early after Ctrl-C, and if a search ends where it began and
+    this point is within all limits. It also ends early if a larger penalty makes no progress towards a limit. The
+    held-out members then show whether the limit holds.
+
+    The updates may not converge: the judge may measure very different values on either side of a limit, and the
+    searches then alternate between the sides. The function then returns the optimum of least goal within all limits,
+    if there is one.
     """
     within, moved = list[np.ndarray](), True
     for update in range(MOST_UPDATES + 1):
@@ -49,7 +54,7 @@ def search_within_limits(course: Course, x: np.ndarray) -> tuple[np.ndarray, boo
             within.append(x)
         limits = tuple(limit.updated(*found) for limit, found in zip(before, numbers, strict=True))
         stuck = [limit for limit, (_, judged) in zip(before, numbers, strict=True) if _stuck(limit, judged)]
-        if stuck and update:  # an excess of an earlier round belongs to other members
+        if stuck and update:  # at update 0, `missed` is of an earlier round, with other members
             names = ", ".join(limit.name for limit in stuck)
             say(f"a larger penalty makes no progress towards the limit of {names}; its multiplier is no longer updated")
             break
@@ -113,7 +118,8 @@ def met(limit: Limit, judged: float) -> bool:
 def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
     """Return (the search's value, the judge's value) of each limit at x [m].
 
-    The judge uses the validation ensemble, or the training ensemble if tune.validation is 0.
+    The judge uses the validation ensemble, or the training ensemble if tune.validation is 0. If all limits are clearly
+    met (CLEARLY_BELOW), the judge's value is estimated: it is `Limit.ratio` times the search's value.
     """
     problem, budget = course.problem, course.problem.tune.budget
     limits = problem.limits

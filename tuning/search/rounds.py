@@ -2,10 +2,10 @@
 
 The first round searches with restarts. If the error of the integration steps at the optimum is too large, the search
 continues with finer steps. If a limit is not met, it continues with other multipliers. The answer is then validated.
-These members join the training ensemble for the next round: validation members that are lost, members that are lost
-with accurate steps and, if the rms error of the validation members is much larger than that of the training members,
-the validation members with the largest errors. If tune.objective or --pareto requires it, the front of error against
-voltage is traced at the end.
+If it is not `SearchResult.good`, two kinds of members join the training ensemble for the next round: validation members
+that are lost, and members that are lost with accurate steps. If it is good, but the rms error of the validation members
+is much larger than that of the training members, the validation members with the largest errors join instead. If
+tune.objective or --pareto requires it, the front of error against voltage is traced at the end.
 """
 
 import dataclasses
@@ -37,10 +37,10 @@ def rounds(
     `out`: directory of the checkpoints. `facts`: settings that a checkpoint must match. `resume`: whether to continue
     from the checkpoints. The result is the confirmed answer that loses the fewest members; of several such answers, one
     within all limits, and of those the one of least error on the validation ensemble. If no answer is confirmed, the
-    result is an earlier point of the searches that accurate steps confirm, or, without such a point, the answer that
+    result is an earlier point of the searches that is `SearchResult.good`, or, without such a point, the answer that
     loses the fewest members. If a front is traced, the result is the answer that `trace_front` selects.
 
-    Raises ValueError if the goal is not finite at any starting point, or if a checkpoint belongs to another search.
+    Raises ValueError if the goal is finite at no starting point, or if a checkpoint belongs to another search.
     """
     budget, answers = problem.tune.budget, list[SearchResult]()
     course = Course(problem, training(problem), budget.seed, out, facts, resume)
@@ -98,7 +98,7 @@ def with_fine_steps(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepErro
 
 
 def earlier_confirmed(course: Course, best: SearchResult) -> SearchResult:
-    """Return the best earlier point of the searches that is confirmed, or `best` if there is none."""
+    """Return the best earlier point of the searches that is `SearchResult.good`, or `best` if there is none."""
     say("accurate steps confirm none of the answers; earlier points of the searches are tried")
     for x in points_of(course.past):
         error = step_error(course.problem, x)

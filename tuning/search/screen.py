@@ -1,4 +1,7 @@
-"""Starting points: the case's gains, the middle of the search ranges, and quasi-random points."""
+"""Starting points of a search, and the screen, which selects the best of them.
+
+The points are the case's gains, the middle of the search ranges, and quasi-random points.
+"""
 
 import numpy as np
 
@@ -9,7 +12,8 @@ from tuning.objective.members import Members, Objective
 from tuning.objective.ranges import from_unit_cube, ranges
 from tuning.objective.shortfalls import Bound
 
-# Rounds of successive halving (a, b): one member in a is simulated, and one point in b is kept.
+# Rounds of the screen (a, b): one member in a is simulated, and one point in b is kept, but at least 2 `keep` points
+# and at least the members that `Members.part` keeps.
 ROUNDS = (8, 4), (4, 1)
 # Half-widths of the two neighbourhoods of a point, in coordinates: factors of e^1.5 and e^3 of each gain.
 NEAR, FAR = 1.5, 3.0

@@ -1,4 +1,4 @@
-"""Validation of an answer on members that the search has not seen, and the members that join the search after it."""
+"""Validation of an answer on members that the search does not use, and the members that then join the search."""
 
 import math
 from typing import NamedTuple
@@ -27,7 +27,7 @@ class Validation(NamedTuple):
     """Result of `validated`.
 
     `result`: the answer. `error`: its step error. `lost`: numbers of the validation members that are lost, the earliest
-    loss first. `large`: numbers of those that join the training ensemble because of their large errors.
+    loss first. `large`: numbers of those with large errors, which join the training ensemble if `result` is good.
     """
 
     result: SearchResult
@@ -37,9 +37,10 @@ class Validation(NamedTuple):
 
 
 def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> Validation:
-    """Judge x [m] on the validation ensemble, and on its worst members by accurate steps.
+    """Evaluate x [m] on the validation ensemble, with the steps of the search.
 
-    `error`: the step error at x, if it is known.
+    In continuous time, if no member is lost and the step error does not refute x, the worst members are simulated again
+    with accurate steps. `error`: the step error at x, if it is known.
     """
     problem, budget = course.problem, course.problem.tune.budget
     error = step_error(problem, x) if error is None else error
@@ -97,9 +98,9 @@ def _overall(errors: np.ndarray) -> float:
 def joining(problem: TuningProblem, lost: np.ndarray, error: StepError, number: int) -> Members:
     """Return the members that join the training ensemble.
 
-    The first of the `lost` validation members join with half of the additional noise of stressed members, which leaves
-    a margin. Members that are lost with accurate steps join with NOISE_GROWTH**number times their noise. `number`: of
-    the round, from 1.
+    The first MOST_LOST of the `lost` validation members join with half of the additional noise of stressed members, as
+    a margin. Members that are lost or stall with accurate steps join with NOISE_GROWTH**number times their noise.
+    `number`: of the round, from 1.
     """
     budget = problem.tune.budget
     those = problem.objective.chosen(seeds(budget)[1], lost[:MOST_LOST], budget.validation)

@@ -31,8 +31,8 @@ ABOUT = {
     ),
     "plant": About(
         "0: the next step reads the sensors in the initial state",
-        "inputs of a step: u and the disturbances, constant over the sample that ends with the step, and the noise of\n"
-        " * its readings",
+        "inputs of a step: u, commanded at the last sample; the disturbances, constant over the sample that ends with\n"
+        " * the step; and the noise of its readings",
         "Initialise the state before the first step.",
         "Advance the plant to the next sample, then read the sensors; the first step reads them in the initial state.\n"
         " * Returns the status bits above.",
@@ -42,8 +42,8 @@ ABOUT = {
         "0: the next step begins with the plant in the initial state",
         "inputs of a step: disturbances, constant over the sample that ends with the step, then noise and reference",
         "Initialise the state before the first step.",
-        "Advance the plant to the next sample under the last voltage, read the sensors, and step the controller; the\n"
-        " * first step reads the sensors in the initial state. Returns the status bits above.",
+        "Advance the plant to the next sample under the voltages that act, read the sensors, and step the\n"
+        " * controller; the first step reads the sensors in the initial state. Returns the status bits above.",
         "Begin again: the next step reads the sensors in the initial state, params->initial.",
     ),
 }
@@ -57,7 +57,7 @@ def notes_of(trace: Trace) -> list[str]:
 
 
 def _of_plant(trace: Trace) -> list[str]:
-    """Return these lines for a plant or a loop."""
+    """Return the lines of `notes_of` for a plant or a loop."""
     block: Any = trace.block
     lines = [
         f"Step n ends at t = n T, T = {block.period:g} s. It advances the plant by T under the voltages that act, with",
@@ -69,14 +69,14 @@ def _of_plant(trace: Trace) -> list[str]:
             "params->delay delays it further.",
         ]
     else:
-        lines += ["Then the controller computes output->u from these readings. Step n + 1 applies it."]
+        lines += ["Then the controller computes output->u from these readings; it acts params->delay samples later."]
     return [
         *lines,
         "",
         f"Fixed at export: T = {block.period:g} s, the parts of the plant, the integration steps in a sample. Export",
         "again to change one. An input that is not finite, or a delay out of range, sets the bit INVALID. A lost",
         "rotor is frozen until the next reset.",
-        "No other parameter of the plant is checked: a value beyond its range may lose the rotor at once.",
+        "No other parameter of the plant is checked: with a value beyond its range, the rotor may be lost at once.",
     ]
 
 
@@ -96,7 +96,7 @@ def order_of_work(trace: Trace) -> list[str]:
 
 
 def fixed(trace: Trace) -> list[str]:
-    """Return lines on what the export of a controller fixes, what params set, and what a step checks and predicts."""
+    """Return lines on what the export of a controller fixes, what params contains, and what a step checks."""
     parameters = {x.name: x for x in trace.parameters}
     unit = trace.block.outputs["u"][0]
     u_max, delay = parameters["limits.u_max"].value, parameters["processor.delay"].allowed

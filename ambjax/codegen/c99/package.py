@@ -68,8 +68,8 @@ def _vectors(writer: Writer, at: Points, given: Results) -> str:
         [
             writer.banner(f"{p}_vectors.h"),
             "",
-            "/* Steps computed by JAX: state and input before, state and output after. Points are random, or at limits",
-            " * and on both sides of the threshold of a comparison. */",
+            "/* Steps computed by JAX: state and input before, state and output after. Points are random, at limits,",
+            " * or on both sides of the threshold of a comparison. */",
             "",
             f"#ifndef {guard}",
             f"#define {guard}",
@@ -177,7 +177,9 @@ def _readme(writer: Writer) -> str:
         writers="\n".join(f"void write_{name}({p}_real {port});" for name, port in written_.items()),
         writes="\n".join(f"    write_{name}(output.{port});" for name, port in written_.items()),
         faults=" | ".join(f"{p}_{bit}" for bit in bits),
-        fault_note="SAFE: u is 0; FAILED, INVALID: the last u is held" if controller else "the rotor is lost, or NaN",
+        fault_note="SAFE: u is 0; FAILED, INVALID: the last u is held"
+        if controller
+        else "the rotor is lost, or an input or a parameter is invalid",
         flops=t.flops(),
         precision=t.precision,
         period=f"{t.block.period:g}",

@@ -25,7 +25,7 @@ class Origin(NamedTuple):
 
 
 class Writer:
-    """A traced step as text, all names beginning with `prefix`."""
+    """A traced step as C text. All global names begin with `prefix`, some in capitals."""
 
     def __init__(self, trace: Trace, prefix: str, origin: Origin) -> None:
         self.trace, self.prefix, self.origin = trace, prefix, origin
@@ -156,7 +156,7 @@ class Writer:
         )
 
     def notes(self) -> list[str]:
-        """Return the description in the header: parts, order of work, cost."""
+        """Return the description in the header: parts, order of operations, what the export fixes, cost."""
         t, counts = self.trace, self.trace.counts()
         size = 4 if t.precision == "float" else 8
         cost = ", ".join(f"{counts[name]} {words}" for name, words in COSTS.items() if counts[name])

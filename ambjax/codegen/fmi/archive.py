@@ -103,7 +103,7 @@ def compiled(files: dict[str, str], identifier: str) -> bytes:
 
 
 def packed(traced: Trace, identifier: str, origin: Origin, version: int) -> bytes:
-    """Return the bytes of an FMU; the comment of the archive is the mark of an export.
+    """Return the bytes of an FMU. A later export recognises it by MARK, the comment of the archive.
 
     The arguments are those of `sources`.
 

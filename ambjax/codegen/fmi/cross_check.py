@@ -42,9 +42,9 @@ def run_block(block: Block, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def reference(block: Block, cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[np.ndarray, np.ndarray]:
     """Return inputs and outputs of a block's FMU in the loop of the case.
 
-    Each is an array [instants, 1 + numbers] with the time (s) in the first column. The inputs of a row act in the
-    communication step that begins at its time. For a plant and a loop, the first row is also the input of the step that
-    reads the sensors at the start.
+    Each is an array [instants, 1 + numbers] with the time (s) in the first column; the outputs have one instant more.
+    The inputs of a row act in the communication step that begins at its time. For a plant and a loop, the first row is
+    also the input of the step that reads the sensors at the start.
     """
     count = min(clock.samples, SAMPLES[block.noun])
     if block.noun == "plant":

@@ -32,7 +32,7 @@ class Variable(NamedTuple):
 
 
 def variables(traced: Trace) -> list[Variable]:
-    """Return the variables of an exported block, except those that it does not read.
+    """Return the variables of an exported block, except inputs and parameters that it does not read.
 
     Their value references are those of fmu_core.h: time, inputs, outputs, parameters, states, status.
     """
@@ -58,7 +58,7 @@ def variables(traced: Trace) -> list[Variable]:
 
 
 def token(traced: Trace, identifier: str, files: dict[str, str]) -> str:
-    """Return the GUID of an FMU, a digest of its sources. `files`: their texts by name."""
+    """Return the GUID of an FMU, a digest of its identifier, block and sources. `files`: their texts by name."""
     text = "\n".join([identifier, traced.block.noun, *(files[name] for name in sorted(files))])
     digest = hashlib.sha256(text.encode()).hexdigest()
     return "{" + "-".join([digest[:8], digest[8:12], digest[12:16], digest[16:20], digest[20:32]]) + "}"

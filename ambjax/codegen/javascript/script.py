@@ -12,7 +12,8 @@ from ambjax.codegen.primitives import OPS
 from ambjax.codegen.program import PERIOD, STARTED, Operand, Ref
 from ambjax.codegen.trace import Trace, trace
 
-# Functions that the rows of OPS use and `Math` lacks. They treat NaN and the sign of 0 as JAX does.
+# Functions that the rows of OPS use, and that `Math` lacks or defines differently. They treat NaN and the sign of 0 as
+# JAX does.
 HELPERS = {
     "max": "(a, b) => a > b || a !== a ? a : b",
     "min": "(a, b) => a < b || a !== a ? a : b",
@@ -165,7 +166,7 @@ class Body:
         ]
 
     def helpers(self) -> list[str]:
-        """Return the definitions of the functions that the step uses and JavaScript lacks."""
+        """Return the definitions of the functions in HELPERS that the step uses, and of those that they call."""
         texts = {OPS[self.program.nodes[n].op].javascript for n in self.order}
         used = [name for name in HELPERS if any(re.search(rf"(?<![.\w]){name}\(", text) for text in texts)]
         used += [more for name in used for more in NEEDS.get(name, ()) if more not in used]
