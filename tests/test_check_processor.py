@@ -10,18 +10,22 @@ from texts import write
 
 import ambjax as amb
 from ambjax.__main__ import main
+from ambjax.control.guard import Guard
 from ambjax.control.inversion import ClosedForm
+from ambjax.control.observer import Direct
 from ambjax.control.processor import Processor
 from ambjax.control.sampling import Relay, band, disturbance, slope_limits
 from ambjax.ensemble import delays as searched
 from ambjax.ensemble.delays import DELAYS, delay_margin
 from ambjax.extend import InversionLaw, record
-from ambjax.simulation.rollout import Outcome
+from ambjax.simulation.rollout import Outcome, prepare
 from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Trajectory
 from ambjax.theorem import advice, sampled_report, slopes
-from ambjax.theorem.sampled_report import Delays, SampledReport
+from ambjax.theorem.law_signals import LawSignalsRecorder
+from ambjax.theorem.sampled_report import Delays, SampledReport, rolled
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.coils import TwoCoil
+from ambjax.world.faults import Outliers
 
 INF = math.inf
 LATE = [0.0, 0.2, 0.25, 0.4, 0.5, 0.8, 1.0, 1.3, 1.5, 2.0]
@@ -402,3 +406,21 @@ def test_check_passes_for_a_stable_cascade_on_a_processor(capsys):
     }
     margin = {"held": 2.0, "lost": None, "undecided": None, "resolution": None, "step": 1 / 256}
     assert summary["processor"]["delay_margin"] == margin
+
+
+@pytest.mark.parametrize("guarded", [False, True])
+def test_the_computed_signals_are_those_of_the_readings_that_the_laws_receive(guarded):
+    # one outlier of 0.1 mm at sample 50 moves sigma = z_dot - r_dot + c (z - r), unless it is refused
+    c, size, at = 17.0, 1e-4, 50
+    processor = Processor(guard=Guard(speed=1e-3) if guarded else None)
+    cascade = dataclasses.replace(amb.paper.cascade("sampled"), processor=processor, observer=Direct())
+    cascade = dataclasses.replace(cascade, position=dataclasses.replace(cascade.position, c=c))
+    scenario = amb.Scenario(sensor=amb.Sensor(outliers=Outliers(rate=0.0, size=size, at=at * 1e-4)))
+    loop, clock = prepare(cascade, scenario, amb.Clock(80, 1e-4))
+    rows = rolled(LawSignalsRecorder(loop), clock).trajectory.rows
+    apart = np.asarray(rows.computed.sigma - rows.true.sigma)
+    # The computed sigma is that at the end of the delay, one sample later. In the last 30 samples before the outlier,
+    # sigma changes by less than 1e-5 m/s in a sample.
+    np.testing.assert_allclose(apart[at - 30 : at], 0.0, atol=1e-5)
+    # the prediction over the delay adds the motion away from the outlier, so c times its size is a lower bound
+    assert abs(apart[at]) < 2e-5 if guarded else abs(apart[at]) > c * size

@@ -213,6 +213,13 @@ WRONG = {
 }
 
 
+def test_an_array_in_an_npz_file_is_refused(folder):
+    with pathlib.Path("k.npz").open("wb") as file:
+        np.save(file, np.eye(2))
+    with pytest.raises(ValueError, match=r"not an .npz file of plain numbers"):
+        read_case("case.toml")
+
+
 @pytest.mark.parametrize("wrong", WRONG)
 def test_a_wrong_file_is_refused_in_one_line(wrong, folder, capsys):
     arrays, wanted = WRONG[wrong]

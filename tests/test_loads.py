@@ -10,6 +10,7 @@ import pytest
 
 import ambjax as amb
 from ambjax.cases.reader import case_from, read_case
+from ambjax.commands.sensitivity import references
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import apply
 from ambjax.linear import linearise
@@ -254,6 +255,10 @@ def test_wrong_arrays_are_refused(tmp_path):
     (tmp_path / "x.npz").write_text("no")
     with pytest.raises(ValueError, match="not an npz file"):
         case_from(table, folder=tmp_path)
+    with (tmp_path / "x.npz").open("wb") as file:
+        np.save(file, np.eye(2))
+    with pytest.raises(ValueError, match="not an npz file"):
+        case_from(table, folder=tmp_path)
 
 
 def test_parquet_needs_its_extra(tmp_path):
@@ -294,3 +299,16 @@ def test_parquet_needs_its_extra(tmp_path):
 def test_wrong_loads_of_a_turning_rotor_are_refused(tables, said):
     with pytest.raises(ValueError, match=said):
         world(**tables)
+
+
+def test_a_reference_counts_within_the_run_only(tmp_path):
+    # 5 mm is beyond the stop of the paper's rotor (4.5 mm); the recording reaches it at 2 s
+    (tmp_path / "r.csv").write_text("0,0\n1,0.001\n2,0.005\n")
+    table = {"reference": {"kind": "table", "file": "r.csv"}}
+    case = case_from(table | {"clock": {"duration": 1.0}}, folder=tmp_path)
+    assert references(case)[1] == ("at +reference", pytest.approx(1e-3, rel=1e-3))
+    with pytest.raises(ValueError, match=r"reaches 0\.005 m within clock\.duration = 3 s"):
+        case_from(table | {"clock": {"duration": 3.0}}, folder=tmp_path)
+    # every zero of this sine is on a grid of 2,001 instants
+    sine = {"reference": {"kind": "sine", "amplitude": 1e-3, "frequency": 1000.0}, "clock": {"duration": 1.0}}
+    assert references(case_from(sine))[1] == ("at +reference", 1e-3)

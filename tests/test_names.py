@@ -42,6 +42,7 @@ from ambjax.host.synonyms import OTHER_WORDS, meant
         ({"m": 2.0}, "m = 2.0: unknown key. Did you mean 'plant.m'"),
         ({"processor": {"rate": 2e4}}, "Did you mean 'clock.sample_period'"),
         ({"actuator": {"supply": 48.0}}, "Did you mean 'u_max'"),
+        ({"processor": {"deadtime": 1.0}}, "Did you mean 'delay'"),
         ({"controller": {"position": {"kind": "PID"}}}, "Did you mean 'pid'"),
         ({"disturbance": {"q_z": {"kind": "step", "unit": "n", "amplitude": 1.0}}}, "Did you mean 'N'"),
         ({"sensor": {"runout": {"speed": 100.0}}}, "sensor.runout.harmonics is missing: it must be a list"),

@@ -80,6 +80,15 @@ def test_ranges_contain_the_values_of_every_preset(case):
             assert one.low <= value <= one.high, one.path
 
 
+def test_the_ranges_of_the_clearance_and_of_the_start_contain_values_close_to_the_gap(case):
+    plant, stop = case.scenario.plant, 0.99 * float(case.scenario.plant.s_0)
+    initial = dataclasses.replace(case.scenario.initial, z=0.98 * stop)
+    wide = dataclasses.replace(case, scenario=dataclasses.replace(case.scenario, clearance=stop, initial=initial))
+    found = {one.path: (one.low, one.high) for one in sliders(wide, [])}
+    assert plant.s_0 > found["run.clearance"][1] >= stop
+    assert found["initial.z"] == (-0.98 * stop, 0.98 * stop)
+
+
 def test_a_case_without_a_processor_is_refused_in_one_line(tmp_path, capsys):
     path = tmp_path / "paper.toml"
     path.write_text(case_template("tracking"))

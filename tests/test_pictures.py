@@ -354,6 +354,10 @@ def test_maps_outline_the_cells_that_survive(tmp_path, drawn):
     assert "initial $z$ (m)" in words
     assert "settled max |error| (µm)" in words
     assert "no survivor" in words
+    survival[0, 0] = np.nan
+    heatmaps.maps([a_panel(survival, error, x, y)], "z (m)", "speed (m/s)", False, False, tmp_path / "n.png")
+    assert "not run or no survivor" in texts(drawn[1])
+    survival[0, 0] = 1.0
     assert "in 15 of 55 cells" in words
     cells, *_, outline = drawn[0].axes[0].collections
     segments = {tuple(np.round(np.ravel(segment), 9)) for segment in outline.get_segments()}

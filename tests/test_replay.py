@@ -186,7 +186,8 @@ def test_the_reported_deviation_is_the_largest_over_the_metrics():
     relative = replaying._relative
     assert [relative(*pair) for pair in ((1.0, 1.0), (2.0, 1.0), (-1.0, 1.0))] == [0.0, 0.5, 2.0]
     assert [relative(*pair) for pair in ((np.inf, np.inf), (np.inf, 1.0), (True, False))] == [0.0, 1.0, 1.0]
-    assert relative(0.0, 0.0) == 0.0
+    assert relative(0.0, 0.0) == relative(np.nan, np.nan) == 0.0
+    assert relative(np.nan, 1.0) == 1.0
 
 
 # --- other loops ---

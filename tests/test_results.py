@@ -16,7 +16,7 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.linear import linearise
 from ambjax.simulation.metrics import standard_for
-from ambjax.simulation.trajectory import NOT_SAVED, SIGNAL_UNITS, Row
+from ambjax.simulation.trajectory import NOT_SAVED, SIGNAL_UNITS, STALLED, Row
 from tuning.__main__ import parser
 
 CASE = """
@@ -111,6 +111,9 @@ def test_the_pictures_show_the_results(run, members):
 def test_a_notebook_shows_the_metrics(run):
     page = run._repr_html_()
     assert "case: the rotor is held" in page
+    stalled = dataclasses.replace(run.trajectory, lost_code=jnp.asarray(STALLED), lost_at=jnp.asarray(0.01))
+    page = dataclasses.replace(run, trajectory=stalled)._repr_html_()
+    assert "case: not decided, stalled: the integrator could not meet its tolerance" in page
     assert f"<td>rms_u_V</td><td>{run.metrics['rms_u_V']:.6g}</td><td>V</td>" in page
 
 

@@ -114,7 +114,7 @@ def _updated_inverse(state: BFGSState, s: Array, y: Array, smooth: Array) -> Arr
     curvature = s @ y
     usable = (state.trials > 0) & smooth & (curvature > 1e-10 * jnp.sqrt((s @ s) * (y @ y)))
     rho = 1 / jnp.where(usable, curvature, 1.0)
-    # the first pair (s, y) sets the scale of the inverse Hessian
+    # The first pair (s, y) of a search sets the scale of the inverse Hessian, also of one kept from an earlier search.
     scale = jnp.where(state.trials == 1, curvature / jnp.where(usable, y @ y, 1.0), 1.0)
     left = jnp.eye(len(s), dtype=s.dtype) - rho * jnp.outer(s, y)
     return jnp.where(usable, scale * left @ state.inverse @ left.T + rho * jnp.outer(s, s), state.inverse)

@@ -60,6 +60,11 @@ class TuningProblem:
         """Whether the laws run on a processor, so that only the plant is integrated."""
         return self.case.cascade.processor is not None
 
+    @property
+    def sliding(self) -> bool:
+        """Whether the search integrates with sliding steps, tune.substeps in each sample."""
+        return slides(self.case.cascade, self.case.scenario.plant)
+
     @functools.cached_property
     def reference(self) -> Engine:
         """Engine with accurate steps.

@@ -70,7 +70,7 @@ def _of_npz(path: pathlib.Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path) as file:
             return {name: file[name] for name in file.files}
-    except (ValueError, EOFError, AttributeError, zipfile.BadZipFile):  # not an archive, or it contains pickled objects
+    except (ValueError, TypeError, EOFError, AttributeError, zipfile.BadZipFile):  # no archive, or pickled objects
         raise ValueError("not an .npz file of plain numbers. Write it with save_controller or numpy.savez.") from None
 
 

@@ -10,9 +10,13 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import Spread, ends
 from ambjax.simulation.clock import Clock
 from ambjax.world.band_noise import BandNoise
+from ambjax.world.ramps import Trapezoid
+from ambjax.world.recorded import Recorded
 from ambjax.world.scenario import Scenario
 from ambjax.world.signals import Sum
 
+# Signals whose bound (`span`) need not be reached within the run.
+BOUNDED = (Sum, BandNoise, Recorded, Trapezoid)
 # Instants per block at which a signal is sampled.
 BLOCK = 2**16
 # Largest number of combinations of the ends of a spread at which a sum is sampled.
@@ -36,13 +40,13 @@ def widest(spread: Spread, cascade: Cascade, scenario: Scenario) -> Scenario:
 def check_reference(spread: Spread, cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
     """Raise ValueError, with the largest |r| and the fix, if the reference leaves the clearance.
 
-    A sum or a noise need not reach its bound, so its values at the samples decide. They are computed for the case and
-    for each combination of the ends of its spread. More than MOST_CORNERS combinations are not checked.
+    A signal in BOUNDED need not reach its bound, so its values at the samples decide. They are computed for the case
+    and for each combination of the ends of its spread. More than MOST_CORNERS combinations are not checked.
     """
     _compare("reference", scenario, clock)
     wide = widest(spread, cascade, scenario)
     what = "spread.reference: at the ends of its [spread], the reference"
-    if not isinstance(scenario.reference, (Sum, BandNoise)):
+    if not isinstance(scenario.reference, BOUNDED):
         _compare(what, wide, clock)
     elif reach(wide, clock) >= np.min(wide.touchdown):
         shape = np.broadcast_shapes(*map(np.shape, jax.tree.leaves((wide.reference, wide.touchdown))))
@@ -52,7 +56,7 @@ def check_reference(spread: Spread, cascade: Cascade, scenario: Scenario, clock:
 
 def _compare(what: str, scenario: Scenario, clock: Clock) -> None:
     far, stop = reach(scenario, clock), float(np.min(scenario.touchdown))
-    if far >= stop and isinstance(scenario.reference, (Sum, BandNoise)):
+    if far >= stop and isinstance(scenario.reference, BOUNDED):
         far = largest_at_samples(scenario, clock)
     if not far < stop:
         raise ValueError(
@@ -60,6 +64,11 @@ def _compare(what: str, scenario: Scenario, clock: Clock) -> None:
             f"touches down at {stop:.6g} m (run.clearance, by default 0.9 of plant.s_0). Units are SI: make the "
             "reference smaller, or the gap wider."
         )
+
+
+def largest(scenario: Scenario, clock: Clock) -> float:
+    """Return the largest |r| of the run, m; of a signal in BOUNDED, the largest at the samples."""
+    return (largest_at_samples if isinstance(scenario.reference, BOUNDED) else reach)(scenario, clock)
 
 
 def largest_at_samples(scenario: Scenario, clock: Clock) -> float:

@@ -180,7 +180,7 @@ def _npz(file: pathlib.Path) -> dict[str, np.ndarray]:
     try:
         with np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
-    except (ValueError, zipfile.BadZipFile, EOFError):
+    except (ValueError, TypeError, zipfile.BadZipFile, EOFError):  # TypeError: an array of numpy.save
         raise ValueError("it is not an npz file of numbers. Write it with numpy.savez.") from None
 
 

@@ -60,7 +60,7 @@ def acceptance(case: Case) -> tuple[dict[str, object], str]:
         system = linearise(case.cascade, case.scenario, case.clock)
         loop = analyse(system, case.scenario.plant.m, case.clock.sample_period, case.zones)
     except ValueError as error:
-        return {"zone": None, "stable": False}, f"{error} {_facts_table(machine(case))}"
+        return {"zone": None, "stable": False}, f"{error}\n\n{_facts_table(machine(case))}"
     facts = [*_loop_facts(loop), *machine(case)]
     summary = {"stable": loop.stable, "zone": loop.zone, **{fact.key: fact.value for fact in facts}}
     return summary, "\n".join([_verdict(case, loop), "", _facts_table(facts)])

@@ -179,8 +179,8 @@ def comparison_markdown(summary: Mapping[str, Any]) -> str:
 
 
 def _words(summary: Mapping[str, Any]) -> str:
-    poor = [case["case"] for case in summary["cases"] if case["lost"] or case["peak"] is None]
-    why = f" Lost members, or a loop not stable at rest: {', '.join(poor)}; see 'ambjax check'." if poor else ""
+    poor = [case["case"] for case in summary["cases"] if case["lost"] or case["stalled"] or case["peak"] is None]
+    why = f" Members not held, or a loop not stable at rest: {', '.join(poor)}; see 'ambjax check'." if poor else ""
     return (
         f"{summary['members']} members, seed {summary['seed']}, the same in all cases. Errors, voltages, currents and "
         f"losses are those of the members that are held. Sensitivity and margins are those of the linearised loop at "

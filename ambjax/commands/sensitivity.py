@@ -3,8 +3,7 @@
 import argparse
 import pathlib
 
-import numpy as np
-
+from ambjax.cases.reach import largest
 from ambjax.cases.reader import Case
 from ambjax.commands.ensemble import study_of
 from ambjax.commands.outputs import directory, files, plain, write_json, written
@@ -51,9 +50,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
 
 def references(case: Case) -> list[tuple[str, float]]:
     """Return the names and references r (m) of the equilibria: 0, and plus and minus the largest |r| of the case."""
-    t = np.linspace(0.0, float(case.clock.duration), 2001)
-    r = np.asarray([float(case.scenario.reference(x)) for x in t])
-    size = float(np.max(np.abs(r)))
+    size = largest(case.scenario, case.clock)
     ends = [] if size == 0 else [("at +reference", size), ("at -reference", -size)]
     return [("nominal", 0.0), *ends]
 

@@ -87,7 +87,7 @@ def _velocity(case: Case) -> Iterator[str]:
 def idealised(case: Case) -> str:
     """Return a line that lists the idealisations of a case and the keys that remove them; '' if there are none."""
     sensor, parts = case.scenario.sensor, []
-    if case.scenario.plant.lumped:
+    if case.scenario.plant.one_current:
         parts.append("one current for both coils (plant.kind = 'two-coil' gives each its own)")
     if sensor is None or sensor.velocity:
         parts.append("a measured velocity (sensor.velocity = false, and an observer that estimates it)")
@@ -97,10 +97,10 @@ def idealised(case: Case) -> str:
 def reversal(case: Case, most_i: float) -> Iterator[str]:
     """Yield a warning if the largest |i| of a run, `most_i` in A, reverses the current of one coil.
 
-    It applies to the paper's plant with ideal iron only. With two coils, i is half the difference of their currents and
+    It applies to plants with one current for both coils. With two coils, i is half the difference of their currents and
     does not determine either of them.
     """
-    if case.scenario.plant.lumped and most_i > case.scenario.plant.i_0:
+    if case.scenario.plant.one_current and most_i > case.scenario.plant.i_0:
         yield f"|i| reaches {most_i:.4g} A, {_beyond(case)} plant.kind = 'two-coil' simulates each coil's current."
 
 

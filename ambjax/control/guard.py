@@ -74,7 +74,7 @@ class Guard:
     speed: Scalar | None = _limit(
         "m/s",
         "largest error of the predicted velocity; none: 6.8 sensor.std_z_dot, plus pole times clearance if z_dot is "
-        "estimated",
+        "estimated or the sensor has a low-pass, else plus pole times clearance times |sensor.gain - 1|",
         0,
     )
     samples: Scalar | None = leaf(

@@ -106,9 +106,9 @@ def replay(study: Study, index: int, tell: Callable[[int], object] = lambda _: N
 
 
 def _relative(a: SupportsFloat, b: SupportsFloat) -> float:
-    """Return |a - b|/max(|a|, |b|); 0 if a = b, and 1 if they differ and are not both finite (two NaN differ)."""
+    """Return |a - b|/max(|a|, |b|); 0 if both are equal or NaN, 1 if they differ and are not both finite."""
     a, b = float(a), float(b)
-    if a == b:
+    if a == b or np.isnan([a, b]).all():
         return 0.0
     return abs(a - b) / max(abs(a), abs(b)) if np.isfinite(a - b) else 1.0
 

@@ -105,7 +105,9 @@ def meant(word: str, allowed: Iterable[str]) -> str | None:
             return name
     elsewhere = (name for name, words in OTHER_WORDS.items() if "." in name and plain in words.split())
     close = difflib.get_close_matches(word, names, n=1)
-    return next(elsewhere, close[0] if close else None)
+    path = next(elsewhere, close[0] if close else None)
+    last = path.rpartition(".")[2] if path else ""
+    return last if last in names else path
 
 
 def other_words(name: str) -> list[str]:

@@ -72,50 +72,46 @@ class LinearScript(NamedTuple):
     facts: dict[str, Any]
 
 
-@dataclasses.dataclass(frozen=True)
-class LinearFunctions:
-    """The functions of the linear loop, which JAX traces. `numbers`: the numbers of the case, as JAX values."""
+def _start(numbers: Numbers) -> tuple[EquilibriumPoint, EquilibriumPoint]:
+    """Return the initial guess of the equilibrium, and the characteristic sizes of its components."""
+    numbers = _ideal(numbers)
+    point = start_of(numbers.cascade, numbers.scenario, numbers.period, 0.0)
+    sizes = sizes_of(numbers.cascade, numbers.scenario, point)
+    return _with_lags(numbers.scenario, point), _with_lags(numbers.scenario, sizes)
 
-    numbers: Numbers
 
-    def start(self, numbers: Numbers) -> tuple[EquilibriumPoint, EquilibriumPoint]:
-        """Return the initial guess of the equilibrium, and the characteristic sizes of its components."""
-        numbers = _ideal(numbers)
-        point = start_of(numbers.cascade, numbers.scenario, numbers.period, 0.0)
-        sizes = sizes_of(numbers.cascade, numbers.scenario, point)
-        return _with_lags(numbers.scenario, point), _with_lags(numbers.scenario, sizes)
+def _columns(numbers: Numbers, x: LoopPoint) -> tuple[PointValues, list[PointValues]]:
+    """Return the values at a point, and a list of their derivatives with respect to each component of the point."""
+    leaves, tree = jax.tree.flatten(x)
 
-    def columns(self, numbers: Numbers, x: LoopPoint) -> tuple[PointValues, list[PointValues]]:
-        """Return the values at a point, and a list of their derivatives with respect to each component of the point."""
-        leaves, tree = jax.tree.flatten(x)
+    def values(x: LoopPoint) -> PointValues:
+        return _values(_ideal(numbers), x)
 
-        def values(x: LoopPoint) -> PointValues:
-            return self._values(_ideal(numbers), x)
+    found = []
+    for k in range(len(leaves)):
+        unit = jax.tree.unflatten(tree, [jnp.ones(()) if j == k else jnp.zeros(()) for j in range(len(leaves))])
+        found.append(jax.jvp(values, (x,), (unit,))[1])
+    return values(x), found
 
-        found = []
-        for k in range(len(leaves)):
-            unit = jax.tree.unflatten(tree, [jnp.ones(()) if j == k else jnp.zeros(()) for j in range(len(leaves))])
-            found.append(jax.jvp(values, (x,), (unit,))[1])
-        return values(x), found
 
-    def _values(self, numbers: Numbers, x: LoopPoint) -> PointValues:
-        """Return the values at a point. `numbers`: those of `_ideal`."""
-        scenario: Any = numbers.scenario
-        lagged: Any = x.lagged
-        motion = scenario.plant.measurement(lagged.plant)
-        sensor, amplifier, lags = scenario.sensor, scenario.amplifier, LagState((), (), ())
-        u: Any = x.acting
-        read = motion
-        if sensor is not None and sensor.bandwidth is not None:
-            lags = lags._replace(z_filtered=2 * jnp.pi * sensor.bandwidth * (motion.z - lagged.z_filtered))
-            read = motion._replace(z=jnp.asarray(lagged.z_filtered))
-        if amplifier is not None:
-            lags = lags._replace(u_a=amplifier.slope() * (u - lagged.u_a))
-            u = lagged.u_a
-        measured = reading(scenario, read, (x.e, 0.0))
-        sample = Sample(at_rest(0.0), jnp.asarray(numbers.period), jnp.asarray(jnp.inf), x.past)
-        command, control, _ = numbers.cascade.step(measured, x.control, sample)
-        return PointValues(lags._replace(plant=scenario.plant.rates(lagged.plant, u)), control, command.u, measured.z)
+def _values(numbers: Numbers, x: LoopPoint) -> PointValues:
+    """Return the values at a point. `numbers`: those of `_ideal`."""
+    scenario: Any = numbers.scenario
+    lagged: Any = x.lagged
+    motion = scenario.plant.measurement(lagged.plant)
+    sensor, amplifier, lags = scenario.sensor, scenario.amplifier, LagState((), (), ())
+    u: Any = x.acting
+    read = motion
+    if sensor is not None and sensor.bandwidth is not None:
+        lags = lags._replace(z_filtered=2 * jnp.pi * sensor.bandwidth * (motion.z - lagged.z_filtered))
+        read = motion._replace(z=jnp.asarray(lagged.z_filtered))
+    if amplifier is not None:
+        lags = lags._replace(u_a=amplifier.slope() * (u - lagged.u_a))
+        u = lagged.u_a
+    measured = reading(scenario, read, (x.e, 0.0))
+    sample = Sample(at_rest(0.0), jnp.asarray(numbers.period), jnp.asarray(jnp.inf), x.past)
+    command, control, _ = numbers.cascade.step(measured, x.control, sample)
+    return PointValues(lags._replace(plant=scenario.plant.rates(lagged.plant, u)), control, command.u, measured.z)
 
 
 def _ideal(numbers: Numbers) -> Numbers:
@@ -140,13 +136,12 @@ def linear_script(case: Case) -> LinearScript:
     """
     with precision("double"):
         numbers = canonical(loop_parameters(case, any_delay=True))
-        functions = LinearFunctions(numbers)
-        (lagged, u, control), _ = jax.eval_shape(functions.start, numbers)
+        (lagged, u, control), _ = jax.eval_shape(_start, numbers)
         zero = jnp.zeros(())
         x = LoopPoint(lagged, u, control, (zero, zero), zero)
         x = jax.tree.map(lambda _: zero, x)
-        start = piece_of(functions.start, "p", (numbers,))
-        point = piece_of(functions.columns, "px", (numbers, x))
+        start = piece_of(_start, "p", (numbers,))
+        point = piece_of(_columns, "px", (numbers, x))
     low, high = case.zones.range(case.clock.sample_period)
     zones = [float(z) for z in (case.zones.zone_a, case.zones.zone_b, case.zones.zone_c)]
     sizes = {"lagged": len(jax.tree.leaves(x.lagged)), "control": len(jax.tree.leaves(x.control))}

@@ -51,14 +51,11 @@ class GivenNoise(Realised):
 class LoopFunctions:
     """The functions of the loop, which JAX traces.
 
-    - `clock`: number of samples and integrator.
-    - `numbers`: the numbers of the case, as JAX values.
-
-    The argument `normals` of the methods is a tuple of three scalars, the normal numbers of the sample.
+    `clock`: number of samples and integrator. The argument `normals` of the methods is a tuple of three scalars, the
+    normal numbers of the sample.
     """
 
     clock: Clock
-    numbers: Numbers
 
     def _system(self, numbers: Numbers, normals: Any) -> tuple[Sampled, Clock, Standard]:
         clock = dataclasses.replace(self.clock, sample_period=numbers.period)

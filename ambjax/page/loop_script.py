@@ -46,7 +46,7 @@ def loop_script(case: Case, any_delay: bool = False) -> LoopScript:
     """
     with precision("double"):
         numbers = canonical(loop_parameters(case, any_delay))
-        functions = LoopFunctions(case.clock, numbers)
+        functions = LoopFunctions(case.clock)
         zero = jnp.zeros(())
         normals = (zero, zero, zero)
         start = piece_of(functions.start, "pw", (numbers, normals))

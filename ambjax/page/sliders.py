@@ -152,9 +152,9 @@ def _range(path: str, place: Place, values: list[float], case: Case) -> tuple[fl
     elif path == SEED:
         low, high, log = 0.0, max(100.0, large), False
     elif path == "run.clearance":
-        low, high, log = 0.2 * small, 0.95 * float(case.scenario.plant.s_0), False
+        low, high, log = 0.2 * small, max(large, 0.95 * float(case.scenario.plant.s_0)), False
     elif path == "initial.z":
-        most = 0.95 * float(case.scenario.limit)
+        most = max(-small, large, 0.95 * float(case.scenario.limit))
         low, high, log = -most, most, False
     elif meta["whole"]:
         low, high, log = float(meta["at_least"]), float(meta["at_most"]), False

@@ -92,9 +92,8 @@ def map_figure(
     if any(panel.low is not None for panel in panels):
         words = "bounds of the confidence interval at 95 %"
         keys.append(Line2D([], [], color=INK, linewidth=LINES["low"], label=words))
-    grids = [grid for panel in panels for grid in (panel.survival, panel.error) if grid is not None]
-    if not all(np.isfinite(grid).all() for grid in grids):
-        keys.append(Patch(label="no survivor" if rows == 2 else "not run", **EMPTY_CELL))
+    if empty := _empty_words(panels):
+        keys.append(Patch(label=empty, **EMPTY_CELL))
     figure.legend(handles=keys, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     return figure
 
@@ -167,6 +166,14 @@ def _outline(ax: Axes, x_edges: np.ndarray, y_edges: np.ndarray, inside: np.ndar
     for colour, stroke in (("white", width + 1.4), (INK, width)):
         lines = LineCollection([*upright, *level], colors=colour, linewidths=stroke, capstyle="projecting")
         ax.add_collection(lines, autolim=False)
+
+
+def _empty_words(panels: Sequence[MapPanel]) -> str:
+    """Return what the hatched cells of the maps show: cells that were not run, cells without a survivor, or both."""
+    unrun = [np.isnan(np.asarray(panel.survival, float)) for panel in panels]
+    lost = [~np.isfinite(x.error) & ~cells for x, cells in zip(panels, unrun, strict=True) if x.error is not None]
+    words = {"not run": unrun, "no survivor": lost}
+    return " or ".join(word for word, cells in words.items() if any(one.any() for one in cells))
 
 
 def _contour_words(panels: Sequence[MapPanel]) -> str:

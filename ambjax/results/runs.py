@@ -95,8 +95,9 @@ class CaseRun:
 
     def _repr_html_(self) -> str:
         """Return the table of the metrics, with the status of the rotor as its caption."""
-        state = f"lost: {self.trajectory.lost_why}" if self.lost else "held"
-        head = f"{html.escape(self.case.name)}: the rotor is {html.escape(state)}"
+        why = self.trajectory.lost_why
+        ended = f"the rotor is lost: {why}" if self.lost else f"not decided, {why}" if why else "the rotor is held"
+        head = html.escape(f"{self.case.name}: {ended}")
         rows = "".join(
             f"<tr><td>{name}</td><td>{value:.6g}</td><td>{UNITS.get(name, '')}</td></tr>"
             for name, value in self.metrics.items()

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.compiler.barrier import materialised
-from ambjax.control.cascade_state import Command, Sample
+from ambjax.control.cascade_state import CascadeState, Command, Sample
 from ambjax.control.guard import GuardResult, Watch, expected
 from ambjax.control.processor import Processor
 from ambjax.numerics.records import Scalar, record, static
@@ -137,13 +137,8 @@ class Sampled:
         `measured`: the readings, before the guard. `reference`: see `Sample`. The exported C is traced from this
         function.
         """
-        cascade, past, checked, laws = self.loop.cascade, (state.command.u, state.past[0]), None, state.control
-        if self.processor.guard is not None:
-            estimated = cascade.observer.estimates_velocity
-            checked = self.processor.guard.check(cascade.model, measured, state.watch, self.period, estimated)
-            measured = checked.reading
-        if not isinstance(state.started, tuple):
-            laws = choose(state.started.astype(bool), laws, cascade.init(measured))
+        cascade, past = self.loop.cascade, (state.command.u, state.past[0])
+        checked, measured, laws = self.inputs_of_laws(measured, state)
         sample = Sample(reference, self.period, jnp.asarray(self.loop.scenario.command_limit), past)
         command, control, estimate = cascade.step(measured, laws, sample)
         command = command._replace(u=limited(command.u, sample.u_max))
@@ -162,6 +157,19 @@ class Sampled:
             watch = watch._replace(left=checked.left)
         finite = jnp.where(finite, state.finite, 0.0)
         return state._replace(control=control, command=command, past=past, finite=finite, watch=watch, started=started)
+
+    def inputs_of_laws(
+        self, measured: Measurement, state: SampledState
+    ) -> tuple[GuardResult | None, Measurement, CascadeState]:
+        """Return the result of the guard, and the readings and the states with which the laws step at this sample."""
+        cascade, checked, laws = self.loop.cascade, None, state.control
+        if self.processor.guard is not None:
+            estimated = cascade.observer.estimates_velocity
+            checked = self.processor.guard.check(cascade.model, measured, state.watch, self.period, estimated)
+            measured = checked.reading
+        if not isinstance(state.started, tuple):
+            laws = choose(state.started.astype(bool), laws, cascade.init(measured))
+        return checked, measured, laws
 
     def _next_guard_state(
         self, checked: GuardResult | None, estimate: Measurement, voltages: tuple[Array, ...]

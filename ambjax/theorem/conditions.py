@@ -205,7 +205,7 @@ def _conditions(
     def line(one: Required, name: str, over: str, side: tuple[float, float], ideal: bool = False) -> Condition:
         requires, (against, at) = f"{one.gain} > {over}", side
         if one.value is None:
-            return Condition(name, requires, None, against, at, one.unit, None, "the law in use has no such gain")
+            return Condition(name, requires, None, against, at, one.unit, None, "the law in use has no such condition")
         gain, path = float(one.value), one.path
         return Condition(name, requires, gain, against, at, one.unit, gain > against, "", path, over, ideal)
 

@@ -1,4 +1,4 @@
-"""The loop on a processor, with rows that also contain sigma, v_tilde and e as computed from the estimate."""
+"""The loop on a processor, with rows that also contain sigma, v_tilde and e as the laws compute them."""
 
 from typing import NamedTuple
 
@@ -25,8 +25,8 @@ class LawSignals(NamedTuple):
 class LawSignalsRow(NamedTuple):
     """One sample: time (s), limited voltage (V), z (m), i_ref (A), and signals.
 
-    `computed`: signals computed from the estimate (with prediction: at the end of the delay); the estimate follows from
-    the readings before faults and guard. `true`: sigma and e of the plant at the sample; v_tilde is the computed one.
+    `computed`: signals that the laws compute from the estimate (with prediction: at the end of the delay). `true`:
+    sigma and e of the plant at the sample; v_tilde is the computed one.
     """
 
     t: Array
@@ -65,8 +65,8 @@ class LawSignalsRecorder:
         cascade, after = loop.loop.cascade, loop.jump(t, before, errors)
         reference = loop.reference(t)
         sample = Sample(reference, loop.period, jnp.asarray(loop.loop.scenario.command_limit), after.past)
-        measured = loop.measured(before.plant, before.z_filtered, errors)
-        estimate, *_ = cascade.estimate(measured, before.control.observer, sample)
+        _, measured, laws = loop.inputs_of_laws(loop.read(before, errors)[1], before)
+        estimate, *_ = cascade.estimate(measured, laws.observer, sample)
         sigma, command = cascade.sigma(estimate, reference), after.command
         return LawSignalsState(after, LawSignals(sigma, command.v_tilde, estimate.i - command.i_ref))
 

@@ -63,7 +63,7 @@ def _peak(row: Row, found: Row) -> tuple[float, float]:
 
     It is the injected peak if only injected peaks decide, otherwise the larger one.
     """
-    if row["repetitions"] and row["peak"] is None:
+    if row["lost"]:
         return math.inf, math.nan
     linear, injected = (row["linear"], row["frequency_hz"]), (row["peak"], row["at_hz"])
     if row["peak"] is None:

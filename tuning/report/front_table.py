@@ -52,10 +52,12 @@ def sentence(rows: list[Facts]) -> str:
     words = f"{least['settled_rms_error_m']:.3g} m at {least['settled_rms_u_V']:.3g} V"
     if taken is least:
         return f"This answer has the least error: {words}."
-    return (
-        f"This answer has the least rms voltage of those with an error of at most {KNEE:g} times the least error: "
-        f"{taken['settled_rms_error_m']:.3g} m at {taken['settled_rms_u_V']:.3g} V. Least error: {words}."
-    )
+    near = [row for row in rows if row["settled_rms_error_m"] <= KNEE * least["settled_rms_error_m"]]
+    why = ""
+    if taken is min(near, key=lambda row: row["settled_rms_u_V"]):
+        why = f" has the least rms voltage of those with an error of at most {KNEE:g} times the least error"
+    at = f"{taken['settled_rms_error_m']:.3g} m at {taken['settled_rms_u_V']:.3g} V"
+    return f"This answer{why}: {at}. Least error: {words}."
 
 
 def letter(n: int) -> str:

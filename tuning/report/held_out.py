@@ -77,7 +77,7 @@ def _accurate(again: Row | None) -> list[str]:
         return [f"{words}No difference exceeds {100 * again['marked_beyond']:g} %."]
     return [
         f"{words}Differences above {100 * again['marked_beyond']:g} % are in bold. For these metrics, use the values "
-        "with accurate steps, and raise tune.substeps."
+        "with accurate steps. With sliding steps, raise tune.substeps."
     ]
 
 

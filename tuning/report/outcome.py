@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from ambjax.theorem.advice import STALLED, STALLED_PLANT
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
 from tuning.report import front_table
@@ -135,15 +136,17 @@ def remedies(
         return ""
     words = []
     if outcome.refuted:
+        keys = "tune.substeps or tune.stress" if problem.sliding else "tune.stress"
         words.append(
-            f"Not verified: {outcome.refuted}. Raise tune.substeps or tune.stress, or lower the upper "
-            "bounds of the gains that end at them (tune.bounds)."
+            f"Not verified: {outcome.refuted}. Raise {keys}, or lower the upper bounds of the gains that end at them "
+            "(tune.bounds)."
         )
     if outcome.broken:
         keys = ", ".join(f"tune.limits.{name}" for name in outcome.broken)
         words.append(f"Not held: {keys}. Loosen these limits, tune more gains (also each p), or raise tune.screen.")
     if outcome.stalled:
-        words.append(f"Not decided: {outcome.stalled} held-out members, whose integration stalls. Raise tune.substeps.")
+        remedy = STALLED_PLANT if problem.sampled else STALLED
+        words.append(f"Not decided: {outcome.stalled} held-out members, whose integration stalls. {remedy}")
     return " ".join(
         [*words, *(_causes_of_loss(problem, facts, x, members) if not outcome.rotors_held and outcome.lost else [])]
     )

@@ -19,8 +19,7 @@ def facts(problem: TuningProblem, measured: Sensitivity) -> Facts:
     rows = []
     for one in measured.peaks:
         row = {name: value for name, value in dataclasses.asdict(one).items() if name != "largest"}
-        lost = one.repetitions > 0 and one.peak is None
-        row["injected_zone"] = "D" if lost else None if one.peak is None else zones.zone(one.peak)
+        row["injected_zone"] = "D" if one.lost else None if one.peak is None else zones.zone(one.peak)
         rows.append(row)
     limits = [float(x) for x in (zones.zone_a, zones.zone_b, zones.zone_c)]
     return {"members": rows, "injected": injects(problem), "decides": measured.decides, "zones": limits}
@@ -66,7 +65,7 @@ def section(found: Facts | None) -> list[str]:
 
 
 def _injected(row: Facts) -> list[str]:
-    if row["peak"] is None:
+    if row["lost"]:
         return [f"lost: {row['lost']} of {row['repetitions']}", "-", "-", row["injected_zone"], "-"]
     interval = "-" if row["low"] is None else f"{row['low']:.4g} to {row['high']:.4g}"
     saturated = f"{100 * row['saturated']:.2g} %"

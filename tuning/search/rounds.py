@@ -113,6 +113,8 @@ def finer(problem: TuningProblem) -> TuningProblem | None:
     """Return the problem with steps half as long, or None after MOST_HALVINGS. The count of rollouts is kept."""
     if problem.finer >= 2**MOST_HALVINGS:
         return None
-    fine = problem_of(problem.case, problem.tune, finer=2 * problem.finer, front=problem.front).limited(problem.limits)
+    threads = problem.engine.threads
+    fine = problem_of(problem.case, problem.tune, finer=2 * problem.finer, threads=threads, front=problem.front)
+    fine = fine.limited(problem.limits)
     fine.engine.rollouts = problem.engine.rollouts
     return fine

@@ -90,7 +90,7 @@ def order_of_work(trace: Trace) -> list[str]:
         f"{delay:g} T after the reading, until the u of the next sample replaces it; before the first u, apply 0 "
         f"{unit}.",
     ]
-    ahead = f"{delay:g} T after the reading" if processor.predicts else "of the reading"
+    ahead = f"{processor.ahead:g} T after the reading" if processor.predicts else "of the reading"
     lines.append(f"The reference is that of the instant {ahead}.")
     return lines
 
