@@ -1691,8 +1691,8 @@ SAMPLED = [
     M(
         "the voltages of the two previous samples are exchanged",
         "ambjax/simulation/sampled.py",
-        "past, checked, laws = self.loop.cascade, (state.command.u, state.past[0]),",
-        "past, checked, laws = self.loop.cascade, (state.past[0], state.command.u),",
+        "cascade, past = self.loop.cascade, (state.command.u, state.past[0])",
+        "cascade, past = self.loop.cascade, (state.past[0], state.command.u)",
         "tests/test_sampled.py::test_the_voltage_of_a_sample_acts_after_the_delay",
     ),
     M(

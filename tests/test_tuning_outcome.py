@@ -166,5 +166,5 @@ def test_the_number_of_members_lost_by_a_changed_gain_is_reported():
     ]
     text = report._gains(types.SimpleNamespace(gains=rows, trained_on=40, nominal_steps="by accurate steps"))
     assert [line.split("|")[-2].strip() for line in text if line.startswith("| controller")] == [
-        "**2 of 40 training members are lost**", "3 %", "0 %",
+        "**2 of 40 training members are also lost**", "3 %", "0 %",
     ]  # fmt: skip

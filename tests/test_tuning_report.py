@@ -402,18 +402,20 @@ def test_each_row_of_the_picture_shows_the_run_of_its_label(study, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("decides", "row", "words"),
+    ("decides", "row", "lost", "words"),
     [
-        (False, (2.0, 300.0, 1.5, 400.0), "at most 2 (at 300 Hz)"),
-        (False, (1.2, 300.0, 1.5, 400.0), "at most 1.5 (at 400 Hz)"),
-        (True, (2.0, 300.0, 1.5, 400.0), "at most 1.5 (at 400 Hz)"),
-        (False, (2.0, 300.0, None, None), "at most 2 (at 300 Hz)"),
+        (False, (2.0, 300.0, 1.5, 400.0), 0, "at most 2 (at 300 Hz)"),
+        (False, (1.2, 300.0, 1.5, 400.0), 0, "at most 1.5 (at 400 Hz)"),
+        (True, (2.0, 300.0, 1.5, 400.0), 0, "at most 1.5 (at 400 Hz)"),
+        (False, (2.0, 300.0, None, None), 0, "at most 2 (at 300 Hz)"),
+        # one of two injections loses the rotor: the limits count this as infinite
+        (False, (2.0, 300.0, 1.5, 400.0), 1, "a member is lost when a test signal is injected: zone A"),
     ],
 )
-def test_the_frequency_of_the_largest_peak_is_that_of_the_printed_value(decides, row, words):
+def test_the_frequency_of_the_largest_peak_is_that_of_the_printed_value(decides, row, lost, words):
     linear, frequency, peak, at = row
     member = {"linear": linear, "frequency_hz": frequency, "peak": peak, "at_hz": at, "zone": "A"}
-    member |= {"injected_zone": None, "repetitions": 0 if peak is None else 2}
+    member |= {"injected_zone": None, "repetitions": 0 if peak is None else 2, "lost": lost}
     facts = types.SimpleNamespace(sensitivity={"members": [member], "decides": decides})
     assert words in sensitivity_line(facts)
 

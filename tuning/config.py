@@ -113,7 +113,7 @@ def read_tune(
 
 
 def _merged(own: Any, other: Any) -> Any:
-    """Return [tune] of `other` with the gains and bounds of `own`. If one of them is not a table, return `own`."""
+    """Return [tune] of `other` with the gains and bounds of `own`; `own` if either argument is not a table."""
     if not (isinstance(own, dict) and isinstance(other, dict)):
         return own
     kept = {key: value for key, value in own.items() if key in KEYS_OF_LAWS}

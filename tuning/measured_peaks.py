@@ -18,11 +18,12 @@ from ambjax.results.operating import one_period
 from tuning.objective.limits import PREFIX, Limit
 from tuning.problem import TuningProblem
 
-# Number of members, those with the largest peaks, that are measured by injection, and number of repetitions of each
-# measurement with different noise.
+# INJECTED: number of members, those with the largest peaks, that are measured by injection. REPETITIONS: number of
+# injections into each of them, with different noise.
 INJECTED, REPETITIONS = 3, 8
-# If only injections decide, the linear peaks do not show which members have the largest peaks. The first SCREENED
-# members are then measured once each. One call measures all of them in the time that it takes for one member.
+# If only injections decide, the linear peaks do not show which members have the largest peaks. The first SCREENED held
+# members are then measured once each. They run in blocks of 16, one per core: on four cores, this takes as long as the
+# measurement of one member.
 SCREENED = 64
 # Limited quantities that an injection measures.
 MEASURED = {"sensitivity": "S", "complementary": "T", "control_sensitivity": "KS"}
@@ -35,8 +36,8 @@ class MeasuredPeak:
     `linear`, `frequency_hz`, `zone`: of the linearised loop; None, None and "D" if it is not stable or has no
     equilibrium. `peak`, `low`, `high`, `at_hz`: injected, with the 95 % interval; None if all injections lose the rotor
     or the laws run in continuous time. `saturated`: share of samples with the supply at its limit. `repetitions`:
-    number of injections; 0 in continuous time. `lost`: in how many of them the rotor is lost. `largest`: injected peaks
-    of |S|, |T| and |KS| by the name of the limit; empty without injections, or if one of them loses the rotor.
+    number of injections; 0 in continuous time. `lost`: in how many of them the rotor is lost or the run stalls.
+    `largest`: injected peaks of |S|, |T| and |KS| by the name of the limit; empty without injections, or if `lost` > 0.
     """
 
     member: int
@@ -68,7 +69,8 @@ def injects(problem: TuningProblem) -> bool:
 def decides(problem: TuningProblem) -> bool:
     """Return whether only injected peaks are compared with the limits.
 
-    This holds if injections measure a limit and a sign is set-valued: no linear loop describes its chattering.
+    This holds if injections measure a limited quantity and a sign is set-valued: no linear loop describes the
+    chattering of such a sign.
     """
     return injects(problem) and any(set_valued_signs(getattr(problem.case.cascade, stage)) for stage in DEFAULT_LAWS)
 
@@ -77,8 +79,9 @@ def injections(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[s
     """Analyse the INJECTED held members with the largest peaks at coordinates x [m]; on a processor, also inject.
 
     `columns` [N]: result of `judge` for the ensemble with this `seed`. The members are those with the largest linear
-    peak or, if only injections decide, with the largest peak in one injection into each of the first SCREENED members.
-    Returns None if no limit concerns such a peak, or if no member is held.
+    peak of the first quantity of MEASURED that has a limit. If only injections decide, they are those with the largest
+    injected |S|, measured once in each of the first SCREENED held members. Returns None if no quantity of MEASURED has
+    a limit, or if no member is held.
     """
     name = next((name for name in MEASURED if f"loss.{PREFIX}{name}" in columns), None)
     alive = np.flatnonzero(~np.isfinite(columns["lost_at_s"]))

@@ -21,10 +21,11 @@ OUTPUTS = {
 
 
 def try_law(law: Law, stage: str, model: Plant) -> None:
-    """Trace `init`, `init_sampled`, the call, `step`, `begin`, `scale` and `slope` of a law, as far as it has them.
+    """Trace the call, `init`, `scale` and `slope` of a law, and `step` if the law has it.
 
-    Raises TypeError if an output, a rate, a scale or a next state has a wrong structure or shape. Exceptions that the
-    methods raise are passed on.
+    Of a position law, `begin` is traced too; of every law but an observer, `init_sampled`. Raises TypeError if an
+    output, a rate, a scale, a slope or a state has a wrong structure or shape. Exceptions that the methods raise are
+    passed on.
     """
     one: Any = law
     motion, reference = Measurement(*_zeros(3)), Reference(*_zeros(3))

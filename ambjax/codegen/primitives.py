@@ -115,7 +115,7 @@ def split_scan(params: dict[str, Any], args: list[Argument]) -> tuple[list[Argum
     """Return the constants and the carry of a scan over scalars, from all its arguments.
 
     Such a scan has no inputs or results per step. Its results are therefore the carry, which comes last in `args`. The
-    parameter of the scan that gives the number of constants has another name in newer versions of JAX.
+    parameter with the number of constants is not used, because newer versions of JAX rename it.
     """
     first = len(args) - len(params["jaxpr"].out_avals)
     return args[:first], args[first:]

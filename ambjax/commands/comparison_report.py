@@ -32,7 +32,7 @@ class Compared:
 
     @property
     def held(self) -> np.ndarray:
-        """Whether each member keeps its rotor to the end [N]."""
+        """Whether each member is held to the end of the run [N]."""
         return ~np.isfinite(self.columns["lost_at"])
 
     def of(self, name: str, reduce: Callable[[np.ndarray], Any]) -> float | None:
@@ -121,7 +121,10 @@ def _better(one: Compared, first: Compared) -> int:
 
 
 def _loop(one: Compared) -> dict[str, object]:
-    """Return the numbers of the linearised loop. If it is not stable, its zone is D and its other numbers are None."""
+    """Return the numbers of the linearised loops of a case.
+
+    If the nominal loop has no equilibrium or is not stable, its zone is D and its other numbers are None.
+    """
     keys = ("peak", "frequency_hz", "t_peak", "ks_peak", "gain_margin_low", "gain_margin_high", "phase_margin_deg")
     keys += ("delay_margin_s", "disk_margin", "stiffness_N_per_m")
     worst: dict[str, object] = {"unstable": None, "worst_peak": None}
@@ -183,8 +186,8 @@ def _words(summary: Mapping[str, Any]) -> str:
     why = f" Members not held, or a loop not stable at rest: {', '.join(poor)}; see 'ambjax check'." if poor else ""
     return (
         f"{summary['members']} members, seed {summary['seed']}, the same in all cases. Errors, voltages, currents and "
-        f"losses are those of the members that are held. Sensitivity and margins are those of the linearised loop at "
-        f"rest.{why}"
+        f"power losses are those of the members that are held. Sensitivity and margins are those of the linearised "
+        f"loop at rest.{why}"
     )
 
 

@@ -4,9 +4,9 @@ XLA's CPU backend dispatches every fused operation of a loop's body separately, 
 a few hundred floating-point operations that is nearly all the time. A call with the attributes MARK is compiled into
 one function, loops included. On processors with AVX-512 a compiler option also selects vectors of 512 bits.
 
-Neither feature is documented, so both are tested once per process. If one is not available or changes a result, the
-program runs without it, correct but slower. It logs one line if it runs without the mark. AMBJAX_PLAIN=1 in the
-environment disables both.
+Neither feature is documented, so both are tested once per process. If the option is not available or changes a
+result, the program runs with the mark only. If the mark alone fails too, the program uses neither, is correct but
+slower, and logs one line. AMBJAX_PLAIN=1 in the environment disables both.
 """
 
 import functools
@@ -92,9 +92,9 @@ def block_length(members: int) -> int:
 
     A block must fit the first-level cache, and be large enough to outweigh the start of each loop over it. In float64
     it usually has at most 64 members. Blocks of 128 are slower on Intel's cores with AVX-512. On AMD's they are faster,
-    unless much of the last block is padding; they are used from 256 members on. Few members have a shorter block, so
-    that little of it is padding: a step of 16 members takes half as long in a block of 16 as in a block of 64. Blocks
-    of 8 are hardly faster than blocks of 16.
+    unless much of the last block is padding; they are used from 256 members on. If there are few
+    members, the block is shorter, so that little of it is padding: a step of 16 members takes half as long in a block
+    of 16 as in a block of 64. Blocks of 8 are hardly faster than blocks of 16.
     """
     number = jnp.result_type(float).itemsize
     longest = (1024 if members >= 256 and _has_avx512() and "AuthenticAMD" in _cpuinfo() else 512) // number
@@ -107,7 +107,7 @@ def options() -> dict[str, Any] | None:
     if jax.default_backend() != "cpu":
         return None
     if os.environ.get("AMBJAX_PLAIN", "0") not in ("", "0"):
-        log.warning("one-kernel path is off: AMBJAX_PLAIN is set. Results are the same, several times slower.")
+        log.warning("one-kernel path is off: AMBJAX_PLAIN is set. Results are the same, runs are several times slower.")
         return None
     faults = []
     for trial in [WIDE, {}] if _has_avx512() else [{}]:

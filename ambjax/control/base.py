@@ -66,9 +66,9 @@ class Law:
         return None
 
     def layer(self, model: Plant) -> object:
-        """Return, for each state, the largest integration error with which it stays in the boundary layer of its sign.
+        """Return, for each state, the largest integration error that keeps it in the boundary layer of its sign.
 
-        The default, inf, is for a state that no sign moves.
+        The value is inf for a state that no sign moves; this is the default for all states.
         """
         scale: Any = self
         return jax.tree.map(lambda _: jnp.inf, scale.scale(model))
@@ -181,8 +181,8 @@ def set_valued_signs(law: Law) -> list[str]:
         infinite = np.array([True]) if value is None else np.isinf(np.asarray(value, float))
         if infinite.any() and not infinite.all():
             raise ValueError(
-                f"{name}: inf for some members and a number for others. A set-valued sign needs another "
-                "program: give inf to all members or to none."
+                f"{name}: inf for some members and a number for others. A set-valued sign needs different "
+                "code: give inf to all members or to none."
             )
         if infinite.all():
             names.append(name)

@@ -38,8 +38,8 @@ class Realisation:
 
     `A` [n, n]: upper quasi-triangular (real Schur form). `B` [n, m], `C` [n], `D` [m]. The states are scaled, so that
     for inputs w of amplitude 1 their amplitudes are about 1 or less. `dt`: sample period of a discrete controller, s;
-    0: continuous. A discrete controller is stored as the continuous one that the bilinear transform with period dt
-    turns into it. `realisation` constructs a `Realisation` from arrays.
+    0: continuous. For a discrete controller, the matrices are those of a continuous one, whose bilinear transform
+    with period dt is the discrete controller. `realisation` constructs a `Realisation` from arrays.
     """
 
     A: tuple[Row, ...]

@@ -25,7 +25,7 @@ L = TypeVar("L", bound=Law)
 OVER = {"error": ("m", "|z - r|"), "reference": ("m", "|r|"), "reference-speed": ("m/s", "|r_dot|")}
 # Largest number of knots, largest value of the signal at a knot, and smallest distance between two knots.
 MOST_KNOTS, LARGEST, CLOSEST = 50, 1e6, 1e-12
-# Signals below this share of the last knot use a smoothed derivative of |x|, which is 0 at 0 (`_magnitude`).
+# Below this share of the last knot, the derivative of |x| is linear in x, and so 0 at 0 (`_magnitude`).
 ROUNDED = 1e-9
 
 
@@ -46,7 +46,7 @@ class Schedule(GainFunction):
         """Return the gain at a position z (m) and a reference.
 
         At a knot, the derivative with respect to the signal is the mean of those on both sides. Where the signal is 0,
-        the derivative is 0.
+        the derivative with respect to z, r or r_dot is 0.
         """
         signal = {"error": z - reference.r, "reference": reference.r, "reference-speed": reference.r_dot}[self.over]
         x, total = _magnitude(jnp.asarray(signal), ROUNDED * self.at[-1]), jnp.asarray(self.values[0])
@@ -84,7 +84,7 @@ class Schedule(GainFunction):
 
 
 def finite(field: dataclasses.Field) -> dataclasses.Field:
-    """Return the field by which the value at a knot is checked: the gain `field`, but finite."""
+    """Return the gain's `field` without infinite values; the value at a knot is checked against it."""
     return dataclasses.field(metadata={**field.metadata, "infinite": False, "steepness": False})
 
 

@@ -27,7 +27,8 @@ from ambjax.simulation.loop import Realised
 from ambjax.simulation.rollout import Outcome, prepare, run
 from ambjax.world.scenario import Scenario
 
-# One member per thread, 32 threads to a warp.
+# Threads of a warp, and largest number of warps of a program. A thread simulates one member, or block/1024 members in
+# larger blocks.
 WARP, MOST_WARPS = 32, 32
 BLOCK = 128
 

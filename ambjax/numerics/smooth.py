@@ -68,7 +68,8 @@ def refined(x: Array) -> Array:
 
     CPUs divide vectors of float32 much faster than vectors of float64. In float64 on a CPU, the function therefore
     refines a float32 quotient by one step of third order, with an error of at most about one unit in the last place. In
-    a JAX trace it is a call whose name is the value of RECIPROCAL. The exporter writes this call as a quotient.
+    a JAX trace, the function is a call whose name is the value of RECIPROCAL. The exporter writes this call as a
+    quotient.
     """
     return _refined_reciprocal(x)
 
@@ -129,7 +130,7 @@ def _smaller_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) ->
 def polynomial(u: Array, coefficients: Sequence[Scalar]) -> Scalar:
     """Evaluate a polynomial in u, coefficients in ascending order, by Estrin's scheme.
 
-    Its latency is a third of that of Horner's scheme.
+    With 9 coefficients, the chain of dependent multiply-adds is half as long as in Horner's scheme.
     """
     terms = list(coefficients)
     while len(terms) > 1:

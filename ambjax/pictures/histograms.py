@@ -45,10 +45,11 @@ def histograms(columns: Mapping[str, np.ndarray], path: pathlib.Path, metrics: S
 
 @own_style
 def histogram_figure(columns: Mapping[str, np.ndarray], metrics: Sequence[str] = CHIEF) -> Figure:
-    """Return histograms of the `metrics` in `columns` (of members.npz, each [N]). Lost members have another colour.
+    """Return histograms of the `metrics` in `columns`, the arrays [N] of members.npz. Survivors have their own colour.
 
-    A member with a finite `lost_at` or `lost_at_s` does not survive; without these columns all survive. `stalled` marks
-    members at which the integrator stalled. Raises ValueError if `columns` has none of the metrics.
+    A member with a finite `lost_at` or `lost_at_s` does not survive; without these columns all survive. The column
+    `stalled` marks members at which the integrator stalled; they are drawn like lost members. Raises ValueError if
+    `columns` has none of the metrics.
     """
     names = [name for name in metrics if name in columns]
     if not names:

@@ -99,8 +99,9 @@ def rollout(cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | 
     - `fold`: accumulated at every sample, so that metrics need no stored trajectory; None: no metrics.
     - `every`: a row is recorded at the start of every `every`-th sample; 0: no rows.
 
-    Returns an `Outcome`. If |z| reaches `Scenario.limit`, a state leaves the range of the model (`loop.DIVERGENCE`), or
-    the integrator stalls, the state is frozen and the trajectory has the status. Values and derivatives stay finite.
+    Returns an `Outcome`. The state is frozen if |z| reaches `Scenario.limit`, a state leaves the range of the model
+    (`loop.DIVERGENCE`), or the integrator stalls. `Trajectory.lost_code` then gives the reason, and values and
+    derivatives stay finite.
 
     The function is pure and jitted. It works under vmap, jvp and grad; reverse mode requires a method with fixed steps.
 

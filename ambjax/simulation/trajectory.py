@@ -12,10 +12,12 @@ from ambjax.numerics.records import Scalar, record
 # Status codes of a rotor, for compiled code; the event of each status, its reason, and both as one text.
 ALIVE, TOUCHED, DIVERGED, STALLED = range(4)
 EVENTS = ("", "touched down", "diverged", "stalled")
+# Reasons of the events, for messages. With an elastic stop, the limit of |z| is 0.99 s_0 instead of the clearance. A
+# command or a reading that is not finite counts as a state out of range.
 REASONS = (
     "",
-    "|z| reached the clearance, or 0.99 s_0 with an elastic stop",
-    "a state left the range in which the model is valid, or a command or reading was not finite",
+    "|z| reached the clearance",
+    "a state left the range in which the model is valid",
     "the integrator could not meet its tolerance",
 )
 STATUSES = tuple(f"{event}: {reason}" if event else "" for event, reason in zip(EVENTS, REASONS, strict=True))

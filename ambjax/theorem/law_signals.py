@@ -1,4 +1,4 @@
-"""The loop on a processor, with rows that also contain sigma, v_tilde and e as the laws compute them."""
+"""The loop on a processor, with rows of sigma, v_tilde and e as the laws compute them, and of the plant."""
 
 from typing import NamedTuple
 

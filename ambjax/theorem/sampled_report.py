@@ -132,10 +132,11 @@ def check_sampled(
     settle: float,
     run: Callable[[System, Clock], Outcome] = rolled,
 ) -> SampledReport:
-    """Return the report on a cascade with a processor, from a run without sensor noise and, if it differs, one with.
+    """Return the report on a cascade with a processor. It is computed from a run without sensor noise and, if the case
+    has noise, from a run with it.
 
-    `run`: function that simulates a system; `ensemble.replay.record_system` rounds as `ambjax simulate` does. `settle`:
-    start of the evaluation, s. Raises ValueError as `rollout` does.
+    `run`: function that simulates a system. With `ensemble.replay.record_system`, the rounding is that of
+    `ambjax simulate`. `settle`: start of the evaluation, s. Raises ValueError as `rollout` does.
     """
     loop, clock = prepare(cascade, scenario, clock)
     cascade, quiet = cascade.on_processor(), _without_noise(scenario)

@@ -19,10 +19,11 @@ DELAYED = ("position", "current")
 class SlopeCheck:
     """Slope of a law times T, and the limits for stability and for no oscillation.
 
-    `slope`: the slope (`Law.slope`) times T. `effective_slope`: for an explicit step, equal to `slope`. An implicit
-    step acts as an explicit step with a/(1 + a), where a = `slope`; `effective_slope` is then the larger of a/(1 + a)
-    and T times `Law.explicit_rate`. Without a delay, a/(1 + a) is below both limits. `limit`: the law is stable if
-    `effective_slope` is below it. `oscillation_limit`: the law does not oscillate if `effective_slope` is below it.
+    `slope`: the slope (`Law.slope`) times T. `effective_slope`: for an explicit step, equal to `slope`. With
+    a = `slope`, an implicit step acts as an explicit step whose slope times T is a/(1 + a). Its `effective_slope` is
+    the larger of a/(1 + a) and T times `Law.explicit_rate`. Without a delay, a/(1 + a) is below both limits. `limit`:
+    the law is stable if `effective_slope` is below it. `oscillation_limit`: the law does not oscillate if
+    `effective_slope` is below it.
     """
 
     stage: str

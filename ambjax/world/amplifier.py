@@ -89,7 +89,7 @@ class Amplifier:
         return u + jnp.where(u_a > u, left, -left) * decay
 
     def _tail(self) -> Scalar:
-        """Return the duration (s) of the final first-order part, in which the rate is below the slew rate."""
+        """Return the time (s) in which the slew rate would cover the final first-order part: 1/w; 0 without a lag."""
         return 0.0 if self.bandwidth is None else 1 / self.slope()
 
     def at_coil(self, u_a: Array, i: Array, u_max: Scalar, response: Callable[[], CoilResponse]) -> Array:

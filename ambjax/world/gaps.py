@@ -11,7 +11,7 @@ from ambjax.numerics.records import Scalar
 from ambjax.numerics.smooth import refined, safe_sqrt
 
 # Lower bound of a gap in the divisions, as a share of s_0. The rotor is lost at a larger gap, so the bound acts only on
-# trial stages of an integrator. It keeps these and their derivatives finite.
+# trial stages of an integrator. It keeps the quotients and their derivatives finite.
 GAP_FLOOR = 0.005
 
 

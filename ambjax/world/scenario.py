@@ -150,7 +150,7 @@ class Scenario:
 
     @property
     def random(self) -> bool:
-        """Whether two members differ: the scenario has sensor noise, random sensor faults or a random signal."""
+        """Whether the scenario has sensor noise, random sensor faults or a random signal. A spread does not count."""
         sensor = self.sensor
         noisy = sensor is not None and any(np.any(std) for std in (sensor.std, sensor.std_z_dot, sensor.std_i))
         if sensor is not None:
@@ -198,7 +198,7 @@ class Scenario:
         return jax.random.fold_in(jax.random.key(self.seed), self.member)
 
     def words(self) -> tuple[Array, Array]:
-        """The same key as two 32-bit words."""
+        """The member's random key (`key`) as two 32-bit words."""
         high, low = jax.random.key_data(self.key())
         return high, low
 

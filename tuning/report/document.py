@@ -51,9 +51,10 @@ def _gains(facts: TuningFacts) -> list[str]:
     lines = ["## Gains", "", *markdown_table(head, rows), ""]
     words = (
         "Last column: increase of the risk if this gain alone is larger or smaller by a factor of e^0.25 = 1.28. The "
-        "larger of the two increases is shown. Here the risk includes the stressed members and the penalty of the "
-        "theorem's conditions. A gain with a large increase must be set accurately. If this change "
-        "loses members of the training ensemble, the column shows how many more are lost than with the answer. "
+        "larger of the two increases is shown. Here the risk is that of the search of least error: it includes the "
+        "stressed members and the penalty of the theorem's conditions, but not the limits. A gain with a large "
+        "increase must be set accurately. If this change loses more members of the training ensemble than the "
+        "answer does, the column shows how many more. "
         "`tune.bounds` sets other bounds."
     )
     sources = [f"- {row['path']}: {escape_markdown(row['source'])}" for row in facts.gains if row.get("source")]
@@ -77,9 +78,9 @@ def _gains(facts: TuningFacts) -> list[str]:
 
 
 def _sensitivity(row: Row, facts: TuningFacts) -> str:
-    """Return the increase of the risk, or the number of members lost, if a gain changes by a factor of 1.28."""
+    """Return the increase of the risk, or the number of further members lost, if a gain changes by a factor of 1.28."""
     if row.get("sensitivity_lost"):
-        return f"**{row['sensitivity_lost']} of {facts.trained_on} training members are lost**"
+        return f"**{row['sensitivity_lost']} of {facts.trained_on} training members are also lost**"
     return "-" if row["sensitivity_percent"] is None else f"{row['sensitivity_percent']:.3g} %"
 
 
@@ -118,7 +119,7 @@ def _minimised(facts: TuningFacts) -> list[str]:
     words = f"over {parts['ordinary']} members (seed {facts.search['seed']})"
     rows = [[f"risk: {parts['of']} {words}", f"{parts['risk']:.4e}"]]
     if parts["survival_only"]:
-        label = f"+ mean of clearance + survival over {parts['survival_only']} stressed members"
+        label = f"+ mean of (clearance + survival) over {parts['survival_only']} stressed members"
         rows.append([label, f"{parts['held']:.4e}"])
     rows.append(["x penalty of the theorem's conditions", f"{parts['penalty']:.6g}"])
     if parts["limits"] != 1:
