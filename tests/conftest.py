@@ -1,3 +1,4 @@
+import collections
 import ctypes
 import gc
 import os
@@ -16,6 +17,9 @@ CACHE = pathlib.Path(__file__).parent.parent / ".pytest_cache" / "programs"
 LARGEST = 512 * 2**20
 # Resident memory above which the programs of a module are released when it ends (bytes).
 MUCH = 700 * 2**20
+
+# Modules with single tests of half a minute and more.
+LONG = ("test_mutations.py", "test_paper.py")
 
 # Workers whose threads share the cores take an eighth more time.
 _worker = os.environ.get("PYTEST_XDIST_WORKER", "")
@@ -42,9 +46,12 @@ def pytest_configure(config):
         shutil.rmtree(CACHE)
 
 
-@pytest.hookimpl(tryfirst=True)
+@pytest.hookimpl(wrapper=True)
 def pytest_collection_modifyitems(config, items):
-    """A thorough test is slow, and runs in the thorough profile only."""
+    """A thorough test is slow, and runs in the thorough profile only. Long tests and large modules run first.
+
+    Otherwise a worker would start a long test at the end, when the other worker has no more tests.
+    """
     left_out = [] if THOROUGH else [item for item in items if item.get_closest_marker("thorough")]
     for item in items:
         if item.get_closest_marker("thorough"):
@@ -52,6 +59,10 @@ def pytest_collection_modifyitems(config, items):
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if not item.get_closest_marker("thorough")]
+    result = yield
+    sizes = collections.Counter(item.path.name for item in items)
+    items.sort(key=lambda item: (item.path.name not in LONG, -sizes[item.path.name]))
+    return result
 
 
 def pytest_collection_finish(session):

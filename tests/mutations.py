@@ -2818,6 +2818,78 @@ PAGE = [
         "tests/test_page.py::test_every_number_reads_back_from_the_case_file",
     ),
 ]
+VARIOUS = [
+    M(
+        "the constants of a scan are its first argument",
+        "ambjax/codegen/primitives.py",
+        'first = len(args) - len(params["jaxpr"].out_avals)',
+        "first = 1",
+        "tests/test_export_emitter.py::test_random_expressions_equal_jax",
+    ),
+    M(
+        "a kernel on the CPU is compiled",
+        "ambjax/ensemble/gpu_kernel.py",
+        'if not interpret and (backend := jax.default_backend()) != "gpu":',
+        'if not interpret and (backend := jax.default_backend()) == "tpu":',
+        "tests/test_onekernel.py::test_bad_input_is_refused",
+    ),
+    M(
+        "a kernel contains a recorded signal",
+        "ambjax/ensemble/gpu_kernel.py",
+        "if any(np.ndim(constant) for constant in traced.consts):",
+        "if any(np.ndim(constant) > 2 for constant in traced.consts):",
+        "tests/test_onekernel.py::test_bad_input_is_refused",
+    ),
+    M(
+        "the sine of a scalar is selected from Python numbers",
+        "ambjax/numerics/smooth.py",
+        "return _quarter(jnp.maximum(jnp.minimum(y, 0.5 - y), -0.5 - y))",
+        "return _quarter(jnp.where(jnp.abs(y) > 0.25, jnp.where(y < 0, -0.5, 0.5) - y, y))",
+        "tests/test_onekernel.py::test_the_kernel_compiles_for_a_gpu",
+    ),
+    M(
+        "the signals of the laws are computed without the guard",
+        "ambjax/theorem/law_signals.py",
+        "_, measured, laws = loop.inputs_of_laws(loop.read(before, errors)[1], before)",
+        "measured, laws = loop.read(before, errors)[1], before.control",
+        "tests/test_check_processor.py::test_the_computed_signals_are_those_of_the_readings_that_the_laws_receive",
+    ),
+    M(
+        "the signals of the laws are computed without the faults of the sensor",
+        "ambjax/theorem/law_signals.py",
+        "loop.read(before, errors)[1], before)",
+        "loop.measured(before.plant, before.z_filtered, errors), before)",
+        "tests/test_check_processor.py::test_the_computed_signals_are_those_of_the_readings_that_the_laws_receive",
+    ),
+    M(
+        "a recorded reference counts beyond the run",
+        "ambjax/cases/reach.py",
+        "BOUNDED = (Sum, BandNoise, Recorded, Trapezoid)",
+        "BOUNDED = (Sum, BandNoise)",
+        "tests/test_loads.py::test_a_reference_counts_within_the_run_only",
+    ),
+    M(
+        "a member that some injections lose has a finite peak",
+        "tuning/report/answer.py",
+        'if row["lost"]:',
+        'if row["peak"] is None and row["repetitions"]:',
+        "tests/test_tuning_report.py::test_the_frequency_of_the_largest_peak_is_that_of_the_printed_value",
+    ),
+    M(
+        "two NaN metrics differ",
+        "ambjax/ensemble/replay.py",
+        "if a == b or np.isnan([a, b]).all():",
+        "if a == b:",
+        "tests/test_replay.py",
+    ),
+    M(
+        "a map that has no runs in a cell says that none survived",
+        "ambjax/pictures/heatmaps.py",
+        'words = {"not run": unrun, "no survivor": lost}',
+        'words = {"no survivor": lost}',
+        "tests/test_pictures.py::test_maps_outline_the_cells_that_survive",
+    ),
+]
 MUTATIONS = [
     *PLANT,
     *LAWS,
@@ -2835,4 +2907,5 @@ MUTATIONS = [
     *INJECTION,
     *SCHEDULES,
     *PAGE,
+    *VARIOUS,
 ]

@@ -142,9 +142,11 @@ def _coil_voltage(scenario: Scenario, least: float) -> Iterator[str]:
             "V that hold the rotor at z = 0."
         )
     if scenario.u_max > coil.u_max + bias:
-        given = "is left out" if math.isinf(scenario.u_max) else f"= {scenario.u_max:g} V"
+        given = "is left out: the command has no limit"
+        if not math.isinf(scenario.u_max):
+            given = f"= {scenario.u_max:g} V: the controller commands up to this voltage"
         yield (
-            f"actuator.u_max {given}: the controller commands up to this voltage, but beyond {coil.u_max + bias:.4g} V "
+            f"actuator.u_max {given}, but beyond {coil.u_max + bias:.4g} V "
             f"both coils are at actuator.coil.u_max. Set u_max to {reserve:.4g} V, at which the first coil is at its "
             "limit."
         )

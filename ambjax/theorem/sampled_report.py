@@ -205,7 +205,7 @@ def _bands(cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, row
         scheduled, notes = schedules(law), ["the supply limits u"] * limited
         relay = None if scheduled else law.relay()
         if scheduled:
-            notes.append(f"no band: {', '.join(scheduled)} has a schedule")
+            notes.append(f"no band: schedule of {', '.join(scheduled)}")
         gain = W = limit = None
         if relay is not None:
             implicit = law.has_own_step(sampling.implicit)
