@@ -2820,10 +2820,10 @@ PAGE = [
 ]
 VARIOUS = [
     M(
-        "the constants of a scan are its first argument",
+        "the constants of a scan are part of its carry",
         "ambjax/codegen/primitives.py",
         'first = len(args) - len(params["jaxpr"].out_avals)',
-        "first = 1",
+        "first = 0",
         "tests/test_export_emitter.py::test_random_expressions_equal_jax",
     ),
     M(
