@@ -164,6 +164,10 @@ def test_injections_find_the_members_with_the_largest_measured_peak():
     assert [one.member for one in found.peaks] == expected
     # the same signal, amplitude and plant, in another program
     assert [one.peak for one in found.peaks] == pytest.approx([each[k].peak for k in expected], rel=1e-6)
+    # the order of the peaks of |T| is another one
+    columns = {"loss.limit.complementary": np.ones(count), "lost_at_s": columns["lost_at_s"]}
+    by_T = sorted(range(count), key=lambda k: -np.abs(each[k].T).max())[:INJECTED]
+    assert [one.member for one in injections(problem, x, 1, columns).peaks] == by_T != expected
 
 
 def found_frequency(problem, m):

@@ -80,7 +80,7 @@ def injections(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[s
 
     `columns` [N]: result of `judge` for the ensemble with this `seed`. The members are those with the largest linear
     peak of the first quantity of MEASURED that has a limit. If only injections decide, they are those with the largest
-    injected |S|, measured once in each of the first SCREENED held members. Returns None if no quantity of MEASURED has
+    injected peak, measured once in each of the first SCREENED held members. Returns None if no quantity of MEASURED has
     a limit, or if no member is held.
     """
     name = next((name for name in MEASURED if f"loss.{PREFIX}{name}" in columns), None)
@@ -95,7 +95,8 @@ def injections(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[s
     peak = None if first is None else first.S.frequency
     if decides(problem):
         once = of.responses(alive[:SCREENED], 1, peak)
-        size = np.where(once.held, np.abs(once.S).max(axis=1), np.inf)
+        response = {"S": once.S, "T": once.S - 1, "KS": once.KS}[MEASURED[name]]
+        size = np.where(once.held, np.abs(response).max(axis=1), np.inf)
         order = alive[np.argsort(-size, kind="stable")]
     random = problem.objective.scenario.random
     repetitions = REPETITIONS if random else 1
