@@ -72,17 +72,16 @@ def switch(context: SearchContext, name: str, p: Scalar, times: float, over: str
     per, below = TWO_OVER_PI * float(p), context.bounds.get(over, 0.0)
     low, high = context.w / 3 / per, times * context.w / per
     words = f"slope 2/pi {name} p from w/3 to {times:g} w, {context.pole}"
-    return _beyond(Interval(low, high, words), over, below)
+    return _beyond(low, high, words, over, below)
 
 
-def _beyond(range_: Interval, over: str, below: float) -> Interval:
+def _beyond(low: float, high: float, words: str, over: str, below: float) -> Interval:
     """Return the range with its start at least 2 times, and its end at least 200 times, the bound `below`."""
-    low, high, words, *rest = range_
     if 2 * below > low:
         words += f"; at least twice the disturbance bound {over} = {below:.3g}"
     if 200 * below > high:
         words += f"; up to 200 times the disturbance bound {over} = {below:.3g}"
-    return Interval(max(low, 2 * below), max(high, 200 * below), words, *rest)
+    return Interval(max(low, 2 * below), max(high, 200 * below), words)
 
 
 def authority(context: SearchContext, size: Scalar, share: tuple[float, float], what: str, over: str = "") -> Interval:
@@ -94,7 +93,7 @@ def authority(context: SearchContext, size: Scalar, share: tuple[float, float], 
     below = context.bounds.get(over, 0.0)
     low, high = (part * float(size) for part in share)
     words = f"{share[0]:g} to {share[1]:g} of {float(size):.3g}, {what}"
-    return _beyond(Interval(low, high, words), over, below)
+    return _beyond(low, high, words, over, below)
 
 
 def position_switch(context: SearchContext, p: Scalar | None) -> Interval:
