@@ -2820,6 +2820,13 @@ PAGE = [
 ]
 VARIOUS = [
     M(
+        "the sliding step takes a commanded current as a voltage",
+        "ambjax/simulation/sliding.py",
+        'scenario.plant.lumped and scenario.drive == "voltage" and scenario.stop is None',
+        "scenario.plant.lumped and scenario.stop is None",
+        "tests/test_current_drive.py::test_the_sliding_step_is_for_a_voltage_drive_without_a_stop",
+    ),
+    M(
         "the constants of a scan are part of its carry",
         "ambjax/codegen/primitives.py",
         'first = len(args) - len(params["jaxpr"].out_avals)',

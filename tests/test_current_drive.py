@@ -12,9 +12,11 @@ from ambjax.codegen.controller import controller_of
 from ambjax.control import current, inversion, observer, position
 from ambjax.linear import injected, linearise, loop_matrices
 from ambjax.simulation.integrate import FixedSteps
+from ambjax.simulation.sliding import Slide, slides
 from ambjax.world.amplifier import CurrentAmplifier
 from ambjax.world.coils import TwoCoil
 from ambjax.world.sensor import Measurement
+from tuning.problem import method_for
 
 # a magnet of 2.4 kg and 0.5 mm, as a data sheet gives it
 NUMBERS = {"m": 2.4, "k_z": -2e4, "mu_0": 1.2566e-6, "n": 300.0, "A": 2e-4, "s_0": 5e-4, "i_0": 2.0, "R": 1.0}
@@ -160,3 +162,24 @@ def test_adaptive_steps_are_refused_in_continuous_time():
     assert isinstance(with_method(Clock(10, PERIOD), cascade(), world()).method, FixedSteps)
     with pytest.raises(ValueError, match=r"controls the current requires fixed steps.*dt = 'auto'"):
         rollout(cascade(), world(), Clock(10, PERIOD, AdaptiveRodas3()))
+
+
+@pytest.mark.parametrize(
+    ("tables", "sliding"),
+    [
+        ({}, True),
+        ({"actuator": {"mode": "current", "bandwidth": 3000.0}}, False),
+        ({"run": {"stop_stiffness": 1e8}}, False),
+    ],
+    ids=("voltage", "current", "stop"),
+)
+def test_the_sliding_step_is_for_a_voltage_drive_without_a_stop(tables, sliding):
+    # of these cases, `ambjax tune` takes sliding steps only for the first
+    case = case_from(tables)
+    assert isinstance(method_for(case, 3, 1), Slide) == sliding
+    assert slides(case.cascade, case.scenario) == sliding
+    if sliding:
+        assert isinstance(case_from(tables | {"clock": {"method": "sliding"}}).clock.method, Slide)
+    else:
+        with pytest.raises(ValueError, match=r'clock.method = "sliding": it (needs|does not)'):
+            case_from(tables | {"clock": {"method": "sliding"}})

@@ -63,7 +63,7 @@ class TuningProblem:
     @property
     def sliding(self) -> bool:
         """Whether the search integrates with sliding steps, tune.substeps in each sample."""
-        return slides(self.case.cascade, self.case.scenario.plant)
+        return slides(self.case.cascade, self.case.scenario)
 
     @functools.cached_property
     def reference(self) -> Engine:
@@ -159,7 +159,7 @@ def method_for(case: Case, substeps: int, finer: int) -> Integrator:
     The number of steps is fixed, so every member takes the same time. In sliding mode there are `substeps` steps a
     sample, independent of the stiffness of the inversion law.
     """
-    if slides(case.cascade, case.scenario.plant):
+    if slides(case.cascade, case.scenario):
         return Slide(finer * substeps)
     method: Any = choose_method(case.cascade, case.scenario, float(case.clock.sample_period), reverse=True)
     return dataclasses.replace(method, substeps=finer * method.substeps)

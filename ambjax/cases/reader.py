@@ -138,15 +138,15 @@ def case_from(
     recordings = Recordings(folder, known.recorded if known else ())
     scenario, settle = scenario_from(top, plant, recordings)
     check_parts(cascade, scenario, clock.sample_period)
-    if isinstance(clock.method, Slide) and not slides(cascade, scenario.plant):
+    if isinstance(clock.method, Slide) and scenario.stop is not None:
+        raise ValueError('clock.method = "sliding": it does not resolve run.stop_stiffness. Use method = "adaptive".')
+    if isinstance(clock.method, Slide) and not slides(cascade, scenario):
         made = " or ".join(f'"{kind}"' for kind, law in KINDS["inversion"].items() if law.slides)
         raise ValueError(
             f'clock.method = "sliding": it needs controller.inversion.kind = {made}, continuous time, a lumped plant '
             "without [plant.iron], "
-            'and an observer other than "ired-1" and "ired-2". Use method = "adaptive".'
+            'an observer other than "ired-1" and "ired-2", and actuator.mode = "voltage". Leave out clock.method.'
         )
-    if isinstance(clock.method, Slide) and scenario.stop is not None:
-        raise ValueError('clock.method = "sliding": it does not resolve run.stop_stiffness. Use method = "adaptive".')
     check_start(scenario)
     settle = duration / 4 if settle is None else settled(settle, clock)
     spread = spread_from(top, cascade, scenario)

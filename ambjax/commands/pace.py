@@ -74,11 +74,7 @@ def print_estimate(study: Study, pace: Pace) -> None:
         return
     rate = f"{pace.whole:.2g}" if pace.whole < 10 else f"{pace.whole:,.0f}"
     words = f"about {duration(seconds)} for {study.members:,} members ({rate} a second)"
-    if (
-        seconds > LONG
-        and isinstance(study.clock.method, AdaptiveRodas3)
-        and slides(study.cascade, study.scenario.plant)
-    ):
+    if seconds > LONG and isinstance(study.clock.method, AdaptiveRodas3) and slides(study.cascade, study.scenario):
         words += '; clock.method = "sliding" would be faster; its error is measured and printed'
     say(words)
 

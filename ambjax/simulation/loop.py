@@ -197,8 +197,7 @@ class ClosedLoop:
 
     def problem(self, errors: Errors) -> InitialValueProblem:
         """Return the initial value problem of one sample."""
-        sliding = slides(self.cascade, self.scenario.plant) and self.scenario.stop is None
-        step = functools.partial(slide, self, errors) if sliding else None
+        step = functools.partial(slide, self, errors) if slides(self.cascade, self.scenario) else None
         rates = lambda inputs, x: self.rates(inputs, x, errors)  # noqa: E731
         observed = lambda inputs, x: self.observed(inputs, x, errors)  # noqa: E731
         jumps = self.scenario.sensor is not None

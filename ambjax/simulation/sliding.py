@@ -28,8 +28,8 @@ from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.smooth import limited
 from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, Times, axpy
 from ambjax.simulation.span import Instant, Span
-from ambjax.world.bearing import Bearing
 from ambjax.world.plant import State
+from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
 
 S = TypeVar("S")
@@ -155,10 +155,11 @@ def _phi_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arra
     return y, slope * dx
 
 
-def slides(cascade: Cascade, plant: Bearing) -> bool:
-    """Return whether this step applies to the cascade and the plant."""
+def slides(cascade: Cascade, scenario: Scenario) -> bool:
+    """Return whether this step applies to the cascade and the scenario."""
     slow = not cascade.observer.stiff  # Heun's method integrates the observer
-    return cascade.processor is None and cascade.inversion.slides and plant.lumped and slow
+    paper = scenario.plant.lumped and scenario.drive == "voltage" and scenario.stop is None
+    return cascade.processor is None and cascade.inversion.slides and slow and paper
 
 
 @record
@@ -167,7 +168,8 @@ class Slide(FixedSteps):
 
     The step is of second order in the slow motion of the loop, for any stiffness of the inversion law. It requires
     continuous time, an inversion law with a method `slide`, such as `inversion.Adaptive`, a lumped plant, an observer
-    that is not `stiff`, and a scenario without an elastic stop; otherwise a simulation raises ValueError.
+    that is not `stiff`, and a scenario with a voltage drive and without an elastic stop; otherwise a simulation raises
+    ValueError.
     """
 
     limit = None
@@ -178,7 +180,8 @@ class Slide(FixedSteps):
         if problem.slide is None:
             raise ValueError(
                 "clock.method = Slide(...): it requires continuous time, a lumped plant without iron, the 'adaptive' "
-                "inversion law, an observer other than IRED1 and IRED2, and no elastic stop. Use Rodas3."
+                "inversion law, an observer other than IRED1 and IRED2, a voltage drive, and no elastic stop. Use "
+                "Rodas3."
             )
         return problem.slide(problem.inputs(at(0.0)), problem.inputs(at(1.0)), h, state, span)
 
