@@ -50,7 +50,7 @@ def parser() -> Parser:
         "--member", type=int, metavar="K", help="simulate member K of the ensemble, with its values drawn from [spread]"
     )
     _seed_option(simulate)
-    meaning = "number of members of the ensemble; required if [spread] is a Latin hypercube"
+    meaning = "with --member: number of members of the ensemble; required if [spread] is a Latin hypercube"
     simulate.add_argument("--members", type=int, metavar="N", help=meaning)
     simulate.add_argument("--from", dest="begin", type=float, metavar="T", help="plot the run from time T (s)")
     simulate.add_argument("--to", dest="end", type=float, metavar="T", help="plot the run up to time T (s)")

@@ -193,8 +193,10 @@ def test_the_readme_states_the_measured_errors_and_voltages_of_the_structures():
     for name in ("bearing", "rig"):
         three = [medians[name][law] for law in ("cascade-integral", "super-twisting", "pid")]
         assert max(low for _, low, _ in three) < min(high for *_, high in three)
-    _, low, high = medians["G20"]["pid"]
-    assert f"{high / low:.0f}" == "11"
+    factors = {law: f"{medians['G20'][law][2] / medians['G20'][law][1]:.0f}" for law in ("pid", "super-twisting")}
+    assert f"a factor of {factors['pid']} for PID, and of {factors['super-twisting']} for super-twisting" in text
+    worst = max(cases["F20"]["structures"]["lqg"]["lost"])
+    assert f"lose {worst} of 500 members" in text
 
 
 def test_text_is_escaped_in_markdown():

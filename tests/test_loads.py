@@ -244,6 +244,13 @@ def test_wrong_tables_are_refused(text, keys, said, tmp_path):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("text", ['t,"value\n0,1\n1,2\n', 't,"value\n' + "0,1\n" * 50_000], ids=("short", "long"))
+def test_an_open_quotation_mark_is_refused(tmp_path, text):
+    (tmp_path / "x.csv").write_text(text)
+    with pytest.raises(ValueError, match='a quotation mark " is not closed'):
+        case_from({"disturbance": {"q_z": {"kind": "table", "file": "x.csv"}}}, folder=tmp_path)
+
+
 def test_wrong_arrays_are_refused(tmp_path):
     np.savez(tmp_path / "x.npz", t=np.zeros((2, 2)), value=np.zeros(2))
     table = {"disturbance": {"q_z": {"kind": "table", "file": "x.npz"}}}

@@ -59,6 +59,7 @@ def test_a_lost_member_breaks_the_limit():
     kept = limit_table._tested(row, DelayTest(16, 0), "")
     assert kept["verdict"] == limit_table.HELD
     assert "0 of 16" in kept["what"]
-    assert limit_table._tested(row, DelayTest(16, 1), "")["verdict"] == limit_table.BROKEN
+    broken = limit_table._tested(row, DelayTest(16, 1), "")
+    assert (broken["verdict"], broken["price"]) == (limit_table.BROKEN, None)
     other = row | {"name": "sensitivity"}
     assert limit_table._tested(other, DelayTest(16, 1), "") == other

@@ -32,7 +32,7 @@ from tuning.search.rounds import rounds
 from tuning.space import Gain, Space, tunable
 
 WRITTEN = ("tuned.toml", "history.npz", "report.html", "report.md", "report.json")
-# This file is written last. The search has ended if the file is newer than all checkpoints.
+# This file is written after the search. The search has ended if the file is newer than all checkpoints.
 REPORT = "report.json"
 
 
@@ -135,7 +135,7 @@ def _kept(out: pathlib.Path) -> str:
 
 
 def _write(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: TuningFacts, slices: Slices) -> None:
-    """Write all files into the temporary folder `part`. The caller moves them to `out`.
+    """Write the files, except those of --pareto and --page, into the folder `part`. The caller moves them to `out`.
 
     The text of tuned.toml is read back first, to check that it is a valid case.
     """

@@ -1,4 +1,4 @@
-"""Evaluation of gains: by an ensemble in fine steps, and by a comparison of the search's steps with accurate ones."""
+"""Evaluation of gains on an ensemble, and comparison of the search's steps with accurate ones."""
 
 import math
 from collections.abc import Mapping
@@ -39,10 +39,11 @@ def judge(problem: TuningProblem, x: np.ndarray, seed: int, count: int) -> dict[
 
 
 def worst(problem: TuningProblem, judged: dict[str, np.ndarray], seed: int) -> dict[str, Any]:
-    """Return the worst member of the judged ensemble [N]: the first one lost, else that of the largest settled error.
+    """Return the worst member of the judged ensemble [N].
 
-    `replay` is the command, run in the directory of the report, that simulates the member and returns these values. It
-    is None if the judge's steps differ from those of `ambjax simulate`.
+    It is the member whose run ends first (lost or stalled), or else the one with the largest settled error. `replay` is
+    the command that simulates it and returns these values, for the directory of the report; None if the judge's steps
+    differ from those of `ambjax simulate`.
     """
     error, lost_at = judged["settled_max_abs_error_m"], judged["lost_at_s"]
     index = int(np.lexsort((-error, lost_at))[0])
@@ -171,8 +172,8 @@ def summarise(metrics: dict[str, np.ndarray]) -> dict[str, Any]:
     """Return the statistics of an ensemble [N] for the report: statuses, survival, and metrics over members.
 
     The status of a member whose integration stalled is unknown: the member counts neither as lost nor as held, and not
-    as a survivor. Metrics include only held members, because the voltage and current of a lost rotor are 0. If no
-    member is held, the summary has no metrics.
+    as a survivor. Metrics include only held members, because the state of a lost rotor is frozen and its drive is
+    off. If no member is held, the summary has no metrics.
     """
     alive, n = held(metrics), len(metrics["lost_at_s"])
     survival = wilson(int(alive.sum()), n)

@@ -32,8 +32,8 @@ TRACED = ("rms_error_m", "rms_u_V")
 # Initial multiplier of the limit on the error in the searches for the front, which minimise the voltage. It corresponds
 # to 1.5 % more voltage for 1 % less error.
 EXCHANGE = 3.0
-# Cost of a gradient in plain rollouts: 1 + m in forward mode for m gains, RERUN + SWEEP q in reverse mode for q
-# differentiated quantities (benchmarks/schedules.py, gradients.py).
+# Cost of a gradient, divided by that of a rollout: 1 + m in forward mode for m gains, RERUN + SWEEP q in reverse mode
+# for q differentiated quantities (benchmarks/schedules.py, gradients.py).
 SWEEP, RERUN = 4, 5
 
 
@@ -115,9 +115,9 @@ class TuningProblem:
     def towards_voltage(self, error_m: float, volts: float, factor: float) -> "TuningProblem":
         """Return the problem of least rms voltage, subject to an rms error of at most `factor` times `error_m` (m).
 
-        If the case has a smaller limit on the rms error, that limit applies. The other limits are kept. `volts` (V):
-        rms voltage at `error_m`. The voltage is scaled so that (unit volts)^2
-        equals (error_m/s_0)^2. A lost rotor then costs as much, relative to the rest, as before.
+        If the case has a smaller limit on the rms error, that limit applies. The other limits are kept. `volts`: rms
+        voltage at `error_m`, V. `Goal.unit` is chosen so that (unit volts)^2 = (error_m/s_0)^2. A lost rotor then
+        costs as much, relative to the voltage term, as it did relative to the error.
         """
         weights = tuple(weight if name in HELD else 0.0 for name, weight in zip(TERMS, self.tune.weights, strict=True))
         unit = error_m / float(np.asarray(self.objective.loss.s_0)) / volts

@@ -81,7 +81,7 @@ class Recordings:
 
 
 def relocated_files(files: Iterable[RecordedFile], out: pathlib.Path) -> dict[str, str]:
-    """Return, by dotted key, the path of each file that a case file in the folder `out` must contain.
+    """Return the paths, by dotted key, by which a case file in the folder `out` must name these files.
 
     A path is kept as written if it leads to the same file from `out`.
     """
@@ -150,7 +150,12 @@ def _csv(file: pathlib.Path) -> dict[str, np.ndarray]:
         raise ValueError("it is empty.")
     if ";" in numbered[0][1]:
         raise ValueError("its columns are separated by ';'. Separate them by commas, with a point in decimal numbers.")
-    rows = list(csv.reader(line for _, line in numbered))
+    try:
+        rows = list(csv.reader(line for _, line in numbered))
+    except csv.Error:  # a cell longer than the limit of the module csv
+        rows = []
+    if len(rows) != len(numbered):
+        raise ValueError('a quotation mark " is not closed.')
     named = any(_float(cell) is None for cell in rows[0])
     names = [cell.strip() for cell in rows[0]] if named else [str(n + 1) for n in range(len(rows[0]))]
     if len(set(names)) < len(names):

@@ -206,8 +206,8 @@ def _seed(run: Table) -> int:
 def check_start(scenario: Scenario) -> None:
     """Raise ValueError unless the rotor starts within its clearance, and the clearance is less than the gap.
 
-    With an elastic stop, the rotor may also start in contact with it, and both must be below `Scenario.limit`. The
-    limits of a coil must contain its bias and its initial current.
+    With an elastic stop, the rotor may also start in contact with it; the initial |z| and the clearance must then be
+    below `Scenario.limit`. The limits of a coil must contain its bias and its initial current.
     """
     _check_coils(scenario)
     gap, stop, z = scenario.plant.s_0, scenario.touchdown, scenario.initial.z

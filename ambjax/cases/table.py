@@ -14,7 +14,7 @@ from ambjax.numerics.records import check_leaf
 
 # Largest number of characters of a key or a value in a message.
 LONGEST = 60
-# Largest depth of nested tables and lists. A sum of sums needs less; the readers rely on the limit.
+# Largest depth of nested tables and lists. A sum of sums needs less. The readers are recursive and rely on this limit.
 DEEPEST = 32
 # Largest size of a case file.
 MOST_BYTES = 10_000_000
@@ -104,7 +104,10 @@ class Table:
         return Table(self.raw.get(key, {}), self.at(key))
 
     def number(self, key: str, default: object, allowed: str = "a number") -> Any:
-        """Return a number, or the default if left out. Raises ValueError, with `allowed`, for anything else."""
+        """Return a number, or the default if left out. Raises ValueError for anything else.
+
+        `allowed`: description of the valid values, for the message.
+        """
         value = self.raw.get(key, default)
         if value is default:
             return default
@@ -157,7 +160,7 @@ class Table:
         """Return a record of type `kind` whose leaves have the values of this table's keys.
 
         `extra`: further keys that the table may have. `base`: a record that gives the defaults; None: `kind`. Raises
-        ValueError for an unknown or missing key, or a value out of bounds.
+        ValueError for an unknown or missing key, a value out of bounds, or two leaves in the wrong order.
         """
         fields = [field for field in dataclasses.fields(kind) if field.metadata.get("leaf")]
         self.only([*extra, *(f.name for f in fields)])

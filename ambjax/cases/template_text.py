@@ -78,11 +78,11 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 # guard = {{}}                  # limits of the readings, below; false: every reading is accepted
 #
 # [processor.guard]           # a reading beyond a limit is replaced by a prediction (left out: derived from the case)
-# z = 4.5e-3                  # m; largest |z| (left out: clearance times sensor gain, plus its offset and error)
+# z = 4.5e-3                  # m; largest |z| (left out: clearance times sensor gain, plus sensor offset and error)
 # z_dot = 100.0               # m/s; largest |z_dot| (left out: two gaps per sample)
 # i = 25.0                    # A; largest |i| (left out: 100 i_0)
 # noise = 1.4e-5              # m; largest difference of two readings of one z (left out: from the sensor's errors)
-# speed = 1e-3                # m/s; error of the predicted velocity (left out: from the sensor or the observer)
+# speed = 1e-3                # m/s; largest error of the predicted velocity (left out: from the sensor or the observer)
 # samples = 18                # largest number of successive predictions (left out: until an error grows by a factor e)
 
 # [actuator]

@@ -32,7 +32,7 @@ from ambjax.world.signals import Reference
 T = TypeVar("T")
 
 (U_MAX,) = (field for field in dataclasses.fields(Scenario) if field.name == "u_max")
-# A step sets the bit `singular` if the function of Eq. (9) is at most this value (1 at rest, 0 on the singular curve).
+# A step sets the bit `singular` if `Bearing.singularity` (Eq. (9): 1 at z = 0, 0 on C) is at most this value.
 NEAR = 0.1
 
 
@@ -44,7 +44,8 @@ def _end(of: str, unit: str) -> Any:
 class StepLimits:
     """The limit of the command, the threshold of the bit `singular`, and the limits of the reference.
 
-    The largest |r| is GAPS gaps. The limit of each derivative is the previous limit divided by the sample period.
+    `controller_of` sets the largest |r| to GAPS gaps, and the limit of each derivative to the previous limit divided by
+    the sample period. The user of the exported code may change all of them.
     """
 
     u_max: Scalar = dataclasses.field(metadata=U_MAX.metadata)

@@ -98,7 +98,7 @@ class _Reader:
         return apply(name, args, dtype, law)
 
     def _composed(self, name: str, x: Operand, dtype: np.dtype, law: str) -> Operand:
-        """Compose a primitive that not every target language has from others, as XLA does."""
+        """Express a primitive that some target languages lack by other primitives, as XLA does."""
         apply, one = self.program.apply, np.ones((), dtype)[()]
         if name == "rsqrt":
             return apply("div", (one, apply("sqrt", (x,), dtype, law)), dtype, law)

@@ -105,7 +105,7 @@ class Machine:
 class PlantStep(Block):
     """The plant of a case as it is exported.
 
-    - `cascade`: the controller, on a processor; the plant takes from it whether the delay is a whole number of samples.
+    - `cascade`: the controller, on a processor. The plant takes `whole` and `most` from its `Processor`.
     - `method`: integrator between samples, with a fixed number of steps.
     """
 

@@ -1,8 +1,8 @@
 """The horizon within which two closed loops can be compared despite rounding errors.
 
-A closed loop with hard signs or converters amplifies rounding errors until two correct programs agree only in their
-statistics. Twins of JAX's loop measure this growth. A twin is the loop that JAX simulates, with every state of the
-plant and of the laws, and the command, changed at every sample by one unit in the last place, up or down at random.
+A closed loop with set-valued signs or converters amplifies rounding errors until two correct programs agree only in
+their statistics. Twins of JAX's loop measure this growth. A twin is the loop that JAX simulates, with every state of
+the plant and of the laws, and the command, changed at every sample by one unit in the last place, up or down at random.
 While the twins stay close to JAX's loop, a correct program does too.
 """
 
@@ -85,7 +85,7 @@ class Twin(Sampled):
         key = jax.random.fold_in(jax.random.key(jnp.asarray(self.seed, jnp.int32)), sample)
         before, after = jax.random.split(key)
         moved = self._moved(before, state, self._sizes(state))
-        # flags and counters are not changed
+        # flags, counters and the state of a faulty sensor are not changed
         watch = moved.watch._replace(left=state.watch.left) if state.watch else ()
         state = moved._replace(finite=state.finite, watch=watch, started=state.started, sensed=state.sensed)
         stepped = super().jump(t, state, errors)

@@ -32,6 +32,8 @@ from ambjax.host.arguments import names_arguments
 
 # Files of the verification.
 VERIFIED = ("verify.md", "verify.json")
+# Largest length of a prefix.
+MOST_LETTERS = 61
 # Names of the files of an FMU export, with the prefix p: the FMU, and its reference input, output and options.
 FMU_NAMES = ("{p}.fmu", "{p}_in.csv", "{p}_ref.csv", "{p}_ref.opt")
 # Names of the standard C headers. A prefix must not be one of them, because the package contains PREFIX.h.
@@ -200,7 +202,8 @@ def destination(out: str | None, name: str, plan: Plan) -> Iterator[tuple[pathli
     """Yield the output directory, and a folder whose files move into it at the end of the `with` block, as in `files`.
 
     `out` and `name` are those of `directory`. Without verification, the verification of an earlier export is removed,
-    because it does not apply to the new files. Raises ValueError if it would replace a file that is not from an export.
+    because it does not apply to the new files. Raises ValueError if it would replace a file that is not from an export
+    with the same prefix.
     """
     path = directory(out, name)
     names = FMU_NAMES[: 1 if _holds_fmu(path, plan) else None] if plan.fmi else package.NAMES
@@ -232,11 +235,11 @@ def _prefix(option: str | None, name: str) -> str:
     """Return the prefix of all C names: the option, or one from `name`. Raises ValueError for an invalid option."""
     if option is None:
         derived = re.sub(r"\W", "_", name, flags=re.ASCII)
-        return derived if _is_name(derived) else f"amb_{derived}"
+        return derived if _is_name(derived) else f"amb_{derived}"[:MOST_LETTERS]
     if not isinstance(option, str) or not _is_name(option):
         raise ValueError(
-            f"--prefix {option}: it must be a C identifier (a letter, then letters, digits or '_'), and neither a C "
-            "keyword nor the name of a C header. For example: controller."
+            f"--prefix {option}: it must be a C identifier (a letter, then at most {MOST_LETTERS - 1} letters, "
+            "digits or '_'), and neither a C keyword nor the name of a C header. For example: controller."
         )
     return option
 
@@ -244,4 +247,5 @@ def _prefix(option: str | None, name: str) -> str:
 def _is_name(text: str) -> bool:
     """Return whether a text can be the prefix: a C identifier that is neither a keyword nor the name of a C header."""
     words = RESERVED | HEADER_NAMES | {"break", "continue", "else", "for", "if", "return", "while"}
-    return re.fullmatch(r"[A-Za-z]\w{0,60}", text, flags=re.ASCII) is not None and text not in words
+    valid = re.fullmatch(r"[A-Za-z]\w*", text, flags=re.ASCII) is not None and len(text) <= MOST_LETTERS
+    return valid and text not in words

@@ -198,8 +198,8 @@ def _check_samples(case: Case, x: Axis, y: Axis, members: int) -> None:
             )
         if duration / low > MOST_SAMPLES or total > MOST_TOTAL:
             raise ValueError(
-                f"{flag} {PERIOD}: from {low:g} s on, it makes runs of up to {duration / low:.3g} samples, {total:.3g} "
-                f"in all; at most {MOST_SAMPLES:,} a run and {MOST_TOTAL:.0e} in all are allowed. Raise LOW, or "
+                f"{flag} {PERIOD}: with {low:g} s a run has {duration / low:.3g} samples, and all runs {total:.3g}; "
+                f"at most {MOST_SAMPLES:,} a run and {MOST_TOTAL:.0e} in all are allowed. Raise LOW, or "
                 "shorten clock.duration."
             )
 

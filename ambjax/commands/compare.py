@@ -1,4 +1,4 @@
-"""`ambjax compare`: several cases on the same members: errors, voltages, losses, sensitivity, margins, cost."""
+"""`ambjax compare`: several cases on the same members: errors, voltages, power losses, sensitivity, margins, cost."""
 
 import argparse
 import contextlib

@@ -13,14 +13,14 @@ from ambjax.results.operating import OperatingPoint, SpreadPeaks, analysis_summa
 
 
 class Injections(NamedTuple):
-    """The measured sensitivity at the position sensor, and at the velocity sensor; None without that sensor."""
+    """The measured sensitivity at the position sensor, and at the velocity sensor (None without a velocity sensor)."""
 
     position: Injection
     velocity: Injection | None
 
 
 def set_valued(case: Case) -> list[str]:
-    """Return the tables of the laws with set-valued signs on a processor.
+    """Return the names of the case-file tables of the laws with set-valued signs; none without a processor.
 
     The linear loop describes these laws only inside their bands.
     """
@@ -62,7 +62,10 @@ def _measured_numbers(peaks: MemberPeaks, zones: Zones) -> dict[str, object]:
 
 
 def _injected_numbers(point: OperatingPoint, measured: Injections | None) -> dict[str, object]:
-    """Return the numbers of the measured sensitivity; None each if it was not measured."""
+    """Return the numbers of the measured sensitivity.
+
+    Without a measurement, only the peak and the ends of its interval are returned, each as None.
+    """
     if measured is None:
         return {"injected_peak": None, "injected_low": None, "injected_high": None}
     one = measured.position

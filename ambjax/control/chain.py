@@ -83,7 +83,10 @@ class FilterChain(PositionLaw[ChainState]):
         return ChainState(size, size, *[(size, size)] * 4)
 
     def designed(self, model: Plant, period: float | None) -> "FilterChain":
-        """Return the law with the gains of `optimal_gains` in continuous time. Raises ValueError as it does."""
+        """Return the law with the gains of `optimal_gains` in continuous time, and k_aw and all corners from the pole.
+
+        Raises ValueError as `optimal_gains` does.
+        """
         (k_int, k_p, k_d), w = map(float, optimal_gains(model)), float(model.pole)
         return dataclasses.replace(
             self, k_p=k_p, k_d=k_d, k_int=k_int, k_aw=w / 50, w_f=20 * w, w_z=5 * w, w_p=5 * w, w_1=10 * w, w_2=20 * w,

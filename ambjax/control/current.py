@@ -152,7 +152,7 @@ class DeadBeat(CurrentLaw[tuple[()]]):
     def step(self, model: Plant, inputs: CurrentInputs, state: tuple[()], period: Scalar) -> tuple[Array, tuple[()]]:
         """Return the voltage that moves i to its wanted value in one sample.
 
-        The model is i' = b u - decay i with constant b = 2 (s_0+z)/kappa and decay.
+        The model is i' = b u - decay i. Its coefficients b = 2 (s_0+z)/kappa and decay are constant in the sample.
         """
         measured, demand = inputs.measured, inputs.demand
         gaps = inputs.gaps or model.gaps(measured.z)
@@ -239,7 +239,7 @@ class AmplifierCurrent(CurrentLaw[tuple[()]]):
 def _mean_decay(x: Array) -> Array:
     """Return (1 - exp(-x))/x with |x| limited to 30.
 
-    Near 0, where the difference loses digits, a series replaces the formula.
+    Near 0, where the formula is 0/0 and its derivative loses digits, a series replaces it.
     """
     x = limited(x, 30.0)
     near = jnp.abs(x) < 1e-3

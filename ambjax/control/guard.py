@@ -101,8 +101,8 @@ class Guard:
 
         `period`: sample period, s. `estimated`: whether an observer estimates the velocity.
 
-        The derivation uses the gap, the pole and the bias current of `model`, and the sensor, the gap and the |z| of a
-        lost rotor of `scenario`.
+        The derivation uses the gap, the pole and the bias current of `model`. Of `scenario`, it uses the sensor, the
+        gap and the |z| at which the rotor is lost.
         """
         sensor = Sensor() if scenario.sensor is None else scenario.sensor
         limit, clearance = scenario.limit, scenario.limit / scenario.plant.s_0 * model.s_0

@@ -19,7 +19,7 @@ from ambjax.numerics.smooth import TWO_OVER_PI, away_from_zero, smooth_sign
 from ambjax.world.plant import Plant
 
 # Lower bound of |dv/di| as a share of its value at the origin. Eq. (6) divides by zero on the singular curve C; with
-# the bound the rate stays finite, and the trajectory reports the crossing.
+# the bound the rate stays finite. `Trajectory.singular_at` is the time at which C is first crossed.
 GRADIENT_FLOOR = 1e-4
 
 
@@ -90,7 +90,10 @@ class Adaptive(AdaptiveReference):
         return {"gamma": gamma, **steepness(context, "gamma")}
 
     def slide(self, model: Plant, begin: ForceDemand, end: ForceDemand, i_ref: Array, h: Scalar) -> Relaxation:
-        """Integrate i_ref over a step: at its initial rate up to the boundary layer, then inside it. Eq. (14a)."""
+        """Integrate i_ref over a step: at its initial rate up to the boundary layer, then by one backward Euler step.
+
+        Eq. (14a).
+        """
         v_0, gradient_0 = v_and_gradient(model, begin, i_ref)
         v_1, gradient_1 = v_and_gradient(model, end, i_ref)
         w = begin.v_star - v_0
@@ -99,7 +102,7 @@ class Adaptive(AdaptiveReference):
         return Relaxation(sliding / gradient_0, slaved / gradient_1, turn, path)
 
     def step(self, model: Plant, inputs: ForceDemand, state: Array, period: Scalar) -> tuple[CurrentDemand, Array]:
-        """Step v(z, i_ref) towards v_star with the sign at the end of the step; gamma bounds the rate of v."""
+        """Step v(z, i_ref) towards v_star; the sign is evaluated at the end of the step. gamma bounds the rate of v."""
         w = inputs.v_star - model.v_and_dv_di(inputs.z, state, inputs.gaps)[0]
         after = model.current_for(inputs.z, inputs.v_star - relax(w, period * self.gamma, self.p))
         return CurrentDemand(state, (after - state) * (1 / period)), after
@@ -129,7 +132,7 @@ class FeedForwardAdaptive(AdaptiveReference):
         return {"gamma": gamma, **steepness(context, "gamma")}
 
     def step(self, model: Plant, inputs: ForceDemand, state: Array, period: Scalar) -> tuple[CurrentDemand, Array]:
-        """Step v towards v_star, with z and v_star extrapolated to the end of the sample, and the sign at its end."""
+        """Step v towards v_star. z and v_star are extrapolated to the end of the step, where the sign is evaluated."""
         w = inputs.v_star - model.v_and_dv_di(inputs.z, state, inputs.gaps)[0]
         z, v_star = inputs.z + period * inputs.z_rate, inputs.v_star + period * inputs.v_star_rate
         after = model.current_for(z, v_star - relax(w, period * self.gamma, self.p))
@@ -190,7 +193,7 @@ class StaticInversion(InversionLaw[tuple[()]]):
 
 @record
 class ClosedForm(StaticInversion):
-    """Static inversion: i_ref is the root of v(z, i_ref) = v_star that is continuous at i = 0, with its exact rate.
+    """Static inversion: i_ref is the root of v(z, i_ref) = v_star that stays finite at z = 0, with its exact rate.
 
     The paper argues against this law (Mouille and Lottin 1992): it is exact on a known plant, but passes every jump of
     v_star, such as noise, directly to i_ref. It has no state in continuous time. On a processor it equals the adaptive

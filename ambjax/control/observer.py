@@ -74,8 +74,8 @@ class Difference(Observer[Array]):
     """Filtered difference: the estimated velocity is w (z - z_f) with z_f' = w (z - z_f). z itself is not filtered.
 
     With implicit steps on a processor, it is the backward difference (z_n - z_{n-1})/T through a low-pass with the pole
-    exp(-w T). The estimate is exact on a ramp after the initial transient, and lags by 1/w. It amplifies noise of the
-    position by w.
+    exp(-w T). On a ramp, the estimate is exact after the initial transient. It follows a change of the velocity with
+    a lag of 1/w, and amplifies noise of the position by w.
     """
 
     w: Scalar = gain(default=2000.0, unit="1/s", doc="corner of the low-pass on the differenced position")

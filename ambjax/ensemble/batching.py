@@ -1,6 +1,7 @@
 """The ensemble engine: run many members at once, in blocks that fit the first-level cache, on all cores or devices.
 
-The result of a member does not depend on the other members, nor on its block, thread, device or position in the order.
+On a CPU, the result of a member does not depend on the other members, nor on its block, thread or position in the
+order. On a GPU it may, because the compiled program depends on the number of members in a call.
 """
 
 import functools
@@ -96,7 +97,8 @@ def map_members(
 
     - `function`: maps a tree with the leaves of one member to a pytree of arrays. JAX traces it, and compiles it again
       unless an equal (==) function was mapped before. Use a named function or a frozen dataclass, not a new lambda.
-    - `threads`: CPU cores to use (None: all cores that this process may use).
+    - `threads`: CPU cores to use (None: all cores that this process may use). It has no effect on a GPU or on several
+      devices.
     - `call`: members in one call of the compiled program, rounded up to whole blocks (None: equal shares for all cores,
       at most 4096 members each). The memory of the simulation grows with `call`, not with N. A new value of `call`
       requires a new compilation. Each core runs one call at a time. If there are fewer calls than cores, some cores are
@@ -193,7 +195,7 @@ def _blocks(
     block: int,
     vectorised: bool,
 ) -> Result:
-    """Run all members of a call: a loop over blocks, with the whole function vectorised over a block."""
+    """Run all members of a call: on a CPU, in a loop over blocks, vectorised over a block; elsewhere, all at once."""
     axes = jax.tree.unflatten(tree, [0 if varies else None for varies in moves])
 
     def together(moving: tuple[Array, ...]) -> Result:

@@ -65,7 +65,7 @@ def shares(x: Sequence[np.ndarray], y: Sequence[np.ndarray], confidence: float =
 def drivers(
     spread: Mapping[str, np.ndarray], metrics: Mapping[str, np.ndarray], confidence: float = 0.95
 ) -> tuple[dict[str, list[dict[str, object]]], dict[str, dict[str, object]]]:
-    """Rank the spread quantities by the share of the variation of each metric that they explain, with a summary.
+    """For each metric, rank the spread quantities by the share of its variation that they explain, with a summary.
 
     - `spread`: columns [N] of the spread quantities, by dotted path.
     - `metrics`: columns [N] of the metrics, by name.

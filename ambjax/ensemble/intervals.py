@@ -61,15 +61,16 @@ def wilson(successes: ArrayLike, n: ArrayLike, confidence: float = 0.95) -> Esti
 def quantile(values: np.ndarray, q: npt.ArrayLike, confidence: float = 0.95) -> Estimate:
     """Compute the q-quantile of values [N], the value of rank ceil(q N), with its interval. q: a number or an array.
 
-    The number of values below the true quantile is binomial with N trials of probability q. The quantiles of this
-    distribution are the ranks of the two ends. An end is -inf or +inf if N is too small. Values of +inf are allowed.
+    The number of values below the true quantile is binomial with N trials of probability q. Its quantiles are
+    the ranks of the two ends, the upper one plus 1. An end is -inf or +inf if N is too small. Values of +inf are
+    allowed.
     Raises ValueError as `column_of` does.
     """
     from scipy.stats import binom
 
     x = np.sort(column_of(values))
     n, tail = len(x), (1 - confidence) / 2
-    # A product such as 0.1 * 30 may round to just above an integer.
+    # A product may round to just above an integer: 0.07 * 100 is 7.000000000000001.
     rank = np.clip(np.ceil(np.asarray(q) * n - 1e-9 * n), 1, n).astype(int)
     padded = np.concatenate([[-np.inf], x, [np.inf]])
     low, high = binom.ppf(tail, n, q), binom.ppf(1 - tail, n, q) + 1
@@ -173,8 +174,8 @@ def _studentised_ends(
     - `whole`: the estimate and its standard error, each [1, columns].
     - `resamples`: the same of each resample, [replicates, columns].
 
-    A resample with standard error 0 (all its values are equal) counts as infinitely far from the estimate. If the
-    standard error of the estimate itself is 0 (its tail is a single value), the percentile interval is returned.
+    A resample with standard error 0 (its values, or those of its tail, are equal) counts as infinitely far from an
+    estimate that differs from it. If the standard error of the estimate is 0, the percentile interval is returned.
     """
     (value,), (error,) = whole
     values, errors = resamples

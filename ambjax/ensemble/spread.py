@@ -171,9 +171,10 @@ def _check_one(path: str, kind: Distribution, place: Place) -> None:
 def _check_together(
     kinds: dict[str, Distribution], known: dict[str, Place], cascade: Cascade, scenario: Scenario
 ) -> None:
-    """Check the conditions that involve two numbers: start before stop, and the rotor inside its clearance.
+    """Check the conditions that involve more than one number.
 
-    Raises SpreadError with the path of the number that is spread.
+    They are: start before stop, the clearance below the gap, the rotor inside its clearance, and `_check_coils`. Raises
+    SpreadError with the path of the number that is spread.
     """
 
     def reach(path: str) -> tuple[float, float]:

@@ -9,7 +9,7 @@ import numpy as np
 from ambjax.ensemble.drivers import drivers
 from ambjax.ensemble.intervals import STATISTICS, TAIL, Estimate, bootstrap, column_of, quantile, wilson
 
-# Level of the CVaR, which is the mean over the largest values, a share 1 - ALPHA of all.
+# Level of the CVaR: the mean of the largest values, which are a share of 1 - ALPHA of all values.
 ALPHA = 0.95
 # HEAVY: kurtosis above which a tail counts as heavy. An exponential distribution has 9, a normal one 3.
 # COVERED: coverage, in per cent, of the 95 % interval of the standard deviation of a lognormal distribution, by number
@@ -43,10 +43,10 @@ def summary(
     - `worst`: length of that list.
 
     A member survives, is lost, or is stalled (its integration stopped early, so it is neither held nor lost). Metrics
-    and their drivers (the spread quantities that explain them) are computed from the survivors, as the key `metrics_of`
-    states: a lost rotor is frozen, so its voltage, current and chatter are 0 from then on. Lost and stalled members
-    count in
-    `survival`, in the drivers of lost_at_s and in `worst`.
+    and their drivers (the spread quantities that explain them) are computed from the survivors; the key `metrics_of`
+    states this. The state of a lost rotor is frozen: its error is that of the frozen state, and its rms voltage, rms
+    current and chatter cover only the time before the loss. Lost and stalled members count in `survival`, in the
+    drivers of lost_at_s and in `worst`.
 
     A metric that is infinite for some survivors (a time never reached) has quantiles, but no mean, standard deviation
     or CVaR; `finite` counts its finite values. Without survivors all its statistics are None. `drivers` and

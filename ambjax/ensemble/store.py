@@ -43,7 +43,7 @@ class Store:
         self.chunks, self.manifest, self.path = directory / "chunks", directory / MANIFEST, directory / RESULT
 
     def check(self, columns: int, resume: bool) -> None:
-        """Check that the directory is unused, or holds a part of this study. The directory is not changed.
+        """Check that the directory is unused or holds this study, and read its manifest. The directory is not changed.
 
         Raises ValueError if the directory holds another study, if it holds a study and `resume` is False, if it holds
         none and `resume` is True, or if the disk has no room for twice `columns` numbers per member.

@@ -119,7 +119,7 @@ class Analysis(NamedTuple):
     - `stable`: whether all poles are stable. If not, the peaks and the stiffness have no physical meaning.
     - `S`, `T`, `KS`: peaks of |S|, |T| (1) and |KS| (V/m).
     - `zone`: zone of the peak of |S|; D if the loop is unstable.
-    - `S_velocity`: peak of |S| for a test signal on the velocity reading; None if the velocity is not measured.
+    - `S_velocity`: peak of |S| for a test signal on the velocity reading; None if the controller does not use one.
     - `margins`: see `Margins`; all are 0 if the loop is unstable.
     - `stiffness`: static stiffness, N/m; inf if the law integrates the measured position. If it integrates a prediction
       over the delay T, the stiffness is finite, about 2 m / T^2, because the prediction does not include the force.
@@ -143,8 +143,8 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
     """Linearise the loop at the equilibrium of the constant reference r (m).
 
     The linear system contains the gain, offset and bandwidth of the sensor and the bandwidth of the amplifier. It does
-    not contain noise, disturbances, converters, faults, the guard, the limits of supply and amplifier, or the dead
-    band. On a processor it is the exact map of one sample period.
+    not contain noise, runout, disturbances, converters, faults, the guard, the limits of supply and amplifier, or the
+    dead band. On a processor it is the exact map of one sample period.
 
     Returns the state space with NumPy arrays. Raises ValueError as `rollout` does, and if no equilibrium is found at r.
     """

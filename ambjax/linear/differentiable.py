@@ -20,7 +20,7 @@ ROUNDS, LOCAL = 4, 17
 # Upper bound of the peaks of a stable loop, in the unit of each, and of 1/(pole times delay margin). The values of an
 # unstable loop are at least as large.
 MOST = 1e3
-# The same values for a loop without an equilibrium, relative to MOST.
+# Values of these quantities for a loop without an equilibrium, divided by MOST.
 NO_EQUILIBRIUM = 100.0
 # Step of the logarithm of the frequency in the difference quotient for the slope of L at a crossing.
 SLOPE_STEP = 1e-4
@@ -34,9 +34,10 @@ class LoopQuantities(NamedTuple):
     - `delay_margin_s`: smallest additional delay that makes the loop unstable, s.
     - `growth`: largest real part of a pole, 1/s; negative if the loop is stable, inf without an equilibrium.
 
-    The unit of |S| and |T| is 1, that of |KS| is `volts_per_metre`. For a stable loop, the peaks are those of
-    `analyse`, smoothly limited to MOST times their unit. For an unstable loop they are MOST (1 + growth/pole) times
-    their unit, so that a descent leads to a stable loop. The same holds for 1/(pole times delay margin).
+    The unit of |S| and |T| is 1, that of |KS| is `volts_per_metre`; `pole` is the unstable pole of the plant. For a
+    stable loop, the peaks are those of `analyse`, smoothly limited to MOST times their unit. For an unstable loop they
+    are MOST (1 + growth/pole) times their unit, so that a descent leads to a stable loop. The same holds for
+    1/(pole times delay margin).
     """
 
     sensitivity: Array
@@ -136,7 +137,7 @@ def _capped(x: Array) -> Array:
 
 
 def _growth(system: StateSpace) -> tuple[Array, Array]:
-    """Return the largest real part of the poles in 1/s, and the poles [N] without derivatives.
+    """Return the largest real part of the poles, 1/s, and the poles [N] in the s- or z-plane, without derivatives.
 
     The derivative of the dominant pole is that of a simple eigenvalue, from its left and right eigenvectors. JAX's
     derivative of `eig` requires independent eigenvectors of all poles. A delay adds a defective pole at

@@ -184,8 +184,9 @@ def is_traced(x: object) -> bool:
 
 
 def validate(node: object, path: str = "") -> None:
-    """Check every leaf of the records in `node` against the bounds of its field, and the order of the pair `ordered`.
+    """Check every leaf of the records in `node` against the bounds of its field.
 
+    If a record type has the attribute `ordered`, a pair of field names, the first value must not exceed the second.
     Traced leaves are not checked. `path`: dotted path of `node`, for messages. Raises ValueError for an invalid value.
     """
     if isinstance(node, (tuple, list)):
@@ -225,7 +226,7 @@ def _fields(kind: type) -> tuple[tuple[dataclasses.Field, bool], ...]:
 
 @functools.cache
 def _leaves(kind: type) -> tuple[tuple[dataclasses.Field, float, float], ...]:
-    """Return the leaves of a record type, each with an open interval of allowed floats (empty: `whole`). Cached."""
+    """Return the leaves of a record type, each with an open interval of allowed floats, empty if `whole`. Cached."""
     found = []
     for field in (field for field, is_leaf in _fields(kind) if is_leaf):
         lows = [x for x in (field.metadata["above"], field.metadata["at_least"]) if x is not None]

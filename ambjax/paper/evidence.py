@@ -35,8 +35,8 @@ SEEDS = 2
 BASIN = np.logspace(-7, -3, 10)
 # The plant's parameters that are varied, one at a time.
 UNCERTAIN = ("m", "k_z", "R", "A")
-# Fixed steps for a reading under held noise. They cost half as much as adaptive steps; z differs by at most 4e-9 m
-# (tested).
+# Fixed steps for a reading of the paper whose noise is constant over each sample. They cost half as much as adaptive
+# steps; z differs by at most 4e-9 m (tested).
 STEPS = {"tuned": Slide(16)}
 
 
@@ -95,7 +95,7 @@ class Noise(NamedTuple):
         return survival_of(NOISE_STDS, self.lost, self.stalled).undecided
 
     def std_for(self, radius: float) -> float | None:
-        """Return the std, m, at which sigma's neighbourhood has this radius, m/s. None: not within the scan.
+        """Return the std, m, at which the largest settled |sigma| equals `radius`, m/s. None: not within the scan.
 
         The std is interpolated linearly on logarithmic scales, between the stds up to which every member survives.
         """

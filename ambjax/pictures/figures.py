@@ -14,9 +14,9 @@ from ambjax.simulation.trajectory import STALLED, Row, Trajectory
 
 # Okabe and Ito's colours: distinct in print and to colour-blind readers.
 INK, BLUE, ORANGE, GREEN, RED = "#222222", "#0072B2", "#E69F00", "#009E73", "#D55E00"
-# A panel of a stretch with more than 4 PIXELS samples is divided into PIXELS columns.
+# A panel of a part of the run (a stretch) with more than 4 PIXELS samples is divided into PIXELS columns.
 PIXELS = 500
-# Smallest vertical range of an enlarged panel, as a share of the range over the whole run.
+# Smallest vertical range of a panel of a stretch, as a share of the range over the whole run.
 FLAT = 0.005
 
 
@@ -111,8 +111,8 @@ def draw_panel(
 ) -> None:
     """Draw a panel of the whole run, or of `stretch` (begin and end, s), up to the loss of the rotor.
 
-    If a stretch has more than 4 PIXELS samples, the panel shows the mean of each column over a band of extremes.
-    `first`: write the cause of a loss into this panel, as into POSITION and FORCE of a whole run.
+    If a stretch has more than 4 PIXELS samples, the panel shows means over PIXELS columns, and the extremes as a band.
+    `first`: write the cause of a loss into this panel. POSITION and FORCE of a whole run always contain it.
     """
     rows, lost_at = trajectory.rows, float(trajectory.lost_at)
     t = np.asarray(rows.t)

@@ -31,8 +31,8 @@ class MapPanel(NamedTuple):
     - `x` [nx], `y` [ny]: values of the axes, ascending.
     - `survival` [ny, nx]: shares 0 to 1; NaN: not run.
     - `low`, `high` [ny, nx]: bounds of the confidence interval of the survival. None: not drawn, and the contour
-      encloses the cells in which all runs survive, instead of a share of CONTOUR.
-    - `error` [ny, nx]: in the unit of the error metric; not finite: no survivor. None: no map of errors.
+      encloses the cells in which all runs survive, instead of those in which a share of CONTOUR survives.
+    - `error` [ny, nx]: in the unit of the error metric; not finite: not run, or no survivor. None: no map of errors.
     """
 
     title: str
@@ -185,7 +185,7 @@ def _contour_words(panels: Sequence[MapPanel]) -> str:
 
 
 def _range(panel: MapPanel) -> str:
-    """Return in words in how many cells enough runs survive: in all or in none if no contour is drawn."""
+    """Return in words in how many cells enough runs survive. Without a contour, this tells whether all or none do."""
     share = np.asarray(panel.survival, float)
     cells = share[np.isfinite(share)]
     if not cells.size:

@@ -100,7 +100,7 @@ class ClosedLoop:
         return LoopState(plant, self.cascade.init(measured, inputs.reference))
 
     def measured(self, plant: object, errors: Errors) -> Measurement:
-        """Return the readings of the sensors for a state of the plant."""
+        """Return the readings of the sensors for a state of the plant, without the runout."""
         motion, sensor = self.scenario.plant.measurement(plant), self.scenario.sensor
         return motion if sensor is None else sensor.reading(motion, errors)
 
@@ -123,7 +123,7 @@ class ClosedLoop:
         return ExternalInputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t), runout)
 
     def received(self, inputs: Any, plant: Any, errors: Errors) -> Measurement:
-        """Return the readings that the controller receives.
+        """Return the readings that the controller receives, with the runout.
 
         `inputs`: the external inputs at this instant (method `inputs`).
         """

@@ -35,17 +35,17 @@ TOUCHED = 0.05
 DRIVEN = 0.5
 # Names of the plant's slopes in messages.
 PLANT, COILS, FLUX, STOP = "plant", "current in the coils", "flux behind the current", "rotor on its stop"
-# Number of RK4 substeps per sample above which the larger steps of the L-stable method are cheaper.
+# The same in continuous time: number of RK4 substeps per sample above which the L-stable method is cheaper.
 MOST_SUBSTEPS = 4
 # Fixed L-stable steps: largest value of slope h^2. The error at the corner of a smoothed sign is an impulse
 # proportional to slope h^2. At this value the gradient in gamma under held noise is correct to 1e-3; with twice the
 # step its error is 12 %.
 CORNER = 7.5e-6
-# Relative error per step of the adaptive method, with and without noise. The error of z is proportional to the response
-# of the loop to an impulse: the largest later change of z, m, after a velocity change of 1 m/s. At QUIET_TOLERANCE, z
-# is within 1e-8 m if that response is at most 0.1 m. The response is unbounded for a loop that nearly loses its rotor,
-# so that no bound in metres holds for every loop (tests/test_tolerance.py). Under noise every sample begins with a
-# jump, and QUIET_TOLERANCE would take up to twice the steps.
+# Relative error per step of the adaptive method, with and without a sensor model. The error of z is proportional to the
+# response of the loop to an impulse: the largest later change of z, m, after a velocity change of 1 m/s. At
+# QUIET_TOLERANCE, z is within 1e-8 m if that response is at most 0.1 m. The response is unbounded for a loop that
+# nearly loses its rotor, so that no bound in metres holds for every loop (tests/test_tolerance.py). Under noise every
+# sample begins with a jump, and QUIET_TOLERANCE would take up to twice the steps.
 TOLERANCE, QUIET_TOLERANCE = 1e-6, 1e-7
 
 
@@ -71,10 +71,10 @@ def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
 def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *, reverse: bool = False) -> Integrator:
     """Choose RK4, adaptive RODAS3, or RODAS3 with equal substeps.
 
-    RK4 is chosen with a sensor model if MOST_SUBSTEPS substeps resolve the slopes, and for a cascade on a processor if
-    MOST_SETTLED substeps resolve current and flux. Otherwise the choice is adaptive RODAS3. Without noise, adaptive
-    steps can be much longer than the slopes suggest. Noise jumps at every sample and prevents such steps, so the
-    explicit method is then cheaper.
+    On a processor, the choice is RK4 if MOST_SETTLED substeps resolve current and flux. In continuous time, it is RK4
+    if the scenario has a sensor model and MOST_SUBSTEPS substeps resolve the slopes. Otherwise it is adaptive RODAS3.
+    Without noise, adaptive steps can be much longer than the slopes suggest. Noise jumps at every sample and prevents
+    such steps, so RK4 is then cheaper.
 
     `reverse`: choose a method with a fixed number of steps, which supports reverse mode: RK4, or RODAS3 with equal
     substeps. A jump of a disturbance inside such a step causes an error of about 3e-8 m per m/s^2 on smooth gains. An
@@ -117,11 +117,11 @@ def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: 
     """Return `clock` with an integration method that is valid for the cascade and the scenario.
 
     A clock without a method gets the result of `choose_method`; otherwise the method is checked against its stability
-    limit. For a cascade on a processor, the function also computes `cuts`, the largest number of edges of disturbances
-    inside one sample. A larger `cuts` of the clock is kept, so that a part of an ensemble runs the compiled program of
-    the whole.
+    limit, unless the sample period or a slope is traced. For a cascade on a processor, the function also computes
+    `cuts`, the largest number of edges of disturbances inside one sample. A larger `cuts` of the clock is kept, so that
+    a part of an ensemble runs the compiled program of the whole.
 
-    Raises ValueError for an explicit step above the stability limit; the message names both and the fix. Raises
+    Raises ValueError for an explicit step above the stability limit; the message names step, limit and fix. Raises
     ValueError also for adaptive steps if an amplifier controls the current in continuous time, and as `slopes` does.
     """
     if clock.method is None:

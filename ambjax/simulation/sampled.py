@@ -126,7 +126,7 @@ class Sampled:
         sensed = sensor.sensed(measured.z, sensed, errors.onsets, self.period, self.loop.scenario.plant.s_0)
         z = jnp.where(jnp.isnan(sensed.z), 0.0, sensed.z)
         state = state._replace(sensed=sensed._replace(z=z))
-        if self.processor.guard is None:  # a NaN reading ends the run; z = 0 instead keeps derivatives finite
+        if self.processor.guard is None:  # a NaN reading ends the run; z = 0 in place of NaN keeps derivatives finite
             state = state._replace(finite=jnp.where(jnp.isnan(sensed.z), 0.0, state.finite))
             return state, measured._replace(z=z)
         return state, measured._replace(z=sensed.z)

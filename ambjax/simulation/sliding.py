@@ -1,17 +1,18 @@
 """The sliding step: an integration step for a closed loop whose only stiff part is a sliding inversion law.
 
-The adaptive inversion law is such a law: w' = d - gamma sgn(w) for w = v_star - v(z, i_ref), Eq. (14a). d is the rate
-of w at constant i_ref, and p the steepness of the smoothed sign. When the
-measurements jump at a sample, i_ref slides to its new value within microseconds, and then follows that value.
-General methods are not suitable. A linearised implicit step has no stiffness in its Jacobian while the sign is
-saturated, and overshoots by gamma h. An explicit step must be shorter than 1/(gamma p).
+The adaptive inversion law is such a law: w' = d - gamma sgn(w) for w = v_star - v(z, i_ref), Eq. (14a). Here d is the
+rate of w at constant i_ref, and sgn is a smoothed sign of steepness p. When the measurements jump at a sample, i_ref
+slides to its new value within microseconds, and then follows that value. General methods are not suitable. A
+linearised implicit step has no stiffness in its Jacobian while the sign is saturated, and overshoots by gamma h. An
+explicit step must be shorter than 1/(gamma p).
 
 This step is divided at the end of the slide. The second part is solved implicitly with the full arctan, not with its
 slope. The supply's limit applies to each part. A fast slide saturates the voltage, so the current receives a
 bounded impulse instead of the whole jump.
 
-The motion of the rotor and the states of the observer and of the position law are integrated by Heun's method. In each
-part, the current is integrated by an exponential step, the state of the current law by an explicit Euler step.
+The states of the observer and of the position law are integrated by Heun's method. The motion of the rotor is
+integrated with an acceleration linear in time between those at the start and at the predicted end. In each part, the
+current is integrated by an exponential step, and the state of the current law by an explicit Euler step.
 """
 
 from typing import Any, NamedTuple, TypeVar
@@ -89,7 +90,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     plant = State(
         z + h * z_dot + h * h / 6 * (2 * z_ddot_0 + z_ddot_1), z_dot + h / 2 * (z_ddot_0 + z_ddot_1), i_ref + e
     )
-    # tau = 0: no slide, because w was within the boundary layer of the sign, or would not approach it.
+    # tau = 0: no slide, because w was inside the boundary layer of the sign, or did not move towards this layer.
     instants = (
         loop.instant(begin.reference, state.plant, i_ref_0, w, jnp.where(tau > 0, first.u, second.u)),
         loop.instant(begin.reference, state.plant._replace(i=middle.i), i_ref - (h - tau) * slaved, w_1, second.u),

@@ -12,7 +12,7 @@ QUESTION = "Do the conditions of Theorem 1 hold along this run?"
 MARGIN = 1.1
 # Share of the time until the rotor is lost, after which it counts as falling.
 FALL_SHARE = 0.9
-# Ratio of gamma to Delta_1 along the reference that leaves room for transients.
+# Ratio of gamma to the Delta_1 of the ideal motion z = r; it leaves room for transients.
 TRANSIENT_FACTOR = 2.0
 IMPLICIT = 'discretisation = "implicit"'
 # Advice for a run in which the integrator stalled.
@@ -70,8 +70,8 @@ def processor_lines(sampled: SampledReport, margin: Delays, unknown: Delays | No
     """Return the lines below the tables of a cascade on a processor.
 
     They report the slopes, the distance to C, the status of the rotor, an alternating voltage, and the delay margins.
-    `margin`: delay margin if the controller predicts over the actual delay. `unknown`: delay margin if it predicts over
-    the delay of the case; None: it does not predict.
+    `margin`: delay margin; a prediction, if there is one, uses the actual delay. `unknown`: delay margin if the
+    prediction uses the delay of the case; None: the controller does not predict.
     """
     lines = [
         f"- {slope.stage}: slope T of the step is {number(slope.effective_slope)} and must be less than "
@@ -108,9 +108,8 @@ def _curve(distance: float, at: float) -> str:
 def _alternates(share: float) -> str:
     return (
         f"The voltage alternates: without noise, the part that changes sign from sample to sample is {100 * share:.0f} "
-        "% of its rms value. One step of a law changes its error by more than this error, or the output of a law acts "
-        "with a delay that the law does not include. Lower "
-        f"the gain or p of this law, set {IMPLICIT} or predict = true, or shorten clock.sample_period."
+        "% of its rms value. A law overshoots in one step, or its output acts with a delay that the law does not "
+        f"include. Lower the gain or p of this law, set {IMPLICIT} or predict = true, or shorten clock.sample_period."
     )
 
 

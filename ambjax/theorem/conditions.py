@@ -31,12 +31,12 @@ from ambjax.world.signals import Reference, Signal, reference_at
 
 @dataclasses.dataclass(frozen=True)
 class Condition:
-    """One condition `gain` > `against`, evaluated along a run.
+    """One condition `gain` > `against` (>= for a gain that must be constant), evaluated along a run.
 
     `requires`: the condition as text. `gain`, `against`: its left and right side, in `unit`; `gain` is None if the law
     has no such gain. `at_s`: time of the worst value, s. `holds`: None for a line that is only informative, or if
-    `gain` is None. `path`, `over`: path of the gain in a case file and name of the right side; '' if the condition is
-    not about a gain. `ideal`: whether `against` depends on the reference only, not on the run.
+    `gain` is None. `path`, `over`: path of the gain in a case file and name of the right side; '' if the left side is
+    not a gain of a law in use. `ideal`: whether `against` depends on the reference only, not on the run.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Condition:
 
     @property
     def margin(self) -> float | None:
-        """The left side minus the right side: positive where the condition holds."""
+        """The left side minus the right side: positive where the condition holds (0 for a gain that is constant)."""
         return None if self.gain is None else self.gain - self.against
 
 

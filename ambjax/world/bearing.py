@@ -27,7 +27,8 @@ class Bearing(Generic[S]):
     """Parameters of rotor and magnets (Table 1), and the force of given currents. All parameters are in SI units.
 
     A plant is a subclass of this record, and its state is a NamedTuple of scalars. The subclass implements `start`,
-    `rates`, `rest`, `scale`, `measurement` and `signals`; it inherits the other methods.
+    `rates`, `rest`, `scale`, `measurement` and `signals`. It overrides `currents` if the coils do not share one
+    current deviation, and `flux_currents` if the flux can lag. It inherits the other methods.
 
     The paper prints k_z in N m. Here it is a stiffness in N/m; a negative value is restoring.
     """

@@ -55,7 +55,7 @@ class LimitTerm:
     ratio: Scalar
 
     def excess(self, values: Array) -> Array:
-        """Return g = log(reached / allowed), or -g for a lower limit.
+        """Return g = log(reached / allowed), or log(allowed / reached) for a lower limit.
 
         `values` [N]: the quantity of each member in the search. Their reduction over members is multiplied by `ratio`.
         """
@@ -114,15 +114,15 @@ class Limit:
         return LimitTerm(self.name, math.log(self.allowed), self.multiplier, self.penalty, self.ratio)
 
     def log_excess(self, reached: float) -> float:
-        """Return g = log(reached / allowed), or -g for a lower limit."""
+        """Return g = log(reached / allowed), or log(allowed / reached) for a lower limit."""
         excess = math.log(max(reached, TINY) / self.allowed)
         return -excess if self.kind.at_least else excess
 
     def active(self, reached: float | None) -> bool:
         """Return whether the limit is active: its multiplier is above 0, and `reached` (judged) is near the limit.
 
-        It is near if g is at least -(TOLERANCE_BELOW + margin). `reached`: None if no member is judged; then only the
-        multiplier decides.
+        It is near if g is at least -(TOLERANCE_BELOW + margin). `reached`: None if no judged member is held; then only
+        the multiplier decides.
         """
         near = reached is None or self.log_excess(reached) >= -(TOLERANCE_BELOW + self.margin)
         return self.multiplier > 0 and near

@@ -58,7 +58,8 @@ def examined(answer: SearchResult, gradients: bool, front_written: bool) -> tupl
 def _judged(problem: TuningProblem, x: np.ndarray, held_out: int) -> dict[str, dict[str, np.ndarray]]:
     """Return the metrics of the held-out members [N] with the gains of the case (`before`) and at x [m] (`after`).
 
-    Gains of the case outside the bounds, or close to one, are clipped. Both are empty if there are no held-out members.
+    Gains of the case that are outside their bounds, or close to a bound, are clipped. Both results are empty if there
+    are no held-out members.
     `held_out`: seed of these members.
     """
     space, count = problem.objective.space, problem.tune.budget.held_out

@@ -36,8 +36,8 @@ def facts(
     - `held`: whether the limit is held; None if no member was judged, or if the limit is held but accurate steps do not
       confirm the answer. `verdict`: the same in words.
     - `price`: decrease of the minimised settled rms error (m) or voltage (V) for a limit 10 % looser
-      (`Limit.error_reduction`). It is 0 if the limit is not active, and None for survival and if the members' values do
-      not give the verdict "held".
+      (`Limit.error_reduction`). It is None for survival, and if the verdict is not "held". Otherwise it is 0 if the
+      limit is not active.
     """
     members, held, settings = summary["members"], summary["held"], problem.tune.limits
     share = held / members if members else None
@@ -112,7 +112,7 @@ def _tested(row: Facts, delayed: DelayTest | None, refuted: str) -> Facts:
     words = (
         f"{row['what']}; with this additional delay {delayed.lost} of {delayed.members} of the worst members are lost"
     )
-    return row | {"what": words} | (_verdict(False, refuted) if delayed.lost else {})
+    return row | {"what": words} | (_verdict(False, refuted) | {"price": None} if delayed.lost else {})
 
 
 def _asked(problem: TuningProblem) -> list[Limit]:

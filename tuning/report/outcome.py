@@ -19,7 +19,7 @@ NO_HELD_OUT = "The tuned gains are not judged on held-out members (tune.held_out
 class TuningOutcome:
     """Result of judging the tuned gains on an ensemble.
 
-    `members`: number of members judged. `lost`, `stalled`: numbers of members that are lost, and whose integration
+    `members`: number of members judged. `lost`: number of lost members. `stalled`: number of members whose integration
     stalls. `may_lose`: largest number of members that may be lost or stalled. `limits`: the verdict on each limit by
     name. `refuted`: the reason why accurate steps do not confirm the result; '' if they do.
     """
@@ -67,7 +67,8 @@ class TuningOutcome:
 def outcome_of(facts: TuningFacts, may_lose: int) -> TuningOutcome:
     """Return the outcome on the held-out members, or on the training members if tune.held_out is 0.
 
-    `may_lose`: number of held-out members that may be lost. No training member may be lost.
+    `may_lose`: number of held-out members that may be lost or stalled. No training member may be lost; one whose
+    integration stalls counts as lost.
     """
     after, limits = facts.after, {row["name"]: row["verdict"] for row in facts.limits}
     if not after["members"]:
@@ -95,10 +96,10 @@ def outcome_text(facts: TuningFacts, outcome: TuningOutcome) -> str:
 
 
 def _sensitive(facts: TuningFacts) -> list[str]:
-    """Return a sentence for each gain that loses training members if it changes by a factor of 1.28."""
+    """Return a sentence for each gain that loses further training members if it changes by a factor of 1.28."""
     return [
         f"If {row['path']} changes by a factor of 1.28, {row['sensitivity_lost']} of {facts.trained_on} training "
-        "members are lost"
+        "members are also lost"
         for row in facts.gains
         if row.get("sensitivity_lost")
     ]
@@ -138,8 +139,8 @@ def remedies(
     if outcome.refuted:
         keys = "tune.substeps or tune.stress" if problem.sliding else "tune.stress"
         words.append(
-            f"Not verified: {outcome.refuted}. Raise {keys}, or lower the upper bounds of the gains that end at them "
-            "(tune.bounds)."
+            f"Not verified: {outcome.refuted}. Raise {keys}, or lower the upper bounds (tune.bounds) of the gains "
+            "that are at them."
         )
     if outcome.broken:
         keys = ", ".join(f"tune.limits.{name}" for name in outcome.broken)

@@ -21,7 +21,7 @@ HIGHEST = 30.0
 GAINS_PER_ROW = 5
 # Largest value of the goal in `convergence`, relative to the least. Strongly violated limits give values above 1e300.
 LARGEST_GOAL = 1e9
-# Length (s) of the enlarged start and end of a run; at most a quarter of the run.
+# Length (s) of the enlarged start and end of a run; at most a quarter of the run, but at least four sample periods.
 ZOOM = 0.02
 # Time shown after the loss of a rotor, as a share of the time shown before it.
 SHOWN_AFTER_LOSS = 0.15
@@ -129,8 +129,8 @@ def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
 def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
     """Return frequencies (Hz) above 0 and amplitudes of `values`, with the sample period (s) and a Hann window.
 
-    A sine of amplitude a gives a peak of height a, also at half the sampling rate. Both arrays are empty for fewer than
-    FEWEST samples.
+    A sine of amplitude a at one of these frequencies gives a peak of height a, also at half the sampling rate. Both
+    arrays are empty for fewer than FEWEST samples.
     """
     n = len(values)
     if n < FEWEST:

@@ -104,8 +104,9 @@ class Course:
         """Search from `points` [K, m] and append the search to `past`. Return the best point [m] and its goal.
 
         `at_optimum`: whether an earlier search on all members ended at the first point, so that this point need not be
-        refined again. Raises KeyboardInterrupt if Ctrl-C ends the first search before its first iteration, and
-        ValueError if the goal is finite at none of the points.
+        refined again. If Ctrl-C ends a later search before its first iteration, the search before it is marked as
+        interrupted, and its result is returned. Raises KeyboardInterrupt if Ctrl-C ends the first search before its
+        first iteration, and ValueError if the goal is finite at none of the points.
         """
         tune, number = self.problem.tune, len(self.past) + 1
         path = self.out / checkpoint(number) if self.out else None

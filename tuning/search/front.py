@@ -29,7 +29,7 @@ FACTORS = (KNEE, 1.1, 1.5, 1.05, 2.0)
 # MOST_SEARCHES_PER_POINT: largest number of searches for a point of the front. Between two searches, the multipliers
 # are updated or members join. MOST_VALIDATIONS: largest number of answers that are validated.
 MOST_SEARCHES_PER_POINT, MOST_VALIDATIONS = 6, 4
-# If the judge's error exceeds the error that the search expects by more than the share UNEXPECTED, the training
+# If the judge's error exceeds its expected value (`_members_to_join`) by more than the share UNEXPECTED, the training
 # ensemble lacks members with large errors. The share is below that of the validation, `validation.LARGER` - 1, because
 # the error is limited here.
 UNEXPECTED = 0.1
@@ -59,6 +59,8 @@ class FrontPoint(NamedTuple):
 
 def trace_front(course: Course, answer: SearchResult) -> SearchResult:
     """Trace the front from the answer of least error. Return the answer that tune.objective selects.
+
+    After Ctrl-C, or if the validation confirms no other point, the returned answer is `answer`.
 
     The result contains the point of least error, and then, for each limit of the error in ascending order, the judged
     point of least voltage. Equal points appear once. If `answer` is returned and is not among them, it comes last. If a
@@ -127,9 +129,10 @@ def _admissible(seen: Sequence[FrontPoint]) -> list[FrontPoint]:
 def _search_least_voltage(course: Course, factor: float, seen: Sequence[FrontPoint]) -> list[FrontPoint]:
     """Search for the least voltage within the limits, from the best point in `seen`. Return the judged answers.
 
-    The searches end when all limits are met. Otherwise the multipliers are updated, and the next search starts at the
-    last answer. If validation members have large errors, they join the training ensemble instead, and the next search
-    starts at the best point so far.
+    The searches end when each limit is met (`met`), or is not exceeded and has the multiplier 0. They also end after
+    Ctrl-C, and if a search ends where it began and this point is within all limits. Otherwise the multipliers are
+    updated, and the next search starts at the last answer. If validation members have large errors, they join the
+    training ensemble instead, and the next search starts at the best point so far.
     """
     points, x = list[FrontPoint](), chosen(seen, factor).x
     for _ in range(MOST_SEARCHES_PER_POINT):
@@ -163,8 +166,9 @@ def _members_to_join(
 ) -> Members | None:
     """Return the validation members that join the training ensemble; None if none joins.
 
-    They join if the judge's rms error breaks its limit and exceeds the expected error by more than UNEXPECTED: those
-    with the largest errors that are not in the training ensemble.
+    They are those with the largest errors that are not in the training ensemble. They join if the judge's rms error
+    breaks its limit and exceeds its expected value by more than UNEXPECTED. The expected value is the search's value
+    times `Limit.ratio`.
 
     `numbers`: the values of the search and of the judge for each limit. `columns` [N]: metrics of the judged members.
     """

@@ -23,7 +23,7 @@ MOST_UPDATES = 6
 # Smallest decrease of g that counts as progress towards a limit.
 LEAST_DECREASE = 1e-3
 # A limit with g below -CLEARLY_BELOW is clearly met, because two ensembles differ by far less. The limits are not
-# judged again if all are clearly met and none concerns the worst member.
+# judged if all are clearly met, by the values of the search, and none concerns the worst member.
 CLEARLY_BELOW = 0.1
 # A quantity whose linear value has g above -INJECTED_FROM is also measured by injection, because the measured value may
 # exceed the linear one by up to a fifth.
@@ -119,7 +119,8 @@ def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
     """Return (the search's value, the judge's value) of each limit at x [m].
 
     The judge uses the validation ensemble, or the training ensemble if tune.validation is 0. If all limits are clearly
-    met (CLEARLY_BELOW), the judge's value is estimated: it is `Limit.ratio` times the search's value.
+    met (CLEARLY_BELOW) and none concerns the worst member, the judge's value is estimated: it is `Limit.ratio` times
+    the search's value.
     """
     problem, budget = course.problem, course.problem.tune.budget
     limits = problem.limits
@@ -155,9 +156,10 @@ def judged_values(
 
     `columns` [N]: result of `judge` for the ensemble with this `seed`. `tuned`: the search's value of each limit.
 
-    On a processor, members are measured by injection, as the held-out members are, if a linear peak may break a limit,
-    or if the search's value, corrected by an earlier injection, may break it. If only injections decide
-    (`measured_peaks.decides`), there is no new injection while these corrected values are clearly within their limits.
+    On a processor, members are measured by injection, as the held-out members are, if a linear peak or a corrected
+    value may break a limit. The corrected value is the search's value times `Limit.ratio`. If only injections decide
+    (`measured_peaks.decides`), linear peaks do not count. Members are then measured before the first update of the
+    multipliers, and later if a corrected value is not clearly within its limit.
     """
     if not injects(problem):
         return [limit.reached(columns) for limit in problem.limits]

@@ -44,9 +44,10 @@ class Phase(NamedTuple):
 # A start with a gradient above STEEP uses CMA-ES at once. Such a gradient predicts that the goal, a logarithm, changes
 # by more than 1 within the shortest step.
 STEEP = 1 / SHORTEST
-# The first phase uses few members: their optimum is close to that of all members, at less than half of the cost. At a
-# minimum of the goal, the gradient vanishes. In benchmarks/tasks, converged descents end with norms of 0.001 to 0.02,
-# and descents that stop early with norms of 0.36 to 1e127: change of the goal, a logarithm, per factor e of a gain.
+# The first phase uses few members: their optimum is close to that of all members, at less than half of the cost. In
+# the last phase, `gradient_limit` distinguishes converged descents from those that stop early. In benchmarks/tasks, the
+# former end with gradients of norm 0.001 to 0.02, the latter with 0.36 to 1e127. The norm is the change of the goal, a
+# logarithm, per factor e of a gain.
 FEW, ALL = Phase(4, 0.02, 3, STEEP), Phase(1, 1e-3, 4, 0.1)
 # Message at the first Ctrl-C.
 INTERRUPT_MESSAGE = "the search ends after this iteration; its best gains are then judged and written."
@@ -118,10 +119,10 @@ def _switch(progress: SearchState, phase: Phase) -> None:
     """Select the starts that continue, and those that switch to CMA-ES.
 
     A start ends if its step is at most SHORTEST. A descent also ends if its goal stalls, and CMA-ES if it has
-    converged. The worse half ends after the iterations HALVINGS. A descent switches to CMA-ES at once if its gradient
-    is STEEP or more, and instead of ending if its gradient is `gradient_limit` or more. In a chaotic loop the
-    derivatives grow with time and do not describe the goal. At a jump of the goal, beyond which members are lost, a
-    descent stops early.
+    converged. The worse half ends after the iterations HALVINGS. A descent switches to CMA-ES at once if the norm of
+    its gradient is STEEP or more. A descent that would end switches if the norm is `gradient_limit` or more. There are
+    two causes of such a gradient: in a chaotic loop the derivatives grow with time and do not describe the goal; and a
+    descent stops early at a jump of the goal, beyond which members are lost.
     """
     starts, count = progress.starts, progress.iteration - progress.since
     value, norm, active = np.asarray(starts.value), np.asarray(starts.gradient_norm), progress.active
