@@ -521,6 +521,15 @@ def test_all_files_are_written_or_none(tmp_path):
     assert (out / "a").read_text() == "new"
 
 
+def test_json_files_move_last(tmp_path, monkeypatch):
+    moved, move = [], pathlib.Path.replace
+    monkeypatch.setattr(pathlib.Path, "replace", lambda path, to: (moved.append(path.name), move(path, to))[1])
+    with files(tmp_path) as part:
+        for name in ("report.json", "tuned.toml", "gains.png"):
+            (part / name).write_text("")
+    assert moved == ["gains.png", "tuned.toml", "report.json"]
+
+
 def shell(command):
     code = "import sys; from ambjax.__main__ import main; sys.exit(main())"
     line = command.replace("AMBJAX", f"{sys.executable} -c '{code}'")

@@ -132,7 +132,7 @@ def files(out: pathlib.Path) -> Iterator[pathlib.Path]:
             with tempfile.TemporaryDirectory(prefix=".ambjax-", dir=out, ignore_cleanup_errors=True) as folder:
                 part = pathlib.Path(folder)
                 yield part
-                names = sorted(p.relative_to(part) for p in part.rglob("*") if p.is_file())
+                names = sorted((p.relative_to(part) for p in part.rglob("*") if p.is_file()), key=_order)
                 check_places(out, names)
                 with uninterrupted():
                     for name in names:
@@ -142,6 +142,11 @@ def files(out: pathlib.Path) -> Iterator[pathlib.Path]:
             with contextlib.suppress(OSError):
                 out.rmdir()
             raise
+
+
+def _order(name: pathlib.Path) -> tuple[bool, pathlib.Path]:
+    """Return the key by which files are moved: JSON files last, because report.json ends a search of the tuner."""
+    return name.suffix == ".json", name
 
 
 @contextlib.contextmanager
