@@ -34,6 +34,7 @@ from ambjax.host.synonyms import OTHER_WORDS, meant
         ({"disturbance": {"force": {}}}, "Did you mean 'q_z'"),
         ({"disturbance": {"q_z": {"kind": "sine", "freq": 1.0}}}, "Did you mean 'frequency'"),
         ({"sensor": {"sigma": 1.0}}, "Did you mean 'std'"),
+        ({"sensor": {"Sigma": 1.0}}, "Did you mean 'std'"),
         ({"plant": {"q_z": 1.0}}, "Did you mean 'disturbance.q_z'"),
         ({"plant": {"saturation": 1.2}}, "Did you mean 'plant.iron.saturation'"),
         ({"plant": {"iron": {"B_sat": 1.2}}}, "Did you mean 'saturation'"),
