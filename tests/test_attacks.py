@@ -314,6 +314,8 @@ def test_a_warning_names_idealised_parts_of_the_case():
     assert ["plant.kind" in line for line in said] == [True, False, True, False]
     assert ["sensor.velocity" in line for line in said] == [True, True, False, False]
     assert said[-1] == ""
+    # iron does not give the coils two currents
+    assert "plant.kind" in idealised(read_case(write("[plant.iron]\nsaturation = 1.2\n")))
 
 
 # For each command: its arguments, and what comes after its case file is read.

@@ -24,6 +24,7 @@ from ambjax.__main__ import main
 from ambjax.cases.template_text import template
 from ambjax.codegen.c99 import machine
 from ambjax.codegen.c99.machine import Compiled, build
+from ambjax.codegen.c99.notes import order_of_work
 from ambjax.codegen.c99.package import package_files
 from ambjax.codegen.c99.source import Origin, Writer
 from ambjax.codegen.c99.texts import MARK
@@ -32,7 +33,7 @@ from ambjax.codegen.interface import StepInputs
 from ambjax.codegen.trace import arguments, trace
 from ambjax.codegen.twins import LoopCase
 from ambjax.codegen.verify import Check, draft, verify
-from ambjax.commands.case_export import VERIFIED
+from ambjax.commands.case_export import VERIFIED, _is_name, _prefix
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.guard import Guard
@@ -264,6 +265,19 @@ def test_a_delay_beyond_the_exported_one_is_refused(tmp_path):
     allowed = "params->processor.delay: from 0 to 1, else every step is invalid"
     assert "amb_real delay; /* [samples, from 0 to 1] " in made["amb.h"]
     assert all(allowed in made[name] for name in ("amb.h", "README.md"))
+
+
+def test_the_order_of_work_names_the_delay_that_the_prediction_assumes():
+    processor = Processor(1.0, assumed=0.5)
+    lines = order_of_work(trace(controller_of(hard(processor=processor), 200.0, PERIOD), "float"))
+    assert lines[1].startswith("1 T after the reading")
+    assert lines[-1] == "The reference is that of the instant 0.5 T after the reading."
+
+
+def test_a_long_name_gives_a_valid_prefix():
+    assert _is_name(_prefix(None, "9" * 100))
+    assert _prefix(None, "a" * 61) == "a" * 61
+    assert len(_prefix(None, "a" * 62)) == 61
 
 
 @pytest.mark.parametrize(

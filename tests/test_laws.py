@@ -5,6 +5,7 @@ A new law joins by adding a row to LAWS.
 
 import dataclasses
 import itertools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -201,6 +202,20 @@ SITE = SearchContext(
     {"Q_z": 0.1, "Q_i": 2.0, "Delta_1": 6e4},
     LowerBound(6e4, "Delta_1", "along the reference"),
 )
+
+
+def test_a_range_says_by_which_bound_it_is_extended():
+    # slope 2/pi k p from w/3 to 100 w for p = 25 s/m: k from 10.5 to 3140 m/s^2
+    plain = SITE._replace(bounds={"Q_z": 1.0})
+    wider, shifted = (SITE._replace(bounds={"Q_z": bound}) for bound in (20.0, 40.0))
+    ranges = [position.SlidingMode().ranges(site)["k"] for site in (plain, wider, shifted)]
+    assert [(one.low > 500 / 3 / 25 * math.pi / 2 * 1.001, "at least twice" in one.source) for one in ranges] == [
+        (False, False), (True, True), (True, True),
+    ]  # fmt: skip
+    assert ["up to 200 times the disturbance bound Q_z" in one.source for one in ranges] == [False, True, True]
+    assert (ranges[1].low, ranges[1].high) == (40.0, 4000.0)
+
+
 # sigma, v_tilde or e: the error of the stage; the last so large that any sign is saturated
 ERRORS = jnp.asarray([-1e9, -1e-3, 0.0, 1e-3, 1e9])
 

@@ -61,6 +61,14 @@ def test_verdicts_depend_on_the_evidence():
     levels = len(NOISE_STDS)
     for scans, verdict in (([levels, levels], findings.HOLDS), ([3, 3], findings.FAILS), ([levels, 3], findings.OPEN)):
         assert judge(types.SimpleNamespace(noise=[noise(n) for n in scans])).verdict == verdict
+    # the smallest std stalls and a larger one is lost: nothing is known about the smallest
+    stalled, lost = np.arange(levels) == 0, np.arange(levels) == 1
+    unknown = noise(levels)._replace(stalled=stalled, lost=lost)
+    assert judge(types.SimpleNamespace(noise=[unknown])).verdict == findings.UNDECIDED
+    # the radii are compared at the periods at which the smallest std is held
+    specified = judges["The noise is specified"]
+    scans = [noise(levels), noise(levels), noise(0, radius_at_least=1.0)]
+    assert specified(types.SimpleNamespace(noise=scans)).value == 1.0
 
 
 def test_a_stall_is_neither_held_nor_lost():

@@ -105,6 +105,16 @@ def test_bad_input_is_refused_in_one_line(tmp_path, capsys, text, flags, message
     assert not (tmp_path / "out").exists()
 
 
+def test_check_prints_the_numbers_of_the_machine_also_without_an_equilibrium(tmp_path, capsys):
+    path = tmp_path / "case.toml"
+    path.write_text("[controller.position]\nk = 5.0\n[controller.model]\nm = 0.1\n[clock]\nduration = 0.01\n")
+    main(["check", str(path)])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("no equilibrium at r = 0 m")
+    assert lines[1] == ""
+    assert lines[2].split()[-2:] == ["value", "unit"]
+
+
 def test_check_begins_with_the_numbers_of_the_machine(tmp_path, capsys):
     """By hand for the plant of Table 1: kappa = mu_0 n^2 A, k_s = kappa i_0^2/s_0^3, k_i = kappa i_0/s_0^2."""
     path = tmp_path / "case.toml"

@@ -154,3 +154,24 @@ def test_the_knee_holds_as_many_members_and_limits_as_the_point_of_least_error()
     better = [point(2.0, 20.0), point(0.5, 15.0, lost=1), point(1.0, 15.0), point(1.2, 10.0), point(2.4, 5.0)]
     assert least_of(better) is better[2]
     assert chosen(better, 1.25) is better[3]
+
+
+@pytest.mark.parametrize(
+    ("taken", "volts", "words"),
+    [
+        (0, 3.0, "This answer has the least error: 1e-06 m at 5 V."),
+        (
+            1,
+            3.0,
+            "This answer has the least rms voltage of those with an error of at most 1.25 times the least error: ",
+        ),
+        (1, 9.0, "This answer: 1.2e-06 m at 9 V. Least error: 1e-06 m at 5 V."),
+    ],
+)
+def test_the_sentence_on_the_answer_claims_only_what_the_front_shows(taken, volts, words):
+    points = [(1e-6, 5.0), (1.2e-6, volts)]
+    rows = [
+        {"settled_rms_error_m": error, "settled_rms_u_V": volt, "taken": n == taken}
+        for n, (error, volt) in enumerate(points)
+    ]
+    assert front_table.sentence(rows).startswith(words)

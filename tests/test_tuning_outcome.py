@@ -15,12 +15,13 @@ from tomlkit import dumps
 import tuning.command
 import tuning.search.rounds
 from ambjax.cases.tune_table import Budget
+from ambjax.theorem.advice import STALLED, STALLED_PLANT
 from tuning.config import seeds
 from tuning.judge import summarise
 from tuning.objective.limits import Limit
 from tuning.report import document as report
 from tuning.report.limit_table import BROKEN, EMPHASISED, HELD, UNJUDGED, UNVERIFIED
-from tuning.report.outcome import ALL_MET, NO_HELD_OUT, NOT_MET, TuningOutcome
+from tuning.report.outcome import ALL_MET, NO_HELD_OUT, NOT_MET, TuningOutcome, remedies
 from tuning.search.explore import REACH, Slices
 
 HELD_OUT = seeds(Budget())[2]
@@ -168,3 +169,13 @@ def test_the_number_of_members_lost_by_a_changed_gain_is_reported():
     assert [line.split("|")[-2].strip() for line in text if line.startswith("| controller")] == [
         "**2 of 40 training members are also lost**", "3 %", "0 %",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("sliding", [False, True])
+@pytest.mark.parametrize("sampled", [False, True])
+def test_remedies_name_keys_that_have_an_effect(sliding, sampled):
+    problem = types.SimpleNamespace(sliding=sliding, sampled=sampled)
+    outcome = TuningOutcome(10, 0, 1, 0, {}, "accurate steps lose a member")
+    advice = remedies(problem, None, outcome, None, None)
+    assert ("tune.substeps" in advice) == sliding
+    assert (STALLED_PLANT if sampled else STALLED) in advice
