@@ -662,6 +662,13 @@ ENSEMBLE = [
         "tests/test_ensemble.py::test_bands_at_few_instants_include_the_extremes_between_them",
     ),
     M(
+        "the variation of u in a fan chart is that of the time after an instant",
+        "ambjax/ensemble/study.py",
+        "rate[:, width:] = ",
+        "rate[:, :-width] = ",
+        "tests/test_ensemble.py::test_bands_at_few_instants_include_the_extremes_between_them",
+    ),
+    M(
         "frozen members contribute to the extremes of a fan chart",
         "ambjax/ensemble/blocks.py",
         "jnp.where(row.alive, x, -NO_VALUE)",
@@ -1340,7 +1347,7 @@ SEARCH = [
         "ambjax/pictures/thinning.py",
         "np.concatenate([t[:1], centres, t[-1:]])",
         "np.concatenate([centres[:1], centres, centres[-1:]])",
-        "tests/test_drawn.py::test_a_smoothed_median_reaches_from_the_first_to_the_last_instant",
+        "tests/test_drawn.py::test_an_overview_shows_the_signals_of_its_run",
     ),
     M(
         "rounding removes the last sample of an interval",
