@@ -402,7 +402,7 @@ def test_check_passes_for_a_stable_cascade_on_a_processor(capsys):
     assert [slope["stage"] for slope in summary["processor"]["slopes"]] == ["position", "inversion", "current"]
     assert set(summary["processor"]) == {
         *("lost_at_s", "lost_why", "stalled", "slopes", "bands", "distance_to_C", "distance_to_C_at_s"),
-        *("alternating", "alternates", "delay_margin", "delay_margin_unknown"),
+        *("alternating", "alternates", "delay_margin", "delay_margin_unknown", "loss_cause", "alternation_cause"),
     }
     margin = {"held": 2.0, "lost": None, "undecided": None, "resolution": None, "step": 1 / 256}
     assert summary["processor"]["delay_margin"] == margin

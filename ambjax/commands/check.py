@@ -13,8 +13,13 @@ from ambjax.cases.reader import Case
 from ambjax.commands.acceptance import acceptance, forces
 from ambjax.commands.outputs import plain, say, table
 from ambjax.commands.warnings import idealised, read_with_warnings
+from ambjax.control.cascade import Cascade
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.rollout import rollout
+from ambjax.theorem.causes import Cause, find_cause
 from ambjax.theorem.conditions import Condition, Report, check
 from ambjax.theorem.sampled_report import Delays, SampledReport
+from ambjax.world.scenario import Scenario
 
 Summary = dict[str, object]
 CONTINUOUS = (
@@ -47,6 +52,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         "holds": report.holds,
         "lost_at_s": report.lost_at,
         "lost_why": report.lost_why,
+        "cause": _cause(report.cause),
         "stalled": report.stalled,
         "method": report.method,
         "conditions": [_condition(c) for c in report.conditions],
@@ -95,15 +101,24 @@ def _results(case: Case) -> tuple[Report, tuple[Summary, str], _OnProcessor | No
         loop, on_processor = acceptance(case), None
         if case.cascade.processor is not None:
             on_processor = _OnProcessor(_sampled(case), *_margins(case))
-        return theorem.result(), loop, on_processor
+        report = theorem.result()
+    if report.lost and case.cascade.processor is None:
+        cause = find_cause(_is_lost, case.cascade, case.scenario, case.clock, say)
+        report = dataclasses.replace(report, cause=cause)
+    return report, loop, on_processor
+
+
+def _is_lost(cascade: Cascade, scenario: Scenario, clock: Clock) -> bool:
+    return bool(np.isfinite(rollout(cascade, scenario, clock, every=0).trajectory.lost_at))
 
 
 def _sampled(case: Case) -> SampledReport:
     from ambjax.ensemble.replay import as_member, record_system
-    from ambjax.theorem.sampled_report import check_sampled
+    from ambjax.theorem.sampled_report import check_sampled, with_causes
 
     say("simulating on the processor, with and without noise")
-    return check_sampled(case.cascade, as_member(case.scenario), case.clock, case.settle, record_system)
+    parts = (case.cascade, as_member(case.scenario), case.clock, case.settle, record_system)
+    return with_causes(check_sampled(*parts), *parts, say)
 
 
 def _margins(case: Case) -> tuple[Delays, Delays | None]:
@@ -137,12 +152,14 @@ def _processor_summary(case: Case, args: argparse.Namespace, results: _OnProcess
         "processor": {
             "lost_at_s": sampled.lost_at,
             "lost_why": sampled.lost_why,
+            "loss_cause": _cause(sampled.loss_cause),
             "stalled": sampled.stalled,
             "slopes": slopes,
             "distance_to_C": sampled.distance[0],
             "distance_to_C_at_s": sampled.distance[1],
             "alternating": sampled.alternating,
             "alternates": sampled.alternates,
+            "alternation_cause": _cause(sampled.alternation_cause),
             "bands": [dataclasses.asdict(band) | {"bound": band.bound} for band in sampled.bands],
             "delay_margin": _margin(margin),
             "delay_margin_unknown": None if unknown is None else _margin(unknown),
@@ -170,6 +187,10 @@ def _clearance(case: Case, args: argparse.Namespace, largest: float | None) -> S
 
 def _margin(margin: Delays) -> Mapping[str, object]:
     return margin._asdict() | {"resolution": margin.resolution}
+
+
+def _cause(cause: Cause | None) -> Mapping[str, object] | None:
+    return None if cause is None else cause._asdict()
 
 
 def _condition(c: Condition) -> Mapping[str, object]:

@@ -175,12 +175,12 @@ def _causes_of_loss(problem: TuningProblem, facts: TuningFacts, x: np.ndarray, m
     u_max = float(np.asarray(problem.case.scenario.u_max))
     if np.isfinite(u_max) and effort > 0.25:
         words.append(
-            f"The voltage is at {100 * np.sqrt(effort):.0f} % of its limit (rms): a supply above {u_max:g} V, less "
-            "sensor noise, or an observer ([controller.observer] kind = 'complementary', with a tuned l) would help."
+            f"The voltage is at {100 * np.sqrt(effort):.0f} % of its limit (rms), a possible cause that was not tested: "
+            f"try a supply above {u_max:g} V, less sensor noise, or an observer that attenuates it more."
         )
     bound = [row["path"] for row in facts.gains if row["at_bound"]]
     if bound:
-        words.append(f"Gains at a bound: {', '.join(bound)}; widen tune.bounds.")
+        words.append(f"Gains at a bound, also a possible cause: {', '.join(bound)}; widen tune.bounds.")
     return [
         *words,
         "For a larger margin, raise tune.members or set risk = 'cvar'. For other starting points, raise tune.screen.",
