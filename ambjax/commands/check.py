@@ -14,6 +14,7 @@ from ambjax.commands.acceptance import acceptance, forces
 from ambjax.commands.outputs import plain, say, table
 from ambjax.commands.warnings import idealised, read_with_warnings
 from ambjax.control.cascade import Cascade
+from ambjax.linear.stability import Findings, stability
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import rollout
 from ambjax.theorem.causes import Cause, find_cause
@@ -41,13 +42,15 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """Check a case. Print the results of the linearised loop, then those on the processor, then those of Theorem 1.
 
     Returns the exit code and the summary. The exit code is 1 if a condition fails, if the rotor is lost, if the
-    integrator stalls, or if the magnets cannot carry the rotor. On a processor, the conditions of Theorem 1 do not
-    count. The zones and the margins of the linearised loop never count.
+    integrator stalls, if the rotor is held but the loop is not stable, or if the magnets cannot carry the rotor. On a
+    processor, the conditions of Theorem 1 do not count. The zones and the margins of the linearised loop never count.
     """
     from ambjax.theorem import advice
 
     case = read_with_warnings(args.case)
     report, (loop, text), on_processor = _results(case)
+    lost = report.lost_at if on_processor is None else on_processor.sampled.lost_at
+    findings = _stability(case) if math.isinf(lost) else None
     summary = {
         "holds": report.holds,
         "lost_at_s": report.lost_at,
@@ -58,11 +61,14 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         "conditions": [_condition(c) for c in report.conditions],
         "proof": [_condition(c) for c in report.proof],
         "loop": loop,
+        "stability": None if findings is None else findings._asdict(),
     }
     if not args.json:
         print(text)
         if ideal := idealised(case):
             print(f"\n{ideal}")
+    if findings is not None and not args.json:
+        print(f"\n{findings.words(float(case.scenario.plant.i_0))}")
     largest, weight, _ = forces(case)
     if not args.json and largest < weight:
         words = f"their largest force is {largest:.4g} N, below its weight of {weight:.4g} N"
@@ -77,7 +83,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         print("\n" + "\n".join(advice.theorem_lines(report, args.case)))
         if on_processor is not None:
             print(CONTINUOUS)
-    summary["holds"] = bool(summary["holds"]) and largest >= weight
+    steady = findings is None or findings.stable
+    summary["holds"] = bool(summary["holds"]) and largest >= weight and steady
     return int(not summary["holds"]), plain(summary)
 
 
@@ -127,13 +134,29 @@ def _margins(case: Case) -> tuple[Delays, Delays | None]:
     If the processor does not predict, the first is the margin without prediction, and the second is None.
     """
     from ambjax.ensemble.delays import DELAYS, delay_margin
+    from ambjax.linear.stability import with_stability
+
+    loop = (case.cascade, case.scenario, case.clock)
+
+    def found(known: bool) -> Delays:
+        margin = delay_margin(*loop, known=known)
+        say("testing whether the loop is stable at these delays")
+        return with_stability(margin, *loop, known=known)
 
     say(f"finding the delay margin: simulating {DELAYS} delays, twice if the rotor is lost at one of them")
-    margin = delay_margin(case.cascade, case.scenario, case.clock)
+    margin = found(True)
     if (processor := case.cascade.processor) is None or processor.predict is False:
         return margin, None
     say("finding the delay margin again: the prediction uses the delay of the case")
-    return margin, delay_margin(case.cascade, case.scenario, case.clock, known=False)
+    return margin, found(False)
+
+
+def _stability(case: Case) -> Findings:
+    """Return whether the loop of the case is stable, from its poles and from a run without noise and loads."""
+    from ambjax.ensemble.replay import as_member
+
+    say("testing whether the loop is stable: simulating without noise and loads")
+    return stability(case.cascade, as_member(case.scenario), case.clock).findings()
 
 
 def _processor_summary(case: Case, args: argparse.Namespace, results: _OnProcessor) -> Summary:

@@ -18,17 +18,21 @@ from ambjax.linear.differentiable import LoopQuantities, loop_quantities
 from ambjax.linear.injection import Injection, MemberPeaks, frequency_lines, injected, injected_members
 from ambjax.linear.margins import Margins, ResponsePeak, margins_of, noise_gain, peak
 from ambjax.linear.matrices import loop_matrices
+from ambjax.linear.stability import MOST_TESTED, Findings, Stability, stability
 from ambjax.linear.state_space import INPUTS, OUTPUTS, StateSpace
 
 __all__ = [
     "INPUTS",
+    "MOST_TESTED",
     "OUTPUTS",
     "Analysis",
+    "Findings",
     "Injection",
     "LoopQuantities",
     "Margins",
     "MemberPeaks",
     "ResponsePeak",
+    "Stability",
     "StateSpace",
     "Zones",
     "analyse",
@@ -43,4 +47,5 @@ __all__ = [
     "margins_of",
     "noise_gain",
     "peak",
+    "stability",
 ]

@@ -136,13 +136,27 @@ def _margin(name: str, margin: Delays) -> str:
         parts = [] if held is None else [f"held up to {_samples(held)} samples"]
         parts += [f"not decided at {_samples(undecided)}, where the integrator stalled"]
         parts += [] if lost is None else [f"lost at {_samples(lost)}"]
-        return f"{name}: the rotor is {', '.join(parts)} ({tried})."
+        return f"{name}: the rotor is {', '.join(parts)} ({tried}).{_stable(margin)}"
     if held is None:
         return f"{name}: none, because the rotor is lost even without a delay."
     if lost is None:
         longest = "the longest delay that ambjax simulates"
-        return f"{name}: the rotor is held up to {_samples(held)} samples, {longest} ({tried})."
-    return f"{name}: the rotor is held up to {_samples(held)} samples and lost at {_samples(lost)} ({tried})."
+        return f"{name}: the rotor is held up to {_samples(held)} samples, {longest} ({tried}).{_stable(margin)}"
+    ends = f"held up to {_samples(held)} samples and lost at {_samples(lost)}"
+    return f"{name}: the rotor is {ends} ({tried}).{_stable(margin)}"
+
+
+def _stable(margin: Delays) -> str:
+    """Return the sentence on the delays at which the rotor is held, but the loop is not stable."""
+    if not margin.tested or margin.held is None:
+        return ""
+    if margin.swing_m is None or margin.current_A is None:
+        return f" The loop is stable at all {margin.tested} delays tested up to there."
+    upto = "at none of them from the first on" if margin.stable is None else f"up to {_samples(margin.stable)} samples"
+    return (
+        f" The loop is stable {upto} only: beyond, the rotor is held, but its motion does not decay without noise and "
+        f"loads (amplitude up to {margin.swing_m:.3g} m, |i| up to {margin.current_A:.3g} A)."
+    )
 
 
 def _samples(delay: float) -> str:

@@ -116,12 +116,21 @@ class Delays(NamedTuple):
     which it is lost; None if there is none. `undecided`: the delay that follows `held`, if the integrator stalled
     there; else None. A second pass divides the step that follows `held`. If the rotor is not held at the delay of the
     case, the delays go from 0 to that delay; if it is not held at 0 either, `held` is None.
+
+    `stable`: the largest delay of these up to which the loop is stable (`linear.stability`); None if it is not stable
+    at the first of them. `swing_m`, `current_A`: at the delays up to `held` at which it is not stable, the largest
+    amplitude of z and the largest |i| in a run without noise and loads; None if there are none. `tested`: number of
+    delays from the first to `held` whose stability was computed.
     """
 
     held: float | None
     lost: float | None
     undecided: float | None
     step: float
+    stable: float | None = None
+    swing_m: float | None = None
+    current_A: float | None = None
+    tested: int = 0
 
     @property
     def resolution(self) -> float | None:
