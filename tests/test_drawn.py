@@ -389,7 +389,7 @@ def test_the_cells_of_a_map_lie_at_their_coordinates(path, drawn, monkeypatch):
     x, y = Axis(path, np.geomspace(1e-5, 1e-3, 3), True), Axis("initial.z_dot", np.array([1.0, 2.0, 3.0, 4.0]))
     survival = np.arange(12.0).reshape(4, 3) / 11
     error = np.where(survival > 0, 1e-6 * (1 + np.arange(12.0).reshape(4, 3)), np.nan)
-    one = Map(x, y, survival, survival - 0.05, survival + 0.05, error, 0 * error, 0 * survival, 100)
+    one = Map(x, y, survival, survival - 0.05, survival + 0.05, error, 0 * error, 0 * survival, 0 * survival, 100)
     other = one._replace(survival=survival[::-1], low=survival[::-1] - 0.05, high=survival[::-1], error=None)
     map_command._draw([_Case(), _Case()], [one, other], NOWHERE)
     axes = drawn[0].axes[:3]

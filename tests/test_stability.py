@@ -82,9 +82,9 @@ def test_below_the_margin_stable_above_it_held_but_not_stable_far_above_it_lost(
     # it rattles in more than a tenth of the gap, with more than the bias current
     assert found.swing[1] > 0.1 * 5e-4
     assert found.current[1] > 2.0
-    facts = found._replace(**{k: getattr(found, k)[:2] for k in Stability._fields[:-1]}).findings()
+    facts = found._replace(**{k: getattr(found, k)[:2] for k in Stability._fields[:-2]}).findings()
     assert (facts.tested, facts.unstable, facts.reason) == (2, 1, None)
-    assert "1 of 2 members tested are held, but NOT stable" in facts.words(2.0)
+    assert "1 of 2 members tested are held, but NOT stable" in facts.words()
 
 
 @pytest.mark.slow
@@ -125,10 +125,10 @@ def test_a_limit_cycle_that_the_linear_loop_does_not_have_is_found_and_explained
     assert found.growth[0] < 0
     assert not found.stable[0]
     facts = found.findings()
-    assert "The linear and the simulated verdict differ: the linear loop is stable" in facts.words(2.0)
+    assert "The linear and the simulated verdict differ: the linear loop is stable" in facts.words()
 
 
-ONE = Stability(*(np.array([x]) for x in (True, -10.0, False, 1e-9, 0.1, False)), 0.5)
+ONE = Stability(*(np.array([x]) for x in (True, -10.0, False, 1e-9, 0.1, False)), 0.5, 2.0)
 TABLE = {
     # growth, sustained, swing, lost, stable: whether the verdicts differ, and words
     "both stable": ((-10.0, False, 1e-9, False, True), None),
@@ -148,7 +148,7 @@ def test_one_record_gives_the_verdict_and_the_reason(name):
     (growth, sustained, swing, lost, stable), reason = TABLE[name]
     values = {"growth": growth, "sustained": sustained, "swing": swing, "lost": lost, "stable": stable, "current": 3.0}
     facts = ONE._replace(**{key: np.array([value]) for key, value in values.items()}).findings()
-    said = facts.words(2.0)
+    said = facts.words()
     assert facts.stable == stable == said.startswith("The loop is stable") == (facts.swing_m is None)
     assert ("NOT stable" in said) == (not stable)
     assert (facts.reason is None) == (reason is None)
@@ -159,4 +159,4 @@ def test_one_record_gives_the_verdict_and_the_reason(name):
 
 
 def test_no_member_tested_is_no_verdict():
-    assert Findings(0, 0).words(2.0) == ""
+    assert Findings(0, 0).words() == ""

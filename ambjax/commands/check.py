@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         if ideal := idealised(case):
             print(f"\n{ideal}")
     if findings is not None and not args.json:
-        print(f"\n{findings.words(float(case.scenario.plant.i_0))}")
+        print(f"\n{findings.words()}")
     largest, weight, _ = forces(case)
     if not args.json and largest < weight:
         words = f"their largest force is {largest:.4g} N, below its weight of {weight:.4g} N"

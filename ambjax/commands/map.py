@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.reader import Case
-from ambjax.commands.case_map import labels, panel, study_and_axes
+from ambjax.commands.case_map import is_stable, labels, panel, study_and_axes
 from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.intervals import wilson
@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
             say(f"{case.name}: {len(x.values) * len(y.values)} cells of {args.members}; method: {study.clock.method}")
             if args.members == 1 and case.spread.entries:
                 say(f"{case.name}: nominal, because one member does not draw the [spread]; --members 2 or more do.")
-            maps.append(grid(study, x, y))
+            maps.append(grid(study, x, y, is_stable))
         summary = {"cases": [_summary(case, one) for case, one in zip(cases, maps, strict=True)], "out": str(out)}
         _draw(cases, maps, part / "map.png")
         write_json(part / "map.json", summary)
@@ -49,6 +49,9 @@ def _text(cases: list[Case], maps: list[Map]) -> str:
         cells += [f"{100 * np.mean(one.low >= CERTAIN):.1f} %" if one.decisive else "-"] * sure
         rows.append((case.name, *cells, held))
         lines += [f"{case.name}: {_spread_words(one)}"]
+        if one.unstable.any():
+            many = f"{int(one.unstable.sum())} of {one.unstable.size} cells"
+            lines += [f"{case.name}: in {many} the rotor is held, but the loop is NOT stable (hatched in map.png)"]
         if not one.decisive:
             lines += [f"{case.name}: {_confidence_note(one)}"]
         if one.stalled.any():

@@ -18,12 +18,11 @@ from ambjax.linear.differentiable import LoopQuantities, loop_quantities
 from ambjax.linear.injection import Injection, MemberPeaks, frequency_lines, injected, injected_members
 from ambjax.linear.margins import Margins, ResponsePeak, margins_of, noise_gain, peak
 from ambjax.linear.matrices import loop_matrices
-from ambjax.linear.stability import MOST_TESTED, Findings, Stability, stability
+from ambjax.linear.stability import Findings, Stability, stability, suspects
 from ambjax.linear.state_space import INPUTS, OUTPUTS, StateSpace
 
 __all__ = [
     "INPUTS",
-    "MOST_TESTED",
     "OUTPUTS",
     "Analysis",
     "Findings",
@@ -48,4 +47,5 @@ __all__ = [
     "noise_gain",
     "peak",
     "stability",
+    "suspects",
 ]

@@ -42,8 +42,8 @@ BORDER = 1e-3
 # Resolution that stands for an ideal converter, bits.
 FINE_BITS = 32
 QUARTERS = 4
-# Largest number of members of an ensemble whose stability is computed.
-MOST_TESTED = 256
+# Largest number of members of an ensemble whose stability is computed: those with the largest settled errors.
+MOST_TESTED = 64
 
 
 class Stability(NamedTuple):
@@ -57,7 +57,7 @@ class Stability(NamedTuple):
       there.
     - `current`: largest |i| in the last quarter in which the rotor is held, A.
     - `lost`: whether the rotor is lost in the quiet run.
-    - `duration`: length of a run, s.
+    - `duration`: length of a run, s. `bias`: bias current, A.
     """
 
     stable: np.ndarray
@@ -67,6 +67,7 @@ class Stability(NamedTuple):
     current: np.ndarray
     lost: np.ndarray
     duration: float
+    bias: float
 
     def findings(self) -> "Findings":
         """Return the summary that all reports use."""
@@ -78,6 +79,7 @@ class Stability(NamedTuple):
         return Findings(
             len(self.stable),
             int(bad.sum()),
+            self.bias,
             None if worst is None else float(self.swing[worst]),
             None if worst is None else float(self.current[worst]),
             None if shown is None else self._reason(shown),
@@ -103,13 +105,15 @@ class Stability(NamedTuple):
 class Findings(NamedTuple):
     """Summary of a `Stability`; the log, the JSON files, the reports and the exit codes use this record.
 
-    `tested`: number of members. `unstable`: number of members held but not stable. `swing_m`, `current_A`: amplitude of
-    z and largest |i| of the unstable member with the largest amplitude, in a run without noise and loads; None if all
-    are stable. `reason`: why the linear and the simulated verdict differ, for one member; None if they agree.
+    `tested`: number of members. `unstable`: number of members held but not stable. `bias_A`: bias current. `swing_m`,
+    `current_A`: amplitude of z and largest |i| of the unstable member with the largest amplitude, in a run without
+    noise and loads; None if all are stable. `reason`: why the linear and the simulated verdict differ, for one member;
+    None if they agree.
     """
 
     tested: int
     unstable: int
+    bias_A: float = 0.0
     swing_m: float | None = None
     current_A: float | None = None
     reason: str | None = None
@@ -119,8 +123,8 @@ class Findings(NamedTuple):
         """Whether all members are stable."""
         return not self.unstable
 
-    def words(self, bias: float) -> str:
-        """Return the verdict as a sentence. `bias`: the bias current, A."""
+    def words(self) -> str:
+        """Return the verdict as a sentence; '' if no member was tested."""
         why = "" if self.reason is None else f" The linear and the simulated verdict differ: {self.reason}."
         if self.stable:
             many = "The loop is stable" if self.tested == 1 else f"All {self.tested} members tested are stable"
@@ -128,7 +132,7 @@ class Findings(NamedTuple):
         many = "The rotor is held, but the loop is NOT stable"
         if self.tested > 1:
             many = f"{self.unstable} of {self.tested} members tested are held, but NOT stable"
-        size = f"amplitude {self.swing_m:.3g} m, |i| up to {self.current_A:.3g} A (bias {bias:.3g} A)"
+        size = f"amplitude {self.swing_m:.3g} m, |i| up to {self.current_A:.3g} A (bias {self.bias_A:.3g} A)"
         return f"{many}: without noise and loads, the motion does not decay ({size}).{why}"
 
 
@@ -145,7 +149,17 @@ def stability(cascade: Cascade, scenario: Scenario, clock: Clock) -> Stability:
     sustained = lost | ((swing > SMALL * clearance) & (swing > (1 - DECAY) * swings[:, -2]))
     chatters = (growth * duration > GROWN) & (swing <= SMALL * clearance)
     stable = ~(sustained | ((growth * duration > BORDER) & ~chatters))
-    return Stability(stable, growth, sustained, swing, current, lost, duration)
+    bias = float(np.max(np.asarray(scenario.plant.i_0)))
+    return Stability(stable, growth, sustained, swing, current, lost, duration, bias)
+
+
+def suspects(error: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Return the indices of the held members with the largest settled errors, ascending, at most MOST_TESTED.
+
+    `error` [N]: settled errors, m. `held` [N]: whether a member is held.
+    """
+    alive = np.flatnonzero(held)
+    return np.sort(alive[np.argsort(-np.asarray(error)[alive], kind="stable")[:MOST_TESTED]])
 
 
 def with_stability(margin: Delays, cascade: Cascade, scenario: Scenario, clock: Clock, *, known: bool) -> Delays:

@@ -17,7 +17,7 @@ SUMMARY_METRICS = (
     "clearance_used.largest",
 )
 # Fields that report.json leaves out if they are None.
-OPTIONAL = ("accurate", "gradient", "front", "sensitivity")
+OPTIONAL = ("accurate", "gradient", "front", "sensitivity", "stability")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,9 +26,10 @@ class TuningFacts:
 
     `before`, `after`: the held-out members under the case's gains and the tuned ones. `refuted`: why accurate steps
     contradict the answer; '' if they confirm it. `accurate`: some members with accurate steps. `gradient`: None if not
-    requested. `front`: of error against voltage; None if it was not traced. `front_written`: whether each of its points
-    has a case file. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it. `beside`: the
-    lowest point of the slices through the answer. `next`: the next command, in words.
+    requested. `stability`: of the held-out members with the largest settled errors (`ambjax.linear.Findings`); None if
+    no member was judged. `front`: of error against voltage; None if it was not traced. `front_written`: whether each of
+    its points has a case file. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it.
+    `beside`: the lowest point of the slices through the answer. `next`: the next command, in words.
     """
 
     case: str
@@ -61,6 +62,7 @@ class TuningFacts:
     beside: Row
     slices: Row
     front_written: bool = False
+    stability: Row | None = None
     outcome: Row = dataclasses.field(default_factory=dict)
     verdict: str = ""
     advice: str = ""
