@@ -2,14 +2,18 @@
 
 import copy
 import dataclasses
+import json
 import math
 
 import numpy as np
 import pytest
 import test_check_processor as sampled
 from test_tuning_delay import CASE
+from texts import write
+from tomlkit import dumps
 
 import ambjax as amb
+from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.ensemble import run_ensemble
 from ambjax.ensemble.delays import at_delays
@@ -126,6 +130,41 @@ def test_a_limit_cycle_that_the_linear_loop_does_not_have_is_found_and_explained
     assert not found.stable[0]
     facts = found.findings()
     assert "The linear and the simulated verdict differ: the linear loop is stable" in facts.words()
+
+
+def command(words, capsys):
+    code = main([*words, "--json"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("elsewhere")
+def test_every_command_says_that_a_rotor_is_held_in_a_limit_cycle(capsys):
+    """Without prediction, the loop is stable up to 1.12 samples, and the rotor is held up to 1.33 samples."""
+    good, cycles = (
+        write(dumps(CASE | {"processor": {"delay": d, "predict": False}}), f"{d}.toml") for d in (0.9, 1.25)
+    )
+    code, found = command(["check", cycles], capsys)
+    assert code == 1
+    assert (found["lost_at_s"], found["processor"]["lost_at_s"], found["holds"]) == (None, None, False)
+    facts = found["stability"]
+    assert facts["unstable"] == 1
+    assert found["processor"]["delay_margin"]["stable"] is None
+    code, found = command(["ensemble", cycles, "--members", "2"], capsys)
+    assert (code, found["survivors"]) == (1, 2)
+    assert found["stability"]["unstable"] == 2
+    # one loop, one limit cycle, in another program
+    assert found["stability"]["swing_m"] == pytest.approx(facts["swing_m"], rel=0.05)
+    assert command(["ensemble", good, "--members", "2"], capsys)[0] == 0
+    code, found = command(["compare", good, cycles, "--members", "2"], capsys)
+    assert code == 1
+    assert [case["not_stable"] for case in found["cases"]] == [0, 2]
+    axes = ["--x", "processor.delay=0.9:1.6:3", "--y", "initial.z=1e-5:2e-5:2"]
+    code, found = command(["map", cycles, *axes], capsys)
+    (one,) = found["cases"]
+    assert one["unstable"] == [[0, 1, 0]] * 2
+    assert one["survival"] == [[1, 1, 0]] * 2
+    assert one["reach"] == [0.9, 0.9]
 
 
 ONE = Stability(*(np.array([x]) for x in (True, -10.0, False, 1e-9, 0.1, False)), 0.5, 2.0)

@@ -64,7 +64,7 @@ def _text(cases: list[Case], maps: list[Map]) -> str:
         "cells in which all survive",
         *[f"cells above {100 * CERTAIN:g} % with confidence"] * sure,
     ]
-    head = f"{first.x.path} survived at {first.y.path} = {first.y.values[first.middle]:.3g}"
+    head = f"{first.x.path} survived, stable, at {first.y.path} = {first.y.values[first.middle]:.3g}"
     return "\n".join([table([*header, head], rows), *lines])
 
 

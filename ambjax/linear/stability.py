@@ -128,7 +128,7 @@ class Findings(NamedTuple):
         why = "" if self.reason is None else f" The linear and the simulated verdict differ: {self.reason}."
         if self.stable:
             many = "The loop is stable" if self.tested == 1 else f"All {self.tested} members tested are stable"
-            return f"{many}: without noise and loads, its motion decays.{why}" if self.tested else ""
+            return f"{many}: without noise and loads, the motion decays.{why}" if self.tested else ""
         many = "The rotor is held, but the loop is NOT stable"
         if self.tested > 1:
             many = f"{self.unstable} of {self.tested} members tested are held, but NOT stable"

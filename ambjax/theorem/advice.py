@@ -126,7 +126,9 @@ def _alternates(share: float, cause: Cause | None) -> str:
         f"The voltage alternates: without noise, the part that changes sign from sample to sample is {100 * share:.0f} "
         "% of its rms value."
     )
-    return words if cause is None else f"{words} {cause_words(cause, 'it alternates', 'it does not')}"
+    return (
+        words if cause is None else f"{words} {cause_words(cause, 'it alternates', 'the voltage does not alternate')}"
+    )
 
 
 def _margin(name: str, margin: Delays) -> str:

@@ -69,7 +69,7 @@ def find_cause(
 def cause_words(cause: Cause, with_part: str, without: str) -> str:
     """Return the sentences on a cause. `with_part`, `without`: clauses on the run with the cause and without it."""
     if cause.part is not None:
-        return f"The cause is {cause.part}: {without} in a run without it. {cause.remedy}".strip()
+        return f"The cause is {cause.part}: in a run without this, {without}. {cause.remedy}".strip()
     remains = f": {with_part} also without {', '.join(cause.tried)} (each taken away alone)" if cause.tried else ""
     return f"{NO_PART}{remains}. Possible causes, not tested: the gains and p of the laws, or several parts together."
 
