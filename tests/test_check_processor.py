@@ -384,7 +384,7 @@ def test_check_fails_if_an_explicit_slope_exceeds_its_limit(capsys):
     said, _, theorem = capsys.readouterr().out.partition("Theorem 1:")
     assert "The linearised loop is not stable" in said.partition("On the processor")[0]
     assert "Yes, all 5" in theorem
-    assert "for continuous time" in theorem
+    assert "in continuous time" in theorem
     assert "- inversion: slope T of the step is 318.3 and must be less than" in said
     assert "1 of 3 is not" in said
     assert "The rotor is held." in said
@@ -402,9 +402,10 @@ def test_check_passes_for_a_stable_cascade_on_a_processor(capsys):
     assert [slope["stage"] for slope in summary["processor"]["slopes"]] == ["position", "inversion", "current"]
     assert set(summary["processor"]) == {
         *("lost_at_s", "lost_why", "stalled", "slopes", "bands", "distance_to_C", "distance_to_C_at_s"),
-        *("alternating", "alternates", "delay_margin", "delay_margin_unknown"),
+        *("alternating", "alternates", "delay_margin", "delay_margin_unknown", "loss_cause", "alternation_cause"),
     }
     margin = {"held": 2.0, "lost": None, "undecided": None, "resolution": None, "step": 1 / 256}
+    margin |= {"stable": 2.0, "swing_m": None, "current_A": None, "tested": DELAYS}
     assert summary["processor"]["delay_margin"] == margin
 
 

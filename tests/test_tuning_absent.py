@@ -136,7 +136,7 @@ def unjudged(tmp_path_factory):
 ABSENT = {
     "loss": {}, "minimised": None, "conditions": [], "advice_on_conditions": [], "step_error": None,
     "worst_step_error": None, "worst_member": None, "accurate": None, "gradient": None, "front": None, "beside": None,
-    "slices": None, "sensitivity": None,
+    "slices": None, "sensitivity": None, "stability": None,
 }  # fmt: skip
 
 

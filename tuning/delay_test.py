@@ -8,6 +8,7 @@ import numpy as np
 
 from ambjax.control.processor import MOST_DELAY
 from ambjax.ensemble import run_ensemble
+from ambjax.linear import stability
 from tuning.objective.limits import PREFIX
 from tuning.problem import TuningProblem
 
@@ -17,10 +18,16 @@ TESTED = 16
 
 
 class DelayTest(NamedTuple):
-    """Number of members tested, and how many of them are lost with the additional delay."""
+    """Number of members tested with the additional delay, and how many of them are lost, or held but not stable."""
 
     members: int
     lost: int
+    unstable: int
+
+    @property
+    def fails(self) -> bool:
+        """Whether the delay is not survived: a member is lost or not stable."""
+        return bool(self.lost or self.unstable)
 
 
 def delay_test(problem: TuningProblem, x: np.ndarray, seed: int, columns: Mapping[str, np.ndarray]) -> DelayTest | None:
@@ -42,5 +49,8 @@ def delay_test(problem: TuningProblem, x: np.ndarray, seed: int, columns: Mappin
     if np.max(delay) > MOST_DELAY:
         return None
     late = dataclasses.replace(processor, delay=delay, assumed=processor.ahead, predict=processor.predicts)
-    ended = run_ensemble(dataclasses.replace(cascade, processor=late), scenario, problem.case.clock, fold=None, every=0)
-    return DelayTest(len(members.member), int(np.isfinite(ended.trajectory.lost_at).sum()))
+    cascade = dataclasses.replace(cascade, processor=late)
+    ended = run_ensemble(cascade, scenario, problem.case.clock, fold=None, every=0)
+    lost = np.isfinite(ended.trajectory.lost_at)
+    unstable = ~lost & ~stability(cascade, scenario, problem.case.clock).stable
+    return DelayTest(len(members.member), int(lost.sum()), int(unstable.sum()))

@@ -18,6 +18,7 @@ from ambjax.commands.case_export import guarded_for
 from ambjax.commands.comparison_report import Compared, comparison_markdown, comparison_summary, comparison_table
 from ambjax.commands.ensemble import study_of
 from ambjax.commands.outputs import described, directory, files, plain, say, write_json, written
+from ambjax.commands.study_report import findings_of
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
@@ -37,7 +38,11 @@ MAY_DIFFER = ("controller.", "clock.method")
 
 
 def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
-    """Compare cases. The exit code is 0 if each case holds all members, and its nominal loop is stable at rest."""
+    """Compare cases.
+
+    The exit code is 0 if each case holds all members, the members tested are stable, and its nominal loop is stable at
+    rest.
+    """
     cases = _read(args.cases)
     studies = [study_of(case, _seed(args, cases), args.members) for case in cases]
     notes = _differences(args.cases, cases, studies)
@@ -63,7 +68,10 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     if not args.json:
         print(described("the table", lambda: comparison_table(summary)) or "")
         written(out, ", ".join([*names, *html_pages]))
-    good = all(one.held.all() and one.point is not None and one.point.analysis.stable for one in compared)
+    good = all(
+        one.held.all() and one.findings.stable and one.point is not None and one.point.analysis.stable
+        for one in compared
+    )
     return int(not good), plain(summary | {"out": str(out)})
 
 
@@ -138,7 +146,8 @@ def _tuned(path: str, name: str, out: pathlib.Path, args: argparse.Namespace) ->
 def _compared(case: Case, study: Study) -> Compared:
     """Simulate the members of a case, analyse its loop, and count the operations of a step."""
     point, peaks = _linear(case, study)
-    return Compared(case, _columns(case, study), point, peaks, _flops(case))
+    columns = _columns(case, study)
+    return Compared(case, columns, point, peaks, _flops(case), findings_of(study, columns))
 
 
 def _columns(case: Case, study: Study) -> dict[str, np.ndarray]:

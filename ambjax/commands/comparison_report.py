@@ -12,6 +12,8 @@ from ambjax.commands.outputs import table
 from ambjax.ensemble.paths import kinds, places
 from ambjax.ensemble.study import Study
 from ambjax.host import web_page
+from ambjax.linear import Findings
+from ambjax.linear.stability import MOST_TESTED
 from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks
 
 
@@ -21,7 +23,8 @@ class Compared:
 
     `columns`: metrics of the members by name, [N] each. `point`: the nominal loop; None without an equilibrium.
     `peaks`: sensitivity peaks of the members; None without a spread or without an equilibrium. `flops`: operations of a
-    step of the controller; None without a processor, or if a law cannot be exported.
+    step of the controller; None without a processor, or if a law cannot be exported. `findings`: the stability of the
+    members with the largest settled errors.
     """
 
     case: Case
@@ -29,6 +32,7 @@ class Compared:
     point: OperatingPoint | None
     peaks: SpreadPeaks | None
     flops: int | None
+    findings: Findings = Findings(0, 0)
 
     @property
     def held(self) -> np.ndarray:
@@ -53,6 +57,8 @@ class Quantity(NamedTuple):
 QUANTITIES = (
     Quantity("lost", "members lost", "1"),
     Quantity("stalled", "members not decided (the integrator stalled)", "1"),
+    Quantity("not_stable", f"members held, but not stable, of at most {MOST_TESTED} tested", "1"),
+    Quantity("cycle_m", "the largest amplitude of their own oscillation", "m"),
     Quantity("rms_error_median_m", "settled rms error, median", "m"),
     Quantity("rms_error_worst_m", "settled rms error, worst member", "m"),
     Quantity("max_error_m", "largest settled error", "m"),
@@ -97,6 +103,8 @@ def _values(one: Compared, first: Compared) -> dict[str, object]:
     return {
         "lost": int(np.sum(~one.held & ~stalled)),
         "stalled": int(np.sum(stalled)),
+        "not_stable": one.findings.unstable,
+        "cycle_m": one.findings.swing_m,
         "rms_error_median_m": one.of("settled_rms_error_m", np.median),
         "rms_error_worst_m": one.of("settled_rms_error_m", np.max),
         "max_error_m": one.of("settled_max_abs_error_m", np.max),
@@ -182,8 +190,10 @@ def comparison_markdown(summary: Mapping[str, Any]) -> str:
 
 
 def _words(summary: Mapping[str, Any]) -> str:
-    poor = [case["case"] for case in summary["cases"] if case["lost"] or case["stalled"] or case["peak"] is None]
-    why = f" Members not held, or a loop not stable at rest: {', '.join(poor)}; see 'ambjax check'." if poor else ""
+    bad = ("lost", "stalled", "not_stable")
+    poor = [case["case"] for case in summary["cases"] if case["peak"] is None or any(case[key] for key in bad)]
+    why = f" Members not held or not stable, or a loop not stable at rest: {', '.join(poor)}." if poor else ""
+    why += " See 'ambjax check'." if poor else ""
     return (
         f"{summary['members']} members, seed {summary['seed']}, the same in all cases. Errors, voltages, currents and "
         f"power losses are those of the members that are held. Sensitivity and margins are those of the linearised "

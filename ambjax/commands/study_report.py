@@ -12,6 +12,7 @@ from ambjax.commands.warnings import reversal
 from ambjax.ensemble import statistics
 from ambjax.ensemble.study import Study
 from ambjax.host.words import one_line
+from ambjax.linear import Findings, stability, suspects
 
 # Files written with members.npz; the last one only if the case has a spread and a member survives.
 WRITTEN = ("summary.json", "fan.png", "histograms.png", "tornado.png")
@@ -28,27 +29,31 @@ def write_report(
 ) -> tuple[int, dict[str, object]]:
     """Write and print the results of a finished study. Return the exit code and the summary.
 
-    The exit code is 0 if every member survives. `error`: result of `sliding_error`, or None.
+    The exit code is 0 if every member survives, and the members tested are stable. `error`: result of `sliding_error`,
+    or None.
     """
     with np.load(out / "members.npz") as file:
         columns = {name: file[name] for name in file.files}
+    findings = findings_of(study, columns)
     held = ~np.isfinite(columns["lost_at"])
     survivors = {"survivors": int(held.sum()), "members": study.members}
     summary = described("summary.json", lambda: _summary(case, study, columns, str(args.case)))
     with files(out) as part:
         if summary is not None:
+            summary["stability"] = findings._asdict()
             if error is not None:
                 summary["sliding_step_error"] = error
             write_json(part / "summary.json", summary)
         _pictures(case, study, columns, summary, part)
         names = [name for name in WRITTEN if (part / name).exists()]
     if not args.json:
-        tables = None if summary is None else described("the table", lambda: study_tables(summary))
+        tables = None if summary is None else described("the table", lambda: study_tables(summary, findings.words()))
         print(tables or "{survivors} of {members} members survive".format(**survivors))
         written(out, ", ".join(["members.npz", *names]))
     for warning in reversal(case, float(np.max(columns["max_abs_i_A"], initial=0.0, where=held))):
         say(warning)
-    return int(not held.all()), plain(summary or survivors) | {"out": str(out)}
+    good = held.all() and findings.stable
+    return int(not good), plain(summary or survivors) | {"out": str(out)}
 
 
 def _summary(case: Case, study: Study, columns: dict[str, np.ndarray], path: str) -> dict[str, Any]:
@@ -62,6 +67,15 @@ def _summary(case: Case, study: Study, columns: dict[str, np.ndarray], path: str
     for worst in numbers["worst"]:
         worst["replay"] = study.command(path, worst["index"])
     return facts | numbers
+
+
+def findings_of(study: Study, columns: dict[str, np.ndarray]) -> Findings:
+    """Test whether the loops of the surviving members with the largest settled errors are stable."""
+    index = suspects(columns[statistics.DECIDING], ~np.isfinite(columns["lost_at"]))
+    if not index.size:
+        return Findings(0, 0)
+    say(f"testing whether the loops of {index.size} members are stable: simulating them without noise and loads")
+    return stability(*study.batch(index), study.clock).findings()
 
 
 def _pictures(
@@ -111,8 +125,8 @@ def _quantiles(x: np.ndarray, extremes: tuple[np.ndarray, np.ndarray] | None) ->
     return dict(zip(BANDS, quantiles, strict=True))
 
 
-def study_tables(summary: dict[str, Any]) -> str:
-    """Return the tables that the command prints."""
+def study_tables(summary: dict[str, Any], stable: str = "") -> str:
+    """Return the tables that the command prints. `stable`: the sentence on the stability of the members."""
     share, low, high = (100 * summary["survival"][key] for key in ("estimate", "low", "high"))
     sure = f"{100 * summary['confidence']:g} % interval"
     held = f"{summary['survivors']} of {summary['members']} members survive"
@@ -120,6 +134,7 @@ def study_tables(summary: dict[str, Any]) -> str:
     if summary["stalled"]:
         why = "the integrator stalled, so whether the rotor survives is not known"
         lines += [f"{summary['lost']} lost, {summary['stalled']} not decided: {why}"]
+    lines += [stable] * bool(stable)
     lines += [f"note: {note}" for note in summary["notes"]]
 
     def number(x: float | None) -> str:

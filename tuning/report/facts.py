@@ -17,7 +17,7 @@ SUMMARY_METRICS = (
     "clearance_used.largest",
 )
 # Fields that report.json leaves out if they are None.
-OPTIONAL = ("accurate", "gradient", "front", "sensitivity")
+OPTIONAL = ("accurate", "gradient", "front", "sensitivity", "stability")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,10 +26,11 @@ class TuningFacts:
 
     `before`, `after`: the held-out members under the case's gains and the tuned ones. `refuted`: why accurate steps
     contradict the answer; '' if they confirm it. `accurate`: some members with accurate steps. `gradient`: None if not
-    requested. `front`: of error against voltage; None if it was not traced. `front_written`: whether each of its points
-    has a case file. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it. `beside`: the
-    lowest point of the slices through the answer; None without slices. `next`: the next command, in words. `loss`,
-    `minimised`, `conditions` and `slices` are empty or None if they could not be computed.
+    requested. `stability`: of the held-out members with the largest settled errors (`ambjax.linear.Findings`); None if
+    no member was judged. `front`: of error against voltage; None if it was not traced. `front_written`: whether each of
+    its points has a case file. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it.
+    `beside`: the lowest point of the slices through the answer; None without slices. `next`: the next command, in
+    words. `loss`, `minimised`, `conditions` and `slices` are empty or None if they could not be computed.
     """
 
     case: str
@@ -62,6 +63,7 @@ class TuningFacts:
     beside: Row | None
     slices: Row | None
     front_written: bool = False
+    stability: Row | None = None
     outcome: Row = dataclasses.field(default_factory=dict)
     verdict: str = ""
     advice: str = ""

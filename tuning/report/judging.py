@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.commands.outputs import described, say
+from ambjax.linear import Findings, stability, suspects
 from ambjax.theorem.advice import advice as on_conditions
 from ambjax.theorem.conditions import Report as Check
 from ambjax.theorem.conditions import check
@@ -95,12 +96,25 @@ def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_
         found["after"] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
     found["loss"] = described("the loss of the held-out members", lambda: _losses(problem, judged)) or {}
     found["worst_member"] = described("the worst member", lambda: worst(problem, after, held_out)) if after else None
+    found["stability"] = _stability(problem, answer.x, held_out, after) if after else None
     lost = problem.engine.terms(answer.x[None], answer.members)["survival"] > 0
     return found | {"lost_in_training": int(lost.sum())}
 
 
 def _losses(problem: TuningProblem, judged: dict[str, Any]) -> Row:
     return {name: breakdown.loss_breakdown(problem.error_goal, one) for name, one in judged.items() if one}
+
+
+def _stability(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray]) -> Row:
+    """Return whether the loops of the held members with the largest settled errors are stable (`linear.Findings`)."""
+    index = suspects(columns["settled_max_abs_error_m"], held(columns))
+    if not index.size:
+        return Findings(0, 0)._asdict()
+    say(f"testing whether the loops of {index.size} held-out members are stable ...")
+    members = problem.objective.chosen(seed, index, len(columns["lost_at_s"]))
+    # in continuous time, the step of the case may be too coarse for these gains
+    clock = problem.case.clock if problem.sampled else dataclasses.replace(problem.case.clock, method=None)
+    return stability(*problem.objective.fixed(x, members), clock).findings()._asdict()
 
 
 def _steps(answer: SearchResult, unlucky: StepError | None, again: Row | None, refuted: str) -> Row:

@@ -110,9 +110,10 @@ def _tested(row: Facts, delayed: DelayTest | None, refuted: str) -> Facts:
     if row["name"] != DELAY_MARGIN or delayed is None:
         return row
     words = (
-        f"{row['what']}; with this additional delay {delayed.lost} of {delayed.members} of the worst members are lost"
+        f"{row['what']}; with this additional delay {delayed.lost} of {delayed.members} of the worst members are lost, "
+        f"and {delayed.unstable} held but not stable"
     )
-    return row | {"what": words} | (_verdict(False, refuted) | {"price": None} if delayed.lost else {})
+    return row | {"what": words} | (_verdict(False, refuted) | {"price": None} if delayed.fails else {})
 
 
 def _asked(problem: TuningProblem) -> list[Limit]:
