@@ -10,6 +10,7 @@ from jax import Array
 from ambjax.control.force import force_of_current, linear_mechanics, resting_current
 from ambjax.control.laws import PositionLaw
 from ambjax.control.regulator import optimal_gains
+from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
 from ambjax.numerics.biquad import Biquad, lead_lag, low_pass, notch
 from ambjax.numerics.records import Scalar, gain, record
@@ -82,7 +83,7 @@ class FilterChain(PositionLaw[ChainState]):
         size = jnp.asarray(model.i_0 / 25)
         return ChainState(size, size, *[(size, size)] * 4)
 
-    def designed(self, model: Plant, period: float | None) -> "FilterChain":
+    def designed(self, model: Plant, sampling: Sampling | None) -> "FilterChain":
         """Return the law with the gains of `optimal_gains` in continuous time, and k_aw and all corners from the pole.
 
         Raises ValueError as `optimal_gains` does.

@@ -8,6 +8,7 @@ from jax import Array
 from ambjax.control.force import force_of_current, linear_mechanics, resting_current
 from ambjax.control.laws import PositionLaw
 from ambjax.control.regulator import optimal_gains
+from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.world.plant import Plant
@@ -41,9 +42,9 @@ class StateFeedback(PositionLaw[Array]):
     def scale(self, model: Plant) -> Scalar:
         return model.i_0 / 25
 
-    def designed(self, model: Plant, period: float | None) -> "StateFeedback":
+    def designed(self, model: Plant, sampling: Sampling | None) -> "StateFeedback":
         """Return the law with k_aw = w/50 and the gains of `optimal_gains`. Raises ValueError as that does."""
-        k_int, k_p, k_d = map(float, optimal_gains(model, period))
+        k_int, k_p, k_d = map(float, optimal_gains(model, None if sampling is None else sampling.period))
         return dataclasses.replace(self, k_p=k_p, k_d=k_d, k_int=k_int, k_aw=model.pole / 50)
 
     def slope(self, model: Plant) -> Scalar:
