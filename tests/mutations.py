@@ -83,10 +83,31 @@ LAWS = [
         "tests/test_inner_laws.py::test_feed_forward_leaves_only_the_sign_in_equation_8",
     ),
     M(
+        "a processor starts the filters of a position law at 0",
+        "ambjax/control/cascade.py",
+        "return laws._replace(position=_chosen(started, laws.position, begun))",
+        "return laws",
+        "tests/test_starts.py::test_the_first_command_from_rest_is_that_of_the_static_law",
+    ),
+    M(
+        "the filter of the derivative starts at 0 on a processor",
+        "ambjax/control/chain.py",
+        "derivative = -self.k_d * self.w_f / (1 + self.w_f * period / 2) * e",
+        "derivative = 0 * e",
+        "tests/test_starts.py::test_the_first_command_from_rest_is_that_of_the_static_law",
+    ),
+    M(
+        "a slow mode of a linear controller starts in its steady state",
+        "ambjax/control/realisation.py",
+        "np.hypot(re, im) > SLOWEST",
+        "np.hypot(re, im) > 0",
+        "tests/test_starts.py::test_a_linear_controller_starts_in_the_steady_state_of_its_fast_modes",
+    ),
+    M(
         "Utkin's integral sliding mode starts off its manifold",
         "ambjax/control/manifolds.py",
-        "jnp.where(state.begun > 0.5, state.integral, self.begin(model, inputs))",
-        "state.integral",
+        "return -sliding_variable(self.k_d, *inputs)",
+        "return 0 * sliding_variable(self.k_d, *inputs)",
         "tests/test_manifolds.py::test_an_integral_sliding_mode_begins_on_its_manifold",
     ),
     M(
@@ -99,8 +120,8 @@ LAWS = [
     M(
         "the sampled notch is not prewarped",
         "ambjax/numerics/biquad.py",
-        "K = 2 / period if self.centre is None else",
-        "K = 2 / period if True else",
+        "return 2 / period if self.centre is None else",
+        "return 2 / period if True else",
         "tests/test_structures.py::test_the_sampled_chain_is_scipy_s_bilinear_transform_of_each_part",
     ),
     M(
@@ -2955,15 +2976,15 @@ VARIOUS = [
     M(
         "the signals of the laws are computed without the guard",
         "ambjax/theorem/law_signals.py",
-        "_, measured, laws = loop.inputs_of_laws(loop.read(before, errors)[1], before)",
+        "_, measured, laws = loop.inputs_of_laws(loop.read(before, errors)[1], sample, before)",
         "measured, laws = loop.read(before, errors)[1], before.control",
         "tests/test_check_processor.py::test_the_computed_signals_are_those_of_the_readings_that_the_laws_receive",
     ),
     M(
         "the signals of the laws are computed without the faults of the sensor",
         "ambjax/theorem/law_signals.py",
-        "loop.read(before, errors)[1], before)",
-        "loop.measured(before.plant, before.z_filtered, errors), before)",
+        "loop.read(before, errors)[1], sample, before)",
+        "loop.measured(before.plant, before.z_filtered, errors), sample, before)",
         "tests/test_check_processor.py::test_the_computed_signals_are_those_of_the_readings_that_the_laws_receive",
     ),
     M(

@@ -1,7 +1,9 @@
 """The controller of industrial magnetic bearings: PID, lead-lag, notches and low-pass in series."""
 
 import dataclasses
-from typing import NamedTuple
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -78,6 +80,29 @@ class FilterChain(PositionLaw[ChainState]):
 
     def init(self, model: Plant) -> ChainState:
         return jax.tree.map(jnp.zeros_like, self.scale(model))
+
+    def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> ChainState:
+        """Return the filters in the steady state for the first error, and an integral of 0."""
+        e = jnp.asarray(inputs[0].z - inputs[1].r)
+        return self._begun(self.k_d * self.w_f * e, self.k_p * e, [part.steady for part in self._biquads()])
+
+    def begin_sampled(self, model: Plant, inputs: tuple[Measurement, Reference], period: Scalar) -> ChainState:
+        """Return the filters in the steady state for the error of the first sample, and an integral of 0."""
+        e = jnp.asarray(inputs[0].z - inputs[1].r)
+        parts = [functools.partial(part.steady_sampled, period=period) for part in self._biquads()]
+        derivative = -self.k_d * self.w_f / (1 + self.w_f * period / 2) * e
+        return self._begun(derivative, self.k_p * e + self.k_int * period / 2 * e, parts)
+
+    def _begun(self, derivative: Array, y: Array, parts: Sequence[Callable[..., Any]]) -> ChainState:
+        """Return the state for an output y (A) of the PID. `parts`: functions that return output and state of a filter.
+
+        `derivative`: state of the derivative filter, A.
+        """
+        states = []
+        for steady in parts:
+            y, state = steady(y)
+            states.append(state)
+        return ChainState(derivative, jnp.zeros_like(derivative), *states)
 
     def scale(self, model: Plant) -> ChainState:
         size = jnp.asarray(model.i_0 / 25)

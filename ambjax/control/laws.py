@@ -122,8 +122,20 @@ class PositionLaw(Law, Generic[State], abc.ABC):
     def init(self, model: Plant) -> State: ...
 
     def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> State:
-        """Return the state at t = 0 in continuous time, from the first estimate and reference; by default `init`."""
+        """Return the state at t = 0 in continuous time, from the first estimate and reference; by default `init`.
+
+        Filters start in the steady state for this estimate, so that the first command is not that of a jump from 0.
+        """
         return self.init(model)
+
+    def begin_sampled(self, model: Plant, inputs: tuple[Measurement, Reference], period: Scalar) -> object:
+        """Return the state before the first sample of a processor, from the estimate and the reference of this sample.
+
+        `period`: sample period, s. The default is `begin`, or `init_sampled` for a law whose state on a processor
+        differs from that in continuous time.
+        """
+        own = type(self).init_sampled is not Law.init_sampled
+        return self.init_sampled(model) if own else self.begin(model, inputs)
 
     @abc.abstractmethod
     def scale(self, model: Plant) -> object: ...

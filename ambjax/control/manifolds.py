@@ -4,7 +4,7 @@ They are Utkin's integral sliding mode, which starts on its manifold, and a non-
 """
 
 import dataclasses
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jax import Array
@@ -24,13 +24,6 @@ from ambjax.world.signals import Reference
 
 # Speed below which the root of `TerminalSlidingMode` is smoothed, as a share of c l.
 WIDTH = 0.01
-
-
-class UtkinState(NamedTuple):
-    """State of `UtkinSlidingMode` on a processor: the integral (m/s), and a flag: 0 before the first sample."""
-
-    integral: Array
-    begun: Array
 
 
 @record
@@ -58,7 +51,7 @@ class UtkinSlidingMode(PositionLaw[Array]):
         steepness=True,
     )
     switching: ClassVar = ("k",)
-    memory = (("integral", "m/s", "integral of k_p e"), ("begun", "1", "1 after the first sample"))
+    memory = (("integral", "m/s", "integral of k_p e"),)
     own_steps = ("implicit", "explicit")
 
     def init(self, model: Plant) -> Array:
@@ -68,14 +61,8 @@ class UtkinSlidingMode(PositionLaw[Array]):
         """Return the integral x for which s = 0."""
         return -sliding_variable(self.k_d, *inputs)
 
-    def init_sampled(self, model: Plant) -> UtkinState:
-        return UtkinState(jnp.zeros(()), jnp.zeros(()))
-
     def scale(self, model: Plant) -> Scalar:
         return model.sigma_size
-
-    def scale_sampled(self, model: Plant) -> UtkinState:
-        return UtkinState(jnp.asarray(model.sigma_size), jnp.ones(()))
 
     def designed(self, model: Plant, sampling: Sampling | None) -> "UtkinSlidingMode":
         k_p, k_d = (model.pole / 3) ** 2, 2 * model.pole / 3
@@ -113,14 +100,12 @@ class UtkinSlidingMode(PositionLaw[Array]):
         }
 
     def step(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: UtkinState, period: Scalar
-    ) -> tuple[Array, UtkinState]:
-        """Step with the sign of s at the end of the step; s = 0 at the first sample."""
+        self, model: Plant, inputs: tuple[Measurement, Reference], state: Array, period: Scalar
+    ) -> tuple[Array, Array]:
+        """Step with the sign of s at the end of the step."""
         motion, reference = inputs
-        x = jnp.where(state.begun > 0.5, state.integral, self.begin(model, inputs))
-        sign = share(sliding_variable(self.k_d, *inputs) + x, period * self.k, self.p)
-        after = UtkinState(x + period * self.k_p * (motion.z - reference.r), jnp.ones(()))
-        return self._force(model, inputs, sign), after
+        sign = share(sliding_variable(self.k_d, *inputs) + state, period * self.k, self.p)
+        return self._force(model, inputs, sign), state + period * self.k_p * (motion.z - reference.r)
 
 
 @record

@@ -52,6 +52,11 @@ class PID(PositionLaw[PIDState]):
     def scale(self, model: Plant) -> PIDState:
         return PIDState(jnp.asarray(model.sigma_size), jnp.abs(model.g) / 50 + 1e-3)
 
+    def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> PIDState:
+        """Return the filter in the steady state for the first rate of the error, and an integral of 0."""
+        rate = jnp.asarray(inputs[0].z_dot - inputs[1].r_dot)
+        return PIDState(rate, jnp.zeros_like(rate))
+
     def designed(self, model: Plant, sampling: Sampling | None) -> "PID":
         w = model.pole
         return PID(k_p=1.25 * w**2, k_int=w**3 / 4, k_d=2 * w, w_f=20 * w, k_aw=w / 20)
