@@ -104,6 +104,13 @@ LAWS = [
         "tests/test_starts.py::test_a_linear_controller_starts_in_the_steady_state_of_its_fast_modes",
     ),
     M(
+        "an anti-windup charges a law without integral action",
+        "ambjax/control/laws.py",
+        "jnp.where(jnp.asarray(k_int) > 0, k_aw, 0.0)",
+        "jnp.asarray(k_aw)",
+        "tests/test_starts.py::test_an_anti_windup_charges_no_law_without_integral_action",
+    ),
+    M(
         "Utkin's integral sliding mode starts off its manifold",
         "ambjax/control/manifolds.py",
         "return -sliding_variable(self.k_d, *inputs)",
@@ -261,14 +268,14 @@ LAWS = [
     M(
         "the integral of the PI law has no anti-windup",
         "ambjax/control/current.py",
-        "self.k_int * error + self.k_aw * excess",
+        "self.k_int * error + unwinding(self.k_aw, self.k_int) * excess",
         "self.k_int * error",
         "tests/test_laws.py::test_pi_integral_is_bounded_while_the_supply_saturates",
     ),
     M(
         "the integral of the PID law has no anti-windup in continuous time",
         "ambjax/control/pid.py",
-        "self.k_int * e + self.k_aw * lacking",
+        "self.k_int * e + unwinding(self.k_aw, self.k_int) * lacking",
         "self.k_int * e",
         "tests/test_laws.py::test_a_pid_steps_its_filter_and_its_anti_windup_by_backward_euler",
     ),

@@ -13,6 +13,7 @@ from ambjax import Cascade, Plant, Processor, Scenario, current, inversion, obse
 from ambjax.cases.controller_tables import KINDS
 from ambjax.control.base import default_law
 from ambjax.control.cascade_state import Sample
+from ambjax.control.laws import CurrentDemand, CurrentInputs, CurrentLaw, step_law
 from ambjax.control.realisation import realisation
 from ambjax.control.sampling import Sampling
 from ambjax.simulation.loop import ClosedLoop
@@ -142,3 +143,22 @@ def test_a_start_at_rest_on_the_reference_and_at_an_error_differ_by_the_static_g
         command, laws, _ = cascade.step(measured, laws, sample)
         i_ref.append(float(command.i_ref + T * command.i_ref_dot))
     assert np.max(np.abs(np.array(i_ref) - i_ref[0])) < 0.1 * abs(i_ref[0])
+
+
+WOUND = [kind for stage in ("position", "current") for kind in KINDS[stage].values() if hasattr(kind(), "k_aw")]
+
+
+@pytest.mark.parametrize("kind", WOUND, ids=lambda kind: kind.__name__)
+def test_an_anti_windup_charges_no_law_without_integral_action(kind):
+    """The current lags behind its demand and the supply limits u, as at the start; only k_int moves the integral."""
+    motion, error = Measurement(Z, 0.01, 0.3), Reference(-Z, 0.0, 0.0)
+    inputs = (motion, error)
+    if issubclass(kind, CurrentLaw):
+        inputs = CurrentInputs(motion, CurrentDemand(jnp.asarray(1.0), jnp.asarray(0.0)), 0.1)
+    for k_int in (0.0, 1.0):
+        law = dataclasses.replace(default_law(kind, RIG), k_int=np.asarray(k_int))  # an array is not checked
+        state = law.init(RIG)
+        after = step_law(law, inputs, state, model=RIG, period=T, implicit=True)[1]
+        rate = law(RIG, inputs, state)[1]
+        found = [getattr(x, "integral", x) for x in (after, rate)]
+        assert [bool(x != 0) for x in found] == [k_int > 0] * 2

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.force import force_of_current, linear_mechanics, resting_current
-from ambjax.control.laws import PositionLaw
+from ambjax.control.laws import PositionLaw, unwinding
 from ambjax.control.regulator import optimal_gains
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
@@ -148,7 +148,7 @@ class FilterChain(PositionLaw[ChainState]):
             y, moved = part.output(y, x)
             rates.append(moved)
         i_star = resting_current(model, reference) - y
-        integral = self.k_int * e + self.k_aw * (i_star - motion.i)
+        integral = self.k_int * e + unwinding(self.k_aw, self.k_int) * (i_star - motion.i)
         return force_of_current(model, motion.z, i_star), ChainState(derivative, integral, *rates)
 
     def step(
@@ -160,7 +160,7 @@ class FilterChain(PositionLaw[ChainState]):
         """
         motion, reference = inputs
         e = motion.z - reference.r
-        half, leak = self.w_f * period / 2, self.k_aw * period
+        half, leak = self.w_f * period / 2, unwinding(self.k_aw, self.k_int) * period
         # derivative: k_d w_f (1 - q)/(1 + half - (1 - half) q), with the backward shift q
         differentiated = self.k_d * self.w_f / (1 + half) * e + state.derivative
         derivative = -self.k_d * self.w_f / (1 + half) * e + (1 - half) / (1 + half) * differentiated

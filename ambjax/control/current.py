@@ -8,7 +8,7 @@ from jax import Array
 
 from ambjax.control.base import Requirement, scaled_steepness
 from ambjax.control.defaults import current_rate, printed
-from ambjax.control.laws import CurrentInputs, CurrentLaw
+from ambjax.control.laws import CurrentInputs, CurrentLaw, unwinding
 from ambjax.control.sampling import Relay, Sampling, slope_limits
 from ambjax.control.search import Interval, SearchContext, authority, rate, steepness, switch
 from ambjax.numerics.records import Scalar, gain, leaf, record
@@ -116,7 +116,7 @@ class ProportionalIntegral(CurrentLaw[Array]):
         error = inputs.demand.i_ref - inputs.measured.i
         u = self.k_p * error + model.L * inputs.demand.i_ref_dot + state
         excess = limited(u, inputs.u_max) - u
-        return u, self.k_int * error + self.k_aw * excess
+        return u, self.k_int * error + unwinding(self.k_aw, self.k_int) * excess
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         per = 1 / float(context.model.L)

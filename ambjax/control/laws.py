@@ -17,6 +17,7 @@ import abc
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.base import Law
@@ -209,6 +210,14 @@ STAGES: dict[str, type[Law]] = {
     "inversion": InversionLaw,
     "current": CurrentLaw,
 }
+
+
+def unwinding(k_aw: Scalar, k_int: Scalar) -> Array:
+    """Return the rate of an anti-windup, 1/s: k_aw, or 0 if there is no integral (k_int = 0).
+
+    Without integral action, nothing would remove what the anti-windup adds to the state while the current rises.
+    """
+    return jnp.where(jnp.asarray(k_int) > 0, k_aw, 0.0)
 
 
 def step_law(

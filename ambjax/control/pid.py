@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.force import force_for, sliding_variable
-from ambjax.control.laws import PositionLaw
+from ambjax.control.laws import PositionLaw, unwinding
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
 from ambjax.numerics.records import Scalar, gain, record
@@ -75,7 +75,8 @@ class PID(PositionLaw[PIDState]):
         e, e_dot = motion.z - reference.r, motion.z_dot - reference.r_dot
         v_star = self._force(model, inputs, state.rate, state.integral)
         lacking = model.a * (v_star - model.v(motion.z, motion.i))
-        return v_star, PIDState(self.w_f * (e_dot - state.rate), self.k_int * e + self.k_aw * lacking)
+        integral = self.k_int * e + unwinding(self.k_aw, self.k_int) * lacking
+        return v_star, PIDState(self.w_f * (e_dot - state.rate), integral)
 
     def _force(self, model: Plant, inputs: tuple[Measurement, Reference], rate: Array, integral: Scalar) -> Array:
         motion, reference = inputs
@@ -104,7 +105,7 @@ class PID(PositionLaw[PIDState]):
         """
         motion, reference = inputs
         e, e_dot = motion.z - reference.r, motion.z_dot - reference.r_dot
-        follow, leak = period * self.w_f, period * self.k_aw
+        follow, leak = period * self.w_f, period * unwinding(self.k_aw, self.k_int)
         after = (state.rate + follow * e_dot) / (1 + follow)
         lacking = model.a * (self._force(model, inputs, after, 0.0) - model.v(motion.z, motion.i))
         integral = (state.integral + period * self.k_int * e + leak * lacking) / (1 + leak)
