@@ -2418,9 +2418,30 @@ FMU = [
     M(
         "a parameter of an FMU may be NaN",
         "ambjax/codegen/fmi/fmu_core.h",
-        "if (isnan(value) || (isinf(value) && (value < 0 || !model_infinite[at]))) {",
-        "if (isinf(value) && (value < 0 || !model_infinite[at])) {",
+        "return value >= model_least[parameter] && value <= model_most[parameter];",
+        "return !(value < model_least[parameter] || value > model_most[parameter]);",
         "tests/test_export_fmu.py::test_a_changed_gain_a_reset_a_nan_and_a_second_instance[3]",
+    ),
+    M(
+        "an FMU accepts a parameter below its least value",
+        "ambjax/codegen/fmi/fmu_core.h",
+        "return value >= model_least[parameter] && value <= model_most[parameter];",
+        "return value <= model_most[parameter];",
+        "tests/test_export_fmu.py::test_a_changed_gain_a_reset_a_nan_and_a_second_instance[3]",
+    ),
+    M(
+        "the bound of a gain is the excluded value itself",
+        "ambjax/codegen/numbering.py",
+        'floors.append(math.nextafter(float(meta["above"]), math.inf))',
+        'floors.append(float(meta["above"]))',
+        "tests/test_export_fmu.py::test_every_parameter_has_the_bounds_that_its_record_declares",
+    ),
+    M(
+        "the FMU of a controller needs a plant that can be exported",
+        "ambjax/codegen/fmi/cross_check.py",
+        "short = dataclasses.replace(clock, samples=count)",
+        'short = dataclasses.replace(clock, samples=count); block_of("loop", cascade, scenario, clock)',
+        "tests/test_export_fmu.py::test_the_reference_of_a_controller_does_not_depend_on_what_a_plant_can_export",
     ),
     M(
         "an FMU accepts a step that is not a whole number of periods",
