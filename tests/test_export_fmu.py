@@ -1,8 +1,10 @@
 """FMUs, run by fmpy: controller and plant in a loop are the simulator's; parameters, reset, NaN, instances, sources."""
 
 import contextlib
+import dataclasses
 import functools
 import pathlib
+import tomllib
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -12,8 +14,10 @@ from test_export_blocks import rig
 
 from ambjax import Cascade, Processor, Scenario, rollout
 from ambjax.__main__ import main
-from ambjax.cases.reader import read_case
+from ambjax.cases.reader import case_from, read_case
+from ambjax.cases.template_text import template
 from ambjax.codegen.c99.source import Origin
+from ambjax.codegen.fmi import cross_check
 from ambjax.codegen.fmi.archive import packed, sources
 from ambjax.codegen.fmi.cross_check import files_of
 from ambjax.codegen.fmi.description import description, variables
@@ -22,6 +26,7 @@ from ambjax.codegen.of_case import block_of, blocks_of
 from ambjax.codegen.series import series
 from ambjax.codegen.trace import trace
 from ambjax.codegen.twins import LoopCase, horizons
+from ambjax.commands.case_export import guarded_for
 from ambjax.simulation.clock import Clock
 
 ORIGIN = Origin("test", "0" * 64, [])
@@ -68,6 +73,69 @@ def test_an_infinite_start_value_is_written_as_xml_allows():
     one = trace(block_of("controller", cascade, Scenario(), Clock(10)), "double")
     assert 'start="INF"' in description(one, "amb", "x", "{1}", [], 3)
     assert 'start="1e300"' in description(one, "amb", "x", "{1}", [], 2)
+
+
+def declared(record, path):
+    """The metadata of a field by its dotted name, read from the records themselves."""
+    *parts, name = path.split(".")
+    for part in parts:
+        record = getattr(record, part)
+    return next(field.metadata for field in dataclasses.fields(record) if field.name == name)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("what", ["controller", "plant", "loop"])
+def test_every_parameter_has_the_bounds_that_its_record_declares(what, version):
+    one = traced(what)
+    root = ET.fromstring(description(one, "amb", "rig", "{1}", ["amb.c"], version))
+    rows = {row.get("name"): row.find("Real") if version == 2 else row for row in root.find("ModelVariables")}
+    parts = {"controller": one.block} if what != "loop" else {"controller": one.block.controller}
+    checked = 0
+    for x in one.parameters:
+        if x.allowed == "not read":
+            continue
+        row = rows[x.name]
+        low, high, start = (row.get(name) and float(row.get(name)) for name in ("min", "max", "start"))
+        # an importer that writes the start values is not refused
+        assert low is None or low <= start
+        assert high is None or start <= high
+        name = x.name.removeprefix("controller.") if what == "loop" else x.name
+        if what == "plant" or name.startswith(("limits.", "processor.")) or (what == "loop" and name == x.name):
+            continue
+        meta = declared(parts["controller"].parameters.controller, name)
+        checked += 1
+        if meta.get("above") is not None:
+            assert low > meta["above"] >= np.nextafter(low, -1)
+        else:
+            assert low == meta.get("at_least")
+        assert high == (None if meta.get("infinite") and not meta.get("steepness") else meta.get("at_most"))
+    assert checked > 10 or what == "plant"
+    assert float(rows["processor.delay" if what == "controller" else "delay"].get("max")) in (1.0, 2.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["runout", "current drive", "dropouts"])
+def test_the_reference_of_a_controller_does_not_depend_on_what_a_plant_can_export(fault):
+    """The controller contains no runout, no faults of the sensor and no coil."""
+    raw = tomllib.loads(template("rig"))
+    if fault == "runout":
+        raw["sensor"]["runout"] = {"speed": 6000.0, "harmonics": [{"number": 1, "amplitude": 2e-6}]}
+    elif fault == "dropouts":
+        raw["sensor"]["dropouts"] = {"rate": 20.0}
+    else:
+        raw["actuator"] = {"mode": "current", "bandwidth": 1e3}
+        raw["controller"]["current"] = {"kind": "amplifier"}
+    raw["clock"]["duration"] = 0.01
+    del raw["run"]["settle"]
+    case = case_from(raw)
+    cascade = guarded_for(case)
+    block = block_of("controller", cascade, case.scenario, case.clock)
+    given, found = cross_check.reference(block, cascade, case.scenario, case.clock)
+    assert np.isfinite(found).all()
+    assert np.ptp(found[1:, 1]) > 0
+    # its commands in the loop of the case: the readings differ only by the noise of the current and rounding
+    u = rollout(case.cascade, case.scenario, case.clock).trajectory.rows
+    assert np.array_equal(given[:, 1], u.z_measured)
 
 
 @pytest.mark.slow
@@ -242,9 +310,19 @@ def test_a_changed_gain_a_reset_a_nan_and_a_second_instance(version, tmp_path):
     held = one.step(period, z=4e-5, r=np.nan).get("u")["u"]
     assert one.status & bits["invalid"]
     assert held == u
-    for wrong in (np.nan, np.inf):
+    for wrong in (np.nan, np.inf, -1.0, 0.0, 1e31):
         with pytest.raises(Exception, match=r"rror|status 3"):
             one.set({"position.c": wrong})
+    for wrong in (-1.0, 0.0, 1e7):
+        with pytest.raises(Exception, match=r"rror|status 3"):
+            one.set({"model.m": wrong})
+    for right in (1e-6, 1e6, 1.64):  # its bounds, and its value
+        one.set({"model.m": right})
+    # infinity, and what stands for it in FMI 2.0
+    for right in (np.inf, 1e300, 48.0):
+        one.set({"limits.u_max": right})
+    # some tools read every output as a real number
+    assert one.get("status")["status"] == one.status != 0
     with pytest.raises(Exception, match=r"rror|status 3"):
         one.set(u=1.0)  # an output
     with pytest.raises(Exception, match=r"rror|status 3"):

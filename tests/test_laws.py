@@ -14,7 +14,7 @@ import pytest
 
 from ambjax import AdaptiveRodas3, Cascade, Clock, Plant, Pulse, Scenario, Sine, rollout
 from ambjax.control import current, inversion, observer, position
-from ambjax.control.base import default_law, memory_of
+from ambjax.control.base import memory_of, scaled_steepness
 from ambjax.control.force import linear_mechanics
 from ambjax.control.laws import CurrentDemand, CurrentInputs, ForceDemand
 from ambjax.control.pid import PIDState
@@ -245,7 +245,7 @@ def test_the_optional_methods_of_a_law_are_consistent(stage, law):
     wide = dataclasses.replace(MODEL, s_0=2 * MODEL.s_0, i_0=MODEL.i_0 * 8**0.5)
     for name in steep:
         ratio = law.size(MODEL) / law.size(wide)
-        suited = getattr(default_law(type(law), wide), name)
+        suited = getattr(scaled_steepness(type(law)(), wide), name)
         assert suited == pytest.approx(ratio * getattr(type(law)(), name), rel=1e-12)
     assert law.slides == isinstance(law, inversion.Adaptive)
 

@@ -32,7 +32,8 @@ def motion_of(law, e, e_dot, q, T, samples):
         after = e + T * e_dot + T**2 / 2 * acceleration, e_dot + T * acceleration, state
         return after, (e, e_dot)
 
-    start = jnp.asarray(e), jnp.asarray(e_dot), law.init_sampled(MODEL)
+    first = law.begin_sampled(MODEL, (Measurement(e, e_dot, 0.0), STILL), T)
+    start = jnp.asarray(e), jnp.asarray(e_dot), first
     return jax.jit(lambda x: jax.lax.scan(sample, x, jnp.arange(samples)))(start)[1]
 
 
@@ -64,10 +65,10 @@ def test_an_integral_sliding_mode_begins_on_its_manifold(sampled):
     s = inputs[0].z_dot - inputs[1].r_dot + law.k_d * inputs[0].z
     if sampled:  # from the first estimate that the law is given, predicted or not
         T = 1e-4
-        v_star, after = law.step(MODEL, inputs, law.init_sampled(MODEL), T)
-        assert float(after.integral) == pytest.approx(-s + T * law.k_p * inputs[0].z, rel=1e-12)
-        assert after.begun == 1
-        free, _ = dataclasses.replace(law, k=2e-30).step(MODEL, inputs, law.init_sampled(MODEL), T)
+        first = law.begin_sampled(MODEL, inputs, T)
+        v_star, after = law.step(MODEL, inputs, first, T)
+        assert float(after) == pytest.approx(-s + T * law.k_p * inputs[0].z, rel=1e-12)
+        free, _ = dataclasses.replace(law, k=2e-30).step(MODEL, inputs, first, T)
         assert v_star == free  # the sign of s = 0 adds nothing
         return
     scenario = Scenario(reference=reference, initial=Initial(*inputs[0]))

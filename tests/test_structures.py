@@ -16,6 +16,7 @@ from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.control import regulator
 from ambjax.control.base import default_law
+from ambjax.control.sampling import Sampling
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 
@@ -55,7 +56,7 @@ def test_sampled_state_feedback_minimises_the_cost(model):
     """The cost-to-go of the law's own map is that of value iteration, which needs no Riccati solver."""
     T = 5e-5 if model is RIG else 2e-4
     law = dataclasses.replace(
-        default_law(position.StateFeedback, model, T), k_aw=np.zeros(())
+        default_law(position.StateFeedback, model, Sampling(T, 0.0, True)), k_aw=np.zeros(())
     )  # an array is not checked
     K = np.array([law.k_int, law.k_p, law.k_d])
     A, B = regulator.state_space(model)
@@ -110,7 +111,7 @@ def test_a_pid_with_default_gains_holds_the_machines_of_the_templates(name, most
 
 @pytest.mark.parametrize("period", [2.5e-5, 1e-4])  # 1/(4 T) is above and below ten times the pole of the magnets
 def test_the_default_current_loop_has_fifty_degrees_of_phase_margin_with_a_sample_of_delay(period):
-    law = default_law(current.ProportionalIntegral, RIG, period)
+    law = default_law(current.ProportionalIntegral, RIG, Sampling(period, 1.0, True))
     w = np.geomspace(1e-2, 10, 100_000) * law.k_p / RIG.L
     loop = (law.k_p + law.k_int / (1j * w)) / (1j * w * RIG.L + RIG.R) * np.exp(-1.5j * w * period)
     crossing = np.argmin(np.abs(np.abs(loop) - 1))
@@ -161,8 +162,8 @@ def test_feedback_linearisation_makes_the_mechanics_linear(model):
         e_ddot = model.z_ddot(z, i) - r_ddot
         # rounding of terms of some 1e3 m/s^2
         np.testing.assert_allclose(e_ddot, -law.k_p * (z - r) - law.k_d * (z_dot - r_dot), rtol=1e-9, atol=1e-9)
-    # two poles at w/3
-    np.testing.assert_allclose(np.roots([1, law.k_d, law.k_p]), -model.pole / 3, rtol=1e-6)
+    # a double pole at -w
+    np.testing.assert_allclose(np.roots([1, law.k_d, law.k_p]), -model.pole, rtol=1e-6)
 
 
 # --- the chain of filters ---

@@ -146,12 +146,14 @@ def test_the_papers_p_is_25_bit_for_bit():
 def test_the_default_p_follows_from_the_scales_of_the_plant(name):
     case = case_from(tomllib.loads(BEARINGS[name]))
     plant = case.scenario.plant
+    # a given k does not determine the slope of the sign, so p has the scale of the plant
+    k = case_from(tomllib.loads(BEARINGS[name] + "[controller.position]\nk = 3.0\n")).cascade
     for stage, scale in SCALES.items():
-        law = getattr(case.cascade, stage)
+        law = getattr(k, stage)
         assert law.p == pytest.approx(25.0 * scale(Plant()) / scale(plant), rel=1e-12)
-        assert law == getattr(Cascade(model=plant), stage)
-    twisting = case_from(tomllib.loads(BEARINGS[name] + '[controller.position]\nkind = "super-twisting"\n')).cascade
-    assert twisting.position.p == pytest.approx(4 * case.cascade.position.p)
+        assert getattr(case.cascade, stage) == getattr(Cascade(model=plant), stage)
+    laws = '[controller.position]\nkind = "super-twisting"\nk_2 = 3.0\n'
+    assert case_from(tomllib.loads(BEARINGS[name] + laws)).cascade.position.p == pytest.approx(4 * k.position.p)
     given = case_from(tomllib.loads(BEARINGS[name] + "[controller.inversion]\np = 3.0\n")).cascade
     assert given.inversion.p == 3.0
 

@@ -15,6 +15,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.control.guard import Guard
 from ambjax.control.linear_controller import OUTPUTS
 from ambjax.control.processor import Processor
+from ambjax.control.sampling import Sampling
 from ambjax.numerics.records import Scalar
 from ambjax.world.bearing import Bearing
 from ambjax.world.plant import Plant
@@ -93,6 +94,7 @@ def cascade_from(
     command = drive(actuator)
     table.only(["model", *KINDS])
     model = table.table("model").record(Plant, base=plant)  # always lumped, even for a two-coil plant
+    sampling = None if processor is None or period is None else processor.sampling(period)
     laws, own, matrices = {}, [], None
     for stage, kinds in KINDS.items():
         law = table.table(stage)
@@ -106,7 +108,7 @@ def cascade_from(
         if kind is position.LinearController:
             laws[stage], matrices = _linear(law, files)
         else:
-            laws[stage] = law_from(_nominal(law, kind, actuator), kind, _defaults(law, kind, model, period))
+            laws[stage] = law_from(_nominal(law, kind, actuator), kind, _defaults(law, kind, model, sampling))
     return Cascade(model=model, processor=processor, **laws), tuple(own), matrices
 
 
@@ -156,12 +158,12 @@ def _linear(table: Table, files: Files) -> tuple[Law, ControllerFile]:
     return dataclasses.replace(law, output=output, realisation=found.contents), found
 
 
-def _defaults(table: Table, kind: type[Law], model: Plant, period: Scalar | None) -> Law | None:
+def _defaults(table: Table, kind: type[Law], model: Plant, sampling: Sampling | None) -> Law | None:
     """Return the law of this kind with its default gains; None if the table gives every gain."""
     names = _gains(kind)
     if names <= set(table.raw):
         return None
     try:
-        return default_law(kind, model, None if period is None else float(period))
+        return default_law(kind, model, sampling, table.raw)
     except ValueError as error:
         raise ValueError(f"{table.path}: {error}. Give all of {', '.join(sorted(names))}.") from None

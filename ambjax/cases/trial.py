@@ -23,9 +23,9 @@ OUTPUTS = {
 def try_law(law: Law, stage: str, model: Plant) -> None:
     """Trace the call, `init`, `scale` and `slope` of a law, and `step` if the law has it.
 
-    Of a position law, `begin` is traced too; of every law but an observer, `init_sampled`. Raises TypeError if an
-    output, a rate, a scale, a slope or a state has a wrong structure or shape. Exceptions that the methods raise are
-    passed on.
+    Of a position law, `begin` and `begin_sampled` are traced too; of every law but an observer, `init_sampled`. Raises
+    TypeError if an output, a rate, a scale, a slope or a state has a wrong structure or shape. Exceptions that the
+    methods raise are passed on.
     """
     one: Any = law
     motion, reference = Measurement(*_zeros(3)), Reference(*_zeros(3))
@@ -43,15 +43,18 @@ def try_law(law: Law, stage: str, model: Plant) -> None:
         kept = state if stage == "observer" else one.init_sampled(model)
         owns = any(one.has_own_step(implicit) for implicit in (True, False))
         after = one.step(model, inputs, kept, 1e-4) if owns else one(model, inputs, kept)
-        begun = one.begin(model, inputs) if stage == "position" else state
-        return state, one(model, inputs, state), one.scale(model), kept, after, one.slope(model), begun
+        starts = state, kept
+        if stage == "position":
+            starts = one.begin(model, inputs), one.begin_sampled(model, inputs, 1e-4)
+        return state, one(model, inputs, state), one.scale(model), kept, after, one.slope(model), starts
 
-    state, (output, rate), scale, kept, after, slope, begun = jax.eval_shape(everything, inputs)
+    state, (output, rate), scale, kept, after, slope, (begun, sampled) = jax.eval_shape(everything, inputs)
     _same(output, wanted, f"{type(law).__name__} must return {OUTPUTS[stage]} and the rate of its state; the output is")
     _same(rate, state, "the rate of the state must be like init(model); it is")
     _same(scale, state, "scale(model) must be like init(model); it is")
     _same(after, (wanted, kept), "on a processor, a step must return the output and the next state; they are")
     _same(begun, state, "begin(model, inputs) must be like init(model); it is")
+    _same(sampled, kept, "begin_sampled(model, inputs, period) must be like init_sampled(model); it is")
     _same(slope, _zero(), "slope(model) must be a number; it is")
 
 

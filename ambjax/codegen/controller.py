@@ -159,7 +159,8 @@ class Controller(Block):
             u_max = {"unit": "A", "doc": "limit of the commanded current; inf: none"}
             found = [x._replace(**u_max) if x.name == "limits.u_max" else x for x in found]
         most = float(processor.most)
-        delay = {"allowed": f"from 0 to {processor.most}", "ends": (0.0, most, most + 0.5, -0.5, math.nan)}
+        ends = (0.0, most, most + 0.5, -0.5, math.nan)
+        delay = {"allowed": f"from 0 to {processor.most}", "ends": ends, "least": 0.0, "most": most}
         return [x._replace(**delay) if x.name == "processor.delay" else x for x in found]
 
     def states(self) -> list[Number]:

@@ -23,6 +23,7 @@ class Number(NamedTuple):
       first, then values that are not finite or that a step must reject.
     - `among`: values of a state that is a flag or a code, from which the comparison draws; a value that occurs twice is
       drawn twice as often. () for a real number.
+    - `least`, `most`: smallest and largest value of a parameter. `infinite`: whether inf is allowed, too.
     """
 
     name: str
@@ -32,6 +33,9 @@ class Number(NamedTuple):
     value: float
     ends: tuple[float, ...] = ()
     among: tuple[float, ...] = ()
+    least: float = -math.inf
+    most: float = math.inf
+    infinite: bool = False
 
 
 def numbers_of(node: Any, path: str = "", home: str = "") -> Iterator[Number]:
@@ -64,7 +68,18 @@ def _number(name: str, field: dataclasses.Field, value: float) -> Number:
     meta = field.metadata
     unit, doc = meta.get("unit", ""), meta.get("doc", "")
     infinity = "finite: set p = inf in the case and export again" if meta.get("steepness") else "or inf"
-    return Number(name, unit, allowed(field, infinity), doc, value, _ends(meta, value))
+    least, most = _bounds(meta)
+    unbounded = bool(meta.get("infinite")) and not meta.get("steepness")  # an infinite steepness is another program
+    shown = allowed(field, infinity)
+    return Number(name, unit, shown, doc, value, _ends(meta, value), (), least, most, unbounded)
+
+
+def _bounds(meta: Mapping[str, Any]) -> tuple[float, float]:
+    """Return the smallest and the largest finite value that a field allows; -inf or inf without a bound."""
+    floors = [-math.inf if meta.get("at_least") is None else float(meta["at_least"])]
+    if meta.get("above") is not None:
+        floors.append(math.nextafter(float(meta["above"]), math.inf))
+    return max(floors), math.inf if meta.get("at_most") is None else float(meta["at_most"])
 
 
 def _ends(meta: Mapping[str, Any], value: float) -> tuple[float, ...]:

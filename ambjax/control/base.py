@@ -4,6 +4,7 @@ The classes of `control.laws` add the inputs and outputs of each stage.
 """
 
 import dataclasses
+from collections.abc import Collection
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.control.sampling import Relay
+from ambjax.control.sampling import Relay, Sampling
 from ambjax.control.search import Interval, SearchContext
 from ambjax.numerics.records import GainFunction, Scalar, is_traced
 from ambjax.world.plant import Plant
@@ -40,6 +41,8 @@ class Law:
       `step`.
     - `stiff`: whether a smoothed sign keeps a state of the law inside its boundary layer, so that this state changes
       fast; True for a class that defines `layer`.
+    - `switching`: names of the gains that multiply smoothed signs and that `designed` chooses together with the
+      steepnesses. If a case gives one of them, the default steepnesses are those of `scaled_steepness`.
     - `slides`: whether an inversion law has the method `slide`, which integrates across the boundary layer
       (`laws.Relaxation`); True for a class that defines it.
     """
@@ -49,6 +52,7 @@ class Law:
     memory: ClassVar[tuple[tuple[str, str, str], ...] | None] = None
     own_steps: ClassVar[tuple[str, ...]] = ()
     stiff: ClassVar[bool] = False
+    switching: ClassVar[tuple[str, ...]] = ()
     slides: ClassVar[bool] = False
 
     def __init_subclass__(cls, **kwargs: object) -> None:
@@ -61,7 +65,7 @@ class Law:
     def size(self, model: Plant) -> Scalar | None:
         """Return the characteristic size of the argument of the law's smoothed sign; None if the law has no such sign.
 
-        Default steepnesses are proportional to 1/size (`default_law`).
+        Default steepnesses are proportional to 1/size (`scaled_steepness`).
         """
         return None
 
@@ -106,13 +110,13 @@ class Law:
         law: Any = self
         return law.scale(model)
 
-    def designed(self, model: Plant, period: float | None) -> "Law":
-        """Return the law with default gains designed for `model`, whose parameters are concrete numbers.
+    def designed(self, model: Plant, sampling: Sampling | None) -> "Law":
+        """Return the law with default gains designed for `model`.
 
-        The default implementation returns the law itself. `period`: sample period of the processor, s; None in
-        continuous time.
+        The default implementation scales the steepnesses (`scaled_steepness`). `sampling`: None in continuous time; on
+        a processor, the parameters of the model are concrete numbers.
         """
-        return self
+        return scaled_steepness(self, model)
 
     def idle_gains(self, implicit: bool | None) -> tuple[str, ...]:
         """Return the names of gains that have no effect.
@@ -137,19 +141,32 @@ class Law:
         return ("implicit" if implicit else "explicit") in self.own_steps
 
 
-def default_law(kind: type[L], model: Plant, period: float | None = None) -> L:
-    """Return the law of type `kind` with its default gains (`Law.designed`), and with steepnesses scaled to `model`.
+def default_law(kind: type[L], model: Plant, sampling: Sampling | None = None, given: Collection[str] = ()) -> L:
+    """Return the law of type `kind` with its default gains for `model` (`Law.designed`).
 
-    The default of a steepness p is for the plant of Table 1. It is scaled by the inverse size of the sign's argument,
-    so that the boundary layer 1/p is the same share of this size for every plant. The size of v for Table 1, for
-    example, is 2500 A^2/m^2; with p = 25 m^2/A^2 the boundary layer of v_tilde is 1.6e-5 of it.
+    `sampling`: None in continuous time. `given`: names of the gains that the caller replaces; with one of
+    `Law.switching` among them, the steepnesses are those of `scaled_steepness`.
     """
-    law: Any = kind().designed(model, period)
+    law: Any = kind().designed(model, sampling)
+    if set(kind.switching).isdisjoint(given):
+        return law
+    scaled: Any = scaled_steepness(kind(), model)
+    return dataclasses.replace(law, **{name: getattr(scaled, name) for name in _steepnesses(law)})
+
+
+def scaled_steepness(law: L, model: Plant) -> L:
+    """Return the law with each steepness scaled from the plant of Table 1 to `model`.
+
+    A steepness p is divided by the ratio of the sizes of the sign's argument, so that the boundary layer 1/p is the
+    same share of this size for every plant. The size of v for Table 1, for example, is 2500 A^2/m^2; with
+    p = 25 m^2/A^2 the boundary layer of v_tilde is 1.6e-5 of it.
+    """
+    given: Any = law
     size = law.size(model)
     if size is None:
         return law
-    ratio = law.size(Plant()) / size
-    return dataclasses.replace(law, **{name: getattr(law, name) * ratio for name in _steepnesses(law)})
+    ratio = given.size(Plant()) / size
+    return dataclasses.replace(given, **{name: getattr(law, name) * ratio for name in _steepnesses(law)})
 
 
 def _steepnesses(law: Law) -> list[str]:
@@ -206,5 +223,5 @@ def with_default_steepness(law: L, model: Plant) -> L:
     given: Any = law
     if not set_valued_signs(law):
         return law
-    usual = default_law(type(law), model)
+    usual = scaled_steepness(type(law)(), model)
     return dataclasses.replace(given, **{name: getattr(usual, name) for name in set_valued_signs(law)})

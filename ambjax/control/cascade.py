@@ -71,7 +71,8 @@ class Cascade:
         """Return the states of all laws at t = 0, in continuous time or on the processor.
 
         `measured`: the first measurement, from which the observer starts. `reference`: the reference and its rates at
-        t = 0; in continuous time, the initial state of the position law may depend on them (`PositionLaw.begin`).
+        t = 0; in continuous time, the initial state of the position law may depend on them (`PositionLaw.begin`). On a
+        processor, `begun` gives the states of the first sample.
         """
         observed = extremes(self.observer)[0].init(self.model, measured)
         rest = [extremes(law)[0] for law in self.laws[1:]]
@@ -83,6 +84,18 @@ class Cascade:
             position = with_gains_at(self.position, estimate.z, reference)
             states[0] = position.begin(self.model, (estimate, reference))
         return CascadeState(observed, *states)
+
+    def begun(self, measured: Measurement, sample: Sample, laws: CascadeState, started: Array) -> CascadeState:
+        """Return the states of all laws with which a processor steps at a sample.
+
+        They are `laws` if `started`; otherwise the initial states for these readings. The position law starts from its
+        first estimate (`PositionLaw.begin_sampled`).
+        """
+        laws = _chosen(started, laws, self.init(measured))
+        estimate, *_ = self.estimate(measured, laws.observer, sample)
+        position = with_gains_at(self.position, estimate.z, sample.reference)
+        begun = position.begin_sampled(self.model, (estimate, sample.reference), sample.period)
+        return laws._replace(position=_chosen(started, laws.position, begun))
 
     def scale(self) -> CascadeState:
         """Return the characteristic size of each state of the laws; integration errors are relative to it."""
@@ -264,6 +277,10 @@ class Cascade:
         v_tilde = force.v_star - self.model.v_and_dv_di(force.z, demand.i_ref, force.gaps)[0]
         command = Command(force.v_star, v_tilde, demand.i_ref, demand.i_ref_dot, u)
         return command, rates._replace(inversion=inversion_rate, current=current_rate)
+
+
+def _chosen(condition: Array, yes: State, no: State) -> State:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
 def _rates(

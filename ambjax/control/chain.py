@@ -1,15 +1,18 @@
 """The controller of industrial magnetic bearings: PID, lead-lag, notches and low-pass in series."""
 
 import dataclasses
-from typing import NamedTuple
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.force import force_of_current, linear_mechanics, resting_current
-from ambjax.control.laws import PositionLaw
+from ambjax.control.laws import PositionLaw, unwinding
 from ambjax.control.regulator import optimal_gains
+from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
 from ambjax.numerics.biquad import Biquad, lead_lag, low_pass, notch
 from ambjax.numerics.records import Scalar, gain, record
@@ -78,11 +81,34 @@ class FilterChain(PositionLaw[ChainState]):
     def init(self, model: Plant) -> ChainState:
         return jax.tree.map(jnp.zeros_like, self.scale(model))
 
+    def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> ChainState:
+        """Return the filters in the steady state for the first error, and an integral of 0."""
+        e = jnp.asarray(inputs[0].z - inputs[1].r)
+        return self._begun(self.k_d * self.w_f * e, self.k_p * e, [part.steady for part in self._biquads()])
+
+    def begin_sampled(self, model: Plant, inputs: tuple[Measurement, Reference], period: Scalar) -> ChainState:
+        """Return the filters in the steady state for the error of the first sample, and an integral of 0."""
+        e = jnp.asarray(inputs[0].z - inputs[1].r)
+        parts = [functools.partial(part.steady_sampled, period=period) for part in self._biquads()]
+        derivative = -self.k_d * self.w_f / (1 + self.w_f * period / 2) * e
+        return self._begun(derivative, self.k_p * e + self.k_int * period / 2 * e, parts)
+
+    def _begun(self, derivative: Array, y: Array, parts: Sequence[Callable[..., Any]]) -> ChainState:
+        """Return the state for an output y (A) of the PID. `parts`: functions that return output and state of a filter.
+
+        `derivative`: state of the derivative filter, A.
+        """
+        states = []
+        for steady in parts:
+            y, state = steady(y)
+            states.append(state)
+        return ChainState(derivative, jnp.zeros_like(derivative), *states)
+
     def scale(self, model: Plant) -> ChainState:
         size = jnp.asarray(model.i_0 / 25)
         return ChainState(size, size, *[(size, size)] * 4)
 
-    def designed(self, model: Plant, period: float | None) -> "FilterChain":
+    def designed(self, model: Plant, sampling: Sampling | None) -> "FilterChain":
         """Return the law with the gains of `optimal_gains` in continuous time, and k_aw and all corners from the pole.
 
         Raises ValueError as `optimal_gains` does.
@@ -122,7 +148,7 @@ class FilterChain(PositionLaw[ChainState]):
             y, moved = part.output(y, x)
             rates.append(moved)
         i_star = resting_current(model, reference) - y
-        integral = self.k_int * e + self.k_aw * (i_star - motion.i)
+        integral = self.k_int * e + unwinding(self.k_aw, self.k_int) * (i_star - motion.i)
         return force_of_current(model, motion.z, i_star), ChainState(derivative, integral, *rates)
 
     def step(
@@ -134,7 +160,7 @@ class FilterChain(PositionLaw[ChainState]):
         """
         motion, reference = inputs
         e = motion.z - reference.r
-        half, leak = self.w_f * period / 2, self.k_aw * period
+        half, leak = self.w_f * period / 2, unwinding(self.k_aw, self.k_int) * period
         # derivative: k_d w_f (1 - q)/(1 + half - (1 - half) q), with the backward shift q
         differentiated = self.k_d * self.w_f / (1 + half) * e + state.derivative
         derivative = -self.k_d * self.w_f / (1 + half) * e + (1 - half) / (1 + half) * differentiated

@@ -1,13 +1,15 @@
 """Current laws: the voltage that drives the current to its reference, or the current that an amplifier follows."""
 
+import dataclasses
 from typing import ClassVar
 
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.base import Requirement
-from ambjax.control.laws import CurrentInputs, CurrentLaw
-from ambjax.control.sampling import Relay
+from ambjax.control.base import Requirement, scaled_steepness
+from ambjax.control.defaults import current_rate, printed
+from ambjax.control.laws import CurrentInputs, CurrentLaw, unwinding
+from ambjax.control.sampling import Relay, Sampling, slope_limits
 from ambjax.control.search import Interval, SearchContext, authority, rate, steepness, switch
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.numerics.relax import share
@@ -17,9 +19,15 @@ from ambjax.world.plant import Plant, State
 
 @record
 class SlidingMode(CurrentLaw[tuple[()]]):
-    """u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - k_i sgn(i - i_ref)) + R i. Eq. (11), sgn smoothed."""
+    """u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - k_i sgn(i - i_ref)) + R i. Eq. (11), sgn smoothed.
 
-    k_i: Scalar = gain(default=152.0, unit="A/s", doc="switching gain; above the disturbance bound Q_i")
+    The default k_i is that of Table 2 for the plant of Table 1. For other plants it gives the sign the slope
+    2/pi k_i p = w_c at 0, where w_c is the bandwidth of the current loop (`control.defaults`).
+    """
+
+    k_i: Scalar = gain(
+        default=152.0, unit="A/s", doc="switching gain; above the disturbance bound Q_i; left out: w_c i_0/4"
+    )
     p: Scalar = gain(
         default=25.0,
         unit="1/A",
@@ -27,6 +35,12 @@ class SlidingMode(CurrentLaw[tuple[()]]):
         steepness=True,
     )
     requirement: ClassVar = Requirement("k_i", "Q_i")
+
+    def designed(self, model: Plant, sampling: Sampling | None) -> "SlidingMode":
+        scaled = scaled_steepness(self, model)
+        if printed(model):
+            return scaled
+        return dataclasses.replace(scaled, k_i=current_rate(model, sampling) / (TWO_OVER_PI * scaled.p))
 
     def init(self, model: Plant) -> tuple[()]:
         return ()
@@ -91,10 +105,8 @@ class ProportionalIntegral(CurrentLaw[Array]):
     def scale(self, model: Plant) -> Scalar:
         return model.R * model.i_0 / 10 + 1e-3
 
-    def designed(self, model: Plant, period: float | None) -> "ProportionalIntegral":
-        w, L = 10 * float(model.pole), float(model.L)
-        if period is not None:
-            w = min(w, 1 / (4 * period))
+    def designed(self, model: Plant, sampling: Sampling | None) -> "ProportionalIntegral":
+        w, L = float(current_rate(model, sampling)), float(model.L)
         return ProportionalIntegral(w * L, w**2 * L / 4, w / 4)
 
     def slope(self, model: Plant) -> Scalar:
@@ -104,7 +116,7 @@ class ProportionalIntegral(CurrentLaw[Array]):
         error = inputs.demand.i_ref - inputs.measured.i
         u = self.k_p * error + model.L * inputs.demand.i_ref_dot + state
         excess = limited(u, inputs.u_max) - u
-        return u, self.k_int * error + self.k_aw * excess
+        return u, self.k_int * error + unwinding(self.k_aw, self.k_int) * excess
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         per = 1 / float(context.model.L)
@@ -127,12 +139,19 @@ class DeadBeat(CurrentLaw[tuple[()]]):
     so a wrong resistance of the model leaves an offset.
     """
 
-    w: Scalar = gain(default=1e4, unit="1/s", doc="decay rate of the current error in continuous time")
+    w: Scalar = gain(
+        default=5310.0, unit="1/s", doc="decay rate of the current error in continuous time; left out: w_c"
+    )
     share: Scalar = gain(
         default=1.0,
         unit="1",
-        doc="share of the current error that each sample removes; 1: dead-beat",
+        doc="share of the current error that each sample removes; 1: dead-beat; left out: 1 with prediction; without "
+        "it, the largest share that does not oscillate (1/4 for a delay of one sample)",
     )
+
+    def designed(self, model: Plant, sampling: Sampling | None) -> "DeadBeat":
+        share = 1.0 if sampling is None else slope_limits(sampling.late).non_oscillating
+        return DeadBeat(current_rate(model, sampling), share)
 
     def init(self, model: Plant) -> tuple[()]:
         return ()

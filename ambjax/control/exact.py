@@ -1,11 +1,12 @@
 """Base class of the observers that are robust exact differentiators."""
 
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.laws import Observer
+from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
 from ambjax.numerics import differentiator
 from ambjax.numerics.records import Scalar
@@ -28,6 +29,9 @@ class ExactDifferentiator(Observer[tuple[Array, ...]]):
     L: Scalar
     order: ClassVar[int]
     estimates_velocity: ClassVar[bool] = True
+
+    def designed(self, model: Plant, sampling: Sampling | None) -> Self:
+        return type(self)(model.pole ** (self.order + 1) * model.s_0 / 25)  # pyright: ignore[reportCallIssue]
 
     def init(self, model: Plant, measured: Measurement) -> tuple[Array, ...]:
         return (jnp.asarray(measured.z), *[jnp.zeros(())] * self.order)

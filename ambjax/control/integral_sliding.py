@@ -1,10 +1,14 @@
 """The paper's position law with integral action: its sliding variable contains the integral of the error."""
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.control.defaults import printed, switching_gain, switching_steepness
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.laws import PositionLaw
+from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, manifold, position_switch, rate, steepness
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share
@@ -26,18 +30,29 @@ class IntegralSlidingMode(PositionLaw[Array]):
     The integral starts at 0, and s reaches 0 later. In `manifolds.UtkinSlidingMode`, s is 0 from the start. There, a PD
     controller determines the motion, and the sign only cancels the disturbance. That law, too, has no offset under a
     constant disturbance |q_z| < k.
+
+    The default gains are those of SlidingMode; c_int = c^2/4 gives two equal poles on the manifold.
     """
 
-    c: Scalar = gain(default=17.0, unit="1/s", doc="coefficient of the error in the sliding variable")
-    c_int: Scalar = gain(default=70.0, unit="1/s^2", doc="gain of the integral of the error; c^2/4: two equal poles")
-    k: Scalar = gain(default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z")
+    c: Scalar = gain(default=17.0, unit="1/s", doc="coefficient of the error in the sliding variable; left out: w")
+    c_int: Scalar = gain(default=70.0, unit="1/s^2", doc="gain of the integral of the error; left out: w^2/4")
+    k: Scalar = gain(
+        default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z; left out: w^2 s_0/2"
+    )
     p: Scalar = gain(
         default=25.0,
         unit="s/m",
-        doc="steepness of the smoothed sign; left out: scaled to the nominal plant",
+        doc="steepness of the smoothed sign; left out: pi/(w s_0), or scaled to the nominal plant if k is given",
         steepness=True,
     )
+    switching: ClassVar = ("k",)
     memory = (("x", "m s", "integral of the error"),)
+
+    def designed(self, model: Plant, sampling: Sampling | None) -> "IntegralSlidingMode":
+        if printed(model):
+            return self
+        w = model.pole
+        return IntegralSlidingMode(w, w**2 / 4, switching_gain(model), switching_steepness(model))
 
     def init(self, model: Plant) -> Array:
         return jnp.zeros(())

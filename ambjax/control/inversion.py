@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.base import Requirement
+from ambjax.control.base import Requirement, scaled_steepness
+from ambjax.control.defaults import adaptation_gain, printed
 from ambjax.control.laws import CurrentDemand, ForceDemand, InversionLaw, Relaxation
-from ambjax.control.sampling import Relay
+from ambjax.control.sampling import Relay, Sampling
 from ambjax.control.search import Interval, SearchContext, steepness
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.numerics.relax import relax, relaxation
@@ -31,9 +32,15 @@ def v_and_gradient(model: Plant, inputs: ForceDemand, i_ref: Array) -> tuple[Arr
 
 @record
 class AdaptiveReference(InversionLaw[Array]):
-    """Base class of a law whose state is i_ref (A), moved by a smoothed sign of v_tilde with the gain gamma."""
+    """Base class of a law whose state is i_ref (A), moved by a smoothed sign of v_tilde with the gain gamma.
 
-    gamma: Scalar = gain(default=7.5e4, unit="A^2/m^2/s", doc="adaptation gain; above Delta_1 of Eq. (7)")
+    The default gamma is 7.5e4 for the plant of Table 1. For other plants it is |dv/dz| w s_0 at the origin, where w is
+    the pole of the magnets: gamma then exceeds Delta_1 of Eq. (7) up to the speed w s_0.
+    """
+
+    gamma: Scalar = gain(
+        default=7.5e4, unit="A^2/m^2/s", doc="adaptation gain; above Delta_1 of Eq. (7); left out: 4 w (i_0/s_0)^2"
+    )
     p: Scalar = gain(
         default=25.0,
         unit="m^2/A^2",
@@ -42,6 +49,15 @@ class AdaptiveReference(InversionLaw[Array]):
     )
     i_ref: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="initial current reference")
     memory = (("i_ref", "A", "current reference of the next sample"),)
+
+    def designed(self, model: Plant, sampling: Sampling | None) -> Self:
+        scaled = scaled_steepness(self, model)
+        if printed(model):
+            return scaled
+        gamma, p = adaptation_gain(model), scaled.p
+        if sampling is not None and not sampling.implicit:  # an explicit step then ends at v_tilde = 0
+            p = min(float(p), 1 / (TWO_OVER_PI * float(gamma) * sampling.period))
+        return dataclasses.replace(scaled, gamma=gamma, p=p)
 
     def init(self, model: Plant) -> Array:
         return jnp.asarray(self.i_ref)
@@ -117,7 +133,11 @@ class FeedForwardAdaptive(AdaptiveReference):
     They add the noise of the velocity to i_ref'. In Eq. (6) this noise acts only inside the sign, through v_star.
     """
 
-    gamma: Scalar = gain(default=7.5e4, unit="A^2/m^2/s", doc="adaptation gain; above the error of the rates")
+    gamma: Scalar = gain(
+        default=7.5e4,
+        unit="A^2/m^2/s",
+        doc="adaptation gain; above the error of the rates; left out: 4 w (i_0/s_0)^2",
+    )
 
     def __call__(self, model: Plant, inputs: ForceDemand, state: Array) -> tuple[CurrentDemand, Array]:
         v, gradient = v_and_gradient(model, inputs, state)

@@ -17,6 +17,7 @@ import abc
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.base import Law
@@ -122,8 +123,20 @@ class PositionLaw(Law, Generic[State], abc.ABC):
     def init(self, model: Plant) -> State: ...
 
     def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> State:
-        """Return the state at t = 0 in continuous time, from the first estimate and reference; by default `init`."""
+        """Return the state at t = 0 in continuous time, from the first estimate and reference; by default `init`.
+
+        Filters start in the steady state for this estimate, so that the first command is not that of a jump from 0.
+        """
         return self.init(model)
+
+    def begin_sampled(self, model: Plant, inputs: tuple[Measurement, Reference], period: Scalar) -> object:
+        """Return the state before the first sample of a processor, from the estimate and the reference of this sample.
+
+        `period`: sample period, s. The default is `begin`, or `init_sampled` for a law whose state on a processor
+        differs from that in continuous time.
+        """
+        own = type(self).init_sampled is not Law.init_sampled
+        return self.init_sampled(model) if own else self.begin(model, inputs)
 
     @abc.abstractmethod
     def scale(self, model: Plant) -> object: ...
@@ -197,6 +210,14 @@ STAGES: dict[str, type[Law]] = {
     "inversion": InversionLaw,
     "current": CurrentLaw,
 }
+
+
+def unwinding(k_aw: Scalar, k_int: Scalar) -> Array:
+    """Return the rate of an anti-windup, 1/s: k_aw, or 0 if there is no integral (k_int = 0).
+
+    Without integral action, nothing would remove what the anti-windup adds to the state while the current rises.
+    """
+    return jnp.where(jnp.asarray(k_int) > 0, k_aw, 0.0)
 
 
 def step_law(

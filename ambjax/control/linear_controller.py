@@ -95,6 +95,10 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
     def init(self, model: Plant) -> tuple[Array, ...]:
         return (jnp.zeros(()),) * len(self.realisation.A)
 
+    def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> tuple[Array, ...]:
+        """Return the state of `Realisation.steady`, in continuous time and for the bilinear transform."""
+        return self.realisation.steady(self._inputs(inputs))
+
     def scale(self, model: Plant) -> tuple[Scalar, ...]:
         return (model.sizes().z,) * len(self.realisation.A)
 

@@ -4,13 +4,16 @@ They are Utkin's integral sliding mode, which starts on its manifold, and a non-
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.control.base import scaled_steepness
+from ambjax.control.defaults import printed, switching_gain, switching_steepness
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.laws import PositionLaw
+from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, position_switch, rate, steepness
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share
@@ -21,13 +24,6 @@ from ambjax.world.signals import Reference
 
 # Speed below which the root of `TerminalSlidingMode` is smoothed, as a share of c l.
 WIDTH = 0.01
-
-
-class UtkinState(NamedTuple):
-    """State of `UtkinSlidingMode` on a processor: the integral (m/s), and a flag: 0 before the first sample."""
-
-    integral: Array
-    begun: Array
 
 
 @record
@@ -45,12 +41,17 @@ class UtkinSlidingMode(PositionLaw[Array]):
 
     k_p: Scalar = gain(default=3.1e4, unit="1/s^2", doc="proportional gain; left out: (w/3)^2")
     k_d: Scalar = gain(default=354.0, unit="1/s", doc="derivative gain; left out: 2 w/3")
-    k: Scalar = gain(default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z")
+    k: Scalar = gain(
+        default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z; left out: w^2 s_0/2"
+    )
     p: Scalar = gain(
-        default=25.0, unit="s/m", doc="steepness of the smoothed sign of s; left out: scaled to the nominal plant",
+        default=25.0,
+        unit="s/m",
+        doc="steepness of the smoothed sign of s; left out: pi/(w s_0), or scaled to the nominal plant if k is given",
         steepness=True,
-    )  # fmt: skip
-    memory = (("integral", "m/s", "integral of k_p e"), ("begun", "1", "1 after the first sample"))
+    )
+    switching: ClassVar = ("k",)
+    memory = (("integral", "m/s", "integral of k_p e"),)
     own_steps = ("implicit", "explicit")
 
     def init(self, model: Plant) -> Array:
@@ -60,17 +61,14 @@ class UtkinSlidingMode(PositionLaw[Array]):
         """Return the integral x for which s = 0."""
         return -sliding_variable(self.k_d, *inputs)
 
-    def init_sampled(self, model: Plant) -> UtkinState:
-        return UtkinState(jnp.zeros(()), jnp.zeros(()))
-
     def scale(self, model: Plant) -> Scalar:
         return model.sigma_size
 
-    def scale_sampled(self, model: Plant) -> UtkinState:
-        return UtkinState(jnp.asarray(model.sigma_size), jnp.ones(()))
-
-    def designed(self, model: Plant, period: float | None) -> "UtkinSlidingMode":
-        return dataclasses.replace(self, k_p=(model.pole / 3) ** 2, k_d=2 * model.pole / 3)
+    def designed(self, model: Plant, sampling: Sampling | None) -> "UtkinSlidingMode":
+        k_p, k_d = (model.pole / 3) ** 2, 2 * model.pole / 3
+        if printed(model):
+            return dataclasses.replace(self, k_p=k_p, k_d=k_d)
+        return UtkinSlidingMode(k_p, k_d, switching_gain(model), switching_steepness(model))
 
     def slope(self, model: Plant) -> Scalar:
         return jnp.maximum(TWO_OVER_PI * self.k * self.p, self.explicit_rate(model))
@@ -102,14 +100,12 @@ class UtkinSlidingMode(PositionLaw[Array]):
         }
 
     def step(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: UtkinState, period: Scalar
-    ) -> tuple[Array, UtkinState]:
-        """Step with the sign of s at the end of the step; s = 0 at the first sample."""
+        self, model: Plant, inputs: tuple[Measurement, Reference], state: Array, period: Scalar
+    ) -> tuple[Array, Array]:
+        """Step with the sign of s at the end of the step."""
         motion, reference = inputs
-        x = jnp.where(state.begun > 0.5, state.integral, self.begin(model, inputs))
-        sign = share(sliding_variable(self.k_d, *inputs) + x, period * self.k, self.p)
-        after = UtkinState(x + period * self.k_p * (motion.z - reference.r), jnp.ones(()))
-        return self._force(model, inputs, sign), after
+        sign = share(sliding_variable(self.k_d, *inputs) + state, period * self.k, self.p)
+        return self._force(model, inputs, sign), state + period * self.k_p * (motion.z - reference.r)
 
 
 @record
@@ -139,8 +135,9 @@ class TerminalSlidingMode(PositionLaw[tuple[()]]):
     def scale(self, model: Plant) -> tuple[()]:
         return ()
 
-    def designed(self, model: Plant, period: float | None) -> "TerminalSlidingMode":
-        return dataclasses.replace(self, c=model.pole, l=model.s_0 / 50, k=model.pole**2 * model.s_0 / 5)
+    def designed(self, model: Plant, sampling: Sampling | None) -> "TerminalSlidingMode":
+        scaled = scaled_steepness(self, model)
+        return dataclasses.replace(scaled, c=model.pole, l=model.s_0 / 50, k=model.pole**2 * model.s_0 / 5)
 
     def slope(self, model: Plant) -> Scalar:
         """Return the larger of the rate of the sign at |y| = 1 (d sigma/d e_dot is 3/2 there) and that of the root."""

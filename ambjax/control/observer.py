@@ -8,6 +8,7 @@ from jax import Array
 
 from ambjax.control.exact import DERIVATIVES, ExactDifferentiator
 from ambjax.control.laws import Observer
+from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.world.plant import Plant
@@ -39,7 +40,7 @@ class Complementary(Observer[Array]):
     the position sensor passes through a low-pass of corner l, noise of the velocity through a low-pass of gain 1/l.
     """
 
-    l: Scalar = gain(default=10.0, unit="1/s", doc="corner between velocity and position sensor")
+    l: Scalar = gain(default=10.6, unit="1/s", doc="corner between velocity and position sensor; left out: w/50")
     z_hat: Scalar | None = leaf(
         default=None,
         unit="m",
@@ -52,6 +53,9 @@ class Complementary(Observer[Array]):
 
     def init(self, model: Plant, measured: Measurement) -> Array:
         return jnp.asarray(measured.z if self.z_hat is None else self.z_hat)
+
+    def designed(self, model: Plant, sampling: Sampling | None) -> "Complementary":
+        return Complementary(model.pole / 50)
 
     def started(self, z: Array) -> "Complementary":
         return dataclasses.replace(self, z_hat=z)
@@ -78,9 +82,16 @@ class Difference(Observer[Array]):
     a lag of 1/w, and amplifies noise of the position by w.
     """
 
-    w: Scalar = gain(default=2000.0, unit="1/s", doc="corner of the low-pass on the differenced position")
+    w: Scalar = gain(
+        default=5310.0,
+        unit="1/s",
+        doc="corner of the low-pass on the differenced position; left out: ten times the pole of the magnets",
+    )
     estimates_velocity: ClassVar[bool] = True
     memory = (("z_f", "m", "position through the low-pass"),)
+
+    def designed(self, model: Plant, sampling: Sampling | None) -> "Difference":
+        return Difference(10 * model.pole)
 
     def init(self, model: Plant, measured: Measurement) -> Array:
         return jnp.asarray(measured.z)
@@ -133,7 +144,12 @@ class Kalman(Observer[Predicted]):
     optimal filter.
     """
 
-    w: Scalar = gain(default=800.0, unit="1/s", doc="decay rate of the estimation error, which has three poles at -w")
+    w: Scalar = gain(
+        default=1590.0,
+        unit="1/s",
+        doc="decay rate of the estimation error, which has three poles at -w; left out: three times the pole of the "
+        "magnets",
+    )
     estimates_velocity: ClassVar[bool] = True
     memory = (
         ("z", "m", "position predicted for the next sample"),
@@ -141,6 +157,9 @@ class Kalman(Observer[Predicted]):
         ("d", "m/s^2", "disturbance predicted for the next sample"),
         ("z_ddot", "m/s^2", "acceleration of the model at the last sample"),
     )
+
+    def designed(self, model: Plant, sampling: Sampling | None) -> "Kalman":
+        return Kalman(3 * model.pole)
 
     def init(self, model: Plant, measured: Measurement) -> Predicted:
         zero = jnp.zeros(())
@@ -192,7 +211,7 @@ class IRED1(ExactDifferentiator):
     smoothed. With implicit steps on a processor, it is evaluated at the end of the step.
     """
 
-    L: Scalar = gain(default=50.0, unit="m/s^2", doc="bound on the acceleration")
+    L: Scalar = gain(default=56.3, unit="m/s^2", doc="bound on the acceleration; left out: w^2 s_0/25")
     order: ClassVar[int] = 1
     memory = DERIVATIVES[:2]
 
@@ -201,6 +220,6 @@ class IRED1(ExactDifferentiator):
 class IRED2(ExactDifferentiator):
     """Robust exact differentiator of order 2: as `IRED1`, but exact while the rate of the acceleration is at most L."""
 
-    L: Scalar = gain(default=3e4, unit="m/s^3", doc="bound on the rate of the acceleration")
+    L: Scalar = gain(default=2.99e4, unit="m/s^3", doc="bound on the rate of the acceleration; left out: w^3 s_0/25")
     order: ClassVar[int] = 2
     memory = DERIVATIVES

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.force import force_for, sliding_variable
-from ambjax.control.laws import PositionLaw
+from ambjax.control.laws import PositionLaw, unwinding
+from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.world.plant import Plant
@@ -34,16 +35,15 @@ class PID(PositionLaw[PIDState]):
     limits u, the force v(z, i) of the measured current differs from v_star, and x moves v_star towards v(z, i) at the
     rate k_aw. The term also acts, for a shorter time, while the current follows its reference without a limit.
 
-    k_d = 2 w, k_p = 2 w^2, k_int = w^3 are the optimal gains (LQR) for the cost w^6 (int e)^2 + e_ddot^2. The closed
-    loop then has the poles of a Butterworth filter of bandwidth w. The default gains for a model have w = w_m/2, where
-    w_m is the unstable pole of the magnets.
+    With the default gains for a model, and without the filter, the closed loop has a pole at -w and two at -w/2, where
+    w is the unstable pole of the magnets. With an ideal current, the peak of |S| is then 1.15.
     """
 
-    k_p: Scalar = gain(default=1.41e5, unit="1/s^2", doc="proportional gain; left out: w_m^2/2")
-    k_int: Scalar = gain(default=1.87e7, unit="1/s^3", doc="integral gain; left out: w_m^3/8")
-    k_d: Scalar = gain(default=531.0, unit="1/s", doc="derivative gain; left out: w_m")
-    w_f: Scalar = gain(default=5310.0, unit="1/s", doc="bandwidth of the filter of the derivative; left out: 10 w_m")
-    k_aw: Scalar = gain(default=26.5, unit="1/s", doc="anti-windup rate; left out: w_m/20")
+    k_p: Scalar = gain(default=3.52e5, unit="1/s^2", doc="proportional gain; left out: 5/4 w^2")
+    k_int: Scalar = gain(default=3.74e7, unit="1/s^3", doc="integral gain; left out: w^3/4")
+    k_d: Scalar = gain(default=1062.0, unit="1/s", doc="derivative gain; left out: 2 w")
+    w_f: Scalar = gain(default=1.06e4, unit="1/s", doc="bandwidth of the filter of the derivative; left out: 20 w")
+    k_aw: Scalar = gain(default=26.5, unit="1/s", doc="anti-windup rate; left out: w/20")
     memory = (("rate", "m/s", "filtered rate of the error"), ("integral", "m/s^2", "integral term"))
 
     def init(self, model: Plant) -> PIDState:
@@ -52,9 +52,14 @@ class PID(PositionLaw[PIDState]):
     def scale(self, model: Plant) -> PIDState:
         return PIDState(jnp.asarray(model.sigma_size), jnp.abs(model.g) / 50 + 1e-3)
 
-    def designed(self, model: Plant, period: float | None) -> "PID":
-        w = model.pole / 2
-        return PID(k_p=2 * w**2, k_int=w**3, k_d=2 * w, w_f=20 * w, k_aw=w / 10)
+    def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> PIDState:
+        """Return the filter in the steady state for the first rate of the error, and an integral of 0."""
+        rate = jnp.asarray(inputs[0].z_dot - inputs[1].r_dot)
+        return PIDState(rate, jnp.zeros_like(rate))
+
+    def designed(self, model: Plant, sampling: Sampling | None) -> "PID":
+        w = model.pole
+        return PID(k_p=1.25 * w**2, k_int=w**3 / 4, k_d=2 * w, w_f=20 * w, k_aw=w / 20)
 
     def slope(self, model: Plant) -> Scalar:
         """Return the largest of the rates w_f, k_d, k_aw, sqrt(k_p) and cbrt(k_int)."""
@@ -70,7 +75,8 @@ class PID(PositionLaw[PIDState]):
         e, e_dot = motion.z - reference.r, motion.z_dot - reference.r_dot
         v_star = self._force(model, inputs, state.rate, state.integral)
         lacking = model.a * (v_star - model.v(motion.z, motion.i))
-        return v_star, PIDState(self.w_f * (e_dot - state.rate), self.k_int * e + self.k_aw * lacking)
+        integral = self.k_int * e + unwinding(self.k_aw, self.k_int) * lacking
+        return v_star, PIDState(self.w_f * (e_dot - state.rate), integral)
 
     def _force(self, model: Plant, inputs: tuple[Measurement, Reference], rate: Array, integral: Scalar) -> Array:
         motion, reference = inputs
@@ -99,7 +105,7 @@ class PID(PositionLaw[PIDState]):
         """
         motion, reference = inputs
         e, e_dot = motion.z - reference.r, motion.z_dot - reference.r_dot
-        follow, leak = period * self.w_f, period * self.k_aw
+        follow, leak = period * self.w_f, period * unwinding(self.k_aw, self.k_int)
         after = (state.rate + follow * e_dot) / (1 + follow)
         lacking = model.a * (self._force(model, inputs, after, 0.0) - model.v(motion.z, motion.i))
         integral = (state.integral + period * self.k_int * e + leak * lacking) / (1 + leak)
@@ -113,11 +119,11 @@ class FeedbackLinearisation(PositionLaw[tuple[()]]):
     The demanded force cancels stiffness and weight. With inversion.ClosedForm, which cancels the nonlinear magnet, the
     nominal mechanics become e_ddot = -k_p e - k_d e_dot at any z (H. Khalil, Nonlinear Systems, 2002, 13.2 and 13.3).
     There is no integral: a disturbance q_z leaves the offset q_z/k_p. The default gains for a model place a double pole
-    at -w/3, where w is the unstable pole of the magnets.
+    at -w, where w is the unstable pole of the magnets. With an ideal current, |S| is then 1 at every frequency.
     """
 
-    k_p: Scalar = gain(default=3.1e4, unit="1/s^2", doc="proportional gain; left out: (w/3)^2")
-    k_d: Scalar = gain(default=354.0, unit="1/s", doc="derivative gain; left out: 2 w/3")
+    k_p: Scalar = gain(default=2.82e5, unit="1/s^2", doc="proportional gain; left out: w^2")
+    k_d: Scalar = gain(default=1062.0, unit="1/s", doc="derivative gain; left out: 2 w")
 
     def init(self, model: Plant) -> tuple[()]:
         return ()
@@ -125,8 +131,8 @@ class FeedbackLinearisation(PositionLaw[tuple[()]]):
     def scale(self, model: Plant) -> tuple[()]:
         return ()
 
-    def designed(self, model: Plant, period: float | None) -> "FeedbackLinearisation":
-        return FeedbackLinearisation((model.pole / 3) ** 2, 2 * model.pole / 3)
+    def designed(self, model: Plant, sampling: Sampling | None) -> "FeedbackLinearisation":
+        return FeedbackLinearisation(model.pole**2, 2 * model.pole)
 
     def slope(self, model: Plant) -> Scalar:
         return jnp.maximum(self.k_d, jnp.sqrt(self.k_p))

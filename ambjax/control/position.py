@@ -7,6 +7,7 @@ from jax import Array
 
 from ambjax.control.base import Requirement
 from ambjax.control.chain import FilterChain as FilterChain
+from ambjax.control.defaults import printed, switching_gain, switching_steepness
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.integral_sliding import IntegralSlidingMode as IntegralSlidingMode
 from ambjax.control.laws import PositionLaw
@@ -15,7 +16,7 @@ from ambjax.control.manifolds import TerminalSlidingMode as TerminalSlidingMode
 from ambjax.control.manifolds import UtkinSlidingMode as UtkinSlidingMode
 from ambjax.control.pid import PID as PID
 from ambjax.control.pid import FeedbackLinearisation as FeedbackLinearisation
-from ambjax.control.sampling import Relay
+from ambjax.control.sampling import Relay, Sampling
 from ambjax.control.search import Interval, SearchContext, authority, manifold, position_switch, rate, steepness
 from ambjax.control.state_feedback import StateFeedback as StateFeedback
 from ambjax.numerics.records import Scalar, gain, record
@@ -28,17 +29,30 @@ from ambjax.world.signals import Reference
 
 @record
 class SlidingMode(PositionLaw[tuple[()]]):
-    """v_star = (-2 k_z z/m - c (z_dot - r_dot) + r_ddot + g - k sgn(sigma)) / a. Eq. (5), sgn smoothed."""
+    """v_star = (-2 k_z z/m - c (z_dot - r_dot) + r_ddot + g - k sgn(sigma)) / a. Eq. (5), sgn smoothed.
 
-    c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold")
-    k: Scalar = gain(default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z")
+    The default gains are those of Table 2 for the plant of Table 1. For other plants the error has a double pole at -w,
+    the pole of the magnets (`control.defaults`).
+    """
+
+    c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold; left out: w")
+    k: Scalar = gain(
+        default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z; left out: w^2 s_0/2"
+    )
     p: Scalar = gain(
         default=25.0,
         unit="s/m",
-        doc="steepness of the smoothed sign of sigma; left out: scaled to the nominal plant",
+        doc="steepness of the smoothed sign of sigma; left out: pi/(w s_0), or scaled to the nominal plant if k is "
+        "given",
         steepness=True,
     )
     requirement: ClassVar = Requirement("k", "Q_z")
+    switching: ClassVar = ("k",)
+
+    def designed(self, model: Plant, sampling: Sampling | None) -> "SlidingMode":
+        if printed(model):
+            return self
+        return SlidingMode(model.pole, switching_gain(model), switching_steepness(model))
 
     def init(self, model: Plant) -> tuple[()]:
         return ()
@@ -91,19 +105,31 @@ class SuperTwisting(PositionLaw[Array]):
 
     Levant, Int. J. Control 58 (1993) 1247-1263. Both terms are smoothed with p: the root as sigma / (sigma^2 +
     1/p^2)^(1/4), whose slope at zero is sqrt(p). The state w (m/s^2) is an integral, so a constant disturbance leaves
-    no offset. The default slope at zero is k_1 sqrt(p) = 400 1/s, about that of SlidingMode.
+    no offset. For the plant of Table 1, the default slope at zero is k_1 sqrt(p) = 400 1/s, about that of SlidingMode.
+    For other plants, sigma has a double pole at -W/2, and the error on the manifold a pole at -W, where W is the pole
+    of the magnets.
     """
 
-    c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold")
-    k_1: Scalar = gain(default=40.0, unit="m^0.5/s^1.5", doc="gain of the root term")
-    k_2: Scalar = gain(default=50.0, unit="m/s^3", doc="gain of the integral; above the bound on dq_z/dt")
+    c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold; left out: W")
+    k_1: Scalar = gain(default=40.0, unit="m^0.5/s^1.5", doc="gain of the root term; left out: sqrt(W^3 s_0/pi)")
+    k_2: Scalar = gain(
+        default=50.0, unit="m/s^3", doc="gain of the integral; above the bound on dq_z/dt; left out: W^3 s_0/8"
+    )
     p: Scalar = gain(
         default=100.0,
         unit="s/m",
-        doc="steepness of the smoothed root and sign of sigma; left out: scaled to the nominal plant",
+        doc="steepness of the smoothed root and sign of sigma; left out: pi/(W s_0), or scaled to the nominal plant if "
+        "k_1 or k_2 is given",
         steepness=True,
     )
+    switching: ClassVar = ("k_1", "k_2")
     memory = (("w", "m/s^2", "integral of the sign of sigma"),)
+
+    def designed(self, model: Plant, sampling: Sampling | None) -> "SuperTwisting":
+        if printed(model):
+            return self
+        p, w = switching_steepness(model), model.pole
+        return SuperTwisting(w, w / p**0.5, w**2 / 4 / (TWO_OVER_PI * p), p)
 
     def init(self, model: Plant) -> Array:
         return jnp.zeros(())

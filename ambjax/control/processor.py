@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.guard import Guard
+from ambjax.control.sampling import Sampling
 from ambjax.numerics.records import Scalar, is_traced, leaf, part, record, static
 from ambjax.numerics.runge_kutta import rk4_step
 from ambjax.world.plant import Plant, State
@@ -71,6 +72,11 @@ class Processor:
     def predicts(self) -> bool:
         """Whether the laws use a prediction over the delay."""
         return bool(self.resolved().most) if self.predict is None else self.predict
+
+    def sampling(self, period: Scalar) -> Sampling:
+        """Return the sampling of the laws, with the delay that the prediction does not cover. `period`: s."""
+        late = float(self.delay) - (float(self.ahead) if self.predicts else 0.0)
+        return Sampling(float(period), max(late, 0.0), self.implicit)
 
     def resolved(self, *others: Scalar, between: bool = False) -> "Processor":
         """Return this processor with `whole` and `most` set. These two fields select the compiled program.

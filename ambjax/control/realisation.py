@@ -1,6 +1,7 @@
 """The matrices of a linear controller in real Schur form, computed from a state space that another tool designed."""
 
 import dataclasses
+import functools
 import hashlib
 from collections.abc import Sequence
 from typing import Protocol
@@ -19,6 +20,9 @@ MOST_STATES = 30
 FREQUENCIES, DAMPED = np.geomspace(10.0, 1e5, 81), 0.05
 # Largest condition number of A + I of a discrete controller. Above it, a pole is too close to z = -1.
 MOST_CONDITION = 1e8
+
+# Modes of a controller below this rate (1/s) count as integrals, which start at 0.
+SLOWEST = 10.0
 
 Row = tuple[float, ...]
 
@@ -69,6 +73,10 @@ class Realisation:
         states = np.linalg.solve(s * np.eye(n) - A, np.broadcast_to(B + 0j, (len(s), *B.shape)))
         return np.array(self.C) @ states + np.array(self.D) if n else np.tile(np.array(self.D) + 0j, (len(s), 1))
 
+    def steady(self, w: Sequence[Array]) -> tuple[Array, ...]:
+        """Return the n states for constant inputs w (in metres). Modes slower than SLOWEST (integrators) are 0."""
+        return tuple(_sum(row, w) for row in _steady_states(self))
+
     def output(self, x: Sequence[Array], w: Sequence[Array]) -> Array:
         """Return y (a current in A or a voltage in V) for the n states x and the inputs w (in metres)."""
         return _sum(self.C, x) + _sum(self.D, w)
@@ -106,6 +114,24 @@ class Realisation:
             blocks.append(tuple(range(k, k + size)))
             k += size
         return blocks
+
+
+@functools.cache
+def _steady_states(of: Realisation) -> tuple[Row, ...]:
+    """Return the matrix [n, m] from constant inputs to the steady state of the modes faster than SLOWEST."""
+    n, m = len(of.A), len(of.D)
+    if not n:
+        return ()
+    import scipy.linalg
+
+    T, Q, fast = scipy.linalg.schur(np.array(of.A), sort=lambda re, im: np.hypot(re, im) > SLOWEST)
+    b = Q.T @ np.reshape(of.B, (n, m))
+    # (I, Y; 0, I) separates the fast modes from the slow ones
+    Y = np.zeros((fast, n - fast))
+    if 0 < fast < n:
+        Y = scipy.linalg.solve_sylvester(T[:fast, :fast], -T[fast:, fast:], -T[:fast, fast:])
+    states = -Q[:, :fast] @ np.linalg.solve(T[:fast, :fast], b[:fast] - Y @ b[fast:])
+    return tuple(map(tuple, states.tolist()))
 
 
 def _sum(row: Row, x: Sequence[Array]) -> Array:

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.force import force_of_current, linear_mechanics, resting_current
-from ambjax.control.laws import PositionLaw
+from ambjax.control.laws import PositionLaw, unwinding
 from ambjax.control.regulator import optimal_gains
+from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.world.plant import Plant
@@ -41,9 +42,9 @@ class StateFeedback(PositionLaw[Array]):
     def scale(self, model: Plant) -> Scalar:
         return model.i_0 / 25
 
-    def designed(self, model: Plant, period: float | None) -> "StateFeedback":
+    def designed(self, model: Plant, sampling: Sampling | None) -> "StateFeedback":
         """Return the law with k_aw = w/50 and the gains of `optimal_gains`. Raises ValueError as that does."""
-        k_int, k_p, k_d = map(float, optimal_gains(model, period))
+        k_int, k_p, k_d = map(float, optimal_gains(model, None if sampling is None else sampling.period))
         return dataclasses.replace(self, k_p=k_p, k_d=k_d, k_int=k_int, k_aw=model.pole / 50)
 
     def slope(self, model: Plant) -> Scalar:
@@ -59,7 +60,7 @@ class StateFeedback(PositionLaw[Array]):
     def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: Array) -> tuple[Array, Array]:
         motion, reference = inputs
         i_star = self._current(model, inputs) - state
-        rate = self.k_int * (motion.z - reference.r) + self.k_aw * (i_star - motion.i)
+        rate = self.k_int * (motion.z - reference.r) + unwinding(self.k_aw, self.k_int) * (i_star - motion.i)
         return force_of_current(model, motion.z, i_star), rate
 
     def _current(self, model: Plant, inputs: tuple[Measurement, Reference]) -> Array:
@@ -85,6 +86,6 @@ class StateFeedback(PositionLaw[Array]):
     ) -> tuple[Array, Array]:
         """Step the anti-windup by backward Euler: x+ = x + T (k_int e + k_aw (i_star(x+) - i)). The output uses x."""
         motion, reference = inputs
-        free, leak = self._current(model, inputs), period * self.k_aw
+        free, leak = self._current(model, inputs), period * unwinding(self.k_aw, self.k_int)
         after = state + period * self.k_int * (motion.z - reference.r) + leak * (free - motion.i)
         return force_of_current(model, motion.z, free - state), after / (1 + leak)

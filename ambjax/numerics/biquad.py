@@ -34,12 +34,29 @@ class Biquad(NamedTuple):
         w = jnp.sqrt(jnp.asarray(self.a_0))
         return self.d * u + x[0], (self.c_1 * u - self.a_1 * x[0] + w * x[1], self.c_0 / w * u - w * x[0])
 
+    def steady(self, u: Array) -> tuple[Array, tuple[Array, Array]]:
+        """Return the output and the state for a constant input u."""
+        x = self.c_0 / self.a_0 * u
+        return self.d * u + x, (x, (self.a_1 * x - self.c_1 * u) / jnp.sqrt(jnp.asarray(self.a_0)))
+
+    def steady_sampled(self, u: Array, period: Scalar) -> tuple[Array, tuple[Array, Array]]:
+        """Return the output and the state of the sampled filter for a constant input u."""
+        K = self._bilinear(period)
+        over = 1 / (K * K + K * self.a_1 + self.a_0)
+        y = self.c_0 / self.a_0 * u
+        second = (self.c_0 - K * self.c_1) * over * u - (K * K - K * self.a_1 + self.a_0) * over * y
+        return self.d * u + y, (y - (self.c_0 + K * self.c_1) * over * u, second)
+
+    def _bilinear(self, period: Scalar) -> Scalar:
+        """Return K of the bilinear transform s = K (1 - q)/(1 + q), q the backward shift."""
+        return 2 / period if self.centre is None else _prewarped(jnp.asarray(self.centre), period)
+
     def step(self, u: Array, x: tuple[Array, Array], period: Scalar) -> tuple[Array, tuple[Array, Array]]:
         """Return the output and the next state of the sampled filter, in transposed direct form II.
 
         s = K (1 - q)/(1 + q), q the backward shift: K = 2/T, or w/tan(w T/2) at the centre w.
         """
-        K = 2 / period if self.centre is None else _prewarped(jnp.asarray(self.centre), period)
+        K = self._bilinear(period)
         square = K * K
         over = 1 / (square + K * self.a_1 + self.a_0)
         y = (self.c_0 + K * self.c_1) * over * u + x[0]

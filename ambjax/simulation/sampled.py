@@ -20,7 +20,7 @@ from ambjax.control.processor import Processor
 from ambjax.numerics.records import Scalar, record, static
 from ambjax.numerics.smooth import limited
 from ambjax.simulation.between import acting, amplified, lags, plant_status, sensed_motion, subproblems
-from ambjax.simulation.integrate import Advanced, Integrator, choose, in_turn
+from ambjax.simulation.integrate import Advanced, Integrator, in_turn
 from ambjax.simulation.loop import ClosedLoop, LoopState
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.span import Span
@@ -76,9 +76,11 @@ class Sampled:
         measured = self.measured(plant, z_filtered, self.sensor_errors(0))
         command, past, guard = Command(*[zero] * 5), (zero, zero), self.processor.guard
         faulty = scenario.sensor is not None and scenario.sensor.faulty
+        cascade = self.loop.cascade
+        sample = self.sample(self.reference(0.0), past)
         return SampledState(
             plant,
-            self.loop.cascade.init(measured),
+            cascade.begun(measured, sample, cascade.init(measured), jnp.asarray(False)),
             command,
             past,
             jnp.ones(()),
@@ -138,8 +140,8 @@ class Sampled:
         function.
         """
         cascade, past = self.loop.cascade, (state.command.u, state.past[0])
-        checked, measured, laws = self.inputs_of_laws(measured, state)
-        sample = Sample(reference, self.period, jnp.asarray(self.loop.scenario.command_limit), past)
+        sample = self.sample(reference, past)
+        checked, measured, laws = self.inputs_of_laws(measured, sample, state)
         command, control, estimate = cascade.step(measured, laws, sample)
         command = command._replace(u=limited(command.u, sample.u_max))
         new = materialised((control, command, self._next_guard_state(checked, estimate, (command.u, *past))))
@@ -158,8 +160,12 @@ class Sampled:
         finite = jnp.where(finite, state.finite, 0.0)
         return state._replace(control=control, command=command, past=past, finite=finite, watch=watch, started=started)
 
+    def sample(self, reference: Reference, past: tuple[Array, Array]) -> Sample:
+        """Return the inputs of the cascade at a sample. `past`: u of the last sample and of the one before it."""
+        return Sample(reference, self.period, jnp.asarray(self.loop.scenario.command_limit), past)
+
     def inputs_of_laws(
-        self, measured: Measurement, state: SampledState
+        self, measured: Measurement, sample: Sample, state: SampledState
     ) -> tuple[GuardResult | None, Measurement, CascadeState]:
         """Return the result of the guard, and the readings and the states with which the laws step at this sample."""
         cascade, checked, laws = self.loop.cascade, None, state.control
@@ -168,7 +174,7 @@ class Sampled:
             checked = self.processor.guard.check(cascade.model, measured, state.watch, self.period, estimated)
             measured = checked.reading
         if not isinstance(state.started, tuple):
-            laws = choose(state.started.astype(bool), laws, cascade.init(measured))
+            laws = cascade.begun(measured, sample, laws, state.started.astype(bool))
         return checked, measured, laws
 
     def _next_guard_state(

@@ -5,7 +5,6 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.cascade_state import Sample
 from ambjax.numerics.records import Scalar, record
 from ambjax.simulation.integrate import Advanced, Integrator
 from ambjax.simulation.sampled import Sampled
@@ -64,8 +63,8 @@ class LawSignalsRecorder:
         loop, before = self.loop, state.loop
         cascade, after = loop.loop.cascade, loop.jump(t, before, errors)
         reference = loop.reference(t)
-        sample = Sample(reference, loop.period, jnp.asarray(loop.loop.scenario.command_limit), after.past)
-        _, measured, laws = loop.inputs_of_laws(loop.read(before, errors)[1], before)
+        sample = loop.sample(reference, after.past)
+        _, measured, laws = loop.inputs_of_laws(loop.read(before, errors)[1], sample, before)
         estimate, *_ = cascade.estimate(measured, laws.observer, sample)
         sigma, command = cascade.sigma(estimate, reference), after.command
         return LawSignalsState(after, LawSignals(sigma, command.v_tilde, estimate.i - command.i_ref))

@@ -64,5 +64,4 @@ def _steepest(slope: SupportsFloat) -> float:
 def sampling_of(cascade: Cascade, clock: Clock) -> Sampling:
     """Return the sampling of the laws of a cascade with a processor."""
     processor: Any = cascade.on_processor().processor
-    late = float(processor.delay) - (float(processor.ahead) if processor.predicts else 0.0)
-    return Sampling(float(clock.sample_period), max(late, 0.0), processor.implicit)
+    return processor.sampling(clock.sample_period)

@@ -2,6 +2,7 @@
 
 import importlib.resources
 import io
+import math
 import platform
 import sys
 import zipfile
@@ -44,7 +45,9 @@ typedef {p}_output model_output;
 #define model_init {p}_init
 #define model_step {p}_step
 
-/* for each parameter, whether it may be infinite */
+/* for each parameter, its smallest and its largest finite value, and whether it may be infinite */
+static const double model_least[MODEL_PARAMETERS] = {{{least}}};
+static const double model_most[MODEL_PARAMETERS] = {{{most}}};
 static const unsigned char model_infinite[MODEL_PARAMETERS] = {{{infinite}}};
 
 #endif
@@ -72,9 +75,16 @@ def sources(traced: Trace, identifier: str, origin: Origin, version: int) -> tup
         parameters=len(traced.parameters),
         states=len(traced.state),
         reads=int(traced.block.noun != "controller"),
-        infinite=", ".join(str(int("or inf" in x.allowed)) for x in traced.parameters),
+        least=", ".join(_bound(x.least) for x in traced.parameters),
+        most=", ".join(_bound(x.most) for x in traced.parameters),
+        infinite=", ".join(str(int(x.infinite)) for x in traced.parameters),
     )
     return found, guid
+
+
+def _bound(x: float) -> str:
+    """Return a bound as a constant of C: the largest finite number stands for infinity."""
+    return repr(math.copysign(sys.float_info.max, x) if math.isinf(x) else float(x))
 
 
 def binary_name(identifier: str, version: int) -> str:

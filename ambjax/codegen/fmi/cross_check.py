@@ -1,5 +1,6 @@
 """Reference data of an FMU in the format of FMI's cross-check: the signals of a case, and the outputs of JAX."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -14,6 +15,7 @@ from ambjax.codegen.series import series
 from ambjax.codegen.trace import arguments, precision
 from ambjax.control.cascade import Cascade
 from ambjax.simulation.clock import Clock
+from ambjax.simulation.rollout import rollout
 from ambjax.world.scenario import Scenario
 
 # Largest number of samples of the reference data of each block. Those of a loop are few, because its signs amplify
@@ -42,6 +44,9 @@ def run_block(block: Block, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def reference(block: Block, cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[np.ndarray, np.ndarray]:
     """Return inputs and outputs of a block's FMU in the loop of the case.
 
+    The readings of a controller are the reading of z and the true velocity and current of the simulated case. They do
+    not depend on whether the plant can be exported.
+
     Each is an array [instants, 1 + numbers] with the time (s) in the first column; the outputs have one instant more.
     The inputs of a row act in the communication step that begins at its time. For a plant and a loop, the first row is
     also the input of the step that reads the sensors at the start.
@@ -50,15 +55,17 @@ def reference(block: Block, cascade: Cascade, scenario: Scenario, clock: Clock) 
     if block.noun == "plant":
         pole = float(scenario.plant.pole) * block.period
         count = max(min(count, int(math.log(GROWTH) / pole)), 1)
-    loop = block if block.noun == "loop" else block_of("loop", cascade, scenario, clock)
     given = series(cascade, scenario, clock, count + 1)
-    plain = np.array([given[name] for name in loop.inputs]).T
-    outputs = dict(zip(loop.outputs, run_block(loop, plain)[0].T, strict=True))
-    signals = {**given, **outputs}
     if block.noun == "controller":
-        rows = np.array([signals[name] for name in block.inputs]).T[:count]
+        short = dataclasses.replace(clock, samples=count)
+        read: Any = rollout(cascade, scenario, short).trajectory.rows
+        signals = {**given, "z": read.z_measured, "z_dot": read.z_dot, "i": read.i}
+        rows = np.array([signals[name][:count] for name in block.inputs]).T
         found = np.concatenate([np.zeros((1, len(block.outputs))), run_block(block, rows)[0]])
     else:
+        loop = block if block.noun == "loop" else block_of("loop", cascade, scenario, clock)
+        plain = np.array([given[name] for name in loop.inputs]).T
+        outputs = dict(zip(loop.outputs, run_block(loop, plain)[0].T, strict=True))
         late = [outputs[name][:count] if name == "u" else given[name][1:] for name in block.inputs]
         rows = np.array(late).T
         found = run_block(block, np.concatenate([rows[:1], rows]))[0]

@@ -1,6 +1,7 @@
 """The model description of an FMU: names, units, start values and value references, as XML of FMI 2.0 or 3.0."""
 
 import hashlib
+import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
@@ -18,6 +19,7 @@ class Variable(NamedTuple):
 
     - `reference`: its value reference.
     - `start`: its start value; None for a variable that the FMU computes.
+    - `least`, `most`: smallest and largest value, which the FMU checks; None: not bounded.
     - `whole`: whether it is an integer.
     """
 
@@ -28,6 +30,8 @@ class Variable(NamedTuple):
     unit: str
     description: str
     start: float | None = None
+    least: float | None = None
+    most: float | None = None
     whole: bool = False
 
 
@@ -51,7 +55,8 @@ def variables(traced: Trace) -> list[Variable]:
             name = f"state.{x.name}" if causality == "local" else x.name
             words = f"{x.doc}; {x.allowed}" if causality == "parameter" and x.allowed else x.doc
             if not unread:
-                found.append(Variable(name, reference, causality, variability, x.unit, words, start))
+                ends = (None if math.isinf(x.least) else x.least, None if x.infinite or math.isinf(x.most) else x.most)
+                found.append(Variable(name, reference, causality, variability, x.unit, words, start, *ends))
             reference += 1
     bits = "; ".join(f"{1 << k}: {traced.block.bits[name]}" for k, (name, _) in enumerate(traced.bits))
     return [*found, Variable(STATUS, reference, "output", "discrete", "", bits, whole=True)]
@@ -101,6 +106,12 @@ def _number(x: float, version: int) -> str:
     return repr(float(x))
 
 
+def _values(x: Variable, version: int) -> str:
+    """Return the attributes of a variable that are numbers: its bounds and its start value."""
+    given = (("min", x.least), ("max", x.most), ("start", x.start))
+    return "".join(f' {name}="{_number(value, version)}"' for name, value in given if value is not None)
+
+
 def _three(traced: Trace, identifier: str, guid: str) -> Iterator[str]:
     """Yield the lines of the description for FMI 3.0; `description` fills in @HEAD@."""
     found, period = variables(traced), traced.block.period
@@ -114,12 +125,11 @@ def _three(traced: Trace, identifier: str, guid: str) -> Iterator[str]:
     yield _experiment(traced)
     yield "  <ModelVariables>"
     for x in found:
-        start = "" if x.start is None else f' start="{_number(x.start, 3)}"'
         unit = f" unit={quoteattr(x.unit)}" if x.unit else ""
         kind = "UInt32" if x.whole else "Float64"
         yield (
             f'    <{kind} name={quoteattr(x.name)} valueReference="{x.reference}" causality="{x.causality}" '
-            f'variability="{x.variability}" description={quoteattr(x.description)}{unit}{start}/>'
+            f'variability="{x.variability}" description={quoteattr(x.description)}{unit}{_values(x, 3)}/>'
         )
     yield "  </ModelVariables>"
     yield "  <ModelStructure>"
@@ -148,9 +158,8 @@ def _two(traced: Trace, identifier: str, guid: str, sources: list[str]) -> Itera
     yield _experiment(traced)
     yield "  <ModelVariables>"
     for x in found:
-        start = "" if x.start is None else f' start="{_number(x.start, 2)}"'
         unit = f" unit={quoteattr(x.unit)}" if x.unit else ""
-        kind = f"<Integer{start}/>" if x.whole else f"<Real{unit}{start}/>"
+        kind = f"<Integer{_values(x, 2)}/>" if x.whole else f"<Real{unit}{_values(x, 2)}/>"
         yield (
             f'    <ScalarVariable name={quoteattr(x.name)} valueReference="{x.reference}" causality="{x.causality}" '
             f'variability="{x.variability}" description={quoteattr(x.description)}>{kind}</ScalarVariable>'

@@ -125,7 +125,7 @@ EXPORTED status_t fmi2SetReal(instance_t instance, const reference_t references[
     fmu *one = instance;
     for (size_t k = 0; k < count; k++) {
         if (!core_set(&one->block, references[k], values[k])) {
-            return said(one, ERROR, "only inputs and parameters may be set, parameters to finite numbers");
+            return said(one, ERROR, "only inputs and parameters may be set, a parameter to a number from its min to its max");
         }
     }
     return OK;

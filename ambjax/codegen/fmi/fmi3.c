@@ -142,7 +142,7 @@ EXPORTED status_t fmi3SetFloat64(
     fmu *one = instance;
     for (size_t k = 0; k < count; k++) {
         if (k >= length || !core_set(&one->block, references[k], values[k])) {
-            return said(one, ERROR, "only inputs and parameters may be set, parameters to finite numbers");
+            return said(one, ERROR, "only inputs and parameters may be set, a parameter to a number from its min to its max");
         }
     }
     return OK;

@@ -79,7 +79,8 @@ static int core_do_step(numbers *x, double now, double step)
     return count > 0;
 }
 
-/* Return the address of a number that may be read, or NULL. */
+/* Return the address of a number that may be read, or NULL. The status bits are a whole number of their own, but some
+ * tools read every output as a real number: `core_get`. */
 static const double *core_number(numbers *x, uint32_t reference)
 {
     if (reference == 0) {
@@ -101,18 +102,30 @@ static const double *core_number(numbers *x, uint32_t reference)
 static int core_get(numbers *x, uint32_t reference, double *value)
 {
     const double *found = core_number(x, reference);
-    if (found == NULL) {
+    if (found == NULL && reference != STATUS) {
         return 0;
     }
     if (x->mode == INITIALIZING && reference >= FIRST_OUTPUT) {
         core_begin(x);
     }
-    *value = *found;
+    *value = found == NULL ? (double)x->status : *found;
     return 1;
 }
 
-/* Write an input or a parameter. Return 0 for any other number, for a parameter that is NaN, and for a parameter that
- * is infinite but must be finite. An input may be NaN: the block reports it in its status. */
+/* What stands for an infinite parameter: a value from here on. XML of FMI 2.0 cannot contain infinity. */
+#define INFINITE 1e300
+
+/* Return whether a parameter may have a value, which NaN never is. */
+static int core_allows(uint32_t parameter, double value)
+{
+    if (value >= INFINITE && model_infinite[parameter]) {
+        return 1;
+    }
+    return value >= model_least[parameter] && value <= model_most[parameter];
+}
+
+/* Write an input or a parameter. Return 0 for any other number, and for a parameter outside its min and max. An input
+ * may be NaN: the block reports it in its status. */
 static int core_set(numbers *x, uint32_t reference, double value)
 {
     if (reference >= FIRST_INPUT && reference < FIRST_OUTPUT) {
@@ -121,7 +134,7 @@ static int core_set(numbers *x, uint32_t reference, double value)
     }
     if (reference >= FIRST_PARAMETER && reference < FIRST_STATE) {
         const uint32_t at = reference - FIRST_PARAMETER;
-        if (isnan(value) || (isinf(value) && (value < 0 || !model_infinite[at]))) {
+        if (!core_allows(at, value)) {
             return 0;
         }
         x->params.numbers[at] = value;

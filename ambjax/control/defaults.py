@@ -1,0 +1,54 @@
+"""Default gains of the laws with a sign, from the nominal plant and the sampling.
+
+For the plant of Table 1 they are those of the paper, Table 2 with gamma = 7.5e4. With them the peak of |S| of that
+plant is about 40, and they lose a plant of another size. For every other plant they follow from the unstable pole w of
+the magnets, the gap s_0 and the bias current i_0:
+
+- Position: c = w and 2/pi k p = w, the slope of the sign at 0. The error then has a double pole at -w. With an exact
+  inversion and an ideal current, S = (s^2 - w^2)/(s + w)^2, so that |S| = 1 at every frequency. Slower poles increase
+  |S| at 0 Hz, which is w^2/(c 2/pi k p); faster poles increase it near the bandwidth of the current.
+- k = w^2 s_0/2, so p = pi/(w s_0). w^2 s_0 is the largest acceleration that the magnets give at z = 0 (i = i_0).
+- Inversion: gamma = |dv/dz| w s_0 at the origin, which is Delta_1 of Eq. (7) for a rotor of the speed w s_0.
+- Current: 2/pi k_i p = 10 w, the bandwidth of the current loop, but at most a quarter of the sampling rate.
+"""
+
+import math
+
+import jax
+import numpy as np
+
+from ambjax.control.sampling import Sampling
+from ambjax.numerics.records import Scalar, is_traced
+from ambjax.world.plant import Plant
+
+# Bandwidth of the current loop as a multiple of w, and its largest product with the sample period.
+FASTER, MOST = 10.0, 1 / 4
+
+
+def printed(model: Plant) -> bool:
+    """Return whether the model is the plant of Table 1, for which the paper prints its gains."""
+    (found, one), (wanted, other) = jax.tree.flatten(model), jax.tree.flatten(Plant())
+    return one == other and all(
+        not is_traced(x) and bool(np.all(np.asarray(x) == y)) for x, y in zip(found, wanted, strict=True)
+    )
+
+
+def switching_gain(model: Plant) -> Scalar:
+    """Return the default switching gain k of a position law, m/s^2."""
+    return model.pole**2 * model.s_0 / 2
+
+
+def switching_steepness(model: Plant) -> Scalar:
+    """Return the steepness p (s/m) for which the sign of the default k has the slope w at 0."""
+    return math.pi / model.sigma_size
+
+
+def adaptation_gain(model: Plant) -> Scalar:
+    """Return the default gamma, A^2/m^2/s."""
+    return 4 * model.v_size * model.pole  # dv/dz = 4 v_size/s_0 at the origin
+
+
+def current_rate(model: Plant, sampling: Sampling | None) -> Scalar:
+    """Return the default bandwidth of the current loop, 1/s. `sampling`: None in continuous time."""
+    rate = FASTER * model.pole
+    return rate if sampling is None else min(float(rate), MOST / sampling.period)
