@@ -375,6 +375,29 @@ LOOP = [
         "tests/test_current_drive.py::test_the_poles_in_continuous_time_are_those_of_the_textbook",
     ),
     M(
+        "a state that never changes makes the Jacobian of an equilibrium singular",
+        "ambjax/linear/equilibrium.py",
+        "rows = jnp.where(size[:, None] > 0, J, jnp.eye(len(J), dtype=J.dtype))",
+        "rows = jnp.where(size[:, None] > -1, J, jnp.nan)",
+        "tests/test_linearised_structures.py::test_a_small_deviation_decays_if_and_only_if_the_linear_loop_is_stable"
+        "[continuous-kalman-pid]",
+    ),
+    M(
+        "a state that never changes is a mode of the linear loop",
+        "ambjax/linear/analysis.py",
+        "return system.without_constants()",
+        "return StateSpace(*(None if x is None else np.asarray(x) for x in system))",
+        "tests/test_linearised_structures.py::test_a_small_deviation_decays_if_and_only_if_the_linear_loop_is_stable"
+        "[continuous-kalman-pid]",
+    ),
+    M(
+        "check succeeds without a linear loop",
+        "ambjax/commands/check.py",
+        'return int(not summary["holds"] or loop["stable"] is None), plain(summary)',
+        'return int(not summary["holds"]), plain(summary)',
+        "tests/test_sensitivity.py::test_check_does_not_succeed_without_a_linearisation",
+    ),
+    M(
         "a law and an amplifier with different commands are accepted",
         "ambjax/simulation/system.py",
         "if cascade.current.commands != scenario.drive:",
@@ -2857,8 +2880,8 @@ VARIOUS = [
     M(
         "the table of the machine begins on the line of an error",
         "ambjax/commands/acceptance.py",
-        'f"{error}\\n\\n{_facts_table',
-        'f"{error} {_facts_table',
+        "{error}\\n\\n{_facts_table",
+        "{error} {_facts_table",
         "tests/test_sensitivity.py::test_check_prints_the_numbers_of_the_machine_also_without_an_equilibrium",
     ),
     M(

@@ -36,8 +36,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """Check a case. Print the results of the linearised loop, then those on the processor, then those of Theorem 1.
 
     Returns the exit code and the summary. The exit code is 1 if a condition fails, if the rotor is lost, if the
-    integrator stalls, or if the magnets cannot carry the rotor. On a processor, the conditions of Theorem 1 do not
-    count. The zones and the margins of the linearised loop never count.
+    integrator stalls, if the magnets cannot carry the rotor, or if the loop cannot be linearised. On a processor, the
+    conditions of Theorem 1 do not count. The zones and the margins of the linearised loop never count.
     """
     from ambjax.theorem import advice
 
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         if on_processor is not None:
             print(CONTINUOUS)
     summary["holds"] = bool(summary["holds"]) and largest >= weight
-    return int(not summary["holds"]), plain(summary)
+    return int(not summary["holds"] or loop["stable"] is None), plain(summary)
 
 
 class _OnProcessor(NamedTuple):

@@ -41,7 +41,7 @@ def sensitivity_summary(
     }
     if spread is not None:
         worst = {} if spread.point is None else analysis_summary(spread.point.analysis)
-        counts = {"members": spread.members, "stable": spread.stable, "zone_a": spread.zone_a}
+        counts = {name: getattr(spread, name) for name in ("members", "stable", "zone_a", "failed")}
         summary["spread"] = {**counts, "worst_member": spread.worst, **({"worst": worst} if worst else {})}
         if spread.measured is not None:
             summary["spread"] |= _measured_numbers(spread.measured, zones)
@@ -136,6 +136,8 @@ def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None
             f"Of {spread.members} members of [spread], {spread.stable} are stable and {spread.zone_a} are in zone A; "
             f"the worst is member {spread.worst}."
         ]
+        if spread.failed:
+            rows += [f"{spread.failed} of them have no equilibrium at r = 0 m, and so no linearised loop."]
         rows += [] if spread.measured is None else [_measured_text(spread.measured, case.zones)]
     if signs := set_valued(case):
         rows += [
