@@ -4,17 +4,27 @@ The verdict of the linear loop agrees with the nonlinear simulation of a small d
 stable, and grows if not.
 """
 
+import dataclasses
+import importlib.resources
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from javascript import run_rows, with_node
 
 from ambjax import Cascade, Clock, Plant, Scenario, rollout
 from ambjax.cases.controller_tables import KINDS
+from ambjax.cases.reader import case_from
 from ambjax.control import current, inversion
 from ambjax.control.base import default_law
 from ambjax.control.processor import Processor
 from ambjax.linear import StateSpace, linearise, loop_quantities
+from ambjax.numerics.records import canonical
+from ambjax.page.functions import PRELUDE
+from ambjax.page.linear_script import linear_script
+from ambjax.page.loop_functions import loop_parameters
 from ambjax.world.scenario import Initial
 
 RIG = Plant(1.64, 0.0, 1.2566e-6, 208.0, 2.68e-4, 5e-4, 2.5, 1.0, 0.0)
@@ -84,3 +94,24 @@ def test_a_pole_on_the_border_is_stable_only_up_to_rounding_errors():
         parts = np.zeros((2, 3)), np.zeros((4, 2)), np.zeros((4, 3)), np.ones(2)
         assert StateSpace(np.diag([-1.0, growth]), *parts).stable is stable
         assert StateSpace(np.diag([0.1, 1 + growth]), *parts, period=np.asarray(1.0)).stable is stable
+
+
+@with_node
+@pytest.mark.slow
+def test_the_page_linearises_a_loop_with_a_state_that_never_changes(tmp_path):
+    """Explicit steps do not use the memory of the Kalman filter. The page's JavaScript runs in node."""
+    laws = {"observer": {"kind": "kalman"}, "inversion": {"kind": "linearised"}, "current": {"kind": "pi"}}
+    plant = {field.name: getattr(RIG, field.name) for field in dataclasses.fields(RIG) if field.name != "iron"}
+    given = {"plant": plant, "controller": laws, "processor": {"delay": 1.0, "discretisation": "explicit"}}
+    case = case_from(given | {"clock": {"sample_period": T, "duration": 0.01}})
+    script, asset = linear_script(case), importlib.resources.files("ambjax.page") / "assets" / "sensitivity.js"
+    run = f"""const facts = {json.dumps(script.facts)};
+    function run(P) {{ const S = sensitivity(P, facts, {T}, 1.0); return [S.peak, S.frequency, Number(S.stable)]; }}"""
+    numbers = np.array([jax.tree.leaves(canonical(loop_parameters(case, any_delay=True)))], float)
+    peak, f, stable = run_rows(
+        "\n".join([PRELUDE, script.source, asset.read_text(encoding="utf-8"), run]), numbers, tmp_path
+    )[0]
+    system = linearise(case.cascade, case.scenario, case.clock)
+    # both equilibria are exact to 1e-9 of the sizes of the states
+    assert peak == pytest.approx(np.abs(system.sensitivity(np.array([f])))[0], rel=1e-7)
+    assert stable == system.stable
