@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.base import Requirement
-from ambjax.control.laws import CurrentInputs, CurrentLaw
+from ambjax.control.laws import CurrentInputs, CurrentLaw, unwinding
 from ambjax.control.sampling import Relay
 from ambjax.control.search import Interval, SearchContext, authority, rate, steepness, switch
 from ambjax.numerics.records import Scalar, gain, leaf, record
@@ -81,8 +81,8 @@ class ProportionalIntegral(CurrentLaw[Array]):
     """
 
     k_p: Scalar = gain(default=1.76e5, unit="V/A", doc="proportional gain; left out: w_c L")
-    k_int: Scalar = gain(default=2.33e8, unit="V/A/s", doc="integral gain; left out: w_c^2 L/4")
-    k_aw: Scalar = gain(default=1330.0, unit="1/s", doc="anti-windup rate; left out: w_c/4")
+    k_int: Scalar = gain(default=2.33e8, unit="V/A/s", doc="integral gain, 0: none; left out: w_c^2 L/4", zero=True)
+    k_aw: Scalar = gain(default=1330.0, unit="1/s", doc="anti-windup rate, 0: none; left out: w_c/4", zero=True)
     memory = (("x", "V", "integral of the current error"),)
 
     def init(self, model: Plant) -> Array:
@@ -104,7 +104,7 @@ class ProportionalIntegral(CurrentLaw[Array]):
         error = inputs.demand.i_ref - inputs.measured.i
         u = self.k_p * error + model.L * inputs.demand.i_ref_dot + state
         excess = limited(u, inputs.u_max) - u
-        return u, self.k_int * error + self.k_aw * excess
+        return u, self.k_int * error + unwinding(self.k_aw, self.k_int) * excess
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         per = 1 / float(context.model.L)

@@ -29,7 +29,9 @@ class IntegralSlidingMode(PositionLaw[Array]):
     """
 
     c: Scalar = gain(default=17.0, unit="1/s", doc="coefficient of the error in the sliding variable")
-    c_int: Scalar = gain(default=70.0, unit="1/s^2", doc="gain of the integral of the error; c^2/4: two equal poles")
+    c_int: Scalar = gain(
+        default=70.0, unit="1/s^2", doc="gain of the integral of the error, 0: none; c^2/4: two equal poles", zero=True
+    )
     k: Scalar = gain(default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z")
     p: Scalar = gain(
         default=25.0,
@@ -58,7 +60,7 @@ class IntegralSlidingMode(PositionLaw[Array]):
     def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: Array) -> tuple[Array, Array]:
         motion, reference = inputs
         s = self.sigma(motion, reference) + self.c_int * state
-        return self._force(model, inputs, -self.k * smooth_sign(s, self.p)), motion.z - reference.r
+        return self._force(model, inputs, -self.k * smooth_sign(s, self.p)), self._integrated(inputs)
 
     def _force(self, model: Plant, inputs: tuple[Measurement, Reference], robust: Array) -> Array:
         motion, reference = inputs
@@ -80,4 +82,8 @@ class IntegralSlidingMode(PositionLaw[Array]):
         motion, reference = inputs
         s = self.sigma(motion, reference) + self.c_int * state
         robust = -self.k * share(s, period * self.k, self.p)
-        return self._force(model, inputs, robust), state + period * (motion.z - reference.r)
+        return self._force(model, inputs, robust), state + period * self._integrated(inputs)
+
+    def _integrated(self, inputs: tuple[Measurement, Reference]) -> Array:
+        """Return the rate of the integral: the error, or 0 if its gain c_int is 0."""
+        return jnp.where(jnp.asarray(self.c_int) > 0, inputs[0].z - inputs[1].r, 0.0)

@@ -17,6 +17,7 @@ import abc
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.base import Law
@@ -84,6 +85,14 @@ class Relaxation(NamedTuple):
     rest: Array
     turn: Array
     v_tilde: tuple[Array, Array, Array]
+
+
+def unwinding(k_aw: Scalar, k_int: Scalar) -> Array:
+    """Return the anti-windup rate k_aw (1/s) of an integral with the gain k_int, or 0 without an integral.
+
+    Without an integral there is nothing to unwind, and the error would never remove what the anti-windup adds.
+    """
+    return jnp.where(jnp.asarray(k_int) > 0, k_aw, 0.0)
 
 
 class Observer(Law, Generic[State], abc.ABC):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.force import force_for, sliding_variable
-from ambjax.control.laws import PositionLaw
+from ambjax.control.laws import PositionLaw, unwinding
 from ambjax.control.search import Interval, SearchContext, rate
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.world.plant import Plant
@@ -40,10 +40,10 @@ class PID(PositionLaw[PIDState]):
     """
 
     k_p: Scalar = gain(default=1.41e5, unit="1/s^2", doc="proportional gain; left out: w_m^2/2")
-    k_int: Scalar = gain(default=1.87e7, unit="1/s^3", doc="integral gain; left out: w_m^3/8")
+    k_int: Scalar = gain(default=1.87e7, unit="1/s^3", doc="integral gain, 0: none; left out: w_m^3/8", zero=True)
     k_d: Scalar = gain(default=531.0, unit="1/s", doc="derivative gain; left out: w_m")
     w_f: Scalar = gain(default=5310.0, unit="1/s", doc="bandwidth of the filter of the derivative; left out: 10 w_m")
-    k_aw: Scalar = gain(default=26.5, unit="1/s", doc="anti-windup rate; left out: w_m/20")
+    k_aw: Scalar = gain(default=26.5, unit="1/s", doc="anti-windup rate, 0: none; left out: w_m/20", zero=True)
     memory = (("rate", "m/s", "filtered rate of the error"), ("integral", "m/s^2", "integral term"))
 
     def init(self, model: Plant) -> PIDState:
@@ -70,7 +70,8 @@ class PID(PositionLaw[PIDState]):
         e, e_dot = motion.z - reference.r, motion.z_dot - reference.r_dot
         v_star = self._force(model, inputs, state.rate, state.integral)
         lacking = model.a * (v_star - model.v(motion.z, motion.i))
-        return v_star, PIDState(self.w_f * (e_dot - state.rate), self.k_int * e + self.k_aw * lacking)
+        integral = self.k_int * e + unwinding(self.k_aw, self.k_int) * lacking
+        return v_star, PIDState(self.w_f * (e_dot - state.rate), integral)
 
     def _force(self, model: Plant, inputs: tuple[Measurement, Reference], rate: Array, integral: Scalar) -> Array:
         motion, reference = inputs
@@ -99,7 +100,7 @@ class PID(PositionLaw[PIDState]):
         """
         motion, reference = inputs
         e, e_dot = motion.z - reference.r, motion.z_dot - reference.r_dot
-        follow, leak = period * self.w_f, period * self.k_aw
+        follow, leak = period * self.w_f, period * unwinding(self.k_aw, self.k_int)
         after = (state.rate + follow * e_dot) / (1 + follow)
         lacking = model.a * (self._force(model, inputs, after, 0.0) - model.v(motion.z, motion.i))
         integral = (state.integral + period * self.k_int * e + leak * lacking) / (1 + leak)

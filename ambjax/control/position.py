@@ -96,7 +96,9 @@ class SuperTwisting(PositionLaw[Array]):
 
     c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold")
     k_1: Scalar = gain(default=40.0, unit="m^0.5/s^1.5", doc="gain of the root term")
-    k_2: Scalar = gain(default=50.0, unit="m/s^3", doc="gain of the integral; above the bound on dq_z/dt")
+    k_2: Scalar = gain(
+        default=50.0, unit="m/s^3", doc="gain of the integral, 0: none; above the bound on dq_z/dt", zero=True
+    )
     p: Scalar = gain(
         default=100.0,
         unit="s/m",

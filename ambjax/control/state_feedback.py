@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.force import force_of_current, linear_mechanics, resting_current
-from ambjax.control.laws import PositionLaw
+from ambjax.control.laws import PositionLaw, unwinding
 from ambjax.control.regulator import optimal_gains
 from ambjax.control.search import Interval, SearchContext, rate
 from ambjax.numerics.records import Scalar, gain, record
@@ -31,8 +31,8 @@ class StateFeedback(PositionLaw[Array]):
 
     k_p: Scalar = gain(default=135.0, unit="A/m", doc="proportional gain; left out: LQR")
     k_d: Scalar = gain(default=0.219, unit="A s/m", doc="derivative gain; left out: LQR")
-    k_int: Scalar = gain(default=5310.0, unit="A/m/s", doc="integral gain; left out: LQR")
-    k_aw: Scalar = gain(default=10.6, unit="1/s", doc="anti-windup rate; left out: w/50")
+    k_int: Scalar = gain(default=5310.0, unit="A/m/s", doc="integral gain, 0: none; left out: LQR", zero=True)
+    k_aw: Scalar = gain(default=10.6, unit="1/s", doc="anti-windup rate, 0: none; left out: w/50", zero=True)
     memory = (("integral", "A", "integral term"),)
 
     def init(self, model: Plant) -> Array:
@@ -59,7 +59,7 @@ class StateFeedback(PositionLaw[Array]):
     def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: Array) -> tuple[Array, Array]:
         motion, reference = inputs
         i_star = self._current(model, inputs) - state
-        rate = self.k_int * (motion.z - reference.r) + self.k_aw * (i_star - motion.i)
+        rate = self.k_int * (motion.z - reference.r) + unwinding(self.k_aw, self.k_int) * (i_star - motion.i)
         return force_of_current(model, motion.z, i_star), rate
 
     def _current(self, model: Plant, inputs: tuple[Measurement, Reference]) -> Array:
@@ -85,6 +85,6 @@ class StateFeedback(PositionLaw[Array]):
     ) -> tuple[Array, Array]:
         """Step the anti-windup by backward Euler: x+ = x + T (k_int e + k_aw (i_star(x+) - i)). The output uses x."""
         motion, reference = inputs
-        free, leak = self._current(model, inputs), period * self.k_aw
+        free, leak = self._current(model, inputs), period * unwinding(self.k_aw, self.k_int)
         after = state + period * self.k_int * (motion.z - reference.r) + leak * (free - motion.i)
         return force_of_current(model, motion.z, free - state), after / (1 + leak)

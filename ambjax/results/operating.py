@@ -59,7 +59,7 @@ def operating_point(case: Case, name: str, r: float) -> OperatingPoint:
     """Linearise and analyse the loop of a case at a constant reference r (m). Raises ValueError as `linearise` does."""
     system = linearise(case.cascade, case.scenario, case.clock, r)
     m = float(case.scenario.plant.m)
-    return OperatingPoint(name, r, m, system, _analysis(case, system, m))
+    return OperatingPoint(name, r, m, system, _analysis(case, system, m, _velocity_sensor(case)))
 
 
 def sensitivity(case: Case, r: float = 0.0) -> Analysis:
@@ -75,10 +75,14 @@ def sensitivity(case: Case, r: float = 0.0) -> Analysis:
     return operating_point(case, "nominal", r).analysis
 
 
-def _analysis(case: Case, system: StateSpace, m: float) -> Analysis:
+def _velocity_sensor(case: Case) -> bool:
+    """Return whether the velocity is measured and the laws use this measurement."""
     sensor = case.scenario.sensor
-    measured = (sensor is None or sensor.velocity) and not case.cascade.observer.estimates_velocity
-    return analyse(system, m, case.clock.sample_period, case.zones, measured)
+    return (sensor is None or sensor.velocity) and case.cascade.reads_velocity(case.clock.sample_period)
+
+
+def _analysis(case: Case, system: StateSpace, m: float, velocity: bool) -> Analysis:
+    return analyse(system, m, case.clock.sample_period, case.zones, velocity)
 
 
 def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPeaks:
@@ -89,7 +93,7 @@ def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPea
     members = study.members if most is None else min(study.members, most)
     cascade, scenario = study.batch(np.arange(members))
     systems, found = linearise_members(cascade, scenario, study.clock)
-    peaks, good = np.full(members, math.inf), np.zeros(members, bool)
+    peaks, good, velocity = np.full(members, math.inf), np.zeros(members, bool), _velocity_sensor(case)
     masses = np.broadcast_to(np.asarray(scenario.plant.m, float), (members,))
     analyses: list[Analysis | None] = []
     loops: list[StateSpace] = []
@@ -97,7 +101,7 @@ def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPea
         one, loop = None, StateSpace(*(None if x is None else np.asarray(x)[k] for x in systems))  # pyright: ignore
         with contextlib.suppress(ValueError):  # the member has no linearisation
             loop = checked(loop, found[k], 0.0)
-            one = _analysis(case, loop, float(masses[k]))
+            one = _analysis(case, loop, float(masses[k]), velocity)
         loops.append(loop)
         analyses.append(one)
         if one is not None and one.stable:
