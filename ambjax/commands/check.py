@@ -130,7 +130,7 @@ def _processor_summary(case: Case, args: argparse.Namespace, results: _OnProcess
         print(f"\nOn the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s.\n")
         _print_sampled(sampled)
         print("\n" + "\n".join(advice.processor_lines(sampled, margin, unknown)))
-    slopes = [dataclasses.asdict(slope) | {"holds": slope.holds} for slope in sampled.slopes]
+    laws = [dataclasses.asdict(law) | {"holds": law.holds} for law in sampled.laws]
     return {
         **_clearance(case, args, sampled.largest_z),
         "holds": sampled.holds,
@@ -138,7 +138,7 @@ def _processor_summary(case: Case, args: argparse.Namespace, results: _OnProcess
             "lost_at_s": sampled.lost_at,
             "lost_why": sampled.lost_why,
             "stalled": sampled.stalled,
-            "slopes": slopes,
+            "laws": laws,
             "distance_to_C": sampled.distance[0],
             "distance_to_C_at_s": sampled.distance[1],
             "alternating": sampled.alternating,
@@ -203,17 +203,15 @@ def _print_check(conditions: list[Condition], proof: list[Condition]) -> None:
 def _print_sampled(sampled: SampledReport) -> None:
     rows = [
         (
-            slope.stage,
-            f"{slope.slope:.4g}",
-            "implicit" if slope.implicit else "explicit",
-            f"{slope.effective_slope:.4g}",
-            f"{slope.limit:.4g}",
-            f"{slope.oscillation_limit:.4g}",
-            "holds" if slope.holds else "FAILS",
+            law.stage,
+            "implicit" if law.implicit else "explicit",
+            f"{law.radius:.4g}",
+            f"{law.damping:.4g}",
+            "holds" if law.holds else "FAILS",
         )
-        for slope in sampled.slopes
+        for law in sampled.laws
     ]
-    head = ("law", "slope T", "step", "slope T of the step", "stable below", "no oscillation below", "verdict")
+    head = ("law", "step", "largest |pole|", "least damping ratio", "verdict")
     print(table(head, rows))
 
     def number(x: float | None) -> str:

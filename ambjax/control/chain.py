@@ -100,8 +100,9 @@ class FilterChain(PositionLaw[ChainState]):
         )
 
     def slope(self, model: Plant) -> Scalar:
-        """Return the largest of k_aw, the poles of all parts, and `explicit_rate`, 1/s."""
-        corners = [self.w_f, self.k_aw, self.w_p, self.w_1, self.w_2, self.explicit_rate(model)]
+        """Return the largest of k_aw, the poles of all parts, b k_d and sqrt(b k_p), 1/s."""
+        b = linear_mechanics(model).b
+        corners = [self.w_f, self.k_aw, self.w_p, self.w_1, self.w_2, b * self.k_d, jnp.sqrt(b * self.k_p)]
         corners += [] if self.w_lp is None else [self.w_lp]
         return jnp.max(jnp.stack([jnp.asarray(x) for x in corners]))
 
@@ -160,11 +161,6 @@ class FilterChain(PositionLaw[ChainState]):
         i_star = resting_current(model, reference) - y
         integral = state.integral + self.k_int * period * e + leak / (1 + leak) * (i_star - motion.i)
         return force_of_current(model, motion.z, i_star), self._state(derivative, integral, after)
-
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of b k_d and sqrt(b k_p), 1/s. `step` evaluates both terms at the start of a sample."""
-        b = linear_mechanics(model).b
-        return jnp.maximum(b * self.k_d, jnp.sqrt(b * self.k_p))
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         b = linear_mechanics(context.model).b

@@ -48,7 +48,7 @@ class IntegralSlidingMode(PositionLaw[Array]):
         return model.s_0 / 500
 
     def slope(self, model: Plant) -> Scalar:
-        return jnp.maximum(TWO_OVER_PI * self.k * self.p, self.explicit_rate(model))
+        return jnp.maximum(TWO_OVER_PI * self.k * self.p, jnp.maximum(self.c, jnp.sqrt(self.c_int)))
 
     def size(self, model: Plant) -> Scalar:
         return model.sigma_size
@@ -65,10 +65,6 @@ class IntegralSlidingMode(PositionLaw[Array]):
     def _force(self, model: Plant, inputs: tuple[Measurement, Reference], robust: Array) -> Array:
         motion, reference = inputs
         return force_for(self.c, model, motion, reference, robust - self.c_int * (motion.z - reference.r))
-
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of c and sqrt(c_int), because their terms are evaluated at the start of a sample."""
-        return jnp.maximum(self.c, jnp.sqrt(self.c_int))
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         k = position_switch(context, self.p)

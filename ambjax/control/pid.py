@@ -78,10 +78,6 @@ class PID(PositionLaw[PIDState]):
         wanted = -self.k_p * (motion.z - reference.r) - self.k_d * rate - integral
         return force_for(0.0, model, motion, reference, wanted)
 
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of k_d and sqrt(k_p), because their terms are evaluated at the start of a sample."""
-        return jnp.maximum(self.k_d, jnp.sqrt(self.k_p))
-
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         return {
             "k_p": rate(context, 1 / 30, 3, "corner sqrt(k_p) from w/30 to 3 w", power=2),
@@ -141,10 +137,6 @@ class FeedbackLinearisation(PositionLaw[tuple[()]]):
     ) -> tuple[Array, tuple[()]]:
         motion, reference = inputs
         return force_for(0.0, model, motion, reference, -self.k_d * self.sigma(motion, reference)), ()
-
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of k_d and sqrt(k_p), because their terms are evaluated at the start of a sample."""
-        return self.slope(model)
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         return {

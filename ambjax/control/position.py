@@ -68,10 +68,6 @@ class SlidingMode(PositionLaw[tuple[()]]):
     def relay(self) -> Relay:
         return Relay(self.k, self.p)
 
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return c, because its term is evaluated at the start of a sample."""
-        return self.c
-
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         k = position_switch(context, self.p)
         return {"c": manifold(context), "k": k, **steepness(context, "k")}
@@ -130,10 +126,6 @@ class SuperTwisting(PositionLaw[Array]):
         sigma = self.sigma(motion, reference)
         robust = state - self.k_1 * smooth_root(sigma, self.p)
         return force_for(self.c, model, motion, reference, robust), -self.k_2 * smooth_sign(sigma, self.p)
-
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return c, because its term is evaluated at the start of a sample."""
-        return self.c
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         if context.stepped or self.p is None:

@@ -66,11 +66,6 @@ class StateFeedback(PositionLaw[Array]):
         """Return the demanded current (A) without the integral term."""
         return resting_current(model, inputs[1]) - self.k_d * self.sigma(*inputs)
 
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of b k_d and sqrt(b k_p), because their terms are evaluated at the start of a sample."""
-        b = linear_mechanics(model).b
-        return jnp.maximum(b * self.k_d, jnp.sqrt(b * self.k_p))
-
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         b = linear_mechanics(context.model).b
         return {
