@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from javascript import run_rows, with_node
+from profiles import THOROUGH
 
 from ambjax import Cascade, Clock, Plant, Scenario, rollout
 from ambjax.cases.controller_tables import KINDS
@@ -58,6 +59,15 @@ ALL = [
 ]  # fmt: skip
 
 
+@pytest.fixture
+def released():
+    """Release the programs of a thorough test: the operating system limits the memory maps of one process."""
+    yield
+    if THOROUGH:
+        jax.clear_caches()
+
+
+@pytest.mark.usefixtures("released")
 @pytest.mark.parametrize(("mode", "watching", "moving"), ALL)
 def test_a_small_deviation_decays_if_and_only_if_the_linear_loop_is_stable(mode, watching, moving):
     cascade = cascade_of(mode, KINDS["observer"][watching], KINDS["position"][moving])

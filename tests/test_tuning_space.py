@@ -31,10 +31,10 @@ from ambjax.simulation.loop import INSTANT_TREE, Densities
 from ambjax.simulation.span import blank
 from ambjax.theorem.conditions import delta_1_on_reference
 from tuning.config import read_tune
+from tuning.gains_table import off
 from tuning.objective.loss import TERMS, Loss, loss_for
 from tuning.objective.risk import CVaR, Mean, SoftWorst
 from tuning.objective.shortfalls import bounds, shortfall
-from tuning.gains_table import off
 from tuning.space import CLOSEST, MARGIN, Gain, Space, tunable
 
 GAINS = [Gain("controller.position.c"), Gain("controller.position.c", 3.0), Gain("controller.position.c", 2.0, 5e3)]
