@@ -399,7 +399,7 @@ LOOP = [
     M(
         "a state that never changes is a mode of the linear loop",
         "ambjax/linear/analysis.py",
-        "return system.without_constants()",
+        "return system.without_idle()",
         "return StateSpace(*(None if x is None else np.asarray(x) for x in system))",
         "tests/test_linearised_structures.py::test_a_small_deviation_decays_if_and_only_if_the_linear_loop_is_stable"
         "[continuous-kalman-pid]",

@@ -73,7 +73,7 @@ def test_a_small_deviation_decays_if_and_only_if_the_linear_loop_is_stable(mode,
     cascade = cascade_of(mode, KINDS["observer"][watching], KINDS["position"][moving])
     scenario = Scenario(plant=RIG, initial=Initial(SMALL))
     system = linearise(cascade, scenario, CLOCK)
-    assert not system.constant().any()
+    assert not system.idle().any()
     poles = system.poles()
     growth = np.max(np.real(poles) if system.period is None else np.log(np.abs(poles) + 1e-300) / T)
     assert system.stable == (growth < 0)
@@ -88,8 +88,8 @@ def test_a_state_that_never_changes_is_no_mode_of_the_tuner_s_loop():
     A = np.array([[-3.0, 0.0, 2.0], [0.0, -5.0, 1.0], [0.0, 0.0, 0.0]])
     B, C = np.array([[1.0] * 3, [0.5] * 3, [0.0] * 3]), np.ones((4, 3))
     system = StateSpace(*map(jnp.asarray, (A, B, C, np.eye(4, 3), np.ones(3))))
-    assert system.constant().tolist() == [False, False, True]
-    smaller = system.without_constants()
+    assert system.idle().tolist() == [False, False, True]
+    smaller = system.without_idle()
     assert smaller.stable
     smaller = jax.tree.map(jnp.asarray, smaller)
     whole, part = (loop_quantities(one, jnp.asarray(True), 1.0, 100.0, 10.0, 1.0) for one in (system, smaller))

@@ -67,6 +67,26 @@ def test_a_member_without_an_equilibrium_is_reported_as_the_worst(tmp_path, caps
     assert "0 are in zone A" in counted
 
 
+def test_a_picture_without_a_stable_loop_gives_no_warning():
+    """Warnings are errors in the tests."""
+    assert frequency_figure("x", [], [3.0, 4.0, 5.0], (1.0, 500.0)).axes[0].get_legend() is None
+
+
+@pytest.mark.slow
+def test_a_reference_without_an_equilibrium_is_named_and_the_others_are_analysed(tmp_path, capsys):
+    """At r = 1 mm the model misses 68 m/s^2 of the plant's springs, and k gives 25 m/s^2."""
+    text = CASE + "[plant]\nk_z = -20000.0\n[controller.model]\nk_z = 0.0\n"
+    code, out, _, _ = answered(tmp_path, capsys, text)
+    assert code == 1
+    lines = out.splitlines()
+    for sign in "+-":
+        (why,) = [line for line in lines if line.startswith(f"at {sign}reference: ")]
+        assert f"no equilibrium at r = {'-' * (sign == '-')}0.001 m" in why
+    points = json.loads((tmp_path / "out" / "sensitivity.json").read_text())["points"]
+    assert [row["zone"] for row in points] == ["B", None, None]
+    assert [row["stable"] for row in points] == [True, None, None]
+
+
 def test_the_picture_shows_the_response(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(CASE)

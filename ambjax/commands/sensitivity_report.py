@@ -33,7 +33,9 @@ def sensitivity_summary(
     points: list[OperatingPoint], spread: SpreadPeaks | None, measured: Injections | None, zones: Zones
 ) -> dict[str, object]:
     """Return the numbers of sensitivity.json: of the equilibria `points`, the spread, and the injection."""
-    rows = [{"point": point.name, "reference_m": point.r, **analysis_summary(point.analysis)} for point in points]
+    rows: list[dict[str, object]] = [
+        {"point": point.name, "reference_m": point.r, **analysis_summary(point.analysis)} for point in points
+    ]
     summary: dict[str, object] = {
         **analysis_summary(points[0].analysis),
         **_injected_numbers(points[0], measured),

@@ -146,7 +146,7 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
     not contain noise, runout, disturbances, converters, faults, the guard, the limits of supply and amplifier, or the
     dead band. On a processor it is the exact map of one sample period.
 
-    Returns the state space with NumPy arrays. States that never change are left out. Raises ValueError as `rollout`
+    Returns the state space with NumPy arrays. States that no input reaches are left out. Raises ValueError as `rollout`
     does, if no equilibrium is found at r, and if a law has no derivative there.
     """
     system, found = _matrices(*canonical((*linearisation_inputs(cascade, scenario, clock), r)))
@@ -154,7 +154,7 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
 
 
 def checked(system: StateSpace, found: Any, r: Scalar) -> StateSpace:
-    """Return a result of `loop_matrices` with NumPy arrays, without the states that never change.
+    """Return a result of `loop_matrices` with NumPy arrays, without the states that no input reaches.
 
     Raises ValueError if it has no meaning: no equilibrium at r (m), or a matrix that is not finite.
     """
@@ -168,7 +168,7 @@ def checked(system: StateSpace, found: Any, r: Scalar) -> StateSpace:
             f"the loop has no linearisation at the equilibrium of r = {float(r):g} m: the derivative of a law or of "
             "the plant is not finite there."
         )
-    return system.without_constants()
+    return system.without_idle()
 
 
 def linearise_members(

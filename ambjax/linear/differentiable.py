@@ -98,7 +98,7 @@ def loop_quantities(
     safe = 0.5 * jnp.eye(n, dtype=system.A.dtype) * (1.0 if system.period is not None else -1.0)
     scaled = system.scaled()
     scaled = scaled._replace(
-        A=jnp.where(fine, _without_constants(scaled), safe),
+        A=jnp.where(fine, _without_idle(scaled), safe),
         **{name: jnp.where(fine, getattr(scaled, name), 0.0) for name in "BC"},
     )
     growth, poles = _growth(scaled)
@@ -128,11 +128,11 @@ def loop_quantities(
     )
 
 
-def _without_constants(system: StateSpace) -> Array:
-    """Return A with a stable mode, which nothing excites, in place of each state that never changes."""
-    constant = jnp.asarray(system.constant())
+def _without_idle(system: StateSpace) -> Array:
+    """Return A with a stable mode, which nothing excites, in place of each state that no input reaches."""
+    idle = jnp.asarray(system.idle())
     rate = jnp.zeros(()) if system.period is not None else -jnp.max(jnp.abs(jnp.diagonal(system.A)))
-    return jnp.where(constant[:, None], rate * jnp.eye(len(system.A), dtype=system.A.dtype), system.A)
+    return jnp.where(idle[:, None], rate * jnp.eye(len(system.A), dtype=system.A.dtype), system.A)
 
 
 def _point(f: Array, period: Array | None) -> Array:

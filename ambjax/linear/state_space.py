@@ -36,15 +36,17 @@ class StateSpace(NamedTuple):
         s = self.sizes
         return self._replace(A=self.A * s / s[:, None], B=self.B / s[:, None], C=self.C * s, sizes=s / s)
 
-    def constant(self) -> Array | np.ndarray:
-        """Return which states [N] never change, such as an integral whose gain is 0: their equation is x' = 0."""
-        moved = self.A if self.period is None else self.A - np.eye(len(self.A))
-        return ~((moved != 0).any(1) | (self.B != 0).any(1))
+    def idle(self) -> Array | np.ndarray:
+        """Return which states [N] no input reaches, such as an integral whose gain is 0: their deviations stay 0."""
+        linked, reached = self.A != 0, (self.B != 0).any(1)
+        for _ in range(len(self.A)):
+            reached = reached | (linked & reached).any(1)
+        return ~reached
 
-    def without_constants(self) -> "StateSpace":
-        """Return the system with NumPy arrays, without the states that never change. Their deviations are 0."""
+    def without_idle(self) -> "StateSpace":
+        """Return the system with NumPy arrays, without the states that no input reaches."""
         one = StateSpace(*(None if x is None else np.asarray(x) for x in self))  # pyright: ignore[reportArgumentType]
-        kept = ~np.asarray(one.constant())
+        kept = ~np.asarray(one.idle())
         A, B, C, sizes = one.A[kept][:, kept], one.B[kept], one.C[:, kept], one.sizes[kept]
         return one._replace(A=A, B=B, C=C, sizes=sizes)
 

@@ -114,8 +114,10 @@ function sampleMap(P, facts, period, delay) {
   M.push(inputs.map((c) => c[lagged + control]));
   M.push(inputs.map((_, k) => (k === n - 2 ? 1 : 0)));
   const s = [...point.sizes.subarray(0, lagged), ...point.sizes.subarray(lagged + 1), point.sizes[lagged], point.sizes[lagged]];
-  // a state that never changes is no state of the linear loop
-  const moves = (_, i) => M[i].some((x, k) => x !== Number(i === k)), columns = (row) => row.slice(0, n).filter(moves);
+  // a state that e does not reach is no state of the linear loop
+  let reached = M.map((row) => row[n] !== 0);
+  for (let k = 0; k < n; k++) reached = M.map((row, i) => reached[i] || row.slice(0, n).some((x, j) => x !== 0 && reached[j]));
+  const moves = (_, i) => reached[i], columns = (row) => row.slice(0, n).filter(moves);
   return {
     A: M.map((row, i) => columns(row.map((x, k) => (x * s[k]) / s[i]))).filter(moves),
     B: M.map((row, i) => row[n] / s[i]).filter(moves),
