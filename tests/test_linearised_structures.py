@@ -78,9 +78,10 @@ def test_a_small_deviation_decays_if_and_only_if_the_linear_loop_is_stable(mode,
     growth = np.max(np.real(poles) if system.period is None else np.log(np.abs(poles) + 1e-300) / T)
     assert system.stable == (growth < 0)
     size = np.abs(np.asarray(rollout(cascade, scenario, CLOCK).trajectory.rows.z)) / SMALL
-    first, last = np.max(size[:200]), np.max(size[-200:])
     if abs(growth) * CLOCK.duration > 3:  # otherwise the deviation neither decays nor grows during the run
-        assert (last < first) == system.stable, (growth, first, last)
+        # a deviation that grows may end in a small limit cycle of the signs
+        decays = np.max(size[-200:]) < np.max(size[:200]) < 1e6
+        assert decays if system.stable else np.max(size) > 10, (growth, np.max(size), np.max(size[-200:]))
 
 
 def test_a_state_that_never_changes_is_no_mode_of_the_tuner_s_loop():
