@@ -13,7 +13,7 @@ from ambjax.linear import analyse, frequency_lines, injected, linearise
 from ambjax.results.operating import one_period
 from tuning.measured_peaks import INJECTED, injections
 from tuning.objective.limits import PREFIX
-from tuning.objective.loops import loops
+from tuning.objective.loops import check_loops, loops
 from tuning.objective.quantities import KINDS, LOOPS
 from tuning.problem import problem_of
 from tuning.search.rounds import finer
@@ -49,6 +49,22 @@ def made():
     problem = problem_of(*case_and_tune(DOCUMENT), threads=1)
     x = problem.objective.space.encode(problem.objective.space.values(problem.case.cascade))
     return problem, x, problem.objective.training(1, 12, 2, 1.2, 1.25)
+
+
+@pytest.mark.slow
+def test_a_search_does_not_begin_if_its_limits_cannot_be_evaluated(made):
+    """The model is six times lighter than the rotor, so k = 5 m/s^2 cannot carry the rest of its weight."""
+    problem, x, members = made
+    check_loops(problem.objective, x[None], members.searched)
+    laws = {"position": {"c": 200.0, "k": 5.0, "p": 5.0}, "model": {"m": 0.1}}
+    bounds = {"controller.position.k": [1.0, 6.0]}
+    light = DOCUMENT | {"controller": GAINS | laws, "tune": DOCUMENT["tune"] | {"bounds": bounds}}
+    problem = problem_of(*case_and_tune(light), threads=1)
+    x = problem.objective.space.encode(problem.objective.space.values(problem.case.cascade))
+    with pytest.raises(ValueError, match=r"tune\.limits: .*sensitivity cannot be evaluated.* none of the 2 starting"):
+        check_loops(
+            problem.objective, np.stack([x, x + 0.01]), problem.objective.training(1, 12, 2, 1.2, 1.25).searched
+        )
 
 
 @pytest.mark.slow

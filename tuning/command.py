@@ -21,6 +21,7 @@ from ambjax.host.web_page import render_page
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
 from tuning.config import read_tune, settings
+from tuning.gains_table import off
 from tuning.problem import TuningProblem, problem_of
 from tuning.report import accurate, front_table, pictures
 from tuning.report import document as report
@@ -119,6 +120,8 @@ def _searched(plan: TuningPlan, resume: bool) -> SearchResult:
     say(
         f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {problem.objective.clock.method}"
     )
+    if zero := off(problem.case.cascade):
+        say(f"not tuned, because they are 0 in the case, which switches their terms off: {', '.join(zero)}")
     laws = {law.stage: law.digest for law in problem.case.own_laws}
     if problem.case.controller_file:
         laws["position"] = problem.case.controller_file.contents.digest

@@ -54,13 +54,15 @@ def bias_flux(case: Case) -> float:
 def acceptance(case: Case) -> tuple[dict[str, object], str]:
     """Return the JSON summary and the text: zone and margins of the loop linearised at r = 0, and the machine.
 
-    If the loop cannot be linearised, the zone is None, and only the text has the numbers of the machine.
+    If the loop cannot be linearised, `zone` and `stable` are None, and `why` is the cause.
     """
     try:
         system = linearise(case.cascade, case.scenario, case.clock)
-        loop = analyse(system, case.scenario.plant.m, case.clock.sample_period, case.zones)
     except ValueError as error:
-        return {"zone": None, "stable": False}, f"{error}\n\n{_facts_table(machine(case))}"
+        facts = machine(case)
+        summary = {"stable": None, "zone": None, "why": str(error), **{fact.key: fact.value for fact in facts}}
+        return summary, f"No zone and no margins: {error}\n\n{_facts_table(facts)}"
+    loop = analyse(system, case.scenario.plant.m, case.clock.sample_period, case.zones)
     facts = [*_loop_facts(loop), *machine(case)]
     summary = {"stable": loop.stable, "zone": loop.zone, **{fact.key: fact.value for fact in facts}}
     return summary, "\n".join([_verdict(case, loop), "", _facts_table(facts)])

@@ -42,8 +42,9 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """Check a case. Print the results of the linearised loop, then those on the processor, then those of Theorem 1.
 
     Returns the exit code and the summary. The exit code is 1 if a condition fails, if the rotor is lost, if the
-    integrator stalls, if the rotor is held but the loop is not stable, or if the magnets cannot carry the rotor. On a
-    processor, the conditions of Theorem 1 do not count. The zones and the margins of the linearised loop never count.
+    integrator stalls, if the rotor is held but the loop is not stable, if the magnets cannot carry the rotor, or if the
+    loop cannot be linearised. On a processor, the conditions of Theorem 1 do not count. The zones and the margins of
+    the linearised loop never count.
     """
     from ambjax.theorem import advice
 
@@ -85,7 +86,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
             print(CONTINUOUS)
     steady = findings is None or findings.stable
     summary["holds"] = bool(summary["holds"]) and largest >= weight and steady
-    return int(not summary["holds"]), plain(summary)
+    return int(not summary["holds"] or loop["stable"] is None), plain(summary)
 
 
 class _OnProcessor(NamedTuple):
@@ -168,7 +169,7 @@ def _processor_summary(case: Case, args: argparse.Namespace, results: _OnProcess
         print(f"\nOn the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s.\n")
         _print_sampled(sampled)
         print("\n" + "\n".join(advice.processor_lines(sampled, margin, unknown)))
-    slopes = [dataclasses.asdict(slope) | {"holds": slope.holds} for slope in sampled.slopes]
+    laws = [dataclasses.asdict(law) | {"holds": law.holds} for law in sampled.laws]
     return {
         **_clearance(case, args, sampled.largest_z),
         "holds": sampled.holds,
@@ -177,7 +178,7 @@ def _processor_summary(case: Case, args: argparse.Namespace, results: _OnProcess
             "lost_why": sampled.lost_why,
             "loss_cause": _cause(sampled.loss_cause),
             "stalled": sampled.stalled,
-            "slopes": slopes,
+            "laws": laws,
             "distance_to_C": sampled.distance[0],
             "distance_to_C_at_s": sampled.distance[1],
             "alternating": sampled.alternating,
@@ -247,17 +248,15 @@ def _print_check(conditions: list[Condition], proof: list[Condition]) -> None:
 def _print_sampled(sampled: SampledReport) -> None:
     rows = [
         (
-            slope.stage,
-            f"{slope.slope:.4g}",
-            "implicit" if slope.implicit else "explicit",
-            f"{slope.effective_slope:.4g}",
-            f"{slope.limit:.4g}",
-            f"{slope.oscillation_limit:.4g}",
-            "holds" if slope.holds else "FAILS",
+            law.stage,
+            "implicit" if law.implicit else "explicit",
+            f"{law.radius:.4g}",
+            f"{law.damping:.4g}",
+            "holds" if law.holds else "FAILS",
         )
-        for slope in sampled.slopes
+        for law in sampled.laws
     ]
-    head = ("law", "slope T", "step", "slope T of the step", "stable below", "no oscillation below", "verdict")
+    head = ("law", "step", "largest |pole|", "least damping ratio", "verdict")
     print(table(head, rows))
 
     def number(x: float | None) -> str:

@@ -131,7 +131,8 @@ def _better(one: Compared, first: Compared) -> int:
 def _loop(one: Compared) -> dict[str, object]:
     """Return the numbers of the linearised loops of a case.
 
-    If the nominal loop has no equilibrium or is not stable, its zone is D and its other numbers are None.
+    If the nominal loop is not stable, its zone is D and its other numbers are None. If it has no linearisation, its
+    zone is None too.
     """
     keys = ("peak", "frequency_hz", "t_peak", "ks_peak", "gain_margin_low", "gain_margin_high", "phase_margin_deg")
     keys += ("delay_margin_s", "disk_margin", "stiffness_N_per_m")
@@ -141,7 +142,8 @@ def _loop(one: Compared) -> dict[str, object]:
         if not worst["unstable"] and one.peaks.point is not None:
             worst["worst_peak"] = one.peaks.point.analysis.S.height
     if one.point is None or not one.point.analysis.stable:
-        return {"stable": False, "zone": "D", **dict.fromkeys(keys), **worst}
+        unstable = {"stable": None, "zone": None} if one.point is None else {"stable": False, "zone": "D"}
+        return {**unstable, **dict.fromkeys(keys), **worst}
     loop = one.point.analysis
     margins = loop.margins
     found = (loop.S.height, loop.S.frequency, loop.T.height, loop.KS.height, margins.gain_low, margins.gain_high)

@@ -28,25 +28,44 @@ INJECTED = 8
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
-    """Analyse the loop of a case. Exit code 1 if it is not stable at an equilibrium, or if a member is not stable."""
+    """Analyse the loop of a case.
+
+    The exit code is 1 if the loop is not stable at an equilibrium or cannot be linearised at one of the references, or
+    if a member is not stable. Raises ValueError as `linearise` does for the reference 0.
+    """
     case = read_with_warnings(args.case)
     study = _study(case, args)
-    points = [operating_point(case, name, r) for name, r in references(case)]
+    points, missing = _points(case)
     spread = None if study is None else spread_peaks(case, study)
     if study is not None and spread is not None and set_valued(case):
         spread = spread._replace(measured=measured_peaks(case, study, points[0].analysis.S.frequency))
     measured = _injections(case, points[0]) if args.inject or case.cascade.processor is not None else None
     out = directory(args.out, f"sensitivity-{case.name}", WRITTEN, args.force)
     summary = sensitivity_summary(points, spread, measured, case.zones)
+    rows = [{"point": name, "stable": None, "zone": None, "why": why} for name, why in missing.items()]
+    summary["points"] = [*summary["points"], *rows]
     with files(out) as part:
         write_json(part / "sensitivity.json", summary)
         described("sensitivity.png", lambda: _draw(case, points, spread, measured, part / "sensitivity.png"))
         names = [name for name in WRITTEN if (part / name).exists()]
     if not args.json:
-        print(described("the table", lambda: text_of(case, points, spread, measured)) or "")
+        tables = described("the table", lambda: text_of(case, points, spread, measured)) or ""
+        print("\n".join([tables, *(f"{name}: {missing[name]}" for name in missing)]))
         written(out, ", ".join(names))
     stable = all(point.analysis.stable for point in points) and (spread is None or spread.stable == spread.members)
-    return int(not stable), plain(summary | {"out": str(out)})
+    return int(bool(missing) or not stable), plain(summary | {"out": str(out)})
+
+
+def _points(case: Case) -> tuple[list[OperatingPoint], dict[str, str]]:
+    """Return the loops at the references, and the cause, by name, for each reference other than 0 without a loop."""
+    (first, *rest), missing = references(case), {}
+    points = [operating_point(case, *first)]
+    for name, r in rest:
+        try:
+            points.append(operating_point(case, name, r))
+        except ValueError as error:
+            missing[name] = str(error)
+    return points, missing
 
 
 def references(case: Case) -> list[tuple[str, float]]:

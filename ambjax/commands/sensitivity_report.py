@@ -33,7 +33,9 @@ def sensitivity_summary(
     points: list[OperatingPoint], spread: SpreadPeaks | None, measured: Injections | None, zones: Zones
 ) -> dict[str, object]:
     """Return the numbers of sensitivity.json: of the equilibria `points`, the spread, and the injection."""
-    rows = [{"point": point.name, "reference_m": point.r, **analysis_summary(point.analysis)} for point in points]
+    rows: list[dict[str, object]] = [
+        {"point": point.name, "reference_m": point.r, **analysis_summary(point.analysis)} for point in points
+    ]
     summary: dict[str, object] = {
         **analysis_summary(points[0].analysis),
         **_injected_numbers(points[0], measured),
@@ -41,7 +43,7 @@ def sensitivity_summary(
     }
     if spread is not None:
         worst = {} if spread.point is None else analysis_summary(spread.point.analysis)
-        counts = {"members": spread.members, "stable": spread.stable, "zone_a": spread.zone_a}
+        counts = {name: getattr(spread, name) for name in ("members", "stable", "zone_a", "failed")}
         summary["spread"] = {**counts, "worst_member": spread.worst, **({"worst": worst} if worst else {})}
         if spread.measured is not None:
             summary["spread"] |= _measured_numbers(spread.measured, zones)
@@ -136,6 +138,8 @@ def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None
             f"Of {spread.members} members of [spread], {spread.stable} are stable and {spread.zone_a} are in zone A; "
             f"the worst is member {spread.worst}."
         ]
+        if spread.failed:
+            rows += [f"{spread.failed} of them have no equilibrium at r = 0 m, and so no linearised loop."]
         rows += [] if spread.measured is None else [_measured_text(spread.measured, case.zones)]
     if signs := set_valued(case):
         rows += [

@@ -13,7 +13,7 @@ to the sensor's own reading, and KS that from e to u.
 `injected` measures S, T and KS in the nonlinear simulation, `injected_members` the peak of |S| of each member.
 """
 
-from ambjax.linear.analysis import Analysis, Zones, analyse, linearisation_inputs, linearise, linearise_members
+from ambjax.linear.analysis import Analysis, Zones, analyse, checked, linearisation_inputs, linearise, linearise_members
 from ambjax.linear.differentiable import LoopQuantities, loop_quantities
 from ambjax.linear.injection import Injection, MemberPeaks, frequency_lines, injected, injected_members
 from ambjax.linear.margins import Margins, ResponsePeak, margins_of, noise_gain, peak
@@ -35,6 +35,7 @@ __all__ = [
     "StateSpace",
     "Zones",
     "analyse",
+    "checked",
     "frequency_lines",
     "injected",
     "injected_members",

@@ -146,12 +146,29 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
     not contain noise, runout, disturbances, converters, faults, the guard, the limits of supply and amplifier, or the
     dead band. On a processor it is the exact map of one sample period.
 
-    Returns the state space with NumPy arrays. Raises ValueError as `rollout` does, and if no equilibrium is found at r.
+    Returns the state space with NumPy arrays. States that no input reaches are left out. Raises ValueError as `rollout`
+    does, if no equilibrium is found at r, and if a law has no derivative there.
     """
     system, found = _matrices(*canonical((*linearisation_inputs(cascade, scenario, clock), r)))
+    return checked(system, found, r)
+
+
+def checked(system: StateSpace, found: Any, r: Scalar) -> StateSpace:
+    """Return a result of `loop_matrices` with NumPy arrays, without the states that no input reaches.
+
+    Raises ValueError if it has no meaning: no equilibrium at r (m), or a matrix that is not finite.
+    """
     if not found:
-        raise ValueError(f"no equilibrium at r = {float(r):g} m was found: the laws probably cannot hold the rotor.")
-    return StateSpace(*(None if x is None else np.asarray(x) for x in system))  # pyright: ignore[reportArgumentType]
+        raise ValueError(
+            f"no equilibrium at r = {float(r):g} m was found, so the loop has no linearisation there: Newton's method "
+            "ended where the plant or a law still moves. `ambjax simulate` shows whether the rotor is held."
+        )
+    if not all(np.isfinite(np.asarray(x)).all() for x in system if x is not None):
+        raise ValueError(
+            f"the loop has no linearisation at the equilibrium of r = {float(r):g} m: the derivative of a law or of "
+            "the plant is not finite there."
+        )
+    return system.without_idle()
 
 
 def linearise_members(
@@ -159,8 +176,8 @@ def linearise_members(
 ) -> tuple[StateSpace, np.ndarray]:
     """Linearise the loop of every member of an ensemble, whose varying leaves are arrays [N], at the reference r (m).
 
-    Returns the matrices, each with a leading axis [N], and whether an equilibrium was found for each
-    member [N]; if not, the matrices of the member have no meaning. Raises ValueError as `rollout` does.
+    Returns the matrices, each with a leading axis [N], and whether an equilibrium was found for each member [N]; if
+    not, the matrices of the member have no meaning. `checked` examines one member. Raises ValueError as `rollout` does.
     """
     # one call at a time: XLA runs LAPACK on its own threads, and two calls may deadlock
     return map_members(_member, canonical((*linearisation_inputs(cascade, scenario, clock), r)), threads=1, plain=True)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ambjax.linear.margins import STATIC
-from ambjax.linear.state_space import StateSpace
+from ambjax.linear.state_space import NEUTRAL, StateSpace
 from ambjax.numerics.records import Scalar
 
 # Numbers of frequencies in the first scan, on a logarithmic axis: for peaks, and for crossings of |L| = 1.
@@ -32,7 +32,8 @@ class LoopQuantities(NamedTuple):
     - `sensitivity`, `complementary`: peaks of |S| and |T|.
     - `control_sensitivity`: peak of |KS|, V/m.
     - `delay_margin_s`: smallest additional delay that makes the loop unstable, s.
-    - `growth`: largest real part of a pole, 1/s; negative if the loop is stable, inf without an equilibrium.
+    - `growth`: largest real part of a pole, 1/s; inf without an equilibrium. The loop is stable as in
+      `StateSpace.stable`.
 
     The unit of |S| and |T| is 1, that of |KS| is `volts_per_metre`; `pole` is the unstable pole of the plant. For a
     stable loop, the peaks are those of `analyse`, smoothly limited to MOST times their unit. For an unstable loop they
@@ -97,7 +98,8 @@ def loop_quantities(
     safe = 0.5 * jnp.eye(n, dtype=system.A.dtype) * (1.0 if system.period is not None else -1.0)
     scaled = system.scaled()
     scaled = scaled._replace(
-        A=jnp.where(fine, scaled.A, safe), **{name: jnp.where(fine, getattr(scaled, name), 0.0) for name in "BC"}
+        A=jnp.where(fine, _without_idle(scaled), safe),
+        **{name: jnp.where(fine, getattr(scaled, name), 0.0) for name in "BC"},
     )
     growth, poles = _growth(scaled)
     loop = _loop(lax.stop_gradient(scaled), poles, jnp.asarray(volts_per_metre))
@@ -110,7 +112,8 @@ def loop_quantities(
     response = scaled.response(jnp.stack(peaks))
     heights = jnp.abs(response[0, 0, 0]), jnp.abs(response[1, 0, 0] - 1), jnp.abs(response[2, 2, 0])
     delay = _delay_margin(scaled, loop, low)
-    stable = fine & (growth < 0)
+    fastest = jnp.max(jnp.abs(poles)) if system.period is None else 1 / system.period
+    stable = fine & (growth < NEUTRAL * fastest)
     worse = MOST * jnp.where(fine, 1 + jnp.maximum(growth, 0.0) / pole, NO_EQUILIBRIUM)
 
     def bounded(x: Array) -> Array:
@@ -123,6 +126,13 @@ def loop_quantities(
         1 / (pole * bounded(1 / (delay * pole))),
         jnp.where(fine, growth, jnp.inf),
     )
+
+
+def _without_idle(system: StateSpace) -> Array:
+    """Return A with a stable mode, which nothing excites, in place of each state that no input reaches."""
+    idle = jnp.asarray(system.idle())
+    rate = jnp.zeros(()) if system.period is not None else -jnp.max(jnp.abs(jnp.diagonal(system.A)))
+    return jnp.where(idle[:, None], rate * jnp.eye(len(system.A), dtype=system.A.dtype), system.A)
 
 
 def _point(f: Array, period: Array | None) -> Array:

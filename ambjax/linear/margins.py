@@ -18,6 +18,9 @@ POINTS = 600
 NARROW = 1e-6
 # Frequency that stands for 0, as a share of the lowest one. At 0 itself the response of an integrator is not finite.
 STATIC = 1e-6
+# DOUBLINGS: most doublings of the time over which the response to noise is summed, 1e18 samples. SETTLED: relative
+# change in a doubling below which the variance is final.
+DOUBLINGS, SETTLED = 60, 1e-13
 GOLDEN = (math.sqrt(5) - 1) / 2
 
 
@@ -144,9 +147,12 @@ def _crossings(function: Magnitude, f: np.ndarray, values: np.ndarray) -> list[f
 def noise_gain(system: StateSpace, period: float) -> float:
     """Return the rms of z per rms of white noise on the reading of z, for a stable loop.
 
-    Each noise value is held for `period` (s); on a processor, for the system's own sample period.
+    Each noise value is held for `period` (s); on a processor, for the system's own sample period. The covariance is the
+    sum over the values so far, whose number is doubled until the variance of z settles (Smith, SIAM J. Appl. Math. 16
+    (1968) 198-201). A linear solver is not accurate here: a pole close to 1, as that of an integral with a negligible
+    gain, makes the Lyapunov equation singular.
     """
-    from scipy.linalg import expm, solve_discrete_lyapunov
+    from scipy.linalg import expm
 
     scaled = system.scaled()
     A, b, c = np.asarray(scaled.A), np.asarray(scaled.B)[:, :1], np.asarray(scaled.C)[3]
@@ -154,5 +160,10 @@ def noise_gain(system: StateSpace, period: float) -> float:
         n = len(A)
         whole = expm(np.block([[A, b], [np.zeros((1, n + 1))]]) * period)
         A, b = whole[:n, :n], whole[:n, n:]
-    covariance = solve_discrete_lyapunov(A, b @ b.T)
-    return float(np.sqrt(max(c @ covariance @ c, 0.0)))
+    covariance, variance, before = b @ b.T, float((c @ b)[0] ** 2), -1.0
+    for _ in range(DOUBLINGS):
+        if variance > 0 and variance - before <= SETTLED * variance:
+            break
+        covariance, A = covariance + A @ covariance @ A.T, A @ A
+        before, variance = variance, float(c @ covariance @ c)
+    return math.sqrt(variance)

@@ -25,7 +25,8 @@ def loop_matrices(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scala
     - `period`: sample period, s; not used in continuous time.
 
     The function is pure, works under jit and vmap, and is differentiable in all gains and parameters. Returns the state
-    space, and whether an equilibrium was found; if not, the matrices have no meaning.
+    space, and whether an equilibrium was found; if not, the matrices have no meaning. They are not finite if a law has
+    no derivative at the equilibrium.
     """
     scenario = ideal(scenario)
     if cascade.processor is not None:

@@ -11,6 +11,9 @@ INPUTS = ("e_z", "e_z_dot", "q_z")
 # Outputs: the readings of z (m) and z_dot (m/s), test signals included, the voltage u (V), and the true position z (m).
 OUTPUTS = ("z_read", "z_dot_read", "u", "z")
 
+# A mode whose growth rate is below this share of the fastest rate is at rest: the difference is a rounding error.
+NEUTRAL = 1e-12
+
 
 class StateSpace(NamedTuple):
     """The linear system x' = A x + B w, y = C x + D w, or x_{n+1} = A x_n + B w_n on a processor.
@@ -32,6 +35,20 @@ class StateSpace(NamedTuple):
         """Return the same system with each state divided by its size."""
         s = self.sizes
         return self._replace(A=self.A * s / s[:, None], B=self.B / s[:, None], C=self.C * s, sizes=s / s)
+
+    def idle(self) -> Array | np.ndarray:
+        """Return which states [N] no input reaches, such as an integral whose gain is 0: their deviations stay 0."""
+        linked, reached = self.A != 0, (self.B != 0).any(1)
+        for _ in range(len(self.A)):
+            reached = reached | (linked & reached).any(1)
+        return ~reached
+
+    def without_idle(self) -> "StateSpace":
+        """Return the system with NumPy arrays, without the states that no input reaches."""
+        one = StateSpace(*(None if x is None else np.asarray(x) for x in self))  # pyright: ignore[reportArgumentType]
+        kept = ~np.asarray(one.idle())
+        A, B, C, sizes = one.A[kept][:, kept], one.B[kept], one.C[:, kept], one.sizes[kept]
+        return one._replace(A=A, B=B, C=C, sizes=sizes)
 
     def response(self, frequency: Array | np.ndarray) -> Array:
         """Return the complex frequency response at frequencies [F] in Hz, as an array [F, 4 outputs, 3 inputs].
@@ -56,9 +73,15 @@ class StateSpace(NamedTuple):
 
     @property
     def stable(self) -> bool:
-        """Whether all poles lie inside the unit circle, or in the left half-plane in continuous time."""
+        """Whether no mode grows: no pole is outside the unit circle, or right of the imaginary axis in continuous time.
+
+        A pole on this border, up to rounding errors (NEUTRAL), is that of a mode at rest. An integral with a gain of
+        1e-20 has such a pole.
+        """
         poles = self.poles()
-        return bool(np.all(np.real(poles) < 0) if self.period is None else np.all(np.abs(poles) < 1))
+        if self.period is None:
+            return bool(np.all(np.real(poles) <= NEUTRAL * np.max(np.abs(poles), initial=0.0)))
+        return bool(np.all(np.abs(poles) <= 1 + NEUTRAL))
 
     def to_control(self) -> Any:
         """Return the system as a `StateSpace` of python-control, with the names INPUTS and OUTPUTS.

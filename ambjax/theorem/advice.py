@@ -3,12 +3,11 @@
 import math
 import re
 
-from ambjax.control.sampling import slope_limits
 from ambjax.host.words import command
 from ambjax.theorem.causes import Cause, cause_words
 from ambjax.theorem.conditions import Condition, Report
+from ambjax.theorem.law_poles import LEAST_DAMPING
 from ambjax.theorem.sampled_report import Delays, SampledReport
-from ambjax.theorem.slopes import SlopeCheck
 
 QUESTION = "Do the conditions of Theorem 1 hold along this run?"
 # Ratio of an advised gain to the number that it must exceed; the result is rounded up to two digits.
@@ -74,17 +73,18 @@ def advice(report: Report) -> list[str]:
 def processor_lines(sampled: SampledReport, margin: Delays, unknown: Delays | None) -> list[str]:
     """Return the lines below the tables of a cascade on a processor.
 
-    They report the slopes, the distance to C, the status of the rotor, an alternating voltage, and the delay margins.
-    `margin`: delay margin; a prediction, if there is one, uses the actual delay. `unknown`: delay margin if the
-    prediction uses the delay of the case; None: the controller does not predict.
+    They report the poles of the laws, the distance to C, the status of the rotor, an alternating voltage, and the delay
+    margins. `margin`: delay margin; a prediction, if there is one, uses the actual delay. `unknown`: delay margin if
+    the prediction uses the delay of the case; None: the controller does not predict.
     """
     lines = [
-        f"- {slope.stage}: slope T of the step is {number(slope.effective_slope)} and must be less than "
-        f"{number(slope.limit)}. {_smaller_slope(slope)}"
-        for slope in sampled.slopes
-        if not slope.holds
+        f"- {law.stage}: the largest |pole| is {number(law.radius)} and must be less than 1, the least damping ratio "
+        f"is {number(law.damping)} and must be at least {LEAST_DAMPING:g}. Lower the gain or p, shorten "
+        f"clock.sample_period, or set {'predict = true' if law.implicit else IMPLICIT}."
+        for law in sampled.laws
+        if not law.holds
     ]
-    words = f"No, {len(lines)} of {len(sampled.slopes)} {'is' if len(lines) == 1 else 'are'} not:" if lines else "Yes."
+    words = f"No, {len(lines)} of {len(sampled.laws)} {'is' if len(lines) == 1 else 'are'} not:" if lines else "Yes."
     end = status(sampled.lost_at, sampled.lost_why, sampled.stalled, STALLED_PLANT)
     lines = [f"Is the discrete step of every law stable? {words}", *lines, _curve(*sampled.distance), end]
     if sampled.loss_cause is not None:
@@ -109,16 +109,6 @@ def _curve(distance: float, at: float) -> str:
         f"{question} No: it is {number(-distance)} beyond C at {at:.4g} s. Choose a smaller reference, a slower "
         "position law (c, k), or an observer that attenuates the noise more."
     )
-
-
-def _smaller_slope(slope: SlopeCheck) -> str:
-    """Return the changes that lower the slope of a step, or raise its limit."""
-    ways = ["lower the gain or p", "shorten clock.sample_period"]
-    if not slope.implicit:
-        ways.append(f"set {IMPLICIT}")
-    elif slope.limit < slope_limits(0.0)[0]:  # the law acts with a delay that it does not include
-        ways.append("set predict = true")
-    return f"{', '.join(ways[:-1])} or {ways[-1]}.".capitalize()
 
 
 def _alternates(share: float, cause: Cause | None) -> str:

@@ -1,4 +1,4 @@
-"""Checks of a cascade on a processor: slopes of laws times T, the distance to the singular curve C, the rotor's status.
+"""Checks of a cascade on a processor: poles of the laws, the distance to the singular curve C, the rotor's status.
 
 Theorem 1 applies in continuous time, where sigma, v_tilde and e reach 0. With steps of length T they only reach a band
 around 0. A law computes its signal from an estimate, so the computed signal differs from that of the plant. Along a
@@ -25,8 +25,8 @@ from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
 from ambjax.theorem.causes import Cause, find_cause
+from ambjax.theorem.law_poles import LawPoles, law_poles, sampling_of
 from ambjax.theorem.law_signals import LawSignalsRecorder
-from ambjax.theorem.slopes import SlopeCheck, sampling_of, slope_checks
 from ambjax.world.bearing import Bearing
 from ambjax.world.scenario import Scenario
 
@@ -71,7 +71,7 @@ class Band:
 
 @dataclasses.dataclass(frozen=True)
 class SampledReport:
-    """Slopes and bands of a cascade on its processor, and the rotor's status under the case's noise.
+    """Poles of the laws and bands of a cascade on its processor, and the rotor's status under the case's noise.
 
     `bands`: of the runs that do not end early. `lost_at`: time at which the run with noise ends early, s; inf if it
     does not. `lost_why`: the reason. `stalled`: whether the integrator stalled at `lost_at`; the rotor's status is then
@@ -82,7 +82,7 @@ class SampledReport:
     `with_causes`; None if the rotor is not lost, or if the voltage does not alternate.
     """
 
-    slopes: list[SlopeCheck]
+    laws: list[LawPoles]
     bands: list[Band]
     lost_at: float
     lost_why: str
@@ -105,8 +105,8 @@ class SampledReport:
 
     @property
     def holds(self) -> bool:
-        """Whether every slope is below its limit, C is not reached, and the rotor is held to the end."""
-        return math.isinf(self.lost_at) and self.distance[0] > 0 and all(slope.holds for slope in self.slopes)
+        """Whether every law is stable, C is not reached, and the rotor is held to the end."""
+        return math.isinf(self.lost_at) and self.distance[0] > 0 and all(law.holds for law in self.laws)
 
 
 class Delays(NamedTuple):
@@ -167,7 +167,7 @@ def check_sampled(
     alternating = alternation(np.asarray(calm.rows.u)[settled:]) if np.isinf(calm.lost_at) else None
     stalled = int(outcome.lost_code) == STALLED
     return SampledReport(
-        slope_checks(cascade, clock),
+        law_poles(cascade, clock),
         bands,
         float(outcome.lost_at),
         outcome.lost_why,
