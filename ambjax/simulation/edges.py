@@ -1,6 +1,6 @@
 """Edges: instants at which the rates of a problem jump. Integrators end a step at each edge of the problem.
 
-Only problems of loops on a processor have edges (`simulation.between`). In continuous time a step may contain a jump.
+In continuous time, only adaptive steps end at edges. Steps of a fixed number may contain a jump there.
 
 A method has its nominal order only on steps in which the rates are smooth. A jump inside a step causes an error of
 first order in the step length for every method.
@@ -22,7 +22,8 @@ class Edges(NamedTuple):
     """Instants at which the rates jump.
 
     - `at`: the instants, s.
-    - `most`: largest number of them strictly inside one advance of an integrator.
+    - `most`: largest number of them strictly inside one advance of an integrator with a fixed number of steps; 0: such
+      steps do not end at edges.
     """
 
     at: tuple[Scalar, ...] = ()
@@ -84,15 +85,17 @@ def _rounding() -> float:
     return 4 * float(jnp.finfo(jnp.result_type(float)).eps)
 
 
-def most_inside(scenario: Scenario, period: Scalar) -> int | None:
+def most_inside(scenario: Scenario, period: Scalar, reference: bool = False) -> int | None:
     """Return the largest number of edges of the disturbances strictly inside one sample; None if an
     edge or the period is traced.
 
-    `period`: one sample period or several, s. The number is an upper bound for an ensemble. An edge that differs
+    `reference`: include the edges of the reference, which a processor reads at the samples only. `period`: one sample period or several, s.
+
+    The number is an upper bound for an ensemble. An edge that differs
     between members counts as inside a sample. Two edges count as inside the same sample if their distance can be
     shorter than the longest period. The distance can have every value between its extremes over the members.
     """
-    edges = scenario.edges()
+    edges = scenario.edges(reference)
     if any(map(is_traced, (*edges, period))):
         return None
     periods = np.asarray(period, float)

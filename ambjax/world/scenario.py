@@ -152,7 +152,7 @@ class Scenario:
     def random(self) -> bool:
         """Whether the scenario has sensor noise, random sensor faults or a random signal. A spread does not count."""
         sensor = self.sensor
-        noisy = sensor is not None and any(np.any(std) for std in (sensor.std, sensor.std_z_dot, sensor.std_i))
+        noisy = sensor is not None and any(map(np.any, sensor.noises))
         if sensor is not None:
             noisy = noisy or any(np.any(x.rate) for x in (sensor.outliers, sensor.dropouts) if x is not None)
         return noisy or any(is_random(getattr(self, slot)) for slot in SLOTS)
@@ -183,9 +183,11 @@ class Scenario:
             total = total + self.q_f(t) / self.plant.m
         return total if self.base is None else total - self.base(t)
 
-    def edges(self) -> tuple[Scalar, ...]:
-        """Return the times (s) at which the disturbances jump."""
-        return tuple(edge for slot in SLOTS if slot != "reference" for edge in edges_of(getattr(self, slot)))
+    def edges(self, reference: bool = False) -> tuple[Scalar, ...]:
+        """Return the times (s) at which the disturbances jump; with `reference`, also those of the reference."""
+        return tuple(
+            edge for slot in SLOTS if reference or slot != "reference" for edge in edges_of(getattr(self, slot))
+        )
 
     def undisturbed(self) -> "Scenario":
         """Return the scenario without disturbances and runout."""
