@@ -14,7 +14,7 @@ import ambjax as amb
 from ambjax.numerics import linear
 from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.method import QUIET_TIGHT, QUIET_TOLERANCE, TIGHT, TOLERANCE
-from ambjax.simulation.trajectory import ALIVE, STALLED
+from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED
 
 FIXED = {"Euler": (amb.Euler, 1), "RK4": (amb.RK4, 4), "Rodas3": (amb.Rodas3, 3)}
 REPAIRED = amb.Cascade()
@@ -274,6 +274,32 @@ def test_integration_stops_at_the_first_invalid_state_and_returns_the_last_valid
     assert float(out.state) < 0.55 <= float(out.t) - 3.0  # y = t - 3: the time is that of the bad state
     if method.step_size(1.0):
         assert (float(out.state), float(out.t)) == pytest.approx((0.5, 3.6))
+
+
+@pytest.mark.parametrize(
+    "method",
+    [amb.RK4(3), amb.DOP853(3), amb.Rodas3(3), amb.AdaptiveRodas3(), amb.AdaptiveCashKarp(1e-3)],
+    ids=str,
+)
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_the_time_of_a_touchdown_is_that_of_the_crossing_inside_a_step(method, side):
+    """A free fall with a drag that makes z a cubic: z = side (t^2/2 + t^3/6) reaches 0.6 inside a step of a third."""
+
+    def rates(t, state):
+        return state[1], side * (1 + t)
+
+    def status(state):
+        return jnp.where(jnp.abs(state[0]) >= 0.6, TOUCHED, ALIVE).astype(jnp.int32)
+
+    fall = problem(rates, (1.0, 1.0), status)._replace(motion=lambda state: state, limit=0.6)
+    zero = jnp.zeros(())
+    out = method.advance(fall, 0.0, 2.0, (zero, zero), method.start(2.0))
+    assert int(out.code) == TOUCHED
+    exact = float(np.real(np.roots([1 / 6, 1 / 2, 0.0, -0.6])[2]))
+    # Methods of order 3 and more are exact for this cubic, and so is the cubic between the ends of a step.
+    assert float(out.t) == pytest.approx(exact, rel=1e-12)
+    one = lambda x: method.advance(fall, 0.0, 2.0, (x, zero), method.start(2.0)).t  # noqa: E731
+    assert float(jax.jacfwd(one)(zero)) == 0.0  # the time is no function of the state to JAX
 
 
 # Not Rodas3 with three steps: a fixed implicit step may leap over the pole and never see it.

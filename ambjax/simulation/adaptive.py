@@ -1,6 +1,6 @@
 """Adaptive steps: the error estimate of a trial step decides whether it is accepted, and how long the next one is."""
 
-from typing import ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,7 @@ class _Progress(NamedTuple):
 
     - `h`, `first`: next trial step (s), and the one that the first accepted step suggested.
     - `elapsed`, `before`: elapsed time, and the previous step (s).
+    - `last`: begin of the last accepted step (s after t), and the motion of the rotor at its end.
     """
 
     state: object
@@ -42,6 +43,7 @@ class _Progress(NamedTuple):
     trials: Array
     before: Array
     span: Span
+    last: tuple[Array, Any]
 
 
 @record
@@ -111,11 +113,14 @@ class AdaptiveSteps:
                 now.trials + 1,
                 jnp.where(accept, before, now.before),
                 choose(accept, span, now.span),
+                choose(accept, (now.elapsed, problem.moving(cast(State, tried.state))), now.last),
             )
 
         zero, code = jnp.zeros_like(period), jnp.asarray(code, jnp.int32)
         h = cast(Array, lax.stop_gradient(memory))
-        begin = _Progress(state, h, h, zero, code, jnp.int32(0), zero, blank(problem.instant_structure))
+        begin = _Progress(
+            state, h, h, zero, code, jnp.int32(0), zero, blank(problem.instant_structure), (zero, problem.moving(state))
+        )
         done = lax.while_loop(unfinished, trial, begin)
         x = cast(State, done.state)
         end = problem.rates_and_signals(problem.inputs(stage_times(t, done.elapsed)(1.0)), x)[1]
@@ -123,7 +128,8 @@ class AdaptiveSteps:
         stalled = (done.code == ALIVE) & (done.elapsed < period)
         # Under noise, the step at the start of a sample is a better guess for the next sample than that at its end.
         memory = jnp.where(problem.jumps & (done.elapsed > 0), done.first, done.h)
-        return Advanced(x, jnp.where(stalled, STALLED, done.code), t + done.elapsed, memory, span)
+        t_end = problem.ended(x, done.last[1], t + done.last[0], t + done.elapsed, done.code)
+        return Advanced(x, jnp.where(stalled, STALLED, done.code), t_end, memory, span)
 
     @staticmethod
     def _recorded(now: _Progress, tried: Attempt, step: Array, first: Array) -> tuple[Span, Array]:

@@ -170,6 +170,10 @@ class Chirp:
     def span(self, end: float) -> tuple[float, float]:
         return _swing(self.amplitude, 0.0, self._cycles(end, np.minimum(end, self.duration)))
 
+    def edges(self) -> tuple[Scalar, ...]:
+        """Return the end of the sweep, s, where the slope of the frequency jumps."""
+        return (self.duration,)
+
 
 @record
 class Sum:
@@ -191,6 +195,10 @@ class Sum:
         """Return the edges of all terms, s."""
         return tuple(edge for term in self.terms for edge in edges_of(term))
 
+    def knots(self) -> tuple[Any, ...]:
+        """Return the knots of all recorded terms."""
+        return tuple(one for term in self.terms for one in knots_of(term))
+
     def realised(self, key: Array) -> "Sum":
         """Return the sum with its random terms drawn, each from a separate key."""
         return Sum(tuple(realised(term, jax.random.fold_in(key, n)) for n, term in enumerate(self.terms)))
@@ -209,6 +217,11 @@ def realised(signal: Any, key: Array) -> Any:
 def edges_of(signal: Any) -> tuple[Scalar, ...]:
     """Return the times (s) at which the signal or a derivative jumps; empty if it is smooth."""
     return signal.edges() if hasattr(signal, "edges") else ()
+
+
+def knots_of(signal: Any) -> tuple[Any, ...]:
+    """Return the knots of a recorded signal, of type `recorded.Knots`; empty for other signals."""
+    return signal.knots() if hasattr(signal, "knots") else ()
 
 
 class Reference(NamedTuple):
