@@ -175,6 +175,25 @@ def test_margins_agree_with_python_control(name):
 
 
 @pytest.mark.slow
+def test_a_loop_without_response_at_half_the_sampling_rate_has_margins():
+    """L = 0.7 (1 + 1/z)/(z - 0.9) is exactly 0 there. The logarithm of 0 must not warn (all warnings are errors)."""
+
+    class Loop:
+        period = 1e-3
+
+        def poles(self):  # of 1 + L: z^2 - 0.2 z + 0.7 = 0
+            return np.roots([1.0, -0.2, 0.7])
+
+        def sensitivity(self, f):
+            z = np.where(f == 0.5 / self.period, -1.0, np.exp(2j * np.pi * f * self.period))
+            return 1 / (1 + 0.7 * (1 + 1 / z) / (z - 0.9))
+
+    found = margins_of(Loop())
+    # z^2 + (0.7 g - 0.9) z + 0.7 g = 0 has a root on the unit circle for 0.7 g = 1
+    assert found.gain_high == pytest.approx(1 / 0.7, rel=1e-6)
+    assert 0 < found.phase_deg < 90
+
+
 def test_python_control_gets_the_same_system():
     cascade, scenario, r = loop_of("true signs")
     system = linearise(cascade, scenario, CLOCK, r)

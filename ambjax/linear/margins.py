@@ -116,7 +116,7 @@ def margins_of(system: StateSpace) -> Margins:
     # L is exactly 0 at half the sampling rate if the controller has a zero there, as after a bilinear transform
     gains = [float(-1 / x) for x in real if x and math.isfinite(x) and -1 / x > 1e-9]
     phases, delays = [], []
-    for x in _crossings(lambda x: np.log(np.abs(L(x))), f, np.log(np.abs(along))):
+    for x in _crossings(lambda x: _log(L(x)), f, _log(along)):
         lag = math.pi + float(np.angle(L(np.array([x]))[0]))
         phases.append(math.degrees(min(lag, 2 * math.pi - lag)))
         delays.append(lag / (2 * math.pi * x))
@@ -129,6 +129,11 @@ def margins_of(system: StateSpace) -> Margins:
         min(delays, default=math.inf),
         1 / disk,
     )
+
+
+def _log(response: np.ndarray) -> np.ndarray:
+    """Return the logarithm of the magnitude, which may be 0."""
+    return np.log(np.maximum(np.abs(response), np.finfo(float).tiny))
 
 
 def _crossings(function: Magnitude, f: np.ndarray, values: np.ndarray) -> list[float]:
