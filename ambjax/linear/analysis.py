@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
@@ -151,7 +152,7 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
     system, found = _matrices(*canonical((*linearisation_inputs(cascade, scenario, clock), r)))
     if not found:
         raise ValueError(f"no equilibrium at r = {float(r):g} m was found: the laws probably cannot hold the rotor.")
-    return StateSpace(*(None if x is None else np.asarray(x) for x in system))  # pyright: ignore[reportArgumentType]
+    return jax.tree.map(np.asarray, system)
 
 
 def linearise_members(

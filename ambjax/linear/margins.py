@@ -1,7 +1,7 @@
 """Peaks of the sensitivity functions and stability margins of a linearised loop, in NumPy.
 
-The loop is cut at the reading of the position sensor: with S from `StateSpace.sensitivity`, the loop transfer is
-L = 1/S - 1.
+The margins are those of the loop broken at the reading of the position sensor, and broken at the command
+(`StateSpace.loop_transfer`).
 """
 
 import math
@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ambjax.linear.state_space import StateSpace
+from ambjax.linear.held_command import HeldCommand
+from ambjax.linear.state_space import Place, StateSpace
 
 # Number of logarithmically spaced frequencies in a scan, in addition to those near poles.
 POINTS = 600
@@ -29,12 +30,12 @@ class ResponsePeak(NamedTuple):
 
 
 class Margins(NamedTuple):
-    """Margins of the loop transfer L = 1/S - 1, broken at the reading of the position sensor.
+    """Margins of the loop transfer L = 1/S - 1, with the loop broken at one place.
 
     - `gain_low`, `gain_high`: the loop stays stable for every factor on L between these two (0, inf: no such limit).
     - `gain`: `gain_low` or `gain_high`, whichever is nearer to 1 on a logarithmic scale (inf: no limit).
     - `phase_deg`: smallest phase change, lag or lead, that makes the loop unstable, degrees (inf: |L| is never 1).
-    - `delay`: smallest additional delay that makes the loop unstable, s (inf: none).
+    - `delay`: smallest additional delay at this place that makes the loop unstable, s (inf: none).
     - `disk`: disk margin 1/max|S - 1/2| (P. Seiler, A. Packard and P. Gahinet, IEEE Control Systems 40:5 (2020)). The
       loop stays stable for every factor on L between (2 - disk)/(2 + disk) and its inverse.
     """
@@ -47,6 +48,31 @@ class Margins(NamedTuple):
     disk: float
 
 
+class LoopMargins(NamedTuple):
+    """Margins of a loop broken at the reading of the position sensor, and at the command; None: not known.
+
+    A factor or a delay at the command is that of the drive: of processor, converter and amplifier. The laws remember
+    their own commands, and the prediction assumes the delay of the case.
+    """
+
+    reading: Margins
+    command: Margins | None
+
+    @property
+    def smaller(self) -> Margins:
+        """The smaller margin of each kind."""
+        one, other = self.reading, self.command or self.reading
+        return Margins(
+            min(one.gain, other.gain, key=lambda x: abs(math.log(x)) if x else 0.0),
+            max(one.gain_low, other.gain_low),
+            *(min(a, b) for a, b in zip(one[2:], other[2:], strict=True)),
+        )
+
+    def place(self, kind: str) -> Place:
+        """Return the place of the smaller margin. `kind`: the name of a field of `Margins`."""
+        return "command" if getattr(self.reading, kind) != getattr(self.smaller, kind) else "reading"
+
+
 Magnitude = Callable[[np.ndarray], np.ndarray]
 
 
@@ -55,7 +81,11 @@ def peak(system: StateSpace, magnitude: Magnitude, low: float, high: float) -> R
 
     `magnitude`: function that returns magnitudes [F] for frequencies [F] in Hz.
     """
-    f = scan(system, low, high)
+    return _peak(magnitude, scan(system, low, high))
+
+
+def _peak(magnitude: Magnitude, f: np.ndarray) -> ResponsePeak:
+    """Return the largest value of a magnitude near the frequencies `f`, of which the first stands for 0."""
     size = magnitude(f)
     k = int(np.argmax(size))
     if k == 0:
@@ -89,22 +119,29 @@ def poles_in_s(system: StateSpace) -> np.ndarray:
     return np.log(poles[np.abs(poles) > 1e-9] + 0j) / float(system.period)
 
 
-def margins_of(system: StateSpace) -> Margins:
-    """Return the margins of a stable loop.
+def margins_of(system: StateSpace) -> LoopMargins:
+    """Return the margins of a stable loop, broken at the reading and at the command.
 
     The scan ends at half the sampling rate or, in continuous time, far above all poles.
     """
     fastest = float(np.max(np.abs(poles_in_s(system)), initial=1.0)) / (2 * math.pi)
     high = 100 * fastest if system.period is None else 0.5 / float(system.period)
-    low = min(1e-3, 1e-6 * high)
+    f = scan(system, min(1e-3, 1e-6 * high), high)
+    reading = _margins(system, "reading", f)
+    return LoopMargins(reading, None if system.path is None else _margins(system, "command", f))
 
-    def S(f: np.ndarray) -> np.ndarray:
-        return np.asarray(system.sensitivity(f))
+
+def _margins(system: StateSpace, place: Place, scanned: np.ndarray) -> Margins:
+    """Return the margins at one place. `scanned`: frequencies, Hz, of which the first stands for 0."""
+
+    held = None
+    if place == "command" and system.period is not None:
+        held = HeldCommand(system)
 
     def L(f: np.ndarray) -> np.ndarray:
-        return 1 / S(f) - 1
+        return np.asarray(system.loop_transfer(f, place)) if held is None else held.transfer(f)
 
-    f = scan(system, low, high)[1:]
+    f = scanned[1:]
     along = L(f)
     real = [L(np.array([x]))[0].real for x in _crossings(lambda x: np.imag(L(x)), f, np.imag(along))]
     if system.period is not None:
@@ -117,7 +154,9 @@ def margins_of(system: StateSpace) -> Margins:
         lag = math.pi + float(np.angle(L(np.array([x]))[0]))
         phases.append(math.degrees(min(lag, 2 * math.pi - lag)))
         delays.append(lag / (2 * math.pi * x))
-    disk = peak(system, lambda f: np.abs(S(f) - 0.5), low, high).height
+    if held is not None:
+        delays = held.delays(f)
+    disk = _peak(lambda f: np.abs(1 / (1 + L(f)) - 0.5), scanned).height
     return Margins(
         min(gains, key=lambda x: abs(math.log(x)), default=math.inf),
         max((x for x in gains if x < 1), default=0.0),

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from ambjax.cases.reader import Case, require_case
@@ -90,7 +91,7 @@ def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPea
     analyses: list[Analysis | None] = []
     loops: list[StateSpace] = []
     for k in range(members):
-        loops.append(StateSpace(*(None if x is None else np.asarray(x)[k] for x in systems)))  # pyright: ignore
+        loops.append(jax.tree.map(lambda x, k=k: np.asarray(x)[k], systems))
         one = _analysis(case, loops[k], float(masses[k])) if found[k] else None
         analyses.append(one)
         if one is not None and one.stable:
