@@ -5,6 +5,7 @@ except for the equilibrium.
 """
 
 import dataclasses
+import itertools
 from typing import NamedTuple
 
 import jax
@@ -68,7 +69,7 @@ class Parts:
         after = self.laws @ np.concatenate([motion, laws, past[:2]])
         past = np.concatenate([after[:1], past])  # u_n, u_{n-1}, ...
         cuts, position = sorted({0.0, part_u, 1 - part_z, 1.0}), None
-        for begin, end in zip(cuts, cuts[1:], strict=False):
+        for begin, end in itertools.pairwise(cuts):
             acting = past[int(whole_u) + (begin < part_u)] * change.command
             step = expm(np.block([[self.A, self.b[:, None]], [np.zeros((1, nx + 1))]]) * (end - begin) * T)
             x = step[:nx, :nx] @ x + step[:nx, nx:] @ acting[None]

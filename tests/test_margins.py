@@ -70,8 +70,8 @@ LOOPS = {
                                                      current={"kind": "pi"}),
     "PID, dead-beat": lambda: on({"kind": "pid"}, {"kind": "kalman", "w": 3000.0},
                                  laws=CURRENT | {"inversion": {"kind": "closed-form"}}, **VELOCITY),
-    "PID, pi, late": lambda: on({"kind": "pid"}, processor={"delay": 1.5, "predict": False}, actuator={"bandwidth": 4e3},
-                                laws=CURRENT | {"current": {"kind": "pi"}}),
+    "PID, pi, late": lambda: on({"kind": "pid"}, processor={"delay": 1.5, "predict": False},
+                                actuator={"bandwidth": 4e3}, laws=CURRENT | {"current": {"kind": "pi"}}),
     "chain, dead-beat": lambda: on({"kind": "chain"}, {"kind": "difference"}, {"delay": 0.3}, **VELOCITY),
     "state feedback, dead-beat": lambda: on({"kind": "state-feedback"}),
     "state feedback, amplifier": lambda: on({"kind": "state-feedback"}, {"kind": "kalman", "w": 1700.0},
@@ -89,12 +89,13 @@ def agrees(parts, margin, changed, most):
     return below and (margin > most or not parts.stable(changed((1 + ERROR) * margin)))
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=() if k < 1 else pytest.mark.slow) for k, x in enumerate(LOOPS)])
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=() if k < 1 else pytest.mark.slow) for k, x in enumerate(LOOPS)]
+)
 def test_the_margins_agree_with_the_poles_of_the_changed_loop(name):
     case = LOOPS[name]()
     system = linearise(case.cascade, case.scenario, case.clock)
     parts, found = parts_of(case.cascade, case.scenario, case.clock), margins_of(system)
-    print(name, found)
     assert system.stable
     assert parts.stable(Change())
     for place in PLACES:

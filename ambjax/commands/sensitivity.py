@@ -19,6 +19,7 @@ from ambjax.results.operating import (
     measured_peaks,
     one_period,
     operating_point,
+    shown_band,
     spread_peaks,
 )
 
@@ -98,9 +99,9 @@ def _draw(
         shown.append(spread.point)
     loops = [frequency.NamedLoop(point.name, point.system, point.m, point.analysis.margins.disk) for point in shown]
     limits = [float(x) for x in (case.zones.zone_a, case.zones.zone_b, case.zones.zone_c)]
-    low, high = case.zones.range(None if case.cascade.processor is None else case.clock.sample_period)
     injected_points = None
     one = None if measured is None else measured.position
     if one is not None and one.S is not None and one.T is not None and one.KS is not None:
         injected_points = frequency.MeasuredPoints(one.frequency, one.S, one.T, one.KS)
-    frequency.sensitivity_picture(case.name, loops, limits, (low, high), path, injected_points)
+    span = shown_band(case, [point.system for point in shown])
+    frequency.sensitivity_picture(case.name, loops, limits, span, path, injected_points)

@@ -16,15 +16,17 @@ to the sensor's own reading, and KS that from e to u.
 from ambjax.linear.analysis import Analysis, Zones, analyse, linearisation_inputs, linearise, linearise_members
 from ambjax.linear.differentiable import LoopQuantities, loop_quantities
 from ambjax.linear.injection import Injection, MemberPeaks, frequency_lines, injected, injected_members
-from ambjax.linear.margins import Margins, ResponsePeak, margins_of, noise_gain, peak
+from ambjax.linear.margins import LoopMargins, Margins, ResponsePeak, decayed_end, margins_of, noise_gain, peak
 from ambjax.linear.matrices import loop_matrices
-from ambjax.linear.state_space import INPUTS, OUTPUTS, StateSpace
+from ambjax.linear.state_space import INPUTS, OUTPUTS, PLACES, StateSpace
 
 __all__ = [
     "INPUTS",
     "OUTPUTS",
+    "PLACES",
     "Analysis",
     "Injection",
+    "LoopMargins",
     "LoopQuantities",
     "Margins",
     "MemberPeaks",
@@ -32,6 +34,7 @@ __all__ = [
     "StateSpace",
     "Zones",
     "analyse",
+    "decayed_end",
     "frequency_lines",
     "injected",
     "injected_members",
