@@ -88,7 +88,7 @@ def test_the_picture_shows_the_response(tmp_path):
     ("text", "flags", "message"),
     [
         ("[sensitivity]\nzone_a = 4.5\n", [], "sensitivity.zone_a to zone_c = [4.5, 4.0, 5.0]"),
-        ("[sensitivity]\nf_low = 3e3\n", [], "sensitivity.f_low = 3000: it must be below f_high"),
+        ("[sensitivity]\nf_low = 3e3\nf_high = 2e3\n", [], "sensitivity.f_low = 3000: it must be below f_high"),
         ("[processor]\n[sensitivity]\nf_high = 6e3\n", [], "at most half the sampling rate, 5000 Hz"),
         ("[sensitivity]\nzone = 3\n", [], "zone_"),
         ("[sensitivity]\namplitude = 0\n", [], "sensitivity.amplitude = 0: it must be a finite number above 0"),

@@ -144,7 +144,7 @@ class _Judged(NamedTuple):
             system = linearise(cascade, scenario, case.clock)
         except ValueError:  # no equilibrium
             return None
-        return analyse(system, scenario.plant.m, float(case.clock.sample_period), case.zones)
+        return analyse(system, scenario.plant.m, float(case.clock.sample_period), case.zones.whole)
 
     def responses(self, numbers: np.ndarray, repetitions: int, peak: float | None) -> Responses:
         """Inject a test signal into the members `numbers` [n], each `repetitions` times with different noise.
@@ -156,14 +156,14 @@ class _Judged(NamedTuple):
         cascade, scenario = objective.fixed(self.x, members)
         scenario = dataclasses.replace(scenario, seed=0, member=np.arange(len(numbers) * repetitions))
         clock = one_period(case)
-        lines = frequency_lines(case.zones, clock, peak)
+        lines = frequency_lines(case.zones.whole, clock, peak)
         return member_responses(cascade, scenario, clock, lines, amplitude=case.zones.amplitude)
 
 
 def _summary(number: int, analysis: Analysis | None, one: Injection | None) -> MeasuredPeak:
     linear, frequency, zone = None, None, "D"
     if analysis is not None and analysis.stable:
-        linear, frequency, zone = *analysis.S, analysis.zone
+        linear, frequency, zone = analysis.S.height, analysis.S.frequency, analysis.zone
     if one is None:
         return MeasuredPeak(number, linear, frequency, zone, None, None, None, None, None, 0, 0, {})
     largest = {}
