@@ -4,17 +4,21 @@ import dataclasses
 import math
 import tomllib
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from margin_oracle import Change, parts_of
 
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
+from ambjax.compiler.short_compilation import QUICKEST, supported
 from ambjax.control.force import linear_mechanics
 from ambjax.control.linear_controller import LinearController
-from ambjax.linear import linearise, margins_of
+from ambjax.linear import LoopMargins, Margins, linearise, loop_quantities, margins_of
 from ambjax.linear.state_space import PLACES
 
+QUICK = supported(QUICKEST)  # each program runs once
 # Each margin lies within this share of the margin of the oracle.
 ERROR = 0.03
 PLANT = {"m": 1.64, "k_z": 0.0, "mu_0": 1.2566e-6, "n": 208.0, "A": 2.68e-4, "s_0": 5e-4, "i_0": 2.5, "R": 1.0}
@@ -107,3 +111,43 @@ def test_the_margins_agree_with_the_poles_of_the_changed_loop(name):
         turns = [lambda x, at=place, sign=sign: Change(**{at: np.exp(sign * 1j * x)}) for sign in (1, -1)]
         assert any(agrees(parts, math.radians(one.phase_deg), turn, math.pi) for turn in turns)
         assert agrees(parts, one.delay, lambda x, at=place: Change(**{f"late_{at}": x}), 0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["LQG, dead-beat", "PID, dead-beat", "state feedback, continuous"])
+def test_the_search_of_the_tuner_finds_the_delay_margin_of_the_analysis(name):
+    """The derivative is compared with differences of the analysis, along a change of the gain of the drive.
+
+    The second loop becomes unstable at half the sampling rate.
+    """
+    case = LOOPS[name]()
+    system = linearise(case.cascade, case.scenario, case.clock)
+
+    def changed(x):
+        path = system.path._replace(b=(1 + x) * system.path.b)
+        return jax.tree.map(jnp.asarray, system)._replace(path=path)
+
+    # a large unit of the rate 1/delay: no margin is near the smooth limit of this rate
+    find = jax.jit(jax.value_and_grad(lambda x: quantities(changed(x)).delay_margin_s), compiler_options=QUICK)
+    value, slope = find(0.0)
+    expected = margins_of(system)
+    assert value == pytest.approx(expected.smaller.delay, rel=1e-6)
+    assert expected.place("delay") == "command"
+    # the solutions are found to 1e-9 of a sample, and the step's error is its square
+    ends = [margins_of(jax.tree.map(np.asarray, changed(x))).command.delay for x in (1e-3, -1e-3)]
+    assert slope == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=1e-3)
+
+
+def quantities(system):
+    return loop_quantities(system, jnp.asarray(True), 1.0, 1e7, 1e9)
+
+
+def test_the_smaller_margin_of_each_kind_is_that_of_the_loop():
+    one = Margins(0.5, 0.5, 3.0, 40.0, 1e-3, 0.8)
+    other = Margins(1.6, 0.2, 1.6, 50.0, 1e-5, 0.5)
+    both = LoopMargins(one, other)
+    assert both.smaller == Margins(1.6, 0.5, 1.6, 40.0, 1e-5, 0.5)
+    assert [both.place(kind) for kind in ("gain", "phase_deg", "delay", "disk")] == [
+        "command", "reading", "command", "command",
+    ]  # fmt: skip
+    assert LoopMargins(one, one).place("delay") == "reading"
