@@ -7,7 +7,7 @@ import pytest
 from texts import case_and_tune
 
 from ambjax.linear import analyse, linearise
-from tuning.delay_test import DELAY_MARGIN, DelayTest, delay_test
+from tuning.delay_test import DELAY_MARGIN, DelayTest, delay_test, not_simulated
 from tuning.objective.limits import PREFIX
 from tuning.problem import problem_of
 from tuning.report import limit_table
@@ -63,5 +63,15 @@ def test_a_lost_member_breaks_the_limit():
     for test in (DelayTest(16, 1, 0), DelayTest(16, 0, 1)):
         broken = limit_table._tested(row, test, "")
         assert (broken["verdict"], broken["price"]) == (limit_table.BROKEN, None)
+    # a delay that is not simulated: the report says why
+    late = {share: problem(share * PERIOD) for share in (1.4, 1.6)}
+    limits = {share: next(x for x in one.limits if x.name == DELAY_MARGIN) for share, one in late.items()}
+    reason = not_simulated(late[1.6], limits[1.6])
+    assert reason == "the total delay of 2.1 samples exceeds the 2 samples that can be simulated"
+    assert not_simulated(late[1.4], limits[1.4]) == ""
+    said = limit_table._tested(row, None, "", reason)
+    assert said["held"]
+    assert reason in said["what"]
     other = row | {"name": "sensitivity"}
+    assert limit_table._tested(other, None, "", reason) == other
     assert limit_table._tested(other, DelayTest(16, 1, 0), "") == other

@@ -9,7 +9,7 @@ import numpy as np
 from ambjax.control.processor import MOST_DELAY
 from ambjax.ensemble import run_ensemble
 from ambjax.linear import stability
-from tuning.objective.limits import PREFIX
+from tuning.objective.limits import PREFIX, Limit
 from tuning.problem import TuningProblem
 
 DELAY_MARGIN = "delay_margin_s"
@@ -30,16 +30,27 @@ class DelayTest(NamedTuple):
         return bool(self.lost or self.unstable)
 
 
+def not_simulated(problem: TuningProblem, limit: Limit) -> str:
+    """Return why the additional delay of the limit is not simulated; '' if it is."""
+    processor = problem.case.cascade.processor
+    if processor is None:
+        return "the controller runs in continuous time"
+    total = float(np.max(np.asarray(processor.delay))) + limit.threshold / float(problem.case.clock.sample_period)
+    if total > MOST_DELAY:
+        return f"the total delay of {total:.3g} samples exceeds the {MOST_DELAY:g} samples that can be simulated"
+    return ""
+
+
 def delay_test(problem: TuningProblem, x: np.ndarray, seed: int, columns: Mapping[str, np.ndarray]) -> DelayTest | None:
     """Simulate the held members of least linear delay margin, with the limit on this margin as an additional delay.
 
     The prediction of the controller assumes the delay of the case. `x`: coordinates of the m gains [m]. `columns` [N]:
-    result of `judge` for the ensemble with this `seed`. Returns None without such a limit, without a processor, if the
-    sum of the delays is longer than a processor allows, or if no member is held.
+    result of `judge` for the ensemble with this `seed`. Returns None without such a limit, if `not_simulated` gives a
+    reason, or if no member is held.
     """
     limit = next((limit for limit in problem.limits if limit.name == DELAY_MARGIN), None)
     alive = np.flatnonzero(~np.isfinite(columns["lost_at_s"]))
-    if limit is None or not problem.sampled or not alive.size:
+    if limit is None or not_simulated(problem, limit) or not alive.size:
         return None
     order = np.argsort(columns[f"loss.{PREFIX}{DELAY_MARGIN}"][alive], kind="stable")
     members = problem.objective.chosen(seed, alive[order[:TESTED]], len(columns["lost_at_s"]))

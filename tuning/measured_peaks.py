@@ -148,7 +148,7 @@ class _Judged(NamedTuple):
             system = linearise(cascade, scenario, case.clock)
         except ValueError as error:
             return str(error)
-        return analyse(system, scenario.plant.m, float(case.clock.sample_period), case.zones)
+        return analyse(system, scenario.plant.m, float(case.clock.sample_period), case.zones.whole)
 
     def responses(self, numbers: np.ndarray, repetitions: int, peak: float | None) -> Responses:
         """Inject a test signal into the members `numbers` [n], each `repetitions` times with different noise.
@@ -160,7 +160,7 @@ class _Judged(NamedTuple):
         cascade, scenario = objective.fixed(self.x, members)
         scenario = dataclasses.replace(scenario, seed=0, member=np.arange(len(numbers) * repetitions))
         clock = one_period(case)
-        lines = frequency_lines(case.zones, clock, peak)
+        lines = frequency_lines(case.zones.whole, clock, peak)
         return member_responses(cascade, scenario, clock, lines, amplitude=case.zones.amplitude)
 
 

@@ -26,7 +26,7 @@ from ambjax.host.extensions import extension
 from ambjax.host.web_page import render_page
 from ambjax.linear.state_space import StateSpace
 from ambjax.page.html_page import check_processor, pages
-from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks, operating_point, spread_peaks
+from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks, operating_point, shown_band, spread_peaks
 
 WRITTEN = ("compare.html", "compare.json", "compare.png")
 # Largest number of cases in a table and a picture.
@@ -201,7 +201,8 @@ def _draw(cases: Sequence[Case], compared: Sequence[Compared], path: pathlib.Pat
         for one in compared
     ]
     limits = [float(x) for x in (first.zones.zone_a, first.zones.zone_b, first.zones.zone_c)]
-    spans = [case.zones.range(None if case.cascade.processor is None else case.clock.sample_period) for case in cases]
+    systems = [_stable(one.point) for one in compared]
+    spans = [shown_band(case, [one] if one else []) for case, one in zip(cases, systems, strict=True)]
     span = max(low for low, _ in spans), min(high for _, high in spans)
     comparison.comparison(shown, limits, span if span[0] < span[1] else spans[0], path)
 

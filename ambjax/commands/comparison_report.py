@@ -74,6 +74,7 @@ QUANTITIES = (
     Quantity("peak", "peak of |S|", "1"),
     Quantity("frequency_hz", "its frequency", "Hz", None),
     Quantity("zone", "its zone (ISO 14839-3)", "", None),
+    Quantity("outside_peak", "|S| outside the band of [sensitivity], if larger", "1"),
     Quantity("unstable", f"members not stable at rest, of the first {MEMBERS}", "1"),
     Quantity("worst_peak", "peak of |S|, worst member", "1"),
     Quantity("t_peak", "peak of |T|", "1"),
@@ -81,7 +82,9 @@ QUANTITIES = (
     Quantity("gain_margin_low", "gain margin below 1", "1"),
     Quantity("gain_margin_high", "gain margin above 1", "1", less=False),
     Quantity("phase_margin_deg", "phase margin", "degrees", less=False),
-    Quantity("delay_margin_s", "delay margin", "s", less=False),
+    Quantity("delay_margin_s", "delay margin, the smaller one", "s", less=False),
+    Quantity("delay_margin_reading_s", "delay margin at the reading", "s", less=False),
+    Quantity("delay_margin_command_s", "delay margin at the command", "s", less=False),
     Quantity("disk_margin", "disk margin", "1", less=False),
     Quantity("stiffness_N_per_m", "static stiffness", "N/m", less=False),
     Quantity("flops", "cost of a step", "flops"),
@@ -135,7 +138,8 @@ def _loop(one: Compared) -> dict[str, object]:
     zone is None too.
     """
     keys = ("peak", "frequency_hz", "t_peak", "ks_peak", "gain_margin_low", "gain_margin_high", "phase_margin_deg")
-    keys += ("delay_margin_s", "disk_margin", "stiffness_N_per_m")
+    keys += ("delay_margin_s", "disk_margin", "stiffness_N_per_m", "outside_peak")
+    keys += ("delay_margin_reading_s", "delay_margin_command_s")
     worst: dict[str, object] = {"unstable": None, "worst_peak": None}
     if one.peaks is not None:
         worst["unstable"] = one.peaks.members - one.peaks.stable
@@ -145,9 +149,10 @@ def _loop(one: Compared) -> dict[str, object]:
         unstable = {"stable": None, "zone": None} if one.point is None else {"stable": False, "zone": "D"}
         return {**unstable, **dict.fromkeys(keys), **worst}
     loop = one.point.analysis
-    margins = loop.margins
+    margins, at, outside = loop.margins, loop.margins_at, loop.S.outside
     found = (loop.S.height, loop.S.frequency, loop.T.height, loop.KS.height, margins.gain_low, margins.gain_high)
     found += (margins.phase_deg, margins.delay, margins.disk, loop.stiffness)
+    found += (None if outside is None else outside.height, at.reading.delay, at.command.delay)
     return {"stable": True, "zone": loop.zone, **dict(zip(keys, found, strict=True)), **worst}
 
 

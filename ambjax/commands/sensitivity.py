@@ -2,6 +2,7 @@
 
 import argparse
 import pathlib
+from typing import Any
 
 from ambjax.cases.reach import largest
 from ambjax.cases.reader import Case
@@ -19,6 +20,7 @@ from ambjax.results.operating import (
     measured_peaks,
     one_period,
     operating_point,
+    shown_band,
     spread_peaks,
 )
 
@@ -41,9 +43,8 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
         spread = spread._replace(measured=measured_peaks(case, study, points[0].analysis.S.frequency))
     measured = _injections(case, points[0]) if args.inject or case.cascade.processor is not None else None
     out = directory(args.out, f"sensitivity-{case.name}", WRITTEN, args.force)
-    summary = sensitivity_summary(points, spread, measured, case.zones)
-    rows = [{"point": name, "stable": None, "zone": None, "why": why} for name, why in missing.items()]
-    summary["points"] = [*summary["points"], *rows]
+    summary: dict[str, Any] = sensitivity_summary(points, spread, measured, case.zones)
+    summary["points"] += [{"point": name, "stable": None, "zone": None, "why": why} for name, why in missing.items()]
     with files(out) as part:
         write_json(part / "sensitivity.json", summary)
         described("sensitivity.png", lambda: _draw(case, points, spread, measured, part / "sensitivity.png"))
@@ -118,9 +119,9 @@ def _draw(
         shown.append(spread.point)
     loops = [frequency.NamedLoop(point.name, point.system, point.m, point.analysis.margins.disk) for point in shown]
     limits = [float(x) for x in (case.zones.zone_a, case.zones.zone_b, case.zones.zone_c)]
-    low, high = case.zones.range(None if case.cascade.processor is None else case.clock.sample_period)
     injected_points = None
     one = None if measured is None else measured.position
     if one is not None and one.S is not None and one.T is not None and one.KS is not None:
         injected_points = frequency.MeasuredPoints(one.frequency, one.S, one.T, one.KS)
-    frequency.sensitivity_picture(case.name, loops, limits, (low, high), path, injected_points)
+    span = shown_band(case, [point.system for point in shown])
+    frequency.sensitivity_picture(case.name, loops, limits, span, path, injected_points)

@@ -105,7 +105,7 @@ class FilterChain(PositionLaw[ChainState]):
 
         `derivative`: state of the derivative filter, A.
         """
-        states = []
+        states: list[Any] = []
         for steady in parts:
             y, state = steady(y)
             states.append(state)
@@ -113,7 +113,8 @@ class FilterChain(PositionLaw[ChainState]):
 
     def scale(self, model: Plant) -> ChainState:
         size = jnp.asarray(model.i_0 / 25)
-        return ChainState(size, size, *[(size, size)] * 3, () if self.w_lp is None else (size, size))
+        pair = (size, size)
+        return ChainState(size, size, pair, pair, pair, () if self.w_lp is None else pair)
 
     def designed(self, model: Plant, sampling: Sampling | None) -> "FilterChain":
         """Return the law with the gains of `optimal_gains` in continuous time, and k_aw and the corners from the pole.

@@ -16,17 +16,19 @@ to the sensor's own reading, and KS that from e to u.
 from ambjax.linear.analysis import Analysis, Zones, analyse, checked, linearisation_inputs, linearise, linearise_members
 from ambjax.linear.differentiable import LoopQuantities, loop_quantities
 from ambjax.linear.injection import Injection, MemberPeaks, frequency_lines, injected, injected_members
-from ambjax.linear.margins import Margins, ResponsePeak, margins_of, noise_gain, peak
+from ambjax.linear.margins import LoopMargins, Margins, ResponsePeak, decayed_end, margins_of, noise_gain, peak
 from ambjax.linear.matrices import loop_matrices
 from ambjax.linear.stability import Findings, Stability, stability, suspects
-from ambjax.linear.state_space import INPUTS, OUTPUTS, StateSpace
+from ambjax.linear.state_space import INPUTS, OUTPUTS, PLACES, StateSpace
 
 __all__ = [
     "INPUTS",
     "OUTPUTS",
+    "PLACES",
     "Analysis",
     "Findings",
     "Injection",
+    "LoopMargins",
     "LoopQuantities",
     "Margins",
     "MemberPeaks",
@@ -36,6 +38,7 @@ __all__ = [
     "Zones",
     "analyse",
     "checked",
+    "decayed_end",
     "frequency_lines",
     "injected",
     "injected_members",

@@ -5,16 +5,20 @@ import dataclasses
 import math
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from ambjax.cases.reader import Case, require_case
 from ambjax.ensemble.study import Study
 from ambjax.linear import (
+    PLACES,
     Analysis,
+    Margins,
     MemberPeaks,
     StateSpace,
     analyse,
     checked,
+    decayed_end,
     frequency_lines,
     injected_members,
     linearise,
@@ -98,7 +102,7 @@ def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPea
     analyses: list[Analysis | None] = []
     loops: list[StateSpace] = []
     for k in range(members):
-        one, loop = None, StateSpace(*(None if x is None else np.asarray(x)[k] for x in systems))  # pyright: ignore
+        one, loop = None, jax.tree.map(lambda x, k=k: np.asarray(x)[k], systems)
         with contextlib.suppress(ValueError):  # the member has no linearisation
             loop = checked(loop, found[k], 0.0)
             one = _analysis(case, loop, float(masses[k]), velocity)
@@ -130,6 +134,14 @@ def one_period(case: Case) -> Clock:
     return dataclasses.replace(case.clock, samples=math.ceil(1 / (float(case.zones.f_low) * period)))
 
 
+def shown_band(case: Case, systems: list[StateSpace]) -> tuple[float, float]:
+    """Return the band (Hz) of a picture of these loops: that of the case, by default until |S - 1| has decayed."""
+    if case.cascade.processor is not None:
+        return case.zones.range(case.clock.sample_period)
+    low = float(case.zones.f_low)
+    return case.zones.range(None, max([decayed_end(system, low) for system in systems], default=1e3 * low))
+
+
 def analysis_summary(one: Analysis) -> dict[str, object]:
     """Return the numbers of an analysis by their names in the JSON summary."""
     margins = one.margins
@@ -143,13 +155,27 @@ def analysis_summary(one: Analysis) -> dict[str, object]:
         "ks_peak": one.KS.height,
         "ks_frequency_hz": one.KS.frequency,
         "velocity_peak": None if one.S_velocity is None else one.S_velocity.height,
+        "velocity_frequency_hz": None if one.S_velocity is None else one.S_velocity.frequency,
+        **_margin_numbers(margins),
+        "margins": margin_numbers(one),
+        "static_stiffness_N_per_m": one.stiffness,
+        "noise_gain": one.noise,
+        "poles_per_s": [[float(pole.real), float(pole.imag)] for pole in one.poles],
+    }
+
+
+def margin_numbers(one: Analysis) -> dict[str, object]:
+    """Return the margins of a loop by place, and the place of the smaller delay margin, for a JSON summary."""
+    numbers: dict[str, object] = {place: _margin_numbers(getattr(one.margins_at, place)) for place in PLACES}
+    return numbers | {"delay_at": one.margins_at.place("delay")}
+
+
+def _margin_numbers(margins: Margins) -> dict[str, float]:
+    return {
         "gain_margin": margins.gain,
         "gain_margin_low": margins.gain_low,
         "gain_margin_high": margins.gain_high,
         "phase_margin_deg": margins.phase_deg,
         "delay_margin_s": margins.delay,
         "disk_margin": margins.disk,
-        "static_stiffness_N_per_m": one.stiffness,
-        "noise_gain": one.noise,
-        "poles_per_s": [[float(pole.real), float(pole.imag)] for pole in one.poles],
     }

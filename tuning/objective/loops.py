@@ -39,7 +39,9 @@ class LaneLoop:
     def __call__(self, lane: LoopLane) -> tuple[LoopQuantities, LoopQuantities]:
         def quantities(x: Array) -> tuple[LoopQuantities, LoopQuantities]:
             cascade = self.space.decode(x, lane.cascade)
-            found = loop_quantities(*loop_matrices(cascade, lane.scenario, lane.period, 0.0), *self.range[1:])
+            names, *numbers = self.range
+            matrices = loop_matrices(cascade, lane.scenario, lane.period, 0.0)
+            found = loop_quantities(*matrices, *numbers, delay="delay_margin_s" in names)
             return found, found
 
         slopes, values = jax.jacfwd(quantities, has_aux=True)(lane.x)
