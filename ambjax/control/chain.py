@@ -46,6 +46,7 @@ class FilterChain(PositionLaw[ChainState]):
     its depth is 1. By default, all of them are off.
     """
 
+    analytic = True
     k_p: Scalar = gain(default=135.0, unit="A/m", doc="proportional gain; left out: LQR in continuous time")
     k_int: Scalar = gain(default=5310.0, unit="A/m/s", doc="integral gain; left out: LQR in continuous time")
     k_d: Scalar = gain(default=0.219, unit="A s/m", doc="derivative gain; left out: LQR in continuous time")

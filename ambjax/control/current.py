@@ -19,6 +19,7 @@ from ambjax.world.plant import Plant, State
 class SlidingMode(CurrentLaw[tuple[()]]):
     """u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - k_i sgn(i - i_ref)) + R i. Eq. (11), sgn smoothed."""
 
+    analytic = True
     k_i: Scalar = gain(default=152.0, unit="A/s", doc="switching gain; above the disturbance bound Q_i")
     p: Scalar = gain(
         default=25.0,
@@ -80,6 +81,7 @@ class ProportionalIntegral(CurrentLaw[Array]):
     much lower gains lose it.
     """
 
+    analytic = True
     k_p: Scalar = gain(default=1.76e5, unit="V/A", doc="proportional gain; left out: w_c L")
     k_int: Scalar = gain(default=2.33e8, unit="V/A/s", doc="integral gain; left out: w_c^2 L/4")
     k_aw: Scalar = gain(default=1330.0, unit="1/s", doc="anti-windup rate; left out: w_c/4")
@@ -127,6 +129,7 @@ class DeadBeat(CurrentLaw[tuple[()]]):
     so a wrong resistance of the model leaves an offset.
     """
 
+    analytic = True
     w: Scalar = gain(default=1e4, unit="1/s", doc="decay rate of the current error in continuous time")
     share: Scalar = gain(
         default=1.0,
@@ -182,6 +185,7 @@ class OpenLoop(CurrentLaw[tuple[()]]):
     the inversion computes at this sample.
     """
 
+    analytic = True
     accepts: ClassVar = ("voltage",)
 
     def init(self, model: Plant) -> tuple[()]:

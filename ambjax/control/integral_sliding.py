@@ -28,6 +28,7 @@ class IntegralSlidingMode(PositionLaw[Array]):
     constant disturbance |q_z| < k.
     """
 
+    analytic = True
     c: Scalar = gain(default=17.0, unit="1/s", doc="coefficient of the error in the sliding variable")
     c_int: Scalar = gain(default=70.0, unit="1/s^2", doc="gain of the integral of the error; c^2/4: two equal poles")
     k: Scalar = gain(default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z")

@@ -18,6 +18,8 @@ from ambjax.world.sensor import Measurement
 class Direct(Observer[tuple[()]]):
     """No observer: the estimate is the measurement, as in the paper."""
 
+    analytic = True
+
     def init(self, model: Plant, measured: Measurement) -> tuple[()]:
         return ()
 
@@ -39,6 +41,7 @@ class Complementary(Observer[Array]):
     the position sensor passes through a low-pass of corner l, noise of the velocity through a low-pass of gain 1/l.
     """
 
+    analytic = True
     l: Scalar = gain(default=10.0, unit="1/s", doc="corner between velocity and position sensor")
     z_hat: Scalar | None = leaf(
         default=None,
@@ -133,6 +136,7 @@ class Kalman(Observer[Predicted]):
     optimal filter.
     """
 
+    analytic = True
     w: Scalar = gain(default=800.0, unit="1/s", doc="decay rate of the estimation error, which has three poles at -w")
     estimates_velocity: ClassVar[bool] = True
     memory = (

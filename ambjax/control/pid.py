@@ -39,6 +39,7 @@ class PID(PositionLaw[PIDState]):
     w_m is the unstable pole of the magnets.
     """
 
+    analytic = True
     k_p: Scalar = gain(default=1.41e5, unit="1/s^2", doc="proportional gain; left out: w_m^2/2")
     k_int: Scalar = gain(default=1.87e7, unit="1/s^3", doc="integral gain; left out: w_m^3/8")
     k_d: Scalar = gain(default=531.0, unit="1/s", doc="derivative gain; left out: w_m")
@@ -116,6 +117,7 @@ class FeedbackLinearisation(PositionLaw[tuple[()]]):
     at -w/3, where w is the unstable pole of the magnets.
     """
 
+    analytic = True
     k_p: Scalar = gain(default=3.1e4, unit="1/s^2", doc="proportional gain; left out: (w/3)^2")
     k_d: Scalar = gain(default=354.0, unit="1/s", doc="derivative gain; left out: 2 w/3")
 

@@ -30,6 +30,7 @@ from ambjax.world.signals import Reference
 class SlidingMode(PositionLaw[tuple[()]]):
     """v_star = (-2 k_z z/m - c (z_dot - r_dot) + r_ddot + g - k sgn(sigma)) / a. Eq. (5), sgn smoothed."""
 
+    analytic = True
     c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold")
     k: Scalar = gain(default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z")
     p: Scalar = gain(

@@ -223,4 +223,5 @@ class FixedSteps:
         code, last = jnp.asarray(code, jnp.int32), (t, t, problem.moving(state))
         begin = (state, code, last, blank(problem.instant_structure), place)
         x, code, (start, end, motion), span, _ = lax.fori_loop(0, self.substeps + problem.edges.most, body, begin)
-        return Advanced(x, code, problem.ended(x, motion, start, end, code), memory, span)
+        t_end = problem.ended(x, motion, start, end, code)
+        return Advanced(x, code, t_end, memory, span.shortened(end - t_end))
