@@ -9,6 +9,7 @@ import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import is_traced
+from ambjax.simulation.adaptive import AdaptiveSteps
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.edges import most_inside
 from ambjax.simulation.explicit import DOP853, RK4, AdaptiveCashKarp
@@ -87,13 +88,14 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
 
     `reverse`: choose a method with a fixed number of steps, which supports reverse mode: RK4, or RODAS3 with equal
     substeps. A jump of a disturbance inside such a step causes an error of about 3e-8 m per m/s^2 on smooth gains. An
-    amplifier that controls the current, in continuous time, always gets such a method.
+    amplifier that controls the current, in continuous time, always gets fixed steps: of DOP853, or of RODAS3 if the
+    loop is stiff.
 
     Raises ValueError as `slopes` does.
     """
     named = slopes(cascade, scenario)
     slope = max(named.values())
-    reverse = reverse or _fixed_only(cascade, scenario)
+    fixed_only, noisy = _fixed_only(cascade, scenario), _noisy(scenario)
     if cascade.processor is not None:
         settled = math.ceil(sample_period * max(named[COILS] / SETTLED, named[FLUX] / LAGGED))
         amplifier = scenario.amplifier
@@ -107,13 +109,14 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
         substeps = max(math.ceil(sample_period * slope / ACCURATE), 1)
         explicit = reverse and substeps <= MOST_SUBSTEPS
         fixed = math.ceil(sample_period / math.sqrt(CORNER / slope))
+        smooth = fixed_only or (noisy and _smooth_inside(cascade, scenario, sample_period))
+        if smooth and not reverse and substeps <= MOST_SUBSTEPS:
+            return DOP853(max(math.ceil(sample_period * slope / NOISY), 1))
     if explicit:
         return RK4(substeps)
-    if reverse:
+    if reverse or fixed_only:
         return Rodas3(fixed)
-    noisy, stiff = _noisy(scenario), cascade.processor is not None or sample_period * slope > EXPLICIT
-    if noisy and not stiff and substeps <= MOST_SUBSTEPS and _smooth_inside(cascade, scenario, sample_period):
-        return DOP853(max(math.ceil(sample_period * slope / NOISY), 1))
+    stiff = cascade.processor is not None or sample_period * slope > EXPLICIT
     tolerance = (TOLERANCE if noisy else QUIET_TOLERANCE) if stiff else (TIGHT if noisy else QUIET_TIGHT)
     # The tolerance must be well above the rounding errors, which otherwise cause rejected steps. In float32 it is
     # 1.2e-4.
@@ -155,7 +158,7 @@ def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: 
     """
     if clock.method is None:
         clock = clock.with_method(choose_method(cascade, scenario, float(clock.sample_period), reverse=reverse))
-    elif isinstance(clock.method, AdaptiveRodas3) and _fixed_only(cascade, scenario):
+    elif isinstance(clock.method, AdaptiveSteps) and _fixed_only(cascade, scenario):
         raise ValueError(
             f"clock.method = {clock.method}: an amplifier that controls the current requires fixed steps in continuous "
             "time. Use dt = 'auto', or method = 'rodas3' with a dt."
