@@ -653,6 +653,13 @@ METHODS = [
         "tests/test_accuracy.py::test_the_limit_of_the_supply_and_a_table_of_the_sensor_do_not_cost_accuracy[noise]",
     ),
     M(
+        "under noise, the steps are fixed also for laws with corners",
+        "ambjax/simulation/method.py",
+        "if not all(law.analytic for law in cascade.laws):",
+        "if not cascade.laws:",
+        "tests/test_accuracy.py::test_fixed_steps_under_noise_are_accurate_for_analytic_laws_and_only_chosen_for_them",
+    ),
+    M(
         "an adaptive step may contain an edge of the reference",
         "ambjax/simulation/loop.py",
         "edges(reference=True)",

@@ -6,7 +6,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import AdaptiveRodas3, Cascade, Clock, Initial, Plant, Processor, Scenario, rollout, with_method
+from ambjax import (
+    AdaptiveCashKarp,
+    AdaptiveRodas3,
+    Cascade,
+    Clock,
+    Initial,
+    Plant,
+    Processor,
+    Scenario,
+    rollout,
+    with_method,
+)
 from ambjax.cases.reader import case_from
 from ambjax.codegen.controller import controller_of
 from ambjax.control import current, inversion, observer, position
@@ -162,6 +173,8 @@ def test_adaptive_steps_are_refused_in_continuous_time():
     assert isinstance(with_method(Clock(10, PERIOD), cascade(), world()).method, FixedSteps)
     with pytest.raises(ValueError, match=r"controls the current requires fixed steps.*dt = 'auto'"):
         rollout(cascade(), world(), Clock(10, PERIOD, AdaptiveRodas3()))
+    with pytest.raises(ValueError, match="requires fixed steps in continuous"):
+        rollout(cascade(), world(), Clock(10, PERIOD, AdaptiveCashKarp()))
 
 
 @pytest.mark.parametrize(

@@ -260,7 +260,7 @@ def test_a_span_ends_when_the_rotor_is_lost(short, lost):
     time = np.asarray(short.measured["spans"].time)
     np.testing.assert_allclose(time, 1e-4, rtol=1e-12)  # a sum of some ten steps
     lost_at = float(lost.trajectory.lost_at)
-    # of the step that loses the rotor all counts: it ends where the rotor was lost
+    # the step that loses the rotor counts up to the crossing of the clearance
     np.testing.assert_allclose(np.sum(lost.measured["spans"].time), lost_at, rtol=1e-9)
 
 

@@ -39,6 +39,8 @@ class Law:
     - `own_steps`: the discretisations, "implicit" or "explicit", for which a processor calls the method `step`. With
       the others, the processor makes an explicit Euler step. The default is ("implicit",) for a class that defines
       `step`.
+    - `analytic`: whether output and rates are analytic functions of inputs and state, without corners and roots, where
+      |state| is not larger than usual. Few steps per sample are then accurate under noise.
     - `stiff`: whether a smoothed sign keeps a state of the law inside its boundary layer, so that this state changes
       fast; True for a class that defines `layer`.
     - `switching`: names of the gains that multiply smoothed signs and that `designed` chooses together with the
@@ -51,6 +53,7 @@ class Law:
     estimates_velocity: ClassVar[bool] = False
     memory: ClassVar[tuple[tuple[str, str, str], ...] | None] = None
     own_steps: ClassVar[tuple[str, ...]] = ()
+    analytic: ClassVar[bool] = False
     stiff: ClassVar[bool] = False
     switching: ClassVar[tuple[str, ...]] = ()
     slides: ClassVar[bool] = False
@@ -60,6 +63,8 @@ class Law:
         written = vars(cls)
         if "step" in written and "own_steps" not in written:
             cls.own_steps = ("implicit",)
+        if "__call__" in written and "analytic" not in written:
+            cls.analytic = False  # the property of an overridden law says nothing about this one
         cls.stiff, cls.slides = cls.stiff or "layer" in written, cls.slides or "slide" in written
 
     def size(self, model: Plant) -> Scalar | None:

@@ -53,6 +53,7 @@ class FilterChain(PositionLaw[ChainState]):
     and k_d > 0, the law is a PD controller.
     """
 
+    analytic = True
     k_p: Scalar = gain(default=135.0, unit="A/m", doc="proportional gain; left out: LQR in continuous time")
     k_int: Scalar = gain(
         default=5310.0, unit="A/m/s", doc="integral gain, 0: none; left out: LQR in continuous time", zero=True

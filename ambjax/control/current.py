@@ -25,6 +25,7 @@ class SlidingMode(CurrentLaw[tuple[()]]):
     2/pi k_i p = w_c at 0, where w_c is the bandwidth of the current loop (`control.defaults`).
     """
 
+    analytic = True
     k_i: Scalar = gain(
         default=152.0, unit="A/s", doc="switching gain; above the disturbance bound Q_i; left out: w_c i_0/4"
     )
@@ -94,6 +95,7 @@ class ProportionalIntegral(CurrentLaw[Array]):
     much lower gains lose it.
     """
 
+    analytic = True
     k_p: Scalar = gain(default=1.76e5, unit="V/A", doc="proportional gain; left out: w_c L")
     k_int: Scalar = gain(default=2.33e8, unit="V/A/s", doc="integral gain, 0: none; left out: w_c^2 L/4", zero=True)
     k_aw: Scalar = gain(default=1330.0, unit="1/s", doc="anti-windup rate, 0: none; left out: w_c/4", zero=True)
@@ -139,6 +141,7 @@ class DeadBeat(CurrentLaw[tuple[()]]):
     so a wrong resistance of the model leaves an offset.
     """
 
+    analytic = True
     w: Scalar = gain(
         default=5310.0, unit="1/s", doc="decay rate of the current error in continuous time; left out: w_c"
     )
@@ -201,6 +204,7 @@ class OpenLoop(CurrentLaw[tuple[()]]):
     the inversion computes at this sample.
     """
 
+    analytic = True
     accepts: ClassVar = ("voltage",)
 
     def init(self, model: Plant) -> tuple[()]:

@@ -34,6 +34,7 @@ class IntegralSlidingMode(PositionLaw[Array]):
     The default gains are those of SlidingMode; c_int = c^2/4 gives two equal poles on the manifold.
     """
 
+    analytic = True
     c: Scalar = gain(default=17.0, unit="1/s", doc="coefficient of the error in the sliding variable; left out: w")
     c_int: Scalar = gain(
         default=70.0, unit="1/s^2", doc="gain of the integral of the error, 0: none; left out: w^2/4", zero=True

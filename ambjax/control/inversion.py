@@ -38,6 +38,7 @@ class AdaptiveReference(InversionLaw[Array]):
     the pole of the magnets: gamma then exceeds Delta_1 of Eq. (7) up to the speed w s_0.
     """
 
+    analytic = True
     gamma: Scalar = gain(
         default=7.5e4, unit="A^2/m^2/s", doc="adaptation gain; above Delta_1 of Eq. (7); left out: 4 w (i_0/s_0)^2"
     )
@@ -86,6 +87,7 @@ class Adaptive(AdaptiveReference):
     Deviation from the paper: the default gamma is 7.5e4, because the printed value, 1000, violates Eq. (7).
     """
 
+    analytic = True
     requirement: ClassVar = Requirement("gamma", "Delta_1")
 
     def __call__(self, model: Plant, inputs: ForceDemand, state: Array) -> tuple[CurrentDemand, Array]:
@@ -133,6 +135,7 @@ class FeedForwardAdaptive(AdaptiveReference):
     They add the noise of the velocity to i_ref'. In Eq. (6) this noise acts only inside the sign, through v_star.
     """
 
+    analytic = True
     gamma: Scalar = gain(
         default=7.5e4,
         unit="A^2/m^2/s",
@@ -176,6 +179,7 @@ class StaticInversion(InversionLaw[tuple[()]]):
     respond twice to each change of i_ref: to i_ref', and to the change itself.
     """
 
+    analytic = True
     own_steps = ("implicit", "explicit")
     memory = (("i_ref", "A", "current reference of the next sample"), ("begun", "1", "1 after the first sample"))
 
@@ -220,6 +224,8 @@ class ClosedForm(StaticInversion):
     law with gamma = inf after the first sample.
     """
 
+    analytic = True
+
     def inverse(self, model: Plant, z: Array, v_star: Array) -> Array:
         return model.current_for(z, v_star)
 
@@ -233,6 +239,7 @@ class Linearised(StaticInversion):
     is zero at z = 0, and for v_star = 0 at every z; elsewhere it is of third order in z and v_star.
     """
 
+    analytic = True
     accepts: ClassVar = ("force", "voltage")
 
     def inverse(self, model: Plant, z: Array, v_star: Array) -> Array:

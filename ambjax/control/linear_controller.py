@@ -36,6 +36,7 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
     reported sigma is the rate of the error, m/s. `of` constructs the law from a state space of python-control or SciPy.
     """
 
+    analytic = True
     gain: Scalar = records.gain(default=1.0, unit="1", doc="factor of the controller's output")
     output: str = static(default=OUTPUTS[0], doc="quantity that the controller returns: a current (A) or a voltage (V)")
     realisation: Realisation = static(default=LEAD, doc="matrices of the controller")

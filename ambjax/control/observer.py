@@ -19,6 +19,8 @@ from ambjax.world.sensor import Measurement
 class Direct(Observer[tuple[()]]):
     """No observer: the estimate is the measurement, as in the paper."""
 
+    analytic = True
+
     def init(self, model: Plant, measured: Measurement) -> tuple[()]:
         return ()
 
@@ -40,6 +42,7 @@ class Complementary(Observer[Array]):
     the position sensor passes through a low-pass of corner l, noise of the velocity through a low-pass of gain 1/l.
     """
 
+    analytic = True
     l: Scalar = gain(default=10.6, unit="1/s", doc="corner between velocity and position sensor; left out: w/50")
     z_hat: Scalar | None = leaf(
         default=None,
@@ -144,6 +147,7 @@ class Kalman(Observer[Predicted]):
     optimal filter.
     """
 
+    analytic = True
     w: Scalar = gain(
         default=1590.0,
         unit="1/s",

@@ -39,6 +39,7 @@ class PID(PositionLaw[PIDState]):
     w is the unstable pole of the magnets. With an ideal current, the peak of |S| is then 1.15.
     """
 
+    analytic = True
     k_p: Scalar = gain(default=3.52e5, unit="1/s^2", doc="proportional gain; left out: 5/4 w^2")
     k_int: Scalar = gain(default=3.74e7, unit="1/s^3", doc="integral gain, 0: none; left out: w^3/4", zero=True)
     k_d: Scalar = gain(default=1062.0, unit="1/s", doc="derivative gain; left out: 2 w")
@@ -118,6 +119,7 @@ class FeedbackLinearisation(PositionLaw[tuple[()]]):
     at -w, where w is the unstable pole of the magnets. With an ideal current, |S| is then 1 at every frequency.
     """
 
+    analytic = True
     k_p: Scalar = gain(default=2.82e5, unit="1/s^2", doc="proportional gain; left out: w^2")
     k_d: Scalar = gain(default=1062.0, unit="1/s", doc="derivative gain; left out: 2 w")
 

@@ -35,6 +35,7 @@ class SlidingMode(PositionLaw[tuple[()]]):
     the pole of the magnets (`control.defaults`).
     """
 
+    analytic = True
     c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold; left out: w")
     k: Scalar = gain(
         default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z; left out: w^2 s_0/2"

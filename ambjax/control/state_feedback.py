@@ -30,6 +30,7 @@ class StateFeedback(PositionLaw[Array]):
     ((i_star - i_r)/(0.1 i_0))^2; on a processor, the sum over the samples. w is the pole of the magnets.
     """
 
+    analytic = True
     k_p: Scalar = gain(default=135.0, unit="A/m", doc="proportional gain; left out: LQR")
     k_d: Scalar = gain(default=0.219, unit="A s/m", doc="derivative gain; left out: LQR")
     k_int: Scalar = gain(default=5310.0, unit="A/m/s", doc="integral gain, 0: none; left out: LQR", zero=True)

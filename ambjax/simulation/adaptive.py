@@ -129,6 +129,7 @@ class AdaptiveSteps:
         # Under noise, the step at the start of a sample is a better guess for the next sample than that at its end.
         memory = jnp.where(problem.jumps & (done.elapsed > 0), done.first, done.h)
         t_end = problem.ended(x, done.last[1], t + done.last[0], t + done.elapsed, done.code)
+        span = span.shortened(t + done.elapsed - t_end)
         return Advanced(x, jnp.where(stalled, STALLED, done.code), t_end, memory, span)
 
     @staticmethod

@@ -58,7 +58,7 @@ class InitialValueProblem(NamedTuple, Generic[Inputs, State]):
     layer: State | None = None
     observed: Callable[[Inputs, State], tuple[State, Instant]] | None = None
     instant_structure: Instant = NOTHING
-    jumps: bool = False
+    jumps: Array | bool = False
     slide: Callable[[Inputs, Inputs, Scalar, State, Span], tuple[State, Span]] | None = None
     edges: Edges = NO_EDGES
     motion: Callable[[State], tuple[Array, Array]] | None = None
@@ -222,5 +222,6 @@ class FixedSteps:
         t = jnp.asarray(t, h.dtype)
         code, last = jnp.asarray(code, jnp.int32), (t, t, problem.moving(state))
         begin = (state, code, last, blank(problem.instant_structure), place)
-        x, code, (start, end, motion), span, _ = lax.fori_loop(0, self.substeps + problem.edges.most, body, begin)
-        return Advanced(x, code, problem.ended(x, motion, start, end, code), memory, span)
+        x, ended, (start, end, motion), span, _ = lax.fori_loop(0, self.substeps + problem.edges.most, body, begin)
+        t_end = problem.ended(x, motion, start, end, ended)
+        return Advanced(x, ended, t_end, memory, span.shortened(end - t_end))

@@ -9,6 +9,7 @@ import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import is_traced
+from ambjax.simulation.adaptive import AdaptiveSteps
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.edges import most_inside
 from ambjax.simulation.explicit import DOP853, RK4, AdaptiveCashKarp
@@ -53,7 +54,7 @@ CORNER = 7.5e-6
 TOLERANCE, QUIET_TOLERANCE = 1e-6, 1e-7
 # The same for the Cash-Karp method, whose number of steps grows only as the fifth root of the tolerance. Kinks at the
 # limit of the supply require TIGHT; a drop onto a fast transient requires QUIET_TIGHT (tests/test_tolerance.py).
-TIGHT, QUIET_TIGHT = 1e-7, 1e-9
+TIGHT, QUIET_TIGHT = 1e-8, 1e-9
 
 
 def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
@@ -81,19 +82,20 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
     On a processor, the choice is RK4 if MOST_SETTLED substeps resolve current and flux, otherwise adaptive RODAS3.
 
     In continuous time, the choice is the adaptive Cash-Karp method, or adaptive RODAS3 if the loop is stiff (EXPLICIT).
-    Noise is constant over each sample, and the motion in a sample is smooth unless a limit or an edge lies inside. If
-    there is none, noise is the only exception: DOP853 with one or two equal substeps then reaches the same error in
-    less time, because the slowest member of an ensemble does not determine the number of steps.
+    There is one exception. Noise is constant over each sample. If the laws are analytic and no limit and no edge can
+    lie inside a sample, the motion in a sample is smooth. One or two steps of DOP853 then reach the same error in less
+    time, because the slowest member of an ensemble does not determine the number of steps.
 
     `reverse`: choose a method with a fixed number of steps, which supports reverse mode: RK4, or RODAS3 with equal
     substeps. A jump of a disturbance inside such a step causes an error of about 3e-8 m per m/s^2 on smooth gains. An
-    amplifier that controls the current, in continuous time, always gets such a method.
+    amplifier that controls the current, in continuous time, always gets fixed steps: of DOP853, or of RODAS3 if the
+    loop is stiff.
 
     Raises ValueError as `slopes` does.
     """
     named = slopes(cascade, scenario)
     slope = max(named.values())
-    reverse = reverse or _fixed_only(cascade, scenario)
+    fixed_only, noisy = _fixed_only(cascade, scenario), _noisy(scenario)
     if cascade.processor is not None:
         settled = math.ceil(sample_period * max(named[COILS] / SETTLED, named[FLUX] / LAGGED))
         amplifier = scenario.amplifier
@@ -107,13 +109,14 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
         substeps = max(math.ceil(sample_period * slope / ACCURATE), 1)
         explicit = reverse and substeps <= MOST_SUBSTEPS
         fixed = math.ceil(sample_period / math.sqrt(CORNER / slope))
+        smooth = fixed_only or (noisy and _smooth_inside(cascade, scenario, sample_period))
+        if smooth and not reverse and substeps <= MOST_SUBSTEPS:
+            return DOP853(max(math.ceil(sample_period * slope / NOISY), 1))
     if explicit:
         return RK4(substeps)
-    if reverse:
+    if reverse or fixed_only:
         return Rodas3(fixed)
-    noisy, stiff = _noisy(scenario), cascade.processor is not None or sample_period * slope > EXPLICIT
-    if noisy and not stiff and substeps <= MOST_SUBSTEPS and _smooth_inside(scenario, sample_period):
-        return DOP853(max(math.ceil(sample_period * slope / NOISY), 1))
+    stiff = cascade.processor is not None or sample_period * slope > EXPLICIT
     tolerance = (TOLERANCE if noisy else QUIET_TOLERANCE) if stiff else (TIGHT if noisy else QUIET_TIGHT)
     # The tolerance must be well above the rounding errors, which otherwise cause rejected steps. In float32 it is
     # 1.2e-4.
@@ -127,8 +130,10 @@ def _noisy(scenario: Scenario) -> bool:
     return any(is_traced(std) or bool(np.any(np.asarray(std))) for std in noises)
 
 
-def _smooth_inside(scenario: Scenario, sample_period: float) -> bool:
-    """Return whether the rates have neither kinks nor jumps inside samples: no limit, no stop, and no edge."""
+def _smooth_inside(cascade: Cascade, scenario: Scenario, sample_period: float) -> bool:
+    """Return whether the rates have neither kinks nor jumps inside samples: analytic laws, no limit, stop or edge."""
+    if not all(law.analytic for law in cascade.laws):
+        return False
     u_max = scenario.u_max
     limited = is_traced(u_max) or bool(np.any(np.isfinite(np.asarray(u_max))))
     inside = most_inside(scenario, sample_period, reference=True)
@@ -153,7 +158,7 @@ def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: 
     """
     if clock.method is None:
         clock = clock.with_method(choose_method(cascade, scenario, float(clock.sample_period), reverse=reverse))
-    elif isinstance(clock.method, AdaptiveRodas3) and _fixed_only(cascade, scenario):
+    elif isinstance(clock.method, AdaptiveSteps) and _fixed_only(cascade, scenario):
         raise ValueError(
             f"clock.method = {clock.method}: an amplifier that controls the current requires fixed steps in continuous "
             "time. Use dt = 'auto', or method = 'rodas3' with a dt."

@@ -54,6 +54,13 @@ class Span(NamedTuple):
         more = jax.tree.map(lambda total, x: total + weight * x, self.densities, instant.densities)
         return self._replace(densities=more)
 
+    def shortened(self, by: Scalar) -> "Span":
+        """Return the interval without its last `by` seconds. The means of the densities are kept."""
+        share = 1 - by / jnp.where(self.time > 0, self.time, 1.0)
+        return self._replace(
+            time=share * self.time, densities=jax.tree.map(lambda total: share * total, self.densities)
+        )
+
     def joined(self, after: "Span") -> "Span":
         """Return the union of this interval and the next one."""
         most = jax.tree.map(larger, self.most, after.most)
