@@ -17,7 +17,7 @@ from ambjax.ensemble.spread import no_such_number
 from ambjax.ensemble.study import Study
 from ambjax.host.arguments import names_arguments
 from ambjax.host.optional import extra
-from ambjax.linear import stability
+from ambjax.linear import stability_of
 from ambjax.numerics.declared import numbers, within
 from ambjax.simulation.clock import Clock
 from ambjax.world.scenario import Scenario
@@ -104,7 +104,7 @@ def survival_map(case: Case, x: str, y: str, *, members: int = 1, seed: int | No
 
 def is_stable(cascade: Cascade, scenario: Scenario, clock: Clock) -> np.ndarray:
     """Return whether each member of an ensemble [N] is stable, for `grid`."""
-    return stability(cascade, scenario, clock).stable
+    return stability_of(cascade, scenario, clock).stable
 
 
 def study_and_axes(case: Case, x: str, y: str, members: int, seed: int | None) -> tuple[Study, Axis, Axis]:

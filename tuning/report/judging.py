@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.commands.outputs import say
-from ambjax.linear import Findings, stability, suspects
+from ambjax.linear import Findings, stability_of, suspects
 from ambjax.theorem.advice import advice as on_conditions
 from ambjax.theorem.conditions import Report as Check
 from ambjax.theorem.conditions import check
@@ -102,7 +102,7 @@ def _stability(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[s
         return Findings(0, 0)._asdict()
     say(f"testing whether the loops of {index.size} held-out members are stable ...")
     members = problem.objective.chosen(seed, index, len(columns["lost_at_s"]))
-    return stability(*problem.objective.fixed(x, members), problem.case.clock).findings()._asdict()
+    return stability_of(*problem.objective.fixed(x, members), problem.case.clock).findings()._asdict()
 
 
 def _steps(answer: SearchResult, unlucky: StepError | None, again: Row | None, refuted: str) -> Row:
