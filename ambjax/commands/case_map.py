@@ -98,8 +98,8 @@ def survival_map(case: Case, x: str, y: str, *, members: int = 1, seed: int | No
     for name, axis in (("x", x), ("y", y)):
         if not isinstance(axis, str):
             raise ValueError(f"{name} = {axis!r}: it must be text. Write {FORM}.")
-    study, *axes = study_and_axes(case, x, y, members, seed)
-    return CaseMap(case, grid(study, *axes, is_stable))
+    study, first, second = study_and_axes(case, x, y, members, seed)
+    return CaseMap(case, grid(study, first, second, is_stable))
 
 
 def is_stable(cascade: Cascade, scenario: Scenario, clock: Clock) -> np.ndarray:

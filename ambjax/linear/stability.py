@@ -258,6 +258,6 @@ def quiet(scenario: Scenario) -> Scenario:
     )
 
 
-def _at_start(reference: Signal) -> np.ndarray | float:
+def _at_start(reference: Signal) -> Any:
     """Return the reference at t = 0, m; 0 for one that is drawn for each member."""
     return 0.0 if is_random(reference) else np.asarray(reference(0.0))

@@ -143,8 +143,8 @@ def _cells(ax: Axes, panel: MapPanel, values: np.ndarray, norm: Normalize, colou
     ax.pcolormesh(x_edges, y_edges, np.ma.masked_invalid(values), norm=norm, cmap=colours)
     if panel.unstable is not None:
         for row, column in np.argwhere(panel.unstable):
-            corner, width = (x_edges[column], y_edges[row]), x_edges[column + 1] - x_edges[column]
-            ax.add_patch(Rectangle(corner, width, y_edges[row + 1] - y_edges[row], **UNSTABLE_CELL))
+            left, right, low, high = (float(x) for x in (*x_edges[column : column + 2], *y_edges[row : row + 2]))
+            ax.add_patch(Rectangle((left, low), right - left, high - low, **UNSTABLE_CELL))
     for name, width in LINES.items():
         values = getattr(panel, name)
         if values is None:
