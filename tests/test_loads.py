@@ -210,6 +210,23 @@ def test_a_written_case_finds_its_tables(tmp_path):
     assert found.scenario == again.scenario == case.scenario
 
 
+@pytest.mark.parametrize("end", ["csv", "tsv", "txt"])
+@pytest.mark.parametrize("named", [False, True])
+@pytest.mark.parametrize(
+    ("between", "point"), [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("   ", ".")]
+)
+def test_a_text_file_is_read_with_any_separator_and_decimal_mark(between, point, named, end, tmp_path):
+    t, value = np.array([0.0, 0.125, 1.0]), np.array([-1.5, 2e-3, 1234.5])
+    rows = [["t", "value"]] * named + [
+        [repr(float(x)).replace(".", point) for x in row] for row in zip(t, value, strict=True)
+    ]
+    (tmp_path / f"x.{end}").write_text("# comment; with, all\tmarks\n" + "\n".join(between.join(row) for row in rows))
+    load = {"kind": "table", "file": f"x.{end}", "unit": "N"}
+    found = case_from({"disturbance": {"q_z": load}}, folder=tmp_path).scenario.q_f.samples
+    np.testing.assert_array_equal(found.times, t)
+    np.testing.assert_array_equal(found.values, value)
+
+
 GOOD = "t,value\n0,1\n1,2\n"
 
 
@@ -217,14 +234,16 @@ GOOD = "t,value\n0,1\n1,2\n"
     ("text", "keys", "said"),
     [
         (None, {}, r"file = \"x.csv\": .*x.csv cannot be read \(No such file or directory\). A path is relative"),
-        (GOOD, {"file": "x.txt"}, "must be the path of a file, '.csv', '.npz' or '.parquet'"),
+        (GOOD, {"file": "x.doc"}, "must be the path of a file, '.csv', '.tsv', '.txt', '.npz' or '.parquet'"),
         (GOOD, {"file": 3}, "must be the path of a file"),
         (GOOD, {"columns": ["t"]}, r"columns = \[\"t\"\]: it must be two names"),
         (GOOD, {"columns": ["t", "force"]}, "no column 'force'. Its columns: t, value"),
         (GOOD, {"interpolation": "cubic"}, "interpolation = \"cubic\": it must be one of 'linear' or 'held'"),
         (GOOD, {"amplitude": 2.0}, "amplitude = 2.0: unknown key"),
         ("", {}, "it is empty"),
-        ("0;1\n1;2\n", {}, "separated by ';'"),
+        ("0;1\n1,2\n", {}, "line 2 has 1 columns, but the first line has 2"),
+        ('0,1\n1,"1,500"\n', {}, 'line 2: "1,500" is not a number'),
+        ("0;1\n1;1.234,5\n", {}, 'line 2: "1.234,5" is not a number'),
         ("t,a,b\n0,1,2\n1,2,3\n", {}, "it has the columns t, a, b; name those"),
         ("0,1\n", {}, "it has 1 rows; give 2 to"),
         ("0,1\n1,\n", {}, "line 2: the cell of column '2' is empty. Give a number"),

@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 from ambjax import Plant, Scenario
+from ambjax.cases.reader import case_from
 from ambjax.simulation.metrics import Standard, standard_for
 from ambjax.world.coils import Currents, TwoCoil
+from ambjax.world.iron import Iron
+from ambjax.world.sensor import Measurement
 
 PLANT = Plant()
 OTHER = Plant(m=0.7, k_z=-900.0, n=1200.0, A=0.1, s_0=4e-3, i_0=0.4, R=30.0, g=3.0)
@@ -19,6 +22,31 @@ def points(plant, n=400, reach=0.95, seed=0):
     """Random (z, i): |z| < reach s_0, |i| < 3 i_0."""
     z, i = np.random.default_rng(seed).uniform(-1, 1, (2, n))
     return z * reach * plant.s_0, 3 * i * plant.i_0
+
+
+def test_a_plant_with_given_stiffness_force_per_current_and_inductance():
+    """The formulas of docs/magnet.md, for any gap and any number of turns."""
+    draw = np.random.default_rng(0)
+    for _ in range(20):
+        k_s, k_i, s_0, n = (10 ** draw.uniform(*ends) for ends in ((4, 7), (1, 3), (-4, -2), (1, 3)))
+        leakage = draw.uniform(1.0, 2.0)
+        L = leakage * k_i**2 / (2 * k_s)
+        i_0, kappa, found = s_0 * k_s / k_i, s_0 * k_i**2 / k_s, 2 * k_s * L / k_i**2
+        plant = TwoCoil(m=2.0, mu_0=1.2566e-6, n=n, A=kappa / (1.2566e-6 * n**2), s_0=s_0, i_0=i_0, R=0.5)
+        plant = dataclasses.replace(plant, iron=Iron(leakage=found))
+        np.testing.assert_allclose([plant.k_s, plant.k_i, found], [k_s, k_i, leakage], rtol=1e-12)  # rounding
+        rest = plant.start(Measurement(*np.zeros(3)))
+        # the rate of the current per volt is 1/L; 1e-9: the rate is a difference of R i_0 terms
+        np.testing.assert_allclose(1 / plant.measurement(plant.rates(rest, 1.0)).i, L, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(Plant) if field.metadata.get("leaf")])
+def test_a_refused_number_of_a_machine_is_not_answered_with_that_of_another(name):
+    for value in (np.nan, -1e30, np.inf):
+        with pytest.raises(ValueError, match=f"plant.{name} = ") as error:
+            case_from({"plant": {name: value}})
+        assert f"{getattr(PLANT, name):g}" not in str(error.value)
+        assert "it must be" in str(error.value)
 
 
 def test_derived_constants_of_table_1():

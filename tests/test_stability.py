@@ -16,8 +16,12 @@ import ambjax as amb
 from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.ensemble import run_ensemble
+from ambjax.ensemble.blocks import BlockValues
 from ambjax.ensemble.delays import at_delays
-from ambjax.linear.stability import SMALL, Findings, Stability, stability, with_stability
+from ambjax.linear import stability as module
+from ambjax.linear.stability import SMALL, Findings, Stability, stability_of, with_stability
+from ambjax.simulation.rollout import Outcome
+from ambjax.simulation.trajectory import Trajectory
 from ambjax.theorem.advice import processor_lines
 from ambjax.theorem.sampled_report import Delays, SampledReport
 
@@ -74,7 +78,7 @@ def test_the_delay_from_which_the_loop_is_not_stable_is_that_of_brute_force():
 @pytest.mark.slow
 def test_below_the_margin_stable_above_it_held_but_not_stable_far_above_it_lost():
     case, delays = case_of(), [STABLE, CYCLE, GONE]
-    found = stability(late(case, delays), members(case, 3), case.clock)
+    found = stability_of(late(case, delays), members(case, 3), case.clock)
     held = np.isinf(run_ensemble(late(case, delays), members(case, 3), case.clock, fold=None).trajectory.lost_at)
     assert held.tolist() == [True, True, False]
     assert found.stable.tolist() == [True, False, False]
@@ -99,7 +103,7 @@ def test_noise_and_unbalance_do_not_make_a_loop_unstable():
     run = amb.rollout(case.cascade, case.scenario, case.clock).trajectory
     assert np.isinf(run.lost_at)
     assert np.ptp(np.asarray(run.rows.z)[250:]) / 2 > 0.15 * case.scenario.touchdown
-    found = stability(case.cascade, members(case), case.clock)
+    found = stability_of(case.cascade, members(case), case.clock)
     assert found.stable.all()
     assert found.swing[0] < 1e-3 * SMALL * case.scenario.touchdown
 
@@ -110,14 +114,32 @@ def test_the_chatter_of_signs_is_not_called_unstable():
     delays, clock = np.array([0.25, 0.5, 0.75, 1.0]), amb.Clock(2000, 1e-4, amb.RK4(1))
     cascade = sampled.cascade_of(*sampled.HARD, delay=delays, predict=False).on_processor(2.0, 0.0, between=True)
     world = dataclasses.replace(sampled.WORLD, member=np.zeros(4, int))
-    found = stability(cascade, world, clock)
+    found = stability_of(cascade, world, clock)
     assert found.stable.all()
     assert np.isnan(found.growth).all()
     explicit = sampled.cascade_of(200.0, 25.0, 2e5, 2000.0, 25.0, delay=0.0, implicit=False)
-    found = stability(explicit, dataclasses.replace(world, member=np.zeros(1, int)), clock)
+    found = stability_of(explicit, dataclasses.replace(world, member=np.zeros(1, int)), clock)
     assert found.growth[0] > 1000
     assert found.stable.all()
     assert "it chatters" in found.findings().reason
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("motion", ["creep", "slow decay", "limit cycle"])
+def test_only_an_oscillation_that_the_linear_loop_does_not_explain_is_sustained(motion, monkeypatch):
+    """The run is constructed: z in each quarter, with an amplitude of 5 % of the clearance."""
+    case = case_of()
+    t, size = np.linspace(0, 1, 400).reshape(4, 100), 0.05 * case.scenario.touchdown
+    oscillation = size * np.sin(2 * np.pi * 40 * t)
+    z = {"creep": 8 * size * t, "slow decay": oscillation * np.exp(-0.2 * t)}.get(motion, oscillation)
+    values = BlockValues(
+        {"z": z.min(1)[None], "i": -np.ones((1, 4))}, {"z": z.max(1)[None], "i": np.ones((1, 4))}, None, None
+    )
+    run = Outcome(Trajectory(None, np.array([np.inf]), np.zeros(1), None), values)
+    monkeypatch.setattr(module, "run_ensemble", lambda *_, **__: run)
+    rate = -0.2 / float(case.clock.duration) if motion == "slow decay" else -50.0
+    monkeypatch.setattr(module, "_growth", lambda *_: np.array([rate]))
+    assert stability_of(case.cascade, members(case), case.clock).stable[0] == (motion != "limit cycle")
 
 
 @pytest.mark.slow
@@ -125,7 +147,7 @@ def test_a_limit_cycle_that_the_linear_loop_does_not_have_is_found_and_explained
     """A dead band of the amplifier: the linear loop, which has none, is stable."""
     change = {"actuator": {"mode": "voltage", "bandwidth": None, "dead_band": 0.8}}
     case = case_of(**change, controller=CASE["controller"] | {"current": {"kind": "pi"}}, processor={"delay": 0.2})
-    found = stability(case.cascade, members(case), case.clock)
+    found = stability_of(case.cascade, members(case), case.clock)
     assert found.growth[0] < 0
     assert not found.stable[0]
     facts = found.findings()

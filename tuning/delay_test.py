@@ -8,7 +8,7 @@ import numpy as np
 
 from ambjax.control.processor import MOST_DELAY
 from ambjax.ensemble import run_ensemble
-from ambjax.linear import stability
+from ambjax.linear import stability_of
 from tuning.objective.limits import PREFIX, Limit
 from tuning.problem import TuningProblem
 
@@ -63,5 +63,5 @@ def delay_test(problem: TuningProblem, x: np.ndarray, seed: int, columns: Mappin
     cascade = dataclasses.replace(cascade, processor=late)
     ended = run_ensemble(cascade, scenario, problem.case.clock, fold=None, every=0)
     lost = np.isfinite(ended.trajectory.lost_at)
-    unstable = ~lost & ~stability(cascade, scenario, problem.case.clock).stable
+    unstable = ~lost & ~stability_of(cascade, scenario, problem.case.clock).stable
     return DelayTest(len(members.member), int(lost.sum()), int(unstable.sum()))

@@ -1,4 +1,4 @@
-"""Recorded signals of a case file: `kind = "table"` with a file of times and values (CSV, npz or Parquet)."""
+"""Recorded signals of a case file: `kind = "table"` with a file of times and values (text, npz or Parquet)."""
 
 import csv
 import dataclasses
@@ -137,9 +137,10 @@ def _checked(times: np.ndarray, values: np.ndarray) -> Samples:
 
 
 def _csv(file: pathlib.Path) -> dict[str, np.ndarray]:
-    """Read columns separated by commas. The first line may give their names; otherwise they are "1", "2" and so on.
+    """Read columns separated by semicolons, tabs, commas or spaces.
 
-    Lines that begin with # are comments.
+    The first line decides the separator, and may name the columns; otherwise they are "1", "2" and so on. Unless commas
+    separate columns, a number may have a decimal comma. Lines that begin with # are comments.
     """
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
@@ -148,15 +149,17 @@ def _csv(file: pathlib.Path) -> dict[str, np.ndarray]:
     numbered = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
     if not numbered:
         raise ValueError("it is empty.")
-    if ";" in numbered[0][1]:
-        raise ValueError("its columns are separated by ';'. Separate them by commas, with a point in decimal numbers.")
+    between = next((mark for mark in ";\t, " if mark in numbered[0][1].strip()), ",")
+    if between == " ":
+        numbered, between = [(n, "\t".join(line.split())) for n, line in numbered], "\t"
+    comma = between != ","
     try:
-        rows = list(csv.reader(line for _, line in numbered))
+        rows = list(csv.reader((line for _, line in numbered), delimiter=between))
     except csv.Error:  # a cell longer than the limit of the module csv
         rows = []
     if len(rows) != len(numbered):
         raise ValueError('a quotation mark " is not closed.')
-    named = any(_float(cell) is None for cell in rows[0])
+    named = any(_float(cell, comma) is None for cell in rows[0])
     names = [cell.strip() for cell in rows[0]] if named else [str(n + 1) for n in range(len(rows[0]))]
     if len(set(names)) < len(names):
         raise ValueError(f"two of its columns have the same name: {', '.join(names)}.")
@@ -167,16 +170,19 @@ def _csv(file: pathlib.Path) -> dict[str, np.ndarray]:
         for k, cell in enumerate(row):
             if not cell.strip():
                 raise ValueError(f"line {line}: the cell of column '{names[k]}' is empty. Give a number.")
-            if (number := _float(cell)) is None:
+            if (number := _float(cell, comma)) is None:
                 raise ValueError(f"line {line}: {show(cell)} is not a number.")
             table[n, k] = number
     return dict(zip(names, table.T, strict=True))
 
 
-def _float(cell: str) -> float | None:
-    """Return the number in a cell; NaN if the cell is empty, None if its text is not a number."""
+def _float(cell: str, comma: bool) -> float | None:
+    """Return the number in a cell; NaN if the cell is empty, None if its text is not a number.
+
+    `comma`: whether a number may have a decimal comma.
+    """
     try:
-        return float(cell) if cell.strip() else math.nan
+        return float(cell.replace(",", ".") if comma else cell) if cell.strip() else math.nan
     except ValueError:
         return None
 
@@ -201,4 +207,4 @@ def _parquet(file: pathlib.Path) -> dict[str, np.ndarray]:
     return {name: table[name].to_numpy() for name in table.column_names}
 
 
-READERS = {".csv": _csv, ".npz": _npz, ".parquet": _parquet}
+READERS = {".csv": _csv, ".tsv": _csv, ".txt": _csv, ".npz": _npz, ".parquet": _parquet}

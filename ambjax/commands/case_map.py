@@ -13,10 +13,11 @@ from ambjax.commands.ensemble import study_of
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, with_method_for_axes
 from ambjax.ensemble.paths import Place, places
+from ambjax.ensemble.spread import no_such_number
 from ambjax.ensemble.study import Study
 from ambjax.host.arguments import names_arguments
 from ambjax.host.optional import extra
-from ambjax.linear import stability
+from ambjax.linear import stability_of
 from ambjax.numerics.declared import numbers, within
 from ambjax.simulation.clock import Clock
 from ambjax.world.scenario import Scenario
@@ -97,13 +98,13 @@ def survival_map(case: Case, x: str, y: str, *, members: int = 1, seed: int | No
     for name, axis in (("x", x), ("y", y)):
         if not isinstance(axis, str):
             raise ValueError(f"{name} = {axis!r}: it must be text. Write {FORM}.")
-    study, x_axis, y_axis = study_and_axes(case, x, y, members, seed)
-    return CaseMap(case, grid(study, x_axis, y_axis, is_stable))
+    study, first, second = study_and_axes(case, x, y, members, seed)
+    return CaseMap(case, grid(study, first, second, is_stable))
 
 
 def is_stable(cascade: Cascade, scenario: Scenario, clock: Clock) -> np.ndarray:
     """Return whether each member of an ensemble [N] is stable, for `grid`."""
-    return stability(cascade, scenario, clock).stable
+    return stability_of(cascade, scenario, clock).stable
 
 
 def study_and_axes(case: Case, x: str, y: str, members: int, seed: int | None) -> tuple[Study, Axis, Axis]:
@@ -170,7 +171,9 @@ def _axis(flag: str, text: str, case: Case) -> Axis:
     if len(parts) not in (2, 3):
         raise refuse("it must be a path, '=' and a range")
     known = places(case.cascade, case.scenario)
-    nominal = float(case.clock.sample_period) if path == PERIOD else _nominal(known.get(path))
+    if path != PERIOD and path not in known:
+        raise ValueError(f"{flag} {path}: {no_such_number(path, [*known, PERIOD])}")
+    nominal = float(case.clock.sample_period) if path == PERIOD else _nominal(known[path])
     try:
         low, high = (_value(part, nominal) for part in parts[:2])
         count = int(parts[2]) if len(parts) == 3 else COUNT
@@ -180,8 +183,8 @@ def _axis(flag: str, text: str, case: Case) -> Axis:
         raise refuse(f"LOW must be less than HIGH, both finite; they are {low:g} and {high:g}")
     if not 2 <= count <= MOST_CELLS:
         raise refuse(f"COUNT must be 2 to {MOST_CELLS:,}, and it is {count}")
-    field = SAMPLE_PERIOD if path == PERIOD else known[path].field if path in known else None
-    if field is not None and not within(field.metadata, np.array([low, high])):
+    field = SAMPLE_PERIOD if path == PERIOD else known[path].field
+    if not within(field.metadata, np.array([low, high])):
         raise refuse(f"{path} must be {numbers(field)}, and the range is {low:g} to {high:g}")
     if log and low <= 0:
         raise refuse(f"a logarithmic range must begin above 0, and it begins at {low:g}")
@@ -215,8 +218,8 @@ def _check_samples(case: Case, x: Axis, y: Axis, members: int) -> None:
             )
 
 
-def _nominal(place: Place | None) -> float | None:
-    return None if place is None or place.value is None else float(place.value)
+def _nominal(place: Place) -> float | None:
+    return None if place.value is None else float(place.value)
 
 
 def _value(text: str, nominal: float | None) -> float:

@@ -14,7 +14,7 @@ from ambjax.commands.acceptance import acceptance, forces
 from ambjax.commands.outputs import plain, say, table
 from ambjax.commands.warnings import idealised, read_with_warnings
 from ambjax.control.cascade import Cascade
-from ambjax.linear.stability import Findings, stability
+from ambjax.linear.stability import Findings, stability_of
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import rollout
 from ambjax.theorem.causes import Cause, find_cause
@@ -157,7 +157,7 @@ def _stability(case: Case) -> Findings:
     from ambjax.ensemble.replay import as_member
 
     say("testing whether the loop is stable: simulating without noise and loads")
-    return stability(case.cascade, as_member(case.scenario), case.clock).findings()
+    return stability_of(case.cascade, as_member(case.scenario), case.clock).findings()
 
 
 def _processor_summary(case: Case, args: argparse.Namespace, results: _OnProcessor) -> Summary:

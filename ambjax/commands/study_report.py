@@ -12,7 +12,7 @@ from ambjax.commands.warnings import reversal
 from ambjax.ensemble import statistics
 from ambjax.ensemble.study import Study
 from ambjax.host.words import one_line
-from ambjax.linear import Findings, stability, suspects
+from ambjax.linear import Findings, stability_of, suspects
 
 # Files written with members.npz; the last one only if the case has a spread and a member survives.
 WRITTEN = ("summary.json", "fan.png", "histograms.png", "tornado.png")
@@ -75,7 +75,7 @@ def findings_of(study: Study, columns: dict[str, np.ndarray]) -> Findings:
     if not index.size:
         return Findings(0, 0)
     say(f"testing whether the loops of {index.size} members are stable: simulating them without noise and loads")
-    return stability(*study.batch(index), study.clock).findings()
+    return stability_of(*study.batch(index), study.clock).findings()
 
 
 def _pictures(

@@ -194,8 +194,8 @@ def _cells(study: Study, x: Axis, y: Axis | None, stable: StabilityTest | None) 
     scenario = dataclasses.replace(scenario, seed=study.seed, member=member)
     metrics = run_ensemble(cascade, scenario, study.clock, fold=standard_for(study.settle, scenario)).measured
     ended, stalled, error = np.isfinite(metrics["lost_at_s"]), metrics["stalled"], metrics["settled_max_abs_error_m"]
-    law, world = jax.tree.map(lambda x: x[:: study.members] if np.ndim(x) else x, (cascade, scenario))
-    unstable = np.zeros(shape[:2], bool).ravel() if stable is None else ~stable(law, world, study.clock)
+    one, world = jax.tree.map(lambda x: x[:: study.members] if np.ndim(x) else x, (cascade, scenario))
+    unstable = np.zeros(shape[:2], bool).ravel() if stable is None else ~stable(one, world, study.clock)
     unstable = unstable & ~ended[:: study.members]
     values = (np.reshape(part, shape) for part in (ended, stalled, error))
     return *values, np.reshape(unstable, shape[:2]).astype(int)

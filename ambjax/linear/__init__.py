@@ -18,7 +18,7 @@ from ambjax.linear.differentiable import LoopQuantities, loop_quantities
 from ambjax.linear.injection import Injection, MemberPeaks, frequency_lines, injected, injected_members
 from ambjax.linear.margins import LoopMargins, Margins, ResponsePeak, decayed_end, margins_of, noise_gain, peak
 from ambjax.linear.matrices import loop_matrices
-from ambjax.linear.stability import Findings, Stability, stability, suspects
+from ambjax.linear.stability import Findings, Stability, stability_of, suspects
 from ambjax.linear.state_space import INPUTS, OUTPUTS, PLACES, StateSpace
 
 __all__ = [
@@ -50,6 +50,6 @@ __all__ = [
     "margins_of",
     "noise_gain",
     "peak",
-    "stability",
+    "stability_of",
     "suspects",
 ]

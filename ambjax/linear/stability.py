@@ -4,7 +4,8 @@ Two verdicts are combined. The linear one is that of the poles of the loop linea
 that of a quiet run: the case without noise, converter, faults, runout and disturbances, at a constant reference, from a
 displaced start. No unbalance and no noise moves the rotor there, so a motion that persists is one that the loop
 sustains itself, a limit cycle. A motion counts as sustained if the half peak-to-peak value of z in the last quarter of
-the run exceeds SMALL times the clearance, and is not smaller than that of the third quarter by more than DECAY.
+the run exceeds SMALL times the clearance, and is not smaller than that of the third quarter by more than DECAY. A creep
+does not count, nor does the motion of a stable linear loop whose own decay is that slow.
 
 - A sustained motion is not stable, whatever the linear verdict.
 - Without one, an unstable linear loop is not stable either, unless its motion had the time to grow and did not: then it
@@ -35,6 +36,8 @@ SMALL = 0.01
 KICK = 0.01
 # Decrease of a motion, from one quarter of a quiet run to the next, below which the motion is sustained.
 DECAY = 0.1
+# Share of the smaller one of the ranges of z in two quarters that both have in common if z oscillates.
+SHARED = 0.5
 # Growth exponent of an unstable mode over a run, above which its motion had the time to grow: a factor of 22,000.
 GROWN = 10.0
 # Growth exponent over a run below which a pole counts as one on the border: rounding moves such poles across it.
@@ -136,7 +139,7 @@ class Findings(NamedTuple):
         return f"{many}: without noise and loads, the motion does not decay ({size}).{why}"
 
 
-def stability(cascade: Cascade, scenario: Scenario, clock: Clock) -> Stability:
+def stability_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> Stability:
     """Compute the stability of the members of an ensemble, whose varying leaves are arrays [N].
 
     The result has no meaning for a member whose rotor is lost in the case's own run. Raises ValueError as `rollout`
@@ -144,13 +147,15 @@ def stability(cascade: Cascade, scenario: Scenario, clock: Clock) -> Stability:
     """
     growth, duration = _growth(cascade, scenario, clock), float(clock.duration)
     clearance = np.broadcast_to(np.asarray(scenario.touchdown, float), growth.shape)
-    swings, current, lost = _quiet_run(cascade, scenario, clock)
-    swing = np.where(lost, clearance, swings[:, -1])
-    sustained = lost | ((swing > SMALL * clearance) & (swing > (1 - DECAY) * swings[:, -2]))
+    run = _quiet_run(cascade, scenario, clock)
+    swing = np.where(run.lost, clearance, run.swings[:, -1])
+    slow = (growth < 0) & (-growth * duration / QUARTERS < -np.log1p(-DECAY))
+    persists = (swing > SMALL * clearance) & (swing > (1 - DECAY) * run.swings[:, -2]) & run.returns & ~slow
+    sustained = run.lost | persists
     chatters = (growth * duration > GROWN) & (swing <= SMALL * clearance)
     stable = ~(sustained | ((growth * duration > BORDER) & ~chatters))
     bias = float(np.max(np.asarray(scenario.plant.i_0)))
-    return Stability(stable, growth, sustained, swing, current, lost, duration, bias)
+    return Stability(stable, growth, sustained, swing, run.current, run.lost, duration, bias)
 
 
 def suspects(error: np.ndarray, held: np.ndarray) -> np.ndarray:
@@ -175,7 +180,7 @@ def with_stability(margin: Delays, cascade: Cascade, scenario: Scenario, clock: 
 
     def tried(low: float, high: float) -> tuple[np.ndarray, Stability]:
         delays = np.linspace(low, high, DELAYS)
-        return delays, stability(at_delays(cascade, delays, known=known), scenario, clock)
+        return delays, stability_of(at_delays(cascade, delays, known=known), scenario, clock)
 
     delays, found = tried(first, margin.held)
     if found.stable.all():
@@ -205,22 +210,35 @@ def _growth(cascade: Cascade, scenario: Scenario, clock: Clock) -> np.ndarray:
     return np.where(known, rate, np.nan)
 
 
-def _quiet_run(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Simulate the quiet runs.
+class _QuietRun(NamedTuple):
+    """Results of the quiet runs.
 
-    Returns the swing of z in each quarter [N, QUARTERS] (m; 0 after a loss), the largest |i| in the last quarter with
-    the rotor held [N] (A), and whether the rotor is lost [N].
+    - `swings`: half peak-to-peak value of z in each quarter [N, QUARTERS], m; 0 after a loss.
+    - `returns`: whether z returns, in the last quarter, to most of the range of the third one [N]; False for a creep.
+    - `current`: largest |i| in the last quarter in which the rotor is held [N], A.
+    - `lost`: whether the rotor is lost [N].
     """
+
+    swings: np.ndarray
+    returns: np.ndarray
+    current: np.ndarray
+    lost: np.ndarray
+
+
+def _quiet_run(cascade: Cascade, scenario: Scenario, clock: Clock) -> _QuietRun:
+    """Simulate the quiet runs."""
     every = max(clock.samples // QUARTERS, 1)
     fold = Blocks(("z", "i"), every, -(-clock.samples // every), clock.sample_period)
     run = run_ensemble(cascade, quiet(scenario), clock, fold=fold, every=0)
     low, high = ({name: x[:, :QUARTERS] for name, x in part.items()} for part in (run.measured.low, run.measured.high))
     swings = np.zeros((len(low["z"]), QUARTERS))
     swings[:, : low["z"].shape[1]] = np.maximum(high["z"] - low["z"], 0.0) / 2
+    common = np.minimum(high["z"][:, -1], high["z"][:, -2:][:, 0]) - np.maximum(low["z"][:, -1], low["z"][:, -2:][:, 0])
+    returns = common / 2 > SHARED * swings[:, -2:].min(axis=1)
     most = np.maximum(high["i"], -low["i"])
     last = np.maximum(np.sum(np.isfinite(most), axis=1) - 1, 0)
     current = most[np.arange(len(most)), last]
-    return swings, np.where(np.isfinite(current), current, 0.0), np.isfinite(run.trajectory.lost_at)
+    return _QuietRun(swings, returns, np.where(np.isfinite(current), current, 0.0), np.isfinite(run.trajectory.lost_at))
 
 
 def quiet(scenario: Scenario) -> Scenario:

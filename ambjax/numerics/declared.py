@@ -81,17 +81,11 @@ def within(meta: Mapping[str, Any], value: npt.ArrayLike) -> bool:
     return whole and all(within(meta, float(x)) for x in (low, high))
 
 
-def _example(field: dataclasses.Field) -> str:
-    """Return a sentence that proposes the default of a field; empty if the default is not a finite number."""
-    default = field.default
-    usable = isinstance(default, (int, float)) and math.isfinite(default)
-    return f" Use {default:g}, for example." if usable else ""
-
-
 def check_number(field: dataclasses.Field, name: str, value: object) -> None:
     """Raise ValueError if `field` does not allow `value`, a number or an array.
 
-    The message contains the dotted name, the value, the allowed range and, if there is one, the default.
+    The message contains the dotted name, the value and the allowed range. It proposes no value: a default is the number
+    of one machine.
     """
     try:
         number = value if isinstance(value, (int, float)) else np.asarray(value, dtype=float)
@@ -100,7 +94,7 @@ def check_number(field: dataclasses.Field, name: str, value: object) -> None:
     number = math.nan if isinstance(value, str) else number
     if not within(field.metadata, number):
         shown = f"{value:g}" if isinstance(value, (int, float)) else _shown(value, number)
-        raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.{_example(field)}")
+        raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.")
 
 
 def _shown(value: object, number: npt.ArrayLike) -> str:

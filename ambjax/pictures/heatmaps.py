@@ -143,7 +143,7 @@ def _cells(ax: Axes, panel: MapPanel, values: np.ndarray, norm: Normalize, colou
     ax.pcolormesh(x_edges, y_edges, np.ma.masked_invalid(values), norm=norm, cmap=colours)
     if panel.unstable is not None:
         for row, column in np.argwhere(panel.unstable):
-            (left, right), (low, high) = x_edges[column : column + 2].tolist(), y_edges[row : row + 2].tolist()
+            left, right, low, high = (float(x) for x in (*x_edges[column : column + 2], *y_edges[row : row + 2]))
             ax.add_patch(Rectangle((left, low), right - left, high - low, **UNSTABLE_CELL))
     for name, width in LINES.items():
         values = getattr(panel, name)

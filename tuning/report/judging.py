@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.commands.outputs import described, say
-from ambjax.linear import Findings, stability, suspects
+from ambjax.linear import Findings, stability_of, suspects
 from ambjax.theorem.advice import advice as on_conditions
 from ambjax.theorem.conditions import Report as Check
 from ambjax.theorem.conditions import check
@@ -114,7 +114,7 @@ def _stability(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[s
     members = problem.objective.chosen(seed, index, len(columns["lost_at_s"]))
     # in continuous time, the step of the case may be too coarse for these gains
     clock = problem.case.clock if problem.sampled else dataclasses.replace(problem.case.clock, method=None)
-    return stability(*problem.objective.fixed(x, members), clock).findings()._asdict()
+    return stability_of(*problem.objective.fixed(x, members), clock).findings()._asdict()
 
 
 def _steps(answer: SearchResult, unlucky: StepError | None, again: Row | None, refuted: str) -> Row:
