@@ -41,9 +41,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
         spread = spread._replace(measured=measured_peaks(case, study, points[0].analysis.S.frequency))
     measured = _injections(case, points[0]) if args.inject or case.cascade.processor is not None else None
     out = directory(args.out, f"sensitivity-{case.name}", WRITTEN, args.force)
-    summary = sensitivity_summary(points, spread, measured, case.zones)
-    rows = [{"point": name, "stable": None, "zone": None, "why": why} for name, why in missing.items()]
-    summary["points"] = [*summary["points"], *rows]
+    summary = sensitivity_summary(points, spread, measured, case.zones, missing)
     with files(out) as part:
         write_json(part / "sensitivity.json", summary)
         _draw(case, points, spread, measured, part / "sensitivity.png")

@@ -1,5 +1,7 @@
 """The summary of `ambjax sensitivity` as plain data, and as text."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -30,12 +32,20 @@ def set_valued(case: Case) -> list[str]:
 
 
 def sensitivity_summary(
-    points: list[OperatingPoint], spread: SpreadPeaks | None, measured: Injections | None, zones: Zones
+    points: list[OperatingPoint],
+    spread: SpreadPeaks | None,
+    measured: Injections | None,
+    zones: Zones,
+    missing: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, object]:
-    """Return the numbers of sensitivity.json: of the equilibria `points`, the spread, and the injection."""
+    """Return the numbers of sensitivity.json: of the equilibria `points`, the spread, and the injection.
+
+    `missing`: the cause by name for each reference without a linearised loop.
+    """
     rows: list[dict[str, object]] = [
         {"point": point.name, "reference_m": point.r, **analysis_summary(point.analysis)} for point in points
     ]
+    rows += [{"point": name, "stable": None, "zone": None, "why": why} for name, why in missing.items()]
     summary: dict[str, object] = {
         **analysis_summary(points[0].analysis),
         **_injected_numbers(points[0], measured),

@@ -87,7 +87,8 @@ class FilterChain(PositionLaw[ChainState]):
 
     def scale(self, model: Plant) -> ChainState:
         size = jnp.asarray(model.i_0 / 25)
-        return ChainState(size, size, *[(size, size)] * 3, () if self.w_lp is None else (size, size))
+        pair = (size, size)
+        return ChainState(size, size, pair, pair, pair, () if self.w_lp is None else pair)
 
     def designed(self, model: Plant, period: float | None) -> "FilterChain":
         """Return the law with the gains of `optimal_gains` in continuous time, and k_aw and the corners from the pole.
@@ -138,7 +139,8 @@ class FilterChain(PositionLaw[ChainState]):
         return force_of_current(model, motion.z, i_star), self._state(derivative, integral, rates)
 
     def _state(self, derivative: Array, integral: Array, rest: list[tuple[Array, Array]]) -> ChainState:
-        return ChainState(derivative, integral, *rest, *[()] * (self.w_lp is None))
+        lead, first, second, *last = rest
+        return ChainState(derivative, integral, lead, first, second, last[0] if last else ())
 
     def step(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: ChainState, period: Scalar
