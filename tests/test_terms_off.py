@@ -170,7 +170,7 @@ def test_an_integral_without_gain_does_not_remove_the_offset_of_a_heavier_rotor(
     cascade = Cascade(position=law, inversion=inversion.ClosedForm(), model=RIG, processor=processor)
     cascade = cascade if processor is None else cascade.on_processor()
     heavy = ideal(Scenario(plant=dataclasses.replace(RIG, m=1.1 * RIG.m)))
-    point, found = equilibrium(cascade, heavy, T, 0.0)
+    point, found, _ = equilibrium(cascade, heavy, T, 0.0)
     assert found
     assert abs(float(point.control.position.integral)) < 1e-12  # of 0.2 m/s^2: rounding
     # 1e-6: the equilibrium is exact to 1e-9 of the size of z, a fiftieth of the gap
