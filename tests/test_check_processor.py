@@ -4,12 +4,17 @@ import dataclasses
 import json
 import math
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from texts import write
 
 import ambjax as amb
 from ambjax.__main__ import main
+from ambjax.cases.controller_tables import KINDS
+from ambjax.control.base import default_law
 from ambjax.control.guard import Guard
 from ambjax.control.inversion import ClosedForm
 from ambjax.control.observer import Direct
@@ -27,6 +32,8 @@ from ambjax.theorem.sampled_report import Delays, SampledReport, rolled
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.coils import TwoCoil
 from ambjax.world.faults import Outliers
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import Reference
 
 INF = math.inf
 LATE = [0.0, 0.2, 0.25, 0.4, 0.5, 0.8, 1.0, 1.3, 1.5, 2.0]
@@ -237,6 +244,33 @@ def test_the_poles_of_a_law_are_those_of_its_theory(law, implicit, radius):
     # 1e-5: the triple pole of the Kalman filter is exact to the cube root of rounding errors
     assert found.radius == pytest.approx(radius, rel=1e-5, abs=1e-7)
     assert found.implicit == (implicit and law.own_steps != ())
+
+
+RIG = amb.Plant(1.64, 0.0, 1.2566e-6, 208.0, 2.68e-4, 5e-4, 2.5, 1.0)
+POSITION = [kind for kind in KINDS["position"].values() if kind is not amb.position.LinearController]
+
+
+@pytest.mark.parametrize("implicit", [True, False])
+@pytest.mark.parametrize("kind", POSITION)
+def test_the_slowest_pole_of_a_position_law_tends_to_that_in_continuous_time(kind, implicit):
+    """In continuous time, from the call of the law, not from its step; the rotor obeys the demanded force at once."""
+    law, T = default_law(kind, RIG), 1e-6
+
+    def rates(x):
+        motion = Measurement(x[0], x[1], jnp.zeros(()))
+        reference = Reference(*[jnp.zeros(())] * 3)
+        v, _ = law(RIG, (motion, reference), restore(x[2:]))
+        motion = motion._replace(i=RIG.current_for(x[0], v))
+        moved = law(RIG, (motion, reference), restore(x[2:]))[1]
+        return jnp.concatenate([jnp.stack([x[1], RIG.a * v - RIG.g]), ravel_pytree(moved)[0]])
+
+    start, restore = ravel_pytree(law.init(RIG))
+    poles = np.linalg.eigvals(jax.jacfwd(rates)(jnp.concatenate([jnp.zeros(2), start])))
+    slowest = max(pole.real for pole in poles if abs(pole) > 1e-6)
+    cascade = amb.Cascade(position=law, model=RIG, processor=Processor(0.0, implicit=implicit))
+    found = law_poles(cascade, amb.Clock(10, T))[0]
+    # the error of a step is about T times the fastest pole; the chain's are at 20 times the pole of the magnets
+    assert math.log(found.radius) / T == pytest.approx(slowest, rel=0.03)
 
 
 def test_a_sign_one_sample_late_is_unstable():

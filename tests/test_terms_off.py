@@ -16,6 +16,7 @@ from ambjax.control.base import default_law
 from ambjax.control.laws import CurrentDemand, CurrentInputs
 from ambjax.control.processor import Processor
 from ambjax.linear import analyse, linearise
+from ambjax.linear.equilibrium import equilibrium, ideal
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 
@@ -161,6 +162,20 @@ def test_a_pd_controller_has_the_static_stiffness_of_the_textbook():
     # the anti-windup of the tiny integral, at 4.8 1/s, changes |S| by less than a thousandth
     assert tiny.S.height == pytest.approx(found.S.height, rel=1e-3)
     assert tiny.noise == pytest.approx(found.noise, rel=1e-3)
+
+
+@pytest.mark.parametrize("processor", [None, Processor(0.0)], ids=["continuous", "sampled"])
+def test_an_integral_without_gain_does_not_remove_the_offset_of_a_heavier_rotor(processor):
+    """The rotor is 10 % heavier than the model: k_p e = -0.1 g, with springs k_z = 0 and an exact inversion."""
+    law = dataclasses.replace(default_law(position.PID, RIG), k_int=0.0)
+    cascade = Cascade(position=law, inversion=inversion.ClosedForm(), model=RIG, processor=processor)
+    cascade = cascade if processor is None else cascade.on_processor()
+    heavy = ideal(Scenario(plant=dataclasses.replace(RIG, m=1.1 * RIG.m)))
+    point, found, _ = equilibrium(cascade, heavy, T, 0.0)
+    assert found
+    assert abs(float(point.control.position.integral)) < 1e-12  # of 0.2 m/s^2: rounding
+    # 1e-6: the equilibrium is exact to 1e-9 of the size of z, a fiftieth of the gap
+    assert float(point.plant.z) == pytest.approx(-0.1 * RIG.g / law.k_p, rel=1e-6)
 
 
 def test_the_low_pass_is_off_unless_it_is_given():

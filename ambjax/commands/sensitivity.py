@@ -2,7 +2,6 @@
 
 import argparse
 import pathlib
-from typing import Any
 
 from ambjax.cases.reach import largest
 from ambjax.cases.reader import Case
@@ -43,8 +42,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
         spread = spread._replace(measured=measured_peaks(case, study, points[0].analysis.S.frequency))
     measured = _injections(case, points[0]) if args.inject or case.cascade.processor is not None else None
     out = directory(args.out, f"sensitivity-{case.name}", WRITTEN, args.force)
-    summary: dict[str, Any] = sensitivity_summary(points, spread, measured, case.zones)
-    summary["points"] += [{"point": name, "stable": None, "zone": None, "why": why} for name, why in missing.items()]
+    summary = sensitivity_summary(points, spread, measured, case.zones, missing)
     with files(out) as part:
         write_json(part / "sensitivity.json", summary)
         described("sensitivity.png", lambda: _draw(case, points, spread, measured, part / "sensitivity.png"))

@@ -1,5 +1,7 @@
 """The summary of `ambjax sensitivity` as plain data, and as text."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -31,9 +33,16 @@ def set_valued(case: Case) -> list[str]:
 
 
 def sensitivity_summary(
-    points: list[OperatingPoint], spread: SpreadPeaks | None, measured: Injections | None, zones: Zones
+    points: list[OperatingPoint],
+    spread: SpreadPeaks | None,
+    measured: Injections | None,
+    zones: Zones,
+    missing: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, object]:
-    """Return the numbers of sensitivity.json: of the equilibria `points`, the spread, and the injection."""
+    """Return the numbers of sensitivity.json: of the equilibria `points`, the spread, and the injection.
+
+    `missing`: the cause by name for each reference without a linearised loop.
+    """
 
     def numbers(point: OperatingPoint) -> dict[str, object]:
         return analysis_summary(point.analysis) | band_numbers(point.analysis, zones)
@@ -41,6 +50,7 @@ def sensitivity_summary(
     rows: list[dict[str, object]] = [
         {"point": point.name, "reference_m": point.r, **numbers(point)} for point in points
     ]
+    rows += [{"point": name, "stable": None, "zone": None, "why": why} for name, why in missing.items()]
     summary: dict[str, object] = {
         **numbers(points[0]),
         **_injected_numbers(points[0], measured),

@@ -169,7 +169,8 @@ class FilterChain(PositionLaw[ChainState]):
         return force_of_current(model, motion.z, i_star), self._state(derivative, integral, rates)
 
     def _state(self, derivative: Array, integral: Array, rest: list[tuple[Array, Array]]) -> ChainState:
-        return ChainState(derivative, integral, *rest, *[()] * (self.w_lp is None))
+        lead, first, second, *last = rest
+        return ChainState(derivative, integral, lead, first, second, last[0] if last else ())
 
     def step(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: ChainState, period: Scalar

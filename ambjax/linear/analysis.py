@@ -21,7 +21,7 @@ from ambjax.linear.margins import (
     poles_in_s,
     whole_end,
 )
-from ambjax.linear.matrices import loop_matrices
+from ambjax.linear.matrices import loop_matrices, rest
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar, canonical, leaf, record
 from ambjax.simulation.clock import Clock
@@ -29,6 +29,7 @@ from ambjax.simulation.rollout import prepare
 from ambjax.world.scenario import Scenario
 
 _matrices = compiled_quickly(loop_matrices, options=QUICKEST)
+_rest = compiled_quickly(rest, options=QUICKEST)
 
 
 @record
@@ -169,19 +170,21 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
     Returns the state space with NumPy arrays. States that no input reaches are left out. Raises ValueError as `rollout`
     does, if no equilibrium is found at r, and if a law has no derivative there.
     """
-    system, found = _matrices(*canonical((*linearisation_inputs(cascade, scenario, clock), r)))
-    return checked(system, found, r)
+    inputs = canonical((*linearisation_inputs(cascade, scenario, clock), r))
+    system, found = _matrices(*inputs)
+    return checked(system, found, r, "" if found else _rest(*inputs).moving())
 
 
-def checked(system: StateSpace, found: Any, r: Scalar) -> StateSpace:
+def checked(system: StateSpace, found: Any, r: Scalar, moving: str = "") -> StateSpace:
     """Return a result of `loop_matrices` with NumPy arrays, without the states that no input reaches.
 
-    Raises ValueError if it has no meaning: no equilibrium at r (m), or a matrix that is not finite.
+    `moving`: path of the state that changes most where the search for an equilibrium ended, for the message. Raises
+    ValueError if the result has no meaning: no equilibrium at r (m), or a matrix that is not finite.
     """
     if not found:
         raise ValueError(
             f"no equilibrium at r = {float(r):g} m was found, so the loop has no linearisation there: Newton's method "
-            "ended where the plant or a law still moves. `ambjax simulate` shows whether the rotor is held."
+            f"ended where {moving or 'a state'} still changes. `ambjax simulate` shows whether the rotor is held."
         )
     if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(system)):
         raise ValueError(

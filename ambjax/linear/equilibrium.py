@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 
@@ -40,10 +41,20 @@ class Point(NamedTuple):
 
 
 class Equilibrium(NamedTuple):
-    """An equilibrium. `found`: whether Newton's method converged; if not, `point` is not an equilibrium."""
+    """An equilibrium. `found`: whether Newton's method converged; if not, `point` is not an equilibrium.
+
+    `residual`: the residual at `point`, in the form of a `Point`, relative to the sizes of the states.
+    """
 
     point: Point
     found: Array
+    residual: Point
+
+    def moving(self) -> str:
+        """Return the path of the component with the largest residual, such as "control.position.integral"."""
+        leaves = jax.tree_util.tree_leaves_with_path(self.residual)
+        path, _ = max(leaves, key=lambda leaf: np.nan_to_num(abs(float(leaf[1])), nan=np.inf))
+        return jax.tree_util.keystr(path, simple=True, separator=".")
 
 
 def ideal(scenario: Scenario) -> Scenario:
@@ -125,7 +136,7 @@ def equilibrium(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar)
     found = newton.error <= TOLERANCE * jnp.finfo(y.dtype).eps
     # one more Newton step with a constant Jacobian: its derivative is that of the implicit function
     y = newton.y - jnp.where(found, _inverse(newton.J) @ residual(newton.y, cascade, scenario), 0.0)
-    return Equilibrium(restore(y * sizes), found)
+    return Equilibrium(restore(y * sizes), found, restore(residual(lax.stop_gradient(y), *held)))
 
 
 class _Newton(NamedTuple):

@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import Sample
-from ambjax.linear.equilibrium import Point, at_rest, equilibrium, ideal, reading, sizes_of
+from ambjax.linear.equilibrium import Equilibrium, Point, at_rest, equilibrium, ideal, reading, sizes_of
 from ambjax.linear.held_plant import Lagged
 from ambjax.linear.state_space import CommandPath, StateSpace
 from ambjax.numerics.records import Scalar
@@ -28,12 +28,22 @@ def loop_matrices(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scala
     space, and whether an equilibrium was found; if not, the matrices have no meaning. They are not finite if a law has
     no derivative at the equilibrium.
     """
-    scenario = ideal(scenario)
-    if cascade.processor is not None:
-        cascade = dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=None))
-    point, found = equilibrium(cascade, scenario, period, r)
+    cascade, scenario = _linear_parts(cascade, scenario)
+    point, found, _ = equilibrium(cascade, scenario, period, r)
     build = _continuous if cascade.processor is None else _sampled
     return build(cascade, scenario, period, r, point), found
+
+
+def rest(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> Equilibrium:
+    """Return the equilibrium at which `loop_matrices` linearises the loop. The arguments are those of that function."""
+    return equilibrium(*_linear_parts(cascade, scenario), period, r)
+
+
+def _linear_parts(cascade: Cascade, scenario: Scenario) -> tuple[Cascade, Scenario]:
+    """Return the cascade without its guard, and the scenario without the parts that a linear system cannot contain."""
+    if cascade.processor is not None:
+        cascade = dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=None))
+    return cascade, ideal(scenario)
 
 
 def _continuous(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, point: Point) -> StateSpace:

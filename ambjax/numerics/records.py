@@ -83,8 +83,11 @@ def gain(
     processor it may be inf, which selects the set-valued sign. `zero`: whether 0 is allowed, which switches the term of
     the gain off. Returns the dataclass field.
     """
-    low: Any = {"at_least": 0.0} if zero else {"above": GAINS[0]}
-    plain = leaf(default=default, unit=unit, doc=doc, at_most=GAINS[1], infinite=steepness, optional=optional, **low)
+    above, at_least = (None, 0.0) if zero else (GAINS[0], None)
+    plain = leaf(
+        default=default, unit=unit, doc=doc, above=above, at_least=at_least, at_most=GAINS[1], infinite=steepness,
+        optional=optional,
+    )  # fmt: skip
     return dataclasses.field(default=default, metadata={**plain.metadata, "steepness": steepness})
 
 

@@ -80,7 +80,7 @@ def processor_lines(sampled: SampledReport, margin: Delays, unknown: Delays | No
     lines = [
         f"- {law.stage}: the largest |pole| is {number(law.radius)} and must be less than 1, the least damping ratio "
         f"is {number(law.damping)} and must be at least {LEAST_DAMPING:g}. Lower the gain or p, shorten "
-        f"clock.sample_period, or set {'predict = true' if law.implicit else IMPLICIT}."
+        f"clock.sample_period, or set {IMPLICIT} and predict = true."
         for law in sampled.laws
         if not law.holds
     ]
