@@ -3020,7 +3020,7 @@ VARIOUS = [
         "tuning/report/answer.py",
         'if row["lost"]:',
         'if row["peak"] is None and row["repetitions"]:',
-        "tests/test_tuning_report.py::test_the_frequency_of_the_largest_peak_is_that_of_the_printed_value",
+        "tests/test_tuning_absent.py::test_the_printed_peak_is_the_one_that_counts",
     ),
     M(
         "two NaN metrics differ",

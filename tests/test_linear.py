@@ -29,8 +29,8 @@ from ambjax.linear import (
 from ambjax.linear.equilibrium import ideal
 from ambjax.linear.matrices import loop_matrices
 from ambjax.numerics.records import canonical
-from ambjax.simulation.explicit import DOP853
-from ambjax.simulation.rollout import prepare
+from ambjax.simulation.explicit import DOP853, RK4
+from ambjax.simulation.rollout import prepare, rollout
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.coils import TwoCoil
 from ambjax.world.sensor import Errors
@@ -308,3 +308,13 @@ def test_an_unstable_loop_has_no_margins():
     assert analysis.zone == "D"
     assert analysis.margins.phase_deg == 0
     assert analysis.noise == np.inf
+
+
+def test_the_step_of_the_case_has_no_effect_on_the_linearisation():
+    """The tuner linearises tuned gains with the clock of the case. Its step may be far too coarse for these gains."""
+    coarse = dataclasses.replace(Clock(samples=100), method=RK4(substeps=1))
+    stiff = Cascade(inversion=inversion.Adaptive(gamma=1.8e7))
+    with pytest.raises(ValueError, match="stable only up to"):
+        rollout(stiff, Scenario(), coarse)
+    A, same = (np.asarray(linearise(stiff, Scenario(), clock).A) for clock in (coarse, Clock(samples=100)))
+    np.testing.assert_array_equal(A, same)

@@ -6,6 +6,7 @@ import dataclasses
 import pathlib
 import sys
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -16,7 +17,7 @@ from ambjax.codegen.trace import trace
 from ambjax.commands.case_export import guarded_for
 from ambjax.commands.comparison_report import Compared, comparison_markdown, comparison_summary, comparison_table
 from ambjax.commands.ensemble import study_of
-from ambjax.commands.outputs import directory, files, plain, say, write_json, written
+from ambjax.commands.outputs import described, directory, files, plain, say, write_json, written
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
@@ -53,21 +54,25 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     compared = [_compared(case, study) for case, study in zip(cases, studies, strict=True)]
     summary = comparison_summary(compared, studies[0], notes)
     with files(out) as part:
-        _draw(cases, compared, part / "compare.png")
-        html = render_page(
-            comparison_markdown(summary),
-            {"compare.png": (part / "compare.png").read_bytes()},
-            "Comparison of controllers",
-        )
-        (part / "compare.html").write_text(html, encoding="utf-8")
         write_json(part / "compare.json", summary)
+        described("compare.png", lambda: _draw(cases, compared, part / "compare.png"))
+        described("compare.html", lambda: _write_html(summary, part))
         for name, html in html_pages.items():
             (part / name).write_text(html, encoding="utf-8")
+        names = [name for name in WRITTEN if (part / name).exists()]
     if not args.json:
-        print(comparison_table(summary))
-        written(out, ", ".join([*WRITTEN, *html_pages]))
+        print(described("the table", lambda: comparison_table(summary)) or "")
+        written(out, ", ".join([*names, *html_pages]))
     good = all(one.held.all() and one.point is not None and one.point.analysis.stable for one in compared)
     return int(not good), plain(summary | {"out": str(out)})
+
+
+def _write_html(summary: Mapping[str, Any], part: pathlib.Path) -> None:
+    """Write compare.html into the folder `part`, with the picture in it."""
+    picture = part / "compare.png"
+    drawn = {picture.name: picture.read_bytes()} if picture.exists() else {}
+    html = render_page(comparison_markdown(summary), drawn, "Comparison of controllers")
+    (part / "compare.html").write_text(html, encoding="utf-8")
 
 
 def _seed(args: argparse.Namespace, cases: Sequence[Case]) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ambjax.cases.reader import Case
 from ambjax.commands.case_map import labels, panel, study_and_axes
-from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
+from ambjax.commands.outputs import described, directory, files, plain, say, table, write_json, written
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.maps import CERTAIN, GRIDS, Map, grid
@@ -31,11 +31,12 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
                 say(f"{case.name}: nominal, because one member does not draw the [spread]; --members 2 or more do.")
             maps.append(grid(study, x, y))
         summary = {"cases": [_summary(case, one) for case, one in zip(cases, maps, strict=True)], "out": str(out)}
-        _draw(cases, maps, part / "map.png")
         write_json(part / "map.json", summary)
+        described("map.png", lambda: _draw(cases, maps, part / "map.png"))
+        names = [name for name in WRITTEN if (part / name).exists()]
     if not args.json:
-        print(_text(cases, maps))
-        written(out, ", ".join(WRITTEN))
+        print(described("the table", lambda: _text(cases, maps)) or "")
+        written(out, ", ".join(names))
     return 0, plain(summary)
 
 

@@ -6,7 +6,7 @@ import pathlib
 from ambjax.cases.reach import largest
 from ambjax.cases.reader import Case
 from ambjax.commands.ensemble import study_of
-from ambjax.commands.outputs import directory, files, plain, write_json, written
+from ambjax.commands.outputs import described, directory, files, plain, write_json, written
 from ambjax.commands.sensitivity_report import Injections, sensitivity_summary, set_valued, text_of
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.study import Study
@@ -41,10 +41,11 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     summary = sensitivity_summary(points, spread, measured, case.zones)
     with files(out) as part:
         write_json(part / "sensitivity.json", summary)
-        _draw(case, points, spread, measured, part / "sensitivity.png")
+        described("sensitivity.png", lambda: _draw(case, points, spread, measured, part / "sensitivity.png"))
+        names = [name for name in WRITTEN if (part / name).exists()]
     if not args.json:
-        print(text_of(case, points, spread, measured))
-        written(out, ", ".join(WRITTEN))
+        print(described("the table", lambda: text_of(case, points, spread, measured)) or "")
+        written(out, ", ".join(names))
     stable = all(point.analysis.stable for point in points) and (spread is None or spread.stable == spread.members)
     return int(not stable), plain(summary | {"out": str(out)})
 

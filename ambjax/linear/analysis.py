@@ -193,10 +193,10 @@ def _member(tree: Any) -> tuple[StateSpace, Any]:
 def linearisation_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Cascade, Scenario, Scalar]:
     """Check a case, and return the first three arguments of `loop_matrices`: cascade, scenario and sample period (s).
 
-    If the cascade has a processor, the returned cascade is that of `Cascade.on_processor`. Raises ValueError as
-    `rollout` does.
+    If the cascade has a processor, the returned cascade is that of `Cascade.on_processor`. The integration method of
+    `clock` has no effect: it may be too coarse for this cascade. Raises ValueError as `rollout` does otherwise.
     """
-    system, clock = prepare(cascade, scenario, clock)
+    system, clock = prepare(cascade, scenario, dataclasses.replace(clock, method=None))
     if cascade.processor is not None:
         cascade = system.loop.cascade  # pyright: ignore[reportAttributeAccessIssue]
     return dataclasses.replace(cascade), scenario, clock.sample_period

@@ -28,7 +28,8 @@ class TuningFacts:
     contradict the answer; '' if they confirm it. `accurate`: some members with accurate steps. `gradient`: None if not
     requested. `front`: of error against voltage; None if it was not traced. `front_written`: whether each of its points
     has a case file. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it. `beside`: the
-    lowest point of the slices through the answer. `next`: the next command, in words.
+    lowest point of the slices through the answer; None without slices. `next`: the next command, in words. `loss`,
+    `minimised`, `conditions` and `slices` are empty or None if they could not be computed.
     """
 
     case: str
@@ -41,7 +42,7 @@ class TuningFacts:
     limits: list[Row]
     sensitivity: Row | None
     loss: Row
-    minimised: Row
+    minimised: Row | None
     conditions: list[Row]
     advice_on_conditions: list[str]
     step_error: Row | None
@@ -58,8 +59,8 @@ class TuningFacts:
     gains: list[Row]
     gradient: Row | None
     front: list[Row] | None
-    beside: Row
-    slices: Row
+    beside: Row | None
+    slices: Row | None
     front_written: bool = False
     outcome: Row = dataclasses.field(default_factory=dict)
     verdict: str = ""

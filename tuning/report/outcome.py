@@ -59,6 +59,13 @@ class TuningOutcome:
             words.append(UNVERIFIED)
         return words
 
+    @property
+    def text(self) -> str:
+        """Whether the requirements are met, in one sentence."""
+        if not self.good:
+            return f"{NOT_MET} {'; '.join(self.against)}."
+        return NO_HELD_OUT if UNJUDGED in self.limits.values() else ALL_MET
+
     def facts(self) -> Row:
         """Return the outcome as a dict for report.json."""
         return dataclasses.asdict(self) | {"good": self.good, "rotors_held": self.rotors_held, "against": self.against}
@@ -79,8 +86,7 @@ def outcome_of(facts: TuningFacts, may_lose: int) -> TuningOutcome:
 def outcome_text(facts: TuningFacts, outcome: TuningOutcome) -> str:
     """Return the outcome as text: verdict, lost members, error, limits, sensitive gains and gains at a bound."""
     unjudged = [name for name, found in outcome.limits.items() if found == UNJUDGED]
-    met = NO_HELD_OUT if unjudged else ALL_MET
-    words = [met if outcome.good else f"{NOT_MET} {'; '.join(outcome.against)}.", _statuses(facts)]
+    words = [outcome.text, _statuses(facts)]
     if taken := front_table.sentence(facts.front or []):
         words.append(taken)
     if outcome.refuted:
