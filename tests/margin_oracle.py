@@ -112,7 +112,7 @@ def parts_of(cascade, scenario, clock, r=0.0):
     scenario, sampled, plant = ideal(scenario), cascade.processor is not None, scenario.plant
     if sampled:
         cascade = dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=None))
-    point, found = equilibrium(cascade, scenario, period, r)
+    point, found, *_ = equilibrium(cascade, scenario, period, r)
     assert found
     state, restore = ravel_pytree(point.plant)
     laws, restore_laws = ravel_pytree(point.control)

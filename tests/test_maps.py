@@ -230,6 +230,11 @@ def test_the_reported_surviving_interval_has_no_gap():
     assert made([[1, 0, 1, 1, 1, 0]], 1).reach() == (2.0, 4.0)
     assert made([[0, 0.9]], 10).reach() is None
     assert made([[0, 0], [1, 1], [0, 0], [1, 1]], 1).reach() == (0.0, 1.0)  # of the two middle rows, the lower
+    # an end of the interval at an end of the map is not a limit of the rotor
+    ends = {(1, 0, 1, 1, 1, 0): "", (1, 1, 0): " (lower end of the map)", (1, 1): " (lower and upper end of the map)"}
+    for survival, words in ends.items():
+        one = made([survival], 1)
+        assert commands._open_ends(one, one.reach()) == words
 
 
 @pytest.mark.slow

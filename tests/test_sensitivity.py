@@ -51,6 +51,13 @@ def test_the_summary_agrees_with_the_analysis(tmp_path, capsys):
         assert row["reference_m"] == pytest.approx(r, rel=1e-3)
         assert row["zone"] == "D"
     assert summary["peak"] == summary["points"][0]["peak"]
+    at = summary["margins"]
+    for key in ("delay_margin_s", "phase_margin_deg", "disk_margin"):
+        assert summary[key] == min(at["reading"][key], at["command"][key])
+    assert summary["gain_margin_low"] == max(at[place]["gain_margin_low"] for place in ("reading", "command"))
+    assert at[at["delay_at"]]["delay_margin_s"] == summary["delay_margin_s"]
+    assert at["reading"]["delay_margin_s"] != at["command"]["delay_margin_s"]
+    assert summary["at_band_edge"] is False
     written = json.loads((tmp_path / "out" / "sensitivity.json").read_text())
     assert written == {key: value for key, value in summary.items() if key != "out"}
     assert (tmp_path / "out" / "sensitivity.png").stat().st_size > 20_000
@@ -171,6 +178,7 @@ def test_check_begins_with_the_numbers_of_the_machine(tmp_path, capsys):
     assert {key: loop[key] for key in expected} == pytest.approx(expected, rel=1e-12)
     assert loop["zone"] == "D"
     assert loop["converter_step_m"] is None
+    assert loop["delay_margin_s"] == min(loop["margins"][at]["delay_margin_s"] for at in ("reading", "command"))
     main(["check", str(path)])
     assert capsys.readouterr().out.startswith("Sensitivity: zone D, peak 41.27 at 0 Hz.")
 

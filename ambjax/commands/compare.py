@@ -203,8 +203,8 @@ def _draw(cases: Sequence[Case], compared: Sequence[Compared], path: pathlib.Pat
     limits = [float(x) for x in (first.zones.zone_a, first.zones.zone_b, first.zones.zone_c)]
     systems = [_stable(one.point) for one in compared]
     spans = [shown_band(case, [one] if one else []) for case, one in zip(cases, systems, strict=True)]
-    span = max(low for low, _ in spans), min(high for _, high in spans)
-    comparison.comparison(shown, limits, span if span[0] < span[1] else spans[0], path)
+    span = min(low for low, _ in spans), max(high for _, high in spans)
+    comparison.comparison(shown, limits, span, path)
 
 
 def _stable(point: OperatingPoint | None) -> StateSpace | None:

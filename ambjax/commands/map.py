@@ -45,7 +45,7 @@ def _text(cases: list[Case], maps: list[Map]) -> str:
     rows, lines = [], []
     for case, one in zip(cases, maps, strict=True):
         reach = one.reach()
-        held = "nowhere" if reach is None else f"{reach[0]:.4g} to {reach[1]:.4g}"
+        held = "nowhere" if reach is None else f"{reach[0]:.4g} to {reach[1]:.4g}{_open_ends(one, reach)}"
         cells = [f"{100 * share:.1f} %" for share in (one.survival.mean(), np.mean(one.survival == 1))]
         cells += [f"{100 * np.mean(one.low >= CERTAIN):.1f} %" if one.decisive else "-"] * sure
         rows.append((case.name, *cells, held))
@@ -67,6 +67,13 @@ def _text(cases: list[Case], maps: list[Map]) -> str:
     ]
     head = f"{first.x.path} survived, stable, at {first.y.path} = {first.y.values[first.middle]:.3g}"
     return "\n".join([table([*header, head], rows), *lines])
+
+
+def _open_ends(one: Map, reach: tuple[float, float]) -> str:
+    """Say at which ends the interval is limited by the map and not by a lost rotor."""
+    values = sorted((float(one.x.values[0]), float(one.x.values[-1])))
+    ends = [name for name, x, end in zip(("lower", "upper"), sorted(reach), values, strict=True) if x == end]
+    return f" ({' and '.join(ends)} end of the map)" if ends else ""
 
 
 def _confidence_note(one: Map) -> str:

@@ -115,7 +115,10 @@ def _draw(
     shown = [point for point in points if point.analysis.stable]
     if spread is not None and spread.point is not None and spread.point.analysis.stable:
         shown.append(spread.point)
-    loops = [frequency.NamedLoop(point.name, point.system, point.m, point.analysis.margins.disk) for point in shown]
+    loops = [
+        frequency.NamedLoop(point.name, point.system, point.m, point.analysis.margins_at.reading.disk)
+        for point in shown
+    ]
     limits = [float(x) for x in (case.zones.zone_a, case.zones.zone_b, case.zones.zone_c)]
     injected_points = None
     one = None if measured is None else measured.position

@@ -39,7 +39,8 @@ class CommandPath(NamedTuple):
         `fraction` [...]: part of the sample after which a new command acts. The first result is the effect of the new
         command, per unit; the second is that of the command before it.
         """
-        np_, expm = (np, _exponential) if isinstance(self.A, np.ndarray) else (jnp, jax_expm)
+        tools: Any = (np, _exponential) if isinstance(self.A, np.ndarray) else (jnp, jax_expm)
+        np_, expm = tools
         n, fraction = len(self.b), np_.asarray(fraction)[..., None, None]
         table = np_.concatenate([np_.concatenate([self.A, self.b[:, None]], 1), np_.zeros((1, n + 1))]) * period
         late, early = expm(table * (1 - fraction)), expm(table * fraction)
@@ -98,7 +99,7 @@ class StateSpace(NamedTuple):
         If the matrices are NumPy arrays, NumPy computes the response, without compilation. If they are JAX arrays, it
         is differentiable.
         """
-        np_ = np if isinstance(self.A, np.ndarray) else jnp
+        np_: Any = np if isinstance(self.A, np.ndarray) else jnp
         A, B, C, D, *_ = self.scaled()
         at = self.point(frequency)[:, None, None]
         x = np_.linalg.solve(at * np.eye(len(A)) - A, np_.broadcast_to(B + 0j, (at.shape[0], *B.shape)))
@@ -106,7 +107,7 @@ class StateSpace(NamedTuple):
 
     def point(self, frequency: Array | np.ndarray) -> Any:
         """Return s = 2 pi j f, or z = exp(s T) on a processor, at frequencies [F] in Hz."""
-        np_ = np if isinstance(self.A, np.ndarray) else jnp
+        np_: Any = np if isinstance(self.A, np.ndarray) else jnp
         s = 2j * np.pi * np_.asarray(frequency)
         return s if self.period is None else np_.exp(s * self.period)
 
@@ -116,7 +117,7 @@ class StateSpace(NamedTuple):
 
     def command_row(self, frequency: Array | np.ndarray) -> Any:
         """Return h [F, n]: response of the command to an input of each state of the plant, in the units of `scaled`."""
-        np_ = np if isinstance(self.A, np.ndarray) else jnp
+        np_: Any = np if isinstance(self.A, np.ndarray) else jnp
         A, _, C, *_ = self.scaled()
         at, n = self.point(frequency)[:, None, None], len(self.path.b)  # pyright: ignore[reportOptionalMemberAccess]
         row = np_.broadcast_to(C[4][:, None] + 0j, (at.shape[0], len(A), 1))
@@ -129,7 +130,7 @@ class StateSpace(NamedTuple):
         the delay and ends one sample later.
         """
         path: Any = self.scaled().path
-        np_ = np if isinstance(self.A, np.ndarray) else jnp
+        np_: Any = np if isinstance(self.A, np.ndarray) else jnp
         s = 2j * np.pi * np_.asarray(frequency)[:, None]
         if self.period is None:
             return path.b * np_.exp(-s * late)
@@ -145,7 +146,7 @@ class StateSpace(NamedTuple):
         the laws remember their own commands. S = 1/(1 + L) is the response of the signal at this place to a signal that
         is added to it.
         """
-        np_ = np if isinstance(self.A, np.ndarray) else jnp
+        np_: Any = np if isinstance(self.A, np.ndarray) else jnp
         if place == "reading":
             return (1 / self.sensitivity(frequency) - 1) * np_.exp(-2j * np.pi * np_.asarray(frequency) * late)
         row, own = self.command_row(frequency), self.command_effect(frequency)

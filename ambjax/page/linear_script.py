@@ -142,7 +142,7 @@ def linear_script(case: Case) -> LinearScript:
         x = jax.tree.map(lambda _: zero, x)
         start = piece_of(_start, "p", (numbers,))
         point = piece_of(_columns, "px", (numbers, x))
-    low, high = case.zones.range(case.clock.sample_period)
+    low, high = case.zones.whole.range(case.clock.sample_period)
     zones = [float(z) for z in (case.zones.zone_a, case.zones.zone_b, case.zones.zone_c)]
     sizes = {"lagged": len(jax.tree.leaves(x.lagged)), "control": len(jax.tree.leaves(x.control))}
     facts = {**sizes, "zones": zones, "low": low, "high": high}

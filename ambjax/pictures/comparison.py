@@ -45,18 +45,21 @@ def comparison(
 def comparison_figure(cases: Sequence[Contender], limits: Sequence[float], span: tuple[float, float]) -> Figure:
     """Return a picture: |S| with zones, |KS|, share of members below an rms error, rms error against rms voltage.
 
-    `limits`: upper limits of the zones A, B and C. `span`: lowest and highest frequency, Hz. A member that is lost has
+    `limits`: upper limits of the zones A, B and C. `span`: lowest and highest frequency, Hz; a curve ends at half the
+    sampling rate of its case. A member that is lost has
     no error: the curve of a case that loses members ends below 1. At most 8 cases are drawn.
     """
     figure = Figure(figsize=(12, 8.5), layout="constrained")
     (S_axes, error_axes), (KS_axes, effort_axes) = figure.subplots(2, 2)
-    f = np.geomspace(*span, POINTS)
+    grid = np.geomspace(*span, POINTS)
     finite = [case.error[case.held] for case in cases if case.held.any()]
     factor, unit = prefix_of("m", float(max((x.max() for x in finite), default=1e-6)))
     looks = [(colour, style) for style, colour in itertools.product(STYLES, COLOURS)]
     for case, (colour, style) in zip(cases, looks, strict=False):
         look = {"color": colour, "linestyle": style, "linewidth": 1.5, "label": case.name}
         if case.system is not None:
+            period = case.system.period
+            f = grid if period is None else grid[grid <= 0.5 / float(period)]
             H = np.asarray(case.system.response(f))
             S_axes.loglog(f, np.abs(H[:, 0, 0]), **look)
             KS_axes.loglog(f, np.abs(H[:, 2, 0]), **look)

@@ -124,7 +124,8 @@ async function buildPlots(parent) {
         const top = data.linear.zones[2] * 1.5, sizes = S === null ? [1] : S.size;
         sensitivityPlot.figure.y_range.setv({ start: Math.max(Math.min(...sizes) / 2, 1e-6), end: Math.max(top, ...sizes) });
       });
-      const unstable = S === null ? "no equilibrium" : `peak ${S.peak.toPrecision(4)} at ${S.frequency.toPrecision(4)} Hz, zone ${S.zone}${S.stable ? "" : ", unstable"}`;
+      const atEnd = S !== null && [S.f[0], S.f[S.f.length - 1]].some((end) => Math.abs(S.frequency / end - 1) < 1e-4);
+      const unstable = S === null ? "no equilibrium" : `${atEnd ? "largest at an end of the range," : "peak"} ${S.peak.toPrecision(4)} at ${S.frequency.toPrecision(4)} Hz, zone ${S.zone}${S.stable ? "" : ", unstable"}`;
       retitle(sensitivityPlot, `Sensitivity |S|: ${unstable}`);
     },
     members({ low, high, kept, count }) {
