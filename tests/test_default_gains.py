@@ -41,6 +41,20 @@ def test_the_plant_of_table_1_has_the_gains_of_table_2(sampling):
     assert paper.position.p == paper.inversion.p == paper.current.p == 25.0
 
 
+def test_the_paper_s_inner_gains_belong_to_its_position_law():
+    """Its gamma is too small for the demand of a faster law on the same plant."""
+    for kind, law in KINDS["position"].items():
+        if kind == "linear":
+            continue
+        laws = case_from({"controller": {"position": {"kind": kind}}}).cascade
+        usual = Cascade()
+        if law in SIGNS["position"]:
+            assert (laws.inversion, laws.current) == (usual.inversion, usual.current)
+        else:
+            assert laws.inversion.gamma > 50 * usual.inversion.gamma
+            assert laws.current.k_i > 2 * usual.current.k_i
+
+
 # poles of the error, as multiples of the pole of the magnets
 POLES = {
     position.SlidingMode: [-1, -1],
