@@ -90,6 +90,13 @@ LAWS = [
         "tests/test_starts.py::test_the_first_command_from_rest_is_that_of_the_static_law",
     ),
     M(
+        "explicit steps start with the states of implicit steps",
+        "ambjax/control/laws.py",
+        "if law.has_own_step(implicit) or has_sampled_state(law):",
+        "if True:",
+        "tests/test_starts.py::test_the_first_command_from_rest_is_that_of_the_static_law",
+    ),
+    M(
         "the filter of the derivative starts at 0 on a processor",
         "ambjax/control/chain.py",
         "derivative = -self.k_d * self.w_f / (1 + self.w_f * period / 2) * e",
