@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import hashlib
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import jax.numpy as jnp
 import numpy as np
@@ -124,7 +124,8 @@ def _steady_states(of: Realisation) -> tuple[Row, ...]:
         return ()
     import scipy.linalg
 
-    T, Q, fast = scipy.linalg.schur(np.array(of.A), sort=lambda re, im: np.hypot(re, im) > SLOWEST)
+    sorted_form: Any = scipy.linalg.schur(np.array(of.A), sort=lambda re, im: np.hypot(re, im) > SLOWEST)
+    T, Q, fast = sorted_form
     b = Q.T @ np.reshape(of.B, (n, m))
     # (I, Y; 0, I) separates the fast modes from the slow ones
     Y = np.zeros((fast, n - fast))
