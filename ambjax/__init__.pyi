@@ -30,6 +30,7 @@ from ambjax.results.vector_field import vector_field as vector_field
 from ambjax.simulation.clock import Clock as Clock
 from ambjax.simulation.explicit import DOP853 as DOP853
 from ambjax.simulation.explicit import RK4 as RK4
+from ambjax.simulation.explicit import AdaptiveCashKarp as AdaptiveCashKarp
 from ambjax.simulation.explicit import Euler as Euler
 from ambjax.simulation.method import choose_method as choose_method
 from ambjax.simulation.method import with_method as with_method

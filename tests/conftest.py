@@ -92,6 +92,14 @@ def _release_programs():
         getattr(ctypes.CDLL(None), "malloc_trim", lambda _: 0)(0)
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _strict():
+    """Let an error in a description of a result end the command, so that a test sees it."""
+    from ambjax.commands import outputs
+
+    outputs.STRICT = True
+
+
 @pytest.fixture
 def elsewhere(tmp_path, monkeypatch):
     """A separate folder for the test; the compilation cache is beside this folder."""

@@ -1,4 +1,4 @@
-"""Conditions on a processor: slopes, bands and the delay margin, compared with recursions and simulated loops."""
+"""Conditions on a processor: poles, bands and the delay margin, compared with recursions and simulated loops."""
 
 import dataclasses
 import json
@@ -14,13 +14,14 @@ from ambjax.control.guard import Guard
 from ambjax.control.inversion import ClosedForm
 from ambjax.control.observer import Direct
 from ambjax.control.processor import Processor
-from ambjax.control.sampling import Relay, band, disturbance, slope_limits
+from ambjax.control.sampling import Relay, band, disturbance
 from ambjax.ensemble import delays as searched
 from ambjax.ensemble.delays import DELAYS, delay_margin
 from ambjax.extend import InversionLaw, record
 from ambjax.simulation.rollout import Outcome, prepare
 from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Trajectory
-from ambjax.theorem import advice, sampled_report, slopes
+from ambjax.theorem import advice, sampled_report
+from ambjax.theorem.law_poles import law_poles
 from ambjax.theorem.law_signals import LawSignalsRecorder
 from ambjax.theorem.sampled_report import Delays, SampledReport, rolled
 from ambjax.world.amplifier import Amplifier
@@ -39,23 +40,6 @@ def roots(a, late):
     coefficients[1 + whole] += a * (1 - share)
     coefficients[2 + whole] += a * share
     return np.roots(coefficients)
-
-
-@pytest.mark.parametrize("late", LATE)
-def test_slope_limits_are_the_stability_and_oscillation_limits_of_the_recursion(late):
-    stable, quiet = slope_limits(late)
-    assert np.abs(roots(0.999 * stable, late)).max() < 1 < np.abs(roots(1.001 * stable, late)).max()
-    # of two roots that meet, what rounding leaves of their imaginary parts is its square root
-    dominant = lambda a: max(roots(a, late), key=abs)  # noqa: E731
-    assert dominant(0.999 * quiet).real > 0
-    assert abs(dominant(0.999 * quiet).imag) < 1e-6
-    after = roots(1.001 * quiet, late)
-    assert (np.abs(after.imag) > 1e-4).any() or after.real.min() < 0
-
-
-def test_slope_limits_without_delay_and_with_one_sample():
-    assert slope_limits(0.0) == (2.0, 1.0)
-    assert slope_limits(1.0) == (1.0, 0.25)
 
 
 def driven(implicit, T, k, p, w, x, steps=400):
@@ -178,20 +162,103 @@ def test_a_signal_outside_its_band_is_bounded_by_its_value_at_settle():
     assert line.computed == line.band
 
 
-def test_the_effective_slope_of_an_implicit_step_is_at_most_one():
-    """It is a/(1 + a), which is stable unless the sign acts one sample late."""
+def current_of(law, late, R=0.0, implicit=True):
+    """Return the poles of a current law of a coil with the resistance R; only the current law has gains."""
+    model = amb.Plant(R=R)
+    others = {"position": amb.position.LinearController(output="voltage"), "inversion": amb.inversion.Linearised()}
+    processor = Processor(late, implicit=implicit, predict=False)
+    (found,) = law_poles(amb.Cascade(current=law, model=model, processor=processor, **others), CLOCK)
+    return found
+
+
+@pytest.mark.parametrize("late", LATE)
+def test_the_poles_of_a_current_law_are_those_of_the_delayed_recursion(late):
+    """Without resistance, the law that removes a share of the error makes x_{n+1} = x_n - share x(n - late)."""
+    for share in (0.2, 0.6, 1.0):
+        found, z = current_of(amb.current.DeadBeat(share=share), late), roots(share, late)
+        assert found.radius == pytest.approx(np.abs(z).max(), abs=1e-7)  # a double root is exact to 1e-8
+        s = np.log(z[np.abs(z) > 1e-9] + 0j)
+        assert found.damping == pytest.approx((-s.real / np.abs(s)).min(initial=1.0), abs=1e-6)
+
+
+def test_dead_beat_control_one_sample_late_is_at_its_limit():
+    """w, which implicit steps do not use, has no effect. The resistance of a coil damps the oscillation by 0.2 %."""
+    for R in (0.0, 10.0):
+        slow, fast = (current_of(amb.current.DeadBeat(w=w, share=1.0), 1.0, R) for w in (100.0, 1e4))
+        assert slow == fast
+        assert slow.radius == pytest.approx(1.0, abs=1e-4)
+        assert not slow.holds
+        assert current_of(amb.current.DeadBeat(share=1.0), 0.0, R).holds
+    # explicit steps use w, and not share
+    assert current_of(amb.current.DeadBeat(w=3e3, share=1.0), 0.0, implicit=False).radius == pytest.approx(
+        0.7, rel=1e-9
+    )
+
+
+T0, SIGN = 1e-4, 2 / np.pi
+# Poles that the theory of each law gives, for T = 1e-4 s without delay: law, implicit steps, largest |pole|.
+KNOWN = [
+    (amb.observer.Complementary(l=300.0), True, 1 - 300 * T0),
+    (amb.observer.Difference(w=2e3), True, math.exp(-0.2)),
+    (amb.observer.Difference(w=2e3), False, 0.8),
+    (amb.observer.Kalman(w=500.0), True, math.exp(-0.05)),
+    (amb.observer.Kalman(w=500.0), False, 0.95),
+    (amb.inversion.Adaptive(2e5, 0.1), True, 1 / (1 + SIGN * 2e5 * 0.1 * T0)),
+    (amb.inversion.Adaptive(2e5, 0.1), False, abs(1 - SIGN * 2e5 * 0.1 * T0)),
+    (amb.inversion.FeedForwardAdaptive(2e5, 0.1), True, 1 / (1 + SIGN * 2e5 * 0.1 * T0)),
+    (amb.inversion.Adaptive(2e5, INF), True, 0.0),
+    (amb.inversion.Adaptive(2e5, INF), False, INF),
+    (amb.current.SlidingMode(200.0, 10.0), True, 1 / (1 + SIGN * 200 * 10 * T0)),
+    (amb.current.SlidingMode(200.0, 10.0), False, 1 - SIGN * 200 * 10 * T0),
+    (amb.current.SlidingMode(200.0, INF), True, 0.0),
+    (amb.current.SlidingMode(200.0, INF), False, INF),
+    # L = 33.13 H: x+ = x + T (u - k_p x)/L, u+ = u - T k_int x
+    (amb.current.ProportionalIntegral(3e4, 1e6, 0.0), True,
+     max(abs(np.linalg.eigvals([[1 - T0 * 3e4 / 33.1298, T0 / 33.1298], [-T0 * 1e6, 1]])))),
+    # sigma decays by the sign, and z on the manifold: z+ = z + T z_dot + T^2/2 z_ddot
+    (amb.position.SlidingMode(200.0, 30.0, 5.0), False, None),
+    (amb.position.FeedbackLinearisation(4e4, 500.0), True,
+     max(abs(np.linalg.eigvals([[1 - T0**2 / 2 * 4e4, T0 - T0**2 / 2 * 500], [-T0 * 4e4, 1 - T0 * 500]])))),
+    (amb.position.SlidingMode(200.0, 30.0, INF), False, INF),
+    (amb.position.SuperTwisting(17.0, 40.0, 50.0, INF), False, INF),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("law", "implicit", "radius"), KNOWN)
+def test_the_poles_of_a_law_are_those_of_its_theory(law, implicit, radius):
+    stage = type(law).__module__.rpartition(".")[2]
+    stage = stage if stage in ("observer", "inversion", "current") else "position"
+    cascade = amb.Cascade(**{stage: law}, model=amb.Plant(R=0.0), processor=Processor(0.0, implicit=implicit))
+    (found,) = (one for one in law_poles(cascade, CLOCK) if one.stage == stage)
+    if radius is None:  # with the slope K = 2/pi k p: z_ddot = -c z_dot - K (z_dot + c z)
+        rate, K = np.array([0.0, -200.0]), SIGN * 30 * 5
+        acceleration = rate - K * np.array([200.0, 1.0])
+        radius = max(abs(np.linalg.eigvals([[1, T0] + T0**2 / 2 * acceleration, [0, 1] + T0 * acceleration])))
+    # 1e-5: the triple pole of the Kalman filter is exact to the cube root of rounding errors
+    assert found.radius == pytest.approx(radius, rel=1e-5, abs=1e-7)
+    assert found.implicit == (implicit and law.own_steps != ())
+
+
+def test_a_sign_one_sample_late_is_unstable():
     hard, soft = cascade_of(*HARD, delay=1.0), cascade_of(*SOFT, delay=1.0, predict=False)
     late = dataclasses.replace(hard, processor=Processor(1.0, predict=False))
-    assert [slope.effective_slope for slope in slopes.slope_checks(hard, CLOCK)] == [1.0, 1.0, 1.0]
-    assert [slope.holds for slope in slopes.slope_checks(hard, CLOCK)] == [True, True, True]
-    assert [slope.holds for slope in slopes.slope_checks(late, CLOCK)] == [False, True, False]
-    for slope in slopes.slope_checks(soft, CLOCK):
-        assert slope.holds
-        assert slope.effective_slope == pytest.approx(slope.slope / (1 + slope.slope))
-    # what stays explicit in the position law, c T, may be all that is steep
-    (position, *_) = slopes.slope_checks(cascade_of(3e4, 25.0, 2e6, 2000.0, 25.0), CLOCK)
-    assert position.effective_slope == pytest.approx(3.0)
+    assert [one.holds for one in law_poles(hard, CLOCK)] == [True, True, True]
+    assert [one.holds for one in law_poles(late, CLOCK)] == [False, True, False]
+    assert [one.holds for one in law_poles(soft, CLOCK)] == [True, True, True]
+    # the term c e_dot of the position law acts at the start of a sample: 1 - c T = -2 beside the sign
+    (position, *_) = law_poles(cascade_of(3e4, 25.0, 2e6, 2000.0, 25.0), CLOCK)
+    assert position.radius > 1.9
     assert not position.holds
+
+
+def test_parts_of_a_chain_that_are_off_have_no_poles():
+    """With explicit steps, the poles of a notch would be unstable; the notch is off, and nothing excites it."""
+    radius = {}
+    for w in (5e3, 4e4):
+        chain = amb.position.FilterChain(w_1=w, w_2=w)
+        cascade = amb.Cascade(position=chain, processor=Processor(0.0, implicit=False))
+        radius[w] = law_poles(cascade, CLOCK)[0].radius
+    assert radius[5e3] == radius[4e4] < 1
 
 
 def test_the_bands_are_reported_without_noise_and_with_it():
@@ -378,14 +445,15 @@ settle = 0.01
 
 @pytest.mark.thorough
 @pytest.mark.usefixtures("elsewhere")
-def test_check_fails_if_an_explicit_slope_exceeds_its_limit(capsys):
-    # gamma 2 p/pi T is 318; nothing loses the rotor in this time, the theorem's conditions hold, and the answer is no
+def test_check_fails_if_an_explicit_law_is_unstable(capsys):
+    # gamma 2 p/pi T is 318, so a pole is -317;
+    # nothing loses the rotor in this time, the theorem's conditions hold, and the answer is no
     assert main(["check", write(CASE + 'discretisation = "explicit"\npredict = false\n')]) == 1
     said, _, theorem = capsys.readouterr().out.partition("Theorem 1:")
     assert "The linearised loop is not stable" in said.partition("On the processor")[0]
     assert "Yes, all 5" in theorem
-    assert "for continuous time" in theorem
-    assert "- inversion: slope T of the step is 318.3 and must be less than" in said
+    assert "in continuous time" in theorem
+    assert "- inversion: the largest |pole| is 317.3 and must be less than 1" in said
     assert "1 of 3 is not" in said
     assert "The rotor is held." in said
     assert "Delay margin" in said
@@ -399,12 +467,13 @@ def test_check_passes_for_a_stable_cascade_on_a_processor(capsys):
     assert [progress.count(part) for part in ("Theorem 1", "on the processor", "delay margin")] == [1, 1, 2]
     summary = json.loads(out)
     assert summary["holds"]
-    assert [slope["stage"] for slope in summary["processor"]["slopes"]] == ["position", "inversion", "current"]
+    assert [law["stage"] for law in summary["processor"]["laws"]] == ["position", "inversion", "current"]
     assert set(summary["processor"]) == {
-        *("lost_at_s", "lost_why", "stalled", "slopes", "bands", "distance_to_C", "distance_to_C_at_s"),
-        *("alternating", "alternates", "delay_margin", "delay_margin_unknown"),
+        *("lost_at_s", "lost_why", "stalled", "laws", "bands", "distance_to_C", "distance_to_C_at_s"),
+        *("alternating", "alternates", "delay_margin", "delay_margin_unknown", "loss_cause", "alternation_cause"),
     }
     margin = {"held": 2.0, "lost": None, "undecided": None, "resolution": None, "step": 1 / 256}
+    margin |= {"stable": 2.0, "swing_m": None, "current_A": None, "tested": DELAYS}
     assert summary["processor"]["delay_margin"] == margin
 
 

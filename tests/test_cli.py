@@ -6,6 +6,8 @@ import json
 import os
 import pathlib
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -180,6 +182,25 @@ def test_a_command_collects_garbage_rarely(capsys):
         assert gc.get_threshold() == GC_THRESHOLDS
     finally:
         gc.set_threshold(*before)
+
+
+def test_a_warning_of_a_library_does_not_reach_stderr():
+    """In another process, because pytest turns warnings into errors; -W prints them for developers."""
+    code = """
+import argparse, sys, warnings
+import numpy as np
+from ambjax.host.command_line import run_command
+def run(args):
+    np.log(np.zeros(1))
+    warnings.warn("for developers", UserWarning)
+    warnings.warn("old", DeprecationWarning)
+    return 0, None
+sys.exit(run_command(argparse.ArgumentParser(), [], run))
+"""
+    for options, words in (([], ""), (["-W", "default"], "divide by zero")):
+        done = subprocess.run([sys.executable, *options, "-c", code], capture_output=True, text=True, check=True)
+        assert done.stdout == ""
+        assert (words in done.stderr) if words else (done.stderr == "")
 
 
 def test_without_a_command_the_help_lists_the_first_commands(capsys):

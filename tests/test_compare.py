@@ -223,9 +223,10 @@ def test_a_missing_tuner_is_reported(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ("changes", "poor"), [({}, False), ({"lost": 1}, True), ({"stalled": 1}, True), ({"peak": None}, True)]
+    ("changes", "poor"),
+    [({}, False), ({"lost": 1}, True), ({"stalled": 1}, True), ({"not_stable": 1}, True), ({"peak": None}, True)],
 )
 def test_the_text_names_the_cases_for_which_the_exit_code_is_1(changes, poor):
-    case = {"case": "soft", "lost": 0, "stalled": 0, "peak": 2.0} | changes
+    case = {"case": "soft", "lost": 0, "stalled": 0, "not_stable": 0, "peak": 2.0} | changes
     words = comparison_report._words({"members": 8, "seed": 0, "cases": [case]})
-    assert ("not held, or a loop not stable at rest: soft" in words) == poor
+    assert ("not held or not stable, or a loop not stable at rest: soft" in words) == poor

@@ -345,10 +345,10 @@ def test_the_variation_of_the_voltage_over_parts_of_the_run_adds_up():
     rate = bands.signals["variation of u"]
     assert rate.shape == (5, len(bands.t)) == (5, 40)
     chatter = study.columns(0, 5)["chatter_V"]
-    # 25 parts, of one sample or two each, that each have one rate: to be counted once, at the first of their samples
-    starts = np.arange(25) * 40 // 25
-    total = rate[:, starts] @ (1e-4 * np.diff(starts, append=40))
-    np.testing.assert_allclose(total, chatter, rtol=1e-9)  # sums in another order, in another program
+    # the rate at an instant is that of the two samples before it; the odd instants cover the run but its first step
+    first = np.abs(np.diff(bands.trajectory.rows.u_mean[:, :2]))[:, 0]
+    np.testing.assert_allclose(first + 2e-4 * rate[:, 3::2].sum(1), chatter, rtol=1e-9)  # another order and program
+    assert np.isnan(rate[:, :2]).all()
     assert np.all(chatter > 0)
     assert np.isinf(bands.trajectory.lost_at).all()
 
@@ -384,10 +384,9 @@ def test_bands_at_few_instants_include_the_extremes_between_them(monkeypatch):
                 beside = values[:, edges[max(k - 1, 0)] : edges[min(k + 1, len(edges) - 1)]]
                 low, high = bands.extremes[name]
                 assert (low[k], high[k]) == (np.nanmin(beside), np.nanmax(beside))
-        steps = np.abs(np.diff(whole.u_mean[:, :samples]))
-        for k, (begin, end) in enumerate(itertools.pairwise(edges)):
-            rate = steps[:2, begin:end].sum(1) / (1e-4 * (end - begin))
-            np.testing.assert_allclose(
-                bands.signals["variation of u"][:2, k], rate, rtol=1e-12
-            )  # sums in another order
-            assert np.isfinite(bands.signals["variation of u"][2, k]) == (1e-4 * end <= lost_at[2])
+        steps, rate = np.abs(np.diff(whole.u_mean)), bands.signals["variation of u"]
+        assert np.isnan(rate[:, 0]).all()
+        for k, (begin, end) in enumerate(itertools.pairwise(at), 1):
+            before = steps[:2, begin:end].sum(1) / (1e-4 * (end - begin))
+            np.testing.assert_allclose(rate[:2, k], before, rtol=1e-12)  # sums in another order
+            assert np.isfinite(rate[2, k]) == alive[2, end]

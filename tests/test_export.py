@@ -113,7 +113,7 @@ CASCADES = {
     ),
     "a chain, a differentiator": hard(
         observer=observer.IRED1(),
-        position=position.FilterChain(depth_1=0.1, w_z=2000.0),
+        position=position.FilterChain(depth_1=0.1, w_z=2000.0, w_lp=1.06e4),
         inversion=inversion.Linearised(),
         processor=Processor(0.5),
     ),

@@ -244,11 +244,11 @@ def test_lines_are_dense_near_the_peak_and_whole_harmonics():
     clock = Clock(10_000, T)
     f = frequency_lines(Zones(), clock, 40.0)
     assert f[0] == 1.0
-    assert f[-1] == 2000.0
+    assert f[-1] == 4500.0  # 0.45 of the sampling rate
     assert f == pytest.approx(np.round(f))
     near = (f > 29) & (f < 54)
     assert near.sum() >= 11
-    assert len(frequency_lines(Zones(), clock)) < len(f) <= 41
+    assert len(frequency_lines(Zones(), clock)) < len(f) <= 47
 
 
 def test_impossible_measurements_are_refused_in_one_line():

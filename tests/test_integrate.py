@@ -13,7 +13,8 @@ from oracle import World, solve
 import ambjax as amb
 from ambjax.numerics import linear
 from ambjax.simulation.integrate import InitialValueProblem
-from ambjax.simulation.trajectory import ALIVE, STALLED
+from ambjax.simulation.method import QUIET_TIGHT, QUIET_TOLERANCE, TIGHT, TOLERANCE
+from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED
 
 FIXED = {"Euler": (amb.Euler, 1), "RK4": (amb.RK4, 4), "Rodas3": (amb.Rodas3, 3)}
 REPAIRED = amb.Cascade()
@@ -51,7 +52,9 @@ def slope(x, y):
 
 every_fixed = pytest.mark.parametrize(("method", "order"), FIXED.values(), ids=FIXED)
 every_method = pytest.mark.parametrize(
-    "method", [amb.Euler(3), amb.RK4(3), amb.DOP853(3), amb.Rodas3(3), amb.AdaptiveRodas3()], ids=str
+    "method",
+    [amb.Euler(3), amb.RK4(3), amb.DOP853(3), amb.Rodas3(3), amb.AdaptiveRodas3(), amb.AdaptiveCashKarp()],
+    ids=str,
 )
 
 
@@ -84,25 +87,31 @@ def rooted_trees(most):
         grown = {tuple(sorted((*tree, b))) for m in range(1, n) for tree in trees[n - m] for b in trees[m]}
         trees[n] = sorted(grown)
         size |= dict.fromkeys(grown, n)
-    return trees, size
+    return trees
+
+
+def stage_weights(A, tree):
+    """Weights of the stages of a tableau in the condition of a rooted tree (Hairer, Norsett and Wanner I, II.2)."""
+    return np.prod([A @ stage_weights(A, branch) for branch in tree], axis=0, initial=1.0) * np.ones(len(A))
+
+
+def nodes(tree):
+    return 1 + sum(map(nodes, tree))
+
+
+def density(tree):
+    return nodes(tree) * math.prod(map(density, tree))
 
 
 def test_dop853_meets_every_condition_of_order_eight():
     """One condition for each rooted tree (Hairer, Norsett and Wanner I, II.2): b . weights(tree) = 1 / density."""
     b, c = np.array(amb.DOP853.ROWS[-1]), np.array(amb.DOP853.TIMES)
     A = np.array([[*row, *[0.0] * (12 - len(row))] for row in [(), *amb.DOP853.ROWS[:-1]]])
-    trees, size = rooted_trees(8)
-
-    def weights(tree):
-        return np.prod([A @ weights(branch) for branch in tree], axis=0, initial=1.0) * np.ones(12)
-
-    def density(tree):
-        return size[tree] * np.prod([density(branch) for branch in tree])
-
+    trees = rooted_trees(8)
     np.testing.assert_allclose(A.sum(1), c, atol=4e-14)  # cancellation of terms up to 43
     assert [len(trees[n]) for n in trees] == [1, 1, 2, 4, 9, 20, 48, 115]
     for tree in (t for same in trees.values() for t in same):
-        assert b @ weights(tree) == pytest.approx(1 / density(tree), abs=1e-13)
+        assert b @ stage_weights(A, tree) == pytest.approx(1 / density(tree), abs=1e-13)
 
 
 def test_dop853_on_a_problem_with_known_solution():
@@ -203,12 +212,28 @@ def test_a_step_of_length_0_does_not_change_the_state(method):
     assert end_of(method, curved, 0.2, 0.0, state) == state
 
 
-def test_adaptive_error_falls_with_the_tolerance():
+@pytest.mark.parametrize("method", [amb.AdaptiveRodas3, amb.AdaptiveCashKarp])
+def test_adaptive_error_falls_with_the_tolerance(method):
     tolerances = np.array([1e-5, 1e-6, 1e-7, 1e-8, 1e-9])
-    errors = [curved_error(amb.AdaptiveRodas3(tolerance=tol)) for tol in tolerances]
-    # Error per step h^3 = tolerance and global error h^3: proportional.
+    errors = [curved_error(method(tolerance=tol)) for tol in tolerances]
+    # Error per step h^3 = tolerance and global error h^3: proportional. The same with h^5.
     assert slope(tolerances, errors) == pytest.approx(1.0, abs=0.15)
     assert all(errors < 10 * tolerances)
+
+
+def test_the_coefficients_of_cash_and_karp_meet_the_conditions_of_their_orders():
+    """One condition for each rooted tree, b . weights(tree) = 1 / density: b is of order 5, b - error of order 4."""
+    b, c = np.array(amb.AdaptiveCashKarp.ROWS[-1]), np.array(amb.AdaptiveCashKarp.TIMES)
+    A = np.array([[*row, *[0.0] * (6 - len(row))] for row in [(), *amb.AdaptiveCashKarp.ROWS[:-1]]])
+    np.testing.assert_allclose(A.sum(1), c, atol=1e-14)
+    for weights, order in ((b, 5), (b - np.array(amb.AdaptiveCashKarp.ERROR), 4)):
+        for tree in (t for same in rooted_trees(order).values() for t in same):
+            assert weights @ stage_weights(A, tree) == pytest.approx(1 / density(tree), abs=1e-14)
+    # the estimate is not 0: the second solution does not meet all conditions of order 5
+    fifth = [
+        (b - np.array(amb.AdaptiveCashKarp.ERROR)) @ stage_weights(A, t) - 1 / density(t) for t in rooted_trees(5)[5]
+    ]
+    assert np.max(np.abs(fifth)) > 1e-4
 
 
 def test_the_adaptive_step_is_kept_for_the_next_sample():
@@ -251,6 +276,32 @@ def test_integration_stops_at_the_first_invalid_state_and_returns_the_last_valid
         assert (float(out.state), float(out.t)) == pytest.approx((0.5, 3.6))
 
 
+@pytest.mark.parametrize(
+    "method",
+    [amb.RK4(3), amb.DOP853(3), amb.Rodas3(3), amb.AdaptiveRodas3(), amb.AdaptiveCashKarp(1e-3)],
+    ids=str,
+)
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_the_time_of_a_touchdown_is_that_of_the_crossing_inside_a_step(method, side):
+    """A free fall with a drag that makes z a cubic: z = side (t^2/2 + t^3/6) reaches 0.6 inside a step of a third."""
+
+    def rates(t, state):
+        return state[1], side * (1 + t)
+
+    def status(state):
+        return jnp.where(jnp.abs(state[0]) >= 0.6, TOUCHED, ALIVE).astype(jnp.int32)
+
+    fall = problem(rates, (1.0, 1.0), status)._replace(motion=lambda state: state, limit=0.6)
+    zero = jnp.zeros(())
+    out = method.advance(fall, 0.0, 2.0, (zero, zero), method.start(2.0))
+    assert int(out.code) == TOUCHED
+    exact = float(np.real(np.roots([1 / 6, 1 / 2, 0.0, -0.6])[2]))
+    # Methods of order 3 and more are exact for this cubic, and so is the cubic between the ends of a step.
+    assert float(out.t) == pytest.approx(exact, rel=1e-12)
+    one = lambda x: method.advance(fall, 0.0, 2.0, (x, zero), method.start(2.0)).t  # noqa: E731
+    assert float(jax.jacfwd(one)(zero)) == 0.0  # the time is no function of the state to JAX
+
+
 # Not Rodas3 with three steps: a fixed implicit step may leap over the pole and never see it.
 @pytest.mark.parametrize("method", [amb.Euler(3), amb.RK4(3), amb.AdaptiveRodas3()], ids=str)
 def test_a_divergent_solution_ends_with_a_status_and_a_finite_state(method):
@@ -274,9 +325,15 @@ def test_an_explicit_step_beyond_its_limit_is_refused(method):
 
 def test_method_choice():
     noisy = dataclasses.replace(TRACKING, sensor=amb.Sensor(1e-6))
-    assert isinstance(amb.choose_method(SMOOTH, TRACKING, 1e-4), amb.AdaptiveRodas3)
-    assert isinstance(amb.choose_method(SMOOTH, noisy, 1e-4), amb.RK4)
-    assert isinstance(amb.choose_method(REPAIRED, noisy, 1e-4), amb.AdaptiveRodas3)
+    for quiet in (None, amb.Sensor(), amb.Sensor(gain=1.1, offset=1e-6)):  # a sensor without noise changes nothing
+        scenario = dataclasses.replace(TRACKING, sensor=quiet)
+        assert amb.choose_method(SMOOTH, scenario, 1e-4) == amb.AdaptiveCashKarp(QUIET_TIGHT)
+        assert amb.choose_method(REPAIRED, scenario, 1e-4) == amb.AdaptiveRodas3(QUIET_TOLERANCE)
+    assert amb.choose_method(SMOOTH, noisy, 1e-4) == amb.DOP853(1)
+    for kink in ({"u_max": 100.0}, {"q_z": amb.Pulse(1.0, 0.01003, 0.02)}, {"reference": amb.Step(1e-4, 0.00103)}):
+        one = dataclasses.replace(noisy, **kink)
+        assert amb.choose_method(SMOOTH, one, 1e-4) == amb.AdaptiveCashKarp(TIGHT)
+    assert amb.choose_method(REPAIRED, noisy, 1e-4) == amb.AdaptiveRodas3(TOLERANCE)
     assert isinstance(amb.choose_method(REPAIRED, TRACKING, 1e-4), amb.AdaptiveRodas3)
     assert isinstance(amb.choose_method(REPAIRED, TRACKING, 1e-4, reverse=True), amb.Rodas3)
     assert isinstance(amb.choose_method(SMOOTH, TRACKING, 1e-4, reverse=True), amb.RK4)

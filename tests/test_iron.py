@@ -72,6 +72,25 @@ def test_the_voltage_of_a_coil_is_the_rate_of_its_flux_linkage():
         assert float(moved) == pytest.approx(side * u + plant.R * (plant.i_0 - i), rel=1e-11)
 
 
+def test_saturation_scales_the_inductance_and_the_motional_voltage_of_one_current_alike():
+    """The linkage of the lower gap with the slope of saturation, and with the factor 2 of Eq. (2) for the motion."""
+    plant = made(Plant, saturation=LIMIT, leakage=1.1)
+    z, z_dot, i, u = 1e-4, 0.3, 1.5, 20.0
+    rate = plant.rates(plant.start(Measurement(*map(jnp.asarray, (z, z_dot, i)))), u).i
+
+    def linkage(i, z):  # of ideal iron: kappa i/2 (1/(s_0 + z) + 0.1/s_0)
+        return 1.2566e-6 * 208**2 * 2.68e-4 / 2 * i * (1 / (5e-4 + z) + 0.1 / 5e-4)
+
+    def density(b):
+        return b * (AIR + (1 - AIR) * (1 + (b / LIMIT) ** 4) ** -0.25)
+
+    cores = (1.2566e-6 * 208 / 2 * x * (1 / gap + 0.1 / 5e-4) for x, gap in ((4.0, 4e-4), (1.0, 6e-4)))
+    slope = sum(jax.grad(density)(b) for b in cores) / 2
+    assert slope < 0.7  # saturated
+    by_current, by_motion = (jax.grad(linkage, k)(i, z) for k in (0, 1))
+    assert float(slope * (by_current * rate + 2 * by_motion * z_dot)) == pytest.approx(u - plant.R * i, rel=1e-11)
+
+
 @PLANTS
 def test_leakage_increases_the_time_constant_but_not_the_force(kind):
     bare, leaky = kind(**RIG), made(kind, leakage=1.25)

@@ -42,6 +42,7 @@ LAWS = [
     ("position", position.FeedbackLinearisation()),
     ("position", position.StateFeedback()),
     ("position", position.FilterChain()),
+    ("position", position.FilterChain(w_lp=1e4)),
     ("position", position.PID()),
     ("position", position.LinearController()),
     ("inversion", inversion.Adaptive()),

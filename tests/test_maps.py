@@ -202,7 +202,7 @@ def made(survival, members, **changes):
     _, low, high = wilson(survival * members, members)
     y, x = (Axis(path, np.arange(float(n))) for path, n in zip(("initial.z", "plant.m"), survival.shape, strict=True))
     lost = np.round((1 - survival) * members).astype(int)
-    return maps.Map(x, y, survival, low, high, survival, lost, 0 * lost, members, **changes)
+    return maps.Map(x, y, survival, low, high, survival, lost, 0 * lost, 0 * lost, members, **changes)
 
 
 @pytest.mark.parametrize("members", [1, 72, 73])

@@ -204,20 +204,6 @@ def test_fan_does_not_let_a_brief_transient_hide_the_rest(tmp_path, drawn):
     assert "beyond this axis" in texts(drawn[0])
 
 
-def test_fan_smooths_a_median_that_chatters(tmp_path, drawn):
-    t = np.linspace(0, 1, 500)
-    signs = np.sign(np.random.default_rng(0).normal(size=500))
-    slow = np.sin(2 * np.pi * 5 * t)
-    for values in (200 * signs + 20 * t, slow):
-        fans.fan(t, {"u": {0: values - 1, 50: values, 100: values + 1}}, {}, "chatter", tmp_path / "fan.png")
-    (chattering,), (smooth,) = (figure.axes[0].lines for figure in drawn)
-    assert chattering.get_label() == "median, smoothed where it chatters"
-    # a mean of ten signs is off by 63 V; the whole height once in 1,000
-    assert np.ptp(chattering.get_ydata()) < 400
-    assert smooth.get_label() == "median"
-    np.testing.assert_array_equal(smooth.get_ydata(), slow)
-
-
 def test_fan_refuses_unknown_quantity(tmp_path):
     with pytest.raises(ValueError, match=r"'w'. Use one of z - r, z, sigma"):
         fans.fan(np.zeros(1), {"w": {50: np.zeros(1)}}, {}, "", tmp_path / "fan.png")

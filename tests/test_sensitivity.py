@@ -7,6 +7,7 @@ import pytest
 
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
+from ambjax.commands import acceptance
 from ambjax.commands.sensitivity_report import _measured_numbers, _measured_text
 from ambjax.linear import MemberPeaks, Zones, analyse, linearise
 from ambjax.pictures.frequency import MeasuredPoints, NamedLoop, frequency_figure
@@ -66,6 +67,26 @@ def test_a_member_without_an_equilibrium_is_reported_as_the_worst(tmp_path, caps
     assert "0 are in zone A" in counted
 
 
+def test_a_picture_without_a_stable_loop_gives_no_warning():
+    """Warnings are errors in the tests."""
+    assert frequency_figure("x", [], [3.0, 4.0, 5.0], (1.0, 500.0)).axes[0].get_legend() is None
+
+
+@pytest.mark.slow
+def test_a_reference_without_an_equilibrium_is_named_and_the_others_are_analysed(tmp_path, capsys):
+    """At r = 1 mm the model misses 68 m/s^2 of the plant's springs, and k gives 25 m/s^2."""
+    text = CASE + "[plant]\nk_z = -20000.0\n[controller.model]\nk_z = 0.0\n"
+    code, out, _, _ = answered(tmp_path, capsys, text)
+    assert code == 1
+    lines = out.splitlines()
+    for sign in "+-":
+        (why,) = [line for line in lines if line.startswith(f"at {sign}reference: ")]
+        assert f"no equilibrium at r = {'-' * (sign == '-')}0.001 m" in why
+    points = json.loads((tmp_path / "out" / "sensitivity.json").read_text())["points"]
+    assert [row["zone"] for row in points] == ["B", None, None]
+    assert [row["stable"] for row in points] == [True, None, None]
+
+
 def test_the_picture_shows_the_response(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(CASE)
@@ -88,7 +109,7 @@ def test_the_picture_shows_the_response(tmp_path):
     ("text", "flags", "message"),
     [
         ("[sensitivity]\nzone_a = 4.5\n", [], "sensitivity.zone_a to zone_c = [4.5, 4.0, 5.0]"),
-        ("[sensitivity]\nf_low = 3e3\n", [], "sensitivity.f_low = 3000: it must be below f_high"),
+        ("[sensitivity]\nf_low = 3e3\nf_high = 2e3\n", [], "sensitivity.f_low = 3000: it must be below f_high"),
         ("[processor]\n[sensitivity]\nf_high = 6e3\n", [], "at most half the sampling rate, 5000 Hz"),
         ("[sensitivity]\nzone = 3\n", [], "zone_"),
         ("[sensitivity]\namplitude = 0\n", [], "sensitivity.amplitude = 0: it must be a finite number above 0"),
@@ -108,11 +129,28 @@ def test_bad_input_is_refused_in_one_line(tmp_path, capsys, text, flags, message
 def test_check_prints_the_numbers_of_the_machine_also_without_an_equilibrium(tmp_path, capsys):
     path = tmp_path / "case.toml"
     path.write_text("[controller.position]\nk = 5.0\n[controller.model]\nm = 0.1\n[clock]\nduration = 0.01\n")
-    main(["check", str(path)])
+    assert main(["check", str(path)]) == 1
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("no equilibrium at r = 0 m")
+    assert lines[0].startswith("No zone and no margins: no equilibrium at r = 0 m")
     assert lines[1] == ""
     assert lines[2].split()[-2:] == ["value", "unit"]
+
+
+def test_check_does_not_succeed_without_a_linearisation(tmp_path, capsys, monkeypatch):
+    """All conditions hold, the rotor is held, and the verdict on the linear loop is missing."""
+    path = tmp_path / "case.toml"
+    path.write_text("[controller]\n[clock]\nduration = 0.01\n")
+    assert main(["check", str(path), "--json"]) == 0
+    capsys.readouterr()
+
+    def fails(*args):
+        raise ValueError("the cause")
+
+    monkeypatch.setattr(acceptance, "linearise", fails)
+    assert main(["check", str(path), "--json"]) == 1
+    loop = json.loads(capsys.readouterr().out)["loop"]
+    assert (loop["zone"], loop["stable"], loop["why"]) == (None, None, "the cause")
+    assert loop["k_s_N_per_m"] > 0
 
 
 def test_check_begins_with_the_numbers_of_the_machine(tmp_path, capsys):
@@ -169,7 +207,7 @@ def test_the_injected_and_the_linear_peak_are_both_reported(tmp_path, capsys):
     code, out, _, _ = answered(tmp_path, capsys, PROCESSOR)
     assert "Injected into the simulation (multi-sine of 5e-05 m)" in out
     assert "Injected at the velocity sensor into the simulation (multi-sine of 0.0265 m/s)" in out
-    assert "|S| peaks at 2.712 at 40 Hz; the linear value there is 2.694." in out
+    assert "|S| peaks at 2.705 at 40 Hz; the linear value there is 2.694." in out
     assert summary["injected_velocity_frequency_hz"] == 40.0
     # half the amplitude, at both sensors: half the pole times the gap
     _, out, _, _ = answered(tmp_path, capsys, f"{PROCESSOR}amplitude = 2.5e-5\n")

@@ -32,7 +32,7 @@ NOTCHED = realisation(
 )
 FILTERED = dataclasses.replace(
     default_law(position.FilterChain, RIG, Sampling(T, 0.0, True)), w_z=900.0, w_p=9e3, w_1=5650.0, width_1=0.3,
-    depth_1=0.1, w_2=2e4, depth_2=0.3,
+    depth_1=0.1, w_2=2e4, depth_2=0.3, w_lp=20 * float(RIG.pole),
 )  # fmt: skip
 POSITIONS = {
     **{name: default_law(kind, RIG, Sampling(T, 0.0, True)) for name, kind in KINDS["position"].items()},

@@ -7,7 +7,7 @@ import pytest
 from texts import case_and_tune
 
 from ambjax.linear import analyse, linearise
-from tuning.delay_test import DELAY_MARGIN, DelayTest, delay_test
+from tuning.delay_test import DELAY_MARGIN, DelayTest, delay_test, not_simulated
 from tuning.objective.limits import PREFIX
 from tuning.problem import problem_of
 from tuning.report import limit_table
@@ -34,7 +34,7 @@ def problem(limit):
 
 
 @pytest.mark.thorough
-def test_members_are_lost_above_the_linear_margin_only():
+def test_members_are_stable_below_the_margin_then_held_and_then_lost():
     made = problem(1e-4)
     case = made.case
     margin = analyse(linearise(case.cascade, case.scenario, case.clock), 2.4, PERIOD, case.zones).margins.delay
@@ -44,9 +44,10 @@ def test_members_are_lost_above_the_linear_margin_only():
         f"loss.{PREFIX}{DELAY_MARGIN}": np.array([3.0, 1.0, 2.0]),
         "lost_at_s": np.array([math.inf, math.inf, 1.0]),
     }
-    found = {share: delay_test(problem(share * margin), x, 1, columns) for share in (0.8, 2.0)}
-    # up to 1.4 times the margin the unstable loop ends in an oscillation that holds the rotor
-    assert found == {0.8: DelayTest(2, 0), 2.0: DelayTest(2, 2)}
+    found = {share: delay_test(problem(share * margin), x, 1, columns) for share in (0.8, 1.5, 2.0)}
+    # The model does not predict over the added delay, so the loop is stable up to 1.44 times this margin. From there to
+    # 1.55 times, it ends in an oscillation that holds the rotor.
+    assert found == {0.8: DelayTest(2, 0, 0), 1.5: DelayTest(2, 0, 2), 2.0: DelayTest(2, 2, 0)}
     # a delay beyond two samples cannot be simulated, and a case in continuous time has no delay
     assert delay_test(problem(1.6 * PERIOD), x, 1, columns) is None
     lost = columns | {"lost_at_s": np.zeros(3)}
@@ -56,10 +57,21 @@ def test_members_are_lost_above_the_linear_margin_only():
 def test_a_lost_member_breaks_the_limit():
     row = {"name": DELAY_MARGIN, "what": "delay margin", "held": True, "verdict": limit_table.HELD}
     assert limit_table._tested(row, None, "") == row
-    kept = limit_table._tested(row, DelayTest(16, 0), "")
+    kept = limit_table._tested(row, DelayTest(16, 0, 0), "")
     assert kept["verdict"] == limit_table.HELD
     assert "0 of 16" in kept["what"]
-    broken = limit_table._tested(row, DelayTest(16, 1), "")
-    assert (broken["verdict"], broken["price"]) == (limit_table.BROKEN, None)
+    for test in (DelayTest(16, 1, 0), DelayTest(16, 0, 1)):
+        broken = limit_table._tested(row, test, "")
+        assert (broken["verdict"], broken["price"]) == (limit_table.BROKEN, None)
+    # a delay that is not simulated: the report says why
+    late = {share: problem(share * PERIOD) for share in (1.4, 1.6)}
+    limits = {share: next(x for x in one.limits if x.name == DELAY_MARGIN) for share, one in late.items()}
+    reason = not_simulated(late[1.6], limits[1.6])
+    assert reason == "the total delay of 2.1 samples exceeds the 2 samples that can be simulated"
+    assert not_simulated(late[1.4], limits[1.4]) == ""
+    said = limit_table._tested(row, None, "", reason)
+    assert said["held"]
+    assert reason in said["what"]
     other = row | {"name": "sensitivity"}
-    assert limit_table._tested(other, DelayTest(16, 1), "") == other
+    assert limit_table._tested(other, None, "", reason) == other
+    assert limit_table._tested(other, DelayTest(16, 1, 0), "") == other

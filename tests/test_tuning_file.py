@@ -5,7 +5,8 @@ import tomllib
 import pytest
 import tomlkit
 
-from tuning.report.tuned import tuned
+from ambjax.cases.reader import case_from
+from tuning.report.tuned import tuned, tuned_case
 
 GIVEN = """# the fan of hall 3
 
@@ -109,3 +110,19 @@ def test_gains_that_cannot_be_written_are_refused(monkeypatch):
     monkeypatch.setattr(tomlkit, "dumps", lambda document: dumps(document) + "\n[plant]\nm = 1.0\n")
     with pytest.raises(ValueError, match="would be another case"):
         written(GIVEN)
+
+
+@pytest.mark.parametrize("method", ["", 'method = "rk4"\n'])
+def test_a_step_too_coarse_for_the_tuned_gains_is_replaced(method, tmp_path):
+    """The printed gains allow dt = 5e-5 s; the tuned gamma makes the equations a thousand times stiffer."""
+    text = f"[controller.inversion]\ngamma = 1000.0\n[clock]\ndt = 5e-5\n{method}"
+    case = case_from(tomllib.loads(text), "case", text)
+    same, _ = tuned_case(case, {"controller.inversion.gamma": 2000.0}, "Good.", tmp_path)
+    assert tomllib.loads(same)["clock"]["dt"] == 5e-5
+    changed, tuned = tuned_case(case, {"controller.inversion.gamma": 1.8e7}, "Good.", tmp_path)
+    assert set(tomllib.loads(changed)["clock"].values()) == {"auto"}
+    assert 'In [clock], "auto" replaces dt' in changed.splitlines()[1]
+    assert float(tuned.cascade.inversion.gamma) == 1.8e7
+    wrong = {"controller.inversion.gamma": -1.0}  # the step is not the cause
+    with pytest.raises(ValueError, match="gamma = -1"):
+        tuned_case(case, wrong, "Good.", tmp_path)

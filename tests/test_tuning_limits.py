@@ -471,6 +471,6 @@ def test_the_reported_saturation_is_that_of_the_deciding_injection():
 @pytest.mark.parametrize("saturated", [0.0, 0.15])
 def test_the_section_on_the_sensitivity_names_the_amplitude_where_the_supply_saturates(saturated):
     row = {"member": 3, "linear": 2.0, "frequency_hz": 90.0, "zone": "A", "peak": 4.2, "low": 4.1, "high": 4.3}
-    row |= {"at_hz": 80.0, "injected_zone": "C", "saturated": saturated, "lost": 0, "repetitions": 8}
+    row |= {"at_hz": 80.0, "injected_zone": "C", "saturated": saturated, "lost": 0, "repetitions": 8, "why": ""}
     found = {"members": [row], "injected": True, "decides": False, "zones": [3.0, 4.0, 5.0]}
     assert ("`sensitivity.amplitude`" in "\n".join(sensitivity_table.section(found))) == (saturated > 0)

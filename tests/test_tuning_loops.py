@@ -13,7 +13,7 @@ from ambjax.linear import analyse, frequency_lines, injected, linearise
 from ambjax.results.operating import one_period
 from tuning.measured_peaks import INJECTED, injections
 from tuning.objective.limits import PREFIX
-from tuning.objective.loops import loops
+from tuning.objective.loops import check_loops, loops
 from tuning.objective.quantities import KINDS, LOOPS
 from tuning.problem import problem_of
 from tuning.search.rounds import finer
@@ -49,6 +49,22 @@ def made():
     problem = problem_of(*case_and_tune(DOCUMENT), threads=1)
     x = problem.objective.space.encode(problem.objective.space.values(problem.case.cascade))
     return problem, x, problem.objective.training(1, 12, 2, 1.2, 1.25)
+
+
+@pytest.mark.slow
+def test_a_search_does_not_begin_if_its_limits_cannot_be_evaluated(made):
+    """The model is six times lighter than the rotor, so k = 5 m/s^2 cannot carry the rest of its weight."""
+    problem, x, members = made
+    check_loops(problem.objective, x[None], members.searched)
+    laws = {"position": {"c": 200.0, "k": 5.0, "p": 5.0}, "model": {"m": 0.1}}
+    bounds = {"controller.position.k": [1.0, 6.0]}
+    light = DOCUMENT | {"controller": GAINS | laws, "tune": DOCUMENT["tune"] | {"bounds": bounds}}
+    problem = problem_of(*case_and_tune(light), threads=1)
+    x = problem.objective.space.encode(problem.objective.space.values(problem.case.cascade))
+    with pytest.raises(ValueError, match=r"tune\.limits: .*sensitivity cannot be evaluated.* none of the 2 starting"):
+        check_loops(
+            problem.objective, np.stack([x, x + 0.01]), problem.objective.training(1, 12, 2, 1.2, 1.25).searched
+        )
 
 
 @pytest.mark.slow
@@ -145,7 +161,7 @@ def test_injections_find_the_members_with_the_largest_measured_peak():
         "controller": {stage: law | {"p": math.inf} for stage, law in signs.items()},
         "processor": {"delay": 1.0},
         "sensor": {"std": 0.0},
-        "sensitivity": {"f_low": 20.0, "amplitude": 2e-5},
+        "sensitivity": {"f_low": 20.0, "amplitude": 5e-5},
         "spread": {"plant": {"m": {"percent": 30}}},
         "tune": DOCUMENT["tune"] | {"gains": PATHS[:1], "bounds": {}},
     }
@@ -164,7 +180,7 @@ def test_injections_find_the_members_with_the_largest_measured_peak():
             dataclasses.replace(case.scenario, plant=dataclasses.replace(case.scenario.plant, m=m)),
             clock,
             at,
-            amplitude=2e-5,
+            amplitude=5e-5,
         )
         for m in masses
     ]
@@ -172,10 +188,10 @@ def test_injections_find_the_members_with_the_largest_measured_peak():
     assert [one.member for one in found.peaks] == expected
     # the same signal, amplitude and plant, in another program
     assert [one.peak for one in found.peaks] == pytest.approx([each[k].peak for k in expected], rel=1e-6)
-    # the order of the peaks of |T| is another one
-    columns = {"loss.limit.complementary": np.ones(count), "lost_at_s": columns["lost_at_s"]}
-    by_T = sorted(range(count), key=lambda k: -np.abs(each[k].T).max())[:INJECTED]
-    assert [one.member for one in injections(problem, x, 1, columns).peaks] == by_T != expected
+    # the order of the peaks of |KS| is another one
+    columns = {"loss.limit.control_sensitivity": np.ones(count), "lost_at_s": columns["lost_at_s"]}
+    by_KS = sorted(range(count), key=lambda k: -np.abs(each[k].KS).max())[:INJECTED]
+    assert [one.member for one in injections(problem, x, 1, columns).peaks] == by_KS != expected
 
 
 def found_frequency(problem, m):

@@ -15,11 +15,13 @@ from tomlkit import dumps
 import tuning.command
 import tuning.search.rounds
 from ambjax.cases.tune_table import Budget
+from ambjax.linear import Findings
 from ambjax.theorem.advice import STALLED, STALLED_PLANT
 from tuning.config import seeds
 from tuning.judge import summarise
 from tuning.objective.limits import Limit
 from tuning.report import document as report
+from tuning.report import judging
 from tuning.report.limit_table import BROKEN, EMPHASISED, HELD, UNJUDGED, UNVERIFIED
 from tuning.report.outcome import ALL_MET, NO_HELD_OUT, NOT_MET, TuningOutcome, remedies
 from tuning.search.explore import REACH, Slices
@@ -123,6 +125,20 @@ def test_all_outputs_give_the_same_verdict(kind, ran):
     assert "tune.limits.survival" not in advice
     # and no message before the end states a result
     assert not re.search(r"cannot be held|is held|not held", err.replace(facts["advice"], ""), re.IGNORECASE)
+
+
+def test_members_that_are_held_but_not_stable_are_told_everywhere(ran, monkeypatch):
+    found = Findings(6, 2, 0.25, 1e-4, 3.0)
+    monkeypatch.setattr(judging, "_stability", lambda *_: found._asdict())
+    code, facts, out, err, folder = ran(World(), {})
+    assert facts["stability"] == found._asdict()
+    assert (code, facts["outcome"]["good"], facts["outcome"]["unstable"]) == (1, False, 2)
+    assert facts["outcome"]["rotors_held"]
+    assert facts["verdict"].startswith(f"{NOT_MET} 2 of 6 members tested held, but not stable")
+    for text in (facts["verdict"], facts["advice"], out, err, (folder / "tuned.toml").read_text()):
+        assert "2 of 6 members tested are held, but NOT stable" in text
+        assert "amplitude 0.0001 m, |i| up to 3 A (bias 0.25 A)" in text
+    assert "All requirements are met" not in (folder / "report.md").read_text()
 
 
 def test_each_reason_against_the_gains_suffices():

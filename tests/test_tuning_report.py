@@ -28,7 +28,6 @@ from tuning.objective.lanes import Engine
 from tuning.objective.loss import TERMS, weigh
 from tuning.report import accurate, breakdown, extras, gradient, held_out, pictures
 from tuning.report import document as report
-from tuning.report.answer import _sensitivity as sensitivity_line
 from tuning.report.facts import SUMMARY_METRICS
 from tuning.search.explore import REACH, Slices, slices
 from tuning.search.rounds import training
@@ -399,25 +398,6 @@ def test_each_row_of_the_picture_shows_the_run_of_its_label(study, monkeypatch):
     assert [one.get_text() for one in entries] == ["before: lost before 0.01 s", "after: stalled before 0.01 s", "held"]
     entries = pictures.spectrum({"held": before}, float(before.rows.t[-5])).axes[0].get_legend().get_texts()
     assert entries[0].get_text().startswith("held: fewer than 16 samples after ")
-
-
-@pytest.mark.parametrize(
-    ("decides", "row", "lost", "words"),
-    [
-        (False, (2.0, 300.0, 1.5, 400.0), 0, "at most 2 (at 300 Hz)"),
-        (False, (1.2, 300.0, 1.5, 400.0), 0, "at most 1.5 (at 400 Hz)"),
-        (True, (2.0, 300.0, 1.5, 400.0), 0, "at most 1.5 (at 400 Hz)"),
-        (False, (2.0, 300.0, None, None), 0, "at most 2 (at 300 Hz)"),
-        # one of two injections loses the rotor: the limits count this as infinite
-        (False, (2.0, 300.0, 1.5, 400.0), 1, "a member is lost when a test signal is injected: zone A"),
-    ],
-)
-def test_the_frequency_of_the_largest_peak_is_that_of_the_printed_value(decides, row, lost, words):
-    linear, frequency, peak, at = row
-    member = {"linear": linear, "frequency_hz": frequency, "peak": peak, "at_hz": at, "zone": "A"}
-    member |= {"injected_zone": None, "repetitions": 0 if peak is None else 2, "lost": lost}
-    facts = types.SimpleNamespace(sensitivity={"members": [member], "decides": decides})
-    assert words in sensitivity_line(facts)
 
 
 def test_ranges_and_their_sources_are_in_the_table():

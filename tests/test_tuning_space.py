@@ -31,6 +31,7 @@ from ambjax.simulation.loop import INSTANT_TREE, Densities
 from ambjax.simulation.span import blank
 from ambjax.theorem.conditions import delta_1_on_reference
 from tuning.config import read_tune
+from tuning.gains_table import off
 from tuning.objective.loss import TERMS, Loss, loss_for
 from tuning.objective.risk import CVaR, Mean, SoftWorst
 from tuning.objective.shortfalls import bounds, shortfall
@@ -108,6 +109,17 @@ def test_only_positive_gains_are_tunable():
     found = tunable(Cascade())
     assert {"controller.position.c", "controller.inversion.gamma", "controller.current.k_i"} <= set(found)
     assert "controller.inversion.i_ref" not in found
+
+
+def test_a_gain_that_is_0_is_tuned_neither_by_default_nor_by_name():
+    path = "controller.position.k_int"
+    given = {"controller": {"position": {"kind": "pid", "k_int": 0.0}}, "actuator": {"u_max": 200.0}}
+    case, tune = case_and_tune(given)
+    assert path not in tune.space.paths
+    assert "controller.position.k_p" in tune.space.paths
+    assert off(case.cascade) == [path]
+    with pytest.raises(ValueError, match=r"tune\.gains: controller\.position\.k_int = 0 .* positive value"):
+        case_and_tune(given | {"tune": {"gains": [path]}})
 
 
 def test_gains_without_effect_are_left_out():

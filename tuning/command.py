@@ -1,16 +1,18 @@
 """The command `ambjax tune`: reads a case, searches, judges the gains and writes the report."""
 
 import argparse
+import functools
 import pathlib
 import tomllib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.reader import Case, case_from
 from ambjax.cases.table import one_line
-from ambjax.commands.outputs import check_new, directory, files, plain, say, write_json, written
+from ambjax.commands.outputs import check_new, described, directory, files, plain, say, write_json, written
 from ambjax.commands.warnings import print_warnings
 from ambjax.control.cascade import Cascade
 from ambjax.host.interrupts import reporting
@@ -19,6 +21,7 @@ from ambjax.host.web_page import render_page
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
 from tuning.config import read_tune, settings
+from tuning.gains_table import off
 from tuning.problem import TuningProblem, problem_of
 from tuning.report import accurate, front_table, pictures
 from tuning.report import document as report
@@ -31,9 +34,12 @@ from tuning.search.explore import Slices
 from tuning.search.rounds import rounds
 from tuning.space import Gain, Space, tunable
 
-WRITTEN = ("tuned.toml", "history.npz", "report.html", "report.md", "report.json")
+TUNED = "tuned.toml"
+WRITTEN = (TUNED, "history.npz", "report.html", "report.md", "report.json")
 # This file is written after the search. The search has ended if the file is newer than all checkpoints.
 REPORT = "report.json"
+# Verdict in tuned.toml until the gains are judged.
+NOT_JUDGED = "The tuned gains are not judged."
 
 
 class TuningPlan(NamedTuple):
@@ -84,16 +90,27 @@ def _plan(args: argparse.Namespace) -> TuningPlan:
 
 
 def _tune(plan: TuningPlan, args: argparse.Namespace) -> tuple[int, Row]:
-    """Search, judge the result, and write and print the report. Return the exit code and the content of report.json."""
+    """Search, write the answer, judge it, and write and print the report. Return the exit code and the content of
+    report.json.
+
+    The answer is written before it is judged. If it cannot be judged, the exit code is 1 and there is no report.
+    """
     answer = _searched(plan, args.resume)
-    facts, slices = examined(answer, args.gradients, args.pareto)
+    with files(plan.out) as part:
+        _put_answer(part, plan.out, answer, NOT_JUDGED)
+    found = described("the judgement of the tuned gains", lambda: examined(answer, args.gradients, args.pareto))
+    if found is None:
+        say(f"the tuned gains are in {plan.out / TUNED}. To judge them, repeat the command with --resume.")
+        return 1, {"verdict": NOT_JUDGED, "outcome": {"good": False}, "out": str(plan.out)}
+    facts, slices = found
     with files(plan.out) as part:
         _write(part, plan.out, answer, facts, slices)
         if args.pareto:
-            _write_front(part, plan.out, answer, facts)
+            described("the case files of the front", lambda: _put_front(part, plan.out, answer, facts))
         if args.page:
-            _write_page(part, answer.problem.case, args.case)
-    _print(plan.out, facts, (*WRITTEN, NAME) if args.page else WRITTEN, quiet=args.json)
+            described(NAME, lambda: _put_page(part, answer.problem.case, args.case))
+        names = [name for name in (*WRITTEN, NAME) if (part / name).exists()]
+    _print(plan.out, facts, names, quiet=args.json)
     return int(not facts.outcome["good"]), plain(facts.table) | {"out": str(plan.out)}
 
 
@@ -103,6 +120,8 @@ def _searched(plan: TuningPlan, resume: bool) -> SearchResult:
     say(
         f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {problem.objective.clock.method}"
     )
+    if zero := off(problem.case.cascade):
+        say(f"not tuned, because they are 0 in the case, which switches their terms off: {', '.join(zero)}")
     laws = {law.stage: law.digest for law in problem.case.own_laws}
     if problem.case.controller_file:
         laws["position"] = problem.case.controller_file.contents.digest
@@ -134,29 +153,40 @@ def _kept(out: pathlib.Path) -> str:
     return f"the search so far is saved. To continue, repeat the command with --out {out} --resume"
 
 
-def _write(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: TuningFacts, slices: Slices) -> None:
-    """Write the files, except those of --pareto and --page, into the folder `part`. The caller moves them to `out`.
+def _put_answer(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, verdict: str) -> Cascade:
+    """Write tuned.toml and history.npz into the folder `part`, and return the cascade with the tuned gains.
 
-    The text of tuned.toml is read back first, to check that it is a valid case.
+    The text of tuned.toml is read back first, to check that it is a valid case. `verdict`: first lines of the file.
+    `out`: the folder to which the caller moves the files.
     """
     problem = answer.problem
-    gains = _laws(problem, {row["path"]: row["after"] for row in facts.gains})
-    text, tuned = tuned_case(problem.case, gains, facts.verdict, out)
-    (part / "tuned.toml").write_text(text, encoding="utf-8")
     history: dict[str, Any] = answer.history
     np.savez(part / "history.npz", **history)
-    words = report.report_markdown(facts)
-    drawn = _pictures(problem, tuned.cascade, history, slices, facts.front)
+    gains = np.asarray(problem.objective.space.gains_at(jnp.asarray(answer.x))).tolist()
+    after = dict(zip(problem.objective.space.paths, gains, strict=True))
+    text, tuned = tuned_case(problem.case, _laws(problem, after), verdict, out)
+    (part / TUNED).write_text(text, encoding="utf-8")
+    return tuned.cascade
+
+
+def _write(
+    part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: TuningFacts, slices: Slices | None
+) -> None:
+    """Write the files, except those of --pareto and --page, into the folder `part`. The caller moves them to `out`."""
+    cascade = _put_answer(part, out, answer, facts.verdict)
+    write_json(part / REPORT, facts.table)
+    drawn = _pictures(answer.problem, cascade, answer.history, slices, facts.front)
     for name, data in drawn.items():
         (part / name).write_bytes(data)
+    words = report.report_markdown(facts)
     (part / "report.md").write_text(words, encoding="utf-8")
-    (part / "report.html").write_text(
-        render_page(words, drawn, f"Tuning of {facts.case}", unfolded=(front_table.TITLE,)), encoding="utf-8"
-    )
-    write_json(part / REPORT, facts.table)
+    title = f"Tuning of {facts.case}"
+    page = described("report.html", lambda: render_page(words, drawn, title, unfolded=(front_table.TITLE,)))
+    if page is not None:
+        (part / "report.html").write_text(page, encoding="utf-8")
 
 
-def _write_front(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: TuningFacts) -> None:
+def _put_front(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: TuningFacts) -> None:
     """Write a case file for each point of the front of error against voltage into `part`."""
     case = answer.problem.case
     for row in facts.front or []:
@@ -168,7 +198,7 @@ def _write_front(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, fa
         (part / row["file"]).write_text(text, encoding="utf-8")
 
 
-def _write_page(part: pathlib.Path, case: Case, path: str) -> None:
+def _put_page(part: pathlib.Path, case: Case, path: str) -> None:
     """Write the page with sliders into `part`; its presets are the case and the case files in `part`."""
     files = sorted(part.glob("*.toml"), key=lambda file: (file.name != "tuned.toml", file.name))
     found = [case_from(tomllib.loads(text := file.read_text()), file.stem, text, known=case) for file in files]
@@ -176,18 +206,29 @@ def _write_page(part: pathlib.Path, case: Case, path: str) -> None:
 
 
 def _pictures(
-    problem: TuningProblem, tuned: Cascade, history: Any, slices: Slices, front: list[Row] | None
+    problem: TuningProblem, tuned: Cascade, history: Any, slices: Slices | None, front: list[Row] | None
 ) -> dict[str, bytes]:
-    """Return the pictures of the report as PNG data by file name. `tuned`: the controller with the tuned gains."""
-    paths, runs = problem.objective.space.paths, {"before": problem.case.cascade, "after": tuned}
-    shown = {name: accurate.nominal(problem, one) for name, one in runs.items()}
-    drawn = {
-        "nominal.png": pictures.before_after(shown, problem.case.settle),
-        "spectrum.png": pictures.spectrum(shown, problem.case.settle),
-        "convergence.png": pictures.convergence(history, paths),
-        "slices.png": pictures.landscape(slices, paths),
-    }
-    return drawn | ({"front.png": pictures.front(front)} if front else {})
+    """Return the pictures of the report as PNG data by file name. `tuned`: the controller with the tuned gains.
+
+    A picture that cannot be drawn is left out.
+    """
+    paths, settle = problem.objective.space.paths, problem.case.settle
+    runs = {"before": problem.case.cascade, "after": tuned}
+    shown = {}
+    for name, cascade in runs.items():
+        run = described(f"the run {name} tuning", functools.partial(accurate.nominal, problem, cascade))
+        if run is not None:
+            shown[name] = run
+    draw = {"convergence.png": lambda: pictures.convergence(history, paths)}
+    if shown:
+        draw["nominal.png"] = lambda: pictures.before_after(shown, settle)
+        draw["spectrum.png"] = lambda: pictures.spectrum(shown, settle)
+    if slices is not None:
+        draw["slices.png"] = lambda: pictures.landscape(slices, paths)
+    if front:
+        draw["front.png"] = lambda: pictures.front(front)
+    drawn = {name: described(name, one) for name, one in draw.items()}
+    return {name: data for name, data in drawn.items() if data is not None}
 
 
 def _laws(problem: TuningProblem, tuned: dict[str, float]) -> dict[str, float]:

@@ -8,7 +8,8 @@ import numpy as np
 
 from ambjax.control.processor import MOST_DELAY
 from ambjax.ensemble import run_ensemble
-from tuning.objective.limits import PREFIX
+from ambjax.linear import stability
+from tuning.objective.limits import PREFIX, Limit
 from tuning.problem import TuningProblem
 
 DELAY_MARGIN = "delay_margin_s"
@@ -17,22 +18,39 @@ TESTED = 16
 
 
 class DelayTest(NamedTuple):
-    """Number of members tested, and how many of them are lost with the additional delay."""
+    """Number of members tested with the additional delay, and how many of them are lost, or held but not stable."""
 
     members: int
     lost: int
+    unstable: int
+
+    @property
+    def fails(self) -> bool:
+        """Whether the delay is not survived: a member is lost or not stable."""
+        return bool(self.lost or self.unstable)
+
+
+def not_simulated(problem: TuningProblem, limit: Limit) -> str:
+    """Return why the additional delay of the limit is not simulated; '' if it is."""
+    processor = problem.case.cascade.processor
+    if processor is None:
+        return "the controller runs in continuous time"
+    total = float(np.max(np.asarray(processor.delay))) + limit.threshold / float(problem.case.clock.sample_period)
+    if total > MOST_DELAY:
+        return f"the total delay of {total:.3g} samples exceeds the {MOST_DELAY:g} samples that can be simulated"
+    return ""
 
 
 def delay_test(problem: TuningProblem, x: np.ndarray, seed: int, columns: Mapping[str, np.ndarray]) -> DelayTest | None:
     """Simulate the held members of least linear delay margin, with the limit on this margin as an additional delay.
 
     The prediction of the controller assumes the delay of the case. `x`: coordinates of the m gains [m]. `columns` [N]:
-    result of `judge` for the ensemble with this `seed`. Returns None without such a limit, without a processor, if the
-    sum of the delays is longer than a processor allows, or if no member is held.
+    result of `judge` for the ensemble with this `seed`. Returns None without such a limit, if `not_simulated` gives a
+    reason, or if no member is held.
     """
     limit = next((limit for limit in problem.limits if limit.name == DELAY_MARGIN), None)
     alive = np.flatnonzero(~np.isfinite(columns["lost_at_s"]))
-    if limit is None or not problem.sampled or not alive.size:
+    if limit is None or not_simulated(problem, limit) or not alive.size:
         return None
     order = np.argsort(columns[f"loss.{PREFIX}{DELAY_MARGIN}"][alive], kind="stable")
     members = problem.objective.chosen(seed, alive[order[:TESTED]], len(columns["lost_at_s"]))
@@ -42,5 +60,8 @@ def delay_test(problem: TuningProblem, x: np.ndarray, seed: int, columns: Mappin
     if np.max(delay) > MOST_DELAY:
         return None
     late = dataclasses.replace(processor, delay=delay, assumed=processor.ahead, predict=processor.predicts)
-    ended = run_ensemble(dataclasses.replace(cascade, processor=late), scenario, problem.case.clock, fold=None, every=0)
-    return DelayTest(len(members.member), int(np.isfinite(ended.trajectory.lost_at).sum()))
+    cascade = dataclasses.replace(cascade, processor=late)
+    ended = run_ensemble(cascade, scenario, problem.case.clock, fold=None, every=0)
+    lost = np.isfinite(ended.trajectory.lost_at)
+    unstable = ~lost & ~stability(cascade, scenario, problem.case.clock).stable
+    return DelayTest(len(members.member), int(lost.sum()), int(unstable.sum()))

@@ -7,6 +7,7 @@ import numpy as np
 
 from ambjax.cases.reader import Case
 from ambjax.cases.table import Table, show
+from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import no_such_number
 from ambjax.extend import GAINS
 from tuning.space import CLOSEST, Gain, Space, knots, read, tunable
@@ -35,6 +36,12 @@ def space_from(table: Table, case: Case) -> Space:
     for path in bounds:
         if path not in paths:
             raise ValueError(f"{table.at('bounds')}: {path} is not in tune.gains. Add it there or leave it out here.")
+    for path in paths:
+        if path in off(case.cascade):
+            raise ValueError(
+                f"{table.at('gains')}: {path} = 0 in this case, which switches its term off, and the search, in "
+                f"logarithms, cannot begin there. Give {path} a positive value, or leave it out of tune.gains."
+            )
     clash = [path for path in paths if path in case.spread.paths]
     if clash:
         raise ValueError(f"spread.{clash[0]} is in tune.gains too. Remove it from one of them.")
@@ -45,12 +52,20 @@ def _default_gains(case: Case) -> list[str]:
     """Return the default of tune.gains: all gains, but without the steepnesses in continuous time.
 
     In continuous time, a steeper sign makes the equations stiffer, so a steepness is tuned only if tune.gains names it.
-    On a processor, gains that are not finite (p = inf) are left out.
+    Gains that switch a term off, 0 or p = inf, are left out.
     """
     cascade = case.cascade
-    if cascade.processor is None:
-        return tunable(cascade, steepness=False)
-    return [path for path in tunable(cascade) if math.isfinite(float(np.max(np.asarray(read(cascade, path)))))]
+    return [path for path in tunable(cascade, steepness=cascade.processor is not None) if not _off(cascade, path)]
+
+
+def off(cascade: Cascade) -> list[str]:
+    """Return the paths of the gains that are 0. The search, in logarithms, cannot begin at them."""
+    return [path for path in tunable(cascade) if np.any(np.asarray(read(cascade, path)) == 0)]
+
+
+def _off(cascade: Cascade, path: str) -> bool:
+    value = np.asarray(read(cascade, path), float)
+    return bool(np.any(value == 0) or np.isinf(np.max(value)))
 
 
 def _flat(raw: dict[str, Any], prefix: str = "") -> dict[str, Any]:

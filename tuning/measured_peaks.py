@@ -25,6 +25,7 @@ INJECTED, REPETITIONS = 3, 8
 # members are then measured once each. They run in blocks of 16, one per core: on four cores, this takes as long as the
 # measurement of one member.
 SCREENED = 64
+UNSTABLE = "its linearised loop is not stable"
 # Limited quantities that an injection measures.
 MEASURED = {"sensitivity": "S", "complementary": "T", "control_sensitivity": "KS"}
 
@@ -33,17 +34,20 @@ MEASURED = {"sensitivity": "S", "complementary": "T", "control_sensitivity": "KS
 class MeasuredPeak:
     """The linear and the injected peak of |S| of one member.
 
-    `linear`, `frequency_hz`, `zone`: of the linearised loop; None, None and "D" if it is not stable or has no
-    equilibrium. `peak`, `low`, `high`, `at_hz`: injected, with the 95 % interval; None if all injections lose the rotor
-    or the laws run in continuous time. `saturated`: share of samples with the supply at its limit. `repetitions`:
-    number of injections; 0 in continuous time. `lost`: in how many of them the rotor is lost or the run stalls.
-    `largest`: injected peaks of |S|, |T| and |KS| by the name of the limit; empty without injections, or if `lost` > 0.
+    `linear`, `frequency_hz`, `zone`: of the linearised loop. If it is not stable, they are None, None and "D"; if it
+    could not be computed, all are None. `why`: which of the two, with the cause; '' otherwise.
+
+    `peak`, `low`, `high`, `at_hz`: injected, with the 95 % interval; None if all injections lose the rotor or the laws
+    run in continuous time. `saturated`: share of samples with the supply at its limit. `repetitions`: number of
+    injections; 0 in continuous time. `lost`: in how many of them the rotor is lost or the run stalls. `largest`:
+    injected peaks of |S|, |T| and |KS| by the name of the limit; empty without injections, or if `lost` > 0.
     """
 
     member: int
     linear: float | None
     frequency_hz: float | None
-    zone: str
+    zone: str | None
+    why: str
     peak: float | None
     low: float | None
     high: float | None
@@ -92,7 +96,7 @@ def injections(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[s
     if not injects(problem):
         return Sensitivity(tuple(_summary(int(k), of.analysis(k), None) for k in order[:INJECTED]), False)
     first = of.analysis(order[0])
-    peak = None if first is None else first.S.frequency
+    peak = None if isinstance(first, str) else first.S.frequency
     if decides(problem):
         once = of.responses(alive[:SCREENED], 1, peak)
         response = {"S": once.S, "T": once.S - 1, "KS": once.KS}[MEASURED[name]]
@@ -133,8 +137,8 @@ class _Judged(NamedTuple):
     seed: int
     total: int
 
-    def analysis(self, number: int) -> Analysis | None:
-        """Analyse the linearised loop of one member; None if it has no equilibrium."""
+    def analysis(self, number: int) -> Analysis | str:
+        """Analyse the linearised loop of one member. Return the cause as text if it cannot be linearised."""
         objective, case = self.problem.objective, self.problem.case
         member = jax.tree.map(lambda a: a[0], objective.chosen(self.seed, np.array([number]), self.total))
         cascade, scenario = objective.world(member)
@@ -142,9 +146,9 @@ class _Judged(NamedTuple):
         scenario = dataclasses.replace(scenario, seed=case.scenario.seed, member=case.scenario.member)
         try:
             system = linearise(cascade, scenario, case.clock)
-        except ValueError:  # no equilibrium
-            return None
-        return analyse(system, scenario.plant.m, float(case.clock.sample_period), case.zones)
+        except ValueError as error:
+            return str(error)
+        return analyse(system, scenario.plant.m, float(case.clock.sample_period), case.zones.whole)
 
     def responses(self, numbers: np.ndarray, repetitions: int, peak: float | None) -> Responses:
         """Inject a test signal into the members `numbers` [n], each `repetitions` times with different noise.
@@ -156,21 +160,26 @@ class _Judged(NamedTuple):
         cascade, scenario = objective.fixed(self.x, members)
         scenario = dataclasses.replace(scenario, seed=0, member=np.arange(len(numbers) * repetitions))
         clock = one_period(case)
-        lines = frequency_lines(case.zones, clock, peak)
+        lines = frequency_lines(case.zones.whole, clock, peak)
         return member_responses(cascade, scenario, clock, lines, amplitude=case.zones.amplitude)
 
 
-def _summary(number: int, analysis: Analysis | None, one: Injection | None) -> MeasuredPeak:
-    linear, frequency, zone = None, None, "D"
-    if analysis is not None and analysis.stable:
-        linear, frequency, zone = *analysis.S, analysis.zone
+def _summary(number: int, analysis: Analysis | str, one: Injection | None) -> MeasuredPeak:
+    """Return the peaks of a member. `analysis`: of `_Judged`. `one`: its injection; None if there was none."""
+    loop: tuple[float | None, float | None, str | None, str]
+    if isinstance(analysis, str):
+        loop = None, None, None, f"it cannot be linearised: {analysis}"
+    elif not analysis.stable:
+        loop = None, None, "D", UNSTABLE
+    else:
+        loop = analysis.S.height, analysis.S.frequency, analysis.zone, ""
     if one is None:
-        return MeasuredPeak(number, linear, frequency, zone, None, None, None, None, None, 0, 0, {})
+        return MeasuredPeak(number, *loop, None, None, None, None, None, 0, 0, {})
     largest = {}
     if one.S is not None and not one.lost:
         responses = {name: np.asarray(getattr(one, which)) for name, which in MEASURED.items()}
         largest = {name: float(np.max(np.abs(response))) for name, response in responses.items()}
     return MeasuredPeak(
-        number, linear, frequency, zone, one.peak, one.peak_low, one.peak_high, one.peak_frequency, one.saturated,
+        number, *loop, one.peak, one.peak_low, one.peak_high, one.peak_frequency, one.saturated,
         one.lost, one.members, largest,
     )  # fmt: skip

@@ -202,8 +202,7 @@ def _loop_range(case: Case, limits: tuple[Limit, ...]) -> LoopRange | None:
     if not names:
         return None
     plant = case.scenario.plant
-    low, high = case.zones.range(None if case.cascade.processor is None else case.clock.sample_period)
     size = (plant.R + plant.L * plant.pole) * plant.i_0 / plant.s_0
     # these are scale factors, so the mean plant of the ensemble is sufficient
     pole, size = (float(np.mean(np.asarray(one))) for one in (plant.pole, size))
-    return LoopRange(names, low, high, pole, size)
+    return LoopRange(names, float(case.zones.f_low), pole, size)

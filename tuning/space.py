@@ -141,7 +141,7 @@ class Space:
 
 
 def tunable(cascade: Cascade, *, steepness: bool = True, idle: bool = False) -> list[str]:
-    """Return the dotted paths of the gains of a cascade that may be tuned: the positive leaves of its laws.
+    """Return the dotted paths of the gains of a cascade that may be tuned: the fields of its laws declared by `gain`.
 
     `steepness`: whether to include the steepness of smoothed signs. `idle`: whether to include gains without effect
     under the processor of the cascade, or without one.
@@ -152,8 +152,8 @@ def tunable(cascade: Cascade, *, steepness: bool = True, idle: bool = False) -> 
         left_out = () if idle else law.idle_gains(implicit)
         for field in dataclasses.fields(law):
             meta = field.metadata
-            positive = meta.get("leaf") and meta["above"] is not None and getattr(law, field.name) is not None
-            if positive and field.name not in left_out and (steepness or not meta.get("steepness")):
+            given = "steepness" in meta and getattr(law, field.name) is not None
+            if given and field.name not in left_out and (steepness or not meta["steepness"]):
                 paths += knots(cascade, f"{ROOT}.{stage}.{field.name}") or [f"{ROOT}.{stage}.{field.name}"]
     return paths
 

@@ -101,7 +101,7 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 
 # [sensitivity]               # range and zones of 'ambjax sensitivity' (ISO 14839, from secondary sources)
 # f_low = 1.0                 # Hz; lowest frequency; 0 is always included
-# f_high = 2e3                # Hz; highest (left out: 2 kHz, or 0.45 of the sampling rate if that is lower)
+# f_high = 2e3                # Hz; highest (left out: 0.45 of the sampling rate)
 # amplitude = 5e-5            # m; of the multi-sine of an injection (left out: 1 % of the gap)
 # zone_a = 3.0                # upper limit of zone A for the peak of |S|
 # zone_b = 4.0                # upper limit of zone B

@@ -107,7 +107,7 @@ def template_lines() -> Iterator[Line]:
     )
     yield Line(
         'gains = ["controller.position.c", "controller.position.k"]',
-        "gains to tune; left out: all, but p only on a processor and only if it is finite",
+        "gains to tune; left out: all that are not 0, but p only on a processor and only if it is finite",
     )
     yield Line(
         "bounds.controller.position.c = [1.0, 500.0]",

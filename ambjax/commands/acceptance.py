@@ -6,15 +6,20 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from ambjax.cases.reader import Case
+from ambjax.commands.band_text import band_lines, band_numbers
 from ambjax.commands.outputs import table
 from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import DEFAULT_LAWS
-from ambjax.linear import Analysis, analyse, linearise
+from ambjax.linear import PLACES, Analysis, analyse, linearise
+from ambjax.results.operating import margin_numbers
 from ambjax.world.coil_limits import difference
 
 
 class Fact(NamedTuple):
-    """A number of the machine: its key in the JSON summary, its meaning, its value (None: not applicable), its unit."""
+    """A number of the machine: its key in the JSON summary, its meaning, its value (None: not applicable), its unit.
+
+    An empty key: the number is not in the summary.
+    """
 
     key: str
     words: str
@@ -54,16 +59,22 @@ def bias_flux(case: Case) -> float:
 def acceptance(case: Case) -> tuple[dict[str, object], str]:
     """Return the JSON summary and the text: zone and margins of the loop linearised at r = 0, and the machine.
 
-    If the loop cannot be linearised, the zone is None, and only the text has the numbers of the machine.
+    If the loop cannot be linearised, `zone` and `stable` are None, and `why` is the cause.
     """
     try:
         system = linearise(case.cascade, case.scenario, case.clock)
-        loop = analyse(system, case.scenario.plant.m, case.clock.sample_period, case.zones)
     except ValueError as error:
-        return {"zone": None, "stable": False}, f"{error}\n\n{_facts_table(machine(case))}"
+        facts = machine(case)
+        summary = {"stable": None, "zone": None, "why": str(error), **{fact.key: fact.value for fact in facts}}
+        return summary, f"No zone and no margins: {error}\n\n{_facts_table(facts)}"
+    loop = analyse(system, case.scenario.plant.m, case.clock.sample_period, case.zones)
     facts = [*_loop_facts(loop), *machine(case)]
-    summary = {"stable": loop.stable, "zone": loop.zone, **{fact.key: fact.value for fact in facts}}
-    return summary, "\n".join([_verdict(case, loop), "", _facts_table(facts)])
+    summary = {"stable": loop.stable, "zone": loop.zone, **{fact.key: fact.value for fact in facts if fact.key}}
+    lines = [_verdict(case, loop)]
+    if loop.stable:
+        summary |= {"frequency_hz": loop.S.frequency, **band_numbers(loop, case.zones), "margins": margin_numbers(loop)}
+        lines += band_lines("Nominal loop", loop, case.zones)
+    return summary, "\n".join([*lines, "", _facts_table(facts)])
 
 
 def _verdict(case: Case, loop: Analysis) -> str:
@@ -71,19 +82,27 @@ def _verdict(case: Case, loop: Analysis) -> str:
         return "The linearised loop is not stable at r = 0."
     signs = any(set_valued_signs(getattr(case.cascade, stage)) for stage in DEFAULT_LAWS)
     inside = " (linear loop, valid inside the bands of the set-valued signs)" if signs else ""
-    return f"Sensitivity: zone {loop.zone}, peak {loop.S.height:.4g} at {loop.S.frequency:.4g} Hz{inside}."
+    word = "largest |S|" if loop.S.at_edge else "peak"
+    return f"Sensitivity: zone {loop.zone}, {word} {loop.S.height:.4g} at {loop.S.frequency:.4g} Hz{inside}."
 
 
 def _loop_facts(loop: Analysis) -> list[Fact]:
+    """Return the peak of a stable loop, and its margins: the smaller one of each kind, and that at the other place."""
     if not loop.stable:
         return []
-    return [
-        Fact("peak", "peak of |S|", loop.S.height, "1"),
-        Fact("gain_margin", "gain margin (the one nearer to 1)", loop.margins.gain, "1"),
-        Fact("phase_margin_deg", "phase margin", loop.margins.phase_deg, "degrees"),
-        Fact("delay_margin_s", "delay margin", loop.margins.delay, "s"),
-        Fact("disk_margin", "disk margin", loop.margins.disk, "1"),
-    ]
+    kinds = {
+        "gain": ("gain_margin", "gain margin (the one nearer to 1)", "1"),
+        "phase_deg": ("phase_margin_deg", "phase margin", "degrees"),
+        "delay": ("delay_margin_s", "delay margin", "s"),
+        "disk": ("disk_margin", "disk margin", "1"),
+    }
+    facts = [Fact("peak", "peak of |S|", loop.S.height, "1")]
+    for kind, (key, words, unit) in kinds.items():
+        place = loop.margins_at.place(kind)
+        other = next(one for one in PLACES if one != place)
+        facts.append(Fact(key, f"{words}, at the {place}", getattr(loop.margins, kind), unit))
+        facts.append(Fact("", f"{words}, at the {other}", getattr(getattr(loop.margins_at, other), kind), unit))
+    return facts
 
 
 def machine(case: Case) -> list[Fact]:

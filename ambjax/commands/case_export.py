@@ -24,7 +24,7 @@ from ambjax.codegen.of_case import WHAT, block_of
 from ambjax.codegen.program import PRECISIONS
 from ambjax.codegen.trace import trace
 from ambjax.codegen.twins import LoopCase
-from ambjax.commands.outputs import directory, files, plain, spare
+from ambjax.commands.outputs import described, directory, files, plain, spare
 from ambjax.control.cascade import Cascade
 from ambjax.control.guard import guarded
 from ambjax.ensemble.spread import ends
@@ -179,7 +179,10 @@ def generated(plan: Plan) -> ExportedCase:
         return ExportedCase(plan, _built(plan), [])
     case = plan.case
     drafts = {name: verify.draft(plan.block, name, plan.prefix, plan.origin) for name in PRECISIONS}
-    checks = verify.verify(drafts, LoopCase(case.cascade, case.scenario, case.clock, case.settle))
+    loop = LoopCase(case.cascade, case.scenario, case.clock, case.settle)
+    checks = described("the verification", lambda: verify.verify(drafts, loop))
+    if checks is None:  # the files are written, but they are not verified
+        checks = [verify.Check("verification", plan.precision, "it ended with an error", "it is complete", False)]
     built = _built(plan) if plan.fmi else {**drafts[plan.precision].files}
     record = {"from": plan.mark, "ok": verify.holds(checks), "checks": [check._asdict() for check in checks]}
     page = verify.checks_page(checks, case.name, plan.mark, plan.block.noun)
@@ -194,7 +197,8 @@ def _built(plan: Plan) -> dict[str, str | bytes]:
     case, traced = plan.case, trace(plan.block, "double")
     fmu = {f"{plan.prefix}.fmu": archive.packed(traced, plan.prefix, plan.origin, plan.fmi)}
     cascade = guarded_for(case)
-    return fmu | cross_check.files_of(plan.block, plan.prefix, traced.read, cascade, case.scenario, case.clock)
+    block = plan.block, plan.prefix, traced.read, cascade, case.scenario, case.clock
+    return fmu | (described("the reference data", lambda: cross_check.files_of(*block)) or {})
 
 
 @contextlib.contextmanager

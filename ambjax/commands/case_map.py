@@ -10,12 +10,16 @@ import numpy as np
 from ambjax.cases.reader import Case, require_case
 from ambjax.cases.timing import FEWEST_SAMPLES, MOST_SAMPLES, SAMPLE_PERIOD
 from ambjax.commands.ensemble import study_of
+from ambjax.control.cascade import Cascade
 from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, with_method_for_axes
 from ambjax.ensemble.paths import Place, places
 from ambjax.ensemble.study import Study
 from ambjax.host.arguments import names_arguments
 from ambjax.host.optional import extra
+from ambjax.linear import stability
 from ambjax.numerics.declared import numbers, within
+from ambjax.simulation.clock import Clock
+from ambjax.world.scenario import Scenario
 
 COUNT = 21
 MOST_CELLS = 1_000_000
@@ -30,6 +34,7 @@ MEANINGS = {
     "error": ("m", "median over the survivors of the largest settled |z - r|"),
     "lost": ("1", "number of members whose rotor is lost"),
     "stalled": ("1", "number of members whose integration stopped early"),
+    "unstable": ("1", "1 where member 0 is held, but its loop is not stable"),
 }
 
 
@@ -92,8 +97,13 @@ def survival_map(case: Case, x: str, y: str, *, members: int = 1, seed: int | No
     for name, axis in (("x", x), ("y", y)):
         if not isinstance(axis, str):
             raise ValueError(f"{name} = {axis!r}: it must be text. Write {FORM}.")
-    study, *axes = study_and_axes(case, x, y, members, seed)
-    return CaseMap(case, grid(study, *axes))
+    study, x_axis, y_axis = study_and_axes(case, x, y, members, seed)
+    return CaseMap(case, grid(study, x_axis, y_axis, is_stable))
+
+
+def is_stable(cascade: Cascade, scenario: Scenario, clock: Clock) -> np.ndarray:
+    """Return whether each member of an ensemble [N] is stable, for `grid`."""
+    return stability(cascade, scenario, clock).stable
 
 
 def study_and_axes(case: Case, x: str, y: str, members: int, seed: int | None) -> tuple[Study, Axis, Axis]:
@@ -125,6 +135,7 @@ def panel(case: Case, one: Map) -> Any:
         low=one.low if one.decisive else None,
         high=one.high if one.decisive else None,
         error=one.error,
+        unstable=one.unstable > 0,
     )
 
 

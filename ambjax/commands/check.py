@@ -13,8 +13,14 @@ from ambjax.cases.reader import Case
 from ambjax.commands.acceptance import acceptance, forces
 from ambjax.commands.outputs import plain, say, table
 from ambjax.commands.warnings import idealised, read_with_warnings
+from ambjax.control.cascade import Cascade
+from ambjax.linear.stability import Findings, stability
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.rollout import rollout
+from ambjax.theorem.causes import Cause, find_cause
 from ambjax.theorem.conditions import Condition, Report, check
 from ambjax.theorem.sampled_report import Delays, SampledReport
+from ambjax.world.scenario import Scenario
 
 Summary = dict[str, object]
 CONTINUOUS = (
@@ -36,27 +42,34 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """Check a case. Print the results of the linearised loop, then those on the processor, then those of Theorem 1.
 
     Returns the exit code and the summary. The exit code is 1 if a condition fails, if the rotor is lost, if the
-    integrator stalls, or if the magnets cannot carry the rotor. On a processor, the conditions of Theorem 1 do not
-    count. The zones and the margins of the linearised loop never count.
+    integrator stalls, if the rotor is held but the loop is not stable, if the magnets cannot carry the rotor, or if the
+    loop cannot be linearised. On a processor, the conditions of Theorem 1 do not count. The zones and the margins of
+    the linearised loop never count.
     """
     from ambjax.theorem import advice
 
     case = read_with_warnings(args.case)
     report, (loop, text), on_processor = _results(case)
+    lost = report.lost_at if on_processor is None else on_processor.sampled.lost_at
+    findings = _stability(case) if math.isinf(lost) else None
     summary = {
         "holds": report.holds,
         "lost_at_s": report.lost_at,
         "lost_why": report.lost_why,
+        "cause": _cause(report.cause),
         "stalled": report.stalled,
         "method": report.method,
         "conditions": [_condition(c) for c in report.conditions],
         "proof": [_condition(c) for c in report.proof],
         "loop": loop,
+        "stability": None if findings is None else findings._asdict(),
     }
     if not args.json:
         print(text)
         if ideal := idealised(case):
             print(f"\n{ideal}")
+    if findings is not None and not args.json:
+        print(f"\n{findings.words()}")
     largest, weight, _ = forces(case)
     if not args.json and largest < weight:
         words = f"their largest force is {largest:.4g} N, below its weight of {weight:.4g} N"
@@ -71,8 +84,9 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         print("\n" + "\n".join(advice.theorem_lines(report, args.case)))
         if on_processor is not None:
             print(CONTINUOUS)
-    summary["holds"] = bool(summary["holds"]) and largest >= weight
-    return int(not summary["holds"]), plain(summary)
+    steady = findings is None or findings.stable
+    summary["holds"] = bool(summary["holds"]) and largest >= weight and steady
+    return int(not summary["holds"] or loop["stable"] is None), plain(summary)
 
 
 class _OnProcessor(NamedTuple):
@@ -95,15 +109,24 @@ def _results(case: Case) -> tuple[Report, tuple[Summary, str], _OnProcessor | No
         loop, on_processor = acceptance(case), None
         if case.cascade.processor is not None:
             on_processor = _OnProcessor(_sampled(case), *_margins(case))
-        return theorem.result(), loop, on_processor
+        report = theorem.result()
+    if report.lost and case.cascade.processor is None:
+        cause = find_cause(_is_lost, case.cascade, case.scenario, case.clock, say)
+        report = dataclasses.replace(report, cause=cause)
+    return report, loop, on_processor
+
+
+def _is_lost(cascade: Cascade, scenario: Scenario, clock: Clock) -> bool:
+    return bool(np.isfinite(rollout(cascade, scenario, clock, every=0).trajectory.lost_at))
 
 
 def _sampled(case: Case) -> SampledReport:
     from ambjax.ensemble.replay import as_member, record_system
-    from ambjax.theorem.sampled_report import check_sampled
+    from ambjax.theorem.sampled_report import check_sampled, with_causes
 
     say("simulating on the processor, with and without noise")
-    return check_sampled(case.cascade, as_member(case.scenario), case.clock, case.settle, record_system)
+    parts = (case.cascade, as_member(case.scenario), case.clock, case.settle, record_system)
+    return with_causes(check_sampled(*parts), *parts, say)
 
 
 def _margins(case: Case) -> tuple[Delays, Delays | None]:
@@ -112,13 +135,29 @@ def _margins(case: Case) -> tuple[Delays, Delays | None]:
     If the processor does not predict, the first is the margin without prediction, and the second is None.
     """
     from ambjax.ensemble.delays import DELAYS, delay_margin
+    from ambjax.linear.stability import with_stability
+
+    loop = (case.cascade, case.scenario, case.clock)
+
+    def found(known: bool) -> Delays:
+        margin = delay_margin(*loop, known=known)
+        say("testing whether the loop is stable at these delays")
+        return with_stability(margin, *loop, known=known)
 
     say(f"finding the delay margin: simulating {DELAYS} delays, twice if the rotor is lost at one of them")
-    margin = delay_margin(case.cascade, case.scenario, case.clock)
+    margin = found(True)
     if (processor := case.cascade.processor) is None or processor.predict is False:
         return margin, None
     say("finding the delay margin again: the prediction uses the delay of the case")
-    return margin, delay_margin(case.cascade, case.scenario, case.clock, known=False)
+    return margin, found(False)
+
+
+def _stability(case: Case) -> Findings:
+    """Return whether the loop of the case is stable, from its poles and from a run without noise and loads."""
+    from ambjax.ensemble.replay import as_member
+
+    say("testing whether the loop is stable: simulating without noise and loads")
+    return stability(case.cascade, as_member(case.scenario), case.clock).findings()
 
 
 def _processor_summary(case: Case, args: argparse.Namespace, results: _OnProcessor) -> Summary:
@@ -130,19 +169,21 @@ def _processor_summary(case: Case, args: argparse.Namespace, results: _OnProcess
         print(f"\nOn the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s.\n")
         _print_sampled(sampled)
         print("\n" + "\n".join(advice.processor_lines(sampled, margin, unknown)))
-    slopes = [dataclasses.asdict(slope) | {"holds": slope.holds} for slope in sampled.slopes]
+    laws = [dataclasses.asdict(law) | {"holds": law.holds} for law in sampled.laws]
     return {
         **_clearance(case, args, sampled.largest_z),
         "holds": sampled.holds,
         "processor": {
             "lost_at_s": sampled.lost_at,
             "lost_why": sampled.lost_why,
+            "loss_cause": _cause(sampled.loss_cause),
             "stalled": sampled.stalled,
-            "slopes": slopes,
+            "laws": laws,
             "distance_to_C": sampled.distance[0],
             "distance_to_C_at_s": sampled.distance[1],
             "alternating": sampled.alternating,
             "alternates": sampled.alternates,
+            "alternation_cause": _cause(sampled.alternation_cause),
             "bands": [dataclasses.asdict(band) | {"bound": band.bound} for band in sampled.bands],
             "delay_margin": _margin(margin),
             "delay_margin_unknown": None if unknown is None else _margin(unknown),
@@ -170,6 +211,10 @@ def _clearance(case: Case, args: argparse.Namespace, largest: float | None) -> S
 
 def _margin(margin: Delays) -> Mapping[str, object]:
     return margin._asdict() | {"resolution": margin.resolution}
+
+
+def _cause(cause: Cause | None) -> Mapping[str, object] | None:
+    return None if cause is None else cause._asdict()
 
 
 def _condition(c: Condition) -> Mapping[str, object]:
@@ -203,17 +248,15 @@ def _print_check(conditions: list[Condition], proof: list[Condition]) -> None:
 def _print_sampled(sampled: SampledReport) -> None:
     rows = [
         (
-            slope.stage,
-            f"{slope.slope:.4g}",
-            "implicit" if slope.implicit else "explicit",
-            f"{slope.effective_slope:.4g}",
-            f"{slope.limit:.4g}",
-            f"{slope.oscillation_limit:.4g}",
-            "holds" if slope.holds else "FAILS",
+            law.stage,
+            "implicit" if law.implicit else "explicit",
+            f"{law.radius:.4g}",
+            f"{law.damping:.4g}",
+            "holds" if law.holds else "FAILS",
         )
-        for slope in sampled.slopes
+        for law in sampled.laws
     ]
-    head = ("law", "slope T", "step", "slope T of the step", "stable below", "no oscillation below", "verdict")
+    head = ("law", "step", "largest |pole|", "least damping ratio", "verdict")
     print(table(head, rows))
 
     def number(x: float | None) -> str:

@@ -6,6 +6,7 @@ import dataclasses
 import pathlib
 import sys
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -16,7 +17,8 @@ from ambjax.codegen.trace import trace
 from ambjax.commands.case_export import guarded_for
 from ambjax.commands.comparison_report import Compared, comparison_markdown, comparison_summary, comparison_table
 from ambjax.commands.ensemble import study_of
-from ambjax.commands.outputs import directory, files, plain, say, write_json, written
+from ambjax.commands.outputs import described, directory, files, plain, say, write_json, written
+from ambjax.commands.study_report import findings_of
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
@@ -24,7 +26,7 @@ from ambjax.host.extensions import extension
 from ambjax.host.web_page import render_page
 from ambjax.linear.state_space import StateSpace
 from ambjax.page.html_page import check_processor, pages
-from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks, operating_point, spread_peaks
+from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks, operating_point, shown_band, spread_peaks
 
 WRITTEN = ("compare.html", "compare.json", "compare.png")
 # Largest number of cases in a table and a picture.
@@ -36,7 +38,11 @@ MAY_DIFFER = ("controller.", "clock.method")
 
 
 def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
-    """Compare cases. The exit code is 0 if each case holds all members, and its nominal loop is stable at rest."""
+    """Compare cases.
+
+    The exit code is 0 if each case holds all members, the members tested are stable, and its nominal loop is stable at
+    rest.
+    """
     cases = _read(args.cases)
     studies = [study_of(case, _seed(args, cases), args.members) for case in cases]
     notes = _differences(args.cases, cases, studies)
@@ -53,21 +59,28 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     compared = [_compared(case, study) for case, study in zip(cases, studies, strict=True)]
     summary = comparison_summary(compared, studies[0], notes)
     with files(out) as part:
-        _draw(cases, compared, part / "compare.png")
-        html = render_page(
-            comparison_markdown(summary),
-            {"compare.png": (part / "compare.png").read_bytes()},
-            "Comparison of controllers",
-        )
-        (part / "compare.html").write_text(html, encoding="utf-8")
         write_json(part / "compare.json", summary)
+        described("compare.png", lambda: _draw(cases, compared, part / "compare.png"))
+        described("compare.html", lambda: _write_html(summary, part))
         for name, html in html_pages.items():
             (part / name).write_text(html, encoding="utf-8")
+        names = [name for name in WRITTEN if (part / name).exists()]
     if not args.json:
-        print(comparison_table(summary))
-        written(out, ", ".join([*WRITTEN, *html_pages]))
-    good = all(one.held.all() and one.point is not None and one.point.analysis.stable for one in compared)
+        print(described("the table", lambda: comparison_table(summary)) or "")
+        written(out, ", ".join([*names, *html_pages]))
+    good = all(
+        one.held.all() and one.findings.stable and one.point is not None and one.point.analysis.stable
+        for one in compared
+    )
     return int(not good), plain(summary | {"out": str(out)})
+
+
+def _write_html(summary: Mapping[str, Any], part: pathlib.Path) -> None:
+    """Write compare.html into the folder `part`, with the picture in it."""
+    picture = part / "compare.png"
+    drawn = {picture.name: picture.read_bytes()} if picture.exists() else {}
+    html = render_page(comparison_markdown(summary), drawn, "Comparison of controllers")
+    (part / "compare.html").write_text(html, encoding="utf-8")
 
 
 def _seed(args: argparse.Namespace, cases: Sequence[Case]) -> int:
@@ -133,7 +146,8 @@ def _tuned(path: str, name: str, out: pathlib.Path, args: argparse.Namespace) ->
 def _compared(case: Case, study: Study) -> Compared:
     """Simulate the members of a case, analyse its loop, and count the operations of a step."""
     point, peaks = _linear(case, study)
-    return Compared(case, _columns(case, study), point, peaks, _flops(case))
+    columns = _columns(case, study)
+    return Compared(case, columns, point, peaks, _flops(case), findings_of(study, columns))
 
 
 def _columns(case: Case, study: Study) -> dict[str, np.ndarray]:
@@ -187,7 +201,8 @@ def _draw(cases: Sequence[Case], compared: Sequence[Compared], path: pathlib.Pat
         for one in compared
     ]
     limits = [float(x) for x in (first.zones.zone_a, first.zones.zone_b, first.zones.zone_c)]
-    spans = [case.zones.range(None if case.cascade.processor is None else case.clock.sample_period) for case in cases]
+    systems = [_stable(one.point) for one in compared]
+    spans = [shown_band(case, [one] if one else []) for case, one in zip(cases, systems, strict=True)]
     span = max(low for low, _ in spans), min(high for _, high in spans)
     comparison.comparison(shown, limits, span if span[0] < span[1] else spans[0], path)
 

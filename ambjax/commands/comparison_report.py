@@ -12,6 +12,8 @@ from ambjax.commands.outputs import table
 from ambjax.ensemble.paths import kinds, places
 from ambjax.ensemble.study import Study
 from ambjax.host import web_page
+from ambjax.linear import Findings
+from ambjax.linear.stability import MOST_TESTED
 from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks
 
 
@@ -21,7 +23,8 @@ class Compared:
 
     `columns`: metrics of the members by name, [N] each. `point`: the nominal loop; None without an equilibrium.
     `peaks`: sensitivity peaks of the members; None without a spread or without an equilibrium. `flops`: operations of a
-    step of the controller; None without a processor, or if a law cannot be exported.
+    step of the controller; None without a processor, or if a law cannot be exported. `findings`: the stability of the
+    members with the largest settled errors.
     """
 
     case: Case
@@ -29,6 +32,7 @@ class Compared:
     point: OperatingPoint | None
     peaks: SpreadPeaks | None
     flops: int | None
+    findings: Findings = Findings(0, 0)
 
     @property
     def held(self) -> np.ndarray:
@@ -53,6 +57,8 @@ class Quantity(NamedTuple):
 QUANTITIES = (
     Quantity("lost", "members lost", "1"),
     Quantity("stalled", "members not decided (the integrator stalled)", "1"),
+    Quantity("not_stable", f"members held, but not stable, of at most {MOST_TESTED} tested", "1"),
+    Quantity("cycle_m", "the largest amplitude of their own oscillation", "m"),
     Quantity("rms_error_median_m", "settled rms error, median", "m"),
     Quantity("rms_error_worst_m", "settled rms error, worst member", "m"),
     Quantity("max_error_m", "largest settled error", "m"),
@@ -68,6 +74,7 @@ QUANTITIES = (
     Quantity("peak", "peak of |S|", "1"),
     Quantity("frequency_hz", "its frequency", "Hz", None),
     Quantity("zone", "its zone (ISO 14839-3)", "", None),
+    Quantity("outside_peak", "|S| outside the band of [sensitivity], if larger", "1"),
     Quantity("unstable", f"members not stable at rest, of the first {MEMBERS}", "1"),
     Quantity("worst_peak", "peak of |S|, worst member", "1"),
     Quantity("t_peak", "peak of |T|", "1"),
@@ -75,7 +82,9 @@ QUANTITIES = (
     Quantity("gain_margin_low", "gain margin below 1", "1"),
     Quantity("gain_margin_high", "gain margin above 1", "1", less=False),
     Quantity("phase_margin_deg", "phase margin", "degrees", less=False),
-    Quantity("delay_margin_s", "delay margin", "s", less=False),
+    Quantity("delay_margin_s", "delay margin, the smaller one", "s", less=False),
+    Quantity("delay_margin_reading_s", "delay margin at the reading", "s", less=False),
+    Quantity("delay_margin_command_s", "delay margin at the command", "s", less=False),
     Quantity("disk_margin", "disk margin", "1", less=False),
     Quantity("stiffness_N_per_m", "static stiffness", "N/m", less=False),
     Quantity("flops", "cost of a step", "flops"),
@@ -97,6 +106,8 @@ def _values(one: Compared, first: Compared) -> dict[str, object]:
     return {
         "lost": int(np.sum(~one.held & ~stalled)),
         "stalled": int(np.sum(stalled)),
+        "not_stable": one.findings.unstable,
+        "cycle_m": one.findings.swing_m,
         "rms_error_median_m": one.of("settled_rms_error_m", np.median),
         "rms_error_worst_m": one.of("settled_rms_error_m", np.max),
         "max_error_m": one.of("settled_max_abs_error_m", np.max),
@@ -123,21 +134,25 @@ def _better(one: Compared, first: Compared) -> int:
 def _loop(one: Compared) -> dict[str, object]:
     """Return the numbers of the linearised loops of a case.
 
-    If the nominal loop has no equilibrium or is not stable, its zone is D and its other numbers are None.
+    If the nominal loop is not stable, its zone is D and its other numbers are None. If it has no linearisation, its
+    zone is None too.
     """
     keys = ("peak", "frequency_hz", "t_peak", "ks_peak", "gain_margin_low", "gain_margin_high", "phase_margin_deg")
-    keys += ("delay_margin_s", "disk_margin", "stiffness_N_per_m")
+    keys += ("delay_margin_s", "disk_margin", "stiffness_N_per_m", "outside_peak")
+    keys += ("delay_margin_reading_s", "delay_margin_command_s")
     worst: dict[str, object] = {"unstable": None, "worst_peak": None}
     if one.peaks is not None:
         worst["unstable"] = one.peaks.members - one.peaks.stable
         if not worst["unstable"] and one.peaks.point is not None:
             worst["worst_peak"] = one.peaks.point.analysis.S.height
     if one.point is None or not one.point.analysis.stable:
-        return {"stable": False, "zone": "D", **dict.fromkeys(keys), **worst}
+        unstable = {"stable": None, "zone": None} if one.point is None else {"stable": False, "zone": "D"}
+        return {**unstable, **dict.fromkeys(keys), **worst}
     loop = one.point.analysis
-    margins = loop.margins
+    margins, at, outside = loop.margins, loop.margins_at, loop.S.outside
     found = (loop.S.height, loop.S.frequency, loop.T.height, loop.KS.height, margins.gain_low, margins.gain_high)
     found += (margins.phase_deg, margins.delay, margins.disk, loop.stiffness)
+    found += (None if outside is None else outside.height, at.reading.delay, at.command.delay)
     return {"stable": True, "zone": loop.zone, **dict(zip(keys, found, strict=True)), **worst}
 
 
@@ -182,8 +197,10 @@ def comparison_markdown(summary: Mapping[str, Any]) -> str:
 
 
 def _words(summary: Mapping[str, Any]) -> str:
-    poor = [case["case"] for case in summary["cases"] if case["lost"] or case["stalled"] or case["peak"] is None]
-    why = f" Members not held, or a loop not stable at rest: {', '.join(poor)}; see 'ambjax check'." if poor else ""
+    bad = ("lost", "stalled", "not_stable")
+    poor = [case["case"] for case in summary["cases"] if case["peak"] is None or any(case[key] for key in bad)]
+    why = f" Members not held or not stable, or a loop not stable at rest: {', '.join(poor)}." if poor else ""
+    why += " See 'ambjax check'." if poor else ""
     return (
         f"{summary['members']} members, seed {summary['seed']}, the same in all cases. Errors, voltages, currents and "
         f"power losses are those of the members that are held. Sensitivity and margins are those of the linearised "

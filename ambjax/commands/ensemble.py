@@ -35,7 +35,10 @@ def study_of(case: Case, seed: int | None, members: int) -> Study:
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
-    """Run or resume a study and report it. Return the exit code (1 if a member is lost or stalled) and the summary."""
+    """Run or resume a study and report it. Return the exit code and the summary.
+
+    The exit code is 1 if a member is lost, stalled or not stable.
+    """
     case = read_with_warnings(args.case)
     study, store = _study_and_store(case, args)
     out = store.directory

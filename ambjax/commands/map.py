@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.reader import Case
-from ambjax.commands.case_map import labels, panel, study_and_axes
-from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
+from ambjax.commands.case_map import is_stable, labels, panel, study_and_axes
+from ambjax.commands.outputs import described, directory, files, plain, say, table, write_json, written
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.maps import CERTAIN, GRIDS, Map, grid
@@ -29,13 +29,14 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
             say(f"{case.name}: {len(x.values) * len(y.values)} cells of {args.members}; method: {study.clock.method}")
             if args.members == 1 and case.spread.entries:
                 say(f"{case.name}: nominal, because one member does not draw the [spread]; --members 2 or more do.")
-            maps.append(grid(study, x, y))
+            maps.append(grid(study, x, y, is_stable))
         summary = {"cases": [_summary(case, one) for case, one in zip(cases, maps, strict=True)], "out": str(out)}
-        _draw(cases, maps, part / "map.png")
         write_json(part / "map.json", summary)
+        described("map.png", lambda: _draw(cases, maps, part / "map.png"))
+        names = [name for name in WRITTEN if (part / name).exists()]
     if not args.json:
-        print(_text(cases, maps))
-        written(out, ", ".join(WRITTEN))
+        print(described("the table", lambda: _text(cases, maps)) or "")
+        written(out, ", ".join(names))
     return 0, plain(summary)
 
 
@@ -49,6 +50,9 @@ def _text(cases: list[Case], maps: list[Map]) -> str:
         cells += [f"{100 * np.mean(one.low >= CERTAIN):.1f} %" if one.decisive else "-"] * sure
         rows.append((case.name, *cells, held))
         lines += [f"{case.name}: {_spread_words(one)}"]
+        if one.unstable.any():
+            many = f"{int(one.unstable.sum())} of {one.unstable.size} cells"
+            lines += [f"{case.name}: in {many} the rotor is held, but the loop is NOT stable (hatched in map.png)"]
         if not one.decisive:
             lines += [f"{case.name}: {_confidence_note(one)}"]
         if one.stalled.any():
@@ -61,7 +65,7 @@ def _text(cases: list[Case], maps: list[Map]) -> str:
         "cells in which all survive",
         *[f"cells above {100 * CERTAIN:g} % with confidence"] * sure,
     ]
-    head = f"{first.x.path} survived at {first.y.path} = {first.y.values[first.middle]:.3g}"
+    head = f"{first.x.path} survived, stable, at {first.y.path} = {first.y.values[first.middle]:.3g}"
     return "\n".join([table([*header, head], rows), *lines])
 
 

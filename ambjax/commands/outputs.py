@@ -11,14 +11,19 @@ import os
 import pathlib
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ambjax.ensemble.store import MANIFEST, RESULT
 from ambjax.host.interrupts import uninterrupted
 from ambjax.host.words import one_line
+
+Described = TypeVar("Described")
+# Whether an error in a description ends the command (`described`). The tests set it, so that no defect is overlooked.
+STRICT = False
 
 
 def directory(out: str | None, name: str, names: Iterable[str] = (), force: bool = False) -> pathlib.Path:
@@ -142,6 +147,34 @@ def files(out: pathlib.Path) -> Iterator[pathlib.Path]:
             with contextlib.suppress(OSError):
                 out.rmdir()
             raise
+
+
+def described(name: str, describe: Callable[[], Described]) -> Described | None:
+    """Return the result of `describe`, which only describes a result: it makes a report, a picture or a table.
+
+    An error costs this description only: it is reported on one line of stderr, with the `name` of the description and
+    the place in the code, and None is returned. Commands write the result itself before its descriptions. An error of
+    the file system is raised, because it concerns the result too.
+    """
+    try:
+        return describe()
+    except OSError:
+        raise
+    except Exception as error:
+        if STRICT:
+            raise
+        say(f"{name} is left out: {fault(error)}")
+        return None
+
+
+def fault(error: Exception) -> str:
+    """Return an error in one sentence or more. One that is not a ValueError is a defect: its place is added."""
+    words = str(error) or type(error).__name__
+    if isinstance(error, ValueError):
+        return words if words.endswith(".") else f"{words}."
+    at = traceback.extract_tb(error.__traceback__)[-1]
+    where = f"{pathlib.Path(at.filename).name}, line {at.lineno}"
+    return f"{type(error).__name__}: {words.rstrip('.')} ({where}). This is a defect of ambjax: please report it."
 
 
 def _order(name: pathlib.Path) -> tuple[bool, pathlib.Path]:

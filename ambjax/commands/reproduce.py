@@ -11,7 +11,7 @@ from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from tqdm import tqdm
 
 from ambjax import paper
-from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
+from ambjax.commands.outputs import described, directory, files, plain, say, table, write_json, written
 from ambjax.ensemble.worker import processes
 from ambjax.paper import ledger
 from ambjax.paper.evidence import Evidence, gather
@@ -79,12 +79,12 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
                 jobs.append(artist.submit(_paper_figures, reading, evidence[reading], part))
             stage("figures and ledger")
             for job in jobs:
-                job.result()
+                described("a figure", job.result)
         std = paper.TABLE_2.noise_std
         words = f"the paper's noise (std {std:.2g} m on z), {paper.SUPPLY:g} V"
         words = f"Tracking on a 10 kHz processor with a delay of one sample, under {words}"
         shown = {str(SHOWN_AS.get(name, name)): one.on_processor[True].trajectory for name, one in evidence.items()}
-        figures.readings(shown, words, paper.SETTLE, part / "readings.png")
+        described("readings.png", lambda: figures.readings(shown, words, paper.SETTLE, part / "readings.png"))
         claims, noise = ledger.judge_claims(evidence), ledger.noise_table(evidence)
         processor = ledger.processor_table(evidence)
         page = ledger.ledger_markdown(claims, noise, processor, sensitivity)

@@ -2,11 +2,12 @@
 
 import argparse
 import pathlib
+from typing import Any
 
 from ambjax.cases.reach import largest
 from ambjax.cases.reader import Case
 from ambjax.commands.ensemble import study_of
-from ambjax.commands.outputs import directory, files, plain, write_json, written
+from ambjax.commands.outputs import described, directory, files, plain, write_json, written
 from ambjax.commands.sensitivity_report import Injections, sensitivity_summary, set_valued, text_of
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.study import Study
@@ -19,6 +20,7 @@ from ambjax.results.operating import (
     measured_peaks,
     one_period,
     operating_point,
+    shown_band,
     spread_peaks,
 )
 
@@ -28,24 +30,43 @@ INJECTED = 8
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
-    """Analyse the loop of a case. Exit code 1 if it is not stable at an equilibrium, or if a member is not stable."""
+    """Analyse the loop of a case.
+
+    The exit code is 1 if the loop is not stable at an equilibrium or cannot be linearised at one of the references, or
+    if a member is not stable. Raises ValueError as `linearise` does for the reference 0.
+    """
     case = read_with_warnings(args.case)
     study = _study(case, args)
-    points = [operating_point(case, name, r) for name, r in references(case)]
+    points, missing = _points(case)
     spread = None if study is None else spread_peaks(case, study)
     if study is not None and spread is not None and set_valued(case):
         spread = spread._replace(measured=measured_peaks(case, study, points[0].analysis.S.frequency))
     measured = _injections(case, points[0]) if args.inject or case.cascade.processor is not None else None
     out = directory(args.out, f"sensitivity-{case.name}", WRITTEN, args.force)
-    summary = sensitivity_summary(points, spread, measured, case.zones)
+    summary: dict[str, Any] = sensitivity_summary(points, spread, measured, case.zones)
+    summary["points"] += [{"point": name, "stable": None, "zone": None, "why": why} for name, why in missing.items()]
     with files(out) as part:
         write_json(part / "sensitivity.json", summary)
-        _draw(case, points, spread, measured, part / "sensitivity.png")
+        described("sensitivity.png", lambda: _draw(case, points, spread, measured, part / "sensitivity.png"))
+        names = [name for name in WRITTEN if (part / name).exists()]
     if not args.json:
-        print(text_of(case, points, spread, measured))
-        written(out, ", ".join(WRITTEN))
+        tables = described("the table", lambda: text_of(case, points, spread, measured)) or ""
+        print("\n".join([tables, *(f"{name}: {missing[name]}" for name in missing)]))
+        written(out, ", ".join(names))
     stable = all(point.analysis.stable for point in points) and (spread is None or spread.stable == spread.members)
-    return int(not stable), plain(summary | {"out": str(out)})
+    return int(bool(missing) or not stable), plain(summary | {"out": str(out)})
+
+
+def _points(case: Case) -> tuple[list[OperatingPoint], dict[str, str]]:
+    """Return the loops at the references, and the cause, by name, for each reference other than 0 without a loop."""
+    (first, *rest), missing = references(case), {}
+    points = [operating_point(case, *first)]
+    for name, r in rest:
+        try:
+            points.append(operating_point(case, name, r))
+        except ValueError as error:
+            missing[name] = str(error)
+    return points, missing
 
 
 def references(case: Case) -> list[tuple[str, float]]:
@@ -98,9 +119,9 @@ def _draw(
         shown.append(spread.point)
     loops = [frequency.NamedLoop(point.name, point.system, point.m, point.analysis.margins.disk) for point in shown]
     limits = [float(x) for x in (case.zones.zone_a, case.zones.zone_b, case.zones.zone_c)]
-    low, high = case.zones.range(None if case.cascade.processor is None else case.clock.sample_period)
     injected_points = None
     one = None if measured is None else measured.position
     if one is not None and one.S is not None and one.T is not None and one.KS is not None:
         injected_points = frequency.MeasuredPoints(one.frequency, one.S, one.T, one.KS)
-    frequency.sensitivity_picture(case.name, loops, limits, (low, high), path, injected_points)
+    span = shown_band(case, [point.system for point in shown])
+    frequency.sensitivity_picture(case.name, loops, limits, span, path, injected_points)

@@ -5,10 +5,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ambjax.cases.reader import Case
+from ambjax.commands.band_text import band_lines, band_numbers
 from ambjax.commands.outputs import table
 from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import DEFAULT_LAWS
-from ambjax.linear import Injection, MemberPeaks, Zones
+from ambjax.linear import PLACES, Injection, MemberPeaks, Zones
 from ambjax.results.operating import OperatingPoint, SpreadPeaks, analysis_summary
 
 
@@ -33,15 +34,21 @@ def sensitivity_summary(
     points: list[OperatingPoint], spread: SpreadPeaks | None, measured: Injections | None, zones: Zones
 ) -> dict[str, object]:
     """Return the numbers of sensitivity.json: of the equilibria `points`, the spread, and the injection."""
-    rows = [{"point": point.name, "reference_m": point.r, **analysis_summary(point.analysis)} for point in points]
+
+    def numbers(point: OperatingPoint) -> dict[str, object]:
+        return analysis_summary(point.analysis) | band_numbers(point.analysis, zones)
+
+    rows: list[dict[str, object]] = [
+        {"point": point.name, "reference_m": point.r, **numbers(point)} for point in points
+    ]
     summary: dict[str, object] = {
-        **analysis_summary(points[0].analysis),
+        **numbers(points[0]),
         **_injected_numbers(points[0], measured),
         "points": rows,
     }
     if spread is not None:
-        worst = {} if spread.point is None else analysis_summary(spread.point.analysis)
-        counts = {"members": spread.members, "stable": spread.stable, "zone_a": spread.zone_a}
+        worst = {} if spread.point is None else numbers(spread.point)
+        counts = {name: getattr(spread, name) for name in ("members", "stable", "zone_a", "failed")}
         summary["spread"] = {**counts, "worst_member": spread.worst, **({"worst": worst} if worst else {})}
         if spread.measured is not None:
             summary["spread"] |= _measured_numbers(spread.measured, zones)
@@ -74,6 +81,7 @@ def _injected_numbers(point: OperatingPoint, measured: Injections | None) -> dic
         "injected_low": one.peak_low,
         "injected_high": one.peak_high,
         "injected_frequency_hz": one.peak_frequency,
+        "injected_at_band_edge": _at_edge(one),
         "injected_linear_there": _linear_there(point, one),
         "injected_amplitude_m": one.amplitude,
         "injected_members": one.members,
@@ -91,6 +99,11 @@ def _linear_there(point: OperatingPoint, measured: Injection, channel: int = 0) 
     return float(np.abs(point.system.response(np.array([measured.peak_frequency])))[0, channel, channel])
 
 
+def _at_edge(measured: Injection) -> bool | None:
+    """Return whether the largest |S| is that of the first or last line; None if none was measured."""
+    return None if measured.peak is None else measured.peak_frequency in measured.frequency[[0, -1]]
+
+
 def _injection_text(point: OperatingPoint, measured: Injection, channel: int = 0) -> str:
     """Describe the measured sensitivity at one sensor in one line. `channel` as in `_linear_there`."""
     unit, sensor = (("m", ""), ("m/s", " at the velocity sensor"))[channel]
@@ -99,6 +112,8 @@ def _injection_text(point: OperatingPoint, measured: Injection, channel: int = 0
     if measured.peak is None:
         return f"{how}: the rotor is lost, so no sensitivity can be measured."
     text = f"{how}: |S| peaks at {measured.peak:.4g} at {measured.peak_frequency:.4g} Hz"
+    if _at_edge(measured):
+        text += ", an end of the measured band, so this value is not a peak"
     if measured.peak_low is not None and measured.members > 1:
         text += f" (95 % interval {measured.peak_low:.4g} to {measured.peak_high:.4g})"
     text += f"; the linear value there is {_linear_there(point, measured, channel):.4g}."
@@ -115,10 +130,18 @@ def _injection_text(point: OperatingPoint, measured: Injection, channel: int = 0
 def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None, measured: Injections | None) -> str:
     """Return the numbers of `sensitivity_summary` as a table and sentences."""
     worst = [spread.point] if spread is not None and spread.point is not None else []
-    head = ("loop", "peak |S|", "at (Hz)", "zone", "peak |T|", "peak |KS| (V/m)", "gain margins")
-    margins = ("phase margin (deg)", "delay margin (s)", "disk margin")
-    rows = [table((*head, *margins), [_row(point) for point in [*points, *worst]]), ""]
+    head = ("loop", "peak |S|", "at (Hz)", "zone", "peak |T|", "peak |KS| (V/m)")
+    margins = ("loop", "broken at", "gain margins", "phase margin (deg)", "delay margin (s)", "disk margin")
+    shown = [*points, *worst]
+    rows = [table(head, [_row(point) for point in shown]), ""]
     one, zones = points[0].analysis, case.zones
+    stable = [point for point in shown if point.analysis.stable]
+    rows += [line for point in stable for line in band_lines(point.name, point.analysis, zones)]
+    if stable:
+        rows += ["", table(margins, [row for point in stable for row in _margin_rows(point)]), ""]
+        first = stable[0].analysis
+        where = first.margins_at.place("delay")
+        rows += [f"The delay margin is the smaller one, {_number(first.margins.delay)} s, at the {where}."]
     stiffness = f"{_number(one.stiffness)} N/m" if np.isfinite(one.stiffness) else "infinite"
     rows += [
         f"Zones of the peak of |S|: A below {zones.zone_a:g}, B below {zones.zone_b:g}, C below {zones.zone_c:g}, D "
@@ -136,6 +159,8 @@ def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None
             f"Of {spread.members} members of [spread], {spread.stable} are stable and {spread.zone_a} are in zone A; "
             f"the worst is member {spread.worst}."
         ]
+        if spread.failed:
+            rows += [f"{spread.failed} of them have no equilibrium at r = 0 m, and so no linearised loop."]
         rows += [] if spread.measured is None else [_measured_text(spread.measured, case.zones)]
     if signs := set_valued(case):
         rows += [
@@ -167,17 +192,19 @@ def _measured_text(peaks: MemberPeaks, zones: Zones) -> str:
 def _row(point: OperatingPoint) -> tuple[str, ...]:
     one = point.analysis
     if not one.stable:
-        return (point.name, "unstable", "-", "D", *["-"] * 6)
-    margins = one.margins
-    gains = f"{_number(margins.gain_low)} to {_number(margins.gain_high)}"
-    return (
-        point.name,
-        *map(_number, (one.S.height, one.S.frequency)),
-        one.zone,
-        *map(_number, (one.T.height, one.KS.height)),
-        gains,
-        *map(_number, (margins.phase_deg, margins.delay, margins.disk)),
-    )
+        return (point.name, "unstable", "-", "D", "-", "-")
+    S, T, KS = (_number(x.height) + (" (at edge)" if x.at_edge else "") for x in (one.S, one.T, one.KS))
+    return (point.name, S, _number(one.S.frequency), one.zone, T, KS)
+
+
+def _margin_rows(point: OperatingPoint) -> list[tuple[str, ...]]:
+    """Return the margins of a stable loop at each place, the place with the smaller disk margin first."""
+    at, rows = point.analysis.margins_at, []
+    for place in sorted(PLACES, key=lambda place: place != at.place("disk")):
+        one = getattr(at, place)
+        gains = f"{_number(one.gain_low)} to {_number(one.gain_high)}"
+        rows.append((point.name, place, gains, *map(_number, (one.phase_deg, one.delay, one.disk))))
+    return rows
 
 
 def _number(x: float) -> str:

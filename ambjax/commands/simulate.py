@@ -9,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ambjax.cases.reader import Case
-from ambjax.commands.outputs import directory, files, plain, say, table, write_json, written
+from ambjax.commands.outputs import described, directory, files, plain, say, table, write_json, written
 from ambjax.commands.warnings import read_with_warnings, reversal
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.replay import Replay, replay
@@ -58,9 +58,11 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     with files(out) as part:
         trajectory.save(part / "trajectory.npz")
         write_json(part / "metrics.json", metrics)
-        overview(trajectory, f"{case.name}: {case.clock.method}", part / "overview.png", window, case.settle)
+        title, path = f"{case.name}: {case.clock.method}", part / "overview.png"
+        described(path.name, lambda: overview(trajectory, title, path, window, case.settle))
         for name, page in html.items():
             (part / name).write_text(page, encoding="utf-8")
+        names = [name for name in names if (part / name).exists()]
     if not args.json:
         print(_metrics_text(metrics))
         written(out, ", ".join(names))

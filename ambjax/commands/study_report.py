@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.reader import Case
-from ambjax.commands.outputs import files, plain, say, table, write_json, written
+from ambjax.commands.outputs import described, files, plain, say, table, write_json, written
 from ambjax.commands.warnings import reversal
 from ambjax.ensemble import statistics
 from ambjax.ensemble.study import Study
 from ambjax.host.words import one_line
+from ambjax.linear import Findings, stability, suspects
 
-# Files written with members.npz; the last one only if the case has a spread.
+# Files written with members.npz; the last one only if the case has a spread and a member survives.
 WRITTEN = ("summary.json", "fan.png", "histograms.png", "tornado.png")
 # Members and instants in the fan chart, for a study of any size.
 FAN_MEMBERS, FAN_TIMES = 256, 500
@@ -28,23 +29,31 @@ def write_report(
 ) -> tuple[int, dict[str, object]]:
     """Write and print the results of a finished study. Return the exit code and the summary.
 
-    The exit code is 0 if every member survives. `error`: result of `sliding_error`, or None.
+    The exit code is 0 if every member survives, and the members tested are stable. `error`: result of `sliding_error`,
+    or None.
     """
     with np.load(out / "members.npz") as file:
         columns = {name: file[name] for name in file.files}
-    summary = _summary(case, study, columns, str(args.case))
-    if error is not None:
-        summary["sliding_step_error"] = error
-    with files(out) as part:
-        write_json(part / "summary.json", summary)
-        _pictures(case, study, columns, summary, part)
-    if not args.json:
-        print(study_tables(summary))
-        written(out, ", ".join(["members.npz", *WRITTEN[: None if study.spread.entries else -1]]))
+    findings = findings_of(study, columns)
     held = ~np.isfinite(columns["lost_at"])
+    survivors = {"survivors": int(held.sum()), "members": study.members}
+    summary = described("summary.json", lambda: _summary(case, study, columns, str(args.case)))
+    with files(out) as part:
+        if summary is not None:
+            summary["stability"] = findings._asdict()
+            if error is not None:
+                summary["sliding_step_error"] = error
+            write_json(part / "summary.json", summary)
+        _pictures(case, study, columns, summary, part)
+        names = [name for name in WRITTEN if (part / name).exists()]
+    if not args.json:
+        tables = None if summary is None else described("the table", lambda: study_tables(summary, findings.words()))
+        print(tables or "{survivors} of {members} members survive".format(**survivors))
+        written(out, ", ".join(["members.npz", *names]))
     for warning in reversal(case, float(np.max(columns["max_abs_i_A"], initial=0.0, where=held))):
         say(warning)
-    return int(summary["survivors"] < study.members), plain(summary) | {"out": str(out)}
+    good = held.all() and findings.stable
+    return int(not good), plain(summary or survivors) | {"out": str(out)}
 
 
 def _summary(case: Case, study: Study, columns: dict[str, np.ndarray], path: str) -> dict[str, Any]:
@@ -60,10 +69,37 @@ def _summary(case: Case, study: Study, columns: dict[str, np.ndarray], path: str
     return facts | numbers
 
 
+def findings_of(study: Study, columns: dict[str, np.ndarray]) -> Findings:
+    """Test whether the loops of the surviving members with the largest settled errors are stable."""
+    index = suspects(columns[statistics.DECIDING], ~np.isfinite(columns["lost_at"]))
+    if not index.size:
+        return Findings(0, 0)
+    say(f"testing whether the loops of {index.size} members are stable: simulating them without noise and loads")
+    return stability(*study.batch(index), study.clock).findings()
+
+
 def _pictures(
-    case: Case, study: Study, columns: dict[str, np.ndarray], summary: dict[str, Any], out: pathlib.Path
+    case: Case, study: Study, columns: dict[str, np.ndarray], summary: dict[str, Any] | None, out: pathlib.Path
 ) -> None:
-    from ambjax.pictures import fans, histograms, tornado
+    """Draw the pictures into the folder `out`. One that cannot be drawn is left out."""
+    from ambjax.pictures import histograms
+
+    described("fan.png", lambda: _fan(case, study, columns, out / "fan.png"))
+    described("histograms.png", lambda: histograms.histograms(columns, out / "histograms.png"))
+    if summary is not None and summary["drivers"][statistics.DECIDING]:  # there are none if no member survives
+        described("tornado.png", lambda: _tornado(summary, out / "tornado.png"))
+
+
+def _tornado(summary: dict[str, Any], path: pathlib.Path) -> None:
+    from ambjax.pictures import tornado
+
+    deciding = statistics.DECIDING
+    bars = [tornado.Bar(*(d[k] for k in tornado.Bar._fields)) for d in summary["drivers"][deciding]]
+    tornado.tornado(bars, deciding, summary["explained"][deciding]["says"], path)
+
+
+def _fan(case: Case, study: Study, columns: dict[str, np.ndarray], path: pathlib.Path) -> None:
+    from ambjax.pictures import fans
 
     lost_at = columns["lost_at"]
     # End the fan chart soon after the last loss if every member is lost.
@@ -72,12 +108,7 @@ def _pictures(
     few = np.size(bands.trajectory.lost_at)
     title = case.name if few == study.members else f"{case.name}: bands of {few} of {study.members} members"
     limits = {"z - r": float(np.min(study.scenario.touchdown)), "u": float(np.min(study.scenario.u_max))}
-    fans.fan(bands.t, shown, limits, title, out / "fan.png", lost_at=lost_at, stalled=columns["stalled"])
-    histograms.histograms(columns, out / "histograms.png")
-    if study.spread.entries:
-        deciding = statistics.DECIDING
-        bars = [tornado.Bar(*(d[k] for k in tornado.Bar._fields)) for d in summary["drivers"][deciding]]
-        tornado.tornado(bars, deciding, summary["explained"][deciding]["says"], out / "tornado.png")
+    fans.fan(bands.t, shown, limits, title, path, lost_at=lost_at, stalled=columns["stalled"])
 
 
 def _quantiles(x: np.ndarray, extremes: tuple[np.ndarray, np.ndarray] | None) -> dict[float, np.ndarray]:
@@ -94,8 +125,8 @@ def _quantiles(x: np.ndarray, extremes: tuple[np.ndarray, np.ndarray] | None) ->
     return dict(zip(BANDS, quantiles, strict=True))
 
 
-def study_tables(summary: dict[str, Any]) -> str:
-    """Return the tables that the command prints."""
+def study_tables(summary: dict[str, Any], stable: str = "") -> str:
+    """Return the tables that the command prints. `stable`: the sentence on the stability of the members."""
     share, low, high = (100 * summary["survival"][key] for key in ("estimate", "low", "high"))
     sure = f"{100 * summary['confidence']:g} % interval"
     held = f"{summary['survivors']} of {summary['members']} members survive"
@@ -103,6 +134,7 @@ def study_tables(summary: dict[str, Any]) -> str:
     if summary["stalled"]:
         why = "the integrator stalled, so whether the rotor survives is not known"
         lines += [f"{summary['lost']} lost, {summary['stalled']} not decided: {why}"]
+    lines += [stable] * bool(stable)
     lines += [f"note: {note}" for note in summary["notes"]]
 
     def number(x: float | None) -> str:

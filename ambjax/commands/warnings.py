@@ -77,7 +77,8 @@ def _noise(case: Case) -> Iterator[str]:
 def _velocity(case: Case) -> Iterator[str]:
     sensor = case.scenario.sensor
     perfect = sensor is None or (sensor.velocity and sensor.std_z_dot == 0)
-    if perfect and not (sensor is None and case.cascade.processor is None):
+    sampled = sensor is not None or case.cascade.processor is not None
+    if perfect and sampled and case.cascade.reads_velocity(case.clock.sample_period):
         yield (
             "sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ERROR, unlike by any real sensor. Set "
             "sensor.std_z_dot, or set sensor.velocity = false and use an observer that estimates the velocity."
@@ -89,7 +90,7 @@ def idealised(case: Case) -> str:
     sensor, parts = case.scenario.sensor, []
     if case.scenario.plant.one_current:
         parts.append("one current for both coils (plant.kind = 'two-coil' gives each its own)")
-    if sensor is None or sensor.velocity:
+    if (sensor is None or sensor.velocity) and case.cascade.reads_velocity(case.clock.sample_period):
         parts.append("a measured velocity (sensor.velocity = false, and an observer that estimates it)")
     return f"Idealisations of this case, unlike a real bearing: {' and '.join(parts)}." if parts else ""
 

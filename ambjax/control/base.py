@@ -98,10 +98,6 @@ class Law:
         """Return the sign of the law if the rate of the stage's error is one sign plus a disturbance; else None."""
         return None
 
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the largest rate (1/s) of the terms that the implicit `step` treats explicitly."""
-        return 0.0
-
     def init_sampled(self, model: Plant) -> object:
         """Return the state at t = 0 on a processor. For an observer, `init` is called instead."""
         law: Any = self
@@ -231,12 +227,6 @@ def with_set_valued_signs(law: L) -> L:
     """Return the law with None for every steepness that is inf. Raises ValueError as `set_valued_signs` does."""
     given: Any = law
     return dataclasses.replace(given, **dict.fromkeys(set_valued_signs(law)))
-
-
-def with_infinite_steepness(law: L) -> L:
-    """Return the law with inf for every steepness that is None, because the method `slope` cannot compute with None."""
-    given: Any = law
-    return dataclasses.replace(given, **dict.fromkeys(set_valued_signs(law), np.inf))
 
 
 def with_default_steepness(law: L, model: Plant) -> L:

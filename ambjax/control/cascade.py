@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ambjax.compiler.barrier import materialised
@@ -29,7 +30,7 @@ from ambjax.control.laws import (
 )
 from ambjax.control.processor import Processor, predicted_over_delay
 from ambjax.control.schedule import extremes, with_gains_at
-from ambjax.numerics.records import Scalar, part, record
+from ambjax.numerics.records import Scalar, is_traced, part, record
 from ambjax.world.plant import Plant
 from ambjax.world.plant import State as NominalState
 from ambjax.world.sensor import Measurement
@@ -181,6 +182,36 @@ class Cascade:
         assert self.processor is not None
         laws = {stage: with_set_valued_signs(getattr(self, stage)) for stage in DEFAULT_LAWS}
         return dataclasses.replace(self, **laws, processor=self.processor.resolved(*delays, between=between))
+
+    def reads_velocity(self, period: Scalar) -> bool:
+        """Return whether the command or a state of a law depends on the measured velocity.
+
+        `period`: sample period, s. True if a number is traced, because the laws are then not evaluated. Otherwise the
+        laws of the first member are evaluated at three velocities, and the results compared.
+        """
+        if self.observer.estimates_velocity or (self.processor is not None and self.processor.predicts):
+            return not self.observer.estimates_velocity
+        if any(map(is_traced, jax.tree.leaves((self, period)))):
+            return True
+        one = self if self.processor is None else self.on_processor()
+        one, period = jax.tree.map(lambda x: np.ravel(np.asarray(x, float))[0], (one, period))
+        z, z_dot, i = (float(x) for x in one.model.sizes())
+        results = [
+            one._response(Measurement(jnp.asarray(z), jnp.asarray(v), jnp.asarray(i)), period)
+            for v in (-1e3 * z_dot, z_dot, 1e3 * z_dot)
+        ]
+        return len({tuple(map(float, jax.tree.leaves(result))) for result in results}) > 1
+
+    def _response(self, measured: Measurement, period: Scalar) -> Any:
+        """Return the command, and the next states or the rates of the states, for the first reading at z = 0."""
+        zero = jnp.zeros(())
+        reference, still = Reference(zero, zero, zero), measured._replace(z_dot=zero)
+        state = self.init(still, reference)
+        if self.processor is None:
+            command, after = self(measured, state, reference, jnp.inf)
+        else:
+            command, after, _ = self.step(measured, state, Sample(reference, period, jnp.inf, (zero, zero)))
+        return command.u, after
 
     def check_smooth(self) -> None:
         """Raise ValueError for a law with a steepness of inf: in continuous time a sign must be smoothed."""

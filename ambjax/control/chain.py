@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.force import force_of_current, linear_mechanics, resting_current
+from ambjax.control.force import force_of_current, linear_mechanics, resting_current, sliding_variable
 from ambjax.control.laws import PositionLaw, unwinding
 from ambjax.control.regulator import optimal_gains
 from ambjax.control.sampling import Sampling
@@ -22,14 +22,17 @@ from ambjax.world.signals import Reference
 
 
 class ChainState(NamedTuple):
-    """State of `FilterChain`, in A: derivative filter, integral, and the two states of each biquad."""
+    """State of `FilterChain`, in A: derivative filter, integral, and the two states of each biquad.
+
+    `low_pass` is () if the law has no low-pass.
+    """
 
     derivative: Array
     integral: Array
     lead_lag: tuple[Array, Array]
     notch_1: tuple[Array, Array]
     notch_2: tuple[Array, Array]
-    low_pass: tuple[Array, Array]
+    low_pass: tuple[Array, Array] | tuple[()]
 
 
 @record
@@ -45,38 +48,42 @@ class FilterChain(PositionLaw[ChainState]):
     limits the integral while the supply limits u.
 
     On a processor each part is discretised by the bilinear transform. The response of a notch is exact at its centre,
-    or at 0.98 of the Nyquist frequency if the centre is higher. The lead-lag is off if w_z = w_p, and a notch is off if
-    its depth is 1. By default, all of them are off.
+    or at 0.98 of the Nyquist frequency if the centre is higher. The lead-lag is off if w_z = w_p, a notch is off if
+    its depth is 1, and the low-pass is off if w_lp is None (left out). By default, all of them are off. With k_int = 0
+    and k_d > 0, the law is a PD controller.
     """
 
     k_p: Scalar = gain(default=135.0, unit="A/m", doc="proportional gain; left out: LQR in continuous time")
-    k_int: Scalar = gain(default=5310.0, unit="A/m/s", doc="integral gain; left out: LQR in continuous time")
-    k_d: Scalar = gain(default=0.219, unit="A s/m", doc="derivative gain; left out: LQR in continuous time")
+    k_int: Scalar = gain(
+        default=5310.0, unit="A/m/s", doc="integral gain, 0: none; left out: LQR in continuous time", zero=True
+    )
+    k_d: Scalar = gain(
+        default=0.219, unit="A s/m", doc="derivative gain, 0: none; left out: LQR in continuous time", zero=True
+    )
     w_f: Scalar = gain(default=1.06e4, unit="1/s", doc="bandwidth of the derivative filter; left out: 20 w")
-    k_aw: Scalar = gain(default=10.6, unit="1/s", doc="anti-windup rate; left out: w/50")
+    k_aw: Scalar = gain(default=10.6, unit="1/s", doc="anti-windup rate, 0: none; left out: w/50", zero=True)
     w_z: Scalar = gain(default=2650.0, unit="1/s", doc="zero of the lead-lag; left out: 5 w")
     w_p: Scalar = gain(default=2650.0, unit="1/s", doc="pole of the lead-lag; left out: 5 w")
     w_1: Scalar = gain(default=5310.0, unit="1/s", doc="centre of the first notch; left out: 10 w")
     width_1: Scalar = gain(default=0.5, unit="1", doc="width of the first notch, as a share of its centre")
-    depth_1: Scalar = gain(default=1.0, unit="1", doc="gain of the first notch at its centre; 1: no notch")
+    depth_1: Scalar = gain(default=1.0, unit="1", doc="gain of the first notch at its centre; 1: no notch", zero=True)
     w_2: Scalar = gain(default=10600.0, unit="1/s", doc="centre of the second notch; left out: 20 w")
     width_2: Scalar = gain(default=0.5, unit="1", doc="width of the second notch, as a share of its centre")
-    depth_2: Scalar = gain(default=1.0, unit="1", doc="gain of the second notch at its centre; 1: no notch")
-    w_lp: Scalar = gain(default=1.06e4, unit="1/s", doc="corner of the low-pass; left out: 20 w")
-    memory = (
-        ("derivative", "A", "filter of the derivative"),
-        ("integral", "A", "integral term"),
-        *(
-            (f"{part}_{k}", "A", f"state of the {words}")
-            for part, words in (
-                ("lead_lag", "lead-lag"),
-                ("notch_1", "first notch"),
-                ("notch_2", "second notch"),
-                ("low_pass", "low-pass"),
-            )
-            for k in (1, 2)
-        ),
+    depth_2: Scalar = gain(default=1.0, unit="1", doc="gain of the second notch at its centre; 1: no notch", zero=True)
+    w_lp: Scalar | None = gain(
+        default=None, unit="1/s", doc="corner of the low-pass; left out: no low-pass", optional=True
     )
+
+    @property
+    def memory(self) -> tuple[tuple[str, str, str], ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Name, unit and meaning of each state."""
+        parts = ["lead-lag", "first notch", "second notch", *["low-pass"] * (self.w_lp is not None)]
+        names = zip(ChainState._fields[2:], parts, strict=False)
+        return (
+            ("derivative", "A", "filter of the derivative"),
+            ("integral", "A", "integral term"),
+            *((f"{name}_{k}", "A", f"state of the {part}") for name, part in names for k in (1, 2)),
+        )
 
     def init(self, model: Plant) -> ChainState:
         return jax.tree.map(jnp.zeros_like, self.scale(model))
@@ -84,12 +91,12 @@ class FilterChain(PositionLaw[ChainState]):
     def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> ChainState:
         """Return the filters in the steady state for the first error, and an integral of 0."""
         e = jnp.asarray(inputs[0].z - inputs[1].r)
-        return self._begun(self.k_d * self.w_f * e, self.k_p * e, [part.steady for part in self._biquads()])
+        return self._begun(self.k_d * self.w_f * e, self.k_p * e, [part.steady for part in self._parts()])
 
     def begin_sampled(self, model: Plant, inputs: tuple[Measurement, Reference], period: Scalar) -> ChainState:
         """Return the filters in the steady state for the error of the first sample, and an integral of 0."""
         e = jnp.asarray(inputs[0].z - inputs[1].r)
-        parts = [functools.partial(part.steady_sampled, period=period) for part in self._biquads()]
+        parts = [functools.partial(part.steady_sampled, period=period) for part in self._parts()]
         derivative = -self.k_d * self.w_f / (1 + self.w_f * period / 2) * e
         return self._begun(derivative, self.k_p * e + self.k_int * period / 2 * e, parts)
 
@@ -98,43 +105,52 @@ class FilterChain(PositionLaw[ChainState]):
 
         `derivative`: state of the derivative filter, A.
         """
-        states = []
+        states: list[Any] = []
         for steady in parts:
             y, state = steady(y)
             states.append(state)
-        return ChainState(derivative, jnp.zeros_like(derivative), *states)
+        return self._state(derivative, jnp.zeros_like(derivative), states)
 
     def scale(self, model: Plant) -> ChainState:
         size = jnp.asarray(model.i_0 / 25)
-        return ChainState(size, size, *[(size, size)] * 4)
+        pair = (size, size)
+        return ChainState(size, size, pair, pair, pair, () if self.w_lp is None else pair)
 
     def designed(self, model: Plant, sampling: Sampling | None) -> "FilterChain":
-        """Return the law with the gains of `optimal_gains` in continuous time, and k_aw and all corners from the pole.
+        """Return the law with the gains of `optimal_gains` in continuous time, and k_aw and the corners from the pole.
 
-        Raises ValueError as `optimal_gains` does.
+        It has no low-pass. Raises ValueError as `optimal_gains` does.
         """
         (k_int, k_p, k_d), w = map(float, optimal_gains(model)), float(model.pole)
         return dataclasses.replace(
-            self, k_p=k_p, k_d=k_d, k_int=k_int, k_aw=w / 50, w_f=20 * w, w_z=5 * w, w_p=5 * w, w_1=10 * w, w_2=20 * w,
-            w_lp=20 * w,
-        )  # fmt: skip
+            self, k_p=k_p, k_d=k_d, k_int=k_int, k_aw=w / 50, w_f=20 * w, w_z=5 * w, w_p=5 * w, w_1=10 * w, w_2=20 * w
+        )
 
     def slope(self, model: Plant) -> Scalar:
-        """Return the largest of k_aw, the poles of all parts, and `explicit_rate`, 1/s."""
-        corners = (self.w_f, self.k_aw, self.w_p, self.w_1, self.w_2, self.w_lp, self.explicit_rate(model))
+        """Return the largest of k_aw, the poles of all parts, b k_d and sqrt(b k_p), 1/s."""
+        b = linear_mechanics(model).b
+        corners = [self.w_f, self.k_aw, self.w_p, self.w_1, self.w_2, b * self.k_d, jnp.sqrt(b * self.k_p)]
+        corners += [] if self.w_lp is None else [self.w_lp]
         return jnp.max(jnp.stack([jnp.asarray(x) for x in corners]))
 
     def sigma(self, motion: Measurement, reference: Reference) -> Array:
-        """Return e_dot + (k_p/k_d) e, the error that the feedback of e and e_dot drives to zero."""
-        return motion.z_dot - reference.r_dot + self.k_p / self.k_d * (motion.z - reference.r)
+        """Return e_dot + (k_p/k_d) e, the error that the feedback of e and e_dot drives to zero; e_dot if k_d = 0."""
+        damped = jnp.asarray(self.k_d) > 0
+        c = jnp.where(damped, self.k_p / jnp.where(damped, self.k_d, 1.0), 0.0)
+        return sliding_variable(c, motion, reference)
 
-    def _biquads(self) -> tuple[Biquad, ...]:
-        return (
+    def _parts(self) -> list[Biquad]:
+        """Return the parts after the PID."""
+        parts = [
             lead_lag(self.w_z, self.w_p),
             notch(self.w_1, self.width_1, self.depth_1),
             notch(self.w_2, self.width_2, self.depth_2),
-            low_pass(self.w_lp),
-        )
+        ]
+        return parts if self.w_lp is None else [*parts, low_pass(self.w_lp)]
+
+    def _biquads(self, state: ChainState) -> list[tuple[Biquad, tuple[Array, Array]]]:
+        """Return the parts after the PID, each with its state."""
+        return list(zip(self._parts(), [x for x in state[2:] if x], strict=True))
 
     def __call__(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: ChainState
@@ -144,12 +160,15 @@ class FilterChain(PositionLaw[ChainState]):
         # k_d s/(1 + s/w_f) = k_d w_f (1 - w_f/(s + w_f)): the state is k_d w_f^2/(s + w_f) e
         y = self.k_p * e + state.integral + self.k_d * self.w_f * e - state.derivative
         derivative, rates = self.w_f * (self.k_d * self.w_f * e - state.derivative), []
-        for part, x in zip(self._biquads(), state[2:], strict=True):
+        for part, x in self._biquads(state):
             y, moved = part.output(y, x)
             rates.append(moved)
         i_star = resting_current(model, reference) - y
         integral = self.k_int * e + unwinding(self.k_aw, self.k_int) * (i_star - motion.i)
-        return force_of_current(model, motion.z, i_star), ChainState(derivative, integral, *rates)
+        return force_of_current(model, motion.z, i_star), self._state(derivative, integral, rates)
+
+    def _state(self, derivative: Array, integral: Array, rest: list[tuple[Array, Array]]) -> ChainState:
+        return ChainState(derivative, integral, *rest, *[()] * (self.w_lp is None))
 
     def step(
         self, model: Plant, inputs: tuple[Measurement, Reference], state: ChainState, period: Scalar
@@ -166,21 +185,17 @@ class FilterChain(PositionLaw[ChainState]):
         derivative = -self.k_d * self.w_f / (1 + half) * e + (1 - half) / (1 + half) * differentiated
         y = self.k_p * e + state.integral + self.k_int * period / 2 * e + differentiated
         after = []
-        for part, x in zip(self._biquads(), state[2:], strict=True):
+        for part, x in self._biquads(state):
             y, moved = part.step(y, x, period)
             after.append(moved)
         i_star = resting_current(model, reference) - y
         integral = state.integral + self.k_int * period * e + leak / (1 + leak) * (i_star - motion.i)
-        return force_of_current(model, motion.z, i_star), ChainState(derivative, integral, *after)
-
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of b k_d and sqrt(b k_p), 1/s. `step` evaluates both terms at the start of a sample."""
-        b = linear_mechanics(model).b
-        return jnp.maximum(b * self.k_d, jnp.sqrt(b * self.k_p))
+        return force_of_current(model, motion.z, i_star), self._state(derivative, integral, after)
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         b = linear_mechanics(context.model).b
-        corners = {name: rate(context, 2, 100, "corner from 2 w to 100 w") for name in ("w_f", "w_lp")}
+        names = ["w_f", *["w_lp"] * (self.w_lp is not None)]
+        corners = {name: rate(context, 2, 100, "corner from 2 w to 100 w") for name in names}
         corners |= {name: rate(context, 1, 50, "corner from w to 50 w") for name in ("w_z", "w_p")}
         corners |= {name: rate(context, 2, 50, "centre from 2 w to 50 w") for name in ("w_1", "w_2")}
         shares = {f"width_{k}": Interval(0.1, 2.0, "a tenth to twice the centre") for k in (1, 2)}

@@ -9,7 +9,7 @@ from jax import Array
 from ambjax.control.base import Requirement, scaled_steepness
 from ambjax.control.defaults import current_rate
 from ambjax.control.laws import CurrentInputs, CurrentLaw, unwinding
-from ambjax.control.sampling import Relay, Sampling, slope_limits
+from ambjax.control.sampling import Relay, Sampling, non_oscillating
 from ambjax.control.search import Interval, SearchContext, authority, rate, steepness, switch
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.numerics.relax import share
@@ -94,8 +94,8 @@ class ProportionalIntegral(CurrentLaw[Array]):
     """
 
     k_p: Scalar = gain(default=1.76e5, unit="V/A", doc="proportional gain; left out: w_c L")
-    k_int: Scalar = gain(default=2.33e8, unit="V/A/s", doc="integral gain; left out: w_c^2 L/4")
-    k_aw: Scalar = gain(default=1330.0, unit="1/s", doc="anti-windup rate; left out: w_c/4")
+    k_int: Scalar = gain(default=2.33e8, unit="V/A/s", doc="integral gain, 0: none; left out: w_c^2 L/4", zero=True)
+    k_aw: Scalar = gain(default=1330.0, unit="1/s", doc="anti-windup rate, 0: none; left out: w_c/4", zero=True)
     memory = (("x", "V", "integral of the current error"),)
 
     def init(self, model: Plant) -> Array:
@@ -149,7 +149,7 @@ class DeadBeat(CurrentLaw[tuple[()]]):
     )
 
     def designed(self, model: Plant, sampling: Sampling | None) -> "DeadBeat":
-        share = 1.0 if sampling is None else slope_limits(sampling.late).non_oscillating
+        share = 1.0 if sampling is None else non_oscillating(sampling.late)
         return DeadBeat(current_rate(model, sampling), share)
 
     def init(self, model: Plant) -> tuple[()]:

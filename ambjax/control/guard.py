@@ -74,7 +74,7 @@ class Guard:
     speed: Scalar | None = _limit(
         "m/s",
         "largest error of the predicted velocity; none: 6.8 sensor.std_z_dot, plus pole times clearance if z_dot is "
-        "estimated or the sensor has a low-pass, else plus pole times clearance times |sensor.gain - 1|",
+        "not measured or the sensor has a low-pass, else plus pole times clearance times |sensor.gain - 1|",
         0,
     )
     samples: Scalar | None = leaf(
@@ -109,7 +109,8 @@ class Guard:
         step = 0.0 if sensor.bits is None else 2 * sensor.ends(scenario.plant.s_0) / 2.0**sensor.bits
         runout = 0.0 if sensor.runout is None else sum(abs(one.amplitude) for one in sensor.runout.harmonics)
         error, fall = LARGEST_NORMAL * sensor.std + step / 2 + sensor.gain * runout, model.pole * clearance
-        velocity_error = 1.0 if estimated or sensor.bandwidth is not None else abs(sensor.gain - 1)
+        unknown = estimated or not sensor.velocity or sensor.bandwidth is not None
+        velocity_error = 1.0 if unknown else abs(sensor.gain - 1)
         values = {
             "z": sensor.gain * limit + abs(sensor.offset) + error,
             "z_dot": GAPS * model.s_0 / period,

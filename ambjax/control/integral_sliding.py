@@ -35,7 +35,9 @@ class IntegralSlidingMode(PositionLaw[Array]):
     """
 
     c: Scalar = gain(default=17.0, unit="1/s", doc="coefficient of the error in the sliding variable; left out: w")
-    c_int: Scalar = gain(default=70.0, unit="1/s^2", doc="gain of the integral of the error; left out: w^2/4")
+    c_int: Scalar = gain(
+        default=70.0, unit="1/s^2", doc="gain of the integral of the error, 0: none; left out: w^2/4", zero=True
+    )
     k: Scalar = gain(
         default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z; left out: w^2 s_0/2"
     )
@@ -60,7 +62,7 @@ class IntegralSlidingMode(PositionLaw[Array]):
         return model.s_0 / 500
 
     def slope(self, model: Plant) -> Scalar:
-        return jnp.maximum(TWO_OVER_PI * self.k * self.p, self.explicit_rate(model))
+        return jnp.maximum(TWO_OVER_PI * self.k * self.p, jnp.maximum(self.c, jnp.sqrt(self.c_int)))
 
     def size(self, model: Plant) -> Scalar:
         return model.sigma_size
@@ -72,15 +74,11 @@ class IntegralSlidingMode(PositionLaw[Array]):
     def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: Array) -> tuple[Array, Array]:
         motion, reference = inputs
         s = self.sigma(motion, reference) + self.c_int * state
-        return self._force(model, inputs, -self.k * smooth_sign(s, self.p)), motion.z - reference.r
+        return self._force(model, inputs, -self.k * smooth_sign(s, self.p)), self._integrated(inputs)
 
     def _force(self, model: Plant, inputs: tuple[Measurement, Reference], robust: Array) -> Array:
         motion, reference = inputs
         return force_for(self.c, model, motion, reference, robust - self.c_int * (motion.z - reference.r))
-
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of c and sqrt(c_int), because their terms are evaluated at the start of a sample."""
-        return jnp.maximum(self.c, jnp.sqrt(self.c_int))
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         k = position_switch(context, self.p)
@@ -94,4 +92,8 @@ class IntegralSlidingMode(PositionLaw[Array]):
         motion, reference = inputs
         s = self.sigma(motion, reference) + self.c_int * state
         robust = -self.k * share(s, period * self.k, self.p)
-        return self._force(model, inputs, robust), state + period * (motion.z - reference.r)
+        return self._force(model, inputs, robust), state + period * self._integrated(inputs)
+
+    def _integrated(self, inputs: tuple[Measurement, Reference]) -> Array:
+        """Return the rate of the integral: the error, or 0 if its gain c_int is 0."""
+        return jnp.where(jnp.asarray(self.c_int) > 0, inputs[0].z - inputs[1].r, 0.0)

@@ -87,6 +87,14 @@ class Relaxation(NamedTuple):
     v_tilde: tuple[Array, Array, Array]
 
 
+def unwinding(k_aw: Scalar, k_int: Scalar) -> Array:
+    """Return the anti-windup rate k_aw (1/s) of an integral with the gain k_int, or 0 without an integral.
+
+    Without an integral there is nothing to unwind, and the error would never remove what the anti-windup adds.
+    """
+    return jnp.where(jnp.asarray(k_int) > 0, k_aw, 0.0)
+
+
 class Observer(Law, Generic[State], abc.ABC):
     """Base class of an observer: its input is the measurement, its output the estimated motion and current."""
 
@@ -209,14 +217,6 @@ STAGES: dict[str, type[Law]] = {
     "inversion": InversionLaw,
     "current": CurrentLaw,
 }
-
-
-def unwinding(k_aw: Scalar, k_int: Scalar) -> Array:
-    """Return the rate of an anti-windup, 1/s: k_aw, or 0 if there is no integral (k_int = 0).
-
-    Without integral action, nothing would remove what the anti-windup adds to the state while the current rises.
-    """
-    return jnp.where(jnp.asarray(k_int) > 0, k_aw, 0.0)
 
 
 def has_sampled_state(law: Law) -> bool:

@@ -103,18 +103,15 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
         return (model.sizes().z,) * len(self.realisation.A)
 
     def slope(self, model: Plant) -> Scalar:
-        """Return the larger of the fastest pole of the controller and the crossover frequency of the loop, 1/s."""
-        return jnp.maximum(self.realisation.fastest, self.explicit_rate(model))
+        """Return the larger of the fastest pole of the controller and the crossover frequency of the loop, 1/s.
 
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the crossover frequency w of the loop, 1/s: the largest frequency at which the loop gain is 1 or more.
-
-        With the inertia of the linearised mechanics alone, the loop gain is b gain |K|/w^2; for a voltage, it is
-        b gain |K|/(L w^3).
+        The crossover is the largest frequency w at which the loop gain is 1 or more. With the inertia of the linearised
+        mechanics alone, the loop gain is b gain |K|/w^2; for a voltage, it is b gain |K|/(L w^3).
         """
         size = self.gain * linear_mechanics(model).b * np.abs(self.realisation.response(FREQUENCIES)[:, -1])
         loop = size / FREQUENCIES**2 if self.demand == "force" else size / (model.L * FREQUENCIES**3)
-        return jnp.max(jnp.where(loop >= 1, FREQUENCIES, FREQUENCIES[0]))
+        crossover = jnp.max(jnp.where(loop >= 1, FREQUENCIES, FREQUENCIES[0]))
+        return jnp.maximum(self.realisation.fastest, crossover)
 
     def sigma(self, motion: Measurement, reference: Reference) -> Array:
         """Return the rate of the error: a linear controller has no manifold."""

@@ -4,6 +4,7 @@ They are Utkin's integral sliding mode, which starts on its manifold, and a non-
 """
 
 import dataclasses
+import functools
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -69,7 +70,8 @@ class UtkinSlidingMode(PositionLaw[Array]):
         return UtkinSlidingMode(k_p, k_d, switching_gain(model), switching_steepness(model))
 
     def slope(self, model: Plant) -> Scalar:
-        return jnp.maximum(TWO_OVER_PI * self.k * self.p, self.explicit_rate(model))
+        rates = (TWO_OVER_PI * self.k * self.p, self.k_d, jnp.sqrt(self.k_p))
+        return functools.reduce(jnp.maximum, rates)
 
     def size(self, model: Plant) -> Scalar:
         return model.sigma_size
@@ -84,10 +86,6 @@ class UtkinSlidingMode(PositionLaw[Array]):
     def _force(self, model: Plant, inputs: tuple[Measurement, Reference], sign: Array) -> Array:
         motion, reference = inputs
         return force_for(0.0, model, motion, reference, -self.k_d * self.sigma(motion, reference) - self.k * sign)
-
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of k_d and sqrt(k_p), 1/s, because their terms are evaluated at the start of a sample."""
-        return jnp.maximum(self.k_d, jnp.sqrt(self.k_p))
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         return {
@@ -139,7 +137,7 @@ class TerminalSlidingMode(PositionLaw[tuple[()]]):
 
     def slope(self, model: Plant) -> Scalar:
         """Return the larger of the rate of the sign at |y| = 1 (d sigma/d e_dot is 3/2 there) and that of the root."""
-        return jnp.maximum(1.5 * TWO_OVER_PI * self.k * self.p, self.explicit_rate(model))
+        return jnp.maximum(1.5 * TWO_OVER_PI * self.k * self.p, 2 / 3 * self.c * WIDTH**-0.5)
 
     def size(self, model: Plant) -> Scalar:
         return model.sigma_size
@@ -159,10 +157,6 @@ class TerminalSlidingMode(PositionLaw[tuple[()]]):
     def _force(self, model: Plant, inputs: tuple[Measurement, Reference], sign: Array) -> Array:
         root = smooth_root(self._speed(*inputs), 1 / WIDTH)
         return force_for(0.0, model, *inputs, -2 / 3 * self.c**2 * self.l * root - self.k * sign)
-
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the slope of the smoothed root at 0, 1/s, because the root is evaluated at the start of a sample."""
-        return 2 / 3 * self.c * WIDTH**-0.5
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         size = float(context.model.s_0)

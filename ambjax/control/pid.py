@@ -40,10 +40,10 @@ class PID(PositionLaw[PIDState]):
     """
 
     k_p: Scalar = gain(default=3.52e5, unit="1/s^2", doc="proportional gain; left out: 5/4 w^2")
-    k_int: Scalar = gain(default=3.74e7, unit="1/s^3", doc="integral gain; left out: w^3/4")
+    k_int: Scalar = gain(default=3.74e7, unit="1/s^3", doc="integral gain, 0: none; left out: w^3/4", zero=True)
     k_d: Scalar = gain(default=1062.0, unit="1/s", doc="derivative gain; left out: 2 w")
     w_f: Scalar = gain(default=1.06e4, unit="1/s", doc="bandwidth of the filter of the derivative; left out: 20 w")
-    k_aw: Scalar = gain(default=26.5, unit="1/s", doc="anti-windup rate; left out: w/20")
+    k_aw: Scalar = gain(default=26.5, unit="1/s", doc="anti-windup rate, 0: none; left out: w/20", zero=True)
     memory = (("rate", "m/s", "filtered rate of the error"), ("integral", "m/s^2", "integral term"))
 
     def init(self, model: Plant) -> PIDState:
@@ -82,10 +82,6 @@ class PID(PositionLaw[PIDState]):
         motion, reference = inputs
         wanted = -self.k_p * (motion.z - reference.r) - self.k_d * rate - integral
         return force_for(0.0, model, motion, reference, wanted)
-
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of k_d and sqrt(k_p), because their terms are evaluated at the start of a sample."""
-        return jnp.maximum(self.k_d, jnp.sqrt(self.k_p))
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         return {
@@ -146,10 +142,6 @@ class FeedbackLinearisation(PositionLaw[tuple[()]]):
     ) -> tuple[Array, tuple[()]]:
         motion, reference = inputs
         return force_for(0.0, model, motion, reference, -self.k_d * self.sigma(motion, reference)), ()
-
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of k_d and sqrt(k_p), because their terms are evaluated at the start of a sample."""
-        return self.slope(model)
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         return {

@@ -81,10 +81,6 @@ class SlidingMode(PositionLaw[tuple[()]]):
     def relay(self) -> Relay:
         return Relay(self.k, self.p)
 
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return c, because its term is evaluated at the start of a sample."""
-        return self.c
-
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         k = position_switch(context, self.p)
         return {"c": manifold(context), "k": k, **steepness(context, "k")}
@@ -112,7 +108,10 @@ class SuperTwisting(PositionLaw[Array]):
     c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold; left out: W")
     k_1: Scalar = gain(default=40.0, unit="m^0.5/s^1.5", doc="gain of the root term; left out: sqrt(W^3 s_0/pi)")
     k_2: Scalar = gain(
-        default=50.0, unit="m/s^3", doc="gain of the integral; above the bound on dq_z/dt; left out: W^3 s_0/8"
+        default=50.0,
+        unit="m/s^3",
+        doc="gain of the integral, 0: none; above the bound on dq_z/dt; left out: W^3 s_0/8",
+        zero=True,
     )
     p: Scalar = gain(
         default=100.0,
@@ -152,10 +151,6 @@ class SuperTwisting(PositionLaw[Array]):
         sigma = self.sigma(motion, reference)
         robust = state - self.k_1 * smooth_root(sigma, self.p)
         return force_for(self.c, model, motion, reference, robust), -self.k_2 * smooth_sign(sigma, self.p)
-
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return c, because its term is evaluated at the start of a sample."""
-        return self.c
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         if context.stepped or self.p is None:

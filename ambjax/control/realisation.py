@@ -124,8 +124,8 @@ def _steady_states(of: Realisation) -> tuple[Row, ...]:
         return ()
     import scipy.linalg
 
-    sorted_form: Any = scipy.linalg.schur(np.array(of.A), sort=lambda re, im: np.hypot(re, im) > SLOWEST)
-    T, Q, fast = sorted_form
+    parts: Any = scipy.linalg.schur(np.array(of.A), sort=lambda re, im: np.hypot(re, im) > SLOWEST)
+    T, Q, fast = parts
     b = Q.T @ np.reshape(of.B, (n, m))
     # (I, Y; 0, I) separates the fast modes from the slow ones
     Y = np.zeros((fast, n - fast))

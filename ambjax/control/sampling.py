@@ -1,4 +1,4 @@
-"""Effects of sampling on a sign law: the largest stable slope, and the band around zero in which the signal stays.
+"""The effect of sampling on a sign law: the band around zero in which the signal stays.
 
 A sign law drives x' = -k sgn_p(x) + w with |w| <= W < k. Steps of length T bring x into a band around 0. Explicit steps
 of the set-valued sign give |x| <= T (k + W), implicit steps |x| <= T W (V. Acary and B. Brogliato, Syst. Control Lett.
@@ -26,32 +26,16 @@ class Sampling(NamedTuple):
     implicit: bool
 
 
-class SlopeLimits(NamedTuple):
-    """Limits of slope times T of a law with explicit steps.
+def non_oscillating(late: float) -> float:
+    """Return the largest a = slope T for which x_{n+1} = x_n - a x(n - late), 0 <= late <= 2, does not oscillate.
 
-    Below `stable` the law is stable. Below `non_oscillating` it does not oscillate.
-    """
-
-    stable: float
-    non_oscillating: float
-
-
-def slope_limits(late: float) -> SlopeLimits:
-    """Return the limits of a = slope T in x_{n+1} = x_n - a x(n - late), 0 <= late <= 2.
-
-    x is interpolated linearly between samples. The limits are 2 and 1 without delay, and 1 and 1/4 with a delay of one
-    sample.
+    x is interpolated linearly between samples. The limit is 1 without delay, and 1/4 with a delay of one sample.
     """
     if late <= 1:
-        stable = min(1 / late if late else math.inf, 2 / (1 - 2 * late) if late < 0.5 else math.inf)
-        return SlopeLimits(stable, 1 / (1 + math.sqrt(late)) ** 2)
-    rest = late - 1
-    # characteristic polynomial r^2 (r - 1) + a ((1 - rest) r + rest): at the limit for no oscillation, its real root r
-    # is double
-    r = np.linspace(1e-6, 1.0, 20_001)
-    non_oscillating = float(np.max(r * r * (1 - r) / ((1 - rest) * r + rest)))
-    # Jury: a^2 rest^2 + a < 1
-    return SlopeLimits(2 / (1 + math.sqrt(1 + 4 * rest**2)), non_oscillating)
+        return 1 / (1 + math.sqrt(late)) ** 2
+    # characteristic polynomial r^2 (r - 1) + a ((1 - rest) r + rest): at the limit its real root r is double
+    rest, r = late - 1, np.linspace(1e-6, 1.0, 20_001)
+    return float(np.max(r * r * (1 - r) / ((1 - rest) * r + rest)))
 
 
 class Relay(NamedTuple):

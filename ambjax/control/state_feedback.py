@@ -32,8 +32,8 @@ class StateFeedback(PositionLaw[Array]):
 
     k_p: Scalar = gain(default=135.0, unit="A/m", doc="proportional gain; left out: LQR")
     k_d: Scalar = gain(default=0.219, unit="A s/m", doc="derivative gain; left out: LQR")
-    k_int: Scalar = gain(default=5310.0, unit="A/m/s", doc="integral gain; left out: LQR")
-    k_aw: Scalar = gain(default=10.6, unit="1/s", doc="anti-windup rate; left out: w/50")
+    k_int: Scalar = gain(default=5310.0, unit="A/m/s", doc="integral gain, 0: none; left out: LQR", zero=True)
+    k_aw: Scalar = gain(default=10.6, unit="1/s", doc="anti-windup rate, 0: none; left out: w/50", zero=True)
     memory = (("integral", "A", "integral term"),)
 
     def init(self, model: Plant) -> Array:
@@ -66,11 +66,6 @@ class StateFeedback(PositionLaw[Array]):
     def _current(self, model: Plant, inputs: tuple[Measurement, Reference]) -> Array:
         """Return the demanded current (A) without the integral term."""
         return resting_current(model, inputs[1]) - self.k_d * self.sigma(*inputs)
-
-    def explicit_rate(self, model: Plant) -> Scalar:
-        """Return the larger of b k_d and sqrt(b k_p), because their terms are evaluated at the start of a sample."""
-        b = linear_mechanics(model).b
-        return jnp.maximum(b * self.k_d, jnp.sqrt(b * self.k_p))
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         b = linear_mechanics(context.model).b

@@ -33,15 +33,12 @@ def delay_margin(cascade: Cascade, scenario: Scenario, clock: Clock, *, known: b
 
     Returns the Delays, in samples. Raises ValueError as `rollout` does.
     """
-    processor: Any = cascade.on_processor(0.0, MOST_DELAY).processor
-    processor, own = dataclasses.replace(processor, predict=processor.predict is not False), float(processor.delay)
+    processor: Any = cascade.processor
+    own = float(processor.delay)
 
     def tried(low: float, high: float) -> Delays:
         delays = np.linspace(low, high, DELAYS)
-        # an array in both cases, so that both use the same compiled program
-        assumed = delays if known else np.full(DELAYS, float(processor.ahead))
-        late = dataclasses.replace(cascade, processor=dataclasses.replace(processor, delay=delays, assumed=assumed))
-        ending = run_ensemble(late, scenario, clock, fold=None).trajectory
+        ending = run_ensemble(at_delays(cascade, delays, known=known), scenario, clock, fold=None).trajectory
         return _read(delays, np.asarray(ending.lost_at), np.asarray(ending.lost_code))
 
     found = tried(own, MOST_DELAY)
@@ -54,6 +51,15 @@ def delay_margin(cascade: Cascade, scenario: Scenario, clock: Clock, *, known: b
     if finer.held is None:
         return found
     return finer if finer.lost is not None else finer._replace(lost=found.lost)
+
+
+def at_delays(cascade: Cascade, delays: np.ndarray, *, known: bool) -> Cascade:
+    """Return the cascade with these delays [N] (samples) of its processor. `known`: as in `delay_margin`."""
+    processor: Any = cascade.on_processor(0.0, MOST_DELAY).processor
+    # an array in both cases, so that both use the same compiled program
+    assumed = delays if known else np.full(len(delays), float(processor.ahead))
+    late = dataclasses.replace(processor, predict=processor.predict is not False, delay=delays, assumed=assumed)
+    return dataclasses.replace(cascade, processor=late)
 
 
 def _read(delays: np.ndarray, lost_at: np.ndarray, code: np.ndarray) -> Delays:

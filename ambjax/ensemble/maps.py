@@ -1,6 +1,7 @@
 """Maps: survival and error over a grid of two quantities. Each cell of the grid is a small ensemble."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -13,6 +14,7 @@ from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import STEP_PATHS, Spread, SpreadError, apply, check_spread, corners, ends, no_such_number
 from ambjax.ensemble.study import Study
+from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import choose_method
 from ambjax.simulation.metrics import standard_for
 from ambjax.world.scenario import Scenario
@@ -21,7 +23,7 @@ PERIOD = "clock.sample_period"
 # Survival of a cell is certain if the lower end of its interval is at least this share.
 CERTAIN = 0.95
 # Fields of a Map with one value per cell.
-GRIDS = ("survival", "low", "high", "error", "lost", "stalled")
+GRIDS = ("survival", "low", "high", "error", "lost", "stalled", "unstable")
 
 
 class Axis(NamedTuple):
@@ -39,6 +41,7 @@ class Map(NamedTuple):
     - `error`: median over the survivors of the largest settled |z - r|, m; NaN in cells without a survivor.
     - `lost`: number of members whose rotor is lost.
     - `stalled`: number of members whose integration stopped early; `survival` counts them as not surviving.
+    - `unstable`: 1 where member 0 of the cell is held, but its loop is not stable; else 0.
     - `members`: number of members in each cell.
     - `varied`: whether the members of a cell differ, by noise or by the case's spread.
     - `drawn`: dotted paths of the spread quantities that are not axes; empty for one member.
@@ -52,6 +55,7 @@ class Map(NamedTuple):
     error: np.ndarray
     lost: np.ndarray
     stalled: np.ndarray
+    unstable: np.ndarray
     members: int
     varied: bool = True
     drawn: tuple[str, ...] = ()
@@ -67,8 +71,12 @@ class Map(NamedTuple):
         return int(np.argmin(np.abs(self.y.values - (self.y.values[0] + self.y.values[-1]) / 2)))
 
     def reach(self) -> tuple[float, float] | None:
-        """Return the ends of the longest run of x values at which all members survive, on the middle row, or None."""
-        held = np.concatenate([[False], self.survival[self.middle] == 1, [False]])
+        """Return the ends of the longest run of x values at which all members survive, on the middle row, or None.
+
+        Cells that are not stable are left out.
+        """
+        good = (self.survival[self.middle] == 1) & (self.unstable[self.middle] == 0)
+        held = np.concatenate([[False], good, [False]])
         begin, end = np.flatnonzero(held[1:] & ~held[:-1]), np.flatnonzero(held[:-1] & ~held[1:]) - 1
         if not begin.size:
             return None
@@ -76,23 +84,29 @@ class Map(NamedTuple):
         return float(self.x.values[begin[longest]]), float(self.x.values[end[longest]])
 
 
-def grid(study: Study, x: Axis, y: Axis) -> Map:
+# Returns whether each member of an ensemble is stable, [N].
+StabilityTest = Callable[[Cascade, Scenario, Clock], np.ndarray]
+
+
+def grid(study: Study, x: Axis, y: Axis, stable: StabilityTest | None = None) -> Map:
     """Compute a map with `study.members` members in every cell.
 
     An axis may be any number of the case, or clock.sample_period. All cells with the same sample period run in one
     ensemble. Sample periods run one after the other, each for the duration of the case. Member k has the same noise in
     each cell. With one member the case is nominal: no spread, and the noise of member 0. With more members, the case's
-    spread applies to all quantities that are not axes.
+    spread applies to all quantities that are not axes. `stable`: the test of member 0 of each
+    cell; None: `unstable` is 0.
 
     Raises ValueError for a path that does not exist, for two equal paths, and for values of an axis that the case does
     not allow.
     """
     if x.path == PERIOD:
-        transpose = grid(study, y, x)
+        transpose = grid(study, y, x, stable)
         return transpose._replace(x=x, y=y, **{k: getattr(transpose, k).T for k in GRIDS})
     _check(study, x, y)
-    rows = [_cells(study, x, y)] if y.path != PERIOD else [_cells(_at_period(study, p), x, None) for p in y.values]
-    ended, stalled, error = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    studies = [(study, y)] if y.path != PERIOD else [(_at_period(study, p), None) for p in y.values]
+    rows = [_cells(one, x, axis, stable) for one, axis in studies]
+    ended, stalled, error, unstable = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     survival = wilson(np.sum(~ended, axis=-1), study.members)
     held = ~ended.all(axis=-1)
     median = np.full(held.shape, np.nan)
@@ -107,6 +121,7 @@ def grid(study: Study, x: Axis, y: Axis) -> Map:
         survival.high,
         median,
         *counts,
+        unstable,
         study.members,
         bool(paths) or study.scenario.random,
         paths,
@@ -162,10 +177,11 @@ def _at_period(study: Study, period: float) -> Study:
     return dataclasses.replace(study, clock=dataclasses.replace(study.clock, samples=samples, sample_period=period))
 
 
-def _cells(study: Study, x: Axis, y: Axis | None) -> tuple[np.ndarray, ...]:
+def _cells(study: Study, x: Axis, y: Axis | None, stable: StabilityTest | None) -> tuple[np.ndarray, ...]:
     """Return, for each member, whether it is lost or stalled, whether it is stalled, and its settled error, m.
 
-    The settled error is the largest settled |z - r|. Each array has shape [ny, nx, members].
+    The settled error is the largest settled |z - r|. Each array has shape [ny, nx, members]. The last array, [ny, nx],
+    is 1 where member 0 is held but not stable.
     """
     shape = (1 if y is None else len(y.values), len(x.values), study.members)
     member = np.broadcast_to(np.arange(study.members), shape).ravel()
@@ -178,7 +194,11 @@ def _cells(study: Study, x: Axis, y: Axis | None) -> tuple[np.ndarray, ...]:
     scenario = dataclasses.replace(scenario, seed=study.seed, member=member)
     metrics = run_ensemble(cascade, scenario, study.clock, fold=standard_for(study.settle, scenario)).measured
     ended, stalled, error = np.isfinite(metrics["lost_at_s"]), metrics["stalled"], metrics["settled_max_abs_error_m"]
-    return tuple(np.reshape(part, shape) for part in (ended, stalled, error))
+    law, world = jax.tree.map(lambda x: x[:: study.members] if np.ndim(x) else x, (cascade, scenario))
+    unstable = np.zeros(shape[:2], bool).ravel() if stable is None else ~stable(law, world, study.clock)
+    unstable = unstable & ~ended[:: study.members]
+    values = (np.reshape(part, shape) for part in (ended, stalled, error))
+    return *values, np.reshape(unstable, shape[:2]).astype(int)
 
 
 def _batch(cascade: Cascade, scenario: Scenario, values: dict[str, np.ndarray]) -> tuple[Cascade, Scenario]:

@@ -22,7 +22,7 @@ from ambjax.world.scenario import Scenario
 SPREAD = "spread."
 # Largest number of columns of members.npz besides those of the spread, to estimate the disk space of a study.
 COLUMNS = 34
-# Largest number of parts of a fan chart's time. The variation of the voltage is computed in each part.
+# The variation of the voltage in a fan chart is that of the last one of this many parts of its time.
 WINDOWS = 25
 # Signals of a fan chart, and the corresponding fields of a Row.
 FAN_SIGNALS = {"z - r": "e_z", "u": "u_mean", "sigma": "sigma"}
@@ -34,8 +34,8 @@ class Bands(NamedTuple):
     - `t`: instants [T], s.
     - `trajectory`: trajectories of the members.
     - `signals`: signals by name [members, T]; NaN from the instant at which a member is lost. "variation of u" is the
-      total variation of `u_mean` per second, V/s, in each of WINDOWS nearly equal parts of the time shown (fewer in a
-      short run); NaN from the part in which a member is lost.
+      total variation of `u_mean` per second, V/s, over the time before each instant, a share 1/WINDOWS of the time
+      shown; NaN at the instants before the end of the first such time.
     - `extremes`: for each other signal, the minimum and the maximum, each [T], over the members that are alive and over
       the samples between the previous and the next instant; NaN if there is no such sample.
     """
@@ -135,12 +135,9 @@ class Study:
             signals[name] = np.concatenate([values, folded.last[of][:, None][:, : len(ends)]], axis=1)
             low, high = folded.low[of].min(axis=0), folded.high[of].max(axis=0)
             extremes[name] = _beside(low, np.fmin, len(t)), _beside(high, np.fmax, len(t))
-        starts = np.arange(min(WINDOWS, count)) * count // min(WINDOWS, count)
-        edges = period * np.append(every * starts, samples)
-        rate = np.add.reduceat(folded.variation, starts, axis=1) / np.diff(edges)
-        rate[edges[1:] > np.asarray(outcome.trajectory.lost_at)[:, None]] = np.nan
-        part = np.searchsorted(starts, np.minimum(np.arange(len(t)), count - 1), side="right") - 1
-        return Bands(t, outcome.trajectory, signals | {"variation of u": rate[:, part]}, extremes)
+        rate = _rate(folded.variation, t, -(-count // WINDOWS))
+        rate[np.isnan(signals["u"])] = np.nan
+        return Bands(t, outcome.trajectory, signals | {"variation of u": rate}, extremes)
 
     def fingerprint(self) -> dict[str, object]:
         """Return everything that determines the results of the study, by name, as values that JSON can hold."""
@@ -158,3 +155,14 @@ def _beside(blocks: np.ndarray, combine: Callable[[np.ndarray, np.ndarray], np.n
     values = np.where(np.isfinite(blocks), blocks, np.nan)
     padded = np.concatenate([[np.nan], values, [np.nan]])
     return combine(padded[:-1], padded[1:])[:instants]
+
+
+def _rate(increments: np.ndarray, t: np.ndarray, width: int) -> np.ndarray:
+    """Return the mean rate of growth over the `width` blocks before each instant t [T]; NaN before all have passed.
+
+    `increments` [members, count]: growth from each instant to the next.
+    """
+    total = np.concatenate([np.zeros((len(increments), 1)), np.cumsum(increments, axis=1)], axis=1)[:, : len(t)]
+    rate = np.full(total.shape, np.nan)
+    rate[:, width:] = (total[:, width:] - total[:, :-width]) / (t[width:] - t[:-width])
+    return rate

@@ -7,6 +7,7 @@ import difflib
 import errno
 import gc
 import json
+import logging
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
@@ -72,6 +73,8 @@ def run_command(parser: argparse.ArgumentParser, words: list[str] | None, run: R
     cannot be written. A closed pipe (`| head`) is not an error; any other failure of stdout gives exit code 2. Raises
     SystemExit for --help, --version and wrong arguments, as argparse does.
     """
+    if not sys.warnoptions:  # warnings of libraries are for developers: `python -W default -m ambjax` prints them
+        logging.captureWarnings(True)
     gc.set_threshold(*GC_THRESHOLDS)
     atexit.register(gc.freeze)  # without this, the collector would scan all objects once more at exit
     with lenient() as stdout:

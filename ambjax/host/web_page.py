@@ -37,7 +37,8 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[s
 
 
 def render_page(text: str, pictures: Mapping[str, bytes], title: str, unfolded: Collection[str] | None = None) -> str:
-    """Return the HTML page. `pictures`: PNG data by file name; images with these names are embedded.
+    """Return the HTML page. `pictures`: PNG data by file name; images with these names are embedded. A sentence
+    replaces an image without data.
 
     `unfolded`: headings of level 2 whose sections are open; all other sections are folded. None: all are open.
     """
@@ -50,7 +51,10 @@ def render_page(text: str, pictures: Mapping[str, bytes], title: str, unfolded: 
         renderer: RendererHTML, tokens: Sequence[Token], at: int, options: OptionsDict, environment: EnvType
     ) -> str:
         words = html.escape(renderer.renderInlineAsText(tokens[at].children, options, environment))
-        data = base64.b64encode(pictures[str(tokens[at].attrs["src"])]).decode()
+        picture = pictures.get(str(tokens[at].attrs["src"]))
+        if picture is None:
+            return f"<em>The picture is missing: {words}.</em>"
+        data = base64.b64encode(picture).decode()
         return f'<span class="wide"><img alt="{words}" src="data:image/png;base64,{data}"></span>'
 
     markdown.add_render_rule("image", image)

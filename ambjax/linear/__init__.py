@@ -13,25 +13,32 @@ to the sensor's own reading, and KS that from e to u.
 `injected` measures S, T and KS in the nonlinear simulation, `injected_members` the peak of |S| of each member.
 """
 
-from ambjax.linear.analysis import Analysis, Zones, analyse, linearisation_inputs, linearise, linearise_members
+from ambjax.linear.analysis import Analysis, Zones, analyse, checked, linearisation_inputs, linearise, linearise_members
 from ambjax.linear.differentiable import LoopQuantities, loop_quantities
 from ambjax.linear.injection import Injection, MemberPeaks, frequency_lines, injected, injected_members
-from ambjax.linear.margins import Margins, ResponsePeak, margins_of, noise_gain, peak
+from ambjax.linear.margins import LoopMargins, Margins, ResponsePeak, decayed_end, margins_of, noise_gain, peak
 from ambjax.linear.matrices import loop_matrices
-from ambjax.linear.state_space import INPUTS, OUTPUTS, StateSpace
+from ambjax.linear.stability import Findings, Stability, stability, suspects
+from ambjax.linear.state_space import INPUTS, OUTPUTS, PLACES, StateSpace
 
 __all__ = [
     "INPUTS",
     "OUTPUTS",
+    "PLACES",
     "Analysis",
+    "Findings",
     "Injection",
+    "LoopMargins",
     "LoopQuantities",
     "Margins",
     "MemberPeaks",
     "ResponsePeak",
+    "Stability",
     "StateSpace",
     "Zones",
     "analyse",
+    "checked",
+    "decayed_end",
     "frequency_lines",
     "injected",
     "injected_members",
@@ -43,4 +50,6 @@ __all__ = [
     "margins_of",
     "noise_gain",
     "peak",
+    "stability",
+    "suspects",
 ]

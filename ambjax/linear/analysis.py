@@ -1,14 +1,26 @@
 """Linearisation of a case, and its analysis: sensitivity with its zone, margins, stiffness, noise, poles."""
 
 import dataclasses
+import math
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
-from ambjax.linear.margins import STATIC, Margins, ResponsePeak, margins_of, noise_gain, peak, poles_in_s
+from ambjax.linear.margins import (
+    STATIC,
+    LoopMargins,
+    Margins,
+    ResponsePeak,
+    margins_of,
+    noise_gain,
+    peak,
+    poles_in_s,
+    whole_end,
+)
 from ambjax.linear.matrices import loop_matrices
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar, canonical, leaf, record
@@ -34,7 +46,7 @@ class Zones:
         above=0,
         at_most=1e6,
         optional=True,
-        doc="highest frequency; none: 2 kHz, or 0.45 of the sampling rate if that is lower",
+        doc="highest frequency; none: 0.45 of the sampling rate, in continuous time where |S - 1| has decayed",
     )
     amplitude: Scalar | None = leaf(
         default=None,
@@ -82,15 +94,20 @@ class Zones:
         """Return the zone of a share of the clearance that |z| reaches: A, B, C or D."""
         return _zone(share, self.clearance_a, self.clearance_b, self.clearance_c)
 
-    def range(self, period: Scalar | None) -> tuple[float, float]:
-        """Return the lowest and the highest frequency, Hz. `period`: sample period, s; None in continuous time.
+    @property
+    def whole(self) -> "Zones":
+        """These zones with the whole range of frequencies, in which no peak can be outside."""
+        return dataclasses.replace(self, f_high=None)
 
-        Raises ValueError if the range is empty or exceeds half the sampling rate.
+    def range(self, period: Scalar | None, end: float = math.inf) -> tuple[float, float]:
+        """Return the lowest and the highest frequency, Hz.
+
+        `period`: sample period, s; None in continuous time. `end`: the highest frequency in continuous time if f_high
+        is not given, Hz. Raises ValueError if the range is empty or exceeds half the sampling rate.
         """
-        high = self.f_high
-        if high is None:
-            high = 2000.0 if period is None else min(2000.0, 0.45 / float(period))
-        low, high = float(self.f_low), float(high)
+        low, high = float(self.f_low), end if period is None else 0.45 / float(period)
+        if self.f_high is not None:
+            high = float(self.f_high)
         if period is not None and high > 0.5 / float(period):
             raise ValueError(
                 f"sensitivity.f_high = {high:g}: it must be at most half the sampling rate, {0.5 / float(period):g} Hz."
@@ -117,10 +134,12 @@ class Analysis(NamedTuple):
     """Linear analysis of a loop at one equilibrium.
 
     - `stable`: whether all poles are stable. If not, the peaks and the stiffness have no physical meaning.
-    - `S`, `T`, `KS`: peaks of |S|, |T| (1) and |KS| (V/m).
+    - `S`, `T`, `KS`: peaks of |S|, |T| (1) and |KS| (V/m) in the band of the case. Each contains the largest value
+      outside this band if it is larger.
     - `zone`: zone of the peak of |S|; D if the loop is unstable.
     - `S_velocity`: peak of |S| for a test signal on the velocity reading; None if the controller does not use one.
-    - `margins`: see `Margins`; all are 0 if the loop is unstable.
+    - `margins`: the smaller of the margins at the reading and at the command; all are 0 if the loop is unstable.
+    - `margins_at`: the margins at each of the two places.
     - `stiffness`: static stiffness, N/m; inf if the law integrates the measured position. If it integrates a prediction
       over the delay T, the stiffness is finite, about 2 m / T^2, because the prediction does not include the force.
     - `noise`: rms of z per rms of white noise on the reading of z, one value per sample; inf if the loop is unstable.
@@ -137,6 +156,7 @@ class Analysis(NamedTuple):
     stiffness: float
     noise: float
     poles: np.ndarray
+    margins_at: LoopMargins
 
 
 def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.0) -> StateSpace:
@@ -146,12 +166,29 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
     not contain noise, runout, disturbances, converters, faults, the guard, the limits of supply and amplifier, or the
     dead band. On a processor it is the exact map of one sample period.
 
-    Returns the state space with NumPy arrays. Raises ValueError as `rollout` does, and if no equilibrium is found at r.
+    Returns the state space with NumPy arrays. States that no input reaches are left out. Raises ValueError as `rollout`
+    does, if no equilibrium is found at r, and if a law has no derivative there.
     """
     system, found = _matrices(*canonical((*linearisation_inputs(cascade, scenario, clock), r)))
+    return checked(system, found, r)
+
+
+def checked(system: StateSpace, found: Any, r: Scalar) -> StateSpace:
+    """Return a result of `loop_matrices` with NumPy arrays, without the states that no input reaches.
+
+    Raises ValueError if it has no meaning: no equilibrium at r (m), or a matrix that is not finite.
+    """
     if not found:
-        raise ValueError(f"no equilibrium at r = {float(r):g} m was found: the laws probably cannot hold the rotor.")
-    return StateSpace(*(None if x is None else np.asarray(x) for x in system))  # pyright: ignore[reportArgumentType]
+        raise ValueError(
+            f"no equilibrium at r = {float(r):g} m was found, so the loop has no linearisation there: Newton's method "
+            "ended where the plant or a law still moves. `ambjax simulate` shows whether the rotor is held."
+        )
+    if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(system)):
+        raise ValueError(
+            f"the loop has no linearisation at the equilibrium of r = {float(r):g} m: the derivative of a law or of "
+            "the plant is not finite there."
+        )
+    return system.without_idle()
 
 
 def linearise_members(
@@ -159,8 +196,8 @@ def linearise_members(
 ) -> tuple[StateSpace, np.ndarray]:
     """Linearise the loop of every member of an ensemble, whose varying leaves are arrays [N], at the reference r (m).
 
-    Returns the matrices, each with a leading axis [N], and whether an equilibrium was found for each
-    member [N]; if not, the matrices of the member have no meaning. Raises ValueError as `rollout` does.
+    Returns the matrices, each with a leading axis [N], and whether an equilibrium was found for each member [N]; if
+    not, the matrices of the member have no meaning. `checked` examines one member. Raises ValueError as `rollout` does.
     """
     # one call at a time: XLA runs LAPACK on its own threads, and two calls may deadlock
     return map_members(_member, canonical((*linearisation_inputs(cascade, scenario, clock), r)), threads=1, plain=True)
@@ -173,10 +210,10 @@ def _member(tree: Any) -> tuple[StateSpace, Any]:
 def linearisation_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Cascade, Scenario, Scalar]:
     """Check a case, and return the first three arguments of `loop_matrices`: cascade, scenario and sample period (s).
 
-    If the cascade has a processor, the returned cascade is that of `Cascade.on_processor`. Raises ValueError as
-    `rollout` does.
+    If the cascade has a processor, the returned cascade is that of `Cascade.on_processor`. The integration method of
+    `clock` has no effect: it may be too coarse for this cascade. Raises ValueError as `rollout` does otherwise.
     """
-    system, clock = prepare(cascade, scenario, clock)
+    system, clock = prepare(cascade, scenario, dataclasses.replace(clock, method=None))
     if cascade.processor is not None:
         cascade = system.loop.cascade  # pyright: ignore[reportAttributeAccessIssue]
     return dataclasses.replace(cascade), scenario, clock.sample_period
@@ -195,13 +232,15 @@ def analyse(
     Raises ValueError as `Zones.range` does.
     """
     zones = Zones() if zones is None else zones
-    low, high = zones.range(system.period)
+    end = whole_end(system)
+    low, high = zones.range(system.period, max(end, 2 * float(zones.f_low)))
 
     def largest(output: int, source: int, less: float = 0.0) -> ResponsePeak:
-        return peak(system, lambda f: np.abs(system.response(f)[:, output, source] - less), low, high)
+        return peak(system, lambda f: np.abs(system.response(f)[:, output, source] - less), low, high, end)
 
     stable, S = system.stable, largest(0, 0)
-    poles = poles_in_s(system)
+    poles, none = poles_in_s(system), Margins(*[0.0] * 6)
+    margins = margins_of(system) if stable else LoopMargins(none, none)
     return Analysis(
         stable,
         S,
@@ -209,8 +248,9 @@ def analyse(
         largest(2, 0),
         zones.zone(S.height) if stable else "D",
         largest(1, 1) if velocity else None,
-        margins_of(system) if stable else Margins(*[0.0] * 6),
+        margins.smaller,
         _stiffness(system, float(m), STATIC * low),
         noise_gain(system, float(period)) if stable else np.inf,
         poles[np.argsort(-np.real(poles))],
+        margins,
     )

@@ -3,17 +3,20 @@
 The functions work under jit and vmap. `linear.analysis.analyse` computes the same numbers with NumPy, for reports.
 """
 
+import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from ambjax.linear.margins import STATIC
-from ambjax.linear.state_space import StateSpace
+from ambjax.linear.late_command import NONE, command_delay
+from ambjax.linear.margins import DECAYED, STATIC
+from ambjax.linear.state_space import NEUTRAL, StateSpace
 from ambjax.numerics.records import Scalar
 
 # Numbers of frequencies in the first scan, on a logarithmic axis: for peaks, and for crossings of |L| = 1.
-POINTS, CROSSING_POINTS = 120, 240
+POINTS, CROSSING_POINTS = 240, 240
 # Rounds in which a frequency is refined, and points of a round. A round divides the spacing by (LOCAL - 1)/2 at a peak,
 # and by LOCAL - 1 at a crossing.
 ROUNDS, LOCAL = 4, 17
@@ -31,8 +34,10 @@ class LoopQuantities(NamedTuple):
 
     - `sensitivity`, `complementary`: peaks of |S| and |T|.
     - `control_sensitivity`: peak of |KS|, V/m.
-    - `delay_margin_s`: smallest additional delay that makes the loop unstable, s.
-    - `growth`: largest real part of a pole, 1/s; negative if the loop is stable, inf without an equilibrium.
+    - `delay_margin_s`: smallest additional delay, at the position reading or at the command, that makes the loop
+      unstable, s.
+    - `growth`: largest real part of a pole, 1/s; inf without an equilibrium. The loop is stable as in
+      `StateSpace.stable`.
 
     The unit of |S| and |T| is 1, that of |KS| is `volts_per_metre`; `pole` is the unstable pole of the plant. For a
     stable loop, the peaks are those of `analyse`, smoothly limited to MOST times their unit. For an unstable loop they
@@ -79,28 +84,33 @@ class _Loop(NamedTuple):
 
 
 def loop_quantities(
-    system: StateSpace, found: Array, low: Scalar, high: Scalar, pole: Scalar, volts_per_metre: Scalar
+    system: StateSpace, found: Array, low: Scalar, pole: Scalar, volts_per_metre: Scalar, *, delay: bool = True
 ) -> LoopQuantities:
     """Return the quantities of a loop from the matrices of `loop_matrices`.
 
     - `found`: whether the loop has an equilibrium.
-    - `low`, `high`: frequency range of the peaks, Hz; the static response is always included.
+    - `low`: lowest frequency of the peaks, Hz, besides 0. The highest is that of `margins.whole_end`, so that no change
+      of the gains moves a peak out of the range.
     - `pole`: unstable pole of the plant, 1/s.
     - `volts_per_metre`: unit of |KS|, V/m.
+    - `delay`: whether the delay margin is computed; if not, it is inf.
 
     The frequency of each peak is found without derivatives, from the poles and zeros of the loop. The derivative of a
     peak is that of the response at this frequency (envelope theorem). The derivative of the delay margin is that of the
-    implicit equation |L| = 1.
+    implicit equation L = -1.
     """
-    fine = found & jnp.all(jnp.asarray([jnp.all(jnp.isfinite(x)) for x in system if x is not None]))
+    fine = found & jnp.all(jnp.asarray([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(system)]))
     n = len(system.A)
     safe = 0.5 * jnp.eye(n, dtype=system.A.dtype) * (1.0 if system.period is not None else -1.0)
     scaled = system.scaled()
     scaled = scaled._replace(
-        A=jnp.where(fine, scaled.A, safe), **{name: jnp.where(fine, getattr(scaled, name), 0.0) for name in "BC"}
+        A=jnp.where(fine, _without_idle(scaled), safe),
+        **{name: jnp.where(fine, getattr(scaled, name), 0.0) for name in "BC"},
+        path=jax.tree.map(lambda x: jnp.where(fine, x, 0.0), scaled.path),
     )
     growth, poles = _growth(scaled)
     loop = _loop(lax.stop_gradient(scaled), poles, jnp.asarray(volts_per_metre))
+    high = _whole_end(loop)
     f = _frequencies(loop, low, high)
     S, KS = loop.responses(f)
     peaks = [
@@ -109,8 +119,11 @@ def loop_quantities(
     ]
     response = scaled.response(jnp.stack(peaks))
     heights = jnp.abs(response[0, 0, 0]), jnp.abs(response[1, 0, 0] - 1), jnp.abs(response[2, 2, 0])
-    delay = _delay_margin(scaled, loop, low)
-    stable = fine & (growth < 0)
+    margin = jnp.asarray(jnp.inf)
+    if delay:
+        margin = jnp.minimum(_delay_margin(scaled, loop, low), command_delay(scaled, low, _fastest(loop, low)))
+    fastest = jnp.max(jnp.abs(poles)) if system.period is None else 1 / system.period
+    stable = fine & (growth < NEUTRAL * fastest)
     worse = MOST * jnp.where(fine, 1 + jnp.maximum(growth, 0.0) / pole, NO_EQUILIBRIUM)
 
     def bounded(x: Array) -> Array:
@@ -120,9 +133,16 @@ def loop_quantities(
         bounded(heights[0]),
         bounded(heights[1]),
         loop.unit * bounded(heights[2] / loop.unit),
-        1 / (pole * bounded(1 / (delay * pole))),
+        1 / (pole * bounded(1 / (margin * pole))) if delay else margin,
         jnp.where(fine, growth, jnp.inf),
     )
+
+
+def _without_idle(system: StateSpace) -> Array:
+    """Return A with a stable mode, which nothing excites, in place of each state that no input reaches."""
+    idle = jnp.asarray(system.idle())
+    rate = jnp.zeros(()) if system.period is not None else -jnp.max(jnp.abs(jnp.diagonal(system.A)))
+    return jnp.where(idle[:, None], rate * jnp.eye(len(system.A), dtype=system.A.dtype), system.A)
 
 
 def _point(f: Array, period: Array | None) -> Array:
@@ -165,6 +185,20 @@ def _loop(system: StateSpace, poles: Array, unit: Array) -> _Loop:
     return _Loop(poles, zeros, zeros_u, system.D[2, 0], unit, system.period, in_s)
 
 
+def _whole_end(loop: _Loop) -> Array:
+    """Return `margins.whole_end` (Hz)."""
+    if loop.period is not None:
+        return 0.45 / loop.period
+    total = jnp.sum(jnp.abs(loop.poles)) + jnp.sum(jnp.abs(loop.zeros))
+    return (1 + DECAYED) * total / math.log1p(DECAYED) / (2 * jnp.pi)
+
+
+def _fastest(loop: _Loop, low: Scalar) -> Array:
+    """Return the end of the search for crossings of |L| = 1, Hz."""
+    fastest = 100 * jnp.max(jnp.abs(loop.poles_in_s)) / (2 * jnp.pi)
+    return jnp.maximum(fastest, 2 * low) if loop.period is None else 0.5 / loop.period
+
+
 def _frequencies(loop: _Loop, low: Scalar, high: Scalar) -> Array:
     """Return the frequencies (Hz) of the first scan: STATIC * low (for 0), a grid, and the frequencies of poles."""
     grid = jnp.geomspace(low, high, POINTS)
@@ -189,13 +223,11 @@ def _refined(loop: _Loop, f: Array, size: Array, low: Scalar, high: Scalar, whic
 
 
 def _delay_margin(system: StateSpace, loop: _Loop, low: Scalar) -> Array:
-    """Return the delay margin (s): the smallest lag/(2 pi f) over the frequencies f at which |L| = 1.
+    """Return the delay margin (s) at the reading: the smallest lag/(2 pi f) over the frequencies f at which |L| = 1.
 
-    Without such a frequency it is 1e12/low.
+    Without such a frequency it is NONE/low.
     """
-    fastest = 100 * jnp.max(jnp.abs(loop.poles_in_s)) / (2 * jnp.pi)
-    high = jnp.maximum(fastest, 2 * low) if system.period is None else 0.5 / system.period
-    f = jnp.geomspace(low, high, CROSSING_POINTS)
+    f = jnp.geomspace(low, _fastest(loop, low), CROSSING_POINTS)
     L = loop.transfer(f)
     size = jnp.log(jnp.abs(L))
     crosses = size[:-1] * size[1:] < 0
@@ -213,7 +245,7 @@ def _delay_margin(system: StateSpace, loop: _Loop, low: Scalar) -> Array:
     shift = -jnp.log(jnp.abs(L[1])) / jnp.real(slope)
     lag = _lag(L[1]) + jnp.imag(slope) * shift
     delay = lag / (2 * jnp.pi * f0 * jnp.exp(shift))
-    return jnp.where(jnp.any(crosses), delay, 1e12 / low)
+    return jnp.where(jnp.any(crosses), delay, NONE / low)
 
 
 def _lag(L: Array) -> Array:

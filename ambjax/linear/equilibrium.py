@@ -90,7 +90,8 @@ def equilibrium(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar)
     - `period`: sample period, s; not used in continuous time.
 
     If the equilibrium is found, its derivatives with respect to gains and parameters are those of the implicit
-    function; otherwise they have no meaning. The function is pure and works under jit and vmap.
+    function; otherwise they have no meaning. A state that never changes, such as an integral whose gain is 0, keeps
+    its initial value. The function is pure and works under jit and vmap.
     """
     start = start_of(cascade, scenario, period, r)
     flat, restore = ravel_pytree(start)
@@ -108,7 +109,7 @@ def equilibrium(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar)
     def evaluate(newton: _Newton) -> _Newton:
         J, G = jax.jacfwd(both, has_aux=True)(newton.trial)
         better = _size(G) < newton.error
-        direction = jnp.where(better, jnp.linalg.solve(J, G), newton.direction)
+        direction = jnp.where(better, _inverse(J) @ G, newton.direction)
         fraction = jnp.where(better, 1.0, 0.5 * newton.fraction)
         y, J = jnp.where(better, newton.trial, newton.y), jnp.where(better, J, newton.J)
         error = jnp.where(better, _size(G), newton.error)
@@ -123,7 +124,7 @@ def equilibrium(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar)
     newton = lax.stop_gradient(lax.while_loop(unfinished, evaluate, first))
     found = newton.error <= TOLERANCE * jnp.finfo(y.dtype).eps
     # one more Newton step with a constant Jacobian: its derivative is that of the implicit function
-    y = newton.y - jnp.where(found, jnp.linalg.solve(newton.J, residual(newton.y, cascade, scenario)), 0.0)
+    y = newton.y - jnp.where(found, _inverse(newton.J) @ residual(newton.y, cascade, scenario), 0.0)
     return Equilibrium(restore(y * sizes), found)
 
 
@@ -148,6 +149,22 @@ class _Newton(NamedTuple):
 def _size(G: Array) -> Array:
     """Return the largest residual; inf if one is not finite."""
     return jnp.where(jnp.all(jnp.isfinite(G)), jnp.max(jnp.abs(G)), jnp.inf)
+
+
+def _inverse(J: Array) -> Array:
+    """Return the pseudo-inverse of a Jacobian, in which a state that never changes is held.
+
+    The row of a state that never changes is 0: the equation dx = 0 replaces it. The other rows are divided by their
+    largest entries. Singular values that are rounding errors count as 0, so that a law with an integral gain of 1e-20
+    rests where the law without this integral does.
+    """
+    size = jnp.max(jnp.abs(J), 1)
+    rows = jnp.where(size[:, None] > 0, J, jnp.eye(len(J), dtype=J.dtype))
+    size = jnp.where(size > 0, size, 1.0)
+    usable = jnp.all(jnp.isfinite(J))
+    # a matrix with NaN stops the LAPACK routine
+    scaled = jnp.where(usable, rows / size[:, None], jnp.eye(len(J), dtype=J.dtype))
+    return jnp.where(usable, jnp.linalg.pinv(scaled) / size, jnp.nan)
 
 
 def start_of(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> Point:

@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import expm
 
 from ambjax.linear.equilibrium import Point, reading
+from ambjax.linear.state_space import CommandPath
 from ambjax.numerics.records import Scalar
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
@@ -21,7 +22,8 @@ class HeldPlant(NamedTuple):
     """Linear map of one sample, x_{n+1} = transition x_n + now u_n + before u_{n-1} + first u_{n-2} + disturbed q_z.
 
     x [N] is the state of the plant, of the sensor's low-pass (m) and of the amplifier (V), `transition` is [N, N], and
-    the others are [N]. x and u are deviations from the equilibrium. q_z (m/s^2) is constant during the sample.
+    the others are [N]. x and u are deviations from the equilibrium. q_z (m/s^2) is constant during the sample. `path`:
+    the rates of x under a command.
     """
 
     transition: Array
@@ -29,6 +31,7 @@ class HeldPlant(NamedTuple):
     before: Array
     first: Array
     disturbed: Array
+    path: CommandPath
 
 
 class Lagged:
@@ -85,12 +88,12 @@ class Lagged:
         A, B = jax.jacfwd(lambda x, w: self.rates(x, w[0], w[1]), (0, 1))(
             self.start, jnp.stack([point.u, 0.0 * point.u])
         )
-        delay = jnp.asarray(delay)
-        part = (delay - jnp.floor(delay)) * period
-        (early, early_in), (late, late_in) = _integrated(A, B, part), _integrated(A, B, period - part)
-        old, new = late @ early_in[:, 0], late_in[:, 0]
-        now, before, first = (_at(jnp.ceil(delay), k) * old + _at(jnp.floor(delay), k) * new for k in range(3))
-        return HeldPlant(late @ early, now, before, first, late @ early_in[:, 1] + late_in[:, 1])
+        path = CommandPath(A, B[:, 0], jnp.asarray(delay))
+        whole = jnp.floor(path.delay)
+        new, old = path.held(path.delay - whole, jnp.asarray(period))
+        now, before, first = (_at(whole + 1, k) * old + _at(whole, k) * new for k in range(3))
+        transition, disturbed = _integrated(A, B[:, 1], period)
+        return HeldPlant(transition, now, before, first, disturbed, path)
 
 
 def _at(lag: Array, number: int) -> Array:
@@ -98,9 +101,9 @@ def _at(lag: Array, number: int) -> Array:
     return jnp.where(jnp.abs(lag - number) < 0.5, 1.0, 0.0)
 
 
-def _integrated(A: Array, B: Array, h: Scalar) -> tuple[Array, Array]:
-    """Return exp(A h), and the integral of exp(A t) B over t from 0 to h (s)."""
-    n, inputs = B.shape
-    table: Any = jnp.zeros((n + inputs, n + inputs), A.dtype).at[:n].set(jnp.concatenate([A, B], 1) * h)
+def _integrated(A: Array, b: Array, h: Scalar) -> tuple[Array, Array]:
+    """Return exp(A h), and the integral of exp(A t) b over t from 0 to h (s)."""
+    n = len(b)
+    table: Any = jnp.zeros((n + 1, n + 1), A.dtype).at[:n].set(jnp.concatenate([A, b[:, None]], 1) * h)
     whole = expm(table)
-    return whole[:n, :n], whole[:n, n:]
+    return whole[:n, :n], whole[:n, n]

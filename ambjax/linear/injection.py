@@ -22,7 +22,7 @@ from ambjax.world.scenario import Scenario
 
 # LINES: number of logarithmically spaced lines. NEAR: number of lines near a peak. AROUND: their range as multiples of
 # the frequency of the peak.
-LINES, NEAR, AROUND = 30, 11, (0.75, 1.33)
+LINES, NEAR, AROUND = 36, 11, (0.75, 1.33)
 
 
 class Injection(NamedTuple):

@@ -1,7 +1,7 @@
 """Peaks of the sensitivity functions and stability margins of a linearised loop, in NumPy.
 
-The loop is cut at the reading of the position sensor: with S from `StateSpace.sensitivity`, the loop transfer is
-L = 1/S - 1.
+The margins are those of the loop broken at the reading of the position sensor, and broken at the command
+(`StateSpace.loop_transfer`).
 """
 
 import math
@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ambjax.linear.state_space import StateSpace
+from ambjax.linear.held_command import HeldCommand
+from ambjax.linear.state_space import Place, StateSpace
 
 # Number of logarithmically spaced frequencies in a scan, in addition to those near poles.
 POINTS = 600
@@ -18,23 +19,38 @@ POINTS = 600
 NARROW = 1e-6
 # Frequency that stands for 0, as a share of the lowest one. At 0 itself the response of an integrator is not finite.
 STATIC = 1e-6
+# DOUBLINGS: most doublings of the time over which the response to noise is summed, 1e18 samples. SETTLED: relative
+# change in a doubling below which the variance is final.
+DOUBLINGS, SETTLED = 60, 1e-13
 GOLDEN = (math.sqrt(5) - 1) / 2
+# Relative distance from an end of the band, or from the value there, within which a maximum counts as one at this end.
+EDGE = 1e-4
+# Below the band, frequencies from this share of its lowest one on are searched.
+BELOW = 1e-3
+# |S - 1| that counts as decayed, in continuous time.
+DECAYED = 0.01
 
 
 class ResponsePeak(NamedTuple):
-    """Largest magnitude of a response, and its frequency, Hz, which is 0 if the static response is the largest."""
+    """Largest magnitude of a response in a band, and its frequency, Hz, which is 0 if the static response is largest.
+
+    - `at_edge`: whether it lies at an end of the band, so that it is not known to be a peak.
+    - `outside`: the largest magnitude outside the band if it is larger; None if it is not, or if it is not searched.
+    """
 
     height: float
     frequency: float
+    at_edge: bool = False
+    outside: "ResponsePeak | None" = None
 
 
 class Margins(NamedTuple):
-    """Margins of the loop transfer L = 1/S - 1, broken at the reading of the position sensor.
+    """Margins of the loop transfer L = 1/S - 1, with the loop broken at one place.
 
     - `gain_low`, `gain_high`: the loop stays stable for every factor on L between these two (0, inf: no such limit).
     - `gain`: `gain_low` or `gain_high`, whichever is nearer to 1 on a logarithmic scale (inf: no limit).
     - `phase_deg`: smallest phase change, lag or lead, that makes the loop unstable, degrees (inf: |L| is never 1).
-    - `delay`: smallest additional delay that makes the loop unstable, s (inf: none).
+    - `delay`: smallest additional delay at this place that makes the loop unstable, s (inf: none).
     - `disk`: disk margin 1/max|S - 1/2| (P. Seiler, A. Packard and P. Gahinet, IEEE Control Systems 40:5 (2020)). The
       loop stays stable for every factor on L between (2 - disk)/(2 + disk) and its inverse.
     """
@@ -47,20 +63,63 @@ class Margins(NamedTuple):
     disk: float
 
 
+class LoopMargins(NamedTuple):
+    """Margins of a loop broken at the reading of the position sensor, and broken at the command.
+
+    A factor or a delay at the command is that of the drive: of processor, converter and amplifier. The laws remember
+    their own commands, and the prediction assumes the delay of the case.
+    """
+
+    reading: Margins
+    command: Margins
+
+    @property
+    def smaller(self) -> Margins:
+        """The smaller margin of each kind."""
+        one, other = self
+        return Margins(
+            min(one.gain, other.gain, key=lambda x: abs(math.log(x)) if x else 0.0),
+            max(one.gain_low, other.gain_low),
+            *(min(a, b) for a, b in zip(one[2:], other[2:], strict=True)),
+        )
+
+    def place(self, kind: str) -> Place:
+        """Return the place of the smaller margin. `kind`: the name of a field of `Margins`."""
+        return "command" if getattr(self.reading, kind) != getattr(self.smaller, kind) else "reading"
+
+
 Magnitude = Callable[[np.ndarray], np.ndarray]
 
 
-def peak(system: StateSpace, magnitude: Magnitude, low: float, high: float) -> ResponsePeak:
+def peak(system: StateSpace, magnitude: Magnitude, low: float, high: float, end: float | None = None) -> ResponsePeak:
     """Return the largest value of a magnitude at frequency 0 and from `low` to `high` (Hz), with its frequency.
 
-    `magnitude`: function that returns magnitudes [F] for frequencies [F] in Hz.
+    `magnitude`: function that returns magnitudes [F] for frequencies [F] in Hz. `end`: frequency up to which the
+    magnitude is also searched outside the band, above it and below it; None: it is not.
     """
-    f = scan(system, low, high)
+    found = _peak(magnitude, scan(system, low, high))
+    if end is None:
+        return found
+    parts = [(BELOW * low, low)] + ([(high, end)] if end > high else [])
+    others = [_peak(magnitude, scan(system, *part)[1:], static=False) for part in parts]
+    larger = max(others, key=lambda one: one.height)
+
+    def at_edge(one: ResponsePeak, bottom: float, top: float) -> bool:
+        flat = one.height <= (1 + EDGE) * float(magnitude(np.array([top]))[0])  # also if it no longer changes there
+        return one.frequency > 0 and (one.frequency <= bottom * (1 + EDGE) or flat)
+
+    larger = larger._replace(at_edge=at_edge(larger, BELOW * low, max(high, end)))
+    found = found._replace(at_edge=at_edge(found, low, high))
+    return found._replace(outside=larger) if larger.height > found.height * (1 + EDGE) else found
+
+
+def _peak(magnitude: Magnitude, f: np.ndarray, static: bool = True) -> ResponsePeak:
+    """Return the largest value of a magnitude near the frequencies `f`. `static`: whether the first stands for 0."""
     size = magnitude(f)
-    k = int(np.argmax(size))
-    if k == 0:
+    k, first = int(np.argmax(size)), int(static)
+    if static and k == 0:
         return ResponsePeak(float(size[0]), 0.0)
-    left, right = f[max(k - 1, 1)], f[min(k + 1, len(f) - 1)]
+    left, right = f[max(k - 1, first)], f[min(k + 1, len(f) - 1)]
     while right > left * (1 + NARROW):
         a, b = right - GOLDEN * (right - left), left + GOLDEN * (right - left)
         at_a, at_b = magnitude(np.array([a, b]))
@@ -68,6 +127,30 @@ def peak(system: StateSpace, magnitude: Magnitude, low: float, high: float) -> R
     tried = np.array([f[k], 0.5 * (left + right)])
     best = magnitude(tried)
     return ResponsePeak(float(best.max()), float(tried[best.argmax()]))
+
+
+def whole_end(system: StateSpace) -> float:
+    """Return the frequency (Hz) up to which peaks are searched: 0.45 of the sampling rate.
+
+    In continuous time, it is a frequency above which |S - 1| stays below DECAYED: with the poles p and the zeros q of
+    S, |log S| <= sum |p/s| + sum |q/s| + ..., and the sums are below log(1 + DECAYED) there.
+    """
+    if system.period is not None:
+        return 0.45 / float(system.period)
+    scaled = system.scaled()
+    zeros = np.linalg.eigvals(scaled.A - scaled.B[:, :1] @ scaled.C[:1])
+    total = float(np.abs(scaled.poles()).sum() + np.abs(zeros).sum())
+    return (1 + DECAYED) * total / math.log1p(DECAYED) / (2 * math.pi)
+
+
+def decayed_end(system: StateSpace, low: float) -> float:
+    """Return the end (Hz) of the band that pictures show: of `whole_end`, the part with |S - 1| above DECAYED."""
+    end = whole_end(system)
+    if system.period is not None:
+        return end
+    f = scan(system, low, max(end, 2 * low))[1:]
+    above = np.flatnonzero(np.abs(np.asarray(system.sensitivity(f)) - 1) > DECAYED)
+    return float(f[min(above[-1] + 1, len(f) - 1)]) if above.size else float(f[-1])
 
 
 def scan(system: StateSpace, low: float, high: float) -> np.ndarray:
@@ -89,22 +172,28 @@ def poles_in_s(system: StateSpace) -> np.ndarray:
     return np.log(poles[np.abs(poles) > 1e-9] + 0j) / float(system.period)
 
 
-def margins_of(system: StateSpace) -> Margins:
-    """Return the margins of a stable loop.
+def margins_of(system: StateSpace) -> LoopMargins:
+    """Return the margins of a stable loop, broken at the reading and at the command.
 
     The scan ends at half the sampling rate or, in continuous time, far above all poles.
     """
     fastest = float(np.max(np.abs(poles_in_s(system)), initial=1.0)) / (2 * math.pi)
     high = 100 * fastest if system.period is None else 0.5 / float(system.period)
-    low = min(1e-3, 1e-6 * high)
+    f = scan(system, min(1e-3, 1e-6 * high), high)
+    return LoopMargins(_margins(system, "reading", f), _margins(system, "command", f))
 
-    def S(f: np.ndarray) -> np.ndarray:
-        return np.asarray(system.sensitivity(f))
+
+def _margins(system: StateSpace, place: Place, scanned: np.ndarray) -> Margins:
+    """Return the margins at one place. `scanned`: frequencies, Hz, of which the first stands for 0."""
+
+    held = None
+    if place == "command" and system.period is not None:
+        held = HeldCommand(system)
 
     def L(f: np.ndarray) -> np.ndarray:
-        return 1 / S(f) - 1
+        return np.asarray(system.loop_transfer(f, place)) if held is None else held.transfer(f)
 
-    f = scan(system, low, high)[1:]
+    f = scanned[1:]
     along = L(f)
     real = [L(np.array([x]))[0].real for x in _crossings(lambda x: np.imag(L(x)), f, np.imag(along))]
     if system.period is not None:
@@ -113,11 +202,13 @@ def margins_of(system: StateSpace) -> Margins:
     # L is exactly 0 at half the sampling rate if the controller has a zero there, as after a bilinear transform
     gains = [float(-1 / x) for x in real if x and math.isfinite(x) and -1 / x > 1e-9]
     phases, delays = [], []
-    for x in _crossings(lambda x: np.log(np.abs(L(x))), f, np.log(np.abs(along))):
+    for x in _crossings(lambda x: _log(L(x)), f, _log(along)):
         lag = math.pi + float(np.angle(L(np.array([x]))[0]))
         phases.append(math.degrees(min(lag, 2 * math.pi - lag)))
         delays.append(lag / (2 * math.pi * x))
-    disk = peak(system, lambda f: np.abs(S(f) - 0.5), low, high).height
+    if held is not None:
+        delays = held.delays(f)
+    disk = _peak(lambda f: np.abs(1 / (1 + L(f)) - 0.5), scanned).height
     return Margins(
         min(gains, key=lambda x: abs(math.log(x)), default=math.inf),
         max((x for x in gains if x < 1), default=0.0),
@@ -126,6 +217,11 @@ def margins_of(system: StateSpace) -> Margins:
         min(delays, default=math.inf),
         1 / disk,
     )
+
+
+def _log(response: np.ndarray) -> np.ndarray:
+    """Return the logarithm of the magnitude, which may be 0."""
+    return np.log(np.maximum(np.abs(response), np.finfo(float).tiny))
 
 
 def _crossings(function: Magnitude, f: np.ndarray, values: np.ndarray) -> list[float]:
@@ -144,9 +240,12 @@ def _crossings(function: Magnitude, f: np.ndarray, values: np.ndarray) -> list[f
 def noise_gain(system: StateSpace, period: float) -> float:
     """Return the rms of z per rms of white noise on the reading of z, for a stable loop.
 
-    Each noise value is held for `period` (s); on a processor, for the system's own sample period.
+    Each noise value is held for `period` (s); on a processor, for the system's own sample period. The covariance is the
+    sum over the values so far, whose number is doubled until the variance of z settles (Smith, SIAM J. Appl. Math. 16
+    (1968) 198-201). A linear solver is not accurate here: a pole close to 1, as that of an integral with a negligible
+    gain, makes the Lyapunov equation singular.
     """
-    from scipy.linalg import expm, solve_discrete_lyapunov
+    from scipy.linalg import expm
 
     scaled = system.scaled()
     A, b, c = np.asarray(scaled.A), np.asarray(scaled.B)[:, :1], np.asarray(scaled.C)[3]
@@ -154,5 +253,10 @@ def noise_gain(system: StateSpace, period: float) -> float:
         n = len(A)
         whole = expm(np.block([[A, b], [np.zeros((1, n + 1))]]) * period)
         A, b = whole[:n, :n], whole[:n, n:]
-    covariance = solve_discrete_lyapunov(A, b @ b.T)
-    return float(np.sqrt(max(c @ covariance @ c, 0.0)))
+    covariance, variance, before = b @ b.T, float((c @ b)[0] ** 2), -1.0
+    for _ in range(DOUBLINGS):
+        if variance > 0 and variance - before <= SETTLED * variance:
+            break
+        covariance, A = covariance + A @ covariance @ A.T, A @ A
+        before, variance = variance, float(c @ covariance @ c)
+    return math.sqrt(variance)

@@ -12,7 +12,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import Sample
 from ambjax.linear.equilibrium import Point, at_rest, equilibrium, ideal, reading, sizes_of
 from ambjax.linear.held_plant import Lagged
-from ambjax.linear.state_space import StateSpace
+from ambjax.linear.state_space import CommandPath, StateSpace
 from ambjax.numerics.records import Scalar
 from ambjax.world.scenario import Scenario
 
@@ -25,7 +25,8 @@ def loop_matrices(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scala
     - `period`: sample period, s; not used in continuous time.
 
     The function is pure, works under jit and vmap, and is differentiable in all gains and parameters. Returns the state
-    space, and whether an equilibrium was found; if not, the matrices have no meaning.
+    space, and whether an equilibrium was found; if not, the matrices have no meaning. They are not finite if a law has
+    no derivative at the equilibrium.
     """
     scenario = ideal(scenario)
     if cascade.processor is not None:
@@ -45,13 +46,18 @@ def _continuous(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar,
         measured = reading(scenario, plant.measurement(state), (w[0], w[1]))
         command, rates = cascade(measured, control, reference, jnp.asarray(jnp.inf))
         u = scenario.coil_voltage(command.u, state)
-        outputs = jnp.stack([measured.z, measured.z_dot, u, plant.measurement(state).z])
+        outputs = jnp.stack([measured.z, measured.z_dot, u, plant.measurement(state).z, command.u])
         moved = plant.rates(state, u, w[2])
         return ravel_pytree((moved, rates))[0], outputs
 
+    def driven(u: Array) -> Array:
+        return ravel_pytree(plant.rates(point.plant, scenario.coil_voltage(u, point.plant)))[0]
+
     (A, B), (C, D) = jax.jacfwd(system, (0, 1))(x, jnp.zeros(3, x.dtype))
-    sizes = sizes_of(cascade, scenario, point)
-    return StateSpace(A, B, C, D, ravel_pytree((sizes.plant, sizes.control))[0])
+    sizes, b = sizes_of(cascade, scenario, point), jax.jacfwd(driven)(point.u)
+    # in continuous time, the path does not use its A
+    path = CommandPath(jnp.zeros((len(b), len(b)), b.dtype), b, jnp.zeros_like(point.u))
+    return StateSpace(A, B, C, D, ravel_pytree((sizes.plant, sizes.control))[0], None, path)
 
 
 def _sampled(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, point: Point) -> StateSpace:
@@ -70,10 +76,11 @@ def _sampled(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, po
         moved = held.transition @ at + held.now * command.u + held.before * past[0] + held.first * past[1]
         moved = moved + held.disturbed * w[2]
         after = jnp.concatenate([moved, ravel_pytree(after)[0], jnp.stack([command.u, past[0]])])
-        return after, jnp.stack([measured.z, measured.z_dot, plant.voltage(at, command.u), plant.motion(at).z])
+        u = plant.voltage(at, command.u)
+        return after, jnp.stack([measured.z, measured.z_dot, u, plant.motion(at).z, command.u])
 
     x = jnp.concatenate([plant.start, laws, jnp.stack([point.u, point.u])])
     (A, B), (C, D) = jax.jacfwd(step, (0, 1))(x, jnp.zeros(3, x.dtype))
     sizes = sizes_of(cascade, scenario, point)
     scale = jnp.concatenate([plant.sizes(sizes), ravel_pytree(sizes.control)[0], jnp.stack([sizes.u, sizes.u])])
-    return StateSpace(A, B, C, D, scale, jnp.asarray(period))
+    return StateSpace(A, B, C, D, scale, jnp.asarray(period), held.path)

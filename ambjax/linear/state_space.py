@@ -1,24 +1,63 @@
 """A linear state space with the inputs and outputs of the closed loop, its frequency response and its poles."""
 
-from typing import Any, NamedTuple
+import math
+from typing import Any, Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.scipy.linalg import expm as jax_expm
+
+from ambjax.numerics.records import Scalar
+
+# Places at which the loop can be broken: the reading of the position sensor, and the command of the laws.
+Place = Literal["reading", "command"]
+PLACES: tuple[Place, ...] = ("reading", "command")
 
 # Inputs: test signals added to the readings of z (m) and z_dot (m/s), and a disturbance q_z (m/s^2).
 INPUTS = ("e_z", "e_z_dot", "q_z")
-# Outputs: the readings of z (m) and z_dot (m/s), test signals included, the voltage u (V), and the true position z (m).
-OUTPUTS = ("z_read", "z_dot_read", "u", "z")
+# Outputs: the readings of z (m) and z_dot (m/s), test signals included, the voltage u (V), the true position z (m), and
+# the command of the laws (V, or A for a commanded current).
+OUTPUTS = ("z_read", "z_dot_read", "u", "z", "command")
+
+
+class CommandPath(NamedTuple):
+    """Path from the command to the plant, x' = A x + b u, where x [n] are the first n states of the loop.
+
+    - `A` [n, n], `b` [n]: the linearised plant with the lags of sensor and amplifier; u is the command, V or A.
+    - `delay`: samples after which the command of a sample begins to act; 0 in continuous time.
+    """
+
+    A: Array
+    b: Array
+    delay: Array
+
+    def held(self, fraction: Any, period: Any) -> tuple[Any, Any]:
+        """Return the effects [..., n] on x at the next sample of a command that is held for a part of this sample.
+
+        `fraction` [...]: part of the sample after which a new command acts. The first result is the effect of the new
+        command, per unit; the second is that of the command before it.
+        """
+        np_, expm = (np, _exponential) if isinstance(self.A, np.ndarray) else (jnp, jax_expm)
+        n, fraction = len(self.b), np_.asarray(fraction)[..., None, None]
+        table = np_.concatenate([np_.concatenate([self.A, self.b[:, None]], 1), np_.zeros((1, n + 1))]) * period
+        late, early = expm(table * (1 - fraction)), expm(table * fraction)
+        return late[..., :n, n], (late[..., :n, :n] @ early[..., :n, n:])[..., 0]
+
+
+# A mode whose growth rate is below this share of the fastest rate is at rest: the difference is a rounding error.
+NEUTRAL = 1e-12
 
 
 class StateSpace(NamedTuple):
     """The linear system x' = A x + B w, y = C x + D w, or x_{n+1} = A x_n + B w_n on a processor.
 
-    - `A` [N, N], `B` [N, 3], `C` [4, N], `D` [4, 3]: matrices in SI units, with the inputs INPUTS and the outputs
+    - `A` [N, N], `B` [N, 3], `C` [5, N], `D` [5, 3]: matrices in SI units, with the inputs INPUTS and the outputs
       OUTPUTS. On a processor the disturbance q_z is held over a sample.
     - `sizes` [N]: characteristic sizes of the states, with which `scaled` improves the conditioning.
     - `period`: sample period, s; None in continuous time.
+    - `path`: path from the command to the plant, at which the loop can be broken; None: not known.
     """
 
     A: Array
@@ -27,28 +66,91 @@ class StateSpace(NamedTuple):
     D: Array
     sizes: Array
     period: Array | None = None
+    path: CommandPath | None = None
 
     def scaled(self) -> "StateSpace":
         """Return the same system with each state divided by its size."""
-        s = self.sizes
-        return self._replace(A=self.A * s / s[:, None], B=self.B / s[:, None], C=self.C * s, sizes=s / s)
+        s, path = self.sizes, self.path
+        if path is not None:
+            own = s[: len(path.b)]
+            path = path._replace(A=path.A * own / own[:, None], b=path.b / own)
+        return self._replace(A=self.A * s / s[:, None], B=self.B / s[:, None], C=self.C * s, sizes=s / s, path=path)
+
+    def idle(self) -> Array | np.ndarray:
+        """Return which states [N] no input reaches, such as an integral whose gain is 0: their deviations stay 0."""
+        linked, reached = self.A != 0, (self.B != 0).any(1)
+        for _ in range(len(self.A)):
+            reached = reached | (linked & reached).any(1)
+        return ~reached
+
+    def without_idle(self) -> "StateSpace":
+        """Return the system with NumPy arrays, without the states of the laws that no input reaches."""
+        one: Any = jax.tree.map(np.asarray, self)
+        kept = ~np.asarray(one.idle())
+        if one.path is not None:
+            kept[: len(one.path.b)] = True  # the states of the plant
+        A, B, C, sizes = one.A[kept][:, kept], one.B[kept], one.C[:, kept], one.sizes[kept]
+        return one._replace(A=A, B=B, C=C, sizes=sizes)
 
     def response(self, frequency: Array | np.ndarray) -> Array:
-        """Return the complex frequency response at frequencies [F] in Hz, as an array [F, 4 outputs, 3 inputs].
+        """Return the complex frequency response at frequencies [F] in Hz, as an array [F, 5 outputs, 3 inputs].
 
         If the matrices are NumPy arrays, NumPy computes the response, without compilation. If they are JAX arrays, it
         is differentiable.
         """
         np_ = np if isinstance(self.A, np.ndarray) else jnp
         A, B, C, D, *_ = self.scaled()
-        s = 2j * np.pi * np_.asarray(frequency)[:, None, None]
-        at = s if self.period is None else np_.exp(s * self.period)
+        at = self.point(frequency)[:, None, None]
         x = np_.linalg.solve(at * np.eye(len(A)) - A, np_.broadcast_to(B + 0j, (at.shape[0], *B.shape)))
         return C @ x + D
+
+    def point(self, frequency: Array | np.ndarray) -> Any:
+        """Return s = 2 pi j f, or z = exp(s T) on a processor, at frequencies [F] in Hz."""
+        np_ = np if isinstance(self.A, np.ndarray) else jnp
+        s = 2j * np.pi * np_.asarray(frequency)
+        return s if self.period is None else np_.exp(s * self.period)
 
     def sensitivity(self, frequency: Array | np.ndarray) -> Array:
         """Return S [F] at frequencies [F] in Hz: the complex response of the reading of z to a test signal on it."""
         return self.response(frequency)[:, 0, 0]
+
+    def command_row(self, frequency: Array | np.ndarray) -> Any:
+        """Return h [F, n]: response of the command to an input of each state of the plant, in the units of `scaled`."""
+        np_ = np if isinstance(self.A, np.ndarray) else jnp
+        A, _, C, *_ = self.scaled()
+        at, n = self.point(frequency)[:, None, None], len(self.path.b)  # pyright: ignore[reportOptionalMemberAccess]
+        row = np_.broadcast_to(C[4][:, None] + 0j, (at.shape[0], len(A), 1))
+        return np_.linalg.solve(at * np.eye(len(A)) - A.T, row)[:, :n, 0]
+
+    def command_effect(self, frequency: Array | np.ndarray, late: Scalar = 0.0) -> Array:
+        """Return the effect [F, n] of a unit command on the states of the plant, in the units of `scaled`.
+
+        `late`: additional delay of the command, s. On a processor, the effect is that of the hold, which begins after
+        the delay and ends one sample later.
+        """
+        path: Any = self.scaled().path
+        np_ = np if isinstance(self.A, np.ndarray) else jnp
+        s = 2j * np.pi * np_.asarray(frequency)[:, None]
+        if self.period is None:
+            return path.b * np_.exp(-s * late)
+        delay = path.delay + late / self.period
+        whole, back = np_.floor(delay), np_.exp(-s * self.period)
+        new, before = path.held(delay - whole, self.period)
+        return np_.exp(-s * self.period * whole) * (new + before * back)
+
+    def loop_transfer(self, frequency: Array | np.ndarray, place: Place, late: Scalar = 0.0) -> Array:
+        """Return the loop transfer L [F], broken at the position reading or at the command, at frequencies [F] in Hz.
+
+        `late`: additional delay (s) at this place. At the command, the loop is broken between the laws and the plant:
+        the laws remember their own commands. S = 1/(1 + L) is the response of the signal at this place to a signal that
+        is added to it.
+        """
+        np_ = np if isinstance(self.A, np.ndarray) else jnp
+        if place == "reading":
+            return (1 / self.sensitivity(frequency) - 1) * np_.exp(-2j * np.pi * np_.asarray(frequency) * late)
+        row, own = self.command_row(frequency), self.command_effect(frequency)
+        effect = self.command_effect(frequency, late)
+        return -np_.sum(row * effect, -1) / (1 + np_.sum(row * own, -1))
 
     def poles(self) -> np.ndarray:
         """Return the poles [N], complex: in the z-plane on a processor, else in 1/s."""
@@ -56,9 +158,15 @@ class StateSpace(NamedTuple):
 
     @property
     def stable(self) -> bool:
-        """Whether all poles lie inside the unit circle, or in the left half-plane in continuous time."""
+        """Whether no mode grows: no pole is outside the unit circle, or right of the imaginary axis in continuous time.
+
+        A pole on this border, up to rounding errors (NEUTRAL), is that of a mode at rest. An integral with a gain of
+        1e-20 has such a pole.
+        """
         poles = self.poles()
-        return bool(np.all(np.real(poles) < 0) if self.period is None else np.all(np.abs(poles) < 1))
+        if self.period is None:
+            return bool(np.all(np.real(poles) <= NEUTRAL * np.max(np.abs(poles), initial=0.0)))
+        return bool(np.all(np.abs(poles) <= 1 + NEUTRAL))
 
     def to_control(self) -> Any:
         """Return the system as a `StateSpace` of python-control, with the names INPUTS and OUTPUTS.
@@ -74,3 +182,20 @@ class StateSpace(NamedTuple):
         matrices = [np.asarray(x) for x in (self.A, self.B, self.C, self.D)]
         step = 0 if self.period is None else float(self.period)
         return control.StateSpace(*matrices, step, inputs=list(INPUTS), outputs=list(OUTPUTS))
+
+
+def _exponential(M: np.ndarray) -> np.ndarray:
+    """Return exp(M) of small matrices [..., n, n] by scaling, a Taylor polynomial of degree 13, and squaring.
+
+    SciPy's function uses the threads of its linear algebra, whose start takes longer than the computation.
+    """
+    size = float(np.abs(M).sum(axis=-1).max(initial=0.0))
+    halvings = max(0, math.ceil(math.log2(size)) + 1) if size else 0
+    small, total = M / 2.0**halvings, np.broadcast_to(np.eye(M.shape[-1]), M.shape)
+    term = total
+    for k in range(1, 14):
+        term = term @ small / k
+        total = total + term
+    for _ in range(halvings):
+        total = total @ total
+    return total

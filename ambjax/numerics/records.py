@@ -68,19 +68,23 @@ def leaf(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-# Lower (exclusive) and upper bound of all gains. They are wide, because the unit and the size of a gain depend on the
-# law and the plant.
+# Lower (exclusive) and upper bound of all gains; 0 is allowed where it switches a term off. The bounds are wide,
+# because the unit and the size of a gain depend on the law and the plant.
 GAINS = 1e-30, 1e30
 
 
-def gain(*, default: object, unit: str, doc: str, steepness: bool = False) -> Any:
+def gain(
+    *, default: object, unit: str, doc: str, steepness: bool = False, zero: bool = False, optional: bool = False
+) -> Any:
     """Declare a gain: a positive numeric field of a law, which the tuner varies on a logarithmic scale.
 
-    `default`, `unit` and `doc` are those of `leaf`. `steepness`: whether the gain is the steepness of a smoothed sign.
-    The default of a steepness is scaled to the plant, and the tuner varies it only on request. On a processor it may be
-    inf, which selects the set-valued sign. Returns the dataclass field.
+    `default`, `unit`, `doc` and `optional` are those of `leaf`. `steepness`: whether the gain is the steepness of a
+    smoothed sign. The default of a steepness is scaled to the plant, and the tuner varies it only on request. On a
+    processor it may be inf, which selects the set-valued sign. `zero`: whether 0 is allowed, which switches the term of
+    the gain off. Returns the dataclass field.
     """
-    plain = leaf(default=default, unit=unit, doc=doc, above=GAINS[0], at_most=GAINS[1], infinite=steepness)
+    low: Any = {"at_least": 0.0} if zero else {"above": GAINS[0]}
+    plain = leaf(default=default, unit=unit, doc=doc, at_most=GAINS[1], infinite=steepness, optional=optional, **low)
     return dataclasses.field(default=default, metadata={**plain.metadata, "steepness": steepness})
 
 

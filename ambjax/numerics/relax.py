@@ -76,14 +76,14 @@ def _relaxed_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) ->
 
 
 def twist(x: Scalar, a: Scalar, b: Scalar, p: Scalar | None) -> tuple[Array, Array]:
-    """Return root_p(y) and sgn_p(y) for the y with y + a root_p(y) + b sgn_p(y) = x; a, b > 0.
+    """Return root_p(y) and sgn_p(y) for the y with y + a root_p(y) + b sgn_p(y) = x; a > 0, b >= 0.
 
-    root_p is `smooth_root`. p = None has a closed form: if |x| <= b, then y = 0 and the sign is x/b.
+    root_p is `smooth_root`. p = None has a closed form: if |x| <= b, then y = 0 and the sign is x/b, or sgn x if b = 0.
     """
     x, a, b = jnp.asarray(x), jnp.asarray(a), jnp.asarray(b)
     if p is None:
         y = _hard_twist(x, a, b)
-        return smooth_root(y, None), jnp.clip(x / b, -1.0, 1.0)
+        return smooth_root(y, None), jnp.where(b > 0, jnp.clip(x / jnp.where(b > 0, b, 1.0), -1.0, 1.0), jnp.sign(x))
     y = _twisted(x, a, b, jnp.asarray(p))
     return smooth_root(y, p), smooth_sign(y, p)
 

@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from ambjax.pictures.figures import BLUE, INK, RED
 from ambjax.pictures.scales import digits, prefix_of, style_axes
 from ambjax.pictures.style import own_style
-from ambjax.pictures.thinning import envelope, smoothed, thin
+from ambjax.pictures.thinning import envelope, thin
 
 # Quantities of a fan chart: label and SI unit.
 QUANTITIES = {
@@ -25,8 +25,6 @@ QUANTITIES = {
     "variation of u": ("variation of $u$", "V/s"),
     "v_tilde": (r"force error $\tilde v$", "A²/m²"),
 }
-# A chattering median is averaged over each of this many parts of the run.
-SMOOTHED = 50
 
 
 @own_style
@@ -81,8 +79,8 @@ def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float,
         name = f"{percents[k]:g} to {percents[-1 - k]:g} %"
         ax.fill_between(x, factor * lower, factor * upper, color=_tint(k, pairs), linewidth=0, label=name)
     if len(percents) % 2:
-        middle, words = _median(t, factor * curves[pairs])
-        ax.plot(*middle, color=INK, linewidth=1.0, label=words)
+        # Not smoothed: the members share loads and a speed, so that a fast median can be a motion of all of them.
+        ax.plot(*thin(t, factor * curves[pairs]), color=INK, linewidth=0.8, label="median")
     # near: the largest value is at least three quarters of the limit
     near = [value for value, peak in ((limit, high), (-limit, -low)) if limit <= 1.33 * peak]
     margin = 0.08 * (high - low) or 0.1 * abs(high) or 1.0
@@ -96,16 +94,6 @@ def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float,
         )
         ax.set_title(words, fontsize=7, loc="right", pad=2, color=INK)
     style_axes(ax, f"{label}\n({unit})")
-
-
-def _median(t: np.ndarray, y: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], str]:
-    """Return the curve of the median and its label. A chattering median is averaged over parts of the run."""
-    finite = np.isfinite(y)
-    steps = np.diff(y[finite])
-    turns = np.count_nonzero(np.diff(np.sign(steps)))
-    if turns <= steps.size / 4 or np.abs(steps).sum() <= 20 * np.ptp(y[finite]):
-        return thin(t, y), "median"
-    return smoothed(t[finite], y[finite], min(SMOOTHED, int(finite.sum()))), "median, smoothed where it chatters"
 
 
 def _tint(k: int, pairs: int) -> tuple[float, ...]:

@@ -111,7 +111,8 @@ def frequency_figure(
         ax.grid(True, which="major", color="#dddddd", linewidth=0.6)
     for ax in (stiffness_axes, phase_axes):
         ax.set_xlabel("frequency, Hz")
-    S_axes.legend(fontsize=8, loc="best")
+    if S_axes.get_legend_handles_labels()[0]:  # there are none if no loop is stable
+        S_axes.legend(fontsize=8, loc="best")
     figure.suptitle(f"{title}: sensitivity at the position sensor", fontsize=12)
     return figure
 

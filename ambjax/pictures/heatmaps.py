@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Rectangle
 
 from ambjax.pictures.figures import INK
 from ambjax.pictures.scales import axis_of, edges, label_of, log_ticks, size_of
@@ -22,6 +22,8 @@ CONTOUR = 0.95
 LINES = {"low": 0.8, "high": 0.8, "survival": 2.2}
 # Both colour maps run evenly from dark to light, so that light means good in grey print too.
 SURVIVAL, ERROR = "cividis", "viridis_r"
+# A cell that is held but not stable.
+UNSTABLE_CELL = {"facecolor": "none", "edgecolor": "#D55E00", "hatch": "xxxx", "linewidth": 0.0}
 EMPTY_CELL = {"facecolor": "#d4d4d4", "edgecolor": "#8a8a8a", "hatch": "////", "linewidth": 0.0}
 
 
@@ -32,6 +34,7 @@ class MapPanel(NamedTuple):
     - `survival` [ny, nx]: shares 0 to 1; NaN: not run.
     - `low`, `high` [ny, nx]: bounds of the confidence interval of the survival. None: not drawn, and the contour
       encloses the cells in which all runs survive, instead of those in which a share of CONTOUR survives.
+    - `unstable` [ny, nx]: whether the loop is held but not stable; hatched. None: not known.
     - `error` [ny, nx]: in the unit of the error metric; not finite: not run, or no survivor. None: no map of errors.
     """
 
@@ -42,6 +45,7 @@ class MapPanel(NamedTuple):
     low: np.ndarray | None
     high: np.ndarray | None
     error: np.ndarray | None
+    unstable: np.ndarray | None = None
 
 
 @own_style
@@ -92,6 +96,8 @@ def map_figure(
     if any(panel.low is not None for panel in panels):
         words = "bounds of the confidence interval at 95 %"
         keys.append(Line2D([], [], color=INK, linewidth=LINES["low"], label=words))
+    if any(panel.unstable is not None and np.any(panel.unstable) for panel in panels):
+        keys.append(Patch(label="held, but not stable", **UNSTABLE_CELL))
     if empty := _empty_words(panels):
         keys.append(Patch(label=empty, **EMPTY_CELL))
     figure.legend(handles=keys, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
@@ -135,6 +141,10 @@ def _cells(ax: Axes, panel: MapPanel, values: np.ndarray, norm: Normalize, colou
     ax.set_xscale("log" if x_log else "linear")
     ax.set_yscale("log" if y_log else "linear")
     ax.pcolormesh(x_edges, y_edges, np.ma.masked_invalid(values), norm=norm, cmap=colours)
+    if panel.unstable is not None:
+        for row, column in np.argwhere(panel.unstable):
+            (left, right), (low, high) = x_edges[column : column + 2].tolist(), y_edges[row : row + 2].tolist()
+            ax.add_patch(Rectangle((left, low), right - left, high - low, **UNSTABLE_CELL))
     for name, width in LINES.items():
         values = getattr(panel, name)
         if values is None:

@@ -1,18 +1,24 @@
 """Operating points: linearised loops of a case at its equilibria, and of the members of its spread."""
 
+import contextlib
 import dataclasses
 import math
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from ambjax.cases.reader import Case, require_case
 from ambjax.ensemble.study import Study
 from ambjax.linear import (
+    PLACES,
     Analysis,
+    Margins,
     MemberPeaks,
     StateSpace,
     analyse,
+    checked,
+    decayed_end,
     frequency_lines,
     injected_members,
     linearise,
@@ -38,6 +44,7 @@ class SpreadPeaks(NamedTuple):
     """Result of `spread_peaks`.
 
     `members`: number of members analysed. `stable`, `zone_a`: how many of them are stable, and stable in zone A.
+    `failed`: how many have no linearisation; they count as not stable.
     `worst`: index of the member with the largest peak, or of the first one that is not stable. `point`: the loop of
     this member; None if it has no equilibrium. `measured`: the peaks of all members by injection; None from
     `spread_peaks` itself.
@@ -49,13 +56,14 @@ class SpreadPeaks(NamedTuple):
     worst: int
     point: OperatingPoint | None
     measured: MemberPeaks | None = None
+    failed: int = 0
 
 
 def operating_point(case: Case, name: str, r: float) -> OperatingPoint:
     """Linearise and analyse the loop of a case at a constant reference r (m). Raises ValueError as `linearise` does."""
     system = linearise(case.cascade, case.scenario, case.clock, r)
     m = float(case.scenario.plant.m)
-    return OperatingPoint(name, r, m, system, _analysis(case, system, m))
+    return OperatingPoint(name, r, m, system, _analysis(case, system, m, _velocity_sensor(case)))
 
 
 def sensitivity(case: Case, r: float = 0.0) -> Analysis:
@@ -71,10 +79,14 @@ def sensitivity(case: Case, r: float = 0.0) -> Analysis:
     return operating_point(case, "nominal", r).analysis
 
 
-def _analysis(case: Case, system: StateSpace, m: float) -> Analysis:
+def _velocity_sensor(case: Case) -> bool:
+    """Return whether the velocity is measured and the laws use this measurement."""
     sensor = case.scenario.sensor
-    measured = (sensor is None or sensor.velocity) and not case.cascade.observer.estimates_velocity
-    return analyse(system, m, case.clock.sample_period, case.zones, measured)
+    return (sensor is None or sensor.velocity) and case.cascade.reads_velocity(case.clock.sample_period)
+
+
+def _analysis(case: Case, system: StateSpace, m: float, velocity: bool) -> Analysis:
+    return analyse(system, m, case.clock.sample_period, case.zones, velocity)
 
 
 def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPeaks:
@@ -85,20 +97,24 @@ def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPea
     members = study.members if most is None else min(study.members, most)
     cascade, scenario = study.batch(np.arange(members))
     systems, found = linearise_members(cascade, scenario, study.clock)
-    peaks, good = np.full(members, math.inf), np.zeros(members, bool)
+    peaks, good, velocity = np.full(members, math.inf), np.zeros(members, bool), _velocity_sensor(case)
     masses = np.broadcast_to(np.asarray(scenario.plant.m, float), (members,))
     analyses: list[Analysis | None] = []
     loops: list[StateSpace] = []
     for k in range(members):
-        loops.append(StateSpace(*(None if x is None else np.asarray(x)[k] for x in systems)))  # pyright: ignore
-        one = _analysis(case, loops[k], float(masses[k])) if found[k] else None
+        one, loop = None, jax.tree.map(lambda x, k=k: np.asarray(x)[k], systems)
+        with contextlib.suppress(ValueError):  # the member has no linearisation
+            loop = checked(loop, found[k], 0.0)
+            one = _analysis(case, loop, float(masses[k]), velocity)
+        loops.append(loop)
         analyses.append(one)
         if one is not None and one.stable:
             peaks[k], good[k] = one.S.height, True
     worst, zone_a = int(np.argmax(peaks)), sum(one is not None and one.stable and one.zone == "A" for one in analyses)
     one = analyses[worst]
     point = None if one is None else OperatingPoint(f"member {worst}", 0.0, float(masses[worst]), loops[worst], one)
-    return SpreadPeaks(members, int(good.sum()), int(zone_a), worst, point)
+    failed = sum(one is None for one in analyses)
+    return SpreadPeaks(members, int(good.sum()), int(zone_a), worst, point, failed=failed)
 
 
 def measured_peaks(case: Case, study: Study, peak: float) -> MemberPeaks:
@@ -118,6 +134,14 @@ def one_period(case: Case) -> Clock:
     return dataclasses.replace(case.clock, samples=math.ceil(1 / (float(case.zones.f_low) * period)))
 
 
+def shown_band(case: Case, systems: list[StateSpace]) -> tuple[float, float]:
+    """Return the band (Hz) of a picture of these loops: that of the case, by default until |S - 1| has decayed."""
+    if case.cascade.processor is not None:
+        return case.zones.range(case.clock.sample_period)
+    low = float(case.zones.f_low)
+    return case.zones.range(None, max([decayed_end(system, low) for system in systems], default=1e3 * low))
+
+
 def analysis_summary(one: Analysis) -> dict[str, object]:
     """Return the numbers of an analysis by their names in the JSON summary."""
     margins = one.margins
@@ -131,13 +155,27 @@ def analysis_summary(one: Analysis) -> dict[str, object]:
         "ks_peak": one.KS.height,
         "ks_frequency_hz": one.KS.frequency,
         "velocity_peak": None if one.S_velocity is None else one.S_velocity.height,
+        "velocity_frequency_hz": None if one.S_velocity is None else one.S_velocity.frequency,
+        **_margin_numbers(margins),
+        "margins": margin_numbers(one),
+        "static_stiffness_N_per_m": one.stiffness,
+        "noise_gain": one.noise,
+        "poles_per_s": [[float(pole.real), float(pole.imag)] for pole in one.poles],
+    }
+
+
+def margin_numbers(one: Analysis) -> dict[str, object]:
+    """Return the margins of a loop by place, and the place of the smaller delay margin, for a JSON summary."""
+    numbers: dict[str, object] = {place: _margin_numbers(getattr(one.margins_at, place)) for place in PLACES}
+    return numbers | {"delay_at": one.margins_at.place("delay")}
+
+
+def _margin_numbers(margins: Margins) -> dict[str, float]:
+    return {
         "gain_margin": margins.gain,
         "gain_margin_low": margins.gain_low,
         "gain_margin_high": margins.gain_high,
         "phase_margin_deg": margins.phase_deg,
         "delay_margin_s": margins.delay,
         "disk_margin": margins.disk,
-        "static_stiffness_N_per_m": one.stiffness,
-        "noise_gain": one.noise,
-        "poles_per_s": [[float(pole.real), float(pole.imag)] for pole in one.poles],
     }

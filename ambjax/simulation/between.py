@@ -73,16 +73,18 @@ def subproblems(
 
     `state`: of the plant at t. `cuts`: largest number of edges inside one sample; None: the number of all edges.
     """
-    at = loop.scenario.edges()
-    edges = Edges(at, len(at) if cuts is None else min(cuts, len(at)))
+    at, knots = loop.scenario.edges(), loop.scenario.knots()
+    most = len(at) + sum(len(one.times) for one in knots)
+    edges = Edges(at, most if cuts is None else min(cuts, most), knots)
     if not edges.most:
         edges = NO_EDGES
     if not lags(loop):
         return [(_under(loop, state, command, voltage, edges), time) for voltage, time in voltages]
-    # The solution of the sensor's low-pass requires a motion that is smooth over each part, so divide at edges too.
-    cut = []
+    # The solution of the sensor's low-pass requires a motion that is smooth over each part, so divide at edges too. The
+    # knots of records may be many; steps end there, but parts do not.
+    cut, inside = [], Edges((), edges.most, edges.knots) if edges.knots else NO_EDGES
     for voltage, time in voltages:
-        problem = _under(loop, state, command, voltage, NO_EDGES)
+        problem = _under(loop, state, command, voltage, inside)
         cut += [(problem, length) for length in edges.pieces(t, time)]
         t = t + time
     return cut
@@ -134,4 +136,15 @@ def _under(loop: ClosedLoop, state: object, command: Command, voltage: Voltage, 
         return plant_status(loop, x)
 
     scale = jax.tree.map(jnp.asarray, plant.scale())
-    return InitialValueProblem(inputs, rates, scale, status, None, observed, INSTANT_TREE, edges=edges)
+    return InitialValueProblem(
+        inputs,
+        rates,
+        scale,
+        status,
+        None,
+        observed,
+        INSTANT_TREE,
+        edges=edges,
+        motion=loop.motion,
+        limit=loop.scenario.limit,
+    )

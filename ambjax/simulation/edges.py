@@ -1,32 +1,35 @@
-"""Edges: instants at which the rates of a problem jump. Integrators end a step at each edge of the problem.
+"""Edges: instants at which the rates of a problem, or a derivative of them, jump. Steps end at edges.
 
-Only problems of loops on a processor have edges (`simulation.between`). In continuous time a step may contain a jump.
+In continuous time, only adaptive steps end at edges. Steps of a fixed number may contain a jump there.
 
 A method has its nominal order only on steps in which the rates are smooth. A jump inside a step causes an error of
-first order in the step length for every method.
+first order in the step length for every method, and a kink one of second order.
 """
 
-import itertools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from ambjax.numerics.records import Scalar, is_traced
+from ambjax.world.recorded import Knots
 from ambjax.world.scenario import Scenario
 
 
 class Edges(NamedTuple):
-    """Instants at which the rates jump.
+    """Instants at which the rates jump or have a kink.
 
-    - `at`: the instants, s.
-    - `most`: largest number of them strictly inside one advance of an integrator.
+    - `at`: single instants, s.
+    - `most`: largest number of instants strictly inside one advance of an integrator with a fixed number of steps; 0:
+      such steps do not end at edges.
+    - `knots`: instants of recorded signals.
     """
 
     at: tuple[Scalar, ...] = ()
     most: int = 0
+    knots: tuple[Knots, ...] = ()
 
     def until(self, now: Scalar, h: Scalar) -> Array:
         """Return the time from `now` to the first edge within the next `h`, s; h if there is no edge.
@@ -34,38 +37,42 @@ class Edges(NamedTuple):
         An edge within rounding of either end is not inside: `inset` moves the stages to the correct side of it.
         """
         tolerance, step = inset(now, h), jnp.asarray(h)
-        for edge in self.at:
+        for edge in (*self.at, *(knots.after(now + 2 * tolerance) for knots in self.knots)):
             ahead = (edge > now + tolerance) & (edge < now + step - tolerance)
             step = jnp.where(ahead, edge - now, step)
         return step
 
     def pieces(self, t: Scalar, time: Scalar) -> list[Array]:
-        """Return the lengths, s, of the `most` + 1 parts into which edges divide t to t + time; some may be 0."""
-        lengths, left = [], jnp.asarray(time)
-        for _ in range(self.most):
-            lengths.append(self.until(t, left))
+        """Return the lengths, s, of the parts into which the single instants divide t to t + time; some may be 0."""
+        lengths, left, single = [], jnp.asarray(time), Edges(self.at)
+        for _ in range(min(self.most, len(self.at))):
+            lengths.append(single.until(t, left))
             t, left = t + lengths[-1], left - lengths[-1]
         return [*lengths, left]
 
-    def steps(self, t: Scalar, h: Scalar, count: int) -> Callable[[Array], tuple[Array, Array, Array]]:
+    def steps(
+        self, t: Scalar, h: Scalar, count: int
+    ) -> tuple[Any, Callable[[Array, Any], tuple[Array, Array, Array, Any]]]:
         """Divide `count` equal steps of length h, from t on, at the edges inside them.
 
-        Returns a function from the number of a step, 0 to `count` + `most` - 1, to its begin, end and length, s. If
-        there are fewer edges than `most`, some steps have length 0.
+        Returns the position before the first step, and a function from the number of a step, 0 to `count` + `most` - 1,
+        and the position to its begin, end and length, s, and the next position. If there are fewer edges than `most`,
+        the last steps have length 0. If there are more, the last of them are not ends of steps.
         """
         if not self.most:
-            return lambda number: (t + number * h, t + (number + 1) * h, jnp.asarray(h))
-        after = list(itertools.accumulate(self.pieces(t, count * h)[:-1]))
+            return (), lambda number, place: (t + number * h, t + (number + 1) * h, jnp.asarray(h), place)
+        h = jnp.asarray(h)
 
-        def step(number: Array) -> tuple[Array, Array, Array]:
-            # Insert one edge after another into the sorted ends of equal steps; the clip keeps them sorted.
-            ends = [h * jnp.clip(number + k, 0, count) for k in range(-self.most, 2)]
-            for edge in after:
-                ends = [jnp.clip(edge, low, high) for low, high in itertools.pairwise(ends)]
-            begin, end = ends
-            return t + begin, t + end, end - begin
+        def step(number: Array, place: tuple[Array, Array]) -> tuple[Array, Array, Array, tuple[Array, Array]]:
+            begin, done = place  # time since t, and number of the equal steps that are complete
+            goal = h * jnp.minimum(done + 1, count)
+            more = count + self.most - number > count - done  # more steps than equal steps are left
+            length = jnp.where(more, self.until(t + begin, goal - begin), goal - begin)
+            whole = length >= goal - begin
+            end = jnp.where(whole, goal, begin + length)
+            return t + begin, t + end, end - begin, (end, jnp.minimum(done + whole, count))
 
-        return step
+        return (jnp.zeros_like(h), jnp.zeros((), jnp.int32)), step
 
 
 NO_EDGES = Edges()
@@ -84,16 +91,19 @@ def _rounding() -> float:
     return 4 * float(jnp.finfo(jnp.result_type(float)).eps)
 
 
-def most_inside(scenario: Scenario, period: Scalar) -> int | None:
+def most_inside(scenario: Scenario, period: Scalar, reference: bool = False) -> int | None:
     """Return the largest number of edges of the disturbances strictly inside one sample; None if an
     edge or the period is traced.
 
-    `period`: one sample period or several, s. The number is an upper bound for an ensemble. An edge that differs
+    `reference`: include the edges of the reference, which a processor reads at the samples only. `period`: one sample
+    period or several, s.
+
+    The number is an upper bound for an ensemble. An edge that differs
     between members counts as inside a sample. Two edges count as inside the same sample if their distance can be
     shorter than the longest period. The distance can have every value between its extremes over the members.
     """
-    edges = scenario.edges()
-    if any(map(is_traced, (*edges, period))):
+    edges, knots = scenario.edges(reference), scenario.knots(reference)
+    if any(map(is_traced, (*edges, *(one.start for one in knots), period))):
         return None
     periods = np.asarray(period, float)
     inside = [x for x in (np.asarray(x, float) for x in edges) if np.any(x > 0) and _between_samples(x, periods)]
@@ -102,7 +112,25 @@ def most_inside(scenario: Scenario, period: Scalar) -> int | None:
     def share(a: np.ndarray, b: np.ndarray) -> bool:
         return bool(np.min(a - b) < longest and np.max(a - b) > -longest)
 
-    return max((sum(share(a, b) for b in inside) for a in inside), default=0)
+    single = max((sum(share(a, b) for b in inside) for a in inside), default=0)
+    return single + sum(_knots_inside(one, periods) for one in knots)
+
+
+def _knots_inside(knots: Knots, periods: np.ndarray) -> int:
+    """Return the largest number of knots strictly inside one sample.
+
+    If the start of the record or the period differs between members, it is an upper bound: the largest number in any
+    interval of the longest period.
+    """
+    longest = float(np.max(periods))
+    if np.ptp(np.asarray(knots.start, float)) > 0 or np.ptp(periods) > 0:
+        ends = np.searchsorted(knots.times, knots.times + longest)
+        return int(np.max(ends - np.arange(len(ends)), initial=0))
+    at = knots.times + np.ravel(np.asarray(knots.start, float))[0]
+    nearest = np.round(at / longest) * longest
+    inside = (at > 0) & (np.abs(at - nearest) > _rounding() * (np.abs(nearest) + longest))
+    samples = np.floor(at[inside] / longest)
+    return int(np.max(np.unique(samples, return_counts=True)[1], initial=0))
 
 
 def _between_samples(edge: np.ndarray, periods: np.ndarray) -> bool:

@@ -1,4 +1,4 @@
-"""Explicit Runge-Kutta methods with equal substeps, for smooth gains: Euler, RK4, DOP853."""
+"""Explicit Runge-Kutta methods for smooth gains: Euler, RK4, DOP853 with equal steps, Cash-Karp with adaptive steps."""
 
 import functools
 from collections.abc import Callable
@@ -10,8 +10,9 @@ from jax import Array
 
 from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.numerics.records import Scalar, record
+from ambjax.simulation.adaptive import AdaptiveSteps, Attempt
 from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, State, Times
-from ambjax.simulation.span import Span
+from ambjax.simulation.span import Instant, Span
 
 
 @functools.cache
@@ -41,7 +42,7 @@ def _combination(weights: tuple[float, ...]) -> Callable[..., Array]:
     return combination
 
 
-class _Explicit(FixedSteps):
+class _Tableau:
     """Base class of explicit Runge-Kutta methods.
 
     - `TIMES`: times of the stages, as fractions of the step.
@@ -55,23 +56,34 @@ class _Explicit(FixedSteps):
     TIMES: ClassVar[tuple[float, ...]]
     ROWS: ClassVar[tuple[tuple[float, ...], ...]]
 
+    def _stages(
+        self, problem: InitialValueProblem[Inputs, State], at: Times, h: Array, state: State
+    ) -> tuple[State, list[State], list[Instant]]:
+        """Return the new state, and the rates and the signals of all stages."""
+        inputs = {share: problem.inputs(at(share)) for share in self.TIMES}
+        x, rates, instants = state, [], []
+        for share, row in zip(self.TIMES, self.ROWS, strict=True):
+            rate, instant = problem.rates_and_signals(inputs[share], x)
+            rates.append(materialised(rate, x))
+            instants.append(instant)
+            combination = _combination(row)
+            x = jax.tree.map(lambda x, *ks, combination=combination: combination(x, h, ks), state, *rates)
+        return x, rates, instants
+
+
+class _Explicit(_Tableau, FixedSteps):
+    """Base class of explicit Runge-Kutta methods with equal substeps."""
+
     def _step(
         self, problem: InitialValueProblem[Inputs, State], at: Times, h: Scalar, state: State, span: Span
     ) -> tuple[State, Span]:
-        inputs = {share: problem.inputs(at(share)) for share in self.TIMES}
-        x, stages, h = state, [], jnp.asarray(h)
-        for share, row, weight in zip(self.TIMES, self.ROWS, self.ROWS[-1], strict=True):
-            rates, instant = problem.rates_and_signals(inputs[share], x)
-            stages.append(materialised(rates, x))
-            combination = _combination(row)
-            x = jax.tree.map(lambda x, *ks, combination=combination: combination(x, h, ks), state, *stages)
-            # Integrals use the weights of the method. Only the first stage counts for extremes; the others are trial
-            # states.
-            span = (
-                span.with_instant(instant, weight * h, h)
-                if len(stages) == 1
-                else span.with_densities(instant, weight * h)
-            )
+        h = jnp.asarray(h)
+        x, _, (first, *others) = self._stages(problem, at, h, state)
+        # Integrals use the weights of the method. Only the first stage counts for extremes; the others are trial
+        # states.
+        span = span.with_instant(first, self.ROWS[-1][0] * h, h)
+        for instant, weight in zip(others, self.ROWS[-1][1:], strict=True):
+            span = span.with_densities(instant, weight * h)
         return x, span
 
 
@@ -137,3 +149,38 @@ class DOP853(_Explicit):
 
     def __str__(self) -> str:
         return f"DOP853, {self.substeps} substeps"
+
+
+@record
+class AdaptiveCashKarp(_Tableau, AdaptiveSteps):
+    """The method of Cash and Karp, order 5(4), with adaptive steps. `AdaptiveSteps` defines the allowed error.
+
+    Suitable if the loop is not stiff. A trial step takes six evaluations and no Jacobian. A kink of the rates, such as
+    the limit of the supply, takes few of them.
+
+    Coefficients: Cash and Karp, ACM Trans. Math. Softw. 16 (1990) 201-222. `ERROR`: the weights of the solution of
+    order 5 minus those of order 4.
+    """
+
+    ORDER = 5
+    TIMES = (0.0, 1 / 5, 3 / 10, 3 / 5, 1.0, 7 / 8)
+    ROWS = (
+        (1 / 5,),
+        (3 / 40, 9 / 40),
+        (3 / 10, -9 / 10, 6 / 5),
+        (-11 / 54, 5 / 2, -70 / 27, 35 / 27),
+        (1631 / 55296, 175 / 512, 575 / 13824, 44275 / 110592, 253 / 4096),
+        (37 / 378, 0.0, 250 / 621, 125 / 594, 0.0, 512 / 1771),
+    )
+    ERROR = (-277 / 64512, 0.0, 6925 / 370944, -6925 / 202752, -277 / 14336, 277 / 7084)
+
+    def _attempt(self, problem: InitialValueProblem[Inputs, State], at: Times, h: Array, state: State) -> Attempt:
+        def total(weights: tuple[float, ...], trees: list[State]) -> State:
+            return jax.tree.map(lambda *ks: h * sum(w * k for w, k in zip(weights, ks, strict=True) if w), *trees)
+
+        new, rates, instants = self._stages(problem, at, h, state)
+        integrals = total(self.ROWS[-1], [x.densities for x in instants])
+        return Attempt(new, total(self.ERROR, rates), instants[0], integrals)
+
+    def __str__(self) -> str:
+        return f"Cash-Karp 5(4), adaptive, tolerance {float(self.tolerance):g}"

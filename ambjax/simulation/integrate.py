@@ -13,16 +13,17 @@ order there.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
 from ambjax.numerics.records import Scalar, record, static
+from ambjax.numerics.smooth import away_from_zero
 from ambjax.simulation.edges import NO_EDGES, Edges, inset
 from ambjax.simulation.span import NOTHING, Instant, Span, blank
-from ambjax.simulation.trajectory import ALIVE
+from ambjax.simulation.trajectory import ALIVE, TOUCHED
 
 State = TypeVar("State")
 # External inputs of a problem at one instant.
@@ -46,6 +47,8 @@ class InitialValueProblem(NamedTuple, Generic[Inputs, State]):
     - `slide`: slide(inputs(t_0), inputs(t_1), h, state, span) -> (state, span), a step for this particular system;
       None: there is none.
     - `edges`: other instants at which the rates jump.
+    - `motion`: motion(state) -> displacement and velocity of the rotor; None: no rotor.
+    - `limit`: |displacement| at which the status becomes TOUCHED.
     """
 
     inputs: Callable[[Scalar], Inputs]
@@ -58,6 +61,34 @@ class InitialValueProblem(NamedTuple, Generic[Inputs, State]):
     jumps: bool = False
     slide: Callable[[Inputs, Inputs, Scalar, State, Span], tuple[State, Span]] | None = None
     edges: Edges = NO_EDGES
+    motion: Callable[[State], tuple[Array, Array]] | None = None
+    limit: Scalar = jnp.inf
+
+    def moving(self, state: State) -> tuple[Array, Array] | tuple[()]:
+        """Return the displacement and the velocity of the rotor; empty without a rotor."""
+        return () if self.motion is None else self.motion(state)
+
+    def ended(
+        self, before: State, after: tuple[Array, Array] | tuple[()], begin: Array, end: Array, code: Array
+    ) -> Array:
+        """Return the time of the end, s; if the last step reaches the limit, that at which |displacement| equals it.
+
+        `before`: state at the begin of the last step. `after`: motion at its end. Between them the motion is the cubic
+        with these displacements and velocities. Its crossing is found by Newton's method, from the crossing of the
+        chord. The time has no derivatives.
+        """
+        if self.motion is None or not after:
+            return end
+        h, sign = end - begin, jnp.where(after[0] < 0, -1.0, 1.0)
+        (a, slope_a), (b, slope_b) = ((sign * z, sign * h * z_dot) for z, z_dot in (self.motion(before), after))
+        curve, twist = 3 * (b - a) - 2 * slope_a - slope_b, 2 * (a - b) + slope_a + slope_b
+        share = jnp.clip((self.limit - a) / away_from_zero(b - a, 1e-30), 0.0, 1.0)
+        for _ in range(5):
+            beyond = a + share * (slope_a + share * (curve + share * twist)) - self.limit
+            slope = away_from_zero(slope_a + share * (2 * curve + share * 3 * twist), 1e-30)
+            share = jnp.clip(share - beyond / slope, 0.0, 1.0)
+        crossed = (code == TOUCHED) & jnp.isfinite(share)
+        return lax.stop_gradient(jnp.where(crossed, begin + share * h, end))
 
     def rates_and_signals(self, inputs: Inputs, state: State) -> tuple[State, Instant]:
         """Return the rates, and the signals to record."""
@@ -69,7 +100,7 @@ class Advanced(NamedTuple, Generic[State]):
 
     - `state`: last state with status code 0.
     - `code`: status code at the end.
-    - `t`: time of the end, s; of the first invalid state, if there is one.
+    - `t`: time of the end, s; if there is an invalid state, of the first one, or of its crossing of the limit.
     - `memory`: data for the next sample.
     - `span`: extremes and integrals of the signals.
     """
@@ -175,18 +206,21 @@ class FixedSteps:
         code: Scalar = ALIVE,
     ) -> Advanced[State]:
         h = jnp.asarray(period) / self.substeps
-        steps = problem.edges.steps(t, h, self.substeps)
+        place, steps = problem.edges.steps(t, h, self.substeps)
 
-        def body(number: Array, carry: tuple[State, Array, Array, Span]) -> tuple[State, Array, Array, Span]:
-            x, code, end, span = carry
+        def body(number: Array, carry: tuple[State, Array, Any, Span, Any]) -> tuple[State, Array, Any, Span, Any]:
+            x, code, last, span, place = carry
             alive = code == ALIVE
             # Times do not depend on the status, so that members share the times and the inputs at these times.
-            start, stop, step = steps(number)
+            start, stop, step, place = steps(number, place)
             new, after = self._step(problem, stage_times(start, step), step, x, span)
             code = jnp.where(alive, problem.status(new), code)
             x = choose(code == ALIVE, new, x)
-            return x, code, jnp.where(alive, stop, end), choose(alive, after, span)
+            last = choose(alive, (start, stop, problem.moving(new)), last)
+            return x, code, last, choose(alive, after, span), place
 
-        begin = (state, jnp.asarray(code, jnp.int32), jnp.asarray(t, h.dtype), blank(problem.instant_structure))
-        x, last, end, span = lax.fori_loop(0, self.substeps + problem.edges.most, body, begin)
-        return Advanced(x, last, end, memory, span)
+        t = jnp.asarray(t, h.dtype)
+        code, last = jnp.asarray(code, jnp.int32), (t, t, problem.moving(state))
+        begin = (state, code, last, blank(problem.instant_structure), place)
+        x, code, (start, end, motion), span, _ = lax.fori_loop(0, self.substeps + problem.edges.most, body, begin)
+        return Advanced(x, code, problem.ended(x, motion, start, end, code), memory, span)

@@ -11,6 +11,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
 from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.smooth import larger, limited
+from ambjax.simulation.edges import Edges
 from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.sliding import slide, slides
 from ambjax.simulation.span import Instant, Span
@@ -185,6 +186,10 @@ class ClosedLoop:
             functools.reduce(jnp.logical_and, in_range), jnp.where(touched, TOUCHED, ALIVE), DIVERGED
         ).astype(jnp.int32)
 
+    def motion(self, plant: object) -> tuple[Array, Array]:
+        """Return the displacement (m) and the velocity (m/s) of the rotor for a state of the plant."""
+        return self.scenario.plant.measurement(plant)[:2]
+
     def rest(self, state: LoopState, code: Array) -> LoopState:
         """Return the state in which a lost rotor is frozen: at rest, at the stop that it touched or else at its last z.
 
@@ -200,9 +205,21 @@ class ClosedLoop:
         step = functools.partial(slide, self, errors) if slides(self.cascade, self.scenario) else None
         rates = lambda inputs, x: self.rates(inputs, x, errors)  # noqa: E731
         observed = lambda inputs, x: self.observed(inputs, x, errors)  # noqa: E731
-        jumps = self.scenario.sensor is not None
+        jumps = self.scenario.sensor is not None and sum(map(jnp.abs, self.scenario.sensor.noises)) > 0
+        edges = Edges(self.scenario.edges(reference=True), 0, self.scenario.knots(reference=True))
         return InitialValueProblem(
-            self.inputs, rates, self.scale(), self.status, self.layer(), observed, INSTANT_TREE, jumps, step
+            self.inputs,
+            rates,
+            self.scale(),
+            self.status,
+            self.layer(),
+            observed,
+            INSTANT_TREE,
+            jumps,
+            step,
+            edges,
+            lambda state: self.motion(state.plant),
+            self.scenario.limit,
         )
 
     def row(self, t: Scalar, state: LoopState, errors: Errors, alive: Array) -> Row:

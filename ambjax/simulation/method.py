@@ -11,7 +11,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import is_traced
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.edges import most_inside
-from ambjax.simulation.explicit import RK4
+from ambjax.simulation.explicit import DOP853, RK4, AdaptiveCashKarp
 from ambjax.simulation.integrate import Integrator
 from ambjax.simulation.rosenbrock import AdaptiveRodas3, Rodas3
 from ambjax.world.scenario import Scenario
@@ -35,18 +35,25 @@ TOUCHED = 0.05
 DRIVEN = 0.5
 # Names of the plant's slopes in messages.
 PLANT, COILS, FLUX, STOP = "plant", "current in the coils", "flux behind the current", "rotor on its stop"
-# The same in continuous time: number of RK4 substeps per sample above which the L-stable method is cheaper.
+# The same in continuous time, for steps of a fixed number.
 MOST_SUBSTEPS = 4
+# In continuous time: largest product of sample period and slope at which an explicit method is cheaper than RODAS3.
+EXPLICIT = 8.0
+# Product of step and slope at which the error of DOP853 under noise is below 1e-10 m (tests/test_accuracy.py).
+NOISY = 2.0
 # Fixed L-stable steps: largest value of slope h^2. The error at the corner of a smoothed sign is an impulse
 # proportional to slope h^2. At this value the gradient in gamma under held noise is correct to 1e-3; with twice the
 # step its error is 12 %.
 CORNER = 7.5e-6
-# Relative error per step of the adaptive method, with and without a sensor model. The error of z is proportional to the
-# response of the loop to an impulse: the largest later change of z, m, after a velocity change of 1 m/s. At
-# QUIET_TOLERANCE, z is within 1e-8 m if that response is at most 0.1 m. The response is unbounded for a loop that
-# nearly loses its rotor, so that no bound in metres holds for every loop (tests/test_tolerance.py). Under noise every
-# sample begins with a jump, and QUIET_TOLERANCE would take up to twice the steps.
+# Relative error per step of adaptive RODAS3 with and without noise. The error of z is proportional to the response of
+# the loop to an impulse: the largest later change of z, m, after a velocity change of 1 m/s. At QUIET_TOLERANCE, z is
+# within 1e-8 m if that response is at most 0.1 m. The response is unbounded for a loop that nearly loses its rotor, so
+# that no bound in metres holds for every loop (tests/test_tolerance.py). Under noise every sample begins with a jump,
+# and QUIET_TOLERANCE would take up to twice the steps.
 TOLERANCE, QUIET_TOLERANCE = 1e-6, 1e-7
+# The same for the Cash-Karp method, whose number of steps grows only as the fifth root of the tolerance. Kinks at the
+# limit of the supply require TIGHT; a drop onto a fast transient requires QUIET_TIGHT (tests/test_tolerance.py).
+TIGHT, QUIET_TIGHT = 1e-7, 1e-9
 
 
 def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
@@ -69,12 +76,14 @@ def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
 
 
 def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *, reverse: bool = False) -> Integrator:
-    """Choose RK4, adaptive RODAS3, or RODAS3 with equal substeps.
+    """Choose an integration method from the slopes of the loop.
 
-    On a processor, the choice is RK4 if MOST_SETTLED substeps resolve current and flux. In continuous time, it is RK4
-    if the scenario has a sensor model and MOST_SUBSTEPS substeps resolve the slopes. Otherwise it is adaptive RODAS3.
-    Without noise, adaptive steps can be much longer than the slopes suggest. Noise jumps at every sample and prevents
-    such steps, so RK4 is then cheaper.
+    On a processor, the choice is RK4 if MOST_SETTLED substeps resolve current and flux, otherwise adaptive RODAS3.
+
+    In continuous time, the choice is the adaptive Cash-Karp method, or adaptive RODAS3 if the loop is stiff (EXPLICIT).
+    Noise is constant over each sample, and the motion in a sample is smooth unless a limit or an edge lies inside. If
+    there is none, noise is the only exception: DOP853 with one or two equal substeps then reaches the same error in
+    less time, because the slowest member of an ensemble does not determine the number of steps.
 
     `reverse`: choose a method with a fixed number of steps, which supports reverse mode: RK4, or RODAS3 with equal
     substeps. A jump of a disturbance inside such a step causes an error of about 3e-8 m per m/s^2 on smooth gains. An
@@ -96,16 +105,34 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
         explicit = settled <= MOST_SETTLED
     else:
         substeps = max(math.ceil(sample_period * slope / ACCURATE), 1)
-        explicit = substeps <= MOST_SUBSTEPS and (reverse or scenario.sensor is not None)
+        explicit = reverse and substeps <= MOST_SUBSTEPS
         fixed = math.ceil(sample_period / math.sqrt(CORNER / slope))
     if explicit:
         return RK4(substeps)
     if reverse:
         return Rodas3(fixed)
+    noisy, stiff = _noisy(scenario), cascade.processor is not None or sample_period * slope > EXPLICIT
+    if noisy and not stiff and substeps <= MOST_SUBSTEPS and _smooth_inside(scenario, sample_period):
+        return DOP853(max(math.ceil(sample_period * slope / NOISY), 1))
+    tolerance = (TOLERANCE if noisy else QUIET_TOLERANCE) if stiff else (TIGHT if noisy else QUIET_TIGHT)
     # The tolerance must be well above the rounding errors, which otherwise cause rejected steps. In float32 it is
     # 1.2e-4.
-    tolerance = QUIET_TOLERANCE if scenario.sensor is None else TOLERANCE
-    return AdaptiveRodas3(max(tolerance, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps)))
+    tolerance = max(tolerance, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps))
+    return AdaptiveRodas3(tolerance) if stiff else AdaptiveCashKarp(tolerance)
+
+
+def _noisy(scenario: Scenario) -> bool:
+    """Return whether a sensor has noise. Traced values count as noise."""
+    noises = () if scenario.sensor is None else scenario.sensor.noises
+    return any(is_traced(std) or bool(np.any(np.asarray(std))) for std in noises)
+
+
+def _smooth_inside(scenario: Scenario, sample_period: float) -> bool:
+    """Return whether the rates have neither kinks nor jumps inside samples: no limit, no stop, and no edge."""
+    u_max = scenario.u_max
+    limited = is_traced(u_max) or bool(np.any(np.isfinite(np.asarray(u_max))))
+    inside = most_inside(scenario, sample_period, reference=True)
+    return not limited and scenario.amplifier is None and scenario.stop is None and inside == 0
 
 
 def _fixed_only(cascade: Cascade, scenario: Scenario) -> bool:

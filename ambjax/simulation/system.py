@@ -30,10 +30,11 @@ def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> 
         )
     _check_coils(scenario)
     sensor = scenario.sensor
-    if sensor is not None and not sensor.velocity and not cascade.observer.estimates_velocity:
+    if sensor is not None and not sensor.velocity and cascade.reads_velocity(sample_period):
         raise ValueError(
-            "sensor.velocity = false: the velocity is not measured, and controller.observer does not estimate it. "
-            'Choose an observer that estimates it, for example kind = "kalman".'
+            "sensor.velocity = false: the velocity is not measured, controller.observer does not estimate it, and the "
+            'laws or the prediction use it. Choose an observer that estimates it, for example kind = "kalman", or laws '
+            "that do not use it, with processor.predict = false."
         )
 
 

@@ -4,7 +4,9 @@ import math
 import re
 
 from ambjax.host.words import command
+from ambjax.theorem.causes import Cause, cause_words
 from ambjax.theorem.conditions import Condition, Report
+from ambjax.theorem.law_poles import LEAST_DAMPING
 from ambjax.theorem.sampled_report import Delays, SampledReport
 
 QUESTION = "Do the conditions of Theorem 1 hold along this run?"
@@ -14,6 +16,8 @@ MARGIN = 1.1
 FALL_SHARE = 0.9
 # Ratio of gamma to the Delta_1 of the ideal motion z = r; it leaves room for transients.
 TRANSIENT_FACTOR = 2.0
+# Clauses on a lost rotor for `cause_words`.
+LOSS = ("the rotor is lost", "the rotor is held")
 IMPLICIT = 'discretisation = "implicit"'
 # Advice for a run in which the integrator stalled.
 STALLED = (
@@ -69,22 +73,24 @@ def advice(report: Report) -> list[str]:
 def processor_lines(sampled: SampledReport, margin: Delays, unknown: Delays | None) -> list[str]:
     """Return the lines below the tables of a cascade on a processor.
 
-    They report the slopes, the distance to C, the status of the rotor, an alternating voltage, and the delay margins.
-    `margin`: delay margin; a prediction, if there is one, uses the actual delay. `unknown`: delay margin if the
-    prediction uses the delay of the case; None: the controller does not predict.
+    They report the poles of the laws, the distance to C, the status of the rotor, an alternating voltage, and the delay
+    margins. `margin`: delay margin; a prediction, if there is one, uses the actual delay. `unknown`: delay margin if
+    the prediction uses the delay of the case; None: the controller does not predict.
     """
     lines = [
-        f"- {slope.stage}: slope T of the step is {number(slope.effective_slope)} and must be less than "
-        f"{number(slope.limit)}. Lower the gain or p, shorten clock.sample_period, or set "
-        f"{'predict = true' if slope.implicit else IMPLICIT}."
-        for slope in sampled.slopes
-        if not slope.holds
+        f"- {law.stage}: the largest |pole| is {number(law.radius)} and must be less than 1, the least damping ratio "
+        f"is {number(law.damping)} and must be at least {LEAST_DAMPING:g}. Lower the gain or p, shorten "
+        f"clock.sample_period, or set {'predict = true' if law.implicit else IMPLICIT}."
+        for law in sampled.laws
+        if not law.holds
     ]
-    words = f"No, {len(lines)} of {len(sampled.slopes)} {'is' if len(lines) == 1 else 'are'} not:" if lines else "Yes."
+    words = f"No, {len(lines)} of {len(sampled.laws)} {'is' if len(lines) == 1 else 'are'} not:" if lines else "Yes."
     end = status(sampled.lost_at, sampled.lost_why, sampled.stalled, STALLED_PLANT)
     lines = [f"Is the discrete step of every law stable? {words}", *lines, _curve(*sampled.distance), end]
+    if sampled.loss_cause is not None:
+        lines.append(cause_words(sampled.loss_cause, *LOSS))
     if sampled.alternates:
-        lines.append(_alternates(sampled.alternating or 0.0))
+        lines.append(_alternates(sampled.alternating or 0.0, sampled.alternation_cause))
     if unknown is None:
         return [*lines, _margin("Delay margin", margin)]
     return [
@@ -105,11 +111,13 @@ def _curve(distance: float, at: float) -> str:
     )
 
 
-def _alternates(share: float) -> str:
-    return (
+def _alternates(share: float, cause: Cause | None) -> str:
+    words = (
         f"The voltage alternates: without noise, the part that changes sign from sample to sample is {100 * share:.0f} "
-        "% of its rms value. A law overshoots in one step, or its output acts with a delay that the law does not "
-        f"include. Lower the gain or p of this law, set {IMPLICIT} or predict = true, or shorten clock.sample_period."
+        "% of its rms value."
+    )
+    return (
+        words if cause is None else f"{words} {cause_words(cause, 'it alternates', 'the voltage does not alternate')}"
     )
 
 
@@ -120,13 +128,27 @@ def _margin(name: str, margin: Delays) -> str:
         parts = [] if held is None else [f"held up to {_samples(held)} samples"]
         parts += [f"not decided at {_samples(undecided)}, where the integrator stalled"]
         parts += [] if lost is None else [f"lost at {_samples(lost)}"]
-        return f"{name}: the rotor is {', '.join(parts)} ({tried})."
+        return f"{name}: the rotor is {', '.join(parts)} ({tried}).{_stable(margin)}"
     if held is None:
         return f"{name}: none, because the rotor is lost even without a delay."
     if lost is None:
         longest = "the longest delay that ambjax simulates"
-        return f"{name}: the rotor is held up to {_samples(held)} samples, {longest} ({tried})."
-    return f"{name}: the rotor is held up to {_samples(held)} samples and lost at {_samples(lost)} ({tried})."
+        return f"{name}: the rotor is held up to {_samples(held)} samples, {longest} ({tried}).{_stable(margin)}"
+    ends = f"held up to {_samples(held)} samples and lost at {_samples(lost)}"
+    return f"{name}: the rotor is {ends} ({tried}).{_stable(margin)}"
+
+
+def _stable(margin: Delays) -> str:
+    """Return the sentence on the delays at which the rotor is held, but the loop is not stable."""
+    if not margin.tested or margin.held is None:
+        return ""
+    if margin.swing_m is None or margin.current_A is None:
+        return f" The loop is stable at all {margin.tested} delays tested up to there."
+    upto = "at none of them from the first on" if margin.stable is None else f"up to {_samples(margin.stable)} samples"
+    return (
+        f" The loop is stable {upto} only: beyond, the rotor is held, but its motion does not decay without noise and "
+        f"loads (amplitude up to {margin.swing_m:.3g} m, |i| up to {margin.current_A:.3g} A)."
+    )
 
 
 def _samples(delay: float) -> str:
@@ -172,15 +194,17 @@ def _sides(line: Condition) -> tuple[str, str, str]:
 
 
 def _status(report: Report, fails: bool) -> str:
-    words = status(report.lost_at, report.lost_why, report.stalled)
+    words = [status(report.lost_at, report.lost_why, report.stalled)]
     if report.lost and not fails:
-        return (
-            f"{words} The theorem assumes an exact model, no noise, no voltage limit and no sampling: a violated "
-            "assumption is the cause."
+        words.append(
+            "The theorem assumes an exact model, no noise, no voltage limit and no sampling, and it does not bound the "
+            "motion before sigma is 0."
         )
+    if report.cause is not None:
+        words.append(cause_words(report.cause, *LOSS))
     if math.isinf(report.lost_at) and fails:
         return "The rotor is held nevertheless: the conditions are sufficient, not necessary."
-    return words
+    return " ".join(words)
 
 
 def status(lost_at: float, lost_why: str, stalled: bool, remedy: str = STALLED) -> str:

@@ -22,6 +22,7 @@ from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Lowest, Named, Peak
 from ambjax.simulation.rollout import check_inputs, prepare, roll
 from ambjax.simulation.trajectory import STALLED, STATUSES
+from ambjax.theorem.causes import Cause
 from ambjax.theorem.proof import Monitored
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Scenario
@@ -69,6 +70,8 @@ class Report:
     stalled: bool = False
     largest_z: float | None = None
     """largest |z| after `settle`, m; None if the run ends early"""
+    cause: Cause | None = None
+    """cause of a lost rotor, from `causes.find_cause`; None if it was not searched for"""
 
     @property
     def lost(self) -> bool:

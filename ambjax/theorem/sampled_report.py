@@ -1,4 +1,4 @@
-"""Checks of a cascade on a processor: slopes of laws times T, the distance to the singular curve C, the rotor's status.
+"""Checks of a cascade on a processor: poles of the laws, the distance to the singular curve C, the rotor's status.
 
 Theorem 1 applies in continuous time, where sigma, v_tilde and e reach 0. With steps of length T they only reach a band
 around 0. A law computes its signal from an estimate, so the computed signal differs from that of the plant. Along a
@@ -24,8 +24,9 @@ from ambjax.simulation.rollout import Outcome, System, prepare, roll
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
+from ambjax.theorem.causes import Cause, find_cause
+from ambjax.theorem.law_poles import LawPoles, law_poles, sampling_of
 from ambjax.theorem.law_signals import LawSignalsRecorder
-from ambjax.theorem.slopes import SlopeCheck, sampling_of, slope_checks
 from ambjax.world.bearing import Bearing
 from ambjax.world.scenario import Scenario
 
@@ -70,17 +71,18 @@ class Band:
 
 @dataclasses.dataclass(frozen=True)
 class SampledReport:
-    """Slopes and bands of a cascade on its processor, and the rotor's status under the case's noise.
+    """Poles of the laws and bands of a cascade on its processor, and the rotor's status under the case's noise.
 
     `bands`: of the runs that do not end early. `lost_at`: time at which the run with noise ends early, s; inf if it
     does not. `lost_why`: the reason. `stalled`: whether the integrator stalled at `lost_at`; the rotor's status is then
     unknown. `distance`: smallest distance of (z/s_0, i_ref/i_0) to the singular curve C at the samples (negative beyond
     C), and its time (s). `alternating`: result of `alternation` for the voltage after `settle`, in the run without
     sensor noise; None if that run ends early. `largest_z`: largest |z| (m) at the samples after
-    `settle`, in the run with noise; None if that run ends early.
+    `settle`, in the run with noise; None if that run ends early. `loss_cause`, `alternation_cause`: results of
+    `with_causes`; None if the rotor is not lost, or if the voltage does not alternate.
     """
 
-    slopes: list[SlopeCheck]
+    laws: list[LawPoles]
     bands: list[Band]
     lost_at: float
     lost_why: str
@@ -88,6 +90,13 @@ class SampledReport:
     distance: tuple[float, float] = (math.inf, 0.0)
     alternating: float | None = None
     largest_z: float | None = None
+    loss_cause: Cause | None = None
+    alternation_cause: Cause | None = None
+
+    @property
+    def lost(self) -> bool:
+        """Whether the rotor is lost in the run with noise. False if that run stalls."""
+        return math.isfinite(self.lost_at) and not self.stalled
 
     @property
     def alternates(self) -> bool:
@@ -96,8 +105,8 @@ class SampledReport:
 
     @property
     def holds(self) -> bool:
-        """Whether every slope is below its limit, C is not reached, and the rotor is held to the end."""
-        return math.isinf(self.lost_at) and self.distance[0] > 0 and all(slope.holds for slope in self.slopes)
+        """Whether every law is stable, C is not reached, and the rotor is held to the end."""
+        return math.isinf(self.lost_at) and self.distance[0] > 0 and all(law.holds for law in self.laws)
 
 
 class Delays(NamedTuple):
@@ -107,12 +116,21 @@ class Delays(NamedTuple):
     which it is lost; None if there is none. `undecided`: the delay that follows `held`, if the integrator stalled
     there; else None. A second pass divides the step that follows `held`. If the rotor is not held at the delay of the
     case, the delays go from 0 to that delay; if it is not held at 0 either, `held` is None.
+
+    `stable`: the largest delay of these up to which the loop is stable (`linear.stability`); None if it is not stable
+    at the first of them. `swing_m`, `current_A`: at the delays up to `held` at which it is not stable, the largest
+    amplitude of z and the largest |i| in a run without noise and loads; None if there are none. `tested`: number of
+    delays from the first to `held` whose stability was computed.
     """
 
     held: float | None
     lost: float | None
     undecided: float | None
     step: float
+    stable: float | None = None
+    swing_m: float | None = None
+    current_A: float | None = None
+    tested: int = 0
 
     @property
     def resolution(self) -> float | None:
@@ -149,7 +167,7 @@ def check_sampled(
     alternating = alternation(np.asarray(calm.rows.u)[settled:]) if np.isinf(calm.lost_at) else None
     stalled = int(outcome.lost_code) == STALLED
     return SampledReport(
-        slope_checks(cascade, clock),
+        law_poles(cascade, clock),
         bands,
         float(outcome.lost_at),
         outcome.lost_why,
@@ -158,6 +176,41 @@ def check_sampled(
         alternating,
         _peak(np.asarray(outcome.rows.z)[settled:]) if np.isinf(outcome.lost_at) else None,
     )
+
+
+def with_causes(
+    report: SampledReport,
+    cascade: Cascade,
+    scenario: Scenario,
+    clock: Clock,
+    settle: float,
+    run: Callable[[System, Clock], Outcome] = rolled,
+    tell: Callable[[str], object] = lambda _: None,
+) -> SampledReport:
+    """Return the report with the causes of a lost rotor and of an alternating voltage (`causes.find_cause`).
+
+    The arguments are those of `check_sampled`. `tell`: is called with a line of text before each run.
+    """
+
+    def simulated(cascade: Cascade, scenario: Scenario, clock: Clock) -> Trajectory:
+        return _simulated(*prepare(cascade, scenario, clock), run)
+
+    def lost(*case: Any) -> bool:
+        return bool(np.isfinite(simulated(*case).lost_at))
+
+    def alternating(cascade: Cascade, scenario: Scenario, finer: Clock) -> bool:
+        one, every = simulated(cascade, scenario, finer), finer.samples // clock.samples
+        first = min(round(settle / float(clock.sample_period)), max(clock.samples - 2, 0))
+        # at the instants of the case, so that a shorter sample period does not change the measure itself
+        return bool(np.isfinite(one.lost_at)) or alternation(np.asarray(one.rows.u)[::every][first:]) > ALTERNATING
+
+    case = (cascade, scenario, clock)
+    if report.lost:
+        report = dataclasses.replace(report, loss_cause=find_cause(lost, *case, tell))
+    if report.alternates:
+        quiet = (cascade, _without_noise(scenario), clock)
+        report = dataclasses.replace(report, alternation_cause=find_cause(alternating, *quiet, tell))
+    return report
 
 
 def _simulated(loop: System, clock: Clock, run: Callable[[System, Clock], Outcome]) -> Trajectory:

@@ -46,7 +46,8 @@ class Plant(Bearing[State]):
     def _iron_rates(self, iron: Iron, state: State, u: Scalar, q_z: Scalar, q_i: Scalar) -> State:
         """Return the rates with iron: Eq. (2) with an inductance that leakage increases and saturation reduces.
 
-        One current describes both coils, so the inductance contains the mean of `Iron.slope` over both cores.
+        Both the inductance and the voltage that the motion induces are derivatives of the flux linkage. One current
+        describes both coils, so they contain the mean of `Iron.slope` over both cores.
         """
         z, z_dot, i, delayed = state
         gaps = self.gaps(z)
@@ -57,7 +58,7 @@ class Plant(Bearing[State]):
             for current, inverse in zip(self.currents(state), gaps.inverses, strict=True)
         )
         slope = sum(iron.slope(b) for b in cores) / 2
-        motional = self.kappa * z_dot * i * below * below
+        motional = slope * (self.kappa * z_dot * i * below * below)
         per_inductance = (2 / self.kappa) * reciprocal(slope * (below + iron.beside(self)))
         i_dot = per_inductance * (motional + u - self.R * i) + q_i
         return State(z_dot, z_ddot, i_dot, () if isinstance(delayed, tuple) else iron.following(i, delayed))

@@ -30,6 +30,10 @@ class Ramp:
         ends = (np.clip((t - np.asarray(self.start)) / self.duration, 0.0, 1.0) for t in (0.0, end))
         return hull(*(self.amplitude * share for share in ends))
 
+    def edges(self) -> tuple[Scalar, ...]:
+        """Return the times of the two kinks, s."""
+        return (self.start, self.start + self.duration)
+
     def shifted(self, by: Scalar) -> "Ramp":
         """Return the signal, `by` seconds later."""
         return dataclasses.replace(self, start=self.start + by)
@@ -51,6 +55,11 @@ class Trapezoid:
 
     def span(self, end: float) -> tuple[float, float]:
         return hull(0.0, self.amplitude)
+
+    def edges(self) -> tuple[Scalar, ...]:
+        """Return the times of the four kinks, s."""
+        top, down = self.start + self.rise, self.start + self.rise + self.hold
+        return (self.start, top, down, down + self.fall)
 
     def shifted(self, by: Scalar) -> "Trapezoid":
         """Return the signal, `by` seconds later."""

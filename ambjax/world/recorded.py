@@ -3,12 +3,25 @@
 import dataclasses
 import functools
 import hashlib
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record, static
+
+
+class Knots(NamedTuple):
+    """Instants start + times (s) at which a recorded signal or its slope jumps. `times` [n] is sorted."""
+
+    times: np.ndarray
+    start: Scalar
+
+    def after(self, t: Scalar) -> Array:
+        """Return the first instant after t, s; +inf if there is none."""
+        times = jnp.asarray(np.append(self.times, np.inf), jnp.result_type(float))
+        return self.start + times[jnp.searchsorted(times, jnp.asarray(t, times.dtype) - self.start, side="right")]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -35,8 +48,8 @@ class Recorded:
     """A recorded signal: scale times value(t - start). Between two times, the value is interpolated linearly or held.
 
     Before the first time the value is the first one, and after the last time it is the last one. The samples are
-    constants of the compiled program, so another file needs another compilation. The integrator does not end a substep
-    where a held value changes. On a processor, such a jump is resolved exactly only if it is at a sample.
+    constants of the compiled program, so another file needs another compilation. Steps of the integrator end where the
+    value jumps or its slope changes, so a record with many values per sample needs as many steps.
     """
 
     samples: Samples = static(doc="times and values")
@@ -62,6 +75,14 @@ class Recorded:
         low, high = np.min(self.samples.values), np.max(self.samples.values)
         ends = [np.asarray(self.scale) * x for x in (low, high)]
         return float(np.min(ends)), float(np.max(ends))
+
+    def knots(self) -> tuple[Knots, ...]:
+        """Return the instants at which the value (held) or the slope (linear) jumps."""
+        times, values = self.samples.times, self.samples.values
+        rates = values if self.held else np.concatenate([[0.0], np.diff(values) / np.diff(times), [0.0]])
+        # A change within rounding is none: the lines of a record of decimals are straight over many rows.
+        changes = np.abs(np.diff(rates)) > 1e-9 * np.max(np.abs(rates), initial=0.0)
+        return (Knots(times[1:][changes] if self.held else times[changes], self.start),)
 
     def shifted(self, by: Scalar) -> "Recorded":
         """Return the signal, `by` seconds later."""

@@ -99,6 +99,10 @@ class Unbalance:
     def span(self, end: float) -> tuple[float, float]:
         return _bound(self, GRAM_MM * self.unbalance)
 
+    def edges(self) -> tuple[Scalar, ...]:
+        """Return the end of the run-up, s, where the slope of the speed jumps; empty without a run-up."""
+        return () if self.speed_end is None else (self.duration,)
+
 
 @record
 class UnbalanceGrade:
@@ -128,6 +132,10 @@ class UnbalanceGrade:
 
     def span(self, end: float) -> tuple[float, float]:
         return _bound(self, self.eccentricity)
+
+    def edges(self) -> tuple[Scalar, ...]:
+        """Return the end of the run-up, s, where the slope of the speed jumps; empty without a run-up."""
+        return () if self.speed_end is None else (self.duration,)
 
 
 @record

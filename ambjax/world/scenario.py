@@ -13,8 +13,9 @@ from ambjax.world.amplifier import Amplifier, CoilResponse, CurrentAmplifier
 from ambjax.world.bearing import Bearing
 from ambjax.world.coil_limits import CoilVoltages
 from ambjax.world.plant import Plant
+from ambjax.world.recorded import Knots
 from ambjax.world.sensor import Measurement, Sensor
-from ambjax.world.signals import Constant, Signal, edges_of, is_random, realised
+from ambjax.world.signals import Constant, Signal, edges_of, is_random, knots_of, realised
 from ambjax.world.touchdown import Stop
 
 # Numbers that are folded into a member's key, for the random streams of the design and of the signals. The sensors use
@@ -152,7 +153,7 @@ class Scenario:
     def random(self) -> bool:
         """Whether the scenario has sensor noise, random sensor faults or a random signal. A spread does not count."""
         sensor = self.sensor
-        noisy = sensor is not None and any(np.any(std) for std in (sensor.std, sensor.std_z_dot, sensor.std_i))
+        noisy = sensor is not None and any(map(np.any, sensor.noises))
         if sensor is not None:
             noisy = noisy or any(np.any(x.rate) for x in (sensor.outliers, sensor.dropouts) if x is not None)
         return noisy or any(is_random(getattr(self, slot)) for slot in SLOTS)
@@ -183,9 +184,16 @@ class Scenario:
             total = total + self.q_f(t) / self.plant.m
         return total if self.base is None else total - self.base(t)
 
-    def edges(self) -> tuple[Scalar, ...]:
-        """Return the times (s) at which the disturbances jump."""
-        return tuple(edge for slot in SLOTS if slot != "reference" for edge in edges_of(getattr(self, slot)))
+    def edges(self, reference: bool = False) -> tuple[Scalar, ...]:
+        """Return the edges (s) of the disturbances; with `reference`, also those of the reference."""
+        return tuple(edge for signal in self._signals(reference) for edge in edges_of(signal))
+
+    def knots(self, reference: bool = False) -> tuple[Knots, ...]:
+        """Return the knots of recorded disturbances; with `reference`, also those of the reference."""
+        return tuple(one for signal in self._signals(reference) for one in knots_of(signal))
+
+    def _signals(self, reference: bool) -> tuple[Signal | None, ...]:
+        return tuple(getattr(self, slot) for slot in SLOTS if reference or slot != "reference")
 
     def undisturbed(self) -> "Scenario":
         """Return the scenario without disturbances and runout."""

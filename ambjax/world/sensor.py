@@ -102,6 +102,11 @@ class Sensor:
     )
 
     @property
+    def noises(self) -> tuple[Scalar, Scalar, Scalar]:
+        """The standard deviations of the noise of z (m), z_dot (m/s) and i (A)."""
+        return self.std, self.std_z_dot, self.std_i
+
+    @property
     def faulty(self) -> bool:
         """Whether the position sensor has faults."""
         return self.outliers is not None or self.dropouts is not None

@@ -19,8 +19,8 @@ from ambjax.numerics.smooth import TWO_PI, sine
 class Signal(Protocol):
     """Protocol of a signal: maps a time (s) to a value. `span` returns bounds of its values for times in 0..end (s).
 
-    A signal with jumps also has `edges() -> tuple`, the times of its jumps (s). On a processor, a step of the
-    integrator ends at each jump of a disturbance.
+    A signal with jumps or kinks also has `edges() -> tuple`, the times (s) at which it or a derivative jumps. A step of
+    the integrator ends at each edge of a disturbance, and in continuous time also at each edge of the reference.
     """
 
     def __call__(self, t: Scalar, /) -> Array: ...
@@ -140,6 +140,10 @@ class SmoothStep:
         shares = [np.clip((t - np.asarray(self.start)) / self.duration, 0.0, 1.0) for t in (0.0, end)]
         return hull(*(self.amplitude * s**3 * (10 - 15 * s + 6 * s**2) for s in shares))
 
+    def edges(self) -> tuple[Scalar, ...]:
+        """Return the times at which the third derivative jumps, s."""
+        return (self.start, self.start + self.duration)
+
     def shifted(self, by: Scalar) -> "SmoothStep":
         """Return the signal, `by` seconds later."""
         return dataclasses.replace(self, start=self.start + by)
@@ -166,6 +170,10 @@ class Chirp:
     def span(self, end: float) -> tuple[float, float]:
         return _swing(self.amplitude, 0.0, self._cycles(end, np.minimum(end, self.duration)))
 
+    def edges(self) -> tuple[Scalar, ...]:
+        """Return the end of the sweep, s, where the slope of the frequency jumps."""
+        return (self.duration,)
+
 
 @record
 class Sum:
@@ -184,8 +192,12 @@ class Sum:
         return sum(low for low, _ in ends), sum(high for _, high in ends)
 
     def edges(self) -> tuple[Scalar, ...]:
-        """Return the times at which a term jumps, s."""
+        """Return the edges of all terms, s."""
         return tuple(edge for term in self.terms for edge in edges_of(term))
+
+    def knots(self) -> tuple[Any, ...]:
+        """Return the knots of all recorded terms."""
+        return tuple(one for term in self.terms for one in knots_of(term))
 
     def realised(self, key: Array) -> "Sum":
         """Return the sum with its random terms drawn, each from a separate key."""
@@ -203,8 +215,13 @@ def realised(signal: Any, key: Array) -> Any:
 
 
 def edges_of(signal: Any) -> tuple[Scalar, ...]:
-    """Return the times (s) at which the signal jumps; empty if it has no jumps."""
+    """Return the times (s) at which the signal or a derivative jumps; empty if it is smooth."""
     return signal.edges() if hasattr(signal, "edges") else ()
+
+
+def knots_of(signal: Any) -> tuple[Any, ...]:
+    """Return the knots of a recorded signal, of type `recorded.Knots`; empty for other signals."""
+    return signal.knots() if hasattr(signal, "knots") else ()
 
 
 class Reference(NamedTuple):

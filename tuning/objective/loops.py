@@ -39,17 +39,22 @@ class LaneLoop:
     def __call__(self, lane: LoopLane) -> tuple[LoopQuantities, LoopQuantities]:
         def quantities(x: Array) -> tuple[LoopQuantities, LoopQuantities]:
             cascade = self.space.decode(x, lane.cascade)
-            found = loop_quantities(*loop_matrices(cascade, lane.scenario, lane.period, 0.0), *self.range[1:])
+            names, *numbers = self.range
+            matrices = loop_matrices(cascade, lane.scenario, lane.period, 0.0)
+            found = loop_quantities(*matrices, *numbers, delay="delay_margin_s" in names)
             return found, found
 
         slopes, values = jax.jacfwd(quantities, has_aux=True)(lane.x)
         return values, slopes
 
 
-def loops(objective: Objective, x: np.ndarray, members: Members) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def loops(
+    objective: Objective, x: np.ndarray, members: Members, also: tuple[str, ...] = ()
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return the limited quantities [S, N] by name at coordinates x [S, m] for members [N], and derivatives [S, N, m].
 
-    The gains of stressed members are not shifted. Raises ValueError as `rollout` does.
+    `also`: names of further quantities of `LoopQuantities`. The gains of stressed members are not shifted. Raises
+    ValueError as `rollout` does.
     """
     assert objective.loop is not None
     count, n = len(x), len(members.member)
@@ -63,8 +68,22 @@ def loops(objective: Objective, x: np.ndarray, members: Members) -> tuple[dict[s
     function = LaneLoop(objective.space, objective.loop)
     # one call at a time: XLA runs LAPACK on its own threads, and two calls wait for each other for ever
     values, slopes = map_members(function, lane, threads=1, call=LANES, block=LANES, plain=True)
-    names = objective.loop.names
+    names = (*objective.loop.names, *also)
     return (
         {name: getattr(values, name).reshape(count, n) for name in names},
         {name: getattr(slopes, name).reshape(count, n, -1) for name in names},
+    )
+
+
+def check_loops(objective: Objective, x: np.ndarray, members: Members) -> None:
+    """Raise ValueError if limits concern linearised loops and no member has one at any of the coordinates x [S, m]."""
+    if objective.loop is None:
+        return
+    for some in (x[:1], x[1:]):  # most often the first point decides
+        if len(some) and np.isfinite(loops(objective, some, members, also=("growth",))[0]["growth"]).any():
+            return
+    raise ValueError(
+        f"tune.limits: {', '.join(objective.loop.names)} cannot be evaluated, because the loop has an equilibrium, and "
+        f"there a linearisation, at none of the {len(x)} starting points. `ambjax sensitivity` names the cause. Change "
+        "the laws or their gains, or remove these limits."
     )

@@ -27,7 +27,6 @@ class LoopRange(NamedTuple):
 
     names: tuple[str, ...]
     low: float
-    high: float
     pole: float
     volts_per_metre: float
 

@@ -1,7 +1,8 @@
 """The answer of a search in five lines, at the beginning of the report."""
 
-import math
+import functools
 
+from ambjax.commands.outputs import described
 from ambjax.host.web_page import escape_markdown
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.limit_table import broken, prices
@@ -9,8 +10,9 @@ from tuning.report.limit_table import broken, prices
 
 def answer_lines(facts: TuningFacts) -> list[str]:
     """Return five list items and an empty line: held or not, error and voltage, sensitivity, limits, next command."""
-    items = [_held(facts), _sizes(facts), _sensitivity(facts), _limiting(facts), _next(facts)]
-    return [*(f"- {item}" for item in items), ""]
+    items = {"members": _held, "error": _sizes, "sensitivity": _sensitivity, "limits": _limiting, "next command": _next}
+    lines = [described(f"the line on the {name}", functools.partial(line, facts)) for name, line in items.items()]
+    return [*(f"- {line}" for line in lines if line), ""]
 
 
 def _held(facts: TuningFacts) -> str:
@@ -51,21 +53,31 @@ def _sensitivity(facts: TuningFacts) -> str:
     found = facts.sensitivity
     if not found or not found["members"]:
         return "**Sensitivity:** not computed here; `ambjax sensitivity tuned.toml` computes |S| and the zone."
-    peak, at = max((_peak(row, found) for row in found["members"]), key=lambda one: one[0])
-    zone = max(one["injected_zone"] or one["zone"] for one in found["members"])
-    if not math.isfinite(peak):
-        return f"**Sensitivity:** a member is lost when a test signal is injected: zone {zone}."
+    unknown = next((row for row in found["members"] if _unknown(row, found)), None)
+    if unknown is not None:
+        zone = unknown["injected_zone"] if unknown["lost"] else unknown["zone"]
+        words = escape_markdown(_unknown(unknown, found)).rstrip(".") + (f": zone {zone}" if zone else "")
+        return f"**Sensitivity:** no peak of |S| for member {unknown['member']}: {words}."
+    peak, at, zone = max(_peak(row, found) for row in found["members"])
     return f"**Sensitivity:** |S| is at most {peak:.3g} (at {at:.3g} Hz) over the worst members: zone {zone}."
 
 
-def _peak(row: Row, found: Row) -> tuple[float, float]:
-    """Return the peak that counts and its frequency, Hz; inf if a rotor is lost.
+def _unknown(row: Row, found: Row) -> str:
+    """Return why a member has no peak that counts; '' if it has one."""
+    if row["lost"]:
+        return "it is lost when a test signal is injected"
+    if row["peak"] is None and found["decides"]:
+        return "no injection decides its peak"
+    return "" if found["decides"] else row["why"]
+
+
+def _peak(row: Row, found: Row) -> tuple[float, float, str]:
+    """Return the peak that counts, its frequency (Hz) and its zone.
 
     It is the injected peak if only injected peaks decide, otherwise the larger one.
     """
-    if row["lost"]:
-        return math.inf, math.nan
-    linear, injected = (row["linear"], row["frequency_hz"]), (row["peak"], row["at_hz"])
+    linear = row["linear"], row["frequency_hz"], row["zone"]
+    injected = row["peak"], row["at_hz"], row["injected_zone"]
     if row["peak"] is None:
         return linear
     return injected if found["decides"] else max(injected, linear)

@@ -1,7 +1,9 @@
 """The report of `ambjax tune` in Markdown."""
 
-import itertools
+import functools
+from collections.abc import Callable
 
+from ambjax.commands.outputs import described
 from ambjax.host.web_page import escape_markdown, markdown_table
 from tuning.objective.loss import TERMS
 from tuning.report import answer, extras, front_table, held_out, limit_table, sensitivity_table
@@ -19,22 +21,13 @@ def report_markdown(facts: TuningFacts) -> str:
     Its pictures are files in the same folder.
     """
     lines = [f"# Tuning of {escape_markdown(facts.case)}", "", *answer.answer_lines(facts)]
-    sections = (
-        front_table.section(facts.front, facts.front_written),
-        ["## Verdict in full", "", facts.verdict, ""],
-        limit_table.section(facts.limits),
-        sensitivity_table.section(facts.sensitivity),
-        _gains(facts),
-        held_out.section(facts),
-        _loss(facts),
-        _minimised(facts),
-        _conditions(facts),
-    )
-    lines += itertools.chain.from_iterable(sections)
-    lines += ["## Course of the search", "", *_how(facts), "", "![Goal and gains by iteration](convergence.png)", ""]
-    if facts.gradient:
-        lines += extras.gradient(facts.gradient)
+    for name, section in SECTIONS.items():
+        lines += described(f"the section on {name} of the report", functools.partial(section, facts)) or []
     return "\n".join(lines) + "\n"
+
+
+def _verdict(facts: TuningFacts) -> list[str]:
+    return ["## Verdict in full", "", facts.verdict, ""]
 
 
 def _gains(facts: TuningFacts) -> list[str]:
@@ -137,8 +130,7 @@ def _minimised(facts: TuningFacts) -> list[str]:
         "",
         "![Objective along each gain, through the answer](slices.png)",
         "",
-        _lower_point(facts.beside),
-        "",
+        *([] if facts.beside is None else [_lower_point(facts.beside), ""]),
     ]
 
 
@@ -161,6 +153,8 @@ def _lower_point(beside: Row) -> str:
 
 def _conditions(facts: TuningFacts) -> list[str]:
     """Return the section on the conditions of Theorem 1, left > right."""
+    if not facts.conditions:
+        return []
     rows = []
     for row in facts.conditions:
         gain, margin = (number_text(x) for x in (row["gain"], row["margin"]))
@@ -173,8 +167,8 @@ def _conditions(facts: TuningFacts) -> list[str]:
     return lines
 
 
-def _how(facts: TuningFacts) -> list[str]:
-    """Return the list of the search's settings, its cost, and the error of its steps."""
+def _course(facts: TuningFacts) -> list[str]:
+    """Return the section on the search: its settings, its cost, the error of its steps, and the gradient."""
     how = facts.search
     lines = [
         f"- risk: {how['risk']} over {how['members']} members (seed {how['seed']}), optimiser {how['optimiser']}",
@@ -186,4 +180,21 @@ def _how(facts: TuningFacts) -> list[str]:
             f"- steps of the search compared with {facts.accurate_steps}, at the answer: {error['text']} "
             f"({error['search_m']:.4e} m against {error['reference_m']:.4e} m)"
         )
-    return lines
+    picture = "![Goal and gains by iteration](convergence.png)"
+    more = extras.gradient(facts.gradient) if facts.gradient else []
+    return ["## Course of the search", "", *lines, "", picture, "", *more]
+
+
+# The sections of the report, in order.
+SECTIONS: dict[str, Callable[[TuningFacts], list[str]]] = {
+    "the front": lambda facts: front_table.section(facts.front, facts.front_written),
+    "the verdict": _verdict,
+    "the limits": lambda facts: limit_table.section(facts.limits),
+    "the sensitivity": lambda facts: sensitivity_table.section(facts.sensitivity),
+    "the gains": _gains,
+    "the held-out members": held_out.section,
+    "the loss": _loss,
+    "the objective": _minimised,
+    "the conditions of Theorem 1": _conditions,
+    "the search": _course,
+}

@@ -17,7 +17,7 @@ SUMMARY_METRICS = (
     "clearance_used.largest",
 )
 # Fields that report.json leaves out if they are None.
-OPTIONAL = ("accurate", "gradient", "front", "sensitivity")
+OPTIONAL = ("accurate", "gradient", "front", "sensitivity", "stability")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,9 +26,11 @@ class TuningFacts:
 
     `before`, `after`: the held-out members under the case's gains and the tuned ones. `refuted`: why accurate steps
     contradict the answer; '' if they confirm it. `accurate`: some members with accurate steps. `gradient`: None if not
-    requested. `front`: of error against voltage; None if it was not traced. `front_written`: whether each of its points
-    has a case file. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it. `beside`: the
-    lowest point of the slices through the answer. `next`: the next command, in words.
+    requested. `stability`: of the held-out members with the largest settled errors (`ambjax.linear.Findings`); None if
+    no member was judged. `front`: of error against voltage; None if it was not traced. `front_written`: whether each of
+    its points has a case file. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it.
+    `beside`: the lowest point of the slices through the answer; None without slices. `next`: the next command, in
+    words. `loss`, `minimised`, `conditions` and `slices` are empty or None if they could not be computed.
     """
 
     case: str
@@ -41,7 +43,7 @@ class TuningFacts:
     limits: list[Row]
     sensitivity: Row | None
     loss: Row
-    minimised: Row
+    minimised: Row | None
     conditions: list[Row]
     advice_on_conditions: list[str]
     step_error: Row | None
@@ -58,9 +60,10 @@ class TuningFacts:
     gains: list[Row]
     gradient: Row | None
     front: list[Row] | None
-    beside: Row
-    slices: Row
+    beside: Row | None
+    slices: Row | None
     front_written: bool = False
+    stability: Row | None = None
     outcome: Row = dataclasses.field(default_factory=dict)
     verdict: str = ""
     advice: str = ""

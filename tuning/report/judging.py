@@ -1,12 +1,14 @@
 """The facts of the report: the answer of a search is evaluated on held-out members, which the search did not use."""
 
 import dataclasses
+import math
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.commands.outputs import say
+from ambjax.commands.outputs import described, say
+from ambjax.linear import Findings, stability, suspects
 from ambjax.theorem.advice import advice as on_conditions
 from ambjax.theorem.conditions import Report as Check
 from ambjax.theorem.conditions import check
@@ -20,9 +22,14 @@ from tuning.report.facts import SUMMARY_METRICS, Row, TuningFacts
 from tuning.search import explore
 from tuning.search.course import SearchResult
 
+# Fields on the conditions of Theorem 1 if they cannot be computed.
+NO_CONDITIONS: Row = {"conditions": [], "advice_on_conditions": []}
 
-def examined(answer: SearchResult, gradients: bool, front_written: bool) -> tuple[TuningFacts, explore.Slices]:
+
+def examined(answer: SearchResult, gradients: bool, front_written: bool) -> tuple[TuningFacts, explore.Slices | None]:
     """Return the facts of an answer, and the slices of the goal through it. Arrays [m] have one value per gain.
+
+    Facts that do not decide on the verdict are absent if they cannot be computed (`described`).
 
     `gradients`: whether to compute derivatives in three ways. `front_written`: whether each point of the front has a
     case file.
@@ -39,19 +46,20 @@ def examined(answer: SearchResult, gradients: bool, front_written: bool) -> tupl
         "lost_in_validation": answer.lost,
         **_ensembles(answer, judged, steps[2], held_out),
         **_steps(answer, *steps),
-        **_conditions(problem, x),
-        "minimised": breakdown.minimised(problem, x, members),
+        **(described("the conditions of Theorem 1", lambda: _conditions(problem, x)) or NO_CONDITIONS),
+        "minimised": described("the objective in parts", lambda: breakdown.minimised(problem, x, members)),
         "search": settings(problem.tune)
         | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": answer.seconds},
-        "gradient": _gradient(answer) if gradients else None,
+        "gradient": described("the gradient report", lambda: _gradient(answer)) if gradients else None,
         "front_written": front_written,
-        "front": front_table.facts(answer) or None,
+        "front": described("the front", lambda: front_table.facts(answer)) or None,
     }
-    slices = explore.slices(problem, x, members)
+    slices = described("the slices through the answer", lambda: explore.slices(problem, x, members))
     facts = TuningFacts(**found, **_neighbourhood(problem, x, slices))
     what = outcome.outcome_of(facts, problem.tune.limits.may_lose(problem.tune.budget.held_out))
-    words = {"verdict": outcome.outcome_text(facts, what), "advice": outcome.remedies(problem, facts, what, x, members)}
-    words["next"] = outcome.next_command(problem)
+    verdict = described("the verdict in words", lambda: outcome.outcome_text(facts, what)) or what.text
+    advice = described("the advice", lambda: outcome.remedies(problem, facts, what, x, members)) or ""
+    words = {"verdict": verdict, "advice": advice, "next": outcome.next_command(problem)}
     return dataclasses.replace(facts, outcome=what.facts(), **words), slices
 
 
@@ -86,10 +94,27 @@ def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_
     found["limits"] = limit_table.facts(problem, after, found["after"], refuted, measured, late)
     if refuted and after:
         found["after"] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
-    found["loss"] = {name: breakdown.loss_breakdown(problem.error_goal, one) for name, one in judged.items() if one}
-    found["worst_member"] = worst(problem, after, held_out) if after else None
+    found["loss"] = described("the loss of the held-out members", lambda: _losses(problem, judged)) or {}
+    found["worst_member"] = described("the worst member", lambda: worst(problem, after, held_out)) if after else None
+    found["stability"] = _stability(problem, answer.x, held_out, after) if after else None
     lost = problem.engine.terms(answer.x[None], answer.members)["survival"] > 0
     return found | {"lost_in_training": int(lost.sum())}
+
+
+def _losses(problem: TuningProblem, judged: dict[str, Any]) -> Row:
+    return {name: breakdown.loss_breakdown(problem.error_goal, one) for name, one in judged.items() if one}
+
+
+def _stability(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray]) -> Row:
+    """Return whether the loops of the held members with the largest settled errors are stable (`linear.Findings`)."""
+    index = suspects(columns["settled_max_abs_error_m"], held(columns))
+    if not index.size:
+        return Findings(0, 0)._asdict()
+    say(f"testing whether the loops of {index.size} held-out members are stable ...")
+    members = problem.objective.chosen(seed, index, len(columns["lost_at_s"]))
+    # in continuous time, the step of the case may be too coarse for these gains
+    clock = problem.case.clock if problem.sampled else dataclasses.replace(problem.case.clock, method=None)
+    return stability(*problem.objective.fixed(x, members), clock).findings()._asdict()
 
 
 def _steps(answer: SearchResult, unlucky: StepError | None, again: Row | None, refuted: str) -> Row:
@@ -121,11 +146,12 @@ def _gradient(answer: SearchResult) -> Row:
     return gradient.gradient_report(answer.problem, answer.x, answer.members)
 
 
-def _neighbourhood(problem: TuningProblem, x: np.ndarray, slices: explore.Slices) -> Row:
-    """Return the fields on the gains at x [m], and on the goal around them."""
+def _neighbourhood(problem: TuningProblem, x: np.ndarray, slices: explore.Slices | None) -> Row:
+    """Return the fields on the gains at x [m], and on the goal around them. Without slices, the latter are None."""
     space = problem.objective.space
     ends = zip(space.values(problem.case.cascade), np.asarray(space.gains_at(jnp.asarray(x))), strict=True)
-    sensitivity = zip(slices.sensitivity(), slices.more_lost(), strict=True)
+    unknown = [math.nan] * len(x), [0] * len(x)
+    around = unknown if slices is None else (slices.sensitivity(), slices.more_lost())
     gains = [
         {
             "path": gain.path,
@@ -134,14 +160,14 @@ def _neighbourhood(problem: TuningProblem, x: np.ndarray, slices: explore.Slices
             "least": gain.low,
             "most": gain.high,
             "at_bound": gain.at_bound(float(after)),
-            "sensitivity_percent": None if lost else float(grows),
+            "sensitivity_percent": None if lost or math.isnan(grows) else float(grows),
             "sensitivity_lost": int(lost),
         }
         | dataclasses.asdict(where)
-        for gain, (before, after), (grows, lost), where in zip(
-            space.gains, ends, sensitivity, problem.ranges, strict=True
-        )
+        for gain, (before, after), grows, lost, where in zip(space.gains, ends, *around, problem.ranges, strict=True)
     ]
+    if slices is None:
+        return {"gains": gains, "beside": None, "slices": None}
     j, k, drop = slices.lowest()
     return {
         "gains": gains,

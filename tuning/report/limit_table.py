@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.host.web_page import markdown_table
-from tuning.delay_test import DELAY_MARGIN, DelayTest
+from tuning.delay_test import DELAY_MARGIN, DelayTest, not_simulated
 from tuning.measured_peaks import MEASURED, Sensitivity, reached_of
 from tuning.objective.limits import FRONT, Limit
 from tuning.problem import TuningProblem
@@ -57,8 +57,11 @@ def facts(
         "price": None,
         "price_unit": price_unit,
     } | _verdict(None if share is None else members - held <= settings.may_lose(members), refuted)
-    rows = [_row(limit, columns, summary, refuted, measured, price_unit) for limit in _asked(problem)]
-    return [*(_tested(row, delayed, refuted) for row in rows), survival]
+    numbers = columns, summary, refuted, measured, price_unit
+    rows = [
+        _tested(_row(limit, *numbers), delayed, refuted, not_simulated(problem, limit)) for limit in _asked(problem)
+    ]
+    return [*rows, survival]
 
 
 def _verdict(kept: bool | None, refuted: str) -> Facts:
@@ -105,14 +108,21 @@ def _row(
     } | found
 
 
-def _tested(row: Facts, delayed: DelayTest | None, refuted: str) -> Facts:
-    """Return the row of the delay margin with the result of its test; any other row, or without a test, unchanged."""
-    if row["name"] != DELAY_MARGIN or delayed is None:
+def _tested(row: Facts, delayed: DelayTest | None, refuted: str, reason: str = "") -> Facts:
+    """Return the row of the delay margin with the result of its test; any other row unchanged.
+
+    `reason`: why there was no test (`not_simulated`).
+    """
+    if row["name"] != DELAY_MARGIN:
         return row
+    if delayed is None:
+        words = f"; the linear margins decide, because {reason}: the additional delay was not simulated"
+        return row | {"what": row["what"] + words} if reason else row
     words = (
-        f"{row['what']}; with this additional delay {delayed.lost} of {delayed.members} of the worst members are lost"
+        f"{row['what']}; with this additional delay {delayed.lost} of {delayed.members} of the worst members are lost, "
+        f"and {delayed.unstable} held but not stable"
     )
-    return row | {"what": words} | (_verdict(False, refuted) | {"price": None} if delayed.lost else {})
+    return row | {"what": words} | (_verdict(False, refuted) | {"price": None} if delayed.fails else {})
 
 
 def _asked(problem: TuningProblem) -> list[Limit]:

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from ambjax.linear import Findings
 from ambjax.theorem.advice import STALLED, STALLED_PLANT
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
@@ -21,7 +22,8 @@ class TuningOutcome:
 
     `members`: number of members judged. `lost`: number of lost members. `stalled`: number of members whose integration
     stalls. `may_lose`: largest number of members that may be lost or stalled. `limits`: the verdict on each limit by
-    name. `refuted`: the reason why accurate steps do not confirm the result; '' if they do.
+    name. `refuted`: the reason why accurate steps do not confirm the result; '' if they do. `tested`: number of members
+    whose stability was tested. `unstable`: number of these that are held but not stable.
     """
 
     members: int
@@ -30,6 +32,8 @@ class TuningOutcome:
     may_lose: int
     limits: dict[str, str]
     refuted: str
+    tested: int = 0
+    unstable: int = 0
 
     @property
     def rotors_held(self) -> bool:
@@ -53,11 +57,20 @@ class TuningOutcome:
         if not self.rotors_held:
             ended = f"{self.lost} lost" + f" and {self.stalled} not decided" * bool(self.stalled)
             words.append(f"{ended} of {self.members} members (allowed: {self.may_lose})")
+        if self.unstable:
+            words.append(f"{self.unstable} of {self.tested} members tested held, but not stable")
         if self.broken:
             words.append(f"{BROKEN}: {', '.join(self.broken)}")
         if self.refuted:
             words.append(UNVERIFIED)
         return words
+
+    @property
+    def text(self) -> str:
+        """Whether the requirements are met, in one sentence."""
+        if not self.good:
+            return f"{NOT_MET} {'; '.join(self.against)}."
+        return NO_HELD_OUT if UNJUDGED in self.limits.values() else ALL_MET
 
     def facts(self) -> Row:
         """Return the outcome as a dict for report.json."""
@@ -73,14 +86,16 @@ def outcome_of(facts: TuningFacts, may_lose: int) -> TuningOutcome:
     after, limits = facts.after, {row["name"]: row["verdict"] for row in facts.limits}
     if not after["members"]:
         return TuningOutcome(facts.trained_on, facts.lost_in_training, 0, 0, limits, facts.refuted)
-    return TuningOutcome(after["members"], after["lost"], after["stalled"], may_lose, limits, facts.refuted)
+    found = (facts.stability or {}).get("tested", 0), (facts.stability or {}).get("unstable", 0)
+    return TuningOutcome(after["members"], after["lost"], after["stalled"], may_lose, limits, facts.refuted, *found)
 
 
 def outcome_text(facts: TuningFacts, outcome: TuningOutcome) -> str:
     """Return the outcome as text: verdict, lost members, error, limits, sensitive gains and gains at a bound."""
     unjudged = [name for name, found in outcome.limits.items() if found == UNJUDGED]
-    met = NO_HELD_OUT if unjudged else ALL_MET
-    words = [met if outcome.good else f"{NOT_MET} {'; '.join(outcome.against)}.", _statuses(facts)]
+    words = [outcome.text, _statuses(facts)]
+    if facts.stability is not None:
+        words.append(_stable(facts))
     if taken := front_table.sentence(facts.front or []):
         words.append(taken)
     if outcome.refuted:
@@ -118,6 +133,10 @@ def _statuses(facts: TuningFacts) -> str:
     )
 
 
+def _stable(facts: TuningFacts) -> str:
+    return "" if facts.stability is None else Findings(**facts.stability).words()
+
+
 def _error(summary: Row) -> str:
     return f"{summary['settled_rms_error_m']:.3g} m" if summary["held"] else "none is held"
 
@@ -142,6 +161,8 @@ def remedies(
             f"Not verified: {outcome.refuted}. Raise {keys}, or lower the upper bounds (tune.bounds) of the gains "
             "that are at them."
         )
+    if outcome.unstable and facts.stability is not None:
+        words.append(f"{_stable(facts)} Add tune.limits.sensitivity or tune.limits.delay_margin_s.")
     if outcome.broken:
         keys = ", ".join(f"tune.limits.{name}" for name in outcome.broken)
         words.append(f"Not held: {keys}. Loosen these limits, tune more gains (also each p), or raise tune.screen.")
@@ -175,12 +196,12 @@ def _causes_of_loss(problem: TuningProblem, facts: TuningFacts, x: np.ndarray, m
     u_max = float(np.asarray(problem.case.scenario.u_max))
     if np.isfinite(u_max) and effort > 0.25:
         words.append(
-            f"The voltage is at {100 * np.sqrt(effort):.0f} % of its limit (rms): a supply above {u_max:g} V, less "
-            "sensor noise, or an observer ([controller.observer] kind = 'complementary', with a tuned l) would help."
+            f"The voltage is at {100 * np.sqrt(effort):.0f} % of its limit (rms), a possible cause, not tested: try "
+            f"a supply above {u_max:g} V, less sensor noise, or an observer that attenuates it more."
         )
     bound = [row["path"] for row in facts.gains if row["at_bound"]]
     if bound:
-        words.append(f"Gains at a bound: {', '.join(bound)}; widen tune.bounds.")
+        words.append(f"Gains at a bound, also a possible cause: {', '.join(bound)}; widen tune.bounds.")
     return [
         *words,
         "For a larger margin, raise tune.members or set risk = 'cvar'. For other starting points, raise tune.screen.",

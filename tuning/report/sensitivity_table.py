@@ -3,17 +3,20 @@
 import dataclasses
 from typing import Any
 
-from ambjax.host.web_page import markdown_table
+from ambjax.host.web_page import escape_markdown, markdown_table
 from tuning.measured_peaks import SCREENED, Sensitivity, injects
 from tuning.problem import TuningProblem
 
 Facts = dict[str, Any]
+# Text in place of the linear peak of a loop without one, by its zone.
+NO_PEAK = {"D": "unstable", None: "not computed"}
 
 
 def facts(problem: TuningProblem, measured: Sensitivity) -> Facts:
     """Return plain data: a row for each member of `measured`, and the limits of the zones.
 
-    `zone` of a row is that of the linear peak, `injected_zone` that of the injected one.
+    `zone` of a row is that of the linear peak, `injected_zone` that of the injected one. `why`: why there is no linear
+    peak; '' if there is one.
     """
     zones = problem.case.zones
     rows = []
@@ -32,9 +35,8 @@ def section(found: Facts | None) -> list[str]:
     cells = [
         [
             str(row["member"]),
-            _number(row["linear"]),
-            _number(row["frequency_hz"]),
-            row["zone"],
+            *([_number(row["linear"]), _number(row["frequency_hz"])] if row["linear"] else [NO_PEAK[row["zone"]], "-"]),
+            row["zone"] or "-",
             *(_injected(row) if found["injected"] else []),
         ]
         for row in found["members"]
@@ -61,16 +63,20 @@ def section(found: Facts | None) -> list[str]:
             "The supply limits the voltage during the injection, so the measured peak describes the limited loop. A "
             "smaller `sensitivity.amplitude` measures the loop without this limit."
         )
-    return ["## Sensitivity", "", *markdown_table(head, cells), "", " ".join(words), ""]
+    unknown = [f"- Member {row['member']}: {escape_markdown(row['why'])}." for row in found["members"] if row["why"]]
+    unknown += [""] * bool(unknown)
+    return ["## Sensitivity", "", *markdown_table(head, cells), "", *unknown, " ".join(words), ""]
 
 
 def _injected(row: Facts) -> list[str]:
     if row["lost"]:
         return [f"lost: {row['lost']} of {row['repetitions']}", "-", "-", row["injected_zone"], "-"]
+    if row["peak"] is None:
+        return ["-"] * 5
     interval = "-" if row["low"] is None else f"{row['low']:.4g} to {row['high']:.4g}"
     saturated = f"{100 * row['saturated']:.2g} %"
     return [_number(row["peak"]), interval, _number(row["at_hz"]), row["injected_zone"], saturated]
 
 
-def _number(x: float | None) -> str:
-    return "unstable" if x is None else f"{x:.4g}"
+def _number(x: float) -> str:
+    return f"{x:.4g}"

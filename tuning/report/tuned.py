@@ -15,6 +15,7 @@ from ambjax.cases.reader import Case, case_from
 from ambjax.cases.recordings import relocated_files
 
 FIRST = "Tuned by ambjax tune from the case"
+AUTO = "auto"
 # First lines of tuned.toml. They are removed when the file is tuned again.
 HEAD = re.compile(rf"\A# {FIRST} [^\n]*\n(#[^\n]*\n)?\n?")
 # Characters that a comment must not contain; surrogates come from file names that are not UTF-8.
@@ -24,13 +25,25 @@ CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 def tuned_case(case: Case, gains: Mapping[str, float], verdict: str, out: pathlib.Path) -> tuple[str, Case]:
     """Return the text of tuned.toml for the folder `out`, and its case. Raises ValueError if the text is no valid case.
 
+    If the integration step of the case is too coarse for the tuned gains, "auto" replaces clock.dt and clock.method,
+    and the first lines of the text say so.
+
     The custom laws, the linear controller and the recorded signals are those of `case`: a change of their files during
     the search has no effect.
     """
     moved = relocated(case.own_laws, out) | relocated_files(case.recorded, out)
     moved |= case.controller_file.relocated(out) if case.controller_file else {}
-    text = tuned(case.text, {**gains, **moved}, case.name, verdict)
-    return text, case_from(tomllib.loads(text), case.name, known=case)
+    values = {**gains, **moved}
+    text = tuned(case.text, values, case.name, verdict)
+    try:
+        return text, case_from(tomllib.loads(text), case.name, known=case)
+    except ValueError as error:
+        steps = [key for key in ("dt", "method") if tomllib.loads(case.text).get("clock", {}).get(key, AUTO) != AUTO]
+        if not steps:
+            raise
+        words = f'{verdict} In [clock], "{AUTO}" replaces {" and ".join(steps)} of the case: {error}'
+        text = tuned(case.text, {**values, **{f"clock.{key}": AUTO for key in steps}}, case.name, words)
+        return text, case_from(tomllib.loads(text), case.name, known=case)
 
 
 def tuned(text: str, gains: Mapping[str, float | str], case: str, verdict: str) -> str:

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from ambjax.commands.outputs import say
 from tuning.judge import StepError
 from tuning.objective.goal import shown
+from tuning.objective.loops import check_loops
 from tuning.objective.loss import TERMS
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
@@ -154,11 +155,12 @@ def search_and_restart(course: Course, start: np.ndarray) -> np.ndarray:
     """Search from the gains `start` [m], SI units, then restart around the best point (`should_restart`).
 
     Returns the coordinates [m] of the best point. There is no restart if all members are lost or tune.screen is 0.
+    Raises ValueError as `check_loops` does.
     """
     problem, budget = course.problem, course.problem.tune.budget
-    x, value = course.search(
-        initial_points(problem.objective, problem.goal.conditions, start, budget.screen, course.seed)
-    )
+    points = initial_points(problem.objective, problem.goal.conditions, start, budget.screen, course.seed)
+    check_loops(problem.objective, points, course.members.searched)
+    x, value = course.search(points)
     if course.all_lost or not budget.screen:
         return x
     seen = [(value, x)]  # comparable: all searches use the same members and steps

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.commands.outputs import say
+from ambjax.commands.outputs import described, say
 from tuning.config import seeds
 from tuning.judge import StepError, describe, step_error
 from tuning.problem import TuningProblem, problem_of
@@ -71,7 +71,7 @@ def rounds(
         best = earlier_confirmed(course, best)
     if problem.front and best.good and not course.interrupted:
         course.members = best.members
-        best = trace_front(course, best)
+        best = described("the front of error against voltage", lambda: trace_front(course, best)) or best
     return dataclasses.replace(best, seconds=course.answer(x, None, 0).seconds)
 
 

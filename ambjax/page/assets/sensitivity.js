@@ -1,11 +1,12 @@
 // The linear loop: its equilibrium by Newton's method, the map of one sample, and |S|, as ambjax.linear computes them.
 
 // Solve A x = b for a real matrix (rows of numbers), by Gaussian elimination with scaled partial pivoting.
+// A row of zeros belongs to a state that never changes: its equation is x = 0.
 function solveReal(A, b) {
   const n = b.length, M = A.map((row, i) => [...row, b[i]]);
   for (let i = 0; i < n; i++) {
-    const size = M[i].slice(0, n).reduce((a, x) => Math.max(a, Math.abs(x)), 0) || 1;
-    M[i] = M[i].map((x) => x / size);
+    const size = M[i].slice(0, n).reduce((a, x) => Math.max(a, Math.abs(x)), 0);
+    M[i] = size > 0 ? M[i].map((x) => x / size) : M[i].map((_, k) => Number(k === i));
   }
   for (let k = 0; k < n; k++) {
     let p = k;
@@ -65,8 +66,8 @@ function equilibrium(P, facts) {
       const state = (j) => (k === undefined ? y[j] : Number(k === j));
       const rows = [];
       for (let j = 0; j < lagged; j++) rows.push(v[j]);
-      for (let j = 0; j < control; j++) rows.push(v[lagged + j] - state(lagged + 1 + j));
       rows.push(v[lagged + control] - state(u));
+      for (let j = 0; j < control; j++) rows.push(v[lagged + j] - state(lagged + 1 + j));
       return rows;
     };
     const J = residual(value).map(() => []);
@@ -113,10 +114,14 @@ function sampleMap(P, facts, period, delay) {
   M.push(inputs.map((c) => c[lagged + control]));
   M.push(inputs.map((_, k) => (k === n - 2 ? 1 : 0)));
   const s = [...point.sizes.subarray(0, lagged), ...point.sizes.subarray(lagged + 1), point.sizes[lagged], point.sizes[lagged]];
+  // a state that e does not reach is no state of the linear loop
+  let reached = M.map((row) => row[n] !== 0);
+  for (let k = 0; k < n; k++) reached = M.map((row, i) => reached[i] || row.slice(0, n).some((x, j) => x !== 0 && reached[j]));
+  const moves = (_, i) => reached[i], columns = (row) => row.slice(0, n).filter(moves);
   return {
-    A: M.map((row, i) => row.slice(0, n).map((x, k) => (x * s[k]) / s[i])),
-    B: M.map((row, i) => row[n] / s[i]),
-    C: inputs.slice(0, n).map((c, k) => c[lagged + control + 1] * s[k]),
+    A: M.map((row, i) => columns(row.map((x, k) => (x * s[k]) / s[i]))).filter(moves),
+    B: M.map((row, i) => row[n] / s[i]).filter(moves),
+    C: inputs.slice(0, n).map((c, k) => c[lagged + control + 1] * s[k]).filter(moves),
   };
 }
 
@@ -150,10 +155,10 @@ function sizeOfS({ A, B, C }, f, period) {
   return Math.hypot(sr, si);
 }
 
-// Whether all eigenvalues of A lie inside the unit circle: then the powers A^(2^k) tend to 0.
+// Whether no power A^m grows up to m = 2^40, apart from the growth of modes on the unit circle, such as a slow integral.
 function stable(A) {
   let M = A, logSize = 0;
-  for (let k = 0; k < 24; k++) {
+  for (let k = 0; k < 40; k++) {
     M = times(M, M);
     const size = M.reduce((a, row) => row.reduce((t, x) => Math.max(t, Math.abs(x)), a), 0);
     if (size === 0) return true;
@@ -161,7 +166,7 @@ function stable(A) {
     logSize = 2 * logSize + Math.log(size);
     M = M.map((row) => row.map((x) => x / size));
   }
-  return logSize < 0;
+  return logSize < 20;
 }
 
 // |S| at 300 frequencies (Hz), its peak and the ISO 14839-3 zone; null without an equilibrium.

@@ -1,0 +1,245 @@
+"""Stability of loops whose rotor is held: stable, or held but not stable.
+
+Two verdicts are combined. The linear one is that of the poles of the loop linearised at r = 0. The simulated one is
+that of a quiet run: the case without noise, converter, faults, runout and disturbances, at a constant reference, from a
+displaced start. No unbalance and no noise moves the rotor there, so a motion that persists is one that the loop
+sustains itself, a limit cycle. A motion counts as sustained if the half peak-to-peak value of z in the last quarter of
+the run exceeds SMALL times the clearance, and is not smaller than that of the third quarter by more than DECAY.
+
+- A sustained motion is not stable, whatever the linear verdict.
+- Without one, an unstable linear loop is not stable either, unless its motion had the time to grow and did not: then it
+  chatters within SMALL of the clearance, as a steep sign with explicit steps does.
+- The linear loop of a set-valued sign is valid only inside the band of the sign, so the quiet run alone decides.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ambjax.control.base import set_valued_signs
+from ambjax.control.cascade import DEFAULT_LAWS, Cascade
+from ambjax.ensemble.batching import run_ensemble
+from ambjax.ensemble.blocks import Blocks
+from ambjax.ensemble.delays import DELAYS, at_delays
+from ambjax.linear.analysis import linearise_members
+from ambjax.simulation.clock import Clock
+from ambjax.theorem.sampled_report import Delays
+from ambjax.world.scenario import Scenario
+from ambjax.world.signals import Constant, Signal, is_random
+
+# Half peak-to-peak value of z, as a share of the clearance, below which a sustained motion does not count. The chatter
+# of set-valued signs that act a sample late reaches 0.0025.
+SMALL = 0.01
+# Displacement of the start of a quiet run, as a share of the clearance.
+KICK = 0.01
+# Decrease of a motion, from one quarter of a quiet run to the next, below which the motion is sustained.
+DECAY = 0.1
+# Growth exponent of an unstable mode over a run, above which its motion had the time to grow: a factor of 22,000.
+GROWN = 10.0
+# Growth exponent over a run below which a pole counts as one on the border: rounding moves such poles across it.
+BORDER = 1e-3
+# Resolution that stands for an ideal converter, bits.
+FINE_BITS = 32
+QUARTERS = 4
+# Largest number of members of an ensemble whose stability is computed: those with the largest settled errors.
+MOST_TESTED = 64
+
+
+class Stability(NamedTuple):
+    """Stability of members whose rotors are held; arrays [N].
+
+    - `stable`: the verdict.
+    - `growth`: rate of growth of the least damped mode of the linear loop, 1/s; negative if the loop is stable, NaN
+      without a linear verdict.
+    - `sustained`: whether the quiet run has a sustained motion, or loses the rotor.
+    - `swing`: half peak-to-peak value of z in the last quarter of the quiet run, m; the clearance if the rotor is lost
+      there.
+    - `current`: largest |i| in the last quarter in which the rotor is held, A.
+    - `lost`: whether the rotor is lost in the quiet run.
+    - `duration`: length of a run, s. `bias`: bias current, A.
+    """
+
+    stable: np.ndarray
+    growth: np.ndarray
+    sustained: np.ndarray
+    swing: np.ndarray
+    current: np.ndarray
+    lost: np.ndarray
+    duration: float
+    bias: float
+
+    def findings(self) -> "Findings":
+        """Return the summary that all reports use."""
+        bad = ~self.stable
+        worst = None if not bad.any() else int(np.flatnonzero(bad)[np.argmax(self.swing[bad])])
+        disagree = np.flatnonzero((self.growth * self.duration > BORDER) != self.sustained)
+        disagree = [int(k) for k in disagree if np.isfinite(self.growth[k])]
+        shown = min(disagree, key=lambda k: (self.stable[k], -self.swing[k]), default=None)
+        return Findings(
+            len(self.stable),
+            int(bad.sum()),
+            self.bias,
+            None if worst is None else float(self.swing[worst]),
+            None if worst is None else float(self.current[worst]),
+            None if shown is None else self._reason(shown),
+        )
+
+    def _reason(self, k: int) -> str:
+        """Return why the linear and the simulated verdict on member k differ."""
+        rate = float(self.growth[k])
+        if rate <= 0:
+            decays = f"the linear loop is stable (its slowest mode decays at {-rate:.3g} 1/s)"
+            if self.lost[k]:
+                return (
+                    f"{decays}, but without loads the rotor is lost from a start displaced by {100 * KICK:g} % of the "
+                    "clearance: the start is outside the region in which the linear loop is valid"
+                )
+            return f"{decays}, but a motion of this size does not decay: a nonlinearity sustains it"
+        grows = f"the linear loop is unstable (it grows at {rate:.3g} 1/s)"
+        if self.stable[k]:
+            return f"{grows}, but the motion stays within {self.swing[k]:.3g} m: it chatters"
+        return f"{grows}, too slowly to appear in a run of {self.duration:.3g} s"
+
+
+class Findings(NamedTuple):
+    """Summary of a `Stability`; the log, the JSON files, the reports and the exit codes use this record.
+
+    `tested`: number of members. `unstable`: number of members held but not stable. `bias_A`: bias current. `swing_m`,
+    `current_A`: amplitude of z and largest |i| of the unstable member with the largest amplitude, in a run without
+    noise and loads; None if all are stable. `reason`: why the linear and the simulated verdict differ, for one member;
+    None if they agree.
+    """
+
+    tested: int
+    unstable: int
+    bias_A: float = 0.0
+    swing_m: float | None = None
+    current_A: float | None = None
+    reason: str | None = None
+
+    @property
+    def stable(self) -> bool:
+        """Whether all members are stable."""
+        return not self.unstable
+
+    def words(self) -> str:
+        """Return the verdict as a sentence; '' if no member was tested."""
+        why = "" if self.reason is None else f" The linear and the simulated verdict differ: {self.reason}."
+        if self.stable:
+            many = "The loop is stable" if self.tested == 1 else f"All {self.tested} members tested are stable"
+            return f"{many}: without noise and loads, the motion decays.{why}" if self.tested else ""
+        many = "The rotor is held, but the loop is NOT stable"
+        if self.tested > 1:
+            many = f"{self.unstable} of {self.tested} members tested are held, but NOT stable"
+        size = f"amplitude {self.swing_m:.3g} m, |i| up to {self.current_A:.3g} A (bias {self.bias_A:.3g} A)"
+        return f"{many}: without noise and loads, the motion does not decay ({size}).{why}"
+
+
+def stability(cascade: Cascade, scenario: Scenario, clock: Clock) -> Stability:
+    """Compute the stability of the members of an ensemble, whose varying leaves are arrays [N].
+
+    The result has no meaning for a member whose rotor is lost in the case's own run. Raises ValueError as `rollout`
+    does.
+    """
+    growth, duration = _growth(cascade, scenario, clock), float(clock.duration)
+    clearance = np.broadcast_to(np.asarray(scenario.touchdown, float), growth.shape)
+    swings, current, lost = _quiet_run(cascade, scenario, clock)
+    swing = np.where(lost, clearance, swings[:, -1])
+    sustained = lost | ((swing > SMALL * clearance) & (swing > (1 - DECAY) * swings[:, -2]))
+    chatters = (growth * duration > GROWN) & (swing <= SMALL * clearance)
+    stable = ~(sustained | ((growth * duration > BORDER) & ~chatters))
+    bias = float(np.max(np.asarray(scenario.plant.i_0)))
+    return Stability(stable, growth, sustained, swing, current, lost, duration, bias)
+
+
+def suspects(error: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Return the indices of the held members with the largest settled errors, ascending, at most MOST_TESTED.
+
+    `error` [N]: settled errors, m. `held` [N]: whether a member is held.
+    """
+    alive = np.flatnonzero(held)
+    return np.sort(alive[np.argsort(-np.asarray(error)[alive], kind="stable")[:MOST_TESTED]])
+
+
+def with_stability(margin: Delays, cascade: Cascade, scenario: Scenario, clock: Clock, *, known: bool) -> Delays:
+    """Return a result of `delay_margin` with the delays, up to its `held`, up to which the loop is stable.
+
+    `DELAYS` delays are tested; a second pass divides the step after the last one that is stable. `known`: as in
+    `delay_margin`.
+    """
+    if margin.held is None:
+        return margin
+    own: Any = cascade.processor
+    first = float(own.delay) if margin.held >= float(own.delay) else 0.0
+
+    def tried(low: float, high: float) -> tuple[np.ndarray, Stability]:
+        delays = np.linspace(low, high, DELAYS)
+        return delays, stability(at_delays(cascade, delays, known=known), scenario, clock)
+
+    delays, found = tried(first, margin.held)
+    if found.stable.all():
+        return margin._replace(stable=margin.held, tested=DELAYS)
+    facts, at = found.findings(), int(np.argmin(found.stable))
+    stable = None
+    if at:
+        finer, again = tried(delays[at - 1], delays[at])
+        stable = float(finer[max(int(np.argmin(again.stable)) - 1, 0)])
+    return margin._replace(stable=stable, swing_m=facts.swing_m, current_A=facts.current_A, tested=DELAYS)
+
+
+def _growth(cascade: Cascade, scenario: Scenario, clock: Clock) -> np.ndarray:
+    """Return the largest growth rate of the linear loop of each member [N], 1/s; NaN where there is no verdict."""
+    system, found = linearise_members(cascade, scenario, clock)
+    if any(set_valued_signs(getattr(cascade, stage)) for stage in DEFAULT_LAWS):
+        return np.full(np.shape(found), np.nan)
+    A, sizes = np.asarray(system.A), np.asarray(system.sizes)
+    known = np.asarray(found, bool) & np.isfinite(A).all((1, 2)) & np.isfinite(sizes).all(1)
+    scaled = np.zeros_like(A)
+    scaled[known] = A[known] * sizes[known][:, None, :] / sizes[known][:, :, None]
+    poles = np.linalg.eigvals(scaled)
+    if system.period is None:
+        rate = np.real(poles).max(1)
+    else:
+        rate = np.log(np.maximum(np.abs(poles).max(1), 1e-300)) / float(np.min(np.asarray(system.period)))
+    return np.where(known, rate, np.nan)
+
+
+def _quiet_run(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Simulate the quiet runs.
+
+    Returns the swing of z in each quarter [N, QUARTERS] (m; 0 after a loss), the largest |i| in the last quarter with
+    the rotor held [N] (A), and whether the rotor is lost [N].
+    """
+    every = max(clock.samples // QUARTERS, 1)
+    fold = Blocks(("z", "i"), every, -(-clock.samples // every), clock.sample_period)
+    run = run_ensemble(cascade, quiet(scenario), clock, fold=fold, every=0)
+    low, high = ({name: x[:, :QUARTERS] for name, x in part.items()} for part in (run.measured.low, run.measured.high))
+    swings = np.zeros((len(low["z"]), QUARTERS))
+    swings[:, : low["z"].shape[1]] = np.maximum(high["z"] - low["z"], 0.0) / 2
+    most = np.maximum(high["i"], -low["i"])
+    last = np.maximum(np.sum(np.isfinite(most), axis=1) - 1, 0)
+    current = most[np.arange(len(most)), last]
+    return swings, np.where(np.isfinite(current), current, 0.0), np.isfinite(run.trajectory.lost_at)
+
+
+def quiet(scenario: Scenario) -> Scenario:
+    """Return the scenario of the quiet run. The start is displaced by KICK of the clearance, towards z = 0."""
+    calm = scenario.undisturbed()
+    sensor: Any = calm.sensor
+    if sensor is not None:
+        bits = None if sensor.bits is None else FINE_BITS
+        sensor = dataclasses.replace(sensor.louder(0.0), bits=bits, outliers=None, dropouts=None)
+    initial, z = scenario.initial, np.asarray(scenario.initial.z, float)
+    z = z + np.where(z > 0, -1.0, 1.0) * KICK * np.asarray(scenario.touchdown)
+    return dataclasses.replace(
+        calm,
+        sensor=sensor,
+        reference=Constant(_at_start(scenario.reference)),
+        initial=dataclasses.replace(initial, z=z),
+    )
+
+
+def _at_start(reference: Signal) -> Any:
+    """Return the reference at t = 0, m; 0 for one that is drawn for each member."""
+    return 0.0 if is_random(reference) else np.asarray(reference(0.0))

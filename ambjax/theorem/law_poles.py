@@ -1,0 +1,203 @@
+"""Poles of each law on a processor: of its own step, in a loop with an ideal plant.
+
+The step of a law is differentiated, so a sign counts with its slope inside the boundary layer or the band. A position
+law controls the rotor by a force that acts at once, a current law controls the current of the nominal plant. Both act
+after the delay of the processor. An observer and an inversion law act on their own states, without delay.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.flatten_util import ravel_pytree
+
+from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
+from ambjax.control.base import Law, set_valued_signs
+from ambjax.control.cascade import Cascade
+from ambjax.control.cascade_state import CascadeState
+from ambjax.control.laws import CurrentDemand, CurrentInputs, ForceDemand, step_law
+from ambjax.control.sampling import Sampling
+from ambjax.control.schedule import extremes
+from ambjax.simulation.clock import Clock
+from ambjax.world.plant import Plant
+from ambjax.world.sensor import Measurement
+from ambjax.world.signals import Reference
+
+# A pole closer to 1 than this number is at rest, as that of an integral with a negligible gain.
+ROUNDING = 1e-9
+# Smallest damping ratio of a stable law. A law below it is at its limit: dead-beat control whose output acts one sample
+# late, for example, oscillates with a period of six samples, and only the resistance of the coil damps it.
+LEAST_DAMPING = 0.01
+
+
+class Loop(NamedTuple):
+    """A loop: the map of its state over one sample, its state at rest, and the number of its signals.
+
+    The first components of the state are the signals that the law controls. If there are none, the law acts on its own
+    states.
+    """
+
+    step: Callable[[Array], Array]
+    start: Array
+    signals: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class LawPoles:
+    """The poles of a law on a processor, in the z-plane.
+
+    `implicit`: whether the law makes an implicit step. `radius`: largest magnitude of a pole; inf for an explicit step
+    of a set-valued sign. `damping`: smallest damping ratio of a pole, -Re(s)/|s| for z = exp(s); 1 if no pole
+    oscillates.
+    """
+
+    stage: str
+    implicit: bool
+    radius: float
+    damping: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether the law, without the other laws, is stable, and oscillations decay."""
+        return self.radius < 1 and self.damping >= LEAST_DAMPING
+
+
+def law_poles(cascade: Cascade, clock: Clock) -> list[LawPoles]:
+    """Return the poles of every law that has gains. `cascade`: of one member.
+
+    A position law that demands a voltage has no row, because its plant includes the current.
+    """
+    sampling, cascade, lines = sampling_of(cascade, clock), cascade.on_processor(), []
+    for stage, law in zip(CascadeState._fields, cascade.laws, strict=True):
+        given: Any = law
+        gains = any("steepness" in field.metadata for field in dataclasses.fields(given))
+        if not gains or (stage == "position" and given.demand == "voltage"):
+            continue
+        implicit = law.has_own_step(sampling.implicit)
+        if set_valued_signs(law) and not implicit:
+            lines.append(LawPoles(stage, implicit, math.inf, -1.0))
+            continue
+        poles = np.concatenate([_poles(LOOPS[stage](one, cascade.model, sampling)) for one in extremes(law)])
+        poles = poles[np.abs(poles - 1) > ROUNDING]
+        s = np.log(np.where(np.abs(poles) > 1e-300, poles, 1e-300) + 0j)
+        damping = float(np.min(-np.real(s) / np.abs(s), initial=1.0))
+        lines.append(LawPoles(stage, implicit, float(np.max(np.abs(poles), initial=0.0)), damping))
+    return lines
+
+
+def _poles(loop: Loop) -> np.ndarray:
+    """Return the poles of a loop. States that the signals do not change, or that do not change them, have none."""
+    A = np.asarray(compiled_quickly(jax.jacfwd(loop.step), options=QUICKEST)(loop.start))
+    changing = (np.eye(len(A)) != A).any(1)
+    used = _reached(A, loop.signals) & _reached(A.T, loop.signals) if loop.signals else changing
+    return np.linalg.eigvals(A[used][:, used])
+
+
+def _reached(A: np.ndarray, signals: int) -> np.ndarray:
+    """Return which states the first `signals` states change, over any number of samples."""
+    reached = np.arange(len(A)) < signals
+    for _ in A:
+        reached = reached | (A[:, reached] != 0).any(1)
+    return reached
+
+
+def sampling_of(cascade: Cascade, clock: Clock) -> Sampling:
+    """Return the sampling of the laws of a cascade with a processor."""
+    processor: Any = cascade.on_processor().processor
+    return processor.sampling(clock.sample_period)
+
+
+def _advance(law: Law, model: Plant, sampling: Sampling) -> Callable[..., Any]:
+    return functools.partial(step_law, law, model=model, period=sampling.period, implicit=sampling.implicit)
+
+
+def _rest(model: Plant) -> tuple[Measurement, Array, Reference]:
+    """Return the motion at rest at z = 0, the scaled force that carries the weight (A^2/m^2), and the reference 0."""
+    zero, i = jnp.zeros(()), jnp.asarray(model.equilibrium(0.0)[0])
+    return Measurement(zero, zero, i), jnp.asarray(model.g / model.a), Reference(zero, zero, zero)
+
+
+def _state(state: Any) -> tuple[Array, Callable[[Array], Any]]:
+    return ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, float), state))
+
+
+def _observer(law: Any, model: Plant, sampling: Sampling) -> Loop:
+    rest, _, _ = _rest(model)
+    start, restore = _state(law.init(model, rest))
+    return Loop(lambda x: ravel_pytree(_advance(law, model, sampling)(rest, restore(x))[1])[0], start)
+
+
+def _inversion(law: Any, model: Plant, sampling: Sampling) -> Loop:
+    rest, v, _ = _rest(model)
+    zero = jnp.zeros(())
+    start, restore = _state(law.started(rest.i).init_sampled(model))
+    demand = ForceDemand(rest.z, zero, v, zero)
+    return Loop(lambda x: ravel_pytree(_advance(law, model, sampling)(demand, restore(x))[1])[0], start)
+
+
+def _position(law: Any, model: Plant, sampling: Sampling) -> Loop:
+    """Return the loop of a rotor under the demanded force. State: z, z_dot, the law's, and the last two demands."""
+    _, v, reference = _rest(model)
+    laws, restore = _state(law.init_sampled(model))
+    T, weights = sampling.period, _weights(sampling.late)
+
+    def step(x: Array) -> Array:
+        z, z_dot, past = x[0], x[1], x[-2:]
+        at_sample = past[0] if sampling.late <= 1 else past[1]
+        motion = Measurement(z, z_dot, model.current_for(z, at_sample))
+        v_star, after = _advance(law, model, sampling)((motion, reference), restore(x[2:-2]))
+        demands = (v_star, past[0], past[1])
+        for share, force in reversed(list(zip(weights, demands, strict=True))):
+            rate, h = model.a * force + 2 * model.k_z / model.m * z - model.g, share * T
+            z, z_dot = z + h * z_dot + h * h / 2 * rate, z_dot + h * rate
+        return jnp.concatenate([jnp.stack([z, z_dot]), ravel_pytree(after)[0], jnp.stack([v_star, past[0]])])
+
+    return Loop(step, jnp.concatenate([jnp.zeros(2), laws, jnp.stack([v, v])]), 2)
+
+
+def _current(law: Any, model: Plant, sampling: Sampling) -> Loop:
+    """Return the loop of the current at z = 0. State: i, the law's, and the last two commands."""
+    rest, _, _ = _rest(model)
+    demand, laws = CurrentDemand(rest.i, jnp.zeros(())), law.init_sampled(model)
+    start, restore = _state(laws)
+    u = _advance(law, model, sampling)(CurrentInputs(rest, demand, jnp.inf), laws)[0]
+    weights = _weights(sampling.late)
+
+    def rate(i: Array, u: Array) -> Array:
+        return law.driven(model, u, model.start(rest._replace(i=i))).i
+
+    decay, gain = map(float, jax.grad(rate, (0, 1))(rest.i, u))
+
+    def step(x: Array) -> Array:
+        i, past = x[0], x[-2:]
+        inputs = CurrentInputs(rest._replace(i=i), demand, jnp.inf)
+        command, after = _advance(law, model, sampling)(inputs, restore(x[1:-2]))
+        for share, voltage in reversed(list(zip(weights, (command, past[0], past[1]), strict=True))):
+            h = share * sampling.period
+            reach = math.expm1(decay * h) / decay if decay else h
+            i = i + reach * (rate(rest.i, u) + decay * (i - rest.i) + gain * (voltage - u))
+        return jnp.concatenate([i[None], ravel_pytree(after)[0], jnp.stack([command, past[0]])])
+
+    return Loop(step, jnp.concatenate([rest.i[None], start, jnp.stack([u, u])]), 1)
+
+
+def _weights(late: float) -> tuple[float, float, float]:
+    """Return the shares of a sample in which its own output, that before it and the one before that act, if it begins
+    to act `late` samples after it was computed. The oldest acts first.
+    """
+    share = 1 - abs(late - 1)
+    return max(1 - late, 0.0), share, max(late - 1, 0.0)
+
+
+LOOPS: dict[str, Callable[[Any, Plant, Sampling], Loop]] = {
+    "observer": _observer,
+    "position": _position,
+    "inversion": _inversion,
+    "current": _current,
+}

@@ -1,0 +1,144 @@
+"""Each command from shell to files, in a process of its own, on the paper's scenario and on a sampled bearing."""
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+from ambjax.cases.reader import read_case
+
+# The paper's tracking scenario in continuous time, from the printed gains, with small noise.
+PAPER = """
+[controller.inversion]
+gamma = {gamma}
+[reference]
+kind = "sine"
+amplitude = 0.0025
+frequency = 2.0
+[disturbance.q_z]
+kind = "pulse"
+amplitude = 1.0
+start = 0.01
+stop = 0.015
+unit = "A^2/m^2"
+[sensor]
+std = 1e-6
+std_z_dot = 1e-4
+std_i = 1e-4
+[actuator]
+u_max = 200.0
+[clock]
+duration = 0.03
+[run]
+settle = 0.02
+[spread]
+plant.m = {{ percent = 10 }}
+"""
+# A bearing from a data sheet on a processor, without a velocity sensor.
+BEARING = """
+[plant]
+m = 2.4
+k_z = 0.0
+mu_0 = 1.2566e-6
+n = 300.0
+A = 2.0e-4
+s_0 = 5e-4
+i_0 = 2.0
+R = 1.0
+[controller.observer]
+kind = "kalman"
+[controller.position]
+kind = "pid"
+k_p = {k_p}
+[controller.inversion]
+kind = "linearised"
+[controller.current]
+kind = "pi"
+[processor]
+delay = 1.0
+[sensor]
+std = 3e-7
+std_i = 2e-3
+velocity = false
+bits = 14
+[actuator]
+u_max = 72.0
+[initial]
+z = 2e-5
+[clock]
+duration = 0.03
+sample_period = 6.25e-5
+[run]
+settle = 0.015
+[spread]
+plant.m = {{ percent = 10 }}
+"""
+# The smallest search, of one gain.
+SMALLEST = """
+[tune]
+gains = ["controller.position.{gain}"]
+members = 2
+stressed = 0
+validation = 2
+held_out = 2
+screen = 0
+starts = 1
+iterations = 1
+front = 1
+limits.sensitivity = 8.0
+"""
+# Two case files with the same laws, so that both use the same compiled programs.
+CASES = {
+    "paper": [PAPER.format(gamma=gamma) + SMALLEST.format(gain="c") for gamma in (1000.0, 7.5e4)],
+    "bearing": [BEARING.format(k_p=k_p) + SMALLEST.format(gain="k_p") for k_p in (2e5, 3e5)],
+}
+MAP = ["--x", "plant.m=-10%:10%:2", "--y", "initial.z=1e-5:2e-5:2"]
+REPORT = ("report.json", "report.md", "report.html", "nominal.png", "spectrum.png", "convergence.png", "slices.png")
+# For each command: its arguments, and the files that it writes.
+COMMANDS = {
+    "simulate": (["simulate", "first.toml"], ("trajectory.npz", "metrics.json", "overview.png")),
+    "ensemble": (
+        ["ensemble", "first.toml", "--members", "4"],
+        ("members.npz", "summary.json", "fan.png", "histograms.png"),
+    ),
+    "map": (["map", "first.toml", *MAP], ("map.json", "map.png")),
+    "sensitivity": (["sensitivity", "second.toml", "--members", "2"], ("sensitivity.json", "sensitivity.png")),
+    "tune": (["tune", "first.toml"], ("tuned.toml", "history.npz", *REPORT)),
+    "compare": (
+        ["compare", "first.toml", "second.toml", "--tune", "--members", "4"],
+        ("compare.json", "compare.html", "compare.png", "tuned-first/tuned.toml", "tuned-second/tuned.toml"),
+    ),
+}
+# Commands for a case with a processor.
+SAMPLED = {
+    "export": (["export", "first.toml", "--verify"], ("verify.md", "verify.json", "first.c", "first.h")),
+    "page": (["page", "first.toml", "--out", "page/page.html"], ("page.html",)),
+}
+
+
+@pytest.mark.parametrize(
+    ("case", "command"),
+    [*(("paper", name) for name in COMMANDS), *(("bearing", name) for name in COMMANDS | SAMPLED)],
+)
+def test_a_command_writes_all_of_its_files(case, command, tmp_path):
+    for name, text in zip(("first.toml", "second.toml"), CASES[case], strict=True):
+        (tmp_path / name).write_text(text)
+    words, names = (COMMANDS | SAMPLED)[command]
+    out = tmp_path / command
+    options = [] if "--out" in words else ["--out", str(out)]
+    done = subprocess.run(
+        [sys.executable, "-m", "ambjax", *words, *options, "--json"], cwd=tmp_path, capture_output=True, text=True,
+        timeout=280, check=False, env=os.environ | {"XDG_CACHE_HOME": str(tmp_path.parent / "cache")},
+    )  # fmt: skip
+    assert done.returncode in (0, 1), done.stderr
+    assert "Traceback" not in done.stderr
+    assert "is left out" not in done.stderr
+    assert "Warning" not in done.stderr
+    json.loads(done.stdout)
+    for name in names:
+        assert (out / name).stat().st_size > 0, name
+    for path in out.rglob("tuned.toml"):
+        read_case(pathlib.Path(path))

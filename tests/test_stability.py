@@ -1,0 +1,201 @@
+"""Stable, held but not stable, lost: the verdicts against brute force."""
+
+import copy
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+import test_check_processor as sampled
+from test_tuning_delay import CASE
+from texts import write
+from tomlkit import dumps
+
+import ambjax as amb
+from ambjax.__main__ import main
+from ambjax.cases.reader import case_from
+from ambjax.ensemble import run_ensemble
+from ambjax.ensemble.delays import at_delays
+from ambjax.linear.stability import SMALL, Findings, Stability, stability, with_stability
+from ambjax.theorem.advice import processor_lines
+from ambjax.theorem.sampled_report import Delays, SampledReport
+
+# Additional delays over which the model does not predict; the brute-force margin is 0.97 samples.
+STABLE, CYCLE, GONE = 1.3, 1.51, 1.7
+
+
+def case_of(**change):
+    raw = copy.deepcopy(CASE)
+    for key, value in change.items():
+        raw[key] = raw.get(key, {}) | value
+    return case_from(raw)
+
+
+def members(case, n=1):
+    return dataclasses.replace(case.scenario, member=np.zeros(n, int))
+
+
+def late(case, delays):
+    return at_delays(case.cascade, np.asarray(delays), known=False)
+
+
+def swings(case, delay):
+    """Half peak-to-peak value of z in each tenth of a run without noise; the largest |i| in the last one."""
+    world = dataclasses.replace(case.scenario, sensor=case.scenario.sensor.louder(0.0), initial=amb.Initial(2.5e-5))
+    one = dataclasses.replace(late(case, [delay]).processor, delay=delay, assumed=0.5)
+    run = amb.rollout(dataclasses.replace(case.cascade, processor=one), world, case.clock).trajectory
+    z, i = (np.array_split(np.asarray(x), 10) for x in (run.rows.z, run.rows.i))
+    return np.array([np.ptp(part) / 2 for part in z]), np.abs(i[-1]).max()
+
+
+@pytest.mark.slow
+def test_the_delay_from_which_the_loop_is_not_stable_is_that_of_brute_force():
+    case = case_of()
+    low, high = 0.5, 1.6
+    for _ in range(10):  # 1e-3 samples
+        middle = (low + high) / 2
+        found, _ = swings(case, middle)
+        low, high = (low, middle) if found[6] > found[4] else (middle, high)
+    assert 1.4 < low < 1.5
+    margin = Delays(held=1.53, lost=1.54, undecided=None, step=0.01)
+    found = with_stability(margin, case.cascade, case.scenario, case.clock, known=False)
+    # the sign of a growth over 60 ms is decided to 1 % of the delay; beyond, the linear loop is exact
+    assert found.stable == pytest.approx(low, rel=0.01)
+    size, current = swings(case, 1.53)
+    # other windows of the same limit cycle, which beats slowly
+    assert found.swing_m == pytest.approx(size[-1], rel=0.1)
+    assert found.current_A == pytest.approx(current, rel=0.1)
+    said = processor_lines(SampledReport([], [], math.inf, ""), found, None)[-1]
+    assert f"stable up to {found.stable:.5f}"[:16] in said
+    assert "held, but its motion does not decay" in said
+
+
+@pytest.mark.slow
+def test_below_the_margin_stable_above_it_held_but_not_stable_far_above_it_lost():
+    case, delays = case_of(), [STABLE, CYCLE, GONE]
+    found = stability(late(case, delays), members(case, 3), case.clock)
+    held = np.isinf(run_ensemble(late(case, delays), members(case, 3), case.clock, fold=None).trajectory.lost_at)
+    assert held.tolist() == [True, True, False]
+    assert found.stable.tolist() == [True, False, False]
+    assert found.lost.tolist() == [False, False, True]
+    assert np.sign(found.growth).tolist() == [-1, 1, 1]
+    size, current = swings(case, CYCLE)
+    assert found.swing[1] == pytest.approx(size[-1], rel=0.1)
+    assert found.current[1] == pytest.approx(current, rel=0.1)
+    # it rattles in more than a tenth of the gap, with more than the bias current
+    assert found.swing[1] > 0.1 * 5e-4
+    assert found.current[1] > 2.0
+    facts = found._replace(**{k: getattr(found, k)[:2] for k in Stability._fields[:-2]}).findings()
+    assert (facts.tested, facts.unstable, facts.reason) == (2, 1, None)
+    assert "1 of 2 members tested are held, but NOT stable" in facts.words()
+
+
+@pytest.mark.slow
+def test_noise_and_unbalance_do_not_make_a_loop_unstable():
+    """Forced motion of a fifth of the clearance, and noise of 1 % of it."""
+    loads = {"q_z": {"kind": "sine", "amplitude": 25.0, "frequency": 30.0}}
+    case = case_of(disturbance=loads, sensor={"std": 4.5e-6})
+    run = amb.rollout(case.cascade, case.scenario, case.clock).trajectory
+    assert np.isinf(run.lost_at)
+    assert np.ptp(np.asarray(run.rows.z)[250:]) / 2 > 0.15 * case.scenario.touchdown
+    found = stability(case.cascade, members(case), case.clock)
+    assert found.stable.all()
+    assert found.swing[0] < 1e-3 * SMALL * case.scenario.touchdown
+
+
+@pytest.mark.slow
+def test_the_chatter_of_signs_is_not_called_unstable():
+    """Set-valued signs that act up to a sample late, and steep signs with explicit steps."""
+    delays, clock = np.array([0.25, 0.5, 0.75, 1.0]), amb.Clock(2000, 1e-4, amb.RK4(1))
+    cascade = sampled.cascade_of(*sampled.HARD, delay=delays, predict=False).on_processor(2.0, 0.0, between=True)
+    world = dataclasses.replace(sampled.WORLD, member=np.zeros(4, int))
+    found = stability(cascade, world, clock)
+    assert found.stable.all()
+    assert np.isnan(found.growth).all()
+    explicit = sampled.cascade_of(200.0, 25.0, 2e5, 2000.0, 25.0, delay=0.0, implicit=False)
+    found = stability(explicit, dataclasses.replace(world, member=np.zeros(1, int)), clock)
+    assert found.growth[0] > 1000
+    assert found.stable.all()
+    assert "it chatters" in found.findings().reason
+
+
+@pytest.mark.slow
+def test_a_limit_cycle_that_the_linear_loop_does_not_have_is_found_and_explained():
+    """A dead band of the amplifier: the linear loop, which has none, is stable."""
+    change = {"actuator": {"mode": "voltage", "bandwidth": None, "dead_band": 0.8}}
+    case = case_of(**change, controller=CASE["controller"] | {"current": {"kind": "pi"}}, processor={"delay": 0.2})
+    found = stability(case.cascade, members(case), case.clock)
+    assert found.growth[0] < 0
+    assert not found.stable[0]
+    facts = found.findings()
+    assert "The linear and the simulated verdict differ: the linear loop is stable" in facts.words()
+
+
+def command(words, capsys):
+    code = main([*words, "--json"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("elsewhere")
+def test_every_command_says_that_a_rotor_is_held_in_a_limit_cycle(capsys):
+    """Without prediction, the loop is stable up to 1.12 samples, and the rotor is held up to 1.33 samples."""
+    good, cycles = (
+        write(dumps(CASE | {"processor": {"delay": d, "predict": False}}), f"{d}.toml") for d in (0.9, 1.25)
+    )
+    code, found = command(["check", cycles], capsys)
+    assert code == 1
+    assert (found["lost_at_s"], found["processor"]["lost_at_s"], found["holds"]) == (None, None, False)
+    facts = found["stability"]
+    assert facts["unstable"] == 1
+    assert found["processor"]["delay_margin"]["stable"] is None
+    code, found = command(["ensemble", cycles, "--members", "2"], capsys)
+    assert (code, found["survivors"]) == (1, 2)
+    assert found["stability"]["unstable"] == 2
+    # one loop, one limit cycle, in another program
+    assert found["stability"]["swing_m"] == pytest.approx(facts["swing_m"], rel=0.05)
+    assert command(["ensemble", good, "--members", "2"], capsys)[0] == 0
+    code, found = command(["compare", good, cycles, "--members", "2"], capsys)
+    assert code == 1
+    assert [case["not_stable"] for case in found["cases"]] == [0, 2]
+    axes = ["--x", "processor.delay=0.9:1.6:3", "--y", "initial.z=1e-5:2e-5:2"]
+    code, found = command(["map", cycles, *axes], capsys)
+    (one,) = found["cases"]
+    assert one["unstable"] == [[0, 1, 0]] * 2
+    assert one["survival"] == [[1, 1, 0]] * 2
+    assert one["reach"] == [0.9, 0.9]
+
+
+ONE = Stability(*(np.array([x]) for x in (True, -10.0, False, 1e-9, 0.1, False)), 0.5, 2.0)
+TABLE = {
+    # growth, sustained, swing, lost, stable: whether the verdicts differ, and words
+    "both stable": ((-10.0, False, 1e-9, False, True), None),
+    "both not": ((50.0, True, 1e-4, False, False), None),
+    "no linear verdict": ((math.nan, True, 1e-4, False, False), None),
+    "no linear verdict, stable": ((math.nan, False, 1e-9, False, True), None),
+    "a pole on the border": ((1e-6, False, 1e-9, False, True), None),
+    "too slow": ((2.0, False, 1e-6, False, False), "too slowly to appear in a run of 0.5 s"),
+    "chatter": ((1e4, False, 1e-6, False, True), "chatters"),
+    "sustained": ((-10.0, True, 1e-4, False, False), "a nonlinearity sustains it"),
+    "lost": ((-10.0, True, 4e-4, True, False), "outside the region in which the linear loop is valid"),
+}
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_one_record_gives_the_verdict_and_the_reason(name):
+    (growth, sustained, swing, lost, stable), reason = TABLE[name]
+    values = {"growth": growth, "sustained": sustained, "swing": swing, "lost": lost, "stable": stable, "current": 3.0}
+    facts = ONE._replace(**{key: np.array([value]) for key, value in values.items()}).findings()
+    said = facts.words()
+    assert facts.stable == stable == said.startswith("The loop is stable") == (facts.swing_m is None)
+    assert ("NOT stable" in said) == (not stable)
+    assert (facts.reason is None) == (reason is None)
+    assert reason is None or reason in facts.reason
+    assert ("differ" in said) == (reason is not None)
+    if not stable:
+        assert "3 A (bias 2 A)" in said
+
+
+def test_no_member_tested_is_no_verdict():
+    assert Findings(0, 0).words() == ""

@@ -1,0 +1,286 @@
+"""The report of the tuner if facts are absent, and the answer if a description fails."""
+
+import dataclasses
+import itertools
+import json
+import math
+import re
+import tomllib
+
+import numpy as np
+import pytest
+from bowl import World, document, instead_of_engines
+from test_tuning_outcome import losing
+from tomlkit import dumps
+
+import tuning.command
+import tuning.search.rounds
+from ambjax.commands import outputs
+from ambjax.host.web_page import render_page
+from tuning.__main__ import main
+from tuning.measured_peaks import UNSTABLE
+from tuning.report import document as report
+from tuning.report import judging, pictures
+from tuning.report.answer import _sensitivity as sensitivity_line
+from tuning.report.outcome import outcome_of, outcome_text
+
+# --- one member's peak of |S| --------------------------------------------------------------------------------------
+
+UNKNOWN = "it cannot be linearised: no equilibrium"
+# The linear peak of a member: known, unstable, not computed. Its injection: none (continuous time), known, lost.
+LINEAR = {
+    "2": {"linear": 2.0, "frequency_hz": 300.0, "zone": "A", "why": ""},
+    "unstable": {"linear": None, "frequency_hz": None, "zone": "D", "why": UNSTABLE},
+    "unknown": {"linear": None, "frequency_hz": None, "zone": None, "why": UNKNOWN},
+}
+NONE = dict.fromkeys(("peak", "low", "high", "at_hz", "saturated", "injected_zone"))
+INJECTED = {
+    "none": NONE | {"repetitions": 0, "lost": 0},
+    "1.5": {"peak": 1.5, "low": 1.4, "high": 1.6, "at_hz": 400.0, "saturated": 0.0, "injected_zone": "A"}
+    | {"repetitions": 2, "lost": 0},
+    "3.5": {"peak": 3.5, "low": None, "high": None, "at_hz": 400.0, "saturated": 0.1, "injected_zone": "B"}
+    | {"repetitions": 2, "lost": 0},
+    "one of two lost": {"peak": 1.5, "low": None, "high": None, "at_hz": 400.0, "saturated": 0.0}
+    | {"injected_zone": "D", "repetitions": 2, "lost": 1},
+    "all lost": NONE | {"injected_zone": "D", "repetitions": 2, "lost": 2},
+}
+LOST_WORDS = "no peak of |S| for member 7: it is lost when a test signal is injected: zone D"
+# What the report says, by linear peak, injection, and whether only injections decide.
+SAID = {
+    ("2", "none", False): "at most 2 (at 300 Hz) over the worst members: zone A",
+    ("2", "1.5", False): "at most 2 (at 300 Hz) over the worst members: zone A",
+    ("2", "3.5", False): "at most 3.5 (at 400 Hz) over the worst members: zone B",
+    ("2", "1.5", True): "at most 1.5 (at 400 Hz)",
+    ("unstable", "none", False): f"no peak of |S| for member 7: {UNSTABLE}: zone D",
+    ("unknown", "none", False): f"no peak of |S| for member 7: {UNKNOWN}.",
+    ("unstable", "1.5", False): f"no peak of |S| for member 7: {UNSTABLE}: zone D",
+    ("unknown", "1.5", False): f"no peak of |S| for member 7: {UNKNOWN}.",
+    ("unstable", "3.5", True): "at most 3.5 (at 400 Hz)",
+    ("unknown", "3.5", True): "at most 3.5 (at 400 Hz)",
+}
+
+
+def peak_of(linear, injected):
+    return {"member": 7} | LINEAR[linear] | INJECTED[injected]
+
+
+def sensitivities():
+    """Every combination of a linear and an injected peak, alone and beside a member whose peak is known."""
+    known = {"member": 3} | LINEAR["2"] | INJECTED["1.5"]
+    for linear, injected, decides in itertools.product(LINEAR, INJECTED, (False, True)):
+        if decides and injected == "none":
+            continue  # no injection decides in continuous time
+        one, continuous = peak_of(linear, injected), injected == "none"
+        beside = known | INJECTED["none"] if continuous else known
+        for members in ([one], [one, beside], [beside, one]):
+            yield {"members": members, "injected": not continuous, "decides": decides, "zones": [3.0, 4.0, 5.0]}
+
+
+@pytest.mark.parametrize("kind", SAID)
+def test_the_printed_peak_is_the_one_that_counts(kind, facts):
+    linear, injected, decides = kind
+    found = {"members": [peak_of(linear, injected)], "decides": decides}
+    assert SAID[kind] in sensitivity_line(dataclasses.replace(facts, sensitivity=found))
+
+
+@pytest.mark.parametrize("decides", [False, True])
+@pytest.mark.parametrize("linear", LINEAR)
+@pytest.mark.parametrize("injected", ["one of two lost", "all lost"])
+def test_a_member_that_is_lost_in_an_injection_has_no_peak(linear, injected, decides, facts):
+    found = {"members": [peak_of(linear, injected)], "decides": decides}
+    assert LOST_WORDS in sensitivity_line(dataclasses.replace(facts, sensitivity=found))
+
+
+# --- every combination of facts ------------------------------------------------------------------------------------
+
+
+def tuned(world, folder, *flags, **tune):
+    """Run the tuner on a Bowl from shell to files. Return its exit code and its output folder."""
+    path, out = folder / "case.toml", folder / "out"
+    path.write_text(dumps(document(**tune)))
+    with pytest.MonkeyPatch.context() as patch:
+        instead_of_engines(patch, world)
+        patch.setattr(tuning.search.rounds, "MOST_ROUNDS", 1)
+        return main([str(path), "--out", str(out), "--force", *flags]), out
+
+
+def facts_of(world, folder, *flags, **tune):
+    """Return the facts of such a run."""
+    found, examined = [], judging.examined
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tuning.command, "examined", lambda *args: found.append(examined(*args)) or found[0])
+        patch.setattr(tuning.command, "_pictures", lambda *_: {})
+        tuned(world, folder, *flags, **tune)
+    return found[0][0]
+
+
+@pytest.fixture(scope="module")
+def facts(tmp_path_factory):
+    """The facts of a run in which all members are held, with a front."""
+    return facts_of(World(), tmp_path_factory.mktemp("held"), "--pareto")
+
+
+@pytest.fixture(scope="module")
+def all_lost(tmp_path_factory):
+    """The facts of a run in which no held-out member is held, before or after."""
+    return facts_of(losing(*range(6)), tmp_path_factory.mktemp("lost"), "--pareto")
+
+
+@pytest.fixture(scope="module")
+def unjudged(tmp_path_factory):
+    """The facts of a run without held-out members."""
+    return facts_of(World(), tmp_path_factory.mktemp("none"), held_out=0)
+
+
+# Facts that may be absent, and their values then.
+ABSENT = {
+    "loss": {}, "minimised": None, "conditions": [], "advice_on_conditions": [], "step_error": None,
+    "worst_step_error": None, "worst_member": None, "accurate": None, "gradient": None, "front": None, "beside": None,
+    "slices": None, "sensitivity": None, "stability": None,
+}  # fmt: skip
+
+
+def check_report(facts):
+    """Render the report of these facts: nothing raises an error, and no text shows that a fact is absent."""
+    text = report.report_markdown(facts)
+    assert len(re.findall(r"^- \*\*", text.partition("\n## ")[0], re.MULTILINE)) == 5
+    assert not re.search(r"\bNone\b|\bnan\b", text)
+    json.dumps(outputs.plain(facts.table), allow_nan=False)
+    return text
+
+
+def judged_again(facts):
+    """Return the facts with the outcome and the verdict that follow from them."""
+    outcome = outcome_of(facts, 0)
+    return dataclasses.replace(facts, outcome=outcome.facts(), verdict=outcome_text(facts, outcome))
+
+
+def test_the_report_is_complete_for_every_combination_of_ensembles_and_peaks(facts, all_lost, unjudged):
+    """Held or lost, before and after; not judged; a limit not met; not verified; no front; each kind of peak of |S|."""
+    ends = {"held": facts, "lost": all_lost, "none": unjudged}
+    for before, after in itertools.product(ends, ends):
+        if (before == "none") != (after == "none"):
+            continue  # both are judged, or none
+        mixed = dataclasses.replace(
+            ends[after], before=ends[before].before, loss=ends[after].loss and facts.loss | all_lost.loss
+        )
+        for refuted, front in itertools.product(("", "accurate steps lose 1 of 4 members"), (facts.front, None)):
+            base = judged_again(dataclasses.replace(mixed, refuted=refuted, front=front))
+            for found in (None, *sensitivities()):
+                text = check_report(dataclasses.replace(base, sensitivity=found))
+                assert ("## Sensitivity" in text) == (found is not None)
+
+
+@pytest.mark.parametrize("which", ["facts", "all_lost", "unjudged"])
+def test_the_report_is_complete_without_any_of_the_facts_that_may_be_absent(which, request):
+    whole = request.getfixturevalue(which)
+    lacking = [{name: value} for name, value in ABSENT.items()]
+    gains = [row | {"sensitivity_percent": None, "sensitivity_lost": 0} for row in whole.gains]
+    for change in [*lacking, ABSENT | {"gains": gains}]:
+        check_report(judged_again(dataclasses.replace(whole, **change)))
+
+
+def test_a_page_without_pictures_says_so(facts):
+    shown = render_page(report.report_markdown(facts), {}, "t")
+    assert shown.count("The picture is missing") == 5
+    assert "<img" not in shown
+
+
+def test_a_front_with_a_point_that_holds_no_member_is_drawn(facts):
+    lost = dict(facts.front[0], settled_rms_error_m=math.nan, settled_rms_u_V=math.nan, lost=6, taken=False)
+    assert pictures.front([*facts.front, lost]).startswith(b"\x89PNG")
+
+
+# --- a description fails -------------------------------------------------------------------------------------------
+
+NAMES = {
+    "tuned.toml", "history.npz", "report.json", "report.md", "report.html", "nominal.png", "spectrum.png",
+    "convergence.png", "slices.png", "front.png",
+}  # fmt: skip
+# What fails, and the files that are then missing. Functions of the tuner by module and name.
+FAILING = {
+    "tuning.report.answer.prices": set(),
+    "tuning.report.document._gains": set(),
+    "tuning.report.limit_table.section": set(),
+    "tuning.report.accurate.nominal": {"nominal.png", "spectrum.png"},
+    "tuning.report.pictures.before_after": {"nominal.png"},
+    "tuning.report.pictures.spectrum": {"spectrum.png"},
+    "tuning.report.pictures.convergence": {"convergence.png"},
+    "tuning.report.pictures.landscape": {"slices.png"},
+    "tuning.report.pictures.front": {"front.png"},
+    "tuning.command.render_page": {"report.html"},
+    "tuning.report.judging._conditions": set(),
+    "tuning.report.judging._losses": set(),
+    "tuning.report.judging.worst": set(),
+    "tuning.report.judging.explore.slices": {"slices.png"},
+    "tuning.report.judging.breakdown.minimised": set(),
+    "tuning.report.judging.front_table.facts": {"front.png"},
+    "tuning.report.outcome.outcome_text": set(),
+    "tuning.report.outcome.remedies": set(),
+}
+
+
+def broken(*_, **__):
+    raise TypeError("'>' not supported between instances of 'NoneType' and 'NoneType'")
+
+
+DRAWN = ("before_after", "spectrum", "convergence", "landscape", "front")
+
+
+@pytest.fixture
+def lenient(monkeypatch):
+    """An error in a description does not end the command. Nothing is drawn: that takes most of the time."""
+    monkeypatch.setattr(outputs, "STRICT", False)
+    monkeypatch.setattr("tuning.report.accurate.nominal", lambda *_: object())
+    for name in DRAWN:
+        monkeypatch.setattr(pictures, name, lambda *_: b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", FAILING)
+def test_an_error_in_a_description_costs_only_that_description(name, lenient, monkeypatch, tmp_path, capsys):
+    module = {"_gains": "SECTIONS"}.get(name.rpartition(".")[2])
+    if module:  # a section in the table of sections
+        monkeypatch.setitem(report.SECTIONS, "the gains", broken)
+    else:
+        monkeypatch.setattr(name, broken)
+    code, out = tuned(World(), tmp_path, "--pareto")
+    assert code == 0
+    names = {path.name for path in out.iterdir() if path.is_file() and "V.toml" not in path.name}
+    assert names - {f"tuned_{x}" for x in names} == NAMES - FAILING[name]
+    said = capsys.readouterr()
+    (line,) = {line for line in said.err.splitlines() if " is left out: " in line and "run after" not in line}
+    assert "TypeError: '>' not supported" in line
+    assert "test_tuning_absent.py, line" in line
+    assert "report it" in line
+    assert tomllib.loads((out / "tuned.toml").read_text())["controller"]["position"]["c"] == pytest.approx(
+        100, rel=0.01
+    )
+    assert json.loads((out / "report.json").read_text())["outcome"]["good"]
+
+
+def test_the_answer_is_kept_if_it_cannot_be_judged(lenient, monkeypatch, tmp_path, capsys):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(judging, "judge", broken)
+        code, out = tuned(World(), tmp_path)
+    assert code == 1
+    assert sorted(path.name for path in out.iterdir() if path.is_file()) == ["history.npz", "tuned.toml"]
+    text = (out / "tuned.toml").read_text()
+    assert tuning.command.NOT_JUDGED in text
+    gains = tomllib.loads(text)["controller"]["position"]
+    assert gains["c"] == pytest.approx(100, rel=0.01)  # `World.best`
+    assert "--resume" in capsys.readouterr().err
+    # the same search is judged later
+    with pytest.MonkeyPatch.context() as patch:
+        instead_of_engines(patch, World())
+        assert main([str(tmp_path / "case.toml"), "--out", str(out), "--resume"]) == 0
+    assert tomllib.loads((out / "tuned.toml").read_text())["controller"]["position"] == gains
+    assert {path.name for path in out.iterdir() if path.is_file()} == NAMES - {"front.png"}
+
+
+def test_the_answer_is_kept_if_the_front_fails(lenient, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(tuning.search.rounds, "trace_front", broken)
+    code, out = tuned(World(), tmp_path, objective="knee")
+    assert code == 0
+    assert "the front of error against voltage is left out: TypeError" in capsys.readouterr().err
+    gains = tomllib.loads((out / "tuned.toml").read_text())["controller"]["position"]
+    np.testing.assert_allclose([gains["c"], gains["k"]], [100, 60], rtol=0.01)  # `World.best`
