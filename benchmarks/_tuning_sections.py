@@ -195,6 +195,45 @@ def laws() -> list[str]:
     return lines
 
 
+def default_gains() -> list[str]:
+    """Return the tables of the untuned structures: zone and peak of |S|, and the structures that lose the rotor."""
+    data = load("default_gains")
+    rows: dict[tuple[str, ...], dict[str, Any]] = {tuple(key.split("/")): row for key, row in data["rows"].items()}
+    held = sum(row["held"] for row in rows.values())
+    zones = [row["zone"] for row in rows.values() if row["held"]]
+    lines = ["## Default gains (`default_gains.py`)", "", facts(data["machine"]), "<!-- default gains: -->"]
+    lines += [
+        f"{len(rows)} structures with untuned laws, of which {held} hold the rotor: {zones.count('A')} in zone A, "
+        f"{zones.count('B')} in zone B. Each cell contains the worst zone and the peaks of |S| over the current laws.",
+        "",
+    ]
+    inversions = list(dict.fromkeys(key[2] for key in rows))
+    for name, words in data["machines"].items():
+        ours = {key[1:]: row for key, row in rows.items() if key[0] == name}
+        if not ours:
+            continue
+        found = []
+        for position in dict.fromkeys(key[0] for key in ours):
+            cells = [{key[2]: ours[key] for key in ours if key[:2] == (position, one)} for one in inversions]
+            found.append([f"`{position}`", *map(_cell, cells)])
+        lines += [f"**{name}**: {words}", "", *table(" | ".join(["position law", *inversions]), found)]
+    return [*lines, "<!-- end of default gains -->", ""]
+
+
+def _cell(currents: dict[str, dict[str, Any]]) -> str:
+    """Return the worst zone and the peaks of |S| over the current laws, and the laws that do not hold the rotor."""
+    held = [row for row in currents.values() if row["held"] and row["stable"]]
+    peaks = sorted(row["peak"] for row in held)
+    parts = []
+    if held:
+        ends = [f"{x:.2f}" for x in (peaks[0], peaks[-1])]
+        parts.append(f"{max(row['zone'] for row in held)}, {' to '.join(dict.fromkeys(ends))}")
+    for words, wrong in (("lost", False), ("held, not stable", True)):
+        kinds = [kind for kind, row in currents.items() if row["held"] == wrong and not (row["held"] and row["stable"])]
+        parts += [f"{words}: {', '.join(kinds)}"] if kinds else []
+    return "; ".join(parts) or "-"
+
+
 def _middle(values: list[float] | None, times: float) -> str:
     """Return the median with the range, or the only value; `values`: median, least and largest, or None."""
     if values is None:

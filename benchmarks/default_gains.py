@@ -46,10 +46,9 @@ def main() -> None:
         key = "/".join((name, *laws))
         if key not in rows:
             rows[key] = result(case_of(machine(name), laws))
-            print(key, rows[key], flush=True)
-            path.write_text(json.dumps({"rows": rows}))
+            print(f"{key}: {rows[key]}", flush=True)
+            _measure.write("default_gains", {"machines": MACHINES, "rows": rows})
             jax.clear_caches()
-    _measure.write("default_gains", {"machines": MACHINES, "rows": rows})
 
 
 def order(names: list[str]) -> list[tuple[str, tuple[str, str, str]]]:

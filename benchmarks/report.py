@@ -35,6 +35,7 @@ Smooth gains are gamma = 1e9 and p = 25e-6 in the inversion; repaired gains are 
     .venv/bin/python benchmarks/sampled_tasks.py     # the tuning tasks on a processor
     .venv/bin/python benchmarks/bearings.py          # other bearings, and the templates
     .venv/bin/python benchmarks/laws.py              # control structures against each other
+    .venv/bin/python benchmarks/default_gains.py     # every structure untuned
     .venv/bin/python benchmarks/search.py            # the search against derivative-free methods
     .venv/bin/python benchmarks/schedules.py         # 24 scheduled gains: the search against CMA-ES
     .venv/bin/python benchmarks/from_answer.py       # CMA-ES started from a tuned answer
@@ -60,6 +61,7 @@ SECTIONS = {
     "sampled_tasks": tuned.sampled_tasks,
     "search": tuned.search,
     "laws": tuned.laws,
+    "default_gains": tuned.default_gains,
     "schedules": tuned.schedules,
     "from_answer": tuned.from_answer,
     "export": simulated.export,

@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -73,7 +74,7 @@ def at_rest(law, z, i):
 LINEAR = ("pid", "feedback-linearisation", "state-feedback", "chain", "filtered chain", "linear")
 
 
-@pytest.mark.parametrize("sampled", [False, True], ids=["continuous", "sampled"])
+@pytest.mark.parametrize("sampled", ["", "implicit", "explicit"])
 @pytest.mark.parametrize("name", LINEAR)
 def test_the_first_command_from_rest_is_that_of_the_static_law(name, sampled):
     law, i = POSITIONS[name], float(RIG.equilibrium(Z)[0])
@@ -81,7 +82,8 @@ def test_the_first_command_from_rest_is_that_of_the_static_law(name, sampled):
     cascade = Cascade(position=law, inversion=inversion.ClosedForm(), current=current.ProportionalIntegral(), model=RIG)
     wanted = at_rest(law, Z, i)
     if sampled:
-        cascade = dataclasses.replace(cascade, processor=Processor(delay=0.0, guard=None)).on_processor()
+        processor = Processor(delay=0.0, implicit=sampled == "implicit", guard=None)
+        cascade = dataclasses.replace(cascade, processor=processor).on_processor()
         system = Sampled(ClosedLoop(cascade, scenario), T, 0).realised()
         state = system.start()
         found = system.jump(0.0, state, system.sensor_errors(0)).command.v_star

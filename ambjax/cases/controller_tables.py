@@ -108,7 +108,10 @@ def cascade_from(
         if kind is position.LinearController:
             laws[stage], matrices = _linear(law, files)
         else:
-            laws[stage] = law_from(_nominal(law, kind, actuator), kind, _defaults(law, kind, model, sampling))
+            # the paper's gains of the inner loops belong to its position law
+            printed = type(laws["position"]).printed if "position" in laws else kind.printed
+            base = _defaults(law, kind, model, sampling, printed)
+            laws[stage] = law_from(_nominal(law, kind, actuator), kind, base)
     return Cascade(model=model, processor=processor, **laws), tuple(own), matrices
 
 
@@ -158,12 +161,15 @@ def _linear(table: Table, files: Files) -> tuple[Law, ControllerFile]:
     return dataclasses.replace(law, output=output, realisation=found.contents), found
 
 
-def _defaults(table: Table, kind: type[Law], model: Plant, sampling: Sampling | None) -> Law | None:
-    """Return the law of this kind with its default gains; None if the table gives every gain."""
+def _defaults(table: Table, kind: type[Law], model: Plant, sampling: Sampling | None, printed: bool) -> Law | None:
+    """Return the law of this kind with its default gains; None if the table gives every gain.
+
+    `printed`: whether the paper's gains are the default for its plant.
+    """
     names = _gains(kind)
     if names <= set(table.raw):
         return None
     try:
-        return default_law(kind, model, sampling, table.raw)
+        return default_law(kind, model, sampling, table.raw, printed)
     except ValueError as error:
         raise ValueError(f"{table.path}: {error}. Give all of {', '.join(sorted(names))}.") from None

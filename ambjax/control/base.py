@@ -45,6 +45,7 @@ class Law:
       fast; True for a class that defines `layer`.
     - `switching`: names of the gains that multiply smoothed signs and that `designed` chooses together with the
       steepnesses. If a case gives one of them, the default steepnesses are those of `scaled_steepness`.
+    - `printed`: whether the written defaults are the gains of the paper, for the plant of Table 1.
     - `slides`: whether an inversion law has the method `slide`, which integrates across the boundary layer
       (`laws.Relaxation`); True for a class that defines it.
     """
@@ -56,6 +57,7 @@ class Law:
     analytic: ClassVar[bool] = False
     stiff: ClassVar[bool] = False
     switching: ClassVar[tuple[str, ...]] = ()
+    printed: ClassVar[bool] = False
     slides: ClassVar[bool] = False
 
     def __init_subclass__(cls, **kwargs: object) -> None:
@@ -142,17 +144,36 @@ class Law:
         return ("implicit" if implicit else "explicit") in self.own_steps
 
 
-def default_law(kind: type[L], model: Plant, sampling: Sampling | None = None, given: Collection[str] = ()) -> L:
-    """Return the law of type `kind` with its default gains for `model` (`Law.designed`).
+def default_law(
+    kind: type[L],
+    model: Plant,
+    sampling: Sampling | None = None,
+    given: Collection[str] = (),
+    printed: bool = True,
+) -> L:
+    """Return the law of type `kind` with its default gains for `model`.
+
+    They are those of `Law.designed`, but the written defaults for a law of the paper (`Law.printed`) and the plant of
+    Table 1 if `printed`.
 
     `sampling`: None in continuous time. `given`: names of the gains that the caller replaces; with one of
     `Law.switching` among them, the steepnesses are those of `scaled_steepness`.
     """
+    if printed and kind.printed and is_table_1(model):
+        return kind()
     law: Any = kind().designed(model, sampling)
     if set(kind.switching).isdisjoint(given):
         return law
     scaled: Any = scaled_steepness(kind(), model)
     return dataclasses.replace(law, **{name: getattr(scaled, name) for name in _steepnesses(law)})
+
+
+def is_table_1(model: Plant) -> bool:
+    """Return whether the model is the plant of Table 1, for which the paper prints gains."""
+    (found, one), (wanted, other) = jax.tree.flatten(model), jax.tree.flatten(Plant())
+    return one == other and all(
+        not is_traced(x) and bool(np.all(np.asarray(x) == y)) for x, y in zip(found, wanted, strict=True)
+    )
 
 
 def scaled_steepness(law: L, model: Plant) -> L:

@@ -25,6 +25,7 @@ from ambjax.control.laws import (
     Observer,
     PositionLaw,
     State,
+    begin_law,
     step_law,
 )
 from ambjax.control.processor import Processor, predicted_over_delay
@@ -90,12 +91,15 @@ class Cascade:
         """Return the states of all laws with which a processor steps at a sample.
 
         They are `laws` if `started`; otherwise the initial states for these readings. The position law starts from its
-        first estimate (`PositionLaw.begin_sampled`).
+        first estimate (`laws.begin_law`).
         """
+        implicit = self.processor is not None and self.processor.implicit
         laws = _chosen(started, laws, self.init(measured))
         estimate, *_ = self.estimate(measured, laws.observer, sample)
         position = with_gains_at(self.position, estimate.z, sample.reference)
-        begun = position.begin_sampled(self.model, (estimate, sample.reference), sample.period)
+        begun = begin_law(
+            position, (estimate, sample.reference), model=self.model, period=sample.period, implicit=implicit
+        )
         return laws._replace(position=_chosen(started, laws.position, begun))
 
     def scale(self) -> CascadeState:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.base import Requirement, scaled_steepness
-from ambjax.control.defaults import current_rate, printed
+from ambjax.control.defaults import current_rate
 from ambjax.control.laws import CurrentInputs, CurrentLaw, unwinding
 from ambjax.control.sampling import Relay, Sampling, non_oscillating
 from ambjax.control.search import Interval, SearchContext, authority, rate, steepness, switch
@@ -36,11 +36,10 @@ class SlidingMode(CurrentLaw[tuple[()]]):
         steepness=True,
     )
     requirement: ClassVar = Requirement("k_i", "Q_i")
+    printed: ClassVar = True
 
     def designed(self, model: Plant, sampling: Sampling | None) -> "SlidingMode":
         scaled = scaled_steepness(self, model)
-        if printed(model):
-            return scaled
         return dataclasses.replace(scaled, k_i=current_rate(model, sampling) / (TWO_OVER_PI * scaled.p))
 
     def init(self, model: Plant) -> tuple[()]:

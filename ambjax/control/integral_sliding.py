@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.defaults import printed, switching_gain, switching_steepness
+from ambjax.control.defaults import switching_gain, switching_steepness
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.laws import PositionLaw
 from ambjax.control.sampling import Sampling
@@ -49,11 +49,10 @@ class IntegralSlidingMode(PositionLaw[Array]):
         steepness=True,
     )
     switching: ClassVar = ("k",)
+    printed: ClassVar = True
     memory = (("x", "m s", "integral of the error"),)
 
     def designed(self, model: Plant, sampling: Sampling | None) -> "IntegralSlidingMode":
-        if printed(model):
-            return self
         w = model.pole
         return IntegralSlidingMode(w, w**2 / 4, switching_gain(model), switching_steepness(model))
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.base import Requirement, scaled_steepness
-from ambjax.control.defaults import adaptation_gain, printed
+from ambjax.control.defaults import adaptation_gain
 from ambjax.control.laws import CurrentDemand, ForceDemand, InversionLaw, Relaxation
 from ambjax.control.sampling import Relay, Sampling
 from ambjax.control.search import Interval, SearchContext, steepness
@@ -48,13 +48,12 @@ class AdaptiveReference(InversionLaw[Array]):
         doc="steepness of the smoothed sign of v_tilde; left out: scaled to the nominal plant",
         steepness=True,
     )
+    printed: ClassVar = True
     i_ref: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="initial current reference")
     memory = (("i_ref", "A", "current reference of the next sample"),)
 
     def designed(self, model: Plant, sampling: Sampling | None) -> Self:
         scaled = scaled_steepness(self, model)
-        if printed(model):
-            return scaled
         gamma, p = adaptation_gain(model), scaled.p
         if sampling is not None and not sampling.implicit:  # an explicit step then ends at v_tilde = 0
             p = min(float(p), 1 / (TWO_OVER_PI * float(gamma) * sampling.period))

@@ -138,13 +138,12 @@ class PositionLaw(Law, Generic[State], abc.ABC):
         return self.init(model)
 
     def begin_sampled(self, model: Plant, inputs: tuple[Measurement, Reference], period: Scalar) -> object:
-        """Return the state before the first sample of a processor, from the estimate and the reference of this sample.
+        """Return the state before the first call of `step`, from the estimate and the reference of this sample.
 
         `period`: sample period, s. The default is `begin`, or `init_sampled` for a law whose state on a processor
         differs from that in continuous time.
         """
-        own = type(self).init_sampled is not Law.init_sampled
-        return self.init_sampled(model) if own else self.begin(model, inputs)
+        return self.init_sampled(model) if has_sampled_state(self) else self.begin(model, inputs)
 
     @abc.abstractmethod
     def scale(self, model: Plant) -> object: ...
@@ -218,6 +217,23 @@ STAGES: dict[str, type[Law]] = {
     "inversion": InversionLaw,
     "current": CurrentLaw,
 }
+
+
+def has_sampled_state(law: Law) -> bool:
+    """Return whether the state of a law on a processor may differ from its state in continuous time."""
+    return type(law).init_sampled is not Law.init_sampled
+
+
+def begin_law(
+    law: PositionLaw, inputs: tuple[Measurement, Reference], *, model: Plant, period: Scalar, implicit: bool
+) -> Any:
+    """Return the state of a position law before its first step on a processor (`step_law`).
+
+    Without an own step the law makes explicit Euler steps, so the state is that in continuous time.
+    """
+    if law.has_own_step(implicit) or has_sampled_state(law):
+        return law.begin_sampled(model, inputs, period)
+    return law.begin(model, inputs)
 
 
 def step_law(

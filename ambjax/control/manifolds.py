@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.base import scaled_steepness
-from ambjax.control.defaults import printed, switching_gain, switching_steepness
+from ambjax.control.defaults import switching_gain, switching_steepness
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.laws import PositionLaw
 from ambjax.control.sampling import Sampling
@@ -67,8 +67,6 @@ class UtkinSlidingMode(PositionLaw[Array]):
 
     def designed(self, model: Plant, sampling: Sampling | None) -> "UtkinSlidingMode":
         k_p, k_d = (model.pole / 3) ** 2, 2 * model.pole / 3
-        if printed(model):
-            return dataclasses.replace(self, k_p=k_p, k_d=k_d)
         return UtkinSlidingMode(k_p, k_d, switching_gain(model), switching_steepness(model))
 
     def slope(self, model: Plant) -> Scalar:

@@ -7,7 +7,7 @@ from jax import Array
 
 from ambjax.control.base import Requirement
 from ambjax.control.chain import FilterChain as FilterChain
-from ambjax.control.defaults import printed, switching_gain, switching_steepness
+from ambjax.control.defaults import switching_gain, switching_steepness
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.integral_sliding import IntegralSlidingMode as IntegralSlidingMode
 from ambjax.control.laws import PositionLaw
@@ -49,10 +49,9 @@ class SlidingMode(PositionLaw[tuple[()]]):
     )
     requirement: ClassVar = Requirement("k", "Q_z")
     switching: ClassVar = ("k",)
+    printed: ClassVar = True
 
     def designed(self, model: Plant, sampling: Sampling | None) -> "SlidingMode":
-        if printed(model):
-            return self
         return SlidingMode(model.pole, switching_gain(model), switching_steepness(model))
 
     def init(self, model: Plant) -> tuple[()]:
@@ -123,11 +122,10 @@ class SuperTwisting(PositionLaw[Array]):
         steepness=True,
     )
     switching: ClassVar = ("k_1", "k_2")
+    printed: ClassVar = True
     memory = (("w", "m/s^2", "integral of the sign of sigma"),)
 
     def designed(self, model: Plant, sampling: Sampling | None) -> "SuperTwisting":
-        if printed(model):
-            return self
         p, w = switching_steepness(model), model.pole
         return SuperTwisting(w, w / p**0.5, w**2 / 4 / (TWO_OVER_PI * p), p)
 
