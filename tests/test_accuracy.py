@@ -38,16 +38,16 @@ def rig(sensor, u_max):
 @pytest.mark.parametrize("sensor", [None, {}, {"std": 5e-7}], ids=["no sensor", "empty table", "noise"])
 def test_the_limit_of_the_supply_and_a_table_of_the_sensor_do_not_cost_accuracy(sensor):
     """With one RK4 step per sample, the kinks at the limit cost 2.2e-6 m here, and the filters 8.7e-8 m."""
-    case = rig(sensor, 48.0)
+    case = rig(sensor, 24.0)
     error, u = error_of(case)
-    assert u == 48.0  # the voltage reaches its limit, and leaves it
+    assert u == 24.0  # the voltage reaches its limit, and leaves it
     assert error <= 1e-8
     free = rig(sensor, 1e4)
     error, u = error_of(free)
     assert u < 1e4
     assert error <= 1e-8
     quiet = sensor is None or not sensor
-    assert (case.clock.method == rig(None, 48.0).clock.method) == quiet
+    assert (case.clock.method == rig(None, 24.0).clock.method) == quiet
 
 
 # Each of these draws is held; together they contain a limit that is reached with and without noise, a jump inside a

@@ -93,7 +93,8 @@ def test_a_state_that_never_changes_is_no_mode_of_the_tuner_s_loop():
     smaller = system.without_idle()
     assert smaller.stable
     smaller = jax.tree.map(jnp.asarray, smaller)
-    whole, part = (loop_quantities(one, jnp.asarray(True), 1.0, 10.0, 1.0) for one in (system, smaller))
+    numbers = jnp.asarray(True), 1.0, 10.0, 1.0
+    whole, part = (loop_quantities(one, *numbers, delay=False) for one in (system, smaller))
     assert float(whole.growth) == pytest.approx(-3.0, rel=1e-12)
     # the peak of the smaller system, found by the same scan
     assert float(whole.sensitivity) == pytest.approx(float(part.sensitivity), rel=1e-9)
