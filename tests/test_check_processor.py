@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import tomllib
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,8 @@ from texts import write
 import ambjax as amb
 from ambjax.__main__ import main
 from ambjax.cases.controller_tables import KINDS
+from ambjax.cases.reader import case_from
+from ambjax.cases.template_text import template
 from ambjax.control.base import default_law
 from ambjax.control.guard import Guard
 from ambjax.control.inversion import ClosedForm
@@ -23,7 +26,9 @@ from ambjax.control.sampling import Relay, band, disturbance
 from ambjax.ensemble import delays as searched
 from ambjax.ensemble.delays import DELAYS, delay_margin
 from ambjax.extend import InversionLaw, record
-from ambjax.simulation.rollout import Outcome, prepare
+from ambjax.linear.stability import quiet
+from ambjax.results.operating import sensitivity
+from ambjax.simulation.rollout import Outcome, prepare, rollout
 from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Trajectory
 from ambjax.theorem import advice, sampled_report
 from ambjax.theorem.law_poles import law_poles
@@ -504,7 +509,8 @@ def test_check_passes_for_a_stable_cascade_on_a_processor(capsys):
     assert [law["stage"] for law in summary["processor"]["laws"]] == ["position", "inversion", "current"]
     assert set(summary["processor"]) == {
         *("lost_at_s", "lost_why", "stalled", "laws", "bands", "distance_to_C", "distance_to_C_at_s"),
-        *("alternating", "alternates", "delay_margin", "delay_margin_unknown", "loss_cause", "alternation_cause"),
+        *("alternating", "alternates", "delay_margin", "delay_margin_unknown", "delay_margins_differ", "loss_cause"),
+        "alternation_cause",
     }
     margin = {"held": 2.0, "lost": None, "undecided": None, "resolution": None, "step": 1 / 256}
     margin |= {"stable": 2.0, "swing_m": None, "current_A": None, "tested": DELAYS}
@@ -527,3 +533,29 @@ def test_the_computed_signals_are_those_of_the_readings_that_the_laws_receive(gu
     np.testing.assert_allclose(apart[at - 30 : at], 0.0, atol=1e-5)
     # the prediction over the delay adds the motion away from the outlier, so c times its size is a lower bound
     assert abs(apart[at]) < 2e-5 if guarded else abs(apart[at]) > c * size
+
+
+def test_a_linear_delay_margin_below_the_simulated_one_is_explained():
+    """The sets of 1 sample of delay, T = 50 us: stable up to 1.5 samples, that is 25 us later."""
+    tested = Delays(2.0, None, None, 0.1, stable=1.5, tested=257)
+    assert advice.delay_difference(3e-5, tested, 1.0, 5e-5) == ""
+    assert advice.delay_difference(None, tested, 1.0, 5e-5) == ""
+    assert advice.delay_difference(1e-5, tested._replace(stable=None), 1.0, 5e-5) == ""
+    assert "1e-05 s, is smaller than the 2.5e-05 s tested" in advice.delay_difference(1e-5, tested, 1.0, 5e-5)
+
+
+@pytest.mark.slow
+def test_beyond_the_linear_delay_margin_the_voltage_of_a_set_valued_sign_alternates():
+    """The rig: the margin at the command is 9.9 us, the simulated loop is stable at all delays that are tested."""
+    case = case_from(tomllib.loads(template("rig")))
+    linear = sensitivity(case).margins_at.command.delay
+    assert linear == pytest.approx(9.9e-6, rel=0.01)
+    processor, size = case.cascade.processor, []
+    for share in (0.9, 1.1):
+        delay = float(processor.delay) + share * linear / float(case.clock.sample_period)
+        late = dataclasses.replace(processor, delay=delay, assumed=processor.ahead, predict=True)
+        cascade = dataclasses.replace(case.cascade, processor=late)
+        u = np.asarray(rollout(cascade, quiet(case.scenario), case.clock).trajectory.rows.u)
+        size.append(np.std(u[-len(u) // 4 :]))
+    assert size[0] < 1e-3  # V: it has decayed, up to rounding
+    assert size[1] > 10

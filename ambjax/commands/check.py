@@ -5,7 +5,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         words = f"their largest force is {largest:.4g} N, below its weight of {weight:.4g} N"
         print(f"\nThe magnets cannot carry the rotor: {words}.")
     if on_processor is not None:
-        summary |= _processor_summary(case, args, on_processor)
+        summary |= _processor_summary(case, args, on_processor, loop)
     else:
         summary |= _clearance(case, args, report.largest_z)
     if not args.json:
@@ -160,15 +160,23 @@ def _stability(case: Case) -> Findings:
     return stability_of(case.cascade, as_member(case.scenario), case.clock).findings()
 
 
-def _processor_summary(case: Case, args: argparse.Namespace, results: _OnProcessor) -> Summary:
-    """Print the results on the processor, and return their summary; "holds" is True if all conditions hold."""
+def _processor_summary(case: Case, args: argparse.Namespace, results: _OnProcessor, loop: Summary) -> Summary:
+    """Print the results on the processor, and return their summary; "holds" is True if all conditions hold.
+
+    `loop`: summary of the linearised loop.
+    """
     from ambjax.theorem import advice
 
     sampled, margin, unknown = results
+    places: Any = loop.get("margins") or {}
+    linear = places.get("command", {}).get("delay_margin_s")
+    processor: Any = case.cascade.processor
+    sizes = float(processor.delay), float(case.clock.sample_period)
+    differs = advice.delay_difference(linear, unknown or margin, *sizes)
     if not args.json:
         print(f"\nOn the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s.\n")
         _print_sampled(sampled)
-        print("\n" + "\n".join(advice.processor_lines(sampled, margin, unknown)))
+        print("\n" + "\n".join([*advice.processor_lines(sampled, margin, unknown), *([differs] if differs else [])]))
     laws = [dataclasses.asdict(law) | {"holds": law.holds} for law in sampled.laws]
     return {
         **_clearance(case, args, sampled.largest_z),
@@ -187,6 +195,7 @@ def _processor_summary(case: Case, args: argparse.Namespace, results: _OnProcess
             "bands": [dataclasses.asdict(band) | {"bound": band.bound} for band in sampled.bands],
             "delay_margin": _margin(margin),
             "delay_margin_unknown": None if unknown is None else _margin(unknown),
+            "delay_margins_differ": differs or None,
         },
     }
 
