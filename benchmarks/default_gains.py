@@ -2,14 +2,13 @@
 
 Every position law with every inversion and every current law, with its default gains, on the machines of `MACHINES`. A
 machine without a sensor of the velocity has a Kalman filter, also untuned. The peak of |S| is that of the linearised
-loop, from 0 Hz to 0.45 of the sampling rate (to 2 kHz in continuous time). The simulation contains the disturbances,
-the noise and the limits of the case. `linear` is left out: its gains are in a file.
+loop over the whole range of frequencies. The simulation contains the disturbances, the noise and the limits of the
+case. `linear` is left out: its gains are in a file.
 Results that exist are not computed again; `--again` computes all.
 Run: python benchmarks/default_gains.py [MACHINE ...] [--again]
 """
 
 import argparse
-import dataclasses
 import json
 import pathlib
 import tomllib
@@ -87,13 +86,9 @@ def structures(raw: dict[str, Any]) -> list[tuple[str, str, str]]:
 
 
 def case_of(raw: dict[str, Any], laws: tuple[str, str, str]) -> Case:
-    """Return the case of a machine with these laws, and with the whole range of frequencies."""
+    """Return the case of a machine with these laws."""
     stages = zip(("position", "inversion", "current"), laws, strict=True)
-    case = case_from(raw | {"controller": raw["controller"] | {stage: {"kind": kind} for stage, kind in stages}})
-    if case.cascade.processor is None:
-        return case
-    zones = dataclasses.replace(case.zones, f_high=0.45 / float(case.clock.sample_period))
-    return dataclasses.replace(case, zones=zones)
+    return case_from(raw | {"controller": raw["controller"] | {stage: {"kind": kind} for stage, kind in stages}})
 
 
 def result(case: Case) -> dict[str, Any]:
