@@ -52,7 +52,7 @@ def test_the_limit_of_the_supply_and_a_table_of_the_sensor_do_not_cost_accuracy(
 
 # Each of these draws is held; together they contain a limit that is reached with and without noise, a jump inside a
 # sample, iron, two coils, a stiff loop and a loop of one DOP853 step.
-@pytest.mark.parametrize("seed", [102, 105, 107])
+@pytest.mark.parametrize("seed", [102, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (105, 107))])
 def test_a_random_structure_is_accurate(seed):
     error, _ = error_of(case_from(drawn(seed, 60)))
     assert error <= 1e-8

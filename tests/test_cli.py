@@ -354,6 +354,7 @@ def test_a_lost_rotor_is_reported_and_exits_with_1(capsys):
         assert str(data["lost_why"]).startswith("touched down")
 
 
+@pytest.mark.slow
 def test_check_exits_with_0_if_the_conditions_hold_and_1_otherwise(capsys):
     sine = SHORT + '[reference]\nkind = "sine"\namplitude = 2.5e-3\nfrequency = 2.0\n'
     assert main(["check", write(sine), "--json"]) == 0

@@ -132,6 +132,7 @@ def test_a_case_that_loses_members_is_compared_too(run, capsys):
     assert "members lost" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_differences_other_than_the_laws_are_named(run, cases, capsys):
     (cases / "light.toml").write_text(CASE.format(c=200.0) + "[actuator]\nu_max = 300.0\n")
     code, summary, _ = run("stiff", "light", flags=["--json"])

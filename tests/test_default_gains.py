@@ -174,9 +174,9 @@ LAWS = [
     ("pid", "adaptive", "sliding-mode"),
     ("feedback-linearisation", "adaptive-feed-forward", "pi"),
 ]
-LAWS = [LAWS[0], *(pytest.param(laws, marks=pytest.mark.slow) for laws in LAWS[1:])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("laws", LAWS, ids="/".join)
 def test_untuned_laws_levitate_a_machine_that_is_not_the_papers_in_zone_a(laws):
     raw = tomllib.loads(BLOWER)

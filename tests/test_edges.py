@@ -149,6 +149,7 @@ def test_derivatives_in_the_time_of_an_edge():
     np.testing.assert_allclose(slopes, -2.0 * np.exp(at - 2.0), rtol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("held", [True, False], ids=["held", "linear"])
 def test_a_record_inside_samples_costs_no_accuracy(held):
     """Against 20 times as many steps. Without edges at the times of the record, the errors are 1e-9 to 1e-8 m."""

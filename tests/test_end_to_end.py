@@ -99,7 +99,6 @@ MAP = ["--x", "plant.m=-10%:10%:2", "--y", "initial.z=1e-5:2e-5:2"]
 REPORT = ("report.json", "report.md", "report.html", "nominal.png", "spectrum.png", "convergence.png", "slices.png")
 # For each command: its arguments, and the files that it writes.
 COMMANDS = {
-    "simulate": (["simulate", "first.toml"], ("trajectory.npz", "metrics.json", "overview.png")),
     "ensemble": (
         ["ensemble", "first.toml", "--members", "4"],
         ("members.npz", "summary.json", "fan.png", "histograms.png"),
@@ -109,7 +108,14 @@ COMMANDS = {
     "tune": (["tune", "first.toml"], ("tuned.toml", "history.npz", *REPORT)),
     "compare": (
         ["compare", "first.toml", "second.toml", "--tune", "--members", "4"],
-        ("compare.json", "compare.html", "compare.png", "tuned-first/tuned.toml", "tuned-second/tuned.toml"),
+        (
+            *("compare.json", "compare.html", "compare.png"),
+            *(
+                f"tuned-{case}/{name}"
+                for case in ("first", "second")
+                for name in ("tuned.toml", "history.npz", *REPORT)
+            ),
+        ),
     ),
 }
 # Commands for a case with a processor.
@@ -119,9 +125,16 @@ SAMPLED = {
 }
 
 
+# `compare --tune` writes the files of `tune` too. On a processor, `tune` alone is left to the slow tests.
+ALONE = pytest.param("bearing", "tune", marks=pytest.mark.slow)
+
+
 @pytest.mark.parametrize(
     ("case", "command"),
-    [*(("paper", name) for name in COMMANDS), *(("bearing", name) for name in COMMANDS | SAMPLED)],
+    [
+        *(("paper", name) for name in COMMANDS),
+        *(("bearing", name) if name != "tune" else ALONE for name in COMMANDS | SAMPLED),
+    ],
 )
 def test_a_command_writes_all_of_its_files(case, command, tmp_path):
     for name, text in zip(("first.toml", "second.toml"), CASES[case], strict=True):

@@ -138,6 +138,7 @@ def test_the_printed_command_replays_the_worst_member(printed, monkeypatch, caps
     belongs(metrics, "alone", 0.02)
 
 
+@pytest.mark.slow
 def test_results_of_a_chaotic_loop_do_not_depend_on_the_division_of_the_ensemble(printed):
     _, _, columns, _ = printed
     study = study_of(CASE)

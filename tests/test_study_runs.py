@@ -229,6 +229,7 @@ def test_a_study_killed_at_any_instant_and_resumed_gives_the_same_file(no_pictur
     assert early >= count / 2, "the runs were over before they could be killed"
 
 
+@pytest.mark.slow
 def test_a_study_killed_before_its_first_chunk_is_resumed(no_pictures, monkeypatch):
     write(TINY)
     argv = ["ensemble", "case.toml", "--members", "5", "--seed", "3", "--out", "out"]

@@ -102,6 +102,7 @@ def test_least_error_traces_no_front_without_pareto(ran):
     assert not list(folder.glob("tuned_*"))
 
 
+@pytest.mark.slow
 def test_the_front_does_not_change_an_answer_of_least_error(ran):
     _, facts, out, folder = ran(pareto=True, front=1, bounds=BOUNDLESS)
     assert [(row["factor"], row["taken"]) for row in facts["front"]] == [(1, True), (1.25, False)]

@@ -340,6 +340,7 @@ def test_a_resumed_search_is_the_uninterrupted_one(small, tmp_path):
         run(small, checkpoint_file=CheckpointFile(tmp_path / "kept.npz", {"case": 2}), resume=True)
 
 
+@pytest.mark.slow
 def test_a_search_whose_checkpoint_was_damaged_is_the_uninterrupted_one(small, tmp_path, capsys):
     whole = run(small)
     checkpoint_file = CheckpointFile(tmp_path / "kept.npz", {"case": 1}, 3)
@@ -356,6 +357,7 @@ def test_a_search_whose_checkpoint_was_damaged_is_the_uninterrupted_one(small, t
     assert run(small, checkpoint_file=checkpoint_file, resume=True).ended
 
 
+@pytest.mark.slow
 def test_the_second_phase_restarts_from_its_start_if_its_path_is_worse(small):
     engine, goal, members, start = small
     descent = Descent(goal, "bfgs", 0.1)
