@@ -27,6 +27,7 @@ from ambjax.linear import (
     peak,
 )
 from ambjax.linear.equilibrium import ideal
+from ambjax.linear.margins import _margins, scan
 from ambjax.linear.matrices import loop_matrices
 from ambjax.numerics.records import canonical
 from ambjax.simulation.explicit import DOP853, RK4
@@ -182,11 +183,11 @@ def test_a_loop_without_response_at_half_the_sampling_rate_has_margins():
         def poles(self):  # of 1 + L: z^2 - 0.2 z + 0.7 = 0
             return np.roots([1.0, -0.2, 0.7])
 
-        def sensitivity(self, f):
+        def loop_transfer(self, f, place):
             z = np.where(f == 0.5 / self.period, -1.0, np.exp(2j * np.pi * f * self.period))
-            return 1 / (1 + 0.7 * (1 + 1 / z) / (z - 0.9))
+            return 0.7 * (1 + 1 / z) / (z - 0.9)
 
-    found = margins_of(Loop())
+    found = _margins(Loop(), "reading", scan(Loop(), 1e-3, 500.0))
     # z^2 + (0.7 g - 0.9) z + 0.7 g = 0 has a root on the unit circle for 0.7 g = 1
     assert found.gain_high == pytest.approx(1 / 0.7, rel=1e-6)
     assert 0 < found.phase_deg < 90

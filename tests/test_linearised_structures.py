@@ -21,6 +21,7 @@ from ambjax.cases.reader import case_from
 from ambjax.control import current, inversion
 from ambjax.control.base import default_law
 from ambjax.control.processor import Processor
+from ambjax.control.sampling import Sampling
 from ambjax.linear import StateSpace, linearise, loop_quantities
 from ambjax.numerics.records import canonical
 from ambjax.page.functions import PRELUDE
@@ -38,9 +39,9 @@ CLOCK = Clock(samples=2000, sample_period=T)
 
 def cascade_of(mode, watching, moving):
     processor = MODES[mode]
-    period = None if processor is None else T
+    sampling = None if processor is None else Sampling(T, 0.0, processor.implicit)
     kinds = watching, moving, inversion.Linearised, current.ProportionalIntegral
-    laws = (default_law(kind, RIG, period) for kind in kinds)
+    laws = (default_law(kind, RIG, sampling) for kind in kinds)
     return Cascade(*laws, model=RIG, processor=processor)
 
 

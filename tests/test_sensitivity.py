@@ -82,7 +82,7 @@ def test_a_picture_without_a_stable_loop_gives_no_warning():
 @pytest.mark.slow
 def test_a_reference_without_an_equilibrium_is_named_and_the_others_are_analysed(tmp_path, capsys):
     """At r = 1 mm the model misses 68 m/s^2 of the plant's springs, and k gives 25 m/s^2."""
-    text = CASE + "[plant]\nk_z = -20000.0\n[controller.model]\nk_z = 0.0\n"
+    text = CASE + "[plant]\nk_z = -20000.0\n[controller.model]\nk_z = 0.0\n[controller.position]\nc = 17.0\nk = 25.0\n"
     code, out, _, _ = answered(tmp_path, capsys, text)
     assert code == 1
     lines = out.splitlines()

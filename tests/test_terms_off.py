@@ -15,6 +15,7 @@ from ambjax.control import current, inversion, position
 from ambjax.control.base import default_law
 from ambjax.control.laws import CurrentDemand, CurrentInputs
 from ambjax.control.processor import Processor
+from ambjax.control.sampling import Sampling
 from ambjax.linear import analyse, linearise
 from ambjax.linear.equilibrium import equilibrium, ideal
 from ambjax.world.sensor import Measurement
@@ -108,11 +109,11 @@ LINEARISED = [
 @pytest.mark.parametrize(("kind", "name", "processor"), LINEARISED)
 def test_a_loop_without_a_term_is_the_limit_of_loops_with_a_small_one(kind, name, processor):
     """|S| at 20 frequencies: with 0, and with a millionth of the default gain."""
-    period = None if processor is None else T
-    drive = {"inversion": inversion.Linearised(), "current": default_law(current.ProportionalIntegral, RIG, period)}
+    sampling = None if processor is None else Sampling(T, 0.0, True)
+    drive = {"inversion": inversion.Linearised(), "current": default_law(current.ProportionalIntegral, RIG, sampling)}
     stage = "current" if kind is current.ProportionalIntegral else "position"
-    laws = {"position": default_law(position.PID, RIG, period)} | drive
-    laws[stage] = default_law(kind, RIG, period)
+    laws = {"position": default_law(position.PID, RIG, sampling)} | drive
+    laws[stage] = default_law(kind, RIG, sampling)
     if name == "k_d":  # a lead-lag gives the phase lead
         w = float(RIG.pole)
         laws[stage] = dataclasses.replace(laws[stage], w_z=w, w_p=20 * w, k_int=0.0)

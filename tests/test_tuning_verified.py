@@ -97,9 +97,10 @@ def test_the_reasons_that_refute_an_answer(small):
 
 @pytest.mark.slow
 def test_a_negligible_error_is_that_of_the_reference_relative_to_the_gap(small):
-    error = step_error(small, at(small))
+    error = step_error(small, at(small, [17.0, 25.0, 7.5e4, 152.0]))
     assert error.negligible_m == NEGLIGIBLE * 4e-4
-    # these gains lose the rotor with both kinds of steps, so no member is held or lost in accurate steps alone
+    # these gains, which the paper chose for another plant, lose the rotor with both kinds of steps, so no member is
+    # held or lost in accurate steps alone
     assert (error.members, error.lost, error.stalled, error.tried) == (0, 0, 0, 4)
     assert error.refuted == "no member compared is held with both steps"
 

@@ -14,7 +14,7 @@ does not count, nor does the motion of a stable linear loop whose own decay is t
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -22,12 +22,13 @@ from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import DEFAULT_LAWS, Cascade
 from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.blocks import Blocks
-from ambjax.ensemble.delays import DELAYS, at_delays
 from ambjax.linear.analysis import linearise_members
 from ambjax.simulation.clock import Clock
-from ambjax.theorem.sampled_report import Delays
 from ambjax.world.scenario import Scenario
 from ambjax.world.signals import Constant, Signal, is_random
+
+if TYPE_CHECKING:  # `ambjax simulate` imports this module, and does not need Theorem 1
+    from ambjax.theorem.sampled_report import Delays
 
 # Half peak-to-peak value of z, as a share of the clearance, below which a sustained motion does not count. The chatter
 # of set-valued signs that act a sample late reaches 0.0025.
@@ -167,12 +168,14 @@ def suspects(error: np.ndarray, held: np.ndarray) -> np.ndarray:
     return np.sort(alive[np.argsort(-np.asarray(error)[alive], kind="stable")[:MOST_TESTED]])
 
 
-def with_stability(margin: Delays, cascade: Cascade, scenario: Scenario, clock: Clock, *, known: bool) -> Delays:
+def with_stability(margin: "Delays", cascade: Cascade, scenario: Scenario, clock: Clock, *, known: bool) -> "Delays":
     """Return a result of `delay_margin` with the delays, up to its `held`, up to which the loop is stable.
 
     `DELAYS` delays are tested; a second pass divides the step after the last one that is stable. `known`: as in
     `delay_margin`.
     """
+    from ambjax.ensemble.delays import DELAYS, at_delays
+
     if margin.held is None:
         return margin
     own: Any = cascade.processor
