@@ -175,6 +175,7 @@ def test_cases_of_one_name_get_different_names(cases, tmp_path):
     assert [case.name for case in compare._read([str(cases / "soft.toml"), str(other)])] == ["soft (1)", "soft (2)"]
 
 
+@pytest.mark.slow
 def test_each_case_is_tuned_with_the_settings_of_the_first(run, cases, monkeypatch, capsys):
     """The tuner is replaced. The test checks its arguments, and that its answer is compared."""
     called = []

@@ -76,6 +76,7 @@ def test_a_run_is_written_without_its_picture(monkeypatch, capsys):
     assert {path.name for path in pathlib.Path("out").iterdir()} == {"trajectory.npz", "metrics.json"}
 
 
+@pytest.mark.slow
 def test_a_verification_that_ends_with_an_error_is_not_a_proof(monkeypatch, capsys):
     monkeypatch.setattr(outputs, "STRICT", False)
     monkeypatch.setattr("ambjax.codegen.verify.verify", broken)
@@ -87,15 +88,6 @@ def test_a_verification_that_ends_with_an_error_is_not_a_proof(monkeypatch, caps
     assert "Some checks FAIL." in out
     assert json.loads(pathlib.Path("out/verify.json").read_text())["ok"] is False
     assert pathlib.Path("out/first.c").stat().st_size > 0
-
-
-def test_an_ensemble_without_a_survivor_has_a_report(capsys):
-    """The paper's printed gains lose every member. No quantity then explains the error of the survivors."""
-    write(CASES["paper"][0], "first.toml")
-    assert main([*COMMANDS["ensemble"][0], "--out", "out"]) == 1
-    assert " is left out: " not in capsys.readouterr().err
-    assert {path.name for path in pathlib.Path("out").iterdir()} >= set(COMMANDS["ensemble"][1])
-    assert json.loads(pathlib.Path("out/summary.json").read_text())["survivors"] == 0
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])

@@ -92,6 +92,7 @@ limits.sensitivity = 8.0
 """
 # Two case files with the same laws, so that both use the same compiled programs.
 CASES = {
+    # the printed gains lose every member
     "paper": [PAPER.format(gamma=gamma) + SMALLEST.format(gain="c") for gamma in (1000.0, 7.5e4)],
     "bearing": [BEARING.format(k_p=k_p) + SMALLEST.format(gain="k_p") for k_p in (2e5, 3e5)],
 }
@@ -125,16 +126,13 @@ SAMPLED = {
 }
 
 
-# `compare --tune` writes the files of `tune` too. On a processor, `tune` alone is left to the slow tests.
-ALONE = pytest.param("bearing", "tune", marks=pytest.mark.slow)
+# `compare --tune` runs `tune`, and writes its files too. On a processor, `tune` alone is left to the slow tests.
+RUNS = [(case, command) for case in CASES for command in COMMANDS | (SAMPLED if case == "bearing" else {})]
 
 
 @pytest.mark.parametrize(
     ("case", "command"),
-    [
-        *(("paper", name) for name in COMMANDS),
-        *(("bearing", name) if name != "tune" else ALONE for name in COMMANDS | SAMPLED),
-    ],
+    [pytest.param(*run, marks=pytest.mark.slow) if run == ("bearing", "tune") else run for run in RUNS],
 )
 def test_a_command_writes_all_of_its_files(case, command, tmp_path):
     for name, text in zip(("first.toml", "second.toml"), CASES[case], strict=True):

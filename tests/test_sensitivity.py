@@ -133,6 +133,7 @@ def test_bad_input_is_refused_in_one_line(tmp_path, capsys, text, flags, message
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_check_prints_the_numbers_of_the_machine_also_without_an_equilibrium(tmp_path, capsys):
     path = tmp_path / "case.toml"
     path.write_text("[controller.position]\nk = 5.0\n[controller.model]\nm = 0.1\n[clock]\nduration = 0.01\n")
