@@ -17,7 +17,8 @@ from ambjax.cases.reader import case_from
 from ambjax.linear import linearise
 from ambjax.simulation.metrics import standard_for
 from ambjax.simulation.trajectory import NOT_SAVED, SIGNAL_UNITS, STALLED, Row
-from tuning.__main__ import parser
+from tuning.__main__ import main as tune_main
+from tuning.command import TunedCase
 
 CASE = """
 [reference]
@@ -183,17 +184,17 @@ def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
     """The search itself is that of the command, which tests/test_tuning_search.py tests."""
     given = []
 
-    def searched(args):
-        given.append(args)
-        (tmp_path / "tuned.toml").write_text(CASE)
-        return 1, {"gains": [], "out": str(tmp_path)}
+    def tuned(*words):
+        given.append(words[:2])
+        return TunedCase(ambjax.read_case(path), False, {"verdict": "none"}, tmp_path)
 
-    monkeypatch.setattr("tuning.command.run", searched)
-    tuned = ambjax.tune(path, tmp_path, pareto=True)
-    assert tuned.case == ambjax.read_case(tmp_path / "tuned.toml")
-    assert (tuned.good, tuned.directory, tuned.report["gains"]) == (False, tmp_path, [])
-    parsed = vars(parser().parse_args([str(path), "--out", str(tmp_path), "--pareto", "--json"]))
-    assert vars(given[0]) == parsed
+    monkeypatch.setattr("tuning.command.run", tuned)
+    monkeypatch.setattr("tuning.from_python.run", tuned)
+    flags = dict.fromkeys(("resume", "force", "gradients", "pareto", "page"), True)
+    assert ambjax.tune(path, tmp_path, **flags, settings_of=path, minutes=2.0).directory == tmp_path
+    words = ["--resume", "--force", "--gradients", "--pareto", "--page", "--settings-of", str(path), "--budget", "2"]
+    assert tune_main([str(path), "--out", str(tmp_path), *words]) == 1
+    assert given[0] == given[1]
 
 
 def test_messages_name_python_arguments_instead_of_options(path, tmp_path):

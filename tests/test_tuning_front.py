@@ -1,6 +1,5 @@
 """The front of error against voltage, and its knee: on formulas with a known answer, in report and case files."""
 
-import argparse
 import collections
 import json
 import math
@@ -13,6 +12,7 @@ from tomlkit import dumps
 
 import tuning.command
 from ambjax.cases.reader import read_case
+from tuning.__main__ import main
 from tuning.config import seeds
 from tuning.objective.limits import FRONT
 from tuning.problem import problem_of
@@ -32,9 +32,7 @@ def ran(monkeypatch, tmp_path, capsys):
         study(monkeypatch, World(), **tune)
         path, out = tmp_path / "case.toml", tmp_path / "out"
         path.write_text(dumps(document(**tune)))
-        flags = {"gradients": False, "resume": False, "json": False, "settings_of": None}
-        words = argparse.Namespace(page=False, force=False, case=str(path), out=str(out), pareto=pareto, **flags)
-        code, _ = tuning.command.run(words)
+        code = main([str(path), "--out", str(out), *["--pareto"] * pareto])
         return code, json.loads((out / "report.json").read_text()), capsys.readouterr().out, out
 
     return run

@@ -1,6 +1,5 @@
 """Limits: how they are read and measured, whether the search respects them, their price, and their report."""
 
-import argparse
 import dataclasses
 import math
 import tomllib
@@ -409,11 +408,8 @@ def command(monkeypatch, tmp_path, world=None, **tune):
     study(monkeypatch, world or World(), **tune)
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(dumps(document(**tune)))
-    flags = {"gradients": False, "pareto": False, "resume": False, "force": True, "json": True}
-    code, summary = tuning.command.run(
-        argparse.Namespace(page=False, case=str(path), out=str(out), settings_of=None, **flags)
-    )
-    return code, summary, out
+    tuned = tuning.tune(path, out, force=True)
+    return int(not tuned.good), tuned.report, out
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """Exit code, log, report, JSON and tuned.toml agree for each kind of outcome."""
 
-import argparse
 import collections
 import json
 import math
@@ -17,6 +16,7 @@ import tuning.search.rounds
 from ambjax.cases.tune_table import Budget
 from ambjax.linear import Findings
 from ambjax.theorem.advice import STALLED, STALLED_PLANT
+from tuning.__main__ import main
 from tuning.config import seeds
 from tuning.judge import summarise
 from tuning.objective.limits import Limit
@@ -66,10 +66,7 @@ def ran(monkeypatch, tmp_path, capsys):
         study(monkeypatch, world, **tune)
         path, out = tmp_path / "case.toml", tmp_path / "out"
         path.write_text(dumps(document(**tune)))
-        flags = {"gradients": False, "pareto": False, "resume": False, "force": True, "json": False}
-        code, _ = tuning.command.run(
-            argparse.Namespace(page=False, case=str(path), out=str(out), settings_of=None, **flags)
-        )
+        code = main([str(path), "--out", str(out), "--force"])
         said = capsys.readouterr()
         return code, json.loads((out / "report.json").read_text()), said.out, said.err, out
 

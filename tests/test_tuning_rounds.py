@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from bowl import RARE_FROM, World, study
+from bowl import RARE_FROM, S_0, World, study
 
 import tuning.search.rounds
 from ambjax import Slide
 from tuning.config import seeds
-from tuning.search import course
+from tuning.objective.loss import TERMS
 from tuning.search.rounds import rounds
 
 TRAINING, VALIDATION, HELD_OUT = 0, 1, 2
@@ -17,10 +17,10 @@ TRAINING, VALIDATION, HELD_OUT = 0, 1, 2
 TOLD = {"case": "a bowl"}
 
 
-def tuned(monkeypatch, tmp_path, world, **tune):
+def tuned(monkeypatch, tmp_path, world, listen=lambda event: None, **tune):
     """The answer of the rounds, and its gains (c, k)."""
     made = study(monkeypatch, world, **tune)
-    found = rounds(made, made.tune.space.values(made.case.cascade), tmp_path, TOLD, False)
+    found = rounds(made, made.tune.space.values(made.case.cascade), tmp_path, TOLD, False, listen)
     return found, np.asarray(found.problem.objective.space.gains_at(found.x))
 
 
@@ -51,12 +51,26 @@ def test_the_best_gains_are_found_and_no_member_is_lost(monkeypatch, tmp_path):
     assert seed_of(HELD_OUT) not in world.seeds("terms") | world.seeds("metrics")  # held-out members are unused
 
 
-def test_the_time_of_all_searches_is_estimated_once(monkeypatch, tmp_path, capsys):
-    """20 and 450 iterations of 6 s take 2 and 45 minutes."""
-    tuned(monkeypatch, tmp_path, World())
-    assert capsys.readouterr().err.count("all searches together usually take 20 to 450 iterations") == 1
-    assert "an iteration takes 6 s" in course._pace(6.0)
-    assert "here 2 to 45 min" in course._pace(6.0)
+def test_the_standing_after_an_iteration_is_that_of_the_best_point(monkeypatch, tmp_path):
+    events = []
+    found, _ = tuned(monkeypatch, tmp_path, World(), listen=events.append)
+    standings = [event.standing for event in events if event.standing]
+    assert len(standings) == len(found.history["value"])
+    best = found.history["value"].argmin(axis=1)
+    errors = S_0 * np.sqrt(found.history["terms"][np.arange(len(best)), best, TERMS.index("tracking")])
+    np.testing.assert_allclose([one.error_m for one in standings], errors)
+    last = standings[-1]
+    assert last.members - last.held == found.history["lost"][-1][best[-1]]
+    assert {one.name for one in last.limits} == {one.name for one in found.problem.limits}
+
+
+@pytest.mark.parametrize("minutes", [1e-9, math.inf])
+def test_a_search_without_time_ends_with_a_validated_answer(minutes, monkeypatch, tmp_path):
+    """With no time, each phase of the first search has one iteration, and no other search follows."""
+    found, _ = tuned(monkeypatch, tmp_path, World(), minutes=minutes)
+    assert found.error is not None
+    assert math.isfinite(found.validation_error)
+    assert (len(found.history["value"]) == 1) == math.isfinite(minutes)
 
 
 def test_lost_validation_members_join_and_are_held(monkeypatch, tmp_path):

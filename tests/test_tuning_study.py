@@ -3,7 +3,6 @@
 On losses that are formulas (`bowl.py`), so that each is known by hand.
 """
 
-import argparse
 import json
 import math
 import os
@@ -252,14 +251,10 @@ def command(monkeypatch, tmp_path, world, *flags, force=False, **tune):
     made = study(monkeypatch, world, **tune)
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(dumps(document(**tune)))
-    names = ("--gradients", "--pareto")
-    given = {name.removeprefix("--"): name in flags for name in names}
-    args = argparse.Namespace(
-        page=False, case=str(path), out=str(out), settings_of=None, resume=False, force=force, json=True, **given
-    )
-    code, summary = tuning.command.run(args)
-    assert json.loads(json.dumps(summary)) is not None
-    return code, summary, out, made
+    given = {name: f"--{name}" in flags for name in ("gradients", "pareto")}
+    tuned = tuning.tune(path, out, force=force, **given)
+    assert json.loads(json.dumps(tuned.report)) is not None
+    return int(not tuned.good), tuned.report, out, made
 
 
 @pytest.fixture(scope="module")
@@ -351,11 +346,9 @@ def test_the_front_is_in_the_report_and_has_a_picture(everything):
 def test_a_case_from_a_pipe_is_read_once(monkeypatch, tmp_path):
     """A second read would be empty, and tuned.toml would contain the gains only."""
     study(monkeypatch, World())
-    monkeypatch.setattr(tuning.command, "_tune", lambda plan, args: (plan.raw, plan.problem.case.text))
+    monkeypatch.setattr(tuning.command, "_tune", lambda plan, *_: (plan.raw, plan.problem.case.text))
     text = dumps(document())
-    flags = {"settings_of": None, "pareto": False, "resume": False, "force": False, "json": True}
-    args = argparse.Namespace(page=False, case=piped(text), out=str(tmp_path / "out"), **flags)
-    assert tuning.command.run(args) == (tomllib.loads(text), text)
+    assert tuning.tune(piped(text), tmp_path / "out") == (tomllib.loads(text), text)
 
 
 def test_a_file_whose_gains_could_not_be_written_is_refused_at_the_start(monkeypatch, tmp_path):
@@ -393,10 +386,8 @@ def test_a_search_killed_before_its_first_checkpoint_is_resumed(monkeypatch, tmp
     study(monkeypatch, World())
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(dumps(document()))
-    flags = {"gradients": False, "pareto": False, "resume": True, "force": False, "json": True, "settings_of": None}
-    args = argparse.Namespace(page=False, case=str(path), out=str(out), **flags)
-    with pytest.raises(ValueError, match=r"--resume: --out .* contains no search"):
-        tuning.command.run(args)
+    with pytest.raises(ValueError, match=r"resume=True: out .* contains no search"):
+        tuning.tune(path, out, resume=True)
 
     def killed(*_):
         raise SystemExit(137)
@@ -404,9 +395,9 @@ def test_a_search_killed_before_its_first_checkpoint_is_resumed(monkeypatch, tmp
     with monkeypatch.context() as patch:
         patch.setattr(tuning.command, "rounds", killed)
         with pytest.raises(SystemExit):
-            tuning.command.run(argparse.Namespace(**vars(args) | {"resume": False}))
+            tuning.tune(path, out)
     monkeypatch.setattr(tuning.command, "_tune", lambda *_: "resumed")
-    assert tuning.command.run(args) == "resumed"
+    assert tuning.tune(path, out, resume=True) == "resumed"
 
 
 HELD_OUT = seeds(Budget())[2]

@@ -2,11 +2,16 @@
 
 import argparse
 import sys
+from typing import TYPE_CHECKING
 
 from ambjax import __version__
+from ambjax.commands.outputs import say, written
 from ambjax.host.command_line import Parser, run_command
 from ambjax.host.interrupts import exit_on_interrupt
 from ambjax.host.streams import open_streams
+
+if TYPE_CHECKING:
+    from tuning.command import TunedCase
 
 PROGRAM = "ambjax-tune"
 
@@ -35,6 +40,13 @@ def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
     top.add_argument(
         "--page", action="store_true", help="also write page.html, with sliders and presets (needs [processor])"
     )
+    top.add_argument(
+        "--budget",
+        dest="minutes",
+        type=float,
+        metavar="MINUTES",
+        help="time for the whole tuning (default: tune.minutes)",
+    )
     top.add_argument("--json", action="store_true", help="print only the content of report.json")
     top.add_argument("--version", action="version", version=f"ambjax {__version__}")
     return top
@@ -56,12 +68,29 @@ def _run(args: argparse.Namespace) -> tuple[int, object]:
     from ambjax.ensemble.worker import configure_jax
 
     configure_jax()
-    from tuning import command
+    from tuning.command import Options, run
+    from tuning.events import Log
 
+    words = {name: value for name, value in vars(args).items() if name in Options._fields}
     try:
-        return command.run(args)
+        with Log() as log:
+            tuned = run(args.case, Options(**words), log)
     except KeyboardInterrupt as stop:
         raise KeyboardInterrupt(str(stop) or "nothing is saved") from None
+    if not args.json:
+        _print(tuned)
+    if advice := tuned.report.get("advice"):
+        say(advice)
+    return int(not tuned.good), tuned.report | {"out": str(tuned.directory)}
+
+
+def _print(tuned: "TunedCase") -> None:
+    """Print the verdict, the gains and the files."""
+    print(tuned.report["verdict"])
+    for row in tuned.report.get("gains", ()):
+        bound = f" ({row['at_bound']})" if row["at_bound"] else ""
+        print(f"  {row['path']}: {row['before']:.6g} -> {row['after']:.6g}{bound}")
+    written(tuned.directory, "tuned.toml, report.html, report.md, report.json, history.npz, *.png")
 
 
 if __name__ == "__main__":

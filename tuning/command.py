@@ -1,10 +1,9 @@
-"""The command `ambjax tune`: reads a case, searches, judges the gains and writes the report."""
+"""The tuning of a case file: it reads the case, searches, judges the gains and writes the report."""
 
-import argparse
+import dataclasses
 import functools
 import pathlib
 import tomllib
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ import numpy as np
 
 from ambjax.cases.reader import Case, case_from
 from ambjax.cases.table import one_line
-from ambjax.commands.outputs import check_new, described, directory, files, plain, say, write_json, written
+from ambjax.commands.outputs import check_new, described, directory, files, plain, say, write_json
 from ambjax.commands.warnings import print_warnings
 from ambjax.control.cascade import Cascade
 from ambjax.host.interrupts import reporting
@@ -20,7 +19,8 @@ from ambjax.host.lock import locked
 from ambjax.host.web_page import render_page
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
-from tuning.config import read_tune, settings
+from tuning.config import allowed_minutes, read_tune, settings
+from tuning.events import Listener, teller
 from tuning.gains_table import off
 from tuning.problem import TuningProblem, problem_of
 from tuning.report import accurate, front_table, pictures
@@ -42,6 +42,35 @@ REPORT = "report.json"
 NOT_JUDGED = "The tuned gains are not judged."
 
 
+@dataclasses.dataclass(frozen=True)
+class TunedCase:
+    """The result of `tune`.
+
+    - `case`: the case with the tuned gains, as in tuned.toml.
+    - `good`: whether the gains meet all requirements: [tune.limits], and confirmation by accurate steps.
+    - `report`: the contents of report.json.
+    - `directory`: directory of tuned.toml, history.npz and the report.
+    """
+
+    case: Case
+    good: bool
+    report: dict[str, Any]
+    directory: pathlib.Path
+
+
+class Options(NamedTuple):
+    """Options of the command: see `tune`. `out`: output directory; None: a new one."""
+
+    out: str | None = None
+    resume: bool = False
+    force: bool = False
+    gradients: bool = False
+    pareto: bool = False
+    page: bool = False
+    settings_of: str | None = None
+    minutes: float | None = None
+
+
 class TuningPlan(NamedTuple):
     """The checked input of a tuning.
 
@@ -55,78 +84,81 @@ class TuningPlan(NamedTuple):
     out: pathlib.Path
 
 
-def run(args: argparse.Namespace) -> tuple[int, Row]:
-    """Run `ambjax tune` with parsed arguments. Return the exit code and the content of report.json.
+def run(path: str, options: Options, listen: Listener) -> TunedCase:
+    """Tune the case file at `path`, write the results, and return them. `listen`: receives the events.
 
     Raises ValueError for bad input before anything is written, and in the search as `rounds` does.
     """
-    plan = _plan(args)
+    plan = _plan(path, options)
     with locked(plan.out):
-        if not args.resume:
-            _clear(plan.out, args.force)
+        if not options.resume:
+            _clear(plan.out, options.force)
         mark_directory(plan.out)
         with reporting(lambda: _kept(plan.out)):
-            return _tune(plan, args)
+            return _tune(plan, path, options, listen)
 
 
-def _plan(args: argparse.Namespace) -> TuningPlan:
+def _plan(path: str, options: Options) -> TuningPlan:
     """Read the case and make the output directory. Raises ValueError for an invalid case or option."""
-    case, tune, raw = read_tune(args.case, args.settings_of)
-    if args.resume and args.out is None:
+    case, tune, raw = read_tune(path, options.settings_of)
+    if options.resume and options.out is None:
         raise ValueError("--resume: the directory of the search is missing. Give it as --out.")
-    if args.resume and not can_resume(pathlib.Path(args.out)):
-        raise ValueError(f"--resume: --out {args.out} contains no search. Check --out, or leave out --resume.")
-    print_warnings(case, args.case)
-    if args.page:  # raises ValueError now, before the search, if the case cannot have a page
-        sliders_page(case, (), args.case)
+    if options.resume and not can_resume(pathlib.Path(str(options.out))):
+        raise ValueError(f"--resume: --out {options.out} contains no search. Check --out, or leave out --resume.")
+    if options.minutes is not None:
+        tune = dataclasses.replace(tune, minutes=allowed_minutes(options.minutes))
+    print_warnings(case, path)
+    if options.page:  # raises ValueError now, before the search, if the case cannot have a page
+        sliders_page(case, (), path)
     try:
-        problem = problem_of(case, tune, front=args.pareto)
+        problem = problem_of(case, tune, front=options.pareto)
         start = tune.space.values(case.cascade)
         tune.space.encode(start)
         tuned_case(case, _laws(problem, {}), "", pathlib.Path())
     except ValueError as why:
-        raise ValueError(one_line(f"{args.case}: {why}")) from None
-    return TuningPlan(raw, problem, start, directory(args.out, f"tune-{case.name}", WRITTEN, force=True))
+        raise ValueError(one_line(f"{path}: {why}")) from None
+    return TuningPlan(raw, problem, start, directory(options.out, f"tune-{case.name}", WRITTEN, force=True))
 
 
-def _tune(plan: TuningPlan, args: argparse.Namespace) -> tuple[int, Row]:
-    """Search, write the answer, judge it, and write and print the report. Return the exit code and the content of
-    report.json.
+def _tune(plan: TuningPlan, path: str, options: Options, listen: Listener) -> TunedCase:
+    """Search, write the answer, judge it, and write the report.
 
-    The answer is written before it is judged. If it cannot be judged, the exit code is 1 and there is no report.
+    The answer is written before it is judged. If it cannot be judged, it is not good, and there is no report.
     """
-    answer = _searched(plan, args.resume)
+    answer = _searched(plan, options.resume, listen)
     with files(plan.out) as part:
-        _put_answer(part, plan.out, answer, NOT_JUDGED)
-    found = described("the judgement of the tuned gains", lambda: examined(answer, args.gradients, args.pareto))
+        case = _put_answer(part, plan.out, answer, NOT_JUDGED)
+    tell = teller(listen)
+    found = described(
+        "the judgement of the tuned gains", lambda: examined(answer, options.gradients, options.pareto, tell)
+    )
     if found is None:
-        say(f"the tuned gains are in {plan.out / TUNED}. To judge them, repeat the command with --resume.")
-        return 1, {"verdict": NOT_JUDGED, "outcome": {"good": False}, "out": str(plan.out)}
+        tell(f"the tuned gains are in {plan.out / TUNED}. To judge them, repeat the command with --resume.")
+        return TunedCase(case, False, {"verdict": NOT_JUDGED, "outcome": {"good": False}}, plan.out)
     facts, slices = found
     with files(plan.out) as part:
         _write(part, plan.out, answer, facts, slices)
-        if args.pareto:
+        if options.pareto:
             described("the case files of the front", lambda: _put_front(part, plan.out, answer, facts))
-        if args.page:
-            described(NAME, lambda: _put_page(part, answer.problem.case, args.case))
-        names = [name for name in (*WRITTEN, NAME) if (part / name).exists()]
-    _print(plan.out, facts, names, quiet=args.json)
-    return int(not facts.outcome["good"]), plain(facts.table) | {"out": str(plan.out)}
+        if options.page:
+            described(NAME, lambda: _put_page(part, answer.problem.case, path))
+    return TunedCase(case, facts.outcome["good"], plain(facts.table), plan.out)
 
 
-def _searched(plan: TuningPlan, resume: bool) -> SearchResult:
+def _searched(plan: TuningPlan, resume: bool, listen: Listener) -> SearchResult:
     """Search and return the result. `resume`: whether to continue from the checkpoints."""
-    problem, tune = plan.problem, plan.problem.tune
-    say(
+    problem, tune, tell = plan.problem, plan.problem.tune, teller(listen)
+    tell(
         f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {problem.objective.clock.method}"
     )
     if zero := off(problem.case.cascade):
-        say(f"not tuned, because they are 0 in the case, which switches their terms off: {', '.join(zero)}")
+        tell(f"not tuned, because they are 0 in the case, which switches their terms off: {', '.join(zero)}")
     laws = {law.stage: law.digest for law in problem.case.own_laws}
     if problem.case.controller_file:
         laws["position"] = problem.case.controller_file.contents.digest
     laws |= {one.key: one.samples.digest for one in problem.case.recorded}
-    return rounds(problem, plan.start, plan.out, {"case": plan.raw, "tune": settings(tune), "laws": laws}, resume)
+    facts = {"case": plan.raw, "tune": settings(tune), "laws": laws}
+    return rounds(problem, plan.start, plan.out, facts, resume, listen)
 
 
 def _clear(out: pathlib.Path, force: bool) -> None:
@@ -153,8 +185,8 @@ def _kept(out: pathlib.Path) -> str:
     return f"the search so far is saved. To continue, repeat the command with --out {out} --resume"
 
 
-def _put_answer(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, verdict: str) -> Cascade:
-    """Write tuned.toml and history.npz into the folder `part`, and return the cascade with the tuned gains.
+def _put_answer(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, verdict: str) -> Case:
+    """Write tuned.toml and history.npz into the folder `part`, and return the case with the tuned gains.
 
     The text of tuned.toml is read back first, to check that it is a valid case. `verdict`: first lines of the file.
     `out`: the folder to which the caller moves the files.
@@ -166,14 +198,14 @@ def _put_answer(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, ver
     after = dict(zip(problem.objective.space.paths, gains, strict=True))
     text, tuned = tuned_case(problem.case, _laws(problem, after), verdict, out)
     (part / TUNED).write_text(text, encoding="utf-8")
-    return tuned.cascade
+    return tuned
 
 
 def _write(
     part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: TuningFacts, slices: Slices | None
 ) -> None:
     """Write the files, except those of --pareto and --page, into the folder `part`. The caller moves them to `out`."""
-    cascade = _put_answer(part, out, answer, facts.verdict)
+    cascade = _put_answer(part, out, answer, facts.verdict).cascade
     write_json(part / REPORT, facts.table)
     drawn = _pictures(answer.problem, cascade, answer.history, slices, facts.front)
     for name, data in drawn.items():
@@ -238,15 +270,3 @@ def _laws(problem: TuningProblem, tuned: dict[str, float]) -> dict[str, float]:
     """
     everything = Space(tuple(Gain(path) for path in tunable(problem.case.cascade, idle=True)))
     return dict(zip(everything.paths, everything.values(problem.case.cascade).tolist(), strict=True)) | tuned
-
-
-def _print(out: pathlib.Path, facts: TuningFacts, names: Sequence[str], *, quiet: bool) -> None:
-    """Print the verdict, the gains and the files unless `quiet`. If a requirement is not met, print the advice too."""
-    if not quiet:
-        print(facts.verdict)
-        for row in facts.gains:
-            bound = f" ({row['at_bound']})" if row["at_bound"] else ""
-            print(f"  {row['path']}: {row['before']:.6g} -> {row['after']:.6g}{bound}")
-        written(out, f"{', '.join(names)}, *.png")
-    if not facts.outcome["good"]:
-        say(facts.advice)

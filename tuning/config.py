@@ -75,6 +75,7 @@ class Tune:
     - `stress`: factor on the sensor noise of the stressed members (`Budget.stressed`).
     - `gain_margin`: each gain of a stressed member is multiplied or divided by this factor.
     - `learning_rate`: step size of an optimiser of optax.
+    - `minutes`: time for the whole tuning.
     """
 
     objective: str
@@ -90,6 +91,7 @@ class Tune:
     risk: Risk
     optimiser: str
     learning_rate: float
+    minutes: float
     budget: Budget
 
 
@@ -195,6 +197,13 @@ def _risk(table: Table) -> Risk:
     if not 0 <= alpha < 1:
         raise ValueError(f"{table.at('alpha')} = {alpha:g}: it must be at least 0 and below 1.")
     return CVaR(alpha)
+
+
+def allowed_minutes(minutes: float) -> float:
+    """Return the number of minutes of --budget. Raises ValueError unless it is above 0."""
+    if not minutes > 0:
+        raise ValueError(f"--budget {minutes:g}: it must be above 0, in minutes.")
+    return minutes
 
 
 def settings(tune: Tune) -> dict[str, Any]:

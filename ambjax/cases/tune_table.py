@@ -1,6 +1,7 @@
 """The keys of [tune] in a case file, with their defaults and meanings, for the reader and for the template."""
 
 import dataclasses
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -32,6 +33,14 @@ NUMBERS: dict[str, dataclasses.Field] = {
         1.25, above=0, at_most=1e6, doc="each gain of a stressed member is multiplied or divided by this factor"
     ),
     "learning_rate": leaf(0.1, above=0, at_most=1e3, doc="step size of an optimiser of optax"),
+    "minutes": leaf(
+        math.inf,
+        above=0,
+        at_most=1e6,
+        infinite=True,
+        unit="min",
+        doc="min; time for the whole tuning; inf: until it ends",
+    ),
 }
 
 
@@ -125,7 +134,7 @@ def template_lines() -> Iterator[Line]:
     yield from _defaults("", {name: NUMBERS[name] for name in ("stress", "gain_margin")})
     yield from _defaults("", {name: field for name, field in BUDGET.items() if name not in ("members", "stressed")})
     yield Line(f'optimiser = "{OPTIMISER}"', 'or one of optax, such as "adam"')
-    yield from _defaults("", {"learning_rate": NUMBERS["learning_rate"]})
+    yield from _defaults("", {name: NUMBERS[name] for name in ("learning_rate", "minutes")})
 
 
 def _defaults(prefix: str, fields: dict[str, dataclasses.Field]) -> Iterator[Line]:

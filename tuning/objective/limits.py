@@ -118,6 +118,11 @@ class Limit:
         excess = math.log(max(reached, TINY) / self.allowed)
         return -excess if self.kind.at_least else excess
 
+    def log_excesses(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return g of each member [N] of an ensemble. `columns`: as for `reached`."""
+        ratios = np.log(np.maximum(self._values(columns), TINY) / self.allowed)
+        return -ratios if self.kind.at_least else ratios
+
     def active(self, reached: float | None) -> bool:
         """Return whether the limit is active: its multiplier is above 0, and `reached` (judged) is near the limit.
 
@@ -178,8 +183,11 @@ class Limit:
         a mean. The limit `survival` counts them.
         """
         alive = ~np.isfinite(columns["lost_at_s"])
-        values = np.asarray(columns[self.kind.exact or f"loss.{PREFIX}{self.name}"])
+        values = self._values(columns)
         return values[alive] if alive.any() else values
+
+    def _values(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        return np.asarray(columns[self.kind.exact or f"loss.{PREFIX}{self.name}"])
 
 
 def measures(names: Collection[str], limits: tuple[Limit, ...], context: LimitContext) -> dict[str, Fold]:

@@ -62,8 +62,11 @@ class Members(NamedTuple):
         return jax.tree.map(lambda a: a[: self.ordinary], self)
 
     def joined(self, others: "Members", stressed: bool = True) -> "Members":
-        """Return these members with `others` before the stressed ones. `stressed`: whether `others` become stressed."""
-        more, n = others._replace(stressed=np.full(len(others.stressed), stressed)), self.ordinary
+        """Return these members with `others`, which become stressed or, in front of all members, ordinary.
+
+        In front, they are in every part, and among the members whose loops the search evaluates.
+        """
+        more, n = others._replace(stressed=np.full(len(others.stressed), stressed)), self.ordinary * stressed
         return jax.tree.map(lambda a, b: np.concatenate([a[:n], b, a[n:]]), self, more)
 
     def part(self, share: int, held: int | None = None) -> "Members":

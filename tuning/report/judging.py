@@ -7,13 +7,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.commands.outputs import described, say
+from ambjax.commands.outputs import described
 from ambjax.linear import Findings, stability_of, suspects
 from ambjax.theorem.advice import advice as on_conditions
 from ambjax.theorem.conditions import Report as Check
 from ambjax.theorem.conditions import check
 from tuning.config import seeds, settings
 from tuning.delay_test import delay_test
+from tuning.events import Tell
 from tuning.judge import StepError, describe, held, judge, step_error, summarise, worst, worst_of
 from tuning.measured_peaks import injections
 from tuning.problem import TuningProblem
@@ -26,34 +27,37 @@ from tuning.search.course import SearchResult
 NO_CONDITIONS: Row = {"conditions": [], "advice_on_conditions": []}
 
 
-def examined(answer: SearchResult, gradients: bool, front_written: bool) -> tuple[TuningFacts, explore.Slices | None]:
+def examined(
+    answer: SearchResult, gradients: bool, front_written: bool, tell: Tell
+) -> tuple[TuningFacts, explore.Slices | None]:
     """Return the facts of an answer, and the slices of the goal through it. Arrays [m] have one value per gain.
 
     Facts that do not decide on the verdict are absent if they cannot be computed (`described`).
 
     `gradients`: whether to compute derivatives in three ways. `front_written`: whether each point of the front has a
-    case file.
+    case file. `tell`: receives what is done.
     """
     problem, x, members = answer.problem, answer.x, answer.members
     held_out, rollouts = seeds(problem.tune.budget)[2], problem.engine.rollouts
-    judged = _judged(problem, x, held_out)
-    steps = _checked(answer, judged["after"], held_out)
+    judged = _judged(problem, x, held_out, tell)
+    steps = _checked(answer, judged["after"], held_out, tell)
     found = {
         "case": problem.case.name,
         "weights": list(problem.tune.weights),
         "held_out_seed": held_out,
         "trained_on": len(members.member),
         "lost_in_validation": answer.lost,
-        **_ensembles(answer, judged, steps[2], held_out),
+        **_ensembles(answer, judged, steps[2], held_out, tell),
         **_steps(answer, *steps),
         **(described("the conditions of Theorem 1", lambda: _conditions(problem, x)) or NO_CONDITIONS),
         "minimised": described("the objective in parts", lambda: breakdown.minimised(problem, x, members)),
         "search": settings(problem.tune)
         | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": answer.seconds},
-        "gradient": described("the gradient report", lambda: _gradient(answer)) if gradients else None,
+        "gradient": described("the gradient report", lambda: _gradient(answer, tell)) if gradients else None,
         "front_written": front_written,
         "front": described("the front", lambda: front_table.facts(answer)) or None,
     }
+    tell("the objective around the answer")
     slices = described("the slices through the answer", lambda: explore.slices(problem, x, members))
     facts = TuningFacts(**found, **_neighbourhood(problem, x, slices))
     what = outcome.outcome_of(facts, problem.tune.limits.may_lose(problem.tune.budget.held_out))
@@ -63,7 +67,7 @@ def examined(answer: SearchResult, gradients: bool, front_written: bool) -> tupl
     return dataclasses.replace(facts, outcome=what.facts(), **words), slices
 
 
-def _judged(problem: TuningProblem, x: np.ndarray, held_out: int) -> dict[str, dict[str, np.ndarray]]:
+def _judged(problem: TuningProblem, x: np.ndarray, held_out: int, tell: Tell) -> dict[str, dict[str, np.ndarray]]:
     """Return the metrics of the held-out members [N] with the gains of the case (`before`) and at x [m] (`after`).
 
     Gains of the case that are outside their bounds, or close to a bound, are clipped. Both results are empty if there
@@ -71,14 +75,14 @@ def _judged(problem: TuningProblem, x: np.ndarray, held_out: int) -> dict[str, d
     `held_out`: seed of these members.
     """
     space, count = problem.objective.space, problem.tune.budget.held_out
-    say(f"judging on {count} held-out members ...")
+    tell(f"judging on {count} held-out members")
     start = space.encode(space.clip(space.values(problem.case.cascade)))
     return {
         name: judge(problem, at, held_out, count) if count else {} for name, at in (("before", start), ("after", x))
     }
 
 
-def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_out: int) -> Row:
+def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_out: int, tell: Tell) -> Row:
     """Return the fields on the training members and on the held-out members.
 
     `judged`: from `_judged`. `refuted`: why accurate steps do not confirm the answer; '' if they do. `held_out`: seed
@@ -88,6 +92,7 @@ def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_
     none = {"members": 0, "held": 0, "lost": 0, "stalled": 0}
     found: Row = {name: summarise(one) if one else dict(none) for name, one in judged.items()}
     after = judged["after"]
+    tell("the sensitivity of the held-out members")
     measured = injections(problem, answer.x, held_out, after) if after else None
     found["sensitivity"] = None if measured is None else sensitivity_table.facts(problem, measured)
     late = delay_test(problem, answer.x, held_out, after) if after else None
@@ -96,7 +101,7 @@ def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_
         found["after"] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
     found["loss"] = described("the loss of the held-out members", lambda: _losses(problem, judged)) or {}
     found["worst_member"] = described("the worst member", lambda: worst(problem, after, held_out)) if after else None
-    found["stability"] = _stability(problem, answer.x, held_out, after) if after else None
+    found["stability"] = _stability(problem, answer.x, held_out, after, tell) if after else None
     lost = problem.engine.terms(answer.x[None], answer.members)["survival"] > 0
     return found | {"lost_in_training": int(lost.sum())}
 
@@ -105,12 +110,12 @@ def _losses(problem: TuningProblem, judged: dict[str, Any]) -> Row:
     return {name: breakdown.loss_breakdown(problem.error_goal, one) for name, one in judged.items() if one}
 
 
-def _stability(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray]) -> Row:
+def _stability(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray], tell: Tell) -> Row:
     """Return whether the loops of the held members with the largest settled errors are stable (`linear.Findings`)."""
     index = suspects(columns["settled_max_abs_error_m"], held(columns))
     if not index.size:
         return Findings(0, 0)._asdict()
-    say(f"testing whether the loops of {index.size} held-out members are stable ...")
+    tell(f"testing whether the loops of {index.size} held-out members are stable")
     members = problem.objective.chosen(seed, index, len(columns["lost_at_s"]))
     # in continuous time, the step of the case may be too coarse for these gains
     clock = problem.case.clock if problem.sampled else dataclasses.replace(problem.case.clock, method=None)
@@ -141,8 +146,8 @@ def _conditions(problem: TuningProblem, x: np.ndarray) -> Row:
     return {"conditions": rows, "advice_on_conditions": on_conditions(line)}
 
 
-def _gradient(answer: SearchResult) -> Row:
-    say("gradient report ...")
+def _gradient(answer: SearchResult, tell: Tell) -> Row:
+    tell("the gradient in three ways")
     return gradient.gradient_report(answer.problem, answer.x, answer.members)
 
 
@@ -177,7 +182,7 @@ def _neighbourhood(problem: TuningProblem, x: np.ndarray, slices: explore.Slices
 
 
 def _checked(
-    answer: SearchResult, judged: dict[str, np.ndarray] | None, held_out: int
+    answer: SearchResult, judged: dict[str, np.ndarray] | None, held_out: int, tell: Tell
 ) -> tuple[StepError | None, dict[str, Any] | None, str]:
     """Simulate the worst and the first of the held-out members again, with accurate steps, in continuous time only.
 
@@ -187,9 +192,9 @@ def _checked(
     """
     problem, again, error = answer.problem, None, None
     if judged and not problem.sampled:
-        error = _worst_checked(answer, judged, held_out) if answer.confirmed else None
+        error = _worst_checked(answer, judged, held_out, tell) if answer.confirmed else None
         count = problem.tune.budget.held_out
-        say(f"{min(accurate.COMPARED, count)} of these members again with accurate steps ...")
+        tell(f"{min(accurate.COMPARED, count)} of these members again with accurate steps")
         again = accurate.compare_steps(problem, answer.x, held_out, count, SUMMARY_METRICS)
     refuted = (error or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
     return error, again, refuted or (again["refuted"] if again else "")
@@ -199,7 +204,7 @@ def _confirmed(*errors: StepError | None) -> str:
     return "; ".join(f"accurate steps: {describe(error)}" for error in errors if error)
 
 
-def _worst_checked(answer: SearchResult, judged: dict[str, np.ndarray], held_out: int) -> StepError | None:
+def _worst_checked(answer: SearchResult, judged: dict[str, np.ndarray], held_out: int, tell: Tell) -> StepError | None:
     """Return the step error on the worst held-out members that are held; None if none is held."""
     those = np.flatnonzero(held(judged))
     if not those.size:
@@ -208,5 +213,5 @@ def _worst_checked(answer: SearchResult, judged: dict[str, np.ndarray], held_out
     error = step_error(
         answer.problem, answer.x, answer.problem.objective.chosen(held_out, those, len(judged["lost_at_s"]))
     )
-    say(f"accurate steps on the worst of them: {describe(error)}")
+    tell(f"accurate steps on the worst of them: {describe(error)}")
     return error

@@ -4,13 +4,13 @@ import dataclasses
 import json
 import pathlib
 import re
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.commands.outputs import say
 from ambjax.host.sealed import DamagedError, difference, flat, provenance, seal, shapes, unseal, write_whole
 from tuning.objective.loss import TERMS
 from tuning.search.descent import Descent, Starts
@@ -74,11 +74,18 @@ class CheckpointFile:
     """Reads and writes the checkpoint of a search. A new checkpoint replaces the old one atomically.
 
     `path`: of the file; None: no checkpoint. `facts`: nested settings that a checkpoint must match to be resumed.
-    `round`: number of the search in its `Course`, from 1; a round of `rounds` may have several searches.
+    `round`: number of the search in its `Course`, from 1; a round of `rounds` may have several searches. `tell`:
+    receives messages.
     """
 
-    def __init__(self, path: pathlib.Path | None, facts: dict[str, Any], round: int = 1) -> None:
-        self.path, self.round = path, round
+    def __init__(
+        self,
+        path: pathlib.Path | None,
+        facts: dict[str, Any],
+        round: int = 1,
+        tell: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        self.path, self.round, self.tell = path, round, tell
         self.fingerprint = flat({**provenance(), **facts})
 
     def save(self, progress: SearchState) -> None:
@@ -98,7 +105,7 @@ class CheckpointFile:
     def load(self, descent: Descent, starts: int, m: int) -> SearchState | None:
         """Return the saved search of `starts` starts in m coordinates, or None if there is none.
 
-        If the checkpoint is damaged, prints the reason and returns None. Raises ValueError if it belongs to another
+        If the checkpoint is damaged, tells the reason and returns None. Raises ValueError if it belongs to another
         problem.
         """
         if self.path is None or not self.path.exists():
@@ -117,7 +124,7 @@ class CheckpointFile:
                 raise DamagedError(f"it belongs to round {facts['round']}")
             return _progress(arrays, facts["counts"], descent, starts, m)
         except DamagedError as why:
-            say(f"{self.path}: {why}; round {self.round} restarts")
+            self.tell(f"{self.path}: {why}; search {self.round} begins again")
             return None
 
 
@@ -186,7 +193,7 @@ def _progress(
     leaves, tree = jax.tree.flatten(kinds)
     wanted = {f"{LEAF}{n}": [np.dtype(leaf.dtype).str, list(leaf.shape)] for n, leaf in enumerate(leaves)}
     rows = {"value": (starts,), "x": (starts, m), "gains": (starts, m), "lost": (starts,), "members": ()}
-    rows |= {"terms": (starts, len(TERMS)), "rollouts": ()}
+    rows |= {"terms": (starts, len(TERMS)), "measured": (starts, len(descent.goal.measured)), "rollouts": ()}
     for name, shape in rows.items():
         kind = there.get(f"{PAST}{name}", [None])[0]
         wanted[f"{PAST}{name}"] = [kind, [counts["iteration"], *shape]]

@@ -12,13 +12,11 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from ambjax.commands.outputs import say
+from tuning.events import Event, Listener, Reached, Standing
 from tuning.judge import StepError
-from tuning.objective.goal import shown
 from tuning.objective.loops import check_loops
 from tuning.objective.loss import TERMS
 from tuning.objective.members import Members
@@ -34,9 +32,6 @@ MOST_SEARCHES = 5
 LEAST_IMPROVEMENT = 0.01
 # If accurate steps confirm none of the answers, this number of earlier points of the searches is checked with them.
 FALLBACK_POINTS = 12
-# After PACED iterations of the first search, the time of all searches is estimated from the usual number of iterations.
-# It is 22 to 120 in benchmarks/tasks, and larger if |S| is measured while the supply limits the voltage.
-PACED, USUAL_ITERATIONS = 4, (20, 450)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,8 +85,10 @@ class Course:
     out: pathlib.Path | None = None
     facts: dict[str, Any] = dataclasses.field(default_factory=dict)
     resume: bool = False
-    on_iteration: Callable[[SearchState, float], None] | None = None
-    """called after each iteration with the search and the iteration's duration in s; None: print a line"""
+    listen: Listener = lambda event: None
+    """receives the events of the searches"""
+    minutes: float = math.inf
+    """time of all searches and validations; a search that begins or continues after it ends at its next iteration"""
     past: list[SearchState] = dataclasses.field(default_factory=list)
     """the searches so far"""
     limit_searches: int = 0
@@ -111,21 +108,41 @@ class Course:
         """
         tune, number = self.problem.tune, len(self.past) + 1
         path = self.out / checkpoint(number) if self.out else None
+        members = f"{len(self.members.member)} members"
+        if len(points) > tune.budget.starts:
+            self.tell(f"search {number}: the best {tune.budget.starts} of {len(points)} points, on {members}")
+        else:
+            self.tell(f"search {number}: from the best point, on {members}")
         progress = search(
             self.problem.engine, self.problem.goal, self.members, points, keep=tune.budget.starts,
             iterations=tune.budget.iterations, name=tune.optimiser, rate=tune.learning_rate,
             seed=self.seed + len(self.past), at_optimum=at_optimum,
-            checkpoint_file=CheckpointFile(path, self.facts, number), resume=self.resume,
-            on_iteration=self.on_iteration or _progress_line(self.problem, first=not self.past),
+            checkpoint_file=CheckpointFile(path, self.facts, number, self.tell), resume=self.resume,
+            on_iteration=self._standing(number), until=self.began + 60 * self.minutes,
         )  # fmt: skip
         if progress.ended:
-            say(f"round {number}: the search is complete; its result is read from {path}")
+            self.tell(f"search {number} is complete; its result is read from {path}")
         if progress.interrupted and not progress.history:  # interrupted before the first iteration
             if not self.past:
                 raise KeyboardInterrupt
             progress = dataclasses.replace(self.past.pop(), interrupted=True)
         self.past.append(progress)
         return _best(progress)
+
+    def tell(self, text: str) -> None:
+        """Send an event to the listener."""
+        self.listen(Event(text))
+
+    def _standing(self, number: int) -> Callable[[SearchState, float], None]:
+        """Return the function that sends the standing of a search after each iteration. `number`: of the search."""
+        problem, spent = self.problem, []
+
+        def send(progress: SearchState, seconds: float) -> None:
+            spent.append(seconds)
+            standing = _standing(problem, progress, number, spent)
+            self.listen(Event(standing.text, standing))
+
+        return send
 
     def around(self, x: np.ndarray) -> np.ndarray:
         """Return x [m] and tune.screen quasi-random points around it, [K, m], for the next search."""
@@ -135,6 +152,11 @@ class Course:
     def interrupted(self) -> bool:
         """Whether the last search was interrupted by Ctrl-C."""
         return self.past[-1].interrupted
+
+    @property
+    def over(self) -> bool:
+        """Whether no further search should begin: after Ctrl-C, or if the time is over."""
+        return self.interrupted or time.perf_counter() > self.began + 60 * self.minutes
 
     @property
     def all_lost(self) -> bool:
@@ -164,7 +186,7 @@ def search_and_restart(course: Course, start: np.ndarray) -> np.ndarray:
     if course.all_lost or not budget.screen:
         return x
     seen = [(value, x)]  # comparable: all searches use the same members and steps
-    while should_restart([value for value, _ in seen]) and not course.interrupted:
+    while should_restart([value for value, _ in seen]) and not course.over:
         x, value = course.search(course.around(x), at_optimum=True)
         seen.append((value, x))
         x = min(seen, key=lambda one: one[0])[1]
@@ -227,39 +249,20 @@ def _joined(past: list[SearchState]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([wide(one.history[name]) for one in past if one.history]) for name in names}
 
 
-def _pace(each: float) -> str:
-    """Return an estimate of the time of all searches. `each`: duration of an iteration, s."""
-    few, many = (f"{each * count / 60:.2g}" for count in USUAL_ITERATIONS)
-    return (
-        f"an iteration takes {each:.2g} s; all searches together usually take {USUAL_ITERATIONS[0]} to "
-        f"{USUAL_ITERATIONS[1]} iterations, here {few} to {many} min. A smaller tune.front, tune.members or "
-        "clock.duration takes less time."
-    )
-
-
-def _progress_line(problem: TuningProblem, first: bool) -> Callable[[SearchState, float], None]:
-    """Return the callback that prints a line after each iteration. `first`: whether it is the first search."""
-    scale = float(np.asarray(problem.objective.loss.s_0))
-    budget, spent = problem.tune.budget, []
-
-    def print_line(progress: SearchState, seconds: float) -> None:
-        spent.append(seconds)
-        x, value = best_of(progress)
-        gains = np.asarray(problem.objective.space.gains_at(jnp.asarray(x)))
-        last = {name: rows[-1] for name, rows in progress.history.items()}
-        best, count = int(np.argmin(last["value"])), int(last["members"])
-        done, going = progress.iteration - progress.since, progress.active.sum()
-        # leave out the first iteration, which compiles
-        each = float(np.median(spent[1:])) if len(spent) > 1 else math.nan
-        left = (budget.iterations - done) * each * going / len(progress.active)
-        wait = f", at most {left:.0f} s left in this phase" if math.isfinite(left) else ""
-        if first and len(spent) == PACED:
-            say(_pace(sum(spent[1:]) / len(spent[1:])))
-        named = ", ".join(f"{g.name} {v:.4g}" for g, v in zip(problem.objective.space.gains, gains, strict=True))
-        error = scale * np.sqrt(last["terms"][best][TERMS.index("tracking")])
-        say(
-            f"{done:3d}/{budget.iterations}  objective {shown(value):.3e}  rms error {error:.2e} m  "
-            f"held {count - int(last['lost'][best])}/{count}  {named}  (starts: {going}{wait})"
-        )
-
-    return print_line
+def _standing(problem: TuningProblem, progress: SearchState, number: int, spent: Sequence[float]) -> Standing:
+    """Return the standing of a search. `spent`: durations of its iterations so far, s."""
+    last = {name: rows[-1] for name, rows in progress.history.items()}
+    best, loss, budget = int(np.argmin(last["value"])), problem.objective.loss, problem.tune.budget
+    terms = dict(zip(TERMS, last["terms"][best], strict=True))
+    measured = dict(zip(problem.goal.measured, last["measured"][best], strict=True))
+    volts = measured.get("rms_u_V", float(np.asarray(loss.u_scale)) * math.sqrt(terms["effort"]))
+    values = [(one, one.ratio * float(measured[one.name])) for one in problem.limits]
+    limits = tuple(Reached(one.name, value, one.threshold, one.holds(value)) for one, value in values)
+    done, going = progress.iteration - progress.since, int(progress.active.sum())
+    # the first iteration compiles
+    each = float(np.median(spent[1:])) if len(spent) > 1 else math.nan
+    return Standing(
+        number, done, budget.iterations, going, float(np.asarray(loss.s_0)) * math.sqrt(terms["tracking"]), volts,
+        int(last["members"] - last["lost"][best]), int(last["members"]), limits,
+        (budget.iterations - done) * each * going / len(progress.active),
+    )  # fmt: skip

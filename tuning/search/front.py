@@ -13,13 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ambjax.commands.outputs import say
 from tuning.config import seeds
 from tuning.judge import held, judge, rms
 from tuning.objective.limits import FRONT
 from tuning.objective.members import Members
 from tuning.search.course import Course, SearchResult
-from tuning.search.multipliers import holding, judged_members, judged_values, met, search_values
+from tuning.search.multipliers import holding, join_breaking, judged_members, judged_values, met, search_values
 from tuning.search.validation import largest_unseen, validated
 
 # Limits of the rms error relative to the least error: KNEE for the knee, FACTORS for the points of the front. The first
@@ -72,18 +71,20 @@ def trace_front(course: Course, answer: SearchResult) -> SearchResult:
     course.problem, x = answer.problem, answer.x
     first, *_ = _judged(course, 1.0, x)
     if not (math.isfinite(first.error_m) and first.error_m > 0 and first.volts > 0):
-        say("no front: with the gains of least error, no member is held, or the error or the voltage is 0")
+        course.tell("no front: with the gains of least error, no member is held, or the error or the voltage is 0")
         return answer
     seen, factors = [first], sorted(FACTORS[: answer.problem.tune.budget.front])
     for factor in factors:
-        if course.interrupted:
+        if course.over:
             break
         least = least_of(seen)
-        say(f"front: least rms voltage with an rms error of at most {factor:g} times the least, {least.error_m:.3g} m")
+        course.tell(
+            f"front: least rms voltage with an rms error of at most {factor:g} times the least, {least.error_m:.3g} m"
+        )
         course.problem = answer.problem.towards_voltage(least.error_m, least.volts, factor)
         seen += _search_least_voltage(course, factor, seen)
     taken = answer
-    if not course.interrupted:
+    if not course.over:
         least, course.problem = least_of(seen), answer.problem
         if answer.problem.tune.objective == "knee":
             course.problem = answer.problem.towards_voltage(least.error_m, least.volts, KNEE)
@@ -142,20 +143,22 @@ def _search_least_voltage(course: Course, factor: float, seen: Sequence[FrontPoi
         point, numbers, columns = _judged(course, factor, x)
         points.append(point)
         limits = tuple(limit.updated(*pair) for limit, pair in zip(course.problem.limits, numbers, strict=True))
-        say(f"judged {point.volts:.4g} V at an rms error of {point.error_m:.3g} m")
+        course.tell(f"judged {point.volts:.4g} V at an rms error of {point.error_m:.3g} m")
         both = zip(limits, numbers, strict=True)
-        if course.interrupted or all(
+        if course.over or all(
             met(limit, judged) or (not limit.multiplier and limit.log_excess(judged) <= 0)
             for limit, (_, judged) in both
         ):
             break
         if np.array_equal(x, start) and holding(limits, numbers):
             break
+        if join_breaking(course, numbers, columns):
+            continue
         more = _members_to_join(course, numbers, columns)
         if more is None:
             course.problem = course.problem.limited(limits)
         else:
-            say("validation members with large errors join the training ensemble; the search is repeated")
+            course.tell("validation members with large errors join the training ensemble; the search is repeated")
             course.members = course.members.joined(more, stressed=False)
             x = chosen([*seen, *points], factor).x
     return points
@@ -196,7 +199,9 @@ def _validated_point(course: Course, answer: SearchResult, seen: list[FrontPoint
         found = validated(course, best.x).result
         if found.good:
             return found
-        say(f"the answer of {best.volts:.4g} V is rejected: it loses members, or accurate steps do not confirm it")
+        course.tell(
+            f"the answer of {best.volts:.4g} V is rejected: it loses members, or accurate steps do not confirm it"
+        )
         seen[:] = [point for point in seen if point is not best]
     return answer
 

@@ -9,8 +9,10 @@ import numpy as np
 
 from tuning.objective.goal import Goal
 from tuning.objective.lanes import Engine
+from tuning.objective.limits import PREFIX
 from tuning.objective.loss import TERMS
 from tuning.objective.members import Members
+from tuning.objective.quantities import KINDS
 from tuning.search.checkpoint import SearchState
 from tuning.search.descent import Descent
 from tuning.search.evolution import next_population, updated
@@ -34,7 +36,7 @@ def iterate(
     better = _descended(engine, goal, members, progress, descent, weights) | _evolved(
         engine, goal, members, progress, seed
     )
-    append_history(engine, members, progress, better, fresh=fresh)
+    append_history(engine, goal, members, progress, better, fresh=fresh)
 
 
 def _descended(
@@ -59,7 +61,7 @@ def _descended(
         whole[active] = part
     progress.starts = descent.step(members.ordinary, starts, *full, on)
     better = np.flatnonzero((np.asarray(progress.starts.value) < np.asarray(starts.value))[active])
-    return {int(active[row]): {name: terms[name][row] for name in TERMS} for row in better}
+    return {int(active[row]): {name: one[row] for name, one in terms.items()} for row in better}
 
 
 def _evolved(
@@ -79,7 +81,7 @@ def _evolved(
         first = int(np.argmin(values[row]))
         if values[row, first] < value[at]:
             best[at], value[at] = points[row][first], values[row, first]
-            better[int(at)] = {name: terms[name][row * len(values[row]) + first] for name in TERMS}
+            better[int(at)] = {name: one[row * len(values[row]) + first] for name, one in terms.items()}
         cma = updated(own[row], points[row], values[row])
         length[at] = cma.reach
         progress.set_cma_state(at, cma)
@@ -90,6 +92,7 @@ def _evolved(
 
 def append_history(
     engine: Engine,
+    goal: Goal,
     members: Members,
     progress: SearchState,
     better: dict[int, dict[str, np.ndarray]],
@@ -98,15 +101,17 @@ def append_history(
 ) -> None:
     """Add a row with the best point of each start to the history, and increment `progress.iteration`.
 
-    `better`: loss terms [N] by name, by index of each start that improved. `fresh`: whether this is the first row of a
-    phase; an earlier row then belongs to other members.
+    `better`: loss terms and limited quantities [N] by name, by index of each start that improved. `fresh`: whether this
+    is the first row of a phase; an earlier row then belongs to other members.
     """
-    past, count = progress.history, len(progress.active)
+    past, count, n = progress.history, len(progress.active), members.ordinary
     lost = np.full(count, len(members.member)) if fresh else np.array(past["lost"][-1])
     means = np.full((count, len(TERMS)), np.nan) if fresh else np.array(past["terms"][-1])
+    measured = np.full((count, len(goal.measured)), np.nan) if fresh else np.array(past["measured"][-1])
     for at, terms in better.items():
         lost[at] = int((terms["survival"] > 0).sum())
-        means[at] = [terms[name][: members.ordinary].mean() for name in TERMS]
+        means[at] = [terms[name][:n].mean() for name in TERMS]
+        measured[at] = [float(KINDS[name].tuned(jnp.asarray(terms[PREFIX + name][:n]))) for name in goal.measured]
     row = {
         "value": np.asarray(progress.starts.value),
         "x": np.asarray(progress.starts.best),
@@ -114,6 +119,7 @@ def append_history(
         "lost": lost,
         "members": np.array(len(members.member)),
         "terms": means,
+        "measured": measured,
         "rollouts": np.array(engine.rollouts),
     }
     for key, value in row.items():

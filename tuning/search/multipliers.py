@@ -6,17 +6,17 @@ excess g of a limit is about (required multiplier - multiplier) / penalty. An up
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ambjax.commands.outputs import say
 from tuning.config import seeds
 from tuning.judge import judge
 from tuning.measured_peaks import MEASURED, decides, injections, injects, reached_of
 from tuning.objective.limits import PENALTY, PREFIX, TOLERANCE_BELOW, Limit
 from tuning.problem import TuningProblem
 from tuning.search.course import Course
+from tuning.search.validation import breaking
 
 # Largest number of searches after updates of the multipliers in one round.
 MOST_UPDATES = 6
@@ -49,17 +49,23 @@ def search_within_limits(course: Course, x: np.ndarray) -> tuple[np.ndarray, boo
     within, moved = list[np.ndarray](), True
     for update in range(MOST_UPDATES + 1):
         before = course.problem.limits
-        numbers = _numbers(course, x)
+        numbers, columns = _numbers(course, x)
         if holds := holding(before, numbers):
             within.append(x)
+        if update < MOST_UPDATES and not course.over and join_breaking(course, numbers, columns):
+            course.limit_searches += 1
+            x, _ = course.search(x[None])
+            continue
         limits = tuple(limit.updated(*found) for limit, found in zip(before, numbers, strict=True))
         stuck = [limit for limit, (_, judged) in zip(before, numbers, strict=True) if _stuck(limit, judged)]
         if stuck and update:  # at update 0, `missed` is of an earlier round, with other members
             names = ", ".join(limit.name for limit in stuck)
-            say(f"a larger penalty makes no progress towards the limit of {names}; its multiplier is no longer updated")
+            course.tell(
+                f"a larger penalty makes no progress towards the limit of {names}; its multiplier is no longer updated"
+            )
             break
         course.problem = course.problem.limited(limits)
-        if _all_met(before, limits, numbers) or course.interrupted or (not moved and holds):
+        if _all_met(course, before, limits, numbers) or course.over or (not moved and holds):
             return x, holds
         if update == MOST_UPDATES:
             break
@@ -70,8 +76,30 @@ def search_within_limits(course: Course, x: np.ndarray) -> tuple[np.ndarray, boo
     return (_least(course, within), True) if within else (x, False)
 
 
-def _all_met(before: Sequence[Limit], after: Sequence[Limit], numbers: Sequence[tuple[float, float]]) -> bool:
-    """Return whether all limits are met, and print a line for each limit that is active or not met.
+def join_breaking(
+    course: Course, numbers: Sequence[tuple[float, float]], columns: Mapping[str, np.ndarray] | None
+) -> bool:
+    """Let the members that break a limit join the training ensemble (`breaking`). Return whether there are any.
+
+    The search then measures the worst members itself, so that the limits on them need no correction by a ratio.
+    """
+    more = breaking(course, numbers, columns)
+    if more is None:
+        return False
+    for limit, (_, judged) in zip(course.problem.limits, numbers, strict=True):
+        if limit.kind.worst and not limit.has_reserve(judged):
+            course.tell(f"limit {limit.name} = {limit.threshold:g} {limit.kind.unit}: judged {judged:.4g}")
+    course.tell(f"{len(more.member)} validation members that break a limit join the training ensemble")
+    course.members = course.members.joined(more, stressed=False)
+    limits = (dataclasses.replace(limit, ratio=1.0) if limit.kind.worst else limit for limit in course.problem.limits)
+    course.problem = course.problem.limited(tuple(limits))
+    return True
+
+
+def _all_met(
+    course: Course, before: Sequence[Limit], after: Sequence[Limit], numbers: Sequence[tuple[float, float]]
+) -> bool:
+    """Return whether all limits are met, and tell each limit that is active or not met.
 
     `before`, `after`: the limits before and after the update of their multipliers. `numbers`: as of `_numbers`.
     """
@@ -80,13 +108,13 @@ def _all_met(before: Sequence[Limit], after: Sequence[Limit], numbers: Sequence[
         idle = old.multiplier == new.multiplier == 0
         done.append(met(new, judged) or (idle and new.log_excess(judged) <= 0))
         if not (idle and done[-1]):
-            say(f"limit {new.name} = {new.threshold:g} {new.kind.unit}: judged {judged:.4g}")
+            course.tell(f"limit {new.name} = {new.threshold:g} {new.kind.unit}: judged {judged:.4g}")
     return all(done)
 
 
 def _least(course: Course, points: Sequence[np.ndarray]) -> np.ndarray:
     """Return the point [m] with the least goal on the training ensemble, without the terms of the limits."""
-    say("the multipliers of the limits do not converge; the best answer within the limits is taken")
+    course.tell("the multipliers of the limits do not converge; the best answer within the limits is taken")
     both = np.array(points)
     goal = dataclasses.replace(course.problem.goal, limits=())
     return points[int(np.argmin(goal.score(both, course.problem.engine.terms(both, course.members), course.members)))]
@@ -115,27 +143,27 @@ def met(limit: Limit, judged: float) -> bool:
     return limit.log_excess(judged) >= -TOLERANCE_BELOW and limit.has_reserve(judged)
 
 
-def _numbers(course: Course, x: np.ndarray) -> list[tuple[float, float]]:
-    """Return (the search's value, the judge's value) of each limit at x [m].
+def _numbers(course: Course, x: np.ndarray) -> tuple[list[tuple[float, float]], dict[str, np.ndarray] | None]:
+    """Return (the search's value, the judge's value) of each limit at x [m], and the metrics of the judged members.
 
     The judge uses the validation ensemble, or the training ensemble if tune.validation is 0. If all limits are clearly
     met (CLEARLY_BELOW) and none concerns the worst member, the judge's value is estimated: it is `Limit.ratio` times
-    the search's value.
+    the search's value, and no member is simulated (None).
     """
     problem, budget = course.problem, course.problem.tune.budget
     limits = problem.limits
     if not limits:
-        return []
+        return [], None
     tuned = search_values(course, x)
     known = [limit.ratio * ours for limit, ours in zip(limits, tuned, strict=True)]
     if all(
         not limit.kind.worst and limit.log_excess(one) < -CLEARLY_BELOW
         for limit, one in zip(limits, known, strict=True)
     ):
-        return list(zip(tuned, known, strict=True))
+        return list(zip(tuned, known, strict=True)), None
     seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)
     columns = judge(problem, x, seed, judged_members(limits, count))
-    return list(zip(tuned, judged_values(problem, x, seed, columns, tuned), strict=True))
+    return list(zip(tuned, judged_values(problem, x, seed, columns, tuned), strict=True)), columns
 
 
 def judged_members(limits: Sequence[Limit], count: int) -> int:

@@ -1,5 +1,6 @@
 """The search: a screen, then the simultaneous refinement of several starts. A search can be interrupted and resumed."""
 
+import math
 import time
 from collections.abc import Callable
 from typing import NamedTuple
@@ -10,7 +11,6 @@ import numpy as np
 from ambjax.host.interrupts import deferred, raise_if_interrupted
 from tuning.objective.goal import Goal
 from tuning.objective.lanes import Engine
-from tuning.objective.loss import TERMS
 from tuning.objective.members import Members
 from tuning.optimisers import BFGS
 from tuning.search.checkpoint import CheckpointFile, SearchState
@@ -67,6 +67,7 @@ def search(
     at_optimum: bool = False,
     checkpoint_file: CheckpointFile | None = None,
     resume: bool = False,
+    until: float = math.inf,
     on_iteration: Callable[[SearchState, float], None] = lambda search, seconds: None,
 ) -> SearchState:
     """Refine the best `keep` of these points, coordinates [K, m]. Ctrl-C ends the search early.
@@ -79,7 +80,8 @@ def search(
 
     `at_optimum`: whether an earlier search on all members ended at the first point. If this point is the best after the
     first phase, it is then not refined again. `seed`: seed of the populations of CMA-ES. `on_iteration`: called after
-    each iteration with the search and the duration of the iteration in s.
+    each iteration with the search and the duration of the iteration in s. `until`: time of `time.perf_counter` after
+    which the search ends at its next iteration.
     """
     descent = Descent(goal, name, rate)
     checkpoint_file = checkpoint_file or CheckpointFile(None, {})
@@ -110,6 +112,8 @@ def search(
                 progress.seconds = progress.earlier + time.perf_counter() - began
                 checkpoint_file.save(progress)
                 on_iteration(progress, progress.seconds - before)
+            if time.perf_counter() > until:
+                break
     except KeyboardInterrupt:
         progress.interrupted = True
     return progress
@@ -186,7 +190,9 @@ def _begin_full_phase(
         value = np.where(progress.active, values[best], np.inf)
         progress.starts = progress.starts._replace(state=progress.starts.state._replace(value=jnp.asarray(value)))
         progress.active = np.zeros(starts, bool)
-        append_history(engine, members, progress, {start: {name: terms[name][best] for name in TERMS}}, fresh=True)
+        append_history(
+            engine, goal, members, progress, {start: {name: one[best] for name, one in terms.items()}}, fresh=True
+        )
 
 
 def best_of(progress: SearchState) -> tuple[np.ndarray, float]:

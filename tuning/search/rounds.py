@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.commands.outputs import described, say
+from ambjax.commands.outputs import described
 from tuning.config import seeds
+from tuning.events import Listener
 from tuning.judge import StepError, describe, step_error
 from tuning.problem import TuningProblem, problem_of
 from tuning.search.course import Course, SearchResult, points_of, search_and_restart, training
@@ -27,23 +28,34 @@ from tuning.search.validation import joining, validated
 # Largest number of searches, and of halvings of the step. Restarts count as searches; searches after an update of the
 # multipliers do not.
 MOST_ROUNDS, MOST_HALVINGS = 12, 2
+# Share of tune.minutes for the searches and validations. The rest is for the judgement and the report.
+SEARCHING = 0.7
 
 
 def rounds(
-    problem: TuningProblem, start: np.ndarray, out: pathlib.Path, facts: dict[str, Any], resume: bool
+    problem: TuningProblem,
+    start: np.ndarray,
+    out: pathlib.Path,
+    facts: dict[str, Any],
+    resume: bool,
+    listen: Listener = lambda event: None,
 ) -> SearchResult:
     """Tune from the gains `start` [m], SI units, and return the result.
 
     `out`: directory of the checkpoints. `facts`: settings that a checkpoint must match. `resume`: whether to continue
-    from the checkpoints. The result is the confirmed answer that loses the fewest members; of several such answers, one
-    within all limits, and of those the one of least error on the validation ensemble. If no answer is confirmed, the
-    result is an earlier point of the searches that is `SearchResult.good`, or, without such a point, the answer that
-    loses the fewest members. If a front is traced, the result is the answer that `trace_front` selects.
+    from the checkpoints. `listen`: receives the events.
+
+    The result is the confirmed answer that loses the fewest members; of several such answers, one within all limits,
+    and of those the one of least error on the validation ensemble. If no answer is confirmed, the result is an earlier
+    point of the searches that is `SearchResult.good`, or, without such a point, the answer that loses the fewest
+    members. If a front is traced, the result is the answer that `trace_front` selects.
 
     Raises ValueError if the goal is finite at no starting point, or if a checkpoint belongs to another search.
     """
     budget, answers = problem.tune.budget, list[SearchResult]()
-    course = Course(problem, training(problem), budget.seed, out, facts, resume)
+    course = Course(
+        problem, training(problem), budget.seed, out, facts, resume, listen, SEARCHING * problem.tune.minutes
+    )
     x = search_and_restart(course, start)
     for number in itertools.count(1):
         if course.all_lost:  # no gains hold any member
@@ -54,22 +66,24 @@ def rounds(
             x, error = limited, None
         answer, error, lost, large = validated(course, x, error)
         answers.append(dataclasses.replace(answer, within=within))
-        if (answer.good and not large.size) or course.interrupted or _is_exhausted(course):
+        if (answer.good and not large.size) or course.over or _is_exhausted(course):
             break
         if answer.good:
             more = course.problem.objective.chosen(seeds(budget)[1], large, budget.validation)
             course.members = course.members.joined(more, stressed=False)
-            say("validation members with large errors join the training ensemble; the search continues")
+            course.tell("validation members with large errors join the training ensemble; the search continues")
         else:
             course.members = course.members.joined(joining(course.problem, lost, error, number))
-            say("lost members, and members lost with accurate steps, join the training ensemble; the search continues")
+            course.tell(
+                "lost members, and members lost with accurate steps, join the training ensemble; the search continues"
+            )
         x, _ = course.search(course.around(x))
     if not answers:
         return course.answer(x, None, budget.validation)
     best = min(answers, key=lambda one: (not one.confirmed, one.lost, not one.within, one.validation_error))
-    if not best.confirmed and not course.interrupted:
+    if not best.confirmed and not course.over:
         best = earlier_confirmed(course, best)
-    if problem.front and best.good and not course.interrupted:
+    if problem.front and best.good and not course.over:
         course.members = best.members
         best = described("the front of error against voltage", lambda: trace_front(course, best)) or best
     return dataclasses.replace(best, seconds=course.answer(x, None, 0).seconds)
@@ -88,18 +102,18 @@ def with_fine_steps(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepErro
     """
     while True:
         error = step_error(course.problem, x)
-        say(f"steps of the search compared with {course.problem.accurate}: {describe(error)}")
+        course.tell(f"steps of the search compared with {course.problem.accurate}: {describe(error)}")
         substeps = finer(course.problem)
-        if error.resolved or substeps is None or course.interrupted:
+        if error.resolved or substeps is None or course.over:
             return x, error
         course.problem = substeps
-        say(f"these steps are too coarse; the search continues with {course.problem.objective.clock.method}")
+        course.tell(f"these steps are too coarse; the search continues with {course.problem.objective.clock.method}")
         x, _ = course.search(x[None])
 
 
 def earlier_confirmed(course: Course, best: SearchResult) -> SearchResult:
     """Return the best earlier point of the searches that is `SearchResult.good`, or `best` if there is none."""
-    say("accurate steps confirm none of the answers; earlier points of the searches are tried")
+    course.tell("accurate steps confirm none of the answers; earlier points of the searches are tried")
     for x in points_of(course.past):
         error = step_error(course.problem, x)
         if not error.refuted:

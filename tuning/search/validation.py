@@ -1,20 +1,22 @@
 """Validation of an answer on members that the search does not use, and the members that then join the search."""
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from ambjax.commands.outputs import say
 from tuning.config import seeds
-from tuning.judge import StepError, comparison_members, describe, rms, step_error, worst_of
+from tuning.judge import StepError, comparison_members, describe, held, rms, step_error, worst_of
 from tuning.objective.members import Members
 from tuning.problem import TuningProblem
 from tuning.search.course import Course, SearchResult
 
 # Largest numbers of lost members, and of members with large errors, that join at once.
 MOST_LOST, MOST_LARGE = 16, 8
+# Largest number of members that join because they break a limit on the worst member.
+MOST_BREAKING = 4
 # If the rms error of the validation members exceeds that of the training members by more than this factor, the training
 # ensemble lacks members with large errors.
 LARGER = 1.5
@@ -53,24 +55,46 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
     if not lost.size and not error.refuted and not problem.sampled:
         worst = problem.objective.chosen(seeds(budget)[1], worst_of(terms["peak"]), count)
         error = step_error(problem, x, comparison_members(problem).joined(worst))
-        say(f"accurate steps, with the worst of {count} validation members: {describe(error)}")
+        course.tell(f"accurate steps, with the worst of {count} validation members: {describe(error)}")
     if lost.size:
-        say(f"{lost.size} of {count} validation members are lost")
+        course.tell(f"{lost.size} of {count} validation members are lost")
     errors = _rms_errors(terms)
     found = course.answer(x, error, lost.size + error.unconfirmed, _overall(errors))
     return Validation(found, error, lost, _large(course, x, errors))
 
 
-def largest_unseen(course: Course, errors: np.ndarray) -> np.ndarray:
-    """Return the numbers of the validation members with the largest errors that are not in the training ensemble.
+def largest_unseen(course: Course, values: np.ndarray, most: int = MOST_LARGE) -> np.ndarray:
+    """Return the numbers of at most `most` validation members, not in the training ensemble, with the largest values.
 
-    `errors` [N]: of the validation members; -inf for a member that is lost. At most MOST_LARGE numbers.
+    `values` [N]: of the validation members; -inf for a member that is left out.
     """
     members, seed = course.members, seeds(course.problem.tune.budget)[1]
-    errors = errors.copy()
-    errors[members.unstressed.member[members.unstressed.seed == seed]] = -math.inf
-    worst = np.argsort(-errors, kind="stable")[:MOST_LARGE]
-    return worst[np.isfinite(errors[worst])]
+    values = values.copy()
+    values[members.unstressed.member[members.unstressed.seed == seed]] = -math.inf
+    largest = np.argsort(-values, kind="stable")[:most]
+    return largest[np.isfinite(values[largest])]
+
+
+def breaking(
+    course: Course, numbers: Sequence[tuple[float, float]], columns: Mapping[str, np.ndarray] | None
+) -> Members | None:
+    """Return the validation members that break a limit on the worst member and are not in the training ensemble.
+
+    At most MOST_BREAKING for each limit whose judged value lacks reserve; None if there is none.
+
+    `numbers`: the values of the search and of the judge for each limit. `columns` [N]: metrics of the judged members;
+    None if they were not simulated.
+    """
+    problem, budget = course.problem, course.problem.tune.budget
+    if columns is None or not budget.validation:
+        return None
+    found = np.zeros(0, int)
+    for limit, (_, judged) in zip(problem.limits, numbers, strict=True):
+        if limit.kind.worst and not limit.has_reserve(judged):
+            excess = np.where(held(columns), limit.log_excesses(columns), -math.inf)
+            found = np.append(found, largest_unseen(course, np.where(excess > 0, excess, -math.inf), MOST_BREAKING))
+    total = len(columns["lost_at_s"])
+    return problem.objective.chosen(seeds(budget)[1], np.unique(found), total) if found.size else None
 
 
 def _large(course: Course, x: np.ndarray, errors: np.ndarray) -> np.ndarray:

@@ -1,0 +1,66 @@
+"""The log of a tuning: lines on stderr, never silent for long."""
+
+import math
+import sys
+import time
+
+import pytest
+
+from tuning import events
+from tuning.events import Event, Log, Reached, Standing
+
+STANDING = Standing(1, 3, 40, 2, 1e-6, 5.0, 39, 40, (Reached("sensitivity", 6.0, 3.0, False),), math.nan)
+
+
+class Terminal:
+    """A stream that keeps what is written, and is a terminal or not."""
+
+    def __init__(self, terminal):
+        self.terminal, self.text = terminal, ""
+
+    def write(self, text):
+        self.text += text
+        return len(text)
+
+    def flush(self):
+        pass
+
+    def isatty(self):
+        return self.terminal
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_the_last_line_is_repeated_if_nothing_happens(terminal, monkeypatch):
+    stderr = Terminal(terminal)
+    monkeypatch.setattr(sys, "stderr", stderr)
+    monkeypatch.setattr(events, "SILENCE", 0.1)
+    with Log() as log:
+        log(Event("compiling"))
+        time.sleep(1.5)
+    assert stderr.text.count("compiling") > 1
+    assert ("\r" in stderr.text) == terminal
+    before = stderr.text
+    time.sleep(0.8)
+    assert stderr.text == before  # it has ended
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_standings_are_written_at_intervals_and_other_events_at_once(terminal, monkeypatch):
+    stderr = Terminal(terminal)
+    monkeypatch.setattr(sys, "stderr", stderr)
+    monkeypatch.setattr(events, "INTERVAL", 0.0)
+    log = Log()
+    log(Event(STANDING.text, STANDING))
+    monkeypatch.setattr(events, "INTERVAL", 1e9)
+    log(Event(STANDING.text, STANDING))
+    for _ in range(3):
+        log(Event("join"))
+    assert stderr.text.count("39 of 40 members held") == 1
+    assert stderr.text.count("join") == 3
+
+
+def test_a_standing_names_the_limits_that_are_not_met():
+    assert "sensitivity 6 (beyond 3)" in STANDING.text
+    met = STANDING._replace(limits=(Reached("sensitivity", 2.0, 3.0, True),))
+    assert "sensitivity" not in met.text
+    assert "limits met" in met.text

@@ -1,0 +1,140 @@
+"""Events of a tuning, for whoever listens: a terminal, a notebook or a file. No other module of the tuner prints them.
+
+An event is a sentence, or the standing of a search after an iteration. `Log`, the default listener, writes lines to
+stderr.
+"""
+
+import math
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+from ambjax.commands.outputs import say
+from ambjax.commands.pace import duration
+
+# `Log` writes the standing of a search at most once in INTERVAL seconds, and repeats its last line after SILENCE.
+INTERVAL, SILENCE = 2.0, 4.5
+
+
+class Reached(NamedTuple):
+    """A limit of [tune.limits]: the search's value and the limit itself, in the unit of the quantity."""
+
+    name: str
+    value: float
+    threshold: float
+    holds: bool
+
+    @property
+    def text(self) -> str:
+        """The limit as a phrase."""
+        return f"{self.name} {self.value:.3g} ({'within' if self.holds else 'beyond'} {self.threshold:g})"
+
+
+class Standing(NamedTuple):
+    """The best point of a search, on the members that the search simulates.
+
+    `number`: of the search, from 1. `iteration`, `most`: number of iterations of this phase, and their largest number.
+    `starts`: number of starts that continue. `error_m`, `u_V`: settled rms error (m) and rms voltage (V). `held`,
+    `members`: number of members that are held, and of all. `limits`: the limits. `left_s`: largest time left in this
+    phase, s; NaN if it is not known yet.
+    """
+
+    number: int
+    iteration: int
+    most: int
+    starts: int
+    error_m: float
+    u_V: float
+    held: int
+    members: int
+    limits: tuple[Reached, ...]
+    left_s: float
+
+    @property
+    def text(self) -> str:
+        """The standing in one line."""
+        beyond = [one.text for one in self.limits if not one.holds]
+        met = ", ".join(beyond) if beyond else "limits met" if self.limits else ""
+        left = "" if math.isnan(self.left_s) else f"at most {duration(self.left_s)} left in this phase"
+        parts = [
+            f"search {self.number}: iteration {self.iteration} of at most {self.most}, {self.starts} starts",
+            f"best so far {self.error_m:.3g} m rms at {self.u_V:.3g} V rms",
+            f"{self.held} of {self.members} members held",
+            met,
+            left,
+        ]
+        return "; ".join(part for part in parts if part)
+
+
+class Event(NamedTuple):
+    """An event. `text`: the event in one line. `standing`: of the search after an iteration; None for other events."""
+
+    text: str
+    standing: Standing | None = None
+
+
+# What receives events, and what sends an event that is a sentence.
+Listener = Callable[[Event], None]
+Tell = Callable[[str], None]
+
+
+def teller(listen: Listener) -> Tell:
+    """Return the function that sends a sentence to the listener."""
+    return lambda text: listen(Event(text))
+
+
+class Log:
+    """Listener that writes lines to stderr, each with the time since its beginning.
+
+    As a context manager, it also repeats its last line if there is none for SILENCE seconds, so that a user sees what
+    takes so long. On a terminal, such repetitions and standings overwrite each other.
+    """
+
+    def __init__(self) -> None:
+        self.began = self.written = time.monotonic()
+        self.last, self.open = "", False
+        self.lock, self.ended = threading.Lock(), threading.Event()
+
+    def __call__(self, event: Event) -> None:
+        with self.lock:
+            self.last = event.text
+            if event.standing is None:
+                self._line(event.text)
+            elif time.monotonic() - self.written >= INTERVAL:
+                self._line(event.text, passing=True)
+
+    def __enter__(self) -> "Log":
+        threading.Thread(target=self._repeat, daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.ended.set()
+        with self.lock:
+            self._close()
+
+    def _repeat(self) -> None:
+        while not self.ended.wait(0.5):
+            with self.lock:
+                if self.last and time.monotonic() - self.written >= SILENCE:
+                    self._line(f"... {self.last}", passing=True)
+
+    def _line(self, text: str, *, passing: bool = False) -> None:
+        """Write a line. On a terminal, the next line overwrites it if `passing`."""
+        self.written = time.monotonic()
+        minutes, seconds = divmod(int(self.written - self.began), 60)
+        stamped = f"{minutes}:{seconds:02d} {text}"
+        if passing and sys.stderr.isatty():
+            shown = stamped[: shutil.get_terminal_size().columns - 1]
+            print(f"\r\x1b[K{shown}", end="", file=sys.stderr, flush=True)
+            self.open = True
+        else:
+            self._close()
+            say(stamped)
+
+    def _close(self) -> None:
+        if self.open:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+        self.open = False
