@@ -55,7 +55,7 @@ def test_standings_are_written_at_intervals_and_other_events_at_once(terminal, m
     log(Event(STANDING.text, STANDING))
     for _ in range(3):
         log(Event("join"))
-    assert stderr.text.count("39 of 40 members held") == 1
+    assert stderr.text.count("search 1: iteration 3") == 1
     assert stderr.text.count("join") == 3
 
 
