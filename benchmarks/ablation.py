@@ -27,7 +27,10 @@ from tuning.objective import limits
 from tuning.search import course, multipliers, optimise, rounds, validation
 
 NEVER = 10**9
-FIRST_KINDS = {"blower-pid": ("pid", "linearised", "pi"), "blower-cascade": ("sliding-mode", "adaptive", "sliding-mode")}
+FIRST_KINDS = {
+    "blower-pid": ("pid", "linearised", "pi"),
+    "blower-cascade": ("sliding-mode", "adaptive", "sliding-mode"),
+}
 
 
 def setting(**values: Any) -> Callable[[dict[str, Any]], None]:

@@ -36,11 +36,11 @@ def test_the_last_line_is_repeated_if_nothing_happens(terminal, monkeypatch):
     monkeypatch.setattr(events, "SILENCE", 0.1)
     with Log() as log:
         log(Event("compiling"))
-        time.sleep(1.5)
+        time.sleep(0.4)
     assert stderr.text.count("compiling") > 1
     assert ("\r" in stderr.text) == terminal
     before = stderr.text
-    time.sleep(0.8)
+    time.sleep(0.3)
     assert stderr.text == before  # it has ended
 
 

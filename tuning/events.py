@@ -116,7 +116,7 @@ class Log:
             self._close()
 
     def _repeat(self) -> None:
-        while not self.ended.wait(0.5):
+        while not self.ended.wait(SILENCE / 9):
             with self.lock:
                 if self.last and time.monotonic() - self.written >= SILENCE:
                     self._line(f"... {self.last}", passing=True)
