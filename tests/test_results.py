@@ -190,9 +190,9 @@ def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
 
     monkeypatch.setattr("tuning.command.run", tuned)
     monkeypatch.setattr("tuning.from_python.run", tuned)
-    flags = dict.fromkeys(("resume", "force", "gradients", "pareto", "page"), True)
+    flags = dict.fromkeys(("resume", "force", "pareto", "page"), True)
     assert ambjax.tune(path, tmp_path, **flags, settings_of=path, minutes=2.0).directory == tmp_path
-    words = ["--resume", "--force", "--gradients", "--pareto", "--page", "--settings-of", str(path), "--budget", "2"]
+    words = ["--resume", "--force", "--pareto", "--page", "--settings-of", str(path), "--budget", "2"]
     assert tune_main([str(path), "--out", str(tmp_path), *words]) == 1
     assert given[0] == given[1]
 

@@ -26,7 +26,7 @@ from tuning.judge import judge
 from tuning.objective.goal import shown
 from tuning.objective.lanes import Engine
 from tuning.objective.loss import TERMS, weigh
-from tuning.report import accurate, breakdown, extras, gradient, held_out, pictures
+from tuning.report import accurate, breakdown, held_out, pictures
 from tuning.report import document as report
 from tuning.report.facts import SUMMARY_METRICS
 from tuning.search.explore import REACH, Slices, slices
@@ -415,44 +415,6 @@ def test_ranges_and_their_sources_are_in_the_table():
 
 def test_the_formula_contains_every_term_once():
     assert sorted(re.findall(r"[a-z]{2,}", breakdown.FORMULA)) == sorted(TERMS)
-
-
-def test_the_section_on_gradients_has_three_complete_tables():
-    three = {"samples": 5, **{way: [1.0, 2.0] for way in ("forward", "reverse", "differences")}}
-    three["verdicts"] = [gradient.AGREED, "differences are inconclusive: 1 with a step of 0.001, -1 with 0.0005"]
-    noise = {name: [1.0, 2.0] for name in ("gradient", "standard_error", "ratio")}
-    horizons = [{"horizon_s": 0.1, "norm": 2.0, "lost": 0.0}]
-    facts = {"gains": ["c", "k"], "three_ways": three, "noise": noise, "horizons": horizons}
-    shown = render_page("\n".join(extras.gradient(facts)), {}, "t")
-    assert shown.count("<table>") == 3
-    assert shown.count("<td") == 2 * 5 + 3 + 2 * 4
-    assert "The three derivatives agree for 1 of 2 gains" in shown
-    assert "Differences compare two runs" in shown
-    three["verdicts"] = [gradient.AGREED] * 2
-    assert "Differences compare two runs" not in "".join(extras.gradient(facts))
-
-
-# Derivatives by forward mode, reverse mode and differences with two step sizes, and the expected text.
-WAYS = {
-    "agree": (1.0, 1.0 + 1e-9, 1.04, 1.01, gradient.AGREED),
-    "a loop that is chaotic": (
-        2.83e-2,
-        2.83e-2,
-        -2.31e-2,
-        0.4e-2,
-        "differences are inconclusive: -2.31e-02 with",
-    ),
-    "jumps": (-9.0, -9.0, -9.5, -9.5, "differences differ from both modes by 5.3 % with both steps"),
-    "modes apart": (1.0, 1.1, 1.0, 1.0, "forward and reverse mode differ by 9.1 %"),
-    "all as good as 0": (1e-12, -3e-12, 2e-11, -4e-11, gradient.AGREED),
-    "no number": (math.nan, 1.0, 1.0, 1.0, "a derivative is not finite"),
-}
-
-
-@pytest.mark.parametrize("kind", WAYS)
-def test_the_agreement_of_three_derivatives_is_judged(kind):
-    *ways, words = WAYS[kind]
-    assert gradient.agreement(*ways, floor=1e-7).startswith(words)
 
 
 def test_a_goal_far_from_its_limits_is_shown_without_overflow():

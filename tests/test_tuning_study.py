@@ -11,7 +11,7 @@ import tomllib
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bowl import FLOOR, PATHS, REVERSE, S_0, Bowl, World, document, study
+from bowl import FLOOR, PATHS, S_0, World, document, study
 from scipy import stats
 from texts import piped
 from tomlkit import dumps
@@ -30,7 +30,6 @@ from tuning.objective.ranges import END_FACTOR
 from tuning.objective.risk import Mean
 from tuning.objective.shortfalls import Bound
 from tuning.optimisers import bfgs
-from tuning.report import gradient
 from tuning.search import explore
 from tuning.search.descent import Descent
 from tuning.search.optimise import HALVINGS, search
@@ -246,23 +245,22 @@ def test_the_path_of_bfgs_does_not_depend_on_the_unit_of_the_loss():
 # --- the command ---
 
 
-def command(monkeypatch, tmp_path, world, *flags, force=False, **tune):
+def command(monkeypatch, tmp_path, world, force=False, pareto=False, **tune):
     """`ambjax tune` in this process, its engine a Bowl: exit code, summary, output directory."""
     made = study(monkeypatch, world, **tune)
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(dumps(document(**tune)))
-    given = {name: f"--{name}" in flags for name in ("gradients", "pareto")}
-    tuned = tuning.tune(path, out, force=force, **given)
+    tuned = tuning.tune(path, out, force=force, pareto=pareto)
     assert json.loads(json.dumps(tuned.report)) is not None
     return int(not tuned.good), tuned.report, out, made
 
 
 @pytest.fixture(scope="module")
 def everything(tmp_path_factory):
-    """One run with both flags."""
+    """One run with a front."""
     world = World(limit=lambda seed, number, *_: 400.0)
     with pytest.MonkeyPatch.context() as patch:
-        code, summary, out, made = command(patch, tmp_path_factory.mktemp("all"), world, "--gradients", "--pareto")
+        code, summary, out, made = command(patch, tmp_path_factory.mktemp("all"), world, pareto=True)
     return world, code, summary, out, made
 
 
@@ -289,49 +287,6 @@ def test_tuned_toml_contains_the_gains_and_can_be_read(everything):
     np.testing.assert_allclose(tuned, world.best, rtol=0.05)
     assert tuned == [row["after"] for row in summary["gains"]]
     case_from(written)
-
-
-@pytest.mark.slow
-def test_the_gradient_report_compares_three_derivatives(everything):
-    _, _, summary, out, _ = everything
-    found = summary["gradient"]
-    ways = [np.array(found["three_ways"][name]) for name in ("forward", "reverse", "differences")]
-    # of both modes; that those of a real engine agree: test_tuning_search.py::test_the_gradient_agrees_in_three_ways
-    np.testing.assert_allclose(ways[1], (1 + REVERSE) * ways[0], rtol=1e-12)
-    # h^4 of the extrapolated differences, of slopes that vanish at the optimum: of the size of the loss
-    np.testing.assert_allclose(ways[2], ways[0], rtol=1e-6, atol=1e-9 * FLOOR)
-    assert found["three_ways"]["agree"]
-    assert "The three derivatives agree for 2 of 2 gains" in (out / "report.md").read_text()
-    assert len(found["horizons"]) > 1
-    assert "gradient" in (out / "report.md").read_text().lower()
-
-
-@pytest.mark.parametrize(("samples", "horizons"), [(2, [1, 2]), (3, [1, 2, 3]), (40, [5, 10, 20, 40])])
-def test_each_horizon_of_the_gradient_report_has_settled_samples(monkeypatch, samples, horizons):
-    """Each horizon occurs once, and a horizon with loss 0 is omitted."""
-    settle = (samples - 1) * 1e-4
-    made = study(monkeypatch, World(), {"clock": {"duration": samples * 1e-4}, "run": {"settle": settle}})
-    for count in horizons:
-        short = gradient._shorter(made, count)
-        assert float(short.loss.settle) <= (count - 1) * 1e-4
-    x, members = at(made, 80.0, 40.0), made.objective.training(1, 4, 2, 1.2, 1.25)
-    rows = gradient.against_horizon(made, x, members)
-    np.testing.assert_allclose([row["horizon_s"] for row in rows], np.array(horizons) * 1e-4)
-    assert all(math.isfinite(row["norm"]) for row in rows)
-    monkeypatch.setattr(Bowl, "gradient", lambda *_: (np.zeros((1, 4, 1)), np.zeros((1, 4, 1, 2)), {}))
-    assert gradient.against_horizon(made, x, members) == []
-
-
-def test_gradients_of_a_knee_are_those_of_the_loss(monkeypatch):
-    """The goal of the knee weighs clearance and survival only; both are 0 if no rotor is near its stop."""
-    made = study(monkeypatch, World(), objective="knee")
-    x, members = at(made, 80.0, 40.0), made.objective.training(1, 4, 2, 1.2, 1.25)
-    knee = made.towards_voltage(5e-5, 20.0, 1.25)
-    of_loss, of_knee = (np.array(gradient.three_ways(one, x)["forward"]) for one in (made, knee))
-    assert np.abs(of_loss).min() > 0
-    np.testing.assert_array_equal(of_knee, of_loss)
-    assert len(gradient.against_horizon(knee, x, members)) > 1
-    assert np.isfinite(np.array(gradient.signal_to_noise(knee, x, members)["gradient"])).all()
 
 
 @pytest.mark.slow
@@ -366,15 +321,15 @@ def test_an_unfinished_search_is_kept_and_only_resumed_with_resume(monkeypatch, 
     left = {path.name for path in (out / "checkpoints").glob("*.npz")}
     mine = out / "checkpoints" / "round-my-net.npz"
     mine.touch()
-    with pytest.raises(ValueError, match=r"it has tuned.toml, .* of an earlier run. .* overwrite them with --force"):
+    with pytest.raises(ValueError, match=r"it has tuned.toml, .* of an earlier run. .* overwrite them with force=True"):
         command(monkeypatch, tmp_path, World())
     assert {path.name for path in (out / "checkpoints").glob("*.npz")} == left | {mine.name}
     command(monkeypatch, tmp_path, World(), force=True)  # it has ended: its checkpoints go
     os.utime(out / "report.json", (0, 0))  # of the search before the one whose checkpoints these are
-    with pytest.raises(ValueError, match=r"not ended. Continue it with --resume, discard it with --force"):
+    with pytest.raises(ValueError, match=r"not ended. Continue it with resume=True, discard it with force=True"):
         command(monkeypatch, tmp_path, World())
     (out / "report.json").unlink()
-    with pytest.raises(ValueError, match=r"not ended. Continue it with --resume, discard it with --force"):
+    with pytest.raises(ValueError, match=r"not ended. Continue it with resume=True, discard it with force=True"):
         command(monkeypatch, tmp_path, World())
     assert {path.name for path in (out / "checkpoints").glob("*.npz")} == left | {mine.name}
     (out / "checkpoints" / "round-99.npz").touch()

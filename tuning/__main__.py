@@ -27,9 +27,6 @@ def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
     top.add_argument("--resume", action="store_true", help="continue the interrupted search in --out")
     top.add_argument("--force", action="store_true", help="overwrite the files of an earlier search in --out")
     top.add_argument(
-        "--gradients", action="store_true", help="report the gradient by forward mode, reverse mode and differences"
-    )
-    top.add_argument(
         "--pareto", action="store_true", help="write each point of the front of error against voltage as a case file"
     )
     top.add_argument(

@@ -64,7 +64,6 @@ class Options(NamedTuple):
     out: str | None = None
     resume: bool = False
     force: bool = False
-    gradients: bool = False
     pareto: bool = False
     page: bool = False
     settings_of: str | None = None
@@ -129,9 +128,7 @@ def _tune(plan: TuningPlan, path: str, options: Options, listen: Listener) -> Tu
     with files(plan.out) as part:
         case = _put_answer(part, plan.out, answer, NOT_JUDGED)
     tell = teller(listen)
-    found = described(
-        "the judgement of the tuned gains", lambda: examined(answer, options.gradients, options.pareto, tell)
-    )
+    found = described("the judgement of the tuned gains", lambda: examined(answer, options.pareto, tell))
     if found is None:
         tell(f"the tuned gains are in {plan.out / TUNED}. To judge them, repeat the command with --resume.")
         return TunedCase(case, False, {"verdict": NOT_JUDGED, "outcome": {"good": False}}, plan.out)

@@ -16,7 +16,6 @@ def tune(
     *,
     resume: bool = False,
     force: bool = False,
-    gradients: bool = False,
     pareto: bool = False,
     page: bool = False,
     settings_of: str | pathlib.Path | None = None,
@@ -29,7 +28,6 @@ def tune(
     - `out`: directory of the results; None: a new one under ./out.
     - `resume`: continue the search whose checkpoints are in `out`.
     - `force`: overwrite the files of an earlier search in `out`.
-    - `gradients`: also report the gradient of the loss.
     - `pareto`: write each point of the front of error against voltage as a case file.
     - `page`: also write page.html, with sliders and presets; the case needs [processor] (extra `[page]`).
     - `settings_of`: path of another case file, whose limits, loss and budget replace those of `case`.
@@ -47,6 +45,6 @@ def tune(
             require_file(name, path)
     paths = (None if path is None else str(path) for path in (out, settings_of))
     directory, other = paths
-    options = Options(directory, resume, force, gradients, pareto, page, other, minutes)
+    options = Options(directory, resume, force, pareto, page, other, minutes)
     with contextlib.ExitStack() as stack:
         return run(str(case), options, listen or stack.enter_context(Log()))

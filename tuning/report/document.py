@@ -6,7 +6,7 @@ from collections.abc import Callable
 from ambjax.commands.outputs import described
 from ambjax.host.web_page import escape_markdown, markdown_table
 from tuning.objective.loss import TERMS
-from tuning.report import answer, extras, front_table, held_out, limit_table, sensitivity_table
+from tuning.report import answer, front_table, held_out, limit_table, sensitivity_table
 from tuning.report.breakdown import FORMULA
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.held_out import number_text
@@ -168,7 +168,7 @@ def _conditions(facts: TuningFacts) -> list[str]:
 
 
 def _course(facts: TuningFacts) -> list[str]:
-    """Return the section on the search: its settings, its cost, the error of its steps, and the gradient."""
+    """Return the section on the search: its settings, its cost, and the error of its steps."""
     how = facts.search
     lines = [
         f"- risk: {how['risk']} over {how['members']} members (seed {how['seed']}), optimiser {how['optimiser']}",
@@ -181,8 +181,7 @@ def _course(facts: TuningFacts) -> list[str]:
             f"({error['search_m']:.4e} m against {error['reference_m']:.4e} m)"
         )
     picture = "![Goal and gains by iteration](convergence.png)"
-    more = extras.gradient(facts.gradient) if facts.gradient else []
-    return ["## Course of the search", "", *lines, "", picture, "", *more]
+    return ["## Course of the search", "", *lines, "", picture, ""]
 
 
 # The sections of the report, in order.

@@ -17,7 +17,7 @@ SUMMARY_METRICS = (
     "clearance_used.largest",
 )
 # Fields that report.json leaves out if they are None.
-OPTIONAL = ("accurate", "gradient", "front", "sensitivity", "stability")
+OPTIONAL = ("accurate", "front", "sensitivity", "stability")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,8 +25,8 @@ class TuningFacts:
     """What a search found. Each field is a key of report.json.
 
     `before`, `after`: the held-out members under the case's gains and the tuned ones. `refuted`: why accurate steps
-    contradict the answer; '' if they confirm it. `accurate`: some members with accurate steps. `gradient`: None if not
-    requested. `stability`: of the held-out members with the largest settled errors (`ambjax.linear.Findings`); None if
+    contradict the answer; '' if they confirm it. `accurate`: some members with accurate steps.
+    `stability`: of the held-out members with the largest settled errors (`ambjax.linear.Findings`); None if
     no member was judged. `front`: of error against voltage; None if it was not traced. `front_written`: whether each of
     its points has a case file. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it.
     `beside`: the lowest point of the slices through the answer; None without slices. `next`: the next command, in
@@ -58,7 +58,6 @@ class TuningFacts:
     search: Row
     accurate: Row | None
     gains: list[Row]
-    gradient: Row | None
     front: list[Row] | None
     beside: Row | None
     slices: Row | None

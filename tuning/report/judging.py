@@ -18,7 +18,7 @@ from tuning.events import Tell
 from tuning.judge import StepError, describe, held, judge, step_error, summarise, worst, worst_of
 from tuning.measured_peaks import injections
 from tuning.problem import TuningProblem
-from tuning.report import accurate, breakdown, front_table, gradient, limit_table, outcome, sensitivity_table
+from tuning.report import accurate, breakdown, front_table, limit_table, outcome, sensitivity_table
 from tuning.report.facts import SUMMARY_METRICS, Row, TuningFacts
 from tuning.search import explore
 from tuning.search.course import SearchResult
@@ -27,14 +27,12 @@ from tuning.search.course import SearchResult
 NO_CONDITIONS: Row = {"conditions": [], "advice_on_conditions": []}
 
 
-def examined(
-    answer: SearchResult, gradients: bool, front_written: bool, tell: Tell
-) -> tuple[TuningFacts, explore.Slices | None]:
+def examined(answer: SearchResult, front_written: bool, tell: Tell) -> tuple[TuningFacts, explore.Slices | None]:
     """Return the facts of an answer, and the slices of the goal through it. Arrays [m] have one value per gain.
 
     Facts that do not decide on the verdict are absent if they cannot be computed (`described`).
 
-    `gradients`: whether to compute derivatives in three ways. `front_written`: whether each point of the front has a
+    `front_written`: whether each point of the front has a
     case file. `tell`: receives what is done.
     """
     problem, x, members = answer.problem, answer.x, answer.members
@@ -53,7 +51,6 @@ def examined(
         "minimised": described("the objective in parts", lambda: breakdown.minimised(problem, x, members)),
         "search": settings(problem.tune)
         | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": answer.seconds},
-        "gradient": described("the gradient report", lambda: _gradient(answer, tell)) if gradients else None,
         "front_written": front_written,
         "front": described("the front", lambda: front_table.facts(answer)) or None,
     }
@@ -144,11 +141,6 @@ def _conditions(problem: TuningProblem, x: np.ndarray) -> Row:
     line: Check = check(cascade, case.scenario, dataclasses.replace(case.clock, method=None))
     rows = [dataclasses.asdict(one) | {"margin": one.margin} for one in line.conditions]
     return {"conditions": rows, "advice_on_conditions": on_conditions(line)}
-
-
-def _gradient(answer: SearchResult, tell: Tell) -> Row:
-    tell("the gradient in three ways")
-    return gradient.gradient_report(answer.problem, answer.x, answer.members)
 
 
 def _neighbourhood(problem: TuningProblem, x: np.ndarray, slices: explore.Slices | None) -> Row:
