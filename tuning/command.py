@@ -77,6 +77,8 @@ def _plan(args: argparse.Namespace) -> TuningPlan:
     if args.resume and not can_resume(pathlib.Path(args.out)):
         raise ValueError(f"--resume: --out {args.out} contains no search. Check --out, or leave out --resume.")
     print_warnings(case, args.case)
+    for limit, why in tune.limits.unbreakable:
+        say(f"{args.case}: tune.limits.{limit.name} = {limit.threshold:g} is left out. It cannot be broken: {why}.")
     if args.page:  # raises ValueError now, before the search, if the case cannot have a page
         sliders_page(case, (), args.case)
     try:
