@@ -73,13 +73,16 @@ def measured(case):
 
 
 @pytest.mark.parametrize("kind", ["lumped", "two-coil"])
-@pytest.mark.parametrize("load", [0.0, 30.0])
-def test_the_rms_current_is_that_of_the_coil_that_carries_more(kind, load):
+@pytest.mark.parametrize(("load", "k", "lost"), [(0.0, 60.0, False), (30.0, 60.0, False), (40.0, 9.0, True)])
+def test_the_rms_current_is_that_of_the_coil_that_carries_more(kind, load, k, lost):
+    """The currents count until the rotor is lost."""
     document = tomllib.loads(CASE) | {"disturbance": {"q_z": {"kind": "constant", "value": load}}}
     document["plant"]["kind"] = kind
-    document["controller"]["position"]["k"] = 60.0
+    document["controller"]["position"]["k"] = k
     found, rows = measured(case_and_tune(document)[0])
-    late, i = np.asarray(rows.t) >= 0.001, np.asarray(rows.i)
+    alive, i = np.asarray(rows.alive), np.asarray(rows.i)
+    late = alive & (np.asarray(rows.t) >= 0.001)
+    assert lost != alive.all()
     coils = (1.0 + i, 1.0 - i) if kind == "lumped" else (np.asarray(rows.i_1), np.asarray(rows.i_2))
     upper, lower = (math.sqrt(np.mean(one[late] ** 2)) for one in coils)
     assert (upper > 1.1 * lower) == (load == 0.0)
