@@ -43,6 +43,21 @@ def test_settling_is_when_the_band_is_entered_for_good():
     assert float(measured(Settling(1e-5), decay(0.0), 0.0)) == pytest.approx(100 * SAMPLES * PERIOD)
 
 
+def test_the_settling_time_after_a_load_is_that_of_the_recovery():
+    """A load deflects a settled rotor at 1 s, and its end at 2 s deflects it the other way, by half as much."""
+
+    def after(start):
+        late = np.maximum(T - start, 0.0)
+        return np.exp(-5 * late) * np.sin(20 * late)
+
+    z = 1e-3 * (after(1.0) - 0.5 * after(2.0))
+    # what is left of the first deflection shifts this by 0.2 ms
+    late = np.arange(0, 1, 1e-6)
+    last = late[np.abs(0.5 * np.exp(-5 * late) * np.sin(20 * late)) > 1e-1].max()
+    assert float(measured(Settling(1e-4), z, 0.0)) == pytest.approx(2 + last, abs=PERIOD)
+    assert float(measured(Overshoot(), z, 0.0)) == pytest.approx(np.abs(z).max(), rel=1e-12)
+
+
 def test_the_derivative_of_the_settling_time_points_to_faster_settling():
     def time(rate):
         return measured(Settling(1e-5), decay(rate), 0.0)

@@ -96,6 +96,49 @@ def test_settings_of_another_case_apply_except_its_gains(tmp_path):
         read_tune(own, other)
 
 
+MEANT = {
+    "rms_u": "rms_u_V",
+    "rms_error": "rms_error_m",
+    "max_u": "max_u_V",
+    "u_max": "max_u_V",
+    "i_max": "max_abs_i_A",
+    "max_current_A": "max_abs_i_A",
+    "max_i_A": "max_abs_i_A",
+    "rms_i_A": "rms_coil_A",
+    "chatter_V": "chatter_V_per_s",
+    "max_error_m": "largest_error_m",
+    "settling_time_s": "settling_s",
+    "settle": "settling_s",
+    "settling_band": "settling_band_m",
+    "overshoot": "overshoot_m",
+    "clearance": "clearance_used",
+    "sensitivty": "sensitivity",
+    "complimentary": "complementary",
+    "KS": "control_sensitivity",
+    "delay_margin": "delay_margin_s",
+    "survivl": "survival",
+    "members": "tune.members",
+    "seed": "tune.seed",
+    "effort": "tune.weights.effort",
+}
+
+
+@pytest.mark.parametrize("key", MEANT)
+def test_a_misspelt_limit_suggests_the_right_key(key):
+    with pytest.raises(ValueError, match=rf"^tune\.limits\.{key} = 0\.5: .* Did you mean '{MEANT[key]}'\?"):
+        parsed({"limits": {key: 0.5}})
+    with pytest.raises(ValueError, match=rf"^tune\.limits\.{key} = {{.*}}: .* Did you mean '{MEANT[key]}'\?"):
+        parsed({"limits": {key: {"value": 0.5}}})
+
+
+def test_a_limit_in_another_table_suggests_the_path_of_the_limit():
+    for name in KINDS:
+        with pytest.raises(ValueError, match=rf"^tune\.{name} = 0\.5: .* Did you mean 'tune\.limits\.{name}'\?"):
+            parsed({name: 0.5})
+    with pytest.raises(ValueError, match=r"tune\.limit = .* Did you mean 'limits'\?"):
+        parsed({"limit": {}})
+
+
 @pytest.mark.parametrize("kind", ["sliding-mode", "integral-sliding-mode", "super-twisting", "utkin-sliding-mode"])
 def test_the_gains_of_explicit_set_valued_signs_have_ranges(kind):
     """The sign has no slope, and the processor steps it explicitly.

@@ -107,6 +107,8 @@ def _plan(path: str, options: Options) -> TuningPlan:
     if options.minutes is not None:
         tune = dataclasses.replace(tune, minutes=allowed_minutes(options.minutes))
     print_warnings(case, path)
+    for limit, why in tune.limits.unbreakable:
+        say(f"{path}: tune.limits.{limit.name} = {limit.threshold:g} is left out. It cannot be broken: {why}.")
     if options.page:  # raises ValueError now, before the search, if the case cannot have a page
         sliders_page(case, (), path)
     try:

@@ -31,6 +31,7 @@ from tuning.objective.quantities import KINDS
 from tuning.objective.risk import CVaR, Mean, Risk, SoftWorst
 from tuning.optimisers import NAMES
 from tuning.space import Space
+from tuning.unbreakable import bounds_of
 
 # Keys of [tune] that are neither in NUMBERS nor in BUDGET.
 OTHER_KEYS = ["objective", "gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
@@ -57,6 +58,8 @@ class LimitSettings:
     """share of the held-out members that must be held"""
     band: float = 0.0
     """band of the settling time, m"""
+    unbreakable: tuple[tuple[Limit, str], ...] = ()
+    """limits that are left out because they cannot be broken, each with the reason"""
 
     def may_lose(self, members: int) -> int:
         """Return how many of `members` members may be lost."""
@@ -124,7 +127,7 @@ def _merged(own: Any, other: Any) -> Any:
 
 def tune_from(table: Table, case: Case) -> Tune:
     """Return [tune] of a case. A missing key has its default. Raises ValueError for an invalid table."""
-    table.only([*OTHER_KEYS, *NUMBERS, *BUDGET])
+    table.only([*OTHER_KEYS, *NUMBERS, *BUDGET], [table.at(f"limits.{name}") for name in KINDS])
     budget = Budget(**{name: table.whole(name, field) for name, field in BUDGET.items()})
     weights, conditions = _weights(table.table("weights"))
     optimiser = table.choice("optimiser", list(NAMES), OPTIMISER)
@@ -157,7 +160,8 @@ def _weights(table: Table) -> tuple[tuple[float, ...], float]:
 
 
 def _limits(table: Table, case: Case) -> LimitSettings:
-    table.only([*KINDS, "survival", "margin", "settling_band_m"])
+    beside = [*OTHER_KEYS, *NUMBERS, *BUDGET, *(f"weights.{name}" for name in WEIGHTS)]
+    table.only([*KINDS, "survival", "margin", "settling_band_m"], [f"tune.{key}" for key in beside])
     thresholds = {name: table.leaf(name, OTHER_RANGES.get(name, LIMIT_RANGE)) for name in KINDS if name in table.raw}
     u_max, source = float(np.max(np.asarray(case.scenario.u_max))), dict.fromkeys(thresholds, table.path)
     if "rms_u_V" not in thresholds and math.isfinite(u_max):
@@ -184,7 +188,13 @@ def _limits(table: Table, case: Case) -> LimitSettings:
         for name in sorted(thresholds)
         if math.isfinite(thresholds[name])
     )
-    return LimitSettings(each, table.leaf("survival", SURVIVAL, SURVIVING), band)
+    bounds = {name: bound for name, bound in bounds_of(case).items() if thresholds.get(name, 0.0) >= bound.most}
+    return LimitSettings(
+        tuple(limit for limit in each if limit.name not in bounds),
+        table.leaf("survival", SURVIVAL, SURVIVING),
+        band,
+        tuple((limit, bounds[limit.name].why) for limit in each if limit.name in bounds),
+    )
 
 
 def _risk(table: Table) -> Risk:

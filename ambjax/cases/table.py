@@ -5,6 +5,7 @@ import difflib
 import pathlib
 import re
 import tomllib
+from collections.abc import Iterable
 from typing import Any
 
 from ambjax.host.synonyms import hint, other_words
@@ -90,11 +91,14 @@ class Table:
         """Return the dotted path of a key."""
         return f"{self.path}.{cut(key)}" if self.path else cut(key)
 
-    def only(self, allowed: list[str]) -> None:
-        """Raise ValueError for a key that is not in `allowed`, and suggest the one that is meant."""
+    def only(self, allowed: list[str], elsewhere: Iterable[str] = ()) -> None:
+        """Raise ValueError for a key that is not in `allowed`, and suggest the one that is meant.
+
+        `elsewhere`: paths of keys of other tables, which may be meant too.
+        """
         for key in self.raw:
             if key not in allowed:
-                names, other = ", ".join(allowed) if allowed else "none", hint(key[:LONGEST], allowed)
+                names, other = ", ".join(allowed) if allowed else "none", hint(key[:LONGEST], allowed, elsewhere)
                 raise ValueError(
                     f"{self.at(key)} = {show(self.raw[key])}: unknown key.{other} Keys allowed here: {names}."
                 )

@@ -156,7 +156,11 @@ def _limits() -> Iterator[Line]:
             f"V; root mean square voltage after run.settle, over members (left out: {voltage} % of u_max)",
         ),
         ("max_u_V = 150.0", "V; largest voltage of any member; inf, here and below: no limit (left out: none)"),
-        ("max_abs_i_A = 5.0", "A; largest current of any member (left out: none)"),
+        ("max_abs_i_A = 5.0", "A; largest |i|, without the bias, of any member (left out: none)"),
+        (
+            "rms_coil_A = 0.4",
+            "A; root mean square current of a coil after run.settle, bias included, of any member (left out: none)",
+        ),
         ("chatter_V_per_s = 1e5", "V/s; variation of the voltage after run.settle, mean over members (left out: none)"),
         ("rms_error_m = 1e-6", "m; root mean square error after run.settle, over members (left out: none)"),
         ("largest_error_m = 1e-5", "m; largest error after run.settle, of any member (left out: none)"),

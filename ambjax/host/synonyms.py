@@ -66,6 +66,19 @@ OTHER_WORDS = {
     "q_i": "qi voltage",
     "base": "housing foundation basemotion ground",
     "kind": "type name",
+    "rms_error_m": "rmserror settledrmserror settledrmserrorm",
+    "rms_u_V": "rmsu voltage rmsvoltage settledrmsuv",
+    "max_u_V": "umax maxu maxvoltage peakvoltage maxabsuv",
+    "max_abs_i_A": "imax maxi maxia maxcurrent maxcurrenta peakcurrent",
+    "rms_coil_A": "rmsi rmsia rmscurrent rmscurrenta coilcurrent rmsi1a rmsi2a",
+    "chatter_V_per_s": "chatter chatterv",
+    "largest_error_m": "maxerror maxerrorm peakerror deflection maxabserrorm settledmaxabserrorm",
+    "settling_s": "settle settlingtime settlingtimes",
+    "clearance_used": "clearance",
+    "sensitivity": "ms maxs peaks",
+    "complementary": "mt maxt peakt complementarysensitivity",
+    "control_sensitivity": "ks maxks peakks",
+    "delay_margin_s": "delay delaymargin",
     "disturbance.q_z": "q qz force forces unbalance imbalance",
     "disturbance.q_i": "qi",
     "sensor.runout": "runout",
@@ -97,15 +110,18 @@ DERIVED = {
 }
 
 
-def meant(word: str, allowed: Iterable[str]) -> str | None:
-    """Return the name that `word` probably means: one of `allowed`, or a name of another table; None if unknown."""
+def meant(word: str, allowed: Iterable[str], elsewhere: Iterable[str] = ()) -> str | None:
+    """Return the name that `word` probably means: one of `allowed`, or a name of another table; None if unknown.
+
+    `elsewhere`: paths of names of other tables; those of OTHER_WORDS are added.
+    """
     names, plain = list(allowed), _plain(word)
     for name in names:
         if _plain(name) == plain or plain in other_words(name):
             return name
-    elsewhere = (name for name, words in OTHER_WORDS.items() if "." in name and plain in words.split())
-    close = difflib.get_close_matches(word, names, n=1)
-    path = next(elsewhere, close[0] if close else None)
+    paths = [path for path in elsewhere if _plain(path.rpartition(".")[2]) == plain]
+    paths += [name for name, words in OTHER_WORDS.items() if "." in name and plain in words.split()]
+    path = next(iter(paths or difflib.get_close_matches(word, names, n=1)), None)
     last = path.rpartition(".")[2] if path else ""
     return last if last in names else path
 
@@ -115,15 +131,15 @@ def other_words(name: str) -> list[str]:
     return OTHER_WORDS.get(name, "").split()
 
 
-def hint(word: str, allowed: Iterable[str]) -> str:
-    """Return " Did you mean 'name'?" for the name that `word` probably means; "" if unknown.
+def hint(word: str, allowed: Iterable[str], elsewhere: Iterable[str] = ()) -> str:
+    """Return " Did you mean 'name'?" for the name that `word` probably means (`meant`); "" if unknown.
 
     For a quantity that follows from other numbers of the plant, the text names these instead.
     """
     allowed = list(allowed)
     if _plain(word) in DERIVED and "mu_0" in allowed:
         return f" It follows from {DERIVED[_plain(word)]}."
-    name = meant(word, allowed)
+    name = meant(word, allowed, elsewhere)
     return f" Did you mean '{name}'?" if name else ""
 
 

@@ -1,6 +1,7 @@
 """Quantities of an ensemble that may be limited: their folds, and how they combine members."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +12,7 @@ from jax import Array
 
 from ambjax.cases.tune_table import LOOP_MARGIN, MEAN_MARGIN, WORST_MARGIN
 from ambjax.extend import Scalar, leaf, record, static
-from ambjax.simulation.folds import Driven, Ending, Fold, Peak, Rms, Variation
+from ambjax.simulation.folds import Driven, Ending, Fold, Named, Peak, Rms, Variation
 from ambjax.simulation.response import Overshoot, Settling
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import Row
@@ -66,6 +67,22 @@ class Scaled:
 
     def result(self, carry: object, ending: Ending) -> Array:
         return self.fold.result(carry, ending) / self.by
+
+
+@record
+class LargestOf:
+    """Fold: the largest of the results of other folds."""
+
+    folds: Named
+
+    def init(self) -> dict[str, object]:
+        return self.folds.init()
+
+    def update(self, carry: dict[str, object], row: Row, span: Span) -> dict[str, object]:
+        return self.folds.update(carry, row, span)
+
+    def result(self, carry: dict[str, object], ending: Ending) -> Array:
+        return functools.reduce(lambda a, b: jnp.where(a >= b, a, b), self.folds.result(carry, ending).values())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,6 +177,15 @@ KINDS: dict[str, Kind] = {
     ),
     "max_abs_i_A": Kind(
         "A", "largest current of the run", fold=lambda context, threshold: Peak("i"), exact="max_abs_i_A", **_WORST
+    ),
+    "rms_coil_A": Kind(
+        "A",
+        "root mean square current from run.settle on, bias included, of the coil where it is larger",
+        fold=lambda context, threshold: LargestOf(
+            Named({name: Rms(name, context.settle, driven=True) for name in ("i_1", "i_2")})
+        ),
+        exact=None,
+        **_WORST,
     ),
     "chatter_V_per_s": Kind(
         "V/s",

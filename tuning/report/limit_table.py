@@ -8,6 +8,7 @@ from ambjax.host.web_page import markdown_table
 from tuning.delay_test import DELAY_MARGIN, DelayTest, not_simulated
 from tuning.measured_peaks import MEASURED, Sensitivity, reached_of
 from tuning.objective.limits import FRONT, Limit
+from tuning.objective.quantities import Kind
 from tuning.problem import TuningProblem
 
 Facts = dict[str, Any]
@@ -17,6 +18,7 @@ MORE = 0.1
 MOST_SATURATED = 0.02
 # Verdicts on a limit.
 HELD, BROKEN, UNVERIFIED, UNJUDGED = "held", "NOT HELD", "not verified", "not judged"
+UNBREAKABLE = "cannot be broken"
 EMPHASISED = (BROKEN, UNVERIFIED)
 
 
@@ -30,6 +32,8 @@ def facts(
 ) -> list[Facts]:
     """Return a row for each limit and one for survival, from the held-out members' columns [N] and their summary.
 
+    A limit that cannot be broken has a row without a value reached.
+
     `refuted`: why accurate steps do not confirm the answer; '' if they do. `measured`: the injections into some of the
     held-out members. `delayed`: the test of the limit on the delay margin. Fields of a row:
 
@@ -42,26 +46,37 @@ def facts(
     members, held, settings = summary["members"], summary["held"], problem.tune.limits
     share = held / members if members else None
     price_unit = "V" if problem.goal.minimised else "m"
-    survival = {
-        "name": "survival",
-        "unit": "",
-        "threshold": settings.survival,
-        "at_least": True,
+    survival = _without_price("survival", settings.survival, price_unit) | {"reached": share, "at_least": True}
+    survival |= _verdict(None if share is None else members - held <= settings.may_lose(members), refuted)
+    unbreakable = [
+        _without_price(limit.name, limit.threshold, price_unit, limit.kind)
+        | {"source": f"{limit.source}; {UNBREAKABLE}: {why}", "held": True, "verdict": UNBREAKABLE}
+        for limit, why in settings.unbreakable
+    ]
+    numbers = columns, summary, refuted, measured, price_unit
+    rows = [
+        _tested(_row(limit, *numbers), delayed, refuted, not_simulated(problem, limit)) for limit in _asked(problem)
+    ]
+    return [*rows, *unbreakable, survival]
+
+
+def _without_price(name: str, threshold: float, price_unit: str, kind: Kind | None = None) -> Facts:
+    """Return the row of a limit without a price and a value reached. `kind`: None for survival."""
+    return {
+        "name": name,
+        "unit": kind.unit if kind else "",
+        "threshold": threshold,
+        "at_least": False,
         "source": "tune.limits",
-        "what": "share of members held",
-        "reached": share,
+        "what": f"{kind.words}; {kind.over}" if kind else "share of members held",
+        "reached": None,
         "worst": None,
         "margin": 0.0,
         "active": False,
         "multiplier": None,
         "price": None,
         "price_unit": price_unit,
-    } | _verdict(None if share is None else members - held <= settings.may_lose(members), refuted)
-    numbers = columns, summary, refuted, measured, price_unit
-    rows = [
-        _tested(_row(limit, *numbers), delayed, refuted, not_simulated(problem, limit)) for limit in _asked(problem)
-    ]
-    return [*rows, survival]
+    }
 
 
 def _verdict(kept: bool | None, refuted: str) -> Facts:
