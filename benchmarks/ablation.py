@@ -21,10 +21,10 @@ import tasks
 import tomlkit
 
 from ambjax.cases.template_text import template
-from tuning import optimisers
+from tuning import optimisers, rounds, validate
 from tuning.__main__ import main as tune
-from tuning.objective import limits
-from tuning.search import course, multipliers, optimise, rounds, validation
+from tuning.problem import limits
+from tuning.solve import course, joining, multipliers, refine
 
 NEVER = 10**9
 FIRST_KINDS = {
@@ -50,21 +50,21 @@ def constant(module: Any, **values: Any) -> Callable[[dict[str, Any]], None]:
 
 def by_values(raw: dict[str, Any]) -> None:
     """Refine each start with CMA-ES from its first point on."""
-    constant(optimise, STEEP=-1.0)(raw)
+    constant(refine, STEEP=-1.0)(raw)
 
 
 # What is switched off, and how.
 MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "nothing": lambda raw: None,
-    "screen: the first points are refined": constant(optimise, screen=lambda engine, members, x, keep, goal: x),
+    "screen: the first points are refined": constant(refine, screen=lambda engine, members, x, keep, goal: x),
     "starting points: only the case's gains": setting(screen=0),
     "several starts: only the best of the screen": setting(starts=1),
-    "halvings of the starts": constant(optimise, HALVINGS=(NEVER,)),
-    "first phase on a quarter of the members": constant(optimise, FEW=optimise.FEW._replace(part=1)),
-    "points of the first phase tried on all members": constant(optimise, PATH_POINTS=1),
+    "halvings of the starts": constant(refine, HALVINGS=(NEVER,)),
+    "first phase on a quarter of the members": constant(refine, FEW=refine.FEW._replace(part=1)),
+    "points of the first phase tried on all members": constant(refine, PATH_POINTS=1),
     "CMA-ES": lambda raw: (
-        constant(optimise, STEEP=math.inf, FEW=optimise.FEW._replace(gradient_limit=math.inf))(raw),
-        constant(optimise, ALL=optimise.ALL._replace(gradient_limit=math.inf))(raw),
+        constant(refine, STEEP=math.inf, FEW=refine.FEW._replace(gradient_limit=math.inf))(raw),
+        constant(refine, ALL=refine.ALL._replace(gradient_limit=math.inf))(raw),
     )[0],
     "descent: CMA-ES only": by_values,
     "BFGS: Adam instead": setting(optimiser="adam"),
@@ -74,8 +74,8 @@ MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "stressed members": setting(stressed=0),
     "conditions of Theorem 1 in the goal": lambda raw: raw["tune"].setdefault("weights", {}).update(conditions=0.0),
     "validation": setting(validation=0),
-    "members with large errors join": constant(validation, LARGER=math.inf),
-    "additional noise of lost members": constant(validation, NOISE_GROWTH=1.0),
+    "members with large errors join": constant(validate, LARGER=math.inf),
+    "additional noise of lost members": constant(joining, NOISE_GROWTH=1.0),
     "earlier points if no answer is confirmed": constant(rounds, points_of=lambda past: ()),
     "growth of the penalty": constant(limits, PENALTY_GROWTH=1.0),
     "updates of the multipliers": constant(multipliers, MOST_UPDATES=0),

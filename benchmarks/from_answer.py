@@ -19,12 +19,12 @@ import _measure
 import numpy as np
 import tasks
 
-from tuning.config import read_tune, seeds
-from tuning.judge import judge, summarise
-from tuning.objective.limits import PREFIX
-from tuning.objective.members import Members
-from tuning.problem import TuningProblem, problem_of
-from tuning.search.course import training
+from tuning.judge.evaluate import judge, summarise
+from tuning.problem.config import read_tune, seeds
+from tuning.problem.limits import PREFIX
+from tuning.problem.members import Members
+from tuning.problem.tuning_problem import TuningProblem, problem_of
+from tuning.solve.course import training
 
 TASKS = ("limited/light", "sampled/F10-signs", "D")
 # Number of validation members that are added, the noise factor that the tuner gives them, weight of the penalties.

@@ -28,9 +28,9 @@ from ambjax.compiler.fast_path import one_kernel
 from ambjax.simulation.folds import Rms
 from ambjax.simulation.parts import rolled_in_parts
 from ambjax.simulation.rollout import prepare
-from tuning.config import read_tune
-from tuning.objective.loss import weigh
-from tuning.problem import problem_of
+from tuning.problem.config import read_tune
+from tuning.problem.loss import weigh
+from tuning.problem.tuning_problem import problem_of
 
 GAINS = np.array([17.0, 25.0, workload.GAMMA, 152.0])
 MEMBERS, SAMPLES = (1, 64), 1_000

@@ -25,8 +25,8 @@ import tomlkit
 from ambjax.__main__ import main as ambjax
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
-from tuning.search.checkpoint import checkpoints
-from tuning.space import Gain, Space, tunable
+from tuning.problem.space import Gain, Space, tunable
+from tuning.solve.checkpoint import checkpoints
 
 SAMPLED = tasks.TASKS / "sampled"
 # Limits of each case: a peak of |S| in zone A, an rms voltage (V) of at most 60 % of the supply, and the chatter (V/s).

@@ -29,11 +29,11 @@ import search
 from ambjax.cases.reader import case_from
 from ambjax.cases.table import Table, load
 from ambjax.ensemble.worker import processes
-from tuning.config import tune_from
-from tuning.objective.lanes import GRADIENT_LANES, Engine
-from tuning.problem import TuningProblem, problem_of
-from tuning.search.checkpoint import SearchState
-from tuning.search.course import Course, search_and_restart, training
+from tuning.events import Event
+from tuning.problem.config import tune_from
+from tuning.problem.lanes import GRADIENT_LANES, Engine
+from tuning.problem.tuning_problem import TuningProblem, problem_of
+from tuning.solve.course import Course, search_and_restart, training
 
 SECONDS, MEMBERS, STRESSED = 0.25, 12, 4
 ERRORS, REFERENCES = [0.0, 2e-6, 1e-5], [0.0, 1.25e-3, 2.5e-3]
@@ -97,14 +97,15 @@ def by_gradients(made: tuple[TuningProblem, Any], seed: int, seconds: float) -> 
     found, members = made
     counter = Counter(found.engine, seconds)
 
-    def note(progress: SearchState, _: float) -> None:
-        whole = progress.history["members"][-1] == len(members.member)  # else the goal is over a part
-        counter.note(float(np.min(progress.history["value"][-1])) if whole else np.inf)
+    def note(event: Event) -> None:
+        if event.standing is not None:
+            whole = event.standing.members == len(members.member)  # else the goal is over a part
+            counter.note(event.standing.goal if whole else np.inf)
 
     try:
         while True:
             start = found.tune.space.values(found.case.cascade)
-            search_and_restart(Course(found, members, seed, on_iteration=note), start)
+            search_and_restart(Course(found, members, seed, listen=note), start)
             seed += 1000
     except SpentError:
         return counter.trace

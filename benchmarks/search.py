@@ -32,11 +32,11 @@ import _measure
 import numpy as np
 
 from ambjax.ensemble.worker import processes
-from tuning.config import read_tune
-from tuning.objective.ranges import ranges
-from tuning.problem import TuningProblem, problem_of
-from tuning.search.checkpoint import SearchState
-from tuning.search.course import Course, search_and_restart, training
+from tuning.events import Event
+from tuning.problem.config import read_tune
+from tuning.problem.ranges import ranges
+from tuning.problem.tuning_problem import TuningProblem, problem_of
+from tuning.solve.course import Course, search_and_restart, training
 
 TASKS = pathlib.Path(__file__).parent / "tasks"
 # Points per call for methods without a population.
@@ -134,14 +134,13 @@ def gradient_search(problem: TuningProblem, members: Any, seed: int) -> list[tup
     """Return the trace of the gradient search on all members, including repeated searches around the answer."""
     problem.engine.rollouts, trace, started = 0, [], time.process_time()
 
-    def note(progress: SearchState, _: float) -> None:
-        if progress.history["members"][-1] == len(members.member):  # else the goal is over a subset
-            best = min(float(np.min(progress.history["value"][-1])), trace[-1][2] if trace else np.inf)
-            trace.append((problem.engine.rollouts, time.process_time() - started, best))
+    def note(event: Event) -> None:
+        found = event.standing
+        if found is not None and found.members == len(members.member):  # else the goal is over a subset
+            best = min(found.goal, trace[-1][2] if trace else np.inf)
+            trace.append((found.rollouts, time.process_time() - started, best))
 
-    search_and_restart(
-        Course(problem, members, seed, on_iteration=note), problem.tune.space.values(problem.case.cascade)
-    )
+    search_and_restart(Course(problem, members, seed, listen=note), problem.tune.space.values(problem.case.cascade))
     return trace
 
 

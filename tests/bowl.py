@@ -16,8 +16,8 @@ import numpy as np
 from texts import case_and_tune
 
 from ambjax import AdaptiveRodas3
-from tuning.objective.limits import PREFIX
-from tuning.objective.loss import TERMS, outcomes
+from tuning.problem.limits import PREFIX
+from tuning.problem.loss import TERMS, outcomes
 
 # Smallest tracking error, (m / s_0)^2, and the duration, s.
 FLOOR, DURATION = 1e-4, 0.02
@@ -163,16 +163,16 @@ def document(tables=None, **tune):
 
 def instead_of_engines(monkeypatch, world):
     """Replace every engine that is made from now on by a Bowl in this world."""
-    import tuning.problem
+    import tuning.problem.tuning_problem
 
     monkeypatch.setattr(Bowl, "world", world, raising=False)
-    monkeypatch.setattr(tuning.problem, "Engine", Bowl)
+    monkeypatch.setattr(tuning.problem.tuning_problem, "Engine", Bowl)
 
 
 def study(monkeypatch, world, tables=None, **tune):
     """Return the tuning problem of the case in a world. Each of its engines is a Bowl."""
-    import tuning.problem
+    import tuning.problem.tuning_problem
 
     instead_of_engines(monkeypatch, world)
     raw = document(tables, **tune)
-    return tuning.problem.problem_of(*case_and_tune(raw))
+    return tuning.problem.tuning_problem.problem_of(*case_and_tune(raw))

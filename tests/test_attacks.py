@@ -40,8 +40,8 @@ from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Sensor
 from ambjax.world.signals import Chirp, Pulse, Sine, SmoothStep, Step, Sum
 from tuning.__main__ import main as tune
-from tuning.config import read_tune, settings
-from tuning.objective.loss import Loss
+from tuning.problem.config import read_tune, settings
+from tuning.problem.loss import Loss
 from tuning.report.tuned import tuned
 
 SHORT = "[clock]\nduration = 0.01\n"

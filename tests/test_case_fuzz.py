@@ -28,9 +28,9 @@ from ambjax.world.amplifier import Amplifier
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Sensor
-from tuning.config import read_tune
-from tuning.objective.loss import TERMS
-from tuning.objective.quantities import KINDS as LIMITS
+from tuning.problem.config import read_tune
+from tuning.problem.loss import TERMS
+from tuning.problem.quantities import KINDS as LIMITS
 
 # Every run is of so few samples, and of so few structures, each of which is compiled once.
 SAMPLES, MOST_STRUCTURES = 4, examples(2, 12)

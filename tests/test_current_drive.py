@@ -27,7 +27,7 @@ from ambjax.simulation.sliding import Slide, slides
 from ambjax.world.amplifier import CurrentAmplifier
 from ambjax.world.coils import TwoCoil
 from ambjax.world.sensor import Measurement
-from tuning.problem import method_for
+from tuning.problem.tuning_problem import method_for
 
 # a magnet of 2.4 kg and 0.5 mm, as a data sheet gives it
 NUMBERS = {"m": 2.4, "k_z": -2e4, "mu_0": 1.2566e-6, "n": 300.0, "A": 2e-4, "s_0": 5e-4, "i_0": 2.0, "R": 1.0}

@@ -12,8 +12,8 @@ import pytest
 from ambjax.ensemble.store import Store
 from ambjax.host import sealed
 from ambjax.host.sealed import DamagedError, difference, flat, seal, unseal, write_whole
-from tuning.search.checkpoint import CheckpointFile, SearchState, remove_all
-from tuning.search.descent import Descent
+from tuning.solve.checkpoint import CheckpointFile, SearchState, remove_all
+from tuning.solve.descent import Descent
 
 FACTS = {"seed": 3, "plant.m": "0.588"}
 MEMBERS, CHUNK = 50, 20

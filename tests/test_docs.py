@@ -25,7 +25,7 @@ from ambjax.numerics import declared
 from ambjax.numerics.declared import default_text
 from ambjax.world.amplifier import CurrentAmplifier
 from ambjax.world.faults import Dropouts, Outliers
-from tuning.config import tune_from
+from tuning.problem.config import tune_from
 
 ROOT = pathlib.Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))

@@ -24,7 +24,7 @@ from ambjax.pictures.overview import overview
 from ambjax.pictures.thinning import BINS, envelope, stretch_of, thin
 from ambjax.pictures.tornado import Bar, tornado
 from ambjax.simulation.trajectory import ALIVE, TOUCHED, Row, Trajectory
-from tuning.search.explore import Slices
+from tuning.report.slices import Slices
 
 ROOT = pathlib.Path(__file__).parents[1]
 sys.path.append(str(ROOT / "benchmarks"))

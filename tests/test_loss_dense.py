@@ -10,9 +10,9 @@ from test_oracle import Case, adaptive, current, in_ambjax, noise_of, pulse, sin
 
 from ambjax import AdaptiveRodas3, Clock, Sensor, rollout
 from ambjax.simulation.folds import Named
-from tuning.objective.limits import measures
-from tuning.objective.loss import Loss
-from tuning.objective.quantities import LimitContext
+from tuning.problem.limits import measures
+from tuning.problem.loss import Loss
+from tuning.problem.quantities import LimitContext
 
 PERIOD, S_0, U = 1e-4, 5e-3, 200.0
 LOOPS = {

@@ -13,7 +13,7 @@ from test_oracle import BUMP, Case, adaptive, current, in_ambjax, noise_of, puls
 
 from ambjax import AdaptiveRodas3, Clock, Sensor, Slide, rollout
 from ambjax.simulation.metrics import Standard
-from tuning.problem import REFINEMENT
+from tuning.problem.tuning_problem import REFINEMENT
 
 PERIOD = 1e-4
 SAMPLES, SETTLE = 200, 50 * PERIOD

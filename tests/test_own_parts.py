@@ -51,9 +51,9 @@ from ambjax.extend import (
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.metrics import standard_for
 from ambjax.theorem.conditions import check
-from tuning.config import tune_from
-from tuning.problem import problem_of
-from tuning.search.rounds import rounds
+from tuning.problem.config import tune_from
+from tuning.problem.tuning_problem import problem_of
+from tuning.rounds import rounds
 
 
 class Coils(NamedTuple):

@@ -8,7 +8,7 @@ from ambjax import RK4, Cascade, Clock, Scenario, Sensor, Sine, current, inversi
 from ambjax.simulation.folds import Rms
 from ambjax.simulation.parts import part_length, rolled_in_parts
 from ambjax.simulation.rollout import prepare
-from tuning.problem import cheaper_mode
+from tuning.problem.tuning_problem import cheaper_mode
 
 
 @pytest.mark.parametrize(("samples", "length"), [(100, 10), (20_000, 125), (240, 15), (17, 1), (1, 1)])

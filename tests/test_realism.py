@@ -25,7 +25,7 @@ from ambjax.simulation.folds import Named
 from ambjax.simulation.method import DRIVEN, choose_method
 from ambjax.world.amplifier import Amplifier, CoilResponse
 from ambjax.world.sensor import Errors, Measurement, Sensor, converted
-from tuning.objective.quantities import Typical
+from tuning.problem.quantities import Typical
 
 NONE = Errors(*np.zeros(3))
 

@@ -13,7 +13,7 @@ from ambjax.control.base import default_law
 from ambjax.control.processor import Processor
 from ambjax.simulation.folds import Rms
 from ambjax.world.amplifier import CurrentAmplifier
-from tuning.space import Gain, Space, tunable
+from tuning.problem.space import Gain, Space, tunable
 
 # Three decades up and down of the law's own gains.
 DECADES, POINTS = 3 * math.log(10), 1000

@@ -22,12 +22,12 @@ from ambjax.numerics.records import validate
 from ambjax.theorem.conditions import constant_sigma, required
 from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
-from tuning.config import tune_from
-from tuning.objective.ranges import from_unit_cube
-from tuning.objective.shortfalls import Bound, shortfall
-from tuning.problem import problem_of
+from tuning.problem.config import tune_from
+from tuning.problem.ranges import from_unit_cube
+from tuning.problem.shortfalls import Bound, shortfall
+from tuning.problem.space import tunable
+from tuning.problem.tuning_problem import problem_of
 from tuning.report.tuned import tuned
-from tuning.space import tunable
 
 AT, VALUES = (0.0, 1e-5, 4e-5), (100.0, 300.0, 200.0)
 # A short run of a few laws, with one scheduled gain per stage.

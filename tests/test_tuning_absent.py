@@ -14,11 +14,11 @@ from test_tuning_outcome import losing
 from tomlkit import dumps
 
 import tuning.command
-import tuning.search.rounds
+import tuning.rounds
 from ambjax.commands import outputs
 from ambjax.host.web_page import render_page
 from tuning.__main__ import main
-from tuning.measured_peaks import UNSTABLE
+from tuning.judge.peaks import UNSTABLE
 from tuning.report import document as report
 from tuning.report import judging, pictures
 from tuning.report.answer import _sensitivity as sensitivity_line
@@ -100,7 +100,7 @@ def tuned(world, folder, *flags, **tune):
     path.write_text(dumps(document(**tune)))
     with pytest.MonkeyPatch.context() as patch:
         instead_of_engines(patch, world)
-        patch.setattr(tuning.search.rounds, "MOST_ROUNDS", 1)
+        patch.setattr(tuning.rounds, "MOST_ROUNDS", 1)
         return main([str(path), "--out", str(out), "--force", *flags]), out
 
 
@@ -212,7 +212,7 @@ FAILING = {
     "tuning.report.judging._conditions": set(),
     "tuning.report.judging._losses": set(),
     "tuning.report.judging.worst": set(),
-    "tuning.report.judging.explore.slices": {"slices.png"},
+    "tuning.report.judging.slices_through": {"slices.png"},
     "tuning.report.judging.breakdown.minimised": set(),
     "tuning.report.judging.front_table.facts": {"front.png"},
     "tuning.report.outcome.outcome_text": set(),
@@ -278,7 +278,7 @@ def test_the_answer_is_kept_if_it_cannot_be_judged(lenient, monkeypatch, tmp_pat
 
 
 def test_the_answer_is_kept_if_the_front_fails(lenient, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(tuning.search.rounds, "trace_front", broken)
+    monkeypatch.setattr(tuning.rounds, "trace_front", broken)
     code, out = tuned(World(), tmp_path, objective="knee")
     assert code == 0
     assert "the front of error against voltage is left out: TypeError" in capsys.readouterr().err

@@ -9,11 +9,11 @@ from texts import case_and_tune, problem_from
 
 from ambjax import rollout
 from ambjax.simulation.folds import Named
-from tuning.config import seeds
-from tuning.judge import judge
-from tuning.objective.limits import measures
-from tuning.objective.quantities import LimitContext
-from tuning.search.rounds import rounds
+from tuning.judge.evaluate import judge
+from tuning.problem.config import seeds
+from tuning.problem.limits import measures
+from tuning.problem.quantities import LimitContext
+from tuning.rounds import rounds
 
 # A rotor of 1.64 kg between coils with a bias of 1 A is moved by 0.1 mm. Then a load acts on it.
 CASE = """

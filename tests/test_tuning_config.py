@@ -8,12 +8,12 @@ import pytest
 from texts import case_and_tune
 
 from ambjax.cases.tune_table import NUMBERS, WEIGHTS, Budget
-from tuning.config import LIMIT_RANGE, OTHER_RANGES, read_tune
-from tuning.objective.loss import TERMS
-from tuning.objective.quantities import KINDS
-from tuning.problem import problem_of
-from tuning.search.front import FACTORS
-from tuning.space import tunable
+from tuning.front import FACTORS
+from tuning.problem.config import LIMIT_RANGE, OTHER_RANGES, read_tune
+from tuning.problem.loss import TERMS
+from tuning.problem.quantities import KINDS
+from tuning.problem.space import tunable
+from tuning.problem.tuning_problem import problem_of
 
 
 def parsed(tune):

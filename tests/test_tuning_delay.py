@@ -7,9 +7,9 @@ import pytest
 from texts import case_and_tune
 
 from ambjax.linear import analyse, linearise
-from tuning.delay_test import DELAY_MARGIN, DelayTest, delay_test, not_simulated
-from tuning.objective.limits import PREFIX
-from tuning.problem import problem_of
+from tuning.judge.late import DELAY_MARGIN, DelayTest, delay_test, not_simulated
+from tuning.problem.limits import PREFIX
+from tuning.problem.tuning_problem import problem_of
 from tuning.report import limit_table
 
 PERIOD = 6e-4

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from bowl import World, study
 
-from tuning.search.evolution import PATIENCE, STALL, initial_state, next_population, population, rates, updated
-from tuning.search.rounds import rounds
+from tuning.rounds import rounds
+from tuning.solve.evolution import PATIENCE, STALL, initial_state, next_population, population, rates, updated
 
 # Derivatives of a loop that is chaotic; those of a Bowl's loss are about 1e-4.
 CHAOS = {"chaotic": 1e30, "of moderate size": 1e-2}

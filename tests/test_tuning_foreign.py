@@ -19,9 +19,9 @@ from ambjax.cases.template_text import template
 from ambjax.control.base import default_law
 from tuning.__main__ import main
 from tuning.command import _laws
+from tuning.problem.space import read
 from tuning.report.tuned import tuned
-from tuning.search.screen import around, initial_points
-from tuning.space import read
+from tuning.solve.screen import around, initial_points
 
 CASES = pathlib.Path(__file__).parent / "cases"
 BEARINGS = {path.stem: path.read_text() for path in sorted(CASES.glob("*.toml"))}

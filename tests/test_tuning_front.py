@@ -13,12 +13,12 @@ from tomlkit import dumps
 import tuning.command
 from ambjax.cases.reader import read_case
 from tuning.__main__ import main
-from tuning.config import seeds
-from tuning.objective.limits import FRONT
-from tuning.problem import problem_of
+from tuning.front import KNEE, FrontPoint, chosen, least_of
+from tuning.problem.config import seeds
+from tuning.problem.limits import FRONT
+from tuning.problem.tuning_problem import problem_of
 from tuning.report import front_table, limit_table
-from tuning.search.front import KNEE, FrontPoint, chosen, least_of
-from tuning.search.rounds import rounds
+from tuning.rounds import rounds
 
 BOUNDLESS = {"controller": {"position": {"c": [1.0, 1000.0], "k": [0.1, 1000.0]}}}
 

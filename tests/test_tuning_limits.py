@@ -14,25 +14,25 @@ from texts import case_and_tune, problem_from
 from tomlkit import dumps
 
 import tuning.command
-import tuning.search.rounds
+import tuning.rounds
 from ambjax import rollout
 from ambjax.numerics.records import is_traced
 from ambjax.simulation.folds import Named
 from ambjax.simulation.metrics import standard_for
-from tuning.config import LimitSettings, settings
-from tuning.measured_peaks import MeasuredPeak, Sensitivity
-from tuning.objective.lanes import Engine
-from tuning.objective.limits import PENALTY, Limit, measures
-from tuning.objective.quantities import KINDS, LimitContext, largest
-from tuning.objective.risk import Mean
-from tuning.problem import REFINEMENT, problem_of
+from tuning.judge.peaks import MeasuredPeak, Sensitivity
+from tuning.problem.config import LimitSettings, settings
+from tuning.problem.lanes import Engine
+from tuning.problem.limits import PENALTY, Limit, measures
+from tuning.problem.quantities import KINDS, LimitContext, largest
+from tuning.problem.risk import Mean
+from tuning.problem.tuning_problem import REFINEMENT, problem_of
 from tuning.report import limit_table, sensitivity_table
 from tuning.report.limit_table import MORE
 from tuning.report.pictures import amplitudes
-from tuning.search.course import Course, training
-from tuning.search.multipliers import search_within_limits
-from tuning.search.rounds import rounds
-from tuning.search.validation import Validation
+from tuning.rounds import rounds
+from tuning.solve.course import Course, training
+from tuning.solve.multipliers import search_within_limits
+from tuning.validate import Validation
 
 # The voltage of a Bowl is proportional to k: 20 V at the best k, 60, and 10 V at k = 30.
 TEN = {"limits": {"rms_u_V": 10.0, "margin": 0.002}}
@@ -378,7 +378,7 @@ def test_an_excess_of_an_earlier_round_does_not_end_the_updates(monkeypatch):
 
 def test_an_answer_within_the_limits_is_preferred_to_one_of_less_error(monkeypatch, tmp_path):
     """The first round ends within the limits, but members of large errors join; the second exceeds a limit."""
-    monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 2)
+    monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", 2)
     problem = study(monkeypatch, World(), **TEN)
     start = problem.tune.space.values(problem.case.cascade)
     errors, within = iter([4e-3, 2e-3]), iter([True, False])
@@ -386,8 +386,8 @@ def test_an_answer_within_the_limits_is_preferred_to_one_of_less_error(monkeypat
     def validated(course, x, error):
         return Validation(course.answer(x, error, 0, next(errors)), error, np.zeros(0, int), np.arange(1))
 
-    monkeypatch.setattr(tuning.search.rounds, "search_within_limits", lambda course, x: (x, next(within)))
-    monkeypatch.setattr(tuning.search.rounds, "validated", validated)
+    monkeypatch.setattr(tuning.rounds, "search_within_limits", lambda course, x: (x, next(within)))
+    monkeypatch.setattr(tuning.rounds, "validated", validated)
     assert rounds(problem, start, tmp_path, {"of": "ten"}, False).validation_error == 4e-3
     assert next(errors, None) is None
 

@@ -11,12 +11,12 @@ from texts import case_and_tune
 
 from ambjax.linear import analyse, frequency_lines, injected, linearise
 from ambjax.results.operating import one_period
-from tuning.measured_peaks import INJECTED, injections
-from tuning.objective.limits import PREFIX
-from tuning.objective.loops import check_loops, loops
-from tuning.objective.quantities import KINDS, LOOPS
-from tuning.problem import problem_of
-from tuning.search.rounds import finer
+from tuning.judge.peaks import INJECTED, injections
+from tuning.problem.limits import PREFIX
+from tuning.problem.loops import check_loops, loops
+from tuning.problem.quantities import KINDS, LOOPS
+from tuning.problem.tuning_problem import problem_of
+from tuning.rounds import finer
 
 NAMES = ["complementary", "control_sensitivity", "delay_margin_s", "sensitivity"]
 PATHS = ["controller.position.c", "controller.position.k", "controller.inversion.gamma", "controller.current.k_i"]

@@ -12,19 +12,19 @@ from bowl import World, document, study
 from tomlkit import dumps
 
 import tuning.command
-import tuning.search.rounds
+import tuning.rounds
 from ambjax.cases.tune_table import Budget
 from ambjax.linear import Findings
 from ambjax.theorem.advice import STALLED, STALLED_PLANT
 from tuning.__main__ import main
-from tuning.config import seeds
-from tuning.judge import summarise
-from tuning.objective.limits import Limit
+from tuning.judge.evaluate import summarise
+from tuning.problem.config import seeds
+from tuning.problem.limits import Limit
 from tuning.report import document as report
 from tuning.report import judging
 from tuning.report.limit_table import BROKEN, EMPHASISED, HELD, UNJUDGED, UNVERIFIED
 from tuning.report.outcome import ALL_MET, NO_HELD_OUT, NOT_MET, TuningOutcome, remedies
-from tuning.search.explore import REACH, Slices
+from tuning.report.slices import REACH, Slices
 
 HELD_OUT = seeds(Budget())[2]
 
@@ -60,7 +60,7 @@ OUTCOMES = {
 def ran(monkeypatch, tmp_path, capsys):
     """Run the command on a Bowl without pictures. Return exit code, facts, stdout, stderr and folder."""
     monkeypatch.setattr(tuning.command, "_pictures", lambda *_: collections.defaultdict(bytes))
-    monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 1)
+    monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", 1)
 
     def run(world, tune):
         study(monkeypatch, world, **tune)

@@ -21,16 +21,16 @@ from ambjax.host.web_page import escape_markdown, render_page
 from ambjax.simulation.metrics import Standard
 from ambjax.simulation.trajectory import STALLED, TOUCHED
 from tuning.__main__ import main
-from tuning.config import seeds
-from tuning.judge import judge
-from tuning.objective.goal import shown
-from tuning.objective.lanes import Engine
-from tuning.objective.loss import TERMS, weigh
+from tuning.judge.evaluate import judge
+from tuning.problem.config import seeds
+from tuning.problem.goal import shown
+from tuning.problem.lanes import Engine
+from tuning.problem.loss import TERMS, weigh
 from tuning.report import accurate, breakdown, held_out, pictures
 from tuning.report import document as report
 from tuning.report.facts import SUMMARY_METRICS
-from tuning.search.explore import REACH, Slices, slices
-from tuning.search.rounds import training
+from tuning.report.slices import REACH, Slices, slices
+from tuning.rounds import training
 
 CASE = """
 [reference]

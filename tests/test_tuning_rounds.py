@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from bowl import RARE_FROM, S_0, World, study
 
-import tuning.search.rounds
+import tuning.rounds
 from ambjax import Slide
-from tuning.config import seeds
-from tuning.objective.loss import TERMS
-from tuning.search.rounds import rounds
+from tuning.problem.config import seeds
+from tuning.problem.loss import TERMS
+from tuning.rounds import rounds
 
 TRAINING, VALIDATION, HELD_OUT = 0, 1, 2
 # Fingerprint of the study in a checkpoint.
@@ -115,7 +115,7 @@ def test_without_validation_there_are_no_validation_calls(monkeypatch, tmp_path)
 
 def test_the_answer_that_loses_the_fewest_members_is_returned(monkeypatch, tmp_path):
     """There are three rounds, after which 3, 1 and 2 members are lost for all gains."""
-    monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 3)
+    monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", 3)
     lost = iter([3, 1, 2])
 
     class Moody(World):

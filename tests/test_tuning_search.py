@@ -18,20 +18,20 @@ from ambjax import Cascade, Clock, Initial, Scenario, Sensor, Sine, Slide, inver
 from ambjax.__main__ import main as simulated
 from ambjax.ensemble import Percent, Spread
 from tuning.__main__ import main
-from tuning.objective.goal import Goal
-from tuning.objective.lanes import Engine
-from tuning.objective.loss import TERMS, loss_for, weigh
-from tuning.objective.members import Objective
-from tuning.objective.risk import CVaR, Mean
-from tuning.objective.shortfalls import bounds
 from tuning.optimisers import BACKTRACK, JUMP, NAMES, bfgs, optimiser
-from tuning.problem import problem_of
-from tuning.search.checkpoint import CheckpointFile, SearchState
-from tuning.search.course import LEAST_IMPROVEMENT, MOST_SEARCHES, should_restart
-from tuning.search.descent import Descent
-from tuning.search.optimise import _begin_full_phase, best_of, search
-from tuning.search.screen import FAR, NEAR, around, initial_points, screen
-from tuning.space import Gain, Space
+from tuning.problem.goal import Goal
+from tuning.problem.lanes import Engine
+from tuning.problem.loss import TERMS, loss_for, weigh
+from tuning.problem.members import Objective
+from tuning.problem.risk import CVaR, Mean
+from tuning.problem.shortfalls import bounds
+from tuning.problem.space import Gain, Space
+from tuning.problem.tuning_problem import problem_of
+from tuning.solve.checkpoint import CheckpointFile, SearchState
+from tuning.solve.course import LEAST_IMPROVEMENT, MOST_SEARCHES, should_restart
+from tuning.solve.descent import Descent
+from tuning.solve.refine import _begin_full_phase, best_of, search
+from tuning.solve.screen import FAR, NEAR, around, initial_points, screen
 
 PATHS = ("position.c", "position.k", "inversion.gamma", "current.k_i")
 SPACE = Space(tuple(Gain(f"controller.{path}", 0.0, 1e9) for path in PATHS))

@@ -30,12 +30,12 @@ from ambjax.simulation.folds import Rms
 from ambjax.simulation.loop import INSTANT_TREE, Densities
 from ambjax.simulation.span import blank
 from ambjax.theorem.conditions import delta_1_on_reference
-from tuning.config import read_tune
-from tuning.gains_table import off
-from tuning.objective.loss import TERMS, Loss, loss_for
-from tuning.objective.risk import CVaR, Mean, SoftWorst
-from tuning.objective.shortfalls import bounds, shortfall
-from tuning.space import CLOSEST, MARGIN, Gain, Space, tunable
+from tuning.problem.config import read_tune
+from tuning.problem.gains_table import off
+from tuning.problem.loss import TERMS, Loss, loss_for
+from tuning.problem.risk import CVaR, Mean, SoftWorst
+from tuning.problem.shortfalls import bounds, shortfall
+from tuning.problem.space import CLOSEST, MARGIN, Gain, Space, tunable
 
 GAINS = [Gain("controller.position.c"), Gain("controller.position.c", 3.0), Gain("controller.position.c", 2.0, 5e3)]
 C, K = "controller.position.c", "controller.position.k"

@@ -17,24 +17,24 @@ from texts import piped
 from tomlkit import dumps
 
 import tuning.command
-import tuning.judge
-import tuning.search.rounds
+import tuning.judge.evaluate
+import tuning.rounds
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.cases.tune_table import Budget
-from tuning.config import seeds
-from tuning.judge import RESOLVED, describe, judge, step_error, summarise
-from tuning.objective.goal import Goal
-from tuning.objective.loss import TERMS
-from tuning.objective.ranges import END_FACTOR
-from tuning.objective.risk import Mean
-from tuning.objective.shortfalls import Bound
+from tuning.judge.evaluate import RESOLVED, describe, judge, step_error, summarise
 from tuning.optimisers import bfgs
-from tuning.search import explore
-from tuning.search.descent import Descent
-from tuning.search.optimise import HALVINGS, search
-from tuning.search.screen import initial_points
-from tuning.space import Gain, Space
+from tuning.problem.config import seeds
+from tuning.problem.goal import Goal
+from tuning.problem.loss import TERMS
+from tuning.problem.ranges import END_FACTOR
+from tuning.problem.risk import Mean
+from tuning.problem.shortfalls import Bound
+from tuning.problem.space import Gain, Space
+from tuning.report import slices as explore
+from tuning.solve.descent import Descent
+from tuning.solve.refine import HALVINGS, search
+from tuning.solve.screen import initial_points
 
 
 def at(made, c, k):
@@ -93,7 +93,7 @@ def test_the_judge_evaluates_every_held_out_member_once(monkeypatch):
     world = World(limit=lambda seed, number, *_: 40.0 if number == 5 else math.inf)
     world.bias = lambda substeps: 0.5 if substeps == 3 else 0.0
     made = study(monkeypatch, world)
-    monkeypatch.setattr(tuning.judge, "CHUNK", 4)
+    monkeypatch.setattr(tuning.judge.evaluate, "CHUNK", 4)
     x = at(made, 80.0, 60.0)
     found = judge(made, x, 77, 10)
     np.testing.assert_array_equal(found["chatter_V"], 1 + np.arange(10))  # a Bowl's member k chatters by 1 + k
@@ -378,7 +378,7 @@ def test_a_member_that_accurate_steps_do_not_hold_is_not_a_survivor(monkeypatch,
 @pytest.mark.slow
 def test_a_refuted_survival_is_reported_without_held_out_members(monkeypatch, tmp_path):
     world = World(limit=lambda seed, number, _, accurate: 1e-3 if accurate else math.inf)
-    monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 1)
+    monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", 1)
     code, summary, out, _ = command(monkeypatch, tmp_path, world, held_out=0)
     assert code == 1
     assert "0 members of the training ensemble are lost under the tuned gains. This result is NOT" in summary["verdict"]

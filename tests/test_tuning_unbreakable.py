@@ -17,10 +17,10 @@ from ambjax.simulation.folds import Named
 from ambjax.simulation.metrics import standard_for
 from ambjax.world.coil_limits import difference
 from ambjax.world.coils import Currents
-from tuning.objective.limits import measures
-from tuning.objective.quantities import KINDS, LimitContext
+from tuning.problem.limits import measures
+from tuning.problem.quantities import KINDS, LimitContext
+from tuning.problem.unbreakable import bounds_of
 from tuning.report import limit_table
-from tuning.unbreakable import bounds_of
 
 TWO_COIL = {"plant": {"kind": "two-coil"}, "processor": {"delay": 1.0}}
 BASE = {"sensor": {"std": 1e-6}, "clock": {"duration": 0.02, "sample_period": 1e-4}}

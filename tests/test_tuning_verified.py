@@ -10,18 +10,18 @@ import pytest
 from texts import problem_from
 
 import tuning.report.judging
-import tuning.search.course
-import tuning.search.rounds
-import tuning.search.validation
+import tuning.rounds
+import tuning.solve.course
+import tuning.validate
 from ambjax.cases.reader import case_from
 from tuning.__main__ import main
-from tuning.judge import NEGLIGIBLE, StepError, comparison_members, describe, step_error, worst_of
+from tuning.judge.evaluate import NEGLIGIBLE, StepError, comparison_members, describe, step_error, worst_of
 from tuning.optimisers import FirstOrderState
-from tuning.problem import REFERENCE_MEMBERS
-from tuning.search.checkpoint import SearchState
-from tuning.search.descent import Starts
-from tuning.search.rounds import MOST_HALVINGS, finer, rounds
-from tuning.search.validation import NOISE_GROWTH, joining
+from tuning.problem.tuning_problem import REFERENCE_MEMBERS
+from tuning.rounds import MOST_HALVINGS, finer, rounds
+from tuning.solve.checkpoint import SearchState
+from tuning.solve.descent import Starts
+from tuning.solve.joining import NOISE_GROWTH, joining
 
 ROTOR = (pathlib.Path(__file__).parent / "cases" / "rotor.toml").read_text()
 # Under noise on the velocity, hard signs of these gains drive i_ref onto the singular curve within milliseconds of
@@ -168,11 +168,11 @@ def every_member_is_held(study, x, members):
 def run(small, monkeypatch, tmp_path):
     def answer(*errors, most=4):
         verdicts = Verdicts(*errors)
-        for place in (tuning.search.rounds, tuning.search.validation):
+        for place in (tuning.rounds, tuning.validate):
             monkeypatch.setattr(place, "step_error", verdicts)
-        monkeypatch.setattr(tuning.search.course, "search", searched)
-        monkeypatch.setattr(tuning.search.validation, "_terms", every_member_is_held)
-        monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", most)
+        monkeypatch.setattr(tuning.solve.course, "search", searched)
+        monkeypatch.setattr(tuning.validate, "_terms", every_member_is_held)
+        monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", most)
         start = small.tune.space.values(small.case.cascade)
         return rounds(small, start, tmp_path, {"case": "small"}, False), verdicts
 
@@ -219,10 +219,10 @@ def test_a_refuted_answer_is_a_failure_in_every_file(small, monkeypatch, tmp_pat
     refuted = Verdicts(
         error_of(small, stalled=4, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
     )
-    for place in (tuning.search.rounds, tuning.search.validation, tuning.report.judging):
+    for place in (tuning.rounds, tuning.validate, tuning.report.judging):
         monkeypatch.setattr(place, "step_error", refuted)
-    monkeypatch.setattr(tuning.search.rounds, "MOST_ROUNDS", 1)
-    monkeypatch.setattr(tuning.search.rounds, "MOST_HALVINGS", 0)
+    monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", 1)
+    monkeypatch.setattr(tuning.rounds, "MOST_HALVINGS", 0)
     path, out = tmp_path / "case.toml", tmp_path / "out"
     path.write_text(SMALL)
     assert main([str(path), "--out", str(out)]) == 1
@@ -241,7 +241,7 @@ def test_a_refuted_answer_is_a_failure_in_every_file(small, monkeypatch, tmp_pat
 @pytest.mark.thorough
 def test_an_answer_confirmed_in_training_is_still_refuted_by_held_out_members(small, monkeypatch, tmp_path):
     right = error_of(small)
-    for place in (tuning.search.rounds, tuning.search.validation):
+    for place in (tuning.rounds, tuning.validate):
         monkeypatch.setattr(place, "step_error", Verdicts(right))
     wrong = Verdicts(right._replace(lost=2, members=2))
     monkeypatch.setattr(tuning.report.judging, "step_error", wrong)

@@ -6,8 +6,8 @@ import tomllib
 
 from ambjax.cases.reader import case_from
 from ambjax.cases.table import Table
-from tuning.config import tune_from
-from tuning.problem import problem_of
+from tuning.problem.config import tune_from
+from tuning.problem.tuning_problem import problem_of
 
 
 def write(text, name="case.toml"):

@@ -19,20 +19,20 @@ from ambjax.host.lock import locked
 from ambjax.host.web_page import render_page
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
-from tuning.config import allowed_minutes, read_tune, settings
 from tuning.events import Listener, teller
-from tuning.gains_table import off
-from tuning.problem import TuningProblem, problem_of
+from tuning.problem.config import allowed_minutes, read_tune, settings
+from tuning.problem.gains_table import off
+from tuning.problem.space import Gain, Space, tunable
+from tuning.problem.tuning_problem import TuningProblem, problem_of
 from tuning.report import accurate, front_table, pictures
 from tuning.report import document as report
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.judging import examined
+from tuning.report.slices import Slices
 from tuning.report.tuned import tuned_case
-from tuning.search.checkpoint import can_resume, checkpoint, has_unfinished_search, mark_directory, remove_all
-from tuning.search.course import SearchResult
-from tuning.search.explore import Slices
-from tuning.search.rounds import rounds
-from tuning.space import Gain, Space, tunable
+from tuning.rounds import rounds
+from tuning.solve.checkpoint import can_resume, checkpoint, has_unfinished_search, mark_directory, remove_all
+from tuning.solve.course import SearchResult
 
 TUNED = "tuned.toml"
 WRITTEN = (TUNED, "history.npz", "report.html", "report.md", "report.json")

@@ -39,7 +39,8 @@ class Standing(NamedTuple):
     `number`: of the search, from 1. `iteration`, `most`: number of iterations of this phase, and their largest number.
     `starts`: number of starts that continue. `error_m`, `u_V`: settled rms error (m) and rms voltage (V). `held`,
     `members`: number of members that are held, and of all. `limits`: the limits. `left_s`: largest time left in this
-    phase, s; NaN if it is not known yet.
+    phase, s; NaN if it is not known yet. `goal`: the minimised number. `rollouts`: number of rollouts of all searches
+    so far.
     """
 
     number: int
@@ -52,6 +53,8 @@ class Standing(NamedTuple):
     members: int
     limits: tuple[Reached, ...]
     left_s: float
+    goal: float = math.nan
+    rollouts: int = 0
 
     @property
     def text(self) -> str:

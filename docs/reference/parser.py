@@ -6,7 +6,7 @@ from typing import Any
 from ambjax.cases.reader import case_from
 from ambjax.cases.table import Table
 from ambjax.cases.template_text import template
-from tuning.config import tune_from
+from tuning.problem.config import tune_from
 
 NO_KEY = "?"
 

@@ -13,8 +13,8 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.replay import record_member
 from ambjax.simulation.rollout import rollout
 from ambjax.simulation.trajectory import Trajectory
-from tuning.judge import compare_metrics, metrics_of, summarise
-from tuning.problem import TuningProblem
+from tuning.judge.evaluate import compare_metrics, metrics_of, summarise
+from tuning.problem.tuning_problem import TuningProblem
 
 # Number of held-out members that are simulated by accurate steps.
 COMPARED = 8

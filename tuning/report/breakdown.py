@@ -6,10 +6,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from tuning.objective.goal import Goal, shown
-from tuning.objective.loss import COSTS, HELD, TERMS, outcomes, weigh
-from tuning.objective.members import Members
-from tuning.problem import TuningProblem
+from tuning.problem.goal import Goal, shown
+from tuning.problem.loss import COSTS, HELD, TERMS, outcomes, weigh
+from tuning.problem.members import Members
+from tuning.problem.tuning_problem import TuningProblem
 
 # The loss of one member as a formula. The costs are factors of the error.
 FORMULA = f"{' + '.join(HELD)} + (tracking + peak) x (1 + {' + '.join(COSTS)})"

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from ambjax.commands.outputs import described
 from ambjax.host.web_page import escape_markdown, markdown_table
-from tuning.objective.loss import TERMS
+from tuning.problem.loss import TERMS
 from tuning.report import answer, front_table, held_out, limit_table, sensitivity_table
 from tuning.report.breakdown import FORMULA
 from tuning.report.facts import Row, TuningFacts

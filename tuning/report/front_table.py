@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.host.web_page import markdown_table
-from tuning.search.course import SearchResult
-from tuning.search.front import KNEE, FrontPoint
+from tuning.front import KNEE, FrontPoint
+from tuning.solve.course import SearchResult
 
 Facts = dict[str, Any]
 TITLE = "Error against voltage"

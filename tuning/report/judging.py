@@ -12,22 +12,23 @@ from ambjax.linear import Findings, stability_of, suspects
 from ambjax.theorem.advice import advice as on_conditions
 from ambjax.theorem.conditions import Report as Check
 from ambjax.theorem.conditions import check
-from tuning.config import seeds, settings
-from tuning.delay_test import delay_test
 from tuning.events import Tell
-from tuning.judge import StepError, describe, held, judge, step_error, summarise, worst, worst_of
-from tuning.measured_peaks import injections
-from tuning.problem import TuningProblem
+from tuning.judge.evaluate import StepError, describe, held, judge, step_error, summarise, worst, worst_of
+from tuning.judge.late import delay_test
+from tuning.judge.peaks import injections
+from tuning.problem.config import seeds, settings
+from tuning.problem.tuning_problem import TuningProblem
 from tuning.report import accurate, breakdown, front_table, limit_table, outcome, sensitivity_table
 from tuning.report.facts import SUMMARY_METRICS, Row, TuningFacts
-from tuning.search import explore
-from tuning.search.course import SearchResult
+from tuning.report.slices import Slices
+from tuning.report.slices import slices as slices_through
+from tuning.solve.course import SearchResult
 
 # Fields on the conditions of Theorem 1 if they cannot be computed.
 NO_CONDITIONS: Row = {"conditions": [], "advice_on_conditions": []}
 
 
-def examined(answer: SearchResult, front_written: bool, tell: Tell) -> tuple[TuningFacts, explore.Slices | None]:
+def examined(answer: SearchResult, front_written: bool, tell: Tell) -> tuple[TuningFacts, Slices | None]:
     """Return the facts of an answer, and the slices of the goal through it. Arrays [m] have one value per gain.
 
     Facts that do not decide on the verdict are absent if they cannot be computed (`described`).
@@ -55,7 +56,7 @@ def examined(answer: SearchResult, front_written: bool, tell: Tell) -> tuple[Tun
         "front": described("the front", lambda: front_table.facts(answer)) or None,
     }
     tell("the objective around the answer")
-    slices = described("the slices through the answer", lambda: explore.slices(problem, x, members))
+    slices = described("the slices through the answer", lambda: slices_through(problem, x, members))
     facts = TuningFacts(**found, **_neighbourhood(problem, x, slices))
     what = outcome.outcome_of(facts, problem.tune.limits.may_lose(problem.tune.budget.held_out))
     verdict = described("the verdict in words", lambda: outcome.outcome_text(facts, what)) or what.text
@@ -143,7 +144,7 @@ def _conditions(problem: TuningProblem, x: np.ndarray) -> Row:
     return {"conditions": rows, "advice_on_conditions": on_conditions(line)}
 
 
-def _neighbourhood(problem: TuningProblem, x: np.ndarray, slices: explore.Slices | None) -> Row:
+def _neighbourhood(problem: TuningProblem, x: np.ndarray, slices: Slices | None) -> Row:
     """Return the fields on the gains at x [m], and on the goal around them. Without slices, the latter are None."""
     space = problem.objective.space
     ends = zip(space.values(problem.case.cascade), np.asarray(space.gains_at(jnp.asarray(x))), strict=True)

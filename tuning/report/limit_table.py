@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 
 from ambjax.host.web_page import markdown_table
-from tuning.delay_test import DELAY_MARGIN, DelayTest, not_simulated
-from tuning.measured_peaks import MEASURED, Sensitivity, reached_of
-from tuning.objective.limits import FRONT, Limit
-from tuning.objective.quantities import Kind
-from tuning.problem import TuningProblem
+from tuning.judge.late import DELAY_MARGIN, DelayTest, not_simulated
+from tuning.judge.peaks import MEASURED, Sensitivity, reached_of
+from tuning.problem.limits import FRONT, Limit
+from tuning.problem.quantities import Kind
+from tuning.problem.tuning_problem import TuningProblem
 
 Facts = dict[str, Any]
 # Share by which a limit is loosened to compute the effect.

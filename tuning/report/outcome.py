@@ -6,8 +6,8 @@ import numpy as np
 
 from ambjax.linear import Findings
 from ambjax.theorem.advice import STALLED, STALLED_PLANT
-from tuning.objective.members import Members
-from tuning.problem import TuningProblem
+from tuning.problem.members import Members
+from tuning.problem.tuning_problem import TuningProblem
 from tuning.report import front_table
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.limit_table import BROKEN, UNJUDGED, UNVERIFIED, broken, prices

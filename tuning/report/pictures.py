@@ -10,9 +10,9 @@ from ambjax.pictures.scales import digits, log_ticks, prefix_of
 from ambjax.pictures.style import own_style
 from ambjax.pictures.thinning import stretch_of, thin
 from ambjax.simulation.trajectory import ALIVE, STALLED, Trajectory
-from tuning.objective.goal import shown
+from tuning.problem.goal import shown
 from tuning.report.front_table import letter
-from tuning.search.explore import Slices
+from tuning.report.slices import Slices
 
 # Largest plotted goal along a gain, relative to that of the answer. A lost member raises the goal by about 1e6, which
 # would hide the other values.

@@ -4,8 +4,8 @@ import dataclasses
 from typing import Any
 
 from ambjax.host.web_page import escape_markdown, markdown_table
-from tuning.measured_peaks import SCREENED, Sensitivity, injects
-from tuning.problem import TuningProblem
+from tuning.judge.peaks import SCREENED, Sensitivity, injects
+from tuning.problem.tuning_problem import TuningProblem
 
 Facts = dict[str, Any]
 # Text in place of the linear peak of a loop without one, by its zone.

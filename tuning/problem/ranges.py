@@ -7,9 +7,9 @@ import numpy as np
 from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import extremes
 from ambjax.control.search import Interval, LowerBound, SearchContext
-from tuning.objective.members import Objective
-from tuning.objective.shortfalls import Bound
-from tuning.space import Gain, Space
+from tuning.problem.members import Objective
+from tuning.problem.shortfalls import Bound
+from tuning.problem.space import Gain, Space
 
 # Least initial displacement that is assumed, as a share of the clearance, even if the rotor starts closer to z = 0.
 LEAST_DISPLACEMENT = 0.01

@@ -4,7 +4,7 @@ A lane is one rollout of one member under one vector of gains. A kernel processe
 compiled once. There are three kernels: one for the terms of the loss, one for their derivatives (with fewer lanes), and
 one for metrics. A new number of starts (vectors of gains) or members does not recompile them. The number of lanes can
 change the last digit of a result, so it does not depend on the number of cores. An engine has one integration method;
-where `tuning.judge` uses another, it has its own engine.
+where `tuning.judge.evaluate` uses another, it has its own engine.
 """
 
 import dataclasses
@@ -24,11 +24,11 @@ from ambjax.simulation.folds import Named
 from ambjax.simulation.metrics import standard_for
 from ambjax.simulation.rollout import rollout
 from ambjax.world.scenario import Scenario
-from tuning.objective.limits import PREFIX
-from tuning.objective.loops import loops
-from tuning.objective.loss import TERMS, Loss, outcomes
-from tuning.objective.members import Members, Objective
-from tuning.space import Space
+from tuning.problem.limits import PREFIX
+from tuning.problem.loops import loops
+from tuning.problem.loss import TERMS, Loss, outcomes
+from tuning.problem.members import Members, Objective
+from tuning.problem.space import Space
 
 # Lanes of one kernel call. With 32 lanes XLA unrolls the loops into scalar code, which takes 1.5 times as long.
 LANES = 64

@@ -12,8 +12,8 @@ import optax
 from jax import Array
 
 from ambjax.extend import record, static
-from tuning.objective.goal import Goal
 from tuning.optimisers import BFGSState, FirstOrderState, optimiser
+from tuning.problem.goal import Goal
 
 
 class Starts(NamedTuple):

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.host.interrupts import deferred, raise_if_interrupted
-from tuning.objective.goal import Goal
-from tuning.objective.lanes import Engine
-from tuning.objective.members import Members
 from tuning.optimisers import BFGS
-from tuning.search.checkpoint import CheckpointFile, SearchState
-from tuning.search.descent import Descent
-from tuning.search.evolution import idle_states, initial_state
-from tuning.search.iteration import append_history, iterate
-from tuning.search.screen import screen
+from tuning.problem.goal import Goal
+from tuning.problem.lanes import Engine
+from tuning.problem.members import Members
+from tuning.solve.checkpoint import CheckpointFile, SearchState
+from tuning.solve.descent import Descent
+from tuning.solve.evolution import idle_states, initial_state
+from tuning.solve.iteration import append_history, iterate
+from tuning.solve.screen import screen
 
 # A start has converged if its next step, in coordinates, is shorter than this.
 SHORTEST = 1e-3

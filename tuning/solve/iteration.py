@@ -7,15 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tuning.objective.goal import Goal
-from tuning.objective.lanes import Engine
-from tuning.objective.limits import PREFIX
-from tuning.objective.loss import TERMS
-from tuning.objective.members import Members
-from tuning.objective.quantities import KINDS
-from tuning.search.checkpoint import SearchState
-from tuning.search.descent import Descent
-from tuning.search.evolution import next_population, updated
+from tuning.problem.goal import Goal
+from tuning.problem.lanes import Engine
+from tuning.problem.limits import PREFIX
+from tuning.problem.loss import TERMS
+from tuning.problem.members import Members
+from tuning.problem.quantities import KINDS
+from tuning.solve.checkpoint import SearchState
+from tuning.solve.descent import Descent
+from tuning.solve.evolution import next_population, updated
 
 
 def iterate(

@@ -5,8 +5,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from tuning.objective.members import Members
-from tuning.problem import TuningProblem
+from tuning.problem.members import Members
+from tuning.problem.tuning_problem import TuningProblem
 
 # Coordinates of the points of a slice, relative to the optimum: a gain times about e^-1.5 to e^1.5.
 REACH = np.linspace(-1.5, 1.5, 13)

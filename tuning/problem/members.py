@@ -14,9 +14,9 @@ from ambjax.simulation.clock import Clock
 from ambjax.simulation.parts import rolled_in_parts
 from ambjax.simulation.rollout import prepare, rollout
 from ambjax.world.scenario import Scenario
-from tuning.objective.loss import Loss
-from tuning.objective.quantities import LOOPS
-from tuning.space import Space
+from tuning.problem.loss import Loss
+from tuning.problem.quantities import LOOPS
+from tuning.problem.space import Space
 
 # Smallest number of ordinary members, and of stressed members, in a part.
 LEAST_PART = 4

@@ -8,13 +8,13 @@ import numpy as np
 from jax import Array
 
 from ambjax.extend import Scalar, record, static
-from tuning.objective.limits import LimitTerm
-from tuning.objective.loss import outcomes
-from tuning.objective.members import Members
-from tuning.objective.quantities import KINDS
-from tuning.objective.risk import Risk
-from tuning.objective.shortfalls import Bound, shortfall
-from tuning.space import Space
+from tuning.problem.limits import LimitTerm
+from tuning.problem.loss import outcomes
+from tuning.problem.members import Members
+from tuning.problem.quantities import KINDS
+from tuning.problem.risk import Risk
+from tuning.problem.shortfalls import Bound, shortfall
+from tuning.problem.space import Space
 
 # Largest goal, a logarithm, that is shown; exp overflows above 709.
 MOST = 700.0

@@ -6,11 +6,11 @@ The points are the case's gains, the middle of the search ranges, and quasi-rand
 import numpy as np
 
 from ambjax.ensemble.design import design_points
-from tuning.objective.goal import Goal
-from tuning.objective.lanes import Engine
-from tuning.objective.members import Members, Objective
-from tuning.objective.ranges import from_unit_cube, ranges
-from tuning.objective.shortfalls import Bound
+from tuning.problem.goal import Goal
+from tuning.problem.lanes import Engine
+from tuning.problem.members import Members, Objective
+from tuning.problem.ranges import from_unit_cube, ranges
+from tuning.problem.shortfalls import Bound
 
 # Rounds of the screen (a, b): one member in a is simulated, and one point in b is kept, but at least 2 `keep` points
 # and at least the members that `Members.part` keeps.

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.host.sealed import DamagedError, difference, flat, provenance, seal, shapes, unseal, write_whole
-from tuning.objective.loss import TERMS
-from tuning.search.descent import Descent, Starts
-from tuning.search.evolution import CmaState, idle_states
+from tuning.problem.loss import TERMS
+from tuning.solve.descent import Descent, Starts
+from tuning.solve.evolution import CmaState, idle_states
 
 # Scalar fields of SearchState in a checkpoint.
 COUNTS = ("iteration", "phase", "since", "seconds")

@@ -10,13 +10,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from tuning.config import seeds
-from tuning.judge import judge
-from tuning.measured_peaks import MEASURED, decides, injections, injects, reached_of
-from tuning.objective.limits import PENALTY, PREFIX, TOLERANCE_BELOW, Limit
-from tuning.problem import TuningProblem
-from tuning.search.course import Course
-from tuning.search.validation import breaking
+from tuning.judge.evaluate import judge
+from tuning.judge.peaks import MEASURED, decides, injections, injects, reached_of
+from tuning.problem.config import seeds
+from tuning.problem.limits import PENALTY, PREFIX, TOLERANCE_BELOW, Limit
+from tuning.problem.tuning_problem import TuningProblem
+from tuning.solve.course import Course
+from tuning.solve.joining import breaking
 
 # Largest number of searches after updates of the multipliers in one round.
 MOST_UPDATES = 6

@@ -13,8 +13,8 @@ from ambjax.ensemble import apply, map_members
 from ambjax.extend import Scalar, canonical
 from ambjax.linear import LoopQuantities, linearisation_inputs, loop_matrices, loop_quantities
 from ambjax.world.scenario import Scenario
-from tuning.objective.members import LoopRange, Members, Objective
-from tuning.space import Space
+from tuning.problem.members import LoopRange, Members, Objective
+from tuning.problem.space import Space
 
 # Lanes of one call of the compiled program.
 LANES = 8

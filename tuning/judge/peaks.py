@@ -15,8 +15,8 @@ from ambjax.linear import Analysis, Injection, analyse, frequency_lines, lineari
 from ambjax.linear.injection import injection_of
 from ambjax.linear.member_responses import Responses, member_responses
 from ambjax.results.operating import one_period
-from tuning.objective.limits import PREFIX, Limit
-from tuning.problem import TuningProblem
+from tuning.problem.limits import PREFIX, Limit
+from tuning.problem.tuning_problem import TuningProblem
 
 # INJECTED: number of members, those with the largest peaks, that are measured by injection. REPETITIONS: number of
 # injections into each of them, with different noise.

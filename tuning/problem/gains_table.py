@@ -10,7 +10,7 @@ from ambjax.cases.table import Table, show
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import no_such_number
 from ambjax.extend import GAINS
-from tuning.space import CLOSEST, Gain, Space, knots, read, tunable
+from tuning.problem.space import CLOSEST, Gain, Space, knots, read, tunable
 
 
 def space_from(table: Table, case: Case) -> Space:

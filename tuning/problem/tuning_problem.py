@@ -11,15 +11,15 @@ from ambjax.simulation.integrate import Integrator
 from ambjax.simulation.method import choose_method
 from ambjax.simulation.rosenbrock import AdaptiveRodas3
 from ambjax.simulation.sliding import Slide, slides
-from tuning.config import Tune
-from tuning.objective.goal import Goal
-from tuning.objective.lanes import Engine
-from tuning.objective.limits import FRONT, Limit, measures
-from tuning.objective.loss import HELD, TERMS, loss_for
-from tuning.objective.members import LoopRange, Objective
-from tuning.objective.quantities import KINDS, LimitContext
-from tuning.objective.ranges import Range, bounded
-from tuning.objective.shortfalls import bounds
+from tuning.problem.config import Tune
+from tuning.problem.goal import Goal
+from tuning.problem.lanes import Engine
+from tuning.problem.limits import FRONT, Limit, measures
+from tuning.problem.loss import HELD, TERMS, loss_for
+from tuning.problem.members import LoopRange, Objective
+from tuning.problem.quantities import KINDS, LimitContext
+from tuning.problem.ranges import Range, bounded
+from tuning.problem.shortfalls import bounds
 
 # Ratio of the number of steps of the judge to that of the search, in continuous time. On a processor, it is the ratio
 # for the accurate steps, and the judge makes the steps of the case. On the tuned loops of tests/test_metrics_dense.py,

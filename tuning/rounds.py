@@ -16,14 +16,15 @@ from typing import Any
 import numpy as np
 
 from ambjax.commands.outputs import described
-from tuning.config import seeds
 from tuning.events import Listener
-from tuning.judge import StepError, describe, step_error
-from tuning.problem import TuningProblem, problem_of
-from tuning.search.course import Course, SearchResult, points_of, search_and_restart, training
-from tuning.search.front import trace_front
-from tuning.search.multipliers import search_within_limits
-from tuning.search.validation import joining, validated
+from tuning.front import trace_front
+from tuning.judge.evaluate import StepError, describe, step_error
+from tuning.problem.config import seeds
+from tuning.problem.tuning_problem import TuningProblem, problem_of
+from tuning.solve.course import Course, SearchResult, points_of, search_and_restart, training
+from tuning.solve.joining import joining
+from tuning.solve.multipliers import search_within_limits
+from tuning.validate import validated
 
 # Largest number of searches, and of halvings of the step. Restarts count as searches; searches after an update of the
 # multipliers do not.

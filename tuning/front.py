@@ -13,13 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tuning.config import seeds
-from tuning.judge import held, judge, rms
-from tuning.objective.limits import FRONT
-from tuning.objective.members import Members
-from tuning.search.course import Course, SearchResult
-from tuning.search.multipliers import holding, join_breaking, judged_members, judged_values, met, search_values
-from tuning.search.validation import largest_unseen, validated
+from tuning.judge.evaluate import held, judge, rms
+from tuning.problem.config import seeds
+from tuning.problem.limits import FRONT
+from tuning.problem.members import Members
+from tuning.solve.course import Course, SearchResult
+from tuning.solve.joining import largest_unseen
+from tuning.solve.multipliers import holding, join_breaking, judged_members, judged_values, met, search_values
+from tuning.validate import validated
 
 # Limits of the rms error relative to the least error: KNEE for the knee, FACTORS for the points of the front. The first
 # tune.front factors are used.

@@ -16,14 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from tuning.events import Event, Listener, Reached, Standing
-from tuning.judge import StepError
-from tuning.objective.loops import check_loops
-from tuning.objective.loss import TERMS
-from tuning.objective.members import Members
-from tuning.problem import TuningProblem
-from tuning.search.checkpoint import CheckpointFile, SearchState, checkpoint
-from tuning.search.optimise import best_of, search
-from tuning.search.screen import around, initial_points
+from tuning.judge.evaluate import StepError
+from tuning.problem.loops import check_loops
+from tuning.problem.loss import TERMS
+from tuning.problem.members import Members
+from tuning.problem.tuning_problem import TuningProblem
+from tuning.solve.checkpoint import CheckpointFile, SearchState, checkpoint
+from tuning.solve.refine import best_of, search
+from tuning.solve.screen import around, initial_points
 
 # Largest number of searches in `search_and_restart`.
 MOST_SEARCHES = 5
@@ -264,5 +264,6 @@ def _standing(problem: TuningProblem, progress: SearchState, number: int, spent:
     return Standing(
         number, done, budget.iterations, going, float(np.asarray(loss.s_0)) * math.sqrt(terms["tracking"]), volts,
         int(last["members"] - last["lost"][best]), int(last["members"]), limits,
-        (budget.iterations - done) * each * going / len(progress.active),
+        (budget.iterations - done) * each * going / len(progress.active), float(last["value"][best]),
+        int(last["rollouts"]),
     )  # fmt: skip

@@ -19,7 +19,7 @@ from jax import Array
 
 from ambjax.extend import Scalar, record, static
 from ambjax.simulation.folds import Fold
-from tuning.objective.quantities import KINDS, TINY, Kind, LimitContext
+from tuning.problem.quantities import KINDS, TINY, Kind, LimitContext
 
 # PENALTY: initial penalty; at a multiplier of 0, an excess of 10 % adds 0.14 to the goal. PENALTY_GROWTH: factor by
 # which the penalty grows if an update leaves more than the share SUFFICIENT_DECREASE of the excess (Nocedal and Wright,

@@ -14,7 +14,7 @@ from ambjax.simulation.folds import Ending, Fold, Named
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import ALIVE, Row
 from ambjax.world.scenario import Scenario
-from tuning.objective.limits import PREFIX
+from tuning.problem.limits import PREFIX
 
 # Exponent of the power mean that approximates a maximum. Over 1e4 samples of noise, the maximum is 1.2 to 1.6 times the
 # power mean.

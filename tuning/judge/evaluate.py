@@ -9,10 +9,10 @@ import numpy as np
 
 from ambjax.ensemble import wilson
 from ambjax.ensemble.study import Study
-from tuning.config import seeds
-from tuning.objective.lanes import Engine
-from tuning.objective.members import Members
-from tuning.problem import REFERENCE_MEMBERS, TuningProblem
+from tuning.problem.config import seeds
+from tuning.problem.lanes import Engine
+from tuning.problem.members import Members
+from tuning.problem.tuning_problem import REFERENCE_MEMBERS, TuningProblem
 
 # Largest number of members that the judge simulates in one call.
 CHUNK = 1024

@@ -9,8 +9,8 @@ import numpy as np
 from ambjax.control.processor import MOST_DELAY
 from ambjax.ensemble import run_ensemble
 from ambjax.linear import stability_of
-from tuning.objective.limits import PREFIX, Limit
-from tuning.problem import TuningProblem
+from tuning.problem.limits import PREFIX, Limit
+from tuning.problem.tuning_problem import TuningProblem
 
 DELAY_MARGIN = "delay_margin_s"
 # Number of members tested: those with the smallest linear margins.

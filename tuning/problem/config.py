@@ -24,14 +24,14 @@ from ambjax.cases.tune_table import (
     Budget,
 )
 from ambjax.extend import leaf
-from tuning.gains_table import space_from
-from tuning.objective.limits import LEAST_MARGIN, Limit
-from tuning.objective.loss import TERMS
-from tuning.objective.quantities import KINDS
-from tuning.objective.risk import CVaR, Mean, Risk, SoftWorst
 from tuning.optimisers import NAMES
-from tuning.space import Space
-from tuning.unbreakable import bounds_of
+from tuning.problem.gains_table import space_from
+from tuning.problem.limits import LEAST_MARGIN, Limit
+from tuning.problem.loss import TERMS
+from tuning.problem.quantities import KINDS
+from tuning.problem.risk import CVaR, Mean, Risk, SoftWorst
+from tuning.problem.space import Space
+from tuning.problem.unbreakable import bounds_of
 
 # Keys of [tune] that are neither in NUMBERS nor in BUDGET.
 OTHER_KEYS = ["objective", "gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]

@@ -1,0 +1,1 @@
+"""Evaluation of an answer on members that the search does not use."""

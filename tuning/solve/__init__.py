@@ -1,0 +1,1 @@
+"""The search: starting points, descents, CMA-ES, and the multipliers of the limits."""

@@ -1,0 +1,69 @@
+"""Members of the validation ensemble that join the training ensemble, because they failed."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import jax
+import numpy as np
+
+from tuning.judge.evaluate import StepError, held
+from tuning.problem.config import seeds
+from tuning.problem.members import Members
+from tuning.problem.tuning_problem import TuningProblem
+from tuning.solve.course import Course
+
+# Largest numbers of lost members, and of members with large errors, that join at once.
+MOST_LOST, MOST_LARGE = 16, 8
+# Largest number of members that join because they break a limit on the worst member.
+MOST_BREAKING = 4
+# Members that are lost with accurate steps are held with the steps of the search. They therefore join with more noise,
+# by the factor NOISE_GROWTH**number in round number `number`.
+NOISE_GROWTH = 1.5
+
+
+def largest_unseen(course: Course, values: np.ndarray, most: int = MOST_LARGE) -> np.ndarray:
+    """Return the numbers of at most `most` validation members, not in the training ensemble, with the largest values.
+
+    `values` [N]: of the validation members; -inf for a member that is left out.
+    """
+    members, seed = course.members, seeds(course.problem.tune.budget)[1]
+    values = values.copy()
+    values[members.unstressed.member[members.unstressed.seed == seed]] = -math.inf
+    largest = np.argsort(-values, kind="stable")[:most]
+    return largest[np.isfinite(values[largest])]
+
+
+def breaking(
+    course: Course, numbers: Sequence[tuple[float, float]], columns: Mapping[str, np.ndarray] | None
+) -> Members | None:
+    """Return the validation members that break a limit on the worst member and are not in the training ensemble.
+
+    At most MOST_BREAKING for each limit whose judged value lacks reserve; None if there is none.
+
+    `numbers`: the values of the search and of the judge for each limit. `columns` [N]: metrics of the judged members;
+    None if they were not simulated.
+    """
+    problem, budget = course.problem, course.problem.tune.budget
+    if columns is None or not budget.validation:
+        return None
+    found = np.zeros(0, int)
+    for limit, (_, judged) in zip(problem.limits, numbers, strict=True):
+        if limit.kind.worst and not limit.has_reserve(judged):
+            excess = np.where(held(columns), limit.log_excesses(columns), -math.inf)
+            found = np.append(found, largest_unseen(course, np.where(excess > 0, excess, -math.inf), MOST_BREAKING))
+    total = len(columns["lost_at_s"])
+    return problem.objective.chosen(seeds(budget)[1], np.unique(found), total) if found.size else None
+
+
+def joining(problem: TuningProblem, lost: np.ndarray, error: StepError, number: int) -> Members:
+    """Return the members that join the training ensemble.
+
+    The first MOST_LOST of the `lost` validation members join with half of the additional noise of stressed members, as
+    a margin. Members that are lost or stall with accurate steps join with NOISE_GROWTH**number times their noise.
+    `number`: of the round, from 1.
+    """
+    budget = problem.tune.budget
+    those = problem.objective.chosen(seeds(budget)[1], lost[:MOST_LOST], budget.validation)
+    those = those._replace(noise_factor=those.noise_factor * (1 + problem.tune.stress) / 2)
+    these = error.unheld._replace(noise_factor=error.unheld.noise_factor * NOISE_GROWTH**number)
+    return jax.tree.map(lambda a, b: np.concatenate([a, b]), those, these)
