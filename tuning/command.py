@@ -20,13 +20,14 @@ from ambjax.host.lock import locked
 from ambjax.host.web_page import render_page
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
-from tuning.config import read_tune, settings
+from tuning.config import read_tune
 from tuning.gains_table import off
 from tuning.problem import TuningProblem, problem_of
 from tuning.report import accurate, front_table, pictures
 from tuning.report import document as report
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.judging import examined
+from tuning.report.record import REPORT, TUNED, ended, record, search_facts
 from tuning.report.tuned import tuned_case
 from tuning.search.checkpoint import can_resume, checkpoint, has_unfinished_search, mark_directory, remove_all
 from tuning.search.course import SearchResult
@@ -34,10 +35,7 @@ from tuning.search.explore import Slices
 from tuning.search.rounds import rounds
 from tuning.space import Gain, Space, tunable
 
-TUNED = "tuned.toml"
 WRITTEN = (TUNED, "history.npz", "report.html", "report.md", "report.json")
-# This file is written after the search. The search has ended if the file is newer than all checkpoints.
-REPORT = "report.json"
 # Verdict in tuned.toml until the gains are judged.
 NOT_JUDGED = "The tuned gains are not judged."
 
@@ -64,6 +62,11 @@ def run(args: argparse.Namespace) -> tuple[int, Row]:
     with locked(plan.out):
         if not args.resume:
             _clear(plan.out, args.force)
+        elif found := ended(search_facts(plan.raw, plan.problem), args, plan.out, WRITTEN):
+            say(f"{plan.out}: this search has ended; its results are kept")
+            if not args.json:
+                print(found["verdict"])
+            return int(not found["outcome"]["good"]), found | {"out": str(plan.out)}
         mark_directory(plan.out)
         with reporting(lambda: _kept(plan.out)):
             return _tune(plan, args)
@@ -104,14 +107,14 @@ def _tune(plan: TuningPlan, args: argparse.Namespace) -> tuple[int, Row]:
         return 1, {"verdict": NOT_JUDGED, "outcome": {"good": False}, "out": str(plan.out)}
     facts, slices = found
     with files(plan.out) as part:
-        _write(part, plan.out, answer, facts, slices)
+        table = _write(part, plan, args, answer, facts, slices)
         if args.pareto:
             described("the case files of the front", lambda: _put_front(part, plan.out, answer, facts))
         if args.page:
             described(NAME, lambda: _put_page(part, answer.problem.case, args.case))
         names = [name for name in (*WRITTEN, NAME) if (part / name).exists()]
     _print(plan.out, facts, names, quiet=args.json)
-    return int(not facts.outcome["good"]), plain(facts.table) | {"out": str(plan.out)}
+    return int(not facts.outcome["good"]), plain(table) | {"out": str(plan.out)}
 
 
 def _searched(plan: TuningPlan, resume: bool) -> SearchResult:
@@ -122,11 +125,7 @@ def _searched(plan: TuningPlan, resume: bool) -> SearchResult:
     )
     if zero := off(problem.case.cascade):
         say(f"not tuned, because they are 0 in the case, which switches their terms off: {', '.join(zero)}")
-    laws = {law.stage: law.digest for law in problem.case.own_laws}
-    if problem.case.controller_file:
-        laws["position"] = problem.case.controller_file.contents.digest
-    laws |= {one.key: one.samples.digest for one in problem.case.recorded}
-    return rounds(problem, plan.start, plan.out, {"case": plan.raw, "tune": settings(tune), "laws": laws}, resume)
+    return rounds(problem, plan.start, plan.out, search_facts(plan.raw, problem), resume)
 
 
 def _clear(out: pathlib.Path, force: bool) -> None:
@@ -170,11 +169,20 @@ def _put_answer(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, ver
 
 
 def _write(
-    part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: TuningFacts, slices: Slices | None
-) -> None:
-    """Write the files, except those of --pareto and --page, into the folder `part`. The caller moves them to `out`."""
-    cascade = _put_answer(part, out, answer, facts.verdict)
-    write_json(part / REPORT, facts.table)
+    part: pathlib.Path,
+    plan: TuningPlan,
+    args: argparse.Namespace,
+    answer: SearchResult,
+    facts: TuningFacts,
+    slices: Slices | None,
+) -> Row:
+    """Write the files, except those of --pareto and --page, into the folder `part`. Return the content of report.json.
+
+    The caller moves the files to the output directory.
+    """
+    cascade = _put_answer(part, plan.out, answer, facts.verdict)
+    table = facts.table | record(search_facts(plan.raw, plan.problem), args, part)
+    write_json(part / REPORT, table)
     drawn = _pictures(answer.problem, cascade, answer.history, slices, facts.front)
     for name, data in drawn.items():
         (part / name).write_bytes(data)
@@ -184,6 +192,7 @@ def _write(
     page = described("report.html", lambda: render_page(words, drawn, title, unfolded=(front_table.TITLE,)))
     if page is not None:
         (part / "report.html").write_text(page, encoding="utf-8")
+    return table
 
 
 def _put_front(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: TuningFacts) -> None:

@@ -24,6 +24,7 @@ class _Handler:
     program = ""
     report: Callable[[], str] | None = None
     deferral = ""
+    active = False
     pending = False
 
     def __init__(self) -> None:
@@ -69,13 +70,14 @@ def exit_on_interrupt(program: str) -> Iterator[None]:
     read_end, write_end = os.pipe()
     if os.name == "posix":
         os.set_blocking(write_end, False)
-    _handler.program, _handler.pending = program, False
+    _handler.program, _handler.active, _handler.pending = program, True, False
     before = signal.signal(signal.SIGINT, lambda *_: None), signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
     thread = threading.Thread(target=_read_signals, args=(read_end,), daemon=True)
     thread.start()
     try:
         yield
     finally:
+        _handler.active = False
         signal.set_wakeup_fd(before[1])
         signal.signal(signal.SIGINT, before[0])
         os.close(write_end)
@@ -85,8 +87,12 @@ def exit_on_interrupt(program: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def reporting(words: Callable[[], str]) -> Iterator[None]:
-    """Add the text that `words` returns to the message of a Ctrl-C in this block. Another thread calls `words`."""
-    before, _handler.report = _handler.report, words
+    """Add the text that `words` returns to the message of a Ctrl-C in this block. Another thread calls `words`.
+
+    In a nested block, the words of the outer one apply.
+    """
+    before = _handler.report
+    _handler.report = before or words
     try:
         yield
     finally:
@@ -117,6 +123,11 @@ def raise_if_interrupted() -> None:
     """Raise KeyboardInterrupt if a `deferred` block has received Ctrl-C."""
     if _handler.pending:
         raise KeyboardInterrupt
+
+
+def undisturbed() -> bool:
+    """Return whether an `exit_on_interrupt` block is active and no Ctrl-C was deferred in it."""
+    return _handler.active and not _handler.pending
 
 
 def _read_signals(read_end: int) -> None:
