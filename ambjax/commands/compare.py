@@ -14,7 +14,7 @@ from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
 from ambjax.commands.case_export import guarded_for
 from ambjax.commands.comparison_report import Compared, comparison_markdown, comparison_summary, comparison_table
-from ambjax.commands.comparison_tuning import check_resume, tuned_cases
+from ambjax.commands.comparison_tuning import check_options, tuned_cases
 from ambjax.commands.ensemble import study_of
 from ambjax.commands.outputs import described, directory, files, plain, say, write_json, written
 from ambjax.commands.study_report import findings_of
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     The exit code is 0 if each case holds all members, the members tested are stable, and its nominal loop is stable at
     rest.
     """
-    check_resume(args)
+    check_options(args)
     cases = _read(args.cases)
     studies = [study_of(case, _seed(args, cases), args.members) for case in cases]
     notes = _differences(args.cases, cases, studies)

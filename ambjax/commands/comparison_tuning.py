@@ -19,8 +19,10 @@ from ambjax.host.interrupts import raise_if_interrupted, reporting
 BEGUN, TUNED = "checkpoints/search.json", "tuned.toml"
 
 
-def check_resume(args: argparse.Namespace) -> None:
-    """Raise ValueError if --resume is given without --tune, without --out, or with an --out that does not exist."""
+def check_options(args: argparse.Namespace) -> None:
+    """Raise ValueError if --resume is given without --tune or without an existing --out, or if the tuner is missing."""
+    if args.tune:
+        extension("tune")
     if not args.resume:
         return
     if not args.tune:
@@ -55,8 +57,8 @@ def tuned_cases(cases: Sequence[Case], out: pathlib.Path, args: argparse.Namespa
             except KeyboardInterrupt:
                 raise KeyboardInterrupt(kept) from None
             except Exception as error:
-                failed.append(message(error))
-                say(f"{case.name} is not tuned: {failed[-1]}")
+                failed.append(f"{path}: {message(error).removeprefix(f'{path}: ')}")
+                say(f"not tuned: {failed[-1]}")
     if failed:
         raise ValueError(
             f"--tune: {len(failed)} of {len(cases)} cases could not be tuned: {' '.join(failed)} The tunings of the "
