@@ -8,7 +8,7 @@ import pytest
 HEAD = """
 import os, signal, sys, threading, time
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from ambjax.host.interrupts import deferred, exit_on_interrupt, raise_if_interrupted, reporting, uninterrupted
+from ambjax.host.interrupts import deferred, exit_on_interrupt, raise_if_interrupted, reporting, undisturbed, uninterrupted
 
 def interrupt():
     os.kill(os.getpid(), signal.SIGINT)
@@ -96,8 +96,10 @@ def test_a_deferred_interrupt_is_raised_when_polled():
 with exit_on_interrupt("p"):
     with deferred("It ends."):
         raise_if_interrupted()
+        print(undisturbed())
         interrupt()
         time.sleep(0.2)
+        print(undisturbed())
         try:
             raise_if_interrupted()
         except KeyboardInterrupt:
@@ -108,10 +110,10 @@ print("anew", signal.getsignal(signal.SIGINT) is signal.default_int_handler)
 """
     done = run(code)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["raised", "anew", "True"]
+    assert done.stdout.split() == ["True", "False", "raised", "anew", "True"]
 
 
 def test_an_ignored_sigint_stays_ignored():
-    code = "signal.signal(signal.SIGINT, signal.SIG_IGN)\nwith exit_on_interrupt('p'):\n interrupt()\n print('on')"
+    code = "signal.signal(signal.SIGINT, signal.SIG_IGN)\nwith exit_on_interrupt('p'):\n interrupt()\n print(undisturbed())"
     done = run(code)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "on\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "True\n", "")

@@ -63,21 +63,28 @@ def exit_on_interrupt(program: str) -> Iterator[None]:
 
     Has no effect outside the main thread, or where SIGINT is ignored.
     """
+    _handler.program, _handler.active, _handler.pending = program, True, False
     main = threading.current_thread() is threading.main_thread()
-    if not main or signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, None):
-        yield
-        return
+    arrives = main and signal.getsignal(signal.SIGINT) not in (signal.SIG_IGN, None)
+    try:
+        with _handled() if arrives else contextlib.nullcontext():
+            yield
+    finally:
+        _handler.active = False
+
+
+@contextlib.contextmanager
+def _handled() -> Iterator[None]:
+    """Handle Ctrl-C by `_handler` in this block."""
     read_end, write_end = os.pipe()
     if os.name == "posix":
         os.set_blocking(write_end, False)
-    _handler.program, _handler.active, _handler.pending = program, True, False
     before = signal.signal(signal.SIGINT, lambda *_: None), signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
     thread = threading.Thread(target=_read_signals, args=(read_end,), daemon=True)
     thread.start()
     try:
         yield
     finally:
-        _handler.active = False
         signal.set_wakeup_fd(before[1])
         signal.signal(signal.SIGINT, before[0])
         os.close(write_end)
@@ -126,7 +133,7 @@ def raise_if_interrupted() -> None:
 
 
 def undisturbed() -> bool:
-    """Return whether an `exit_on_interrupt` block is active and no Ctrl-C was deferred in it."""
+    """Return whether this is in an `exit_on_interrupt` block in which no Ctrl-C was deferred."""
     return _handler.active and not _handler.pending
 
 
