@@ -8,7 +8,8 @@ import pytest
 HEAD = """
 import os, signal, sys, threading, time
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from ambjax.host.interrupts import deferred, exit_on_interrupt, raise_if_interrupted, reporting, undisturbed, uninterrupted
+from ambjax.host.interrupts import deferred, exit_on_interrupt, raise_if_interrupted
+from ambjax.host.interrupts import reporting, undisturbed, uninterrupted
 
 def interrupt():
     os.kill(os.getpid(), signal.SIGINT)
@@ -114,6 +115,6 @@ print("anew", signal.getsignal(signal.SIGINT) is signal.default_int_handler)
 
 
 def test_an_ignored_sigint_stays_ignored():
-    code = "signal.signal(signal.SIGINT, signal.SIG_IGN)\nwith exit_on_interrupt('p'):\n interrupt()\n print(undisturbed())"
-    done = run(code)
+    code = "with exit_on_interrupt('p'):\n interrupt()\n print(undisturbed())"
+    done = run(f"signal.signal(signal.SIGINT, signal.SIG_IGN)\n{code}")
     assert (done.returncode, done.stdout, done.stderr) == (0, "True\n", "")
