@@ -100,6 +100,7 @@ def parser() -> Parser:
     compare.add_argument(
         "--tune", action="store_true", help="first tune each case, with the limits, loss and budget of the first case"
     )
+    compare.add_argument("--resume", action="store_true", help="continue the interrupted tunings of --tune in --out")
     _seed_option(compare)
     _page_option(compare)
     summary = "write the controller, the plant or the loop of a case with [processor] as C or as an FMU"

@@ -36,6 +36,11 @@ CASES = {
         "with exit_on_interrupt('p'), reporting(lambda: '3 are kept'):\n interrupt()\n ever()",
         "p: interrupted: 3 are kept.\n",
     ),
+    "nested": (
+        "with exit_on_interrupt('p'), reporting(lambda: '3 are kept'):\n with reporting(lambda: 'lost'):\n"
+        "  interrupt()\n  ever()",
+        "p: interrupted: 3 are kept.\n",
+    ),
     "while it is being kept": (
         "n = [0]\nwith exit_on_interrupt('p'), reporting(lambda: f'{n[0]} are kept'):\n with uninterrupted():\n"
         "  interrupt()\n  time.sleep(0.2)\n  n[0] = 1\n ever()",

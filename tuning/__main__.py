@@ -49,13 +49,16 @@ def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
     return top
 
 
-def main(argv: list[str] | None = None, program: str = PROGRAM) -> int:
+def main(argv: list[str] | None = None, program: str = PROGRAM, *, nested: bool = False) -> int:
     """Tune a case. Return 0 if accurate steps confirm that the gains meet [tune.limits], 1 if not, 2 for bad input.
 
-    `argv`: the arguments; None: those of the process. `program`: name of the command in messages. Ctrl-C after the
-    first iteration of the search ends the search, and its result is judged. A second Ctrl-C, or one at another time,
-    ends the process with exit code 130.
+    `argv`: the arguments; None: those of the process. `program`: name of the command in messages. `nested`: whether
+    another command calls this one and reports its errors, which are then raised. Ctrl-C after the first iteration of
+    the search ends the search, and its result is judged. A second Ctrl-C, or one at another time, ends the process with
+    exit code 130.
     """
+    if nested:
+        return _run(parser(program).parse_args(argv))[0]
     open_streams()
     with exit_on_interrupt(program):
         return run_command(parser(program), argv, _run)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.cases.reader import Case, case_from
+from ambjax.cases.reader import Case, case_from, read_case
 from ambjax.cases.table import one_line
 from ambjax.commands.outputs import check_new, described, directory, files, plain, say, write_json
 from ambjax.commands.warnings import print_warnings
@@ -20,7 +20,7 @@ from ambjax.host.web_page import render_page
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
 from tuning.events import Listener, teller
-from tuning.problem.config import allowed_minutes, read_tune, settings
+from tuning.problem.config import allowed_minutes, read_tune
 from tuning.problem.gains_table import off
 from tuning.problem.space import Gain, Space, tunable
 from tuning.problem.tuning_problem import TuningProblem, problem_of
@@ -28,16 +28,14 @@ from tuning.report import accurate, front_table, pictures
 from tuning.report import document as report
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.judging import examined
+from tuning.report.record import REPORT, TUNED, ended, record, search_facts
 from tuning.report.slices import Slices
 from tuning.report.tuned import tuned_case
 from tuning.rounds import rounds
 from tuning.solve.checkpoint import can_resume, checkpoint, has_unfinished_search, mark_directory, remove_all
 from tuning.solve.course import SearchResult
 
-TUNED = "tuned.toml"
 WRITTEN = (TUNED, "history.npz", "report.html", "report.md", "report.json")
-# This file is written after the search. The search has ended if the file is newer than all checkpoints.
-REPORT = "report.json"
 # Verdict in tuned.toml until the gains are judged.
 NOT_JUDGED = "The tuned gains are not judged."
 
@@ -92,6 +90,9 @@ def run(path: str, options: Options, listen: Listener) -> TunedCase:
     with locked(plan.out):
         if not options.resume:
             _clear(plan.out, options.force)
+        elif found := ended(search_facts(plan.raw, plan.problem), options, plan.out, WRITTEN):
+            teller(listen)(f"{plan.out}: this search has ended; its results are kept")
+            return TunedCase(read_case(plan.out / TUNED), found["outcome"]["good"], found, plan.out)
         mark_directory(plan.out)
         with reporting(lambda: _kept(plan.out)):
             return _tune(plan, path, options, listen)
@@ -136,12 +137,12 @@ def _tune(plan: TuningPlan, path: str, options: Options, listen: Listener) -> Tu
         return TunedCase(case, False, {"verdict": NOT_JUDGED, "outcome": {"good": False}}, plan.out)
     facts, slices = found
     with files(plan.out) as part:
-        _write(part, plan.out, answer, facts, slices)
+        table = _write(part, plan, options, answer, facts, slices)
         if options.pareto:
             described("the case files of the front", lambda: _put_front(part, plan.out, answer, facts))
         if options.page:
             described(NAME, lambda: _put_page(part, answer.problem.case, path))
-    return TunedCase(case, facts.outcome["good"], plain(facts.table), plan.out)
+    return TunedCase(case, facts.outcome["good"], plain(table), plan.out)
 
 
 def _searched(plan: TuningPlan, resume: bool, listen: Listener) -> SearchResult:
@@ -152,12 +153,7 @@ def _searched(plan: TuningPlan, resume: bool, listen: Listener) -> SearchResult:
     )
     if zero := off(problem.case.cascade):
         tell(f"not tuned, because they are 0 in the case, which switches their terms off: {', '.join(zero)}")
-    laws = {law.stage: law.digest for law in problem.case.own_laws}
-    if problem.case.controller_file:
-        laws["position"] = problem.case.controller_file.contents.digest
-    laws |= {one.key: one.samples.digest for one in problem.case.recorded}
-    facts = {"case": plan.raw, "tune": settings(tune), "laws": laws}
-    return rounds(problem, plan.start, plan.out, facts, resume, listen)
+    return rounds(problem, plan.start, plan.out, search_facts(plan.raw, problem), resume, listen)
 
 
 def _clear(out: pathlib.Path, force: bool) -> None:
@@ -201,11 +197,22 @@ def _put_answer(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, ver
 
 
 def _write(
-    part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: TuningFacts, slices: Slices | None
-) -> None:
-    """Write the files, except those of --pareto and --page, into the folder `part`. The caller moves them to `out`."""
-    cascade = _put_answer(part, out, answer, facts.verdict).cascade
-    write_json(part / REPORT, facts.table)
+    part: pathlib.Path,
+    plan: TuningPlan,
+    options: Options,
+    answer: SearchResult,
+    facts: TuningFacts,
+    slices: Slices | None,
+) -> Row:
+    """Write the files, except those of --pareto and --page, into the folder `part`. Return the content of report.json.
+
+    The caller moves the files to the output directory.
+    """
+    cascade = _put_answer(part, plan.out, answer, facts.verdict).cascade
+    table = facts.table
+    if answer.complete:
+        table |= record(search_facts(plan.raw, plan.problem), options, part)
+    write_json(part / REPORT, table)
     drawn = _pictures(answer.problem, cascade, answer.history, slices, facts.front)
     for name, data in drawn.items():
         (part / name).write_bytes(data)
@@ -215,6 +222,7 @@ def _write(
     page = described("report.html", lambda: render_page(words, drawn, title, unfolded=(front_table.TITLE,)))
     if page is not None:
         (part / "report.html").write_text(page, encoding="utf-8")
+    return table
 
 
 def _put_front(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: TuningFacts) -> None:

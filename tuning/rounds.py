@@ -87,7 +87,8 @@ def rounds(
     if problem.front and best.good and not course.over:
         course.members = best.members
         best = described("the front of error against voltage", lambda: trace_front(course, best)) or best
-    return dataclasses.replace(best, seconds=course.answer(x, None, 0).seconds)
+    last = course.answer(x, None, 0)
+    return dataclasses.replace(best, seconds=last.seconds, complete=last.complete)
 
 
 def _is_exhausted(course: Course) -> bool:

@@ -1,28 +1,26 @@
 """`ambjax compare`: several cases on the same members: errors, voltages, power losses, sensitivity, margins, cost."""
 
 import argparse
-import contextlib
 import dataclasses
 import pathlib
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from ambjax.cases.reader import Case, read_case
+from ambjax.cases.reader import Case
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
 from ambjax.commands.case_export import guarded_for
 from ambjax.commands.comparison_report import Compared, comparison_markdown, comparison_summary, comparison_table
+from ambjax.commands.comparison_tuning import check_options, tuned_cases
 from ambjax.commands.ensemble import study_of
 from ambjax.commands.outputs import described, directory, files, plain, say, write_json, written
 from ambjax.commands.study_report import findings_of
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
-from ambjax.host.extensions import extension
 from ambjax.host.web_page import render_page
 from ambjax.linear.state_space import StateSpace
 from ambjax.page.html_page import check_processor, pages
@@ -43,6 +41,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     The exit code is 0 if each case holds all members, the members tested are stable, and its nominal loop is stable at
     rest.
     """
+    check_options(args)
     cases = _read(args.cases)
     studies = [study_of(case, _seed(args, cases), args.members) for case in cases]
     notes = _differences(args.cases, cases, studies)
@@ -51,9 +50,10 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     for path, case in zip(args.cases, cases, strict=True):
         if args.page:
             check_processor(case, path)
-    out = directory(args.out, f"compare-{'-'.join(case.name for case in cases)}"[:80], WRITTEN, args.force)
+    name = f"compare-{'-'.join(case.name for case in cases)}"[:80]
+    out = directory(args.out, name, WRITTEN, args.force or args.resume)
     if args.tune:
-        cases = [_tuned(path, case.name, out, args) for path, case in zip(args.cases, cases, strict=True)]
+        cases = tuned_cases(cases, out, args)
         studies = [study_of(case, _seed(args, cases), args.members) for case in cases]
     html_pages = pages(cases, args.cases) if args.page else {}
     compared = [_compared(case, study) for case, study in zip(cases, studies, strict=True)]
@@ -129,18 +129,6 @@ def _differences(paths: Sequence[str], cases: Sequence[Case], studies: Sequence[
             shown += [f"{len(names) - 6} more"] * (len(names) > 6)
             notes.append(f"{cases[0].name} and {case.name} differ in more than the laws: {', '.join(shown)}")
     return notes
-
-
-def _tuned(path: str, name: str, out: pathlib.Path, args: argparse.Namespace) -> Case:
-    """Tune a case with the settings of the first, and return the tuned case under the same name."""
-    folder = out / f"tuned-{name}"
-    say(f"tuning {name}; its report will be in {folder}")
-    with contextlib.redirect_stdout(sys.stderr):
-        words = [path, "--settings-of", args.cases[0], "--out", str(folder), *["--force"] * args.force]
-        code = extension("tune")(words, "ambjax compare")
-    if code not in (0, 1):
-        raise ValueError(f"--tune: {path} could not be tuned. The line above gives the reason.")
-    return dataclasses.replace(read_case(folder / "tuned.toml"), name=name)
 
 
 def _compared(case: Case, study: Study) -> Compared:

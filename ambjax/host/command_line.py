@@ -102,19 +102,26 @@ def _code(run: Callable[[], tuple[int, object]], as_json: bool, program: str) ->
         code, summary = run()
         if as_json:
             print(json.dumps(summary, indent=2))
-    except ValueError as error:
-        return complain(str(error), program)
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        fix = " Free disk space, or write elsewhere." if error.errno in UNWRITABLE else ""
-        return complain(f"{where}{error.strerror or error}.{fix}", program)
-    except MemoryError:
-        return complain("not enough memory. Use fewer members or samples.", program)
-    except (NotImplementedError, RecursionError):  # these subclasses of RuntimeError indicate a bug of ambjax
-        raise
-    except RuntimeError as error:  # JAX: a device is missing, or its memory is full
-        return complain(str(error).strip().partition("\n")[0] or type(error).__name__, program)
     except KeyboardInterrupt as stop:
         complain(f"interrupted{f': {stop}' if str(stop) else ''}.", program)
         return 130
+    except Exception as error:
+        return complain(message(error), program)
     return code
+
+
+def message(error: Exception) -> str:
+    """Return the message of an error that a user can correct. Raise any other error again: it is a bug of ambjax."""
+    match error:
+        case ValueError():
+            return str(error)
+        case OSError():
+            where = f"{error.filename}: " if error.filename else ""
+            fix = " Free disk space, or write elsewhere." if error.errno in UNWRITABLE else ""
+            return f"{where}{error.strerror or error}.{fix}"
+        case MemoryError():
+            return "not enough memory. Use fewer members or samples."
+        case RuntimeError() if not isinstance(error, (NotImplementedError, RecursionError)):
+            # JAX: a device is missing, or its memory is full
+            return str(error).strip().partition("\n")[0] or type(error).__name__
+    raise error

@@ -7,10 +7,15 @@ from collections.abc import Callable
 GROUP = "ambjax.commands"
 
 
-def extension(name: str) -> Callable[[list[str], str], int]:
+class NothingToTuneError(ValueError):
+    """The case has no gains to tune, or its tune.gains is empty."""
+
+
+def extension(name: str) -> Callable[..., int]:
     """Return the command declared under `name`.
 
-    The command maps its words and the program's name to an exit code.
+    The command maps its words and the program's name to an exit code. With `nested=True`, it raises its errors, so that
+    the command that calls it can report them.
 
     Raises ValueError if no installed package declares it.
     """

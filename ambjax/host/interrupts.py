@@ -85,8 +85,12 @@ def exit_on_interrupt(program: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def reporting(words: Callable[[], str]) -> Iterator[None]:
-    """Add the text that `words` returns to the message of a Ctrl-C in this block. Another thread calls `words`."""
-    before, _handler.report = _handler.report, words
+    """Add the text that `words` returns to the message of a Ctrl-C in this block. Another thread calls `words`.
+
+    In a nested block, the words of the outer one apply.
+    """
+    before = _handler.report
+    _handler.report = before or words
     try:
         yield
     finally:

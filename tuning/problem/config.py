@@ -24,6 +24,7 @@ from ambjax.cases.tune_table import (
     Budget,
 )
 from ambjax.extend import leaf
+from ambjax.host.extensions import NothingToTuneError
 from tuning.optimisers import NAMES
 from tuning.problem.gains_table import space_from
 from tuning.problem.limits import LEAST_MARGIN, Limit
@@ -114,7 +115,8 @@ def read_tune(
         case = case_from(raw, name, text, pathlib.Path(path).parent)
         return case, tune_from(Table(raw).table("tune"), case), raw
     except ValueError as error:
-        raise ValueError(one_line(f"{path}: {error}")) from None
+        kind = NothingToTuneError if isinstance(error, NothingToTuneError) else ValueError
+        raise kind(one_line(f"{path}: {error}")) from None
 
 
 def _merged(own: Any, other: Any) -> Any:

@@ -10,16 +10,19 @@ from ambjax.cases.table import Table, show
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import no_such_number
 from ambjax.extend import GAINS
+from ambjax.host.extensions import NothingToTuneError
 from tuning.problem.space import CLOSEST, Gain, Space, knots, read, tunable
 
 
 def space_from(table: Table, case: Case) -> Space:
     """Return the search space of a case from its table [tune].
 
-    Raises ValueError for an unknown gain, an invalid bound, a bound of a gain that is not tuned, and a gain that is in
-    [spread] too.
+    Raises NothingToTuneError if there are no gains, and ValueError for an unknown gain, an invalid bound, a bound of a
+    gain that is not tuned, and a gain that is in [spread] too.
     """
     known = tunable(case.cascade)
+    if not known:
+        raise NothingToTuneError("the laws of this case have no gains to tune.")
     default = _default_gains(case) or known
     paths = table.raw.get("gains", default)
     if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):

@@ -18,6 +18,7 @@ from jax import Array
 from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import Schedule
 from ambjax.extend import Scalar
+from ambjax.host.extensions import NothingToTuneError
 
 # A coordinate bends within 1/SHARP of a bound, in logarithms. A logistic curve over the whole interval would put the
 # bound at infinity, so that a search converges slowly to an optimum at the bound.
@@ -87,13 +88,16 @@ class Gain:
 
 @dataclasses.dataclass(frozen=True)
 class Space:
-    """The gains to tune. Raises ValueError if it is empty, a path occurs twice or not 0 <= low < high for a gain."""
+    """The gains to tune.
+
+    Raises NothingToTuneError if it is empty, and ValueError if a path occurs twice or not 0 <= low < high for a gain.
+    """
 
     gains: tuple[Gain, ...]
 
     def __post_init__(self) -> None:
         if not self.gains:
-            raise ValueError('tune.gains is empty: name at least one, for example ["controller.position.c"].')
+            raise NothingToTuneError('tune.gains is empty: name at least one, for example ["controller.position.c"].')
         for gain in self.gains:
             if not 0 <= gain.low < gain.high:
                 raise ValueError(

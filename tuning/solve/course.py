@@ -55,6 +55,8 @@ class SearchResult:
     """rms error of the validation members that are held, relative to s_0; inf if it was not computed"""
     within: bool = True
     """whether the answer is within all limits on the validation members"""
+    complete: bool = True
+    """whether neither Ctrl-C nor the end of the time has ended the searches early"""
     front: tuple[Any, ...] = ()
     """points of the front of error against voltage (`front.FrontPoint`); empty if it was not traced"""
 
@@ -170,7 +172,9 @@ class Course:
         """Return the result at x [m]. `error`: step error at x, or None. The others are as in SearchResult."""
         seconds = time.perf_counter() - self.began + sum(progress.earlier for progress in self.past)
         history = _joined(self.past)
-        return SearchResult(self.problem, self.members, x, error, history, lost, seconds, validation_error)
+        return SearchResult(
+            self.problem, self.members, x, error, history, lost, seconds, validation_error, complete=not self.over
+        )
 
 
 def search_and_restart(course: Course, start: np.ndarray) -> np.ndarray:
