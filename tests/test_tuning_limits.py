@@ -31,6 +31,7 @@ from tuning.report.limit_table import MORE
 from tuning.report.pictures import amplitudes
 from tuning.rounds import rounds
 from tuning.solve.course import Course, training
+from tuning.solve.joining import breaking
 from tuning.solve.multipliers import search_within_limits
 from tuning.validate import Validation
 
@@ -308,18 +309,36 @@ def test_a_limit_is_active_if_its_multiplier_is_positive_and_it_is_reached():
     assert not Limit("max_u_V", 10.0, margin=0.03).active(10.0)
 
 
-def test_a_limit_far_from_the_value_costs_nothing(monkeypatch, tmp_path):
+def test_a_limit_far_from_the_value_causes_no_search(monkeypatch, tmp_path):
     far, free = World(), World()
     first, _ = found(monkeypatch, tmp_path, far, limits={"rms_u_V": 30.0})
     second, _ = found(monkeypatch, tmp_path / "free", free, limits={"rms_u_V": math.inf})
     np.testing.assert_array_equal(first.x, second.x)
-    assert [one for one in far.calls if one[0] != "terms"] == [one for one in free.calls if one[0] != "terms"]
-    assert len(far.calls) == len(free.calls) + 1  # the training members, once more
+    gradients = [[one for one in world.calls if one[0] == "gradient"] for world in (far, free)]
+    assert gradients[0] == gradients[1]
 
 
 def test_the_judged_value_corrects_the_search(monkeypatch, tmp_path):
     _, (_, k) = found(monkeypatch, tmp_path, World(louder=1.25), **TEN)
     assert k == pytest.approx(30.0 / 1.25, rel=0.012)
+
+
+def test_members_that_break_a_limit_on_the_worst_member_join(monkeypatch):
+    """The largest values first, without members that are lost or that have joined before; they are then searched."""
+    problem = study(monkeypatch, World(), limits={"settling_s": 1.0})
+    (limit,), count = problem.limits, problem.tune.budget.validation
+    course = Course(problem, training(problem), 1)
+    values = np.full(count, 0.5)
+    values[[1, 4, 7]] = 2.0, 3.0, 9.0
+    columns = {"lost_at_s": np.where(np.arange(count) == 7, 0.01, np.inf), f"loss.limit.{limit.name}": values}
+    more = breaking(course, [(0.6, 3.0)], columns)
+    assert more.member.tolist() == [1, 4]
+    assert set(more.seed) == {seeds(problem.tune.budget)[1]}
+    course.members = course.members.joined(more, stressed=False)
+    assert course.members.searched.member[:2].tolist() == [1, 4]
+    assert course.members.part(4).member[:2].tolist() == [1, 4]
+    assert breaking(course, [(0.6, 3.0)], columns) is None
+    assert breaking(course, [(0.6, 0.5)], columns) is None  # it is held
 
 
 def test_a_search_that_does_not_move_and_holds_the_limits_ends(monkeypatch):

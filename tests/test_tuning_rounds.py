@@ -147,7 +147,7 @@ def test_the_answer_that_loses_the_fewest_members_is_returned(monkeypatch, tmp_p
 
 
 def test_steps_that_do_not_resolve_the_answer_are_halved(monkeypatch, tmp_path):
-    world = World(bias=lambda substeps: {3: 0.5, 6: 0.2, 12: 0.05}[substeps])
+    world = World(bias=lambda substeps: {3: 0.5, 6: 0.2, 12: 0.05}.get(substeps, 0.0))
     found, _ = tuned(monkeypatch, tmp_path, world)
     assert found.problem.objective.clock.method == Slide(12)
     assert found.error.relative == pytest.approx(0.05)

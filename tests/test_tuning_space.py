@@ -81,6 +81,19 @@ def test_every_interval_has_gains_well_within_and_their_coordinates(low, way, sh
     assert low <= float(gain.decode(jnp.asarray(-700.0))) <= float(gain.decode(jnp.asarray(700.0))) <= gain.high
 
 
+def test_a_search_begins_where_a_gain_depends_on_its_coordinate():
+    """Drawn back, a gain is within 4 % of its bound, and its slope is above a tenth. Other coordinates stay."""
+    space = Space((Gain("controller.position.c", 2.0, 500.0), Gain("controller.position.k", 0.0, 9.0)))
+    x = np.array([math.log(500.0) + 5.0, math.log(9.0) + 5.0])
+    start = space.drawn_back(x)
+    np.testing.assert_allclose(space.gains_at(jnp.asarray(start)), [500.0, 9.0], rtol=0.04)
+    slopes = np.diag(jax.jacobian(space.gains_at)(jnp.asarray(start))) / [500.0, 9.0]
+    assert np.all(slopes > 0.1)
+    inside = np.array([1.0, -30.0])
+    np.testing.assert_array_equal(space.drawn_back(inside), inside)
+    np.testing.assert_array_equal(Space((Gain("controller.position.c", 3.0),)).drawn_back(inside[:1]), inside[:1])
+
+
 def test_gains_outside_the_space_are_not_copied():
     cascade = Cascade(position=position.SlidingMode(17.0, 25.0, 25.0))
     space = Space((Gain(C),))

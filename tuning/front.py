@@ -8,31 +8,23 @@ is repeated.
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from tuning.judge.evaluate import held, judge, rms
-from tuning.problem.config import seeds
+from tuning.judge.evaluate import held, rms
 from tuning.problem.limits import FRONT
-from tuning.problem.members import Members
 from tuning.solve.course import Course, SearchResult
-from tuning.solve.joining import largest_unseen
-from tuning.solve.multipliers import holding, join_breaking, judged_members, judged_values, met, search_values
+from tuning.solve.multipliers import Judged, judged_at, optima
 from tuning.validate import validated
 
 # Limits of the rms error relative to the least error: KNEE for the knee, FACTORS for the points of the front. The first
-# tune.front factors are used.
+# tune.front factors are used, and further ones until there are tune.front points besides that of least error.
 KNEE = 1.25
-FACTORS = (KNEE, 1.1, 1.5, 1.05, 2.0)
-# MOST_SEARCHES_PER_POINT: largest number of searches for a point of the front. Between two searches, the multipliers
-# are updated or members join. MOST_VALIDATIONS: largest number of answers that are validated.
-MOST_SEARCHES_PER_POINT, MOST_VALIDATIONS = 6, 4
-# If the judge's error exceeds its expected value (`_members_to_join`) by more than the share UNEXPECTED, the training
-# ensemble lacks members with large errors. The share is below that of the validation, `validation.LARGER` - 1, because
-# the error is limited here.
-UNEXPECTED = 0.1
+FACTORS = (KNEE, 1.1, 1.5, 2.0, 1.05, 3.0)
+# Largest number of answers that are validated.
+MOST_VALIDATIONS = 4
 
 
 class FrontPoint(NamedTuple):
@@ -70,20 +62,23 @@ def trace_front(course: Course, answer: SearchResult) -> SearchResult:
     does.
     """
     course.problem, x = answer.problem, answer.x
-    first, *_ = _judged(course, 1.0, x)
+    first = _point(course, 1.0, judged_at(course, x))
     if not (math.isfinite(first.error_m) and first.error_m > 0 and first.volts > 0):
         course.tell("no front: with the gains of least error, no member is held, or the error or the voltage is 0")
         return answer
-    seen, factors = [first], sorted(FACTORS[: answer.problem.tune.budget.front])
-    for factor in factors:
-        if course.over:
+    seen, factors, count = [first], list[float](), answer.problem.tune.budget.front
+    for factor in (*sorted(FACTORS[:count]), *FACTORS[count:]):
+        if course.over or (len(factors) >= count and len({id(chosen(seen, one)) for one in (1.0, *factors)}) > count):
             break
+        factors.append(factor)
         least = least_of(seen)
         course.tell(
             f"front: least rms voltage with an rms error of at most {factor:g} times the least, {least.error_m:.3g} m"
         )
         course.problem = answer.problem.towards_voltage(least.error_m, least.volts, factor)
-        seen += _search_least_voltage(course, factor, seen)
+        course.limit_searches += 1
+        found, _ = course.again(chosen(seen, factor).x)
+        seen += [_point(course, factor, one) for one in optima(course, found)[0]]
     taken = answer
     if not course.over:
         least, course.problem = least_of(seen), answer.problem
@@ -91,7 +86,7 @@ def trace_front(course: Course, answer: SearchResult) -> SearchResult:
             course.problem = answer.problem.towards_voltage(least.error_m, least.volts, KNEE)
         taken = _validated_point(course, answer, seen)
     least = least_of(seen)
-    points = [least._replace(factor=1.0), *(chosen(seen, factor)._replace(factor=factor) for factor in factors)]
+    points = [least._replace(factor=1.0), *(chosen(seen, factor)._replace(factor=factor) for factor in sorted(factors))]
     if not any(point.x is taken.x for point in points):
         points.append(first._replace(factor=round(first.error_m / least.error_m, 3)))
     kept = [point for k, point in enumerate(points) if not any(point.x is other.x for other in points[:k])]
@@ -128,65 +123,6 @@ def _admissible(seen: Sequence[FrontPoint]) -> list[FrontPoint]:
     ]
 
 
-def _search_least_voltage(course: Course, factor: float, seen: Sequence[FrontPoint]) -> list[FrontPoint]:
-    """Search for the least voltage within the limits, from the best point in `seen`. Return the judged answers.
-
-    The searches end when each limit is met (`met`), or is not exceeded and has the multiplier 0. They also end after
-    Ctrl-C, and if a search ends where it began and this point is within all limits. Otherwise the multipliers are
-    updated, and the next search starts at the last answer. If validation members have large errors, they join the
-    training ensemble instead, and the next search starts at the best point so far.
-    """
-    points, x = list[FrontPoint](), chosen(seen, factor).x
-    for _ in range(MOST_SEARCHES_PER_POINT):
-        course.limit_searches += 1
-        start = x
-        x, _ = course.search(start[None])
-        point, numbers, columns = _judged(course, factor, x)
-        points.append(point)
-        limits = tuple(limit.updated(*pair) for limit, pair in zip(course.problem.limits, numbers, strict=True))
-        course.tell(f"judged {point.volts:.4g} V at an rms error of {point.error_m:.3g} m")
-        both = zip(limits, numbers, strict=True)
-        if course.over or all(
-            met(limit, judged) or (not limit.multiplier and limit.log_excess(judged) <= 0)
-            for limit, (_, judged) in both
-        ):
-            break
-        if np.array_equal(x, start) and holding(limits, numbers):
-            break
-        if join_breaking(course, numbers, columns):
-            continue
-        more = _members_to_join(course, numbers, columns)
-        if more is None:
-            course.problem = course.problem.limited(limits)
-        else:
-            course.tell("validation members with large errors join the training ensemble; the search is repeated")
-            course.members = course.members.joined(more, stressed=False)
-            x = chosen([*seen, *points], factor).x
-    return points
-
-
-def _members_to_join(
-    course: Course, numbers: Sequence[tuple[float, float]], columns: Mapping[str, np.ndarray]
-) -> Members | None:
-    """Return the validation members that join the training ensemble; None if none joins.
-
-    They are those with the largest errors that are not in the training ensemble. They join if the judge's rms error
-    breaks its limit and exceeds its expected value by more than UNEXPECTED. The expected value is the search's value
-    times `Limit.ratio`.
-
-    `numbers`: the values of the search and of the judge for each limit. `columns` [N]: metrics of the judged members.
-    """
-    problem, budget = course.problem, course.problem.tune.budget
-    limit, (tuned, judged) = next(
-        (limit, pair) for limit, pair in zip(problem.limits, numbers, strict=True) if limit.name == "rms_error_m"
-    )
-    if not budget.validation or limit.holds(judged) or judged <= (1 + UNEXPECTED) * limit.ratio * tuned:
-        return None
-    errors = np.where(held(columns), columns["settled_rms_error_m"], -math.inf)
-    worst = largest_unseen(course, errors)
-    return problem.objective.chosen(seeds(budget)[1], worst, len(errors)) if worst.size else None
-
-
 def _validated_point(course: Course, answer: SearchResult, seen: list[FrontPoint]) -> SearchResult:
     """Return the best point that the validation confirms, or `answer` if it confirms none.
 
@@ -207,25 +143,18 @@ def _validated_point(course: Course, answer: SearchResult, seen: list[FrontPoint
     return answer
 
 
-def _judged(
-    course: Course, factor: float, x: np.ndarray
-) -> tuple[FrontPoint, list[tuple[float, float]], dict[str, np.ndarray]]:
-    """Judge x [m] on members of the validation ensemble, or of the training ensemble if tune.validation is 0.
-
-    Returns the point, the search's and the judge's value of each limit, and the metrics of the judged members.
-    """
-    problem, budget = course.problem, course.problem.tune.budget
-    seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)
-    columns, tuned = judge(problem, x, seed, judged_members(problem.limits, count)), search_values(course, x)
-    values = judged_values(problem, x, seed, columns, tuned)
+def _point(course: Course, factor: float, one: Judged) -> FrontPoint:
+    """Return a judged optimum as a point of the front."""
+    columns, limits = one.columns, course.problem.limits
     alive = held(columns)
     error, volts = (
         rms(columns[name][alive]) if alive.any() else math.nan for name in ("settled_rms_error_m", "settled_rms_u_V")
     )
-    each = dict(zip((limit.name for limit in problem.limits), values, strict=True))
-    others = [limit for limit in problem.limits if limit.source != FRONT]
-    within = all(limit.holds(each[limit.name]) for limit in others)
-    reserve = all(limit.has_reserve(each[limit.name]) for limit in others)
+    values = {limit.name: judged for limit, (_, judged) in zip(limits, one.numbers, strict=True)}
+    others = [limit for limit in limits if limit.source != FRONT]
+    within = all(limit.holds(values[limit.name]) for limit in others)
+    reserve = all(limit.has_reserve(values[limit.name]) for limit in others)
     lost, stalled = (int(columns[name].sum()) for name in ("lost", "stalled"))
-    point = FrontPoint(factor, x, error, volts, each.get("sensitivity"), lost, stalled, len(alive), within, reserve)
-    return point, list(zip(tuned, values, strict=True)), columns
+    return FrontPoint(
+        factor, one.x, error, volts, values.get("sensitivity"), lost, stalled, len(alive), within, reserve
+    )

@@ -110,7 +110,7 @@ def with_fine_steps(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepErro
             return x, error
         course.problem = substeps
         course.tell(f"these steps are too coarse; the search continues with {course.problem.objective.clock.method}")
-        x, _ = course.search(x[None])
+        x, _ = course.again(x)
 
 
 def earlier_confirmed(course: Course, best: SearchResult) -> SearchResult:

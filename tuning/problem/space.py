@@ -23,6 +23,9 @@ from ambjax.host.extensions import NothingToTuneError
 # A coordinate bends within 1/SHARP of a bound, in logarithms. A logistic curve over the whole interval would put the
 # bound at infinity, so that a search converges slowly to an optimum at the bound.
 SHARP = 4.0
+# Largest distance of a coordinate beyond a bound at the start of a search. There, the gain is 3 % away from the bound,
+# and a change of the coordinate changes its logarithm by an eighth of that.
+BEYOND = 0.5
 # Distance of `Gain.inner` from the bounds: a share of the bound, the distance from 0 in units of the gain, and the
 # largest share of the interval in logarithms.
 MARGIN, MARGIN_OF_ZERO, SHARE = 0.02, 1e-12, 0.1
@@ -136,6 +139,16 @@ class Space:
     def clip(self, gains: np.ndarray) -> np.ndarray:
         """Return the gains [m], clipped to `Gain.inner`: 2 % inside of the bounds, or less if these are close."""
         return np.array([float(np.clip(value, *gain.inner)) for gain, value in zip(self.gains, gains, strict=True)])
+
+    def drawn_back(self, x: np.ndarray) -> np.ndarray:
+        """Return x [m] with no coordinate more than BEYOND beyond a bound, so that a search can leave the bound.
+
+        Farther beyond, a gain hardly depends on its coordinate.
+        """
+        bent = [(gain.low, gain.high) if math.isfinite(gain.high) else (0.0, math.inf) for gain in self.gains]
+        with np.errstate(divide="ignore"):
+            low, high = np.log(bent).T
+        return np.clip(x, low - BEYOND, high + BEYOND)
 
     def decode(self, x: Array, cascade: Cascade) -> Cascade:
         """Return the cascade with the gains at coordinates x [m]. All other leaves are the same objects."""

@@ -131,6 +131,16 @@ class Course:
         self.past.append(progress)
         return _best(progress)
 
+    def again(self, x: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Search from x [m] on all members. Return the best point [m], and whether it is another one.
+
+        The search begins at x, drawn back from the bounds (`Space.drawn_back`).
+        """
+        start = self.problem.objective.space.drawn_back(x)
+        found, _ = self.search(start[None])
+        moved = not np.array_equal(found, start)
+        return found if moved else x, moved
+
     def tell(self, text: str) -> None:
         """Send an event to the listener."""
         self.listen(Event(text))

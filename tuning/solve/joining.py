@@ -16,6 +16,9 @@ from tuning.solve.course import Course
 MOST_LOST, MOST_LARGE = 16, 8
 # Largest number of members that join because they break a limit on the worst member.
 MOST_BREAKING = 4
+# If the judged mean of a limited quantity exceeds its expected value by more than this share, the training ensemble
+# lacks members with large values.
+UNEXPECTED = 0.1
 # Members that are lost with accurate steps are held with the steps of the search. They therefore join with more noise,
 # by the factor NOISE_GROWTH**number in round number `number`.
 NOISE_GROWTH = 1.5
@@ -34,23 +37,26 @@ def largest_unseen(course: Course, values: np.ndarray, most: int = MOST_LARGE) -
 
 
 def breaking(
-    course: Course, numbers: Sequence[tuple[float, float]], columns: Mapping[str, np.ndarray] | None
+    course: Course, numbers: Sequence[tuple[float, float]], columns: Mapping[str, np.ndarray]
 ) -> Members | None:
-    """Return the validation members that break a limit on the worst member and are not in the training ensemble.
+    """Return the validation members that explain a broken limit and are not in the training ensemble, or None.
 
-    At most MOST_BREAKING for each limit whose judged value lacks reserve; None if there is none.
+    For a limit on the worst member, they are at most MOST_BREAKING members that break it, if the judged value lacks
+    reserve. For a limit on a mean, they are the members with the largest values, if the judged value breaks the limit
+    and exceeds its expected value, the search's value times `Limit.ratio`, by more than UNEXPECTED.
 
-    `numbers`: the values of the search and of the judge for each limit. `columns` [N]: metrics of the judged members;
-    None if they were not simulated.
+    `numbers`: the values of the search and of the judge for each limit. `columns` [N]: metrics of the judged members.
     """
     problem, budget = course.problem, course.problem.tune.budget
-    if columns is None or not budget.validation:
+    if not budget.validation:
         return None
     found = np.zeros(0, int)
-    for limit, (_, judged) in zip(problem.limits, numbers, strict=True):
+    for limit, (tuned, judged) in zip(problem.limits, numbers, strict=True):
+        excess = np.where(held(columns), limit.log_excesses(columns), -math.inf)
         if limit.kind.worst and not limit.has_reserve(judged):
-            excess = np.where(held(columns), limit.log_excesses(columns), -math.inf)
             found = np.append(found, largest_unseen(course, np.where(excess > 0, excess, -math.inf), MOST_BREAKING))
+        elif not limit.kind.worst and not limit.holds(judged) and judged > (1 + UNEXPECTED) * limit.ratio * tuned:
+            found = np.append(found, largest_unseen(course, excess))
     total = len(columns["lost_at_s"])
     return problem.objective.chosen(seeds(budget)[1], np.unique(found), total) if found.size else None
 

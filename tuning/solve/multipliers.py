@@ -6,7 +6,8 @@ excess g of a limit is about (required multiplier - multiplier) / penalty. An up
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,8 +23,7 @@ from tuning.solve.joining import breaking
 MOST_UPDATES = 6
 # Smallest decrease of g that counts as progress towards a limit.
 LEAST_DECREASE = 1e-3
-# A limit with g below -CLEARLY_BELOW is clearly met, because two ensembles differ by far less. The limits are not
-# judged if all are clearly met, by the values of the search, and none concerns the worst member.
+# A limit with g below -CLEARLY_BELOW is clearly met, because two ensembles differ by far less.
 CLEARLY_BELOW = 0.1
 # A quantity whose linear value has g above -INJECTED_FROM is also measured by injection, because the measured value may
 # exceed the linear one by up to a fifth.
@@ -32,67 +32,90 @@ INJECTED_FROM = 0.2
 AVERAGING_MEMBERS = 256
 
 
-def search_within_limits(course: Course, x: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Update the multipliers at x [m] and search again until every limit is met.
+class Judged(NamedTuple):
+    """An optimum, judged on members of the validation ensemble, or of the training ensemble if tune.validation is 0.
 
-    Returns the last optimum [m], or x itself if no search was needed, and whether it is within all limits.
-    `course.problem` receives the updated limits.
-
-    There are at most MOST_UPDATES searches. The loop ends early after Ctrl-C, and if a search ends where it began and
-    this point is within all limits. It also ends early if a larger penalty makes no progress towards a limit. The
-    held-out members then show whether the limit holds.
-
-    The updates may not converge: the judge may measure very different values on either side of a limit, and the
-    searches then alternate between the sides. The function then returns the optimum of least goal within all limits,
-    if there is one.
+    `x` [m]: coordinates. `numbers`: (the search's value, the judge's value) of each limit. `columns` [N]: metrics of
+    the judged members.
     """
-    within, moved = list[np.ndarray](), True
+
+    x: np.ndarray
+    numbers: list[tuple[float, float]]
+    columns: dict[str, np.ndarray]
+
+    def holds(self, limits: Sequence[Limit]) -> bool:
+        """Return whether the judge's values are within all limits, without margins."""
+        return all(limit.holds(judged) for limit, (_, judged) in zip(limits, self.numbers, strict=True))
+
+
+def search_within_limits(course: Course, x: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Search from the optimum x [m] until every limit is met (`optima`). Return an optimum and whether it is within.
+
+    The result is the last optimum. If the searches do not converge, it is the optimum of least goal within all limits,
+    if there is one: the judge may measure very different values on either side of a limit, and the searches then
+    alternate between the sides.
+    """
+    limits = course.problem.limits
+    if not limits:
+        return x, True
+    seen, converged = optima(course, x)
+    within = [one.x for one in seen if one.holds(limits)]
+    if converged or not within:
+        return seen[-1].x, bool(within) and within[-1] is seen[-1].x
+    return _least(course, within), True
+
+
+def optima(course: Course, x: np.ndarray) -> tuple[list[Judged], bool]:
+    """Judge the optimum x [m], let the members that break a limit join, or update the multipliers, and search again.
+
+    Returns the judged optima, the first at x, and whether the last one meets all limits. `course.problem` and
+    `course.members` are those of the last search.
+
+    There are at most MOST_UPDATES searches. The loop ends early if the course is over, and if a search ends where it
+    began and this point is within all limits. It also ends early if a larger penalty makes no progress towards a limit.
+    """
+    seen, moved = list[Judged](), True
     for update in range(MOST_UPDATES + 1):
-        before = course.problem.limits
-        numbers, columns = _numbers(course, x)
-        if holds := holding(before, numbers):
-            within.append(x)
-        if update < MOST_UPDATES and not course.over and join_breaking(course, numbers, columns):
-            course.limit_searches += 1
-            x, _ = course.search(x[None])
-            continue
-        limits = tuple(limit.updated(*found) for limit, found in zip(before, numbers, strict=True))
-        stuck = [limit for limit, (_, judged) in zip(before, numbers, strict=True) if _stuck(limit, judged)]
-        if stuck and update:  # at update 0, `missed` is of an earlier round, with other members
-            names = ", ".join(limit.name for limit in stuck)
-            course.tell(
-                f"a larger penalty makes no progress towards the limit of {names}; its multiplier is no longer updated"
-            )
-            break
-        course.problem = course.problem.limited(limits)
-        if _all_met(course, before, limits, numbers) or course.over or (not moved and holds):
-            return x, holds
-        if update == MOST_UPDATES:
+        before, one = course.problem.limits, judged_at(course, x)
+        seen.append(one)
+        last = update == MOST_UPDATES or course.over
+        if last or not join_breaking(course, one):
+            limits = tuple(limit.updated(*found) for limit, found in zip(before, one.numbers, strict=True))
+            stuck = [limit for limit, (_, judged) in zip(before, one.numbers, strict=True) if _stuck(limit, judged)]
+            if stuck and update:  # at update 0, `missed` is of an earlier round, with other members
+                names = ", ".join(limit.name for limit in stuck)
+                course.tell(f"a larger penalty makes no progress towards the limit of {names}")
+                break
+            course.problem = course.problem.limited(limits)
+            if _all_met(course, before, limits, one.numbers) or (not moved and one.holds(limits)):
+                return seen, True
+        if last:
             break
         course.limit_searches += 1
-        start = x
-        x, _ = course.search(start[None])
-        moved = not np.array_equal(x, start)
-    return (_least(course, within), True) if within else (x, False)
+        x, moved = course.again(x)
+    return seen, False
 
 
-def join_breaking(
-    course: Course, numbers: Sequence[tuple[float, float]], columns: Mapping[str, np.ndarray] | None
-) -> bool:
+def join_breaking(course: Course, one: Judged) -> bool:
     """Let the members that break a limit join the training ensemble (`breaking`). Return whether there are any.
 
-    The search then measures the worst members itself, so that the limits on them need no correction by a ratio.
+    The search then measures these members itself, so that the limits on worst members need no correction by a ratio.
     """
-    more = breaking(course, numbers, columns)
+    more = breaking(course, one.numbers, one.columns)
     if more is None:
         return False
-    for limit, (_, judged) in zip(course.problem.limits, numbers, strict=True):
-        if limit.kind.worst and not limit.has_reserve(judged):
-            course.tell(f"limit {limit.name} = {limit.threshold:g} {limit.kind.unit}: judged {judged:.4g}")
+    limits = course.problem.limits
+    broken = [
+        (limit, judged)
+        for limit, (_, judged) in zip(limits, one.numbers, strict=True)
+        if limit.kind.worst and not limit.has_reserve(judged)
+    ]
+    for limit, judged in broken:
+        course.tell(f"limit {limit.name} = {limit.threshold:g} {limit.kind.unit}: judged {judged:.4g}")
     course.tell(f"{len(more.member)} validation members that break a limit join the training ensemble")
     course.members = course.members.joined(more, stressed=False)
-    limits = (dataclasses.replace(limit, ratio=1.0) if limit.kind.worst else limit for limit in course.problem.limits)
-    course.problem = course.problem.limited(tuple(limits))
+    reset = (dataclasses.replace(limit, ratio=1.0) if limit.kind.worst else limit for limit in limits)
+    course.problem = course.problem.limited(tuple(reset))
     return True
 
 
@@ -101,7 +124,7 @@ def _all_met(
 ) -> bool:
     """Return whether all limits are met, and tell each limit that is active or not met.
 
-    `before`, `after`: the limits before and after the update of their multipliers. `numbers`: as of `_numbers`.
+    `before`, `after`: the limits before and after the update of their multipliers. `numbers`: as of `Judged`.
     """
     done = []
     for old, new, (_, judged) in zip(before, after, numbers, strict=True):
@@ -118,11 +141,6 @@ def _least(course: Course, points: Sequence[np.ndarray]) -> np.ndarray:
     both = np.array(points)
     goal = dataclasses.replace(course.problem.goal, limits=())
     return points[int(np.argmin(goal.score(both, course.problem.engine.terms(both, course.members), course.members)))]
-
-
-def holding(limits: Sequence[Limit], numbers: Sequence[tuple[float, float]]) -> bool:
-    """Return whether the judge's values are within all limits, without margins. `numbers`: as of `_numbers`."""
-    return all(limit.holds(judged) for limit, (_, judged) in zip(limits, numbers, strict=True))
 
 
 def _stuck(limit: Limit, judged: float) -> bool:
@@ -143,41 +161,19 @@ def met(limit: Limit, judged: float) -> bool:
     return limit.log_excess(judged) >= -TOLERANCE_BELOW and limit.has_reserve(judged)
 
 
-def _numbers(course: Course, x: np.ndarray) -> tuple[list[tuple[float, float]], dict[str, np.ndarray] | None]:
-    """Return (the search's value, the judge's value) of each limit at x [m], and the metrics of the judged members.
-
-    The judge uses the validation ensemble, or the training ensemble if tune.validation is 0. If all limits are clearly
-    met (CLEARLY_BELOW) and none concerns the worst member, the judge's value is estimated: it is `Limit.ratio` times
-    the search's value, and no member is simulated (None).
-    """
+def judged_at(course: Course, x: np.ndarray) -> Judged:
+    """Return the values of the limits at x [m], on all members of the ensemble if a limit concerns the worst member."""
     problem, budget = course.problem, course.problem.tune.budget
-    limits = problem.limits
-    if not limits:
-        return [], None
-    tuned = search_values(course, x)
-    known = [limit.ratio * ours for limit, ours in zip(limits, tuned, strict=True)]
-    if all(
-        not limit.kind.worst and limit.log_excess(one) < -CLEARLY_BELOW
-        for limit, one in zip(limits, known, strict=True)
-    ):
-        return list(zip(tuned, known, strict=True)), None
     seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)
-    columns = judge(problem, x, seed, judged_members(limits, count))
-    return list(zip(tuned, judged_values(problem, x, seed, columns, tuned), strict=True)), columns
+    if not any(limit.kind.worst for limit in problem.limits):
+        count = min(count, AVERAGING_MEMBERS)
+    columns = judge(problem, x, seed, count)
+    terms, n = problem.engine.terms(x[None], course.members), course.members.ordinary
+    tuned = [float(limit.kind.tuned(terms[PREFIX + limit.name][0, :n])) for limit in problem.limits]
+    return Judged(x, list(zip(tuned, _judged_values(problem, x, seed, columns, tuned), strict=True)), columns)
 
 
-def judged_members(limits: Sequence[Limit], count: int) -> int:
-    """Return on how many of `count` members the limits are judged: on all, if a limit concerns the worst member."""
-    return count if any(limit.kind.worst for limit in limits) else min(count, AVERAGING_MEMBERS)
-
-
-def search_values(course: Course, x: np.ndarray) -> list[float]:
-    """Return the search's value of each limit at x [m]."""
-    terms, n = course.problem.engine.terms(x[None], course.members), course.members.ordinary
-    return [float(limit.kind.tuned(terms[PREFIX + limit.name][0, :n])) for limit in course.problem.limits]
-
-
-def judged_values(
+def _judged_values(
     problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray], tuned: Sequence[float]
 ) -> list[float]:
     """Return the judge's value of each limit at x [m].
