@@ -20,6 +20,7 @@ from ambjax.numerics.records import is_traced
 from ambjax.simulation.folds import Named
 from ambjax.simulation.metrics import standard_for
 from tuning.judge.peaks import MeasuredPeak, Sensitivity
+from tuning.problem import config
 from tuning.problem.config import LimitSettings, settings
 from tuning.problem.lanes import Engine
 from tuning.problem.limits import PENALTY, Limit, measures
@@ -325,7 +326,7 @@ def test_the_judged_value_corrects_the_search(monkeypatch, tmp_path):
 
 def test_members_that_break_a_limit_on_the_worst_member_join(monkeypatch):
     """The largest values first, without members that are lost or that have joined before; they are then searched."""
-    problem = study(monkeypatch, World(), limits={"settling_s": 1.0})
+    problem = study(monkeypatch, World(), limits={"settling_s": 1.0, "rms_u_V": math.inf})
     (limit,), count = problem.limits, problem.tune.budget.validation
     course = Course(problem, training(problem), 1)
     values = np.full(count, 0.5)
@@ -333,7 +334,7 @@ def test_members_that_break_a_limit_on_the_worst_member_join(monkeypatch):
     columns = {"lost_at_s": np.where(np.arange(count) == 7, 0.01, np.inf), f"loss.limit.{limit.name}": values}
     more = breaking(course, [(0.6, 3.0)], columns)
     assert more.member.tolist() == [1, 4]
-    assert set(more.seed) == {seeds(problem.tune.budget)[1]}
+    assert set(more.seed) == {config.seeds(problem.tune.budget)[1]}
     course.members = course.members.joined(more, stressed=False)
     assert course.members.searched.member[:2].tolist() == [1, 4]
     assert course.members.part(4).member[:2].tolist() == [1, 4]
