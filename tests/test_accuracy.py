@@ -52,12 +52,14 @@ def test_the_limit_of_the_supply_and_a_table_of_the_sensor_do_not_cost_accuracy(
 
 # Each of these draws is held; together they contain a limit that is reached with and without noise, a jump inside a
 # sample, iron, two coils, a stiff loop and a loop of one DOP853 step.
-@pytest.mark.parametrize("seed", [102, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (105, 107))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [102, 105, 107])
 def test_a_random_structure_is_accurate(seed):
     error, _ = error_of(case_from(drawn(seed, 60)))
     assert error <= 1e-8
 
 
+@pytest.mark.slow
 def test_fixed_steps_under_noise_are_accurate_for_analytic_laws_and_only_chosen_for_them():
     """One step of DOP853 per sample; the roots of a differentiator, by contrast, cost 1e-7 m with such steps."""
     raw = drawn(102, 60) | {"sensor": {"std": 5e-7}, "initial": {"z": 1e-5}}
@@ -71,7 +73,7 @@ def test_fixed_steps_under_noise_are_accurate_for_analytic_laws_and_only_chosen_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", range(4))
+@pytest.mark.parametrize("part", range(examples(2, 4)))
 def test_random_structures_are_accurate(part):
     count, errors = examples(6, 40), []
     for seed in range(1000 + part * count, 1000 + (part + 1) * count):

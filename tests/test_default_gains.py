@@ -176,8 +176,15 @@ LAWS = [
 ]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("laws", LAWS, ids="/".join)
+# Laws that take long; the benchmark of the default gains contains every structure.
+LONG = ("super-twisting", "terminal-sliding-mode")
+
+
+@pytest.mark.parametrize(
+    "laws",
+    [pytest.param(laws, marks=pytest.mark.thorough if laws[0] in LONG else pytest.mark.slow) for laws in LAWS],
+    ids="/".join,
+)
 def test_untuned_laws_levitate_a_machine_that_is_not_the_papers_in_zone_a(laws):
     raw = tomllib.loads(BLOWER)
     stages = zip(("position", "inversion", "current"), laws, strict=True)

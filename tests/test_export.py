@@ -131,7 +131,7 @@ CASCADES = {
 # What the fast suite looks at; the slow one at all others, the thorough profile at all in both precisions.
 FAST = [("one and a half", "double")]
 # Laws that other cascades have.
-REPEATED = [name for name, _ in FAST] + ["Kalman"]
+REPEATED = [*(name for name, _ in FAST), "Kalman", "the paper's", "super-twisting, the sign itself", "explicit"]
 EACH_CASCADE = [pytest.param(x, marks=pytest.mark.thorough if x in REPEATED else pytest.mark.slow) for x in CASCADES]
 # Loops that are simulated by default, too.
 LOOPED = ("the paper's", "super-twisting, the sign itself", "terminal sliding mode")

@@ -78,7 +78,8 @@ const run = row => {
 """
 
 
-@pytest.mark.parametrize("what", ["controller", *(pytest.param(x, marks=pytest.mark.slow) for x in ("plant", "loop"))])
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["controller", "plant", "loop"])
 def test_one_step_equals_jax(what, tmp_path):
     traced = trace(blocks_of(*CASES["rig"])[what], "double")
     at = verification_points(traced, 1000)

@@ -110,6 +110,7 @@ def test_every_parameter_changes_the_result_at_some_point(made):
         assert not refused[at.parameters[k] == trace.parameters[k].value].all()
 
 
+@pytest.mark.slow
 def test_a_steepness_of_inf_is_refused_as_the_header_states(made):
     controller = made.trace.block
     parameters, memory, inputs, period = arguments(controller)

@@ -45,7 +45,7 @@ def cascade_of(mode, watching, moving):
     return Cascade(*laws, model=RIG, processor=processor)
 
 
-FAST = {("continuous", "kalman", "sliding-mode"), ("continuous", "kalman", "pid")}
+FAST = {("continuous", "kalman", "pid")}
 ALL = [
     pytest.param(
         mode,
@@ -53,7 +53,7 @@ ALL = [
         moving,
         id=f"{mode}-{watching}-{moving}",
         marks=() if (mode, watching, moving) in FAST
-        else pytest.mark.slow if watching == "kalman" and mode == "explicit" and moving in ("pid", "sliding-mode")
+        else pytest.mark.slow if watching == "kalman" and mode != "implicit" and moving in ("pid", "sliding-mode")
         else pytest.mark.thorough,
     )
     for mode in MODES for watching in KINDS["observer"] for moving in KINDS["position"]
@@ -85,6 +85,7 @@ def test_a_small_deviation_decays_if_and_only_if_the_linear_loop_is_stable(mode,
         assert decays if system.stable else np.max(size) > 10, (growth, np.max(size), np.max(size[-200:]))
 
 
+@pytest.mark.slow
 def test_a_state_that_never_changes_is_no_mode_of_the_tuner_s_loop():
     """Two stable modes, -3 and -5 1/s, and a constant that the second drives nothing with: its growth is not 0."""
     A = np.array([[-3.0, 0.0, 2.0], [0.0, -5.0, 1.0], [0.0, 0.0, 0.0]])

@@ -93,8 +93,16 @@ def agrees(parts, margin, changed, most):
     return below and (margin > most or not parts.stable(changed((1 + ERROR) * margin)))
 
 
+# Loops whose laws and parts others have.
+REPEATED = ("super-twisting", "state feedback, amplifier", "integral sliding mode", "chain, dead-beat")
+
+
 @pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=() if k < 1 else pytest.mark.slow) for k, x in enumerate(LOOPS)]
+    "name",
+    [
+        pytest.param(x, marks=pytest.mark.thorough if x in REPEATED else pytest.mark.slow if k else ())
+        for k, x in enumerate(LOOPS)
+    ],
 )
 def test_the_margins_agree_with_the_poles_of_the_changed_loop(name):
     case = LOOPS[name]()

@@ -93,4 +93,4 @@ def test_a_sample_depends_on_the_text_of_the_program(project):
 @pytest.mark.slow
 def test_no_mutation_of_a_sample_survives(capsys):
     """`python tests/mutate.py` tests all mutations in a quarter of an hour."""
-    assert main(["--share", str(examples(96, 12))]) == 0, capsys.readouterr().out
+    assert main(["--share", str(examples(160, 12))]) == 0, capsys.readouterr().out

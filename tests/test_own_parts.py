@@ -143,6 +143,7 @@ METHOD = choose_method(CASCADE, NOISY, 1e-4, reverse=True)
 RHO, SKEW = "controller.position.rho", "plant.skew"
 
 
+@pytest.mark.slow
 def test_a_custom_law_and_plant_are_simulated():
     rows = rollout(CASCADE, SCENARIO, Clock(600, 1e-4, AdaptiveRodas3(1e-9))).trajectory.rows
     assert rows.alive.all()

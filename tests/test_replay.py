@@ -353,7 +353,8 @@ PRINTED = {
 
 
 @pytest.mark.parametrize(
-    "what", [pytest.param(x, marks=pytest.mark.slow if x == "a rotor is lost" else ()) for x in PRINTED]
+    "what",
+    [pytest.param(x, marks=pytest.mark.slow if x in ("a rotor is lost", "a condition fails") else ()) for x in PRINTED],
 )
 def test_commands_in_messages_work(what, monkeypatch, capsys):
     no_pictures(monkeypatch)

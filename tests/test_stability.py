@@ -53,7 +53,7 @@ def swings(case, delay):
     return np.array([np.ptp(part) / 2 for part in z]), np.abs(i[-1]).max()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_delay_from_which_the_loop_is_not_stable_is_that_of_brute_force():
     case = case_of()
     low, high = 0.5, 1.6

@@ -265,6 +265,7 @@ def test_a_finished_study_is_not_run_again(no_pictures, monkeypatch, capsys):
 # --- damage ---
 
 
+@pytest.mark.slow
 def test_a_damaged_chunk_is_computed_again_with_a_message(no_pictures, capsys):
     write(TINY)
     argv = ["ensemble", "case.toml", "--members", "200", "--seed", "3"]

@@ -206,6 +206,7 @@ def test_an_answer_that_no_steps_confirm_is_not_confirmed(run, small):
     assert len({x.tobytes() for x, *_ in verdicts.calls}) > 3
 
 
+@pytest.mark.slow
 def test_an_earlier_point_that_is_confirmed_is_an_answer(run, small):
     nothing = error_of(small, members=0, relative=math.nan, search_m=math.nan, reference_m=math.nan)
     # refuted at every step size, after one more search and at the first of the points before; not at the second

@@ -131,6 +131,7 @@ def test_a_stalled_run_gives_no_verdict_on_the_rotor(capsys, monkeypatch):
         assert word in said
 
 
+@pytest.mark.slow
 def test_simulate_names_the_commands_to_use_after_a_loss(capsys):
     lost = write(SHORT + "[controller.inversion]\ngamma = 1000.0\n")
     assert main(["simulate", lost]) == 1
@@ -148,7 +149,7 @@ WORDS = {
 }
 
 
-@pytest.mark.parametrize("kind", STATUSES)
+@pytest.mark.parametrize("kind", [pytest.param(x, marks=() if x == "held" else pytest.mark.slow) for x in STATUSES])
 def test_every_command_reports_the_same_status_of_a_rotor(kind, capsys, monkeypatch):
     lost_at, stalled = STATUSES[kind]
     others = [words for other, words in WORDS.items() if other != kind]
