@@ -8,6 +8,7 @@ import errno
 import gc
 import json
 import logging
+import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
@@ -75,6 +76,8 @@ def run_command(parser: argparse.ArgumentParser, words: list[str] | None, run: R
     """
     if not sys.warnoptions:  # warnings of libraries are for developers: `python -W default -m ambjax` prints them
         logging.captureWarnings(True)
+        # XLA's own messages, such as that on a slow compilation; JAX raises errors
+        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     gc.set_threshold(*GC_THRESHOLDS)
     atexit.register(gc.freeze)  # without this, the collector would scan all objects once more at exit
     with lenient() as stdout:
