@@ -19,7 +19,7 @@ LARGEST = 512 * 2**20
 MUCH = 700 * 2**20
 
 # Modules with single tests of half a minute and more.
-LONG = ("test_mutations.py", "test_paper.py")
+LONG = ("test_mutations.py", "test_end_to_end.py", "test_paper.py", "test_stability.py", "test_default_gains.py")
 
 # Workers whose threads share the cores take an eighth more time.
 _worker = os.environ.get("PYTEST_XDIST_WORKER", "")

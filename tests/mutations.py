@@ -995,7 +995,7 @@ SEARCH = [
     ),
     M(
         "members that are lost with accurate steps do not join the training",
-        "tuning/validate.py",
+        "tuning/solve/joining.py",
         "these = error.unheld._replace(",
         "these = jax.tree.map(lambda a: a[:0], error.unheld)._replace(",
         "tests/test_tuning_rounds.py::test_members_that_only_accurate_steps_lose_join_too",
@@ -1206,8 +1206,8 @@ SEARCH = [
     M(
         "the last answer is taken although an earlier one is within the limits",
         "tuning/solve/multipliers.py",
-        "return (_least(course, within), True) if within else (x, False)",
-        "return x, False",
+        "return _least(course, within), True",
+        "return seen[-1].x, False",
         "tests/test_tuning_limits.py::test_the_best_answer_within_the_limits_is_taken_if_the_multipliers_do_not_converge",
     ),
     M(
@@ -1220,7 +1220,7 @@ SEARCH = [
     M(
         "a search that does not move and holds the limits is repeated",
         "tuning/solve/multipliers.py",
-        "or (not moved and holds)",
+        "or (not moved and one.holds(limits))",
         "",
         "tests/test_tuning_limits.py::test_a_search_that_does_not_move_and_holds_the_limits_ends",
     ),
@@ -1353,8 +1353,8 @@ SEARCH = [
     M(
         "the exit code depends on the verification only",
         "tuning/command.py",
-        'int(not facts.outcome["good"])',
-        "int(not facts.verified)",
+        'return TunedCase(case, facts.outcome["good"],',
+        "return TunedCase(case, facts.verified,",
         "tests/test_tuning_outcome.py::test_all_outputs_give_the_same_verdict",
     ),
     M(
@@ -1381,7 +1381,7 @@ SEARCH = [
     M(
         "the log of the search states that a limit cannot be held",
         "tuning/solve/multipliers.py",
-        "a larger penalty makes no progress towards the limit of {names}; its multiplier is no longer updated",
+        "a larger penalty makes no progress towards the limit of {names}",
         "a limit does not give way: it cannot be held here",
         "tests/test_tuning_outcome.py::test_all_outputs_give_the_same_verdict",
     ),
@@ -1801,7 +1801,7 @@ SEARCH = [
     M(
         "the message about a case that cannot be tuned does not name the case",
         "tuning/command.py",
-        'ValueError(one_line(f"{args.case}: {why}"))',
+        'ValueError(one_line(f"{path}: {why}"))',
         'ValueError(one_line(f"{why}"))',
         "tests/test_attacks.py::test_the_error_of_the_tuner_names_the_case_file",
     ),

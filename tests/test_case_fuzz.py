@@ -292,17 +292,17 @@ def path(tmp_path):
     return pathlib.Path(tmp_path) / "case.toml"
 
 
-def test_three_hundred_changed_files_are_read_or_refused_in_one_line(path):
+def test_a_hundred_changed_files_are_read_or_refused_in_one_line(path):
     tally = Tally()
 
-    @settings(max_examples=300, **PROFILE)
+    @settings(max_examples=100, **PROFILE)
     @given(texts())
     def examine(text):
         hold(text, path, tally, run=False)
 
     examine()
-    assert tally.refused > 50  # or nothing was attacked
-    assert tally.read > 50  # or nothing was let through
+    assert tally.refused > 15  # or nothing was attacked
+    assert tally.read > 15  # or nothing was let through
 
 
 @pytest.mark.slow

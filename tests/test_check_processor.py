@@ -255,6 +255,7 @@ RIG = amb.Plant(1.64, 0.0, 1.2566e-6, 208.0, 2.68e-4, 5e-4, 2.5, 1.0)
 POSITION = [kind for kind in KINDS["position"].values() if kind is not amb.position.LinearController]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("implicit", [True, False])
 @pytest.mark.parametrize("kind", POSITION)
 def test_the_slowest_pole_of_a_position_law_tends_to_that_in_continuous_time(kind, implicit):

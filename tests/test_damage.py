@@ -2,6 +2,7 @@
 
 import json
 import pathlib
+import types
 import zipfile
 
 import jax
@@ -382,12 +383,13 @@ STARTS, GAINS, ITERATIONS = 3, 4, 2
 
 @pytest.fixture(scope="module")
 def descent():
-    return Descent(None, "bfgs", 0.1)  # how it begins depends on neither space nor goal
+    # how it begins depends on nothing else of the goal
+    return Descent(types.SimpleNamespace(measured=("rms_u_V",)), "bfgs", 0.1)
 
 
 def search_of(descent, starts=STARTS, gains=GAINS):
     row = {"value": (starts,), "x": (starts, gains), "gains": (starts, gains), "lost": (starts,), "members": ()}
-    row |= {"terms": (starts, 6), "rollouts": ()}
+    row |= {"terms": (starts, 6), "measured": (starts, 1), "rollouts": ()}
     dice = np.random.default_rng(1)
     past = {name: [dice.random(shape) for _ in range(ITERATIONS)] for name, shape in row.items()}
     x = jnp.asarray(dice.random((starts, gains)))
@@ -396,7 +398,7 @@ def search_of(descent, starts=STARTS, gains=GAINS):
 
 @pytest.fixture
 def checkpoint(tmp_path, descent):
-    checkpoint_file = CheckpointFile(tmp_path / "checkpoints" / "round-2.npz", SEARCH_FACTS, 2)
+    checkpoint_file = CheckpointFile(tmp_path / "checkpoints" / "round-2.npz", SEARCH_FACTS, 2, print)
     checkpoint_file.save(search_of(descent))
     return checkpoint_file
 
@@ -457,10 +459,10 @@ CHECKPOINT_STRANGE = STRANGE | {
 def test_a_search_with_a_damaged_checkpoint_starts_again_with_one_line(kind, checkpoint, descent, capsys):
     (DAMAGE | {f"sealed: {k}": damage for k, damage in CHECKPOINT_STRANGE.items()})[kind](checkpoint.path)
     assert checkpoint.load(descent, STARTS, GAINS) is None
-    err = capsys.readouterr().err
-    assert err.startswith(f"{checkpoint.path}: ")
-    assert err.endswith("; round 2 restarts\n")
-    assert err.count("\n") == 1
+    said = capsys.readouterr().out
+    assert said.startswith(f"{checkpoint.path}: ")
+    assert said.endswith("; search 2 begins again\n")
+    assert said.count("\n") == 1
     checkpoint.save(search_of(descent))
     assert checkpoint.load(descent, STARTS, GAINS) is not None
 
@@ -469,7 +471,7 @@ def test_a_folder_in_place_of_a_checkpoint_is_named_and_kept(checkpoint, descent
     checkpoint.path.unlink()
     checkpoint.path.mkdir()
     assert checkpoint.load(descent, STARTS, GAINS) is None
-    assert capsys.readouterr().err.startswith(f"{checkpoint.path}: it is an incomplete archive")
+    assert capsys.readouterr().out.startswith(f"{checkpoint.path}: it is an incomplete archive")
     with pytest.raises(ValueError, match=r"round-2.npz: cannot be written \(Is a directory\)"):
         checkpoint.save(search_of(descent))
     assert [path.name for path in checkpoint.path.parent.iterdir()] == ["round-2.npz"]

@@ -40,7 +40,8 @@ FAILING = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=() if x == "ensemble" else pytest.mark.slow) for x in FAILING])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FAILING)
 def test_an_error_in_a_description_costs_only_that_description(name, monkeypatch, capsys):
     command, missing = name.partition(",")[0], {file for file in FAILING[name].values() if file}
     monkeypatch.setattr(outputs, "STRICT", False)

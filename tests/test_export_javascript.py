@@ -49,6 +49,7 @@ class Functions(Block):
 LOOSER = {"erf": 32, "erfc": 512, "sinh": 64, "cosh": 64, "arctanh": 256, "logistic": 8, "exp2": 8, "arcsinh": 16}
 
 
+@pytest.mark.slow
 def test_every_primitive_equals_jax(tmp_path):
     random = np.random.default_rng(1)
     x = random.choice([-1.0, 1.0], (1500, 2)) * 10.0 ** random.uniform(-3, 1.5, (1500, 2))

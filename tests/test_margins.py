@@ -99,10 +99,7 @@ REPEATED = ("super-twisting", "state feedback, amplifier", "integral sliding mod
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(x, marks=pytest.mark.thorough if x in REPEATED else pytest.mark.slow if k else ())
-        for k, x in enumerate(LOOPS)
-    ],
+    [pytest.param(x, marks=pytest.mark.thorough if x in REPEATED else pytest.mark.slow) for x in LOOPS],
 )
 def test_the_margins_agree_with_the_poles_of_the_changed_loop(name):
     case = LOOPS[name]()

@@ -170,6 +170,7 @@ def test_settled_metrics_of_the_tuned_gains_of_the_benchmarks_agree_with_a_dense
     assert found["settled_rms_error_m"] == pytest.approx(expected["settled_rms_error_m"], abs=5e-9)
 
 
+@pytest.mark.slow
 def test_the_rms_voltage_includes_the_voltage_between_samples():
     """At the samples, where the noise jumps, u is always at the limit of the supply; between samples it is lower."""
     world, std = LOOPS["stiff under noise, limited supply"]

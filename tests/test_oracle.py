@@ -173,7 +173,10 @@ def noise_of(case, scenario):
     return np.stack(errors, axis=1)
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+# One in two is left to the slow tests.
+@pytest.mark.parametrize(
+    "case", [pytest.param(x, id=x.name, marks=pytest.mark.slow if n % 2 else ()) for n, x in enumerate(CASES)]
+)
 def test_the_rotor_moves_as_in_the_independent_solution(case, record_property):
     cascade, scenario, clock = in_ambjax(case)
 

@@ -249,6 +249,7 @@ def done(out):
     return pathlib.Path(out, "members.npz").exists()
 
 
+@pytest.mark.slow
 def test_a_finished_study_is_not_run_again(no_pictures, monkeypatch, capsys):
     write(TINY)
     argv = ["ensemble", "case.toml", "--members", "5", "--out", "out", "--json"]

@@ -77,6 +77,7 @@ def test_the_knee_is_the_least_voltage_within_25_percent_of_the_least_error(ran)
         assert {"controller.position.c": law.c, "controller.position.k": law.k} == row["gains"]
 
 
+@pytest.mark.slow
 def test_members_of_rare_large_errors_join_the_search(monkeypatch, tmp_path):
     """One of ten validation members limits the voltage, and no training member does."""
     slope, validation = 100.0, seeds(case_and_tune(document())[1].budget)[1]

@@ -371,6 +371,7 @@ def test_the_second_phase_restarts_from_its_start_if_its_path_is_worse(small):
 
 
 @pytest.mark.parametrize("phase", [0, 1])
+@pytest.mark.slow
 def test_a_phase_continues_by_values_if_derivatives_are_not_finite(small, phase):
     """If a loop chatters, losses are finite but derivatives overflow."""
     engine, goal, members, start = small

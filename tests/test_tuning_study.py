@@ -359,6 +359,7 @@ HELD_OUT = seeds(Budget())[2]
 
 
 @pytest.mark.parametrize("status", ["lost", pytest.param("stalled", marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_a_member_that_accurate_steps_do_not_hold_is_not_a_survivor(monkeypatch, tmp_path, status):
     """The member is the last of those that are simulated again, after the four worst members."""
     mine = (HELD_OUT, 5)

@@ -186,6 +186,7 @@ def test_an_answer_is_confirmed_on_the_worst_members_too(run, small):
     assert [count for _, count, _ in verdicts.calls] == [4, 8]
 
 
+@pytest.mark.slow
 def test_the_search_goes_on_with_members_that_are_not_confirmed(run, small):
     unconfirmed = small.objective.chosen(1, np.array([1]), 4)
     answer, verdicts = run(error_of(small, stalled=1, members=3, unheld=unconfirmed), error_of(small))

@@ -149,7 +149,8 @@ WORDS = {
 }
 
 
-@pytest.mark.parametrize("kind", [pytest.param(x, marks=() if x == "held" else pytest.mark.slow) for x in STATUSES])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", STATUSES)
 def test_every_command_reports_the_same_status_of_a_rotor(kind, capsys, monkeypatch):
     lost_at, stalled = STATUSES[kind]
     others = [words for other, words in WORDS.items() if other != kind]

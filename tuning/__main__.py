@@ -5,7 +5,6 @@ import sys
 from typing import TYPE_CHECKING
 
 from ambjax import __version__
-from ambjax.commands.outputs import say, written
 from ambjax.host.command_line import Parser, run_command
 from ambjax.host.interrupts import exit_on_interrupt
 from ambjax.host.streams import open_streams
@@ -68,6 +67,7 @@ def _run(args: argparse.Namespace) -> tuple[int, object]:
     from ambjax.ensemble.worker import configure_jax
 
     configure_jax()
+    from ambjax.commands.outputs import say
     from tuning.command import Options, run
     from tuning.events import Log
 
@@ -86,6 +86,8 @@ def _run(args: argparse.Namespace) -> tuple[int, object]:
 
 def _print(tuned: "TunedCase") -> None:
     """Print the verdict, the gains and the files."""
+    from ambjax.commands.outputs import written
+
     print(tuned.report["verdict"])
     for row in tuned.report.get("gains", ()):
         bound = f" ({row['at_bound']})" if row["at_bound"] else ""

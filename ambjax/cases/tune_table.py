@@ -92,7 +92,7 @@ class Budget:
     front: int = leaf(
         3,
         at_least=1,
-        at_most=5,
+        at_most=6,
         whole=True,
         doc="number of points of the front of error against voltage, without that of least error",
     )
