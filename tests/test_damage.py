@@ -2,7 +2,6 @@
 
 import json
 import pathlib
-import types
 import zipfile
 
 import jax
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 
 from ambjax.ensemble.store import Store
+from ambjax.extend import record, static
 from ambjax.host import sealed
 from ambjax.host.sealed import DamagedError, difference, flat, seal, unseal, write_whole
 from tuning.solve.checkpoint import CheckpointFile, SearchState, remove_all
@@ -381,10 +381,16 @@ SEARCH_FACTS = {"case": {"plant": {"m": 0.5}}, "tune": {"members": 4}}
 STARTS, GAINS, ITERATIONS = 3, 4, 2
 
 
+@record
+class Measured:
+    """A goal: how a descent begins depends on nothing else of it."""
+
+    measured: tuple = static(default=("rms_u_V",))
+
+
 @pytest.fixture(scope="module")
 def descent():
-    # how it begins depends on nothing else of the goal
-    return Descent(types.SimpleNamespace(measured=("rms_u_V",)), "bfgs", 0.1)
+    return Descent(Measured(), "bfgs", 0.1)
 
 
 def search_of(descent, starts=STARTS, gains=GAINS):
