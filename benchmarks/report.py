@@ -2,6 +2,7 @@
 
 import pathlib
 
+import _fleet_sections as fleet
 import _measure
 import _simulation_sections as simulated
 import _tuning_sections as tuned
@@ -34,6 +35,8 @@ Smooth gains are gamma = 1e9 and p = 25e-6 in the inversion; repaired gains are 
     .venv/bin/python benchmarks/tasks.py             # the five tuning tasks
     .venv/bin/python benchmarks/sampled_tasks.py     # the tuning tasks on a processor
     .venv/bin/python benchmarks/bearings.py          # other bearings, and the templates
+    .venv/bin/python benchmarks/fleet.py             # bearings drawn at random
+    .venv/bin/python benchmarks/ablation.py          # the tuner without one mechanism
     .venv/bin/python benchmarks/laws.py              # control structures against each other
     .venv/bin/python benchmarks/default_gains.py     # every structure untuned
     .venv/bin/python benchmarks/search.py            # the search against derivative-free methods
@@ -58,6 +61,8 @@ SECTIONS = {
     "workarounds": simulated.workarounds,
     "tasks": tuned.tasks,
     "bearings": tuned.bearings,
+    "fleet": fleet.fleet,
+    "ablation": fleet.ablation,
     "sampled_tasks": tuned.sampled_tasks,
     "search": tuned.search,
     "laws": tuned.laws,

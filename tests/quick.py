@@ -9,7 +9,7 @@ import os
 # XLA aborts on a flag that it does not know, so each version of jaxlib has its own.
 FLAGS = {
     "0.10": "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
-    "--xla_cpu_opt_preset=CPU_OPT_PRESET_FAST_COMPILE"
+    "--xla_cpu_opt_preset=CPU_OPT_PRESET_FAST_COMPILE --xla_cpu_parallel_codegen_split_count=1"
 }
 
 

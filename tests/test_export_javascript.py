@@ -103,7 +103,8 @@ const run = x => { const bits = block.step(p, s, x, y); return [...y, bits]; };
 """
 
 
-@pytest.mark.parametrize("name", ["rig", pytest.param("two coils", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rig", "two coils"])
 def test_the_loop_equals_the_simulator(name, tmp_path):
     cascade, scenario, clock = CASES[name]
     block, count = blocks_of(cascade, scenario, clock)["loop"], 200

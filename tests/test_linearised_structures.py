@@ -45,7 +45,7 @@ def cascade_of(mode, watching, moving):
     return Cascade(*laws, model=RIG, processor=processor)
 
 
-FAST = {("continuous", "kalman", "pid")}
+FAST = {("implicit", "direct", "pid")}
 ALL = [
     pytest.param(
         mode,

@@ -106,8 +106,8 @@ CASES = [
     Case("supply limited at the start", World(u_max=45.0)),
     SLOW(Case("supply limited on the way", World(u_max=108.0, reference=sine()))),
     Case("held noise", World(reference=sine()), samples=200, std=1e-6, solver="DOP853"),
-    Case("super-twisting", World(position=twisting(), reference=sine(), q_v=BUMP)),
-    Case("closed form", World(inversion=CLOSED, reference=sine(), q_v=BUMP), tight=amb.RK4(4)),
+    SLOW(Case("super-twisting", World(position=twisting(), reference=sine(), q_v=BUMP))),
+    SLOW(Case("closed form", World(inversion=CLOSED, reference=sine(), q_v=BUMP), tight=amb.RK4(4))),
     COMBINED(Case("PI current", World(current=pi(), reference=sine(), q_v=BUMP))),
     SLOW(Case("PI current, wound up at the start", World(current=pi(k_aw=2000.0), u_max=45.0), samples=1000)),
     SLOW(Case("complementary observer", World(
@@ -143,7 +143,7 @@ DROPS = [
 CASES += [
     pytest.param(
         Case(f"drop {n}", drop(*numbers), samples=1000),
-        marks=() if n == 1 else pytest.mark.slow if n == 12 else pytest.mark.thorough,
+        marks=pytest.mark.slow if n in (1, 12) else pytest.mark.thorough,
     )
     for n, numbers in enumerate(DROPS, 1)
 ]
@@ -173,10 +173,7 @@ def noise_of(case, scenario):
     return np.stack(errors, axis=1)
 
 
-# One in two is left to the slow tests.
-@pytest.mark.parametrize(
-    "case", [pytest.param(x, id=x.name, marks=pytest.mark.slow if n % 2 else ()) for n, x in enumerate(CASES)]
-)
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_the_rotor_moves_as_in_the_independent_solution(case, record_property):
     cascade, scenario, clock = in_ambjax(case)
 

@@ -50,6 +50,7 @@ class Listening:
         return jax.random.key_data(key)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slot", SLOTS)
 def test_designs_and_signals_share_no_random_words(slot):
     """A number drawn with the key of a signal does not occur among the coordinates of the member in the design."""

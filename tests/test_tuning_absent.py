@@ -237,6 +237,7 @@ def lenient(monkeypatch):
 
 
 @pytest.mark.parametrize("name", FAILING)
+@pytest.mark.slow
 def test_an_error_in_a_description_costs_only_that_description(name, lenient, monkeypatch, tmp_path, capsys):
     module = {"_gains": "SECTIONS"}.get(name.rpartition(".")[2])
     if module:  # a section in the table of sections

@@ -62,8 +62,9 @@ class Standing(NamedTuple):
         beyond = [one.text for one in self.limits if not one.holds]
         met = ", ".join(beyond) if beyond else "limits met" if self.limits else ""
         left = "" if math.isnan(self.left_s) else f"at most {duration(self.left_s)} left in this phase"
+        starts = "1 start" if self.starts == 1 else f"{self.starts} starts"
         parts = [
-            f"search {self.number}: iteration {self.iteration} of at most {self.most}, {self.starts} starts",
+            f"search {self.number}: iteration {self.iteration} of at most {self.most}, {starts}",
             f"best so far {self.error_m:.3g} m rms at {self.u_V:.3g} V rms",
             f"{self.held} of {self.members} members held",
             met,

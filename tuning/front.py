@@ -80,7 +80,7 @@ def trace_front(course: Course, answer: SearchResult) -> SearchResult:
         found, _ = course.again(chosen(seen, factor).x)
         seen += [_point(course, factor, one) for one in optima(course, found)[0]]
     taken = answer
-    if not course.over:
+    if not course.interrupted:
         least, course.problem = least_of(seen), answer.problem
         if answer.problem.tune.objective == "knee":
             course.problem = answer.problem.towards_voltage(least.error_m, least.volts, KNEE)

@@ -103,6 +103,7 @@ def with_fine_steps(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepErro
     at most MOST_HALVINGS such searches. The last step error is returned even if it is still too large.
     """
     while True:
+        course.tell(f"comparing the steps of the search with {course.problem.accurate}")
         error = step_error(course.problem, x)
         course.tell(f"steps of the search compared with {course.problem.accurate}: {describe(error)}")
         substeps = finer(course.problem)

@@ -41,6 +41,7 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
     if course.interrupted or not budget.validation:
         return Validation(course.answer(x, error, error.unconfirmed), error, np.zeros(0, int), np.zeros(0, int))
     count = budget.validation
+    course.tell(f"validating the answer on {count} members")
     terms = _terms(problem, x, problem.objective.chosen(seeds(budget)[1], np.arange(count), count))
     share = terms["survival"]
     lost = np.argsort(-share, kind="stable")[: int((share > 0).sum())]

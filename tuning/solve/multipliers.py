@@ -167,6 +167,7 @@ def judged_at(course: Course, x: np.ndarray) -> Judged:
     seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)
     if not any(limit.kind.worst for limit in problem.limits):
         count = min(count, AVERAGING_MEMBERS)
+    course.tell(f"judging the limits on {count} members")
     columns = judge(problem, x, seed, count)
     terms, n = problem.engine.terms(x[None], course.members), course.members.ordinary
     tuned = [float(limit.kind.tuned(terms[PREFIX + limit.name][0, :n])) for limit in problem.limits]

@@ -1,0 +1,77 @@
+"""Sections of the benchmark page: machines that nobody tuned the tuner for, and its mechanisms switched off."""
+
+import statistics
+from typing import Any
+
+from _tables import facts, load, table
+
+
+def fleet() -> list[str]:
+    data = load("fleet")
+    rows: dict[str, dict[str, Any]] = data["rows"]
+    lines = ["## Bearings drawn at random (`fleet.py`)", "", facts(data["machine"])]
+    good = sum(row["good"] for row in rows.values())
+    lines += [
+        f"`ambjax tune --budget {data['minutes']:g}` on {len(rows)} of 24 bearings, drawn as data sheets would give",
+        "them: 0.3 to 50 kg, gap 0.25 to 0.8 mm, bias flux density 0.3 to 0.65 T, largest force 5 to 15 weights, 10 to",
+        "25 kHz, 12 to 16 bits, mass, pole area and resistance known to 10 %. The default limits apply: |S| at most 3,",
+        "rms voltage at most 60 % of the supply. The tuner was developed on bearings with an even number. Other",
+        "programs ran on the machine.",
+        f"{good} of {len(rows)} answers hold every held-out member within all limits.",
+        "",
+    ]
+    cells = [
+        [
+            number,
+            row["structure"],
+            f"{row['lost']} of {row['members']}" if "lost" in row else "-",
+            _number(row.get("error_m"), ".2e"),
+            _number(row.get("u_V"), ".3g"),
+            _number(row.get("sensitivity"), ".3g"),
+            f"{row['minutes']:.1f}",
+            "met" if row["good"] else "; ".join(row["against"]),
+        ]
+        for number, row in rows.items()
+    ]
+    head = "bearing | position law | lost | settled rms error (m) | u rms (V) | peak of S | minutes | requirements"
+    return lines + table(head, cells)
+
+
+def ablation() -> list[str]:
+    data = load("ablation")
+    rows: dict[tuple[str, ...], dict[str, Any]] = {tuple(key.split("/")): row for key, row in data["rows"].items()}
+    lines = ["## The tuner without one mechanism (`ablation.py`)", "", facts(data["machine"])]
+    lines += [
+        '`ambjax tune` with `objective = "least_error"` on one core. Each cell: settled rms error of the held-out',
+        "members, relative to that of the complete tuner with the same seed; seconds of the search, relative to the",
+        "same; and requirements that are not met. Medians over the seeds.",
+        "",
+    ]
+    tasks = list(dict.fromkeys(task for _, task, _ in rows))
+    cells = []
+    for off in dict.fromkeys(off for off, *_ in rows):
+        if off != "nothing":
+            cells.append([off, *(_against(rows, off, task) for task in tasks)])
+    return lines + table(" | ".join(["without", *tasks]), cells)
+
+
+def _against(rows: dict[tuple[str, ...], dict[str, Any]], off: str, task: str) -> str:
+    """Return the cell of a task without a mechanism."""
+    pairs = [
+        (row, rows["nothing", task, seed])
+        for (one, which, seed), row in rows.items()
+        if (one, which) == (off, task) and ("nothing", task, seed) in rows
+    ]
+    done = [(row, whole) for row, whole in pairs if row.get("settled_rms_error_m") and whole.get("settled_rms_error_m")]
+    if not done:
+        return "-"
+    errors, seconds = (
+        statistics.median(row[key] / whole[key] - 1 for row, whole in done)
+        for key in ("settled_rms_error_m", "seconds")
+    )
+    against = sorted({word for row, _ in done for word in row["against"]})
+    return f"{100 * errors:+.1f} %, {100 * seconds:+.0f} % s" + "".join(f"; **{word}**" for word in against)
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
