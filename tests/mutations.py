@@ -1674,7 +1674,7 @@ SEARCH = [
     ),
     M(
         "the table of the front is folded in the report",
-        "tuning/command.py",
+        "tuning/report/folder.py",
         "unfolded=(front_table.TITLE,)",
         "unfolded=()",
         "tests/test_tuning_report.py::test_the_page_shows_the_answer_and_the_front_and_folds_the_rest",
@@ -1793,7 +1793,7 @@ SEARCH = [
     ),
     M(
         "the pictures after tuning show the case before tuning",
-        "tuning/command.py",
+        "tuning/report/folder.py",
         '"after": tuned}',
         '"after": problem.case.cascade}',
         "tests/test_tuning_study.py::test_the_pictures_show_the_case_and_the_tuned_laws",

@@ -13,6 +13,7 @@ from bowl import World, document, instead_of_engines
 from tomlkit import dumps
 
 import tuning.command
+import tuning.report.folder
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
 from ambjax.commands import comparison_tuning
@@ -58,7 +59,7 @@ def world(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     one = World()
     instead_of_engines(monkeypatch, one)
-    monkeypatch.setattr(tuning.command, "_pictures", lambda *_: {})
+    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: {})
     for path, start in zip(PATHS, (20.0, 40.0, 200.0), strict=True):
         write(path, start)
     return one
@@ -157,7 +158,16 @@ def test_resume_needs_the_folder_of_a_comparison(world, capsys, flags, message):
     assert not pathlib.Path("out").exists()
 
 
+@pytest.fixture
+def interruptible():
+    """SIGINT arrives, also if the tests run in the background of a shell that ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("interruptible")
 def test_a_comparison_interrupted_and_resumed_is_the_uninterrupted_one(world, capsys):
     """Ctrl-C arrives in the search of the second case."""
     compare = ["compare", "a.toml", "b.toml", "--tune", "--members", "2"]

@@ -14,6 +14,7 @@ from test_tuning_outcome import losing
 from tomlkit import dumps
 
 import tuning.command
+import tuning.report.folder
 import tuning.rounds
 from ambjax.commands import outputs
 from ambjax.host.web_page import render_page
@@ -109,7 +110,7 @@ def facts_of(world, folder, *flags, **tune):
     found, examined = [], judging.examined
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tuning.command, "examined", lambda *args: found.append(examined(*args)) or found[0])
-        patch.setattr(tuning.command, "_pictures", lambda *_: {})
+        patch.setattr(tuning.report.folder, "_pictures", lambda *_: {})
         tuned(world, folder, *flags, **tune)
     return found[0][0]
 
@@ -208,7 +209,7 @@ FAILING = {
     "tuning.report.pictures.convergence": {"convergence.png"},
     "tuning.report.pictures.landscape": {"slices.png"},
     "tuning.report.pictures.front": {"front.png"},
-    "tuning.command.render_page": {"report.html"},
+    "tuning.report.folder.render_page": {"report.html"},
     "tuning.report.judging._conditions": set(),
     "tuning.report.judging._losses": set(),
     "tuning.report.judging.worst": set(),

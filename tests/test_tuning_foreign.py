@@ -18,8 +18,8 @@ from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.control.base import default_law
 from tuning.__main__ import main
-from tuning.command import _laws
 from tuning.problem.space import read
+from tuning.report.folder import all_laws
 from tuning.report.tuned import tuned
 from tuning.solve.screen import around, initial_points
 
@@ -185,7 +185,7 @@ def test_the_tuned_file_gives_the_tuned_cascade(laws):
     space = found.objective.space
     x = space.encode(space.clip(found.tune.space.values(found.case.cascade))) + 0.1
     gains = dict(zip(space.paths, np.asarray(space.gains_at(jnp.asarray(x))).tolist(), strict=True))
-    text = tuned(BEARINGS["fan"] + laws, _laws(found, gains), "fan", "held")
+    text = tuned(BEARINGS["fan"] + laws, all_laws(found, gains), "fan", "held")
     again = case_from(tomllib.loads(text)).cascade
     assert again == jax.tree.map(float, space.decode(jnp.asarray(x), found.case.cascade))
     if not laws:

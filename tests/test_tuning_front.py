@@ -11,6 +11,7 @@ from texts import case_and_tune
 from tomlkit import dumps
 
 import tuning.command
+import tuning.report.folder
 from ambjax.cases.reader import read_case
 from tuning.__main__ import main
 from tuning.front import KNEE, FrontPoint, chosen, least_of
@@ -26,7 +27,7 @@ BOUNDLESS = {"controller": {"position": {"c": [1.0, 1000.0], "k": [0.1, 1000.0]}
 @pytest.fixture
 def ran(monkeypatch, tmp_path, capsys):
     """Run the command on a Bowl without pictures: exit code, facts, the verdict printed, folder."""
-    monkeypatch.setattr(tuning.command, "_pictures", lambda *_: collections.defaultdict(bytes))
+    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: collections.defaultdict(bytes))
 
     def run(pareto=True, **tune):
         study(monkeypatch, World(), **tune)

@@ -48,7 +48,7 @@ def made():
     """The problem, its start and its members."""
     problem = problem_of(*case_and_tune(DOCUMENT), threads=1)
     x = problem.objective.space.encode(problem.objective.space.values(problem.case.cascade))
-    return problem, x, problem.objective.training(1, 12, 2, 1.2, 1.25)
+    return problem, x, problem.objective.training(1, LOOPS + 4, 2, 1.2, 1.25)
 
 
 @pytest.mark.slow
@@ -89,7 +89,7 @@ def test_the_derivative_of_a_limit_agrees_with_differences(made):
 
 @pytest.mark.slow
 def test_the_engine_adds_the_quantities_of_the_linear_loop_by_name(made, monkeypatch):
-    """For 12 ordinary and 2 stressed members; the rollouts themselves are not simulated here."""
+    """For LOOPS + 4 ordinary and 2 stressed members; the rollouts themselves are not simulated here."""
     problem, x, members = made
     count, m = len(members.member), len(x)
     objective = problem.objective

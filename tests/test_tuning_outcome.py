@@ -12,6 +12,7 @@ from bowl import World, document, study
 from tomlkit import dumps
 
 import tuning.command
+import tuning.report.folder
 import tuning.rounds
 from ambjax.cases.tune_table import Budget
 from ambjax.linear import Findings
@@ -59,7 +60,7 @@ OUTCOMES = {
 @pytest.fixture
 def ran(monkeypatch, tmp_path, capsys):
     """Run the command on a Bowl without pictures. Return exit code, facts, stdout, stderr and folder."""
-    monkeypatch.setattr(tuning.command, "_pictures", lambda *_: collections.defaultdict(bytes))
+    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: collections.defaultdict(bytes))
     monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", 1)
 
     def run(world, tune):

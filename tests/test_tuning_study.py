@@ -18,6 +18,7 @@ from tomlkit import dumps
 
 import tuning.command
 import tuning.judge.evaluate
+import tuning.report.folder
 import tuning.rounds
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
@@ -412,11 +413,11 @@ def test_gains_stay_within_the_documented_bounds(monkeypatch):
 def test_the_pictures_show_the_case_and_the_tuned_laws(monkeypatch):
     made = study(monkeypatch, World())
     tuned = made.objective.space.decode(jnp.asarray(at(made, 80.0, 40.0)), made.case.cascade)
-    monkeypatch.setattr(tuning.command.accurate, "nominal", lambda _, cascade: float(cascade.position.c))
+    monkeypatch.setattr(tuning.report.folder.accurate, "nominal", lambda _, cascade: float(cascade.position.c))
     for name in ("convergence", "landscape"):
-        monkeypatch.setattr(tuning.command.pictures, name, lambda *_: b"")
+        monkeypatch.setattr(tuning.report.folder.pictures, name, lambda *_: b"")
     for name in ("before_after", "spectrum"):
-        monkeypatch.setattr(tuning.command.pictures, name, lambda runs, *_: runs)
-    drawn = tuning.command._pictures(made, tuned, None, None, None)
+        monkeypatch.setattr(tuning.report.folder.pictures, name, lambda runs, *_: runs)
+    drawn = tuning.report.folder._pictures(made, tuned, None, None, None)
     wanted = {"before": float(made.case.cascade.position.c), "after": pytest.approx(80.0)}
     assert drawn["nominal.png"] == drawn["spectrum.png"] == wanted

@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tuning.events import Event, Listener, Reached, Standing
+from tuning.events import Event, Listener
 from tuning.judge.evaluate import StepError
 from tuning.problem.loops import check_loops
-from tuning.problem.loss import TERMS
 from tuning.problem.members import Members
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.checkpoint import CheckpointFile, SearchState, checkpoint
-from tuning.solve.refine import best_of, search
+from tuning.solve.iteration import standing_of
+from tuning.solve.refine import best_of, ranked, search
 from tuning.solve.screen import around, initial_points
 
 # Largest number of searches in `search_and_restart`.
@@ -151,7 +151,7 @@ class Course:
 
         def send(progress: SearchState, seconds: float) -> None:
             spent.append(seconds)
-            standing = _standing(problem, progress, number, spent)
+            standing = standing_of(problem, progress, number, spent)
             self.listen(Event(standing.text, standing))
 
         return send
@@ -226,15 +226,10 @@ def training(problem: TuningProblem) -> Members:
 
 
 def points_of(past: list[SearchState]) -> np.ndarray:
-    """Return at most FALLBACK_POINTS points [K, m] that the searches visited, best first.
-
-    The spacing of their ranks increases, so most of them are good ones.
-    """
+    """Return at most FALLBACK_POINTS points [K, m] that the searches visited, best first (`ranked`)."""
     x = np.concatenate([np.asarray(one.history["x"]).reshape(-1, one.starts.best.shape[-1]) for one in past])
     value = np.concatenate([np.asarray(one.history["value"]).ravel() for one in past])
-    _, first = np.unique(np.where(np.isfinite(value), value, np.inf), return_index=True)
-    chosen = np.unique((np.linspace(0, np.sqrt(len(first) - 1), FALLBACK_POINTS).round(6) ** 2).astype(int))
-    return x[first[chosen]]
+    return x[ranked(value, FALLBACK_POINTS)]
 
 
 def _best(progress: SearchState) -> tuple[np.ndarray, float]:
@@ -261,23 +256,3 @@ def _joined(past: list[SearchState]) -> dict[str, np.ndarray]:
 
     names = past[0].history
     return {name: np.concatenate([wide(one.history[name]) for one in past if one.history]) for name in names}
-
-
-def _standing(problem: TuningProblem, progress: SearchState, number: int, spent: Sequence[float]) -> Standing:
-    """Return the standing of a search. `spent`: durations of its iterations so far, s."""
-    last = {name: rows[-1] for name, rows in progress.history.items()}
-    best, loss, budget = int(np.argmin(last["value"])), problem.objective.loss, problem.tune.budget
-    terms = dict(zip(TERMS, last["terms"][best], strict=True))
-    measured = dict(zip(problem.goal.measured, last["measured"][best], strict=True))
-    volts = measured.get("rms_u_V", float(np.asarray(loss.u_scale)) * math.sqrt(terms["effort"]))
-    values = [(one, one.ratio * float(measured[one.name])) for one in problem.limits]
-    limits = tuple(Reached(one.name, value, one.threshold, one.holds(value)) for one, value in values)
-    done, going = progress.iteration - progress.since, int(progress.active.sum())
-    # the first iteration compiles
-    each = float(np.median(spent[1:])) if len(spent) > 1 else math.nan
-    return Standing(
-        number, done, budget.iterations, going, float(np.asarray(loss.s_0)) * math.sqrt(terms["tracking"]), volts,
-        int(last["members"] - last["lost"][best]), int(last["members"]), limits,
-        (budget.iterations - done) * each * going / len(progress.active), float(last["value"][best]),
-        int(last["rollouts"]),
-    )  # fmt: skip

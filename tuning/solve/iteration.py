@@ -3,16 +3,21 @@
 A start is a point that the search refines, with the state of its optimiser.
 """
 
+import math
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from tuning.events import Reached, Standing
 from tuning.problem.goal import Goal
 from tuning.problem.lanes import Engine
 from tuning.problem.limits import PREFIX
 from tuning.problem.loss import TERMS
 from tuning.problem.members import Members
 from tuning.problem.quantities import KINDS
+from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.checkpoint import SearchState
 from tuning.solve.descent import Descent
 from tuning.solve.evolution import next_population, updated
@@ -125,3 +130,23 @@ def append_history(
     for key, value in row.items():
         past.setdefault(key, []).append(value)
     progress.iteration += 1
+
+
+def standing_of(problem: TuningProblem, progress: SearchState, number: int, spent: Sequence[float]) -> Standing:
+    """Return the standing of a search. `spent`: durations of its iterations so far, s."""
+    last = {name: rows[-1] for name, rows in progress.history.items()}
+    best, loss, budget = int(np.argmin(last["value"])), problem.objective.loss, problem.tune.budget
+    terms = dict(zip(TERMS, last["terms"][best], strict=True))
+    measured = dict(zip(problem.goal.measured, last["measured"][best], strict=True))
+    volts = measured.get("rms_u_V", float(np.asarray(loss.u_scale)) * math.sqrt(terms["effort"]))
+    values = [(one, one.ratio * float(measured[one.name])) for one in problem.limits]
+    limits = tuple(Reached(one.name, value, one.threshold, one.holds(value)) for one, value in values)
+    done, going = progress.iteration - progress.since, int(progress.active.sum())
+    # the first iteration compiles
+    each = float(np.median(spent[1:])) if len(spent) > 1 else math.nan
+    return Standing(
+        number, done, budget.iterations, going, float(np.asarray(loss.s_0)) * math.sqrt(terms["tracking"]), volts,
+        int(last["members"] - last["lost"][best]), int(last["members"]), limits,
+        (budget.iterations - done) * each * going / len(progress.active), float(last["value"][best]),
+        int(last["rollouts"]),
+    )  # fmt: skip

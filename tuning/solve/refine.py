@@ -172,9 +172,7 @@ def _begin_full_phase(
     x, value = (np.array(progress.history[name][progress.since :]) for name in ("x", "value"))
     starts = value.shape[1]
     x, value = x.reshape(-1, x.shape[-1]), value.ravel()
-    _, first = np.unique(np.where(np.isfinite(value), value, np.inf), return_index=True)
-    # the spacing of the ranks increases, so most of the chosen points are good ones
-    chosen = first[np.unique((np.linspace(0, np.sqrt(len(first) - 1), PATH_POINTS).round(6) ** 2).astype(int))]
+    chosen = ranked(value, PATH_POINTS)
     tried = np.concatenate([x[chosen], given[None]])
     terms = engine.terms(tried, members)
     values = goal.score(tried, terms, members)
@@ -193,6 +191,15 @@ def _begin_full_phase(
         append_history(
             engine, goal, members, progress, {start: {name: one[best] for name, one in terms.items()}}, fresh=True
         )
+
+
+def ranked(value: np.ndarray, count: int) -> np.ndarray:
+    """Return the indices of at most `count` different values, the best first.
+
+    The spacing of their ranks increases, so most of them are good ones.
+    """
+    _, first = np.unique(np.where(np.isfinite(value), value, np.inf), return_index=True)
+    return first[np.unique((np.linspace(0, np.sqrt(len(first) - 1), count).round(6) ** 2).astype(int))]
 
 
 def best_of(progress: SearchState) -> tuple[np.ndarray, float]:

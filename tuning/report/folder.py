@@ -1,0 +1,110 @@
+"""The files of a tuning: the case with the tuned gains, the report with its pictures, the front and the page."""
+
+import functools
+import pathlib
+import tomllib
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ambjax.cases.reader import Case, case_from
+from ambjax.commands.outputs import described
+from ambjax.control.cascade import Cascade
+from ambjax.host.web_page import render_page
+from ambjax.page.html_page import NAME
+from ambjax.page.html_page import page as sliders_page
+from tuning.problem.space import Gain, Space, tunable
+from tuning.problem.tuning_problem import TuningProblem
+from tuning.report import accurate, front_table, pictures
+from tuning.report import document as report
+from tuning.report.facts import Row, TuningFacts
+from tuning.report.record import TUNED
+from tuning.report.slices import Slices
+from tuning.report.tuned import tuned_case
+from tuning.solve.course import SearchResult
+
+
+def put_answer(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, verdict: str) -> Case:
+    """Write tuned.toml and history.npz into the folder `part`, and return the case with the tuned gains.
+
+    The text of tuned.toml is read back first, to check that it is a valid case. `verdict`: first lines of the file.
+    `out`: the folder to which the caller moves the files.
+    """
+    problem = answer.problem
+    history: dict[str, Any] = answer.history
+    np.savez(part / "history.npz", **history)
+    gains = np.asarray(problem.objective.space.gains_at(jnp.asarray(answer.x))).tolist()
+    after = dict(zip(problem.objective.space.paths, gains, strict=True))
+    text, tuned = tuned_case(problem.case, all_laws(problem, after), verdict, out)
+    (part / TUNED).write_text(text, encoding="utf-8")
+    return tuned
+
+
+def put_report(
+    part: pathlib.Path, cascade: Cascade, answer: SearchResult, facts: TuningFacts, slices: Slices | None
+) -> None:
+    """Write the report and its pictures into the folder `part`. `cascade`: the controller with the tuned gains."""
+    drawn = _pictures(answer.problem, cascade, answer.history, slices, facts.front)
+    for name, data in drawn.items():
+        (part / name).write_bytes(data)
+    words = report.report_markdown(facts)
+    (part / "report.md").write_text(words, encoding="utf-8")
+    title = f"Tuning of {facts.case}"
+    page = described("report.html", lambda: render_page(words, drawn, title, unfolded=(front_table.TITLE,)))
+    if page is not None:
+        (part / "report.html").write_text(page, encoding="utf-8")
+
+
+def put_front(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, facts: TuningFacts) -> None:
+    """Write a case file for each point of the front of error against voltage into `part`."""
+    case = answer.problem.case
+    for row in facts.front or []:
+        words = (
+            f"A point of the front: settled rms error {row['settled_rms_error_m']:.3g} m, settled rms voltage "
+            f"{row['settled_rms_u_V']:.3g} V. It is not judged on the held-out members."
+        )
+        text, _ = tuned_case(case, all_laws(answer.problem, row["gains"]), words, out)
+        (part / row["file"]).write_text(text, encoding="utf-8")
+
+
+def put_page(part: pathlib.Path, case: Case, path: str) -> None:
+    """Write the page with sliders into `part`; its presets are the case and the case files in `part`."""
+    files = sorted(part.glob("*.toml"), key=lambda file: (file.name != "tuned.toml", file.name))
+    found = [case_from(tomllib.loads(text := file.read_text()), file.stem, text, known=case) for file in files]
+    (part / NAME).write_text(sliders_page(case, found, path), encoding="utf-8")
+
+
+def _pictures(
+    problem: TuningProblem, tuned: Cascade, history: Any, slices: Slices | None, front: list[Row] | None
+) -> dict[str, bytes]:
+    """Return the pictures of the report as PNG data by file name. `tuned`: the controller with the tuned gains.
+
+    A picture that cannot be drawn is left out.
+    """
+    paths, settle = problem.objective.space.paths, problem.case.settle
+    runs = {"before": problem.case.cascade, "after": tuned}
+    shown = {}
+    for name, cascade in runs.items():
+        run = described(f"the run {name} tuning", functools.partial(accurate.nominal, problem, cascade))
+        if run is not None:
+            shown[name] = run
+    draw = {"convergence.png": lambda: pictures.convergence(history, paths)}
+    if shown:
+        draw["nominal.png"] = lambda: pictures.before_after(shown, settle)
+        draw["spectrum.png"] = lambda: pictures.spectrum(shown, settle)
+    if slices is not None:
+        draw["slices.png"] = lambda: pictures.landscape(slices, paths)
+    if front:
+        draw["front.png"] = lambda: pictures.front(front)
+    drawn = {name: described(name, one) for name, one in draw.items()}
+    return {name: data for name, data in drawn.items() if data is not None}
+
+
+def all_laws(problem: TuningProblem, tuned: dict[str, float]) -> dict[str, float]:
+    """Return every gain of the laws by path: the value in `tuned` if there is one, else that of the case.
+
+    tuned.toml lists all gains, because the default of a steepness p depends on the plant.
+    """
+    everything = Space(tuple(Gain(path) for path in tunable(problem.case.cascade, idle=True)))
+    return dict(zip(everything.paths, everything.values(problem.case.cascade).tolist(), strict=True)) | tuned
