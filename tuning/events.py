@@ -4,6 +4,7 @@ An event is a sentence, or the standing of a search after an iteration. `Log`, t
 stderr.
 """
 
+import contextlib
 import math
 import shutil
 import sys
@@ -131,8 +132,7 @@ class Log:
         minutes, seconds = divmod(int(self.written - self.began), 60)
         stamped = f"{minutes}:{seconds:02d} {text}"
         if passing and sys.stderr.isatty():
-            shown = stamped[: shutil.get_terminal_size().columns - 1]
-            print(f"\r\x1b[K{shown}", end="", file=sys.stderr, flush=True)
+            self._rewrite(stamped[: shutil.get_terminal_size().columns - 1])
             self.open = True
         else:
             self._close()
@@ -140,5 +140,10 @@ class Log:
 
     def _close(self) -> None:
         if self.open:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+            self._rewrite("")
         self.open = False
+
+    def _rewrite(self, text: str) -> None:
+        """Replace the last line of the terminal. A failure of stderr is ignored."""
+        with contextlib.suppress(OSError, ValueError):
+            print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
