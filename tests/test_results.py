@@ -214,6 +214,7 @@ def test_messages_name_python_arguments_instead_of_options(path, tmp_path):
             lambda: ambjax.tune(path, folder, resume=True),
             f"resume=True: out {folder} contains no search. Check out, or leave out resume=True.",
         ),
+        (lambda: ambjax.tune(path, minutes=0.0), "minutes = 0: it must be above 0"),
         (lambda: ambjax.tune(path, ""), "out: the name of the directory is empty. Give a name, '.' for this"),
     ):
         with pytest.raises(ValueError) as refused:  # noqa: PT011 - the whole message is compared

@@ -9,7 +9,7 @@ from tuning.command import Options, TunedCase, run
 from tuning.events import Listener, Log
 
 
-@names_arguments()
+@names_arguments(budget="minutes")
 def tune(
     case: str | pathlib.Path,
     out: str | pathlib.Path | None = None,
