@@ -1852,9 +1852,9 @@ SAMPLED = [
     M(
         "the first delay of a processor decides whether later delays are predicted",
         "ambjax/control/processor.py",
-        "return dataclasses.replace(self, whole=whole, most=most)",
+        "return dataclasses.replace(self, whole=whole, most=most, kept=kept)",
         "ahead = most > 0 if self.predict is None else self.predict\n"
-        "        return dataclasses.replace(self, whole=whole, most=most, predict=ahead)",
+        "        return dataclasses.replace(self, whole=whole, most=most, kept=kept, predict=ahead)",
         "tests/test_sampled.py::test_a_delay_that_is_set_later_is_predicted",
     ),
     M(
@@ -1895,8 +1895,8 @@ SAMPLED = [
     M(
         "the expected reading uses the voltage of this sample although it acts later",
         "ambjax/simulation/sampled.py",
-        "u = jnp.maximum(1 - delay, 0.0) * u + share * before",
-        "u = u + 0.0 * share * before",
+        "jnp.maximum(1 - jnp.abs(delay - lag), 0.0) for lag",
+        "float(lag == 0) for lag",
         "tests/test_guard.py::test_the_expected_current_uses_the_voltages_that_act_within_the_sample",
     ),
     M(
@@ -1930,8 +1930,8 @@ SAMPLED = [
     M(
         "the voltages of the two previous samples are exchanged",
         "ambjax/simulation/sampled.py",
-        "cascade, past = self.loop.cascade, (state.command.u, state.past[0])",
-        "cascade, past = self.loop.cascade, (state.past[0], state.command.u)",
+        "past = self.loop.cascade, self.processor.remembered(state.command.u, *state.past)",
+        "past = self.loop.cascade, self.processor.remembered(*state.past, state.command.u)",
         "tests/test_sampled.py::test_the_voltage_of_a_sample_acts_after_the_delay",
     ),
     M(
@@ -2261,8 +2261,8 @@ CHECK = [
     M(
         "the poles of a law ignore the delay",
         "ambjax/theorem/law_poles.py",
-        "return max(1 - late, 0.0), share, max(late - 1, 0.0)",
-        "return 1.0, 0.0, 0.0",
+        "return [max(1 - abs(late - lag), 0.0) for lag",
+        "return [float(lag == 0) for lag",
         "tests/test_check_processor.py::test_the_poles_of_a_current_law_are_those_of_the_delayed_recursion[1.0]",
     ),
     M(
@@ -2487,8 +2487,8 @@ EXPORT = [
     M(
         "the plant does not keep the voltage that waits for the end of the delay",
         "ambjax/codegen/plant_step.py",
-        "PlantMemory(new.plant, u, memory.last",
-        "PlantMemory(new.plant, memory.last, memory.last",
+        "PlantMemory(new.plant, u, before",
+        "PlantMemory(new.plant, memory.last, before",
         "tests/test_export_blocks.py::test_the_first_step_reads_the_initial_state_and_the_second_integrates",
     ),
     M(
@@ -2508,7 +2508,7 @@ EXPORT = [
     M(
         "a delay beyond that of the plant is not reported",
         "ambjax/codegen/plant_step.py",
-        "fine += [delay >= 0, delay <= MOST_DELAY]",
+        "fine += [delay >= 0, delay <= self.longest]",
         "fine += []",
         "tests/test_export_blocks.py::test_an_input_that_is_not_finite_is_reported_and_replaced_by_0[q_z]",
     ),
@@ -3052,7 +3052,7 @@ PAGE = [
     M(
         "the sensitivity of the page omits the voltage of the previous sample",
         "ambjax/page/assets/sensitivity.js",
-        "(k === n - 2 ? before : 0)",
+        "weight(k - first + 1, i)",
         "0",
         "tests/test_page.py::test_sensitivity_is_that_of_the_linear_analysis",
     ),

@@ -94,7 +94,7 @@ def test_the_first_step_reads_the_initial_state_and_the_second_integrates():
     assert not any(status)
     assert later.z_true != outputs.z_true
     assert after.last == 10.0  # applied one sample late, so that it has not moved the current yet
-    assert after.before == 0.0
+    assert after.before == (0.0,)
     _, _, (_, without, _) = plant_step(u=0.0)
     assert without.i_true == later.i_true
 
