@@ -41,7 +41,7 @@ from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 
 INF = math.inf
-LATE = [0.0, 0.2, 0.25, 0.4, 0.5, 0.8, 1.0, 1.3, 1.5, 2.0]
+LATE = [0.0, 0.2, 0.25, 0.4, 0.5, 0.8, 1.0, 1.3, 1.5, 2.0, 3.4]
 
 
 def roots(a, late):

@@ -23,6 +23,7 @@ from ambjax.codegen.series import series
 from ambjax.codegen.trace import arguments
 from ambjax.codegen.twins import LoopCase
 from ambjax.codegen.verify import draft, verify
+from ambjax.control.processor import Processor
 from ambjax.simulation.integrate import FixedSteps
 from ambjax.simulation.rosenbrock import AdaptiveRodas3
 from ambjax.simulation.trajectory import TOUCHED
@@ -39,12 +40,19 @@ def rig(**more):
     return case.cascade, scenario, Clock(400, case.clock.sample_period)
 
 
+def late(delay):
+    """The rig with another delay."""
+    cascade, *rest = rig()
+    return dataclasses.replace(cascade, processor=Processor(delay)), *rest
+
+
 CASES = {
     "rig": rig(),
     "two coils": rig(
         plant=TwoCoil(**{f.name: getattr(rig()[1].plant, f.name) for f in dataclasses.fields(TwoCoil)}),
         amplifier=Amplifier(bandwidth=5e3, slew=2e6, dead_band=0.1),
     ),
+    "3.4 samples late": late(3.4),
 }
 
 
