@@ -2985,8 +2985,8 @@ INJECTION = [
     M(
         "the lines that extend an injected wave are constant readings",
         "ambjax/linear/member_responses.py",
-        "[0.5 * np.pi] * padding",
-        "[0.0] * padding",
+        "constant_values=0.5 * np.pi",
+        "constant_values=0.0",
         "tests/test_injection.py::test_lines_that_extend_a_wave_add_nothing[15]",
     ),
     M(
