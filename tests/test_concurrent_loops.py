@@ -20,7 +20,7 @@ from tuning.problem.tuning_problem import problem_of
 case, tune, _ = read_tune(sys.argv[1])
 problem = problem_of(case, tune)
 x = tune.space.encode(tune.space.values(case.cascade))
-loops(problem.objective, x[None].repeat(4, 0), problem.objective.members(0, 8))
+loops(problem.objective, x[None].repeat(4, 0), problem.objective.members(0, 16))
 """
 
 
@@ -32,7 +32,10 @@ def test_a_limit_on_the_delay_margin_does_not_stop_two_cores(tmp_path):
     path.write_text(tomlkit.dumps(raw))
     # XLA's pool has as many threads as NPROC; a program that waits for ever is ended after 4 minutes
     subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(path)], check=True, timeout=240, env={**os.environ, "NPROC": "2"}
+        [sys.executable, "-c", PROGRAM, str(path)],
+        check=True,
+        timeout=240,
+        env={**os.environ, "NPROC": "2", "JAX_ENABLE_X64": "1"},
     )
 
 
