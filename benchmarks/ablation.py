@@ -79,7 +79,6 @@ MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "earlier points if no answer is confirmed": constant(rounds, points_of=lambda past: ()),
     "growth of the penalty": constant(limits, PENALTY_GROWTH=1.0),
     "updates of the multipliers": constant(multipliers, MOST_UPDATES=0),
-    "limits judged only near them": constant(multipliers, CLEARLY_BELOW=math.inf),
 }
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 from jax.scipy.linalg import expm as jax_expm
 
+from ambjax.numerics.elimination import solve
 from ambjax.numerics.records import Scalar
 
 # Places at which the loop can be broken: the reading of the position sensor, and the command of the laws.
@@ -102,7 +103,8 @@ class StateSpace(NamedTuple):
         np_: Any = np if isinstance(self.A, np.ndarray) else jnp
         A, B, C, D, *_ = self.scaled()
         at = self.point(frequency)[:, None, None]
-        x = np_.linalg.solve(at * np.eye(len(A)) - A, np_.broadcast_to(B + 0j, (at.shape[0], *B.shape)))
+        solved = np.linalg.solve if np_ is np else solve
+        x = solved(at * np.eye(len(A)) - A, np_.broadcast_to(B + 0j, (at.shape[0], *B.shape)))
         return C @ x + D
 
     def point(self, frequency: Array | np.ndarray) -> Any:
@@ -121,7 +123,8 @@ class StateSpace(NamedTuple):
         A, _, C, *_ = self.scaled()
         at, n = self.point(frequency)[:, None, None], len(self.path.b)  # pyright: ignore[reportOptionalMemberAccess]
         row = np_.broadcast_to(C[4][:, None] + 0j, (at.shape[0], len(A), 1))
-        return np_.linalg.solve(at * np.eye(len(A)) - A.T, row)[:, :n, 0]
+        solved = np.linalg.solve if np_ is np else solve
+        return solved(at * np.eye(len(A)) - A.T, row)[:, :n, 0]
 
     def command_effect(self, frequency: Array | np.ndarray, late: Scalar = 0.0) -> Array:
         """Return the effect [F, n] of a unit command on the states of the plant, in the units of `scaled`.
