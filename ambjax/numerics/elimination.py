@@ -1,7 +1,8 @@
 """Solution of many small linear systems inside a compiled program.
 
-`jnp.linalg.solve` calls LAPACK. For a large batch, each such call waits for other threads of XLA's pool. Two independent
-calls of one program wait for each other for ever if they occupy all threads, as on a machine with two cores.
+`jnp.linalg.solve` calls LAPACK. In a large batch, such a call waits for other threads of the pool of XLA. Independent
+calls of one program wait for each other for ever if they occupy all threads of the pool, as on a machine with two
+cores.
 """
 
 import jax.numpy as jnp
