@@ -291,13 +291,6 @@ MUTATIONS = [
         "tests/test_stability.py::test_a_limit_cycle_that_the_linear_loop_does_not_have_is_found_and_explained",
     ),
     M(
-        "the test of the delay margin adds no delay",
-        "tuning/judge/late.py",
-        "delay=delay, assumed",
-        "delay=processor.delay, assumed",
-        "tests/test_tuning_delay.py::test_members_are_stable_below_the_margin_then_held_and_then_lost",
-    ),
-    M(
         "the result on the validation ensemble is ignored",
         "tuning/validate.py",
         'share = terms["survival"]',
