@@ -28,6 +28,7 @@ from tuning.problem.shortfalls import bounds
 from tuning.problem.space import Gain, Space
 from tuning.problem.tuning_problem import problem_of
 from tuning.solve.checkpoint import CheckpointFile, SearchState
+from tuning.solve.course import LEAST_IMPROVEMENT, MOST_SEARCHES, should_restart
 from tuning.solve.descent import Descent
 from tuning.solve.refine import _begin_full_phase, best_of, search
 from tuning.solve.screen import FAR, NEAR, around, initial_points, screen
@@ -259,6 +260,19 @@ def test_the_points_around_the_start_fill_two_neighbourhoods():
         away = np.abs(points - x)
         assert np.all(away <= reach)
         assert np.all(away.max(axis=0) > 0.9 * reach)
+
+
+def test_repeated_searches_end_after_two_small_improvements_or_the_largest_number():
+    assert should_restart([0.0])
+    assert should_restart([0.0, -0.5 * LEAST_IMPROVEMENT])  # one that gains nothing may be chance
+    assert not should_restart([0.0, -0.5 * LEAST_IMPROVEMENT, -0.8 * LEAST_IMPROVEMENT])
+    assert not should_restart([0.0, 1.0, -0.5 * LEAST_IMPROVEMENT])  # worse than what there was
+    assert should_restart([0.0, 1.0, -2 * LEAST_IMPROVEMENT])
+    assert should_restart([0.0, 1.0, -1.0, -1.0])
+    assert not should_restart([0.0, -1.0, -1.0, -1.0])
+    gaining = [-float(n) for n in range(MOST_SEARCHES)]
+    assert should_restart(gaining[:-1])
+    assert not should_restart(gaining)
 
 
 def test_lost_members_join_as_stressed_members():

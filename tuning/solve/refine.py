@@ -15,7 +15,7 @@ from tuning.problem.lanes import Engine
 from tuning.problem.members import Members
 from tuning.solve.checkpoint import CheckpointFile, SearchState
 from tuning.solve.descent import Descent
-from tuning.solve.iteration import iterate
+from tuning.solve.iteration import append_history, iterate
 from tuning.solve.screen import screen
 
 # A start has converged if its next step, in coordinates, is shorter than this.
@@ -54,6 +54,7 @@ def search(
     iterations: int,
     name: str = BFGS,
     rate: float = 0.1,
+    at_optimum: bool = False,
     checkpoint_file: CheckpointFile | None = None,
     resume: bool = False,
     until: float = math.inf,
@@ -66,8 +67,10 @@ def search(
     evaluated on all members, and the best of them is refined further. Each phase has at most `iterations`. A start
     descends by the optimiser `name` with the learning rate `rate`.
 
-    `on_iteration`: called after each iteration with the search and the duration of the iteration in s. `until`: time of
-    `time.perf_counter` after which the search ends at its next iteration.
+    `at_optimum`: whether an earlier search on all members ended at the first point. If this point is the best after the
+    first phase, it is then not refined again. `on_iteration`: called after each iteration with the search and the
+    duration of the iteration in s. `until`: time of `time.perf_counter` after which the search ends at its next
+    iteration.
     """
     descent = Descent(goal, name, rate)
     checkpoint_file = checkpoint_file or CheckpointFile(None, {})
@@ -90,10 +93,11 @@ def search(
                 if not progress.active.any() or progress.iteration - progress.since >= iterations:
                     if progress.phase + 1 == len(phases):
                         break
-                    _begin_full_phase(engine, goal, members, progress, descent, given)
-                phase = phases[progress.phase]
-                iterate(engine, goal, members.part(phase.part, 1), progress, descent)
-                _select(progress, phase)
+                    _begin_full_phase(engine, goal, members, progress, descent, given, at_optimum)
+                if progress.active.any():
+                    phase = phases[progress.phase]
+                    iterate(engine, goal, members.part(phase.part, 1), progress, descent)
+                    _select(progress, phase)
                 progress.seconds = progress.earlier + time.perf_counter() - began
                 checkpoint_file.save(progress)
                 on_iteration(progress, progress.seconds - before)
@@ -134,11 +138,13 @@ def _begin_full_phase(
     progress: SearchState,
     descent: Descent,
     given: np.ndarray,
+    at_optimum: bool = False,
 ) -> None:
     """Begin the phase on all members.
 
     It has one start: the best of `given` and of at most PATH_POINTS points that the first phase visited. The optimum of
-    the first phase may lose members that the phase did not simulate; an earlier point is then better.
+    the first phase may lose members that the phase did not simulate; an earlier point is then better. If `given` is the
+    best point and `at_optimum` is true, the phase ends at once.
     """
     x, value = (np.array(progress.history[name][progress.since :]) for name in ("x", "value"))
     starts = value.shape[1]
@@ -154,6 +160,13 @@ def _begin_full_phase(
     progress.starts = descent.restarted(jnp.asarray(at), progress.starts)
     progress.active = np.arange(starts) == start
     progress.phase, progress.since = progress.phase + 1, progress.iteration
+    if at_optimum and best == len(chosen):
+        value = np.where(progress.active, values[best], np.inf)
+        progress.starts = progress.starts._replace(state=progress.starts.state._replace(value=jnp.asarray(value)))
+        progress.active = np.zeros(starts, bool)
+        append_history(
+            engine, goal, members, progress, {start: {name: one[best] for name, one in terms.items()}}, fresh=True
+        )
 
 
 def ranked(value: np.ndarray, count: int) -> np.ndarray:
