@@ -9,7 +9,7 @@ import pytest
 import tomlkit
 
 from ambjax.cases.template_text import template
-from ambjax.numerics.elimination import solve
+from ambjax.numerics.small_matrices import solve
 
 PROGRAM = """
 import sys

@@ -5,11 +5,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jax.scipy.linalg import expm
 
 from ambjax.linear.held_command import PARTS, TURNS
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar
+from ambjax.numerics.small_matrices import exponential
 
 # Number of frequencies of the scan, of starts of Newton's method, and of its steps.
 POINTS, STARTS, STEPS = 240, 8, 8
@@ -40,7 +40,7 @@ def command_delay(system: StateSpace, low: Scalar, high: Scalar) -> Array:
 
 
 def _solved(A: Array, b: Array) -> Array:
-    """Return x [2] with A x = b, by Cramer's rule. See `elimination` for the reason not to call LAPACK."""
+    """Return x [2] with A x = b, by Cramer's rule. See `small_matrices` for the reason not to call LAPACK."""
     return jnp.stack([b[0] * A[1, 1] - b[1] * A[0, 1], A[0, 0] * b[1] - A[1, 0] * b[0]]) / (
         A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
     )
@@ -58,7 +58,7 @@ class _Command:
         if self.sampled:
             table = jnp.zeros((self.n + 1, self.n + 1), path.A.dtype)
             self.rates = table.at[: self.n].set(jnp.concatenate([path.A, path.b[:, None]], 1)) * self.unit / GRID
-            part = expm(self.rates)
+            part = exponential(self.rates)
             self.powers = lax.scan(lambda x, _: (x @ part, x), jnp.eye(self.n + 1, dtype=part.dtype), None, GRID + 1)[1]
             self.whole = jnp.floor(self.own)
             self.nominal = self.held(self.own - self.whole)

@@ -7,10 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.scipy.linalg import expm as jax_expm
 
-from ambjax.numerics.elimination import solve
 from ambjax.numerics.records import Scalar
+from ambjax.numerics.small_matrices import exponential, solve
 
 # Places at which the loop can be broken: the reading of the position sensor, and the command of the laws.
 Place = Literal["reading", "command"]
@@ -40,7 +39,7 @@ class CommandPath(NamedTuple):
         `fraction` [...]: part of the sample after which a new command acts. The first result is the effect of the new
         command, per unit; the second is that of the command before it.
         """
-        tools: Any = (np, _exponential) if isinstance(self.A, np.ndarray) else (jnp, jax_expm)
+        tools: Any = (np, _exponential) if isinstance(self.A, np.ndarray) else (jnp, exponential)
         np_, expm = tools
         n, fraction = len(self.b), np_.asarray(fraction)[..., None, None]
         table = np_.concatenate([np_.concatenate([self.A, self.b[:, None]], 1), np_.zeros((1, n + 1))]) * period

@@ -13,14 +13,12 @@ import numpy as np
 from tuning.judge.evaluate import judge
 from tuning.judge.peaks import injections, injects, reached_of
 from tuning.problem.config import seeds
-from tuning.problem.limits import PENALTY, PREFIX, TOLERANCE_BELOW, Limit
+from tuning.problem.limits import PREFIX, TOLERANCE_BELOW, Limit
 from tuning.solve.course import Course
 from tuning.solve.joining import breaking
 
 # Largest number of searches after updates of the multipliers in one round.
 MOST_UPDATES = 6
-# Smallest decrease of g that counts as progress towards a limit.
-LEAST_DECREASE = 1e-3
 # Largest number of members on which averages are judged. Limits on worst members need the whole ensemble.
 AVERAGING_MEMBERS = 256
 
@@ -65,7 +63,7 @@ def optima(course: Course, x: np.ndarray) -> tuple[list[Judged], bool]:
     `course.members` are those of the last search.
 
     There are at most MOST_UPDATES searches. The loop ends early if the course is over, and if a search ends where it
-    began and this point is within all limits. It also ends early if a larger penalty makes no progress towards a limit.
+    began and this point is within all limits.
     """
     seen, moved = list[Judged](), True
     for update in range(MOST_UPDATES + 1):
@@ -74,11 +72,6 @@ def optima(course: Course, x: np.ndarray) -> tuple[list[Judged], bool]:
         last = update == MOST_UPDATES or course.over
         if last or not join_breaking(course, one):
             limits = tuple(limit.updated(*found) for limit, found in zip(before, one.numbers, strict=True))
-            stuck = [limit for limit, (_, judged) in zip(before, one.numbers, strict=True) if _stuck(limit, judged)]
-            if stuck and update:  # at update 0, `missed` is of an earlier round, with other members
-                names = ", ".join(limit.name for limit in stuck)
-                course.tell(f"a larger penalty makes no progress towards the limit of {names}")
-                break
             course.problem = course.problem.limited(limits)
             if _all_met(course, before, limits, one.numbers) or (not moved and one.holds(limits)):
                 return seen, True
@@ -134,16 +127,6 @@ def _least(course: Course, points: Sequence[np.ndarray]) -> np.ndarray:
     both = np.array(points)
     goal = dataclasses.replace(course.problem.goal, limits=())
     return points[int(np.argmin(goal.score(both, course.problem.engine.terms(both, course.members), course.members)))]
-
-
-def _stuck(limit: Limit, judged: float) -> bool:
-    """Return whether a larger penalty did not reduce the excess of a limit. `judged`: the judge's value."""
-    excess = limit.log_excess(judged)
-    return (
-        limit.penalty > PENALTY
-        and excess > limit.margin + LEAST_DECREASE
-        and 0 < limit.missed < excess + LEAST_DECREASE
-    )
 
 
 def met(limit: Limit, judged: float) -> bool:
