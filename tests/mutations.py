@@ -566,7 +566,7 @@ LOOP = [
     ),
     M(
         "a synonym of a quantity is not recognised",
-        "ambjax/host/synonyms.py",
+        "ambjax/text/synonyms.py",
         "if _plain(name) == plain or plain in",
         "if _plain(name) == plain or word in",
         "tests/test_names.py::test_the_message_suggests_the_right_name",
@@ -860,7 +860,7 @@ ENSEMBLE = [
     ),
     M(
         "the name of a case file is printed without shell quoting",
-        "ambjax/host/words.py",
+        "ambjax/text/words.py",
         "shlex.join(words)",
         "' '.join(words)",
         "tests/test_replay.py::test_commands_in_messages_work[a rotor is lost]",
@@ -2458,7 +2458,7 @@ EXPORT = [
     ),
     M(
         "an export overwrites files that it did not write",
-        "ambjax/commands/outputs.py",
+        "ambjax/results/outputs.py",
         "and not _holds(out / name, mark)",
         "and False",
         "tests/test_export.py::test_only_files_of_an_earlier_export_of_the_same_prefix_are_replaced",
@@ -2479,7 +2479,7 @@ EXPORT = [
     ),
     M(
         "a failed check of an export does not change the result",
-        "ambjax/commands/case_export.py",
+        "ambjax/results/case_export.py",
         "return verify.holds(self.checks) if self.checks else None",
         "return True if self.checks else None",
         "tests/test_export.py::test_an_export_has_the_record_of_its_verification",
@@ -2912,7 +2912,7 @@ SURROUNDINGS = [
     ),
     M(
         "Ctrl-C while files are moved leaves old and new files together",
-        "ambjax/commands/outputs.py",
+        "ambjax/results/outputs.py",
         "with uninterrupted():",
         "with contextlib.nullcontext():",
         "tests/test_surroundings.py::test_either_all_files_are_moved_or_none",
@@ -3151,7 +3151,7 @@ VARIOUS = [
     ),
     M(
         "JSON files move first",
-        "ambjax/commands/outputs.py",
+        "ambjax/results/outputs.py",
         'return name.suffix == ".json", name',
         'return name.suffix != ".json", name',
         "tests/test_attacks.py::test_json_files_move_last",

@@ -8,10 +8,10 @@ import tomllib
 from collections.abc import Iterable
 from typing import Any
 
-from ambjax.host.synonyms import hint, other_words
-from ambjax.host.words import one_line
 from ambjax.numerics.declared import check_number, numbers, within
 from ambjax.numerics.records import check_leaf
+from ambjax.text.synonyms import hint, other_words
+from ambjax.text.words import one_line
 
 # Largest number of characters of a key or a value in a message.
 LONGEST = 60
