@@ -474,7 +474,7 @@ MUTATIONS = [
     ),
     M(
         "an export overwrites files that it did not write",
-        "ambjax/commands/outputs.py",
+        "ambjax/results/outputs.py",
         "and not _holds(out / name, mark)",
         "and False",
         "tests/test_export.py::test_only_files_of_an_earlier_export_of_the_same_prefix_are_replaced",
@@ -488,7 +488,7 @@ MUTATIONS = [
     ),
     M(
         "a failed check of an export does not change the result",
-        "ambjax/commands/case_export.py",
+        "ambjax/results/case_export.py",
         "return verify.holds(self.checks) if self.checks else None",
         "return True if self.checks else None",
         "tests/test_export.py::test_an_export_has_the_record_of_its_verification",

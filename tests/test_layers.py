@@ -15,8 +15,8 @@ ROOT = pathlib.Path(__file__).parent.parent
 # The layers of each package, the lowest first: each is a folder, or a module beside these folders. A module
 # imports only from lower layers or from its own, without a cycle.
 LAYERS = {
-    "ambjax": "_version compiler numerics host world control simulation extend codegen theorem ensemble linear paper "
-    "pictures cases results page commands __init__ __main__",
+    "ambjax": "_version text compiler numerics host world control simulation extend codegen theorem ensemble linear "
+    "paper pictures cases results page commands __init__ __main__",
     "tuning": "events optimisers problem judge solve validate front rounds report command from_python "
     "__init__ __main__",
 }

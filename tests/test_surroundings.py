@@ -20,13 +20,14 @@ from texts import write
 from tqdm import tqdm
 
 from ambjax.__main__ import main, parser, run_command
-from ambjax.commands import ensemble, outputs, reproduce, simulate
+from ambjax.commands import ensemble, reproduce, simulate
 from ambjax.ensemble import worker
 from ambjax.host import interrupts
 from ambjax.host.lock import LOCK, locked
 from ambjax.host.sealed import write_whole
 from ambjax.host.streams import lenient, open_streams
 from ambjax.pictures import tornado
+from ambjax.results import outputs
 from tuning.__main__ import main as tune
 
 SHORT = "[clock]\nduration = 0.01\n"

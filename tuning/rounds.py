@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.commands.outputs import described
+from ambjax.results.outputs import described
 from tuning.events import Listener
 from tuning.front import trace_front
 from tuning.judge.evaluate import StepError, describe, step_error

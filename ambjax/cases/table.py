@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.host.synonyms import hint, other_words
-from ambjax.host.words import one_line
 from ambjax.numerics.declared import check_number, numbers, within
 from ambjax.numerics.records import check_leaf, leaves_of
 from ambjax.numerics.shapes import axes_of, check_shapes
+from ambjax.text.synonyms import hint, other_words
+from ambjax.text.words import one_line
 
 # Largest number of characters of a key or a value in a message.
 LONGEST = 60
