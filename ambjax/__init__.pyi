@@ -6,10 +6,6 @@ from ambjax._version import __version__ as __version__
 from ambjax.cases.controller_file import save_controller as save_controller
 from ambjax.cases.reader import Case as Case
 from ambjax.cases.reader import read_case as read_case
-from ambjax.commands.case_export import ExportedCase as ExportedCase
-from ambjax.commands.case_export import export as export
-from ambjax.commands.case_map import CaseMap as CaseMap
-from ambjax.commands.case_map import survival_map as survival_map
 from ambjax.control import current as current
 from ambjax.control import inversion as inversion
 from ambjax.control import observer as observer
@@ -18,6 +14,10 @@ from ambjax.control.cascade import Cascade as Cascade
 from ambjax.control.processor import Processor as Processor
 from ambjax.control.schedule import Schedule as Schedule
 from ambjax.ensemble.batching import run_ensemble as run_ensemble
+from ambjax.results.case_export import ExportedCase as ExportedCase
+from ambjax.results.case_export import export as export
+from ambjax.results.case_map import CaseMap as CaseMap
+from ambjax.results.case_map import survival_map as survival_map
 from ambjax.results.gains import gains_of as gains_of
 from ambjax.results.gains import with_gains as with_gains
 from ambjax.results.operating import sensitivity as sensitivity

@@ -21,10 +21,9 @@ import tasks
 import tomlkit
 
 from ambjax.cases.template_text import template
-from tuning import optimisers, rounds, validate
+from tuning import optimisers
 from tuning.__main__ import main as tune
-from tuning.problem import limits
-from tuning.solve import course, joining, multipliers, refine
+from tuning.solve import course, multipliers, refine
 
 NEVER = 10**9
 FIRST_KINDS = {
@@ -48,11 +47,6 @@ def constant(module: Any, **values: Any) -> Callable[[dict[str, Any]], None]:
     return switch
 
 
-def by_values(raw: dict[str, Any]) -> None:
-    """Refine each start with CMA-ES from its first point on."""
-    constant(refine, STEEP=-1.0)(raw)
-
-
 # What is switched off, and how.
 MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "nothing": lambda raw: None,
@@ -62,11 +56,6 @@ MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "halvings of the starts": constant(refine, HALVINGS=(NEVER,)),
     "first phase on a quarter of the members": constant(refine, FEW=refine.FEW._replace(part=1)),
     "points of the first phase tried on all members": constant(refine, PATH_POINTS=1),
-    "CMA-ES": lambda raw: (
-        constant(refine, STEEP=math.inf, FEW=refine.FEW._replace(gradient_limit=math.inf))(raw),
-        constant(refine, ALL=refine.ALL._replace(gradient_limit=math.inf))(raw),
-    )[0],
-    "descent: CMA-ES only": by_values,
     "BFGS: Adam instead": setting(optimiser="adam"),
     "curvature kept between phases": constant(optimisers.BFGSState, restarted=lambda self, fresh: fresh),
     "jumps known to the BFGS": constant(optimisers, JUMP=math.inf),
@@ -74,12 +63,7 @@ MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "stressed members": setting(stressed=0),
     "conditions of Theorem 1 in the goal": lambda raw: raw["tune"].setdefault("weights", {}).update(conditions=0.0),
     "validation": setting(validation=0),
-    "members with large errors join": constant(validate, LARGER=math.inf),
-    "additional noise of lost members": constant(joining, NOISE_GROWTH=1.0),
-    "earlier points if no answer is confirmed": constant(rounds, points_of=lambda past: ()),
-    "growth of the penalty": constant(limits, PENALTY_GROWTH=1.0),
     "updates of the multipliers": constant(multipliers, MOST_UPDATES=0),
-    "limits judged only near them": constant(multipliers, CLEARLY_BELOW=math.inf),
 }
 
 

@@ -95,7 +95,7 @@ def _release_programs():
 @pytest.fixture(autouse=True, scope="session")
 def _strict():
     """Let an error in a description of a result end the command, so that a test sees it."""
-    from ambjax.commands import outputs
+    from ambjax.results import outputs
 
     outputs.STRICT = True
 

@@ -24,13 +24,13 @@ from ambjax.cases.reader import case_from, read_case
 from ambjax.cases.template_text import template
 from ambjax.cases.tune_table import Budget
 from ambjax.commands import simulate
-from ambjax.commands.outputs import files
 from ambjax.commands.warnings import idealised, reversal, warnings_of
 from ambjax.control.processor import Processor
 from ambjax.ensemble import LogUniform
 from ambjax.numerics.declared import within
 from ambjax.numerics.records import validate
 from ambjax.pictures import overview
+from ambjax.results.outputs import files
 from ambjax.simulation.clock import Clock
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.band_noise import LINES, BandNoise
@@ -323,8 +323,8 @@ STOPS = {
     "simulate": ([], "ambjax.commands.simulate._window"),
     "check": ([], "ambjax.commands.check.check"),
     "ensemble": (["--members", "2"], "ambjax.commands.ensemble.study_of"),
-    "map": (["--x", "plant.m=-1%:1%", "--y", "plant.R=-1%:1%"], "ambjax.commands.case_map.study_of"),
-    "export": ([], "ambjax.commands.case_export.package.package_files"),
+    "map": (["--x", "plant.m=-1%:1%", "--y", "plant.R=-1%:1%"], "ambjax.results.case_map.study_of"),
+    "export": ([], "ambjax.results.case_export.package.package_files"),
     "tune": ([], "tuning.command.problem_of"),
 }
 

@@ -18,10 +18,10 @@ from ambjax.cases.controller_tables import KINDS
 from ambjax.cases.reader import case_from, read_case
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.template_text import template
-from ambjax.commands.outputs import directory
 from ambjax.ensemble import replay
 from ambjax.host.command_line import GC_THRESHOLDS, run_command
 from ambjax.paper.readings import CLOCK, SETTLE, cascade, scenario
+from ambjax.results.outputs import directory
 
 SHORT = "[clock]\nduration = 0.05\n"
 

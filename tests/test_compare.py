@@ -10,11 +10,11 @@ from ambjax.cases.reader import read_case
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
 from ambjax.commands import compare, comparison_report, comparison_tuning
-from ambjax.commands.case_export import guarded_for
 from ambjax.ensemble.study import Study
 from ambjax.host import extensions
 from ambjax.linear import analyse, linearise
 from ambjax.pictures.comparison import Contender, comparison_figure
+from ambjax.results.case_export import guarded_for
 
 # A smooth loop on a processor, 0.2 s of it.
 CASE = """

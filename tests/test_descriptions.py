@@ -9,7 +9,7 @@ from test_end_to_end import CASES, COMMANDS, SAMPLED
 from texts import write
 
 from ambjax.__main__ import main
-from ambjax.commands import outputs
+from ambjax.results import outputs
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 

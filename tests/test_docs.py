@@ -19,10 +19,10 @@ from ambjax.cases.controller_tables import KINDS
 from ambjax.cases.reader import OTHERS, TABLES, case_from
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.table import Table
-from ambjax.commands.outputs import table
 from ambjax.control.guard import Guard
 from ambjax.numerics import declared
 from ambjax.numerics.declared import default_text
+from ambjax.results.outputs import table
 from ambjax.world.amplifier import CurrentAmplifier
 from ambjax.world.faults import Dropouts, Outliers
 from tuning.problem.config import tune_from

@@ -16,13 +16,13 @@ from matplotlib.collections import LineCollection, PolyQuadMesh, QuadMesh
 from matplotlib.figure import Figure
 
 import tuning.report.pictures as tuned
-from ambjax.commands import case_map
 from ambjax.commands import map as map_command
 from ambjax.ensemble.maps import PERIOD, Axis, Map
 from ambjax.pictures import fans, figures, heatmaps, histograms
 from ambjax.pictures.overview import overview
 from ambjax.pictures.thinning import BINS, envelope, stretch_of, thin
 from ambjax.pictures.tornado import Bar, tornado
+from ambjax.results import case_map
 from ambjax.simulation.trajectory import ALIVE, TOUCHED, Row, Trajectory
 from tuning.report.slices import Slices
 

@@ -33,7 +33,6 @@ from ambjax.codegen.interface import StepInputs
 from ambjax.codegen.trace import arguments, trace
 from ambjax.codegen.twins import LoopCase
 from ambjax.codegen.verify import Check, draft, verify
-from ambjax.commands.case_export import VERIFIED, _is_name, _prefix
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.guard import Guard
@@ -41,6 +40,7 @@ from ambjax.control.processor import Processor
 from ambjax.extend import PositionLaw
 from ambjax.numerics.records import gain, record
 from ambjax.paper import readings
+from ambjax.results.case_export import VERIFIED, _is_name, _prefix
 
 compiled = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 INF = np.inf
@@ -505,8 +505,8 @@ def test_export_is_the_command_as_a_function(case, tmp_path, capsys):
 def test_an_export_has_the_record_of_its_verification(case, tmp_path, monkeypatch):
     """The checks themselves are those of tests/test_export_verify.py."""
     bad = Check("one step, numbers", "float", "0.1 at 2 points", "<1e-5", False)
-    monkeypatch.setattr("ambjax.commands.case_export.verify.draft", lambda *_: types.SimpleNamespace(files={"a": "b"}))
-    monkeypatch.setattr("ambjax.commands.case_export.verify.verify", lambda *_: [bad])
+    monkeypatch.setattr("ambjax.results.case_export.verify.draft", lambda *_: types.SimpleNamespace(files={"a": "b"}))
+    monkeypatch.setattr("ambjax.results.case_export.verify.verify", lambda *_: [bad])
     exported = ambjax.export(ambjax.read_case(case), verify=True)
     assert (exported.ok, exported.checks) == (False, [bad])
     assert list(exported.files) == ["a", *VERIFIED]

@@ -26,7 +26,7 @@ from ambjax.codegen.of_case import block_of, blocks_of
 from ambjax.codegen.series import series
 from ambjax.codegen.trace import trace
 from ambjax.codegen.twins import LoopCase, horizons
-from ambjax.commands.case_export import guarded_for
+from ambjax.results.case_export import guarded_for
 from ambjax.simulation.clock import Clock
 
 ORIGIN = Origin("test", "0" * 64, [])

@@ -8,9 +8,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from ambjax.cases.reader import case_from
-from ambjax.commands.ensemble import study_of
 from ambjax.commands.study_report import _quantiles
 from ambjax.pictures import fans
+from ambjax.results.spread_runs import study_of
 
 # A step in the force at 10 ms, under a once-per-revolution motion of 540 Hz that the members share.
 BLOWER = """

@@ -18,7 +18,7 @@ from ambjax.control import inversion, position
 from ambjax.control.observer import Kalman
 from ambjax.control.processor import Processor
 from ambjax.linear import Zones, frequency_lines, injected, injected_members, linearise, peak
-from ambjax.linear.member_responses import PADDED, _split, _whole
+from ambjax.linear.member_responses import PADDED, _padded
 from ambjax.linear.multisine import multisine
 from ambjax.simulation.sliding import Slide
 
@@ -217,7 +217,7 @@ def test_measurements_with_other_lines_and_members_share_a_program(caplog):
 def test_lines_that_extend_a_wave_add_nothing(count):
     """The padding's cosines are 6e-17."""
     wave = multisine(np.arange(1, count + 1), 1000, T, 1.0)
-    extended = _whole(_split(wave))
+    extended = _padded(wave)
     assert len(extended.harmonics) % PADDED == 0
     for n in (0, 1, 123):
         assert float(extended.at(jnp.asarray(n))) == pytest.approx(float(wave.at(jnp.asarray(n))), abs=1e-14)

@@ -11,7 +11,7 @@ from ambjax.cases.reader import TABLES, case_from
 from ambjax.commands.acceptance import forces
 from ambjax.commands.plausibility import implausible
 from ambjax.commands.warnings import read_with_warnings
-from ambjax.host.synonyms import OTHER_WORDS, meant
+from ambjax.text.synonyms import OTHER_WORDS, meant
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,8 @@ from texts import write
 
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
-from ambjax.commands.ensemble import study_of
 from ambjax.ensemble.worker import processes, work
+from ambjax.results.spread_runs import study_of
 from tuning.__main__ import main as tune_main
 from tuning.report.tuned import tuned_case
 

@@ -16,11 +16,11 @@ import ambjax as amb
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.commands.acceptance import machine
-from ambjax.commands.ensemble import study_of
 from ambjax.commands.warnings import warnings_of
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
 from ambjax.ensemble.maps import Axis, with_method_for_axes
+from ambjax.results.spread_runs import study_of
 from ambjax.simulation.folds import Named
 from ambjax.simulation.method import DRIVEN, choose_method
 from ambjax.world.amplifier import Amplifier, CoilResponse

@@ -19,6 +19,7 @@ from ambjax.cases.reader import read_case
 from ambjax.commands import ensemble as studies
 from ambjax.commands import pace, study_report, workers
 from ambjax.ensemble import statistics, worker
+from ambjax.results.spread_runs import study_of
 from ambjax.simulation.sliding import Slide
 
 CASE = """
@@ -332,10 +333,10 @@ def test_a_long_run_is_announced_with_the_faster_step(capsys):
         ("adaptive", 'about 13 min for 2,000 members (2.6 a second); clock.method = "sliding" would be faster'),
         ("sliding", "about 13 min for 2,000 members (2.6 a second)\n"),
     ):
-        study = studies.study_of(read_case(write(TINY.replace("dt = 5e-5", f'method = "{name}"'))), 1, 2000)
+        study = study_of(read_case(write(TINY.replace("dt = 5e-5", f'method = "{name}"'))), 1, 2000)
         pace.print_estimate(study, pace.Pace(2.6, None))
         assert words in capsys.readouterr().err
-    pace.print_estimate(studies.study_of(case, 1, 2000), pace.Pace(2000.0, None))
+    pace.print_estimate(study_of(case, 1, 2000), pace.Pace(2000.0, None))
     assert capsys.readouterr().err == ""
     assert [pace.duration(s) for s in (5.0, 100, 119, 770, 7000, 9000, 90000)] == [
         "5 s", "100 s", "119 s", "13 min", "117 min", "2.5 h", "25 h",
@@ -343,7 +344,7 @@ def test_a_long_run_is_announced_with_the_faster_step(capsys):
 
 
 def test_the_pilot_is_the_first_members(no_pictures):
-    study = studies.study_of(read_case(write(TINY)), 3, 40)
+    study = study_of(read_case(write(TINY)), 3, 40)
     columns, seconds = pace.pilot(study)
     assert seconds > 0
     again = study.columns(0, 40, call=worker.CALL)

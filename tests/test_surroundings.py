@@ -20,13 +20,14 @@ from texts import write
 from tqdm import tqdm
 
 from ambjax.__main__ import main, parser, run_command
-from ambjax.commands import ensemble, outputs, reproduce, simulate
+from ambjax.commands import ensemble, reproduce, simulate
 from ambjax.ensemble import worker
 from ambjax.host import interrupts
 from ambjax.host.lock import LOCK, locked
 from ambjax.host.sealed import write_whole
 from ambjax.host.streams import lenient, open_streams
 from ambjax.pictures import tornado
+from ambjax.results import outputs
 from tuning.__main__ import main as tune
 
 SHORT = "[clock]\nduration = 0.01\n"
@@ -267,19 +268,17 @@ def test_names_that_the_system_refuses_are_reported_in_one_line(capsys):
 # --- what a process finds ---
 
 
-def test_without_a_home_folder_nothing_is_cached_and_nothing_fails(monkeypatch):
+def test_no_home_folder_and_a_full_cache_cause_no_error_and_no_message(monkeypatch):
     def homeless(*_):
         raise RuntimeError("Could not determine home directory.")
 
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     monkeypatch.setattr(platformdirs, "user_cache_dir", homeless)
-    worker.configure_jax()
-
-
-def test_a_full_cache_causes_no_message():
-    worker.configure_jax()
-    for act in ("reading", "writing"):
-        warnings.warn(f"Error {act} persistent compilation cache entry for 'jit_f': OSError: full", stacklevel=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        worker.configure_jax()
+        for act in ("reading", "writing"):
+            warnings.warn(f"Error {act} persistent compilation cache entry for 'jit_f': OSError: full", stacklevel=1)
 
 
 @pytest.mark.parametrize("error", [AssertionError(), RuntimeError("Unknown backend\nmore")])

@@ -16,8 +16,8 @@ from tomlkit import dumps
 import tuning.command
 import tuning.report.folder
 import tuning.rounds
-from ambjax.commands import outputs
-from ambjax.host.web_page import render_page
+from ambjax.results import outputs
+from ambjax.text.web_page import render_page
 from tuning.__main__ import main
 from tuning.judge.peaks import UNSTABLE
 from tuning.report import document as report

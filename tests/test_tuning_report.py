@@ -17,9 +17,9 @@ from texts import problem_from
 
 from ambjax import rollout
 from ambjax.cases.reader import safe_name
-from ambjax.host.web_page import escape_markdown, render_page
 from ambjax.simulation.metrics import Standard
 from ambjax.simulation.trajectory import STALLED, TOUCHED
+from ambjax.text.web_page import escape_markdown, render_page
 from tuning.__main__ import main
 from tuning.judge.evaluate import judge
 from tuning.problem.config import seeds

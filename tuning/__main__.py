@@ -67,7 +67,7 @@ def _run(args: argparse.Namespace) -> tuple[int, object]:
     from ambjax.ensemble.worker import configure_jax
 
     configure_jax()
-    from ambjax.commands.outputs import say
+    from ambjax.results.outputs import say
     from tuning.command import Options, run
     from tuning.events import Log
 
@@ -86,7 +86,7 @@ def _run(args: argparse.Namespace) -> tuple[int, object]:
 
 def _print(tuned: "TunedCase") -> None:
     """Print the verdict, the gains and the files."""
-    from ambjax.commands.outputs import written
+    from ambjax.results.outputs import written
 
     print(tuned.report["verdict"])
     for row in tuned.report.get("gains", ()):

@@ -13,8 +13,8 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-from ambjax.commands.outputs import say
 from ambjax.commands.pace import duration
+from ambjax.results.outputs import say
 
 # `Log` writes the standing of a search at most once in INTERVAL seconds, and repeats its last line after SILENCE.
 INTERVAL, SILENCE = 2.0, 4.5

@@ -3,25 +3,22 @@
 The first round searches with restarts. If the error of the integration steps at the optimum is too large, the search
 continues with finer steps. If a limit is not met, it continues with other multipliers. The answer is then validated.
 If it is not `SearchResult.good`, two kinds of members join the training ensemble for the next round: validation members
-that are lost, and members that are lost with accurate steps. If it is good, but the rms error of the validation members
-is much larger than that of the training members, the validation members with the largest errors join instead. If
-tune.objective or --pareto requires it, the front of error against voltage is traced at the end.
+that are lost, and members that are lost with accurate steps. If tune.objective or --pareto requires it, the front of
+error against voltage is traced at the end.
 """
 
 import dataclasses
-import itertools
 import pathlib
 from typing import Any
 
 import numpy as np
 
-from ambjax.commands.outputs import described
+from ambjax.results.outputs import described
 from tuning.events import Listener
 from tuning.front import trace_front
 from tuning.judge.evaluate import StepError, describe, step_error
-from tuning.problem.config import seeds
 from tuning.problem.tuning_problem import TuningProblem, problem_of
-from tuning.solve.course import Course, SearchResult, points_of, search_and_restart, training
+from tuning.solve.course import Course, SearchResult, search_and_restart, training
 from tuning.solve.joining import joining
 from tuning.solve.multipliers import search_within_limits
 from tuning.validate import validated
@@ -47,9 +44,8 @@ def rounds(
     from the checkpoints. `listen`: receives the events.
 
     The result is the confirmed answer that loses the fewest members; of several such answers, one within all limits,
-    and of those the one of least error on the validation ensemble. If no answer is confirmed, the result is an earlier
-    point of the searches that is `SearchResult.good`, or, without such a point, the answer that loses the fewest
-    members. If a front is traced, the result is the answer that `trace_front` selects.
+    and of those the one of least error on the validation ensemble. If a front is traced, the result is the answer that
+    `trace_front` selects.
 
     Raises ValueError if the goal is finite at no starting point, or if a checkpoint belongs to another search.
     """
@@ -58,32 +54,25 @@ def rounds(
         problem, training(problem), budget.seed, out, facts, resume, listen, SEARCHING * problem.tune.minutes
     )
     x = search_and_restart(course, start)
-    for number in itertools.count(1):
+    while True:
         if course.all_lost:  # no gains hold any member
             break
         x, error = with_fine_steps(course, x)
         limited, within = search_within_limits(course, x)
         if limited is not x:
             x, error = limited, None
-        answer, error, lost, large = validated(course, x, error)
+        answer, error, lost = validated(course, x, error)
         answers.append(dataclasses.replace(answer, within=within))
-        if (answer.good and not large.size) or course.over or _is_exhausted(course):
+        if answer.good or course.over or _is_exhausted(course):
             break
-        if answer.good:
-            more = course.problem.objective.chosen(seeds(budget)[1], large, budget.validation)
-            course.members = course.members.joined(more, stressed=False)
-            course.tell("validation members with large errors join the training ensemble; the search continues")
-        else:
-            course.members = course.members.joined(joining(course.problem, lost, error, number))
-            course.tell(
-                "lost members, and members lost with accurate steps, join the training ensemble; the search continues"
-            )
+        course.members = course.members.joined(joining(course.problem, lost, error))
+        course.tell(
+            "lost members, and members lost with accurate steps, join the training ensemble; the search continues"
+        )
         x, _ = course.search(course.around(x))
     if not answers:
         return course.answer(x, None, budget.validation)
     best = min(answers, key=lambda one: (not one.confirmed, one.lost, not one.within, one.validation_error))
-    if not best.confirmed and not course.over:
-        best = earlier_confirmed(course, best)
     if problem.front and best.good and not course.over:
         course.members = best.members
         best = described("the front of error against voltage", lambda: trace_front(course, best)) or best
@@ -112,18 +101,6 @@ def with_fine_steps(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepErro
         course.problem = substeps
         course.tell(f"these steps are too coarse; the search continues with {course.problem.objective.clock.method}")
         x, _ = course.again(x)
-
-
-def earlier_confirmed(course: Course, best: SearchResult) -> SearchResult:
-    """Return the best earlier point of the searches that is `SearchResult.good`, or `best` if there is none."""
-    course.tell("accurate steps confirm none of the answers; earlier points of the searches are tried")
-    for x in points_of(course.past):
-        error = step_error(course.problem, x)
-        if not error.refuted:
-            answer = validated(course, x, error).result
-            if answer.good:
-                return answer
-    return best
 
 
 def finer(problem: TuningProblem) -> TuningProblem | None:

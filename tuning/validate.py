@@ -1,4 +1,4 @@
-"""Validation of an answer on members that the search does not use, and the members with large errors."""
+"""Validation of an answer on members that the search does not use."""
 
 import math
 from typing import NamedTuple
@@ -10,24 +10,18 @@ from tuning.problem.config import seeds
 from tuning.problem.members import Members
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.course import Course, SearchResult
-from tuning.solve.joining import largest_unseen
-
-# If the rms error of the validation members exceeds that of the training members by more than this factor, the training
-# ensemble lacks members with large errors.
-LARGER = 1.5
 
 
 class Validation(NamedTuple):
     """Result of `validated`.
 
     `result`: the answer. `error`: its step error. `lost`: numbers of the validation members that are lost, the earliest
-    loss first. `large`: numbers of those with large errors, which join the training ensemble if `result` is good.
+    loss first.
     """
 
     result: SearchResult
     error: StepError
     lost: np.ndarray
-    large: np.ndarray
 
 
 def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> Validation:
@@ -39,7 +33,7 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
     problem, budget = course.problem, course.problem.tune.budget
     error = step_error(problem, x) if error is None else error
     if course.interrupted or not budget.validation:
-        return Validation(course.answer(x, error, error.unconfirmed), error, np.zeros(0, int), np.zeros(0, int))
+        return Validation(course.answer(x, error, error.unconfirmed), error, np.zeros(0, int))
     count = budget.validation
     course.tell(f"validating the answer on {count} members")
     terms = _terms(problem, x, problem.objective.chosen(seeds(budget)[1], np.arange(count), count))
@@ -51,28 +45,11 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
         course.tell(f"accurate steps, with the worst of {count} validation members: {describe(error)}")
     if lost.size:
         course.tell(f"{lost.size} of {count} validation members are lost")
-    errors = _rms_errors(terms)
-    found = course.answer(x, error, lost.size + error.unconfirmed, _overall(errors))
-    return Validation(found, error, lost, _large(course, x, errors))
-
-
-def _large(course: Course, x: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Return `largest_unseen` if the rms of `errors` [N] exceeds that of the training members by LARGER, else none."""
-    training = _rms_errors(_terms(course.problem, x, course.members.unstressed))
-    return largest_unseen(course, errors) if _overall(errors) > LARGER * _overall(training) else np.zeros(0, int)
+    errors = np.sqrt(terms["tracking"][share <= 0])
+    overall = rms(errors) if errors.size else math.inf
+    return Validation(course.answer(x, error, lost.size + error.unconfirmed, overall), error, lost)
 
 
 def _terms(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, np.ndarray]:
     """Return the terms of the loss by name, each [N], of members [N] at x [m]."""
     return {name: values[0] for name, values in problem.engine.terms(x[None], members).items()}
-
-
-def _rms_errors(terms: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the rms errors [N] of the members, relative to s_0; -inf for a member that is lost."""
-    return np.where(terms["survival"] > 0, -math.inf, np.sqrt(terms["tracking"]))
-
-
-def _overall(errors: np.ndarray) -> float:
-    """Return the rms over the members that are held; inf if all are lost."""
-    held = errors[np.isfinite(errors)]
-    return rms(held) if held.size else math.inf

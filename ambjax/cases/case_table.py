@@ -2,11 +2,13 @@
 
 import dataclasses
 import html
+from typing import Any
 
 import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import GainFunction
+from ambjax.numerics.shapes import axes_of
 from ambjax.simulation.clock import Clock
 from ambjax.world.scenario import SLOTS, Scenario
 from ambjax.world.signals import Constant
@@ -41,7 +43,7 @@ def _described(part: object) -> str:
 def _numbers_of(part: object) -> str:
     """Return the numbers of a record with their units, separated by commas; nested records are in parentheses.
 
-    A schedule is shown as "scheduled", an array as the number of its values.
+    A schedule is shown as "scheduled", a leaf of an ensemble as the number of its members.
     """
     words = []
     for field in dataclasses.fields(part) if dataclasses.is_dataclass(part) else ():
@@ -49,11 +51,16 @@ def _numbers_of(part: object) -> str:
         if isinstance(value, GainFunction):
             words.append(f"{field.name} scheduled")
         elif field.metadata.get("leaf") and value is not None:
-            shown = f"{float(value):g}" if np.ndim(value) == 0 else f"{np.size(value)} values"
+            shown = _shown(value) if np.ndim(value) == len(axes_of(field)) else f"{len(value)} values"
             words.append(f"{field.name} = {shown}{f' {unit}' if unit not in ('', '1') else ''}")
         elif dataclasses.is_dataclass(value):
             words.append(f"{field.name} ({_described(value)})")
     return ", ".join(words)
+
+
+def _shown(value: Any) -> str:
+    """Return a number or an array as a case file writes it."""
+    return f"{float(value):g}" if np.ndim(value) == 0 else f"[{', '.join(map(_shown, value))}]"
 
 
 def case_table(name: str, parts: dict[str, str], spread: tuple[str, ...]) -> str:

@@ -21,12 +21,12 @@ from ambjax.cases.timing import clock_from, settled
 from ambjax.cases.variation import spread_from
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import Spread, corners, ends
-from ambjax.host.words import one_line
 from ambjax.linear.analysis import Zones
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method
 from ambjax.simulation.sliding import Slide, slides
 from ambjax.simulation.system import check_parts
+from ambjax.text.words import one_line
 from ambjax.world.bearing import Bearing
 from ambjax.world.coils import TwoCoil
 from ambjax.world.iron import Iron

@@ -8,10 +8,13 @@ import tomllib
 from collections.abc import Iterable
 from typing import Any
 
-from ambjax.host.synonyms import hint, other_words
-from ambjax.host.words import one_line
+import numpy as np
+
 from ambjax.numerics.declared import check_number, numbers, within
-from ambjax.numerics.records import check_leaf
+from ambjax.numerics.records import check_leaf, leaves_of
+from ambjax.numerics.shapes import axes_of, check_shapes
+from ambjax.text.synonyms import hint, other_words
+from ambjax.text.words import one_line
 
 # Largest number of characters of a key or a value in a message.
 LONGEST = 60
@@ -122,6 +125,23 @@ class Table:
         except OverflowError:  # a whole number of hundreds of digits
             raise ValueError(f"{self.at(key)} = {show(value)}: it must be {allowed}.") from None
 
+    def array(self, key: str, default: object, allowed: str) -> Any:
+        """Return an array of numbers, or the default if left out. The arguments and errors are those of `number`."""
+        value = self.raw.get(key, default)
+        if value is default:
+            return default
+
+        def read(raw: object, path: str) -> Any:
+            if isinstance(raw, list):
+                return [read(x, f"{path}.{n}") for n, x in enumerate(raw)]
+            return Table({path: raw}, self.path).number(path, None, allowed)
+
+        rows = read(value, key)
+        try:
+            return np.asarray(rows)
+        except ValueError:
+            raise ValueError(f"{self.at(key)} = {show(value)}: its rows have different lengths.") from None
+
     def leaf(self, key: str, field: dataclasses.Field, default: object = None) -> Any:
         """Return a number within the bounds of `field`, or the default if left out. Raises ValueError otherwise."""
         value = self.number(key, default, numbers(field))
@@ -166,15 +186,17 @@ class Table:
         `extra`: further keys that the table may have. `base`: a record that gives the defaults; None: `kind`. Raises
         ValueError for an unknown or missing key, a value out of bounds, or two leaves in the wrong order.
         """
-        fields = [field for field in dataclasses.fields(kind) if field.metadata.get("leaf")]
+        fields = leaves_of(kind)
         self.only([*extra, *(f.name for f in fields)])
         values: dict[str, Any] = {}
         for field in fields:
             default = field.default if base is None else getattr(base, field.name)
             if field.name not in self.raw and default is dataclasses.MISSING:
                 raise ValueError(f"{self.at(field.name)} is missing: give {numbers(field)}; {field.metadata['doc']}.")
-            values[field.name] = self.number(field.name, default, numbers(field))
+            read = self.array if axes_of(field) else self.number
+            values[field.name] = read(field.name, default, numbers(field))
             check_leaf(field, self.at(field.name), values[field.name])
+        check_shapes(fields, values, self.path)
         one = kind(**values)
         self._check_order(one)
         return one

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 
 from ambjax.cases.reader import Case
 from ambjax.commands.band_text import band_lines, band_numbers
-from ambjax.commands.outputs import table
 from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import DEFAULT_LAWS
 from ambjax.linear import PLACES, Analysis, analyse, linearise
 from ambjax.results.operating import margin_numbers
+from ambjax.results.outputs import table
 from ambjax.world.coil_limits import difference
 
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from ambjax.cases.reader import Case
 from ambjax.commands.acceptance import acceptance, forces
-from ambjax.commands.outputs import plain, say, table
 from ambjax.commands.warnings import idealised, read_with_warnings
 from ambjax.control.cascade import Cascade
 from ambjax.linear.stability import Findings, stability_of
+from ambjax.results.outputs import plain, say, table
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import rollout
 from ambjax.theorem.causes import Cause, find_cause

@@ -12,19 +12,19 @@ from tqdm import tqdm
 from ambjax.cases.reader import Case
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
-from ambjax.commands.case_export import guarded_for
 from ambjax.commands.comparison_report import Compared, comparison_markdown, comparison_summary, comparison_table
 from ambjax.commands.comparison_tuning import check_options, tuned_cases
-from ambjax.commands.ensemble import study_of
-from ambjax.commands.outputs import described, directory, files, plain, say, write_json, written
 from ambjax.commands.study_report import findings_of
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
-from ambjax.host.web_page import render_page
 from ambjax.linear.state_space import StateSpace
 from ambjax.page.html_page import check_processor, pages
+from ambjax.results.case_export import guarded_for
 from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks, operating_point, shown_band, spread_peaks
+from ambjax.results.outputs import described, directory, files, plain, say, write_json, written
+from ambjax.results.spread_runs import study_of
+from ambjax.text.web_page import render_page
 
 WRITTEN = ("compare.html", "compare.json", "compare.png")
 # Largest number of cases in a table and a picture.

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ambjax.cases.reader import Case
-from ambjax.commands.outputs import table
 from ambjax.ensemble.paths import kinds, places
 from ambjax.ensemble.study import Study
-from ambjax.host import web_page
 from ambjax.linear import Findings
 from ambjax.linear.stability import MOST_TESTED
 from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks
+from ambjax.results.outputs import table
+from ambjax.text import web_page
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,11 +9,11 @@ import time
 from collections.abc import Sequence
 
 from ambjax.cases.reader import Case, read_case
-from ambjax.commands.outputs import say
 from ambjax.commands.pace import duration
 from ambjax.host.command_line import message
 from ambjax.host.extensions import NothingToTuneError, extension
 from ambjax.host.interrupts import raise_if_interrupted, reporting
+from ambjax.results.outputs import say
 
 # In the folder of a case: the file by which the tuner marks a search that has begun, and the case with the tuned gains.
 BEGUN, TUNED = "checkpoints/search.json", "tuned.toml"

@@ -2,36 +2,25 @@
 
 import argparse
 import contextlib
-import numbers
 from concurrent.futures import Executor
 
 import numpy as np
 
 from ambjax.cases.reader import Case
-from ambjax.commands.outputs import check_places, make, say, target
 from ambjax.commands.pace import Pace, error_words, pilot, print_estimate, sliding_error
 from ambjax.commands.study_report import WRITTEN, write_report
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.commands.workers import AHEAD, compute, executor_of
-from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
 from ambjax.host.interrupts import reporting, uninterrupted
 from ambjax.host.lock import locked
+from ambjax.results.outputs import check_places, make, say, target
+from ambjax.results.spread_runs import study_of
 from ambjax.simulation.sliding import Slide
 
 # Largest number of worker processes that --processes accepts.
 MOST_PROCESSES = 1024
-
-
-def study_of(case: Case, seed: int | None, members: int) -> Study:
-    """Return the study of a case. Raises ValueError for a member count or seed out of range."""
-    if not isinstance(members, numbers.Integral) or not 1 <= members <= MOST_MEMBERS:
-        raise ValueError(f"--members {members}: it must be a whole number from 1 to {MOST_MEMBERS:,}.")
-    seed = int(case.scenario.seed) if seed is None else seed
-    if not isinstance(seed, numbers.Integral) or not 0 <= seed < 2**32:
-        raise ValueError(f"--seed {seed}: it must be a whole number from 0 to 4294967295.")
-    return Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, seed, members)
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:

@@ -4,9 +4,9 @@ import argparse
 
 from ambjax.cases.reader import read_case
 from ambjax.codegen import verify
-from ambjax.commands.case_export import destination, generated, planned
-from ambjax.commands.outputs import say, table, written
 from ambjax.commands.warnings import print_warnings
+from ambjax.results.case_export import destination, generated, planned
+from ambjax.results.outputs import say, table, written
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.reader import Case
-from ambjax.commands.case_map import is_stable, labels, panel, study_and_axes
-from ambjax.commands.outputs import described, directory, files, plain, say, table, write_json, written
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.maps import CERTAIN, GRIDS, Map, grid
+from ambjax.results.case_map import is_stable, labels, panel, study_and_axes
+from ambjax.results.outputs import described, directory, files, plain, say, table, write_json, written
 
 WRITTEN = ("map.png", "map.json")
 

@@ -4,9 +4,9 @@ import argparse
 import pathlib
 
 from ambjax.cases.reader import read_case
-from ambjax.commands.outputs import directory, files, make, written
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.page.html_page import NAME, page
+from ambjax.results.outputs import directory, files, make, written
 
 Summary = dict[str, object]
 

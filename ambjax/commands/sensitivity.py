@@ -5,8 +5,6 @@ import pathlib
 
 from ambjax.cases.reach import largest
 from ambjax.cases.reader import Case
-from ambjax.commands.ensemble import study_of
-from ambjax.commands.outputs import described, directory, files, plain, write_json, written
 from ambjax.commands.sensitivity_report import Injections, sensitivity_summary, set_valued, text_of
 from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.study import Study
@@ -22,6 +20,8 @@ from ambjax.results.operating import (
     shown_band,
     spread_peaks,
 )
+from ambjax.results.outputs import described, directory, files, plain, write_json, written
+from ambjax.results.spread_runs import study_of
 
 WRITTEN = ("sensitivity.json", "sensitivity.png")
 # Members of the injection, which differ in the noise.

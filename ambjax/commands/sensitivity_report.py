@@ -8,11 +8,11 @@ import numpy as np
 
 from ambjax.cases.reader import Case
 from ambjax.commands.band_text import band_lines, band_numbers
-from ambjax.commands.outputs import table
 from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import DEFAULT_LAWS
 from ambjax.linear import PLACES, Injection, MemberPeaks, Zones
 from ambjax.results.operating import OperatingPoint, SpreadPeaks, analysis_summary
+from ambjax.results.outputs import table
 
 
 class Injections(NamedTuple):

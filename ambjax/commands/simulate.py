@@ -9,15 +9,15 @@ import numpy as np
 from tqdm import tqdm
 
 from ambjax.cases.reader import Case
-from ambjax.commands.outputs import described, directory, files, plain, say, table, write_json, written
 from ambjax.commands.warnings import read_with_warnings, reversal
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.replay import Replay, replay
 from ambjax.ensemble.study import Study
-from ambjax.host.words import command
+from ambjax.results.outputs import described, directory, files, plain, say, table, write_json, written
 from ambjax.results.runs import simulate
 from ambjax.simulation.metrics import UNITS
 from ambjax.simulation.trajectory import Trajectory
+from ambjax.text.words import command
 
 Summary = dict[str, object]
 WRITTEN = ("trajectory.npz", "metrics.json", "overview.png")
@@ -122,7 +122,7 @@ def _study(case: Case, args: argparse.Namespace) -> Study | None:
         return None
     if case.spread.design == "latin-hypercube" and args.members is None:
         raise ValueError("--member: add --members N, the size of the ensemble, on which a Latin hypercube depends.")
-    from ambjax.commands.ensemble import study_of
+    from ambjax.results.spread_runs import study_of
 
     study = study_of(case, args.seed, MOST_MEMBERS if args.members is None else args.members)
     if not study.varies:

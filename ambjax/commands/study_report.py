@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.reader import Case
-from ambjax.commands.outputs import described, files, plain, say, table, write_json, written
 from ambjax.commands.warnings import reversal
 from ambjax.ensemble import statistics
 from ambjax.ensemble.study import Study
-from ambjax.host.words import one_line
 from ambjax.linear import Findings, stability_of, suspects
+from ambjax.results.outputs import described, files, plain, say, table, write_json, written
+from ambjax.text.words import one_line
 
 # Files written with members.npz; the last one only if the case has a spread and a member survives.
 WRITTEN = ("summary.json", "fan.png", "histograms.png", "tornado.png")

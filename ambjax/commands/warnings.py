@@ -9,9 +9,9 @@ import numpy as np
 
 from ambjax.cases.reach import reach, widest
 from ambjax.cases.reader import Case, read_case
-from ambjax.commands.outputs import say
 from ambjax.commands.plausibility import implausible
-from ambjax.host.words import one_line
+from ambjax.results.outputs import say
+from ambjax.text.words import one_line
 from ambjax.world.scenario import Scenario
 
 # Plausible ranges of gap (m), pole area (m^2) and permeability (N/A^2); the paper's values are 5e-3, 0.121, 1.25e-6.

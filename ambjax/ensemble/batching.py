@@ -20,6 +20,7 @@ from ambjax.compiler.fast_path import block_length, one_kernel
 from ambjax.compiler.short_compilation import compiled_quickly
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import canonical
+from ambjax.numerics.shapes import varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
 from ambjax.simulation.rollout import Outcome, System, prepare, run
@@ -56,8 +57,9 @@ def run_ensemble(
 ) -> Outcome:
     """Simulate every member of an ensemble.
 
-    Each leaf of `cascade`, `scenario` and `fold` is a number, shared by all members, or an array [N] with one entry per
-    member. At least one leaf must be an array, for example `scenario.member`, which selects the noise of a member.
+    A leaf of `cascade`, `scenario` and `fold` that has the shape its field declares (a number, if none is declared) is
+    shared by all members. With one axis more, [N, ...], it has one entry per member. At least one leaf must have this
+    axis, for example `scenario.member`, which selects the noise of a member.
     `fold` is updated at every sample; None: no metrics. Rows are recorded at every `every`-th sample (0: none).
     `threads` and `call` are those of `map_members`.
 
@@ -92,8 +94,9 @@ def map_members(
 ) -> Result:
     """Return function(member) for every member of an ensemble.
 
-    Each leaf of `tree` is a number, shared by all members, or an array [N, ...] with one entry per member. At least one
-    leaf must be an array. Members run on all devices of the default backend.
+    A leaf of `tree` is shared by all members, or an array [N, ...] with one entry per member. In a record, it has this
+    first axis if it has one axis more than its field declares; elsewhere, if it is an array. At least one leaf must
+    have it. Members run on all devices of the default backend.
 
     - `function`: maps a tree with the leaves of one member to a pytree of arrays. JAX traces it, and compiles it again
       unless an equal (==) function was mapped before. Use a named function or a frozen dataclass, not a new lambda.
@@ -117,11 +120,11 @@ def map_members(
 
 
 def size(tree: object) -> int:
-    """Return the number of members: the common length of all array leaves.
+    """Return the number of members: the common length of the leaves' axis of members.
 
-    Raises ValueError if there is no array leaf, or if the lengths differ.
+    Raises ValueError if no leaf has this axis, or if the lengths differ.
     """
-    lengths = {np.shape(x)[0] for x in jax.tree.leaves(tree) if np.ndim(x)}
+    lengths = {np.shape(x)[0] for x, varies in zip(jax.tree.leaves(tree), varying(tree), strict=True) if varies}
     if len(lengths) != 1:
         listing = " and ".join(str(n) for n in sorted(lengths)) or "none"
         raise ValueError(
@@ -145,9 +148,9 @@ class _Engine(Generic[Result]):
         vectorised: bool,
     ) -> None:
         leaves, self.tree = jax.tree.flatten(tree)
-        self.members, self.moves = size(tree), tuple(bool(np.ndim(x)) for x in leaves)
-        self.moving = [np.asarray(x) for x in leaves if np.ndim(x)]
-        self.shared = tuple(x for x in leaves if not np.ndim(x))
+        self.members, self.moves = size(tree), varying(tree)
+        self.moving = [np.asarray(x) for x, varies in zip(leaves, self.moves, strict=True) if varies]
+        self.shared = tuple(x for x, varies in zip(leaves, self.moves, strict=True) if not varies)
         self.static = {"function": function, "moves": self.moves, "tree": self.tree, "vectorised": vectorised}
         self.devices = jax.devices()
         single_cpu = len(self.devices) == 1 and self.devices[0].platform == "cpu"

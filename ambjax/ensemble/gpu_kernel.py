@@ -20,6 +20,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import size
 from ambjax.numerics.records import canonical
+from ambjax.numerics.shapes import varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import RK4
 from ambjax.simulation.folds import Fold
@@ -76,13 +77,13 @@ def _in_one_kernel(
 ) -> Outcome:
     """Build the kernel, run it on all members, and return their outcomes [N]."""
     scenario, key = _with_draws(scenario, members)
-    leaves, tree = jax.tree.flatten((Realised(cascade, scenario, key), clock, fold))
-    axes = [0 if x.ndim else None for x in leaves]
+    whole = Realised(cascade, scenario, key), clock, fold
+    (leaves, tree), axes = jax.tree.flatten(whole), [0 if varies else None for varies in varying(whole)]
     traced, results = _traced(leaves, tree, axes, block)
     programs = -(-members // block)
     # The last program fills its unused threads with copies of the last member.
     index = jnp.minimum(jnp.arange(programs * block), members - 1)
-    operands = [x[index] if x.ndim else x[None] for x in leaves]
+    operands = [x[None] if axis is None else x[index] for x, axis in zip(leaves, axes, strict=True)]
 
     def kernel(*refs: Any) -> None:
         numbers = [ref[0] if axis is None else ref[...] for ref, axis in zip(refs, axes, strict=False)]
@@ -99,7 +100,10 @@ def _traced(leaves: Sequence[Array], tree: Any, axes: Sequence[int | None], bloc
     Raises ValueError for a recorded signal: a kernel cannot contain its samples.
     """
     member = jax.vmap(lambda *leaves: run(*jax.tree.unflatten(tree, leaves), every=0), in_axes=axes)
-    shapes = [jax.ShapeDtypeStruct((block, *x.shape[1:]) if x.ndim else (), x.dtype) for x in leaves]
+    shapes = [
+        jax.ShapeDtypeStruct(x.shape if axis is None else (block, *x.shape[1:]), x.dtype)
+        for x, axis in zip(leaves, axes, strict=True)
+    ]
     traced, results = jax.make_jaxpr(member, return_shape=True)(*shapes)
     if any(np.ndim(constant) for constant in traced.consts):
         raise ValueError("scenario: run_on_gpu cannot simulate a recorded signal (Recorded). Use run_ensemble.")
@@ -122,11 +126,13 @@ def _launch(
     def own(x: Array | jax.ShapeDtypeStruct) -> pl.BlockSpec:
         return pl.BlockSpec((block, *x.shape[1:]), lambda n: (n, *(0 for _ in x.shape[1:])))
 
-    shared = pl.BlockSpec((1,), lambda n: (0,))
+    def shared(x: Array) -> pl.BlockSpec:
+        return pl.BlockSpec(x.shape, lambda _: (0,) * x.ndim)
+
     return pl.pallas_call(
         kernel,
         grid=(programs,),
-        in_specs=[shared if axis is None else own(x) for x, axis in zip(operands, axes, strict=True)],
+        in_specs=[shared(x) if axis is None else own(x) for x, axis in zip(operands, axes, strict=True)],
         out_specs=[own(x) for x in results],
         out_shape=[jax.ShapeDtypeStruct((programs * x.shape[0], *x.shape[1:]), x.dtype) for x in results],
         compiler_params=triton.CompilerParams(num_warps=min(block // WARP, MOST_WARPS)),
@@ -138,7 +144,7 @@ def _with_draws(scenario: Scenario, members: int) -> tuple[Scenario, tuple[Array
     """Draw outside the kernel what needs jax.random: the members' random signals, and their keys as two words [N]."""
     leaves, tree = jax.tree.flatten(scenario)
     # vmap needs an argument with a mapped axis, and the scenario may have none: hence arange(members).
-    axes = ([0 if x.ndim else None for x in leaves], 0)
+    axes = ([0 if varies else None for varies in varying(scenario)], 0)
 
     def one(leaves: list[Array], _: Array) -> tuple[Scenario | None, tuple[Array, Array]]:
         alone = jax.tree.unflatten(tree, leaves)

@@ -14,6 +14,7 @@ from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import STEP_PATHS, Spread, SpreadError, apply, check_spread, corners, ends, no_such_number
 from ambjax.ensemble.study import Study
+from ambjax.numerics.shapes import map_varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import choose_method
 from ambjax.simulation.metrics import standard_for
@@ -194,7 +195,7 @@ def _cells(study: Study, x: Axis, y: Axis | None, stable: StabilityTest | None) 
     scenario = dataclasses.replace(scenario, seed=study.seed, member=member)
     metrics = run_ensemble(cascade, scenario, study.clock, fold=standard_for(study.settle, scenario)).measured
     ended, stalled, error = np.isfinite(metrics["lost_at_s"]), metrics["stalled"], metrics["settled_max_abs_error_m"]
-    one, world = jax.tree.map(lambda x: x[:: study.members] if np.ndim(x) else x, (cascade, scenario))
+    one, world = map_varying(lambda x: x[:: study.members], (cascade, scenario))
     unstable = np.zeros(shape[:2], bool).ravel() if stable is None else ~stable(one, world, study.clock)
     unstable = unstable & ~ended[:: study.members]
     values = (np.reshape(part, shape) for part in (ended, stalled, error))

@@ -10,6 +10,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import Schedule
 from ambjax.host.imports import digest_of
 from ambjax.numerics.records import is_traced, leaf
+from ambjax.numerics.shapes import axes_of, with_entry
 from ambjax.world.scenario import Scenario
 from ambjax.world.signals import Constant
 
@@ -36,7 +37,8 @@ def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
     The paths plant.* refer to the true plant, and controller.model.* to the nominal one. A disturbance of z is
     disturbance.q_z.* if all disturbances of z have the same unit. Otherwise those in m/s^2 are disturbance.q_z.*,
     scaled forces are disturbance.q_v.*, and forces are disturbance.q_f.*. The path *.shift moves start and stop of a
-    signal together in time; its value is 0. The path of a value of a schedule ends with the number of its knot, from 0.
+    signal together in time; its value is 0. The path of a value of a schedule ends with the number of its knot, from 0,
+    and that of an entry of an array with its indices.
     """
     table: dict[str, Place] = {}
     for stage in ("model", "observer", "position", "inversion", "current"):
@@ -79,6 +81,10 @@ def _below(node: object, path: str, route: tuple[int | str, ...]) -> Iterator[tu
         if isinstance(value, Schedule):
             for knot, x in enumerate(value.values):
                 yield f"{at[0]}.{knot}", Place((*at[1], "values", knot), field, x)
+        elif field.metadata.get("leaf") and (axes := axes_of(field)) and value is not None:
+            for index in np.ndindex(*np.shape(value)[-len(axes) :]):
+                entry = value[(..., *index)]
+                yield ".".join(map(str, (at[0], *index))), Place((*at[1], *index), field, entry)
         elif field.metadata.get("leaf"):
             yield at[0], Place(at[1], field, value)
         else:
@@ -138,12 +144,14 @@ def _get(node: Any, route: tuple[int | str, ...]) -> Any:
 
 
 def _set(node: Any, route: tuple[int | str, ...], value: Any) -> Any:
-    """Return the record or tuple `node` with the number at `route` replaced."""
+    """Return the record, tuple or array `node` with the number at `route` replaced."""
     if not route:
         return value
     step, *rest = route
     if step == SHIFT:
         return node.shifted(value)
     if isinstance(step, int):
-        return (*node[:step], _set(node[step], tuple(rest), value), *node[step + 1 :])
+        if isinstance(node, tuple):
+            return (*node[:step], _set(node[step], tuple(rest), value), *node[step + 1 :])
+        return with_entry(node, route, value)
     return dataclasses.replace(node, **{step: _set(getattr(node, step), tuple(rest), value)})

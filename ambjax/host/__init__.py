@@ -1,1 +1,1 @@
-"""Services of the operating system: sealed files, a lock, standard streams, Ctrl-C, and text for messages."""
+"""Services of the operating system: sealed files, a lock, standard streams, Ctrl-C and extensions."""

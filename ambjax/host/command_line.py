@@ -16,7 +16,7 @@ from types import MappingProxyType
 from typing import Any, NoReturn
 
 from ambjax.host.streams import lenient
-from ambjax.host.words import one_line
+from ambjax.text.words import one_line
 
 # Errors of a file system that another folder or free space may resolve.
 UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO)

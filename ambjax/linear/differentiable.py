@@ -108,8 +108,8 @@ def loop_quantities(
         **{name: jnp.where(fine, getattr(scaled, name), 0.0) for name in "BC"},
         path=jax.tree.map(lambda x: jnp.where(fine, x, 0.0), scaled.path),
     )
-    growth, poles = _growth(scaled)
-    loop = _loop(lax.stop_gradient(scaled), poles, jnp.asarray(volts_per_metre))
+    growth, loop = _growth_and_loop(scaled, jnp.asarray(volts_per_metre))
+    poles = loop.poles
     high = _whole_end(loop)
     f = _frequencies(loop, low, high)
     S, KS = loop.responses(f)
@@ -156,33 +156,30 @@ def _capped(x: Array) -> Array:
     return (jnp.maximum(x, 1e-12) ** -4 + MOST**-4) ** -0.25
 
 
-def _growth(system: StateSpace) -> tuple[Array, Array]:
-    """Return the largest real part of the poles, 1/s, and the poles [N] in the s- or z-plane, without derivatives.
+def _growth_and_loop(system: StateSpace, unit: Array) -> tuple[Array, _Loop]:
+    """Return the largest real part of the poles of a scaled system, 1/s, and its poles and zeros without derivatives.
+
+    The zeros follow from det(zI - A + b c)/det(zI - A) = 1 + c (zI - A)^-1 b. `unit`: of KS, V/m. One call of LAPACK
+    computes all eigenvalues (see `small_matrices`).
 
     The derivative of the dominant pole is that of a simple eigenvalue, from its left and right eigenvectors. JAX's
     derivative of `eig` requires independent eigenvectors of all poles. A delay adds a defective pole at
     z = 0, whose eigenvectors are dependent.
     """
-    A = lax.stop_gradient(system.A)
-    poles, left, right = lax.linalg.eig(A, compute_left_eigenvectors=True, compute_right_eigenvectors=True)
+    fixed = lax.stop_gradient(system)
+    A, b = fixed.A, fixed.B[:, :1]
+    every = jnp.stack([A, A - b * fixed.C[0][None], A - b * (fixed.C[2] / unit)[None]])
+    values, left, right = lax.linalg.eig(every, compute_left_eigenvectors=True, compute_right_eigenvectors=True)
+    poles, zeros, zeros_u = values
+    in_s = poles if system.period is None else jnp.log(jnp.where(jnp.abs(poles) > 1e-9, poles, 1.0)) / system.period
+    loop = _Loop(poles, zeros, zeros_u, fixed.D[2, 0], unit, system.period, in_s)
     k = jnp.argmax(jnp.real(poles) if system.period is None else jnp.abs(poles))
-    u, v = jnp.conj(left[:, k]), right[:, k]
+    u, v = jnp.conj(left[0, :, k]), right[0, :, k]
     pole = poles[k] + u @ ((system.A - A) @ v) / (u @ v)
     if system.period is None:
-        return jnp.real(pole), poles
+        return jnp.real(pole), loop
     squared = jnp.real(pole) ** 2 + jnp.imag(pole) ** 2
-    return 0.5 * jnp.log(jnp.maximum(squared, 1e-300)) / system.period, poles
-
-
-def _loop(system: StateSpace, poles: Array, unit: Array) -> _Loop:
-    """Return the poles and zeros of a scaled system, from det(zI - A + b c)/det(zI - A) = 1 + c (zI - A)^-1 b."""
-    A, b = system.A, system.B[:, :1]
-    zeros, zeros_u = (
-        lax.linalg.eig(A - b * row[None], compute_left_eigenvectors=False, compute_right_eigenvectors=False)[0]
-        for row in (system.C[0], system.C[2] / unit)
-    )
-    in_s = poles if system.period is None else jnp.log(jnp.where(jnp.abs(poles) > 1e-9, poles, 1.0)) / system.period
-    return _Loop(poles, zeros, zeros_u, system.D[2, 0], unit, system.period, in_s)
+    return 0.5 * jnp.log(jnp.maximum(squared, 1e-300)) / system.period, loop
 
 
 def _whole_end(loop: _Loop) -> Array:

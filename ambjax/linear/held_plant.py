@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.flatten_util import ravel_pytree
-from jax.scipy.linalg import expm
 
 from ambjax.linear.equilibrium import Point, reading
 from ambjax.linear.state_space import CommandPath
 from ambjax.numerics.records import Scalar
+from ambjax.numerics.small_matrices import exponential
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
 
@@ -104,5 +104,5 @@ def _integrated(A: Array, b: Array, h: Scalar) -> tuple[Array, Array]:
     """Return exp(A h), and the integral of exp(A t) b over t from 0 to h (s)."""
     n = len(b)
     table: Any = jnp.zeros((n + 1, n + 1), A.dtype).at[:n].set(jnp.concatenate([A, b[:, None]], 1) * h)
-    whole = expm(table)
+    whole = exponential(table)
     return whole[:n, :n], whole[:n, n]

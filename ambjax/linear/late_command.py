@@ -5,11 +5,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jax.scipy.linalg import expm
 
 from ambjax.linear.held_command import PARTS, TURNS
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar
+from ambjax.numerics.small_matrices import exponential
 
 # Number of frequencies of the scan, of starts of Newton's method, and of its steps.
 POINTS, STARTS, STEPS = 240, 8, 8
@@ -35,8 +35,15 @@ def command_delay(system: StateSpace, low: Scalar, high: Scalar) -> Array:
     k = jnp.argmin(jnp.where(valid, late, jnp.inf))
     # one more Newton step: its derivative is that of the implicit function
     slopes = jnp.where(valid[k], slopes[k], jnp.eye(2))
-    step = jnp.linalg.solve(slopes, jnp.where(valid[k], _Command(system).residual(f[k], late[k]), 0.0))[1]
+    step = _solved(slopes, jnp.where(valid[k], _Command(system).residual(f[k], late[k]), 0.0))[1]
     return jnp.where(valid[k], loop.unit * (late[k] - step), NONE / low)
+
+
+def _solved(A: Array, b: Array) -> Array:
+    """Return x [2] with A x = b, by Cramer's rule. See `small_matrices` for the reason not to call LAPACK."""
+    return jnp.stack([b[0] * A[1, 1] - b[1] * A[0, 1], A[0, 0] * b[1] - A[1, 0] * b[0]]) / (
+        A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+    )
 
 
 class _Command:
@@ -51,7 +58,7 @@ class _Command:
         if self.sampled:
             table = jnp.zeros((self.n + 1, self.n + 1), path.A.dtype)
             self.rates = table.at[: self.n].set(jnp.concatenate([path.A, path.b[:, None]], 1)) * self.unit / GRID
-            part = expm(self.rates)
+            part = exponential(self.rates)
             self.powers = lax.scan(lambda x, _: (x @ part, x), jnp.eye(self.n + 1, dtype=part.dtype), None, GRID + 1)[1]
             self.whole = jnp.floor(self.own)
             self.nominal = self.held(self.own - self.whole)
@@ -103,7 +110,7 @@ class _Command:
 
         def step(_: int, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             x, slopes, error = state
-            moved = x - jnp.linalg.solve(slopes, error)
+            moved = x - _solved(slopes, error)
             moved = jnp.where(jnp.all(jnp.isfinite(moved)), jnp.clip(moved, x - 0.2, x + 0.2), x)
             return moved, *jax.jacfwd(both, has_aux=True)(moved)
 

@@ -76,7 +76,7 @@ def member_responses(
     method = None if isinstance(clock.method, Slide) else clock.method
     longer = dataclasses.replace(clock, samples=skip + periods * clock.samples, method=method)
     system, longer = prepare(*_at_rest(cascade, scenario, r), longer)
-    response = Response(_split(wave), scenario.voltage_limit, skip)
+    response = Response(_padded(wave), scenario.voltage_limit, skip)
     tree = canonical((system, longer, response))
     sums, code = map_members(_member, tree, call=SHORTEST if size(tree) <= FEW else None)
     e = float(wave.size) * np.exp(1j * np.asarray(wave.phases))
@@ -88,25 +88,18 @@ def member_responses(
 def _member(tree: Any) -> tuple[Any, Any]:
     """Return the `FourierSums` and the status code of one member."""
     system, clock, response = tree
-    response = dataclasses.replace(response, wave=_whole(response.wave))
     outcome = run(with_wave(system, response.wave), clock, response, 0)
     return outcome.measured, outcome.trajectory.lost_code
 
 
-def _split(wave: MultiSine) -> MultiSine:
-    """Return the wave with its arrays [L] as tuples of numbers, which all members of an ensemble share.
+def _padded(wave: MultiSine) -> MultiSine:
+    """Return the wave with a number of lines that is a multiple of PADDED.
 
-    The cosines of the wave are then computed once for all members of a block. Lines of frequency 0 and phase pi/2,
-    whose cosine is 0, extend the tuples to a multiple of PADDED.
+    The new lines have the frequency 0 and the phase pi/2, whose cosine is 0.
     """
-    padding = -len(wave.harmonics) % PADDED
-    harmonics, phases = (*wave.harmonics, *[0.0] * padding), (*wave.phases, *[0.5 * np.pi] * padding)
-    return dataclasses.replace(wave, harmonics=harmonics, phases=phases)
-
-
-def _whole(wave: Any) -> MultiSine:
-    """Return the wave of `_split` with arrays [L] again."""
-    return dataclasses.replace(wave, harmonics=jnp.stack(wave.harmonics), phases=jnp.stack(wave.phases))
+    padding = (0, -len(wave.harmonics) % PADDED)
+    phases = np.pad(wave.phases, padding, constant_values=0.5 * np.pi)
+    return dataclasses.replace(wave, harmonics=np.pad(wave.harmonics, padding), phases=phases)
 
 
 def _at_rest(cascade: Cascade, scenario: Scenario, r: float) -> tuple[Cascade, Scenario]:

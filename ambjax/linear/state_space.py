@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.scipy.linalg import expm as jax_expm
 
 from ambjax.numerics.records import Scalar
+from ambjax.numerics.small_matrices import exponential, solve
 
 # Places at which the loop can be broken: the reading of the position sensor, and the command of the laws.
 Place = Literal["reading", "command"]
@@ -39,7 +39,7 @@ class CommandPath(NamedTuple):
         `fraction` [...]: part of the sample after which a new command acts. The first result is the effect of the new
         command, per unit; the second is that of the command before it.
         """
-        tools: Any = (np, _exponential) if isinstance(self.A, np.ndarray) else (jnp, jax_expm)
+        tools: Any = (np, _exponential) if isinstance(self.A, np.ndarray) else (jnp, exponential)
         np_, expm = tools
         n, fraction = len(self.b), np_.asarray(fraction)[..., None, None]
         table = np_.concatenate([np_.concatenate([self.A, self.b[:, None]], 1), np_.zeros((1, n + 1))]) * period
@@ -102,7 +102,8 @@ class StateSpace(NamedTuple):
         np_: Any = np if isinstance(self.A, np.ndarray) else jnp
         A, B, C, D, *_ = self.scaled()
         at = self.point(frequency)[:, None, None]
-        x = np_.linalg.solve(at * np.eye(len(A)) - A, np_.broadcast_to(B + 0j, (at.shape[0], *B.shape)))
+        solved = np.linalg.solve if np_ is np else solve
+        x = solved(at * np.eye(len(A)) - A, np_.broadcast_to(B + 0j, (at.shape[0], *B.shape)))
         return C @ x + D
 
     def point(self, frequency: Array | np.ndarray) -> Any:
@@ -121,7 +122,8 @@ class StateSpace(NamedTuple):
         A, _, C, *_ = self.scaled()
         at, n = self.point(frequency)[:, None, None], len(self.path.b)  # pyright: ignore[reportOptionalMemberAccess]
         row = np_.broadcast_to(C[4][:, None] + 0j, (at.shape[0], len(A), 1))
-        return np_.linalg.solve(at * np.eye(len(A)) - A.T, row)[:, :n, 0]
+        solved = np.linalg.solve if np_ is np else solve
+        return solved(at * np.eye(len(A)) - A.T, row)[:, :n, 0]
 
     def command_effect(self, frequency: Array | np.ndarray, late: Scalar = 0.0) -> Array:
         """Return the effect [F, n] of a unit command on the states of the plant, in the units of `scaled`.

@@ -13,7 +13,8 @@ import numpy.typing as npt
 def numbers(field: dataclasses.Field) -> str:
     """Return the allowed values of a numeric field in words, with the unit."""
     meta = field.metadata
-    kind = "a whole number" if meta["whole"] else "a number" if meta["infinite"] else "a finite number"
+    kind = "whole number" if meta["whole"] else "number" if meta["infinite"] else "finite number"
+    kind = f"{array} of {kind}s" if (array := _array(meta)) else f"a {kind}"
     unit = f"({meta['unit']})" if meta["unit"] else ""
     return " ".join(filter(None, (kind, _interval(meta), unit))) + (", or inf" if meta["infinite"] else "")
 
@@ -26,8 +27,14 @@ def allowed(field: dataclasses.Field, infinity: str = "or inf") -> str:
     meta = field.metadata
     if not meta.get("leaf"):
         return ""
-    words = " ".join(filter(None, ("a whole number" if meta["whole"] else "", _interval(meta))))
+    words = " ".join(filter(None, (_array(meta), "a whole number" if meta["whole"] else "", _interval(meta))))
     return f"{words}, {infinity}" if meta["infinite"] else words
+
+
+def _array(meta: Mapping[str, Any]) -> str:
+    """Return the declared shape in words; '' for a number."""
+    axes = meta.get("shape", "").split()
+    return f"an array [{', '.join(axes)}]" if axes else ""
 
 
 def _interval(meta: Mapping[str, Any]) -> str:

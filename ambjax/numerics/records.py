@@ -20,6 +20,7 @@ from jax import Array
 from jax.core import Tracer
 
 from ambjax.numerics.declared import check_number, item
+from ambjax.numerics.shapes import axes_of, check_shapes
 
 T = TypeVar("T")
 
@@ -31,6 +32,7 @@ Scalar: TypeAlias = Array | float
 def leaf(
     default: object = dataclasses.MISSING,
     *,
+    shape: str = "",
     unit: str = "",
     doc: str = "",
     above: float | None = None,
@@ -43,6 +45,7 @@ def leaf(
     """Declare a numeric field of a record.
 
     - `default`: default value; without it the field is required.
+    - `shape`: a letter for each axis of the value of one member (`numerics.shapes`); "": a number.
     - `unit`: unit of the value.
     - `doc`: meaning of the value.
     - `above`, `at_least`: exclusive and inclusive lower bound.
@@ -55,6 +58,7 @@ def leaf(
     underflows to 0. Returns the dataclass field.
     """
     metadata = {
+        "shape": shape,
         "unit": unit,
         "doc": doc,
         "above": above,
@@ -163,6 +167,9 @@ def _check_at_construction(cls: type) -> None:
                 continue  # skips `check_leaf`, because tracing constructs many records
             if isinstance(value, (int, float, str, np.number)) or value is None:
                 check_leaf(field, f"{type(self).__name__}.{field.name}", value)
+        for field in _shaped(type(self)):
+            if isinstance(given[field.name], (list, tuple)):  # one leaf, not one for each number
+                given[field.name] = np.asarray(given[field.name], float)
 
     cls.__post_init__ = check  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -191,21 +198,25 @@ def is_traced(x: object) -> bool:
 
 
 def validate(node: object, path: str = "") -> None:
-    """Check every leaf of the records in `node` against the bounds of its field.
+    """Check every leaf of the records in `node` against the bounds and the shape of its field.
 
     If a record type has the attribute `ordered`, a pair of field names, the first value must not exceed the second.
-    Traced leaves are not checked. `path`: dotted path of `node`, for messages. Raises ValueError for an invalid value.
+    Of traced leaves, only the shape is checked. `path`: dotted path of `node`, for messages. Raises ValueError for an
+    invalid value.
     """
     if isinstance(node, (tuple, list)):
         for index, item in enumerate(node):
             validate(item, f"{path}[{index}]")
         return
-    for field, is_leaf in _fields(type(node)):
+    if not (fields := _fields(type(node))):
+        return
+    for field, is_leaf in fields:
         value = getattr(node, field.name)
         if is_leaf:
             check_leaf(field, f"{path}.{field.name}".lstrip("."), value)
         else:
             validate(value, f"{path}.{field.name}".lstrip("."))
+    check_shapes(leaves_of(type(node)), vars(node), path)
     if pair := getattr(type(node), "ordered", None):
         low, high = (getattr(node, name) for name in pair)
         if not (is_traced(low) or is_traced(high)) and np.any(np.greater(low, high)):
@@ -232,10 +243,22 @@ def _fields(kind: type) -> tuple[tuple[dataclasses.Field, bool], ...]:
 
 
 @functools.cache
+def leaves_of(kind: type) -> tuple[dataclasses.Field, ...]:
+    """Return the fields of a record type that are leaves. Cached."""
+    return tuple(field for field, is_leaf in _fields(kind) if is_leaf)
+
+
+@functools.cache
+def _shaped(kind: type) -> tuple[dataclasses.Field, ...]:
+    """Return the leaves of a record type that are arrays. Cached."""
+    return tuple(field for field in leaves_of(kind) if axes_of(field))
+
+
+@functools.cache
 def _leaves(kind: type) -> tuple[tuple[dataclasses.Field, float, float], ...]:
     """Return the leaves of a record type, each with an open interval of allowed floats, empty if `whole`. Cached."""
     found = []
-    for field in (field for field, is_leaf in _fields(kind) if is_leaf):
+    for field in leaves_of(kind):
         lows = [x for x in (field.metadata["above"], field.metadata["at_least"]) if x is not None]
         high = field.metadata["at_most"]
         high = -math.inf if field.metadata["whole"] else math.inf if high is None else high

@@ -1,1 +1,1 @@
-"""Results of a case as objects of Python: of one run, of the members of its spread, and of its linearised loop."""
+"""Results of a case as objects of Python (run, members, linearised loop, map, export), and their files."""

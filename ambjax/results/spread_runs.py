@@ -10,6 +10,7 @@ from ambjax.cases.reader import Case, require_case
 from ambjax.ensemble import statistics
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.study import Study
+from ambjax.host.arguments import names_arguments
 from ambjax.host.optional import extra
 from ambjax.simulation.metrics import UNITS
 
@@ -67,6 +68,7 @@ class MembersRun:
         return histogram_figure(self.columns, metrics or CHIEF)
 
 
+@names_arguments()
 def simulate_members(case: Case, members: int, *, seed: int | None = None, threads: int | None = None) -> MembersRun:
     """Simulate members 0 to members - 1 of the spread of a case, as `ambjax ensemble` does.
 
@@ -78,10 +80,16 @@ def simulate_members(case: Case, members: int, *, seed: int | None = None, threa
     anything but a case, and for a number of members or a seed out of range.
     """
     require_case(case)
-    seed = int(case.scenario.seed) if seed is None else seed
-    for name, value, least, most in (("members", members, 1, MOST_MEMBERS), ("seed", seed, 0, 2**32 - 1)):
-        if not isinstance(value, numbers.Integral) or not least <= value <= most:
-            raise ValueError(f"{name} = {value!r}: it must be a whole number from {least} to {most:,}.")
-    study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, seed, members)
+    study = study_of(case, seed, members)
     columns = {name: np.asarray(x) for name, x in study.columns(0, members, threads=threads).items()}
     return MembersRun(study, columns)
+
+
+def study_of(case: Case, seed: int | None, members: int) -> Study:
+    """Return the study of a case. Raises ValueError for a member count or seed out of range."""
+    if not isinstance(members, numbers.Integral) or not 1 <= members <= MOST_MEMBERS:
+        raise ValueError(f"--members {members!r}: it must be a whole number from 1 to {MOST_MEMBERS:,}.")
+    seed = int(case.scenario.seed) if seed is None else seed
+    if not isinstance(seed, numbers.Integral) or not 0 <= seed < 2**32:
+        raise ValueError(f"--seed {seed!r}: it must be a whole number from 0 to 4294967295.")
+    return Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, seed, members)

@@ -3,7 +3,7 @@
 import math
 import re
 
-from ambjax.host.words import command
+from ambjax.text.words import command
 from ambjax.theorem.causes import Cause, cause_words
 from ambjax.theorem.conditions import Condition, Report
 from ambjax.theorem.law_poles import LEAST_DAMPING

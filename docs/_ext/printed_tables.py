@@ -1,7 +1,7 @@
 """Tables that cells print as text become HTML tables, which fit a phone.
 
 A printed table has a line of titles, a line of dashes under each column, and rows, with two spaces between columns
-(`ambjax.commands.outputs.table`).
+(`ambjax.results.outputs.table`).
 """
 
 import html

@@ -21,10 +21,8 @@ from ambjax.extend import Scalar, record, static
 from ambjax.simulation.folds import Fold
 from tuning.problem.quantities import KINDS, TINY, Kind, LimitContext
 
-# PENALTY: initial penalty; at a multiplier of 0, an excess of 10 % adds 0.14 to the goal. PENALTY_GROWTH: factor by
-# which the penalty grows if an update leaves more than the share SUFFICIENT_DECREASE of the excess (Nocedal and Wright,
-# ch. 17). MOST_PENALTY: largest penalty.
-PENALTY, PENALTY_GROWTH, SUFFICIENT_DECREASE, MOST_PENALTY = 30.0, 4.0, 0.3, 2000.0
+# Penalty; at a multiplier of 0, an excess of 10 % adds 0.14 to the goal.
+PENALTY = 30.0
 # Prefix that marks a limited quantity among the terms of a loss.
 PREFIX = "limit."
 # A limit with a multiplier above 0 is met if g lies between minus this number and half of the margin.
@@ -44,14 +42,13 @@ PRICE_INTERVALS = 200
 class LimitTerm:
     """Term of a limit in the goal. Its numbers are leaves: a change of them does not recompile the search.
 
-    `name`: key of the quantity in KINDS. `log_allowed`: logarithm of `Limit.allowed`. `multiplier`, `penalty`, `ratio`:
-    as in `Limit`.
+    `name`: key of the quantity in KINDS. `log_allowed`: logarithm of `Limit.allowed`. `multiplier`, `ratio`: as in
+    `Limit`.
     """
 
     name: str = static()
     log_allowed: Scalar
     multiplier: Scalar
-    penalty: Scalar
     ratio: Scalar
 
     def excess(self, values: Array) -> Array:
@@ -65,8 +62,8 @@ class LimitTerm:
 
     def __call__(self, values: Array) -> Array:
         """Return the term in the goal for the members' values [N] in the search."""
-        multiplier = jnp.maximum(self.multiplier + self.penalty * self.excess(values), 0.0)
-        return (multiplier**2 - self.multiplier**2) / (2 * self.penalty)
+        multiplier = jnp.maximum(self.multiplier + PENALTY * self.excess(values), 0.0)
+        return (multiplier**2 - self.multiplier**2) / (2 * PENALTY)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,9 +71,8 @@ class Limit:
     """A limit, and the state of its augmented Lagrangian.
 
     `name`: key of the quantity in KINDS. `threshold`: the limit, in the unit of the quantity. `source`: origin of the
-    limit (case file, default or FRONT), for the report. `multiplier`, `penalty`: of the augmented Lagrangian. `ratio`:
-    the judge's value divided by the search's value. `missed`: log excess of the judge's value at the last update; inf
-    before the first. `history`: (judge's value, multiplier) of every update.
+    limit (case file, default or FRONT), for the report. `multiplier`: of the augmented Lagrangian. `ratio`: the judge's
+    value divided by the search's value. `history`: (judge's value, multiplier) of every update.
     """
 
     name: str
@@ -86,8 +82,6 @@ class Limit:
     """relative distance that the search keeps from the limit, on the allowed side"""
     multiplier: float = 0.0
     ratio: float = 1.0
-    penalty: float = PENALTY
-    missed: float = math.inf
     history: tuple[tuple[float, float], ...] = ()
 
     @property
@@ -111,7 +105,7 @@ class Limit:
     @property
     def term(self) -> LimitTerm:
         """The limit's term in the goal."""
-        return LimitTerm(self.name, math.log(self.allowed), self.multiplier, self.penalty, self.ratio)
+        return LimitTerm(self.name, math.log(self.allowed), self.multiplier, self.ratio)
 
     def log_excess(self, reached: float) -> float:
         """Return g = log(reached / allowed), or log(allowed / reached) for a lower limit."""
@@ -139,19 +133,14 @@ class Limit:
         loses the rotor; it is then replaced by LOST_FACTOR times the larger of `tuned` and the limit.
         """
         judged = judged if math.isfinite(judged) else LOST_FACTOR * max(tuned, self.threshold)
-        excess = self.log_excess(judged)
-        multiplier = max(self.multiplier + self.penalty * self.log_excess(self.ratio * tuned), 0.0)
-        slow = multiplier > 0 and abs(excess) > SUFFICIENT_DECREASE * abs(self.missed)
-        penalty = min(PENALTY_GROWTH * self.penalty, MOST_PENALTY) if slow else self.penalty
+        multiplier = max(self.multiplier + PENALTY * self.log_excess(self.ratio * tuned), 0.0)
         ratio = max(judged, TINY) / max(tuned, TINY)
         history = (*self.history, (max(judged, TINY), multiplier))
-        return dataclasses.replace(
-            self, multiplier=multiplier, ratio=ratio, penalty=penalty, missed=excess, history=history
-        )
+        return dataclasses.replace(self, multiplier=multiplier, ratio=ratio, history=history)
 
     def restarted(self) -> "Limit":
         """Return the limit with a new augmented Lagrangian, to minimise another quantity. `ratio` is kept."""
-        return dataclasses.replace(self, multiplier=0.0, penalty=PENALTY, missed=math.inf, history=())
+        return dataclasses.replace(self, multiplier=0.0, history=())
 
     def error_reduction(self, more: float) -> float:
         """Return the relative decrease of the minimised rms value if the limit is looser by the share `more`.

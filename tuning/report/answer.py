@@ -2,8 +2,8 @@
 
 import functools
 
-from ambjax.commands.outputs import described
-from ambjax.host.web_page import escape_markdown
+from ambjax.results.outputs import described
+from ambjax.text.web_page import escape_markdown
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.limit_table import broken, prices
 

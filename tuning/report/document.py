@@ -3,8 +3,8 @@
 import functools
 from collections.abc import Callable
 
-from ambjax.commands.outputs import described
-from ambjax.host.web_page import escape_markdown, markdown_table
+from ambjax.results.outputs import described
+from ambjax.text.web_page import escape_markdown, markdown_table
 from tuning.problem.loss import TERMS
 from tuning.report import answer, front_table, held_out, limit_table, sensitivity_table
 from tuning.report.breakdown import FORMULA

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.reader import Case, case_from
-from ambjax.commands.outputs import described
 from ambjax.control.cascade import Cascade
-from ambjax.host.web_page import render_page
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
+from ambjax.results.outputs import described
+from ambjax.text.web_page import render_page
 from tuning.problem.space import Gain, Space, tunable
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.report import accurate, front_table, pictures

@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.host.web_page import markdown_table
+from ambjax.text.web_page import markdown_table
 from tuning.front import KNEE, FrontPoint
 from tuning.solve.course import SearchResult
 

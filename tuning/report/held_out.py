@@ -2,7 +2,7 @@
 
 import math
 
-from ambjax.host.web_page import markdown_table
+from ambjax.text.web_page import markdown_table
 from tuning.report.facts import SUMMARY_METRICS, Row, TuningFacts
 
 

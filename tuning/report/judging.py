@@ -7,8 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.commands.outputs import described
 from ambjax.linear import Findings, stability_of, suspects
+from ambjax.results.outputs import described
 from ambjax.theorem.advice import advice as on_conditions
 from ambjax.theorem.conditions import Report as Check
 from ambjax.theorem.conditions import check

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.host.web_page import markdown_table
+from ambjax.text.web_page import markdown_table
 from tuning.judge.late import DELAY_MARGIN, DelayTest, not_simulated
 from tuning.judge.peaks import MEASURED, Sensitivity, reached_of
 from tuning.problem.limits import FRONT, Limit

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any
 
-from ambjax.host.web_page import escape_markdown, markdown_table
+from ambjax.text.web_page import escape_markdown, markdown_table
 from tuning.judge.peaks import SCREENED, Sensitivity, injects
 from tuning.problem.tuning_problem import TuningProblem
 

@@ -22,7 +22,7 @@ from tuning.problem.members import Members
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.checkpoint import CheckpointFile, SearchState, checkpoint
 from tuning.solve.iteration import standing_of
-from tuning.solve.refine import best_of, ranked, search
+from tuning.solve.refine import best_of, search
 from tuning.solve.screen import around, initial_points
 
 # Largest number of searches in `search_and_restart`.
@@ -30,8 +30,6 @@ MOST_SEARCHES = 5
 # Restarts end after two successive searches that each lower the goal, a logarithm, by less than this. One such search
 # is not enough, because its points may miss a better optimum by chance.
 LEAST_IMPROVEMENT = 0.01
-# If accurate steps confirm none of the answers, this number of earlier points of the searches is checked with them.
-FALLBACK_POINTS = 12
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,7 +116,7 @@ class Course:
         progress = search(
             self.problem.engine, self.problem.goal, self.members, points, keep=tune.budget.starts,
             iterations=tune.budget.iterations, name=tune.optimiser, rate=tune.learning_rate,
-            seed=self.seed + len(self.past), at_optimum=at_optimum,
+            at_optimum=at_optimum,
             checkpoint_file=CheckpointFile(path, self.facts, number, self.tell), resume=self.resume,
             on_iteration=self._standing(number), until=self.began + 60 * self.minutes,
         )  # fmt: skip
@@ -223,13 +221,6 @@ def training(problem: TuningProblem) -> Members:
     return problem.objective.training(
         tune.budget.seed, tune.budget.members, tune.budget.stressed, tune.stress, tune.gain_margin
     )
-
-
-def points_of(past: list[SearchState]) -> np.ndarray:
-    """Return at most FALLBACK_POINTS points [K, m] that the searches visited, best first (`ranked`)."""
-    x = np.concatenate([np.asarray(one.history["x"]).reshape(-1, one.starts.best.shape[-1]) for one in past])
-    value = np.concatenate([np.asarray(one.history["value"]).ravel() for one in past])
-    return x[ranked(value, FALLBACK_POINTS)]
 
 
 def _best(progress: SearchState) -> tuple[np.ndarray, float]:

@@ -12,16 +12,13 @@ from tuning.problem.members import Members
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.course import Course
 
-# Largest numbers of lost members, and of members with large errors, that join at once.
+# Largest numbers of lost members, and of members with large values of a limited mean, that join at once.
 MOST_LOST, MOST_LARGE = 16, 8
 # Largest number of members that join because they break a limit on the worst member.
 MOST_BREAKING = 4
 # If the judged mean of a limited quantity exceeds its expected value by more than this share, the training ensemble
 # lacks members with large values.
 UNEXPECTED = 0.1
-# Members that are lost with accurate steps are held with the steps of the search. They therefore join with more noise,
-# by the factor NOISE_GROWTH**number in round number `number`.
-NOISE_GROWTH = 1.5
 
 
 def largest_unseen(course: Course, values: np.ndarray, most: int = MOST_LARGE) -> np.ndarray:
@@ -61,15 +58,13 @@ def breaking(
     return problem.objective.chosen(seeds(budget)[1], np.unique(found), total) if found.size else None
 
 
-def joining(problem: TuningProblem, lost: np.ndarray, error: StepError, number: int) -> Members:
+def joining(problem: TuningProblem, lost: np.ndarray, error: StepError) -> Members:
     """Return the members that join the training ensemble.
 
-    The first MOST_LOST of the `lost` validation members join with half of the additional noise of stressed members, as
-    a margin. Members that are lost or stall with accurate steps join with NOISE_GROWTH**number times their noise.
-    `number`: of the round, from 1.
+    They are the first MOST_LOST of the `lost` validation members, and the members that are lost or stall with accurate
+    steps. They join with half of the additional noise of stressed members, as a margin.
     """
     budget = problem.tune.budget
     those = problem.objective.chosen(seeds(budget)[1], lost[:MOST_LOST], budget.validation)
-    those = those._replace(noise_factor=those.noise_factor * (1 + problem.tune.stress) / 2)
-    these = error.unheld._replace(noise_factor=error.unheld.noise_factor * NOISE_GROWTH**number)
-    return jax.tree.map(lambda a, b: np.concatenate([a, b]), those, these)
+    both: Members = jax.tree.map(lambda a, b: np.concatenate([a, b]), those, error.unheld)
+    return both._replace(noise_factor=both.noise_factor * (1 + problem.tune.stress) / 2)

@@ -5,29 +5,20 @@ excess g of a limit is about (required multiplier - multiplier) / penalty. An up
 """
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from tuning.judge.evaluate import judge
-from tuning.judge.peaks import MEASURED, decides, injections, injects, reached_of
+from tuning.judge.peaks import injections, injects, reached_of
 from tuning.problem.config import seeds
-from tuning.problem.limits import PENALTY, PREFIX, TOLERANCE_BELOW, Limit
-from tuning.problem.tuning_problem import TuningProblem
+from tuning.problem.limits import PREFIX, TOLERANCE_BELOW, Limit
 from tuning.solve.course import Course
 from tuning.solve.joining import breaking
 
 # Largest number of searches after updates of the multipliers in one round.
 MOST_UPDATES = 6
-# Smallest decrease of g that counts as progress towards a limit.
-LEAST_DECREASE = 1e-3
-# A limit with g below -CLEARLY_BELOW is clearly met, because two ensembles differ by far less.
-CLEARLY_BELOW = 0.1
-# A quantity whose linear value has g above -INJECTED_FROM is also measured by injection, because the measured value may
-# exceed the linear one by up to a fifth.
-INJECTED_FROM = 0.2
 # Largest number of members on which averages are judged. Limits on worst members need the whole ensemble.
 AVERAGING_MEMBERS = 256
 
@@ -72,7 +63,7 @@ def optima(course: Course, x: np.ndarray) -> tuple[list[Judged], bool]:
     `course.members` are those of the last search.
 
     There are at most MOST_UPDATES searches. The loop ends early if the course is over, and if a search ends where it
-    began and this point is within all limits. It also ends early if a larger penalty makes no progress towards a limit.
+    began and this point is within all limits.
     """
     seen, moved = list[Judged](), True
     for update in range(MOST_UPDATES + 1):
@@ -81,11 +72,6 @@ def optima(course: Course, x: np.ndarray) -> tuple[list[Judged], bool]:
         last = update == MOST_UPDATES or course.over
         if last or not join_breaking(course, one):
             limits = tuple(limit.updated(*found) for limit, found in zip(before, one.numbers, strict=True))
-            stuck = [limit for limit, (_, judged) in zip(before, one.numbers, strict=True) if _stuck(limit, judged)]
-            if stuck and update:  # at update 0, `missed` is of an earlier round, with other members
-                names = ", ".join(limit.name for limit in stuck)
-                course.tell(f"a larger penalty makes no progress towards the limit of {names}")
-                break
             course.problem = course.problem.limited(limits)
             if _all_met(course, before, limits, one.numbers) or (not moved and one.holds(limits)):
                 return seen, True
@@ -143,16 +129,6 @@ def _least(course: Course, points: Sequence[np.ndarray]) -> np.ndarray:
     return points[int(np.argmin(goal.score(both, course.problem.engine.terms(both, course.members), course.members)))]
 
 
-def _stuck(limit: Limit, judged: float) -> bool:
-    """Return whether a larger penalty did not reduce the excess of a limit. `judged`: the judge's value."""
-    excess = limit.log_excess(judged)
-    return (
-        limit.penalty > PENALTY
-        and excess > limit.margin + LEAST_DECREASE
-        and 0 < limit.missed < excess + LEAST_DECREASE
-    )
-
-
 def met(limit: Limit, judged: float) -> bool:
     """Return whether the judge's value is close to the bound `Limit.allowed`, as it should be for an active limit.
 
@@ -162,7 +138,10 @@ def met(limit: Limit, judged: float) -> bool:
 
 
 def judged_at(course: Course, x: np.ndarray) -> Judged:
-    """Return the values of the limits at x [m], on all members of the ensemble if a limit concerns the worst member."""
+    """Return the values of the limits at x [m], on all members of the ensemble if a limit concerns the worst member.
+
+    On a processor, members are measured by injection, as the held-out members are.
+    """
     problem, budget = course.problem, course.problem.tune.budget
     seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)
     if not any(limit.kind.worst for limit in problem.limits):
@@ -171,36 +150,6 @@ def judged_at(course: Course, x: np.ndarray) -> Judged:
     columns = judge(problem, x, seed, count)
     terms, n = problem.engine.terms(x[None], course.members), course.members.ordinary
     tuned = [float(limit.kind.tuned(terms[PREFIX + limit.name][0, :n])) for limit in problem.limits]
-    return Judged(x, list(zip(tuned, _judged_values(problem, x, seed, columns, tuned), strict=True)), columns)
-
-
-def _judged_values(
-    problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray], tuned: Sequence[float]
-) -> list[float]:
-    """Return the judge's value of each limit at x [m].
-
-    `columns` [N]: result of `judge` for the ensemble with this `seed`. `tuned`: the search's value of each limit.
-
-    On a processor, members are measured by injection, as the held-out members are, if a linear peak or a corrected
-    value may break a limit. The corrected value is the search's value times `Limit.ratio`. If only injections decide
-    (`measured_peaks.decides`), linear peaks do not count. Members are then measured before the first update of the
-    multipliers, and later if a corrected value is not clearly within its limit.
-    """
-    if not injects(problem):
-        return [limit.reached(columns) for limit in problem.limits]
-    pairs = [(limit, ours) for limit, ours in zip(problem.limits, tuned, strict=True) if limit.name in MEASURED]
-    if decides(problem):
-        near = any(
-            math.isinf(limit.missed) or limit.log_excess(limit.ratio * ours) > -CLEARLY_BELOW for limit, ours in pairs
-        )
-        known = {limit.name: limit.ratio * ours for limit, ours in pairs}
-    else:
-        # with the ratio of an earlier injection, the searches do not alternate between a measured and a linear value
-        near = any(
-            limit.log_excess(max(limit.reached(columns), limit.ratio * ours)) > -INJECTED_FROM for limit, ours in pairs
-        )
-        known = {}
-    if near:
-        measured = injections(problem, x, seed, columns)
-        return [reached_of(limit, columns, measured) for limit in problem.limits]
-    return [known.get(limit.name, limit.reached(columns)) for limit in problem.limits]
+    measured = injections(problem, x, seed, columns) if injects(problem) else None
+    judged = [reached_of(limit, columns, measured) for limit in problem.limits]
+    return Judged(x, list(zip(tuned, judged, strict=True)), columns)

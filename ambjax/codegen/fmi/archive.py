@@ -13,7 +13,7 @@ from ambjax.codegen.c99.texts import MARK
 from ambjax.codegen.fmi.description import build_description, description, token
 from ambjax.codegen.trace import Trace
 
-SHARED_FILES = ("fmu_core.h", "fmi{}_interface.h", "fmi{}.c")
+SHARED_FILES = ("fmu_core.h", "fmu_functions.h", "fmi{}.c")
 # For each system: its name in the folders of binaries of FMI 2.0 and of FMI 3.0, and the ending of a library.
 SYSTEMS = {
     "linux": ("linux", "linux", ".so"),

@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
@@ -69,6 +69,46 @@ def token(traced: Trace, identifier: str, files: dict[str, str]) -> str:
     return "{" + "-".join([digest[:8], digest[8:12], digest[12:16], digest[16:20], digest[20:32]]) + "}"
 
 
+class Form(NamedTuple):
+    """What differs between the model descriptions of FMI 2.0 and FMI 3.0, with fields for str.format.
+
+    - `root`: attributes of the root; `co_simulation`: the element of that name; `variable`: an element of a variable.
+    - `kinds`: names of the elements of a real number and of an integer.
+    - `unknowns`: the outputs and the initial unknowns, each from a template of the list and one of an output.
+    - `infinity`: FMI 2.0 has no infinity; 1e300 stands for it.
+    """
+
+    root: str
+    co_simulation: str
+    variable: str
+    kinds: tuple[str, str]
+    unknowns: tuple[tuple[str, str], ...]
+    infinity: str
+
+
+FORMS = {
+    2: Form(
+        'fmiVersion="2.0" guid={guid} {head} variableNamingConvention="structured" numberOfEventIndicators="0"',
+        '<CoSimulation modelIdentifier="{identifier}" canHandleVariableCommunicationStepSize="false" '
+        'canInterpolateInputs="false" maxOutputDerivativeOrder="0" canGetAndSetFMUstate="true" '
+        'canSerializeFMUstate="false">\n    <SourceFiles>{files}</SourceFiles>\n  </CoSimulation>',
+        "<ScalarVariable {common}><{kind}{numbers}/></ScalarVariable>",
+        ("Real", "Integer"),
+        tuple((f"<{tag}>{{}}</{tag}>", '<Unknown index="{index}"/>') for tag in ("Outputs", "InitialUnknowns")),
+        "1e300",
+    ),
+    3: Form(
+        'fmiVersion="3.0" instantiationToken={guid} {head}',
+        '<CoSimulation modelIdentifier="{identifier}" canHandleVariableCommunicationStepSize="false" '
+        'fixedInternalStepSize="{period!r}" canGetAndSetFMUState="true" canSerializeFMUState="false"/>',
+        "<{kind} {common}{numbers}/>",
+        ("Float64", "UInt32"),
+        tuple(("{}", f'<{tag} valueReference="{{reference}}"/>') for tag in ("Output", "InitialUnknown")),
+        "INF",
+    ),
+}
+
+
 def description(traced: Trace, identifier: str, case: str, guid: str, sources: list[str], version: int) -> str:
     """Return the text of modelDescription.xml.
 
@@ -76,11 +116,43 @@ def description(traced: Trace, identifier: str, case: str, guid: str, sources: l
     - `sources`: names of the C files.
     - `version`: of FMI, 2 or 3.
     """
+    form, period = FORMS[version], traced.block.period
     words = f"{traced.block.noun} of case {case}: one sample per communication step"
-    lines = _three(traced, identifier, guid) if version == 3 else _two(traced, identifier, guid, sources)
-    head = f" modelName={quoteattr(f'{identifier} ({traced.block.noun})')} description={quoteattr(words)}"
-    tool = f" generationTool={quoteattr(f'ambjax {__version__}')}"
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + "\n".join(lines).replace("@HEAD@", head + tool) + "\n"
+    head = f"modelName={quoteattr(f'{identifier} ({traced.block.noun})')} description={quoteattr(words)}"
+    head += f" generationTool={quoteattr(f'ambjax {__version__}')}"
+    files = "".join(f"<File name={quoteattr(name)}/>" for name in sources)
+    found = variables(traced)[1 if version == 2 else 0 :]  # time is no variable of FMI 2.0
+    outputs = [(index, x.reference) for index, x in enumerate(found, 1) if x.causality == "output"]
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        f"<fmiModelDescription {form.root.format(guid=quoteattr(guid), head=head)}>",
+        f"  {form.co_simulation.format(identifier=identifier, period=period, files=files)}",
+        *_units(found),
+        '  <LogCategories><Category name="logStatusError"/></LogCategories>',
+        f'  <DefaultExperiment startTime="0" stopTime="{1000 * period!r}" stepSize="{period!r}"/>',
+        "  <ModelVariables>",
+        *(f"    {_variable(x, form)}" for x in found),
+        "  </ModelVariables>",
+        "  <ModelStructure>",
+    ]
+    for listed, one in form.unknowns:
+        rows = "".join(one.format(index=index, reference=reference) for index, reference in outputs)
+        lines.append(f"    {listed.format(rows)}")
+    return "\n".join([*lines, "  </ModelStructure>", "</fmiModelDescription>", ""])
+
+
+def _variable(x: Variable, form: Form) -> str:
+    """Return the element of a variable, with its bounds and its start value."""
+    numbers = f" unit={quoteattr(x.unit)}" if x.unit else ""
+    for name, value in (("min", x.least), ("max", x.most), ("start", x.start)):
+        if value is not None:
+            text = repr(float(value)) if math.isfinite(value) else "-" * (value < 0) + form.infinity
+            numbers += f' {name}="{text}"'
+    common = (
+        f'name={quoteattr(x.name)} valueReference="{x.reference}" causality="{x.causality}" '
+        f'variability="{x.variability}" description={quoteattr(x.description)}'
+    )
+    return form.variable.format(kind=form.kinds[x.whole], common=common, numbers=numbers)
 
 
 def _units(found: list[Variable]) -> list[str]:
@@ -91,87 +163,6 @@ def _units(found: list[Variable]) -> list[str]:
         base = "".join(f' {name}="{power}"' for name, power in powers.items())
         rows.append(f"    <Unit name={quoteattr(unit)}><BaseUnit{base}/></Unit>")
     return ["  <UnitDefinitions>", *rows, "  </UnitDefinitions>"]
-
-
-def _experiment(traced: Trace) -> str:
-    """Return the line of the default experiment: 1,000 sample periods."""
-    period = traced.block.period
-    return f'  <DefaultExperiment startTime="0" stopTime="{1000 * period!r}" stepSize="{period!r}"/>'
-
-
-def _number(x: float, version: int) -> str:
-    """Return a number as text of XML Schema. FMI 2.0 has no infinity: 1e300 stands for it."""
-    if abs(x) == float("inf"):
-        return ("-" if x < 0 else "") + ("INF" if version == 3 else "1e300")
-    return repr(float(x))
-
-
-def _values(x: Variable, version: int) -> str:
-    """Return the attributes of a variable that are numbers: its bounds and its start value."""
-    given = (("min", x.least), ("max", x.most), ("start", x.start))
-    return "".join(f' {name}="{_number(value, version)}"' for name, value in given if value is not None)
-
-
-def _three(traced: Trace, identifier: str, guid: str) -> Iterator[str]:
-    """Yield the lines of the description for FMI 3.0; `description` fills in @HEAD@."""
-    found, period = variables(traced), traced.block.period
-    yield f'<fmiModelDescription fmiVersion="3.0" instantiationToken={quoteattr(guid)}@HEAD@>'
-    yield (
-        f'  <CoSimulation modelIdentifier="{identifier}" canHandleVariableCommunicationStepSize="false" '
-        f'fixedInternalStepSize="{period!r}" canGetAndSetFMUState="true" canSerializeFMUState="false"/>'
-    )
-    yield from _units(found)
-    yield '  <LogCategories><Category name="logStatusError"/></LogCategories>'
-    yield _experiment(traced)
-    yield "  <ModelVariables>"
-    for x in found:
-        unit = f" unit={quoteattr(x.unit)}" if x.unit else ""
-        kind = "UInt32" if x.whole else "Float64"
-        yield (
-            f'    <{kind} name={quoteattr(x.name)} valueReference="{x.reference}" causality="{x.causality}" '
-            f'variability="{x.variability}" description={quoteattr(x.description)}{unit}{_values(x, 3)}/>'
-        )
-    yield "  </ModelVariables>"
-    yield "  <ModelStructure>"
-    yield from (f'    <Output valueReference="{x.reference}"/>' for x in found if x.causality == "output")
-    yield from (f'    <InitialUnknown valueReference="{x.reference}"/>' for x in found if x.causality == "output")
-    yield "  </ModelStructure>"
-    yield "</fmiModelDescription>"
-
-
-def _two(traced: Trace, identifier: str, guid: str, sources: list[str]) -> Iterator[str]:
-    """Yield the lines of the description for FMI 2.0; `description` fills in @HEAD@."""
-    found = [x for x in variables(traced) if x.causality != "independent"]
-    yield (
-        f'<fmiModelDescription fmiVersion="2.0" guid={quoteattr(guid)}@HEAD@ '
-        'variableNamingConvention="structured" numberOfEventIndicators="0">'
-    )
-    yield (
-        f'  <CoSimulation modelIdentifier="{identifier}" canHandleVariableCommunicationStepSize="false" '
-        'canInterpolateInputs="false" maxOutputDerivativeOrder="0" canGetAndSetFMUstate="true" '
-        'canSerializeFMUstate="false">'
-    )
-    yield f"    <SourceFiles>{''.join(f'<File name={quoteattr(name)}/>' for name in sources)}</SourceFiles>"
-    yield "  </CoSimulation>"
-    yield from _units(found)
-    yield '  <LogCategories><Category name="logStatusError"/></LogCategories>'
-    yield _experiment(traced)
-    yield "  <ModelVariables>"
-    for x in found:
-        unit = f" unit={quoteattr(x.unit)}" if x.unit else ""
-        kind = f"<Integer{_values(x, 2)}/>" if x.whole else f"<Real{unit}{_values(x, 2)}/>"
-        yield (
-            f'    <ScalarVariable name={quoteattr(x.name)} valueReference="{x.reference}" causality="{x.causality}" '
-            f'variability="{x.variability}" description={quoteattr(x.description)}>{kind}</ScalarVariable>'
-        )
-    yield "  </ModelVariables>"
-    outputs = [k for k, x in enumerate(found, 1) if x.causality == "output"]
-    yield "  <ModelStructure>"
-    for tag in ("Outputs", "InitialUnknowns"):
-        rows = "".join(f'<Unknown index="{k}"/>' for k in outputs)
-        yield f"    <{tag}>{rows}</{tag}>"
-    yield "  </ModelStructure>"
-    yield "</fmiModelDescription>"
 
 
 def build_description(identifier: str, sources: list[str]) -> str:

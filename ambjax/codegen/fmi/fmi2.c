@@ -1,31 +1,43 @@
-/* FMI 2.0 for co-simulation. The signatures are those of the standard; types have names of their own. */
+/* FMI 2.0 for co-simulation: what differs from FMI 3.0. The signatures are those of the standard. */
 
-#include "fmi2_interface.h"
 #include "fmu_core.h"
 
+#define FMI(name) fmi2##name
+#define VERSION "2.0"
+#define GET_NUMBERS fmi2GetReal
+#define SET_NUMBERS fmi2SetReal
+#define GET_WHOLE fmi2GetInteger
+#define GET_STATE fmi2GetFMUstate
+#define SET_STATE fmi2SetFMUstate
+#define FREE_STATE fmi2FreeFMUstate
+/* the length of an array of values is the count of its references */
+#define LENGTH
+#define MOST count
+
+typedef int bool_t;
+typedef int whole_t;
+typedef struct {
+    void (*log)(environment_t environment, const char *name, status_t status, const char *category, const char *text, ...);
+    void *(*allocate)(size_t count, size_t size);
+    void (*release)(void *memory);
+    void (*finished)(environment_t environment, status_t status);
+    environment_t environment;
+} callbacks_t;
+typedef struct {
+    const callbacks_t *callbacks;
+    char name[128];
+} logger_t;
 enum { CO_SIMULATION = 1 };
 
-typedef struct {
-    numbers block;
-    const callbacks_t *callbacks;
-    bool_t logging;
-    char name[128];
-} fmu;
-
-static status_t said(const fmu *one, status_t status, const char *message)
+static void log_error(const logger_t *logger, const char *message)
 {
-    if (one->callbacks->log != NULL && one->logging) {
-        one->callbacks->log(one->callbacks->environment, one->name, status, "logStatusError", "%s", message);
+    const callbacks_t *to = logger->callbacks;
+    if (to->log != NULL) {
+        to->log(to->environment, logger->name, ERROR, "logStatusError", "%s", message);
     }
-    return status;
 }
 
-/* --- creation and modes --- */
-
-EXPORTED const char *fmi2GetVersion(void)
-{
-    return "2.0";
-}
+#include "fmu_functions.h"
 
 EXPORTED const char *fmi2GetTypesPlatform(void)
 {
@@ -36,31 +48,13 @@ EXPORTED instance_t fmi2Instantiate(
     const char *name, int type, const char *token, const char *resources, const callbacks_t *callbacks, bool_t visible,
     bool_t logging)
 {
-    fmu *one;
+    logger_t logger = {callbacks, ""};
     (void)resources, (void)visible;
     if (callbacks == NULL || type != CO_SIMULATION || token == NULL || strcmp(token, MODEL_TOKEN) != 0) {
         return NULL;
     }
-    one = calloc(1, sizeof *one);
-    if (one != NULL) {
-        core_reset(&one->block);
-        one->callbacks = callbacks;
-        one->logging = logging;
-        strncpy(one->name, name == NULL ? "" : name, sizeof one->name - 1);
-    }
-    return one;
-}
-
-EXPORTED void fmi2FreeInstance(instance_t instance)
-{
-    free(instance);
-}
-
-EXPORTED status_t fmi2SetDebugLogging(instance_t instance, bool_t on, size_t count, const char *const categories[])
-{
-    (void)count, (void)categories;
-    ((fmu *)instance)->logging = on;
-    return OK;
+    strncpy(logger.name, name == NULL ? "" : name, sizeof logger.name - 1);
+    return create(logger, logging);
 }
 
 EXPORTED status_t fmi2SetupExperiment(
@@ -77,116 +71,11 @@ EXPORTED status_t fmi2EnterInitializationMode(instance_t instance)
     return OK;
 }
 
-EXPORTED status_t fmi2ExitInitializationMode(instance_t instance)
-{
-    fmu *one = instance;
-    core_begin(&one->block);
-    one->block.mode = STEPPING;
-    return OK;
-}
-
-EXPORTED status_t fmi2Terminate(instance_t instance)
-{
-    ((fmu *)instance)->block.mode = TERMINATED;
-    return OK;
-}
-
-EXPORTED status_t fmi2Reset(instance_t instance)
-{
-    core_reset(&((fmu *)instance)->block);
-    return OK;
-}
-
 EXPORTED status_t fmi2DoStep(instance_t instance, double now, double step, bool_t keep)
 {
-    fmu *one = instance;
     (void)keep;
-    if (one->block.mode != STEPPING || !core_do_step(&one->block, now, step)) {
-        return said(one, ERROR, "the communication step must be a whole number of sample periods, after initialization");
-    }
-    return OK;
+    return do_step(instance, now, step);
 }
-
-/* --- values --- */
-
-EXPORTED status_t fmi2GetReal(instance_t instance, const reference_t references[], size_t count, double values[])
-{
-    fmu *one = instance;
-    for (size_t k = 0; k < count; k++) {
-        if (!core_get(&one->block, references[k], &values[k])) {
-            return said(one, ERROR, "there is no number with this value reference");
-        }
-    }
-    return OK;
-}
-
-EXPORTED status_t fmi2SetReal(instance_t instance, const reference_t references[], size_t count, const double values[])
-{
-    fmu *one = instance;
-    for (size_t k = 0; k < count; k++) {
-        if (!core_set(&one->block, references[k], values[k])) {
-            return said(one, ERROR, "only inputs and parameters may be set, a parameter to a number from its min to its max");
-        }
-    }
-    return OK;
-}
-
-EXPORTED status_t fmi2GetInteger(instance_t instance, const reference_t references[], size_t count, int values[])
-{
-    fmu *one = instance;
-    for (size_t k = 0; k < count; k++) {
-        if (references[k] != STATUS) {
-            return said(one, ERROR, "there is no whole number with this value reference");
-        }
-        if (one->block.mode == INITIALIZING) {
-            core_begin(&one->block);
-        }
-        values[k] = (int)one->block.status;
-    }
-    return OK;
-}
-
-/* --- saved states --- */
-
-EXPORTED status_t fmi2GetFMUstate(instance_t instance, saved_t *saved)
-{
-    if (*saved == NULL) {
-        *saved = malloc(sizeof(numbers));
-    }
-    if (*saved == NULL) {
-        return said(instance, ERROR, "there is no memory left");
-    }
-    memcpy(*saved, &((fmu *)instance)->block, sizeof(numbers));
-    return OK;
-}
-
-EXPORTED status_t fmi2SetFMUstate(instance_t instance, saved_t saved)
-{
-    memcpy(&((fmu *)instance)->block, saved, sizeof(numbers));
-    return OK;
-}
-
-EXPORTED status_t fmi2FreeFMUstate(instance_t instance, saved_t *saved)
-{
-    (void)instance;
-    if (saved != NULL) {
-        free(*saved);
-        *saved = NULL;
-    }
-    return OK;
-}
-
-/* --- the rest of the interface, which this FMU does not have --- */
-
-#define ABSENT(name, ...) \
-    EXPORTED status_t name(instance_t instance, __VA_ARGS__) \
-    { \
-        return said(instance, ERROR, #name ": this FMU has no such function"); \
-    }
-
-#if defined(__GNUC__)
-#pragma GCC diagnostic ignored "-Wunused-parameter"
-#endif
 
 ABSENT(fmi2GetBoolean, const reference_t *a, size_t b, bool_t *c)
 ABSENT(fmi2GetString, const reference_t *a, size_t b, const char **c)
@@ -205,8 +94,4 @@ ABSENT(fmi2GetRealStatus, int a, double *b)
 ABSENT(fmi2GetIntegerStatus, int a, int *b)
 ABSENT(fmi2GetBooleanStatus, int a, bool_t *b)
 ABSENT(fmi2GetStringStatus, int a, const char **b)
-
-EXPORTED status_t fmi2CancelStep(instance_t instance)
-{
-    return said(instance, ERROR, "fmi2CancelStep: this FMU has no such function");
-}
+ABSENT_ALONE(fmi2CancelStep)

@@ -1,60 +1,59 @@
-/* FMI 3.0 for co-simulation. The signatures are those of the standard; types have names of their own. */
+/* FMI 3.0 for co-simulation: what differs from FMI 2.0. The signatures are those of the standard. */
 
-#include "fmi3_interface.h"
+#include <stdbool.h>
+
 #include "fmu_core.h"
 
+#define FMI(name) fmi3##name
+#define VERSION "3.0"
+#define GET_NUMBERS fmi3GetFloat64
+#define SET_NUMBERS fmi3SetFloat64
+#define GET_WHOLE fmi3GetUInt32
+#define GET_STATE fmi3GetFMUState
+#define SET_STATE fmi3SetFMUState
+#define FREE_STATE fmi3FreeFMUState
+/* an array of values has a length of its own */
+#define LENGTH , size_t length
+#define MOST length
+
+typedef bool bool_t;
+typedef uint32_t whole_t;
+typedef void (*log_t)(environment_t environment, status_t status, const char *category, const char *message);
+typedef void (*intermediate_t)(environment_t, double, bool, bool, bool, bool, bool *, double *);
 typedef struct {
-    numbers block;
     environment_t environment;
     log_t log;
-    bool logging;
-} fmu;
+} logger_t;
 
-static status_t said(const fmu *one, status_t status, const char *message)
+static void log_error(const logger_t *logger, const char *message)
 {
-    if (one->log != NULL && one->logging) {
-        one->log(one->environment, status, "logStatusError", message);
+    if (logger->log != NULL) {
+        logger->log(logger->environment, ERROR, "logStatusError", message);
     }
-    return status;
 }
 
-/* --- creation and modes --- */
-
-EXPORTED const char *fmi3GetVersion(void)
-{
-    return "3.0";
-}
+#include "fmu_functions.h"
 
 EXPORTED instance_t fmi3InstantiateCoSimulation(
     const char *name, const char *token, const char *resources, bool visible, bool logging, bool events, bool early,
     const reference_t intermediate[], size_t count, environment_t environment, log_t log, intermediate_t update)
 {
-    fmu *one;
+    const logger_t logger = {environment, log};
     (void)name, (void)resources, (void)visible, (void)early, (void)intermediate, (void)count, (void)update;
     if (events || token == NULL || strcmp(token, MODEL_TOKEN) != 0) {
-        if (log != NULL) {
-            log(environment, ERROR, "logStatusError", events ? "there is no event mode" : "wrong instantiation token");
-        }
+        log_error(&logger, events ? "there is no event mode" : "wrong instantiation token");
         return NULL;
     }
-    one = malloc(sizeof *one);
-    if (one != NULL) {
-        core_reset(&one->block);
-        one->environment = environment;
-        one->log = log;
-        one->logging = logging;
-    }
-    return one;
+    return create(logger, logging);
 }
 
 EXPORTED instance_t fmi3InstantiateModelExchange(
     const char *name, const char *token, const char *resources, bool visible, bool logging, environment_t environment,
     log_t log)
 {
+    const logger_t logger = {environment, log};
     (void)name, (void)token, (void)resources, (void)visible, (void)logging;
-    if (log != NULL) {
-        log(environment, ERROR, "logStatusError", "this FMU is for co-simulation");
-    }
+    log_error(&logger, "this FMU is for co-simulation");
     return NULL;
 }
 
@@ -64,18 +63,6 @@ EXPORTED instance_t fmi3InstantiateScheduledExecution(
 {
     (void)update, (void)lock, (void)unlock;
     return fmi3InstantiateModelExchange(name, token, resources, visible, logging, environment, log);
-}
-
-EXPORTED void fmi3FreeInstance(instance_t instance)
-{
-    free(instance);
-}
-
-EXPORTED status_t fmi3SetDebugLogging(instance_t instance, bool on, size_t count, const char *const categories[])
-{
-    (void)count, (void)categories;
-    ((fmu *)instance)->logging = on;
-    return OK;
 }
 
 EXPORTED status_t fmi3EnterInitializationMode(
@@ -88,131 +75,19 @@ EXPORTED status_t fmi3EnterInitializationMode(
     return OK;
 }
 
-EXPORTED status_t fmi3ExitInitializationMode(instance_t instance)
-{
-    fmu *one = instance;
-    core_begin(&one->block);
-    one->block.mode = STEPPING;
-    return OK;
-}
-
-EXPORTED status_t fmi3Terminate(instance_t instance)
-{
-    ((fmu *)instance)->block.mode = TERMINATED;
-    return OK;
-}
-
-EXPORTED status_t fmi3Reset(instance_t instance)
-{
-    core_reset(&((fmu *)instance)->block);
-    return OK;
-}
-
 EXPORTED status_t fmi3DoStep(
     instance_t instance, double now, double step, bool no_return, bool *event, bool *terminate, bool *early, double *last)
 {
-    fmu *one = instance;
+    const status_t status = do_step(instance, now, step);
     (void)no_return;
     *event = *terminate = *early = false;
-    if (one->block.mode != STEPPING || !core_do_step(&one->block, now, step)) {
-        *last = one->block.time;
-        return said(one, ERROR, "the communication step must be a whole number of sample periods, after initialization");
-    }
-    *last = one->block.time;
-    return OK;
+    *last = ((fmu *)instance)->block.time;
+    return status;
 }
 
-/* --- values --- */
-
-EXPORTED status_t fmi3GetFloat64(
-    instance_t instance, const reference_t references[], size_t count, double values[], size_t length)
-{
-    fmu *one = instance;
-    for (size_t k = 0; k < count; k++) {
-        if (k >= length || !core_get(&one->block, references[k], &values[k])) {
-            return said(one, ERROR, "there is no number with this value reference");
-        }
-    }
-    return OK;
-}
-
-EXPORTED status_t fmi3SetFloat64(
-    instance_t instance, const reference_t references[], size_t count, const double values[], size_t length)
-{
-    fmu *one = instance;
-    for (size_t k = 0; k < count; k++) {
-        if (k >= length || !core_set(&one->block, references[k], values[k])) {
-            return said(one, ERROR, "only inputs and parameters may be set, a parameter to a number from its min to its max");
-        }
-    }
-    return OK;
-}
-
-EXPORTED status_t fmi3GetUInt32(
-    instance_t instance, const reference_t references[], size_t count, uint32_t values[], size_t length)
-{
-    fmu *one = instance;
-    for (size_t k = 0; k < count; k++) {
-        if (k >= length || references[k] != STATUS) {
-            return said(one, ERROR, "there is no whole number with this value reference");
-        }
-        if (one->block.mode == INITIALIZING) {
-            core_begin(&one->block);
-        }
-        values[k] = one->block.status;
-    }
-    return OK;
-}
-
-/* --- saved states --- */
-
-EXPORTED status_t fmi3GetFMUState(instance_t instance, saved_t *saved)
-{
-    if (*saved == NULL) {
-        *saved = malloc(sizeof(numbers));
-    }
-    if (*saved == NULL) {
-        return said(instance, ERROR, "there is no memory left");
-    }
-    memcpy(*saved, &((fmu *)instance)->block, sizeof(numbers));
-    return OK;
-}
-
-EXPORTED status_t fmi3SetFMUState(instance_t instance, saved_t saved)
-{
-    memcpy(&((fmu *)instance)->block, saved, sizeof(numbers));
-    return OK;
-}
-
-EXPORTED status_t fmi3FreeFMUState(instance_t instance, saved_t *saved)
-{
-    (void)instance;
-    if (saved != NULL) {
-        free(*saved);
-        *saved = NULL;
-    }
-    return OK;
-}
-
-/* --- the rest of the interface, which this FMU does not have --- */
-
-#define ABSENT(name, ...) \
-    EXPORTED status_t name(instance_t instance, __VA_ARGS__) \
-    { \
-        return said(instance, ERROR, #name ": this FMU has no such function"); \
-    }
-#define ABSENT_ALONE(name) \
-    EXPORTED status_t name(instance_t instance) \
-    { \
-        return said(instance, ERROR, #name ": this FMU has no such function"); \
-    }
 #define ABSENT_NUMBERS(name, type) \
     ABSENT(fmi3Get##name, const reference_t *a, size_t b, type *c, size_t d) \
     ABSENT(fmi3Set##name, const reference_t *a, size_t b, const type *c, size_t d)
-
-#if defined(__GNUC__)
-#pragma GCC diagnostic ignored "-Wunused-parameter"
-#endif
 
 ABSENT_NUMBERS(Float32, float)
 ABSENT_NUMBERS(Int8, int8_t)

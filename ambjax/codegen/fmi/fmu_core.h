@@ -10,6 +10,21 @@
 
 #include "model.h"
 
+#if defined(_WIN32)
+#define EXPORTED __declspec(dllexport)
+#elif defined(__GNUC__)
+#define EXPORTED __attribute__((visibility("default")))
+#else
+#define EXPORTED
+#endif
+
+/* Types of the standard (fmi-standard.org), with names of their own. */
+typedef void *instance_t;
+typedef void *environment_t;
+typedef void *saved_t;
+typedef uint32_t reference_t;
+typedef enum { OK, WARNING, DISCARD, ERROR, FATAL } status_t;
+
 /* Value references: time, then the numbers of the block in this order, then the status bits. */
 enum {
     FIRST_INPUT = 1,

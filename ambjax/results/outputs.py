@@ -19,7 +19,7 @@ import numpy as np
 
 from ambjax.ensemble.store import MANIFEST, RESULT
 from ambjax.host.interrupts import uninterrupted
-from ambjax.host.words import one_line
+from ambjax.text.words import one_line
 
 Described = TypeVar("Described")
 # Whether an error in a description ends the command (`described`). The tests set it, so that no defect is overlooked.

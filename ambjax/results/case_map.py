@@ -9,7 +9,6 @@ import numpy as np
 
 from ambjax.cases.reader import Case, require_case
 from ambjax.cases.timing import FEWEST_SAMPLES, MOST_SAMPLES, SAMPLE_PERIOD
-from ambjax.commands.ensemble import study_of
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, with_method_for_axes
 from ambjax.ensemble.paths import Place, places
@@ -19,6 +18,7 @@ from ambjax.host.arguments import names_arguments
 from ambjax.host.optional import extra
 from ambjax.linear import stability_of
 from ambjax.numerics.declared import numbers, within
+from ambjax.results.spread_runs import study_of
 from ambjax.simulation.clock import Clock
 from ambjax.world.scenario import Scenario
 

@@ -24,11 +24,11 @@ from ambjax.codegen.of_case import WHAT, block_of
 from ambjax.codegen.program import PRECISIONS
 from ambjax.codegen.trace import trace
 from ambjax.codegen.twins import LoopCase
-from ambjax.commands.outputs import described, directory, files, plain, spare
 from ambjax.control.cascade import Cascade
 from ambjax.control.guard import guarded
 from ambjax.ensemble.spread import ends
 from ambjax.host.arguments import names_arguments
+from ambjax.results.outputs import described, directory, files, plain, spare
 
 # Files of the verification.
 VERIFIED = ("verify.md", "verify.json")

@@ -1,0 +1,1 @@
+"""Text for people: messages, hints for misspelt names, and HTML pages."""
