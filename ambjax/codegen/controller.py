@@ -145,7 +145,8 @@ class Controller(Block):
     def start(self) -> Memory:
         """Return the memory before the first step: zero commands, zero states of the laws, no predicted readings."""
         cascade, zero = self.parameters.controller, jnp.zeros(())
-        processor: Any = cascade.processor
+        processor = cascade.processor
+        assert processor is not None
         laws = jax.tree.map(jnp.zeros_like, cascade.init(Measurement(zero, zero, zero)))
         before, watch = processor.constant_past(zero)[1:], processor.guard.start() if processor.guard else ()
         return Memory(laws, Command(*[zero] * 5), before, watch, jnp.asarray(False))

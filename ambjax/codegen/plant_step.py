@@ -121,8 +121,9 @@ class PlantStep(Block):
     @property
     def longest(self) -> int:
         """The longest delay that the plant can be set to, samples."""
-        processor: Any = self.cascade.processor
-        return processor.kept
+        processor = self.cascade.processor
+        assert processor is not None
+        return len(processor.constant_past(jnp.zeros(())))
 
     def system(self, machine: Machine, period: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Sampled:
         """Return the simulator's loop with the parameters `machine` and constant disturbances (m/s^2, A/s)."""

@@ -138,7 +138,8 @@ def linear_script(case: Case) -> LinearScript:
         numbers = canonical(loop_parameters(case, any_delay=True))
         (lagged, u, control), _ = jax.eval_shape(_start, numbers)
         zero = jnp.zeros(())
-        processor: Any = numbers.cascade.processor
+        processor = numbers.cascade.processor
+        assert processor is not None
         x = LoopPoint(lagged, u, control, processor.constant_past(zero), zero)
         x = jax.tree.map(lambda _: zero, x)
         start = piece_of(_start, "p", (numbers,))

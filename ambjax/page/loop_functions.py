@@ -94,5 +94,6 @@ def loop_parameters(case: Case, any_delay: bool = False) -> Numbers:
 
 def longest_delay(case: Case) -> float:
     """Return the longest delay that the page admits, samples: the number of commands that its programs keep."""
-    processor: Any = case.cascade.on_processor().processor
-    return float(processor.kept)
+    processor = case.cascade.on_processor().processor
+    assert processor is not None
+    return float(len(processor.constant_past(jnp.zeros(()))))
