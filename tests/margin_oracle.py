@@ -6,6 +6,7 @@ except for the equilibrium.
 
 import dataclasses
 import itertools
+import math
 from typing import NamedTuple
 
 import jax
@@ -37,9 +38,9 @@ class Change(NamedTuple):
 class Parts:
     """The linear parts of a loop.
 
-    `A`, `b`, `c`: of the plant, from the command to (z, z_dot, i). `laws`: matrix from (z, z_dot, i, states, last two
+    `A`, `b`, `c`: of the plant, from the command to (z, z_dot, i). `laws`: matrix from (z, z_dot, i, states, past
     commands) to (command, next states, or their rates). `states`: number of states of the laws. `period`: sample
-    period, s; None in continuous time. `delay`: of the processor, samples.
+    period, s; None in continuous time. `delay`: of the processor, samples. `past`: number of past commands.
     """
 
     A: np.ndarray
@@ -49,6 +50,7 @@ class Parts:
     states: int
     period: float | None
     delay: float
+    past: int
 
     def stable(self, change: Change) -> bool:
         """Return whether all poles of the changed loop are stable."""
@@ -61,12 +63,12 @@ class Parts:
         T, nx = self.period, len(self.b)
         whole_u, part_u = divmod(round(self.delay + change.late_command / T, 12), 1.0)
         whole_z, part_z = divmod(round(change.late_reading / T, 12), 1.0)
-        commands, positions = max(int(whole_u) + 1, 2), int(whole_z) + 1
+        commands, positions = max(int(whole_u) + 1, self.past), int(whole_z) + 1
         n = nx + self.states + commands + positions
         x, laws, past, read = np.split(np.eye(n, dtype=complex), np.cumsum([nx, self.states, commands]))
         motion = self.c @ x
         motion[0] = change.reading * read[int(whole_z)]
-        after = self.laws @ np.concatenate([motion, laws, past[:2]])
+        after = self.laws @ np.concatenate([motion, laws, past[: self.past]])
         past = np.concatenate([after[:1], past])  # u_n, u_{n-1}, ...
         cuts, position = sorted({0.0, part_u, 1 - part_z, 1.0}), None
         for begin, end in itertools.pairwise(cuts):
@@ -86,7 +88,7 @@ class Parts:
         motion = self.c @ x
         true = motion[:1].copy()
         motion[0] = change.reading * (late_z[2] @ past_z + late_z[3] * true)[0]
-        after = self.laws @ np.concatenate([motion, laws, np.zeros((2, n))])
+        after = self.laws @ np.concatenate([motion, laws, np.zeros((self.past, n))])
         u = change.command * (late_u[2] @ past_u + late_u[3] * after[:1])
         moved = self.A @ x + self.b[:, None] @ u
         return np.concatenate(
@@ -117,6 +119,7 @@ def parts_of(cascade, scenario, clock, r=0.0):
     state, restore = ravel_pytree(point.plant)
     laws, restore_laws = ravel_pytree(point.control)
     reference, limit = reference_at(Constant(r), 0.0), jnp.asarray(jnp.inf)
+    late = max(1, math.ceil(cascade.processor.delay)) if sampled else 1
 
     def driven(x, u):
         x = restore(x)
@@ -127,14 +130,14 @@ def parts_of(cascade, scenario, clock, r=0.0):
 
     def control(y):
         measured = plant.measurement(point.plant)._replace(z=y[0], z_dot=y[1], i=y[2])
-        states, past = restore_laws(y[3:-2]), (y[-2], y[-1])
+        states, past = restore_laws(y[3:-late]), tuple(y[-late:])
         if sampled:
             command, after, _ = cascade.step(measured, states, Sample(reference, period, limit, past))
         else:
             command, after = cascade(measured, states, reference, limit)
         return jnp.concatenate([command.u[None], ravel_pytree(after)[0]])
 
-    y = jnp.concatenate([motion(state), laws, jnp.stack([point.u, point.u])])
+    y = jnp.concatenate([motion(state), laws, jnp.full(late, point.u)])
     A, b = jax.jit(jax.jacfwd(driven, (0, 1)))(state, point.u)
     c, law = jax.jit(jax.jacfwd(motion))(state), jax.jit(jax.jacfwd(control))(y)
     numbers = [np.asarray(one) for one in (A, b, c, law)]
@@ -150,4 +153,4 @@ def parts_of(cascade, scenario, clock, r=0.0):
         A = np.block([[A, b[:, None]], [np.zeros((1, len(b))), -w * np.ones((1, 1))]])
         numbers[:3] = A, np.append(0 * b, w), np.block([c, np.zeros((3, 1))])
     delay = float(cascade.processor.delay) if sampled else 0.0
-    return Parts(*numbers, len(laws), float(period) if sampled else None, delay)
+    return Parts(*numbers, len(laws), float(period) if sampled else None, delay, late)

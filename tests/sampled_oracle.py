@@ -44,7 +44,7 @@ class World:
     plant: dict = field(default_factory=dict)  # what differs from Table 1
     model: dict = field(default_factory=dict)  # what the controller believes to differ from the true plant
     period: float = 1e-4
-    delay: float = 1.0  # samples, 0 to 2
+    delay: float = 1.0  # samples
     discretisation: str = "implicit"  # or "explicit"
     predict: bool = True
     observer: tuple = ("direct", {})  # ("complementary", {"l"[, "z_hat"]})
@@ -127,7 +127,7 @@ def conversion(x, bits, limit):
 
 def _spans(delay, end):
     """Pieces (start, stop, lag) of the samples 0 to `end` after t_n, in which u_{n - lag} acts."""
-    edges = sorted({0.0, end} | {delay - k for k in range(3) if 0 < delay - k < end})
+    edges = sorted({0.0, end} | {delay - k for k in range(math.ceil(delay)) if delay - k < end})
     return [(a, b, math.ceil(delay - (a + b) / 2)) for a, b in itertools.pairwise(edges)]
 
 

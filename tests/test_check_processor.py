@@ -41,7 +41,7 @@ from ambjax.world.sensor import Measurement
 from ambjax.world.signals import Reference
 
 INF = math.inf
-LATE = [0.0, 0.2, 0.25, 0.4, 0.5, 0.8, 1.0, 1.3, 1.5, 2.0]
+LATE = [0.0, 0.2, 0.25, 0.4, 0.5, 0.8, 1.0, 1.3, 1.5, 2.0, 3.4]
 
 
 def roots(a, late):
@@ -394,7 +394,7 @@ def test_the_margin_is_between_a_delay_that_holds_and_one_that_does_not():
 def test_the_delay_margin_without_a_known_delay_is_smaller():
     cascade, clock = cascade_of(*HARD, delay=1.0), amb.Clock(600, 1e-4, amb.RK4(1))
     margin = delay_margin(cascade, WORLD, clock, known=False)
-    # a prediction that knows it holds the rotor up to 2 samples
+    # a prediction that knows it holds the rotor up to 2 samples and more
     assert 1.0 < margin.held < margin.lost < 1.9
     gone = dataclasses.replace(WORLD, initial=amb.Initial(4e-3))
     assert delay_margin(cascade, gone, clock, known=False).held is None
@@ -416,6 +416,13 @@ def test_a_loss_in_a_narrow_interval_of_delays_is_found(monkeypatch):
     cascade, clock = cascade_of(*HARD, delay=0.0), amb.Clock(300, 1e-4, amb.RK4(1))
     margin = delay_margin(cascade, WORLD, clock)
     assert 0.704 - 2 / 256**2 <= margin.held < 0.704 <= margin.lost < 0.704 + 2 / 256**2
+    # beyond two samples the steps are longer, and the result says so
+    delays.lost = (3.7, 3.74)
+    margin = delay_margin(cascade, WORLD, clock)
+    assert margin.step == pytest.approx(8 / 257)
+    assert 3.7 - 8 / 256**2 <= margin.held < 3.7 <= margin.lost < 3.7 + 8 / 256**2
+    delays.lost = (INF, INF)
+    assert delay_margin(cascade, WORLD, clock)[:4] == (10.0, None, None, pytest.approx(8 / 257))
 
 
 def test_a_delay_whose_run_stalls_is_neither_held_nor_lost(monkeypatch):

@@ -110,15 +110,14 @@ def test_the_default_current_loop_has_ten_times_the_pole_but_not_more_than_a_qua
     assert -float(jax.grad(i_dot)(0.0)) == pytest.approx(wanted, rel=1e-9)
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize("delay", [0.0, 0.5, 1.0, 2.0, 3.4])
 def test_default_dead_beat_control_does_not_oscillate(delay):
     """The roots of x(n+1) = x(n) - share x(n - delay), interpolated between samples, are real or decay faster."""
     share = default_law(current.DeadBeat, RIG, Sampling(5e-5, delay, True)).share
     whole, rest = int(delay), delay - int(delay)
-    polynomial = np.zeros(4)  # z^3 (z - 1) + share z^(3 - delay)
-    polynomial = np.array([1.0, -1.0, 0, 0, 0])
+    polynomial = np.array([1.0, -1.0, *[0.0] * (whole + 1)])  # z^n (z - 1) + share z^(n - delay)
     polynomial[1 + whole] += share * (1 - rest)
-    polynomial[min(2 + whole, 4)] += share * rest
+    polynomial[2 + whole] += share * rest
     roots = np.roots(polynomial)
     slowest = roots[np.abs(roots) > np.abs(roots).max() - 1e-3]
     assert np.abs(roots).max() < 1

@@ -192,7 +192,7 @@ def test_an_invalid_reference_does_not_change_the_state():
             assert status.invalid
             assert not status.refused
             assert (after.laws, after.last, after.started) == (memory.laws, memory.last, True)
-            assert after.before == memory.last.u  # the voltage that is held goes on acting
+            assert after.before == (memory.last.u,)  # the voltage that is held goes on acting
             assert after.watch.left == 0
             assert held == answer
             first = step(controller.start(), bad)

@@ -23,6 +23,7 @@ from ambjax.codegen.series import series
 from ambjax.codegen.trace import arguments
 from ambjax.codegen.twins import LoopCase
 from ambjax.codegen.verify import draft, verify
+from ambjax.control.processor import Processor
 from ambjax.simulation.integrate import FixedSteps
 from ambjax.simulation.rosenbrock import AdaptiveRodas3
 from ambjax.simulation.trajectory import TOUCHED
@@ -39,12 +40,19 @@ def rig(**more):
     return case.cascade, scenario, Clock(400, case.clock.sample_period)
 
 
+def late(delay):
+    """The rig with another delay."""
+    cascade, *rest = rig()
+    return dataclasses.replace(cascade, processor=Processor(delay)), *rest
+
+
 CASES = {
     "rig": rig(),
     "two coils": rig(
         plant=TwoCoil(**{f.name: getattr(rig()[1].plant, f.name) for f in dataclasses.fields(TwoCoil)}),
         amplifier=Amplifier(bandwidth=5e3, slew=2e6, dead_band=0.1),
     ),
+    "3.4 samples late": late(3.4),
 }
 
 
@@ -94,7 +102,7 @@ def test_the_first_step_reads_the_initial_state_and_the_second_integrates():
     assert not any(status)
     assert later.z_true != outputs.z_true
     assert after.last == 10.0  # applied one sample late, so that it has not moved the current yet
-    assert after.before == 0.0
+    assert after.before == (0.0,)
     _, _, (_, without, _) = plant_step(u=0.0)
     assert without.i_true == later.i_true
 

@@ -105,20 +105,20 @@ def test_guard_and_faults_agree_with_the_independent_simulator(name):
         np.testing.assert_allclose(rows.u, run.u, rtol=0, atol=1e-6 * np.abs(run.u).max())
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.5, 1.0, 1.5, 2.0])
+@pytest.mark.parametrize("delay", [0.0, 0.5, 1.0, 1.5, 2.0, 3.4])
 def test_the_expected_current_uses_the_voltages_that_act_within_the_sample(delay):
-    """Eq. (2), written out, under the mean of u_n, which acts after the delay, and of the two voltages before it."""
+    """Eq. (2), written out, under the mean of the voltages that act: u_n after the delay, before it earlier ones."""
     cascade, scenario, clock = loop_of(World(**TRACKING, delay=delay, **soft()), 5, (0.0, 0.0, 0.0))
     cascade = dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=Guard()))
     system = system_of(guarded(cascade, scenario, T), scenario, clock).realised()
     state = system.start()
-    before, first = 7.0, -3.0
-    state = state._replace(command=state.command._replace(u=jnp.asarray(before)), past=(jnp.asarray(first),) * 2)
+    last, *earlier = [7.0, -3.0, 5.0, 2.0, 11.0][: 1 + len(state.past)]
+    state = state._replace(command=state.command._replace(u=jnp.asarray(last)), past=tuple(map(jnp.asarray, earlier)))
     z, z_dot, i = 1e-4, 0.01, 0.2
     measured = Measurement(*map(jnp.asarray, (z, z_dot, i)))
     after = system.with_command(measured, reference_at(scenario.reference, 0.0), state)
     u = float(after.command.u)
-    mean = delay * before + (1 - delay) * u if delay <= 1 else (delay - 1) * first + (2 - delay) * before
+    mean = np.interp(delay, np.arange(2 + len(earlier)), [u, last, *earlier])
     plant = scenario.plant
     gap = plant.s_0 + z
     rate = 2 * z_dot * i / gap + 2 * gap * (mean - plant.R * i) / plant.kappa

@@ -17,6 +17,7 @@ from ambjax.control.force import linear_mechanics
 from ambjax.control.linear_controller import LinearController
 from ambjax.linear import LoopMargins, Margins, linearise, loop_quantities, margins_of
 from ambjax.linear.state_space import PLACES
+from ambjax.simulation.rollout import rollout
 
 QUICK = supported(QUICKEST)  # each program runs once
 # Each margin lies within this share of the margin of the oracle.
@@ -59,6 +60,14 @@ def lqg(delay=1.0):
     return dataclasses.replace(case, cascade=dataclasses.replace(case.cascade, position=law), clock=clock)
 
 
+def slow(delay):
+    """A current amplifier whose loop is slow compared with the period."""
+    clock = {"duration": 0.3, "sample_period": 1.2e-4}
+    processor, actuator = {"delay": delay}, {"mode": "current", "bandwidth": 1500.0}
+    laws, rest = {"inversion": {"kind": "linearised"}}, {"initial": {"z": 2e-5}, "clock": clock, **VELOCITY}
+    return on({"kind": "state-feedback"}, {"kind": "kalman", "w": 1700.0}, processor, actuator, laws=laws, **rest)
+
+
 VELOCITY = {"sensor": {"velocity": False}}
 LOOPS = {
     "LQG, dead-beat": lqg,
@@ -81,6 +90,7 @@ LOOPS = {
     "state feedback, amplifier": lambda: on({"kind": "state-feedback"}, {"kind": "kalman", "w": 1700.0},
                                             {"delay": 0.5}, {"mode": "current", "bandwidth": 1500.0},
                                             laws={"inversion": {"kind": "linearised"}}, **VELOCITY),
+    "state feedback, 3.4 samples late": lambda: slow(3.4),
 }  # fmt: skip
 
 
@@ -116,6 +126,22 @@ def test_the_margins_agree_with_the_poles_of_the_changed_loop(name):
         turns = [lambda x, at=place, sign=sign: Change(**{at: np.exp(sign * 1j * x)}) for sign in (1, -1)]
         assert any(agrees(parts, math.radians(one.phase_deg), turn, math.pi) for turn in turns)
         assert agrees(parts, one.delay, lambda x, at=place: Change(**{f"late_{at}": x}), 0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("own", [0.5, 3.4])
+def test_a_delay_margin_of_several_samples_is_that_of_the_simulation(own):
+    case = slow(own)
+    margin = margins_of(linearise(case.cascade, case.scenario, case.clock)).command.delay / 1.2e-4
+    assert 4 < margin < 10 - own
+    decay = []
+    for share in (0.96, 1.04):
+        late = dataclasses.replace(case.cascade.processor, delay=own + share * margin, assumed=own, predict=True)
+        cascade = dataclasses.replace(case.cascade, processor=late)
+        z = np.abs(np.asarray(rollout(cascade, case.scenario, case.clock).trajectory.rows.z))
+        decay.append(z[-len(z) // 4 :].max() / z[len(z) // 4 : len(z) // 2].max())
+    assert decay[0] < 0.5
+    assert decay[1] > 1.0
 
 
 @pytest.mark.slow

@@ -230,6 +230,22 @@ def test_a_fractional_delay_equals_the_simulator(fresh):
     np.testing.assert_allclose(signal(fresh, "z"), simulate(other).trajectory.rows.z, rtol=0, atol=1e-12)
 
 
+@pytest.mark.thorough
+@in_browser
+def test_the_page_of_a_case_with_a_delay_of_several_samples_equals_the_simulator(tmp_path):
+    case = rig(RIG.replace("delay = 1.0", "delay = 3.4"))
+    (tmp_path / "page.html").write_text(page(case, [], "rig.toml"), encoding="utf-8")
+    with browser.browser(tmp_path) as tab:
+        tab.open(tmp_path / "page.html")
+        settled(tab)
+        for delay in ("3.4", "1", "4"):
+            typed(tab, "processor.delay", delay)
+            other = rig(RIG.replace("delay = 1.0", f"delay = {delay}"))
+            np.testing.assert_allclose(signal(tab, "z"), simulate(other).trajectory.rows.z, rtol=0, atol=1e-12)
+            S, system = tab.run("({...ambjax.state.answer.S})"), linearise(other.cascade, other.scenario, other.clock)
+            np.testing.assert_allclose(S["size"], np.abs(system.sensitivity(np.array(S["f"]))), rtol=1e-7)
+
+
 @in_browser
 def test_a_slider_changes_the_response_and_the_preset_restores_it(fresh):
     before = signal(fresh, "z")

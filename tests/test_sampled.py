@@ -225,19 +225,28 @@ def cascade_of(p=INF, **processor):
     )
 
 
+@pytest.mark.parametrize("wrong", [{}, pytest.param({"predict": False, "model": WRONG}, marks=pytest.mark.slow)])
+def test_a_delay_of_several_samples_agrees_with_the_independent_simulator(wrong):
+    world = World(reference=sine(), q_v=pulse(1.0, 0.01, 0.015), delay=3.4, **soft(), **wrong)
+    cascade, scenario, clock = loop_of(world, 300, (0.0, 0.0, 0.0))
+    rows, run = amb.rollout(cascade, scenario, clock).trajectory.rows, simulate(world, 300)
+    np.testing.assert_allclose(rows.z, run.z, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(rows.u, run.u, rtol=0, atol=1e-8 * np.abs(run.u).max())
+
+
 NOISY = amb.Scenario(reference=amb.Sine(2.5e-3, 2.0), sensor=amb.Sensor(*NOISE), u_max=200.0, seed=3)
 SHORT = amb.Clock(300, 1e-4)
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.4, 1.0, 1.6])
+@pytest.mark.parametrize("delay", [0.0, 0.4, 1.0, 1.6, pytest.param(5.3, marks=pytest.mark.slow)])
 def test_the_voltage_of_a_sample_acts_after_the_delay(delay):
     """u averaged over time is u_n shifted by the delay, and 0 before the first command."""
     outcome = amb.rollout(cascade_of(delay=delay), NOISY, SHORT)
     u, mean = (np.asarray(getattr(outcome.trajectory.rows, name)) for name in ("u", "u_mean"))
     late = math.floor(delay)
-    acting = np.concatenate([np.zeros(3), u])
+    acting = np.concatenate([np.zeros(late + 1), u])
     share = delay - late
-    expected = share * acting[2 - late : -1 - late] + (1 - share) * acting[3 - late : len(acting) - late]
+    expected = share * acting[: len(u)] + (1 - share) * acting[1 : len(u) + 1]
     # a sum of two products in another order
     np.testing.assert_allclose(mean, expected, atol=1e-12 * 200)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from texts import case_and_tune
 
-from ambjax.linear import analyse, linearise
+from ambjax.linear import analyse, linearise, margins_of
 from tuning.judge.late import DELAY_MARGIN, DelayTest, delay_test, not_simulated
 from tuning.problem.limits import PREFIX
 from tuning.problem.tuning_problem import problem_of
@@ -29,8 +29,8 @@ CASE = {
 }
 
 
-def problem(limit):
-    return problem_of(*case_and_tune(CASE | {"tune": {"limits": {DELAY_MARGIN: limit}, "members": 4}}))
+def problem(limit, **more):
+    return problem_of(*case_and_tune(CASE | more | {"tune": {"limits": {DELAY_MARGIN: limit}, "members": 4}}))
 
 
 @pytest.mark.thorough
@@ -48,10 +48,25 @@ def test_members_are_stable_below_the_margin_then_held_and_then_lost():
     # The model does not predict over the added delay, so the loop is stable up to 1.44 times this margin. From there to
     # 1.55 times, it ends in an oscillation that holds the rotor.
     assert found == {0.8: DelayTest(2, 0, 0), 1.5: DelayTest(2, 0, 2), 2.0: DelayTest(2, 2, 0)}
-    # a delay beyond two samples cannot be simulated, and a case in continuous time has no delay
-    assert delay_test(problem(1.6 * PERIOD), x, 1, columns) is None
     lost = columns | {"lost_at_s": np.zeros(3)}
     assert delay_test(problem(1e-4), x, 1, lost) is None
+
+
+@pytest.mark.slow
+def test_an_additional_delay_of_several_samples_is_simulated():
+    """The margin at the command is 5 to 8 samples of this period."""
+    period = 1e-4
+    clock = {"duration": 0.3, "sample_period": period}
+    case = problem(1e-4, clock=clock).case
+    margin = margins_of(linearise(case.cascade, case.scenario, case.clock)).command.delay
+    assert 5 * period < margin < 8 * period
+    columns = {f"loss.{PREFIX}{DELAY_MARGIN}": np.ones(2), "lost_at_s": np.full(2, math.inf)}
+    found = []
+    for share in (0.9, 1.1):
+        made = problem(share * margin, clock=clock)
+        x = made.tune.space.encode(made.tune.space.values(case.cascade))
+        found.append(delay_test(made, x, 1, columns))
+    assert found == [DelayTest(2, 0, 0), DelayTest(2, 0, 2)]
 
 
 def test_a_lost_member_breaks_the_limit():
@@ -64,11 +79,11 @@ def test_a_lost_member_breaks_the_limit():
         broken = limit_table._tested(row, test, "")
         assert (broken["verdict"], broken["price"]) == (limit_table.BROKEN, None)
     # a delay that is not simulated: the report says why
-    late = {share: problem(share * PERIOD) for share in (1.4, 1.6)}
+    late = {share: problem(share * PERIOD) for share in (9.4, 9.6)}
     limits = {share: next(x for x in one.limits if x.name == DELAY_MARGIN) for share, one in late.items()}
-    reason = not_simulated(late[1.6], limits[1.6])
-    assert reason == "the total delay of 2.1 samples exceeds the 2 samples that can be simulated"
-    assert not_simulated(late[1.4], limits[1.4]) == ""
+    reason = not_simulated(late[9.6], limits[9.6])
+    assert reason == "the total delay of 10.1 samples exceeds the 10 samples that can be simulated"
+    assert not_simulated(late[9.4], limits[9.4]) == ""
     said = limit_table._tested(row, None, "", reason)
     assert said["held"]
     assert reason in said["what"]

@@ -79,7 +79,7 @@ class CompiledLoop(Sampled):
         command = Command(**answer, i_ref_dot=jnp.zeros(()))
         faulty = rest[1].astype(int) & sum(FAULTS) != 0
         after: Any = ControllerState(numbers, rest[0], memory.faults + faulty)
-        past, finite = (state.command.u, state.past[0]), jnp.where(faulty, 0.0, state.finite)
+        past, finite = self.processor.remembered(state.command.u, *state.past), jnp.where(faulty, 0.0, state.finite)
         watch, guard = state.watch, self.processor.guard
         if watch and guard:  # from `left`, `Sampled.row` finds whether a reading was refused
             watch = watch._replace(left=jnp.where(rest[1].astype(int) & REFUSED, 0.0, jnp.asarray(guard.samples)))

@@ -15,7 +15,7 @@ from jax import Array
 
 from ambjax.codegen.block import Block, Ports, law_lines, scales
 from ambjax.codegen.interface import BITS, INPUTS, Status, StepInputs, StepOutputs, outputs_of
-from ambjax.codegen.numbering import Number, numbers_of
+from ambjax.codegen.numbering import Number, earlier, numbers_of
 from ambjax.control.base import memory_of
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
@@ -66,8 +66,8 @@ class Memory(NamedTuple):
 
     laws: CascadeState
     last: Command
-    before: Array
-    """command of the sample before the last, V or A"""
+    before: tuple[Array, ...]
+    """commands of the samples before the last, the most recent first, V or A"""
     watch: Watch | tuple[()]
     """state of the guard"""
     started: Array
@@ -120,8 +120,8 @@ class Controller(Block):
         fine += [jnp.isfinite(p) for p in _steepnesses(cascade)]  # p = inf needs another program
         valid = functools.reduce(jnp.logical_and, fine, jnp.asarray(True))
         system = Sampled(ClosedLoop(cascade, Scenario(u_max=limits.u_max)), period, 0)
-        past = (memory.before, memory.before)
-        state = SampledState((), memory.laws, memory.last, past, jnp.ones(()), (), (), memory.watch, memory.started, ())
+        before, watch = memory.before, memory.watch
+        state = SampledState((), memory.laws, memory.last, before, jnp.ones(()), (), (), watch, memory.started, ())
         after = system.with_command(measured, Reference(*inputs[3:]), state)
         last = choose(valid, after.command, memory.last)
         watch, refused, safe = after.watch, jnp.asarray(False), jnp.asarray(False)
@@ -130,7 +130,8 @@ class Controller(Block):
         assert not isinstance(after.started, tuple)  # an array in the state stays an array
         laws, started = choose(valid, (after.control, after.started), (memory.laws, memory.started))
         # an invalid sample resets the guard: the next reading within its limits is accepted
-        kept = Memory(laws, last, after.past[0], choose(valid, watch, jax.tree.map(jnp.zeros_like, watch)), started)
+        watch = choose(valid, watch, jax.tree.map(jnp.zeros_like, watch))
+        kept = Memory(laws, last, after.past[: len(before)], watch, started)
         status = Status(
             jnp.abs(last.u) >= limits.u_max,
             valid & refused,
@@ -144,9 +145,10 @@ class Controller(Block):
     def start(self) -> Memory:
         """Return the memory before the first step: zero commands, zero states of the laws, no predicted readings."""
         cascade, zero = self.parameters.controller, jnp.zeros(())
+        processor: Any = cascade.processor
         laws = jax.tree.map(jnp.zeros_like, cascade.init(Measurement(zero, zero, zero)))
-        guard = cascade.processor.guard if cascade.processor else None
-        return Memory(laws, Command(*[zero] * 5), zero, guard.start() if guard else (), jnp.asarray(False))
+        before, watch = processor.constant_past(zero)[1:], processor.guard.start() if processor.guard else ()
+        return Memory(laws, Command(*[zero] * 5), before, watch, jnp.asarray(False))
 
     def numbers(self) -> list[Number]:
         found = [
@@ -178,7 +180,7 @@ class Controller(Block):
         commands = {**self.outputs, "i_ref_dot": ("A/s", "rate of i_ref")}
         for name in memory.last._fields:
             found.append(Number(f"last.{name}", commands[name][0], "", f"last {commands[name][1]}", 0.0))
-        found.append(Number("before.u", commands["u"][0], "", "u of the sample before the last", 0.0))
+        found += earlier(memory.before, commands["u"][0], "u")
         if memory.watch:
             names = {f"watch.{name}": (INPUTS[name][0], "predicted reading") for name in memory.watch.expected._fields}
             names["watch.left"] = ("samples", "number of samples for which a reading may still be replaced")
@@ -196,7 +198,7 @@ class Controller(Block):
         guard: Any = cascade.processor.guard if cascade.processor else None
         watch = [z, z_dot, i, float(guard.samples)] if guard else []
         # commands are in the order of their pytree
-        states = [*scales(cascade.scale()), v, v, i, i * pole, u, u, *watch]
+        states = [*scales(cascade.scale()), v, v, i, i * pole, u, *[u] * len(self.start().before), *watch]
         return states, [z, z_dot, i, z, z * pole, z * pole**2, z * pole**3]
 
     def bounds(self) -> dict[str, int]:

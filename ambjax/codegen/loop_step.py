@@ -97,7 +97,7 @@ class LoopStep(Block):
         readings: Any = StepInputs._make([*motion[:3], *inputs[len(DISTURBANCES) :]])
         control, command, status = self.controller.step(parameters.controller, before, readings, period, read)
         alive, off = plant.lost == ALIVE, jnp.zeros(())
-        frozen = before._replace(last=before.last._replace(u=off), before=off)
+        frozen = before._replace(last=before.last._replace(u=off), before=(off,) * len(before.before))
         control = choose(alive, control, frozen)
         outputs = LoopOutputs(command._replace(u=control.last.u), motion)
         status = Status._make([*(alive & bit for bit in status[:-1]), (alive & status.invalid) | lost.invalid])

@@ -63,6 +63,13 @@ def numbers_of(node: Any, path: str = "", home: str = "") -> Iterator[Number]:
             raise ValueError(f"{home}{name} has the shape {jnp.shape(value)}: only scalars can be exported.")
 
 
+def earlier(before: tuple[Any, ...], unit: str, what: str) -> list[Number]:
+    """Return the states `before` of a block: commands of the samples before the last. `what`: name of a command."""
+    names = ["before.u"] if len(before) == 1 else [f"before_{k + 1}.u" for k in range(len(before))]
+    words = [f"{what}, {k + 1} sample{'s' * (k > 0)} before last.u" for k in range(len(before))]
+    return [Number(name, unit, "", doc, 0.0) for name, doc in zip(names, words, strict=True)]
+
+
 def _number(name: str, field: dataclasses.Field, value: float) -> Number:
     """Return the number of a field, with the unit, range and meaning that the field declares."""
     meta = field.metadata

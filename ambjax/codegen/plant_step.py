@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.codegen.block import Block, Ports, scales
-from ambjax.codegen.numbering import Number, numbers_of
+from ambjax.codegen.numbering import Number, earlier, numbers_of
 from ambjax.codegen.plant_ports import (
     COORDINATES,
     DISTURBANCES,
@@ -28,7 +28,6 @@ from ambjax.codegen.plant_ports import (
 )
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import Command
-from ambjax.control.processor import MOST_DELAY, Processor
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.numerics.smooth import limited
 from ambjax.simulation.between import lags, plant_status
@@ -51,7 +50,8 @@ class PlantMemory(NamedTuple):
     """State that one step passes to the next: that of a `SampledState`, without the laws.
 
     - `motion`: state of the plant, in its units.
-    - `last`, `before`: inputs u of the last two steps, limited to u_max, the later one first, V; 0 for the first step.
+    - `last`, `before`: input u of the last step and inputs of the steps before it, limited to u_max, the later one
+      first, V; 0 for the first step.
     - `z_filtered`: output of the position sensor's low-pass, m; () without one.
     - `u_a`: output voltage of a slow amplifier, V; () without one.
     - `lost`: 0, or the status code with which the rotor is lost.
@@ -60,7 +60,7 @@ class PlantMemory(NamedTuple):
 
     motion: Any
     last: Array
-    before: Array
+    before: tuple[Array, ...]
     z_filtered: Array | tuple[()]
     u_a: Array | tuple[()]
     lost: Array
@@ -82,9 +82,7 @@ class Machine:
     initial: Initial
     u_max: Scalar = dataclasses.field(metadata=FIELDS["u_max"])
     clearance: Scalar | None = dataclasses.field(metadata=FIELDS["clearance"])
-    delay: Scalar = leaf(
-        unit="samples", at_least=0, at_most=MOST_DELAY, doc="time from the readings until the voltage acts"
-    )
+    delay: Scalar = leaf(unit="samples", at_least=0, doc="time from the readings until the voltage acts")
 
     def scenario(self, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Scenario:
         """Return the scenario with these parameters and constant disturbances, m/s^2 and A/s."""
@@ -105,7 +103,7 @@ class Machine:
 class PlantStep(Block):
     """The plant of a case as it is exported.
 
-    - `cascade`: the controller, on a processor. The plant takes `whole` and `most` from its `Processor`.
+    - `cascade`: the controller, on a processor. The plant takes `whole` and `kept` from its `Processor`.
     - `method`: integrator between samples, with a fixed number of steps.
     """
 
@@ -120,11 +118,17 @@ class PlantStep(Block):
     bits = LOSSES | {"invalid": "the delay is out of range, or an input is not finite and is replaced by 0"}
     crowded = ("touched", "diverged")
 
+    @property
+    def longest(self) -> int:
+        """The longest delay that the plant can be set to, samples."""
+        processor: Any = self.cascade.processor
+        return processor.kept
+
     def system(self, machine: Machine, period: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Sampled:
         """Return the simulator's loop with the parameters `machine` and constant disturbances (m/s^2, A/s)."""
         given: Any = self.cascade.processor
-        processor = Processor(machine.delay, predict=False, guard=None, whole=given.whole, most=given.most)
-        cascade = dataclasses.replace(self.cascade, processor=processor)
+        given = dataclasses.replace(given, delay=machine.delay, assumed=None, predict=False, guard=None)
+        cascade = dataclasses.replace(self.cascade, processor=given)
         return Sampled(ClosedLoop(cascade, machine.scenario(q_z, q_i)), period, 0)
 
     def step(
@@ -132,7 +136,7 @@ class PlantStep(Block):
     ) -> tuple[PlantMemory, PlantOutputs, PlantStatus]:
         fine = [jnp.isfinite(getattr(inputs, name)) for name in PlantInputs._fields if name in read]
         delay = jnp.asarray(parameters.delay)
-        fine += [delay >= 0, delay <= MOST_DELAY]
+        fine += [delay >= 0, delay <= self.longest]
         u, q_z, q_i, *w = (jnp.where(jnp.isfinite(x), x, 0.0) for x in inputs)
         system = self.system(parameters, period, q_z, q_i)
         kept = choose(memory.started, self._advanced(system, memory, limited(u, parameters.u_max)), self._begun(system))
@@ -148,14 +152,15 @@ class PlantStep(Block):
         """Return the memory at the next sample. `u`: voltage commanded at the last sample, V."""
         zero = jnp.zeros(())
         control: Any = ()
-        command, past = Command(zero, zero, zero, zero, u), (memory.last, memory.before)
+        command, past = Command(zero, zero, zero, zero, u), (memory.last, *memory.before)
         state = SampledState(memory.motion, control, command, past, jnp.ones(()), memory.z_filtered, memory.u_a)
         code = jnp.where(memory.lost == TOUCHED, TOUCHED, jnp.where(memory.lost == ALIVE, ALIVE, DIVERGED))
         method: Any = self.method
         after = system.advance(method, Errors(zero, zero, zero), 0.0, system.period, state, (), code)
         lost_now = (code == ALIVE) & (after.code != ALIVE)
         new = choose(lost_now, system.rest(after.state, after.code), after.state)
-        return PlantMemory(new.plant, u, memory.last, new.z_filtered, new.u_a, _real(after.code), jnp.asarray(True))
+        before, lost = past[:-1], _real(after.code)
+        return PlantMemory(new.plant, u, before, new.z_filtered, new.u_a, lost, jnp.asarray(True))
 
     def _begun(self, system: Sampled) -> PlantMemory:
         """Return the memory at the first sample."""
@@ -164,7 +169,8 @@ class PlantStep(Block):
         slow = scenario.amplifier is not None and scenario.amplifier.slow
         z_filtered = scenario.plant.measurement(motion).z if lags(system.loop) else ()
         lost = _real(plant_status(system.loop, motion))
-        return PlantMemory(motion, zero, zero, z_filtered, zero if slow else (), lost, jnp.asarray(True))
+        last, *before = system.processor.constant_past(zero)
+        return PlantMemory(motion, last, tuple(before), z_filtered, zero if slow else (), lost, jnp.asarray(True))
 
     def start(self) -> PlantMemory:
         begun = self._begun(self.system(self.parameters, self.period))
@@ -174,9 +180,9 @@ class PlantStep(Block):
         found = list(numbers_of(self.parameters))
         assert [x.value for x in found] == [float(x) for x in jax.tree.leaves(self.parameters)]
         whole: Any = self.cascade.processor
-        most, words = whole.most, "whole: rounded down" if whole.whole else ""
-        allowed = ", ".join(filter(None, (f"from 0 to {MOST_DELAY:g}", words)))
-        delay = {"allowed": allowed, "ends": (0.0, float(most), MOST_DELAY + 0.5, -0.5, math.nan)}
+        most, words = float(self.longest), "whole: rounded down" if whole.whole else ""
+        allowed = ", ".join(filter(None, (f"from 0 to {most:g}", words)))
+        delay = {"allowed": allowed, "ends": (0.0, most, most + 0.5, -0.5, math.nan), "most": most}
         return [x._replace(**delay) if x.name == "delay" else x for x in found]
 
     def states(self) -> list[Number]:
@@ -186,7 +192,7 @@ class PlantStep(Block):
             names = [field] if count == 1 else [f"{field}_{k + 1}" for k in range(count)]
             found += [Number(name, COORDINATES[name][0], "", COORDINATES[name][1], 0.0) for name in names]
         found.append(Number("last.u", "V", "", "voltage of the sample before the last", 0.0))
-        found.append(Number("before.u", "V", "", "voltage of the sample before that", 0.0))
+        found += earlier(memory.before, "V", "voltage")
         if not isinstance(memory.z_filtered, tuple):
             found.append(Number("z_filtered", "m", "", "output of the position sensor's low-pass", 0.0))
         if not isinstance(memory.u_a, tuple):
@@ -204,7 +210,7 @@ class PlantStep(Block):
             *([] if isinstance(memory.z_filtered, tuple) else [z]),
             *([] if isinstance(memory.u_a, tuple) else [u]),
         ]
-        return [*scales(plant.scale()), u, u, *extra, 1.0], [u, z * pole**2, i * pole, 1.0, 1.0, 1.0]
+        return [*scales(plant.scale()), *[u] * self.longest, *extra, 1.0], [u, z * pole**2, i * pole, 1.0, 1.0, 1.0]
 
     def described(self) -> list[str]:
         parts = self.parameters

@@ -133,7 +133,7 @@ class Twin(Sampled):
             plant=plant.scale(),
             control=cascade.scale(),
             command=Command(i_ref=i, i_ref_dot=i * model.pole, u=volt, v_star=v, v_tilde=v),
-            past=(volt, volt),
+            past=(volt,) * len(state.past),
             finite=jnp.zeros(()),
             z_filtered=jax.tree.map(lambda _: plant.s_0 / 50, state.z_filtered),
             u_a=jax.tree.map(lambda _: volt, state.u_a),

@@ -144,7 +144,7 @@ def _margins(case: Case) -> tuple[Delays, Delays | None]:
         say("testing whether the loop is stable at these delays")
         return with_stability(margin, *loop, known=known)
 
-    say(f"finding the delay margin: simulating {DELAYS} delays, twice if the rotor is lost at one of them")
+    say(f"finding the delay margin: simulating ensembles of {DELAYS} delays, three at most")
     margin = found(True)
     if (processor := case.cascade.processor) is None or processor.predict is False:
         return margin, None

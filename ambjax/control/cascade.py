@@ -210,7 +210,8 @@ class Cascade:
         if self.processor is None:
             command, after = self(measured, state, reference, jnp.inf)
         else:
-            command, after, _ = self.step(measured, state, Sample(reference, period, jnp.inf, (zero, zero)))
+            sample = Sample(reference, period, jnp.inf, self.processor.constant_past(zero))
+            command, after, _ = self.step(measured, state, sample)
         return command.u, after
 
     def check_smooth(self) -> None:

@@ -39,10 +39,10 @@ class Sample(NamedTuple):
     - `reference`: at the instant of the sample; with prediction, at the end of the delay.
     - `period`: sample period, s.
     - `u_max`: limit of u, V or A.
-    - `past`: u of the last sample and of the one before it, V or A.
+    - `past`: u of the samples before, the most recent first, as many as the delay needs, V or A.
     """
 
     reference: Reference
     period: Scalar
     u_max: Scalar
-    past: tuple[Array, Array]
+    past: tuple[Array, ...]

@@ -17,7 +17,9 @@ from ambjax.world.plant import Plant, State
 from ambjax.world.sensor import Measurement
 
 # Largest delay, samples.
-MOST_DELAY = 2.0
+MOST_DELAY = 10.0
+# Every program keeps the commands for this delay (samples) at least: an exported plant or a page admits it.
+USUAL_DELAY = 2.0
 
 
 @record
@@ -58,6 +60,9 @@ class Processor:
     most: int | None = static(
         default=None, doc="number of samples over which the longest prediction extends; None: not determined yet"
     )
+    kept: int | None = static(
+        default=None, doc="number of past commands that the program keeps; None: not determined yet"
+    )
 
     def __str__(self) -> str:
         ahead = "with" if self.predicts else "without"
@@ -79,43 +84,55 @@ class Processor:
         return Sampling(float(period), max(late, 0.0), self.implicit)
 
     def resolved(self, *others: Scalar, between: bool = False) -> "Processor":
-        """Return this processor with `whole` and `most` set. These two fields select the compiled program.
+        """Return this processor with `whole`, `most` and `kept` set. These fields select the compiled program.
 
         The program supports the processor's own delay and the delays `others`; with `between`, also every delay between
-        them. A larger `most`, and a `whole` that is False, are not changed. A part of an ensemble thus runs the same
-        program as the whole ensemble. Raises ValueError if the delay is traced and `most` is None.
+        them. Larger numbers `most` and `kept`, and a `whole` that is False, are not changed. A part of an ensemble thus
+        runs the same program as the whole ensemble. Raises ValueError if a delay is traced and `most` is None.
         """
-        if is_traced(self.delay):
+        traced = "delay" if is_traced(self.delay) else "assumed"
+        if is_traced(getattr(self, traced)):
             if self.most is None:
                 raise ValueError(
-                    "processor.delay is traced (jit, grad or vmap), so its value cannot select the compiled program. "
+                    f"processor.{traced} is traced (jit, grad or vmap), so its value cannot select the program. "
                     "Call cascade.on_processor() before the transformation."
                 )
             return self
         delay = np.concatenate([np.ravel(np.asarray(x, float)) for x in (self.delay, *others)])
         whole = self.whole is not False and not between and bool(np.all(delay == np.round(delay)))
-        longest = float(delay.max()) if self.assumed is None else MOST_DELAY
-        most = max(self.most or 0, math.ceil(longest))
-        return dataclasses.replace(self, whole=whole, most=most)
+        longest = math.ceil(delay.max())
+        ahead = longest if self.assumed is None else math.ceil(np.max(np.asarray(self.assumed)))
+        most = max(self.most or 0, ahead)
+        kept = max(self.kept or 0, most, longest, math.ceil(USUAL_DELAY))
+        return dataclasses.replace(self, whole=whole, most=most, kept=kept)
+
+    def remembered(self, u: Array, *past: Array) -> tuple[Array, ...]:
+        """Return the past commands of the next sample. `u`, `past`: the command of this sample and those before it."""
+        return (u, *past)[: self.resolved().kept]
+
+    def constant_past(self, u: Array) -> tuple[Array, ...]:
+        """Return the past commands of a loop whose command has always been u."""
+        return (u,) * int(self.resolved().kept or 0)
 
     def prediction_steps(self, period: Scalar) -> tuple[Array, ...]:
-        """Return the durations (s) for which u_{n-1} and u_{n-2} act in the prediction; u_{n-2} acts first."""
+        """Return the durations (s) for which u_{n-1}, u_{n-2}, ... act in the prediction; the last one acts first."""
         ahead = jnp.asarray(self.ahead)
-        return (jnp.minimum(ahead, 1.0) * period, jnp.maximum(ahead - 1.0, 0.0) * period)[: self.most]
+        shares = [jnp.minimum(jnp.maximum(ahead - lag, 0.0), 1.0) for lag in range(self.resolved().most or 0)]
+        return tuple(share * period for share in shares)
 
 
 def predicted_over_delay(
     model: Plant,
     driven: Callable[[Array, State], State],
     estimate: Measurement,
-    past: tuple[Array, Array],
+    past: tuple[Array, ...],
     lengths: tuple[Array, ...],
 ) -> Measurement:
     """Return the estimate at the end of the delay. The model makes one RK4 step per command, the earliest first.
 
-    `driven`: `Cascade.driven`. `past`: the commands u_{n-1} and u_{n-2}. `lengths`: durations for which they act, s.
+    `driven`: `Cascade.driven`. `past`: the commands u_{n-1}, u_{n-2}, ... `lengths`: durations for which they act, s.
     """
     x = model.start(estimate)
-    for u, h in reversed(list(zip(past, lengths, strict=False))):
+    for u, h in reversed(list(zip(past[: len(lengths)], lengths, strict=True))):
         x = rk4_step(functools.partial(driven, u), x, h)
     return model.measurement(x)

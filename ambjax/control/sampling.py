@@ -27,15 +27,16 @@ class Sampling(NamedTuple):
 
 
 def non_oscillating(late: float) -> float:
-    """Return the largest a = slope T for which x_{n+1} = x_n - a x(n - late), 0 <= late <= 2, does not oscillate.
+    """Return the largest a = slope T for which x_{n+1} = x_n - a x(n - late), late >= 0, does not oscillate.
 
     x is interpolated linearly between samples. The limit is 1 without delay, and 1/4 with a delay of one sample.
     """
     if late <= 1:
         return 1 / (1 + math.sqrt(late)) ** 2
-    # characteristic polynomial r^2 (r - 1) + a ((1 - rest) r + rest): at the limit its real root r is double
-    rest, r = late - 1, np.linspace(1e-6, 1.0, 20_001)
-    return float(np.max(r * r * (1 - r) / ((1 - rest) * r + rest)))
+    # characteristic polynomial r^whole (r - 1) + a ((1 - rest) r + rest): at the limit its real root r is double
+    whole, r = math.ceil(late), np.linspace(1e-6, 1.0, 20_001)
+    rest = late - whole + 1
+    return float(np.max(r**whole * (1 - r) / ((1 - rest) * r + rest)))
 
 
 class Relay(NamedTuple):

@@ -1,31 +1,34 @@
 """The delay margin of a cascade on a processor: the largest delay up to which the rotor survives."""
 
 import dataclasses
+import itertools
 from typing import Any
 
 import numpy as np
 
 from ambjax.control.cascade import Cascade
-from ambjax.control.processor import MOST_DELAY
+from ambjax.control.processor import MOST_DELAY, USUAL_DELAY
 from ambjax.ensemble.batching import run_ensemble
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.trajectory import STALLED
 from ambjax.theorem.sampled_report import Delays
 from ambjax.world.scenario import Scenario
 
-# Number of delays of one pass, which are simulated together in one ensemble. The first pass has steps of 1/128 sample
-# or less, because the rotor may be lost only in a narrow interval of delays. An interval that lies between two
-# neighbouring delays is not found. The second pass divides one step of the first by 256.
+# Number of delays of one ensemble. Up to USUAL_DELAY, the steps are 1/128 sample or less, because the rotor may be lost
+# only in a narrow interval of delays; from there to MOST_DELAY they are at most 1/32 sample. An interval that lies
+# between two neighbouring delays is not found. The last ensemble divides one step by 256.
 DELAYS = 257
+# The ranges of delays end at these numbers of samples. All delays up to an end share one compiled program.
+ENDS = (USUAL_DELAY, MOST_DELAY)
 
 
 def delay_margin(cascade: Cascade, scenario: Scenario, clock: Clock, *, known: bool = True) -> Delays:
     """Compute the largest delay up to which the rotor survives the clock's horizon with a cascade on a processor.
 
-    The search scans `DELAYS` delays, from the case's own delay to the longest one allowed, in one ensemble. A second
-    pass divides the step that ends at the first delay at which the rotor is lost or the integrator stalls. If this is
-    the case's own delay, the search scans from 0 to that delay. A run that diverges counts as lost; a run that stalls
-    is undecided. All other inputs stay as in the case.
+    The search scans `DELAYS` delays from the case's own delay to USUAL_DELAY in one ensemble. If the rotor survives
+    all of them, a second ensemble continues to MOST_DELAY. A last one divides the step that ends at the first delay at
+    which the rotor is lost or the integrator stalls. If this is the case's own delay, the search scans from 0 to that
+    delay. A run that diverges counts as lost; a run that stalls is undecided. All other inputs stay as in the case.
 
     The controller predicts over the delay unless the processor's `predict` is False, as in a map over delays.
 
@@ -36,12 +39,18 @@ def delay_margin(cascade: Cascade, scenario: Scenario, clock: Clock, *, known: b
     processor: Any = cascade.processor
     own = float(processor.delay)
 
-    def tried(low: float, high: float) -> Delays:
-        delays = np.linspace(low, high, DELAYS)
-        ending = run_ensemble(at_delays(cascade, delays, known=known), scenario, clock, fold=None).trajectory
-        return _read(delays, np.asarray(ending.lost_at), np.asarray(ending.lost_code))
+    def tried(*ends: float) -> Delays:
+        runs = []
+        for low, high in itertools.pairwise(ends):
+            first = len(runs) > 0  # `low` was simulated before
+            delays = np.linspace(low, high, DELAYS + first)[first:]
+            ending = run_ensemble(at_delays(cascade, delays, known=known), scenario, clock, fold=None).trajectory
+            runs.append((delays, np.asarray(ending.lost_at), np.asarray(ending.lost_code)))
+            if np.isfinite(runs[-1][1]).any():
+                break
+        return _read(*map(np.concatenate, zip(*runs, strict=True)))
 
-    found = tried(own, MOST_DELAY)
+    found = tried(own, *([end for end in ENDS if end > own] or ENDS[-1:]))
     if found.held is None and own:
         found = tried(0.0, own)
     first = found.lost if found.undecided is None else found.undecided
@@ -55,7 +64,8 @@ def delay_margin(cascade: Cascade, scenario: Scenario, clock: Clock, *, known: b
 
 def at_delays(cascade: Cascade, delays: np.ndarray, *, known: bool) -> Cascade:
     """Return the cascade with these delays [N] (samples) of its processor. `known`: as in `delay_margin`."""
-    processor: Any = cascade.on_processor(0.0, MOST_DELAY).processor
+    end = next(end for end in ENDS if np.max(delays) <= end)
+    processor: Any = cascade.on_processor(0.0, end).processor
     # an array in both cases, so that both use the same compiled program
     assumed = delays if known else np.full(len(delays), float(processor.ahead))
     late = dataclasses.replace(processor, predict=processor.predict is not False, delay=delays, assumed=assumed)
@@ -64,7 +74,7 @@ def at_delays(cascade: Cascade, delays: np.ndarray, *, known: bool) -> Cascade:
 
 def _read(delays: np.ndarray, lost_at: np.ndarray, code: np.ndarray) -> Delays:
     """Return the margin from runs at ascending `delays` [N], the time (s) of each early end [N] and its code [N]."""
-    ended, step = np.isfinite(lost_at), float(delays[1] - delays[0])
+    ended, step = np.isfinite(lost_at), float(np.max(np.diff(delays)))
     if not ended.any():
         return Delays(float(delays[-1]), None, None, step)
     first, lost = int(np.argmax(ended)), delays[ended & (code != STALLED)]

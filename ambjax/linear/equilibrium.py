@@ -215,7 +215,8 @@ def _residual(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, p
         command, rates = cascade(measured, point.control, reference, u_max)
         control = jax.tree.map(lambda x: x / plant.pole, rates)
     else:
-        command, after, _ = cascade.step(measured, point.control, Sample(reference, period, u_max, (point.u, point.u)))
+        sample = Sample(reference, period, u_max, cascade.processor.constant_past(point.u))
+        command, after, _ = cascade.step(measured, point.control, sample)
         control = jax.tree.map(lambda a, b: b - a, point.control, after)
     change = Point(moved, control, command.u - point.u)
     return ravel_pytree(jax.tree.map(lambda x, size: x / size, change, sizes))[0]

@@ -19,17 +19,15 @@ from ambjax.world.sensor import Measurement
 
 
 class HeldPlant(NamedTuple):
-    """Linear map of one sample, x_{n+1} = transition x_n + now u_n + before u_{n-1} + first u_{n-2} + disturbed q_z.
+    """Linear map of one sample, x_{n+1} = transition x_n + sum over k of driven[k] u_{n-k} + disturbed q_z.
 
-    x [N] is the state of the plant, of the sensor's low-pass (m) and of the amplifier (V), `transition` is [N, N], and
-    the others are [N]. x and u are deviations from the equilibrium. q_z (m/s^2) is constant during the sample. `path`:
-    the rates of x under a command.
+    x [N] is the state of the plant, of the sensor's low-pass (m) and of the amplifier (V). `transition` is [N, N],
+    `driven` [K + 1, N] for K past commands, and `disturbed` [N]. x and u are deviations from the equilibrium. q_z
+    (m/s^2) is constant during the sample. `path`: the rates of x under a command.
     """
 
     transition: Array
-    now: Array
-    before: Array
-    first: Array
+    driven: Array
     disturbed: Array
     path: CommandPath
 
@@ -80,10 +78,11 @@ class Lagged:
         lags = [z] * self.low_passed + [sizes.u] * self.lagged
         return ravel_pytree((sizes.plant, lags))[0]
 
-    def held(self, point: Point, period: Scalar, delay: Scalar) -> HeldPlant:
+    def held(self, point: Point, period: Scalar, delay: Scalar, kept: int) -> HeldPlant:
         """Return the linear map of one sample at the equilibrium `point`.
 
         `period`: sample period, s. `delay`: samples after which the voltage of a sample begins to act.
+        `kept`: number of past commands, at least `delay`.
         """
         A, B = jax.jacfwd(lambda x, w: self.rates(x, w[0], w[1]), (0, 1))(
             self.start, jnp.stack([point.u, 0.0 * point.u])
@@ -91,9 +90,9 @@ class Lagged:
         path = CommandPath(A, B[:, 0], jnp.asarray(delay))
         whole = jnp.floor(path.delay)
         new, old = path.held(path.delay - whole, jnp.asarray(period))
-        now, before, first = (_at(whole + 1, k) * old + _at(whole, k) * new for k in range(3))
+        driven = jnp.stack([_at(whole + 1, lag) * old + _at(whole, lag) * new for lag in range(kept + 1)])
         transition, disturbed = _integrated(A, B[:, 1], period)
-        return HeldPlant(transition, now, before, first, disturbed, path)
+        return HeldPlant(transition, driven, disturbed, path)
 
 
 def _at(lag: Array, number: int) -> Array:

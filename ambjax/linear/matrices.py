@@ -71,26 +71,27 @@ def _continuous(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar,
 
 
 def _sampled(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, point: Point) -> StateSpace:
-    """Return the state space of one sample period, with the state (plant and lags, laws, u_{n-1}, u_{n-2})."""
+    """Return the state space of one sample period, with the state (plant and lags, laws, u_{n-1}, u_{n-2}, ...)."""
     processor: Any = cascade.processor
     plant, reference = Lagged(scenario, point), at_rest(r)
-    held = plant.held(point, period, processor.delay)
+    past = processor.constant_past(point.u)
+    held = plant.held(point, period, processor.delay, len(past))
     laws, restore = ravel_pytree(point.control)
     nx, nl = plant.start.size, laws.size
 
     def step(x: Array, w: Array) -> tuple[Array, Array]:
-        at, laws, past = x[:nx], x[nx : nx + nl], x[nx + nl :]
+        at, laws, past = x[:nx], x[nx : nx + nl], tuple(x[nx + nl :])
         measured = plant.read(at, (w[0], w[1]))
-        sample = Sample(reference, period, jnp.asarray(jnp.inf), (past[0], past[1]))
+        sample = Sample(reference, period, jnp.asarray(jnp.inf), past)
         command, after, _ = cascade.step(measured, restore(laws), sample)
-        moved = held.transition @ at + held.now * command.u + held.before * past[0] + held.first * past[1]
-        moved = moved + held.disturbed * w[2]
-        after = jnp.concatenate([moved, ravel_pytree(after)[0], jnp.stack([command.u, past[0]])])
+        commands = jnp.stack([command.u, *past])
+        moved = held.transition @ at + commands @ held.driven + held.disturbed * w[2]
+        after = jnp.concatenate([moved, ravel_pytree(after)[0], commands[: len(past)]])
         u = plant.voltage(at, command.u)
         return after, jnp.stack([measured.z, measured.z_dot, u, plant.motion(at).z, command.u])
 
-    x = jnp.concatenate([plant.start, laws, jnp.stack([point.u, point.u])])
+    x = ravel_pytree((plant.start, laws, past))[0]
     (A, B), (C, D) = jax.jacfwd(step, (0, 1))(x, jnp.zeros(3, x.dtype))
     sizes = sizes_of(cascade, scenario, point)
-    scale = jnp.concatenate([plant.sizes(sizes), ravel_pytree(sizes.control)[0], jnp.stack([sizes.u, sizes.u])])
+    scale = ravel_pytree((plant.sizes(sizes), sizes.control, processor.constant_past(sizes.u)))[0]
     return StateSpace(A, B, C, D, scale, jnp.asarray(period), held.path)

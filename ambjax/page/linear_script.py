@@ -35,14 +35,14 @@ class LoopPoint(NamedTuple):
     - `lagged`: state of the plant and its lags.
     - `acting`: the voltage that acts, V.
     - `control`: states of the laws.
-    - `past`: the last two commanded voltages, V.
+    - `past`: the voltages commanded before, the most recent first, V.
     - `e`: test signal that is added to the reading of z, m.
     """
 
     lagged: LagState
     acting: Array
     control: CascadeState
-    past: tuple[Array, Array]
+    past: tuple[Array, ...]
     e: Array
 
 
@@ -138,13 +138,14 @@ def linear_script(case: Case) -> LinearScript:
         numbers = canonical(loop_parameters(case, any_delay=True))
         (lagged, u, control), _ = jax.eval_shape(_start, numbers)
         zero = jnp.zeros(())
-        x = LoopPoint(lagged, u, control, (zero, zero), zero)
+        processor: Any = numbers.cascade.processor
+        x = LoopPoint(lagged, u, control, processor.constant_past(zero), zero)
         x = jax.tree.map(lambda _: zero, x)
         start = piece_of(_start, "p", (numbers,))
         point = piece_of(_columns, "px", (numbers, x))
     low, high = case.zones.whole.range(case.clock.sample_period)
     zones = [float(z) for z in (case.zones.zone_a, case.zones.zone_b, case.zones.zone_c)]
-    sizes = {"lagged": len(jax.tree.leaves(x.lagged)), "control": len(jax.tree.leaves(x.control))}
+    sizes = {name: len(jax.tree.leaves(getattr(x, name))) for name in ("lagged", "control", "past")}
     facts = {**sizes, "zones": zones, "low": low, "high": high}
     sources = [
         function_source(start, "linearStart", "P", start.results),

@@ -8,7 +8,6 @@ from jax import Array
 
 from ambjax.cases.reader import Case
 from ambjax.control.cascade import Cascade
-from ambjax.control.processor import MOST_DELAY
 from ambjax.numerics.records import Scalar, record
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import Realised
@@ -85,8 +84,15 @@ class LoopFunctions:
 def loop_parameters(case: Case, any_delay: bool = False) -> Numbers:
     """Return the numbers of a case on a processor.
 
-    `any_delay`: the program admits any delay up to MOST_DELAY, not only that of the case.
+    `any_delay`: the program admits any delay up to `longest_delay`, not only that of the case.
     """
-    assert case.cascade.processor is not None
-    cascade = case.cascade.on_processor(0.0, MOST_DELAY, between=True) if any_delay else case.cascade.on_processor()
+    cascade = case.cascade.on_processor()
+    if any_delay:
+        cascade = cascade.on_processor(0.0, longest_delay(case), between=True)
     return Numbers(cascade, case.scenario, case.settle, case.clock.sample_period)
+
+
+def longest_delay(case: Case) -> float:
+    """Return the longest delay that the page admits, samples: the number of commands that its programs keep."""
+    processor: Any = case.cascade.on_processor().processor
+    return float(processor.kept)

@@ -39,8 +39,8 @@ class LoopScript(NamedTuple):
 
 
 def loop_script(case: Case, any_delay: bool = False) -> LoopScript:
-    """Return the loop of a case on a processor as JavaScript. `any_delay`: for every delay up to MOST_DELAY, not
-    only that of the case.
+    """Return the loop of a case on a processor as JavaScript. `any_delay`: for every delay that the page
+    admits, not only that of the case.
 
     Raises ValueError for a part of the case that scalar code cannot express.
     """

@@ -10,7 +10,7 @@ import numpy as np
 
 from ambjax.cases.reader import Case
 from ambjax.ensemble.paths import SHIFT, Place, places, with_values
-from ambjax.page.loop_functions import loop_parameters
+from ambjax.page.loop_functions import longest_delay, loop_parameters
 
 # The slider of a gain, a number of [actuator], a bandwidth or a sensor's range goes from the number divided by FACTOR
 # to the number times FACTOR. The slider of a number of the plant, or of the sensor's gain, goes from 1 - SHARE to
@@ -76,6 +76,7 @@ def sliders(case: Case, others: list[Case]) -> list[Slider]:
         meta = place.field.metadata
         least = next((x for x in (meta["above"], meta["at_least"]) if x is not None), -math.inf)
         most = math.inf if meta["at_most"] is None else meta["at_most"]
+        most = high if path == "processor.delay" else most  # the program admits no longer delay
         grid = values[0] in edges and path.rpartition(".")[2] in ("start", "stop")
         words = meta["unit"] or UNITS.get(str(place.route[1]), ""), meta["doc"]
         excluded = meta["above"] is not None
@@ -147,6 +148,8 @@ def _range(path: str, place: Place, values: list[float], case: Case) -> tuple[fl
         low, high, log = (min(ends), max(ends), False) if any(values) else (-10.0, 10.0, False)
     elif meta["unit"] == "s" and name in ("start", "stop"):
         low, high, log = min(0.0, small), max(float(case.clock.duration), large), False
+    elif path == "processor.delay":
+        low, high, log = 0.0, longest_delay(case), False
     elif path.startswith("processor."):
         low, high, log = 0.0, float(meta["at_most"]), False
     elif path == SEED:

@@ -23,7 +23,7 @@ Voltage = Callable[[Scalar], Array]
 def acting(voltages: tuple[Array, ...], delay: Array, period: Scalar, whole: bool) -> list[tuple[Array, Scalar]]:
     """Return the commanded voltages (V) that act during a sample, each with its duration (s).
 
-    `voltages`: of this sample and of the two before it, V. `delay`: in samples. `whole`: the delay is a whole number,
+    `voltages`: of this sample and of those before it, V. `delay`: in samples. `whole`: the delay is a whole number,
     so that one voltage acts during the whole sample.
     """
     late = (delay - jnp.floor(delay)) * period
@@ -32,9 +32,11 @@ def acting(voltages: tuple[Array, ...], delay: Array, period: Scalar, whole: boo
 
 
 def _one_of(voltages: tuple[Array, ...], lag: Array) -> Array:
-    """Return the voltage of the sample `lag` samples ago, lag = 0, 1 or 2."""
-    now, before, first = voltages
-    return jnp.where(lag < 0.5, now, jnp.where(lag < 1.5, before, first))
+    """Return the voltage of the sample `lag` samples ago, lag = 0, 1, ..."""
+    found = voltages[-1]
+    for number, voltage in reversed(list(enumerate(voltages[:-1]))):
+        found = jnp.where(lag < number + 0.5, voltage, found)
+    return found
 
 
 def amplified(

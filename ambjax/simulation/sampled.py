@@ -6,7 +6,9 @@ voltage acts during a sample, or two if the delay is not a whole number of sampl
 """
 
 import dataclasses
+import functools
 import itertools
+import operator
 from typing import Any, Self
 
 import jax
@@ -74,7 +76,7 @@ class Sampled:
         z_filtered = sensed_motion(self.loop, plant, zero).z if lags(self.loop) else ()
         slow = scenario.amplifier is not None and scenario.amplifier.slow
         measured = self.measured(plant, z_filtered, self.sensor_errors(0))
-        command, past, guard = Command(*[zero] * 5), (zero, zero), self.processor.guard
+        command, past, guard = Command(*[zero] * 5), self.processor.constant_past(zero), self.processor.guard
         faulty = scenario.sensor is not None and scenario.sensor.faulty
         cascade = self.loop.cascade
         sample = self.sample(self.reference(0.0), past)
@@ -139,7 +141,7 @@ class Sampled:
         `measured`: the readings, before the guard. `reference`: see `Sample`. The exported C is traced from this
         function.
         """
-        cascade, past = self.loop.cascade, (state.command.u, state.past[0])
+        cascade, past = self.loop.cascade, self.processor.remembered(state.command.u, *state.past)
         sample = self.sample(reference, past)
         checked, measured, laws = self.inputs_of_laws(measured, sample, state)
         command, control, estimate = cascade.step(measured, laws, sample)
@@ -160,8 +162,8 @@ class Sampled:
         finite = jnp.where(finite, state.finite, 0.0)
         return state._replace(control=control, command=command, past=past, finite=finite, watch=watch, started=started)
 
-    def sample(self, reference: Reference, past: tuple[Array, Array]) -> Sample:
-        """Return the inputs of the cascade at a sample. `past`: u of the last sample and of the one before it."""
+    def sample(self, reference: Reference, past: tuple[Array, ...]) -> Sample:
+        """Return the inputs of the cascade at a sample. `past`: u of the samples before, the most recent first."""
         return Sample(reference, self.period, jnp.asarray(self.loop.scenario.command_limit), past)
 
     def inputs_of_laws(
@@ -180,13 +182,13 @@ class Sampled:
     def _next_guard_state(
         self, checked: GuardResult | None, estimate: Measurement, voltages: tuple[Array, ...]
     ) -> Watch | tuple[()]:
-        """Return the guard's state for the next sample. `voltages`: of this sample and of the two before it, V."""
+        """Return the guard's state for the next sample. `voltages`: of this sample and of those before it, V."""
         if checked is None:
             return ()
         cascade, delay = self.loop.cascade, jnp.asarray(self.processor.ahead)
         # Each voltage is weighted by the fraction of the sample during which it acts.
-        (u, before, first), share = voltages, 1 - jnp.abs(delay - 1)
-        u = jnp.maximum(1 - delay, 0.0) * u + share * before + jnp.maximum(delay - 1, 0.0) * first
+        shares = [jnp.maximum(1 - jnp.abs(delay - lag), 0.0) for lag in range(len(voltages))]
+        u = functools.reduce(operator.add, map(operator.mul, shares, voltages))
         motion = checked.reading._replace(z_dot=estimate.z_dot)
         return Watch(expected(cascade.driven, cascade.model.start(motion), u, self.period), checked.left)
 
@@ -237,7 +239,7 @@ class Sampled:
         zero = jnp.zeros_like(state.command.u)
         plant = self.loop.rest(LoopState(state.plant, state.control), code).plant
         z_filtered = self.loop.scenario.plant.measurement(plant).z if lags(self.loop) else ()
-        off = state._replace(command=state.command._replace(u=zero), past=(zero, zero))
+        off = state._replace(command=state.command._replace(u=zero), past=self.processor.constant_past(zero))
         return off._replace(plant=plant, z_filtered=z_filtered, u_a=jax.tree.map(jnp.zeros_like, state.u_a))
 
     def row(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors, alive: Array) -> Row:

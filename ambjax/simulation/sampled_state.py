@@ -13,7 +13,7 @@ class SampledState(NamedTuple):
 
     - `plant`, `control`: states of the plant and of the laws.
     - `command`: last command, with u (V, or A for a current) within `Scenario.command_limit`.
-    - `past`: the two commands u before that of `command`, the most recent first.
+    - `past`: the commands u before that of `command`, the most recent first, as many as the delay needs.
     - `finite`: 1 at the start; 0 after a law or, without a guard, the sensor has returned a number that is not finite.
     - `z_filtered`: output of the low-pass of the position sensor, m.
     - `u_a`: output voltage of the amplifier, V.
@@ -26,7 +26,7 @@ class SampledState(NamedTuple):
     plant: Any
     control: CascadeState
     command: Command
-    past: tuple[Array, Array]
+    past: tuple[Array, ...]
     finite: Array
     z_filtered: Array | tuple[()]
     u_a: Array | tuple[()]

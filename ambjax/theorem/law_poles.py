@@ -142,32 +142,31 @@ def _inversion(law: Any, model: Plant, sampling: Sampling) -> Loop:
 
 
 def _position(law: Any, model: Plant, sampling: Sampling) -> Loop:
-    """Return the loop of a rotor under the demanded force. State: z, z_dot, the law's, and the last two demands."""
+    """Return the loop of a rotor under the demanded force. State: z, z_dot, the law's, the past demands."""
     _, v, reference = _rest(model)
     laws, restore = _state(law.init_sampled(model))
-    T, weights = sampling.period, _weights(sampling.late)
+    T, weights, kept = sampling.period, _weights(sampling.late), _kept(sampling.late)
 
     def step(x: Array) -> Array:
-        z, z_dot, past = x[0], x[1], x[-2:]
-        at_sample = past[0] if sampling.late <= 1 else past[1]
+        z, z_dot, past = x[0], x[1], tuple(x[-kept:])
+        at_sample = past[kept - 1]  # the demand that acts at the sample
         motion = Measurement(z, z_dot, model.current_for(z, at_sample))
-        v_star, after = _advance(law, model, sampling)((motion, reference), restore(x[2:-2]))
-        demands = (v_star, past[0], past[1])
-        for share, force in reversed(list(zip(weights, demands, strict=True))):
+        v_star, after = _advance(law, model, sampling)((motion, reference), restore(x[2:-kept]))
+        for share, force in reversed(list(zip(weights, (v_star, *past), strict=True))):
             rate, h = model.a * force + 2 * model.k_z / model.m * z - model.g, share * T
             z, z_dot = z + h * z_dot + h * h / 2 * rate, z_dot + h * rate
-        return jnp.concatenate([jnp.stack([z, z_dot]), ravel_pytree(after)[0], jnp.stack([v_star, past[0]])])
+        return ravel_pytree((z, z_dot, after, (v_star, *past)[:kept]))[0]
 
-    return Loop(step, jnp.concatenate([jnp.zeros(2), laws, jnp.stack([v, v])]), 2)
+    return Loop(step, jnp.concatenate([jnp.zeros(2), laws, jnp.full(kept, v)]), 2)
 
 
 def _current(law: Any, model: Plant, sampling: Sampling) -> Loop:
-    """Return the loop of the current at z = 0. State: i, the law's, and the last two commands."""
+    """Return the loop of the current at z = 0. State: i, the law's, the past commands."""
     rest, _, _ = _rest(model)
     demand, laws = CurrentDemand(rest.i, jnp.zeros(())), law.init_sampled(model)
     start, restore = _state(laws)
     u = _advance(law, model, sampling)(CurrentInputs(rest, demand, jnp.inf), laws)[0]
-    weights = _weights(sampling.late)
+    weights, kept = _weights(sampling.late), _kept(sampling.late)
 
     def rate(i: Array, u: Array) -> Array:
         return law.driven(model, u, model.start(rest._replace(i=i))).i
@@ -175,24 +174,28 @@ def _current(law: Any, model: Plant, sampling: Sampling) -> Loop:
     decay, gain = map(float, jax.grad(rate, (0, 1))(rest.i, u))
 
     def step(x: Array) -> Array:
-        i, past = x[0], x[-2:]
+        i, past = x[0], tuple(x[-kept:])
         inputs = CurrentInputs(rest._replace(i=i), demand, jnp.inf)
-        command, after = _advance(law, model, sampling)(inputs, restore(x[1:-2]))
-        for share, voltage in reversed(list(zip(weights, (command, past[0], past[1]), strict=True))):
+        command, after = _advance(law, model, sampling)(inputs, restore(x[1:-kept]))
+        for share, voltage in reversed(list(zip(weights, (command, *past), strict=True))):
             h = share * sampling.period
             reach = math.expm1(decay * h) / decay if decay else h
             i = i + reach * (rate(rest.i, u) + decay * (i - rest.i) + gain * (voltage - u))
-        return jnp.concatenate([i[None], ravel_pytree(after)[0], jnp.stack([command, past[0]])])
+        return ravel_pytree((i, after, (command, *past)[:kept]))[0]
 
-    return Loop(step, jnp.concatenate([rest.i[None], start, jnp.stack([u, u])]), 1)
+    return Loop(step, jnp.concatenate([rest.i[None], start, jnp.full(kept, u)]), 1)
 
 
-def _weights(late: float) -> tuple[float, float, float]:
-    """Return the shares of a sample in which its own output, that before it and the one before that act, if it begins
-    to act `late` samples after it was computed. The oldest acts first.
+def _kept(late: float) -> int:
+    """Return the number of past outputs that a loop needs whose outputs begin to act `late` samples later."""
+    return max(math.ceil(late), 1)
+
+
+def _weights(late: float) -> list[float]:
+    """Return the shares of a sample in which its own output and the past ones act, if an output begins to act `late`
+    samples after it was computed. The oldest acts first.
     """
-    share = 1 - abs(late - 1)
-    return max(1 - late, 0.0), share, max(late - 1, 0.0)
+    return [max(1 - abs(late - lag), 0.0) for lag in range(_kept(late) + 1)]
 
 
 LOOPS: dict[str, Callable[[Any, Plant, Sampling], Loop]] = {

@@ -110,7 +110,7 @@ class SampledReport:
 
 
 class Delays(NamedTuple):
-    """Result of runs whose delays increase in steps of `step` (samples), from the delay of the case on.
+    """Result of runs whose delays increase in steps of at most `step` (samples), from the delay of the case on.
 
     `held`: the largest delay up to which the rotor is held at every delay of the runs. `lost`: the smallest delay at
     which it is lost; None if there is none. `undecided`: the delay that follows `held`, if the integrator stalled

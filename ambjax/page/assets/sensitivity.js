@@ -56,10 +56,10 @@ function pointAt(P, X, facts) {
 
 // The equilibrium as the argument X of linearPoint, and the sizes of its components; null if the method finds none.
 function equilibrium(P, facts) {
-  const { lagged, control } = facts, n = lagged + control + 1;
+  const { lagged, control, past } = facts, n = lagged + control + 1;
   const begin = linearStart(P, new Float64Array(2 * n));
   const y = begin.slice(0, n), sizes = begin.slice(n), u = lagged;
-  const full = (at) => [...at, at[u], at[u], 0];
+  const full = (at) => [...at, ...new Array(past).fill(at[u]), 0];
   for (let trial = 0; trial < 60; trial++) {
     const X = Float64Array.from(full(y)), { value, column } = pointAt(P, X, facts);
     const residual = (v, k) => {
@@ -73,7 +73,7 @@ function equilibrium(P, facts) {
     const J = residual(value).map(() => []);
     for (let k = 0; k < n; k++) {
       let v = column(k);
-      if (k === u) v = v.map((x, j) => x + column(n)[j] + column(n + 1)[j]);
+      if (k === u) for (let lag = 0; lag < past; lag++) v = v.map((x, j) => x + column(n + lag)[j]);
       residual(v, k).forEach((x, j) => J[j].push(x * sizes[k]));
     }
     const step = solveReal(J, residual(value));
@@ -88,32 +88,31 @@ function equilibrium(P, facts) {
   return null;
 }
 
-// Matrices A, B, C of the map of one sample, scaled. State: (plant and lags, laws, u_{n-1}, u_{n-2}); input: e; output: reading of z.
+// Matrices A, B, C of the map of one sample, scaled. State: (plant and lags, laws, u_{n-1}, u_{n-2}, ...); input: e; output: reading of z.
 function sampleMap(P, facts, period, delay) {
   const point = equilibrium(P, facts);
   if (point === null) return null;
-  const { lagged, control } = facts, { column } = pointAt(P, point.X, facts), n = lagged + control + 2;
+  const { lagged, control, past } = facts, { column } = pointAt(P, point.X, facts), first = lagged + control, n = first + past;
   const rates = (k) => Array.from(column(k).subarray(0, lagged));
   const A = rates(0).map((_, i) => rates(0).map((__, k) => column(k)[i])), B = rates(lagged);
   const part = (delay - Math.floor(delay)) * period;
   const [early, earlyIn] = held(A, B, part), [late, lateIn] = held(A, B, period - part);
   const old = times(late, earlyIn.map((x) => [x])).map((row) => row[0]), whole = times(late, early);
-  const weight = (lag) => (i) => (lag === Math.ceil(delay) ? old[i] : 0) + (lag === Math.floor(delay) ? lateIn[i] : 0);
-  // derivatives of all values of a point with respect to the plant and lags, the laws, both voltages, and e
+  const weight = (lag, i) => (lag === Math.ceil(delay) ? old[i] : 0) + (lag === Math.floor(delay) ? lateIn[i] : 0);
+  // derivatives of all values of a point with respect to the plant and lags, the laws, the past voltages, and e
   const inputs = [];
   for (let k = 0; k < lagged; k++) inputs.push(column(k));
   for (let k = 0; k < control; k++) inputs.push(column(lagged + 1 + k));
-  for (let k = 0; k < 3; k++) inputs.push(column(lagged + control + 1 + k));
+  for (let k = 0; k <= past; k++) inputs.push(column(first + 1 + k));
   const M = [];
   for (let i = 0; i < lagged; i++) {
-    const [now, before, first] = [0, 1, 2].map((lag) => weight(lag)(i));
-    M.push(inputs.map((c, k) => now * c[lagged + control] + (k < lagged ? whole[i][k] : 0)
-      + (k === n - 2 ? before : 0) + (k === n - 1 ? first : 0)));
+    M.push(inputs.map((c, k) => weight(0, i) * c[first] + (k < lagged ? whole[i][k] : 0)
+      + (k >= first && k < n ? weight(k - first + 1, i) : 0)));
   }
   for (let i = 0; i < control; i++) M.push(inputs.map((c) => c[lagged + i]));
-  M.push(inputs.map((c) => c[lagged + control]));
-  M.push(inputs.map((_, k) => (k === n - 2 ? 1 : 0)));
-  const s = [...point.sizes.subarray(0, lagged), ...point.sizes.subarray(lagged + 1), point.sizes[lagged], point.sizes[lagged]];
+  M.push(inputs.map((c) => c[first]));
+  for (let i = first; i < n - 1; i++) M.push(inputs.map((_, k) => (k === i ? 1 : 0)));
+  const s = [...point.sizes.subarray(0, lagged), ...point.sizes.subarray(lagged + 1), ...new Array(past).fill(point.sizes[lagged])];
   // a state that e does not reach is no state of the linear loop
   let reached = M.map((row) => row[n] !== 0);
   for (let k = 0; k < n; k++) reached = M.map((row, i) => reached[i] || row.slice(0, n).some((x, j) => x !== 0 && reached[j]));
@@ -121,7 +120,7 @@ function sampleMap(P, facts, period, delay) {
   return {
     A: M.map((row, i) => columns(row.map((x, k) => (x * s[k]) / s[i]))).filter(moves),
     B: M.map((row, i) => row[n] / s[i]).filter(moves),
-    C: inputs.slice(0, n).map((c, k) => c[lagged + control + 1] * s[k]).filter(moves),
+    C: inputs.slice(0, n).map((c, k) => c[first + 1] * s[k]).filter(moves),
   };
 }
 
