@@ -167,7 +167,7 @@ def test_every_number_has_a_lower_and_an_upper_bound():
 def test_products_at_the_ends_of_the_plant_s_ranges_are_finite():
     numbers = [field for field in dataclasses.fields(Plant) if field.metadata.get("leaf")]
     ends = [[field.metadata[end] for end in ("at_least", "at_most")] for field in numbers]
-    plant = Plant(*(np.reshape(x, [2 if n == m else 1 for m in range(len(ends))]) for n, x in enumerate(ends)))
+    plant = Plant(*(x.ravel() for x in np.meshgrid(*ends)))
     validate(plant)
     for name in ("kappa", "a", "L", "k_s", "k_i"):
         # squares of them are formed, and 1/x: within the square root of what float64 holds

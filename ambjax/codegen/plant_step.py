@@ -82,7 +82,9 @@ class Machine:
     initial: Initial
     u_max: Scalar = dataclasses.field(metadata=FIELDS["u_max"])
     clearance: Scalar | None = dataclasses.field(metadata=FIELDS["clearance"])
-    delay: Scalar = leaf(unit="samples", at_least=0, doc="time from the readings until the voltage acts")
+    delay: Scalar = leaf(
+        unit="samples", at_least=0, at_most=MOST_DELAY, doc="time from the readings until the voltage acts"
+    )
 
     def scenario(self, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Scenario:
         """Return the scenario with these parameters and constant disturbances, m/s^2 and A/s."""
