@@ -28,6 +28,7 @@ from ambjax.codegen.plant_ports import (
 )
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import Command
+from ambjax.control.processor import MOST_DELAY
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.numerics.smooth import limited
 from ambjax.simulation.between import lags, plant_status
