@@ -24,9 +24,9 @@ Reading = Literal["z", "z_dot"]
 class MultiSine:
     """Sum of cosines, e(t) = sum_l size cos(2 pi harmonics_l t/(samples T) + phases_l)."""
 
-    harmonics: Array = leaf(shape="l", doc="whole numbers [L] from 1 to below `samples`/2")
+    harmonics: Array = leaf(shape="l", at_least=1, at_most=1e9, doc="whole numbers [L] from 1 to below `samples`/2")
     size: Scalar = leaf(unit="m or m/s", at_least=0, at_most=1e3, doc="amplitude of every cosine")
-    phases: Array = leaf(shape="l", unit="rad", doc="phases [L]")
+    phases: Array = leaf(shape="l", unit="rad", at_least=-1e3, at_most=1e3, doc="phases [L]")
     period: Scalar = leaf(unit="s", at_least=1e-9, at_most=1e6, doc="sample period T")
     samples: int = static(doc="number of samples in a period of the multi-sine")
     reading: Reading = static(default="z", doc="the reading to which e is added")
