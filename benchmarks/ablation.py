@@ -47,6 +47,11 @@ def constant(module: Any, **values: Any) -> Callable[[dict[str, Any]], None]:
     return switch
 
 
+def by_values(raw: dict[str, Any]) -> None:
+    """Refine each start with CMA-ES from its first point on."""
+    constant(refine, STEEP=-1.0)(raw)
+
+
 # What is switched off, and how.
 MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "nothing": lambda raw: None,
@@ -56,6 +61,11 @@ MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "halvings of the starts": constant(refine, HALVINGS=(NEVER,)),
     "first phase on a quarter of the members": constant(refine, FEW=refine.FEW._replace(part=1)),
     "points of the first phase tried on all members": constant(refine, PATH_POINTS=1),
+    "CMA-ES": lambda raw: (
+        constant(refine, STEEP=math.inf, FEW=refine.FEW._replace(gradient_limit=math.inf))(raw),
+        constant(refine, ALL=refine.ALL._replace(gradient_limit=math.inf))(raw),
+    )[0],
+    "descent: CMA-ES only": by_values,
     "BFGS: Adam instead": setting(optimiser="adam"),
     "curvature kept between phases": constant(optimisers.BFGSState, restarted=lambda self, fresh: fresh),
     "jumps known to the BFGS": constant(optimisers, JUMP=math.inf),

@@ -41,6 +41,8 @@ class World:
     """relative error of the settled error, by number of substeps"""
     rare: Callable[[int, int], float] = lambda seed, number: 0.0
     """slope of the error of a member below a logarithm of -RARE_FROM of the last gain: by seed and number"""
+    chaos: float = 0.0
+    """size of an error of every derivative, with a sign that changes from point to point"""
     louder: float = 1.0
     """ratio of the voltage of the final evaluation to that of the search"""
     calls: list[tuple[str, int, tuple[int, ...], int]] = dataclasses.field(default_factory=list)
@@ -120,7 +122,8 @@ class Bowl:
         each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS))).T[:, :, None]
         found = [outcomes(each, self._terms(x, members, j), members.stressed) for j in range(x.shape[1])]
         slopes = np.stack([np.stack(one, -1).imag for one in found], -1) / TINY
-        return np.stack(found[0], -1).real, slopes, self._terms(x, members)
+        chaos = self.world.chaos * np.sign(np.sin(1e6 * np.asarray(x)))[:, None, None, :]
+        return np.stack(found[0], -1).real, slopes + chaos, self._terms(x, members)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -14,6 +14,7 @@ import numpy as np
 from ambjax.host.sealed import DamagedError, difference, flat, provenance, seal, shapes, unseal, write_whole
 from tuning.problem.loss import TERMS
 from tuning.solve.descent import Descent, Starts
+from tuning.solve.evolution import CmaState, idle_states
 
 # Scalar fields of SearchState in a checkpoint.
 COUNTS = ("iteration", "phase", "since", "seconds")
@@ -42,6 +43,26 @@ class SearchState:
     seconds: float = 0.0
     earlier: float = 0.0
     interrupted: bool = False
+    cma_states: CmaState = None  # pyright: ignore[reportAssignmentType]
+    """CMA-ES distributions of the starts, leaves [S, ...]"""
+
+    def __post_init__(self) -> None:
+        if self.cma_states is None:
+            self.cma_states = idle_states(*self.starts.best.shape)
+
+    @property
+    def evolving(self) -> np.ndarray:
+        """Whether each start uses CMA-ES [S]."""
+        return self.cma_states.drawn >= 0
+
+    def cma_state(self, at: int | np.integer) -> CmaState:
+        """Return the distribution of one start."""
+        return CmaState(*(leaf[at] for leaf in self.cma_states))
+
+    def set_cma_state(self, at: int | np.integer, state: CmaState) -> None:
+        """Set the distribution of one start."""
+        for whole, part in zip(self.cma_states, state, strict=True):
+            whole[at] = part
 
     @property
     def ended(self) -> bool:
@@ -72,7 +93,10 @@ class CheckpointFile:
         if self.path is None:
             return
         _make(self.path.parent)
-        leaves = {f"{LEAF}{n}": np.asarray(leaf) for n, leaf in enumerate(jax.tree.leaves(progress.starts))}
+        leaves = {
+            f"{LEAF}{n}": np.asarray(leaf)
+            for n, leaf in enumerate(jax.tree.leaves((progress.starts, progress.cma_states)))
+        }
         past = {f"{PAST}{name}": np.asarray(rows) for name, rows in progress.history.items()}
         counts = {name: getattr(progress, name) for name in COUNTS}
         facts = {"fingerprint": self.fingerprint, "round": self.round, "counts": counts}
@@ -165,7 +189,8 @@ def _progress(
     Raises DamagedError if their names, types or shapes do not fit.
     """
     there = shapes(arrays)
-    leaves, tree = jax.tree.flatten(jax.eval_shape(descent.begin, jnp.zeros((starts, m))))
+    kinds = jax.eval_shape(descent.begin, jnp.zeros((starts, m))), idle_states(starts, m)
+    leaves, tree = jax.tree.flatten(kinds)
     wanted = {f"{LEAF}{n}": [np.dtype(leaf.dtype).str, list(leaf.shape)] for n, leaf in enumerate(leaves)}
     rows = {"value": (starts,), "x": (starts, m), "gains": (starts, m), "lost": (starts,), "members": ()}
     rows |= {"terms": (starts, len(TERMS)), "measured": (starts, len(descent.goal.measured)), "rollouts": ()}
@@ -177,5 +202,6 @@ def _progress(
     if differs:
         raise DamagedError(f"it does not fit this search: {differs}")
     history = {name.removeprefix(PAST): list(rows) for name, rows in arrays.items() if name.startswith(PAST)}
-    state = jax.tree.unflatten(tree, [jnp.asarray(arrays[f"{LEAF}{n}"]) for n in range(len(leaves))])
-    return SearchState(state, arrays[ACTIVE], history, **counts, earlier=counts["seconds"])
+    state, drawn = jax.tree.unflatten(tree, [arrays[f"{LEAF}{n}"] for n in range(len(leaves))])
+    state = jax.tree.map(jnp.asarray, state)
+    return SearchState(state, arrays[ACTIVE], history, **counts, earlier=counts["seconds"], cma_states=drawn)

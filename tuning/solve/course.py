@@ -116,7 +116,7 @@ class Course:
         progress = search(
             self.problem.engine, self.problem.goal, self.members, points, keep=tune.budget.starts,
             iterations=tune.budget.iterations, name=tune.optimiser, rate=tune.learning_rate,
-            at_optimum=at_optimum,
+            seed=self.seed + len(self.past), at_optimum=at_optimum,
             checkpoint_file=CheckpointFile(path, self.facts, number, self.tell), resume=self.resume,
             on_iteration=self._standing(number), until=self.began + 60 * self.minutes,
         )  # fmt: skip

@@ -20,11 +20,13 @@ class Starts(NamedTuple):
     """State of all starts.
 
     `trial` [S, m]: next points. `state`: of the optimiser. `length` [S]: distance from the best point to the trial.
+    `gradient_norm` [S]: norm of the goal's gradient at the best point.
     """
 
     trial: Array
     state: BFGSState | FirstOrderState
     length: Array
+    gradient_norm: Array
 
     @property
     def best(self) -> Array:
@@ -57,7 +59,8 @@ class Descent:
     def begin(self, x: Array) -> Starts:
         """Return the initial state at coordinates x [S, m]."""
         state: Any = jax.vmap(self.method.init)(x)
-        return Starts(x, state, jnp.full(len(x), jnp.inf, x.dtype))
+        infinite = jnp.full(len(x), jnp.inf, x.dtype)
+        return Starts(x, state, infinite, infinite)
 
     @jax.jit
     def restarted(self, x: Array, starts: Starts) -> Starts:
@@ -80,5 +83,6 @@ class Descent:
         state: Any
         step, state = self.method.update(gradient, start.state, start.trial, value=value)
         trial: Any = optax.apply_updates(start.trial, step)
-        fresh = Starts(trial, state, jnp.linalg.norm(trial - state.best))
+        gradient_norm = jnp.where(state.value < start.value, jnp.linalg.norm(gradient), start.gradient_norm)
+        fresh = Starts(trial, state, jnp.linalg.norm(trial - state.best), gradient_norm)
         return jax.tree.map(lambda p, q: jnp.where(on, p, q), fresh, start)

@@ -1,4 +1,4 @@
-"""One iteration of a search: one descent step of each start.
+"""One iteration of a search: one descent step, or one CMA-ES population, of each start.
 
 A start is a point that the search refines, with the state of its optimiser.
 """
@@ -20,6 +20,7 @@ from tuning.problem.quantities import KINDS
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.checkpoint import SearchState
 from tuning.solve.descent import Descent
+from tuning.solve.evolution import next_population, updated
 
 
 def iterate(
@@ -29,13 +30,17 @@ def iterate(
     progress: SearchState,
     descent: Descent,
     weights: np.ndarray | None = None,
+    seed: int = 0,
 ) -> None:
     """Run one iteration of all active starts and update `progress`.
 
-    `weights` [S, 6]: weights of the loss terms for the descent of each start; None: those of the goal.
+    `weights` [S, 6]: weights of the loss terms for the descent of each start; None: those of the goal. `seed`: seed of
+    the populations of CMA-ES.
     """
     fresh = progress.iteration == progress.since
-    better = _descended(engine, goal, members, progress, descent, weights)
+    better = _descended(engine, goal, members, progress, descent, weights) | _evolved(
+        engine, goal, members, progress, seed
+    )
     append_history(engine, goal, members, progress, better, fresh=fresh)
 
 
@@ -48,7 +53,7 @@ def _descended(
     weights: np.ndarray | None,
 ) -> dict[int, dict[str, np.ndarray]]:
     """Run one step of each start that descends. Return the loss terms of the starts that improve, by index and name."""
-    starts, on = progress.starts, progress.active
+    starts, on = progress.starts, progress.active & ~progress.evolving
     active = np.flatnonzero(on)
     if not active.size:
         return {}
@@ -62,6 +67,32 @@ def _descended(
     progress.starts = descent.step(members.ordinary, starts, *full, on)
     better = np.flatnonzero((np.asarray(progress.starts.value) < np.asarray(starts.value))[active])
     return {int(active[row]): {name: one[row] for name, one in terms.items()} for row in better}
+
+
+def _evolved(
+    engine: Engine, goal: Goal, members: Members, progress: SearchState, seed: int
+) -> dict[int, dict[str, np.ndarray]]:
+    """Evaluate one population of each start that uses CMA-ES and update its distribution. Returns as `_descended`."""
+    active = np.flatnonzero(progress.active & progress.evolving)
+    if not active.size:
+        return {}
+    own = [progress.cma_state(at) for at in active]
+    points = [next_population(cma, seed + int(at)) for cma, at in zip(own, active, strict=True)]
+    terms = engine.terms(np.concatenate(points), members)
+    values = goal.score(np.concatenate(points), terms, members).reshape(len(points), -1)
+    best, value, length = (np.array(x) for x in (progress.starts.best, progress.starts.value, progress.starts.length))
+    better = {}
+    for row, at in enumerate(active):
+        first = int(np.argmin(values[row]))
+        if values[row, first] < value[at]:
+            best[at], value[at] = points[row][first], values[row, first]
+            better[int(at)] = {name: one[row * len(values[row]) + first] for name, one in terms.items()}
+        cma = updated(own[row], points[row], values[row])
+        length[at] = cma.reach
+        progress.set_cma_state(at, cma)
+    state = progress.starts.state._replace(best=jnp.asarray(best), value=jnp.asarray(value))
+    progress.starts = progress.starts._replace(state=state, length=jnp.asarray(length))
+    return better
 
 
 def append_history(

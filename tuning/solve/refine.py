@@ -15,6 +15,7 @@ from tuning.problem.lanes import Engine
 from tuning.problem.members import Members
 from tuning.solve.checkpoint import CheckpointFile, SearchState
 from tuning.solve.descent import Descent
+from tuning.solve.evolution import idle_states, initial_state
 from tuning.solve.iteration import append_history, iterate
 from tuning.solve.screen import screen
 
@@ -30,16 +31,24 @@ class Phase(NamedTuple):
     """A phase of the search.
 
     It simulates 1/`part` of the ordinary members. It simulates all stressed members, because the goal jumps where one
-    of these is lost. A start ends if the goal falls by less than `stall` over `patience` iterations.
+    of these is lost. A descent ends if the goal falls by less than `stall` over `patience` iterations. If the norm of
+    its gradient is then `gradient_limit` or more, the start continues with CMA-ES.
     """
 
     part: int
     stall: float
     patience: int
+    gradient_limit: float
 
 
-# The first phase uses few members: their optimum is close to that of all members, at less than half of the cost.
-FEW, ALL = Phase(4, 0.02, 3), Phase(1, 1e-3, 4)
+# A start with a gradient above STEEP uses CMA-ES at once. Such a gradient predicts that the goal, a logarithm, changes
+# by more than 1 within the shortest step.
+STEEP = 1 / SHORTEST
+# The first phase uses few members: their optimum is close to that of all members, at less than half of the cost. In
+# the last phase, `gradient_limit` distinguishes converged descents from those that stop early. In benchmarks/tasks, the
+# former end with gradients of norm 0.001 to 0.02, the latter with 0.36 to 1e127. The norm is the change of the goal, a
+# logarithm, per factor e of a gain.
+FEW, ALL = Phase(4, 0.02, 3, STEEP), Phase(1, 1e-3, 4, 0.1)
 # Message at the first Ctrl-C.
 INTERRUPT_MESSAGE = "the search ends after this iteration; its best gains are then judged and written."
 
@@ -54,6 +63,7 @@ def search(
     iterations: int,
     name: str = BFGS,
     rate: float = 0.1,
+    seed: int = 0,
     at_optimum: bool = False,
     checkpoint_file: CheckpointFile | None = None,
     resume: bool = False,
@@ -65,12 +75,13 @@ def search(
     With at most `keep` points, all are refined on all members. With more, they are screened, and the best `keep` are
     refined on a part of the members. At most PATH_POINTS points of this phase, and the first of `points`, are then
     evaluated on all members, and the best of them is refined further. Each phase has at most `iterations`. A start
-    descends by the optimiser `name` with the learning rate `rate`.
+    descends by the optimiser `name` with the learning rate `rate`. If its gradient does not lead to a minimum, it
+    continues with CMA-ES.
 
     `at_optimum`: whether an earlier search on all members ended at the first point. If this point is the best after the
-    first phase, it is then not refined again. `on_iteration`: called after each iteration with the search and the
-    duration of the iteration in s. `until`: time of `time.perf_counter` after which the search ends at its next
-    iteration.
+    first phase, it is then not refined again. `seed`: seed of the populations of CMA-ES. `on_iteration`: called after
+    each iteration with the search and the duration of the iteration in s. `until`: time of `time.perf_counter` after
+    which the search ends at its next iteration.
     """
     descent = Descent(goal, name, rate)
     checkpoint_file = checkpoint_file or CheckpointFile(None, {})
@@ -96,8 +107,8 @@ def search(
                     _begin_full_phase(engine, goal, members, progress, descent, given, at_optimum)
                 if progress.active.any():
                     phase = phases[progress.phase]
-                    iterate(engine, goal, members.part(phase.part, 1), progress, descent)
-                    _select(progress, phase)
+                    iterate(engine, goal, members.part(phase.part, 1), progress, descent, seed=seed)
+                    _switch(progress, phase)
                 progress.seconds = progress.earlier + time.perf_counter() - began
                 checkpoint_file.save(progress)
                 on_iteration(progress, progress.seconds - before)
@@ -108,18 +119,30 @@ def search(
     return progress
 
 
-def _select(progress: SearchState, phase: Phase) -> None:
-    """Select the starts that continue.
+def _switch(progress: SearchState, phase: Phase) -> None:
+    """Select the starts that continue, and those that switch to CMA-ES.
 
-    A start ends if its step is at most SHORTEST, or if its goal stalls. The worse half ends after the iterations
-    HALVINGS.
+    A start ends if its step is at most SHORTEST. A descent also ends if its goal stalls, and CMA-ES if it has
+    converged. The worse half ends after the iterations HALVINGS. A descent switches to CMA-ES at once if the norm of
+    its gradient is STEEP or more. A descent that would end switches if the norm is `gradient_limit` or more. There are
+    two causes of such a gradient: in a chaotic loop the derivatives grow with time and do not describe the goal; and a
+    descent stops early at a jump of the goal, beyond which members are lost.
     """
     starts, count = progress.starts, progress.iteration - progress.since
-    ended = (np.asarray(starts.length) <= SHORTEST) | _stalled(progress, phase.patience, phase.stall)
-    active = progress.active & ~ended
+    value, norm, active = np.asarray(starts.value), np.asarray(starts.gradient_norm), progress.active
+    evolving = progress.evolving
+    ended = np.asarray(starts.length) <= SHORTEST
+    converged = np.array([progress.cma_state(at).converged for at in range(len(active))])
+    # in the first phase, CMA-ES only helps to choose among the starts, and ends with the last halving
+    chosen = phase.part > 1 and count >= HALVINGS[-1]
+    ended |= np.where(evolving, converged | chosen, _stalled(progress, phase.patience, phase.stall))
+    turns = active & ~evolving & ~((norm < STEEP) & ((norm < phase.gradient_limit) | ~ended))
+    active = active & (~ended | turns)
     if count in HALVINGS:
-        order = np.argsort(np.where(active, np.asarray(starts.value), np.inf), kind="stable")
+        order = np.argsort(np.where(active, value, np.inf), kind="stable")
         active[order[max((int(active.sum()) + 1) // 2, 1) :]] = False
+    for at in np.flatnonzero(turns & active):
+        progress.set_cma_state(at, initial_state(np.asarray(starts.best)[at]))
     progress.active = active
 
 
@@ -158,6 +181,7 @@ def _begin_full_phase(
     at = np.array(progress.starts.best)
     at[start] = tried[best]
     progress.starts = descent.restarted(jnp.asarray(at), progress.starts)
+    progress.cma_states = idle_states(*at.shape)
     progress.active = np.arange(starts) == start
     progress.phase, progress.since = progress.phase + 1, progress.iteration
     if at_optimum and best == len(chosen):
