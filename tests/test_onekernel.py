@@ -1,6 +1,7 @@
 """run_on_gpu against the rollout, in Pallas's interpreter; lowering of its kernel for CUDA, without a GPU."""
 
 import dataclasses
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -105,6 +106,14 @@ def test_bad_input_is_refused(change, message):
     arguments = {"cascade": CASCADE, "scenario": SCENARIO, "clock": CLOCK, "fold": Peak("e_z")} | change
     with pytest.raises(ValueError, match=message):
         run_on_gpu(**arguments)
+
+
+def test_without_the_triton_back_end_the_ordinary_ensemble_runs(monkeypatch):
+    monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
+    with pytest.warns(UserWarning, match="run_ensemble simulates the members instead"):
+        found = run_on_gpu(CASCADE, SCENARIO, CLOCK, fold=Peak("e_z"), interpret=True)
+    expected = run_ensemble(CASCADE, SCENARIO, CLOCK, fold=Peak("e_z"), threads=1)
+    assert all(map(np.array_equal, jax.tree.leaves(found), jax.tree.leaves(expected)))
 
 
 def test_a_processor_is_refused():

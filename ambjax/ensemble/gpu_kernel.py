@@ -8,6 +8,8 @@ numbers of jax.random are drawn before the kernel starts.
 
 import dataclasses
 import functools
+import importlib
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,7 +20,7 @@ from jax import Array
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from ambjax.control.cascade import Cascade
-from ambjax.ensemble.batching import size
+from ambjax.ensemble.batching import run_ensemble, size
 from ambjax.numerics.records import canonical
 from ambjax.numerics.shapes import varying
 from ambjax.simulation.clock import Clock
@@ -52,7 +54,8 @@ def run_on_gpu(
     - `block`: members of one Pallas program, a power of two, at least 32.
     - `interpret`: run the kernel in Pallas's interpreter, which works on any device but is slow. For tests.
 
-    Returns an Outcome whose leaves have shape [N], in member order.
+    Returns an Outcome whose leaves have shape [N], in member order. JAX deprecated Pallas's Triton back end in 0.11.0. If
+    the installed JAX has none, a UserWarning says so, and `run_ensemble` simulates the members.
 
     Raises ValueError as `run_ensemble` does, and if there is no GPU, for another method, a cascade on a processor, a
     recorded signal, or an invalid `block`.
@@ -68,6 +71,12 @@ def run_on_gpu(
     members = size((cascade, scenario, clock, fold))
     if not interpret and (backend := jax.default_backend()) != "gpu":
         raise ValueError(f"run_on_gpu needs a GPU, and JAX runs on this backend: {backend}. Use run_ensemble.")
+    try:
+        importlib.import_module("jax.experimental.pallas.triton")
+    except ImportError:
+        message = f"JAX {jax.__version__} has no Triton back end of Pallas: run_ensemble simulates the members instead."
+        warnings.warn(message, stacklevel=2)
+        return run_ensemble(cascade, scenario, clock, fold=fold)
     return _in_one_kernel(cascade, scenario, clock, fold, members=members, block=block, interpret=interpret)
 
 
