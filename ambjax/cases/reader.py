@@ -128,6 +128,11 @@ def case_from(
     """
     check_depth(raw)
     top = Table(raw)
+    if "rotor" in raw or "bearing" in raw:
+        raise ValueError(
+            "[rotor], [[bearing]]: a whole machine, and this takes one axis. `ambjax simulate` and `ambjax sensitivity` "
+            "take machines; in Python, read_machine does."
+        )
     top.only([*TABLES, *OTHERS])
     plant = _plant(top.table("plant"))
     processor = processor_from(top.table("processor")) if "processor" in top.raw else None

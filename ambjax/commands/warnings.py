@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ambjax.cases.reach import reach, widest
+from ambjax.cases.machine import MachineCase, read_any
 from ambjax.cases.reader import Case, read_case
 from ambjax.commands.plausibility import implausible
 from ambjax.results.outputs import say
@@ -24,11 +25,23 @@ MOST_NOISE = 0.1
 
 def read_with_warnings(path: str | pathlib.Path) -> Case:
     """Read a case file and print its warnings on stderr. Raises ValueError as `read_case` does."""
-    case = read_case(path)
+    return _warned(read_case(path), path)
+
+
+def _warned(case: Case, path: str | pathlib.Path) -> Case:
+    """Print the warnings of a case, and return it."""
     if not case.text.strip():
         say(one_line(f"{path}: the file is empty, so every number has its default. 'ambjax template' prints a case."))
     print_warnings(case, path)
     return case
+
+
+def read_any_with_warnings(path: str | pathlib.Path) -> Case | MachineCase:
+    """Read the case file of one axis, as `read_with_warnings` does, or of a whole machine."""
+    case = read_any(path)
+    if isinstance(case, MachineCase):
+        return case
+    return _warned(case, path)
 
 
 def print_warnings(case: Case, path: str | pathlib.Path) -> None:

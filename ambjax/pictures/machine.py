@@ -1,0 +1,97 @@
+"""Pictures of a machine: its axes over time and its orbits, and its sensitivity and poles against speed."""
+
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ambjax.pictures.style import own_style
+
+# Largest number of points of a drawn curve.
+MOST_POINTS = 4000
+
+
+@own_style
+def machine_figure(case: Any, signals: dict[str, np.ndarray], title: str) -> Figure:
+    """Return one page: displacement, current and voltage of every axis over time, and the orbit of each radial bearing.
+
+    `signals`: those of a `MachineRun`. The orbits show the time from run.settle on, at the magnets.
+    """
+    axes, t = [str(name) for name in signals["axes"]], signals["t"]
+    step = max(len(t) // MOST_POINTS, 1)
+    pairs = orbits_of(axes)
+    figure = Figure(figsize=(13.0, 8.2), layout="constrained")
+    grid = figure.add_gridspec(3, 2 + bool(pairs), width_ratios=[2, 2, 1.3][: 2 + bool(pairs)])
+    early = t <= min(t[-1], max(0.02, 0.1 * t[-1]))
+    rows = (("z", 1e6, "displacement at the magnet, µm"), ("i", 1.0, "current, A"), ("u", 1.0, "voltage, V"))
+    for row, (name, scale, words) in enumerate(rows):
+        for column, shown in enumerate((slice(None, None, step), early)):
+            ax = figure.add_subplot(grid[row, column])
+            for k, axis in enumerate(axes):
+                ax.plot(t[shown], scale * signals[name][shown, k], label=axis, linewidth=0.9)
+            ax.set_ylabel(words if column == 0 else "")
+            ax.set_title(("whole run", "start of the run")[column] if row == 0 else "")
+            ax.set_xlabel("time, s" if row == 2 else "")
+            ax.grid(True, alpha=0.3)
+    figure.axes[0].legend(ncols=len(axes), fontsize="small", loc="upper right")
+    settled = t >= case.settle
+    for row, (name, x, y) in enumerate(pairs[:3]):
+        ax = figure.add_subplot(grid[row, 2])
+        ax.plot(1e6 * signals["z"][settled, x], 1e6 * signals["z"][settled, y], linewidth=0.7)
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.set_title(f"orbit of {name}, from {case.settle:g} s on")
+        ax.set_xlabel("x axis, µm")
+        ax.set_ylabel("y axis, µm")
+        ax.grid(True, alpha=0.3)
+    ended = str(signals["lost_why"])
+    figure.suptitle(f"{title}: {ended}" if ended else title)
+    return figure
+
+
+def orbits_of(axes: Sequence[str]) -> list[tuple[str, int, int]]:
+    """Return the radial bearings with the positions of their two axes in the list of axes."""
+    names = [name.rpartition(".")[0] for name in axes if name.endswith(".x")]
+    return [(name, list(axes).index(f"{name}.x"), list(axes).index(f"{name}.y")) for name in names]
+
+
+@own_style
+def machine_picture(case: Any, signals: dict[str, np.ndarray], title: str, path: pathlib.Path) -> None:
+    """Write `machine_figure` to a file."""
+    machine_figure(case, signals, title).savefig(path, dpi=130)
+
+
+@own_style
+def machine_sensitivity_picture(points: Sequence[Any], limits: Sequence[float], path: pathlib.Path, title: str) -> None:
+    """Write |S_kk| of every axis and the largest singular value over frequency, a panel for each speed.
+
+    `points`: results of `machine_sensitivity`. `limits`: upper limits of the zones A, B and C.
+    """
+    shown = list(points)[:4]
+    figure = Figure(figsize=(13.0, 4.6 if len(shown) < 3 else 8.2), layout="constrained")
+    grid = figure.subplots(1 + (len(shown) > 2), min(len(shown), 2), squeeze=False, sharex=True, sharey=True)
+    for ax in list(grid.flat)[len(shown) :]:
+        ax.set_axis_off()
+    for ax, point in zip(grid.flat, shown, strict=False):
+        end = 5e3 if point.system.period is None else 0.45 / float(point.system.period)
+        f = np.geomspace(1.0, end, 800)
+        c = len(point.axes)
+        S = np.asarray(point.system.response(f))[:, :c]
+        for k, axis in enumerate(point.axes):
+            ax.loglog(f, np.abs(S[:, k, k]), label=f"{axis.name}: {axis.S.height:.3g}", linewidth=1.0)
+        ax.loglog(f, np.linalg.norm(S, 2, axis=(1, 2)), "k--", label=f"largest singular value: {point.sigma.height:.3g}")
+        top = max(2 * limits[-1], 1.3 * point.sigma.height)
+        bounds = [1e-2, *limits, top]
+        for low, high, colour, name in zip(bounds[:-1], bounds[1:], ("g", "y", "orange", "r"), "ABCD", strict=True):
+            ax.axhspan(low, high, color=colour, alpha=0.08)
+            ax.text(f[-1], np.sqrt(max(low, 0.5) * high), f" {name}", va="center", fontsize="small")
+        ax.set_ylim(1e-2, top)
+        stable = "" if point.stable else ", unstable: no zones"
+        ax.set_title(f"{point.speed:g} rpm{stable}")
+        ax.set_xlabel("frequency, Hz")
+        ax.set_ylabel("|S|")
+        ax.grid(True, alpha=0.3)
+        ax.legend(fontsize="small", loc="lower right")
+    figure.suptitle(title)
+    figure.savefig(path, dpi=130)
