@@ -102,7 +102,9 @@ def scenario_from(top: Table, plant: Bearing, recordings: Recordings) -> tuple[S
     settle = run.leaf("settle", SETTLE)
     scenario = Scenario(
         plant=plant,
-        reference=signal_from(top.table("reference"), "m", recordings) if "reference" in top.raw else signals.Constant(),
+        reference=signal_from(top.table("reference"), "m", recordings)
+        if "reference" in top.raw
+        else signals.Constant(),
         sensor=_sensor(top.table("sensor")) if "sensor" in top.raw else None,
         initial=top.table("initial").record(Initial),
         u_max=actuator.leaf("u_max", FIELDS["u_max"], math.inf),

@@ -3,10 +3,10 @@
 import argparse
 import pathlib
 
-from ambjax.cases.machine import MachineCase
+from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reach import largest
 from ambjax.cases.reader import Case
-from ambjax.commands import machine
+from ambjax.commands import machine_commands
 from ambjax.commands.sensitivity_report import Injections, sensitivity_summary, set_valued, text_of
 from ambjax.commands.warnings import read_any_with_warnings
 from ambjax.ensemble.study import Study
@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     """
     case = read_any_with_warnings(args.case)
     if isinstance(case, MachineCase):
-        return machine.sensitivity(args, case)
+        return machine_commands.sensitivity(args, case)
     study = _study(case, args)
     points, missing = _points(case)
     spread = None if study is None else spread_peaks(case, study)

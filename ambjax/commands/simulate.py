@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from ambjax.cases.machine import MachineCase
+from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
-from ambjax.commands import machine
+from ambjax.commands import machine_commands
 from ambjax.commands.warnings import read_any_with_warnings, reversal
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.replay import Replay, replay
@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """Simulate a case or one member of its ensemble. Exit code 1 if the rotor is lost or the integrator stalls."""
     case = read_any_with_warnings(args.case)
     if isinstance(case, MachineCase):
-        return machine.simulate(args, case)
+        return machine_commands.simulate(args, case)
     study = _study(case, args)
     if study is not None:
         cascade, scenario = study.member(args.member)

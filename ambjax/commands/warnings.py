@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from ambjax.cases.machine_case import MachineCase, read_any
 from ambjax.cases.reach import reach, widest
-from ambjax.cases.machine import MachineCase, read_any
 from ambjax.cases.reader import Case, read_case
 from ambjax.commands.plausibility import implausible
 from ambjax.results.outputs import say

@@ -9,10 +9,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from ambjax.cases.machine import MachineCase
+from ambjax.cases.machine_case import MachineCase
 from ambjax.ensemble.replay import SEGMENT
 from ambjax.numerics.records import canonical
-from ambjax.simulation.machine import PerAxis
+from ambjax.simulation.whole_machine import PerAxis
 from ambjax.simulation.metrics import standard_for
 from ambjax.simulation.rollout import begin, finish, recorded_segment
 from ambjax.simulation.trajectory import SIGNAL_UNITS, STATUSES
@@ -46,7 +46,7 @@ class MachineRun:
 
     def plot(self) -> Any:
         """Return a matplotlib Figure with the motion, the currents and the voltages of all axes, and the orbits."""
-        from ambjax.pictures.machine import machine_figure
+        from ambjax.pictures.machine_pictures import machine_figure
 
         return machine_figure(self.case, self.signals, self.case.name)
 

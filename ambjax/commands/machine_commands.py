@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from ambjax.cases.machine import MachineCase
-from ambjax.linear.machine import MachineSensitivity, machine_sensitivity
+from ambjax.cases.machine_case import MachineCase
+from ambjax.linear.machine_sensitivity import MachineSensitivity, machine_sensitivity
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.outputs import described, directory, files, plain, say, table, write_json, written
 
@@ -43,7 +43,7 @@ def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]
     metrics = plain(run.metrics) | {
         "lost_why": run.lost_why, "method": str(case.clock.method), "settle_s": case.settle,
     }  # fmt: skip
-    from ambjax.pictures.machine import machine_picture
+    from ambjax.pictures.machine_pictures import machine_picture
 
     with files(out) as part:
         run.save(part / "trajectory.npz")
@@ -57,7 +57,7 @@ def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]
         written(out, ", ".join(names))
     if run.lost:
         lost = run.metrics["lost_at_s"]
-        say(f"the rotor is lost at {lost:.6g} s: {run.lost_why}. 'ambjax sensitivity' shows whether the machine is stable.")
+        say(f"the rotor is lost at {lost:.6g} s: {run.lost_why}. 'ambjax sensitivity' shows whether it is stable.")
     return int(run.lost or run.metrics["stalled"]), metrics | {"out": str(out)}
 
 
@@ -74,7 +74,7 @@ def sensitivity(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summa
     out = directory(args.out, f"sensitivity-{case.name}", ANALYSED, args.force)
     summary = sensitivity_summary(points)
     limits = [float(x) for x in (case.zones.zone_a, case.zones.zone_b, case.zones.zone_c)]
-    from ambjax.pictures.machine import machine_sensitivity_picture
+    from ambjax.pictures.machine_pictures import machine_sensitivity_picture
 
     with files(out) as part:
         write_json(part / "sensitivity.json", summary)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from ambjax.pictures.style import own_style
 
@@ -34,8 +35,10 @@ def machine_figure(case: Any, signals: dict[str, np.ndarray], title: str) -> Fig
             ax.set_ylabel(words if column == 0 else "")
             ax.set_title(("whole run", "start of the run")[column] if row == 0 else "")
             ax.set_xlabel("time, s" if row == 2 else "")
+            ax.xaxis.set_major_locator(MaxNLocator(5))
             ax.grid(True, alpha=0.3)
-    figure.axes[0].legend(ncols=len(axes), fontsize="small", loc="upper right")
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, ncols=len(axes), fontsize="small", loc="outside lower center")
     settled = t >= case.settle
     for row, (name, x, y) in enumerate(pairs[:3]):
         ax = figure.add_subplot(grid[row, 2])
@@ -80,7 +83,9 @@ def machine_sensitivity_picture(points: Sequence[Any], limits: Sequence[float], 
         S = np.asarray(point.system.response(f))[:, :c]
         for k, axis in enumerate(point.axes):
             ax.loglog(f, np.abs(S[:, k, k]), label=f"{axis.name}: {axis.S.height:.3g}", linewidth=1.0)
-        ax.loglog(f, np.linalg.norm(S, 2, axis=(1, 2)), "k--", label=f"largest singular value: {point.sigma.height:.3g}")
+        ax.loglog(
+            f, np.linalg.norm(S, 2, axis=(1, 2)), "k--", label=f"largest singular value: {point.sigma.height:.3g}"
+        )
         top = max(2 * limits[-1], 1.3 * point.sigma.height)
         bounds = [1e-2, *limits, top]
         for low, high, colour, name in zip(bounds[:-1], bounds[1:], ("g", "y", "orange", "r"), "ABCD", strict=True):
