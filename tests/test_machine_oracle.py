@@ -221,3 +221,32 @@ def test_the_sensitivity_is_that_of_an_injected_sine(name):
     wave = np.exp(-2j * math.pi * np.arange(1600 - period, 1600) / period)
     S = wave @ (readings[0] - readings[1]) / (period * size)
     assert np.abs(S - loop.S[0][:, axis]).max() < 1e-5
+
+
+def test_the_eigenvalues_of_a_published_rotor():
+    """The test rig of AMrotor under springs -k_s and a PID in currents, from its table of shapes, at 0 rpm.
+
+    The expected values come from a finite-element model. Damping in proportion to stiffness, 5e-7 s, gives theirs.
+    """
+    frequencies = [22.38, 105.57, 176.53, 212.87, 607.4]
+    modes = [{"frequency": f, "damping": 5e-7 * math.pi * f} for f in frequencies]
+    ends = [
+        {"name": "left", "kind": "radial", "at": -0.2516, "modes": [-0.4587, -0.0004, 0.1728, 0.136, -0.2031]},
+        {"name": "right", "kind": "radial", "at": 0.2584, "modes": [-0.4649, 0.0419, 0.088, -0.1208, -0.0117]},
+    ]
+    parts = machine({"rotor": MACHINES["rigid"]["rotor"] | {"modes": modes}, "bearing": ends})
+    k_i, k_s, (k_p, k_int, k_d), n = 50.0, 1e5, (5000.0, 1500.0, 5.0), len(parts.M)
+    magnets, inverse = parts.b.T @ parts.b, np.diag(1 / parts.M)
+    A = np.block([
+        [np.zeros((n, n)), np.eye(n), np.zeros((n, 4))],
+        [inverse @ ((k_s - k_i * k_p) * magnets - parts.K), -inverse @ (parts.D + k_i * k_d * magnets),
+         -k_i * k_int * inverse @ parts.b.T],
+        [parts.b, np.zeros((4, n + 4))],
+    ])  # fmt: skip
+    found = np.linalg.eigvals(A)
+    found = found[found.imag > 1.0]
+    found = found[np.argsort(found.imag)][::2]  # each in x and in y
+    real = [-0.50, -127.45, -128.93, -0.50, -6.04, -5.20, -8.91]
+    imaginary = [16.72, 59.22, 61.10, 105.59, 176.75, 213.03, 607.5]
+    assert found.real == pytest.approx(real, abs=0.05)  # the shapes are printed to four digits
+    assert found.imag / (2 * math.pi) == pytest.approx(imaginary, abs=0.05)
