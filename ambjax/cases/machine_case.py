@@ -6,6 +6,7 @@ import math
 import pathlib
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
@@ -14,7 +15,7 @@ from ambjax.cases.rotor_tables import (
     OWN,
     RIGID,
     SPEED,
-    Axis,
+    BearingAxis,
     axes_from,
     body_from,
     rotor_from,
@@ -26,9 +27,9 @@ from ambjax.linear.analysis import Zones
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
-from ambjax.simulation.whole_machine import Machine, machine_of
 from ambjax.simulation.method import ACCURATE, slopes
 from ambjax.simulation.rollout import prepare
+from ambjax.simulation.whole_machine import Machine, machine_of
 from ambjax.text.words import one_line
 from ambjax.world.rotation import PER_MINUTE
 from ambjax.world.rotor import Rotor
@@ -98,12 +99,12 @@ def machine_from(
         raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
     axes = axes_from(bearings, body)
     rotor = rotor_from(top, body, axes, folder)
-    q = _start(top.table("initial"), rotor)
+    q, currents = _start(top.table("initial"), rotor, len(axes))
     _check_rank(rotor, axes)
     masses, forces = _shares(rotor, axes)
     cases = []
-    for axis, m, force in zip(axes, masses, forces, strict=True):
-        own = _axis_raw(raw, bearings[axis.bearing], axis, m, force, float(axis.b @ q))
+    for axis, m, force, i in zip(axes, masses, forces, currents, strict=True):
+        own = _axis_raw(raw, bearings[axis.bearing], m, force, {"z": float(axis.magnet @ q), "i": i})
         try:
             case = case_from(own, axis.name, "", folder)
         except ValueError as error:
@@ -114,9 +115,17 @@ def machine_from(
     systems = [canonical(prepare(case.cascade, case.scenario, clock)[0]) for case in cases]
     names = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
     return MachineCase(
-        safe_name(name), machine_of(rotor, systems, q), clock, tuple(axis.name for axis in axes), names, tuple(cases),
-        cases[0].settle, cases[0].zones, _speeds(top.table("sensitivity"), rotor, float(clock.duration)), text,
-    )  # fmt: skip
+        name=safe_name(name),
+        machine=machine_of(rotor, systems, jnp.asarray(q)),
+        clock=clock,
+        axes=tuple(axis.name for axis in axes),
+        coordinates=names,
+        cases=tuple(cases),
+        settle=cases[0].settle,
+        zones=cases[0].zones,
+        speeds=_speeds(top.table("sensitivity"), rotor, float(clock.duration)),
+        text=text,
+    )
 
 
 def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:
@@ -130,15 +139,21 @@ def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:
     return tuple(Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(value))
 
 
-def _start(table: Table, rotor: Rotor) -> np.ndarray:
-    """Return the coordinates at t = 0 [n]; the bending modes are at rest."""
+def _start(table: Table, rotor: Rotor, count: int) -> tuple[np.ndarray, list[float]]:
+    """Return the coordinates [n] and the currents [c] (A) at t = 0. `count`: number of axes.
+
+    initial.q gives all coordinates, or the rigid ones alone. initial.i is a number for all axes, or a list of one each.
+    """
     table.only(["q", "i"])
-    q = np.zeros(len(rotor.gravity))
-    q[:RIGID] = vector(table, "q", RIGID, np.zeros(RIGID))
-    return q
+    n, given = len(rotor.gravity), table.raw.get("q", [])
+    q = np.zeros(n)
+    length = n if isinstance(given, list) and len(given) == n else RIGID
+    q[:length] = vector(table, "q", length, np.zeros(length))
+    current = table.raw.get("i", 0.0)
+    return q, vector(table, "i", count).tolist() if isinstance(current, list) else [current] * count
 
 
-def _check_rank(rotor: Rotor, axes: list[Axis]) -> None:
+def _check_rank(rotor: Rotor, axes: list[BearingAxis]) -> None:
     """Raise ValueError if magnets or sensors leave a coordinate free that any of them acts on, or a weight."""
     for rows, what in ((rotor.at_magnets, "magnets"), (rotor.at_sensors, "sensors")):
         rigid = np.asarray(rows)[:, :RIGID]
@@ -155,14 +170,14 @@ def _check_rank(rotor: Rotor, axes: list[Axis]) -> None:
             )
 
 
-def _shares(rotor: Rotor, axes: list[Axis]) -> tuple[np.ndarray, np.ndarray]:
+def _shares(rotor: Rotor, axes: list[BearingAxis]) -> tuple[np.ndarray, np.ndarray]:
     """Return the mass (kg) and the weight (N) that each axis carries [c]: 1/(b M^-1 b), and least-norm forces."""
     B, M = np.asarray(rotor.at_magnets)[:, :RIGID], np.asarray(rotor.M)[:RIGID, :RIGID]
     masses = 1 / np.sum(B * np.linalg.solve(M, B.T).T, 1)
     return masses, np.linalg.pinv(B.T) @ -np.asarray(rotor.gravity)[:RIGID]
 
 
-def _check_force(case: Case, axis: Axis, force: float) -> None:
+def _check_force(case: Case, axis: BearingAxis, force: float) -> None:
     most = float(case.scenario.largest_force)
     if abs(force) > most:
         raise ValueError(
@@ -171,7 +186,7 @@ def _check_force(case: Case, axis: Axis, force: float) -> None:
         )
 
 
-def _axis_raw(raw: dict[str, Any], bearing: Table, axis: Axis, m: float, force: float, z: float) -> dict[str, Any]:
+def _axis_raw(raw: dict[str, Any], bearing: Table, m: float, force: float, initial: dict[str, float]) -> dict[str, Any]:
     """Return the case of one axis: the common tables, what the bearing changes, and the rotor's share."""
     own = copy.deepcopy({key: value for key, value in raw.items() if key not in (*MACHINE_TABLES, "initial", "tune")})
     for table in OWN:
@@ -182,10 +197,13 @@ def _axis_raw(raw: dict[str, Any], bearing: Table, axis: Axis, m: float, force: 
         if isinstance(plant, dict) and name in plant:
             raise ValueError(f"plant.{name} = {show(plant[name])}: the rotor gives it. Leave it out beside [rotor].")
     own["plant"] = plant | {"m": m, "k_z": 0.0, "g": force / m}
+    controller = own.get("controller")
+    if isinstance(controller, dict) and "coordinates" in controller:
+        Table(controller, "controller").choice("coordinates", ["axes"])
+        del controller["coordinates"]
     if isinstance(own.get("sensitivity"), dict):
         own["sensitivity"].pop("speeds", None)
-    own["initial"] = {key: value for key, value in raw.get("initial", {}).items() if key != "q"} | {"z": z}
-    return own
+    return own | {"initial": initial}
 
 
 def _merged(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
@@ -205,8 +223,9 @@ def _clock(cases: list[Case], rotor: Rotor, fixed: bool) -> Clock:
     """
     clock, period = cases[0].clock, float(cases[0].clock.sample_period)
     methods = [case.clock.method for case in cases]
-    if all(isinstance(method, (RK4, DOP853, Euler)) for method in methods):
-        most: Any = max(methods, key=lambda method: method.substeps)
+    fixed_steps = [method for method in methods if isinstance(method, (RK4, DOP853, Euler))]
+    if len(fixed_steps) == len(methods):
+        most = max(fixed_steps, key=lambda method: method.substeps)
     else:
         slope = max(max(slopes(case.cascade, case.scenario).values()) for case in cases)
         most = RK4(max(math.ceil(period * slope / ACCURATE), 1))

@@ -3,8 +3,8 @@
 MACHINE = """\
 # A case for ambjax: a rigid rotor on five magnetic bearing axes, on a 20 kHz processor.
 # Units are SI unless a comment says otherwise. Run it with 'ambjax simulate', analyse it with 'ambjax sensitivity'.
-# Source: Math. Probl. Eng. 2011, 414286, Table 1: mass, inertia, places, gap, k_i = 38 N/A and k_s = 144 kN/m, from which
-# bias and area follow for the assumed turns. "Assumed": not published.
+# Source: Math. Probl. Eng. 2011, 414286, Table 1: mass, inertia, places, gap, k_i = 38 N/A and k_s = 144 kN/m, from
+# which bias and area follow for the assumed turns. "Assumed": not published.
 
 [rotor]
 kind = "rigid"                # or "modal" with [[rotor.modes]]; "shaft": from its geometry

@@ -7,6 +7,7 @@ import pathlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.recordings import Recordings
@@ -43,16 +44,16 @@ MATERIAL = {
 }
 
 
-class Axis(NamedTuple):
-    """One axis of a bearing: its name, the bearing's number, its magnet's row b and its sensor's row c, each [n]."""
+class BearingAxis(NamedTuple):
+    """One axis of a bearing: its name, the bearing's number, and the rows of its magnet and its sensor, each [n]."""
 
     name: str
     bearing: int
-    b: np.ndarray
-    c: np.ndarray
+    magnet: np.ndarray
+    sensor: np.ndarray
 
 
-class Body(NamedTuple):
+class RotorBody(NamedTuple):
     """Mass, inertia and bending modes of a rotor. Places of the case file minus `centre` are those from the centre.
 
     `gyroscopic` [2 + k, 2 + k]: as in `ShaftModel`. `shapes`: shapes [k] of the modes at a place of the case file;
@@ -108,7 +109,7 @@ def vector(table: Table, key: str, length: int, default: Any = None) -> np.ndarr
     return np.asarray(value, float)
 
 
-def body_from(top: Table) -> Body:
+def body_from(top: Table) -> RotorBody:
     """Return the masses and modes of [rotor]."""
     table = top.table("rotor")
     kind = table.choice("kind", KINDS)
@@ -129,7 +130,7 @@ def body_from(top: Table) -> Body:
     dampings = np.array([one.leaf("damping", DAMPING, DAMPING.default) for one in modes])
     gyroscopic = np.zeros((2 + len(modes), 2 + len(modes)))
     gyroscopic[1, 1] = I_p
-    return Body(m, I_t, I_p, 0.0, frequencies, dampings, gyroscopic, None)
+    return RotorBody(m, I_t, I_p, 0.0, frequencies, dampings, gyroscopic, None)
 
 
 def _places(top: Table) -> list[float]:
@@ -151,10 +152,11 @@ def _section(table: Table, begin: float, common: Table, sleeve: bool = False) ->
     outer, inner = needed(table, "diameter", DIAMETER), table.leaf("inner_diameter", INNER, 0.0)
     if inner >= outer:
         raise ValueError(f"{table.at('inner_diameter')} = {inner:g} m: it must be below the diameter, {outer:g} m.")
-    return Section(begin, needed(table, "length", LENGTH), outer, inner, *material, not sleeve)
+    E, rho, nu = material
+    return Section(begin, needed(table, "length", LENGTH), outer, inner, E, rho, nu, not sleeve)
 
 
-def _shaft(table: Table, places: list[float]) -> Body:
+def _shaft(table: Table, places: list[float]) -> RotorBody:
     """Return the body of a shaft from its geometry. Places are measured from the left end of the shaft."""
     elements, begin, sections = tables_of(table, "elements"), 0.0, list[Section]()
     if not elements:
@@ -188,7 +190,7 @@ def _shaft(table: Table, places: list[float]) -> Body:
         for x in middles
     ]
     count = table.whole("modes", MODES)
-    model = shaft_model(sections, discs, np.asarray(nodes), sizes, list(range(len(nodes))), count)
+    model = shaft_model(sections, discs, jnp.asarray(nodes), sizes, list(range(len(nodes))), count)
     shapes = np.asarray(model.shapes)
 
     def at(place: float) -> np.ndarray:
@@ -201,7 +203,7 @@ def _shaft(table: Table, places: list[float]) -> Body:
             Table({"damping": float(x)}, table.path).leaf("damping", DAMPING)
     elif "damping" in table.raw:
         dampings = np.full(count, table.leaf("damping", DAMPING))
-    return Body(
+    return RotorBody(
         float(model.m), float(model.I_t), float(model.I_p), float(model.centre), np.asarray(model.frequencies),
         dampings, np.asarray(model.gyroscopic), at,
     )  # fmt: skip
@@ -219,7 +221,7 @@ def row(at: float, direction: Any, shapes: np.ndarray) -> np.ndarray:
     return np.concatenate([[x, y, z, -at * y, at * x], np.outer(shapes, [x, y]).ravel()])
 
 
-def axes_from(bearings: list[Table], body: Body) -> list[Axis]:
+def axes_from(bearings: list[Table], body: RotorBody) -> list[BearingAxis]:
     """Return the axes of all bearings: two of a radial one, at `angle` and 90 degrees further; one of an axial one."""
     axes, seen = [], set()
     for number, table in enumerate(bearings):
@@ -233,7 +235,7 @@ def axes_from(bearings: list[Table], body: Body) -> list[Axis]:
         if kind == "axial":
             none = np.zeros(len(body.frequencies))
             z = row(0.0, (0.0, 0.0, 1.0), none)
-            axes.append(Axis(f"{name}.z", number, z, z))
+            axes.append(BearingAxis(f"{name}.z", number, z, z))
             continue
         at = needed(table, "at", PLACE)
         if body.shapes is None and len(body.frequencies):
@@ -243,7 +245,9 @@ def axes_from(bearings: list[Table], body: Body) -> list[Axis]:
         angle = math.radians(table.leaf("angle", ANGLE, 0.0))
         cos, sin = _exact(math.cos(angle)), _exact(math.sin(angle))
         for label, d in (("x", (cos, sin, 0.0)), ("y", (-sin, cos, 0.0))):
-            axes.append(Axis(f"{name}.{label}", number, row(magnet[0], d, magnet[1]), row(sensor[0], d, sensor[1])))
+            axes.append(
+                BearingAxis(f"{name}.{label}", number, row(magnet[0], d, magnet[1]), row(sensor[0], d, sensor[1]))
+            )
     return axes
 
 
@@ -252,7 +256,7 @@ def _exact(x: float) -> float:
     return float(round(x)) if abs(x - round(x)) < 1e-15 else x
 
 
-def rotor_from(top: Table, body: Body, axes: list[Axis], folder: pathlib.Path) -> Rotor:
+def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pathlib.Path) -> Rotor:
     """Return the rotor of the tables [rotor], [[unbalance]] and [[load]]."""
     table, k = top.table("rotor"), len(body.frequencies)
     n, w = RIGID + 2 * k, 2 * np.pi * np.repeat(body.frequencies, 2)
@@ -267,22 +271,28 @@ def rotor_from(top: Table, body: Body, axes: list[Axis], folder: pathlib.Path) -
     gravity = np.zeros(n)
     gravity[:3] = body.m * vector(table, "gravity", 3, (0.0, -9.81, 0.0))
     return Rotor(
-        np.diag(mass), np.diag(D), G, np.diag(K), np.stack([axis.b for axis in axes]),
-        np.stack([axis.c for axis in axes]), gravity, table.leaf("speed", SPEED, 0.0),
-        table.leaf("acceleration", ACCELERATION, 0.0),
-        tuple(_unbalance(one, body) for one in tables_of(top, "unbalance")),
-        tuple(_load(one, body, Recordings(folder, ())) for one in tables_of(top, "load")),
-    )  # fmt: skip
+        M=jnp.diag(mass),
+        D=jnp.diag(D),
+        G=jnp.asarray(G),
+        K=jnp.diag(K),
+        at_magnets=jnp.stack([axis.magnet for axis in axes]),
+        at_sensors=jnp.stack([axis.sensor for axis in axes]),
+        gravity=jnp.asarray(gravity),
+        speed=table.leaf("speed", SPEED, 0.0),
+        acceleration=table.leaf("acceleration", ACCELERATION, 0.0),
+        unbalances=tuple(_unbalance(one, body) for one in tables_of(top, "unbalance")),
+        loads=tuple(_load(one, body, Recordings(folder, ())) for one in tables_of(top, "load")),
+    )
 
 
-def _unbalance(table: Table, body: Body) -> RotorUnbalance:
+def _unbalance(table: Table, body: RotorBody) -> RotorUnbalance:
     table.only(["at", "amount", "phase", *(["modes"] if body.shapes is None else [])])
     at, shapes = body.place(table)
-    along = (row(at, d, shapes) for d in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
-    return RotorUnbalance(needed(table, "amount", AMOUNT), *along, table.leaf("phase", PHASE, 0.0))
+    x, y = (jnp.asarray(row(at, d, shapes)) for d in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    return RotorUnbalance(needed(table, "amount", AMOUNT), x, y, table.leaf("phase", PHASE, 0.0))
 
 
-def _load(table: Table, body: Body, recordings: Recordings) -> RotorLoad:
+def _load(table: Table, body: RotorBody, recordings: Recordings) -> RotorLoad:
     places = ("at", "direction", *(["modes"] if body.shapes is None else []))
     direction = vector(table, "direction", 3)
     size = float(np.linalg.norm(direction))
@@ -290,4 +300,4 @@ def _load(table: Table, body: Body, recordings: Recordings) -> RotorLoad:
         raise ValueError(f"{table.at('direction')} = {show(table.raw['direction'])}: it must not be zero.")
     at, shapes = body.place(table)
     rest = Table({key: value for key, value in table.raw.items() if key not in places}, table.path)
-    return RotorLoad(signal_from(rest, "N", recordings), row(at, direction / size, shapes))
+    return RotorLoad(signal_from(rest, "N", recordings), jnp.asarray(row(at, direction / size, shapes)))

@@ -108,7 +108,7 @@ def sensitivity_summary(points: list[MachineSensitivity]) -> Summary:
         for point in points
     ]  # fmt: skip
     axis = worst.worst
-    first = {
+    first: Summary = {
         "stable": all(point.stable for point in points), "peak": axis.S.height, "frequency_hz": axis.S.frequency,
         "zone": axis.zone, "axis": axis.name, "speed_rpm": worst.speed,
     }  # fmt: skip
@@ -125,7 +125,7 @@ def sensitivity_text(points: list[MachineSensitivity]) -> str:
             for axis in point.axes
         ]
         rows.append(("largest singular value", f"{point.sigma.height:.4g}", f"{point.sigma.frequency:.4g}", "", ""))
-        slow = np.max(point.poles.real)
+        slow = np.max(np.real(point.poles))
         words = "stable" if point.stable else "NOT STABLE: the peaks have no physical meaning"
         parts.append(f"{point.speed:g} rpm: {words}; largest real part of a pole {slow:.4g} 1/s")
         parts.append(table(("axis", "peak of |S|", "Hz", "zone", "peak of |T|"), rows))

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,18 +11,20 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 
 from ambjax.control.cascade import Cascade
-from ambjax.control.cascade_state import Sample
+from ambjax.control.cascade_state import CascadeState, Sample
 from ambjax.linear.analysis import Zones
 from ambjax.linear.equilibrium import TOLERANCE, at_rest, ideal, newton_of, reading, sizes_of, start_of
 from ambjax.linear.margins import ResponsePeak, peak, poles_in_s, whole_end
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar, canonical
 from ambjax.numerics.small_matrices import exponential
-from ambjax.simulation.whole_machine import Groups, Machine, MachineState, PlantOnly, SampledMachine, still, times
+from ambjax.simulation.whole_machine import Machine, MachineState, PlantOnly, SampledMachine, still, times
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
 
 T = TypeVar("T")
+# Parts of a point or of its rates: one stacked pytree for each group.
+Groups = tuple
 
 
 class AxisSensitivity(NamedTuple):
@@ -83,7 +85,7 @@ class _Linear:
         """Whether the laws run on a processor."""
         return isinstance(self.machine, SampledMachine)
 
-    def each(self, function: Callable[..., T], *groups: Sequence[Any]) -> list[T]:
+    def each(self, function: Callable[..., T], *groups: Sequence[object]) -> list[T]:
         """Return function(cascade, scenario, ...) of every axis, stacked for each group."""
         return [jax.vmap(function)(*own) for own in zip(self.cascade, self.scenario, *groups, strict=True)]
 
@@ -96,11 +98,13 @@ class _Linear:
         first = _Rest(q, *_parts(points))
         return first, jax.tree.map(lambda x, s: jnp.zeros_like(x) + s, first, _Rest(size.q, *_parts(sizes)))
 
-    def read(self, q: Array, q_dot: Array, plant: Groups, z: Sequence[Any], e: Groups) -> list[Measurement]:
+    def read(
+        self, q: Array, q_dot: Array, plant: Groups, z: Sequence[object], e: Sequence[object]
+    ) -> list[Measurement]:
         """Return the readings of the groups. `z`: outputs of the low-passes, or () without."""
         states = self.machine.moving(self.rotor.at_sensors, q, q_dot, tuple(map(PlantOnly, plant)))
 
-        def one(_: object, scenario: Scenario, own: PlantOnly, z: Any, e: Array) -> Measurement:
+        def one(_: object, scenario: Scenario, own: PlantOnly, z: Array | tuple[()], e: Array) -> Measurement:
             motion = scenario.plant.measurement(own.plant)
             return reading(scenario, motion if isinstance(z, tuple) else motion._replace(z=z), (e, 0.0))
 
@@ -116,11 +120,13 @@ class _Linear:
         moved = self.each(one, states, u)
         return self.machine.coupled((jnp.asarray(self.rotor.gravity), self.W), MachineState(q, q_dot, ()), moved)
 
-    def laws(self, measured: Sequence[Any], control: Groups, past: Sequence[Any]) -> tuple[Groups, Groups]:
+    def laws(self, measured: Sequence[Measurement], control: Groups, past: Sequence[object]) -> tuple[Groups, Groups]:
         """Return the commands of the groups, and the next states of the laws, or their rates in continuous time."""
         reference, unlimited = at_rest(0.0), jnp.asarray(jnp.inf)
 
-        def one(cascade: Cascade, _: object, measured: Measurement, control: Any, past: Any) -> tuple[Array, Any]:
+        def one(
+            cascade: Cascade, _: object, measured: Measurement, control: CascadeState, past: tuple[Array, ...]
+        ) -> tuple[Array, CascadeState]:
             if not self.sampled:
                 command, rates = cascade(measured, control, reference, unlimited)
                 return command.u, rates
@@ -179,10 +185,10 @@ class _Linear:
             z_rates, u_rates, applied = [], [], []
             for k, (scenario, z) in enumerate(zip(self.scenario, self.sensed(q), strict=True)):
                 sensor, amplifier = scenario.sensor, scenario.amplifier
-                low_pass = sensor is not None and sensor.bandwidth is not None
-                z_rates.append(2 * jnp.pi * sensor.bandwidth * (z - filtered[k]) if low_pass else ())
-                slow = amplifier is not None and amplifier.slow
-                u_rates.append(amplifier.slope() * (u[k] - own[k]) if slow else ())
+                low = () if sensor is None or sensor.bandwidth is None else 2 * jnp.pi * jnp.asarray(sensor.bandwidth)
+                z_rates.append(() if isinstance(low, tuple) else low * (z - filtered[k]))
+                slow = amplifier is not None and self.lagged[k]
+                u_rates.append(jnp.asarray(amplifier.slope()) * (u[k] - own[k]) if amplifier and slow else ())
                 applied.append(own[k] if slow else u[k])
             after = self.rates(q, q_dot, plant, tuple(applied))
             return ravel_pytree((after.q, after.q_dot, _plants(after.axes), tuple(z_rates), tuple(u_rates)))[0]
@@ -199,7 +205,9 @@ class _Linear:
         """Return the outputs of the linear system: readings, then commands, in the order of the axes."""
         return jnp.concatenate([self.machine.join([one.z for one in measured]), self.machine.join(u)])
 
-    def _continuous(self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, moved: Any, read: Any) -> Any:
+    def _continuous(
+        self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, moved: Callable, read: Callable
+    ) -> tuple:
         x, restore = ravel_pytree((body, point.control))
 
         def field(x: Array, e: Array) -> tuple[Array, Array]:
@@ -211,7 +219,9 @@ class _Linear:
         scale = ravel_pytree((body_sizes, sizes.control))[0]
         return jax.jacfwd(field, (0, 1))(x, jnp.zeros(self.machine.count, x.dtype)), scale
 
-    def _sampled(self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, moved: Any, read: Any) -> Any:
+    def _sampled(
+        self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, moved: Callable, read: Callable
+    ) -> tuple:
         past, processor = self.past(point.u), self.cascade[0].processor
         assert processor is not None
         A, B = jax.jacfwd(lambda x, u: moved(x, self.machine.split(u)), (0, 1))(body, self.machine.join(point.u))
@@ -240,11 +250,11 @@ def _unguarded(cascade: Cascade) -> Cascade:
     return dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=None))
 
 
-def _plants(axes: Sequence[Any]) -> Groups:
+def _plants(axes: Sequence) -> Groups:
     return tuple(own.plant for own in axes)
 
 
-def _parts(points: Sequence[Any]) -> tuple[Groups, Groups, Groups]:
+def _parts(points: Sequence) -> tuple[Groups, Groups, Groups]:
     """Return the plants without motion, the laws and the commands of the groups' points."""
     return _plants(still(points)), tuple(one.control for one in points), tuple(one.u for one in points)
 
@@ -291,13 +301,16 @@ def linearise_machine(machine: Machine, period: Scalar, speed: float) -> StateSp
 def machine_sensitivity(
     machine: Machine, names: tuple[str, ...], period: Scalar, speed: float, zones: Zones
 ) -> MachineSensitivity:
-    """Return the sensitivity of a machine at a constant speed (rpm). `names`: of the axes. Raises as `linearise_machine`."""
+    """Return the sensitivity of a machine at a constant speed (rpm). Raises ValueError as `linearise_machine` does.
+
+    `names`: of the axes. `period`: sample period, s. `zones`: frequency range and limits.
+    """
     system, c = linearise_machine(machine, period, speed), len(names)
     end = whole_end(system)
     low, high = zones.range(None if system.period is None else float(system.period), max(end, 2 * float(zones.f_low)))
     stable, one = system.stable, np.eye(c)
 
-    def largest(magnitude: Any) -> ResponsePeak:
+    def largest(magnitude: Callable) -> ResponsePeak:
         return peak(system, lambda f: magnitude(np.asarray(system.response(f))), low, high, end)
 
     axes = []

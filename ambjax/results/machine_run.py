@@ -12,10 +12,10 @@ import numpy as np
 from ambjax.cases.machine_case import MachineCase
 from ambjax.ensemble.replay import SEGMENT
 from ambjax.numerics.records import canonical
-from ambjax.simulation.whole_machine import PerAxis
 from ambjax.simulation.metrics import standard_for
 from ambjax.simulation.rollout import begin, finish, recorded_segment
 from ambjax.simulation.trajectory import SIGNAL_UNITS, STATUSES
+from ambjax.simulation.whole_machine import PerAxis
 
 # Metrics of which the smallest value of the axes is the worst.
 SMALLEST = ("singular_at_s", "lost_at_s")
@@ -25,7 +25,7 @@ SMALLEST = ("singular_at_s", "lost_at_s")
 class MachineRun:
     """The result of a simulation of a machine.
 
-    - `signals`: t (s) [N], q [N, coordinates] (m or rad), speed_rpm [N], and each signal of the axes by name, [N, axes].
+    - `signals`: t (s) [N], q [N, coordinates] (m or rad), speed_rpm [N], and by name each signal of the axes [N, axes].
     - `metrics`: each metric by name, of the worst axis; under "axes", the metrics of each axis by its name.
     - `lost_why`: why the rotor was lost; empty if it is held.
     """

@@ -6,6 +6,7 @@ each magnet and each sensor, and the forces of the magnets accelerate the coordi
 """
 
 import dataclasses
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Self, TypeVar
 
@@ -20,17 +21,20 @@ from ambjax.simulation.between import acting, lags, plant_status, under
 from ambjax.simulation.edges import NO_EDGES, Edges
 from ambjax.simulation.folds import Ending
 from ambjax.simulation.integrate import Advanced, InitialValueProblem, Integrator, in_turn
-from ambjax.simulation.loop import INSTANT_TREE, ClosedLoop, Realised
+from ambjax.simulation.loop import INSTANT_TREE, ClosedLoop, ExternalInputs, LoopState, Realised
 from ambjax.simulation.sampled import Sampled
+from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import DIVERGED, Row
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.rotor import Rotor
-from ambjax.world.sensor import Measurement
+from ambjax.world.sensor import Errors, FaultyErrors, Measurement
 
 T = TypeVar("T")
-# States, errors or rates of the axes: one stacked pytree for each group.
-Groups = tuple[Any, ...]
+# Voltages of the groups as functions of time, or outputs of their amplifiers.
+Voltages = list
+# States of the axes, or their rates: one stacked pytree for each group, of type SampledState, LoopState or PlantOnly.
+Groups = tuple
 
 
 class MachineState(NamedTuple):
@@ -67,16 +71,16 @@ class PerAxis:
 
     fold: Any = part(doc="the folds of the axes", channels=True)
 
-    def init(self) -> Any:
+    def init(self) -> object:
         return jax.vmap(lambda fold: fold.init())(self.fold)
 
-    def update(self, carry: Any, row: Any, span: Span) -> Any:
+    def update(self, carry: object, row: Any, span: Span) -> object:
         one = Row(*[0] * len(Row._fields))._replace(t=None, alive=None)  # pyright: ignore[reportArgumentType]
         axes = 0, 0, one, Span(None, 0, 0, 0)  # pyright: ignore[reportArgumentType]
         rows = row.axes._replace(t=row.t, alive=row.alive)
         return jax.vmap(lambda fold, *now: fold.update(*now), in_axes=axes)(self.fold, carry, rows, span)
 
-    def result(self, carry: Any, ending: Ending) -> Any:
+    def result(self, carry: object, ending: Ending) -> Any:
         return jax.vmap(lambda fold, own: fold.result(own, ending))(self.fold, carry)
 
 
@@ -97,9 +101,11 @@ class Machine:
         """Number of axes."""
         return sum(map(len, self.groups))
 
-    def split(self, x: Any) -> Groups:
+    def split(self, x: T) -> tuple[T, ...]:
         """Return the part of each group of arrays [c, ...] of all axes."""
-        return (x,) if len(self.groups) == 1 else tuple(jax.tree.map(lambda x: x[np.array(g)], x) for g in self.groups)
+        if len(self.groups) == 1:
+            return (x,)
+        return tuple(jax.tree.map(operator.itemgetter(np.array(group)), x) for group in self.groups)
 
     def join(self, parts: Sequence[T]) -> T:
         """Return arrays [c, ...] of all axes from those of the groups."""
@@ -108,7 +114,7 @@ class Machine:
         order = np.argsort(np.concatenate([np.array(group) for group in self.groups]))
         return jax.tree.map(lambda *x: jnp.concatenate(x)[order], *parts)
 
-    def each(self, function: Callable[..., T], *groups: Groups) -> list[T]:
+    def each(self, function: Callable[..., T], *groups: Sequence[object]) -> list[T]:
         """Return function(loop, ...) of every axis, stacked for each group. `groups`: further arguments."""
         return [jax.vmap(function)(*own) for own in zip(self.axes, *groups, strict=True)]
 
@@ -130,14 +136,14 @@ class Machine:
         axes = tuple(self.each(_realised, self.split(jnp.arange(self.count))))
         return dataclasses.replace(self, rotor=self.rotor.realised(key), axes=axes, inverse=inverse)
 
-    def sensor_errors(self, sample: Scalar) -> Groups:
+    def sensor_errors(self, sample: Scalar) -> tuple[Errors | FaultyErrors, ...]:
         return tuple(self.each(lambda axis: axis.sensor_errors(sample)))
 
     def start(self) -> MachineState:
         q = jnp.asarray(self.start_q)
         z = self.split(times(self.rotor.at_sensors, q))
 
-        def one(axis: Sampled | ClosedLoop, z: Array) -> Any:
+        def one(axis: Sampled | ClosedLoop, z: Array) -> SampledState | LoopState:
             loop = loop_of(axis)
             begin = dataclasses.replace(loop.scenario.initial, z=z, z_dot=jnp.zeros_like(z))
             scenario = dataclasses.replace(loop.scenario, initial=begin)
@@ -160,7 +166,7 @@ class Machine:
         """Return the states of the groups with the motion at the sensors."""
         return self.moving(self.rotor.at_sensors, *state)
 
-    def coupled(self, outside: tuple[Array, Scalar], state: MachineState, rates: Sequence[Any]) -> MachineState:
+    def coupled(self, outside: tuple[Array, Scalar], state: MachineState, rates: Sequence) -> MachineState:
         """Return the rates of the machine.
 
         `outside`: other forces [n] and the speed (rad/s). `rates`: rates of the groups, of which each axis has its own
@@ -192,7 +198,7 @@ class Machine:
         axes = self.each(lambda axis, own: axis.rest(own, code), self.at_sensors(state))
         return MachineState(state.q, jnp.zeros_like(state.q_dot), still(axes))
 
-    def row(self, t: Scalar, state: MachineState, errors: Groups, alive: Array) -> MachineRow:
+    def row(self, t: Scalar, state: MachineState, errors: Sequence[object], alive: Array) -> MachineRow:
         def rows(axes: Groups) -> Row:
             return self.join(self.each(lambda axis, own, error: axis.row(t, own, error, alive), axes, errors))
 
@@ -210,7 +216,7 @@ class Machine:
     def singularity(self, row: MachineRow) -> Array:
         return jnp.min(self.join(self.each(lambda axis, row: axis.singularity(row), self.split(row.axes))))
 
-    def scale(self, own: Sequence[Any]) -> MachineState:
+    def scale(self, own: Sequence) -> MachineState:
         """Return the characteristic size of each component of the state. `own`: those of the groups' states."""
         z, z_dot = (self.join([getattr(one.plant, name) for one in own]) for name in ("z", "z_dot"))
         rows = jnp.max(jnp.abs(self.rotor.at_magnets) + jnp.abs(self.rotor.at_sensors), 0)
@@ -218,7 +224,7 @@ class Machine:
         rows = jnp.where(rows > 0, rows, 1.0)
         return MachineState(jnp.max(z) / rows, jnp.max(z_dot) / rows, still(own))
 
-    def problem_of(self, inputs: Any, observed: Any, scale: Sequence[Any]) -> InitialValueProblem:
+    def problem_of(self, inputs: Callable, observed: Callable, scale: Sequence) -> InitialValueProblem:
         """Return the initial value problem with these inputs, rates with signals, and sizes of the groups' states."""
         edges = Edges(self.rotor.edges(), len(self.rotor.edges()))
         limit = self.join([jnp.asarray(loop.scenario.limit) for loop in self.loops()])
@@ -240,7 +246,7 @@ class Machine:
 class SampledMachine(Machine):
     """A machine whose cascades run on a processor, one step of all axes per sample."""
 
-    def jump(self, t: Scalar, state: MachineState, errors: Groups) -> MachineState:
+    def jump(self, t: Scalar, state: MachineState, errors: Sequence[object]) -> MachineState:
         """Step the laws of all axes at time t (s)."""
         axes = self.each(lambda axis, own, error: axis.jump(t, own, error), self.at_sensors(state), errors)
         return state._replace(axes=still(axes))
@@ -248,7 +254,7 @@ class SampledMachine(Machine):
     def advance(
         self,
         method: Integrator,
-        errors: Groups,
+        errors: object,
         t: Scalar,
         period: Scalar,
         state: MachineState,
@@ -269,8 +275,8 @@ class SampledMachine(Machine):
         axes = tuple(own._replace(plant=at.plant, z_filtered=z, u_a=u) for own, at, z, u in ended)
         return reached[-1]._replace(state=MachineState(end.q, end.q_dot, axes))
 
-    def _pieces(self, t: Array, period: Scalar, axes: Groups) -> tuple[list[tuple[list[Any], Scalar]], list[Any]]:
-        """Divide a sample. Return the voltages of the groups as functions of time, with the durations (s) of the pieces.
+    def _pieces(self, t: Array, period: Scalar, axes: Groups) -> tuple[list[tuple[Voltages, Scalar]], Voltages]:
+        """Divide a sample. Return the groups' voltages as functions of time, with the durations (s) of the pieces.
 
         The second result contains the amplifiers' outputs at the end (V). With a low-pass of a sensor, pieces also end
         at the jumps of loads.
@@ -295,21 +301,23 @@ class SampledMachine(Machine):
             t = t + time
         return pieces, u_a
 
-    def _problem(self, first: MachineState, voltages: list[Any]) -> InitialValueProblem:
+    def _problem(self, first: MachineState, voltages: Sequence[Callable]) -> InitialValueProblem:
         """Return the initial value problem of rotor and coils under the voltages of the groups, functions of time (V).
 
         `first`: state at the sample.
         """
         sampled = self.at_magnets(first)
 
-        def inputs(t: Scalar) -> Any:
+        def inputs(t: Scalar) -> tuple[object, ...]:
             return self.outside(t), tuple(self.each(lambda axis: axis.loop.inputs(t))), tuple(u(t) for u in voltages)
 
         def observed(inputs: Any, state: MachineState) -> tuple[MachineState, Instant]:
             outside, own, u = inputs
             at = tuple(one.plant for one in self.at_magnets(state))
 
-            def one(axis: Sampled, first: Any, own: Any, u: Array, plant: object) -> tuple[PlantOnly, Instant]:
+            def one(
+                axis: Sampled, first: SampledState, own: ExternalInputs, u: Array, plant: object
+            ) -> tuple[PlantOnly, Instant]:
                 problem = under(axis.loop, first.plant, first.command, lambda _: u, NO_EDGES)
                 rates, instant = problem.rates_and_signals((own, u), plant)
                 return PlantOnly(rates), instant
@@ -320,7 +328,7 @@ class SampledMachine(Machine):
         sizes = self.each(lambda axis: PlantOnly(jax.tree.map(jnp.asarray, axis.loop.scenario.plant.scale())))
         return self.problem_of(inputs, observed, sizes)
 
-    def _filtered(self, t: Array, axes: Groups, states: list[MachineState], durations: list[Scalar]) -> list[Any]:
+    def _filtered(self, t: Array, axes: Groups, states: list[MachineState], durations: list[Scalar]) -> list:
         """Return the outputs of the sensors' low-passes of the groups at the next sample, m."""
         found = []
         sensed = [self.at_sensors(state) for state in states]
@@ -346,10 +354,10 @@ class SampledMachine(Machine):
 class ContinuousMachine(Machine):
     """A machine whose cascades run in continuous time."""
 
-    def problem(self, errors: Groups) -> InitialValueProblem:
+    def problem(self, errors: Sequence[object]) -> InitialValueProblem:
         """Return the initial value problem of one sample, with the measurement errors held."""
 
-        def inputs(t: Scalar) -> Any:
+        def inputs(t: Scalar) -> tuple[object, ...]:
             return self.outside(t), tuple(self.each(lambda axis: axis.inputs(t)))
 
         def observed(inputs: Any, state: MachineState) -> tuple[MachineState, Instant]:
@@ -362,12 +370,12 @@ class ContinuousMachine(Machine):
         return self.problem_of(inputs, observed, self.each(lambda axis: axis.scale()))
 
 
-def times(matrix: Any, x: Array) -> Array:
+def times(matrix: Array | None, x: Array) -> Array:
     """Return matrix @ x as a sum of products, which XLA compiles within one kernel."""
-    return jnp.sum(matrix * x, -1)
+    return jnp.sum(jnp.asarray(matrix) * x, -1)
 
 
-def still(axes: Sequence[Any]) -> Groups:
+def still(axes: Sequence) -> Groups:
     """Return the states of the groups, or their rates, without displacement and velocity."""
     return tuple(own._replace(plant=own.plant._replace(z=(), z_dot=())) for own in axes)
 
@@ -377,7 +385,7 @@ def loop_of(axis: Sampled | ClosedLoop) -> ClosedLoop:
     return axis.loop if isinstance(axis, Sampled) else axis
 
 
-def _with_loop(axis: Any, loop: ClosedLoop) -> Any:
+def _with_loop(axis: Sampled | ClosedLoop, loop: ClosedLoop) -> Sampled | ClosedLoop:
     return dataclasses.replace(axis, loop=loop) if isinstance(axis, Sampled) else loop
 
 
@@ -393,7 +401,7 @@ def machine_of(rotor: Rotor, axes: Sequence[Sampled | ClosedLoop], start_q: Arra
 
     Axes with the same kinds of parts form a group.
     """
-    numbers: dict[Any, list[int]] = {}
+    numbers: dict[object, list[int]] = {}
     for k, axis in enumerate(axes):
         numbers.setdefault(jax.tree.structure(axis), []).append(k)
     stacked = [jax.tree.map(lambda *x: np.stack(x), *(axes[k] for k in group)) for group in numbers.values()]

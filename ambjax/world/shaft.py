@@ -44,7 +44,7 @@ class ShaftModel(NamedTuple):
 
     - `m`, `I_t`, `I_p`: mass (kg) and moments of inertia (kg m^2). `centre`: place of the centre of mass, m.
     - `frequencies` [k]: of the free bending modes at rest, Hz.
-    - `gyroscopic` [2 + k, 2 + k]: in q'' - j W gyroscopic q' + ..., q = (x + j y, tilt, modes) with the masses m, I_t, 1.
+    - `gyroscopic` [2 + k, 2 + k]: in q'' - j W gyroscopic q' + ..., q = (x + j y, tilt, modes), masses m, I_t, 1.
     - `shapes` [places, k]: mass-normalised shapes of the modes at the given places.
     """
 
