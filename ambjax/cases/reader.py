@@ -135,8 +135,8 @@ def case_from(
     top = Table(raw)
     if is_machine(raw):
         raise ValueError(
-            "[rotor], [[bearing]]: a whole machine, and this takes one axis. `ambjax simulate` and `ambjax "
-            "sensitivity` take machines; in Python, read_machine does."
+            "[rotor], [[bearing]]: a whole machine, and this takes one axis. `ambjax simulate`, `check`, "
+            "`sensitivity` and `campbell` take machines; in Python, read_machine does."
         )
     top.only([*TABLES, *OTHERS])
     plant = _plant(top.table("plant"))

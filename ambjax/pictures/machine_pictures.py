@@ -100,3 +100,31 @@ def machine_sensitivity_picture(points: Sequence[Any], limits: Sequence[float], 
         ax.legend(fontsize="small", loc="lower right")
     figure.suptitle(title)
     figure.savefig(path, dpi=130)
+
+
+@own_style
+def campbell_picture(title: str, speeds: np.ndarray, poles: Sequence[np.ndarray], path: pathlib.Path) -> None:
+    """Write the frequencies of the poles against speed, coloured by their damping ratio, with the line of the speed.
+
+    `speeds`: rpm. `poles`: of each speed, 1/s. Unstable poles are red crosses.
+    """
+    figure = Figure(figsize=(10.0, 6.4), layout="constrained")
+    ax = figure.add_subplot()
+    points = [(speed, p.imag / (2 * np.pi), -p.real / abs(p)) for speed, own in zip(speeds, poles, strict=True)
+              for p in own if p.imag > 1e-6 * abs(p)]  # fmt: skip
+    x, y, damping = (np.array(values) for values in zip(*points, strict=True))
+    stable = damping > 0
+    shown = ax.scatter(x[stable], y[stable], c=np.log10(damping[stable]), s=9, cmap="viridis", vmin=-3, vmax=0)
+    ax.scatter(x[~stable], y[~stable], c="r", marker="x", s=18)
+    ax.plot(speeds, speeds / 60, "k--", linewidth=0.8)
+    ax.annotate("1x", (speeds[-1], speeds[-1] / 60), fontsize="small")
+    light = y[damping < 0.3]
+    ax.set_ylim(0, 1.15 * max(float(np.max(light, initial=0.0)), speeds[-1] / 60))
+    ax.set_xlabel("speed, rpm")
+    ax.set_ylabel("frequency of the pole, Hz")
+    bar = figure.colorbar(shown, ticks=[-3, -2, -1, 0])
+    bar.ax.set_yticklabels(["0.001", "0.01", "0.1", "1"])
+    bar.set_label("damping ratio")
+    ax.grid(True, alpha=0.3)
+    ax.set_title(f"{title}: poles of the closed loops" + (", unstable ones as red crosses" if not stable.all() else ""))
+    figure.savefig(path, dpi=130)

@@ -87,7 +87,8 @@ class InitialValueProblem(NamedTuple, Generic[Inputs, State]):
             beyond = a + share * (slope_a + share * (curve + share * twist)) - self.limit
             slope = away_from_zero(slope_a + share * (2 * curve + share * 3 * twist), 1e-30)
             share = jnp.clip(share - beyond / slope, 0.0, 1.0)
-        share = jnp.min(jnp.where(b < self.limit, 1.0, share))  # of several axes, the first that reaches its limit
+        if jnp.ndim(share):  # the first axis that reaches its limit
+            share = jnp.min(jnp.where(b < self.limit, 1.0, share))
         crossed = (code == TOUCHED) & jnp.isfinite(share)
         return lax.stop_gradient(jnp.where(crossed, begin + share * h, end))
 
