@@ -18,7 +18,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 Carry = TypeVar("Carry")
-Values = Sequence[Any]
+Values = Sequence[Array]
 
 KEPT = 32
 
@@ -113,8 +113,8 @@ class _Varied(NamedTuple):
             )
             return after, d_after
 
-        begin = list(begin), list(real)
-        return while_loop(lambda both: self.loop.unfinished(constants, both[0]), step, begin)[1]
+        first = list(begin), list(real)
+        return while_loop(lambda both: self.loop.unfinished(constants, both[0]), step, first)[1]
 
     def backwards(self, constants: Values, begin: Values, d_end: list[Array]) -> tuple[list[Array], list[Array]]:
         """Return the cotangents of the constants and of the carry at the begin, from those of the carry at the end."""
@@ -148,7 +148,7 @@ class _Varied(NamedTuple):
         return lax.fori_loop(0, -(-total // KEPT), part, ([jnp.zeros_like(constants[n]) for n in self.moving], d_end))
 
 
-def _replaced(values: Values, numbers: list[int], new: Values) -> list[Any]:
+def _replaced(values: Values, numbers: list[int], new: Values) -> list[Array]:
     replaced = list(values)
     for n, x in zip(numbers, new, strict=True):
         replaced[n] = x
@@ -166,11 +166,11 @@ def _grouped(args: Values, sizes: tuple[int, int, int]) -> list[Values]:
     return [args[a:b] for a, b in itertools.pairwise(ends)]
 
 
-def _forwards(*args: Any, forwards: Any, backwards: Any, sizes: tuple[int, int, int]) -> list[Any]:
+def _forwards(*args: Any, forwards: Any, backwards: Any, sizes: tuple[int, int, int]) -> list[Array]:
     return forwards(*map(list, _grouped(args, sizes)))
 
 
-def _shapes(*args: Any, sizes: tuple[int, int, int], **_: Any) -> list[Any]:
+def _shapes(*args: Array, sizes: tuple[int, int, int], **_: Any) -> list[Array]:
     return list(args[sum(sizes) :])
 
 
@@ -178,7 +178,7 @@ def _jvp(primals: Values, tangents: Values, **how: Any) -> tuple[list[Any], list
     return jax.jvp(lambda *x: _forwards(*x, **how), tuple(primals), tuple(ad.instantiate_zeros(x) for x in tangents))
 
 
-def _transpose(cotangents: Values, *args: Any, forwards: Any, backwards: Any, sizes: tuple[int, int, int]) -> list[Any]:
+def _transpose(cotangents: Values, *args: Any, forwards: Any, backwards: Any, sizes: tuple[int, int, int]) -> list[Array | None]:
     constants, begin, _, _ = _grouped(args, sizes)
     d_constants, d_begin = backwards(list(constants), list(begin), [ad.instantiate_zeros(x) for x in cotangents])
     return [None] * (len(constants) + len(begin)) + [*d_constants, *d_begin]
