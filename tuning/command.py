@@ -8,7 +8,7 @@ import numpy as np
 
 from ambjax.cases.reader import Case, read_case
 from ambjax.cases.table import one_line
-from ambjax.commands.warnings import print_warnings
+from ambjax.commands.reading import print_warnings
 from ambjax.host.interrupts import reporting
 from ambjax.host.lock import locked
 from ambjax.page.html_page import NAME

@@ -9,9 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ambjax.cases.forces import forces
 from ambjax.cases.reader import Case
-from ambjax.commands.acceptance import acceptance, forces
-from ambjax.commands.warnings import idealised, read_with_warnings
+from ambjax.cases.warned import idealised
+from ambjax.commands.acceptance import acceptance
+from ambjax.commands.reading import read_with_warnings
 from ambjax.control.cascade import Cascade
 from ambjax.linear.stability import Findings, stability_of
 from ambjax.results.outputs import plain, say, table

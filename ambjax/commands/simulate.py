@@ -9,7 +9,8 @@ import numpy as np
 from tqdm import tqdm
 
 from ambjax.cases.reader import Case
-from ambjax.commands.warnings import read_with_warnings, reversal
+from ambjax.cases.warned import reversal
+from ambjax.commands.reading import read_with_warnings
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.replay import Replay, replay
 from ambjax.ensemble.study import Study

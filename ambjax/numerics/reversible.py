@@ -178,10 +178,12 @@ def _jvp(primals: Values, tangents: Values, **how: Any) -> tuple[list[Any], list
     return jax.jvp(lambda *x: _forwards(*x, **how), tuple(primals), tuple(ad.instantiate_zeros(x) for x in tangents))
 
 
-def _transpose(cotangents: Values, *args: Any, forwards: Any, backwards: Any, sizes: tuple[int, int, int]) -> list[Array | None]:
+def _transpose(
+    cotangents: Values, *args: Any, forwards: Any, backwards: Any, sizes: tuple[int, int, int]
+) -> list[Array | None]:
     constants, begin, _, _ = _grouped(args, sizes)
     d_constants, d_begin = backwards(list(constants), list(begin), [ad.instantiate_zeros(x) for x in cotangents])
-    return [None] * (len(constants) + len(begin)) + [*d_constants, *d_begin]
+    return [*[None] * (len(constants) + len(begin)), *d_constants, *d_begin]
 
 
 def _batched(args: Values, axes: Values, *, forwards: Any, backwards: Any, sizes: Any) -> tuple[list[Any], list[int]]:
