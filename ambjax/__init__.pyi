@@ -7,7 +7,7 @@ from ambjax.cases.controller_file import save_controller as save_controller
 from ambjax.cases.machine_case import MachineCase as MachineCase
 from ambjax.cases.machine_case import read_machine as read_machine
 from ambjax.cases.reader import Case as Case
-from ambjax.cases.reader import read_case as read_case
+from ambjax.cases.warned import read_case as read_case
 from ambjax.control import current as current
 from ambjax.control import inversion as inversion
 from ambjax.control import observer as observer

@@ -23,8 +23,8 @@ from ambjax.__main__ import main, parser
 from ambjax.cases.reader import case_from, read_case
 from ambjax.cases.template_text import template
 from ambjax.cases.tune_table import Budget
+from ambjax.cases.warned import idealised, reversal, warnings_of
 from ambjax.commands import simulate
-from ambjax.commands.warnings import idealised, reversal, warnings_of
 from ambjax.control.processor import Processor
 from ambjax.ensemble import LogUniform
 from ambjax.numerics.declared import within

@@ -454,11 +454,6 @@ def test_the_help_of_a_law_lists_its_declared_fields():
     )
 
 
-def test_the_method_is_not_chosen_from_traced_gains():
-    with pytest.raises(ValueError, match="with_method"):
-        jax.jit(lambda c: rollout(c, TRACKING, Clock(10, 1e-4)))(REPAIRED)
-
-
 # --- float32 ---
 
 IN_FLOAT32 = """

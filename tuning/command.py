@@ -9,7 +9,7 @@ import numpy as np
 
 from ambjax.cases.reader import Case, read_case, require_file
 from ambjax.cases.table import one_line
-from ambjax.commands.warnings import print_warnings
+from ambjax.commands.reading import print_warnings
 from ambjax.host.arguments import names_arguments
 from ambjax.host.interrupts import reporting
 from ambjax.host.lock import locked

@@ -101,7 +101,7 @@ def machine_from(
     rotor = rotor_from(top, body, axes, folder)
     q, currents = _start(top.table("initial"), rotor, len(axes))
     _check_rank(rotor, axes)
-    masses, forces = _shares(rotor, axes)
+    masses, forces = _shares(rotor)
     cases = []
     for axis, m, force, i in zip(axes, masses, forces, currents, strict=True):
         own = _axis_raw(raw, bearings[axis.bearing], m, force, {"z": float(axis.magnet @ q), "i": i})
@@ -170,11 +170,12 @@ def _check_rank(rotor: Rotor, axes: list[BearingAxis]) -> None:
             )
 
 
-def _shares(rotor: Rotor, axes: list[BearingAxis]) -> tuple[np.ndarray, np.ndarray]:
+def _shares(rotor: Rotor) -> tuple[list[float], list[float]]:
     """Return the mass (kg) and the weight (N) that each axis carries [c]: 1/(b M^-1 b), and least-norm forces."""
-    B, M = np.asarray(rotor.at_magnets)[:, :RIGID], np.asarray(rotor.M)[:RIGID, :RIGID]
-    masses = 1 / np.sum(B * np.linalg.solve(M, B.T).T, 1)
-    return masses, np.linalg.pinv(B.T) @ -np.asarray(rotor.gravity)[:RIGID]
+    B, M, gravity = (np.asarray(x, np.float64) for x in (rotor.at_magnets, rotor.M, rotor.gravity))
+    B = B[:, :RIGID]
+    masses = 1 / np.sum(B * np.linalg.solve(M[:RIGID, :RIGID], B.T).T, 1)
+    return masses.tolist(), (np.linalg.pinv(B.T) @ -gravity[:RIGID]).tolist()
 
 
 def _check_force(case: Case, axis: BearingAxis, force: float) -> None:

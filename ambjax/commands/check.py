@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ambjax.cases.forces import forces
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
+from ambjax.cases.warned import idealised
 from ambjax.commands import machine_check
-from ambjax.commands.acceptance import acceptance, forces
-from ambjax.commands.warnings import idealised, read_any_with_warnings
+from ambjax.commands.acceptance import acceptance
+from ambjax.commands.reading import read_any_with_warnings
 from ambjax.control.cascade import Cascade
 from ambjax.linear.stability import Findings, stability_of
 from ambjax.results.outputs import plain, say, table

@@ -7,8 +7,8 @@ from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reach import largest
 from ambjax.cases.reader import Case
 from ambjax.commands import machine_commands
+from ambjax.commands.reading import read_any_with_warnings
 from ambjax.commands.sensitivity_report import Injections, sensitivity_summary, set_valued, text_of
-from ambjax.commands.warnings import read_any_with_warnings
 from ambjax.ensemble.study import Study
 from ambjax.linear import Injection, frequency_lines, injected
 from ambjax.linear.multisine import Reading

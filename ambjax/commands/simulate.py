@@ -10,8 +10,9 @@ from tqdm import tqdm
 
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
+from ambjax.cases.warned import reversal
 from ambjax.commands import machine_commands
-from ambjax.commands.warnings import read_any_with_warnings, reversal
+from ambjax.commands.reading import read_any_with_warnings
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.replay import Replay, replay
 from ambjax.ensemble.study import Study
