@@ -313,7 +313,7 @@ def test_one_axis_and_a_machine_are_not_confused(tmp_path):
     alone.write_text(template("bearing"))
     with pytest.raises(ValueError, match="whole machine, and this takes one axis"):
         read_case(whole)
-    with pytest.raises(ValueError, match="case of one axis"):
+    with pytest.raises(ValueError, match="so it is a case of one axis"):
         read_machine(alone)
     assert case_from(tomllib.loads(alone.read_text())).scenario.plant.m == 2.4
     assert pathlib.Path(whole).exists()

@@ -70,7 +70,11 @@ def read_machine(path: str | pathlib.Path) -> MachineCase:
     """Read and check the case file of a machine. Raises ValueError, one line, for an invalid file."""
     case = read_any(path)
     if isinstance(case, Case):
-        raise ValueError(one_line(f"{path}: it has no [rotor] with a kind: it is the case of one axis. Use read_case."))
+        raise ValueError(
+            one_line(
+                f"{path}: it has no [rotor] with a kind, so it is a case of one axis; in Python, read_case reads it."
+            )
+        )
     return case
 
 
