@@ -347,7 +347,7 @@ def test_a_search_that_does_not_move_and_holds_the_limits_ends(monkeypatch):
     problem = study(monkeypatch, World(), limits={"rms_u_V": 20 / 0.9995, "margin": 0.002})
     course, starts = Course(problem, training(problem), 1), []
     course.past.append(SimpleNamespace(interrupted=False))
-    monkeypatch.setattr(course, "search", lambda points: (starts.append(points) or points[0], 0.0))
+    monkeypatch.setattr(course, "search", lambda points: starts.append(points) or points[0])
     best = np.asarray(problem.objective.space.encode(np.array(World.best)))
     x, within = search_within_limits(course, best)
     np.testing.assert_array_equal(x, best)
@@ -371,7 +371,7 @@ def test_the_best_answer_within_the_limits_is_taken_if_the_multipliers_do_not_co
         for k in (20.0, 22.0, 25.0, 45.0, 60.0)
     }
     found = iter(ends[1:])
-    monkeypatch.setattr(course, "search", lambda points: (at[next(found)], 0.0))
+    monkeypatch.setattr(course, "search", lambda points: at[next(found)])
     x, within = search_within_limits(course, at[ends[0]])
     np.testing.assert_array_equal(x, at[25.0])
     assert within

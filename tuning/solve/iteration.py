@@ -41,7 +41,7 @@ def iterate(
     better = _descended(engine, goal, members, progress, descent, weights) | _evolved(
         engine, goal, members, progress, seed
     )
-    append_history(engine, goal, members, progress, better, fresh=fresh)
+    _append_history(engine, goal, members, progress, better, fresh=fresh)
 
 
 def _descended(
@@ -95,7 +95,7 @@ def _evolved(
     return better
 
 
-def append_history(
+def _append_history(
     engine: Engine,
     goal: Goal,
     members: Members,
