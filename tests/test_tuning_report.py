@@ -21,16 +21,13 @@ from ambjax.simulation.metrics import Standard
 from ambjax.simulation.trajectory import STALLED, TOUCHED
 from ambjax.text.web_page import escape_markdown, render_page
 from tuning.__main__ import main
-from tuning.judge.evaluate import judge
 from tuning.problem.config import seeds
 from tuning.problem.goal import shown
 from tuning.problem.lanes import Engine
-from tuning.problem.loss import TERMS, weigh
-from tuning.report import accurate, breakdown, held_out, pictures
+from tuning.report import accurate, held_out, pictures
 from tuning.report import document as report
 from tuning.report.facts import SUMMARY_METRICS
-from tuning.report.slices import REACH, Slices, slices
-from tuning.rounds import training
+from tuning.report.slices import REACH, Slices
 
 CASE = """
 [reference]
@@ -97,69 +94,7 @@ def cells(text, heading):
     return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines if "---" not in line]
 
 
-# --- what adds up --------------------------------------------------------------------------------------------------
-
-
-def test_the_sum_of_the_terms_is_the_loss():
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        weights = rng.uniform(0, 3, len(TERMS))
-        terms = {name: rng.lognormal(0, 2, 50) for name in TERMS}
-        whole = weigh(weights, terms, np.zeros(50, bool))
-        # the same products, added in another order: rounding only
-        np.testing.assert_allclose(sum(breakdown.contributions(weights, terms).values()), whole, rtol=1e-13)
-
-
-@pytest.mark.slow
-def test_the_rows_of_the_loss_table_add_up_to_its_total(written):
-    text = (written / "report.md").read_text()
-    facts = json.loads((written / "report.json").read_text())
-    assert breakdown.FORMULA in text
-    head, *rows = cells(text, "The loss of the held-out members")
-    terms, total, risk = rows[: len(TERMS)], rows[len(TERMS)], rows[len(TERMS) + 1]
-    assert [row[0] for row in terms] == list(TERMS)
-    for when in ("before", "after"):
-        mean, adds = (head.index(f"{word} {when}") for word in ("mean", "contribution"))
-        shown = sum(float(row[adds]) for row in terms)
-        # of six numbers and their sum, each is rounded to five digits
-        assert shown == pytest.approx(float(total[adds].strip("*")), rel=7 * 0.5e-4)
-        for row in terms:
-            if row[0] not in ("effort", "chatter"):
-                assert float(row[adds]) == pytest.approx(float(row[1]) * float(row[mean]), rel=2e-4)
-        assert float(risk[adds]) == pytest.approx(facts["loss"][when]["risk"], rel=1e-4)
-        # the mean of the worst tenth is no less than the mean
-        assert facts["loss"][when]["risk"] >= facts["loss"][when]["loss"] * (1 - 1e-12)
-
-
-@pytest.mark.slow
-def test_the_loss_table_agrees_with_the_losses_of_the_judged_members(study, x):
-    found = judge(study, x, seeds(study.tune.budget)[2], 12)
-    terms = breakdown.loss_breakdown(study.goal, found)
-    losses = weigh(study.goal.weights, {name: found[f"loss.{name}"] for name in TERMS}, np.zeros(12, bool))
-    assert terms["loss"] == pytest.approx(losses.mean(), rel=1e-12)
-    assert terms["risk"] == pytest.approx(float(study.goal.risk(jnp.asarray(losses))), rel=1e-12)
-    # the mean of a product is not the product of the means, so the row alone does not determine what effort adds
-    assert terms["adds"]["effort"] == pytest.approx(
-        np.mean(0.1 * found["loss.effort"] * (found["loss.tracking"] + 0.5 * found["loss.peak"])), rel=1e-12
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("conditions", [0.0, 1.0])
-def test_the_minimised_value_in_the_report_is_the_goal(conditions):
-    # gamma far below Delta_1 of this reference, so that the conditions' penalty counts
-    few = problem_from(CASE.replace("3e5", "1e3").replace('["controller.position.c", "controller.position.k"]',
-                                                        '["controller.inversion.gamma"]'),
-                     weights={"conditions": conditions, "peak": 0.5})  # fmt: skip
-    members = training(few)
-    at = few.objective.space.encode(few.tune.space.values(few.case.cascade))
-    parts = breakdown.minimised(few, at, members)
-    goal = few.goal.score(at[None], few.engine.terms(at[None], members), members)[0]
-    assert math.log(parts["total"]) == pytest.approx(goal, rel=1e-9)
-    whole = (parts["risk"] + parts["held"]) * parts["penalty"] * parts["limits"]
-    assert parts["total"] == pytest.approx(whole, rel=1e-12)
-    assert (parts["ordinary"], parts["survival_only"]) == (4, 2)
-    assert (parts["penalty"] > 1) == (conditions > 0)
+# --- slices ---
 
 
 def test_the_lowest_point_of_the_slices_loses_no_more_members():
@@ -184,12 +119,6 @@ def test_a_lower_point_on_a_slice_is_reported():
     assert "within the tolerance of the search" in report._lower_point(beside)
     beside["lower"] = 0.0
     assert "No point of these slices has a lower objective" in report._lower_point(beside)
-
-
-def test_the_picture_of_the_convergence_starts_at_the_minimised_value_of_the_table(study, x):
-    members = training(study)
-    found, parts = slices(study, x, members), breakdown.minimised(study, x, members)
-    np.testing.assert_allclose(np.exp(found.goals[:, len(REACH) // 2]), parts["total"], rtol=1e-9)
 
 
 # --- accurate steps ------------------------------------------------------------------------------------------------
@@ -411,10 +340,6 @@ def test_ranges_and_their_sources_are_in_the_table():
     table = "\n".join(report._gains(facts))
     assert "| controller.position.c | 1 | 2 | 0.5 | 20 | 0 | 30 | - | 3 % |" in table
     assert "- controller.position.c: w/30 to 10 w" in table
-
-
-def test_the_formula_contains_every_term_once():
-    assert sorted(re.findall(r"[a-z]{2,}", breakdown.FORMULA)) == sorted(TERMS)
 
 
 def test_a_goal_far_from_its_limits_is_shown_without_overflow():

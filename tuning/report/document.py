@@ -5,9 +5,7 @@ from collections.abc import Callable
 
 from ambjax.results.outputs import described
 from ambjax.text.web_page import escape_markdown, markdown_table
-from tuning.problem.loss import TERMS
 from tuning.report import answer, front_table, held_out, limit_table, sensitivity_table
-from tuning.report.breakdown import FORMULA
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.held_out import number_text
 
@@ -77,60 +75,19 @@ def _sensitivity(row: Row, facts: TuningFacts) -> str:
     return "-" if row["sensitivity_percent"] is None else f"{row['sensitivity_percent']:.3g} %"
 
 
-def _loss(facts: TuningFacts) -> list[str]:
-    """Return the section on the terms of the loss of the held-out members."""
-    if not facts.loss:
+def _objective(facts: TuningFacts) -> list[str]:
+    """Return the section on the objective around the answer."""
+    if facts.beside is None:
         return []
-    before, after = facts.loss["before"], facts.loss["after"]
-    rows = [
-        [name, f"{weight:g}"]
-        + [f"{x[what][name]:.4e}" for x in (before, after) for what in ("mean", "adds")]
-        for name, weight in zip(TERMS, facts.weights, strict=True)
-    ]  # fmt: skip
-    head = ["term", "weight", "mean before", "contribution before", "mean after", "contribution after"]
-    rows.append(["**loss, the sum**", "", "", f"{before['loss']:.4e}", "", f"**{after['loss']:.4e}**"])
-    risk = facts.search["risk"]
-    if risk != "mean":
-        rows.append([f"risk: {risk} of the losses", "", "", f"{before['risk']:.4e}", "", f"{after['risk']:.4e}"])
     return [
-        "## The loss of the held-out members",
+        "## Objective along each gain",
         "",
-        f"Loss of a member: `{FORMULA}`, each term times its weight. The columns are means over members. Tracking, "
-        "peak, clearance and survival add weight x mean to the loss. Effort and chatter multiply the error of each "
-        "member: they add the mean of weight x term x (tracking + peak), which is not the product of the means shown.",
-        "",
-        *markdown_table(head, rows),
-        "",
-    ]
-
-
-def _minimised(facts: TuningFacts) -> list[str]:
-    """Return the section on the objective that the search minimised."""
-    parts = facts.minimised
-    if not parts:
-        return []
-    words = f"over {parts['ordinary']} members (seed {facts.search['seed']})"
-    rows = [[f"risk: {parts['of']} {words}", f"{parts['risk']:.4e}"]]
-    if parts["survival_only"]:
-        label = f"+ mean of (clearance + survival) over {parts['survival_only']} stressed members"
-        rows.append([label, f"{parts['held']:.4e}"])
-    rows.append(["x penalty of the theorem's conditions", f"{parts['penalty']:.6g}"])
-    if parts["limits"] != 1:
-        rows.append(["x factor of the limits", f"{parts['limits']:.6g}"])
-    rows.append(["**= objective**", f"**{parts['total']:.4e}**"])
-    return [
-        "## Objective of the search",
-        "",
-        "Stressed members have more noise, and gains that are changed by a factor. Members that were lost in the "
-        "validation or with accurate steps have joined them. All of these must be held, but their error does not "
-        "count. The objective therefore differs from the loss of the held-out members above. The picture shows the "
-        "objective.",
-        "",
-        *markdown_table(["at the answer", "value"], rows),
+        "The objective is that of the search: stressed members must be held, but their error does not count.",
         "",
         "![Objective along each gain, through the answer](slices.png)",
         "",
-        *([] if facts.beside is None else [_lower_point(facts.beside), ""]),
+        _lower_point(facts.beside),
+        "",
     ]
 
 
@@ -192,8 +149,7 @@ SECTIONS: dict[str, Callable[[TuningFacts], list[str]]] = {
     "the sensitivity": lambda facts: sensitivity_table.section(facts.sensitivity),
     "the gains": _gains,
     "the held-out members": held_out.section,
-    "the loss": _loss,
-    "the objective": _minimised,
+    "the objective": _objective,
     "the conditions of Theorem 1": _conditions,
     "the search": _course,
 }

@@ -18,7 +18,7 @@ from tuning.judge.late import delay_test
 from tuning.judge.peaks import injections
 from tuning.problem.config import seeds, settings
 from tuning.problem.tuning_problem import TuningProblem
-from tuning.report import accurate, breakdown, front_table, limit_table, outcome, sensitivity_table
+from tuning.report import accurate, front_table, limit_table, outcome, sensitivity_table
 from tuning.report.facts import SUMMARY_METRICS, Row, TuningFacts
 from tuning.report.slices import Slices
 from tuning.report.slices import slices as slices_through
@@ -42,14 +42,12 @@ def examined(answer: SearchResult, front_written: bool, tell: Tell) -> tuple[Tun
     steps = _checked(answer, judged["after"], held_out, tell)
     found = {
         "case": problem.case.name,
-        "weights": list(problem.tune.weights),
         "held_out_seed": held_out,
         "trained_on": len(members.member),
         "lost_in_validation": answer.lost,
         **_ensembles(answer, judged, steps[2], held_out, tell),
         **_steps(answer, *steps),
         **(described("the conditions of Theorem 1", lambda: _conditions(problem, x)) or NO_CONDITIONS),
-        "minimised": described("the objective in parts", lambda: breakdown.minimised(problem, x, members)),
         "search": settings(problem.tune)
         | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": answer.seconds},
         "front_written": front_written,
@@ -97,15 +95,10 @@ def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_
     found["limits"] = limit_table.facts(problem, after, found["after"], refuted, measured, late)
     if refuted and after:
         found["after"] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
-    found["loss"] = described("the loss of the held-out members", lambda: _losses(problem, judged)) or {}
     found["worst_member"] = described("the worst member", lambda: worst(problem, after, held_out)) if after else None
     found["stability"] = _stability(problem, answer.x, held_out, after, tell) if after else None
     lost = problem.engine.terms(answer.x[None], answer.members)["survival"] > 0
     return found | {"lost_in_training": int(lost.sum())}
-
-
-def _losses(problem: TuningProblem, judged: dict[str, Any]) -> Row:
-    return {name: breakdown.loss_breakdown(problem.error_goal, one) for name, one in judged.items() if one}
 
 
 def _stability(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray], tell: Tell) -> Row:
