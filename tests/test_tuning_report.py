@@ -87,6 +87,9 @@ def written(tmp_path_factory):
     return folder / "out"
 
 
+DRAWN = ("before", "after", "spectrum", "convergence", "slices", "front")
+
+
 def cells(text, heading):
     """Rows of the first Markdown table below a heading, cells as text."""
     below = text.partition(f"## {heading}")[2].lstrip("\n")
@@ -236,7 +239,7 @@ def test_wide_content_scrolls_in_its_own_box(written):
     assert '<meta name="viewport" content="width=device-width,initial-scale=1">' in shown
     assert re.search(r"\.wide\{[^}]*overflow-x:auto", shown)
     assert shown.count("<table>") == shown.count('<div class="wide"><table>') > 4
-    assert shown.count("<img ") == shown.count('<span class="wide"><img ') == 5
+    assert shown.count("<img ") == shown.count('<span class="wide"><img ') == 6
     assert 'src="data:image/png;base64,' in shown
     # the page needs no other file; the data of a picture may contain these letters by chance
     assert "http" not in re.sub(r"base64,[^\"]*", "", shown)
@@ -279,53 +282,20 @@ def test_the_page_does_not_scroll_sideways(written, tmp_path, width):
 
 def test_the_pictures_of_the_report_are_in_its_folder(written):
     named = re.findall(r"!\[.*?\]\((.*?)\)", (written / "report.md").read_text())
-    assert sorted(named) == ["convergence.png", "front.png", "nominal.png", "slices.png", "spectrum.png"]
+    assert sorted(named) == sorted(f"{name}.png" for name in DRAWN)
     for name in named:
         assert (written / name).read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_picture_accepts_lost_rotors(study):
+def test_the_legend_of_the_spectrum_says_why_a_run_has_none(study, monkeypatch):
     run = accurate.nominal(study, study.case.cascade)
-    assert not math.isfinite(float(run.lost_at))
-    assert len(np.asarray(run.rows.t)) == study.case.clock.samples
-    for at in (0.0, 0.01):
-        alive = np.asarray(run.rows.t) < at
-        lost = dataclasses.replace(run, lost_at=at, lost_code=TOUCHED, rows=run.rows._replace(alive=alive))
-        assert pictures.before_after({"before": lost, "after": run}).startswith(b"\x89PNG")
-
-
-def test_a_run_lost_before_tuning_is_reported_in_one_line(study, monkeypatch):
-    run = accurate.nominal(study, study.case.cascade)
-    held = dataclasses.replace(run, lost_at=math.inf, lost_code=0)
-    lost = dataclasses.replace(run, lost_at=0.003, lost_code=TOUCHED)
-    monkeypatch.setattr(pictures, "_png", lambda figure: figure)
-    figure = pictures.before_after({"before": lost, "after": held})
-    assert figure.get_suptitle() == "before tuning: touched down at 0.003 s"
-    assert len(figure.axes) == 2 * 3
-    figure = pictures.before_after({"before": held, "after": lost})  # why the answer is lost must be seen
-    assert len(figure.axes) == 4 * 3
-
-
-def test_each_row_of_the_picture_shows_the_run_of_its_label(study, monkeypatch):
-    before = accurate.nominal(study, study.case.cascade)
-    rows = before.rows
-    other = dataclasses.replace(
-        before, rows=rows._replace(z=rows.r - 3 * (rows.z - rows.r) ** 2, u_mean=-(rows.u_mean**3))
-    )
-    monkeypatch.setattr(pictures, "_png", lambda figure: figure)
-    axes = np.reshape(pictures.before_after({"before": before, "after": other}).axes, (4, 3))
-    shown = [before.rows.e_z, other.rows.e_z, before.rows.u_mean, other.rows.u_mean]
-    for row, name, values in zip(axes, ("before", "after") * 2, shown, strict=True):
-        assert row[0].get_ylabel().startswith(name)
-        drawn, values = row[0].lines[0].get_ydata(), np.asarray(values)
-        # in another unit; 200 samples are not thinned
-        np.testing.assert_allclose(drawn / np.abs(drawn).max(), values / np.abs(values).max(), rtol=1e-12)
-    stalled = dataclasses.replace(before, lost_code=STALLED, rows=rows._replace(alive=np.asarray(rows.t) < 0.005))
+    stalled = dataclasses.replace(run, lost_code=STALLED, rows=run.rows._replace(alive=np.asarray(run.rows.t) < 0.005))
     lost = dataclasses.replace(stalled, lost_code=TOUCHED)
-    runs = {"before": lost, "after": stalled, "held": before}
+    monkeypatch.setattr(pictures, "_png", lambda figure: figure)
+    runs = {"before": lost, "after": stalled, "held": run}
     entries = pictures.spectrum(runs, 0.01).axes[0].get_legend().get_texts()
     assert [one.get_text() for one in entries] == ["before: lost before 0.01 s", "after: stalled before 0.01 s", "held"]
-    entries = pictures.spectrum({"held": before}, float(before.rows.t[-5])).axes[0].get_legend().get_texts()
+    entries = pictures.spectrum({"held": run}, float(run.rows.t[-5])).axes[0].get_legend().get_texts()
     assert entries[0].get_text().startswith("held: fewer than 16 samples after ")
 
 

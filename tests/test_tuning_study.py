@@ -416,8 +416,8 @@ def test_the_pictures_show_the_case_and_the_tuned_laws(monkeypatch):
     monkeypatch.setattr(tuning.report.folder.accurate, "nominal", lambda _, cascade: float(cascade.position.c))
     for name in ("convergence", "landscape"):
         monkeypatch.setattr(tuning.report.folder.pictures, name, lambda *_: b"")
-    for name in ("before_after", "spectrum"):
+    for name in ("nominal", "spectrum"):
         monkeypatch.setattr(tuning.report.folder.pictures, name, lambda runs, *_: runs)
     drawn = tuning.report.folder._pictures(made, tuned, None, None, None)
     wanted = {"before": float(made.case.cascade.position.c), "after": pytest.approx(80.0)}
-    assert drawn["nominal.png"] == drawn["spectrum.png"] == wanted
+    assert {name: drawn[f"{name}.png"] for name in wanted} == drawn["spectrum.png"] == wanted

@@ -58,7 +58,9 @@ def _gains(facts: TuningFacts) -> list[str]:
         "",
         f"The nominal run of the case, without `[spread]`, {facts.nominal_steps}. u is averaged over each sample.",
         "",
-        "![z - r and u before and after tuning](nominal.png)",
+        "![z - r and u before tuning](before.png)",
+        "",
+        "![z - r and u after tuning](after.png)",
         "",
         "Amplitude spectrum of the voltage from `run.settle` on (Hann window). A sine with an amplitude of 1 V has a "
         "peak of 1 V.",

@@ -90,8 +90,9 @@ def _pictures(
         if run is not None:
             shown[name] = run
     draw = {"convergence.png": lambda: pictures.convergence(history, paths)}
+    for name, run in shown.items():
+        draw[f"{name}.png"] = functools.partial(pictures.nominal, run, f"{name} tuning", settle)
     if shown:
-        draw["nominal.png"] = lambda: pictures.before_after(shown, settle)
         draw["spectrum.png"] = lambda: pictures.spectrum(shown, settle)
     if slices is not None:
         draw["slices.png"] = lambda: pictures.landscape(slices, paths)
