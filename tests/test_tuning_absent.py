@@ -22,8 +22,8 @@ from tuning.__main__ import main
 from tuning.judge.peaks import UNSTABLE
 from tuning.report import document as report
 from tuning.report import judging, pictures
-from tuning.report.answer import _sensitivity as sensitivity_line
 from tuning.report.outcome import outcome_of, outcome_text
+from tuning.report.sensitivity_table import line as sensitivity_line
 
 # --- one member's peak of |S| --------------------------------------------------------------------------------------
 
@@ -78,18 +78,18 @@ def sensitivities():
 
 
 @pytest.mark.parametrize("kind", SAID)
-def test_the_printed_peak_is_the_one_that_counts(kind, facts):
+def test_the_printed_peak_is_the_one_that_counts(kind):
     linear, injected, decides = kind
     found = {"members": [peak_of(linear, injected)], "decides": decides}
-    assert SAID[kind] in sensitivity_line(dataclasses.replace(facts, sensitivity=found))
+    assert SAID[kind] in sensitivity_line(found)
 
 
 @pytest.mark.parametrize("decides", [False, True])
 @pytest.mark.parametrize("linear", LINEAR)
 @pytest.mark.parametrize("injected", ["one of two lost", "all lost"])
-def test_a_member_that_is_lost_in_an_injection_has_no_peak(linear, injected, decides, facts):
+def test_a_member_that_is_lost_in_an_injection_has_no_peak(linear, injected, decides):
     found = {"members": [peak_of(linear, injected)], "decides": decides}
-    assert LOST_WORDS in sensitivity_line(dataclasses.replace(facts, sensitivity=found))
+    assert LOST_WORDS in sensitivity_line(found)
 
 
 # --- every combination of facts ------------------------------------------------------------------------------------
@@ -198,10 +198,10 @@ NAMES = {
 }  # fmt: skip
 # What fails, and the files that are then missing. Functions of the tuner by module and name.
 FAILING = {
-    "tuning.report.answer.prices": set(),
+    "tuning.report.document.prices": set(),
     "tuning.report.document._gains": set(),
     "tuning.report.limit_table.section": set(),
-    "tuning.report.accurate.nominal": {"before.png", "after.png", "spectrum.png"},
+    "tuning.report.folder.nominal": {"before.png", "after.png", "spectrum.png"},
     "tuning.report.pictures.nominal": {"before.png", "after.png"},
     "tuning.report.pictures.spectrum": {"spectrum.png"},
     "tuning.report.pictures.convergence": {"convergence.png"},
@@ -228,7 +228,7 @@ DRAWN = ("nominal", "spectrum", "convergence", "landscape", "front")
 def lenient(monkeypatch):
     """An error in a description does not end the command. Nothing is drawn: that takes most of the time."""
     monkeypatch.setattr(outputs, "STRICT", False)
-    monkeypatch.setattr("tuning.report.accurate.nominal", lambda *_: object())
+    monkeypatch.setattr("tuning.report.folder.nominal", lambda *_: object())
     for name in DRAWN:
         monkeypatch.setattr(pictures, name, lambda *_: b"\x89PNG")
 

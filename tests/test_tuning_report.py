@@ -24,9 +24,8 @@ from tuning.__main__ import main
 from tuning.problem.config import seeds
 from tuning.problem.goal import shown
 from tuning.problem.lanes import Engine
-from tuning.report import accurate, held_out, pictures
 from tuning.report import document as report
-from tuning.report.facts import SUMMARY_METRICS
+from tuning.report import folder, held_out, pictures
 from tuning.report.slices import REACH, Slices
 
 CASE = """
@@ -133,11 +132,11 @@ def test_accurate_values_agree_with_adaptive_rollouts():
     study.__dict__["judging"] = study.engine
     x = study.objective.space.encode(study.tune.space.values(study.case.cascade))
     seed = seeds(study.tune.budget)[2]
-    compared = accurate.compare_steps(study, x, seed, 12, SUMMARY_METRICS)
-    assert (compared["members"], compared["held"]) == (accurate.COMPARED, accurate.COMPARED)
+    compared = held_out.compare_steps(study, x, seed, 12)
+    assert (compared["members"], compared["held"]) == (held_out.COMPARED, held_out.COMPARED)
     assert abs(compared["metrics"]["settled_rms_error_m"]["relative"]) > 1e-3
     found = []
-    for k in range(accurate.COMPARED):
+    for k in range(held_out.COMPARED):
         one = study.objective.chosen(seed, np.array([k]), 12)
         cascade, scenario = study.objective.world(type(one)(*({p: v[0] for p, v in field.items()} if isinstance(
             field, dict) else field[0] for field in one)))  # fmt: skip
@@ -161,41 +160,24 @@ def test_accurate_steps_compared_with_themselves_have_no_error(study, x):
     engine = Engine(objective, settle=study.case.settle, lanes=4)
     same = dataclasses.replace(study)
     same.__dict__["judging"] = engine
-    compared = accurate.compare_steps(same, x, 5, 3, SUMMARY_METRICS)
+    compared = held_out.compare_steps(same, x, 5, 3)
     assert compared["members"] == 3
     assert {row["relative"] for row in compared["metrics"].values()} == {0.0}
     assert compared["lost"] == {"report": 0, "accurate": 0}
 
 
-def test_large_differences_are_marked():
-    again = {
-        "members": 8, "held": 8, "marked_beyond": 0.05, "lost": {"report": 0, "accurate": 2},
-        "metrics": {"a": {"report": 1.04, "accurate": 1.0, "relative": 0.04},
-                    "b": {"report": 1.47, "accurate": 1.0, "relative": 0.47}},
-    }  # fmt: skip
-    assert held_out._again(again, "a") == ["1.04", "1", "4 %"]
-    assert held_out._again(again, "b") == ["1.47", "1", "**47 %**"]
-    assert held_out._again(again, "c") == ["-"] * 3
-    assert held_out._statuses(again, "lost") == ["0 of 8", "2 of 8", "-"]
-    assert "Differences above 5 % are in bold." in held_out._accurate(again)[0]
-    del again["metrics"]["b"]
-    assert "No difference exceeds 5 %" in held_out._accurate(again)[0]
-    again["metrics"] = {}
-    assert "accurate steps confirm no number of this table" in held_out._accurate(again)[0]
-
-
 @pytest.mark.slow
-def test_the_columns_of_accurate_steps_are_in_the_report(written):
+def test_the_error_of_the_steps_is_in_the_report_and_marked_if_it_is_large(written):
     head, *rows = cells((written / "report.md").read_text(), "12 held-out members")
-    assert head[3:] == ["after, 8 members", "with accurate steps", "difference"]
+    assert head[3:] == ["error of the steps"]
     facts = json.loads((written / "report.json").read_text())
     metrics = facts["accurate"]["metrics"]
     rows = [row for row in rows if row[0].strip("`") in metrics]
     assert len(rows) == len(metrics) > 3
     for row in rows:
         metric = metrics[row[0].strip("`")]
-        assert float(row[4]) == pytest.approx(metric["accurate"], rel=1e-3)
-        assert row[5].startswith("**") == (abs(metric["relative"]) > 0.05)
+        assert float(row[3].strip("*% ")) == pytest.approx(100 * metric["relative"], rel=0.1, abs=1e-9)
+        assert row[3].startswith("**") == (abs(metric["relative"]) > 0.05)
 
 
 # --- pages ---------------------------------------------------------------------------------------------------------
@@ -288,7 +270,7 @@ def test_the_pictures_of_the_report_are_in_its_folder(written):
 
 
 def test_the_legend_of_the_spectrum_says_why_a_run_has_none(study, monkeypatch):
-    run = accurate.nominal(study, study.case.cascade)
+    run = folder.nominal(study, study.case.cascade)
     stalled = dataclasses.replace(run, lost_code=STALLED, rows=run.rows._replace(alive=np.asarray(run.rows.t) < 0.005))
     lost = dataclasses.replace(stalled, lost_code=TOUCHED)
     monkeypatch.setattr(pictures, "_png", lambda figure: figure)

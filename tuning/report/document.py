@@ -1,13 +1,14 @@
 """The report of `ambjax tune` in Markdown."""
 
 import functools
+import math
 from collections.abc import Callable
 
 from ambjax.results.outputs import described
 from ambjax.text.web_page import escape_markdown, markdown_table
-from tuning.report import answer, front_table, held_out, limit_table, sensitivity_table
+from tuning.report import front_table, held_out, limit_table, sensitivity_table
 from tuning.report.facts import Row, TuningFacts
-from tuning.report.held_out import number_text
+from tuning.report.limit_table import broken, prices
 
 # Relative decrease of the objective below which a point of a slice counts as equal to the answer.
 AS_GOOD = 0.01
@@ -18,10 +19,72 @@ def report_markdown(facts: TuningFacts) -> str:
 
     Its pictures are files in the same folder.
     """
-    lines = [f"# Tuning of {escape_markdown(facts.case)}", "", *answer.answer_lines(facts)]
+    lines = [f"# Tuning of {escape_markdown(facts.case)}", "", *answer_lines(facts)]
     for name, section in SECTIONS.items():
         lines += described(f"the section on {name} of the report", functools.partial(section, facts)) or []
     return "\n".join(lines) + "\n"
+
+
+def answer_lines(facts: TuningFacts) -> list[str]:
+    """Return five list items and an empty line: held or not, error and voltage, sensitivity, limits, next command."""
+    items = {"members": _held, "error": _sizes, "sensitivity": _peaks, "limits": _limiting, "next command": _next}
+    lines = [described(f"the line on the {name}", functools.partial(line, facts)) for name, line in items.items()]
+    return [*(f"- {line}" for line in lines if line), ""]
+
+
+def _held(facts: TuningFacts) -> str:
+    """Return the item on the rotors that are held, and on the requirements."""
+    outcome, after = facts.outcome, facts.after
+    word = "NOT held" if not outcome["rotors_held"] else "Not verified" if facts.refuted else "Held"
+    which = "held-out members" if after["members"] else "training members"
+    kept = outcome["members"] - outcome["lost"] - outcome["stalled"]
+    words = f"**{word}:** {kept} of {outcome['members']} {which} are held"
+    if facts.before["members"]:
+        words += f" (before tuning: {facts.before['held']})"
+    met = "All requirements are met." if outcome["good"] else f"Not met: {'; '.join(outcome['against'])}."
+    return f"{words}. {met}"
+
+
+def _sizes(facts: TuningFacts) -> str:
+    """Return the item on the error and the voltage after tuning, and before it."""
+    after, before = facts.after, facts.before
+    if not after["members"]:
+        return "**Error and voltage:** not measured on held-out members (tune.held_out = 0)."
+    if not after["held"]:
+        return "**Error and voltage:** no held-out member is held."
+
+    def change(name: str, unit: str) -> str:
+        was = f" (before: {before[name]:.3g})" if before["held"] else ""
+        return f"{after[name]:.3g} {unit}{was}"
+
+    most = after.get("max_abs_u_V.largest")
+    return (
+        f"**Error:** {change('settled_rms_error_m', 'm')} rms after settling, largest "
+        f"{after['settled_max_abs_error_m']:.3g} m. **Voltage:** {change('settled_rms_u_V.mean', 'V')} rms"
+        f"{'' if most is None else f', largest {most:.3g} V'}."
+    )
+
+
+def _peaks(facts: TuningFacts) -> str:
+    return sensitivity_table.line(facts.sensitivity)
+
+
+def _limiting(facts: TuningFacts) -> str:
+    """Return the item on the limits that are not held or active, and on the gains at a bound."""
+    words = [escape_markdown(line) for line in (*broken(facts.limits), *prices(facts.limits))]
+    if ends := [row["path"] for row in facts.gains if row["at_bound"]]:
+        words.append(f"gains at a bound of `[tune.bounds]`: {', '.join(ends)}")
+    if not words:
+        front = "the trade-off between error and voltage (table below); " if len(facts.front or ()) > 1 else ""
+        words = [f"{front}no limit of `[tune.limits]` is active, and no gain is at a bound"]
+    return f"**Limited by:** {'; '.join(words)}."
+
+
+def _next(facts: TuningFacts) -> str:
+    """Return the next command, or the advice if a requirement is not met."""
+    if facts.advice:
+        return f"**Next:** {escape_markdown(facts.advice)}"
+    return f"**Next:** in this folder, {facts.next}"
 
 
 def _verdict(facts: TuningFacts) -> list[str]:
@@ -35,8 +98,8 @@ def _gains(facts: TuningFacts) -> list[str]:
     head = ["gain", "before", "after", *looked, "allowed from", "to", "at a bound", "risk increase"]
     rows = []
     for row in facts.gains:
-        ends = [number_text(row.get(end), ".3g") for end in ("low", "high")] if ranged else []
-        bounds = [number_text(row.get(end), ".3g") for end in ("least", "most")]
+        ends = [_number(row.get(end), ".3g") for end in ("low", "high")] if ranged else []
+        bounds = [_number(row.get(end), ".3g") for end in ("least", "most")]
         gains = f"{row['before']:.6g}", f"{row['after']:.6g}"
         rows.append([row["path"], *gains, *ends, *bounds, row["at_bound"] or "-", _sensitivity(row, facts)])
     lines = ["## Gains", "", *markdown_table(head, rows), ""]
@@ -110,15 +173,20 @@ def _lower_point(beside: Row) -> str:
     )
 
 
+def _number(x: float | None, form: str = ".5g") -> str:
+    """Return a number as text; '-' for None and NaN."""
+    return "-" if x is None or math.isnan(x) else format(x, form)
+
+
 def _conditions(facts: TuningFacts) -> list[str]:
     """Return the section on the conditions of Theorem 1, left > right."""
     if not facts.conditions:
         return []
     rows = []
     for row in facts.conditions:
-        gain, margin = (number_text(x) for x in (row["gain"], row["margin"]))
+        gain, margin = (_number(x) for x in (row["gain"], row["margin"]))
         verdict = {True: "holds", False: "FAILS", None: "-"}[row["holds"]]
-        rows.append([row["requires"], gain, number_text(row["against"]), margin, row["unit"], verdict])
+        rows.append([row["requires"], gain, _number(row["against"]), margin, row["unit"], verdict])
     head = ["condition", "left", "right", "margin", "unit", "verdict"]
     lines = ["## Conditions of Theorem 1 along the nominal run", "", *markdown_table(head, rows), ""]
     if facts.advice_on_conditions:

@@ -18,8 +18,9 @@ from tuning.judge.late import delay_test
 from tuning.judge.peaks import injections
 from tuning.problem.config import seeds, settings
 from tuning.problem.tuning_problem import TuningProblem
-from tuning.report import accurate, front_table, limit_table, outcome, sensitivity_table
-from tuning.report.facts import SUMMARY_METRICS, Row, TuningFacts
+from tuning.report import front_table, limit_table, outcome, sensitivity_table
+from tuning.report.facts import Row, TuningFacts
+from tuning.report.held_out import COMPARED, compare_steps
 from tuning.report.slices import Slices
 from tuning.report.slices import slices as slices_through
 from tuning.solve.course import SearchResult
@@ -180,8 +181,8 @@ def _checked(
     if judged and not problem.sampled:
         error = _worst_checked(answer, judged, held_out, tell) if answer.confirmed else None
         count = problem.tune.budget.held_out
-        tell(f"{min(accurate.COMPARED, count)} of these members again with accurate steps")
-        again = accurate.compare_steps(problem, answer.x, held_out, count, SUMMARY_METRICS)
+        tell(f"{min(COMPARED, count)} of these members again with accurate steps")
+        again = compare_steps(problem, answer.x, held_out, count)
     refuted = (error or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
     return error, again, refuted or (again["refuted"] if again else "")
 

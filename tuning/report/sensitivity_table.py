@@ -28,6 +28,40 @@ def facts(problem: TuningProblem, measured: Sensitivity) -> Facts:
     return {"members": rows, "injected": injects(problem), "decides": measured.decides, "zones": limits}
 
 
+def line(found: Facts | None) -> str:
+    """Return the largest peak of |S| of the held-out members and its zone."""
+    if not found or not found["members"]:
+        return "**Sensitivity:** not computed here; `ambjax sensitivity tuned.toml` computes |S| and the zone."
+    unknown = next((row for row in found["members"] if _unknown(row, found)), None)
+    if unknown is not None:
+        zone = unknown["injected_zone"] if unknown["lost"] else unknown["zone"]
+        words = escape_markdown(_unknown(unknown, found)).rstrip(".") + (f": zone {zone}" if zone else "")
+        return f"**Sensitivity:** no peak of |S| for member {unknown['member']}: {words}."
+    peak, at, zone = max(_peak(row, found) for row in found["members"])
+    return f"**Sensitivity:** |S| is at most {peak:.3g} (at {at:.3g} Hz) over the worst members: zone {zone}."
+
+
+def _unknown(row: Facts, found: Facts) -> str:
+    """Return why a member has no peak that counts; '' if it has one."""
+    if row["lost"]:
+        return "it is lost when a test signal is injected"
+    if row["peak"] is None and found["decides"]:
+        return "no injection decides its peak"
+    return "" if found["decides"] else row["why"]
+
+
+def _peak(row: Facts, found: Facts) -> tuple[float, float, str]:
+    """Return the peak that counts, its frequency (Hz) and its zone.
+
+    It is the injected peak if only injected peaks decide, otherwise the larger one.
+    """
+    linear = row["linear"], row["frequency_hz"], row["zone"]
+    injected = row["peak"], row["at_hz"], row["injected_zone"]
+    if row["peak"] is None:
+        return linear
+    return injected if found["decides"] else max(injected, linear)
+
+
 def section(found: Facts | None) -> list[str]:
     """Return the section on the sensitivity."""
     if found is None:
