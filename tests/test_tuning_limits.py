@@ -32,8 +32,7 @@ from tuning.report.limit_table import MORE
 from tuning.report.pictures import amplitudes
 from tuning.rounds import rounds
 from tuning.solve.course import Course, training
-from tuning.solve.joining import breaking
-from tuning.solve.multipliers import search_within_limits
+from tuning.solve.multipliers import breaking, search_within_limits
 from tuning.validate import Validation
 
 # The voltage of a Bowl is proportional to k: 20 V at the best k, 60, and 10 V at k = 30.

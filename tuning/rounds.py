@@ -19,9 +19,8 @@ from tuning.front import trace_front
 from tuning.judge.evaluate import StepError, describe, step_error
 from tuning.problem.tuning_problem import TuningProblem, problem_of
 from tuning.solve.course import Course, SearchResult, first_search, training
-from tuning.solve.joining import joining
 from tuning.solve.multipliers import search_within_limits
-from tuning.validate import validated
+from tuning.validate import joining, validated
 
 # Largest number of searches, and of halvings of the step. Searches after an update of the multipliers do not count.
 MOST_ROUNDS, MOST_HALVINGS = 12, 2
