@@ -387,7 +387,7 @@ def descent():
 
 def search_of(descent, starts=STARTS, gains=GAINS):
     row = {"value": (starts,), "x": (starts, gains), "gains": (starts, gains), "lost": (starts,), "members": ()}
-    row |= {"terms": (starts, 6), "measured": (starts, 1), "rollouts": ()}
+    row |= {"terms": (starts, 6), "quantities": (starts, 1), "rollouts": ()}
     dice = np.random.default_rng(1)
     past = {name: [dice.random(shape) for _ in range(ITERATIONS)] for name, shape in row.items()}
     x = jnp.asarray(dice.random((starts, gains)))

@@ -19,7 +19,7 @@ from ambjax import rollout
 from ambjax.numerics.records import is_traced
 from ambjax.simulation.folds import Named
 from ambjax.simulation.metrics import standard_for
-from tuning.judge.peaks import MeasuredPeak, Sensitivity
+from tuning.judge.peaks import MemberPeak, Sensitivity
 from tuning.problem import config
 from tuning.problem.config import LimitSettings, settings
 from tuning.problem.lanes import Engine
@@ -454,9 +454,9 @@ def test_a_peak_measured_with_a_saturated_supply_is_reported_as_such():
 
 
 def test_the_reported_saturation_is_that_of_the_deciding_injection():
-    peak = dict.fromkeys(MeasuredPeak.__dataclass_fields__) | {"repetitions": 8}
+    peak = dict.fromkeys(MemberPeak.__dataclass_fields__) | {"repetitions": 8}
     peaks = [
-        MeasuredPeak(**peak | {"largest": {"sensitivity": size}, "saturated": share})
+        MemberPeak(**peak | {"largest": {"sensitivity": size}, "saturated": share})
         for size, share in ((2.5, 0.1), (3.2, 0.15))
     ]
     limit = SimpleNamespace(name="sensitivity")

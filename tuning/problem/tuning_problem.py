@@ -186,7 +186,7 @@ def problem_of(
     conditions = bounds(case.cascade, case.scenario, clock)
     space, box = bounded(objective, conditions, tune.space.values(case.cascade))
     objective = dataclasses.replace(objective, space=space)
-    goal = Goal(space, tune.weights, tune.risk, conditions, tune.conditions, tune.margin, measured=tuple(names))
+    goal = Goal(space, tune.weights, tune.risk, conditions, tune.conditions, tune.margin, quantities=tuple(names))
     mode = cheaper_mode(len(tune.space), 1 + len(loss.measures))
     engine = Engine(objective, settle=case.settle, mode=mode, threads=threads)
     return TuningProblem(case, tune, objective, engine, goal, box, finer, front=front).limited(limits.each)

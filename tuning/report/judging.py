@@ -90,10 +90,10 @@ def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_
     found: Row = {name: summarise(one) if one else dict(none) for name, one in judged.items()}
     after = judged["after"]
     tell("the sensitivity of the held-out members")
-    measured = injections(problem, answer.x, held_out, after) if after else None
-    found["sensitivity"] = None if measured is None else sensitivity_table.facts(problem, measured)
+    injected = injections(problem, answer.x, held_out, after) if after else None
+    found["sensitivity"] = None if injected is None else sensitivity_table.facts(problem, injected)
     late = delay_test(problem, answer.x, held_out, after) if after else None
-    found["limits"] = limit_table.facts(problem, after, found["after"], refuted, measured, late)
+    found["limits"] = limit_table.facts(problem, after, found["after"], refuted, injected, late)
     if refuted and after:
         found["after"] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
     found["worst_member"] = described("the worst member", lambda: worst(problem, after, held_out)) if after else None

@@ -12,20 +12,20 @@ Facts = dict[str, Any]
 NO_PEAK = {"D": "unstable", None: "not computed"}
 
 
-def facts(problem: TuningProblem, measured: Sensitivity) -> Facts:
-    """Return plain data: a row for each member of `measured`, and the limits of the zones.
+def facts(problem: TuningProblem, injected: Sensitivity) -> Facts:
+    """Return plain data: a row for each member of `injected`, and the limits of the zones.
 
     `zone` of a row is that of the linear peak, `injected_zone` that of the injected one. `why`: why there is no linear
     peak; '' if there is one.
     """
     zones = problem.case.zones
     rows = []
-    for one in measured.peaks:
+    for one in injected.peaks:
         row = {name: value for name, value in dataclasses.asdict(one).items() if name != "largest"}
         row["injected_zone"] = "D" if one.lost else None if one.peak is None else zones.zone(one.peak)
         rows.append(row)
     limits = [float(x) for x in (zones.zone_a, zones.zone_b, zones.zone_c)]
-    return {"members": rows, "injected": injects(problem), "decides": measured.decides, "zones": limits}
+    return {"members": rows, "injected": injects(problem), "decides": injected.decides, "zones": limits}
 
 
 def line(found: Facts | None) -> str:
@@ -81,7 +81,7 @@ def section(found: Facts | None) -> list[str]:
     a, b, c = found["zones"]
     which = "The held-out members with the largest linear peaks."
     if found["decides"]:
-        which = f"The members with the largest peaks, measured by one injection into each of up to {SCREENED} members."
+        which = f"The members with the largest peaks, by one injection into each of up to {SCREENED} members."
     words = [f"{which} Zone A is below {a:g}, B below {b:g}, C below {c:g}."]
     if found["decides"]:
         words.append("A sign is set-valued: the injected peak decides, because no linear loop describes chattering.")
@@ -94,7 +94,7 @@ def section(found: Facts | None) -> list[str]:
         )
     if any(row["saturated"] for row in found["members"]):
         words.append(
-            "The supply limits the voltage during the injection, so the measured peak describes the limited loop. A "
+            "The supply limits the voltage during the injection, so the injected peak describes the limited loop. A "
             "smaller `sensitivity.amplitude` measures the loop without this limit."
         )
     unknown = [f"- Member {row['member']}: {escape_markdown(row['why'])}." for row in found["members"] if row["why"]]

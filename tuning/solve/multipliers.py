@@ -187,7 +187,7 @@ def met(limit: Limit, judged: float) -> bool:
 def judged_at(course: Course, x: np.ndarray) -> Judged:
     """Return the values of the limits at x [m], on all members of the ensemble if a limit concerns the worst member.
 
-    On a processor, members are measured by injection, as the held-out members are.
+    On a processor, injections into the worst members count too, as for the held-out members.
     """
     problem, budget = course.problem, course.problem.tune.budget
     seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)
@@ -197,6 +197,6 @@ def judged_at(course: Course, x: np.ndarray) -> Judged:
     columns = judge(problem, x, seed, count)
     terms, n = problem.engine.terms(x[None], course.members), course.members.ordinary
     tuned = [float(limit.kind.tuned(terms[PREFIX + limit.name][0, :n])) for limit in problem.limits]
-    measured = injections(problem, x, seed, columns) if injects(problem) else None
-    judged = [reached_of(limit, columns, measured) for limit in problem.limits]
+    injected = injections(problem, x, seed, columns) if injects(problem) else None
+    judged = [reached_of(limit, columns, injected) for limit in problem.limits]
     return Judged(x, list(zip(tuned, judged, strict=True)), columns)
