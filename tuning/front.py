@@ -76,7 +76,6 @@ def trace_front(course: Course, answer: SearchResult) -> SearchResult:
             f"front: least rms voltage with an rms error of at most {factor:g} times the least, {least.error_m:.3g} m"
         )
         course.problem = answer.problem.towards_voltage(least.error_m, least.volts, factor)
-        course.limit_searches += 1
         found, _ = course.again(chosen(seen, factor).x)
         seen += [_point(course, factor, one) for one in optima(course, found)[0]]
     taken = answer

@@ -22,7 +22,7 @@ from tuning.solve.course import Course, SearchResult, first_search, training
 from tuning.solve.multipliers import search_within_limits
 from tuning.validate import joining, validated
 
-# Largest number of searches, and of halvings of the step. Searches after an update of the multipliers do not count.
+# Largest number of rounds, and of halvings of the step.
 MOST_ROUNDS, MOST_HALVINGS = 12, 2
 # Share of tune.minutes for the searches and validations. The rest is for the judgement and the report.
 SEARCHING = 0.7
@@ -61,7 +61,7 @@ def rounds(
             x, error = limited, None
         answer, error, lost = validated(course, x, error)
         answers.append(dataclasses.replace(answer, within=within))
-        if answer.good or course.over or _is_exhausted(course):
+        if answer.good or course.over or len(answers) >= MOST_ROUNDS:
             break
         course.members = course.members.joined(joining(course.problem, lost, error))
         course.tell(
@@ -76,11 +76,6 @@ def rounds(
         best = described("the front of error against voltage", lambda: trace_front(course, best)) or best
     last = course.answer(x, None, 0)
     return dataclasses.replace(best, seconds=last.seconds, complete=last.complete)
-
-
-def _is_exhausted(course: Course) -> bool:
-    """Return whether MOST_ROUNDS searches are done. Those after an update of the multipliers do not count."""
-    return len(course.past) - course.limit_searches >= MOST_ROUNDS
 
 
 def with_fine_steps(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepError]:

@@ -13,7 +13,7 @@ from ambjax.theorem.advice import advice as on_conditions
 from ambjax.theorem.conditions import Report as Check
 from ambjax.theorem.conditions import check
 from tuning.events import Tell
-from tuning.judge.evaluate import StepError, describe, held, judge, step_error, summarise, worst, worst_of
+from tuning.judge.evaluate import describe, held, judge, step_error, summarise, worst, worst_of
 from tuning.judge.late import delay_test
 from tuning.judge.peaks import injections
 from tuning.problem.config import seeds, settings
@@ -40,14 +40,14 @@ def examined(answer: SearchResult, front_written: bool, tell: Tell) -> tuple[Tun
     problem, x, members = answer.problem, answer.x, answer.members
     held_out, rollouts = seeds(problem.tune.budget)[2], problem.engine.rollouts
     judged = _judged(problem, x, held_out, tell)
-    steps = _checked(answer, judged["after"], held_out, tell)
+    steps = _steps(answer, judged["after"], held_out, tell)
     found = {
         "case": problem.case.name,
         "held_out_seed": held_out,
         "trained_on": len(members.member),
         "lost_in_validation": answer.lost,
-        **_ensembles(answer, judged, steps[2], held_out, tell),
-        **_steps(answer, *steps),
+        **_ensembles(answer, judged, steps["refuted"], held_out, tell),
+        **steps,
         **(described("the conditions of Theorem 1", lambda: _conditions(problem, x)) or NO_CONDITIONS),
         "search": settings(problem.tune)
         | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": answer.seconds},
@@ -114,18 +114,33 @@ def _stability(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[s
     return stability_of(*problem.objective.fixed(x, members), clock).findings()._asdict()
 
 
-def _steps(answer: SearchResult, unlucky: StepError | None, again: Row | None, refuted: str) -> Row:
-    """Return the fields on the errors of the search's steps. `unlucky`, `again`, `refuted`: from `_checked`."""
-    problem = answer.problem
+def _steps(answer: SearchResult, judged: dict[str, np.ndarray], held_out: int, tell: Tell) -> Row:
+    """Return the fields on the errors of the steps.
+
+    In continuous time, the worst and the first of the held-out members are simulated again with accurate steps.
+    `judged`: metrics of these members [N]; empty if there are none. `held_out`: their seed.
+    """
+    problem, error, again = answer.problem, None, None
+    if judged and not problem.sampled:
+        count, those = len(judged["lost_at_s"]), np.flatnonzero(held(judged))
+        if answer.confirmed and those.size:
+            those = those[worst_of(judged["settled_max_abs_error_m"][those])]
+            error = step_error(problem, answer.x, problem.objective.chosen(held_out, those, count))
+            tell(f"accurate steps on the worst of them: {describe(error)}")
+        tell(f"{min(COMPARED, count)} of these members again with accurate steps")
+        again = compare_steps(problem, answer.x, held_out, count)
+    refuted = (error or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
+    refuted = refuted or (again["refuted"] if again else "")
+    confirmed = "; ".join(f"accurate steps: {describe(one)}" for one in (error, answer.error) if one)
     return {
         "step_error": answer.error.facts() if answer.error else None,
-        "worst_step_error": unlucky.facts() if unlucky else None,
+        "worst_step_error": error.facts() if error else None,
         "accurate_steps": problem.accurate,
         "nominal_steps": "with the steps of `ambjax simulate`" if problem.replays else "with accurate steps",
         "refuted": refuted,
         "verified": not refuted,
-        "verified_reason": refuted or _confirmed(unlucky, answer.error),
-        "accurate": again or None,
+        "verified_reason": refuted or confirmed,
+        "accurate": again,
     }
 
 
@@ -166,39 +181,3 @@ def _neighbourhood(problem: TuningProblem, x: np.ndarray, slices: Slices | None)
         "beside": {"path": space.paths[j], "gain": slices.gains[j, k], "lower": -np.expm1(-drop)},
         "slices": {"gains": slices.gains, "log_risk": slices.goals, "lost": slices.lost},
     }
-
-
-def _checked(
-    answer: SearchResult, judged: dict[str, np.ndarray] | None, held_out: int, tell: Tell
-) -> tuple[StepError | None, dict[str, Any] | None, str]:
-    """Simulate the worst and the first of the held-out members again, with accurate steps, in continuous time only.
-
-    `judged`: metrics of these members [N]. `held_out`: their seed. Returns the step error on the worst members, the
-    comparison on the first ones (None each if it was not made), and the reason why accurate steps do not confirm the
-    answer ('' if they confirm it).
-    """
-    problem, again, error = answer.problem, None, None
-    if judged and not problem.sampled:
-        error = _worst_checked(answer, judged, held_out, tell) if answer.confirmed else None
-        count = problem.tune.budget.held_out
-        tell(f"{min(COMPARED, count)} of these members again with accurate steps")
-        again = compare_steps(problem, answer.x, held_out, count)
-    refuted = (error or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
-    return error, again, refuted or (again["refuted"] if again else "")
-
-
-def _confirmed(*errors: StepError | None) -> str:
-    return "; ".join(f"accurate steps: {describe(error)}" for error in errors if error)
-
-
-def _worst_checked(answer: SearchResult, judged: dict[str, np.ndarray], held_out: int, tell: Tell) -> StepError | None:
-    """Return the step error on the worst held-out members that are held; None if none is held."""
-    those = np.flatnonzero(held(judged))
-    if not those.size:
-        return None
-    those = those[worst_of(judged["settled_max_abs_error_m"][those])]
-    error = step_error(
-        answer.problem, answer.x, answer.problem.objective.chosen(held_out, those, len(judged["lost_at_s"]))
-    )
-    tell(f"accurate steps on the worst of them: {describe(error)}")
-    return error

@@ -105,22 +105,23 @@ def _row(
     active, found = limit.active(reached), _verdict(kept, refuted)
     minimised = {"m": "settled_rms_error_m", "V": "settled_rms_u_V.mean"}[price_unit]
     price = summary[minimised] * limit.error_reduction(MORE) if active and judged else 0.0
-    return {
-        "name": limit.name,
-        "unit": limit.kind.unit,
-        "threshold": limit.threshold,
-        "at_least": limit.kind.at_least,
-        "source": limit.source,
-        "what": f"{limit.kind.words}; {limit.kind.over}" + _by_injection(limit, injected),
-        "saturated": _saturated(limit, reached, injected),
-        "reached": reached,
-        "worst": reached if limit.kind.fold is None or not judged else limit.worst(columns),
-        "margin": limit.margin,
-        "active": active,
-        "multiplier": limit.multiplier,
-        "price": price if found["held"] else None,
-        "price_unit": price_unit,
-    } | found
+    row = _without_price(limit.name, limit.threshold, price_unit, limit.kind)
+    return (
+        row
+        | {
+            "at_least": limit.kind.at_least,
+            "source": limit.source,
+            "what": row["what"] + _by_injection(limit, injected),
+            "saturated": _saturated(limit, reached, injected),
+            "reached": reached,
+            "worst": reached if limit.kind.fold is None or not judged else limit.worst(columns),
+            "margin": limit.margin,
+            "active": active,
+            "multiplier": limit.multiplier,
+            "price": price if found["held"] else None,
+        }
+        | found
+    )
 
 
 def _tested(row: Facts, delayed: DelayTest | None, refuted: str, reason: str = "") -> Facts:

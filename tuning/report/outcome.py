@@ -95,7 +95,7 @@ def outcome_text(facts: TuningFacts, outcome: TuningOutcome) -> str:
     unjudged = [name for name, found in outcome.limits.items() if found == UNJUDGED]
     words = [outcome.text, _statuses(facts)]
     if facts.stability is not None:
-        words.append(_stable(facts))
+        words.append(Findings(**facts.stability).words())
     if taken := front_table.sentence(facts.front or []):
         words.append(taken)
     if outcome.refuted:
@@ -103,21 +103,16 @@ def outcome_text(facts: TuningFacts, outcome: TuningOutcome) -> str:
     words += [f"{line}." for line in [*broken(facts.limits), *prices(facts.limits)]]
     if unjudged:
         words.append(f"Limits {UNJUDGED}: {', '.join(unjudged)}.")
-    words += [f"{line}." for line in _sensitive(facts)]
+    words += [
+        f"If {row['path']} changes by a factor of 1.28, {row['sensitivity_lost']} of {facts.trained_on} training "
+        "members are also lost."
+        for row in facts.gains
+        if row.get("sensitivity_lost")
+    ]
     ends = [f"{row['path']} = {row['after']:.4g} ({row['at_bound']})" for row in facts.gains if row["at_bound"]]
     if ends:
         words.append(f"Gains at a bound: {', '.join(ends)}.")
     return " ".join(words)
-
-
-def _sensitive(facts: TuningFacts) -> list[str]:
-    """Return a sentence for each gain that loses further training members if it changes by a factor of 1.28."""
-    return [
-        f"If {row['path']} changes by a factor of 1.28, {row['sensitivity_lost']} of {facts.trained_on} training "
-        "members are also lost"
-        for row in facts.gains
-        if row.get("sensitivity_lost")
-    ]
 
 
 def _statuses(facts: TuningFacts) -> str:
@@ -125,24 +120,17 @@ def _statuses(facts: TuningFacts) -> str:
     before, after = facts.before, facts.after
     if not after["members"]:
         return f"{facts.lost_in_training} members of the training ensemble are lost under the tuned gains."
+    largest = f"; largest error {after['settled_max_abs_error_m']:.3g} m" if after["held"] else ""
     undecided = f", {after['stalled']} not decided (their integration stalls)" if after["stalled"] else ""
     return (
         f"Of {after['members']} held-out members, {after['lost']} are lost under the tuned gains (before: "
         f"{before['lost']}){undecided}; settled rms error of the surviving members: {_error(after)} (before: "
-        f"{_error(before)}){_largest(after)}."
+        f"{_error(before)}){largest}."
     )
-
-
-def _stable(facts: TuningFacts) -> str:
-    return "" if facts.stability is None else Findings(**facts.stability).words()
 
 
 def _error(summary: Row) -> str:
     return f"{summary['settled_rms_error_m']:.3g} m" if summary["held"] else "none is held"
-
-
-def _largest(summary: Row) -> str:
-    return f"; largest error {summary['settled_max_abs_error_m']:.3g} m" if summary["held"] else ""
 
 
 def remedies(
@@ -162,7 +150,9 @@ def remedies(
             "that are at them."
         )
     if outcome.unstable and facts.stability is not None:
-        words.append(f"{_stable(facts)} Add tune.limits.sensitivity or tune.limits.delay_margin_s.")
+        words.append(
+            f"{Findings(**facts.stability).words()} Add tune.limits.sensitivity or tune.limits.delay_margin_s."
+        )
     if outcome.broken:
         keys = ", ".join(f"tune.limits.{name}" for name in outcome.broken)
         words.append(f"Not held: {keys}. Loosen these limits, tune more gains (also each p), or raise tune.screen.")

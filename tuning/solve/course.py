@@ -80,10 +80,6 @@ class Course:
     """time of all searches and validations; a search that begins or continues after it ends at its next iteration"""
     past: list[SearchState] = dataclasses.field(default_factory=list)
     """the searches so far"""
-    limit_searches: int = 0
-    """number of searches after an update of the limits' multipliers, and for the front; they do not count towards
-    `rounds.MOST_ROUNDS`
-    """
     began: float = dataclasses.field(default_factory=time.perf_counter)
     """start of the first search, s"""
 

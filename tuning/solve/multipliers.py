@@ -87,7 +87,6 @@ def optima(course: Course, x: np.ndarray) -> tuple[list[Judged], bool]:
                 return seen, True
         if last:
             break
-        course.limit_searches += 1
         x, moved = course.again(x)
     return seen, False
 
