@@ -4,7 +4,7 @@ import pathlib
 
 from ambjax.cases.reader import Case, read_case
 from ambjax.cases.warned import warnings_of_file
-from ambjax.results.outputs import say
+from ambjax.host.heartbeat import say
 from ambjax.text.words import one_line
 
 
