@@ -57,7 +57,8 @@ class Heartbeat:
                 self._rewrite(stamped[: shutil.get_terminal_size().columns - 1])
                 self.written, self.open = time.monotonic(), True
             else:
-                say(stamped)
+                self.close()
+                _print(stamped)
 
     def close(self) -> None:
         """Remove a line that the next one overwrites."""
@@ -76,13 +77,22 @@ def say(text: str) -> None:
     """Print a remark on one line of stderr; stdout carries the results only. A failure of stderr is ignored."""
     for heartbeat in _running:
         heartbeat.close()
+        if heartbeat.text:
+            heartbeat.text = f"{text}; {FIRST_RUN}" if FIRST_RUN in heartbeat.text else text
+    _print(text)
+
+
+def _print(text: str) -> None:
     with contextlib.suppress(OSError, ValueError):
         print(one_line(text), file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager
 def doing(text: str) -> Iterator[None]:
-    """Let the heartbeat of the command, if it has one, say `text` while the block takes long."""
+    """Let the heartbeat of the command, if it has one, say `text` while the block takes long.
+
+    A remark in the block (`say`) replaces the text.
+    """
     if not _running:
         yield
         return
