@@ -7,6 +7,7 @@ import dataclasses
 import inspect
 import itertools
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -597,3 +598,12 @@ def test_slope_of_the_sliding_laws_is_their_steepest_rate(stage, p):
 @TABLE
 def test_every_law_has_the_step_that_its_base_class_documents(stage, law):
     assert list(inspect.signature(law.step).parameters) == list(inspect.signature(Law.step).parameters)[1:]
+
+
+@TABLE
+def test_the_documentation_of_a_law_shows_a_cascade_with_it(stage, law):
+    if isinstance(law, (observer.Direct, position.LinearController, current.OpenLoop, current.AmplifierCurrent)):
+        return  # the default, and laws that require a file or an amplifier
+    (use,) = re.findall(r"`(Cascade\(.*\))`\.", type(law).__doc__)
+    names = {"observer": observer, "position": position, "inversion": inversion, "current": current}
+    assert type(getattr(eval(use, {"Cascade": Cascade} | names), stage)) is type(law)
