@@ -2,6 +2,7 @@
 
 import pathlib
 
+from ambjax.cases.machine_case import MachineCase, read_any
 from ambjax.cases.reader import Case, read_case
 from ambjax.cases.warned import warnings_of_file
 from ambjax.host.heartbeat import say
@@ -12,6 +13,14 @@ def read_with_warnings(path: str | pathlib.Path) -> Case:
     """Read a case file and print its warnings on stderr. Raises ValueError as `read_case` does."""
     case = read_case(path)
     print_warnings(case, path)
+    return case
+
+
+def read_any_with_warnings(path: str | pathlib.Path) -> Case | MachineCase:
+    """Read the case file of one axis, as `read_with_warnings` does, or of a whole machine."""
+    case = read_any(path)
+    if isinstance(case, Case):
+        print_warnings(case, path)
     return case
 
 
