@@ -6,6 +6,7 @@ import sys
 
 from ambjax._version import __version__
 from ambjax.host.command_line import Parser, complain, run_command
+from ambjax.host.heartbeat import Heartbeat
 from ambjax.host.interrupts import exit_on_interrupt
 from ambjax.host.streams import open_streams
 
@@ -175,7 +176,8 @@ def _run(args: argparse.Namespace) -> tuple[int, object]:
     from ambjax.ensemble import worker
 
     worker.configure_jax()
-    return importlib.import_module(f"ambjax.commands.{args.command}").run(args)
+    with Heartbeat():
+        return importlib.import_module(f"ambjax.commands.{args.command}").run(args)
 
 
 if __name__ == "__main__":

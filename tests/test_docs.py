@@ -168,9 +168,9 @@ def test_the_readme_of_the_benchmarks_equals_the_generated_page():
     assert page == (ROOT / "benchmarks" / "README.md").read_text(), "run python benchmarks/report.py"
 
 
-def test_the_readme_states_the_measured_errors_and_voltages_of_the_structures():
+def test_the_comparison_states_the_measured_errors_and_voltages_of_the_structures():
     cases = json.loads((ROOT / "benchmarks" / "results" / "laws.json").read_text())["cases"]
-    text = (ROOT / "README.md").read_text()
+    text = (ROOT / "docs" / "compare.md").read_text()
     names = ("bearing", "rig", "F20", "G20")
     titles = {
         "cascade-integral": "cascade with an integral",
@@ -197,6 +197,19 @@ def test_the_readme_states_the_measured_errors_and_voltages_of_the_structures():
     assert f"a factor of {factors['pid']} for PID, and of {factors['super-twisting']} for super-twisting" in text
     worst = max(cases["F20"]["structures"]["lqg"]["lost"])
     assert f"lose {worst} of 500 members" in text
+
+
+@pytest.mark.slow
+def test_the_python_of_the_readme_prints_the_loss_that_it_states(tmp_path, monkeypatch, capsys):
+    (program,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
+    last, first = map(float, re.search(r"# about (\S+); (\S+) before", program).groups())
+    monkeypatch.chdir(tmp_path)
+    assert main(["template", "rig"]) == 0
+    pathlib.Path("rig.toml").write_text(capsys.readouterr().out)
+    exec(program.replace("for _ in", 'print(f"{loss(logs):.2f}")\nfor _ in'), {})
+    before, after = capsys.readouterr().out.splitlines()
+    found = [float(line.split()[0]) for line in (before, after)]
+    assert found == pytest.approx([first, last], abs=0.02)  # rounding errors grow: the signs have no boundary layer
 
 
 def test_text_is_escaped_in_markdown():

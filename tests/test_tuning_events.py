@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from ambjax.host import heartbeat
 from tuning import events
 from tuning.events import Event, Log, Reached, Standing
 
@@ -33,7 +34,7 @@ class Terminal:
 def test_the_last_line_is_repeated_if_nothing_happens(terminal, monkeypatch):
     stderr = Terminal(terminal)
     monkeypatch.setattr(sys, "stderr", stderr)
-    monkeypatch.setattr(events, "SILENCE", 0.1)
+    monkeypatch.setattr(heartbeat, "SILENCE", 0.1)
     with Log() as log:
         log(Event("compiling"))
         time.sleep(0.4)
@@ -42,6 +43,22 @@ def test_the_last_line_is_repeated_if_nothing_happens(terminal, monkeypatch):
     before = stderr.text
     time.sleep(0.3)
     assert stderr.text == before  # it has ended
+
+
+def test_a_command_says_what_takes_long_and_only_that(monkeypatch, capsys):
+    monkeypatch.setattr(heartbeat, "SILENCE", 0.1)
+    with heartbeat.Heartbeat():
+        with heartbeat.doing("short"):
+            pass
+        with heartbeat.doing("compiling"):
+            time.sleep(0.4)
+        said = capsys.readouterr().err
+        time.sleep(0.3)
+    assert said.count("compiling") > 1
+    assert "short" not in said
+    with heartbeat.doing("called from Python"):
+        time.sleep(0.3)
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("terminal", [False, True])

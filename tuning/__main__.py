@@ -67,7 +67,7 @@ def _run(args: argparse.Namespace) -> tuple[int, object]:
     from ambjax.ensemble.worker import configure_jax
 
     configure_jax()
-    from ambjax.results.outputs import say
+    from ambjax.host.heartbeat import say
     from tuning.command import Options, run
     from tuning.events import Log
 

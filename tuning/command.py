@@ -11,11 +11,12 @@ from ambjax.cases.reader import Case, read_case, require_file
 from ambjax.cases.table import one_line
 from ambjax.commands.reading import print_warnings
 from ambjax.host.arguments import names_arguments
+from ambjax.host.heartbeat import say
 from ambjax.host.interrupts import reporting
 from ambjax.host.lock import locked
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
-from ambjax.results.outputs import check_new, described, directory, files, plain, say, write_json
+from ambjax.results.outputs import check_new, described, directory, files, plain, write_json
 from tuning.events import Listener, Log, teller
 from tuning.problem.config import allowed_minutes, read_tune
 from tuning.problem.gains_table import off

@@ -4,20 +4,16 @@ An event is a sentence, or the standing of a search after an iteration. `Log`, t
 stderr.
 """
 
-import contextlib
 import math
-import shutil
-import sys
-import threading
 import time
 from collections.abc import Callable
 from typing import NamedTuple
 
 from ambjax.commands.pace import duration
-from ambjax.results.outputs import say
+from ambjax.host.heartbeat import Heartbeat
 
-# `Log` writes the standing of a search at most once in INTERVAL seconds, and repeats its last line after SILENCE.
-INTERVAL, SILENCE = 2.0, 4.5
+# `Log` writes the standing of a search at most once in INTERVAL seconds.
+INTERVAL = 2.0
 
 
 class Reached(NamedTuple):
@@ -91,59 +87,17 @@ def teller(listen: Listener) -> Tell:
     return lambda text: listen(Event(text))
 
 
-class Log:
+class Log(Heartbeat):
     """Listener that writes lines to stderr, each with the time since its beginning.
 
-    As a context manager, it also repeats its last line if there is none for SILENCE seconds, so that a user sees what
+    As a context manager, it also repeats its last line if there is none for some seconds, so that a user sees what
     takes so long. On a terminal, such repetitions and standings overwrite each other.
     """
 
-    def __init__(self) -> None:
-        self.began = self.written = time.monotonic()
-        self.last, self.open = "", False
-        self.lock, self.ended = threading.Lock(), threading.Event()
-
     def __call__(self, event: Event) -> None:
         with self.lock:
-            self.last = event.text
+            self.text = event.text
             if event.standing is None:
-                self._line(event.text)
+                self.line(event.text)
             elif time.monotonic() - self.written >= INTERVAL:
-                self._line(event.text, passing=True)
-
-    def __enter__(self) -> "Log":
-        threading.Thread(target=self._repeat, daemon=True).start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.ended.set()
-        with self.lock:
-            self._close()
-
-    def _repeat(self) -> None:
-        while not self.ended.wait(SILENCE / 9):
-            with self.lock:
-                if self.last and time.monotonic() - self.written >= SILENCE:
-                    self._line(f"... {self.last}", passing=True)
-
-    def _line(self, text: str, *, passing: bool = False) -> None:
-        """Write a line. On a terminal, the next line overwrites it if `passing`."""
-        self.written = time.monotonic()
-        minutes, seconds = divmod(int(self.written - self.began), 60)
-        stamped = f"{minutes}:{seconds:02d} {text}"
-        if passing and sys.stderr.isatty():
-            self._rewrite(stamped[: shutil.get_terminal_size().columns - 1])
-            self.open = True
-        else:
-            self._close()
-            say(stamped)
-
-    def _close(self) -> None:
-        if self.open:
-            self._rewrite("")
-        self.open = False
-
-    def _rewrite(self, text: str) -> None:
-        """Replace the last line of the terminal. A failure of stderr is ignored."""
-        with contextlib.suppress(OSError, ValueError):
-            print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
+                self.line(event.text, passing=True)

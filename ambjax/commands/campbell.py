@@ -5,8 +5,9 @@ import argparse
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, read_machine
+from ambjax.host.heartbeat import say
 from ambjax.linear import linearise_machine, poles_in_s
-from ambjax.results.outputs import described, directory, files, plain, say, write_json, written
+from ambjax.results.outputs import described, directory, files, plain, write_json, written
 
 WRITTEN = ("campbell.json", "campbell.png")
 # Number of speeds, and the end of their range as a multiple of the largest speed of the case.

@@ -17,8 +17,9 @@ from ambjax.commands import machine_check
 from ambjax.commands.acceptance import acceptance
 from ambjax.commands.reading import read_any_with_warnings
 from ambjax.control.cascade import Cascade
+from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.linear.stability import Findings, stability_of
-from ambjax.results.outputs import plain, say, table
+from ambjax.results.outputs import plain, table
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import rollout
 from ambjax.theorem.causes import Cause, find_cause
@@ -55,9 +56,11 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     case = read_any_with_warnings(args.case)
     if isinstance(case, MachineCase):
         return machine_check.check(args, case)
-    report, (loop, text), on_processor = _results(case)
+    with doing(f"simulating and analysing the loop; {FIRST_RUN}"):
+        report, (loop, text), on_processor = _results(case)
     lost = report.lost_at if on_processor is None else on_processor.sampled.lost_at
-    findings = _stability(case) if math.isinf(lost) else None
+    with doing(f"testing the stability of the loop; {FIRST_RUN}"):
+        findings = _stability(case) if math.isinf(lost) else None
     summary = {
         "holds": report.holds,
         "lost_at_s": report.lost_at,

@@ -18,11 +18,12 @@ from ambjax.commands.reading import read_with_warnings
 from ambjax.commands.study_report import findings_of
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
+from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.linear.state_space import StateSpace
 from ambjax.page.html_page import check_processor, pages
 from ambjax.results.case_export import guarded_for
 from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks, operating_point, shown_band, spread_peaks
-from ambjax.results.outputs import described, directory, files, plain, say, write_json, written
+from ambjax.results.outputs import described, directory, files, plain, write_json, written
 from ambjax.results.spread_runs import study_of
 from ambjax.text.web_page import render_page
 
@@ -133,9 +134,10 @@ def _differences(paths: Sequence[str], cases: Sequence[Case], studies: Sequence[
 
 def _compared(case: Case, study: Study) -> Compared:
     """Simulate the members of a case, analyse its loop, and count the operations of a step."""
-    point, peaks = _linear(case, study)
-    columns = _columns(case, study)
-    return Compared(case, columns, point, peaks, _flops(case), findings_of(study, columns))
+    with doing(f"{case.name}: linearising and simulating the loops of the members; {FIRST_RUN}"):
+        point, peaks = _linear(case, study)
+        columns = _columns(case, study)
+        return Compared(case, columns, point, peaks, _flops(case), findings_of(study, columns))
 
 
 def _columns(case: Case, study: Study) -> dict[str, np.ndarray]:

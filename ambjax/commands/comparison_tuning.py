@@ -12,8 +12,8 @@ from ambjax.cases.reader import Case, read_case
 from ambjax.commands.pace import duration
 from ambjax.host.command_line import message
 from ambjax.host.extensions import NothingToTuneError, extension
+from ambjax.host.heartbeat import say
 from ambjax.host.interrupts import raise_if_interrupted, reporting
-from ambjax.results.outputs import say
 
 # In the folder of a case: the file by which the tuner marks a search that has begun, and the case with the tuned gains.
 BEGUN, TUNED = "checkpoints/search.json", "tuned.toml"

@@ -13,9 +13,10 @@ from ambjax.commands.study_report import WRITTEN, write_report
 from ambjax.commands.workers import AHEAD, compute, executor_of
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
+from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.host.interrupts import reporting, uninterrupted
 from ambjax.host.lock import locked
-from ambjax.results.outputs import check_places, make, say, target
+from ambjax.results.outputs import check_places, make, target
 from ambjax.results.spread_runs import study_of
 from ambjax.simulation.sliding import Slide
 
@@ -41,12 +42,14 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
             store.begin()
             say(f"method: {case.clock.method}; writing to {out}")
             if isinstance(case.clock.method, Slide):
-                error = sliding_error(study)
+                with doing(f"comparing sliding with adaptive steps; {FIRST_RUN}"):
+                    error = sliding_error(study)
                 say(error_words(error))
             if not store.finished():
                 if fresh or not store.chunk:
                     _pilot(study, store, executor)
-                compute(study, store, executor)
+                with doing(f"simulating the members; {FIRST_RUN}"):
+                    compute(study, store, executor)
         store.finish()
         return write_report(case, study, args, out, error)
 
@@ -78,7 +81,8 @@ def _pilot(study: Study, store: Store, executor: tuple[Executor, int] | None) ->
 
     Prints the expected duration of a long study, and chooses the chunk size if none is set.
     """
-    columns, seconds = pilot(study)
+    with doing(f"simulating the first members; {FIRST_RUN}"):
+        columns, seconds = pilot(study)
     first = len(columns["index"])
     # executor[1]: chunks submitted at a time, AHEAD for each worker
     pace = Pace(first / seconds, None if executor is None else executor[1] // AHEAD)

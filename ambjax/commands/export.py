@@ -5,8 +5,9 @@ import argparse
 from ambjax.cases.reader import read_case
 from ambjax.codegen import verify
 from ambjax.commands.reading import print_warnings
+from ambjax.host.heartbeat import doing, say
 from ambjax.results.case_export import destination, generated, planned
-from ambjax.results.outputs import say, table, written
+from ambjax.results.outputs import table, written
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
@@ -20,7 +21,8 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
                 "verify: in both precisions, one step at 10,000 points, one step at 10,000 points with other "
                 "parameters, and the closed loop"
             )
-        exported = generated(plan)
+        with doing("generating and verifying the code" if plan.verified else "generating the code"):
+            exported = generated(plan)
         exported.put(part)
     checks = exported.checks
     if not args.json:

@@ -7,9 +7,10 @@ import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, machine_from
 from ambjax.commands.machine_commands import analysed
+from ambjax.host.heartbeat import say
 from ambjax.linear import linearise_machine, poles_in_s
 from ambjax.results.machine_run import simulate_machine
-from ambjax.results.outputs import plain, say, table
+from ambjax.results.outputs import plain, table
 
 # Modes that the second analysis adds to those of a shaft. Modes whose damping ratio is below LIGHT are listed.
 MORE, LIGHT = 4, 0.05

@@ -7,9 +7,10 @@ import numpy as np
 from tqdm import tqdm
 
 from ambjax.cases.machine_case import MachineCase
+from ambjax.host.heartbeat import say
 from ambjax.linear.machine_sensitivity import MachineSensitivity, machine_sensitivity
 from ambjax.results.machine_run import simulate_machine
-from ambjax.results.outputs import described, directory, files, plain, say, table, write_json, written
+from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
 
 Summary = dict[str, object]
 SIMULATED = ("trajectory.npz", "metrics.json", "overview.png")

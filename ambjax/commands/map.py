@@ -12,8 +12,9 @@ from ambjax.cases.reader import Case
 from ambjax.commands.reading import read_with_warnings
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.maps import CERTAIN, GRIDS, Map, grid
+from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.results.case_map import is_stable, labels, panel, study_and_axes
-from ambjax.results.outputs import described, directory, files, plain, say, table, write_json, written
+from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
 
 WRITTEN = ("map.png", "map.json")
 
@@ -29,7 +30,8 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
             say(f"{case.name}: {len(x.values) * len(y.values)} cells of {args.members}; method: {study.clock.method}")
             if args.members == 1 and case.spread.entries:
                 say(f"{case.name}: nominal, because one member does not draw the [spread]; --members 2 or more do.")
-            maps.append(grid(study, x, y, is_stable))
+            with doing(f"{case.name}: simulating the cells; {FIRST_RUN}"):
+                maps.append(grid(study, x, y, is_stable))
         summary = {"cases": [_summary(case, one) for case, one in zip(cases, maps, strict=True)], "out": str(out)}
         write_json(part / "map.json", summary)
         described("map.png", lambda: _draw(cases, maps, part / "map.png"))

@@ -11,7 +11,7 @@ import numpy as np
 from ambjax.ensemble.batching import cores
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
-from ambjax.results.outputs import say
+from ambjax.host.heartbeat import say
 from ambjax.simulation.method import TOLERANCE
 from ambjax.simulation.rosenbrock import AdaptiveRodas3
 from ambjax.simulation.sliding import slides

@@ -5,7 +5,7 @@ import pathlib
 from ambjax.cases.machine_case import MachineCase, read_any
 from ambjax.cases.reader import Case, read_case
 from ambjax.cases.warned import warnings_of_file
-from ambjax.results.outputs import say
+from ambjax.host.heartbeat import say
 from ambjax.text.words import one_line
 
 

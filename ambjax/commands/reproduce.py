@@ -12,10 +12,11 @@ from tqdm import tqdm
 
 from ambjax import paper
 from ambjax.ensemble.worker import processes
+from ambjax.host.heartbeat import say
 from ambjax.paper import ledger
 from ambjax.paper.evidence import Evidence, gather
 from ambjax.pictures import figures
-from ambjax.results.outputs import described, directory, files, plain, say, table, write_json, written
+from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
 
 Summary = dict[str, object]
 # Labels of the tuned readings in readings.png.

@@ -10,6 +10,7 @@ from ambjax.commands import machine_commands
 from ambjax.commands.reading import read_any_with_warnings
 from ambjax.commands.sensitivity_report import Injections, sensitivity_summary, set_valued, text_of
 from ambjax.ensemble.study import Study
+from ambjax.host.heartbeat import FIRST_RUN, doing
 from ambjax.linear import Injection, frequency_lines, injected
 from ambjax.linear.multisine import Reading
 from ambjax.results.operating import (
@@ -40,11 +41,13 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     if isinstance(case, MachineCase):
         return machine_commands.sensitivity(args, case)
     study = _study(case, args)
-    points, missing = _points(case)
-    spread = None if study is None else spread_peaks(case, study)
-    if study is not None and spread is not None and set_valued(case):
-        spread = spread._replace(measured=measured_peaks(case, study, points[0].analysis.S.frequency))
-    measured = _injections(case, points[0]) if args.inject or case.cascade.processor is not None else None
+    with doing(f"linearising the loop at the equilibria; {FIRST_RUN}"):
+        points, missing = _points(case)
+    spread = None if study is None else _spread(case, study, points[0])
+    measured = None
+    if args.inject or case.cascade.processor is not None:
+        with doing(f"measuring the sensitivity by injection into the simulation; {FIRST_RUN}"):
+            measured = _injections(case, points[0])
     out = directory(args.out, f"sensitivity-{case.name}", WRITTEN, args.force)
     summary = sensitivity_summary(points, spread, measured, case.zones, missing)
     with files(out) as part:
@@ -57,6 +60,16 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
         written(out, ", ".join(names))
     stable = all(point.analysis.stable for point in points) and (spread is None or spread.stable == spread.members)
     return int(bool(missing) or not stable), plain(summary | {"out": str(out)})
+
+
+def _spread(case: Case, study: Study, point: OperatingPoint) -> SpreadPeaks:
+    """Return the peaks of the members; with set-valued signs, also the peaks measured by injection."""
+    with doing(f"linearising the loops of the members; {FIRST_RUN}"):
+        spread = spread_peaks(case, study)
+    if not set_valued(case):
+        return spread
+    with doing(f"measuring the sensitivity of the members by injection into the simulation; {FIRST_RUN}"):
+        return spread._replace(measured=measured_peaks(case, study, point.analysis.S.frequency))
 
 
 def _points(case: Case) -> tuple[list[OperatingPoint], dict[str, str]]:

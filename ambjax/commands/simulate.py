@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,13 +17,15 @@ from ambjax.commands.reading import read_any_with_warnings
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.replay import Replay, replay
 from ambjax.ensemble.study import Study
-from ambjax.results.outputs import described, directory, files, plain, say, table, write_json, written
+from ambjax.host.heartbeat import FIRST_RUN, doing, say
+from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
 from ambjax.results.runs import simulate
 from ambjax.simulation.metrics import UNITS
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.text.words import command
 
 Summary = dict[str, object]
+SIMULATING = f"simulating the case; {FIRST_RUN}"
 WRITTEN = ("trajectory.npz", "metrics.json", "overview.png")
 
 
@@ -139,19 +142,30 @@ def _study(case: Case, args: argparse.Namespace) -> Study | None:
 
 def _simulated(case: Case) -> tuple[Trajectory, dict[str, Any]]:
     """Simulate a case, with a progress bar if it takes more than two seconds; return trajectory and metrics."""
-    with _bar(case) as bar:
-        done = simulate(case, bar.update)
+    with doing(SIMULATING), _bar(case) as bar:
+        done = simulate(case, _counter(bar))
         return done.trajectory, done.metrics
 
 
 def _replay(case: Case, study: Study, member: int) -> Replay:
     """Simulate one member of a study and record every sample, with a progress bar."""
-    with _bar(case) as bar:
-        return replay(study, member, bar.update)
+    with doing(SIMULATING), _bar(case) as bar:
+        return replay(study, member, _counter(bar))
 
 
 def _bar(case: Case) -> tqdm:
     return tqdm(total=case.clock.samples, unit="sample", unit_scale=True, delay=2, leave=False, desc="simulate")
+
+
+def _counter(bar: tqdm) -> Callable[[int], None]:
+    """Return the function that adds samples to the bar. Its clock starts with the first, after the compilation."""
+
+    def count(samples: int) -> None:
+        if not bar.n:
+            bar.unpause()
+        bar.update(samples)
+
+    return count
 
 
 def _metrics_text(metrics: Summary) -> str:

@@ -10,8 +10,9 @@ from ambjax.cases.reader import Case
 from ambjax.cases.warned import reversal
 from ambjax.ensemble import statistics
 from ambjax.ensemble.study import Study
+from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.linear import Findings, stability_of, suspects
-from ambjax.results.outputs import described, files, plain, say, table, write_json, written
+from ambjax.results.outputs import described, files, plain, table, write_json, written
 from ambjax.text.words import one_line
 
 # Files written with members.npz; the last one only if the case has a spread and a member survives.
@@ -34,17 +35,20 @@ def write_report(
     """
     with np.load(out / "members.npz") as file:
         columns = {name: file[name] for name in file.files}
-    findings = findings_of(study, columns)
+    with doing(f"testing the stability of the members; {FIRST_RUN}"):
+        findings = findings_of(study, columns)
     held = ~np.isfinite(columns["lost_at"])
     survivors = {"survivors": int(held.sum()), "members": study.members}
-    summary = described("summary.json", lambda: _summary(case, study, columns, str(args.case)))
+    with doing("computing the statistics"):
+        summary = described("summary.json", lambda: _summary(case, study, columns, str(args.case)))
     with files(out) as part:
         if summary is not None:
             summary["stability"] = findings._asdict()
             if error is not None:
                 summary["sliding_step_error"] = error
             write_json(part / "summary.json", summary)
-        _pictures(case, study, columns, summary, part)
+        with doing(f"drawing the pictures: simulating members for the fan chart; {FIRST_RUN}"):
+            _pictures(case, study, columns, summary, part)
         names = [name for name in WRITTEN if (part / name).exists()]
     if not args.json:
         tables = None if summary is None else described("the table", lambda: study_tables(summary, findings.words()))

@@ -11,8 +11,8 @@ from tqdm import tqdm
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import chunk, ignore_sigint, processes, work
+from ambjax.host.heartbeat import say
 from ambjax.host.interrupts import uninterrupted
-from ambjax.results.outputs import say
 
 # Chunks submitted per worker: one runs, one waits.
 AHEAD = 2

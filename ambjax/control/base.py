@@ -103,6 +103,17 @@ class Law:
         """Return the sign of the law if the rate of the stage's error is one sign plus a disturbance; else None."""
         return None
 
+    def step(self, model: Plant, inputs: Any, state: Any, period: Scalar) -> tuple[Any, Any]:
+        """Return the output at a sample and the state at the next one, for a law on a processor.
+
+        `inputs`, `state`: as `__call__` takes them. `period`: sample period, s. The default is a step of explicit
+        Euler, state + period * rate. Define it to compute the law differently, for example with the sign at the end of
+        the sample; `own_steps` says for which processors.
+        """
+        law: Any = self
+        output, rate = law(model, inputs, state)
+        return output, jax.tree.map(lambda x, d: x + period * d, state, rate)
+
     def init_sampled(self, model: Plant) -> object:
         """Return the state at t = 0 on a processor. For an observer, `init` is called instead."""
         law: Any = self

@@ -51,6 +51,9 @@ class FilterChain(PositionLaw[ChainState]):
     or at 0.98 of the Nyquist frequency if the centre is higher. The lead-lag is off if w_z = w_p, a notch is off if
     its depth is 1, and the low-pass is off if w_lp is None (left out). By default, all of them are off. With k_int = 0
     and k_d > 0, the law is a PD controller.
+
+    Use it where an existing drive has these filters, or no velocity is estimated:
+    `Cascade(position=position.FilterChain(w_lp=1e4))`.
     """
 
     analytic = True

@@ -23,6 +23,8 @@ class SlidingMode(CurrentLaw[tuple[()]]):
 
     The default k_i is that of Table 2 for the plant of Table 1. For other plants it gives the sign the slope
     2/pi k_i p = w_c at 0, where w_c is the bandwidth of the current loop (`control.defaults`).
+
+    Use it as the paper does: `Cascade(current=current.SlidingMode(k_i=1000.0))`.
     """
 
     analytic = True
@@ -92,6 +94,9 @@ class ProportionalIntegral(CurrentLaw[Array]):
     unstable pole of the magnets. On a processor with sample period T, w_c is at most 1/(4 T). The phase margin is then
     above 50 degrees with one sample of delay. In the paper's tracking scenario, the default gains hold the rotor, and
     much lower gains lose it.
+
+    Use it where the drive has a PI controller, or the resistance is not known:
+    `Cascade(current=current.ProportionalIntegral())`.
     """
 
     analytic = True
@@ -138,6 +143,8 @@ class DeadBeat(CurrentLaw[tuple[()]]):
     after u begins to act, unless the supply limits u (Astrom and Wittenmark, Computer-Controlled Systems, 1997, 4.3).
     Implicit steps do not use w. Explicit steps and the law in continuous time do not use share. There is no integral,
     so a wrong resistance of the model leaves an offset.
+
+    Use it on a processor: `Cascade(current=current.DeadBeat(share=0.5))`.
     """
 
     analytic = True

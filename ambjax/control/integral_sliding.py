@@ -32,6 +32,8 @@ class IntegralSlidingMode(PositionLaw[Array]):
     constant disturbance |q_z| < k.
 
     The default gains are those of SlidingMode; c_int = c^2/4 gives two equal poles on the manifold.
+
+    Use it instead of `SlidingMode` under a constant force: `Cascade(position=position.IntegralSlidingMode())`.
     """
 
     analytic = True

@@ -84,6 +84,8 @@ class Adaptive(AdaptiveReference):
     """i_ref' = gamma sgn(v_star - v(z, i_ref)) / (dv/di)(z, i_ref), with i_ref as its state. Eq. (6), sgn smoothed.
 
     Deviation from the paper: the default gamma is 7.5e4, because the printed value, 1000, violates Eq. (7).
+
+    Use it as the paper does: `Cascade(inversion=inversion.Adaptive(gamma=1e5))`.
     """
 
     analytic = True
@@ -132,6 +134,9 @@ class FeedForwardAdaptive(AdaptiveReference):
     The feed-forward of the rates of v_star and z cancels d, so that w' = -gamma sgn(w) on a known plant. gamma must
     therefore exceed only the error of these rates, not Delta_1 of Eq. (7). The rates are those of the nominal model.
     They add the noise of the velocity to i_ref'. In Eq. (6) this noise acts only inside the sign, through v_star.
+
+    Use it where v_star changes fast and the velocity is known with little noise:
+    `Cascade(inversion=inversion.FeedForwardAdaptive())`.
     """
 
     analytic = True
@@ -221,6 +226,8 @@ class ClosedForm(StaticInversion):
     The paper argues against this law (Mouille and Lottin 1992): it is exact on a known plant, but passes every jump of
     v_star, such as noise, directly to i_ref. It has no state in continuous time. On a processor it equals the adaptive
     law with gamma = inf after the first sample.
+
+    Use it where v_star has little noise: `Cascade(inversion=inversion.ClosedForm())`.
     """
 
     analytic = True
@@ -236,6 +243,8 @@ class Linearised(StaticInversion):
     In forces: i = (F + k_s z)/k_i, with the negative stiffness k_s and the force-current factor k_i (Schweitzer and
     Maslen, Magnetic Bearings, 2009, 2.1). With position.PID it is the loop of the textbook. The inversion error v_tilde
     is zero at z = 0, and for v_star = 0 at every z; elsewhere it is of third order in z and v_star.
+
+    Use it for small displacements, or for a linear controller: `Cascade(inversion=inversion.Linearised())`.
     """
 
     analytic = True

@@ -9,8 +9,9 @@ A law is a frozen record: its type is the algorithm, its leaves are the gains. E
 - `slope(model)`: the fastest rate of the law in closed loop (slope), 1/s; the step size is chosen from it.
 - `sigma(motion, reference)`, for a position law: the sliding variable of a motion, m/s.
 
-`control.base.Law` defines the other methods, with defaults. To add a law, write a record in the file of its stage, and
-add it to `KINDS` in `ambjax/cases/controller_tables.py` and to the conformance test in `tests/test_laws.py`.
+`control.base.Law` defines the other methods, with defaults: `step` is the law on a processor. To add a law, write a
+record in the file of its stage, and add it to `KINDS` in `ambjax/cases/controller_tables.py` and to the conformance
+test in `tests/test_laws.py`.
 """
 
 import abc
@@ -246,8 +247,5 @@ def step_law(
     """
     with jax.named_scope(f"law:{type(law).__module__.rpartition('.')[2]}.{type(law).__qualname__}"):
         if law.has_own_step(implicit):
-            own: Any = law
-            return own.step(model, inputs, state, period)
-        function: Any = law
-        output, rate = function(model, inputs, state)
-        return output, jax.tree.map(lambda x, d: x + period * d, state, rate)
+            return law.step(model, inputs, state, period)
+        return Law.step(law, model, inputs, state, period)

@@ -38,6 +38,9 @@ class UtkinSlidingMode(PositionLaw[Array]):
     `integral_sliding.IntegralSlidingMode` starts its integral at 0 instead. A trajectory does not contain s; it reports
     e_dot + (k_p/k_d) e as sigma. The default k_p and k_d for a model place a double pole at -w/3, where w is
     the unstable pole of the magnets.
+
+    Use it where the motion must be that of a PD controller from the start:
+    `Cascade(position=position.UtkinSlidingMode())`.
     """
 
     k_p: Scalar = gain(default=3.1e4, unit="1/s^2", doc="proportional gain; left out: (w/3)^2")
@@ -113,6 +116,8 @@ class TerminalSlidingMode(PositionLaw[tuple[()]]):
     e_0 reaches 0 in the finite time 3 |e_0/l|^(1/3)/c. At |e| = l the error decays at the rate c, as on the manifold of
     Eq. (4). Below |e| = l it decays faster. The root is smoothed below |y| = 0.01, and the sign with p. The law has no
     integral.
+
+    Use it where an error must vanish in a finite time: `Cascade(position=position.TerminalSlidingMode())`.
     """
 
     c: Scalar = gain(default=530.0, unit="1/s", doc="decay rate on the manifold where |e| = l; left out: w")

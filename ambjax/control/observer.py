@@ -40,6 +40,9 @@ class Complementary(Observer[Array]):
 
     The estimate z_hat (m) integrates the velocity, and converges to the measured position at the rate l (1/s). Noise of
     the position sensor passes through a low-pass of corner l, noise of the velocity through a low-pass of gain 1/l.
+
+    Use it where both the position and the velocity are measured:
+    `Cascade(observer=observer.Complementary(l=10.0))`.
     """
 
     analytic = True
@@ -83,6 +86,8 @@ class Difference(Observer[Array]):
     With implicit steps on a processor, it is the backward difference (z_n - z_{n-1})/T through a low-pass with the pole
     exp(-w T). On a ramp, the estimate is exact after the initial transient. It follows a change of the velocity with
     a lag of 1/w, and amplifies noise of the position by w.
+
+    Use it where the velocity is not measured and no model is to be used: `Cascade(observer=observer.Difference())`.
     """
 
     w: Scalar = gain(
@@ -145,6 +150,8 @@ class Kalman(Observer[Predicted]):
     processor), and the rate of the disturbance white with intensity S_q (m^2/s^5). The variance of the velocity is then
     7/4 (S_r w^3 + S_q / w^3). It is smallest at w = (S_q/S_r)^(1/6), where the rms error is 8 % above that of the
     optimal filter.
+
+    Use it where the velocity is not measured and the plant is known: `Cascade(observer=observer.Kalman(w=1000.0))`.
     """
 
     analytic = True
@@ -213,6 +220,9 @@ class IRED1(ExactDifferentiator):
 
     `ambjax.numerics.differentiator` has the equations. z itself is not filtered. In continuous time, the sign is
     smoothed. With implicit steps on a processor, it is evaluated at the end of the step.
+
+    Use it where the velocity is not measured, and a bound of the acceleration is known:
+    `Cascade(observer=observer.IRED1())`.
     """
 
     L: Scalar = gain(default=56.3, unit="m/s^2", doc="bound on the acceleration; left out: w^2 s_0/25")
@@ -222,7 +232,10 @@ class IRED1(ExactDifferentiator):
 
 @record
 class IRED2(ExactDifferentiator):
-    """Robust exact differentiator of order 2: as `IRED1`, but exact while the rate of the acceleration is at most L."""
+    """Robust exact differentiator of order 2: as `IRED1`, but exact while the rate of the acceleration is at most L.
+
+    Use it where a bound of the rate of the acceleration is known: `Cascade(observer=observer.IRED2())`.
+    """
 
     L: Scalar = gain(default=2.99e4, unit="m/s^3", doc="bound on the rate of the acceleration; left out: w^3 s_0/25")
     order: ClassVar[int] = 2

@@ -37,6 +37,9 @@ class PID(PositionLaw[PIDState]):
 
     With the default gains for a model, and without the filter, the closed loop has a pole at -w and two at -w/2, where
     w is the unstable pole of the magnets. With an ideal current, the peak of |S| is then 1.15.
+
+    Use it as the reference of a comparison, or where an integral and an anti-windup are required:
+    `Cascade(position=position.PID(k_aw=100.0))`.
     """
 
     analytic = True
@@ -117,6 +120,9 @@ class FeedbackLinearisation(PositionLaw[tuple[()]]):
     nominal mechanics become e_ddot = -k_p e - k_d e_dot at any z (H. Khalil, Nonlinear Systems, 2002, 13.2 and 13.3).
     There is no integral: a disturbance q_z leaves the offset q_z/k_p. The default gains for a model place a double pole
     at -w, where w is the unstable pole of the magnets. With an ideal current, |S| is then 1 at every frequency.
+
+    Use it on a known plant without constant disturbances, or as the simplest law with an exact inversion:
+    `Cascade(position=position.FeedbackLinearisation())`.
     """
 
     analytic = True

@@ -33,6 +33,9 @@ class SlidingMode(PositionLaw[tuple[()]]):
 
     The default gains are those of Table 2 for the plant of Table 1. For other plants the error has a double pole at -w,
     the pole of the magnets (`control.defaults`).
+
+    Use it as the paper does, on a known plant under bounded disturbances; a constant force leaves an offset:
+    `Cascade(position=position.SlidingMode(c=300.0))`.
     """
 
     analytic = True
@@ -104,6 +107,8 @@ class SuperTwisting(PositionLaw[Array]):
     no offset. For the plant of Table 1, the default slope at zero is k_1 sqrt(p) = 400 1/s, about that of SlidingMode.
     For other plants, sigma has a double pole at -W/2, and the error on the manifold a pole at -W, where W is the pole
     of the magnets.
+
+    Use it where a constant or slowly varying force acts: `Cascade(position=position.SuperTwisting())`.
     """
 
     c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold; left out: W")

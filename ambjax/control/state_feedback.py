@@ -28,6 +28,8 @@ class StateFeedback(PositionLaw[Array]):
     The default gains k_p, k_d and k_int for a model are optimal (LQR) for the linearised mechanics
     e_ddot = s e + b (i_star - i_r). They minimise the integral of (e/(0.1 s_0))^2 + (0.2 w int e/(0.1 s_0))^2 +
     ((i_star - i_r)/(0.1 i_0))^2; on a processor, the sum over the samples. w is the pole of the magnets.
+
+    Use it with a Kalman filter as LQG: `Cascade(observer=observer.Kalman(), position=position.StateFeedback())`.
     """
 
     analytic = True

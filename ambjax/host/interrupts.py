@@ -47,7 +47,7 @@ class _Handler:
     def _print(self, words: str) -> None:
         """Write a line to stderr. A failure to write must not end the thread."""
         with contextlib.suppress(Exception):
-            begin = "\n" if _bar_is_open() else ""
+            begin = "\n" if bar_is_open() else ""
             if os.name == "posix" and not select.select([], [2], [], STDERR_TIMEOUT)[1]:
                 return  # the reader is gone, or the terminal is paused
             os.write(2, f"{begin}{self.program}: {words}\n".encode(errors="backslashreplace"))
@@ -129,7 +129,7 @@ def _read_signals(read_end: int) -> None:
             _handler.handle()
 
 
-def _bar_is_open() -> bool:
+def bar_is_open() -> bool:
     """Return whether the last line of the terminal shows a progress bar."""
     tqdm = getattr(sys.modules.get("tqdm"), "tqdm", None)
     return any(bar.last_print_t > bar.start_t for bar in getattr(tqdm, "_instances", ()))

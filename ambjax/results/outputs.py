@@ -9,7 +9,6 @@ import json
 import math
 import os
 import pathlib
-import sys
 import tempfile
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,6 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ambjax.ensemble.store import MANIFEST, RESULT
+from ambjax.host.heartbeat import say
 from ambjax.host.interrupts import uninterrupted
 from ambjax.text.words import one_line
 
@@ -224,9 +224,3 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def written(out: pathlib.Path, names: str) -> None:
     """Print which files the command has written, the last line of its output."""
     print(one_line(f"written: {out}/{names}"))
-
-
-def say(text: str) -> None:
-    """Print a remark on one line of stderr; stdout carries the results only. A failure of stderr is ignored."""
-    with contextlib.suppress(OSError, ValueError):
-        print(one_line(text), file=sys.stderr, flush=True)
