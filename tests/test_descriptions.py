@@ -3,7 +3,6 @@
 import json
 import pathlib
 
-import numpy as np
 import pytest
 from test_end_to_end import CASES, COMMANDS, SAMPLED
 from texts import write
@@ -100,15 +99,3 @@ def test_an_error_that_concerns_the_result_too_is_raised(error, monkeypatch):
 
     with pytest.raises(type(error)):
         outputs.described("a picture", fail)
-
-
-def test_a_result_of_a_description_is_returned_and_errors_for_users_are_no_defects(monkeypatch, capsys):
-    monkeypatch.setattr(outputs, "STRICT", False)
-    assert outputs.described("a number", lambda: 3) == 3
-
-    def refuse():
-        raise ValueError("tune.front = 9: it must be at most 5")
-
-    assert outputs.described("the front", refuse) is None
-    assert capsys.readouterr().err == "the front is left out: tune.front = 9: it must be at most 5.\n"
-    assert np.isfinite(outputs.described("an array", lambda: np.ones(2))).all()

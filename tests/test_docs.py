@@ -11,7 +11,7 @@ import re
 
 import numpy as np
 import pytest
-from reference import benchmarks, case_file, commands, fields, markdown, metrics, parser, site
+from reference import benchmarks, case_file, commands, metrics, site
 
 import ambjax
 from ambjax.__main__ import main
@@ -197,28 +197,6 @@ def test_the_readme_states_the_measured_errors_and_voltages_of_the_structures():
     assert f"a factor of {factors['pid']} for PID, and of {factors['super-twisting']} for super-twisting" in text
     worst = max(cases["F20"]["structures"]["lqg"]["lost"])
     assert f"lose {worst} of 500 members" in text
-
-
-def test_text_is_escaped_in_markdown():
-    assert markdown.escaped("|z| < s_0 [m] $ `a|b`") == r"\|z\| \< s_0 \[m\] \$ `a\|b`"
-    assert markdown.table(("a", "b"), [("1", "2")], "keys")[2:5] == ["| a | b |", "|---|---|", "| 1 | 2 |"]
-
-
-def test_allowed_values_are_those_of_the_reader():
-    assert parser.rule("run.seed") == "a whole number from 0 to 4294967295"
-    assert parser.keys("initial") == ["z", "z_dot", "i"]
-    with pytest.raises(LookupError, match="allowed"):
-        parser.complaint("initial.z", 0.0)
-
-
-def test_attributes_are_documented_by_the_docstrings_below_them():
-    class Example:
-        x: float = 0.0
-        """a length, m"""
-        y: float = 0.0
-
-    assert fields.attribute_docs(Example) == {"x": "a length, m"}
-    assert [default_text(x) for x in (None, 0.5, math.inf, "auto", 1e-30)] == ["", "0.5", "inf", "auto", "1e-30"]
 
 
 def test_no_page_mentions_a_script_of_the_network():

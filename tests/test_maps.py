@@ -12,8 +12,7 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.commands import map as commands
 from ambjax.ensemble import Normal, Spread, maps, wilson
-from ambjax.ensemble.maps import PERIOD, Axis, grid, with_method_for_axes
-from ambjax.ensemble.store import MANIFEST
+from ambjax.ensemble.maps import Axis, grid
 from ambjax.ensemble.study import Study
 from ambjax.simulation.folds import Peak
 
@@ -95,19 +94,6 @@ def test_stalled_runs_are_counted_separately():
     assert found.lost.sum() == 0
 
 
-@pytest.mark.thorough
-def test_the_sample_period_can_be_either_axis():
-    period, std = Axis(PERIOD, np.array([1e-4, 5e-4])), Axis("sensor.std", np.array([1e-8, 1e-7, 1e-6]))
-    one, other = grid(SMALL, std, period), grid(SMALL, period, std)
-    np.testing.assert_array_equal(one.survival, other.survival.T)
-    np.testing.assert_array_equal(one.error, other.error.T)
-    slow = dataclasses.replace(SMALL, clock=dataclasses.replace(SMALL.clock, samples=10, sample_period=5e-4))
-    alone = grid(slow, std, Axis("plant.m", np.array([0.588])))
-    np.testing.assert_allclose(
-        one.error[1], alone.error[0], rtol=1e-11
-    )  # the mass is shared in one, an array in the other
-
-
 CASE = """
 [controller.inversion]
 gamma = 1e9
@@ -175,28 +161,6 @@ def test_the_axes_are_checked_for_every_case_before_any_run(x, y, words, tmp_pat
     assert main(["map", one, "--against", two, "--x", x, "--y", y, "--out", out]) == 2
     assert words in capsys.readouterr().err.splitlines()[-1]
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("kind", ["a file", "a study"])
-def test_an_unusable_output_folder_is_refused_before_any_run(kind, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(maps, "run_ensemble", None)
-    (tmp_path / "case.toml").write_text(CASE)
-    out = tmp_path / "out"
-    if kind == "a file":
-        out.touch()
-    else:
-        out.mkdir()
-        (out / MANIFEST).touch()
-    assert main(["map", str(tmp_path / "case.toml"), "--x", X, "--y", Y, "--out", str(out)]) == 2
-    assert f"--out {out}: " in capsys.readouterr().err.splitlines()[-1]
-
-
-def test_a_whole_number_may_be_an_axis_of_whole_numbers():
-    study = dataclasses.replace(SMALL, scenario=dataclasses.replace(NOISY, sensor=Sensor(1e-7, bits=12.0)))
-    mass = Axis("plant.m", np.array([0.588]))
-    assert with_method_for_axes(study, Axis("sensor.bits", np.linspace(2, 14, 13)), mass) == study
-    with pytest.raises(ValueError, match=r"sensor.bits must be a whole number"):
-        with_method_for_axes(study, Axis("sensor.bits", np.linspace(2, 14, 12)), mass)
 
 
 def made(survival, members, **changes):

@@ -7,11 +7,10 @@ import re
 import pytest
 
 from ambjax.__main__ import main
-from ambjax.cases.reader import TABLES, case_from
+from ambjax.cases.reader import case_from
 from ambjax.commands.acceptance import forces
 from ambjax.commands.plausibility import implausible
 from ambjax.commands.warnings import read_with_warnings
-from ambjax.text.synonyms import OTHER_WORDS, meant
 
 
 @pytest.mark.parametrize(
@@ -57,14 +56,6 @@ from ambjax.text.synonyms import OTHER_WORDS, meant
 def test_the_message_suggests_the_right_name(tables, said):
     with pytest.raises(ValueError, match=said):
         case_from(tables)
-
-
-def test_every_synonym_gives_its_name():
-    assert set(TABLES) - {"sensitivity"} <= set(OTHER_WORDS)
-    for name, words in OTHER_WORDS.items():
-        for word in words.split():
-            assert word == word.lower().replace("_", "")
-            assert meant(word, [name]) == name
 
 
 # A plausible bearing: 146 N/A, 364 N at the bias, a weight of 15.7 N, a pole of 675 1/s.

@@ -113,12 +113,6 @@ def test_current_for_inverts_v_on_the_branch_through_zero_current(plant):
     np.testing.assert_allclose(plant.current_for(z, plant.v(z, i)), i, rtol=1e-11, atol=1e-12 * plant.i_0)
 
 
-@PLANTS
-def test_current_for_at_z_zero_is_linear(plant):
-    v = np.linspace(-1, 1, 11) * 1e5
-    np.testing.assert_allclose(plant.current_for(0.0, v), v * plant.s_0**2 / (4 * plant.i_0), rtol=1e-14)
-
-
 def test_current_for_is_smooth_through_z_zero():
     # the derivative at v is di/dz = -dv_dz/dv_di and di/dv = 1/dv_di (implicit function theorem), at z = 0 too
     z = np.concatenate([[-1e-4, -1e-9, 0.0, 1e-9, 1e-4], np.logspace(-300, -2, 40) * PLANT.s_0])
@@ -226,10 +220,6 @@ def test_finite_with_finite_derivatives_at_and_beyond_the_gap(function):
     z, i = BEYOND.reshape(2, -1)
     value, slopes = jax.jit(jax.vmap(jax.value_and_grad(function, (0, 1))))(z, i)
     assert np.all(np.isfinite(np.stack([value, *slopes])))
-
-
-def test_distance_to_C_has_a_finite_derivative_on_C():
-    assert np.all(np.isfinite(jax.grad(PLANT.distance_to_C, (0, 1))(PLANT.s_0, -PLANT.i_0)))
 
 
 def test_thresholds_follow_the_plant():

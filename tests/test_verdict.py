@@ -181,10 +181,3 @@ def test_every_command_reports_the_same_status_of_a_rotor(kind, capsys, monkeypa
 def test_the_last_tenth_of_a_lost_run_is_its_fall():
     early = Report([condition(1.0, 30.0, at=0.05), condition(5.0, 4.0, ideal=True)], [], 0.1, "touched down", "")
     assert advised(advice.advice(early)[0]) == [("controller.inversion", "gamma", "33")]
-
-
-def test_the_advised_gain_is_no_smaller_than_required():
-    # rounded up to two digits, never down, and by less than a tenth
-    for x in (0.011, 9.91, 10.0, 68542.1, 1.0001e9):
-        assert x * (1 - 1e-12) <= advice._up(x) <= 1.1 * x
-    assert [advice.number(x) for x in (1000.0, 62311.0, 2.5e-7, 0.05)] == ["1000", "6.23e4", "2.5e-7", "0.05"]
