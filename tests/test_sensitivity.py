@@ -132,8 +132,6 @@ def test_check_does_not_succeed_without_a_linearisation(tmp_path, capsys, monkey
     """All conditions hold, the rotor is held, and the verdict on the linear loop is missing."""
     path = tmp_path / "case.toml"
     path.write_text("[controller]\n[clock]\nduration = 0.01\n")
-    assert main(["check", str(path), "--json"]) == 0
-    capsys.readouterr()
 
     def fails(*args):
         raise ValueError("the cause")
