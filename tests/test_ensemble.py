@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import linalg
 
-from ambjax import RK4, AdaptiveRodas3, Cascade, Clock, Initial, Scenario, Sensor, Sine, Standard, inversion, rollout
+from ambjax import RK4, Cascade, Clock, Initial, Scenario, Sensor, Sine, Standard, inversion, rollout
 from ambjax.compiler import fast_path
 from ambjax.control.processor import Processor
 from ambjax.ensemble import Normal, Percent, Spread, map_members, run_ensemble
@@ -21,7 +20,6 @@ from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
 from ambjax.host.sealed import difference
 from ambjax.simulation.folds import Rms
-from ambjax.simulation.loop import ClosedLoop, LoopState
 
 SMOOTH = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))
 NOISY = Scenario(reference=Sine(2.5e-3, 2.0), sensor=Sensor(1e-7, 1e-5, 1e-5), seed=7)
@@ -69,20 +67,6 @@ def test_results_do_not_depend_on_calls_threads_or_other_members():
         same(run_ensemble(SMOOTH, members(n), SHORT, fold=FOLD, threads=threads, call=call), whole, 1e-12)
     some = jax.tree.map(lambda x: x[60:70] if np.ndim(x) else x, members(n))
     same(run_ensemble(SMOOTH, some, SHORT, fold=FOLD), jax.tree.map(lambda x: x[60:70], whole), 1e-12)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", [RK4(2), pytest.param(AdaptiveRodas3(), marks=pytest.mark.thorough)], ids=str)
-def test_a_member_of_an_ensemble_equals_its_own_rollout(method):
-    clock = Clock(40, 1e-4, method)
-    found = run_ensemble(SMOOTH, members(66), clock, fold=FOLD, every=10)
-    for k in (0, 33, 65):
-        alone = jax.tree.map(lambda x, k=k: x[k] if np.ndim(x) else x, members(66))
-        one = rollout(SMOOTH, alone, clock, fold=FOLD, every=10)
-        # noise is bit for bit the same; an adaptive step's length depends on rounding, within its tolerance
-        np.testing.assert_array_equal(found.trajectory.rows.z_measured[k][0], one.trajectory.rows.z_measured[0])
-        same(jax.tree.map(lambda x, k=k: x[k], found.measured), one.measured, 1e-12 if method.limit else 1e-9)
-        assert found.trajectory.rows.z[k].shape == (4,)
 
 
 def test_the_plain_path_gives_the_same_numbers_and_logs_its_use(monkeypatch, caplog):
@@ -163,34 +147,6 @@ def test_any_function_of_a_member_is_mapped_over_all_and_compiled_once(plain):
         assert seen[0] == seen[1]
     with pytest.raises(ValueError, match="leaves: 69 and 70"):
         map_members(Scaled(2), {"x": x, "scale": np.arange(69.0)})
-
-
-@pytest.mark.slow
-def test_settled_rms_agrees_with_the_lyapunov_equation():
-    """Held noise in the linearised loop: P = A P A' + B S B' at the samples."""
-    n, std, period = 200, 1e-8, 1e-4
-    current = float(SMOOTH.model.equilibrium(0.0)[0])
-    cascade = dataclasses.replace(SMOOTH, inversion=inversion.Adaptive(1e9, 25e-6, i_ref=current))
-    still = Scenario(initial=Initial(i=current), sensor=Sensor(std, 0.0, 0.0), member=np.arange(n))
-    loop = ClosedLoop(cascade, Scenario(initial=Initial(i=current), sensor=Sensor()))
-    tree = jax.tree.structure(loop.start())
-
-    def rates(x, w):
-        state = LoopState(*jax.tree.unflatten(tree, list(x)))
-        errors = loop.sensor_errors(0)._replace(z=w)
-        return jnp.stack(jax.tree.leaves(loop.rates(loop.inputs(0.0), state, errors)))
-
-    x_0 = jnp.stack(jax.tree.leaves(loop.start()))
-    assert np.abs(rates(x_0, 0.0)[:3]).max() < 1e-9  # at rest: rounding of 9.81 m/s^2 and of currents
-    A, B = jax.jacfwd(rates, (0, 1))(x_0, 0.0)
-    held = linalg.expm(period * np.block([[A, np.asarray(B)[:, None]], [np.zeros((1, 5))]]))
-    P = linalg.solve_discrete_lyapunov(held[:4, :4], std**2 * np.outer(held[:4, 4], held[:4, 4]))
-    # 1/c = 59 ms is the slowest time constant: e^-8.5 of a start at zero is left after 0.5 s
-    clock = Clock(10_000, period, RK4(2))
-    rms = run_ensemble(cascade, still, clock, fold=Rms("e_z", 0.5)).measured
-    mean, error = np.mean(rms**2), np.std(rms**2) / np.sqrt(n)
-    assert error < 0.05 * P[0, 0]  # sharp enough for the comparison
-    assert abs(mean - P[0, 0]) < 3 * error
 
 
 SPREAD = Spread((("plant.m", Percent(1.0)), ("initial.z", Normal(1e-7))), "sobol")

@@ -82,18 +82,6 @@ def test_one_member_is_the_nominal_case():
     assert np.all(several.error > 10 * nominal.error)  # thrown off by 100 times what noise does
 
 
-@pytest.mark.slow
-def test_stalled_runs_are_counted_separately():
-    # two trials a sample are too few for the transient from 10 um at these gains, and enough from the balance
-    clock = Clock(20, 1e-4, AdaptiveRodas3(1e-8, 2))
-    study = dataclasses.replace(basin("repaired"), clock=clock)
-    z = Axis("initial.z", np.array([0.0, 1e-4]))
-    found = grid(study, z, Axis("plant.m", np.array([0.588])))
-    np.testing.assert_array_equal(found.survival + found.lost + found.stalled, 1)  # each run has one status
-    assert found.stalled[0, 1] == 1
-    assert found.lost.sum() == 0
-
-
 CASE = """
 [controller.inversion]
 gamma = 1e9
@@ -188,17 +176,6 @@ def test_confidence_is_stated_if_the_number_of_members_allows_it(members):
     assert "surely" not in commands._text([case], [alike])
     assert "all runs of a cell are the same" in commands._text([case], [alike])
     assert commands._summary(case, alike)["decisive"] is False
-
-
-def test_the_reported_surviving_interval_has_no_gap():
-    assert made([[1, 0, 1, 1, 1, 0]], 1).reach() == (2.0, 4.0)
-    assert made([[0, 0.9]], 10).reach() is None
-    assert made([[0, 0], [1, 1], [0, 0], [1, 1]], 1).reach() == (0.0, 1.0)  # of the two middle rows, the lower
-    # an end of the interval at an end of the map is not a limit of the rotor
-    ends = {(1, 0, 1, 1, 1, 0): "", (1, 1, 0): " (lower end of the map)", (1, 1): " (lower and upper end of the map)"}
-    for survival, words in ends.items():
-        one = made([survival], 1)
-        assert commands._open_ends(one, one.reach()) == words
 
 
 @pytest.mark.slow

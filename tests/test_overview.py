@@ -1,6 +1,5 @@
 """The overview of a run: its enlarged parts, kept extremes, and the visible mean of a chattering voltage."""
 
-import itertools
 import json
 import pathlib
 
@@ -98,17 +97,8 @@ def test_a_figure_of_the_paper_distinguishes_a_loss_from_a_stall(tmp_path, drawn
     assert said == [words]
 
 
-# each number of samples and each end once; the thorough tests combine them otherwise
-FAST_RUNS = [(1, 0.0), (1, np.inf), (2, 1e-4), (3, 1.5e-4), (30, np.inf)]
-
-
-@pytest.mark.parametrize(
-    ("samples", "lost_at"),
-    [
-        pytest.param(*both, marks=pytest.mark.slow if both in FAST_RUNS else pytest.mark.thorough)
-        for both in itertools.product([1, 2, 3, 30], [np.inf, 0.0, 1e-4, 1.5e-4])
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("samples", "lost_at"), [(1, 0.0), (1, np.inf), (2, 1e-4), (3, 1.5e-4), (30, np.inf)])
 def test_runs_of_few_samples_are_drawn(tmp_path, samples, lost_at):
     overview(a_run(samples=samples, lost_at=lost_at, code=TOUCHED), "tiny", tmp_path / "o.png")
     assert (tmp_path / "o.png").stat().st_size > 1000

@@ -239,18 +239,3 @@ def test_tuned_toml_names_the_law_relative_to_its_own_folder(kind, out, wanted, 
     again = read_case(write(text, str(folder / "tuned.toml"))).cascade
     assert again == tuned.cascade
     assert again.position.damp == 500.0
-
-
-@pytest.mark.thorough
-def test_a_custom_law_is_tuned_and_a_search_is_not_resumed_with_another_law(case, monkeypatch, capsys):
-    small = "members = 2\nstressed = 1\nvalidation = 2\nheld_out = 2\nscreen = 2\nstarts = 1\niterations = 1\n"
-    write(CASE + small)
-    assert tune_main(["case.toml", "--out", "there"]) in (0, 1)
-    assert IMPORTED in capsys.readouterr().err
-    tuned = read_case("there/tuned.toml")
-    assert tuned.own_laws[0].kind == "../mine.py:PD"
-    assert tuned.own_laws[0].law is read_case(case).own_laws[0].law
-    write(LAW.replace("10 *", "20 *"), "mine.py")
-    pathlib.Path("there/report.json").unlink()
-    assert tune_main(["case.toml", "--out", "there", "--resume"]) == 2
-    assert "laws.position" in capsys.readouterr().err

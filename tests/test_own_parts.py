@@ -6,7 +6,6 @@ of its own names. Nothing in the package knows either.
 
 import dataclasses
 import itertools
-import math
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -19,7 +18,6 @@ from ambjax import (
     AdaptiveRodas3,
     Cascade,
     Clock,
-    Constant,
     Initial,
     Pulse,
     Scenario,
@@ -29,8 +27,6 @@ from ambjax import (
     inversion,
     rollout,
 )
-from ambjax.cases.reader import Case
-from ambjax.cases.table import Table
 from ambjax.ensemble import Normal, Percent, Spread
 from ambjax.ensemble.study import Study
 from ambjax.extend import (
@@ -50,8 +46,6 @@ from ambjax.extend import (
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.metrics import standard_for
 from ambjax.theorem.conditions import check
-from tuning.problem.config import tune_from
-from tuning.problem.tuning_problem import problem_of
 
 
 class Coils(NamedTuple):
@@ -206,41 +200,6 @@ def test_the_numbers_of_a_custom_law_and_plant_are_spread():
     # the same arithmetic in another order
     assert float(alone["rms_error_m"]) == pytest.approx(columns["rms_error_m"][5], rel=1e-9)
     assert study.fingerprint()["plant.kind"] == "TwoCoils"
-
-
-def tuning_problem():
-    """A tuning problem with the custom parts, its settings and its case."""
-    scenario = dataclasses.replace(NOISY, q_v=Constant(), initial=Initial())
-    slow = dataclasses.replace(CASCADE, position=BoundaryLayer(rho=5.0))
-    case = Case("own", slow, scenario, Clock(200, 1e-4), 0.005, Spread(((SKEW, Normal(0.02)),)))
-    paths = [f"controller.{path}" for path in ("position.decay", "position.rho", "position.width")]
-    budget = {
-        "objective": "least_error",
-        "limits": {"sensitivity": math.inf},
-        "members": 4,
-        "stressed": 2,
-        "validation": 8,
-        "held_out": 8,
-        "screen": 4,
-        "starts": 1,
-        "iterations": 3,
-    }
-    tune = tune_from(Table({"gains": paths, **budget}), case)
-    return problem_of(case, tune), tune, case
-
-
-def test_the_gains_of_a_custom_law_have_paths_and_ranges():
-    problem, tune, case = tuning_problem()
-    every = tune_from(Table({}), case).space.paths
-    assert every == [*tune.space.paths, "controller.inversion.gamma", "controller.current.k_i"]
-    assert (
-        problem_of(case, tune, finer=2).objective.clock.method.substeps == 2 * problem.objective.clock.method.substeps
-    )
-    rho = problem.ranges[1]
-    assert rho.source.startswith("slope rho/width from w/3")
-    width = problem.ranges[2]  # of which the law says nothing
-    assert (width.low, width.high) == pytest.approx((0.05 / 30, 0.05 * 30))
-    assert next(bound for bound in problem.goal.conditions if bound.path == RHO).symbol == "Q_z"
 
 
 def test_a_law_without_the_base_class_is_refused():

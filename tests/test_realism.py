@@ -175,36 +175,6 @@ def test_the_largest_voltage_is_that_at_the_coils_and_within_the_supply():
     np.testing.assert_allclose(found.measured["search"], np.mean(u_peak**16) ** (1 / 16), rtol=1e-12)
 
 
-PARTS = {
-    "converter": ({"bits": 14.0}, None),
-    "sensor": ({"bandwidth": 1e4, "offset": 1e-6, "gain": 1.01}, None),
-    "amplifier": (None, Amplifier(bandwidth=3e3, slew=5e6, dead_band=0.5, i_max=0.5)),
-}
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(("name", "delay"), [("sensor", 1.0), ("amplifier", 0.5)])
-def test_gradients_forward_and_reverse(name, delay):
-    sensor, amplifier = PARTS[name]
-    scenario = dataclasses.replace(
-        WORLD, amplifier=amplifier, sensor=dataclasses.replace(WORLD.sensor, **(sensor or {}))
-    )
-    settled = laws(delay=delay).on_processor()
-
-    def loss(x):
-        cascade = dataclasses.replace(settled, position=dataclasses.replace(settled.position, c=1440.0 * jnp.exp(x)))
-        fold = amb.simulation.folds.Rms("e_z")
-        return 1e9 * amb.rollout(cascade, scenario, amb.Clock(60, 1e-4, amb.RK4(2)), fold=fold, every=0).measured
-
-    # compiled as a whole, because tracing each call separately takes twice as long as the rest
-    forward, reverse = jax.jit(lambda x: jax.jvp(loss, (x,), (1.0,))[1])(0.1), jax.jit(jax.grad(loss))(0.1)
-    assert forward != 0
-    np.testing.assert_allclose(forward, reverse, rtol=1e-10)
-    # central differences: step^2 of a third derivative
-    value = jax.jit(loss)
-    np.testing.assert_allclose(forward, (value(0.1 + 1e-5) - value(0.1 - 1e-5)) / 2e-5, rtol=1e-6)
-
-
 CASE = {"processor": {}, "clock": {"duration": 0.01}}
 
 

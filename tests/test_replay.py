@@ -24,7 +24,6 @@ from ambjax.ensemble import replay as replaying
 from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
-from ambjax.simulation.folds import Named, Variation
 from ambjax.simulation.metrics import standard_for
 from tuning.__main__ import parser as tuner
 
@@ -182,38 +181,6 @@ class _Nothing:
 
 
 # --- other loops ---
-
-LOOPS = {
-    "two-coil, delay of 0.6": {"[plant]\n": '[plant]\nkind = "two-coil"\n', "delay = 1.0 ": "delay = 0.6 "},
-    "amplifier": {"i_max = 2.5 ": "bandwidth = 3e3\nslew = 1e6\ndead_band = 0.2\ni_max = 2.5 "},
-    "no spread": {"[spread]\n": "[tune]\n", "plant.m = {": "# {", "plant.A = {": "# {", "plant.R = {": "# {"},
-    "differentiator": {'kind = "kalman"\nw = 1000.0 ': 'kind = "ired-2"\nL = 1e3 '},
-}
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(
-    "loop",
-    [pytest.param(x, marks=pytest.mark.slow if x.startswith("two-coil") else pytest.mark.thorough) for x in LOOPS],
-)
-def test_members_of_other_loops_are_replayed_bit_by_bit(loop):
-    study = study_of(changed(CASE, LOOPS[loop]))
-    columns = chunk(study, 0, 64, 64)
-    for member in (5, 63):
-        found = replaying.replay(study, member)
-        same_bits({k: v if np.isfinite(v) else None for k, v in found.metrics.items()}, columns, member)
-        assert found.deviation <= found.rounding
-
-
-@pytest.mark.slow
-def test_recorded_rows_and_other_folds_do_not_change_a_bit_of_the_loop():
-    study = study_of(CASE)
-    columns = chunk(study, 0, 64, 64)
-    cascade, scenario = study.batch(np.arange(8))
-    folds = Named({"more": Variation(0.03), "metrics": standard_for(study.settle, scenario)})
-    other = run_ensemble(cascade, scenario, study.clock, fold=folds, every=7, call=CALL).measured["metrics"]
-    for name in ("settled_max_abs_error_m", "max_abs_i_A", "lost_at_s"):
-        np.testing.assert_array_equal(other[name], columns[name][:8])
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """Gain schedules: interpolation, laws of every stage, gradients, tuning, the theorem and the export."""
 
 import dataclasses
-import json
 import re
 import tomllib
 
@@ -11,12 +10,10 @@ import numpy as np
 import pytest
 
 from ambjax import Schedule
-from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.cases.table import Table
 from ambjax.control.cascade_state import Sample
 from ambjax.control.schedule import OVER
-from ambjax.ensemble.paths import kinds, places
 from ambjax.numerics.records import validate
 from ambjax.theorem.conditions import constant_sigma, required
 from ambjax.world.sensor import Measurement
@@ -177,18 +174,6 @@ def test_only_finite_gains_have_schedules():
         validate(law, "position")
 
 
-def test_each_knot_has_a_path():
-    case = loop(k=table(25.0, 50.0), more="[spread]\ncontroller.position.k.1 = { percent = 10 }")
-    known = places(case.cascade, case.scenario)
-    assert [known[f"controller.position.k.{knot}"].value for knot in (0, 1)] == [25.0, 50.0]
-    assert "controller.position.k" not in known
-    assert list(case.spread.paths) == ["controller.position.k.1"]
-    # the knots and the signal are part of the fingerprint of a study
-    other = dict(kinds(loop(k=table(25.0, 50.0, over="reference")).cascade))
-    assert dict(kinds(case.cascade))["position.k.over"] != other["position.k.over"]
-    assert dict(kinds(case.cascade))["position.k.at"] == "(0.0, 1e-05)"
-
-
 SCHEDULED = GAINS | {"c": table(17.0, 20.0, 30.0), "k": table(25.0, 50.0)}
 TUNED = {"gains": ["controller.position.c", "controller.position.k.1"], "members": 8, "stressed": 4}
 
@@ -260,12 +245,3 @@ def test_the_theorem_uses_the_smallest_value_and_requires_a_constant_sigma():
     assert "c constant" in line.requires
     (line,) = constant_sigma(loop(c=table(17.0, 17.0)).cascade.position)
     assert line.holds
-
-
-@pytest.mark.thorough
-def test_the_exported_schedules_agree_with_jax(tmp_path, capsys):
-    path = tmp_path / "case.toml"
-    path.write_text(LOOP.format(more=SAMPLED, **SCHEDULED))
-    assert main(["export", str(path), "--out", str(tmp_path / "out"), "--verify", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["ok"]
-    assert "knot_2" in (tmp_path / "out" / "amb_case.h").read_text()

@@ -331,16 +331,3 @@ def test_the_spread_of_the_template_is_valid(name):
     spread = tail.partition("# [tune]")[0]
     assert len(case.spread.entries) == len(spread.strip().splitlines()) - 2  # the heading's comment and the design
     assert case_from(tomllib.loads(template(name))).spread == Spread()
-
-
-@pytest.mark.parametrize(
-    ("entries", "words"),
-    [
-        ((("plant.m", Percent(1.0)), ("plant.m", Percent(2.0))), "spread.plant.m is given 2 times"),
-        ((("plant.m", Percent(1.0, "flat")),), "shape must be 'uniform' or 'normal'"),
-        ((("plant.mass", Percent(1.0)),), "Did you mean 'plant.m'"),
-    ],
-)
-def test_spreads_made_in_python_are_checked_too(entries, words):
-    with pytest.raises(ValueError, match=words):
-        draw(Spread(entries), CASCADE, SCENARIO, 0, np.arange(3), 3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ambjax.ensemble import cvar, quantile, statistics, summary, wilson
+from ambjax.ensemble import cvar, quantile, summary, wilson
 from ambjax.ensemble.intervals import bootstrap
 
 RNG = np.random.default_rng(5)
@@ -131,18 +131,6 @@ def test_the_interval_is_infinite_if_the_resamples_do_not_determine_it():
         "use at least 200 survivors"
     ]
     assert summary(columns(202), [], seed=0)["notes"] == []
-
-
-@pytest.mark.parametrize(
-    "n", [pytest.param(n, marks=pytest.mark.slow if n == 50 else pytest.mark.thorough) for n in (50, 200, 1000)]
-)
-def test_the_std_of_a_heavy_tail_has_the_stated_coverage(n):
-    # 2,000 ensembles: a share known to 0.8 %, three of which
-    true, hits = stats.lognorm(1).std(), []
-    for seed in range(20):
-        found = bootstrap(list(np.random.default_rng((n, seed)).lognormal(size=(100, n))), 0.95, 0.95, seed)["std"]
-        hits += list((found.low <= true) & (true <= found.high))
-    assert abs(np.mean(hits) - statistics.COVERED[n] / 100) < 0.024
 
 
 def test_grouped_intervals_have_the_width_of_the_central_limit_theorem():
