@@ -22,7 +22,6 @@ from ambjax.cases.table import Table
 from ambjax.control.guard import Guard
 from ambjax.numerics import declared
 from ambjax.numerics.declared import default_text
-from ambjax.results.outputs import table
 from ambjax.world.amplifier import CurrentAmplifier
 from ambjax.world.faults import Dropouts, Outliers
 from tuning.problem.config import tune_from
@@ -209,23 +208,3 @@ def test_the_committed_tables_are_current(name):
     path = site.FOLDER / name
     assert path.exists(), "run: python docs/reference/site.py"
     assert path.read_text(encoding="utf-8") == site.tables()[name], "run: python docs/reference/site.py"
-
-
-@pytest.mark.slow  # the slow tests run with Sphinx installed
-def test_a_printed_table_is_parsed_to_the_same_cells(monkeypatch):
-    """A table printed with `outputs.table` has the same cells in the page; the text around it is kept."""
-    pytest.importorskip("sphinx")
-    monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
-    split = importlib.import_module("printed_tables").split
-    titles, rows = (
-        ["loop", "rms error", "note"],
-        [["A, explicit", "", "lost"], ["b", "1.2 um", "two  spaces, at the end"]],
-    )
-    printed = table(titles, rows)
-    assert split(f"before\n\n{printed}\n\nafter: one two three") == [
-        "before\n",
-        [titles, *rows],
-        "\nafter: one two three",
-    ]
-    assert split(printed) == [[titles, *rows]]
-    assert split("a list\n- one\n--\n") == ["a list\n- one\n--"]

@@ -277,15 +277,6 @@ def test_a_bad_spread_is_refused_in_one_line(wrong):
             ["spread.sensor.bits = { choices = [8, 8.5, 14] }", "a whole number from 2 to 32. Use choices"],
         ),
     ],
-    ids=[
-        "not a table",
-        "no sensor",
-        "nothing in two units",
-        "band turned over",
-        "unstable step",
-        "bits between",
-        "bits by choice",
-    ],
 )
 def test_spreads_that_do_not_fit_the_case_are_refused(text, wanted):
     with pytest.raises(ValueError) as refused:  # noqa: PT011
