@@ -131,15 +131,6 @@ def test_a_stalled_run_gives_no_verdict_on_the_rotor(capsys, monkeypatch):
         assert word in said
 
 
-@pytest.mark.slow
-def test_simulate_names_the_commands_to_use_after_a_loss(capsys):
-    lost = write(SHORT + "[controller.inversion]\ngamma = 1000.0\n")
-    assert main(["simulate", lost]) == 1
-    said = capsys.readouterr().err
-    assert "`ambjax check case.toml` compares the gains" in said
-    assert "`ambjax tune case.toml`" in said
-
-
 # Of each status: when a run ended, whether for the integrator, and what each command must say and return.
 STATUSES = {"held": (math.inf, False), "lost": (0.01, False), "not decided": (0.01, True)}
 WORDS = {
