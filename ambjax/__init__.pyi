@@ -4,8 +4,10 @@ from ambjax import ensemble as ensemble
 from ambjax import paper as paper
 from ambjax._version import __version__ as __version__
 from ambjax.cases.controller_file import save_controller as save_controller
+from ambjax.cases.machine_case import MachineCase as MachineCase
+from ambjax.cases.machine_case import read_machine as read_machine
 from ambjax.cases.reader import Case as Case
-from ambjax.cases.reader import read_case as read_case
+from ambjax.cases.warned import read_case as read_case
 from ambjax.control import current as current
 from ambjax.control import inversion as inversion
 from ambjax.control import observer as observer
@@ -20,6 +22,8 @@ from ambjax.results.case_map import CaseMap as CaseMap
 from ambjax.results.case_map import survival_map as survival_map
 from ambjax.results.gains import gains_of as gains_of
 from ambjax.results.gains import with_gains as with_gains
+from ambjax.results.machine_run import MachineRun as MachineRun
+from ambjax.results.machine_run import simulate_machine as simulate_machine
 from ambjax.results.operating import sensitivity as sensitivity
 from ambjax.results.runs import CaseRun as CaseRun
 from ambjax.results.runs import simulate as simulate

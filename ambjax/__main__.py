@@ -42,8 +42,11 @@ def parser() -> Parser:
 
     command("reproduce", "reproduce Section 4 of the paper: Figures 3 to 6, and a ledger of its claims", out=True)
     template = command("template", "print a case file with comments")
-    cases = ["tracking", "regulation", "rig", "bearing"]
-    meaning = "the paper's tracking or regulation, a laboratory rig, or a bearing from a data sheet"
+    cases = ["tracking", "regulation", "rig", "bearing", "machine", "machine-flexible"]
+    meaning = (
+        "the paper's tracking or regulation, a laboratory rig, a bearing from a data sheet, or a whole machine with a "
+        "rigid or a flexible rotor"
+    )
     template.add_argument("scenario", nargs="?", default=cases[0], choices=cases, help=meaning)
     simulate = command("simulate", "simulate a case: trajectory.npz, metrics.json, overview.png", case=True, out=True)
     simulate.add_argument(
@@ -84,6 +87,8 @@ def parser() -> Parser:
         "fails"
     )
     command("check", summary, case=True)
+    campbell = command("campbell", "poles of a machine against its speed: campbell.json, campbell.png", True, True)
+    campbell.add_argument("--to", type=float, metavar="RPM", help="largest speed (default: 1.2 times that of the case)")
     summary = "sensitivity peaks with ISO 14839-3 zones, margins, stiffness: sensitivity.json, sensitivity.png"
     sensitivity = command("sensitivity", summary, case=True, out=True)
     sensitivity.add_argument("--members", type=int, metavar="N", help="members of [spread] to analyse (default: 100)")

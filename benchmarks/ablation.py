@@ -23,7 +23,7 @@ import tomlkit
 from ambjax.cases.template_text import template
 from tuning import optimisers
 from tuning.__main__ import main as tune
-from tuning.solve import course, multipliers, refine
+from tuning.solve import multipliers, refine
 
 NEVER = 10**9
 FIRST_KINDS = {
@@ -69,7 +69,6 @@ MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "BFGS: Adam instead": setting(optimiser="adam"),
     "curvature kept between phases": constant(optimisers.BFGSState, restarted=lambda self, fresh: fresh),
     "jumps known to the BFGS": constant(optimisers, JUMP=math.inf),
-    "restarts": constant(course, MOST_SEARCHES=1),
     "stressed members": setting(stressed=0),
     "conditions of Theorem 1 in the goal": lambda raw: raw["tune"].setdefault("weights", {}).update(conditions=0.0),
     "validation": setting(validation=0),

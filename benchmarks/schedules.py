@@ -33,7 +33,7 @@ from tuning.events import Event
 from tuning.problem.config import tune_from
 from tuning.problem.lanes import GRADIENT_LANES, Engine
 from tuning.problem.tuning_problem import TuningProblem, problem_of
-from tuning.solve.course import Course, search_and_restart, training
+from tuning.solve.course import Course, first_search, training
 
 SECONDS, MEMBERS, STRESSED = 0.25, 12, 4
 ERRORS, REFERENCES = [0.0, 2e-6, 1e-5], [0.0, 1.25e-3, 2.5e-3]
@@ -105,7 +105,7 @@ def by_gradients(made: tuple[TuningProblem, Any], seed: int, seconds: float) -> 
     try:
         while True:
             start = found.tune.space.values(found.case.cascade)
-            search_and_restart(Course(found, members, seed, listen=note), start)
+            first_search(Course(found, members, seed, listen=note), start)
             seed += 1000
     except SpentError:
         return counter.trace

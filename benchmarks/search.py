@@ -36,7 +36,7 @@ from tuning.events import Event
 from tuning.problem.config import read_tune
 from tuning.problem.ranges import ranges
 from tuning.problem.tuning_problem import TuningProblem, problem_of
-from tuning.solve.course import Course, search_and_restart, training
+from tuning.solve.course import Course, first_search, training
 
 TASKS = pathlib.Path(__file__).parent / "tasks"
 # Points per call for methods without a population.
@@ -140,7 +140,7 @@ def gradient_search(problem: TuningProblem, members: Any, seed: int) -> list[tup
             best = min(found.goal, trace[-1][2] if trace else np.inf)
             trace.append((found.rollouts, time.process_time() - started, best))
 
-    search_and_restart(Course(problem, members, seed, listen=note), problem.tune.space.values(problem.case.cascade))
+    first_search(Course(problem, members, seed, listen=note), problem.tune.space.values(problem.case.cascade))
     return trace
 
 

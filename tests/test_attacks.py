@@ -22,8 +22,8 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
 from ambjax.cases.template_text import template
 from ambjax.cases.tune_table import Budget
+from ambjax.cases.warned import idealised, reversal, warnings_of
 from ambjax.commands import simulate
-from ambjax.commands.warnings import idealised, reversal, warnings_of
 from ambjax.control.processor import Processor
 from ambjax.numerics.declared import within
 from ambjax.pictures import overview

@@ -19,7 +19,7 @@ from ambjax.cases.reader import TABLES, read_case
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.timing import DURATION, METHODS
 from ambjax.cases.tune_table import NUMBERS as TUNED
-from ambjax.commands.warnings import warnings_of
+from ambjax.cases.warned import warnings_of
 from ambjax.ensemble.design import DESIGNS
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import draw

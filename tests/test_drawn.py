@@ -362,29 +362,6 @@ def kept(monkeypatch):
     monkeypatch.setattr(tuned, "_png", lambda figure: figure)
 
 
-@pytest.mark.parametrize("n", [9600, 20_001, 200])
-def test_the_panels_before_and_after_show_their_runs(n, kept):
-    runs = {"before": a_run(n), "after": a_run(n, 0.7 * n * 1e-4)}
-    axes = np.reshape(tuned.before_after(runs).axes, (4, 3))
-    shown = [(name, signal) for signal in ("e_z", "u_mean") for name in runs]
-    for (name, signal), line in zip(shown, axes, strict=True):
-        rows, factor = runs[name].rows, factor_of(line[0].get_ylabel())
-        t, y, alive = rows.t, getattr(rows, signal), rows.alive
-        for ax in line:
-            low, high = ax.get_xlim()
-            inside = alive & (t > low - 1e-9) & (t < high + 1e-9)
-            x, v = ax.lines[0].get_data()
-            at = np.searchsorted(t, x)
-            np.testing.assert_allclose(v, factor * y[at], rtol=ROUNDING)
-            np.testing.assert_allclose(
-                [v.min(), v.max()], factor * np.array([y[inside].min(), y[inside].max()]), ROUNDING
-            )
-            assert x[0] <= t[inside][0]
-            assert x[-1] >= t[inside][-1]
-        assert line[0].lines[0].get_xdata()[-1] == t[alive][-1]
-        assert line[2].lines[0].get_xdata()[-1] == t[alive][-1]
-
-
 @pytest.mark.parametrize("n", [1000, 1001])
 def test_the_spectrum_has_the_amplitudes_of_its_sines(n, kept):
     t = 1e-4 * np.arange(n)

@@ -2,11 +2,13 @@
 
 import dataclasses
 import functools
+import itertools
 import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from oracle import World, solve
 
@@ -307,16 +309,45 @@ def test_a_sign_as_steep_as_a_relay_does_not_stall_the_adaptive_method(p):
     np.testing.assert_allclose(z, expected, rtol=0, atol=2e-8)
 
 
-def test_traced_gains_are_refused_for_the_choice_of_a_method():
-    def peak(gamma, clock):
-        cascade = amb.Cascade(inversion=amb.inversion.Adaptive(gamma=gamma, p=25e-6))
+@pytest.mark.slow
+def test_the_default_clock_works_under_jit_and_in_both_modes_of_differentiation():
+    clock = amb.Clock(10)
+
+    def peak(gamma):
+        cascade = dataclasses.replace(REPAIRED, inversion=dataclasses.replace(REPAIRED.inversion, gamma=gamma))
         return jnp.abs(amb.rollout(cascade, TRACKING, clock).trajectory.rows.z).max()
 
-    clock = amb.Clock(10)
-    with pytest.raises(ValueError, match=r"with_method\(clock, cascade, scenario\)"):
-        jax.eval_shape(lambda gamma: peak(gamma, clock), 1e9)
-    chosen = amb.with_method(clock, SMOOTH, TRACKING)
-    assert jax.eval_shape(lambda gamma: peak(gamma, chosen), 1e9).shape == ()
+    gamma = 7.5e4
+    assert jax.jit(peak)(gamma) == pytest.approx(float(peak(gamma)), abs=1e-8)  # m; tests/test_tolerance.py
+    forward = jax.jacfwd(jax.jit(peak))(gamma)
+    # the same steps in both modes, so that only rounding differs
+    np.testing.assert_allclose(jax.grad(jax.jit(peak))(gamma), forward, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_optax_reduces_an_error_over_the_gains_of_a_law_with_the_default_clock():
+    def error(logarithms):
+        cascade = dataclasses.replace(REPAIRED, position=jax.tree.map(jnp.exp, logarithms))
+        return 1e6 * amb.rollout(cascade, TRACKING, amb.Clock(50)).trajectory.rows.e_z[-1] ** 2
+
+    gains, optimiser = jax.tree.map(jnp.log, REPAIRED.position), optax.adam(1e-2)
+    state, slope = optimiser.init(gains), jax.jit(jax.value_and_grad(error))
+    errors = []
+    for _ in range(4):
+        value, gradient = slope(gains)
+        updates, state = optimiser.update(gradient, state)
+        gains = optax.apply_updates(gains, updates)
+        errors.append(float(value))
+    assert all(after < before for before, after in itertools.pairwise(errors))
+
+
+def test_a_fixed_number_of_steps_is_not_chosen_from_traced_values():
+    def chosen(gamma):
+        cascade = amb.Cascade(inversion=amb.inversion.Adaptive(gamma=gamma, p=25e-6))
+        return amb.with_method(amb.Clock(10), cascade, TRACKING, reverse=True).sample_period
+
+    with pytest.raises(ValueError, match=r"with_method\(clock, cascade, scenario, reverse=True\)"):
+        jax.jit(chosen)(1e9)
 
 
 @pytest.mark.parametrize("n", range(1, 9))

@@ -16,8 +16,7 @@ ROOT = pathlib.Path(__file__).parent.parent
 LAYERS = {
     "ambjax": "_version text compiler numerics host world control simulation extend codegen theorem ensemble linear "
     "paper pictures cases results page commands __init__ __main__",
-    "tuning": "events optimisers problem judge solve validate front rounds report command from_python "
-    "__init__ __main__",
+    "tuning": "events optimisers problem judge solve validate front rounds report command __init__ __main__",
 }
 # Folders and modules that may import matplotlib: those that draw.
 DRAWING = ("ambjax.pictures.", "tuning.report.pictures")

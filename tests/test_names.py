@@ -3,14 +3,16 @@
 import json
 import pathlib
 import re
+import warnings
 
 import pytest
 
+import ambjax
 from ambjax.__main__ import main
+from ambjax.cases.forces import forces
+from ambjax.cases.plausibility import implausible
 from ambjax.cases.reader import case_from
-from ambjax.commands.acceptance import forces
-from ambjax.commands.plausibility import implausible
-from ambjax.commands.warnings import read_with_warnings
+from ambjax.commands.reading import read_with_warnings
 
 
 @pytest.mark.parametrize(
@@ -74,11 +76,26 @@ def runout(amplitude):
     return {"sensor": {"runout": {"speed": 100.0, "harmonics": [{"number": 2, "amplitude": amplitude}]}}}
 
 
-def test_an_empty_file_causes_a_warning(tmp_path, capsys):
-    for text, said in ((" \n", True), ("[plant]\n", False)):
-        (tmp_path / "case.toml").write_text(text)
-        read_with_warnings(tmp_path / "case.toml")
-        assert ("the file is empty" in capsys.readouterr().err) == said
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (" \n", "the file is empty"),
+        ("[plant]\n", None),
+        ("[plant]\ns_0 = 0.005\n", "[plant] omits numbers"),
+        ("[plant]\n" + "\n".join(f"{key} = {value}" for key, value in (GOOD | {"s_0": 0.4}).items()), "millimetres"),
+    ],
+)
+def test_python_and_the_commands_give_the_same_warnings(text, said, tmp_path, capsys):
+    case = tmp_path / "case.toml"
+    case.write_text(text)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        ambjax.read_case(case)
+    assert {one.filename for one in caught} <= {__file__}  # the line of the caller
+    read_with_warnings(case)
+    printed = capsys.readouterr().err.splitlines()
+    assert [str(one.message) for one in caught] == printed
+    assert any(said in line for line in printed) if said else not printed
 
 
 @pytest.mark.parametrize(
@@ -86,6 +103,8 @@ def test_an_empty_file_causes_a_warning(tmp_path, capsys):
     [
         ({}, {}, None),
         ({"m": 5e5}, {}, "plant.m = 500000 kg: usual values are 0.001 to 100000 kg. Is it in grams?"),
+        ({"m": 1600.0}, {}, "plant.m = 1600 kg: the rotor weighs .*, 43.1 times the largest force .* Is it in grams?"),
+        ({"m": 300.0}, {}, None),
         ({"i_0": 2500.0}, {}, "plant.i_0 = 2500 A: .* Is it in milliamperes?"),
         ({"i_0": 5.0}, {}, "the bias flux density .* is 1.31 T; iron saturates above about 1.2 T"),
         (

@@ -164,8 +164,7 @@ def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
         given.append(words[:2])
         return TunedCase(ambjax.read_case(path), False, {"verdict": "none"}, tmp_path)
 
-    for module in ("tuning.from_python", "tuning.command"):  # the first imports the second
-        monkeypatch.setattr(f"{module}.run", tuned)
+    monkeypatch.setattr("tuning.command.run", tuned)
     flags = dict.fromkeys(("resume", "force", "pareto", "page"), True)
     assert ambjax.tune(path, tmp_path, **flags, settings_of=path, minutes=2.0).directory == tmp_path
     words = ["--resume", "--force", "--pareto", "--page", "--settings-of", str(path), "--budget", "2"]

@@ -37,9 +37,6 @@ WRITTEN = """# Tuned by ambjax tune from the case 'fan'.
 model = {}
 position = { c = 20.5, k = 25.0 }  # c: try 30
 
-[controller.current]
-k_i = 9.0
-
 [reference]
 kind = "sine"
 amplitude = 1_0e-4  # m
@@ -54,6 +51,9 @@ p = 3.0
 gains = [
   "controller.position.c", # alone
 ]
+
+[controller.current]
+k_i = 9.0
 """
 GAINS = {"position.c": 20.5, "position.k": 25.0, "current.k_i": 9.0, "inversion.gamma": 1.5e5, "inversion.p": 3.0}
 GAINS = {f"controller.{path}": value for path, value in GAINS.items()}

@@ -19,7 +19,7 @@ from ambjax import rollout
 from ambjax.numerics.records import is_traced
 from ambjax.simulation.folds import Named
 from ambjax.simulation.metrics import standard_for
-from tuning.judge.peaks import MeasuredPeak, Sensitivity
+from tuning.judge.peaks import MemberPeak, Sensitivity
 from tuning.problem import config
 from tuning.problem.config import LimitSettings, settings
 from tuning.problem.lanes import Engine
@@ -32,8 +32,7 @@ from tuning.report.limit_table import MORE
 from tuning.report.pictures import amplitudes
 from tuning.rounds import rounds
 from tuning.solve.course import Course, training
-from tuning.solve.joining import breaking
-from tuning.solve.multipliers import search_within_limits
+from tuning.solve.multipliers import breaking, search_within_limits
 from tuning.validate import Validation
 
 # The voltage of a Bowl is proportional to k: 20 V at the best k, 60, and 10 V at k = 30.
@@ -347,7 +346,7 @@ def test_a_search_that_does_not_move_and_holds_the_limits_ends(monkeypatch):
     problem = study(monkeypatch, World(), limits={"rms_u_V": 20 / 0.9995, "margin": 0.002})
     course, starts = Course(problem, training(problem), 1), []
     course.past.append(SimpleNamespace(interrupted=False))
-    monkeypatch.setattr(course, "search", lambda points: (starts.append(points) or points[0], 0.0))
+    monkeypatch.setattr(course, "search", lambda points: starts.append(points) or points[0])
     best = np.asarray(problem.objective.space.encode(np.array(World.best)))
     x, within = search_within_limits(course, best)
     np.testing.assert_array_equal(x, best)
@@ -371,7 +370,7 @@ def test_the_best_answer_within_the_limits_is_taken_if_the_multipliers_do_not_co
         for k in (20.0, 22.0, 25.0, 45.0, 60.0)
     }
     found = iter(ends[1:])
-    monkeypatch.setattr(course, "search", lambda points: (at[next(found)], 0.0))
+    monkeypatch.setattr(course, "search", lambda points: at[next(found)])
     x, within = search_within_limits(course, at[ends[0]])
     np.testing.assert_array_equal(x, at[25.0])
     assert within
@@ -455,9 +454,9 @@ def test_a_peak_measured_with_a_saturated_supply_is_reported_as_such():
 
 
 def test_the_reported_saturation_is_that_of_the_deciding_injection():
-    peak = dict.fromkeys(MeasuredPeak.__dataclass_fields__) | {"repetitions": 8}
+    peak = dict.fromkeys(MemberPeak.__dataclass_fields__) | {"repetitions": 8}
     peaks = [
-        MeasuredPeak(**peak | {"largest": {"sensitivity": size}, "saturated": share})
+        MemberPeak(**peak | {"largest": {"sensitivity": size}, "saturated": share})
         for size, share in ((2.5, 0.1), (3.2, 0.15))
     ]
     limit = SimpleNamespace(name="sensitivity")

@@ -151,10 +151,10 @@ def test_a_lower_limit_holds_for_larger_values():
 
 
 @pytest.mark.slow
-def test_injections_find_the_members_with_the_largest_measured_peak():
+def test_injections_find_the_members_with_the_largest_injected_peak():
     """Set-valued signs without noise: one measurement of each plant.
 
-    The order of the linear peaks differs from that of the measured ones.
+    The order of the linear peaks differs from that of the injected ones.
     """
     signs = {"position": {"c": 200.0, "k": 30.0}, "inversion": {"gamma": 1e7}, "current": {"k_i": 2000.0}}
     document = DOCUMENT | {

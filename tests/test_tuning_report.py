@@ -21,16 +21,12 @@ from ambjax.simulation.metrics import Standard
 from ambjax.simulation.trajectory import STALLED, TOUCHED
 from ambjax.text.web_page import escape_markdown, render_page
 from tuning.__main__ import main
-from tuning.judge.evaluate import judge
 from tuning.problem.config import seeds
 from tuning.problem.goal import shown
 from tuning.problem.lanes import Engine
-from tuning.problem.loss import TERMS, weigh
-from tuning.report import accurate, breakdown, held_out, pictures
 from tuning.report import document as report
-from tuning.report.facts import SUMMARY_METRICS
-from tuning.report.slices import REACH, Slices, slices
-from tuning.rounds import training
+from tuning.report import folder, held_out, pictures
+from tuning.report.slices import REACH, Slices
 
 CASE = """
 [reference]
@@ -90,6 +86,9 @@ def written(tmp_path_factory):
     return folder / "out"
 
 
+DRAWN = ("before", "after", "spectrum", "convergence", "slices", "front")
+
+
 def cells(text, heading):
     """Rows of the first Markdown table below a heading, cells as text."""
     below = text.partition(f"## {heading}")[2].lstrip("\n")
@@ -97,69 +96,7 @@ def cells(text, heading):
     return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines if "---" not in line]
 
 
-# --- what adds up --------------------------------------------------------------------------------------------------
-
-
-def test_the_sum_of_the_terms_is_the_loss():
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        weights = rng.uniform(0, 3, len(TERMS))
-        terms = {name: rng.lognormal(0, 2, 50) for name in TERMS}
-        whole = weigh(weights, terms, np.zeros(50, bool))
-        # the same products, added in another order: rounding only
-        np.testing.assert_allclose(sum(breakdown.contributions(weights, terms).values()), whole, rtol=1e-13)
-
-
-@pytest.mark.slow
-def test_the_rows_of_the_loss_table_add_up_to_its_total(written):
-    text = (written / "report.md").read_text()
-    facts = json.loads((written / "report.json").read_text())
-    assert breakdown.FORMULA in text
-    head, *rows = cells(text, "The loss of the held-out members")
-    terms, total, risk = rows[: len(TERMS)], rows[len(TERMS)], rows[len(TERMS) + 1]
-    assert [row[0] for row in terms] == list(TERMS)
-    for when in ("before", "after"):
-        mean, adds = (head.index(f"{word} {when}") for word in ("mean", "contribution"))
-        shown = sum(float(row[adds]) for row in terms)
-        # of six numbers and their sum, each is rounded to five digits
-        assert shown == pytest.approx(float(total[adds].strip("*")), rel=7 * 0.5e-4)
-        for row in terms:
-            if row[0] not in ("effort", "chatter"):
-                assert float(row[adds]) == pytest.approx(float(row[1]) * float(row[mean]), rel=2e-4)
-        assert float(risk[adds]) == pytest.approx(facts["loss"][when]["risk"], rel=1e-4)
-        # the mean of the worst tenth is no less than the mean
-        assert facts["loss"][when]["risk"] >= facts["loss"][when]["loss"] * (1 - 1e-12)
-
-
-@pytest.mark.slow
-def test_the_loss_table_agrees_with_the_losses_of_the_judged_members(study, x):
-    found = judge(study, x, seeds(study.tune.budget)[2], 12)
-    terms = breakdown.loss_breakdown(study.goal, found)
-    losses = weigh(study.goal.weights, {name: found[f"loss.{name}"] for name in TERMS}, np.zeros(12, bool))
-    assert terms["loss"] == pytest.approx(losses.mean(), rel=1e-12)
-    assert terms["risk"] == pytest.approx(float(study.goal.risk(jnp.asarray(losses))), rel=1e-12)
-    # the mean of a product is not the product of the means, so the row alone does not determine what effort adds
-    assert terms["adds"]["effort"] == pytest.approx(
-        np.mean(0.1 * found["loss.effort"] * (found["loss.tracking"] + 0.5 * found["loss.peak"])), rel=1e-12
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("conditions", [0.0, 1.0])
-def test_the_minimised_value_in_the_report_is_the_goal(conditions):
-    # gamma far below Delta_1 of this reference, so that the conditions' penalty counts
-    few = problem_from(CASE.replace("3e5", "1e3").replace('["controller.position.c", "controller.position.k"]',
-                                                        '["controller.inversion.gamma"]'),
-                     weights={"conditions": conditions, "peak": 0.5})  # fmt: skip
-    members = training(few)
-    at = few.objective.space.encode(few.tune.space.values(few.case.cascade))
-    parts = breakdown.minimised(few, at, members)
-    goal = few.goal.score(at[None], few.engine.terms(at[None], members), members)[0]
-    assert math.log(parts["total"]) == pytest.approx(goal, rel=1e-9)
-    whole = (parts["risk"] + parts["held"]) * parts["penalty"] * parts["limits"]
-    assert parts["total"] == pytest.approx(whole, rel=1e-12)
-    assert (parts["ordinary"], parts["survival_only"]) == (4, 2)
-    assert (parts["penalty"] > 1) == (conditions > 0)
+# --- slices ---
 
 
 def test_the_lowest_point_of_the_slices_loses_no_more_members():
@@ -186,12 +123,6 @@ def test_a_lower_point_on_a_slice_is_reported():
     assert "No point of these slices has a lower objective" in report._lower_point(beside)
 
 
-def test_the_picture_of_the_convergence_starts_at_the_minimised_value_of_the_table(study, x):
-    members = training(study)
-    found, parts = slices(study, x, members), breakdown.minimised(study, x, members)
-    np.testing.assert_allclose(np.exp(found.goals[:, len(REACH) // 2]), parts["total"], rtol=1e-9)
-
-
 # --- accurate steps ------------------------------------------------------------------------------------------------
 
 
@@ -201,11 +132,11 @@ def test_accurate_values_agree_with_adaptive_rollouts():
     study.__dict__["judging"] = study.engine
     x = study.objective.space.encode(study.tune.space.values(study.case.cascade))
     seed = seeds(study.tune.budget)[2]
-    compared = accurate.compare_steps(study, x, seed, 12, SUMMARY_METRICS)
-    assert (compared["members"], compared["held"]) == (accurate.COMPARED, accurate.COMPARED)
+    compared = held_out.compare_steps(study, x, seed, 12)
+    assert (compared["members"], compared["held"]) == (held_out.COMPARED, held_out.COMPARED)
     assert abs(compared["metrics"]["settled_rms_error_m"]["relative"]) > 1e-3
     found = []
-    for k in range(accurate.COMPARED):
+    for k in range(held_out.COMPARED):
         one = study.objective.chosen(seed, np.array([k]), 12)
         cascade, scenario = study.objective.world(type(one)(*({p: v[0] for p, v in field.items()} if isinstance(
             field, dict) else field[0] for field in one)))  # fmt: skip
@@ -229,41 +160,24 @@ def test_accurate_steps_compared_with_themselves_have_no_error(study, x):
     engine = Engine(objective, settle=study.case.settle, lanes=4)
     same = dataclasses.replace(study)
     same.__dict__["judging"] = engine
-    compared = accurate.compare_steps(same, x, 5, 3, SUMMARY_METRICS)
+    compared = held_out.compare_steps(same, x, 5, 3)
     assert compared["members"] == 3
     assert {row["relative"] for row in compared["metrics"].values()} == {0.0}
     assert compared["lost"] == {"report": 0, "accurate": 0}
 
 
-def test_large_differences_are_marked():
-    again = {
-        "members": 8, "held": 8, "marked_beyond": 0.05, "lost": {"report": 0, "accurate": 2},
-        "metrics": {"a": {"report": 1.04, "accurate": 1.0, "relative": 0.04},
-                    "b": {"report": 1.47, "accurate": 1.0, "relative": 0.47}},
-    }  # fmt: skip
-    assert held_out._again(again, "a") == ["1.04", "1", "4 %"]
-    assert held_out._again(again, "b") == ["1.47", "1", "**47 %**"]
-    assert held_out._again(again, "c") == ["-"] * 3
-    assert held_out._statuses(again, "lost") == ["0 of 8", "2 of 8", "-"]
-    assert "Differences above 5 % are in bold." in held_out._accurate(again)[0]
-    del again["metrics"]["b"]
-    assert "No difference exceeds 5 %" in held_out._accurate(again)[0]
-    again["metrics"] = {}
-    assert "accurate steps confirm no number of this table" in held_out._accurate(again)[0]
-
-
 @pytest.mark.slow
-def test_the_columns_of_accurate_steps_are_in_the_report(written):
+def test_the_error_of_the_steps_is_in_the_report_and_marked_if_it_is_large(written):
     head, *rows = cells((written / "report.md").read_text(), "12 held-out members")
-    assert head[3:] == ["after, 8 members", "with accurate steps", "difference"]
+    assert head[3:] == ["error of the steps"]
     facts = json.loads((written / "report.json").read_text())
     metrics = facts["accurate"]["metrics"]
     rows = [row for row in rows if row[0].strip("`") in metrics]
     assert len(rows) == len(metrics) > 3
     for row in rows:
         metric = metrics[row[0].strip("`")]
-        assert float(row[4]) == pytest.approx(metric["accurate"], rel=1e-3)
-        assert row[5].startswith("**") == (abs(metric["relative"]) > 0.05)
+        assert float(row[3].strip("*% ")) == pytest.approx(100 * metric["relative"], rel=0.1, abs=1e-9)
+        assert row[3].startswith("**") == (abs(metric["relative"]) > 0.05)
 
 
 # --- pages ---------------------------------------------------------------------------------------------------------
@@ -307,7 +221,7 @@ def test_wide_content_scrolls_in_its_own_box(written):
     assert '<meta name="viewport" content="width=device-width,initial-scale=1">' in shown
     assert re.search(r"\.wide\{[^}]*overflow-x:auto", shown)
     assert shown.count("<table>") == shown.count('<div class="wide"><table>') > 4
-    assert shown.count("<img ") == shown.count('<span class="wide"><img ') == 5
+    assert shown.count("<img ") == shown.count('<span class="wide"><img ') == 6
     assert 'src="data:image/png;base64,' in shown
     # the page needs no other file; the data of a picture may contain these letters by chance
     assert "http" not in re.sub(r"base64,[^\"]*", "", shown)
@@ -350,53 +264,20 @@ def test_the_page_does_not_scroll_sideways(written, tmp_path, width):
 
 def test_the_pictures_of_the_report_are_in_its_folder(written):
     named = re.findall(r"!\[.*?\]\((.*?)\)", (written / "report.md").read_text())
-    assert sorted(named) == ["convergence.png", "front.png", "nominal.png", "slices.png", "spectrum.png"]
+    assert sorted(named) == sorted(f"{name}.png" for name in DRAWN)
     for name in named:
         assert (written / name).read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_picture_accepts_lost_rotors(study):
-    run = accurate.nominal(study, study.case.cascade)
-    assert not math.isfinite(float(run.lost_at))
-    assert len(np.asarray(run.rows.t)) == study.case.clock.samples
-    for at in (0.0, 0.01):
-        alive = np.asarray(run.rows.t) < at
-        lost = dataclasses.replace(run, lost_at=at, lost_code=TOUCHED, rows=run.rows._replace(alive=alive))
-        assert pictures.before_after({"before": lost, "after": run}).startswith(b"\x89PNG")
-
-
-def test_a_run_lost_before_tuning_is_reported_in_one_line(study, monkeypatch):
-    run = accurate.nominal(study, study.case.cascade)
-    held = dataclasses.replace(run, lost_at=math.inf, lost_code=0)
-    lost = dataclasses.replace(run, lost_at=0.003, lost_code=TOUCHED)
-    monkeypatch.setattr(pictures, "_png", lambda figure: figure)
-    figure = pictures.before_after({"before": lost, "after": held})
-    assert figure.get_suptitle() == "before tuning: touched down at 0.003 s"
-    assert len(figure.axes) == 2 * 3
-    figure = pictures.before_after({"before": held, "after": lost})  # why the answer is lost must be seen
-    assert len(figure.axes) == 4 * 3
-
-
-def test_each_row_of_the_picture_shows_the_run_of_its_label(study, monkeypatch):
-    before = accurate.nominal(study, study.case.cascade)
-    rows = before.rows
-    other = dataclasses.replace(
-        before, rows=rows._replace(z=rows.r - 3 * (rows.z - rows.r) ** 2, u_mean=-(rows.u_mean**3))
-    )
-    monkeypatch.setattr(pictures, "_png", lambda figure: figure)
-    axes = np.reshape(pictures.before_after({"before": before, "after": other}).axes, (4, 3))
-    shown = [before.rows.e_z, other.rows.e_z, before.rows.u_mean, other.rows.u_mean]
-    for row, name, values in zip(axes, ("before", "after") * 2, shown, strict=True):
-        assert row[0].get_ylabel().startswith(name)
-        drawn, values = row[0].lines[0].get_ydata(), np.asarray(values)
-        # in another unit; 200 samples are not thinned
-        np.testing.assert_allclose(drawn / np.abs(drawn).max(), values / np.abs(values).max(), rtol=1e-12)
-    stalled = dataclasses.replace(before, lost_code=STALLED, rows=rows._replace(alive=np.asarray(rows.t) < 0.005))
+def test_the_legend_of_the_spectrum_says_why_a_run_has_none(study, monkeypatch):
+    run = folder.nominal(study, study.case.cascade)
+    stalled = dataclasses.replace(run, lost_code=STALLED, rows=run.rows._replace(alive=np.asarray(run.rows.t) < 0.005))
     lost = dataclasses.replace(stalled, lost_code=TOUCHED)
-    runs = {"before": lost, "after": stalled, "held": before}
+    monkeypatch.setattr(pictures, "_png", lambda figure: figure)
+    runs = {"before": lost, "after": stalled, "held": run}
     entries = pictures.spectrum(runs, 0.01).axes[0].get_legend().get_texts()
     assert [one.get_text() for one in entries] == ["before: lost before 0.01 s", "after: stalled before 0.01 s", "held"]
-    entries = pictures.spectrum({"held": before}, float(before.rows.t[-5])).axes[0].get_legend().get_texts()
+    entries = pictures.spectrum({"held": run}, float(run.rows.t[-5])).axes[0].get_legend().get_texts()
     assert entries[0].get_text().startswith("held: fewer than 16 samples after ")
 
 
@@ -411,10 +292,6 @@ def test_ranges_and_their_sources_are_in_the_table():
     table = "\n".join(report._gains(facts))
     assert "| controller.position.c | 1 | 2 | 0.5 | 20 | 0 | 30 | - | 3 % |" in table
     assert "- controller.position.c: w/30 to 10 w" in table
-
-
-def test_the_formula_contains_every_term_once():
-    assert sorted(re.findall(r"[a-z]{2,}", breakdown.FORMULA)) == sorted(TERMS)
 
 
 def test_a_goal_far_from_its_limits_is_shown_without_overflow():

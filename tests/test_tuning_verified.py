@@ -21,7 +21,7 @@ from tuning.problem.tuning_problem import REFERENCE_MEMBERS
 from tuning.rounds import MOST_HALVINGS, finer, rounds
 from tuning.solve.checkpoint import SearchState
 from tuning.solve.descent import Starts
-from tuning.solve.joining import joining
+from tuning.validate import joining
 
 ROTOR = (pathlib.Path(__file__).parent / "cases" / "rotor.toml").read_text()
 # Under noise on the velocity, hard signs of these gains drive i_ref onto the singular curve within milliseconds of

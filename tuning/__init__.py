@@ -6,7 +6,7 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tuning.from_python import TunedCase, tune
+    from tuning.command import TunedCase, tune
 
 __all__ = ["TunedCase", "tune"]
 
@@ -14,6 +14,6 @@ __all__ = ["TunedCase", "tune"]
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'tuning' has no attribute '{name}'")
-    from tuning import from_python
+    from tuning import command
 
-    return getattr(from_python, name)
+    return getattr(command, name)

@@ -1,20 +1,22 @@
 """The tuning of a case file: it reads the case, searches, judges the gains and writes the report."""
 
+import contextlib
 import dataclasses
 import pathlib
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ambjax.cases.reader import Case, read_case
+from ambjax.cases.reader import Case, read_case, require_file
 from ambjax.cases.table import one_line
-from ambjax.commands.warnings import print_warnings
+from ambjax.commands.reading import print_warnings
+from ambjax.host.arguments import names_arguments
 from ambjax.host.interrupts import reporting
 from ambjax.host.lock import locked
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
 from ambjax.results.outputs import check_new, described, directory, files, plain, say, write_json
-from tuning.events import Listener, teller
+from tuning.events import Listener, Log, teller
 from tuning.problem.config import allowed_minutes, read_tune
 from tuning.problem.gains_table import off
 from tuning.problem.tuning_problem import TuningProblem, problem_of
@@ -70,6 +72,46 @@ class TuningPlan(NamedTuple):
     problem: TuningProblem
     start: np.ndarray
     out: pathlib.Path
+
+
+@names_arguments(budget="minutes")
+def tune(
+    case: str | pathlib.Path,
+    out: str | pathlib.Path | None = None,
+    *,
+    resume: bool = False,
+    force: bool = False,
+    pareto: bool = False,
+    page: bool = False,
+    settings_of: str | pathlib.Path | None = None,
+    minutes: float | None = None,
+    listen: Listener | None = None,
+) -> TunedCase:
+    """Tune the gains of a case file, as `ambjax tune` does, and write the same files.
+
+    - `case`: path of the case file. Its table [tune] selects the gains, the limits and the budget.
+    - `out`: directory of the results; None: a new one under ./out.
+    - `resume`: continue the search whose checkpoints are in `out`.
+    - `force`: overwrite the files of an earlier search in `out`.
+    - `pareto`: write each point of the front of error against voltage as a case file.
+    - `page`: also write page.html, with sliders and presets; the case needs [processor] (extra `[page]`).
+    - `settings_of`: path of another case file, whose limits, loss and budget replace those of `case`.
+    - `minutes`: time for the whole tuning; None: that of [tune].
+    - `listen`: function that receives each event (`tuning.events.Event`); None: the events are lines on stderr.
+
+    Raises ValueError for an invalid case or option before any search, and in the search if the loss is not finite at
+    any starting point.
+
+        tuned = ambjax.tune("my.toml", "tuned", minutes=10)
+        print(tuned.good, tuned.case.cascade)
+    """
+    for name, path in (("case", case), ("out", out), ("settings_of", settings_of)):
+        if path is not None or name == "case":
+            require_file(name, path)
+    folder, other = (None if path is None else str(path) for path in (out, settings_of))
+    options = Options(folder, resume, force, pareto, page, other, minutes)
+    with contextlib.ExitStack() as stack:
+        return run(str(case), options, listen or stack.enter_context(Log()))
 
 
 def run(path: str, options: Options, listen: Listener) -> TunedCase:

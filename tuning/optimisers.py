@@ -4,7 +4,6 @@
 contains the best point so far and its value. After a rejected trial, the next step starts at the best point.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -14,19 +13,9 @@ from jax import Array
 
 BFGS = "bfgs"
 # optax's optimisers that need only gradients and a learning rate.
-FIRST_ORDER: dict[str, Callable[[float], optax.GradientTransformation]] = {
-    "adabelief": optax.adabelief,
-    "adagrad": optax.adagrad,
-    "adam": optax.adam,
-    "adamax": optax.adamax,
-    "adan": optax.adan,
-    "lamb": optax.lamb,
-    "lion": optax.lion,
-    "nadam": optax.nadam,
-    "radam": optax.radam,
-    "rmsprop": optax.rmsprop,
-    "sgd": optax.sgd,
-}
+FIRST_ORDER = (
+    "adabelief", "adagrad", "adam", "adamax", "adan", "lamb", "lion", "nadam", "radam", "rmsprop", "sgd",
+)  # fmt: skip
 NAMES = (BFGS, *FIRST_ORDER)
 
 # Trust radius of the BFGS: its largest value (1: a factor e of one gain), and its value for the first step, which has
@@ -74,7 +63,7 @@ class FirstOrderState(NamedTuple):
 
 def optimiser(name: str, learning_rate: float) -> optax.GradientTransformationExtraArgs:
     """Return the optimiser of this name, one of NAMES. The BFGS does not use `learning_rate`."""
-    return bfgs() if name == BFGS else backtracking(FIRST_ORDER[name](learning_rate))
+    return bfgs() if name == BFGS else backtracking(getattr(optax, name)(learning_rate))
 
 
 def bfgs() -> optax.GradientTransformationExtraArgs:

@@ -1,6 +1,6 @@
 """Rounds of a search and its validation, repeated until the answer is confirmed.
 
-The first round searches with restarts. If the error of the integration steps at the optimum is too large, the search
+If the error of the integration steps at the optimum is too large, the search
 continues with finer steps. If a limit is not met, it continues with other multipliers. The answer is then validated.
 If it is not `SearchResult.good`, two kinds of members join the training ensemble for the next round: validation members
 that are lost, and members that are lost with accurate steps. If tune.objective or --pareto requires it, the front of
@@ -18,13 +18,11 @@ from tuning.events import Listener
 from tuning.front import trace_front
 from tuning.judge.evaluate import StepError, describe, step_error
 from tuning.problem.tuning_problem import TuningProblem, problem_of
-from tuning.solve.course import Course, SearchResult, search_and_restart, training
-from tuning.solve.joining import joining
+from tuning.solve.course import Course, SearchResult, first_search, training
 from tuning.solve.multipliers import search_within_limits
-from tuning.validate import validated
+from tuning.validate import joining, validated
 
-# Largest number of searches, and of halvings of the step. Restarts count as searches; searches after an update of the
-# multipliers do not.
+# Largest number of searches, and of halvings of the step. Searches after an update of the multipliers do not count.
 MOST_ROUNDS, MOST_HALVINGS = 12, 2
 # Share of tune.minutes for the searches and validations. The rest is for the judgement and the report.
 SEARCHING = 0.7
@@ -53,7 +51,7 @@ def rounds(
     course = Course(
         problem, training(problem), budget.seed, out, facts, resume, listen, SEARCHING * problem.tune.minutes
     )
-    x = search_and_restart(course, start)
+    x = first_search(course, start)
     while True:
         if course.all_lost:  # no gains hold any member
             break
@@ -69,7 +67,7 @@ def rounds(
         course.tell(
             "lost members, and members lost with accurate steps, join the training ensemble; the search continues"
         )
-        x, _ = course.search(course.around(x))
+        x = course.search(course.around(x))
     if not answers:
         return course.answer(x, None, budget.validation)
     best = min(answers, key=lambda one: (not one.confirmed, one.lost, not one.within, one.validation_error))

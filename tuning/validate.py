@@ -3,6 +3,7 @@
 import math
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from tuning.judge.evaluate import StepError, comparison_members, describe, rms, step_error, worst_of
@@ -10,6 +11,9 @@ from tuning.problem.config import seeds
 from tuning.problem.members import Members
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.course import Course, SearchResult
+
+# Largest number of lost members that join the training ensemble at once.
+MOST_LOST = 16
 
 
 class Validation(NamedTuple):
@@ -48,6 +52,18 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
     errors = np.sqrt(terms["tracking"][share <= 0])
     overall = rms(errors) if errors.size else math.inf
     return Validation(course.answer(x, error, lost.size + error.unconfirmed, overall), error, lost)
+
+
+def joining(problem: TuningProblem, lost: np.ndarray, error: StepError) -> Members:
+    """Return the members that join the training ensemble.
+
+    They are the first MOST_LOST of the `lost` validation members, and the members that are lost or stall with accurate
+    steps. They join with half of the additional noise of stressed members, as a margin.
+    """
+    budget = problem.tune.budget
+    those = problem.objective.chosen(seeds(budget)[1], lost[:MOST_LOST], budget.validation)
+    both: Members = jax.tree.map(lambda a, b: np.concatenate([a, b]), those, error.unheld)
+    return both._replace(noise_factor=both.noise_factor * (1 + problem.tune.stress) / 2)
 
 
 def _terms(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, np.ndarray]:

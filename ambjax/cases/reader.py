@@ -97,6 +97,11 @@ def read_case(path: str | pathlib.Path) -> Case:
         raise ValueError(one_line(f"{path}: {error}")) from None
 
 
+def is_machine(raw: dict[str, Any]) -> bool:
+    """Return whether a parsed case file describes a whole machine."""
+    return "bearing" in raw or (isinstance(raw.get("rotor"), dict) and "kind" in raw["rotor"])
+
+
 def require_file(name: str, path: object) -> None:
     """Raise ValueError unless the argument `name` is the path of a file: text or a pathlib.Path."""
     if not isinstance(path, str | pathlib.PurePath):
@@ -128,6 +133,11 @@ def case_from(
     """
     check_depth(raw)
     top = Table(raw)
+    if is_machine(raw):
+        raise ValueError(
+            "[rotor], [[bearing]]: a whole machine, and this takes one axis. `ambjax simulate`, `check`, "
+            "`sensitivity` and `campbell` take machines; in Python, read_machine does."
+        )
     top.only([*TABLES, *OTHERS])
     plant = _plant(top.table("plant"))
     processor = processor_from(top.table("processor")) if "processor" in top.raw else None

@@ -52,7 +52,7 @@ STOP = {field.name: field for field in dataclasses.fields(Stop)}
 FIELDS = {field.name: field for kind in (Scenario, Clock) for field in dataclasses.fields(kind)}
 
 
-def _signal(table: Table, unit: str, recordings: Recordings, extra: tuple[str, ...] = ()) -> Any:
+def signal_from(table: Table, unit: str, recordings: Recordings, extra: tuple[str, ...] = ()) -> Any:
     """Return the signal of a table, whose values are in `unit`. `extra`: further keys that the table may have."""
     kind = table.choice("kind", list(SIGNALS))
     if kind == "sum":
@@ -63,7 +63,7 @@ def _signal(table: Table, unit: str, recordings: Recordings, extra: tuple[str, .
         if len(terms) > MOST_TERMS:
             raise ValueError(f"{table.at('terms')}: {len(terms)} terms are too many; give at most {MOST_TERMS}.")
         parts = [Table(term, f"{table.at('terms')}[{n}]") for n, term in enumerate(terms)]
-        return signals.Sum(tuple(_signal(part, unit, recordings) for part in parts))
+        return signals.Sum(tuple(signal_from(part, unit, recordings) for part in parts))
     if kind == "table":
         return recordings.signal(table, extra)
     made = table.record(SIGNALS[kind], extra=("kind", *extra))
@@ -81,7 +81,7 @@ def _disturbances(table: Table, recordings: Recordings) -> dict[str, Any]:
         for one in _each(table, name) if name in table.raw else ():
             own = [unit for unit in slots if unit == FIXED_UNITS.get(str(one.raw.get("kind")))]
             unit = one.choice("unit", list(slots), [*own, *slots][0])
-            found.setdefault(slots[unit], []).append(_signal(one, unit, recordings, extra=("unit",)))
+            found.setdefault(slots[unit], []).append(signal_from(one, unit, recordings, extra=("unit",)))
     return {slot: made[0] if len(made) == 1 else signals.Sum(tuple(made)) for slot, made in found.items()}
 
 
@@ -102,7 +102,9 @@ def scenario_from(top: Table, plant: Bearing, recordings: Recordings) -> tuple[S
     settle = run.leaf("settle", SETTLE)
     scenario = Scenario(
         plant=plant,
-        reference=_signal(top.table("reference"), "m", recordings) if "reference" in top.raw else signals.Constant(),
+        reference=signal_from(top.table("reference"), "m", recordings)
+        if "reference" in top.raw
+        else signals.Constant(),
         sensor=_sensor(top.table("sensor")) if "sensor" in top.raw else None,
         initial=top.table("initial").record(Initial),
         u_max=actuator.leaf("u_max", FIELDS["u_max"], math.inf),

@@ -6,6 +6,7 @@ import math
 from ambjax.cases import tune_table
 from ambjax.cases.controller_tables import KINDS
 from ambjax.cases.data_sheet import BEARING
+from ambjax.cases.machine_templates import FLEXIBLE, MACHINE
 from ambjax.cases.reader import PLANTS
 from ambjax.cases.rig import RIG
 from ambjax.cases.scenario_tables import SIGNALS
@@ -13,8 +14,8 @@ from ambjax.ensemble.design import DESIGNS
 from ambjax.paper.readings import PULSE, REFERENCE, TABLE_2
 from ambjax.world.plant import Plant
 
-# Templates of machines other than the paper's, by name: a laboratory bearing, and a bearing from a data sheet.
-MACHINES = {"rig": RIG, "bearing": BEARING}
+# Templates of bearings other than the paper's, and of whole machines, by name.
+MACHINES = {"rig": RIG, "bearing": BEARING, "machine": MACHINE, "machine-flexible": FLEXIBLE}
 HEAD = """\
 # A case for ambjax: {title}.
 # Units are SI. A key that is left out has the value shown here, unless its comment says otherwise.

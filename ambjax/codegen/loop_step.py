@@ -11,7 +11,7 @@ from ambjax.codegen.controller import Controller, Memory, Parameters
 from ambjax.codegen.interface import BITS, INPUTS, OUTPUTS, Status, StepInputs, StepOutputs
 from ambjax.codegen.numbering import Number
 from ambjax.codegen.plant_ports import DISTURBANCES, LOSSES, READINGS, PlantInputs, PlantOutputs
-from ambjax.codegen.plant_step import Machine, PlantMemory, PlantStep
+from ambjax.codegen.plant_step import PlantMemory, PlantParameters, PlantStep
 from ambjax.numerics.records import Scalar
 from ambjax.simulation.integrate import choose
 from ambjax.simulation.trajectory import ALIVE
@@ -44,7 +44,7 @@ class LoopParameters(NamedTuple):
     """Parameters of the controller and of the plant."""
 
     controller: Parameters
-    machine: Machine
+    machine: PlantParameters
 
 
 class LoopOutputs(NamedTuple):

@@ -69,7 +69,7 @@ class PlantMemory(NamedTuple):
 
 
 @record
-class Machine:
+class PlantParameters:
     """Parameters of the exported plant: true plant, sensors, amplifier, stop, initial state, limits and delay.
 
     Names and units are those of the case file, except that the file has actuator.u_max, run.clearance, run.stop_* and
@@ -110,7 +110,7 @@ class PlantStep(Block):
     - `method`: integrator between samples, with a fixed number of steps.
     """
 
-    parameters: Machine
+    parameters: PlantParameters
     cascade: Cascade
     method: FixedSteps
 
@@ -128,7 +128,7 @@ class PlantStep(Block):
         assert processor is not None
         return len(processor.constant_past(jnp.zeros(())))
 
-    def system(self, machine: Machine, period: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Sampled:
+    def system(self, machine: PlantParameters, period: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Sampled:
         """Return the simulator's loop with the parameters `machine` and constant disturbances (m/s^2, A/s)."""
         given: Any = self.cascade.processor
         given = dataclasses.replace(given, delay=machine.delay, assumed=None, predict=False, guard=None)
@@ -136,7 +136,12 @@ class PlantStep(Block):
         return Sampled(ClosedLoop(cascade, machine.scenario(q_z, q_i)), period, 0)
 
     def step(
-        self, parameters: Machine, memory: PlantMemory, inputs: PlantInputs, period: Scalar, read: frozenset[str]
+        self,
+        parameters: PlantParameters,
+        memory: PlantMemory,
+        inputs: PlantInputs,
+        period: Scalar,
+        read: frozenset[str],
     ) -> tuple[PlantMemory, PlantOutputs, PlantStatus]:
         fine = [jnp.isfinite(getattr(inputs, name)) for name in PlantInputs._fields if name in read]
         delay = jnp.asarray(parameters.delay)
@@ -265,7 +270,7 @@ def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object
             "method is then RK4, unless clock.method names another."
         )
     resolved = cascade.on_processor()
-    machine = Machine(
+    machine = PlantParameters(
         scenario.plant,
         sensor,
         scenario.amplifier,

@@ -9,9 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ambjax.cases.forces import forces
+from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
-from ambjax.commands.acceptance import acceptance, forces
-from ambjax.commands.warnings import idealised, read_with_warnings
+from ambjax.cases.warned import idealised
+from ambjax.commands import machine_check
+from ambjax.commands.acceptance import acceptance
+from ambjax.commands.reading import read_any_with_warnings
 from ambjax.control.cascade import Cascade
 from ambjax.linear.stability import Findings, stability_of
 from ambjax.results.outputs import plain, say, table
@@ -48,7 +52,9 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """
     from ambjax.theorem import advice
 
-    case = read_with_warnings(args.case)
+    case = read_any_with_warnings(args.case)
+    if isinstance(case, MachineCase):
+        return machine_check.check(args, case)
     report, (loop, text), on_processor = _results(case)
     lost = report.lost_at if on_processor is None else on_processor.sampled.lost_at
     findings = _stability(case) if math.isinf(lost) else None

@@ -14,8 +14,8 @@ from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
 from ambjax.commands.comparison_report import Compared, comparison_markdown, comparison_summary, comparison_table
 from ambjax.commands.comparison_tuning import check_options, tuned_cases
+from ambjax.commands.reading import read_with_warnings
 from ambjax.commands.study_report import findings_of
-from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
 from ambjax.linear.state_space import StateSpace

@@ -8,8 +8,8 @@ import numpy as np
 
 from ambjax.cases.reader import Case
 from ambjax.commands.pace import Pace, error_words, pilot, print_estimate, sliding_error
+from ambjax.commands.reading import read_with_warnings
 from ambjax.commands.study_report import WRITTEN, write_report
-from ambjax.commands.warnings import read_with_warnings
 from ambjax.commands.workers import AHEAD, compute, executor_of
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study

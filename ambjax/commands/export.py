@@ -4,7 +4,7 @@ import argparse
 
 from ambjax.cases.reader import read_case
 from ambjax.codegen import verify
-from ambjax.commands.warnings import print_warnings
+from ambjax.commands.reading import print_warnings
 from ambjax.results.case_export import destination, generated, planned
 from ambjax.results.outputs import say, table, written
 

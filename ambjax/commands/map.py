@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.reader import Case
-from ambjax.commands.warnings import read_with_warnings
+from ambjax.commands.reading import read_with_warnings
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.maps import CERTAIN, GRIDS, Map, grid
 from ambjax.results.case_map import is_stable, labels, panel, study_and_axes

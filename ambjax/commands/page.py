@@ -4,7 +4,7 @@ import argparse
 import pathlib
 
 from ambjax.cases.reader import read_case
-from ambjax.commands.warnings import read_with_warnings
+from ambjax.commands.reading import read_with_warnings
 from ambjax.page.html_page import NAME, page
 from ambjax.results.outputs import directory, files, make, written
 

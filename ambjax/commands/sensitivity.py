@@ -3,10 +3,12 @@
 import argparse
 import pathlib
 
+from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reach import largest
 from ambjax.cases.reader import Case
+from ambjax.commands import machine_commands
+from ambjax.commands.reading import read_any_with_warnings
 from ambjax.commands.sensitivity_report import Injections, sensitivity_summary, set_valued, text_of
-from ambjax.commands.warnings import read_with_warnings
 from ambjax.ensemble.study import Study
 from ambjax.linear import Injection, frequency_lines, injected
 from ambjax.linear.multisine import Reading
@@ -34,7 +36,9 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     The exit code is 1 if the loop is not stable at an equilibrium or cannot be linearised at one of the references, or
     if a member is not stable. Raises ValueError as `linearise` does for the reference 0.
     """
-    case = read_with_warnings(args.case)
+    case = read_any_with_warnings(args.case)
+    if isinstance(case, MachineCase):
+        return machine_commands.sensitivity(args, case)
     study = _study(case, args)
     points, missing = _points(case)
     spread = None if study is None else spread_peaks(case, study)

@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
-from ambjax.commands.warnings import read_with_warnings, reversal
+from ambjax.cases.warned import reversal
+from ambjax.commands import machine_commands
+from ambjax.commands.reading import read_any_with_warnings
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.replay import Replay, replay
 from ambjax.ensemble.study import Study
@@ -25,7 +28,9 @@ WRITTEN = ("trajectory.npz", "metrics.json", "overview.png")
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """Simulate a case or one member of its ensemble. Exit code 1 if the rotor is lost or the integrator stalls."""
-    case = read_with_warnings(args.case)
+    case = read_any_with_warnings(args.case)
+    if isinstance(case, MachineCase):
+        return machine_commands.simulate(args, case)
     study = _study(case, args)
     if study is not None:
         cascade, scenario = study.member(args.member)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.reader import Case
-from ambjax.commands.warnings import reversal
+from ambjax.cases.warned import reversal
 from ambjax.ensemble import statistics
 from ambjax.ensemble.study import Study
 from ambjax.linear import Findings, stability_of, suspects

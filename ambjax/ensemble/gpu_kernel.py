@@ -54,8 +54,8 @@ def run_on_gpu(
     - `block`: members of one Pallas program, a power of two, at least 32.
     - `interpret`: run the kernel in Pallas's interpreter, which works on any device but is slow. For tests.
 
-    Returns an Outcome whose leaves have shape [N], in member order. JAX deprecated Pallas's Triton back end in 0.11.0. If
-    the installed JAX has none, a UserWarning says so, and `run_ensemble` simulates the members.
+    Returns an Outcome whose leaves have shape [N], in member order. JAX deprecated Pallas's Triton back end in 0.11.0.
+    If the installed JAX has none, a UserWarning says so, and `run_ensemble` simulates the members.
 
     Raises ValueError as `run_ensemble` does, and if there is no GPU, for another method, a cascade on a processor, a
     recorded signal, or an invalid `block`.

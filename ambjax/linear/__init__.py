@@ -16,7 +16,17 @@ to the sensor's own reading, and KS that from e to u.
 from ambjax.linear.analysis import Analysis, Zones, analyse, checked, linearisation_inputs, linearise, linearise_members
 from ambjax.linear.differentiable import LoopQuantities, loop_quantities
 from ambjax.linear.injection import Injection, MemberPeaks, frequency_lines, injected, injected_members
-from ambjax.linear.margins import LoopMargins, Margins, ResponsePeak, decayed_end, margins_of, noise_gain, peak
+from ambjax.linear.machine_sensitivity import MachineSensitivity, linearise_machine, machine_sensitivity
+from ambjax.linear.margins import (
+    LoopMargins,
+    Margins,
+    ResponsePeak,
+    decayed_end,
+    margins_of,
+    noise_gain,
+    peak,
+    poles_in_s,
+)
 from ambjax.linear.matrices import loop_matrices
 from ambjax.linear.stability import Findings, Stability, stability_of, suspects
 from ambjax.linear.state_space import INPUTS, OUTPUTS, PLACES, StateSpace
@@ -30,6 +40,7 @@ __all__ = [
     "Injection",
     "LoopMargins",
     "LoopQuantities",
+    "MachineSensitivity",
     "Margins",
     "MemberPeaks",
     "ResponsePeak",
@@ -44,12 +55,15 @@ __all__ = [
     "injected_members",
     "linearisation_inputs",
     "linearise",
+    "linearise_machine",
     "linearise_members",
     "loop_matrices",
     "loop_quantities",
+    "machine_sensitivity",
     "margins_of",
     "noise_gain",
     "peak",
+    "poles_in_s",
     "stability_of",
     "suspects",
 ]

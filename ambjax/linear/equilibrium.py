@@ -6,6 +6,7 @@ left out.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -112,34 +113,14 @@ def equilibrium(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar)
         return _residual(cascade, scenario, period, r, restore(y * sizes))
 
     held = lax.stop_gradient((cascade, scenario))
-
-    def both(y: Array) -> tuple[Array, Array]:
-        G = residual(y, *held)
-        return G, G
-
-    def evaluate(newton: _Newton) -> _Newton:
-        J, G = jax.jacfwd(both, has_aux=True)(newton.trial)
-        better = _size(G) < newton.error
-        direction = jnp.where(better, _inverse(J) @ G, newton.direction)
-        fraction = jnp.where(better, 1.0, 0.5 * newton.fraction)
-        y, J = jnp.where(better, newton.trial, newton.y), jnp.where(better, J, newton.J)
-        error = jnp.where(better, _size(G), newton.error)
-        return _Newton(y, error, J, direction, fraction, y - fraction * direction, newton.number + 1)
-
-    def unfinished(newton: _Newton) -> Array:
-        return (newton.number < STEPS) & (newton.fraction > SMALLEST) & (newton.error > 0)
-
-    y = lax.stop_gradient(flat / sizes)
-    one = jnp.ones_like(y[0])
-    first = _Newton(y, jnp.inf * one, jnp.eye(y.size, dtype=y.dtype), 0 * y, one, y, jnp.asarray(0))
-    newton = lax.stop_gradient(lax.while_loop(unfinished, evaluate, first))
-    found = newton.error <= TOLERANCE * jnp.finfo(y.dtype).eps
+    newton = newton_of(lambda y: residual(y, *held), lax.stop_gradient(flat / sizes))
+    found = newton.error <= TOLERANCE * jnp.finfo(flat.dtype).eps
     # one more Newton step with a constant Jacobian: its derivative is that of the implicit function
     y = newton.y - jnp.where(found, _inverse(newton.J) @ residual(newton.y, cascade, scenario), 0.0)
     return Equilibrium(restore(y * sizes), found, restore(residual(lax.stop_gradient(y), *held)))
 
 
-class _Newton(NamedTuple):
+class Newton(NamedTuple):
     """State of Newton's method, relative to the sizes of the states.
 
     - `y`, `error`, `J`: best point so far, the size of its residual, and its Jacobian.
@@ -155,6 +136,30 @@ class _Newton(NamedTuple):
     fraction: Array
     trial: Array
     number: Array
+
+
+def newton_of(residual: Callable[[Array], Array], y: Array) -> Newton:
+    """Return the last state of a damped Newton's method from y [N] on, for residual(y) = 0. It has no derivatives."""
+
+    def both(y: Array) -> tuple[Array, Array]:
+        G = residual(y)
+        return G, G
+
+    def evaluate(newton: Newton) -> Newton:
+        J, G = jax.jacfwd(both, has_aux=True)(newton.trial)
+        better = _size(G) < newton.error
+        direction = jnp.where(better, _inverse(J) @ G, newton.direction)
+        fraction = jnp.where(better, 1.0, 0.5 * newton.fraction)
+        y, J = jnp.where(better, newton.trial, newton.y), jnp.where(better, J, newton.J)
+        error = jnp.where(better, _size(G), newton.error)
+        return Newton(y, error, J, direction, fraction, y - fraction * direction, newton.number + 1)
+
+    def unfinished(newton: Newton) -> Array:
+        return (newton.number < STEPS) & (newton.fraction > SMALLEST) & (newton.error > 0)
+
+    one = jnp.ones_like(y[0])
+    first = Newton(y, jnp.inf * one, jnp.eye(y.size, dtype=y.dtype), 0 * y, one, y, jnp.asarray(0))
+    return lax.stop_gradient(lax.while_loop(unfinished, evaluate, first))
 
 
 def _size(G: Array) -> Array:

@@ -100,9 +100,12 @@ def static(default: object = dataclasses.MISSING, *, doc: str = "") -> Any:
     return dataclasses.field(default=default, metadata={"static": True, "doc": doc})
 
 
-def part(*, default: object = dataclasses.MISSING, doc: str) -> Any:
-    """Declare a field that is itself a record, or another pytree of numbers. `doc`: its meaning."""
-    return dataclasses.field(default=default, metadata={"doc": doc})
+def part(*, default: object = dataclasses.MISSING, doc: str, channels: bool = False) -> Any:
+    """Declare a field that is itself a record, or another pytree of numbers. `doc`: its meaning.
+
+    `channels`: whether the leaves are stacked, so that each has one axis more than it declares.
+    """
+    return dataclasses.field(default=default, metadata={"doc": doc, "channels": channels})
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(leaf, gain, static, part, dataclasses.field))

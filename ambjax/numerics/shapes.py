@@ -61,20 +61,24 @@ def map_varying(function: Callable[[Any], Any], tree: T) -> T:
 
 @functools.cache
 def _ranks(structure: Any) -> tuple[int, ...]:
-    """Return the number of declared axes of each leaf of this tree structure."""
+    """Return the number of declared axes of each leaf of this tree structure, with those of stacked records."""
     numbered = jax.tree.unflatten(structure, range(structure.num_leaves))
     return tuple(_rank(numbered, path) for path, _ in jax.tree_util.tree_leaves_with_path(numbered))
 
 
 def _rank(node: Any, path: Sequence[Any]) -> int:
-    """Return the number of axes that the last record on the path from `node` to a leaf declares for it."""
-    rank = 0
+    """Return the number of axes that the last record on the path from `node` to a leaf declares for it.
+
+    Each field with `channels` on the path adds one.
+    """
+    rank = stacked = 0
     for key in path:
         name, fields = getattr(key, "name", None), getattr(node, "__dataclass_fields__", {})
         if fields:
             rank = len(axes_of(fields[name]))
+            stacked += fields[name].metadata.get("channels", False)
         node = getattr(node, name) if name is not None else node[getattr(key, "idx", getattr(key, "key", None))]
-    return rank
+    return rank + stacked
 
 
 def with_entry(x: Any, index: tuple[Any, ...], value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 import itertools
 import pathlib
+from collections.abc import Collection
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -46,14 +47,19 @@ def overview(
 
 @own_style
 def overview_figure(
-    trajectory: Trajectory, title: str, window: tuple[float, float] | None = None, settle: float = 0.0
+    trajectory: Trajectory,
+    title: str,
+    window: tuple[float, float] | None = None,
+    settle: float = 0.0,
+    shown: Collection[str] = (),
 ) -> Figure:
     """Return one page with the main signals of a run, over the whole run, and enlarged at its start and at its end.
 
     `window`: begin and end, s; the page then shows only this stretch. `settle` (s): the vertical scales of the panels
     of the whole run fit the signals from this time on, unless the rotor is lost. The start has panels of its own.
+    `shown`: labels of the panels; empty: all panels.
     """
-    panels = _panels(trajectory)
+    panels = [panel for panel in _panels(trajectory) if not shown or panel.ylabel in shown]
     if window is None:
         columns, grid = _stretches(trajectory, settle), [[panel] * 3 for panel in panels]
     else:

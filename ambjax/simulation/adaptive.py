@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ambjax.numerics.records import Scalar, leaf, record, static
+from ambjax.numerics.reversible import while_loop
 from ambjax.simulation.integrate import Advanced, InitialValueProblem, Inputs, State, Times, choose, stage_times
 from ambjax.simulation.span import Instant, Span, blank
 from ambjax.simulation.trajectory import ALIVE, STALLED
@@ -58,7 +59,8 @@ class AdaptiveSteps:
 
     - `ORDER`: the error estimate of a step h falls as h^ORDER.
 
-    Forward mode and vmap work. Reverse mode does not, because JAX cannot reverse a while loop.
+    Forward mode, reverse mode and vmap work. Reverse mode repeats the steps of each sample
+    (`numerics.reversible`).
     """
 
     tolerance: Scalar = leaf(default=1e-6, unit="1", above=0, at_most=1.0, doc="relative error allowed per step")
@@ -121,7 +123,7 @@ class AdaptiveSteps:
         begin = _Progress(
             state, h, h, zero, code, jnp.int32(0), zero, blank(problem.instant_structure), (zero, problem.moving(state))
         )
-        done = lax.while_loop(unfinished, trial, begin)
+        done = while_loop(unfinished, trial, begin)
         x = cast(State, done.state)
         end = problem.rates_and_signals(problem.inputs(stage_times(t, done.elapsed)(1.0)), x)[1]
         span = choose(done.elapsed > 0, done.span.with_instant(end, done.before / 2), done.span)

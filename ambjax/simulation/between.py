@@ -81,12 +81,12 @@ def subproblems(
     if not edges.most:
         edges = NO_EDGES
     if not lags(loop):
-        return [(_under(loop, state, command, voltage, edges), time) for voltage, time in voltages]
+        return [(under(loop, state, command, voltage, edges), time) for voltage, time in voltages]
     # The solution of the sensor's low-pass requires a motion that is smooth over each part, so divide at edges too. The
     # knots of records may be many; steps end there, but parts do not.
     cut, inside = [], Edges((), edges.most, edges.knots) if edges.knots else NO_EDGES
     for voltage, time in voltages:
-        problem = _under(loop, state, command, voltage, inside)
+        problem = under(loop, state, command, voltage, inside)
         cut += [(problem, length) for length in edges.pieces(t, time)]
         t = t + time
     return cut
@@ -113,7 +113,7 @@ def plant_status(loop: ClosedLoop, state: object) -> Array:
     return loop.status_of(state, loop.scenario.plant.scale(), state)
 
 
-def _under(loop: ClosedLoop, state: object, command: Command, voltage: Voltage, edges: Edges) -> InitialValueProblem:
+def under(loop: ClosedLoop, state: object, command: Command, voltage: Voltage, edges: Edges) -> InitialValueProblem:
     """Return the initial value problem of the plant, with `voltage` (V) as a function of time."""
     plant = loop.scenario.plant
     e = plant.measurement(state).i - command.i_ref

@@ -47,8 +47,8 @@ class InitialValueProblem(NamedTuple, Generic[Inputs, State]):
     - `slide`: slide(inputs(t_0), inputs(t_1), h, state, span) -> (state, span), a step for this particular system;
       None: there is none.
     - `edges`: other instants at which the rates jump.
-    - `motion`: motion(state) -> displacement and velocity of the rotor; None: no rotor.
-    - `limit`: |displacement| at which the status becomes TOUCHED.
+    - `motion`: motion(state) -> displacement and velocity of the rotor, or of each of its axes [c]; None: no rotor.
+    - `limit`: |displacement| at which the status becomes TOUCHED; of each axis, if there are several.
     """
 
     inputs: Callable[[Scalar], Inputs]
@@ -87,6 +87,8 @@ class InitialValueProblem(NamedTuple, Generic[Inputs, State]):
             beyond = a + share * (slope_a + share * (curve + share * twist)) - self.limit
             slope = away_from_zero(slope_a + share * (2 * curve + share * 3 * twist), 1e-30)
             share = jnp.clip(share - beyond / slope, 0.0, 1.0)
+        if jnp.ndim(share):  # the first axis that reaches its limit
+            share = jnp.min(jnp.where(b < self.limit, 1.0, share))
         crossed = (code == TOUCHED) & jnp.isfinite(share)
         return lax.stop_gradient(jnp.where(crossed, begin + share * h, end))
 

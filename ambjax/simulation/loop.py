@@ -133,10 +133,15 @@ class ClosedLoop:
             return measured
         return measured._replace(z=measured.z + sensor.gain * inputs.runout)
 
-    def command(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> tuple[Command, CascadeState, Array]:
-        """Return the command of the cascade, the rates of its states, and the voltage at the coils, V."""
+    def command(
+        self, inputs: ExternalInputs, state: LoopState, errors: Errors, sensed: object = None
+    ) -> tuple[Command, CascadeState, Array]:
+        """Return the command of the cascade, the rates of its states, and the voltage at the coils, V.
+
+        `sensed`: state of the plant at the place of the sensor; None: that of `state`.
+        """
         u_max = jnp.asarray(self.scenario.command_limit)
-        measured = self.received(inputs, state.plant, errors)
+        measured = self.received(inputs, state.plant if sensed is None else sensed, errors)
         command, rates = self.cascade(measured, state.control, inputs.reference, u_max)
         return command, rates, self.scenario.coil_voltage(limited(command.u, u_max), state.plant, inputs.q_i)
 
@@ -145,9 +150,11 @@ class ClosedLoop:
         _, control, u = self.command(inputs, state, errors)
         return self.derivative(inputs, state, control, u)
 
-    def observed(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> tuple[LoopState, Instant]:
-        """Return the rates of the state, and the signals to record at this instant."""
-        command, control, u = self.command(inputs, state, errors)
+    def observed(
+        self, inputs: ExternalInputs, state: LoopState, errors: Errors, sensed: object = None
+    ) -> tuple[LoopState, Instant]:
+        """Return the rates of the state, and the signals to record at this instant. `sensed`: as in `command`."""
+        command, control, u = self.command(inputs, state, errors, sensed)
         signals = self.instant(inputs.reference, state.plant, command.i_ref, command.v_tilde, u)
         return self.derivative(inputs, state, control, u), signals
 

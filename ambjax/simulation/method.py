@@ -6,6 +6,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import is_traced
@@ -57,22 +58,31 @@ TOLERANCE, QUIET_TOLERANCE = 1e-6, 1e-7
 TIGHT, QUIET_TIGHT = 1e-8, 1e-9
 
 
+class UnknownSlopeError(ValueError):
+    """A value from which the method is chosen has no number inside jit or vmap."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(
+            f"clock.method is None (dt = 'auto'), but inside jit or vmap the {name} has no value, and no fixed step "
+            "can be computed from it. Choose the method outside: "
+            "clock = with_method(clock, cascade, scenario, reverse=True)."
+        )
+
+
 def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
     """Return the largest slope, 1/s, of each law, the plant, its coils, its flux and its stop, over the members.
 
-    Raises ValueError if a slope is traced, because a step can be chosen only from numbers.
+    A derivative without jit or vmap has numbers as primal values; these are used. Raises UnknownSlopeError if a slope
+    has no value, because a fixed step can be chosen only from numbers.
     """
     # On a processor the laws have discrete steps, and only the plant is integrated.
     laws = {} if cascade.processor else {f"{stage} law": slope for stage, slope in cascade.slopes().items()}
     plant = scenario.plant
     named = laws | {PLANT: plant.slope(), COILS: scenario.current_slope, FLUX: plant.flux_slope()}
     named |= {} if scenario.stop is None else {STOP: scenario.stop.slope(plant.m)}
+    named = {name: lax.stop_gradient(slope) for name, slope in named.items()}
     if traced := [name for name, slope in named.items() if is_traced(slope)]:
-        raise ValueError(
-            f"clock.method is None (dt = 'auto'), but inside jit, grad or vmap the slope of the {traced[0]} is "
-            "traced, and no step can be computed from it. Choose the method outside: "
-            "clock = with_method(clock, cascade, scenario)."
-        )
+        raise UnknownSlopeError(f"slope of the {traced[0]}")
     return {name: float(np.max(np.asarray(x))) for name, x in named.items()}
 
 
@@ -118,10 +128,12 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
         return Rodas3(fixed)
     stiff = cascade.processor is not None or sample_period * slope > EXPLICIT
     tolerance = (TOLERANCE if noisy else QUIET_TOLERANCE) if stiff else (TIGHT if noisy else QUIET_TIGHT)
-    # The tolerance must be well above the rounding errors, which otherwise cause rejected steps. In float32 it is
-    # 1.2e-4.
-    tolerance = max(tolerance, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps))
-    return AdaptiveRodas3(tolerance) if stiff else AdaptiveCashKarp(tolerance)
+    return AdaptiveRodas3(_tolerance(tolerance)) if stiff else AdaptiveCashKarp(_tolerance(tolerance))
+
+
+def _tolerance(wanted: float) -> float:
+    """Return a tolerance well above the rounding errors, which otherwise cause rejected steps: in float32, 1.2e-4."""
+    return max(wanted, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps))
 
 
 def _noisy(scenario: Scenario) -> bool:
@@ -148,16 +160,27 @@ def _fixed_only(cascade: Cascade, scenario: Scenario) -> bool:
 def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: bool = False) -> Clock:
     """Return `clock` with an integration method that is valid for the cascade and the scenario.
 
-    A clock without a method gets the result of `choose_method`; otherwise the method is checked against its stability
-    limit, unless the sample period or a slope is traced. For a cascade on a processor, the function also computes
-    `cuts`, the largest number of edges of disturbances inside one sample. A larger `cuts` of the clock is kept, so that
-    a part of an ensemble runs the compiled program of the whole.
+    A clock without a method gets the result of `choose_method`, or adaptive RODAS3 where jit or vmap hides the values
+    from which that chooses; otherwise the method is checked against its stability limit, unless the sample period or a
+    slope is traced. For a cascade on a processor, the function also computes `cuts`, the largest number of edges of
+    disturbances inside one sample. A larger `cuts` of the clock is kept, so that a part of an ensemble runs the
+    compiled program of the whole.
 
     Raises ValueError for an explicit step above the stability limit; the message names step, limit and fix. Raises
-    ValueError also for adaptive steps if an amplifier controls the current in continuous time, and as `slopes` does.
+    ValueError also for adaptive steps if an amplifier controls the current in continuous time, and UnknownSlopeError if
+    fixed steps are required and the values are hidden.
     """
     if clock.method is None:
-        clock = clock.with_method(choose_method(cascade, scenario, float(clock.sample_period), reverse=reverse))
+        period = lax.stop_gradient(clock.sample_period)
+        try:
+            if is_traced(period):
+                raise UnknownSlopeError("sample period")
+            method = choose_method(cascade, scenario, float(np.max(np.asarray(period))), reverse=reverse)
+        except UnknownSlopeError:
+            if reverse or _fixed_only(cascade, scenario):
+                raise
+            method = AdaptiveRodas3(_tolerance(TOLERANCE if _noisy(scenario) else QUIET_TOLERANCE))
+        clock = clock.with_method(method)
     elif isinstance(clock.method, AdaptiveSteps) and _fixed_only(cascade, scenario):
         raise ValueError(
             f"clock.method = {clock.method}: an amplifier that controls the current requires fixed steps in continuous "

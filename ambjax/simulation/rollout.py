@@ -103,10 +103,9 @@ def rollout(cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | 
     (`loop.DIVERGENCE`), or the integrator stalls. `Trajectory.lost_code` then gives the reason, and values and
     derivatives stay finite.
 
-    The function is pure and jitted. It works under vmap, jvp and grad; reverse mode requires a method with fixed steps.
+    The function is pure and jitted. It works under jit, vmap, jvp and grad, with every method.
 
-    Raises ValueError for an invalid gain, parameter or clock, for an explicit step above its stability limit, and if
-    `clock.method` is None while gains are traced. In the last case, call `with_method` outside the transformation.
+    Raises ValueError for an invalid gain, parameter or clock, and as `with_method` does.
     """
     loop, clock, fold = canonical((*prepare(cascade, scenario, clock), fold))
     return roll(loop, clock, fold, every=every)

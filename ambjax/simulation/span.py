@@ -16,7 +16,7 @@ from ambjax.numerics.smooth import larger, smaller
 
 
 class Instant(NamedTuple):
-    """Signals of a system at one instant, each a pytree of scalars, or empty.
+    """Signals of a system at one instant, each a pytree of numbers, or empty.
 
     - `sizes`: signals for which a Span records the extremes of the absolute value.
     - `densities`: signals for which a Span records the integral over time.
@@ -70,7 +70,7 @@ class Span(NamedTuple):
 
 
 def blank(like: Instant) -> Span:
-    """Return an empty interval. `like`: any Instant with the structure of the signals."""
+    """Return an empty interval. `like`: any Instant with the structure and the shapes of the signals."""
     zero = jnp.zeros((), jnp.result_type(float))
-    nothing = jax.tree.map(lambda _: zero, like)
-    return Span(zero, nothing.sizes, jax.tree.map(lambda _: zero + jnp.inf, like.sizes), nothing.densities)
+    nothing = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), zero.dtype), like)
+    return Span(zero, nothing.sizes, jax.tree.map(lambda x: x + jnp.inf, nothing.sizes), nothing.densities)

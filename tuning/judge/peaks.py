@@ -1,4 +1,4 @@
-"""The sensitivity of members of an ensemble, measured by injection into the simulation."""
+"""The sensitivity of members of an ensemble: linear, and injected, by a test signal in the simulation."""
 
 import dataclasses
 import math
@@ -18,20 +18,20 @@ from ambjax.results.operating import one_period
 from tuning.problem.limits import PREFIX, Limit
 from tuning.problem.tuning_problem import TuningProblem
 
-# INJECTED: number of members, those with the largest peaks, that are measured by injection. REPETITIONS: number of
+# INJECTED: number of members, those with the largest peaks, with an injected signal. REPETITIONS: number of
 # injections into each of them, with different noise.
 INJECTED, REPETITIONS = 3, 8
 # If only injections decide, the linear peaks do not show which members have the largest peaks. The first SCREENED held
-# members are then measured once each. They run in blocks of 16, one per core: on four cores, this takes as long as the
+# members then have one injection each. They run in blocks of 16, one per core: on four cores, this takes as long as the
 # measurement of one member.
 SCREENED = 64
 UNSTABLE = "its linearised loop is not stable"
 # Limited quantities that an injection measures.
-MEASURED = {"sensitivity": "S", "complementary": "T", "control_sensitivity": "KS"}
+BY_INJECTION = {"sensitivity": "S", "complementary": "T", "control_sensitivity": "KS"}
 
 
 @dataclasses.dataclass(frozen=True)
-class MeasuredPeak:
+class MemberPeak:
     """The linear and the injected peak of |S| of one member.
 
     `linear`, `frequency_hz`, `zone`: of the linearised loop. If it is not stable, they are None, None and "D"; if it
@@ -61,13 +61,13 @@ class MeasuredPeak:
 class Sensitivity(NamedTuple):
     """The peaks of some judged members. `decides`: whether the injected values decide alone on a limit."""
 
-    peaks: tuple[MeasuredPeak, ...]
+    peaks: tuple[MemberPeak, ...]
     decides: bool
 
 
 def injects(problem: TuningProblem) -> bool:
     """Return whether the laws run on a processor and a limit concerns a quantity that injections measure."""
-    return problem.sampled and any(limit.name in MEASURED for limit in problem.limits)
+    return problem.sampled and any(limit.name in BY_INJECTION for limit in problem.limits)
 
 
 def decides(problem: TuningProblem) -> bool:
@@ -83,23 +83,23 @@ def injections(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[s
     """Analyse the INJECTED held members with the largest peaks at coordinates x [m]; on a processor, also inject.
 
     `columns` [N]: result of `judge` for the ensemble with this `seed`. The members are those with the largest linear
-    peak of the first quantity of MEASURED that has a limit. If only injections decide, they are those with the largest
-    injected peak, measured once in each of the first SCREENED held members. Returns None if no quantity of MEASURED has
-    a limit, or if no member is held.
+    peak of the first quantity of BY_INJECTION that has a limit. If only injections decide, they are those with the
+    largest injected peak, by one injection into each of the first SCREENED held members. Returns None if no quantity of
+    BY_INJECTION has a limit, or if no member is held.
     """
-    name = next((name for name in MEASURED if f"loss.{PREFIX}{name}" in columns), None)
+    name = next((name for name in BY_INJECTION if f"loss.{PREFIX}{name}" in columns), None)
     alive = np.flatnonzero(~np.isfinite(columns["lost_at_s"]))
     if name is None or not alive.size:
         return None
     order = alive[np.argsort(-columns[f"loss.{PREFIX}{name}"][alive], kind="stable")]
-    of = _Judged(problem, x, seed, len(columns["lost_at_s"]))
+    of = _Ensemble(problem, x, seed, len(columns["lost_at_s"]))
     if not injects(problem):
         return Sensitivity(tuple(_summary(int(k), of.analysis(k), None) for k in order[:INJECTED]), False)
     first = of.analysis(order[0])
     peak = None if isinstance(first, str) else first.S.frequency
     if decides(problem):
         once = of.responses(alive[:SCREENED], 1, peak)
-        response = {"S": once.S, "T": once.S - 1, "KS": once.KS}[MEASURED[name]]
+        response = {"S": once.S, "T": once.S - 1, "KS": once.KS}[BY_INJECTION[name]]
         size = np.where(once.held, np.abs(response).max(axis=1), np.inf)
         order = alive[np.argsort(-size, kind="stable")]
     random = problem.objective.scenario.random
@@ -113,23 +113,23 @@ def injections(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[s
     return Sensitivity(tuple(peaks), decides(problem))
 
 
-def reached_of(limit: Limit, columns: Mapping[str, np.ndarray], measured: Sensitivity | None) -> float:
+def reached_of(limit: Limit, columns: Mapping[str, np.ndarray], injected: Sensitivity | None) -> float:
     """Return the judge's value of a limit: the larger of the linear and the injected one, or the injected one alone.
 
-    The injected value counts alone if `measured.decides`. Without an injection, the value is the linear one.
+    The injected value counts alone if `injected.decides`. Without an injection, the value is the linear one.
 
     The value of a member that is lost during its injection is infinite.
     """
     linear = limit.reached(columns)
-    if limit.name not in MEASURED or measured is None:
+    if limit.name not in BY_INJECTION or injected is None:
         return linear
-    largest = [one.largest.get(limit.name, math.inf) for one in measured.peaks if one.repetitions]
+    largest = [one.largest.get(limit.name, math.inf) for one in injected.peaks if one.repetitions]
     if not largest:
         return linear
-    return max(largest) if measured.decides else max(linear, *largest)
+    return max(largest) if injected.decides else max(linear, *largest)
 
 
-class _Judged(NamedTuple):
+class _Ensemble(NamedTuple):
     """The members of a judged ensemble of `total` members with this `seed`, at coordinates x [m]."""
 
     problem: TuningProblem
@@ -164,8 +164,8 @@ class _Judged(NamedTuple):
         return member_responses(cascade, scenario, clock, lines, amplitude=case.zones.amplitude)
 
 
-def _summary(number: int, analysis: Analysis | str, one: Injection | None) -> MeasuredPeak:
-    """Return the peaks of a member. `analysis`: of `_Judged`. `one`: its injection; None if there was none."""
+def _summary(number: int, analysis: Analysis | str, one: Injection | None) -> MemberPeak:
+    """Return the peaks of a member. `analysis`: of `_Ensemble`. `one`: its injection; None if there was none."""
     loop: tuple[float | None, float | None, str | None, str]
     if isinstance(analysis, str):
         loop = None, None, None, f"it cannot be linearised: {analysis}"
@@ -174,12 +174,12 @@ def _summary(number: int, analysis: Analysis | str, one: Injection | None) -> Me
     else:
         loop = analysis.S.height, analysis.S.frequency, analysis.zone, ""
     if one is None:
-        return MeasuredPeak(number, *loop, None, None, None, None, None, 0, 0, {})
+        return MemberPeak(number, *loop, None, None, None, None, None, 0, 0, {})
     largest = {}
     if one.S is not None and not one.lost:
-        responses = {name: np.asarray(getattr(one, which)) for name, which in MEASURED.items()}
+        responses = {name: np.asarray(getattr(one, which)) for name, which in BY_INJECTION.items()}
         largest = {name: float(np.max(np.abs(response))) for name, response in responses.items()}
-    return MeasuredPeak(
+    return MemberPeak(
         number, *loop, one.peak, one.peak_low, one.peak_high, one.peak_frequency, one.saturated,
         one.lost, one.members, largest,
     )  # fmt: skip

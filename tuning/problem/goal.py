@@ -31,9 +31,9 @@ class Goal:
 
     goal = log(risk(losses) + mean(losses of stressed members)) + weight * shortfall(conditions) + sum(limits).
     The risk and the limits include ordinary members only. `margin` is the relative margin of the conditions.
-    `measured`: names of the quantities, in the order of their columns in `outcomes`. `minimised`: one of these names,
-    or empty. If it is not empty, the square of `unit` times this quantity is added to the risk. The caller then sets
-    the weights of errors and costs to 0 (`TuningProblem.towards_voltage`).
+    `quantities`: names of the limited or minimised quantities, in the order of their columns in `outcomes`.
+    `minimised`: one of these names, or empty. If it is not empty, the square of `unit` times this quantity is added to
+    the risk. The caller then sets the weights of errors and costs to 0 (`TuningProblem.towards_voltage`).
     """
 
     space: Space = static()
@@ -43,14 +43,14 @@ class Goal:
     weight: Scalar
     margin: Scalar
     limits: tuple[LimitTerm, ...] = ()
-    measured: tuple[str, ...] = static(default=())
+    quantities: tuple[str, ...] = static(default=())
     minimised: str = static(default="")
     unit: Scalar = 1.0
 
     def __call__(self, outcomes: Array, x: Array, ordinary: int) -> Array:
         """Return the goal at coordinates x [m].
 
-        `outcomes` [N, 1 + L]: the weighted loss and the quantities `measured` of each member. The first `ordinary`
+        `outcomes` [N, 1 + L]: the weighted loss and the `quantities` of each member. The first `ordinary`
         members are not stressed.
         """
         stressed = outcomes[ordinary:, 0]
@@ -62,7 +62,7 @@ class Goal:
         risk = self.risk(outcomes[:, 0])
         if not self.minimised:
             return risk
-        values = outcomes[:, 1 + self.measured.index(self.minimised)]
+        values = outcomes[:, 1 + self.quantities.index(self.minimised)]
         return risk + (self.unit * KINDS[self.minimised].tuned(values)) ** 2
 
     def penalty(self, x: Array) -> Array:
@@ -71,7 +71,7 @@ class Goal:
 
     def pull(self, held: Array) -> Array | int:
         """Return the sum of the limits' terms for the quantities `held` [N, L] of the ordinary members."""
-        return sum(term(held[:, self.measured.index(term.name)]) for term in self.limits)
+        return sum(term(held[:, self.quantities.index(term.name)]) for term in self.limits)
 
     def score(self, x: np.ndarray, terms: dict[str, np.ndarray], members: Members) -> np.ndarray:
         """Return the goal [S] at x [S, m] from the terms [S, N] of members [N]; +inf where it is not finite."""

@@ -138,10 +138,6 @@ class Limit:
         history = (*self.history, (max(judged, TINY), multiplier))
         return dataclasses.replace(self, multiplier=multiplier, ratio=ratio, history=history)
 
-    def restarted(self) -> "Limit":
-        """Return the limit with a new augmented Lagrangian, to minimise another quantity. `ratio` is kept."""
-        return dataclasses.replace(self, multiplier=0.0, history=())
-
     def error_reduction(self, more: float) -> float:
         """Return the relative decrease of the minimised rms value if the limit is looser by the share `more`.
 

@@ -122,7 +122,8 @@ class TuningProblem:
         weights = tuple(weight if name in HELD else 0.0 for name, weight in zip(TERMS, self.tune.weights, strict=True))
         unit = error_m / float(np.asarray(self.objective.loss.s_0)) / volts
         goal = dataclasses.replace(self.goal, weights=weights, minimised="rms_u_V", unit=unit)
-        own = [limit.restarted() for limit in self.limits if limit.name != "rms_error_m"]
+        others = (limit for limit in self.limits if limit.name != "rms_error_m")
+        own = [dataclasses.replace(limit, multiplier=0.0, history=()) for limit in others]
         asked = min([factor * error_m, *(one.threshold for one in self.tune.limits.each if one.name == "rms_error_m")])
         nearly = Limit("rms_error_m", asked, FRONT, KINDS["rms_error_m"].margin, multiplier=EXCHANGE)
         limits = tuple(sorted([*own, nearly], key=lambda limit: limit.name))
@@ -185,7 +186,7 @@ def problem_of(
     conditions = bounds(case.cascade, case.scenario, clock)
     space, box = bounded(objective, conditions, tune.space.values(case.cascade))
     objective = dataclasses.replace(objective, space=space)
-    goal = Goal(space, tune.weights, tune.risk, conditions, tune.conditions, tune.margin, measured=tuple(names))
+    goal = Goal(space, tune.weights, tune.risk, conditions, tune.conditions, tune.margin, quantities=tuple(names))
     mode = cheaper_mode(len(tune.space), 1 + len(loss.measures))
     engine = Engine(objective, settle=case.settle, mode=mode, threads=threads)
     return TuningProblem(case, tune, objective, engine, goal, box, finer, front=front).limited(limits.each)

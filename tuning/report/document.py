@@ -1,15 +1,14 @@
 """The report of `ambjax tune` in Markdown."""
 
 import functools
+import math
 from collections.abc import Callable
 
 from ambjax.results.outputs import described
 from ambjax.text.web_page import escape_markdown, markdown_table
-from tuning.problem.loss import TERMS
-from tuning.report import answer, front_table, held_out, limit_table, sensitivity_table
-from tuning.report.breakdown import FORMULA
+from tuning.report import front_table, held_out, limit_table, sensitivity_table
 from tuning.report.facts import Row, TuningFacts
-from tuning.report.held_out import number_text
+from tuning.report.limit_table import broken, prices
 
 # Relative decrease of the objective below which a point of a slice counts as equal to the answer.
 AS_GOOD = 0.01
@@ -20,10 +19,72 @@ def report_markdown(facts: TuningFacts) -> str:
 
     Its pictures are files in the same folder.
     """
-    lines = [f"# Tuning of {escape_markdown(facts.case)}", "", *answer.answer_lines(facts)]
+    lines = [f"# Tuning of {escape_markdown(facts.case)}", "", *answer_lines(facts)]
     for name, section in SECTIONS.items():
         lines += described(f"the section on {name} of the report", functools.partial(section, facts)) or []
     return "\n".join(lines) + "\n"
+
+
+def answer_lines(facts: TuningFacts) -> list[str]:
+    """Return five list items and an empty line: held or not, error and voltage, sensitivity, limits, next command."""
+    items = {"members": _held, "error": _sizes, "sensitivity": _peaks, "limits": _limiting, "next command": _next}
+    lines = [described(f"the line on the {name}", functools.partial(line, facts)) for name, line in items.items()]
+    return [*(f"- {line}" for line in lines if line), ""]
+
+
+def _held(facts: TuningFacts) -> str:
+    """Return the item on the rotors that are held, and on the requirements."""
+    outcome, after = facts.outcome, facts.after
+    word = "NOT held" if not outcome["rotors_held"] else "Not verified" if facts.refuted else "Held"
+    which = "held-out members" if after["members"] else "training members"
+    kept = outcome["members"] - outcome["lost"] - outcome["stalled"]
+    words = f"**{word}:** {kept} of {outcome['members']} {which} are held"
+    if facts.before["members"]:
+        words += f" (before tuning: {facts.before['held']})"
+    met = "All requirements are met." if outcome["good"] else f"Not met: {'; '.join(outcome['against'])}."
+    return f"{words}. {met}"
+
+
+def _sizes(facts: TuningFacts) -> str:
+    """Return the item on the error and the voltage after tuning, and before it."""
+    after, before = facts.after, facts.before
+    if not after["members"]:
+        return "**Error and voltage:** not measured on held-out members (tune.held_out = 0)."
+    if not after["held"]:
+        return "**Error and voltage:** no held-out member is held."
+
+    def change(name: str, unit: str) -> str:
+        was = f" (before: {before[name]:.3g})" if before["held"] else ""
+        return f"{after[name]:.3g} {unit}{was}"
+
+    most = after.get("max_abs_u_V.largest")
+    return (
+        f"**Error:** {change('settled_rms_error_m', 'm')} rms after settling, largest "
+        f"{after['settled_max_abs_error_m']:.3g} m. **Voltage:** {change('settled_rms_u_V.mean', 'V')} rms"
+        f"{'' if most is None else f', largest {most:.3g} V'}."
+    )
+
+
+def _peaks(facts: TuningFacts) -> str:
+    return sensitivity_table.line(facts.sensitivity)
+
+
+def _limiting(facts: TuningFacts) -> str:
+    """Return the item on the limits that are not held or active, and on the gains at a bound."""
+    words = [escape_markdown(line) for line in (*broken(facts.limits), *prices(facts.limits))]
+    if ends := [row["path"] for row in facts.gains if row["at_bound"]]:
+        words.append(f"gains at a bound of `[tune.bounds]`: {', '.join(ends)}")
+    if not words:
+        front = "the trade-off between error and voltage (table below); " if len(facts.front or ()) > 1 else ""
+        words = [f"{front}no limit of `[tune.limits]` is active, and no gain is at a bound"]
+    return f"**Limited by:** {'; '.join(words)}."
+
+
+def _next(facts: TuningFacts) -> str:
+    """Return the next command, or the advice if a requirement is not met."""
+    if facts.advice:
+        return f"**Next:** {escape_markdown(facts.advice)}"
+    return f"**Next:** in this folder, {facts.next}"
 
 
 def _verdict(facts: TuningFacts) -> list[str]:
@@ -37,8 +98,8 @@ def _gains(facts: TuningFacts) -> list[str]:
     head = ["gain", "before", "after", *looked, "allowed from", "to", "at a bound", "risk increase"]
     rows = []
     for row in facts.gains:
-        ends = [number_text(row.get(end), ".3g") for end in ("low", "high")] if ranged else []
-        bounds = [number_text(row.get(end), ".3g") for end in ("least", "most")]
+        ends = [_number(row.get(end), ".3g") for end in ("low", "high")] if ranged else []
+        bounds = [_number(row.get(end), ".3g") for end in ("least", "most")]
         gains = f"{row['before']:.6g}", f"{row['after']:.6g}"
         rows.append([row["path"], *gains, *ends, *bounds, row["at_bound"] or "-", _sensitivity(row, facts)])
     lines = ["## Gains", "", *markdown_table(head, rows), ""]
@@ -60,7 +121,9 @@ def _gains(facts: TuningFacts) -> list[str]:
         "",
         f"The nominal run of the case, without `[spread]`, {facts.nominal_steps}. u is averaged over each sample.",
         "",
-        "![z - r and u before and after tuning](nominal.png)",
+        "![z - r and u before tuning](before.png)",
+        "",
+        "![z - r and u after tuning](after.png)",
         "",
         "Amplitude spectrum of the voltage from `run.settle` on (Hann window). A sine with an amplitude of 1 V has a "
         "peak of 1 V.",
@@ -77,60 +140,19 @@ def _sensitivity(row: Row, facts: TuningFacts) -> str:
     return "-" if row["sensitivity_percent"] is None else f"{row['sensitivity_percent']:.3g} %"
 
 
-def _loss(facts: TuningFacts) -> list[str]:
-    """Return the section on the terms of the loss of the held-out members."""
-    if not facts.loss:
+def _objective(facts: TuningFacts) -> list[str]:
+    """Return the section on the objective around the answer."""
+    if facts.beside is None:
         return []
-    before, after = facts.loss["before"], facts.loss["after"]
-    rows = [
-        [name, f"{weight:g}"]
-        + [f"{x[what][name]:.4e}" for x in (before, after) for what in ("mean", "adds")]
-        for name, weight in zip(TERMS, facts.weights, strict=True)
-    ]  # fmt: skip
-    head = ["term", "weight", "mean before", "contribution before", "mean after", "contribution after"]
-    rows.append(["**loss, the sum**", "", "", f"{before['loss']:.4e}", "", f"**{after['loss']:.4e}**"])
-    risk = facts.search["risk"]
-    if risk != "mean":
-        rows.append([f"risk: {risk} of the losses", "", "", f"{before['risk']:.4e}", "", f"{after['risk']:.4e}"])
     return [
-        "## The loss of the held-out members",
+        "## Objective along each gain",
         "",
-        f"Loss of a member: `{FORMULA}`, each term times its weight. The columns are means over members. Tracking, "
-        "peak, clearance and survival add weight x mean to the loss. Effort and chatter multiply the error of each "
-        "member: they add the mean of weight x term x (tracking + peak), which is not the product of the means shown.",
-        "",
-        *markdown_table(head, rows),
-        "",
-    ]
-
-
-def _minimised(facts: TuningFacts) -> list[str]:
-    """Return the section on the objective that the search minimised."""
-    parts = facts.minimised
-    if not parts:
-        return []
-    words = f"over {parts['ordinary']} members (seed {facts.search['seed']})"
-    rows = [[f"risk: {parts['of']} {words}", f"{parts['risk']:.4e}"]]
-    if parts["survival_only"]:
-        label = f"+ mean of (clearance + survival) over {parts['survival_only']} stressed members"
-        rows.append([label, f"{parts['held']:.4e}"])
-    rows.append(["x penalty of the theorem's conditions", f"{parts['penalty']:.6g}"])
-    if parts["limits"] != 1:
-        rows.append(["x factor of the limits", f"{parts['limits']:.6g}"])
-    rows.append(["**= objective**", f"**{parts['total']:.4e}**"])
-    return [
-        "## Objective of the search",
-        "",
-        "Stressed members have more noise, and gains that are changed by a factor. Members that were lost in the "
-        "validation or with accurate steps have joined them. All of these must be held, but their error does not "
-        "count. The objective therefore differs from the loss of the held-out members above. The picture shows the "
-        "objective.",
-        "",
-        *markdown_table(["at the answer", "value"], rows),
+        "The objective is that of the search: stressed members must be held, but their error does not count.",
         "",
         "![Objective along each gain, through the answer](slices.png)",
         "",
-        *([] if facts.beside is None else [_lower_point(facts.beside), ""]),
+        _lower_point(facts.beside),
+        "",
     ]
 
 
@@ -151,15 +173,20 @@ def _lower_point(beside: Row) -> str:
     )
 
 
+def _number(x: float | None, form: str = ".5g") -> str:
+    """Return a number as text; '-' for None and NaN."""
+    return "-" if x is None or math.isnan(x) else format(x, form)
+
+
 def _conditions(facts: TuningFacts) -> list[str]:
     """Return the section on the conditions of Theorem 1, left > right."""
     if not facts.conditions:
         return []
     rows = []
     for row in facts.conditions:
-        gain, margin = (number_text(x) for x in (row["gain"], row["margin"]))
+        gain, margin = (_number(x) for x in (row["gain"], row["margin"]))
         verdict = {True: "holds", False: "FAILS", None: "-"}[row["holds"]]
-        rows.append([row["requires"], gain, number_text(row["against"]), margin, row["unit"], verdict])
+        rows.append([row["requires"], gain, _number(row["against"]), margin, row["unit"], verdict])
     head = ["condition", "left", "right", "margin", "unit", "verdict"]
     lines = ["## Conditions of Theorem 1 along the nominal run", "", *markdown_table(head, rows), ""]
     if facts.advice_on_conditions:
@@ -192,8 +219,7 @@ SECTIONS: dict[str, Callable[[TuningFacts], list[str]]] = {
     "the sensitivity": lambda facts: sensitivity_table.section(facts.sensitivity),
     "the gains": _gains,
     "the held-out members": held_out.section,
-    "the loss": _loss,
-    "the objective": _minimised,
+    "the objective": _objective,
     "the conditions of Theorem 1": _conditions,
     "the search": _course,
 }

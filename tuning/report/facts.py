@@ -30,11 +30,10 @@ class TuningFacts:
     no member was judged. `front`: of error against voltage; None if it was not traced. `front_written`: whether each of
     its points has a case file. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it.
     `beside`: the lowest point of the slices through the answer; None without slices. `next`: the next command, in
-    words. `loss`, `minimised`, `conditions` and `slices` are empty or None if they could not be computed.
+    words. `conditions` and `slices` are empty or None if they could not be computed.
     """
 
     case: str
-    weights: list[float]
     before: Row
     after: Row
     held_out_seed: int
@@ -42,8 +41,6 @@ class TuningFacts:
     lost_in_training: int
     limits: list[Row]
     sensitivity: Row | None
-    loss: Row
-    minimised: Row | None
     conditions: list[Row]
     advice_on_conditions: list[str]
     step_error: Row | None

@@ -1,5 +1,6 @@
 """The files of a tuning: the case with the tuned gains, the report with its pictures, the front and the page."""
 
+import dataclasses
 import functools
 import pathlib
 import tomllib
@@ -10,14 +11,17 @@ import numpy as np
 
 from ambjax.cases.reader import Case, case_from
 from ambjax.control.cascade import Cascade
+from ambjax.ensemble.replay import record_member
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
 from ambjax.results.outputs import described
+from ambjax.simulation.rollout import rollout
+from ambjax.simulation.trajectory import Trajectory
 from ambjax.text.web_page import render_page
 from tuning.problem.space import Gain, Space, tunable
 from tuning.problem.tuning_problem import TuningProblem
-from tuning.report import accurate, front_table, pictures
 from tuning.report import document as report
+from tuning.report import front_table, pictures
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.record import TUNED
 from tuning.report.slices import Slices
@@ -86,12 +90,13 @@ def _pictures(
     runs = {"before": problem.case.cascade, "after": tuned}
     shown = {}
     for name, cascade in runs.items():
-        run = described(f"the run {name} tuning", functools.partial(accurate.nominal, problem, cascade))
+        run = described(f"the run {name} tuning", functools.partial(nominal, problem, cascade))
         if run is not None:
             shown[name] = run
     draw = {"convergence.png": lambda: pictures.convergence(history, paths)}
+    for name, run in shown.items():
+        draw[f"{name}.png"] = functools.partial(pictures.nominal, run, f"{name} tuning", settle)
     if shown:
-        draw["nominal.png"] = lambda: pictures.before_after(shown, settle)
         draw["spectrum.png"] = lambda: pictures.spectrum(shown, settle)
     if slices is not None:
         draw["slices.png"] = lambda: pictures.landscape(slices, paths)
@@ -99,6 +104,18 @@ def _pictures(
         draw["front.png"] = lambda: pictures.front(front)
     drawn = {name: described(name, one) for name, one in draw.items()}
     return {name: data for name, data in drawn.items() if data is not None}
+
+
+def nominal(problem: TuningProblem, cascade: Cascade) -> Trajectory:
+    """Simulate the nominal case under this cascade and record every sample.
+
+    The steps are accurate ones, or those of `ambjax simulate` if the judge uses these.
+    """
+    case = problem.case
+    if problem.replays:
+        return record_member(cascade, case.scenario, case.clock).trajectory
+    clock = dataclasses.replace(case.clock, method=problem.reference.objective.clock.method)
+    return rollout(cascade, case.scenario, clock).trajectory
 
 
 def all_laws(problem: TuningProblem, tuned: dict[str, float]) -> dict[str, float]:

@@ -95,7 +95,7 @@ def section(rows: list[Facts] | None, written: bool) -> list[str]:
     ]
     words = (
         "The least rms voltage for each limit of the settled rms error, within the other limits. The values are those "
-        "of members of the validation ensemble. If a sign is set-valued, the peak is measured by injection. Only the "
+        "of members of the validation ensemble. If a sign is set-valued, the peak is the injected one. Only the "
         "selected answer is judged on the held-out members."
     )
     picture = "![Error against voltage; the selected answer is the filled point](front.png)"

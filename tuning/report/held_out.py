@@ -1,40 +1,73 @@
-"""The held-out members in the report: metrics before and after, also with accurate steps, and the worst member."""
+"""The held-out members in the report: metrics before and after, their errors due to the steps, and the worst member.
+
+To find these errors, a few members are simulated again with accurate steps, in continuous time only, where these are
+the steps of adaptive RODAS3.
+"""
 
 import math
 
+import numpy as np
+
 from ambjax.text.web_page import markdown_table
+from tuning.judge.evaluate import compare_metrics, metrics_of, summarise
+from tuning.problem.tuning_problem import TuningProblem
 from tuning.report.facts import SUMMARY_METRICS, Row, TuningFacts
 
+# Number of held-out members that are simulated by accurate steps.
+COMPARED = 8
+# Relative error of the report's steps above which a number is marked.
+MARKED = 0.05
 
-def number_text(x: float | None, form: str = ".5g") -> str:
-    """Return a number as text; '-' for None and NaN."""
-    return "-" if x is None or math.isnan(x) else format(x, form)
+
+def compare_steps(problem: TuningProblem, x: np.ndarray, seed: int, count: int) -> Row:
+    """Compare the report's steps with accurate steps on the first members of an ensemble, at coordinates x [m].
+
+    Returns plain data. `members`: number of members simulated. `held`: number of members that survive with both steps.
+    `metrics`: for each of SUMMARY_METRICS, the summary over these members (`summarise`) with the report's steps and
+    with accurate steps, and the relative error. `lost`, `stalled`: numbers of members with each of the steps.
+    `refuted`: why accurate steps contradict the report; '' if they do not, or if no member survives in the report.
+    """
+    numbers = np.arange(min(COMPARED, count))
+    members = problem.objective.chosen(seed, numbers, count)
+    both = metrics_of(problem.judging, x, members), metrics_of(problem.reference, x, members)
+    error = compare_metrics(problem, *both, members)
+    held = np.logical_and.reduce([~np.isfinite(metrics["lost_at_s"]) for metrics in both])
+    found: Row = {"members": len(numbers), "held": int(held.sum()), "marked_beyond": MARKED, "metrics": {}}
+    found["refuted"] = error.refuted if error.members + error.unconfirmed else ""
+    for status in ("lost", "stalled"):
+        found[status] = dict(zip(("report", "accurate"), (int(one[status].sum()) for one in both), strict=True))
+    if not held.any():
+        return found
+    ours, theirs = (summarise({name: values[held] for name, values in metrics.items()}) for metrics in both)
+    for name in SUMMARY_METRICS:
+        if name in ours and name in theirs:
+            pair = ours[name], theirs[name]
+            relative = 0.0 if pair[0] == pair[1] else pair[0] / pair[1] - 1 if pair[1] else math.inf
+            found["metrics"][name] = {"report": pair[0], "accurate": pair[1], "relative": relative}
+    return found
 
 
 def section(facts: TuningFacts) -> list[str]:
     """Return the section on the held-out members."""
-    before, after = facts.before, facts.after
+    before, after, again = facts.before, facts.after, facts.accurate
     if not after["members"]:
         return ["There is no held-out ensemble (tune.held_out = 0).", ""]
-    again = facts.accurate
-    head = ["", "before", "after"]
-    if again:
-        head += [f"after, {again['held']} members", "with accurate steps", "difference"]
     rows = [
-        [f"`{name}`", number_text(before.get(name), ".4g"), number_text(after.get(name), ".4g"), *_again(again, name)]
+        [f"`{name}`", _number(before.get(name)), _number(after.get(name)), *([_off(again, name)] if again else [])]
         for name in SUMMARY_METRICS
         if name in after or name in before
     ]
-    rows += [[name, str(before[name]), str(after[name]), *_statuses(again, name)] for name in ("lost", "stalled")]
-    rows.append(["survival, 95 % interval", *map(_survival, (before, after)), *(["-"] * 3 if again else [])])
-    lines = [
-        f"## {after['members']} held-out members (seed {facts.held_out_seed})",
-        "",
-        *markdown_table(head, rows),
-        "",
-    ]
+    dash = ["-"] * bool(again)
+    rows += [[name, str(before[name]), str(after[name]), *dash] for name in ("lost", "stalled")]
+    rows.append(["survival, 95 % interval", *map(_survival, (before, after)), *dash])
+    head = ["", "before", "after", *["error of the steps"] * bool(again)]
+    title = f"## {after['members']} held-out members (seed {facts.held_out_seed})"
     words = ["The metrics include only the members that are held.", *_accurate(again), *_worst(facts.worst_member), ""]
-    return [*lines, *words]
+    return [title, "", *markdown_table(head, rows), "", *words]
+
+
+def _number(x: float | None) -> str:
+    return "-" if x is None or math.isnan(x) else f"{x:.4g}"
 
 
 def _worst(worst: Row | None) -> list[str]:
@@ -48,22 +81,12 @@ def _worst(worst: Row | None) -> list[str]:
     return ["", f"{line} In the folder of this report: `{worst['replay']}`" if worst["replay"] else line]
 
 
-def _again(again: Row | None, name: str) -> list[str]:
-    """Return the cells of a metric: its values with both steps, and the relative difference, in bold if it is large."""
-    if again is None:
-        return []
-    pair = again["metrics"].get(name)
-    if pair is None:
-        return ["-"] * 3
-    off = f"{100 * pair['relative']:.2g} %"
-    marked = abs(pair["relative"]) > again["marked_beyond"]
-    return [f"{pair['report']:.4g}", f"{pair['accurate']:.4g}", f"**{off}**" if marked else off]
-
-
-def _statuses(again: Row | None, name: str) -> list[str]:
-    return (
-        [] if again is None else [f"{again[name][way]} of {again['members']}" for way in ("report", "accurate")] + ["-"]
-    )
+def _off(again: Row, name: str) -> str:
+    """Return the relative error of a metric, in bold if it is large; '-' if it is not known."""
+    if name not in again["metrics"]:
+        return "-"
+    relative = again["metrics"][name]["relative"]
+    return f"**{100 * relative:.2g} %**" if abs(relative) > MARKED else f"{100 * relative:.2g} %"
 
 
 def _accurate(again: Row | None) -> list[str]:
@@ -71,13 +94,10 @@ def _accurate(again: Row | None) -> list[str]:
         return []
     if not again["metrics"]:
         return ["No member is held with both steps: accurate steps confirm no number of this table."]
-    marked = [name for name, pair in again["metrics"].items() if abs(pair["relative"]) > again["marked_beyond"]]
-    words = f"The last three columns compare {again['held']} members with simulations by adaptive RODAS3. "
-    if not marked:
-        return [f"{words}No difference exceeds {100 * again['marked_beyond']:g} %."]
     return [
-        f"{words}Differences above {100 * again['marked_beyond']:g} % are in bold. For these metrics, use the values "
-        "with accurate steps. With sliding steps, raise tune.substeps."
+        f"The last column compares {again['held']} members with simulations by adaptive RODAS3. If an error exceeds "
+        f"{100 * MARKED:g} %, in bold, use the value with accurate steps in report.json. With sliding steps, raise "
+        "tune.substeps."
     ]
 
 

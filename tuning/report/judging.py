@@ -18,8 +18,9 @@ from tuning.judge.late import delay_test
 from tuning.judge.peaks import injections
 from tuning.problem.config import seeds, settings
 from tuning.problem.tuning_problem import TuningProblem
-from tuning.report import accurate, breakdown, front_table, limit_table, outcome, sensitivity_table
-from tuning.report.facts import SUMMARY_METRICS, Row, TuningFacts
+from tuning.report import front_table, limit_table, outcome, sensitivity_table
+from tuning.report.facts import Row, TuningFacts
+from tuning.report.held_out import COMPARED, compare_steps
 from tuning.report.slices import Slices
 from tuning.report.slices import slices as slices_through
 from tuning.solve.course import SearchResult
@@ -42,14 +43,12 @@ def examined(answer: SearchResult, front_written: bool, tell: Tell) -> tuple[Tun
     steps = _checked(answer, judged["after"], held_out, tell)
     found = {
         "case": problem.case.name,
-        "weights": list(problem.tune.weights),
         "held_out_seed": held_out,
         "trained_on": len(members.member),
         "lost_in_validation": answer.lost,
         **_ensembles(answer, judged, steps[2], held_out, tell),
         **_steps(answer, *steps),
         **(described("the conditions of Theorem 1", lambda: _conditions(problem, x)) or NO_CONDITIONS),
-        "minimised": described("the objective in parts", lambda: breakdown.minimised(problem, x, members)),
         "search": settings(problem.tune)
         | {"iterations": len(answer.history["value"]), "rollouts": rollouts, "seconds": answer.seconds},
         "front_written": front_written,
@@ -91,21 +90,16 @@ def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_
     found: Row = {name: summarise(one) if one else dict(none) for name, one in judged.items()}
     after = judged["after"]
     tell("the sensitivity of the held-out members")
-    measured = injections(problem, answer.x, held_out, after) if after else None
-    found["sensitivity"] = None if measured is None else sensitivity_table.facts(problem, measured)
+    injected = injections(problem, answer.x, held_out, after) if after else None
+    found["sensitivity"] = None if injected is None else sensitivity_table.facts(problem, injected)
     late = delay_test(problem, answer.x, held_out, after) if after else None
-    found["limits"] = limit_table.facts(problem, after, found["after"], refuted, measured, late)
+    found["limits"] = limit_table.facts(problem, after, found["after"], refuted, injected, late)
     if refuted and after:
         found["after"] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
-    found["loss"] = described("the loss of the held-out members", lambda: _losses(problem, judged)) or {}
     found["worst_member"] = described("the worst member", lambda: worst(problem, after, held_out)) if after else None
     found["stability"] = _stability(problem, answer.x, held_out, after, tell) if after else None
     lost = problem.engine.terms(answer.x[None], answer.members)["survival"] > 0
     return found | {"lost_in_training": int(lost.sum())}
-
-
-def _losses(problem: TuningProblem, judged: dict[str, Any]) -> Row:
-    return {name: breakdown.loss_breakdown(problem.error_goal, one) for name, one in judged.items() if one}
 
 
 def _stability(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray], tell: Tell) -> Row:
@@ -187,8 +181,8 @@ def _checked(
     if judged and not problem.sampled:
         error = _worst_checked(answer, judged, held_out, tell) if answer.confirmed else None
         count = problem.tune.budget.held_out
-        tell(f"{min(accurate.COMPARED, count)} of these members again with accurate steps")
-        again = accurate.compare_steps(problem, answer.x, held_out, count, SUMMARY_METRICS)
+        tell(f"{min(COMPARED, count)} of these members again with accurate steps")
+        again = compare_steps(problem, answer.x, held_out, count)
     refuted = (error or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
     return error, again, refuted or (again["refuted"] if again else "")
 

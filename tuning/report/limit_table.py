@@ -6,7 +6,7 @@ import numpy as np
 
 from ambjax.text.web_page import markdown_table
 from tuning.judge.late import DELAY_MARGIN, DelayTest, not_simulated
-from tuning.judge.peaks import MEASURED, Sensitivity, reached_of
+from tuning.judge.peaks import BY_INJECTION, Sensitivity, reached_of
 from tuning.problem.limits import FRONT, Limit
 from tuning.problem.quantities import Kind
 from tuning.problem.tuning_problem import TuningProblem
@@ -27,14 +27,14 @@ def facts(
     columns: dict[str, np.ndarray],
     summary: Facts,
     refuted: str = "",
-    measured: Sensitivity | None = None,
+    injected: Sensitivity | None = None,
     delayed: DelayTest | None = None,
 ) -> list[Facts]:
     """Return a row for each limit and one for survival, from the held-out members' columns [N] and their summary.
 
     A limit that cannot be broken has a row without a value reached.
 
-    `refuted`: why accurate steps do not confirm the answer; '' if they do. `measured`: the injections into some of the
+    `refuted`: why accurate steps do not confirm the answer; '' if they do. `injected`: the injections into some of the
     held-out members. `delayed`: the test of the limit on the delay margin. Fields of a row:
 
     - `held`: whether the limit is held; None if no member was judged, or if the limit is held but accurate steps do not
@@ -53,7 +53,7 @@ def facts(
         | {"source": f"{limit.source}; {UNBREAKABLE}: {why}", "held": True, "verdict": UNBREAKABLE}
         for limit, why in settings.unbreakable
     ]
-    numbers = columns, summary, refuted, measured, price_unit
+    numbers = columns, summary, refuted, injected, price_unit
     rows = [
         _tested(_row(limit, *numbers), delayed, refuted, not_simulated(problem, limit)) for limit in _asked(problem)
     ]
@@ -96,11 +96,11 @@ def _row(
     columns: dict[str, np.ndarray],
     summary: Facts,
     refuted: str,
-    measured: Sensitivity | None,
+    injected: Sensitivity | None,
     price_unit: str,
 ) -> Facts:
     judged = summary["held"] > 0
-    reached = reached_of(limit, columns, measured) if judged else None
+    reached = reached_of(limit, columns, injected) if judged else None
     kept = limit.holds(reached) if reached is not None else False if summary["members"] else None
     active, found = limit.active(reached), _verdict(kept, refuted)
     minimised = {"m": "settled_rms_error_m", "V": "settled_rms_u_V.mean"}[price_unit]
@@ -111,8 +111,8 @@ def _row(
         "threshold": limit.threshold,
         "at_least": limit.kind.at_least,
         "source": limit.source,
-        "what": f"{limit.kind.words}; {limit.kind.over}" + _by_injection(limit, measured),
-        "saturated": _saturated(limit, reached, measured),
+        "what": f"{limit.kind.words}; {limit.kind.over}" + _by_injection(limit, injected),
+        "saturated": _saturated(limit, reached, injected),
         "reached": reached,
         "worst": reached if limit.kind.fold is None or not judged else limit.worst(columns),
         "margin": limit.margin,
@@ -146,17 +146,17 @@ def _asked(problem: TuningProblem) -> list[Limit]:
     return [found.get(limit.name, limit) for limit in problem.tune.limits.each]
 
 
-def _by_injection(limit: Limit, measured: Sensitivity | None) -> str:
+def _by_injection(limit: Limit, injected: Sensitivity | None) -> str:
     """Return the text about the injection; '' if injections do not measure the quantity."""
-    if limit.name not in MEASURED or measured is None or not measured.peaks[0].repetitions:
+    if limit.name not in BY_INJECTION or injected is None or not injected.peaks[0].repetitions:
         return ""
-    those = f"measured by injection into {len(measured.peaks)} of the worst members"
-    return f"; {those}" if measured.decides else f", or the value {those}, if that is larger"
+    those = f"by injection into {len(injected.peaks)} of the worst members"
+    return f"; {those}" if injected.decides else f", or its value {those}, if that is larger"
 
 
-def _saturated(limit: Limit, reached: float | None, measured: Sensitivity | None) -> float | None:
+def _saturated(limit: Limit, reached: float | None, injected: Sensitivity | None) -> float | None:
     """Return the share of saturated samples of the injection whose value is `reached`; None if no injection gave it."""
-    peaks = () if measured is None else measured.peaks
+    peaks = () if injected is None else injected.peaks
     return next((one.saturated for one in peaks if one.largest.get(limit.name, np.nan) == reached), None)
 
 
@@ -166,7 +166,7 @@ def _at_the_supply(row: Facts) -> str:
     if share is None or share <= MOST_SATURATED:
         return ""
     return (
-        f"; measured while the supply limits u in {100 * share:.2g} % of the samples: set a smaller "
+        f"; by an injection while the supply limits u in {100 * share:.2g} % of the samples: set a smaller "
         "sensitivity.amplitude, or ask for gains with a smaller peak of |KS| by tune.limits.control_sensitivity or a "
         "lower tune.limits.rms_u_V"
     )

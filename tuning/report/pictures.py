@@ -4,11 +4,12 @@ import io
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from ambjax.pictures.figures import BLUE, ORANGE, RED
+from ambjax.pictures.figures import AVERAGED, BLUE, ERROR, ORANGE
+from ambjax.pictures.overview import overview_figure
 from ambjax.pictures.scales import digits, log_ticks, prefix_of
 from ambjax.pictures.style import own_style
-from ambjax.pictures.thinning import stretch_of, thin
 from ambjax.simulation.trajectory import ALIVE, STALLED, Trajectory
 from tuning.problem.goal import shown
 from tuning.report.front_table import letter
@@ -21,95 +22,19 @@ HIGHEST = 30.0
 GAINS_PER_ROW = 5
 # Largest value of the goal in `convergence`, relative to the least. Strongly violated limits give values above 1e300.
 LARGEST_GOAL = 1e9
-# Length (s) of the enlarged start and end of a run; at most a quarter of the run, but at least four sample periods.
-ZOOM = 0.02
-# Time shown after the loss of a rotor, as a share of the time shown before it.
-SHOWN_AFTER_LOSS = 0.15
-# Smallest height of a vertical axis, as a share of the signal's largest value.
-FLAT = 1e-2
-# Margin above and below the values of a panel, as a share of their range.
-MARGIN = 0.12
 # FAINTEST: smallest plotted amplitude, as a share of the largest. FEWEST: smallest number of samples of a spectrum.
 FAINTEST, FEWEST = 1e-5, 16
 
 
 @own_style
-def before_after(runs: dict[str, Trajectory], settle: float = 0.0) -> bytes:
-    """Draw z - r and u (averaged over each sample) of runs by name, as PNG. Columns: the whole run, its start, its end.
-
-    A lost run is cut shortly after the loss. If the run "before" is lost and there is another run, the title of the
-    figure replaces its panels. In the first column, the vertical axis of a run that is not lost shows the range of its
-    values from `settle` (s) on.
-    """
-    from matplotlib.figure import Figure
-
-    before = runs.get("before")
-    lost = before if before is not None and len(runs) > 1 and np.isfinite(float(before.lost_at)) else None
-    runs = {name: run for name, run in runs.items() if run is not lost}
-    rows = [(name, run, signal) for signal in ("z - r", "u") for name, run in runs.items()]
-    figure = Figure(figsize=(10, 1.75 * len(rows) + 0.4), layout="constrained")
-    axes = figure.subplots(len(rows), 3, squeeze=False)
-    for line, (name, run, signal) in zip(axes, rows, strict=True):
-        t, alive = np.asarray(run.rows.t), np.asarray(run.rows.alive)
-        values, unit = (run.rows.e_z, "m") if signal == "z - r" else (run.rows.u_mean, "V")
-        factor, unit = prefix_of(unit, float(np.abs(np.asarray(values)[alive]).max(initial=0.0)))
-        values = factor * np.asarray(values)
-        least = FLAT * np.abs(values[alive]).max(initial=0.0)
-        ended = float(run.lost_at)
-        last = min(ended, t[-1] + (t[1] - t[0] if len(t) > 1 else 0.0))
-        near = max(min(ZOOM, last / 4), t[min(4, len(t) - 1)])
-        after = SHOWN_AFTER_LOSS * np.isfinite(ended)
-        final = max(last - near, 0.0), max(last + after * near, near)
-        columns = (0.0, max(last + after * last, near)), (0.0, near), final
-        for ax, (low, high) in zip(line, columns, strict=True):
-            part = stretch_of(t, low, high)
-            held = alive[part]
-            ax.plot(*thin(t[part][held], values[part][held]), color=ORANGE if name == "before" else BLUE, lw=0.9)
-            ax.set_xlim(low, high)
-            ax.locator_params(axis="x", nbins=5)
-            late = values[alive & (t >= settle)]
-            if ax is line[0] and settle > 0 and late.size and np.isinf(ended) and np.ptp(late) > 0:
-                margin = MARGIN * np.ptp(late)
-                ax.set_ylim(late.min() - margin, late.max() + margin)
-            bottom, top = ax.get_ylim()
-            if top - bottom < least:  # smaller variations are rounding, or not relevant
-                ax.set_ylim((bottom + top - least) / 2, (bottom + top + least) / 2)
-            ax.ticklabel_format(axis="y", useOffset=False)
-            ax.grid(alpha=0.3)
-            ax.tick_params(labelsize=8)
-            if ended <= high:
-                ax.axvspan(max(ended, low), high, color=RED, alpha=0.12, lw=0)
-        if np.isfinite(ended) and signal == "z - r":
-            words = _ended(run)
-            box = {
-                "facecolor": "white",
-                "alpha": 0.7,
-                "edgecolor": "none",
-                "pad": 1,
-            }  # a curve may run behind the words
-            line[0].annotate(words, (0.04, 0.06), xycoords="axes fraction", fontsize=8, bbox=box)
-        line[0].set_ylabel(f"{name}\n{signal} ({unit})", fontsize=9)
-    whole = f"whole run (axis: values after {settle:g} s)" if settle > 0 else "whole run"
-    for ax, words in zip(axes[0], (whole, "start", "end"), strict=True):
-        ax.set_title(words, fontsize=10)
-    for ax in axes[-1]:
-        ax.set_xlabel("time (s)", fontsize=9)
-    figure.align_ylabels(axes)
-    if lost is not None:
-        figure.suptitle(f"before tuning: {_ended(lost)}", fontsize=10, x=0.01, ha="left", color=RED)
-    return _png(figure)
-
-
-def _ended(run: Trajectory) -> str:
-    """Return how and when a run ended."""
-    return f"{run.lost_event} at {float(run.lost_at):.4g} s"
+def nominal(run: Trajectory, name: str, settle: float) -> bytes:
+    """Draw z - r and u (averaged over each sample) of a run, as in the overview of `ambjax simulate`, as PNG."""
+    return _png(overview_figure(run, name, settle=settle, shown=(ERROR.ylabel, AVERAGED.ylabel)))
 
 
 @own_style
 def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
     """Draw the amplitude spectrum of u (V, averaged over each sample) of runs by name after `settle` (s), as PNG."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     ax, top = figure.subplots(), 0.0
     for name, run in runs.items():
@@ -145,8 +70,6 @@ def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarra
 @own_style
 def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
     """Draw the goal of each starting point, and the gains of the best one, over the iterations, as PNG."""
-    from matplotlib.figure import Figure
-
     value, gains, members = (np.asarray(history[name]) for name in ("value", "gains", "members"))
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -173,8 +96,6 @@ def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
 @own_style
 def landscape(slices: Slices, paths: list[str]) -> bytes:
     """Draw the goal as a function of each gain as PNG. The other gains have their values in the answer."""
-    from matplotlib.figure import Figure
-
     m = len(paths)
     lines = -(-m // GAINS_PER_ROW)
     columns = -(-m // lines)
@@ -211,8 +132,6 @@ def front(rows: list[dict[str, Any]]) -> bytes:
 
     The label of each point contains its letter in the table, its error and its voltage.
     """
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(6.4, 3.8), layout="constrained")
     ax = figure.subplots()
     factor, unit = prefix_of("m", min(r["settled_rms_error_m"] for r in rows))

@@ -12,20 +12,54 @@ Facts = dict[str, Any]
 NO_PEAK = {"D": "unstable", None: "not computed"}
 
 
-def facts(problem: TuningProblem, measured: Sensitivity) -> Facts:
-    """Return plain data: a row for each member of `measured`, and the limits of the zones.
+def facts(problem: TuningProblem, injected: Sensitivity) -> Facts:
+    """Return plain data: a row for each member of `injected`, and the limits of the zones.
 
     `zone` of a row is that of the linear peak, `injected_zone` that of the injected one. `why`: why there is no linear
     peak; '' if there is one.
     """
     zones = problem.case.zones
     rows = []
-    for one in measured.peaks:
+    for one in injected.peaks:
         row = {name: value for name, value in dataclasses.asdict(one).items() if name != "largest"}
         row["injected_zone"] = "D" if one.lost else None if one.peak is None else zones.zone(one.peak)
         rows.append(row)
     limits = [float(x) for x in (zones.zone_a, zones.zone_b, zones.zone_c)]
-    return {"members": rows, "injected": injects(problem), "decides": measured.decides, "zones": limits}
+    return {"members": rows, "injected": injects(problem), "decides": injected.decides, "zones": limits}
+
+
+def line(found: Facts | None) -> str:
+    """Return the largest peak of |S| of the held-out members and its zone."""
+    if not found or not found["members"]:
+        return "**Sensitivity:** not computed here; `ambjax sensitivity tuned.toml` computes |S| and the zone."
+    unknown = next((row for row in found["members"] if _unknown(row, found)), None)
+    if unknown is not None:
+        zone = unknown["injected_zone"] if unknown["lost"] else unknown["zone"]
+        words = escape_markdown(_unknown(unknown, found)).rstrip(".") + (f": zone {zone}" if zone else "")
+        return f"**Sensitivity:** no peak of |S| for member {unknown['member']}: {words}."
+    peak, at, zone = max(_peak(row, found) for row in found["members"])
+    return f"**Sensitivity:** |S| is at most {peak:.3g} (at {at:.3g} Hz) over the worst members: zone {zone}."
+
+
+def _unknown(row: Facts, found: Facts) -> str:
+    """Return why a member has no peak that counts; '' if it has one."""
+    if row["lost"]:
+        return "it is lost when a test signal is injected"
+    if row["peak"] is None and found["decides"]:
+        return "no injection decides its peak"
+    return "" if found["decides"] else row["why"]
+
+
+def _peak(row: Facts, found: Facts) -> tuple[float, float, str]:
+    """Return the peak that counts, its frequency (Hz) and its zone.
+
+    It is the injected peak if only injected peaks decide, otherwise the larger one.
+    """
+    linear = row["linear"], row["frequency_hz"], row["zone"]
+    injected = row["peak"], row["at_hz"], row["injected_zone"]
+    if row["peak"] is None:
+        return linear
+    return injected if found["decides"] else max(injected, linear)
 
 
 def section(found: Facts | None) -> list[str]:
@@ -47,7 +81,7 @@ def section(found: Facts | None) -> list[str]:
     a, b, c = found["zones"]
     which = "The held-out members with the largest linear peaks."
     if found["decides"]:
-        which = f"The members with the largest peaks, measured by one injection into each of up to {SCREENED} members."
+        which = f"The members with the largest peaks, by one injection into each of up to {SCREENED} members."
     words = [f"{which} Zone A is below {a:g}, B below {b:g}, C below {c:g}."]
     if found["decides"]:
         words.append("A sign is set-valued: the injected peak decides, because no linear loop describes chattering.")
@@ -60,7 +94,7 @@ def section(found: Facts | None) -> list[str]:
         )
     if any(row["saturated"] for row in found["members"]):
         words.append(
-            "The supply limits the voltage during the injection, so the measured peak describes the limited loop. A "
+            "The supply limits the voltage during the injection, so the injected peak describes the limited loop. A "
             "smaller `sensitivity.amplitude` measures the loop without this limit."
         )
     unknown = [f"- Member {row['member']}: {escape_markdown(row['why'])}." for row in found["members"] if row["why"]]

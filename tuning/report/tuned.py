@@ -8,7 +8,7 @@ from typing import Any
 
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
-from tomlkit.items import AoT, InlineTable, Table
+from tomlkit.items import InlineTable, Table
 
 from ambjax.cases.own_laws import relocated
 from ambjax.cases.reader import Case, case_from
@@ -94,39 +94,28 @@ def _escaped(character: re.Match[str]) -> str:
 
 
 def _table(table: Any, path: list[str]) -> Any:
-    """Return the table at this path; add it if it is missing.
+    """Return the table at this path. A missing one is added: in an inline table, or at the end of the document.
 
-    A new table in an inline table is inline. Any other new table follows the last table of its parent. Root keys that
-    follow there would become keys of the new table, so it is then added at the end of the document.
+    A table in the middle would take over the root keys that follow.
     """
     document = table
     for depth, word in enumerate(path):
         if isinstance(table, list):
             table = table[int(word)]
             continue
-        if word not in table:
-            if isinstance(table, InlineTable):
-                table[word] = tomlkit.inline_table()
-            elif depth and _followed(document, path[0]):
-                _append(document, path[:depth], word)
-                return _table(document, path)
-            else:
-                table[word] = _behind(_last(table))
+        if word not in table and isinstance(table, InlineTable):
+            table[word] = tomlkit.inline_table()
+        elif word not in table:
+            _append(document, path[: depth + 1])
+            return _table(document, path)
         table = table[word]
     return table
 
 
-def _followed(document: tomlkit.TOMLDocument, name: str) -> bool:
-    """Return whether root keys follow the first root item of this name."""
-    keys = [(key, item) for key, item in document.body if key is not None]
-    first = next(n for n, (key, _) in enumerate(keys) if key.key == name)
-    return any(key.is_dotted() or not isinstance(item, (Table, AoT)) for key, item in keys[first + 1 :])
-
-
-def _append(document: tomlkit.TOMLDocument, path: list[str], word: str) -> None:
-    """Add an empty table [path.word] at the end of the document."""
+def _append(document: tomlkit.TOMLDocument, path: list[str]) -> None:
+    """Add an empty table at this path at the end of the document."""
     table = tomlkit.table().add(tomlkit.nl())
-    for name in [word, *reversed(path[1:])]:
+    for name in reversed(path[1:]):
         table = tomlkit.table(is_super_table=True).add(name, table)
     document.append(path[0], table)
 
@@ -142,23 +131,6 @@ def _put(table: Any, name: str | int, value: float | str) -> None:
         table.value.body.extend(rest)
     else:
         table[name] = value
-
-
-def _behind(last: Table | None) -> Table:
-    """Return a new table. The comments at the end of the table `last` move into it: they describe what follows both."""
-    table = tomlkit.table()
-    rest = [] if last is None else _cut(last)
-    table.value.body.extend(rest or [(None, tomlkit.nl())])
-    return table
-
-
-def _last(table: object) -> Table | None:
-    """Return the table that ends `table`, possibly itself; None if `table` is the document or is in separate parts."""
-    last = None
-    while isinstance(table, Table):
-        last = table
-        table = next((item for key, item in reversed(table.value.body) if key is not None), None)
-    return last
 
 
 def _cut(table: Table) -> list[Any]:

@@ -11,14 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.host.sealed import DamagedError, difference, flat, provenance, seal, shapes, unseal, write_whole
-from tuning.problem.loss import TERMS
+from ambjax.host.sealed import DamagedError, difference, flat, provenance, seal, unseal, write_whole
 from tuning.solve.descent import Descent, Starts
 from tuning.solve.evolution import CmaState, idle_states
 
 # Scalar fields of SearchState in a checkpoint.
 COUNTS = ("iteration", "phase", "since", "seconds")
-FACTS = {"fingerprint", "round", "counts"}
 NAME = re.compile(r"round-[0-9]+\.npz")
 # Subfolder of the output directory, and the file in it that marks a search before its first checkpoint.
 FOLDER, MARK = "checkpoints", "search.json"
@@ -86,7 +84,7 @@ class CheckpointFile:
         tell: Callable[[str], None] = lambda text: None,
     ) -> None:
         self.path, self.round, self.tell = path, round, tell
-        self.fingerprint = flat({**provenance(), **facts})
+        self.fingerprint = flat({**provenance(), **facts, "round": round})
 
     def save(self, progress: SearchState) -> None:
         """Write this state to the checkpoint. Raises ValueError if it cannot be written."""
@@ -99,7 +97,7 @@ class CheckpointFile:
         }
         past = {f"{PAST}{name}": np.asarray(rows) for name, rows in progress.history.items()}
         counts = {name: getattr(progress, name) for name in COUNTS}
-        facts = {"fingerprint": self.fingerprint, "round": self.round, "counts": counts}
+        facts = {"fingerprint": self.fingerprint, "counts": counts}
         seal(self.path, {**leaves, **past, ACTIVE: progress.active}, facts)
 
     def load(self, descent: Descent, starts: int, m: int) -> SearchState | None:
@@ -112,20 +110,24 @@ class CheckpointFile:
             return None
         try:
             arrays, facts = unseal(self.path)
-            if facts.keys() != FACTS or facts["counts"].keys() != set(COUNTS):
-                raise DamagedError("it is not a checkpoint")
             differs = difference(facts["fingerprint"], self.fingerprint)
             if differs:
                 raise ValueError(
                     f"--resume: {self.path} belongs to another search: {differs}. "
                     "Use another --out, or leave out --resume to start a new search."
                 )
-            if facts["round"] != self.round:
-                raise DamagedError(f"it belongs to round {facts['round']}")
-            return _progress(arrays, facts["counts"], descent, starts, m)
-        except DamagedError as why:
-            self.tell(f"{self.path}: {why}; search {self.round} begins again")
-            return None
+            tree = jax.tree.structure((jax.eval_shape(descent.begin, jnp.zeros((starts, m))), idle_states(starts, m)))
+            state, drawn = jax.tree.unflatten(tree, [arrays[f"{LEAF}{n}"] for n in range(tree.num_leaves)])
+            counts = {name: facts["counts"][name] for name in COUNTS}
+            past = {name.removeprefix(PAST): list(rows) for name, rows in arrays.items() if name.startswith(PAST)}
+            state, active = jax.tree.map(jnp.asarray, state), arrays[ACTIVE]
+            return SearchState(state, active, past, **counts, earlier=counts["seconds"], cma_states=drawn)
+        except DamagedError as error:
+            why = str(error)
+        except KeyError:
+            why = "it is not a checkpoint"
+        self.tell(f"{self.path}: {why}; search {self.round} begins again")
+        return None
 
 
 def mark_directory(directory: pathlib.Path) -> None:
@@ -179,29 +181,3 @@ def remove_all(directory: pathlib.Path) -> int:
     for path in left:
         path.unlink()
     return len(left)
-
-
-def _progress(
-    arrays: dict[str, np.ndarray], counts: dict[str, Any], descent: Descent, starts: int, m: int
-) -> SearchState:
-    """Return the state of the search from the arrays of a checkpoint.
-
-    Raises DamagedError if their names, types or shapes do not fit.
-    """
-    there = shapes(arrays)
-    kinds = jax.eval_shape(descent.begin, jnp.zeros((starts, m))), idle_states(starts, m)
-    leaves, tree = jax.tree.flatten(kinds)
-    wanted = {f"{LEAF}{n}": [np.dtype(leaf.dtype).str, list(leaf.shape)] for n, leaf in enumerate(leaves)}
-    rows = {"value": (starts,), "x": (starts, m), "gains": (starts, m), "lost": (starts,), "members": ()}
-    rows |= {"terms": (starts, len(TERMS)), "measured": (starts, len(descent.goal.measured)), "rollouts": ()}
-    for name, shape in rows.items():
-        kind = there.get(f"{PAST}{name}", [None])[0]
-        wanted[f"{PAST}{name}"] = [kind, [counts["iteration"], *shape]]
-    wanted[ACTIVE] = ["|b1", [starts]]
-    differs = difference(there, json.loads(json.dumps(wanted)))
-    if differs:
-        raise DamagedError(f"it does not fit this search: {differs}")
-    history = {name.removeprefix(PAST): list(rows) for name, rows in arrays.items() if name.startswith(PAST)}
-    state, drawn = jax.tree.unflatten(tree, [arrays[f"{LEAF}{n}"] for n in range(len(leaves))])
-    state = jax.tree.map(jnp.asarray, state)
-    return SearchState(state, arrays[ACTIVE], history, **counts, earlier=counts["seconds"], cma_states=drawn)

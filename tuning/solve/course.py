@@ -1,15 +1,10 @@
-"""A sequence of searches. Each later search starts from the results of earlier ones.
-
-A search can stop at a jump of the goal, although the goal is lower on the other side. A restart therefore tries
-quasi-random points around the best point so far.
-"""
+"""A sequence of searches. Each later search starts from the results of earlier ones."""
 
 import dataclasses
-import itertools
 import math
 import pathlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,12 +19,6 @@ from tuning.solve.checkpoint import CheckpointFile, SearchState, checkpoint
 from tuning.solve.iteration import standing_of
 from tuning.solve.refine import best_of, search
 from tuning.solve.screen import around, initial_points
-
-# Largest number of searches in `search_and_restart`.
-MOST_SEARCHES = 5
-# Restarts end after two successive searches that each lower the goal, a logarithm, by less than this. One such search
-# is not enough, because its points may miss a better optimum by chance.
-LEAST_IMPROVEMENT = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,13 +87,12 @@ class Course:
     began: float = dataclasses.field(default_factory=time.perf_counter)
     """start of the first search, s"""
 
-    def search(self, points: np.ndarray, *, at_optimum: bool = False) -> tuple[np.ndarray, float]:
-        """Search from `points` [K, m] and append the search to `past`. Return the best point [m] and its goal.
+    def search(self, points: np.ndarray) -> np.ndarray:
+        """Search from `points` [K, m] and append the search to `past`. Return the best point [m].
 
-        `at_optimum`: whether an earlier search on all members ended at the first point, so that this point need not be
-        refined again. If Ctrl-C ends a later search before its first iteration, the search before it is marked as
-        interrupted, and its result is returned. Raises KeyboardInterrupt if Ctrl-C ends the first search before its
-        first iteration, and ValueError if the goal is finite at none of the points.
+        If Ctrl-C ends a later search before its first iteration, the search before it is marked as interrupted, and its
+        result is returned. Raises KeyboardInterrupt if Ctrl-C ends the first search before its first iteration, and
+        ValueError if the goal is finite at none of the points.
         """
         tune, number = self.problem.tune, len(self.past) + 1
         path = self.out / checkpoint(number) if self.out else None
@@ -116,7 +104,7 @@ class Course:
         progress = search(
             self.problem.engine, self.problem.goal, self.members, points, keep=tune.budget.starts,
             iterations=tune.budget.iterations, name=tune.optimiser, rate=tune.learning_rate,
-            seed=self.seed + len(self.past), at_optimum=at_optimum,
+            seed=self.seed + len(self.past),
             checkpoint_file=CheckpointFile(path, self.facts, number, self.tell), resume=self.resume,
             on_iteration=self._standing(number), until=self.began + 60 * self.minutes,
         )  # fmt: skip
@@ -135,7 +123,7 @@ class Course:
         The search begins at x, drawn back from the bounds (`Space.drawn_back`).
         """
         start = self.problem.objective.space.drawn_back(x)
-        found, _ = self.search(start[None])
+        found = self.search(start[None])
         moved = not np.array_equal(found, start)
         return found if moved else x, moved
 
@@ -185,34 +173,15 @@ class Course:
         )
 
 
-def search_and_restart(course: Course, start: np.ndarray) -> np.ndarray:
-    """Search from the gains `start` [m], SI units, then restart around the best point (`should_restart`).
+def first_search(course: Course, start: np.ndarray) -> np.ndarray:
+    """Search from the gains `start` [m], SI units, and the points of the screen. Return the coordinates [m].
 
-    Returns the coordinates [m] of the best point. There is no restart if all members are lost or tune.screen is 0.
     Raises ValueError as `check_loops` does.
     """
     problem, budget = course.problem, course.problem.tune.budget
     points = initial_points(problem.objective, problem.goal.conditions, start, budget.screen, course.seed)
     check_loops(problem.objective, points, course.members.searched)
-    x, value = course.search(points)
-    if course.all_lost or not budget.screen:
-        return x
-    seen = [(value, x)]  # comparable: all searches use the same members and steps
-    while should_restart([value for value, _ in seen]) and not course.over:
-        x, value = course.search(course.around(x), at_optimum=True)
-        seen.append((value, x))
-        x = min(seen, key=lambda one: one[0])[1]
-    return x
-
-
-def should_restart(goals: Sequence[float]) -> bool:
-    """Return whether to restart. `goals`: values of the goal, a logarithm, at the end of each search so far.
-
-    True if one of the last two searches lowered the goal by more than LEAST_IMPROVEMENT, up to MOST_SEARCHES searches.
-    """
-    best = [math.inf, *itertools.accumulate(goals, min)]
-    gained = [before - after > LEAST_IMPROVEMENT for before, after in itertools.pairwise(best)]
-    return len(goals) < MOST_SEARCHES and any(gained[-2:])
+    return course.search(points)
 
 
 def training(problem: TuningProblem) -> Members:
@@ -223,15 +192,15 @@ def training(problem: TuningProblem) -> Members:
     )
 
 
-def _best(progress: SearchState) -> tuple[np.ndarray, float]:
-    """Return the best point [m] and its goal. Raises ValueError if the goal is not finite."""
+def _best(progress: SearchState) -> np.ndarray:
+    """Return the best point [m]. Raises ValueError if the goal is not finite."""
     x, value = best_of(progress)
     if not np.isfinite(value):
         raise ValueError(
             "tune: at every starting point, the loss or its derivative is not finite. Check the case with 'ambjax "
             "simulate' (for chattering of u), or change tune.screen and tune.bounds."
         )
-    return x, value
+    return x
 
 
 def _joined(past: list[SearchState]) -> dict[str, np.ndarray]:

@@ -41,7 +41,7 @@ def iterate(
     better = _descended(engine, goal, members, progress, descent, weights) | _evolved(
         engine, goal, members, progress, seed
     )
-    append_history(engine, goal, members, progress, better, fresh=fresh)
+    _append_history(engine, goal, members, progress, better, fresh=fresh)
 
 
 def _descended(
@@ -95,7 +95,7 @@ def _evolved(
     return better
 
 
-def append_history(
+def _append_history(
     engine: Engine,
     goal: Goal,
     members: Members,
@@ -112,11 +112,11 @@ def append_history(
     past, count, n = progress.history, len(progress.active), members.ordinary
     lost = np.full(count, len(members.member)) if fresh else np.array(past["lost"][-1])
     means = np.full((count, len(TERMS)), np.nan) if fresh else np.array(past["terms"][-1])
-    measured = np.full((count, len(goal.measured)), np.nan) if fresh else np.array(past["measured"][-1])
+    quantities = np.full((count, len(goal.quantities)), np.nan) if fresh else np.array(past["quantities"][-1])
     for at, terms in better.items():
         lost[at] = int((terms["survival"] > 0).sum())
         means[at] = [terms[name][:n].mean() for name in TERMS]
-        measured[at] = [float(KINDS[name].tuned(jnp.asarray(terms[PREFIX + name][:n]))) for name in goal.measured]
+        quantities[at] = [float(KINDS[name].tuned(jnp.asarray(terms[PREFIX + name][:n]))) for name in goal.quantities]
     row = {
         "value": np.asarray(progress.starts.value),
         "x": np.asarray(progress.starts.best),
@@ -124,7 +124,7 @@ def append_history(
         "lost": lost,
         "members": np.array(len(members.member)),
         "terms": means,
-        "measured": measured,
+        "quantities": quantities,
         "rollouts": np.array(engine.rollouts),
     }
     for key, value in row.items():
@@ -137,9 +137,9 @@ def standing_of(problem: TuningProblem, progress: SearchState, number: int, spen
     last = {name: rows[-1] for name, rows in progress.history.items()}
     best, loss, budget = int(np.argmin(last["value"])), problem.objective.loss, problem.tune.budget
     terms = dict(zip(TERMS, last["terms"][best], strict=True))
-    measured = dict(zip(problem.goal.measured, last["measured"][best], strict=True))
-    volts = measured.get("rms_u_V", float(np.asarray(loss.u_scale)) * math.sqrt(terms["effort"]))
-    values = [(one, one.ratio * float(measured[one.name])) for one in problem.limits]
+    quantities = dict(zip(problem.goal.quantities, last["quantities"][best], strict=True))
+    volts = quantities.get("rms_u_V", float(np.asarray(loss.u_scale)) * math.sqrt(terms["effort"]))
+    values = [(one, one.ratio * float(quantities[one.name])) for one in problem.limits]
     limits = tuple(Reached(one.name, value, one.threshold, one.holds(value)) for one, value in values)
     done, going = progress.iteration - progress.since, int(progress.active.sum())
     # the first iteration compiles

@@ -5,22 +5,32 @@ excess g of a limit is about (required multiplier - multiplier) / penalty. An up
 """
 
 import dataclasses
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from tuning.judge.evaluate import judge
+from tuning.judge.evaluate import held, judge
 from tuning.judge.peaks import injections, injects, reached_of
 from tuning.problem.config import seeds
 from tuning.problem.limits import PREFIX, TOLERANCE_BELOW, Limit
+from tuning.problem.members import Members
 from tuning.solve.course import Course
-from tuning.solve.joining import breaking
 
 # Largest number of searches after updates of the multipliers in one round.
 MOST_UPDATES = 6
 # Largest number of members on which averages are judged. Limits on worst members need the whole ensemble.
 AVERAGING_MEMBERS = 256
+
+
+# Largest number of members that join because they have large values of a limited mean.
+MOST_LARGE = 8
+# Largest number of members that join because they break a limit on the worst member.
+MOST_BREAKING = 4
+# If the judged mean of a limited quantity exceeds its expected value by more than this share, the training ensemble
+# lacks members with large values.
+UNEXPECTED = 0.1
 
 
 class Judged(NamedTuple):
@@ -105,6 +115,43 @@ def join_breaking(course: Course, one: Judged) -> bool:
     return True
 
 
+def largest_unseen(course: Course, values: np.ndarray, most: int = MOST_LARGE) -> np.ndarray:
+    """Return the numbers of at most `most` validation members, not in the training ensemble, with the largest values.
+
+    `values` [N]: of the validation members; -inf for a member that is left out.
+    """
+    members, seed = course.members, seeds(course.problem.tune.budget)[1]
+    values = values.copy()
+    values[members.unstressed.member[members.unstressed.seed == seed]] = -math.inf
+    largest = np.argsort(-values, kind="stable")[:most]
+    return largest[np.isfinite(values[largest])]
+
+
+def breaking(
+    course: Course, numbers: Sequence[tuple[float, float]], columns: Mapping[str, np.ndarray]
+) -> Members | None:
+    """Return the validation members that explain a broken limit and are not in the training ensemble, or None.
+
+    For a limit on the worst member, they are at most MOST_BREAKING members that break it, if the judged value lacks
+    reserve. For a limit on a mean, they are the members with the largest values, if the judged value breaks the limit
+    and exceeds its expected value, the search's value times `Limit.ratio`, by more than UNEXPECTED.
+
+    `numbers`: the values of the search and of the judge for each limit. `columns` [N]: metrics of the judged members.
+    """
+    problem, budget = course.problem, course.problem.tune.budget
+    if not budget.validation:
+        return None
+    found = np.zeros(0, int)
+    for limit, (tuned, judged) in zip(problem.limits, numbers, strict=True):
+        excess = np.where(held(columns), limit.log_excesses(columns), -math.inf)
+        if limit.kind.worst and not limit.has_reserve(judged):
+            found = np.append(found, largest_unseen(course, np.where(excess > 0, excess, -math.inf), MOST_BREAKING))
+        elif not limit.kind.worst and not limit.holds(judged) and judged > (1 + UNEXPECTED) * limit.ratio * tuned:
+            found = np.append(found, largest_unseen(course, excess))
+    total = len(columns["lost_at_s"])
+    return problem.objective.chosen(seeds(budget)[1], np.unique(found), total) if found.size else None
+
+
 def _all_met(
     course: Course, before: Sequence[Limit], after: Sequence[Limit], numbers: Sequence[tuple[float, float]]
 ) -> bool:
@@ -140,7 +187,7 @@ def met(limit: Limit, judged: float) -> bool:
 def judged_at(course: Course, x: np.ndarray) -> Judged:
     """Return the values of the limits at x [m], on all members of the ensemble if a limit concerns the worst member.
 
-    On a processor, members are measured by injection, as the held-out members are.
+    On a processor, injections into the worst members count too, as for the held-out members.
     """
     problem, budget = course.problem, course.problem.tune.budget
     seed, count = (seeds(budget)[1], budget.validation) if budget.validation else (budget.seed, budget.members)
@@ -150,6 +197,6 @@ def judged_at(course: Course, x: np.ndarray) -> Judged:
     columns = judge(problem, x, seed, count)
     terms, n = problem.engine.terms(x[None], course.members), course.members.ordinary
     tuned = [float(limit.kind.tuned(terms[PREFIX + limit.name][0, :n])) for limit in problem.limits]
-    measured = injections(problem, x, seed, columns) if injects(problem) else None
-    judged = [reached_of(limit, columns, measured) for limit in problem.limits]
+    injected = injections(problem, x, seed, columns) if injects(problem) else None
+    judged = [reached_of(limit, columns, injected) for limit in problem.limits]
     return Judged(x, list(zip(tuned, judged, strict=True)), columns)

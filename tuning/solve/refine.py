@@ -16,7 +16,7 @@ from tuning.problem.members import Members
 from tuning.solve.checkpoint import CheckpointFile, SearchState
 from tuning.solve.descent import Descent
 from tuning.solve.evolution import idle_states, initial_state
-from tuning.solve.iteration import append_history, iterate
+from tuning.solve.iteration import iterate
 from tuning.solve.screen import screen
 
 # A start has converged if its next step, in coordinates, is shorter than this.
@@ -64,7 +64,6 @@ def search(
     name: str = BFGS,
     rate: float = 0.1,
     seed: int = 0,
-    at_optimum: bool = False,
     checkpoint_file: CheckpointFile | None = None,
     resume: bool = False,
     until: float = math.inf,
@@ -78,10 +77,9 @@ def search(
     descends by the optimiser `name` with the learning rate `rate`. If its gradient does not lead to a minimum, it
     continues with CMA-ES.
 
-    `at_optimum`: whether an earlier search on all members ended at the first point. If this point is the best after the
-    first phase, it is then not refined again. `seed`: seed of the populations of CMA-ES. `on_iteration`: called after
-    each iteration with the search and the duration of the iteration in s. `until`: time of `time.perf_counter` after
-    which the search ends at its next iteration.
+    `seed`: seed of the populations of CMA-ES. `on_iteration`: called after each iteration with the search and the
+    duration of the iteration in s. `until`: time of `time.perf_counter` after which the search ends at its next
+    iteration.
     """
     descent = Descent(goal, name, rate)
     checkpoint_file = checkpoint_file or CheckpointFile(None, {})
@@ -104,11 +102,10 @@ def search(
                 if not progress.active.any() or progress.iteration - progress.since >= iterations:
                     if progress.phase + 1 == len(phases):
                         break
-                    _begin_full_phase(engine, goal, members, progress, descent, given, at_optimum)
-                if progress.active.any():
-                    phase = phases[progress.phase]
-                    iterate(engine, goal, members.part(phase.part, 1), progress, descent, seed=seed)
-                    _switch(progress, phase)
+                    _begin_full_phase(engine, goal, members, progress, descent, given)
+                phase = phases[progress.phase]
+                iterate(engine, goal, members.part(phase.part, 1), progress, descent, seed=seed)
+                _switch(progress, phase)
                 progress.seconds = progress.earlier + time.perf_counter() - began
                 checkpoint_file.save(progress)
                 on_iteration(progress, progress.seconds - before)
@@ -161,22 +158,18 @@ def _begin_full_phase(
     progress: SearchState,
     descent: Descent,
     given: np.ndarray,
-    at_optimum: bool = False,
 ) -> None:
     """Begin the phase on all members.
 
     It has one start: the best of `given` and of at most PATH_POINTS points that the first phase visited. The optimum of
-    the first phase may lose members that the phase did not simulate; an earlier point is then better. If `given` is the
-    best point and `at_optimum` is true, the phase ends at once.
+    the first phase may lose members that the phase did not simulate; an earlier point is then better.
     """
     x, value = (np.array(progress.history[name][progress.since :]) for name in ("x", "value"))
     starts = value.shape[1]
     x, value = x.reshape(-1, x.shape[-1]), value.ravel()
     chosen = ranked(value, PATH_POINTS)
     tried = np.concatenate([x[chosen], given[None]])
-    terms = engine.terms(tried, members)
-    values = goal.score(tried, terms, members)
-    best = int(np.argsort(values, kind="stable")[0])
+    best = int(np.argsort(goal.score(tried, engine.terms(tried, members), members), kind="stable")[0])
     start = int(chosen[best] % starts) if best < len(chosen) else 0
     at = np.array(progress.starts.best)
     at[start] = tried[best]
@@ -184,13 +177,6 @@ def _begin_full_phase(
     progress.cma_states = idle_states(*at.shape)
     progress.active = np.arange(starts) == start
     progress.phase, progress.since = progress.phase + 1, progress.iteration
-    if at_optimum and best == len(chosen):
-        value = np.where(progress.active, values[best], np.inf)
-        progress.starts = progress.starts._replace(state=progress.starts.state._replace(value=jnp.asarray(value)))
-        progress.active = np.zeros(starts, bool)
-        append_history(
-            engine, goal, members, progress, {start: {name: one[best] for name, one in terms.items()}}, fresh=True
-        )
 
 
 def ranked(value: np.ndarray, count: int) -> np.ndarray:

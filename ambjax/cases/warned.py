@@ -3,14 +3,15 @@
 import dataclasses
 import math
 import pathlib
+import warnings
 from collections.abc import Iterator
 
 import numpy as np
 
+from ambjax.cases import reader
+from ambjax.cases.plausibility import implausible
 from ambjax.cases.reach import reach, widest
-from ambjax.cases.reader import Case, read_case
-from ambjax.commands.plausibility import implausible
-from ambjax.results.outputs import say
+from ambjax.cases.reader import Case
 from ambjax.text.words import one_line
 from ambjax.world.scenario import Scenario
 
@@ -22,21 +23,22 @@ GRAVITY = "g"
 MOST_NOISE = 0.1
 
 
-def read_with_warnings(path: str | pathlib.Path) -> Case:
-    """Read a case file and print its warnings on stderr. Raises ValueError as `read_case` does."""
-    case = read_case(path)
-    if not case.text.strip():
-        say(one_line(f"{path}: the file is empty, so every number has its default. 'ambjax template' prints a case."))
-    print_warnings(case, path)
+def read_case(path: str | pathlib.Path) -> Case:
+    """Read and check the case file at `path`, and return the case.
+
+    A value that is valid but probably unintended, such as millimetres given as metres, causes a UserWarning. Raises
+    ValueError, one line, if `path` is not a path, if the file cannot be read, or if any part of it is invalid.
+    """
+    case = reader.read_case(path)
+    for text in warnings_of_file(case, path):
+        warnings.warn(text, stacklevel=2)
     return case
 
 
-def print_warnings(case: Case, path: str | pathlib.Path) -> None:
-    """Print the custom laws and the warnings of a case on stderr, one line each."""
-    for law in case.own_laws:
-        say(one_line(f"{path}: {law}"))
-    for warning in warnings_of(case):
-        say(one_line(f"{path}: {warning}"))
+def warnings_of_file(case: Case, path: str | pathlib.Path) -> list[str]:
+    """Return the warnings of a case that was read from `path`, one line each."""
+    empty = ["the file is empty, so every number has its default. 'ambjax template' prints a case."]
+    return [one_line(f"{path}: {text}") for text in [*([] if case.text.strip() else empty), *warnings_of(case)]]
 
 
 def warnings_of(case: Case) -> list[str]:

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from ambjax.cases.forces import bias_flux, forces
 from ambjax.cases.reader import Case
-from ambjax.commands.acceptance import bias_flux, forces
 from ambjax.world.recorded import Recorded
 from ambjax.world.scenario import SLOTS
 
@@ -24,6 +24,9 @@ RANGES = {
     "i_0": ((1e-3, 100.0), "A", "milliamperes"),
     "R": ((1e-4, 1e4), "ohm", "milliohms"),
 }
+# Standard gravity, m/s^2, and the largest plausible ratio of a rotor's weight to the largest force of its bearing. The
+# bearings of a vertical axis may be weaker than the weight.
+GRAVITY, MOST_WEIGHT = 9.81, 10.0
 # Largest plausible limit of a current, in bias currents.
 MOST_CURRENT = 100.0
 # Largest plausible length of a recorded signal, in lengths of the run.
@@ -51,6 +54,12 @@ def _ranges(case: Case) -> Iterator[str]:
 
 def _forces(case: Case) -> Iterator[str]:
     largest, weight, load = forces(case)
+    mass = float(case.scenario.plant.m)
+    if (heavy := GRAVITY * mass) > MOST_WEIGHT * largest:
+        yield (
+            f"plant.m = {mass:g} kg: the rotor weighs {heavy:.4g} N, {heavy / largest:.3g} times the largest force of "
+            f"the magnets, {largest:.4g} N. Is it in grams?"
+        )
     if weight <= largest < weight + load:
         yield (
             f"[disturbance]: weight and loads reach {weight + load:.4g} N, but the magnets pull with at most "

@@ -1,0 +1,246 @@
+"""Reader of the case file of a whole machine: [rotor], [[bearing]], [[unbalance]], [[load]], and the common tables."""
+
+import copy
+import dataclasses
+import math
+import pathlib
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
+from ambjax.cases.rotor_tables import (
+    COORDINATES,
+    OWN,
+    RIGID,
+    SPEED,
+    BearingAxis,
+    axes_from,
+    body_from,
+    rotor_from,
+    tables_of,
+    vector,
+)
+from ambjax.cases.table import Table, load, show
+from ambjax.linear.analysis import Zones
+from ambjax.numerics.records import canonical
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.explicit import DOP853, RK4, Euler
+from ambjax.simulation.method import ACCURATE, slopes
+from ambjax.simulation.rollout import prepare
+from ambjax.simulation.whole_machine import Machine, machine_of
+from ambjax.text.words import one_line
+from ambjax.world.rotation import PER_MINUTE
+from ambjax.world.rotor import Rotor
+
+MACHINE_TABLES = ("rotor", "bearing", "unbalance", "load")
+# Product of step and angular frequency of a mode (or of nutation) at which the relative error of RK4 in one period is
+# below 1e-6.
+MODE = 0.1
+# Largest number of speeds of the sensitivity.
+MOST_SPEEDS = 100
+# Largest number of substeps that the reader chooses.
+MOST_SUBSTEPS = 512
+
+
+@dataclasses.dataclass(frozen=True)
+class MachineCase:
+    """The case of a whole machine.
+
+    `machine`: rotor and axes, for a rollout with `clock`. `axes`: names of the axes. `coordinates`: names of the
+    rotor's coordinates. `cases`: the case of each axis, with the mass and the weight that it carries. `settle`: time
+    from which "settled" metrics count, s. `zones`, `speeds`: range, limits and speeds (rpm) of the sensitivity. `text`:
+    the file as read.
+    """
+
+    name: str
+    machine: Machine
+    clock: Clock
+    axes: tuple[str, ...]
+    coordinates: tuple[str, ...]
+    cases: tuple[Case, ...]
+    settle: float
+    zones: Zones
+    speeds: tuple[float, ...]
+    text: str = ""
+
+
+def read_machine(path: str | pathlib.Path) -> MachineCase:
+    """Read and check the case file of a machine. Raises ValueError, one line, for an invalid file."""
+    case = read_any(path)
+    if isinstance(case, Case):
+        raise ValueError(
+            one_line(
+                f"{path}: it has no [rotor] with a kind, so it is a case of one axis; in Python, read_case reads it."
+            )
+        )
+    return case
+
+
+def read_any(path: str | pathlib.Path) -> Case | MachineCase:
+    """Read and check a case file: of one axis, or of a whole machine. Raises ValueError, one line, as `read_case`."""
+    require_file("path", path)
+    path = pathlib.Path(path)
+    raw, text = load(path)
+    try:
+        return (machine_from if is_machine(raw) else case_from)(raw, path.stem, text, path.parent)
+    except ValueError as error:
+        raise ValueError(one_line(f"{path}: {error}")) from None
+
+
+def machine_from(
+    raw: dict[str, Any], name: str = "case", text: str = "", folder: pathlib.Path = pathlib.Path()
+) -> MachineCase:
+    """Return the machine of a parsed TOML document. Raises ValueError, one line, for an invalid one."""
+    top = Table(raw)
+    top.only([*TABLES, *MACHINE_TABLES, "tune"])
+    for table, instead in (("disturbance", "[[load]]"), ("spread", "one case for each value")):
+        if table in raw:
+            raise ValueError(f"[{table}]: a machine with [rotor] does not take it yet. Use {instead} instead.")
+    body, bearings = body_from(top), tables_of(top, "bearing")
+    if not bearings:
+        raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
+    axes = axes_from(bearings, body)
+    rotor = rotor_from(top, body, axes, folder)
+    q, currents = _start(top.table("initial"), rotor, len(axes))
+    _check_rank(rotor, axes)
+    masses, forces = _shares(rotor)
+    cases = []
+    for axis, m, force, i in zip(axes, masses, forces, currents, strict=True):
+        own = _axis_raw(raw, bearings[axis.bearing], m, force, {"z": float(axis.magnet @ q), "i": i})
+        try:
+            case = case_from(own, axis.name, "", folder)
+        except ValueError as error:
+            raise ValueError(f"axis {axis.name}: {error}") from None
+        _check_force(case, axis, force)
+        cases.append(case)
+    clock = _clock(cases, rotor, fixed=not isinstance(raw.get("clock", {}).get("dt", "auto"), str))
+    systems = [canonical(prepare(case.cascade, case.scenario, clock)[0]) for case in cases]
+    names = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
+    return MachineCase(
+        name=safe_name(name),
+        machine=machine_of(rotor, systems, jnp.asarray(q)),
+        clock=clock,
+        axes=tuple(axis.name for axis in axes),
+        coordinates=names,
+        cases=tuple(cases),
+        settle=cases[0].settle,
+        zones=cases[0].zones,
+        speeds=_speeds(top.table("sensitivity"), rotor, float(clock.duration)),
+        text=text,
+    )
+
+
+def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:
+    """Return sensitivity.speeds, rpm; by default those at the start and, after a run-up, at the end."""
+    value = table.raw.get("speeds")
+    if value is None:
+        first, last = float(rotor.speed), float(rotor.speed + rotor.acceleration * duration)
+        return (first,) if first == last else (first, last)
+    if not isinstance(value, list) or not 0 < len(value) <= MOST_SPEEDS:
+        raise ValueError(f"{table.at('speeds')} = {show(value)}: it must be a list of 1 to {MOST_SPEEDS} speeds, rpm.")
+    return tuple(Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(value))
+
+
+def _start(table: Table, rotor: Rotor, count: int) -> tuple[np.ndarray, list[float]]:
+    """Return the coordinates [n] and the currents [c] (A) at t = 0. `count`: number of axes.
+
+    initial.q gives all coordinates, or the rigid ones alone. initial.i is a number for all axes, or a list of one each.
+    """
+    table.only(["q", "i"])
+    n, given = len(rotor.gravity), table.raw.get("q", [])
+    q = np.zeros(n)
+    length = n if isinstance(given, list) and len(given) == n else RIGID
+    q[:length] = vector(table, "q", length, np.zeros(length))
+    current = table.raw.get("i", 0.0)
+    return q, vector(table, "i", count).tolist() if isinstance(current, list) else [current] * count
+
+
+def _check_rank(rotor: Rotor, axes: list[BearingAxis]) -> None:
+    """Raise ValueError if magnets or sensors leave a coordinate free that any of them acts on, or a weight."""
+    for rows, what in ((rotor.at_magnets, "magnets"), (rotor.at_sensors, "sensors")):
+        rigid = np.asarray(rows)[:, :RIGID]
+        used = [k for k in range(RIGID) if np.any(rigid[:, k])]
+        free = [COORDINATES[k] for k in range(RIGID) if k not in used and (k != 2 or rotor.gravity[2] != 0)]
+        if free:
+            raise ValueError(f"bearing: no axis holds {', '.join(free)}. Add a bearing whose {what} act on it.")
+        scale = np.abs(rigid[:, used]).max(0)
+        rank = int(np.linalg.matrix_rank(rigid[:, used] / scale, tol=1e-9))
+        if rank < len(used):
+            raise ValueError(
+                f"bearing: the {what} of the {len(axes)} axes determine {rank} of the {len(used)} rigid motions "
+                f"({', '.join(COORDINATES[k] for k in used)}). Place radial bearings at two different places."
+            )
+
+
+def _shares(rotor: Rotor) -> tuple[list[float], list[float]]:
+    """Return the mass (kg) and the weight (N) that each axis carries [c]: 1/(b M^-1 b), and least-norm forces."""
+    B, M, gravity = (np.asarray(x, np.float64) for x in (rotor.at_magnets, rotor.M, rotor.gravity))
+    B = B[:, :RIGID]
+    masses = 1 / np.sum(B * np.linalg.solve(M[:RIGID, :RIGID], B.T).T, 1)
+    return masses.tolist(), (np.linalg.pinv(B.T) @ -gravity[:RIGID]).tolist()
+
+
+def _check_force(case: Case, axis: BearingAxis, force: float) -> None:
+    most = float(case.scenario.largest_force)
+    if abs(force) > most:
+        raise ValueError(
+            f"axis {axis.name}: it must carry {abs(force):.4g} N, and its magnet gives at most {most:.4g} N at the "
+            "centre. Increase plant.n, plant.A or plant.i_0, or reduce plant.s_0."
+        )
+
+
+def _axis_raw(raw: dict[str, Any], bearing: Table, m: float, force: float, initial: dict[str, float]) -> dict[str, Any]:
+    """Return the case of one axis: the common tables, what the bearing changes, and the rotor's share."""
+    own = copy.deepcopy({key: value for key, value in raw.items() if key not in (*MACHINE_TABLES, "initial", "tune")})
+    for table in OWN:
+        if table in bearing.raw:
+            own[table] = _merged(own.get(table, {}), bearing.table(table).raw)
+    plant = own.setdefault("plant", {})
+    for name in ("m", "k_z", "g"):
+        if isinstance(plant, dict) and name in plant:
+            raise ValueError(f"plant.{name} = {show(plant[name])}: the rotor gives it. Leave it out beside [rotor].")
+    own["plant"] = plant | {"m": m, "k_z": 0.0, "g": force / m}
+    controller = own.get("controller")
+    if isinstance(controller, dict) and "coordinates" in controller:
+        Table(controller, "controller").choice("coordinates", ["axes"])
+        del controller["coordinates"]
+    if isinstance(own.get("sensitivity"), dict):
+        own["sensitivity"].pop("speeds", None)
+    return own | {"initial": initial}
+
+
+def _merged(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """Return the common table with the keys of another one, recursively. Another `kind` replaces the whole table."""
+    if "kind" in own and own["kind"] != common.get("kind", own["kind"]):
+        return own
+    both = dict(common)
+    for key, value in own.items():
+        both[key] = _merged(both[key], value) if isinstance(value, dict) and isinstance(both.get(key), dict) else value
+    return both
+
+
+def _clock(cases: list[Case], rotor: Rotor, fixed: bool) -> Clock:
+    """Return the clock with a method whose fixed steps resolve every axis, the bending modes and nutation.
+
+    `fixed`: whether the case gives the step.
+    """
+    clock, period = cases[0].clock, float(cases[0].clock.sample_period)
+    methods = [case.clock.method for case in cases]
+    fixed_steps = [method for method in methods if isinstance(method, (RK4, DOP853, Euler))]
+    if len(fixed_steps) == len(methods):
+        most = max(fixed_steps, key=lambda method: method.substeps)
+    else:
+        slope = max(max(slopes(case.cascade, case.scenario).values()) for case in cases)
+        most = RK4(max(math.ceil(period * slope / ACCURATE), 1))
+    W = 2 * np.pi * PER_MINUTE * max(abs(rotor.speed), abs(rotor.speed + rotor.acceleration * float(clock.duration)))
+    M, K, G = (np.asarray(x) for x in (rotor.M, rotor.K, rotor.G))
+    fastest = max(math.sqrt(float(np.max(np.diag(K) / np.diag(M)))), float(W * np.max(np.abs(G) / np.diag(M)[:, None])))
+    substeps = most.substeps if fixed else max(most.substeps, math.ceil(period * fastest / MODE))
+    if substeps > MOST_SUBSTEPS:
+        raise ValueError(
+            f"clock: this machine needs {substeps} steps in a sample of {period:g} s; at most {MOST_SUBSTEPS} are "
+            "allowed. Use a processor or smooth gains, leave out the fastest modes, or shorten clock.sample_period."
+        )
+    return dataclasses.replace(clock, method=dataclasses.replace(most, substeps=substeps))

@@ -1,0 +1,303 @@
+"""Readers of the tables [rotor], [[bearing]], [[unbalance]] and [[load]] of a machine: the rotor and its axes."""
+
+import dataclasses
+import itertools
+import math
+import pathlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from ambjax.cases.recordings import Recordings
+from ambjax.cases.scenario_tables import signal_from
+from ambjax.cases.table import Table, show
+from ambjax.numerics.records import leaf
+from ambjax.world.rotor import Rotor, RotorLoad, RotorUnbalance
+from ambjax.world.shaft import Disc, Section, shaft_model
+
+KINDS = ["rigid", "modal", "shaft"]
+COORDINATES = ("x", "y", "z", "beta_x", "beta_y")
+RIGID = len(COORDINATES)
+# Tables that describe one axis, which each bearing may change.
+OWN = ("plant", "controller", "sensor", "actuator", "reference")
+# Longest finite element, as a share of the shaft's length: bending frequencies are then correct to 1e-5.
+LONGEST_ELEMENT = 1 / 70
+PLACE = leaf(default=0.0, unit="m", at_least=-100.0, at_most=100.0, doc="place on the shaft")
+ANGLE = leaf(default=0.0, unit="degrees", at_least=-360.0, at_most=360.0, doc="angle of the first axis from x")
+AMOUNT, PHASE = (field for field in dataclasses.fields(RotorUnbalance) if field.name in ("amount", "phase"))
+SPEED, ACCELERATION = (field for field in dataclasses.fields(Rotor) if field.name in ("speed", "acceleration"))
+MASS = leaf(unit="kg", at_least=1e-6, at_most=1e6, doc="mass")
+I_T = leaf(unit="kg m^2", at_least=0.0, at_most=1e9, doc="moment of inertia about an axis across the shaft")
+I_P = leaf(unit="kg m^2", at_least=0.0, at_most=1e9, doc="moment of inertia about the shaft")
+FREQUENCY = leaf(unit="Hz", at_least=1e-3, at_most=1e6, doc="frequency of a bending mode, free and at rest")
+DAMPING = leaf(default=0.005, unit="1", at_least=0.0, at_most=1.0, doc="damping ratio of the bending modes")
+MODES = leaf(default=4, at_least=0, at_most=20, whole=True, doc="number of bending modes")
+LENGTH = leaf(unit="m", at_least=1e-6, at_most=100.0, doc="length of a section")
+DIAMETER = leaf(unit="m", at_least=1e-6, at_most=100.0, doc="outer diameter of a section")
+INNER = leaf(default=0.0, unit="m", at_least=0.0, at_most=100.0, doc="inner diameter of a section")
+MATERIAL = {
+    "E": leaf(default=2.1e11, unit="Pa", at_least=1e6, at_most=1e13, doc="Young's modulus"),
+    "rho": leaf(default=7850.0, unit="kg/m^3", at_least=1.0, at_most=1e5, doc="density"),
+    "nu": leaf(default=0.3, unit="1", at_least=0.0, at_most=0.5, doc="Poisson's ratio"),
+}
+
+
+class BearingAxis(NamedTuple):
+    """One axis of a bearing: its name, the bearing's number, and the rows of its magnet and its sensor, each [n]."""
+
+    name: str
+    bearing: int
+    magnet: np.ndarray
+    sensor: np.ndarray
+
+
+class RotorBody(NamedTuple):
+    """Mass, inertia and bending modes of a rotor. Places of the case file minus `centre` are those from the centre.
+
+    `gyroscopic` [2 + k, 2 + k]: as in `ShaftModel`. `shapes`: shapes [k] of the modes at a place of the case file;
+    None: the tables give them.
+    """
+
+    m: float
+    I_t: float
+    I_p: float
+    centre: float
+    frequencies: np.ndarray
+    dampings: np.ndarray
+    gyroscopic: np.ndarray
+    shapes: Callable[[float], np.ndarray] | None
+
+    def place(self, table: Table, key: str = "at", modes: str = "modes", other: Any = None) -> tuple[float, np.ndarray]:
+        """Return the distance (m) of a place from the centre of mass, and the shapes of the modes there.
+
+        `other`: place (m) and shapes that are used if the table gives none; None: 0 and no motion.
+        """
+        count = len(self.frequencies)
+        at, default = other or (self.centre, np.zeros(count))
+        found = table.leaf(key, PLACE, at)
+        if self.shapes is not None:
+            return found - self.centre, self.shapes(found)
+        needed = count and other is not None and found != at
+        return found - self.centre, vector(table, modes, count, None if needed else default)
+
+
+def tables_of(top: Table, name: str) -> list[Table]:
+    """Return the tables of a list, written as [[name]]."""
+    raw = top.raw.get(name, [])
+    if not isinstance(raw, list):
+        raise ValueError(f"{top.at(name)} = {show(raw)}: write [[{top.at(name)}]] above each.")
+    return [Table(one, f"{top.at(name)}[{k}]") for k, one in enumerate(raw)]
+
+
+def needed(table: Table, key: str, field: Any) -> float:
+    """Return a number that the table must give."""
+    if key not in table.raw:
+        raise ValueError(f"{table.at(key)} is missing: give the {field.metadata['doc']}, {field.metadata['unit']}.")
+    return table.leaf(key, field)
+
+
+def vector(table: Table, key: str, length: int, default: Any = None) -> np.ndarray:
+    """Return a list of `length` numbers; `default` if it is left out."""
+    if key not in table.raw and default is not None:
+        return np.asarray(default, float)
+    value = table.array(key, None, f"a list of {length} numbers")
+    if value is None or np.shape(value) != (length,) or not np.all(np.isfinite(np.asarray(value, float))):
+        given = "is missing" if key not in table.raw else f"= {show(table.raw[key])}"
+        raise ValueError(f"{table.at(key)} {given}: it must be a list of {length} numbers.")
+    return np.asarray(value, float)
+
+
+def body_from(top: Table) -> RotorBody:
+    """Return the masses and modes of [rotor]."""
+    table = top.table("rotor")
+    kind = table.choice("kind", KINDS)
+    common = ["kind", "gravity", "speed", "acceleration"]
+    if kind == "shaft":
+        table.only([*common, "elements", "discs", "sleeves", "modes", "damping", *MATERIAL])
+        return _shaft(table, _places(top))
+    table.only([*common, "m", "I_t", "I_p", *(["modes"] if kind == "modal" else [])])
+    m, I_t, I_p = needed(table, "m", MASS), needed(table, "I_t", I_T), needed(table, "I_p", I_P)
+    if not 0 < I_p <= 2 * I_t and I_p != 0:
+        raise ValueError(f"{table.at('I_p')} = {I_p:g}: it must be at most 2 I_t = {2 * I_t:g} kg m^2, as of a disc.")
+    if I_t == 0:
+        raise ValueError(f"{table.at('I_t')} = 0: it must be above 0 kg m^2.")
+    modes = tables_of(table, "modes")
+    for one in modes:
+        one.only(["frequency", "damping"])
+    frequencies = np.array([needed(one, "frequency", FREQUENCY) for one in modes])
+    dampings = np.array([one.leaf("damping", DAMPING, DAMPING.default) for one in modes])
+    gyroscopic = np.zeros((2 + len(modes), 2 + len(modes)))
+    gyroscopic[1, 1] = I_p
+    return RotorBody(m, I_t, I_p, 0.0, frequencies, dampings, gyroscopic, None)
+
+
+def _places(top: Table) -> list[float]:
+    """Return all places on the shaft that the tables name, m."""
+    found = [
+        one.leaf(key, PLACE)
+        for name in ("bearing", "unbalance", "load")
+        for one in tables_of(top, name)
+        for key in ("at", "sensor_at")
+        if key in one.raw
+    ]
+    return [*found, 0.0]
+
+
+def _section(table: Table, begin: float, common: Table, sleeve: bool = False) -> Section:
+    """Return a section of the shaft, or a sleeve."""
+    table.only(["length", "diameter", "inner_diameter", *MATERIAL, *(["at"] if sleeve else [])])
+    material = [table.leaf(name, field, common.leaf(name, field, field.default)) for name, field in MATERIAL.items()]
+    outer, inner = needed(table, "diameter", DIAMETER), table.leaf("inner_diameter", INNER, 0.0)
+    if inner >= outer:
+        raise ValueError(f"{table.at('inner_diameter')} = {inner:g} m: it must be below the diameter, {outer:g} m.")
+    E, rho, nu = material
+    return Section(begin, needed(table, "length", LENGTH), outer, inner, E, rho, nu, not sleeve)
+
+
+def _shaft(table: Table, places: list[float]) -> RotorBody:
+    """Return the body of a shaft from its geometry. Places are measured from the left end of the shaft."""
+    elements, begin, sections = tables_of(table, "elements"), 0.0, list[Section]()
+    if not elements:
+        raise ValueError(f"{table.at('elements')} is missing: give [[rotor.elements]] with length and diameter.")
+    for one in elements:
+        sections.append(_section(one, begin, table))
+        begin += float(sections[-1].length)
+    end, shaft = begin, len(sections)
+    for one in tables_of(table, "sleeves"):
+        sections.append(_section(one, needed(one, "at", PLACE), table, sleeve=True))
+    discs = []
+    for one in tables_of(table, "discs"):
+        one.only(["at", "m", "I_t", "I_p"])
+        discs.append(Disc(*(needed(one, k, f) for k, f in (("at", PLACE), ("m", MASS), ("I_t", I_T), ("I_p", I_P)))))
+    ends = [x for one in sections for x in (one.begin, one.begin + one.length)]
+    for place in (*places, *ends, *(disc.at for disc in discs)):
+        if not -1e-9 <= place <= end * (1 + 1e-9):
+            raise ValueError(
+                f"rotor: the place {place:g} m is not on the shaft, which is {end:g} m long from its left end."
+            )
+    points = _distinct([*places, *ends, *(disc.at for disc in discs)], 1e-6 * end)
+    nodes = _distinct(
+        [x for a, b in itertools.pairwise(points)
+         for x in np.linspace(a, b, max(1, math.ceil((b - a) / (LONGEST_ELEMENT * end) - 1e-9)) + 1)], 1e-6 * end,
+    )  # fmt: skip
+    middles = (nodes[1:] + nodes[:-1]) / 2
+    layers = [range(shaft), *([number] for number in range(shaft, len(sections)))]
+    sizes = [
+        next((n for n in layer if sections[n].begin < x < sections[n].begin + sections[n].length), -1)
+        for layer in layers
+        for x in middles
+    ]
+    count = table.whole("modes", MODES)
+    model = shaft_model(sections, discs, jnp.asarray(nodes), sizes, list(range(len(nodes))), count)
+    shapes = np.asarray(model.shapes)
+
+    def at(place: float) -> np.ndarray:
+        return shapes[int(np.argmin(np.abs(nodes - place)))]
+
+    dampings = np.full(count, DAMPING.default)
+    if isinstance(table.raw.get("damping"), list):
+        dampings = vector(table, "damping", count)
+        for x in dampings:
+            Table({"damping": float(x)}, table.path).leaf("damping", DAMPING)
+    elif "damping" in table.raw:
+        dampings = np.full(count, table.leaf("damping", DAMPING))
+    return RotorBody(
+        float(model.m), float(model.I_t), float(model.I_p), float(model.centre), np.asarray(model.frequencies),
+        dampings, np.asarray(model.gyroscopic), at,
+    )  # fmt: skip
+
+
+def _distinct(x: Any, close: float) -> np.ndarray:
+    """Return the values in ascending order, without those that are within `close` of the one before."""
+    x = np.sort(np.asarray(x, float))
+    return x[np.concatenate([[True], np.diff(x) > close])]
+
+
+def row(at: float, direction: Any, shapes: np.ndarray) -> np.ndarray:
+    """Return the displacement [n] along `direction` of the shaft at `at` (m) per unit of each coordinate."""
+    x, y, z = direction
+    return np.concatenate([[x, y, z, -at * y, at * x], np.outer(shapes, [x, y]).ravel()])
+
+
+def axes_from(bearings: list[Table], body: RotorBody) -> list[BearingAxis]:
+    """Return the axes of all bearings: two of a radial one, at `angle` and 90 degrees further; one of an axial one."""
+    axes, seen = [], set()
+    for number, table in enumerate(bearings):
+        own = [] if body.shapes is not None else ["modes", "sensor_modes"]
+        table.only(["name", "kind", "at", "sensor_at", "angle", *own, *OWN])
+        kind = table.choice("kind", ["radial", "axial"])
+        name = table.raw.get("name", f"bearing{number + 1}")
+        if not isinstance(name, str) or not name or name in seen:
+            raise ValueError(f"{table.at('name')} = {show(name)}: each bearing needs a name of its own, as text.")
+        seen.add(name)
+        if kind == "axial":
+            none = np.zeros(len(body.frequencies))
+            z = row(0.0, (0.0, 0.0, 1.0), none)
+            axes.append(BearingAxis(f"{name}.z", number, z, z))
+            continue
+        at = needed(table, "at", PLACE)
+        if body.shapes is None and len(body.frequencies):
+            vector(table, "modes", len(body.frequencies))  # a radial bearing gives the shapes at its magnet
+        magnet = body.place(table)
+        sensor = body.place(table, "sensor_at", "sensor_modes", (at, magnet[1]))
+        angle = math.radians(table.leaf("angle", ANGLE, 0.0))
+        cos, sin = _exact(math.cos(angle)), _exact(math.sin(angle))
+        for label, d in (("x", (cos, sin, 0.0)), ("y", (-sin, cos, 0.0))):
+            axes.append(
+                BearingAxis(f"{name}.{label}", number, row(magnet[0], d, magnet[1]), row(sensor[0], d, sensor[1]))
+            )
+    return axes
+
+
+def _exact(x: float) -> float:
+    """Return x, or the whole number within rounding of it, so that axes along x and y are uncoupled."""
+    return float(round(x)) if abs(x - round(x)) < 1e-15 else x
+
+
+def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pathlib.Path) -> Rotor:
+    """Return the rotor of the tables [rotor], [[unbalance]] and [[load]]."""
+    table, k = top.table("rotor"), len(body.frequencies)
+    n, w = RIGID + 2 * k, 2 * np.pi * np.repeat(body.frequencies, 2)
+    mass = np.concatenate([[body.m, body.m, body.m, body.I_t, body.I_t], np.ones(2 * k)])
+    K, D = np.zeros(n), np.zeros(n)
+    K[RIGID:], D[RIGID:] = w**2, 2 * np.repeat(body.dampings, 2) * w
+    # the complex coordinates x + j y, beta_y - j beta_x and the modes, as rows of real and imaginary parts
+    unit = np.eye(n)
+    real = np.stack([unit[0], unit[4], *unit[RIGID::2]])
+    imaginary = np.stack([unit[1], -unit[3], *unit[RIGID + 1 :: 2]])
+    G = real.T @ body.gyroscopic @ imaginary - imaginary.T @ body.gyroscopic @ real
+    gravity = np.zeros(n)
+    gravity[:3] = body.m * vector(table, "gravity", 3, (0.0, -9.81, 0.0))
+    return Rotor(
+        M=jnp.diag(mass),
+        D=jnp.diag(D),
+        G=jnp.asarray(G),
+        K=jnp.diag(K),
+        at_magnets=jnp.stack([axis.magnet for axis in axes]),
+        at_sensors=jnp.stack([axis.sensor for axis in axes]),
+        gravity=jnp.asarray(gravity),
+        speed=table.leaf("speed", SPEED, 0.0),
+        acceleration=table.leaf("acceleration", ACCELERATION, 0.0),
+        unbalances=tuple(_unbalance(one, body) for one in tables_of(top, "unbalance")),
+        loads=tuple(_load(one, body, Recordings(folder, ())) for one in tables_of(top, "load")),
+    )
+
+
+def _unbalance(table: Table, body: RotorBody) -> RotorUnbalance:
+    table.only(["at", "amount", "phase", *(["modes"] if body.shapes is None else [])])
+    at, shapes = body.place(table)
+    x, y = (jnp.asarray(row(at, d, shapes)) for d in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    return RotorUnbalance(needed(table, "amount", AMOUNT), x, y, table.leaf("phase", PHASE, 0.0))
+
+
+def _load(table: Table, body: RotorBody, recordings: Recordings) -> RotorLoad:
+    places = ("at", "direction", *(["modes"] if body.shapes is None else []))
+    direction = vector(table, "direction", 3)
+    size = float(np.linalg.norm(direction))
+    if size == 0:
+        raise ValueError(f"{table.at('direction')} = {show(table.raw['direction'])}: it must not be zero.")
+    at, shapes = body.place(table)
+    rest = Table({key: value for key, value in table.raw.items() if key not in places}, table.path)
+    return RotorLoad(signal_from(rest, "N", recordings), jnp.asarray(row(at, direction / size, shapes)))

@@ -1,0 +1,132 @@
+"""`simulate` and `sensitivity` of a whole machine."""
+
+import argparse
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from ambjax.cases.machine_case import MachineCase
+from ambjax.linear.machine_sensitivity import MachineSensitivity, machine_sensitivity
+from ambjax.results.machine_run import simulate_machine
+from ambjax.results.outputs import described, directory, files, plain, say, table, write_json, written
+
+Summary = dict[str, object]
+SIMULATED = ("trajectory.npz", "metrics.json", "overview.png")
+ANALYSED = ("sensitivity.json", "sensitivity.png")
+# Metrics of the printed table, with their headings.
+COLUMNS = {
+    "settled_rms_error_m": "rms error, m",
+    "settled_max_abs_error_m": "largest error, m",
+    "clearance_used": "share of clearance",
+    "max_abs_i_A": "largest |i|, A",
+    "rms_u_V": "rms u, V",
+    "max_abs_u_V": "largest |u|, V",
+    "force_used": "share of force",
+}
+
+
+def refuse(args: argparse.Namespace, names: tuple[str, ...]) -> None:
+    """Raise ValueError for an option that a machine does not take."""
+    for name in names:
+        if getattr(args, name, None):
+            raise ValueError(f"--{name}: a machine with [rotor] does not take it yet. Leave it out.")
+
+
+def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]:
+    """Simulate a machine and write its files. Exit code 1 if the rotor is lost."""
+    refuse(args, ("member", "members", "seed", "begin", "end", "page"))
+    out = directory(args.out, f"simulate-{case.name}", SIMULATED, args.force)
+    say(f"method: {case.clock.method}; axes: {', '.join(case.axes)}")
+    with tqdm(total=case.clock.samples, unit="sample", unit_scale=True, delay=2, leave=False, desc="simulate") as bar:
+        run = simulate_machine(case, bar.update)
+    metrics = plain(run.metrics) | {
+        "lost_why": run.lost_why, "method": str(case.clock.method), "settle_s": case.settle,
+    }  # fmt: skip
+    from ambjax.pictures.machine_pictures import machine_picture
+
+    with files(out) as part:
+        run.save(part / "trajectory.npz")
+        write_json(part / "metrics.json", metrics)
+        title = f"{case.name}: {case.clock.method}"
+        described("overview.png", lambda: machine_picture(case, run.signals, title, part / "overview.png"))
+        names = [name for name in SIMULATED if (part / name).exists()]
+    if not args.json:
+        rows = [(axis, *(f"{own[name]:.4g}" for name in COLUMNS)) for axis, own in run.metrics["axes"].items()]
+        print(table(("axis", *COLUMNS.values()), rows))
+        written(out, ", ".join(names))
+    if run.lost:
+        lost = run.metrics["lost_at_s"]
+        say(f"the rotor is lost at {lost:.6g} s: {run.lost_why}. 'ambjax sensitivity' shows whether it is stable.")
+    return int(run.lost or run.metrics["stalled"]), metrics | {"out": str(out)}
+
+
+def analysed(case: MachineCase) -> list[MachineSensitivity]:
+    """Return the sensitivities of a machine at its speeds."""
+    period = float(case.clock.sample_period)
+    return [machine_sensitivity(case.machine, case.axes, period, speed, case.zones) for speed in case.speeds]
+
+
+def sensitivity(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]:
+    """Analyse a machine at its speeds and write the files. Exit code 1 if it is not stable at one of them."""
+    refuse(args, ("members", "seed", "inject"))
+    points = analysed(case)
+    out = directory(args.out, f"sensitivity-{case.name}", ANALYSED, args.force)
+    summary = sensitivity_summary(points)
+    limits = [float(x) for x in (case.zones.zone_a, case.zones.zone_b, case.zones.zone_c)]
+    from ambjax.pictures.machine_pictures import machine_sensitivity_picture
+
+    with files(out) as part:
+        write_json(part / "sensitivity.json", summary)
+        path = part / "sensitivity.png"
+        described(path.name, lambda: machine_sensitivity_picture(points, limits, path, case.name))
+        names = [name for name in ANALYSED if (part / name).exists()]
+    if not args.json:
+        print(sensitivity_text(points))
+        written(out, ", ".join(names))
+    return int(not all(point.stable for point in points)), plain(summary | {"out": str(out)})
+
+
+def sensitivity_summary(points: list[MachineSensitivity]) -> Summary:
+    """Return the JSON of the sensitivities: the axis with the largest peak at any speed, and each speed."""
+    worst = max(points, key=lambda point: (not point.stable, point.worst.S.height))
+    at = [
+        {
+            "speed_rpm": point.speed,
+            "stable": point.stable,
+            "axes": [
+                {
+                    "name": axis.name, "peak": axis.S.height, "frequency_hz": axis.S.frequency, "zone": axis.zone,
+                    "peak_T": axis.T.height, "peak_KS": axis.KS.height,
+                }
+                for axis in point.axes
+            ],
+            "sigma_max": point.sigma.height,
+            "sigma_frequency_hz": point.sigma.frequency,
+            "poles_per_s": [[float(p.real), float(p.imag)] for p in point.poles],
+        }
+        for point in points
+    ]  # fmt: skip
+    axis = worst.worst
+    first: Summary = {
+        "stable": all(point.stable for point in points), "peak": axis.S.height, "frequency_hz": axis.S.frequency,
+        "zone": axis.zone, "axis": axis.name, "speed_rpm": worst.speed,
+    }  # fmt: skip
+    own: dict[str, Any] = at[points.index(worst)]
+    return first | {key: own[key] for key in ("axes", "sigma_max", "sigma_frequency_hz")} | {"speeds": at}
+
+
+def sensitivity_text(points: list[MachineSensitivity]) -> str:
+    """Return the tables of the sensitivities, one for each speed."""
+    parts = []
+    for point in points:
+        rows = [
+            (axis.name, f"{axis.S.height:.4g}", f"{axis.S.frequency:.4g}", axis.zone, f"{axis.T.height:.4g}")
+            for axis in point.axes
+        ]
+        rows.append(("largest singular value", f"{point.sigma.height:.4g}", f"{point.sigma.frequency:.4g}", "", ""))
+        slow = np.max(np.real(point.poles))
+        words = "stable" if point.stable else "NOT STABLE: the peaks have no physical meaning"
+        parts.append(f"{point.speed:g} rpm: {words}; largest real part of a pole {slow:.4g} 1/s")
+        parts.append(table(("axis", "peak of |S|", "Hz", "zone", "peak of |T|"), rows))
+    return "\n".join(parts)

@@ -1,0 +1,324 @@
+"""Linearisation of a whole machine at rest and constant speed: all loops are closed, each axis has a test signal."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.flatten_util import ravel_pytree
+
+from ambjax.control.cascade import Cascade
+from ambjax.control.cascade_state import CascadeState, Sample
+from ambjax.linear.analysis import Zones
+from ambjax.linear.equilibrium import TOLERANCE, at_rest, ideal, newton_of, reading, sizes_of, start_of
+from ambjax.linear.margins import ResponsePeak, peak, poles_in_s, whole_end
+from ambjax.linear.state_space import StateSpace
+from ambjax.numerics.records import Scalar, canonical
+from ambjax.numerics.small_matrices import exponential
+from ambjax.simulation.whole_machine import Machine, MachineState, PlantOnly, SampledMachine, still, times
+from ambjax.world.scenario import Scenario
+from ambjax.world.sensor import Measurement
+
+T = TypeVar("T")
+# Parts of a point or of its rates: one stacked pytree for each group.
+Groups = tuple
+
+
+class AxisSensitivity(NamedTuple):
+    """Peaks of an axis: of |S_kk| with its zone, of |T_kk| (1), and of |KS_kk| (V/m, or A/m for a current command)."""
+
+    name: str
+    S: ResponsePeak
+    T: ResponsePeak
+    KS: ResponsePeak
+    zone: str
+
+
+class MachineSensitivity(NamedTuple):
+    """Sensitivity of a machine at one speed, with all loops closed.
+
+    - `speed`: rpm. `stable`: whether no mode grows. If one does, the peaks have no physical meaning, and zones are D.
+    - `axes`: the peaks of each axis. `sigma`: peak of the largest singular value of the matrix S.
+    - `poles`: poles of the machine, 1/s, in the order of decreasing real part.
+    - `system`: the linear system, with inputs e_k at the sensors, and outputs: readings z_k, then commands u_k.
+    """
+
+    speed: float
+    stable: bool
+    axes: tuple[AxisSensitivity, ...]
+    sigma: ResponsePeak
+    poles: np.ndarray
+    system: StateSpace
+
+    @property
+    def worst(self) -> AxisSensitivity:
+        """The axis with the largest peak of |S_kk|."""
+        return max(self.axes, key=lambda axis: axis.S.height)
+
+
+class _Rest(NamedTuple):
+    """A point of the machine at rest: coordinates [n]; plants, laws and commands [c_g] of each group."""
+
+    q: Array
+    plant: Groups
+    control: Groups
+    u: Groups
+
+
+class _Linear:
+    """The machine at constant speed without what a linear system cannot contain (`ideal`), with test signals e [c]."""
+
+    def __init__(self, machine: Machine, W: Scalar, period: Scalar):
+        self.machine, self.W, self.period = machine.realised(), W, period
+        loops = self.machine.loops()
+        self.scenario = tuple(jax.vmap(ideal)(loop.scenario) for loop in loops)
+        self.cascade = tuple(_unguarded(loop.cascade) for loop in loops)
+        self.rotor = self.machine.rotor
+        self.low_passed = [one.sensor is not None and one.sensor.bandwidth is not None for one in self.scenario]
+        self.lagged = [one.amplifier is not None and one.amplifier.slow for one in self.scenario]
+
+    @property
+    def sampled(self) -> bool:
+        """Whether the laws run on a processor."""
+        return isinstance(self.machine, SampledMachine)
+
+    def each(self, function: Callable[..., T], *groups: Sequence[object]) -> list[T]:
+        """Return function(cascade, scenario, ...) of every axis, stacked for each group."""
+        return [jax.vmap(function)(*own) for own in zip(self.cascade, self.scenario, *groups, strict=True)]
+
+    def start(self) -> tuple[_Rest, _Rest]:
+        """Return the machine at q = 0, where each axis carries its share of the weight, and the sizes of the states."""
+        points = self.each(lambda cascade, scenario: start_of(cascade, scenario, self.period, 0.0))
+        sizes = self.each(lambda cascade, scenario, point: sizes_of(cascade, scenario, point), points)
+        q = jnp.zeros_like(jnp.asarray(self.rotor.gravity))
+        size = self.machine.scale(sizes)
+        first = _Rest(q, *_parts(points))
+        return first, jax.tree.map(lambda x, s: jnp.zeros_like(x) + s, first, _Rest(size.q, *_parts(sizes)))
+
+    def read(
+        self, q: Array, q_dot: Array, plant: Groups, z: Sequence[object], e: Sequence[object]
+    ) -> list[Measurement]:
+        """Return the readings of the groups. `z`: outputs of the low-passes, or () without."""
+        states = self.machine.moving(self.rotor.at_sensors, q, q_dot, tuple(map(PlantOnly, plant)))
+
+        def one(_: object, scenario: Scenario, own: PlantOnly, z: Array | tuple[()], e: Array) -> Measurement:
+            motion = scenario.plant.measurement(own.plant)
+            return reading(scenario, motion if isinstance(z, tuple) else motion._replace(z=z), (e, 0.0))
+
+        return self.each(one, states, z, e)
+
+    def rates(self, q: Array, q_dot: Array, plant: Groups, u: Groups) -> MachineState:
+        """Return the rates of (q, q_dot, plant) under voltages or commanded currents u."""
+        states = self.machine.moving(self.rotor.at_magnets, q, q_dot, tuple(map(PlantOnly, plant)))
+
+        def one(_: object, scenario: Scenario, own: PlantOnly, u: Array) -> PlantOnly:
+            return PlantOnly(scenario.plant.rates(own.plant, scenario.coil_voltage(u, own.plant)))
+
+        moved = self.each(one, states, u)
+        return self.machine.coupled((jnp.asarray(self.rotor.gravity), self.W), MachineState(q, q_dot, ()), moved)
+
+    def laws(self, measured: Sequence[Measurement], control: Groups, past: Sequence[object]) -> tuple[Groups, Groups]:
+        """Return the commands of the groups, and the next states of the laws, or their rates in continuous time."""
+        reference, unlimited = at_rest(0.0), jnp.asarray(jnp.inf)
+
+        def one(
+            cascade: Cascade, _: object, measured: Measurement, control: CascadeState, past: tuple[Array, ...]
+        ) -> tuple[Array, CascadeState]:
+            if not self.sampled:
+                command, rates = cascade(measured, control, reference, unlimited)
+                return command.u, rates
+            command, after, _ = cascade.step(measured, control, Sample(reference, self.period, unlimited, past))
+            return command.u, after
+
+        found = self.each(one, measured, control, past)
+        return tuple(u for u, _ in found), tuple(after for _, after in found)
+
+    def past(self, u: Groups) -> Groups:
+        """Return the commands on their way under constant commands u; () in continuous time."""
+        processors = [cascade.processor for cascade in self.cascade]
+        return tuple(() if p is None else p.constant_past(own) for p, own in zip(processors, u, strict=True))
+
+    def sensed(self, q: Array) -> Groups:
+        """Return the displacements at the sensors, for the groups with a low-pass."""
+        z = self.machine.split(times(self.rotor.at_sensors, q))
+        return tuple(own if on else () for own, on in zip(z, self.low_passed, strict=True))
+
+    def residual(self, point: _Rest) -> _Rest:
+        """Return what is 0 at an equilibrium, in the units of the states."""
+        zero, e = jnp.zeros_like(point.q), tuple(jnp.zeros_like(u) for u in point.u)
+        moved = self.rates(point.q, zero, point.plant, point.u)
+        poles = [scenario.plant.pole for scenario in self.scenario]
+        measured = self.read(point.q, zero, point.plant, self.sensed(point.q), e)
+        u, after = self.laws(measured, point.control, self.past(point.u))
+        if self.sampled:
+            change = jax.tree.map(lambda a, b: b - a, point.control, after)
+        else:
+            change = tuple(jax.tree.map(lambda x, w=w: x / w, own) for own, w in zip(after, poles, strict=True))
+        axes = zip(moved.axes, poles, strict=True)
+        plant = tuple(jax.tree.map(lambda x, w=w: x / w, own.plant) for own, w in axes)
+        fastest = jnp.max(self.machine.join(poles))
+        return _Rest(moved.q_dot / fastest**2, plant, change, jax.tree.map(jnp.subtract, u, point.u))
+
+    def rest(self) -> tuple[_Rest, _Rest, Array]:
+        """Return the equilibrium, the sizes of the states, and whether it was found."""
+        start, sizes = self.start()
+        scale, (flat, restore) = ravel_pytree(sizes)[0], ravel_pytree(start)
+        newton = newton_of(lambda y: ravel_pytree(self.residual(restore(y * scale)))[0] / scale, flat / scale)
+        return restore(newton.y * scale), sizes, newton.error <= TOLERANCE * jnp.finfo(flat.dtype).eps
+
+    def system(self) -> tuple[StateSpace, Array]:
+        """Return the state space, and whether an equilibrium was found."""
+        point, sizes, found = self.rest()
+        amplified = tuple(u if on else () for u, on in zip(point.u, self.lagged, strict=True))
+        body, restore = ravel_pytree((point.q, jnp.zeros_like(point.q), point.plant, self.sensed(point.q), amplified))
+        fastest = jnp.max(self.machine.join([scenario.plant.pole for scenario in self.scenario]))
+        low = self.machine.split(times(jnp.abs(self.rotor.at_sensors), sizes.q))
+        lag_sizes = tuple(x if on else () for x, on in zip(low, self.low_passed, strict=True))
+        u_sizes = tuple(x if on else () for x, on in zip(sizes.u, self.lagged, strict=True))
+        body_sizes = ravel_pytree((sizes.q, sizes.q * fastest, sizes.plant, lag_sizes, u_sizes))[0]
+
+        def moved(x: Array, u: Groups) -> Array:
+            q, q_dot, plant, filtered, own = restore(x)
+            z_rates, u_rates, applied = [], [], []
+            for k, (scenario, z) in enumerate(zip(self.scenario, self.sensed(q), strict=True)):
+                sensor, amplifier = scenario.sensor, scenario.amplifier
+                low = () if sensor is None or sensor.bandwidth is None else 2 * jnp.pi * jnp.asarray(sensor.bandwidth)
+                z_rates.append(() if isinstance(low, tuple) else low * (z - filtered[k]))
+                slow = amplifier is not None and self.lagged[k]
+                u_rates.append(jnp.asarray(amplifier.slope()) * (u[k] - own[k]) if amplifier and slow else ())
+                applied.append(own[k] if slow else u[k])
+            after = self.rates(q, q_dot, plant, tuple(applied))
+            return ravel_pytree((after.q, after.q_dot, _plants(after.axes), tuple(z_rates), tuple(u_rates)))[0]
+
+        def read(x: Array, e: Array) -> list[Measurement]:
+            q, q_dot, plant, filtered, _ = restore(x)
+            return self.read(q, q_dot, plant, filtered, self.machine.split(e))
+
+        build = self._sampled if self.sampled else self._continuous
+        ((A, B), (C, D)), scale = build(point, sizes, body, body_sizes, moved, read)
+        return StateSpace(A, B, C, D, scale, jnp.asarray(self.period) if self.sampled else None), found
+
+    def outputs(self, measured: Sequence[Measurement], u: Groups) -> Array:
+        """Return the outputs of the linear system: readings, then commands, in the order of the axes."""
+        return jnp.concatenate([self.machine.join([one.z for one in measured]), self.machine.join(u)])
+
+    def _continuous(
+        self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, moved: Callable, read: Callable
+    ) -> tuple:
+        x, restore = ravel_pytree((body, point.control))
+
+        def field(x: Array, e: Array) -> tuple[Array, Array]:
+            at, control = restore(x)
+            measured = read(at, e)
+            u, rates = self.laws(measured, control, self.past(point.u))
+            return ravel_pytree((moved(at, u), rates))[0], self.outputs(measured, u)
+
+        scale = ravel_pytree((body_sizes, sizes.control))[0]
+        return jax.jacfwd(field, (0, 1))(x, jnp.zeros(self.machine.count, x.dtype)), scale
+
+    def _sampled(
+        self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, moved: Callable, read: Callable
+    ) -> tuple:
+        past, processor = self.past(point.u), self.cascade[0].processor
+        assert processor is not None
+        A, B = jax.jacfwd(lambda x, u: moved(x, self.machine.split(u)), (0, 1))(body, self.machine.join(point.u))
+        kept = len(past[0])
+        transition, driven = _held(A, B, self.period, jnp.asarray(processor.delay)[0], kept)
+        x, restore = ravel_pytree((body, point.control, past))
+
+        def step(x: Array, e: Array) -> tuple[Array, Array]:
+            at, control, past = restore(x)
+            measured = read(at, e)
+            u, after = self.laws(measured, control, past)
+            commands = [self.machine.join([(own, *old)[lag] for own, old in zip(u, past, strict=True)])
+                        for lag in range(kept + 1)]  # fmt: skip
+            end = transition @ at + sum(effect @ one for effect, one in zip(driven, commands, strict=True))
+            kept_now = tuple((own, *old)[:kept] for own, old in zip(u, past, strict=True))
+            return ravel_pytree((end, after, kept_now))[0], self.outputs(measured, u)
+
+        scale = ravel_pytree((body_sizes, sizes.control, self.past(sizes.u)))[0]
+        return jax.jacfwd(step, (0, 1))(x, jnp.zeros(self.machine.count, x.dtype)), scale
+
+
+def _unguarded(cascade: Cascade) -> Cascade:
+    """Return the cascade without its guard."""
+    if cascade.processor is None:
+        return cascade
+    return dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=None))
+
+
+def _plants(axes: Sequence) -> Groups:
+    return tuple(own.plant for own in axes)
+
+
+def _parts(points: Sequence) -> tuple[Groups, Groups, Groups]:
+    """Return the plants without motion, the laws and the commands of the groups' points."""
+    return _plants(still(points)), tuple(one.control for one in points), tuple(one.u for one in points)
+
+
+def _held(A: Array, B: Array, period: Scalar, delay: Scalar, kept: int) -> tuple[Array, list[Array]]:
+    """Return the map of one sample [N, N], and the effects [N, c] of the command of each sample, the newest first.
+
+    The command of a sample acts from `delay` samples after it until one sample later. `kept`: number of past commands.
+    """
+    n, c = B.shape
+    table = jnp.zeros((n + c, n + c), A.dtype).at[:n].set(jnp.concatenate([A, B], 1) * period)
+    delay = jnp.asarray(delay)
+    whole = jnp.floor(delay)
+    late, early = exponential(table * (1 - (delay - whole))), exponential(table * (delay - whole))
+    new, old = late[:n, n:], late[:n, :n] @ early[:n, n:]
+    at = lambda lag, number: jnp.where(jnp.abs(lag - number) < 0.5, 1.0, 0.0)  # noqa: E731
+    driven = [at(whole + 1, lag) * old + at(whole, lag) * new for lag in range(kept + 1)]
+    return late[:n, :n] @ early[:n, :n], driven
+
+
+@jax.jit
+def _matrices(machine: Machine, W: Scalar, period: Scalar) -> tuple[StateSpace, Array]:
+    return _Linear(machine, W, period).system()
+
+
+def linearise_machine(machine: Machine, period: Scalar, speed: float) -> StateSpace:
+    """Linearise a machine at its equilibrium at a constant speed (rpm). `period`: sample period, s.
+
+    The linear system has a test signal e_k at the sensor of each axis as its inputs, and the readings z_k and the
+    commands u_k as its outputs. It contains what that of one axis contains (`linearise`). Raises ValueError if no
+    equilibrium is found, and if a law has no derivative there.
+    """
+    system, found = _matrices(*canonical((machine, speed * np.pi / 30, period)))
+    if not found:
+        raise ValueError(
+            "no equilibrium of the machine was found, so it has no linearisation: `ambjax simulate` shows whether the "
+            "rotor is held."
+        )
+    if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(system)):
+        raise ValueError("the machine has no linearisation: the derivative of a law or of a magnet is not finite.")
+    return system.without_idle()
+
+
+def machine_sensitivity(
+    machine: Machine, names: tuple[str, ...], period: Scalar, speed: float, zones: Zones
+) -> MachineSensitivity:
+    """Return the sensitivity of a machine at a constant speed (rpm). Raises ValueError as `linearise_machine` does.
+
+    `names`: of the axes. `period`: sample period, s. `zones`: frequency range and limits.
+    """
+    system, c = linearise_machine(machine, period, speed), len(names)
+    end = whole_end(system)
+    low, high = zones.range(None if system.period is None else float(system.period), max(end, 2 * float(zones.f_low)))
+    stable, one = system.stable, np.eye(c)
+
+    def largest(magnitude: Callable) -> ResponsePeak:
+        return peak(system, lambda f: magnitude(np.asarray(system.response(f))), low, high, end)
+
+    axes = []
+    for k, name in enumerate(names):
+        S = largest(lambda H, k=k: np.abs(H[:, k, k]))
+        T = largest(lambda H, k=k: np.abs(H[:, k, k] - 1))
+        KS = largest(lambda H, k=k: np.abs(H[:, c + k, k]))
+        axes.append(AxisSensitivity(name, S, T, KS, zones.zone(S.height) if stable else "D"))
+    sigma = largest(lambda H: np.linalg.norm(H[:, :c], 2, axis=(1, 2)) * one[0, 0])
+    poles = poles_in_s(system)
+    return MachineSensitivity(speed, stable, tuple(axes), sigma, poles[np.argsort(-np.real(poles))], system)

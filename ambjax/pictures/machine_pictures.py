@@ -1,0 +1,130 @@
+"""Pictures of a machine: its axes over time and its orbits, and its sensitivity and poles against speed."""
+
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from ambjax.pictures.style import own_style
+
+# Largest number of points of a drawn curve.
+MOST_POINTS = 4000
+
+
+@own_style
+def machine_figure(case: Any, signals: dict[str, np.ndarray], title: str) -> Figure:
+    """Return one page: displacement, current and voltage of every axis over time, and the orbit of each radial bearing.
+
+    `signals`: those of a `MachineRun`. The orbits show the time from run.settle on, at the magnets.
+    """
+    axes, t = [str(name) for name in signals["axes"]], signals["t"]
+    step = max(len(t) // MOST_POINTS, 1)
+    pairs = orbits_of(axes)
+    figure = Figure(figsize=(13.0, 8.2), layout="constrained")
+    grid = figure.add_gridspec(3, 2 + bool(pairs), width_ratios=[2, 2, 1.3][: 2 + bool(pairs)])
+    early = t <= min(t[-1], max(0.02, 0.1 * t[-1]))
+    rows = (("z", 1e6, "displacement at the magnet, µm"), ("i", 1.0, "current, A"), ("u", 1.0, "voltage, V"))
+    for row, (name, scale, words) in enumerate(rows):
+        for column, shown in enumerate((slice(None, None, step), early)):
+            ax = figure.add_subplot(grid[row, column])
+            for k, axis in enumerate(axes):
+                ax.plot(t[shown], scale * signals[name][shown, k], label=axis, linewidth=0.9)
+            ax.set_ylabel(words if column == 0 else "")
+            ax.set_title(("whole run", "start of the run")[column] if row == 0 else "")
+            ax.set_xlabel("time, s" if row == 2 else "")
+            ax.xaxis.set_major_locator(MaxNLocator(5))
+            ax.grid(True, alpha=0.3)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, ncols=len(axes), fontsize="small", loc="outside lower center")
+    settled = t >= case.settle
+    for row, (name, x, y) in enumerate(pairs[:3]):
+        ax = figure.add_subplot(grid[row, 2])
+        ax.plot(1e6 * signals["z"][settled, x], 1e6 * signals["z"][settled, y], linewidth=0.7)
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.set_title(f"orbit of {name}, from {case.settle:g} s on")
+        ax.set_xlabel("x axis, µm")
+        ax.set_ylabel("y axis, µm")
+        ax.grid(True, alpha=0.3)
+    ended = str(signals["lost_why"])
+    figure.suptitle(f"{title}: {ended}" if ended else title)
+    return figure
+
+
+def orbits_of(axes: Sequence[str]) -> list[tuple[str, int, int]]:
+    """Return the radial bearings with the positions of their two axes in the list of axes."""
+    names = [name.rpartition(".")[0] for name in axes if name.endswith(".x")]
+    return [(name, list(axes).index(f"{name}.x"), list(axes).index(f"{name}.y")) for name in names]
+
+
+@own_style
+def machine_picture(case: Any, signals: dict[str, np.ndarray], title: str, path: pathlib.Path) -> None:
+    """Write `machine_figure` to a file."""
+    machine_figure(case, signals, title).savefig(path, dpi=130)
+
+
+@own_style
+def machine_sensitivity_picture(points: Sequence[Any], limits: Sequence[float], path: pathlib.Path, title: str) -> None:
+    """Write |S_kk| of every axis and the largest singular value over frequency, a panel for each speed.
+
+    `points`: results of `machine_sensitivity`. `limits`: upper limits of the zones A, B and C.
+    """
+    shown = list(points)[:4]
+    figure = Figure(figsize=(13.0, 4.6 if len(shown) < 3 else 8.2), layout="constrained")
+    grid = figure.subplots(1 + (len(shown) > 2), min(len(shown), 2), squeeze=False, sharex=True, sharey=True)
+    for ax in list(grid.flat)[len(shown) :]:
+        ax.set_axis_off()
+    for ax, point in zip(grid.flat, shown, strict=False):
+        end = 5e3 if point.system.period is None else 0.45 / float(point.system.period)
+        f = np.geomspace(1.0, end, 800)
+        c = len(point.axes)
+        S = np.asarray(point.system.response(f))[:, :c]
+        for k, axis in enumerate(point.axes):
+            ax.loglog(f, np.abs(S[:, k, k]), label=f"{axis.name}: {axis.S.height:.3g}", linewidth=1.0)
+        ax.loglog(
+            f, np.linalg.norm(S, 2, axis=(1, 2)), "k--", label=f"largest singular value: {point.sigma.height:.3g}"
+        )
+        top = max(2 * limits[-1], 1.3 * point.sigma.height)
+        bounds = [1e-2, *limits, top]
+        for low, high, colour, name in zip(bounds[:-1], bounds[1:], ("g", "y", "orange", "r"), "ABCD", strict=True):
+            ax.axhspan(low, high, color=colour, alpha=0.08)
+            ax.text(f[-1], np.sqrt(max(low, 0.5) * high), f" {name}", va="center", fontsize="small")
+        ax.set_ylim(1e-2, top)
+        stable = "" if point.stable else ", unstable: no zones"
+        ax.set_title(f"{point.speed:g} rpm{stable}")
+        ax.set_xlabel("frequency, Hz")
+        ax.set_ylabel("|S|")
+        ax.grid(True, alpha=0.3)
+        ax.legend(fontsize="small", loc="lower right")
+    figure.suptitle(title)
+    figure.savefig(path, dpi=130)
+
+
+@own_style
+def campbell_picture(title: str, speeds: np.ndarray, poles: Sequence[np.ndarray], path: pathlib.Path) -> None:
+    """Write the frequencies of the poles against speed, coloured by their damping ratio, with the line of the speed.
+
+    `speeds`: rpm. `poles`: of each speed, 1/s. Unstable poles are red crosses.
+    """
+    figure = Figure(figsize=(10.0, 6.4), layout="constrained")
+    ax = figure.add_subplot()
+    points = [(speed, p.imag / (2 * np.pi), -p.real / abs(p)) for speed, own in zip(speeds, poles, strict=True)
+              for p in own if p.imag > 1e-6 * abs(p)]  # fmt: skip
+    x, y, damping = (np.array(values) for values in zip(*points, strict=True))
+    stable = damping > 0
+    shown = ax.scatter(x[stable], y[stable], c=np.log10(damping[stable]), s=9, cmap="viridis", vmin=-3, vmax=0)
+    ax.scatter(x[~stable], y[~stable], c="r", marker="x", s=18)
+    ax.plot(speeds, speeds / 60, "k--", linewidth=0.8)
+    ax.annotate("1x", (speeds[-1], speeds[-1] / 60), fontsize="small")
+    light = y[damping < 0.3]
+    ax.set_ylim(0, 1.15 * max(float(np.max(light, initial=0.0)), speeds[-1] / 60))
+    ax.set_xlabel("speed, rpm")
+    ax.set_ylabel("frequency of the pole, Hz")
+    bar = figure.colorbar(shown, ticks=[-3, -2, -1, 0])
+    bar.ax.set_yticklabels(["0.001", "0.01", "0.1", "1"])
+    bar.set_label("damping ratio")
+    ax.grid(True, alpha=0.3)
+    ax.set_title(f"{title}: poles of the closed loops" + (", unstable ones as red crosses" if not stable.all() else ""))
+    figure.savefig(path, dpi=130)

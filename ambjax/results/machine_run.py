@@ -1,0 +1,85 @@
+"""Simulate the case of a whole machine."""
+
+import dataclasses
+import functools
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from ambjax.cases.machine_case import MachineCase
+from ambjax.ensemble.replay import SEGMENT
+from ambjax.numerics.records import canonical
+from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.rollout import begin, finish, recorded_segment
+from ambjax.simulation.trajectory import SIGNAL_UNITS, STATUSES
+from ambjax.simulation.whole_machine import PerAxis
+
+# Metrics of which the smallest value of the axes is the worst.
+SMALLEST = ("singular_at_s", "lost_at_s")
+
+
+@dataclasses.dataclass(frozen=True)
+class MachineRun:
+    """The result of a simulation of a machine.
+
+    - `signals`: t (s) [N], q [N, coordinates] (m or rad), speed_rpm [N], and by name each signal of the axes [N, axes].
+    - `metrics`: each metric by name, of the worst axis; under "axes", the metrics of each axis by its name.
+    - `lost_why`: why the rotor was lost; empty if it is held.
+    """
+
+    case: MachineCase
+    signals: dict[str, np.ndarray]
+    metrics: dict[str, Any]
+    lost_why: str
+
+    @property
+    def lost(self) -> bool:
+        """Whether the rotor is lost."""
+        return bool(self.metrics["lost"])
+
+    def save(self, path: str | pathlib.Path) -> None:
+        """Write the signals to an .npz file, in SI units."""
+        np.savez_compressed(path, **self.signals)  # pyright: ignore[reportArgumentType]
+
+    def plot(self) -> Any:
+        """Return a matplotlib Figure with the motion, the currents and the voltages of all axes, and the orbits."""
+        from ambjax.pictures.machine_pictures import machine_figure
+
+        return machine_figure(self.case, self.signals, self.case.name)
+
+
+# Compiled for one machine, without the one-kernel path: with arrays of axes it takes minutes to compile.
+_begun = jax.jit(begin)
+_segment = functools.partial(jax.jit, static_argnames=("count",))(recorded_segment)
+
+
+def simulate_machine(case: MachineCase, progress: Callable[[int], object] = lambda samples: None) -> MachineRun:
+    """Simulate a machine and record every sample.
+
+    `progress`: called with the number of new samples after each part of the run. A lost rotor is no error: see
+    `MachineRun.lost`. Raises ValueError as `rollout` does.
+    """
+    folds = [canonical(standard_for(case.settle, one.scenario)) for one in case.cases]
+    fold = PerAxis(jax.tree.map(lambda *x: np.stack(x), *folds))
+    machine, clock, fold = canonical((case.machine, case.clock, fold))
+    state, parts, count = _begun(machine, clock, fold), [], min(SEGMENT, clock.samples)
+    for first in range(0, clock.samples, count):
+        state, rows = _segment(machine, clock, fold, state, np.asarray(first), count=count)
+        left = min(count, clock.samples - first)
+        parts.append(jax.tree.map(lambda x, left=left: np.asarray(x)[:left], rows))
+        progress(left)
+    rows = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    outcome = finish(state, None, fold)
+    signals = {"t": rows.t, "axes": np.array(case.axes), "coordinates": np.array(case.coordinates), "q": rows.q}
+    signals |= {"speed_rpm": rows.speed * 30 / np.pi}
+    signals |= {name: np.asarray(getattr(rows.axes, name), np.float64) for name in SIGNAL_UNITS if name != "t"}
+    status = outcome.trajectory
+    why = STATUSES[int(status.lost_code)]
+    signals |= {"lost_at": np.asarray(status.lost_at), "lost_why": np.asarray(why)}
+    measured = {name: np.asarray(x) for name, x in outcome.measured.items()}
+    by_axis = {axis: {name: x[k].item() for name, x in measured.items()} for k, axis in enumerate(case.axes)}
+    worst = {name: (x.min() if name in SMALLEST else x.max()).item() for name, x in measured.items()}
+    return MachineRun(case, signals, worst | {"axes": by_axis}, why)

@@ -1,0 +1,409 @@
+"""A whole machine: one rotor on several magnetic bearing axes, each with its own sensors, amplifier and cascade.
+
+Each axis is the loop of one axis, `Sampled` or `ClosedLoop`. Axes with the same kinds of parts form a group, whose
+leaves are stacked, with a leading axis. The axes are coupled by the rotor alone: its coordinates give the motion at
+each magnet and each sensor, and the forces of the magnets accelerate the coordinates.
+"""
+
+import dataclasses
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Self, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.numerics.records import Scalar, leaf, part, record, static
+from ambjax.numerics.small_matrices import solve
+from ambjax.simulation.between import acting, lags, plant_status, under
+from ambjax.simulation.edges import NO_EDGES, Edges
+from ambjax.simulation.folds import Ending
+from ambjax.simulation.integrate import Advanced, InitialValueProblem, Integrator, in_turn
+from ambjax.simulation.loop import INSTANT_TREE, ClosedLoop, ExternalInputs, LoopState, Realised
+from ambjax.simulation.sampled import Sampled
+from ambjax.simulation.sampled_state import SampledState
+from ambjax.simulation.span import Instant, Span
+from ambjax.simulation.trajectory import DIVERGED, Row
+from ambjax.world.amplifier import Amplifier
+from ambjax.world.rotor import Rotor
+from ambjax.world.sensor import Errors, FaultyErrors, Measurement
+
+T = TypeVar("T")
+# Voltages of the groups as functions of time, or outputs of their amplifiers.
+Voltages = list
+# States of the axes, or their rates: one stacked pytree for each group, of type SampledState, LoopState or PlantOnly.
+Groups = tuple
+
+
+class MachineState(NamedTuple):
+    """State of a machine.
+
+    - `q`, `q_dot` [n]: coordinates of the rotor and their rates.
+    - `axes`: states of the groups, without displacement and velocity, which follow from q and q_dot.
+    """
+
+    q: Array
+    q_dot: Array
+    axes: Groups
+
+
+class MachineRow(NamedTuple):
+    """Signals of a machine at one sample: time (s), coordinates [n], speed (rad/s), and the rows of the axes [c]."""
+
+    t: Array
+    alive: Array
+    q: Array
+    speed: Array
+    axes: Row
+
+
+class PlantOnly(NamedTuple):
+    """State of a group of which only the plant is integrated."""
+
+    plant: Any
+
+
+@record
+class PerAxis:
+    """A fold of one axis for each axis. `fold`: the folds of the axes, stacked [c]."""
+
+    fold: Any = part(doc="the folds of the axes", channels=True)
+
+    def init(self) -> object:
+        return jax.vmap(lambda fold: fold.init())(self.fold)
+
+    def update(self, carry: object, row: Any, span: Span) -> object:
+        one = Row(*[0] * len(Row._fields))._replace(t=None, alive=None)  # pyright: ignore[reportArgumentType]
+        axes = 0, 0, one, Span(None, 0, 0, 0)  # pyright: ignore[reportArgumentType]
+        rows = row.axes._replace(t=row.t, alive=row.alive)
+        return jax.vmap(lambda fold, *now: fold.update(*now), in_axes=axes)(self.fold, carry, rows, span)
+
+    def result(self, carry: object, ending: Ending) -> Any:
+        return jax.vmap(lambda fold, own: fold.result(own, ending))(self.fold, carry)
+
+
+@record
+class Machine:
+    """A rotor on c bearing axes, as a `rollout.System`: base class of both kinds of loop."""
+
+    rotor: Rotor = part(doc="the rotor")
+    axes: tuple[Any, ...] = part(doc="the loops of the groups, `Sampled` or `ClosedLoop`, stacked", channels=True)
+    start_q: Array = leaf(shape="n", unit="m or rad", at_least=-10.0, at_most=10.0, doc="coordinates at t = 0, at rest")
+    groups: tuple[tuple[int, ...], ...] = static(doc="numbers of the axes of each group")
+    inverse: Array | None = leaf(
+        default=None, shape="n n", at_least=-1e30, at_most=1e30, optional=True, doc="inverse of the mass matrix"
+    )
+
+    @property
+    def count(self) -> int:
+        """Number of axes."""
+        return sum(map(len, self.groups))
+
+    def split(self, x: T) -> tuple[T, ...]:
+        """Return the part of each group of arrays [c, ...] of all axes."""
+        if len(self.groups) == 1:
+            return (x,)
+        return tuple(jax.tree.map(operator.itemgetter(np.array(group)), x) for group in self.groups)
+
+    def join(self, parts: Sequence[T]) -> T:
+        """Return arrays [c, ...] of all axes from those of the groups."""
+        if len(parts) == 1:
+            return parts[0]
+        order = np.argsort(np.concatenate([np.array(group) for group in self.groups]))
+        return jax.tree.map(lambda *x: jnp.concatenate(x)[order], *parts)
+
+    def each(self, function: Callable[..., T], *groups: Sequence[object]) -> list[T]:
+        """Return function(loop, ...) of every axis, stacked for each group. `groups`: further arguments."""
+        return [jax.vmap(function)(*own) for own in zip(self.axes, *groups, strict=True)]
+
+    def loops(self) -> tuple[ClosedLoop, ...]:
+        """Return the loops of the groups in continuous time."""
+        return tuple(map(loop_of, self.axes))
+
+    def plants(self, name: str) -> Array:
+        """Return a number of the plant of every axis [c]."""
+        return self.join([getattr(loop.scenario.plant, name) for loop in self.loops()])
+
+    def realised(self) -> Self:
+        """Return the machine of one member: random signals drawn, a random key for each axis, and M inverted."""
+        if self.inverse is not None:
+            return self
+        n = self.rotor.M.shape[-1]
+        key = jax.tree.map(lambda x: x[0], self.loops()[0].scenario).key()
+        inverse = solve(jnp.asarray(self.rotor.M)[None], jnp.eye(n, dtype=jnp.result_type(float))[None])[0]
+        axes = tuple(self.each(_realised, self.split(jnp.arange(self.count))))
+        return dataclasses.replace(self, rotor=self.rotor.realised(key), axes=axes, inverse=inverse)
+
+    def sensor_errors(self, sample: Scalar) -> tuple[Errors | FaultyErrors, ...]:
+        return tuple(self.each(lambda axis: axis.sensor_errors(sample)))
+
+    def start(self) -> MachineState:
+        q = jnp.asarray(self.start_q)
+        z = self.split(times(self.rotor.at_sensors, q))
+
+        def one(axis: Sampled | ClosedLoop, z: Array) -> SampledState | LoopState:
+            loop = loop_of(axis)
+            begin = dataclasses.replace(loop.scenario.initial, z=z, z_dot=jnp.zeros_like(z))
+            scenario = dataclasses.replace(loop.scenario, initial=begin)
+            return _with_loop(axis, dataclasses.replace(loop, scenario=scenario)).start()
+
+        return MachineState(q, jnp.zeros_like(q), still(self.each(one, z)))
+
+    def moving(self, rows: Array, q: Array, q_dot: Array, axes: Groups) -> Groups:
+        """Return the states of the groups with the motion at the places of `rows` [c, n]."""
+        z, z_dot = self.split(times(rows, q)), self.split(times(rows, q_dot))
+        return tuple(
+            own._replace(plant=own.plant._replace(z=a, z_dot=b)) for own, a, b in zip(axes, z, z_dot, strict=True)
+        )
+
+    def at_magnets(self, state: MachineState) -> Groups:
+        """Return the states of the groups with the motion at the magnets."""
+        return self.moving(self.rotor.at_magnets, *state)
+
+    def at_sensors(self, state: MachineState) -> Groups:
+        """Return the states of the groups with the motion at the sensors."""
+        return self.moving(self.rotor.at_sensors, *state)
+
+    def coupled(self, outside: tuple[Array, Scalar], state: MachineState, rates: Sequence) -> MachineState:
+        """Return the rates of the machine.
+
+        `outside`: other forces [n] and the speed (rad/s). `rates`: rates of the groups, of which each axis has its own
+        mass and weight.
+        """
+        (others, W), rotor = outside, self.rotor
+        accelerations = self.join([own.plant.z_dot for own in rates])
+        magnets = self.plants("m") * (accelerations + self.plants("g"))
+        forces = jnp.sum(rotor.at_magnets * magnets[:, None], 0) + others
+        forces = forces - times(rotor.D + W * rotor.G, state.q_dot) - times(rotor.K, state.q)
+        return MachineState(state.q_dot, times(self.inverse, forces), still(rates))
+
+    def outside(self, t: Scalar) -> tuple[Array, Array]:
+        """Return the forces on the coordinates other than the magnets' [n], and the speed (rad/s), at t (s)."""
+        return self.rotor.forces(t), self.rotor.speed_at(t)
+
+    def status(self, state: MachineState) -> Array:
+        """Return the status code of the rotor: the largest of its axes; DIVERGED if a coordinate is not finite."""
+        finite = 0.0 * (jnp.sum(state.q) + jnp.sum(state.q_dot)) == 0
+        at = self.at_magnets(state)
+        codes = self.join(self.each(lambda axis, own: plant_status(loop_of(axis), own.plant), at))
+        return jnp.where(finite, jnp.max(codes), DIVERGED)
+
+    def motion(self, state: MachineState) -> tuple[Array, Array]:
+        """Return displacements (m) and velocities (m/s) at the magnets [c]."""
+        return times(self.rotor.at_magnets, state.q), times(self.rotor.at_magnets, state.q_dot)
+
+    def rest(self, state: MachineState, code: Array) -> MachineState:
+        axes = self.each(lambda axis, own: axis.rest(own, code), self.at_sensors(state))
+        return MachineState(state.q, jnp.zeros_like(state.q_dot), still(axes))
+
+    def row(self, t: Scalar, state: MachineState, errors: Sequence[object], alive: Array) -> MachineRow:
+        def rows(axes: Groups) -> Row:
+            return self.join(self.each(lambda axis, own, error: axis.row(t, own, error, alive), axes, errors))
+
+        row, sensed = rows(self.at_magnets(state)), rows(self.at_sensors(state))
+        row = row._replace(z_measured=sensed.z_measured, refused=sensed.refused)
+        return MachineRow(jnp.asarray(t), alive, state.q, self.rotor.speed_at(t), row)
+
+    def completed(self, row: MachineRow, span: Span) -> MachineRow:
+        def one(axis: Sampled | ClosedLoop, row: Row, most: object, least: object, densities: object) -> Row:
+            return axis.completed(row, Span(span.time, most, least, densities))
+
+        parts = (self.split(x) for x in (row.axes, span.most, span.least, span.densities))
+        return row._replace(axes=self.join(self.each(one, *parts)))
+
+    def singularity(self, row: MachineRow) -> Array:
+        return jnp.min(self.join(self.each(lambda axis, row: axis.singularity(row), self.split(row.axes))))
+
+    def scale(self, own: Sequence) -> MachineState:
+        """Return the characteristic size of each component of the state. `own`: those of the groups' states."""
+        z, z_dot = (self.join([getattr(one.plant, name) for one in own]) for name in ("z", "z_dot"))
+        rows = jnp.max(jnp.abs(self.rotor.at_magnets) + jnp.abs(self.rotor.at_sensors), 0)
+        # a coordinate that no axis sees, such as the axial one without a thrust bearing, has the size of the others
+        rows = jnp.where(rows > 0, rows, 1.0)
+        return MachineState(jnp.max(z) / rows, jnp.max(z_dot) / rows, still(own))
+
+    def problem_of(self, inputs: Callable, observed: Callable, scale: Sequence) -> InitialValueProblem:
+        """Return the initial value problem with these inputs, rates with signals, and sizes of the groups' states."""
+        edges = Edges(self.rotor.edges(), len(self.rotor.edges()))
+        limit = self.join([jnp.asarray(loop.scenario.limit) for loop in self.loops()])
+        return InitialValueProblem(
+            inputs,
+            lambda inputs, state: observed(inputs, state)[0],
+            self.scale(scale),
+            self.status,
+            None,
+            observed,
+            jax.tree.map(lambda _: jnp.zeros(self.count), INSTANT_TREE),
+            edges=edges if edges.most else NO_EDGES,
+            motion=self.motion,
+            limit=limit,
+        )
+
+
+@record
+class SampledMachine(Machine):
+    """A machine whose cascades run on a processor, one step of all axes per sample."""
+
+    def jump(self, t: Scalar, state: MachineState, errors: Sequence[object]) -> MachineState:
+        """Step the laws of all axes at time t (s)."""
+        axes = self.each(lambda axis, own, error: axis.jump(t, own, error), self.at_sensors(state), errors)
+        return state._replace(axes=still(axes))
+
+    def advance(
+        self,
+        method: Integrator,
+        errors: object,
+        t: Scalar,
+        period: Scalar,
+        state: MachineState,
+        memory: object,
+        code: Array,
+    ) -> Advanced:
+        """Integrate rotor and coils from the sample at t (s) to the next one."""
+        finite = jnp.min(self.join([own.finite for own in state.axes]))
+        code = jnp.where((code == 0) & (finite == 0), DIVERGED, code)
+        pieces, u_a = self._pieces(jnp.asarray(t), period, state.axes)
+        begin = MachineState(state.q, state.q_dot, tuple(PlantOnly(own.plant) for own in state.axes))
+        parts = [(self._problem(state, voltages), time) for voltages, time in pieces]
+        reached = in_turn(method, parts, t, begin, memory, code)
+        states, times_of = [begin, *(after.state for after in reached)], [time for _, time in pieces]
+        z_filtered = self._filtered(jnp.asarray(t), state.axes, states, times_of)
+        end = reached[-1].state
+        ended = zip(state.axes, end.axes, z_filtered, u_a, strict=True)
+        axes = tuple(own._replace(plant=at.plant, z_filtered=z, u_a=u) for own, at, z, u in ended)
+        return reached[-1]._replace(state=MachineState(end.q, end.q_dot, axes))
+
+    def _pieces(self, t: Array, period: Scalar, axes: Groups) -> tuple[list[tuple[Voltages, Scalar]], Voltages]:
+        """Divide a sample. Return the groups' voltages as functions of time, with the durations (s) of the pieces.
+
+        The second result contains the amplifiers' outputs at the end (V). With a low-pass of a sensor, pieces also end
+        at the jumps of loads.
+        """
+        processor = loop_of(self.axes[0]).cascade.processor
+        assert processor is not None
+        delay, whole = jnp.asarray(processor.delay)[0], bool(processor.whole)
+        commands = [acting((own.command.u, *own.past), delay, period, whole) for own in axes]
+        low_passed = any(map(lags, self.loops()))
+        edges, u_a, pieces = Edges(self.rotor.edges(), len(self.rotor.edges())), [own.u_a for own in axes], []
+        for interval in zip(*commands, strict=True):
+            time = interval[0][1]
+            voltages = []
+            for k, (u, _) in enumerate(interval):
+                amplifier = self.loops()[k].scenario.amplifier
+                if isinstance(amplifier, Amplifier) and amplifier.slow:
+                    voltages.append(lambda now, a=amplifier, u=u, u_a=u_a[k], t=t: a.followed(u_a, u, now - t))
+                    u_a[k] = amplifier.followed(u_a[k], u, jnp.asarray(time))
+                else:
+                    voltages.append(lambda now, u=u: u)
+            pieces += [(voltages, length) for length in (edges.pieces(t, time) if low_passed else [time])]
+            t = t + time
+        return pieces, u_a
+
+    def _problem(self, first: MachineState, voltages: Sequence[Callable]) -> InitialValueProblem:
+        """Return the initial value problem of rotor and coils under the voltages of the groups, functions of time (V).
+
+        `first`: state at the sample.
+        """
+        sampled = self.at_magnets(first)
+
+        def inputs(t: Scalar) -> tuple[object, ...]:
+            return self.outside(t), tuple(self.each(lambda axis: axis.loop.inputs(t))), tuple(u(t) for u in voltages)
+
+        def observed(inputs: Any, state: MachineState) -> tuple[MachineState, Instant]:
+            outside, own, u = inputs
+            at = tuple(one.plant for one in self.at_magnets(state))
+
+            def one(
+                axis: Sampled, first: SampledState, own: ExternalInputs, u: Array, plant: object
+            ) -> tuple[PlantOnly, Instant]:
+                problem = under(axis.loop, first.plant, first.command, lambda _: u, NO_EDGES)
+                rates, instant = problem.rates_and_signals((own, u), plant)
+                return PlantOnly(rates), instant
+
+            parts = self.each(one, sampled, own, u, at)
+            return self.coupled(outside, state, [rates for rates, _ in parts]), self.join([x for _, x in parts])
+
+        sizes = self.each(lambda axis: PlantOnly(jax.tree.map(jnp.asarray, axis.loop.scenario.plant.scale())))
+        return self.problem_of(inputs, observed, sizes)
+
+    def _filtered(self, t: Array, axes: Groups, states: list[MachineState], durations: list[Scalar]) -> list:
+        """Return the outputs of the sensors' low-passes of the groups at the next sample, m."""
+        found = []
+        sensed = [self.at_sensors(state) for state in states]
+        for k, loop in enumerate(self.loops()):
+            z, sensor, motions = axes[k].z_filtered, loop.scenario.sensor, list[Measurement]()
+            if sensor is None or not lags(loop):
+                found.append(z)
+                continue
+            for own, n in zip(sensed, range(len(durations) + 1), strict=True):
+                motion = Measurement(own[k].plant.z, own[k].plant.z_dot, z)
+                if sensor.runout is not None:
+                    at = jnp.broadcast_to(t + sum(durations[:n]), motion.z.shape)
+                    runout, rate = jax.jvp(sensor.runout, (at,), (jnp.ones_like(at),))
+                    motion = motion._replace(z=motion.z + runout, z_dot=motion.z_dot + rate)
+                motions.append(motion)
+            for before, after, time in zip(motions, motions[1:], durations, strict=False):
+                z = sensor.lagged(z, before, after, time)
+            found.append(z)
+        return found
+
+
+@record
+class ContinuousMachine(Machine):
+    """A machine whose cascades run in continuous time."""
+
+    def problem(self, errors: Sequence[object]) -> InitialValueProblem:
+        """Return the initial value problem of one sample, with the measurement errors held."""
+
+        def inputs(t: Scalar) -> tuple[object, ...]:
+            return self.outside(t), tuple(self.each(lambda axis: axis.inputs(t)))
+
+        def observed(inputs: Any, state: MachineState) -> tuple[MachineState, Instant]:
+            outside, own = inputs
+            sensed = tuple(one.plant for one in self.at_sensors(state))
+            observe = lambda axis, *now: axis.observed(*now)  # noqa: E731
+            parts = self.each(observe, own, self.at_magnets(state), errors, sensed)
+            return self.coupled(outside, state, [rates for rates, _ in parts]), self.join([x for _, x in parts])
+
+        return self.problem_of(inputs, observed, self.each(lambda axis: axis.scale()))
+
+
+def times(matrix: Array | None, x: Array) -> Array:
+    """Return matrix @ x as a sum of products, which XLA compiles within one kernel."""
+    return jnp.sum(jnp.asarray(matrix) * x, -1)
+
+
+def still(axes: Sequence) -> Groups:
+    """Return the states of the groups, or their rates, without displacement and velocity."""
+    return tuple(own._replace(plant=own.plant._replace(z=(), z_dot=())) for own in axes)
+
+
+def loop_of(axis: Sampled | ClosedLoop) -> ClosedLoop:
+    """Return the loop of an axis in continuous time."""
+    return axis.loop if isinstance(axis, Sampled) else axis
+
+
+def _with_loop(axis: Sampled | ClosedLoop, loop: ClosedLoop) -> Sampled | ClosedLoop:
+    return dataclasses.replace(axis, loop=loop) if isinstance(axis, Sampled) else loop
+
+
+def _realised(axis: Sampled | ClosedLoop, number: Array) -> Sampled | ClosedLoop:
+    """Return the loop of one axis with its random signals drawn, and with the random key of this axis."""
+    loop = loop_of(axis.realised())
+    high, low = jax.random.key_data(jax.random.fold_in(loop.scenario.key(), number))
+    return _with_loop(axis, Realised(loop.cascade, loop.scenario, (high, low)))
+
+
+def machine_of(rotor: Rotor, axes: Sequence[Sampled | ClosedLoop], start_q: Array) -> Machine:
+    """Return the machine of a rotor and the loops of its axes, of one member. `start_q` [n]: coordinates at t = 0.
+
+    Axes with the same kinds of parts form a group.
+    """
+    numbers: dict[object, list[int]] = {}
+    for k, axis in enumerate(axes):
+        numbers.setdefault(jax.tree.structure(axis), []).append(k)
+    stacked = [jax.tree.map(lambda *x: np.stack(x), *(axes[k] for k in group)) for group in numbers.values()]
+    kind = SampledMachine if isinstance(axes[0], Sampled) else ContinuousMachine
+    return kind(rotor, tuple(stacked), start_q, tuple(map(tuple, numbers.values())))

@@ -1,0 +1,99 @@
+"""The rotor of a machine with several magnetic bearing axes: rigid, or with bending modes."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.numerics.records import Scalar, leaf, part, record
+from ambjax.numerics.smooth import TWO_PI, sine
+from ambjax.world.rotation import GRAM_MM, PER_MINUTE
+from ambjax.world.scenario import SIGNAL_STREAM, SLOTS
+from ambjax.world.signals import Signal, edges_of, realised
+
+
+def _matrix(shape: str, unit: str, doc: str) -> Any:
+    return leaf(shape=shape, unit=unit, at_least=-1e30, at_most=1e30, doc=doc)
+
+
+@record
+class RotorUnbalance:
+    """An unbalance at a place of the shaft. It turns with the rotor."""
+
+    amount: Scalar = leaf(unit="g mm", at_least=0, at_most=1e9, doc="unbalance mass times its distance from the axis")
+    along_x: Array = _matrix("n", "1", "forces on the coordinates per force along x at the place")
+    along_y: Array = _matrix("n", "1", "the same for y")
+    phase: Scalar = leaf(
+        default=0.0, unit="degrees", at_least=-1e6, at_most=1e6, doc="angle from the x axis at rotor angle 0"
+    )
+
+    def force(self, turns: Array, W: Array, W_dot: Array) -> Array:
+        """Return the forces [n] on the coordinates. `turns`: rotor angle. `W`, `W_dot`: speed (rad/s) and its rate."""
+        angle = turns + self.phase / 360
+        sin, cos = sine(angle), sine(angle + 0.25)
+        x, y = W * W * cos + W_dot * sin, W * W * sin - W_dot * cos
+        return GRAM_MM * self.amount * (self.along_x * x + self.along_y * y)
+
+
+@record
+class RotorLoad:
+    """A load on the rotor, in N, at a place and in a direction."""
+
+    signal: Signal = part(doc="the load over time, N")
+    along: Array = _matrix("n", "1", "forces on the coordinates per unit of the load")
+
+
+@record
+class Rotor:
+    """A rotor with n coordinates q and c bearing axes: M q'' + (D + W G) q' + K q = sum of b_k F_k + other forces.
+
+    W is the speed in rad/s. The first five coordinates are x, y, z (m) of the centre of mass and the tilts beta_x,
+    beta_y (rad), in the frame of the stator; z is along the shaft. Each bending mode adds two coordinates, one in x and
+    one in y. A point of the shaft at l (m from the centre of mass) moves by (x + l beta_y, y - l beta_x, z).
+    """
+
+    M: Array = _matrix("n n", "", "mass matrix")
+    D: Array = _matrix("n n", "", "damping matrix")
+    G: Array = _matrix("n n", "", "gyroscopic matrix")
+    K: Array = _matrix("n n", "", "stiffness matrix")
+    at_magnets: Array = _matrix("c n", "", "rows b_k: z_k = b_k q is the displacement at the magnet of axis k")
+    at_sensors: Array = _matrix("c n", "", "rows c_k: c_k q is what the sensor of axis k sees")
+    gravity: Array = _matrix("n", "", "weight, as forces on the coordinates")
+    speed: Scalar = leaf(default=0.0, unit="rpm", at_least=-1e7, at_most=1e7, doc="speed at t = 0")
+    acceleration: Scalar = leaf(default=0.0, unit="rpm/s", at_least=-1e9, at_most=1e9, doc="rate of the speed")
+    unbalances: tuple[RotorUnbalance, ...] = part(default=(), doc="unbalances")
+    loads: tuple[RotorLoad, ...] = part(default=(), doc="loads")
+
+    def speed_at(self, t: Scalar) -> Array:
+        """Return the speed W at time t (s), rad/s."""
+        return jnp.asarray(TWO_PI * PER_MINUTE * (self.speed + self.acceleration * t))
+
+    def forces(self, t: Scalar) -> Array:
+        """Return the weight, the unbalance forces and the loads at time t (s), on the coordinates [n]."""
+        turns = jnp.asarray(PER_MINUTE * (self.speed * t + self.acceleration * t * t / 2))
+        W, W_dot = self.speed_at(t), jnp.asarray(TWO_PI * PER_MINUTE * self.acceleration)
+        total = jnp.asarray(self.gravity)
+        for one in self.unbalances:
+            total = total + one.force(turns, W, W_dot)
+        for load in self.loads:
+            total = total + load.along * load.signal(t)
+        return total
+
+    def without_forces(self) -> "Rotor":
+        """Return the rotor with its weight, without unbalances and loads."""
+        return dataclasses.replace(self, unbalances=(), loads=())
+
+    def edges(self) -> tuple[Scalar, ...]:
+        """Return the instants (s) at which a load jumps."""
+        return tuple(edge for load in self.loads for edge in edges_of(load.signal))
+
+    def realised(self, key: Array) -> "Rotor":
+        """Return the rotor with its random loads drawn. `key`: random key of the member."""
+        key = jax.random.fold_in(key, SIGNAL_STREAM)
+        drawn = [
+            dataclasses.replace(load, signal=realised(load.signal, jax.random.fold_in(key, len(SLOTS) + n)))
+            for n, load in enumerate(self.loads)
+        ]
+        return dataclasses.replace(self, loads=tuple(drawn))

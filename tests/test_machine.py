@@ -1,0 +1,319 @@
+"""Whole machines: several axes on one rotor, against one axis, closed forms and published figures."""
+
+import copy
+import dataclasses
+import json
+import pathlib
+import tomllib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import eig
+
+from ambjax.__main__ import main
+from ambjax.cases.machine_case import machine_from, read_machine
+from ambjax.cases.reader import case_from, read_case
+from ambjax.cases.template_text import template
+from ambjax.linear import linearise
+from ambjax.linear.machine_sensitivity import linearise_machine, machine_sensitivity
+from ambjax.numerics.records import canonical
+from ambjax.results.machine_run import simulate_machine
+from ambjax.results.runs import simulate
+from ambjax.simulation.folds import Rms
+from ambjax.simulation.rollout import run
+from ambjax.simulation.whole_machine import PerAxis
+from ambjax.world.shaft import Section, shaft_model
+
+MACHINE = tomllib.loads(template("machine"))
+FLEXIBLE = tomllib.loads(template("machine-flexible"))
+
+
+def changed(raw, **tables):
+    """A copy of a raw case with other tables."""
+    return copy.deepcopy(raw) | tables
+
+
+def short(raw, samples=200, **tables):
+    """The case, simulated for a few samples."""
+    period = raw["clock"]["sample_period"]
+    return changed(raw, **({"clock": raw["clock"] | {"duration": samples * period}, "run": {"settle": 0.0}} | tables))
+
+
+@pytest.fixture(scope="module")
+def machine():
+    # without noise: each axis of a machine has a random key of its own
+    return machine_from(short(MACHINE, sensor={"velocity": False}), "machine")
+
+
+@pytest.fixture(scope="module")
+def held(machine):
+    return simulate_machine(machine)
+
+
+def test_an_uncoupled_axis_equals_the_case_of_one_axis(machine, held):
+    # The thrust axis is coupled to no other one. Its case has the same mass and no weight.
+    one = machine.cases[-1]
+    assert machine.axes[-1] == "thrust.z"
+    alone = simulate(dataclasses.replace(one, clock=machine.clock))
+    for name in ("z", "i", "u", "i_ref", "z_measured"):
+        ours, theirs = held.signals[name][:, -1], np.asarray(getattr(alone.trajectory.rows, name))
+        # rounding: the machine multiplies the acceleration by the mass and divides by it again
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-11 * np.abs(theirs).max())
+    for name in ("max_abs_u_V", "rms_error_m", "copper_loss_W"):
+        assert held.metrics["axes"]["thrust.z"][name] == pytest.approx(alone.metrics[name], rel=1e-9)
+
+
+def test_the_sensitivity_of_an_uncoupled_axis_is_that_of_one_axis(machine):
+    found = machine_sensitivity(machine.machine, machine.axes, machine.clock.sample_period, 0.0, machine.zones)
+    one = machine.cases[-1]
+    system = linearise(one.cascade, one.scenario, one.clock)
+    f = np.geomspace(1, 9000, 50)
+    ours = np.asarray(found.system.response(f))[:, 4, 4]
+    np.testing.assert_allclose(ours, system.sensitivity(f), rtol=1e-7)  # conditioning of 65 states
+    # no coupling: the other entries of its row vanish
+    assert np.abs(np.asarray(found.system.response(f))[:, 4, :4]).max() < 1e-12
+
+
+def test_nutation_and_precession_of_a_fast_rotor():
+    # Far above all loop frequencies, the free rotor nutates at W I_p/I_t; the loop moves the pole little.
+    raw = changed(MACHINE, rotor=MACHINE["rotor"] | {"I_p": 0.06, "speed": 60_000.0})
+    case = machine_from(raw)
+    system = linearise_machine(case.machine, case.clock.sample_period, 60_000.0)
+    values = np.linalg.eigvals(system.A) + 0j
+    poles = np.log(values[np.abs(values) > 1e-6]) / case.clock.sample_period
+    nutation = 2 * np.pi * 1000.0 * 0.06 / raw["rotor"]["I_t"]
+    assert np.abs(np.abs(poles.imag) - nutation).min() < 0.02 * nutation
+
+
+def test_the_free_rotor_keeps_energy_and_follows_its_unbalance(machine):
+    """The rotor alone: no magnets, so an unbalance U moves its centre by -U/m, opposite to it."""
+    rotor, U, W, t = machine.machine.rotor, 20e-6, 2 * np.pi * 100.0, 0.013
+    case = machine_from(short(MACHINE, unbalance=[{"at": 0.0, "amount": 20.0}], load=[]), "u")
+    force = np.asarray(dataclasses.replace(case.machine.rotor, gravity=np.zeros(5), speed=6000.0).forces(t))
+    direction = np.array([np.cos(W * t), np.sin(W * t)])
+    # M q'' = force, with q = -U/m (cos, sin) and q'' = -W^2 q
+    np.testing.assert_allclose(force[:2], rotor.M[0, 0] * W**2 * (U / rotor.M[0, 0]) * direction, rtol=1e-10)
+    # the gyroscopic matrix does no work, and the stiffness and mass matrices are symmetric: reciprocity
+    flexible = machine_from(short(FLEXIBLE)).machine.rotor
+    for one in (rotor, flexible):
+        np.testing.assert_allclose(one.G, -np.asarray(one.G).T, atol=1e-12)
+        np.testing.assert_allclose(one.K, np.asarray(one.K).T)
+        np.testing.assert_allclose(one.M, np.asarray(one.M).T)
+
+
+def test_a_run_up_has_the_forces_of_the_angle(machine):
+    turning = MACHINE["rotor"] | {"speed": 600.0, "acceleration": 6000.0}
+    unbalance = [{"at": 0.1, "amount": 10.0, "phase": 30.0}]
+    rotor = machine_from(short(MACHINE, rotor=turning, load=[], unbalance=unbalance)).machine.rotor
+    rotor = dataclasses.replace(rotor, gravity=np.zeros(5))
+    U = 10e-6
+
+    def place(t):
+        """Position of the unbalance mass times its mass: its acceleration is the force, with the opposite sign."""
+        angle = 2 * np.pi * (10.0 * t + 100.0 * t * t / 2) + np.pi / 6
+        return jnp.stack([U * jnp.cos(angle), U * jnp.sin(angle)])
+
+    with jax.enable_x64(True):
+        acceleration = jax.jacfwd(jax.jacfwd(place))(jnp.asarray(0.37))
+    force = np.asarray(rotor.forces(0.37))
+    np.testing.assert_allclose(force[:2], -acceleration, rtol=1e-10)
+    np.testing.assert_allclose(force[3:], [-0.1 * force[1], 0.1 * force[0]], rtol=1e-12)
+
+
+# A uniform free beam: (k l)^2 of the first three modes; Euler-Bernoulli, valid for a slender shaft.
+@pytest.mark.parametrize(("mode", "kl"), [(0, 4.730040745), (1, 7.853204624), (2, 10.99560784)])
+def test_a_slender_uniform_shaft_has_the_frequencies_of_the_beam(mode, kl):
+    length, d, E, rho = 1.0, 2e-3, 2.1e11, 7850.0
+    nodes = np.linspace(0, length, 61)
+    model = shaft_model([Section(0.0, length, d, 0.0, E, rho, 0.3)], [], nodes, [0] * 60, [0], 3)
+    area, I = np.pi / 4 * d**2, np.pi / 64 * d**4
+    expected = (kl / length) ** 2 * np.sqrt(E * I / (rho * area)) / (2 * np.pi)
+    # shear and rotary inertia lower the third mode by 4e-5 at this slenderness
+    assert float(model.frequencies[mode]) == pytest.approx(expected, rel=1e-4)
+    assert float(model.m) == pytest.approx(rho * area * length)
+    assert float(model.I_t) == pytest.approx(rho * area * length**3 / 12 + rho * I * length)
+    assert abs(float(model.shapes[0, 0])) == pytest.approx(2 / np.sqrt(float(model.m)), rel=1e-4)  # at the end
+
+
+def test_the_shaft_is_differentiable_in_its_geometry():
+    nodes = np.linspace(0, 1.0, 21)
+
+    def frequency(d):
+        return shaft_model([Section(0.0, 1.0, d, 0.0, 2.1e11, 7850.0, 0.3)], [], nodes, [0] * 20, [0], 1).frequencies[0]
+
+    slope, h = float(jax.grad(frequency)(0.02)), 1e-6
+    difference = float(frequency(0.02 + h) - frequency(0.02 - h)) / (2 * h)
+    assert slope == pytest.approx(difference, rel=1e-6)  # error of a central difference: h^2 and rounding/h
+
+
+MBTR_SHAPES = {"left": [-0.4587, -0.0004, 0.1728, 0.136, -0.2031], "right": [-0.4649, 0.0419, 0.088, -0.1208, -0.0117]}
+
+
+def test_the_rotor_of_the_munich_rig_from_its_geometry():
+    """Mass, inertia, free frequencies and shapes: published model of the TUM rig (AMrotor), 4 to 6 digits."""
+    rotor = machine_from(short(changed(FLEXIBLE, rotor=FLEXIBLE["rotor"] | {"modes": 5}))).machine.rotor
+    np.testing.assert_allclose(np.diag(rotor.M)[[0, 3]], [3.273, 0.12542], rtol=1e-4)
+    assert rotor.G[3, 4] == pytest.approx(3.643e-3, rel=1e-4)
+    frequencies = np.sqrt(np.diag(rotor.K)[5::2]) / (2 * np.pi)
+    np.testing.assert_allclose(frequencies, [22.38, 105.57, 176.53, 212.87, 607.4], rtol=1e-4)
+    for k, name in ((0, "left"), (2, "right")):
+        ours = np.asarray(rotor.at_magnets)[k, 5::2]
+        # the sign of a shape is arbitrary, and the table has four digits
+        np.testing.assert_allclose(np.abs(ours), np.abs(MBTR_SHAPES[name]), atol=2e-4)
+
+
+def test_campbell_lines_of_the_munich_rig_on_springs():
+    """On springs of 3.5e4 N/m at 2000 rpm; AMrotor's published Campbell diagram, read off to about 1 Hz."""
+    rotor = machine_from(short(changed(FLEXIBLE, rotor=FLEXIBLE["rotor"] | {"modes": 6}))).machine.rotor
+    B, n, W = np.asarray(rotor.at_magnets), len(rotor.gravity), 2000 * np.pi / 30
+    K = np.asarray(rotor.K) + 3.5e4 * B.T @ B
+    A = np.block(
+        [[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(rotor.M, K), -W * np.linalg.solve(rotor.M, rotor.G)]]
+    )
+    values, vectors = eig(A)
+    lines = {"forward": [], "backward": []}
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value.imag > 2 * np.pi * 80 and value.imag < 2 * np.pi * 300:
+            x, y = (B[k] @ vector[:n] for k in (0, 1))
+            # forward: y lags x by 90 degrees
+            lines["forward" if np.imag(x * np.conj(y)) > 0 else "backward"].append(value.imag / (2 * np.pi))
+    np.testing.assert_allclose(sorted(lines["forward"]), [125.9, 185.9, 234.0], atol=0.1)
+    np.testing.assert_allclose(sorted(lines["backward"]), [87.6, 168.0, 196.0], atol=0.1)
+
+
+class Pid:
+    """The published PID of the rig, 5000 A/m, 1500 A/(m s), 5 A s/m, with a pole of its derivative at 3e6 1/s."""
+
+    w = 3e6
+    A, B = np.array([[0.0, 0.0], [0.0, -w]]), np.array([[1.0], [1.0]])
+    C, D = np.array([[1500.0, -5.0 * w * w]]), np.array([[5000.0 + 5.0 * w]])
+
+
+def munich(folder, left, right):
+    """The rig with the linear magnets k_i = 50 N/A and k_s = 1e5 N/m and the published PID, in continuous time."""
+    from ambjax import save_controller
+
+    save_controller(folder / "pid.npz", Pid)
+    s_0, i_0, turns, mu_0 = 0.78e-3, 1.56, 208.0, 1.2566e-6
+    rotor = {key: value for key, value in FLEXIBLE["rotor"].items() if key not in ("damping", "speed")}
+    raw = {
+        # damping proportional to the stiffness, 5e-7 s: that of the published figures
+        "rotor": rotor | {"modes": 5, "gravity": [0.0] * 3, "damping": [float(np.pi * 5e-7 * f) for f in
+                          (22.378, 105.575, 176.527, 212.873, 607.44)]},
+        "bearing": [{"name": name, "kind": "radial", "at": at, "sensor_at": sensor} for name, at, sensor in
+                    (("left", 0.113, left), ("right", 0.623, right))],
+        "plant": {"mu_0": mu_0, "n": turns, "A": 50 * s_0**2 / i_0 / mu_0 / turns**2, "s_0": s_0, "i_0": i_0, "R": 0.0},
+        "actuator": {"mode": "current", "bandwidth": 1e6},
+        "controller": {"position": {"kind": "linear", "file": "pid.npz", "output": "current"},
+                       "current": {"kind": "amplifier", "bandwidth": 1e6}},
+        "clock": {"duration": 1e-3, "sample_period": 1e-6},
+    }  # fmt: skip
+    case = machine_from(raw, "munich", "", folder)
+    return machine_sensitivity(case.machine, case.axes, case.clock.sample_period, 0.0, case.zones)
+
+
+def test_the_published_controller_of_the_munich_rig(tmp_path):
+    """Poles and peaks from an independent program: real parts and frequencies (Hz) of the slow poles."""
+    found = munich(tmp_path, 0.113, 0.623)
+    slow = [pole for pole in found.poles if pole.real > -1e3 and pole.imag >= 0]
+    ours = sorted({(round(p.real, 2), round(p.imag / (2 * np.pi), 2)) for p in slow if p.imag > 1}, key=lambda p: p[1])
+    expected = [(-0.50, 16.72), (-127.45, 59.22), (-128.93, 61.10), (-0.50, 105.59), (-6.04, 176.75), (-5.20, 213.03),
+                (-8.91, 607.5)]  # fmt: skip
+    # the amplifier of 1 MHz and the pole of the derivative move the damped pair by 3e-4
+    np.testing.assert_allclose(ours, expected, rtol=2e-3, atol=0.02)
+    peaks = [axis.S.height for axis in found.axes]
+    np.testing.assert_allclose(peaks, [5.05, 5.05, 4.85, 4.85], rtol=3e-3)
+    assert found.stable
+    # the figure depends on the damping of the first mode, which is printed as 0.50 1/s, to 1 %
+    assert found.sigma.height == pytest.approx(9.71, rel=1e-2)
+    assert found.sigma.frequency == pytest.approx(16.7, rel=2e-3)
+
+
+def test_real_sensors_beside_the_magnets_make_the_munich_rig_unstable(tmp_path):
+    found = munich(tmp_path, 0.071, 0.665)
+    worst = found.poles[0]
+    assert not found.stable
+    assert worst.real == pytest.approx(46, abs=1)
+    assert abs(worst.imag) / (2 * np.pi) == pytest.approx(173, abs=1)
+    assert {axis.zone for axis in found.axes} == {"D"}
+
+
+@pytest.mark.slow
+def test_a_machine_is_differentiable_and_an_ensemble_has_one_entry_per_member(machine):
+    fold = PerAxis(jax.tree.map(lambda *x: np.stack(x), *[canonical(Rms("z"))] * 5))
+    whole, clock, fold = canonical((machine.machine, dataclasses.replace(machine.clock, samples=20), fold))
+    whole, clock, fold = jax.tree.map(jnp.asarray, (whole, clock, fold))
+
+    @jax.jit
+    def displacement(amount):
+        one = dataclasses.replace(whole.rotor.unbalances[0], amount=amount)
+        moved = dataclasses.replace(whole, rotor=dataclasses.replace(whole.rotor, unbalances=(one,)))
+        return run(moved, clock, fold, every=0).measured[0]
+
+    at, h = 20.0, 1e-2
+    slope = float(jax.grad(displacement)(at))
+    assert slope == pytest.approx(float(jax.jacfwd(displacement)(at)), rel=1e-9)
+    difference = float(displacement(at + h) - displacement(at - h)) / (2 * h)
+    assert slope == pytest.approx(difference, rel=1e-5)  # rounding/h and h^2
+    members = jax.vmap(displacement)(jnp.array([10.0, 20.0]))
+    assert float(members[1]) == pytest.approx(float(displacement(20.0)), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["machine", pytest.param("machine-flexible", marks=pytest.mark.slow)])
+def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys):
+    path = tmp_path / f"{name}.toml"
+    path.write_text(template(name))
+    assert main(["simulate", str(path), "--out", str(tmp_path / "run"), "--json"]) == 0
+    metrics = json.loads(capsys.readouterr().out)
+    assert metrics["lost"] is False
+    with np.load(tmp_path / "run" / "trajectory.npz") as arrays:
+        assert arrays["z"].shape == (len(arrays["t"]), len(arrays["axes"]))
+        assert arrays["q"].shape == (len(arrays["t"]), len(arrays["coordinates"]))
+    worst = max(one["settled_max_abs_error_m"] for one in metrics["axes"].values())
+    assert metrics["settled_max_abs_error_m"] == worst
+    assert main(["sensitivity", str(path), "--out", str(tmp_path / "s"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert {axis["zone"] for speed in found["speeds"] for axis in speed["axes"]} <= {"A", "B"}
+    assert found["peak"] == max(axis["peak"] for speed in found["speeds"] for axis in speed["axes"])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"rotor": {"kind": "rigid"}}, r"rotor\.m is missing"),
+        ({"rotor": MACHINE["rotor"] | {"I_p": 1.0}}, r"rotor\.I_p = 1: it must be at most 2 I_t"),
+        ({"rotor": MACHINE["rotor"] | {"kind": "elastic"}}, r"rotor\.kind = .*must be one of 'rigid'"),
+        ({"plant": MACHINE["plant"] | {"m": 2.0}}, r"plant\.m = 2\.0: the rotor gives it"),
+        ({"plant": MACHINE["plant"] | {"g": 9.81}}, r"plant\.g = 9\.81: the rotor gives it"),
+        ({"bearing": MACHINE["bearing"][:1]}, "determine .* of the .* rigid motions"),
+        ({"bearing": MACHINE["bearing"][2:]}, "no axis holds x, y"),
+        ({"bearing": []}, r"\[\[bearing\]\] is missing"),
+        ({"bearing": [{"kind": "radial"}]}, r"bearing\[0\]\.at is missing"),
+        ({"bearing": [MACHINE["bearing"][0]] * 2}, r"bearing\[1\]\.name = .*needs a name of its own"),
+        ({"plant": MACHINE["plant"] | {"n": 20.0}}, "must carry .* N, and its magnet gives at most"),
+        ({"disturbance": {"q_z": {"kind": "constant"}}}, r"\[disturbance\].*Use \[\[load\]\]"),
+        ({"load": [{"direction": [0, 0, 0], "kind": "constant", "value": 1.0}]}, r"load\[0\]\.direction"),
+        ({"unbalance": [{"at": 0.0}]}, r"unbalance\[0\]\.amount is missing"),
+        ({"initial": {"q": [0.0, 0.0]}}, r"initial\.q = .*a list of 5 numbers"),
+        ({"sensitivity": {"speeds": []}}, r"sensitivity\.speeds"),
+        ({"controller": {"position": {"kind": "pdi"}}}, "axis left.x: controller.position.kind"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(change, said):
+    with pytest.raises(ValueError, match=said) as refused:
+        machine_from(changed(MACHINE, **change))
+    assert "\n" not in str(refused.value)
+
+
+def test_one_axis_and_a_machine_are_not_confused(tmp_path):
+    whole, alone = tmp_path / "whole.toml", tmp_path / "alone.toml"
+    whole.write_text(template("machine"))
+    alone.write_text(template("bearing"))
+    with pytest.raises(ValueError, match="whole machine, and this takes one axis"):
+        read_case(whole)
+    with pytest.raises(ValueError, match="so it is a case of one axis"):
+        read_machine(alone)
+    assert case_from(tomllib.loads(alone.read_text())).scenario.plant.m == 2.4
+    assert pathlib.Path(whole).exists()
