@@ -21,6 +21,7 @@ from texts import piped
 import ambjax
 from ambjax import RK4, Cascade, Clock, Plant, Scenario, Sensor, Sine
 from ambjax.__main__ import main
+from ambjax.cases.reader import read_case
 from ambjax.codegen.c99 import machine
 from ambjax.codegen.c99.machine import Compiled, build
 from ambjax.codegen.c99.package import package_files
@@ -438,7 +439,7 @@ def test_the_directory_compiles_and_tests_itself(case, tmp_path, capsys):
 
 def test_export_is_the_command_as_a_function(case, tmp_path, capsys):
     assert main(["export", str(case), "--out", str(tmp_path / "c")]) == 0
-    exported = ambjax.export(ambjax.read_case(case))
+    exported = ambjax.export(read_case(case))
     assert exported.ok is None
     assert contents(exported.write(tmp_path / "python")) == contents(tmp_path / "c")
     assert "written: " + str(tmp_path / "c") + "/" + ", ".join(exported.files) in capsys.readouterr().out
@@ -457,7 +458,7 @@ def test_an_export_has_the_record_of_its_verification(case, tmp_path, monkeypatc
     bad = Check("one step, numbers", "float", "0.1 at 2 points", "<1e-5", False)
     monkeypatch.setattr("ambjax.results.case_export.verify.draft", lambda *_: types.SimpleNamespace(files={"a": "b"}))
     monkeypatch.setattr("ambjax.results.case_export.verify.verify", lambda *_: [bad])
-    exported = ambjax.export(ambjax.read_case(case), verify=True)
+    exported = ambjax.export(read_case(case), verify=True)
     assert (exported.ok, exported.checks) == (False, [bad])
     assert list(exported.files) == ["a", *VERIFIED]
     assert json.loads(exported.files["verify.json"])["checks"] == [bad._asdict()]
