@@ -4,7 +4,6 @@ import tomllib
 
 import numpy as np
 import pytest
-from profiles import examples
 from structures import drawn, solution
 
 import ambjax as amb
@@ -76,20 +75,3 @@ def test_fixed_steps_under_noise_are_accurate_for_analytic_laws_and_only_chosen_
     assert error_of(case)[0] <= 1e-10
     raw["controller"]["observer"] = {"kind": "ired-2"}
     assert not isinstance(case_from(raw).clock.method, amb.DOP853)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("part", range(examples(2, 4)))
-def test_random_structures_are_accurate(part):
-    count, errors = examples(6, 40), []
-    for seed in range(1000 + part * count, 1000 + (part + 1) * count):
-        try:
-            case = case_from(drawn(seed, 100))
-        except ValueError:
-            continue  # laws that do not fit each other
-        error, _ = error_of(case)
-        if error is not None:
-            errors.append(error)
-            print(f"{seed}: {error:.1e} m, {case.clock.method}")
-            assert error <= 1e-8, f"seed {seed}"
-    assert len(errors) > count / 2

@@ -3,7 +3,6 @@
 import dataclasses
 import errno
 import importlib
-import json
 import math
 import os
 import pathlib
@@ -19,26 +18,23 @@ from tomlkit import dumps
 
 import ambjax
 import tuning
-from ambjax.__main__ import main, parser
-from ambjax.cases.reader import case_from, read_case
+from ambjax.__main__ import main
+from ambjax.cases.reader import read_case
 from ambjax.cases.template_text import template
 from ambjax.cases.tune_table import Budget
 from ambjax.cases.warned import idealised, reversal, warnings_of
 from ambjax.commands import simulate
 from ambjax.control.processor import Processor
-from ambjax.ensemble import LogUniform
 from ambjax.numerics.declared import within
-from ambjax.numerics.records import validate
 from ambjax.pictures import overview
 from ambjax.results.outputs import files
 from ambjax.simulation.clock import Clock
 from ambjax.world.amplifier import Amplifier
-from ambjax.world.band_noise import LINES, BandNoise
 from ambjax.world.coils import TwoCoil
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Sensor
-from ambjax.world.signals import Chirp, Pulse, Sine, SmoothStep, Step, Sum
+from ambjax.world.signals import Chirp, Pulse, Sine, SmoothStep, Step
 from tuning.__main__ import main as tune
 from tuning.problem.config import read_tune, settings
 from tuning.problem.loss import Loss
@@ -64,31 +60,15 @@ def refusal(text, name="case.toml"):
 # What is wrong, the file, and what the message must contain.
 HOSTILE = {
     "nested 2,000 deep": ("a = " + "[" * 2000 + "]" * 2000, ["nested deeper"]),
-    "nested 60 deep": ("a = " + "[" * 60 + "]" * 60, ["nested deeper than 32"]),
     "tables nested 400 deep": (".".join("a" * 400) + " = 1", ["nested deeper"]),
     "400 digits": ("[plant]\nm = " + "9" * 400, ["plant.m", "digits", "from 1e-06 to 1e+06 (kg)"]),
     "5,000 digits": ("[plant]\nm = " + "9" * 5000, ["thousands of digits"]),
-    "5,000 digits in hexadecimal": ("[plant]\nm = 0x" + "f" * 5000, ["plant.m", "digits"]),
-    "5,000 digits in a list": ("[plant]\nm = [0x" + "f" * 5000 + "]", ["plant.m", "digits"]),
     "seed of 5,000 digits": ("[run]\nseed = 0x" + "f" * 5000, ["run.seed", "digits", "4294967295"]),
     "gap of an underflow": ("[plant]\ns_0 = 1e-110", ["plant.s_0 = 1e-110", "from 1e-06 to 1 (m)"]),
-    "gap of an overflow": ("[plant]\ns_0 = 1e200", ["plant.s_0 = 1e+200"]),
-    "windings of an overflow": ("[plant]\nn = 1e200", ["plant.n = 1e+200"]),
     "least mass": ("[plant]\nm = 5e-324", ["plant.m = 4.94066e-324", "from 1e-06"]),
-    "slope of an overflow": (
-        "[controller.position]\nk = 1e308\np = 1e300",
-        ["controller.position.k = 1e+308", "1e+30"],
-    ),
     "duration": ("[clock]\nduration = 1e308", ["clock.duration = 1e+308", "1e+06 (s)"]),
-    "sample period": ("[clock]\nsample_period = 5e-324", ["clock.sample_period", "from 1e-09"]),
-    "dt": ("[clock]\ndt = 5e-324", ["clock.dt", "from 1e-15"]),
     "steps for years": ('[clock]\ndt = 1e-14\nmethod = "rodas3"', ["clock.dt", "2e+14 steps", '"auto"']),
-    "supply": ("[actuator]\nu_max = 1e200", ["actuator.u_max = 1e+200", "or inf"]),
     "settle": ("[run]\nsettle = nan", ["run.settle = nan"]),
-    "spread of an overflow": (
-        "[spread]\nplant.m = { log-uniform = [1e-200, 1e200] }",
-        ["spread.plant.m", "1e+06 (kg)"],
-    ),
     "percentage of an overflow": ("[spread]\nplant.k_z = { percent = 1e308 }", ["spread.plant.k_z", "inf"]),
     "key of two lines": ('"a\\nb" = 1', ["a\\nb = 1", "unknown key"]),
     "endless key": ('[plant]\n"' + "m" * 5000 + '" = 1', ["plant.mmm", "..."]),
@@ -107,20 +87,6 @@ def test_hostile_files_are_refused_in_one_line(wrong):
     assert len(message) < 1000
     for part in wanted:
         assert part in message
-
-
-@pytest.mark.thorough
-def test_steep_but_possible_gains_run(capsys):
-    # 2/pi k p = 6e59 1/s: no step resolves it, which is no fault of the file; the run says what came of it
-    path = write(SHORT + "[controller.position]\nk = 1e30\np = 1e30\n")
-    assert main(["simulate", path, "--out", "steep", "--json"]) in (0, 1)
-    metrics = json.loads(capsys.readouterr().out)
-    numbers = {name: value for name, value in metrics.items() if name not in ("lost_why", "method", "out")}
-    assert len(numbers) > 15
-    for name, value in numbers.items():  # null stands for a time that never comes, and for nothing else
-        assert isinstance(value, (bool, int, float)) or (value is None and name.endswith("_s")), name
-    with np.load("steep/trajectory.npz") as kept:
-        assert not any(np.isnan(kept[name]).any() for name in kept if kept[name].dtype == float)
 
 
 @pytest.mark.slow
@@ -164,23 +130,11 @@ def test_every_number_has_a_lower_and_an_upper_bound():
         assert not within(field.metadata, -math.inf)
 
 
-def test_products_at_the_ends_of_the_plant_s_ranges_are_finite():
-    numbers = [field for field in dataclasses.fields(Plant) if field.metadata.get("leaf")]
-    ends = [[field.metadata[end] for end in ("at_least", "at_most")] for field in numbers]
-    plant = Plant(*(x.ravel() for x in np.meshgrid(*ends)))
-    validate(plant)
-    for name in ("kappa", "a", "L", "k_s", "k_i"):
-        # squares of them are formed, and 1/x: within the square root of what float64 holds
-        assert np.all((np.abs(getattr(plant, name)) > 1e-150) & (np.abs(getattr(plant, name)) < 1e150)), name
-
-
 # --- references ---
 
 SINE = '[reference]\nkind = "sine"\nfrequency = 2.0\n'
 FAR = {
     "sine": (SINE + "amplitude = 20e-3", ["reference reaches 0.02 m", "0.0045 m", "SI"]),
-    "step": ('[reference]\nkind = "step"\namplitude = -5e-3\nstart = 1.0', ["reaches 0.005 m"]),
-    "constant": ('[reference]\nkind = "constant"\nvalue = 2.5', ["reaches 2.5 m"]),
     "sum": (
         '[reference]\nkind = "sum"\nterms = [{ kind = "step", amplitude = 3e-3 }, '
         '{ kind = "sine", amplitude = 3e-3, frequency = 7 }]',
@@ -191,11 +145,6 @@ FAR = {
         ["reference reaches", "0.0045 m"],
     ),
     "spread": (SINE + "amplitude = 4e-3\n[spread]\nreference.amplitude = { percent = 20 }", ["spread", "0.0048 m"]),
-    "spread of a sum": (
-        '[reference]\nkind = "sum"\nterms = [{ kind = "step", amplitude = 2e-3 }, '
-        '{ kind = "sine", amplitude = 2e-3, frequency = 7 }]\n[spread]\nreference.terms.0.amplitude = { percent = 50 }',
-        ["spread.reference", "0.005 m"],
-    ),
     "gap narrowed": (SINE + "amplitude = 4e-3\n[spread]\nplant.s_0 = { percent = 20 }", ["spread", "0.0036 m"]),
     "clearance": (SINE + "amplitude = 4e-3\n[run]\nclearance = 3e-3", ["0.003 m", "run.clearance"]),
 }
@@ -203,9 +152,6 @@ NEAR = {
     "sine": SINE + "amplitude = 4.4e-3",
     "sine that never gets there": SINE + "amplitude = 20e-3\n[clock]\nduration = 0.01",
     "step after the end": '[reference]\nkind = "step"\namplitude = 5e-3\nstart = 3.0',
-    "spread of a sum": '[reference]\nkind = "sum"\nterms = [{ kind = "step", amplitude = 3e-3, start = 0.5 }, '
-    '{ kind = "step", amplitude = 2e-3 }, { kind = "step", amplitude = -2e-3, start = 0.4 }]\n'
-    "[spread]\nreference.terms.0.amplitude = { percent = 20 }",
     # the sum of its terms' bounds is 8 mm, and it never leaves 4
     "steps up and down": '[reference]\nkind = "sum"\nterms = [{ kind = "step", amplitude = 4e-3 }, '
     '{ kind = "step", amplitude = -4e-3, start = 0.5 }, { kind = "step", amplitude = 4e-3, start = 0.7 }]',
@@ -254,30 +200,16 @@ def test_the_span_of_a_signal_contains_exactly_its_values(signal):
     assert values.max() - 1e-12 <= high
 
 
-def test_the_span_of_an_ensemble_contains_every_member():
-    amplitudes = np.array([1.0, 2.0, -3.0])
-    assert Sine(amplitudes, 5.0).span(1.0) == (-3.0, 3.0)
-    assert Sum((Step(amplitudes), Step(1.0))).span(1.0) == (-2.0, 3.0)
-    # all sines of band-noise at once at their crests
-    assert BandNoise(1.0, 1.0, 2.0).span(1.0)[1] == pytest.approx(LINES * math.sqrt(2 / LINES))
-
-
 # --- warnings ---
 
 DOUBTS = {
     "gap in millimetres": ("[plant]\ns_0 = 0.4", "plant.s_0 = 0.4 m", "millimetres"),
-    "area in cm^2": ("[plant]\nA = 4.0", "plant.A = 4 m^2", "another unit"),
     "noise as large as the gap": ("[sensor]\nstd = 5e-3", "sensor.std = 0.005", "100 %"),
     "initial current": ("[initial]\ni = 0.3", "initial.i = 0.3 A", "plant.i_0 = 0.25 A"),
     "weight beyond the bias": ("[plant]\nm = 588.0", "takes 1.741 A", "plant.i_0 = 0.25 A"),
     "supply too weak": ("[actuator]\nu_max = 0.01", "actuator.u_max = 0.01 V", "0.07215 V that hold"),
     "stiffness the wrong way": ("[plant]\nk_z = 754.0", "plant.k_z = 754", "restoring"),
     "milliseconds": ("[sensor]\nstd = 1e-6\n[clock]\nsample_period = 0.1", "clock.sample_period = 0.1 s", "unstable"),
-    "noise that may go far": (
-        '[reference]\nkind = "band-noise"\nstd = 6e-4\nf_low = 1\nf_high = 99',
-        "reference: it may reach 0.0048 m",
-        "0.0045 m",
-    ),
 }
 
 
@@ -318,32 +250,6 @@ def test_a_warning_names_idealised_parts_of_the_case():
     assert "plant.kind" in idealised(read_case(write("[plant.iron]\nsaturation = 1.2\n")))
 
 
-# For each command: its arguments, and what comes after its case file is read.
-STOPS = {
-    "simulate": ([], "ambjax.commands.simulate._window"),
-    "check": ([], "ambjax.commands.check.check"),
-    "ensemble": (["--members", "2"], "ambjax.commands.ensemble.study_of"),
-    "map": (["--x", "plant.m=-1%:1%", "--y", "plant.R=-1%:1%"], "ambjax.results.case_map.study_of"),
-    "export": ([], "ambjax.results.case_export.package.package_files"),
-    "tune": ([], "tuning.command.problem_of"),
-}
-
-
-@pytest.mark.parametrize("command", STOPS)
-def test_every_command_warns_of_numbers_with_the_paper_s_value(command, capsys, monkeypatch):
-    argv, stop = STOPS[command]
-
-    def stopped(*_, **more):
-        raise ValueError("stopped here")
-
-    monkeypatch.setattr(stop, stopped)
-    path = write("[plant]\nm = 0.5\n[clock]\nduration = 0.01\n" + "[processor]\n" * (command == "export"))
-    assert (tune([path]) if command == "tune" else main([command, path, *argv])) == 2
-    (said, *_, last) = capsys.readouterr().err.splitlines()
-    assert said.startswith(f"{path}: [plant] omits numbers, which keep the paper's values: ")
-    assert last.endswith("stopped here")
-
-
 @pytest.mark.parametrize("name", ["tracking", "regulation"])
 def test_the_papers_cases_have_no_warnings(name):
     sensor = f"\n[sensor]\nstd = {math.sqrt(1e-7)}\n"
@@ -372,25 +278,6 @@ def test_a_current_above_the_bias_causes_one_warning(capsys):
 # --- spreads ---
 
 
-def test_a_logarithmic_spread_of_400_decades_does_not_overflow():
-    u = np.array([1e-16, 0.25, 0.5, 0.75, 1 - 1e-16])
-    values = LogUniform(1e-200, 1e200).quantile(u, math.nan)
-    # the logarithm is uniform: 400 decades times u, to rounding of exp at 460
-    np.testing.assert_allclose(np.log10(values), 400 * u - 200, atol=1e-9)
-
-
-def test_every_number_can_have_a_spread():
-    model, plant = (
-        [f"{where}.{field.name}" for field in dataclasses.fields(Plant) if field.metadata.get("leaf")]
-        for where in ("controller.model", "plant")
-    )
-    lines = "\n".join(f"{path} = {{ percent = 1 }}" for path in [*model, *plant])
-    gains = "".join(
-        f"\ncontroller.{path} = {{ percent = 1 }}" for path in ("position.c", "position.k", "inversion.gamma")
-    )
-    assert len(case_from(tomllib.loads(f"[spread]\n{lines}{gains}")).spread.entries) == 21
-
-
 # --- names ---
 
 
@@ -413,7 +300,7 @@ def test_the_byte_order_mark_of_an_editor_is_ignored(tmp_path):
     assert read_case(path).clock == read_case(write(SHORT, tmp_path / "plain.toml")).clock
 
 
-@pytest.mark.parametrize("code", [*range(32), 0x7F, 0x85, 0x2028, 0xDCFF])
+@pytest.mark.parametrize("code", [0, 9, 10, 13, 31, 0x7F, 0x85, 0x2028, 0xDCFF])
 def test_control_characters_are_escaped_in_the_written_toml(code):
     text = f"a{chr(code)}b"
     written = tuned("a = 1 # kept", {"b": 2.0}, text, f"first{text}\nsecond")
@@ -425,17 +312,13 @@ def test_control_characters_are_escaped_in_the_written_toml(code):
 ARGUMENTS = {
     "no name for a folder": (["simulate", "case.toml", "--out", ""], ["--out", "empty"]),
     "a folder of 300 characters": (["simulate", "case.toml", "--out", "x" * 300], ["--out xxx", "too long"]),
-    "ensemble without a folder": (["ensemble", "case.toml", "--members", "2", "--out", ""], ["--out", "empty"]),
     "member of nothing": (["simulate", "case.toml", "--member", "3"], ["--member", "[spread]"]),
     "a million processes": (["ensemble", "case.toml", "--members", "9", "--processes", "1000000"], ["1 to 1024"]),
-    "members": (["ensemble", "case.toml", "--members", "9" * 30], ["--members", "2,147,483,648"]),
     "seed": (["ensemble", "case.toml", "--members", "9", "--seed", "9" * 30], ["--seed", "4294967295"]),
 }
 MAPS = {
     "count of 1e12": ("plant.m=0.5:0.6:1000000000000", ["--x", "2 to 1,000,000"]),
-    "count of 5,000 digits": ("plant.m=0.5:0.6:" + "9" * 5000, ["--x"]),
     "beyond a field's range": ("plant.m=-1:1:3", ["--x", "from 1e-06 to 1e+06 (kg)"]),
-    "period of nothing": ("clock.sample_period=1e-300:1e-4:3", ["from 1e-09"]),
     "period that takes years": ("clock.sample_period=1e-9:1e-4:3", ["2e+09 samples", "Raise LOW"]),
     "period beyond the run": ("clock.sample_period=1e-4:5:3", ["reaches 5 s", "clock.duration is 2 s"]),
 }
@@ -479,11 +362,6 @@ def test_a_finished_study_is_not_mixed_with_a_simulation(capsys):
         assert [p.name for p in folder.iterdir()] == [kept]
 
 
-def test_member_is_accepted_if_only_the_noise_varies():
-    path = write(SHORT + "[sensor]\nstd = 1e-9\n")
-    assert simulate._study(read_case(path), parser().parse_args(["simulate", path, "--member", "3"])) is not None
-
-
 # --- disks and streams ---
 
 
@@ -523,15 +401,6 @@ def test_all_files_are_written_or_none(tmp_path):
     assert (out / "a").read_text() == "new"
 
 
-def test_json_files_move_last(tmp_path, monkeypatch):
-    moved, move = [], pathlib.Path.replace
-    monkeypatch.setattr(pathlib.Path, "replace", lambda path, to: (moved.append(path.name), move(path, to))[1])
-    with files(tmp_path) as part:
-        for name in ("report.json", "tuned.toml", "gains.png"):
-            (part / name).write_text("")
-    assert moved == ["gains.png", "tuned.toml", "report.json"]
-
-
 def shell(command):
     code = "import sys; from ambjax.__main__ import main; sys.exit(main())"
     line = command.replace("AMBJAX", f"{sys.executable} -c '{code}'")
@@ -545,16 +414,6 @@ def test_a_failed_write_to_stdout_is_reported_in_one_line():
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert "No space left on device" in done.stderr
-
-
-@pytest.mark.thorough
-def test_closed_standard_streams_do_not_change_the_results():
-    path = write(SHORT)
-    assert main(["simulate", path, "--out", "a"]) == 0
-    done = shell("AMBJAX simulate case.toml --out b --json <&- >&- 2>&-")
-    assert done.returncode == 0
-    read = [pathlib.Path(out, "trajectory.npz").read_bytes() for out in "ab"]
-    assert read[0] == read[1]
 
 
 # --- the template and [tune] ---

@@ -15,7 +15,7 @@ from ambjax.cases.reader import read_case
 from ambjax.commands.acceptance import acceptance
 from ambjax.compiler.short_compilation import QUICKEST, supported
 from ambjax.control import current, inversion, position
-from ambjax.linear import StateSpace, Zones, analyse, frequency_lines, linearise, loop_quantities, peak
+from ambjax.linear import StateSpace, Zones, frequency_lines, linearise, loop_quantities, peak
 from ambjax.linear.margins import DECAYED, decayed_end, whole_end
 
 PERIOD = 2e-5
@@ -163,21 +163,3 @@ def test_the_commands_say_that_a_larger_peak_lies_outside_the_band_of_the_case(t
     assert "an end of the measured band, so this value is not a peak" in text
     assert summary["injected_at_band_edge"]
     assert 5000 < full["injected_frequency_hz"] < 5300
-
-
-def test_the_velocity_sensor_and_KS_have_the_same_marks():
-    """All outputs of the resonance are equal, so each has the same peak outside the band."""
-    system = resonance(PERIOD)
-    system = system._replace(B=np.repeat(system.B[:, :1], 3, 1), D=np.repeat(system.D[:, :1], 3, 1))
-    low = analyse_peaks(system, Zones(f_high=2e3))
-    assert all(one.at_edge and one.outside is not None for one in low)
-    assert not any(one.at_edge or one.outside for one in analyse_peaks(system, Zones()))
-
-
-def analyse_peaks(system, zones):
-    """The peaks of `analyse`, for the loop with an unstable pole that has no effect: it has no margins."""
-    unstable = system._replace(A=np.block([[system.A, np.zeros((2, 1))], [np.zeros((1, 2)), 1.1 * np.ones((1, 1))]]),
-                               B=np.vstack([system.B, np.zeros((1, 3))]), C=np.hstack([system.C, np.zeros((5, 1))]),
-                               sizes=np.append(system.sizes, 1.0))  # fmt: skip
-    one = analyse(unstable, 1.0, PERIOD, zones, velocity=True)
-    return one.S, one.T, one.KS, one.S_velocity

@@ -1,31 +1,21 @@
 """Conditions on a processor: poles, bands and the delay margin, compared with recursions and simulated loops."""
 
 import dataclasses
-import json
 import math
 import tomllib
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
-from texts import write
 
 import ambjax as amb
-from ambjax.__main__ import main
-from ambjax.cases.controller_tables import KINDS
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
-from ambjax.control.base import default_law
 from ambjax.control.guard import Guard
-from ambjax.control.inversion import ClosedForm
 from ambjax.control.observer import Direct
 from ambjax.control.processor import Processor
 from ambjax.control.sampling import Relay, band, disturbance
 from ambjax.ensemble import delays as searched
 from ambjax.ensemble.delays import DELAYS, delay_margin
-from ambjax.extend import InversionLaw, record
 from ambjax.linear.stability import quiet
 from ambjax.results.operating import sensitivity
 from ambjax.simulation.rollout import Outcome, prepare, rollout
@@ -37,8 +27,6 @@ from ambjax.theorem.sampled_report import Delays, SampledReport, rolled
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.coils import TwoCoil
 from ambjax.world.faults import Outliers
-from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
 
 INF = math.inf
 LATE = [0.0, 0.2, 0.25, 0.4, 0.5, 0.8, 1.0, 1.3, 1.5, 2.0, 3.4]
@@ -93,10 +81,6 @@ def test_a_sign_law_stays_in_its_band_and_reaches_its_ends(implicit, p):
         assert np.abs(outside).max() <= 3 * limit * (1 + 1e-12)
     # tight where the sign is that of the step's end; else a bound, no further off than this
     assert max(np.abs(x[200:]).max() for x in runs) >= (0.999 if implicit else 0.3) * limit
-
-
-def test_the_band_is_infinite_if_the_gain_does_not_exceed_the_disturbance():
-    assert band(Relay(20.0, None), 20.0, 1e-3, implicit=True) == INF
 
 
 def cascade_of(c, k, gamma, k_i, p, **how):
@@ -167,13 +151,6 @@ def test_bounds_are_tight_without_an_estimate():
         assert lines[1].disturbance == pytest.approx(6.231e4, rel=0.05)
 
 
-def test_a_signal_outside_its_band_is_bounded_by_its_value_at_settle():
-    world = dataclasses.replace(WORLD, initial=amb.Initial(1e-3))
-    (line, *_) = sampled_report.check_sampled(cascade_of(*HARD, delay=0.0), world, LONG, 0.004).bands
-    assert "outside its band" in line.note
-    assert line.computed == line.band
-
-
 def current_of(law, late, R=0.0, implicit=True):
     """Return the poles of a current law of a coil with the resistance R; only the current law has gains."""
     model = amb.Plant(R=R)
@@ -191,20 +168,6 @@ def test_the_poles_of_a_current_law_are_those_of_the_delayed_recursion(late):
         assert found.radius == pytest.approx(np.abs(z).max(), abs=1e-7)  # a double root is exact to 1e-8
         s = np.log(z[np.abs(z) > 1e-9] + 0j)
         assert found.damping == pytest.approx((-s.real / np.abs(s)).min(initial=1.0), abs=1e-6)
-
-
-def test_dead_beat_control_one_sample_late_is_at_its_limit():
-    """w, which implicit steps do not use, has no effect. The resistance of a coil damps the oscillation by 0.2 %."""
-    for R in (0.0, 10.0):
-        slow, fast = (current_of(amb.current.DeadBeat(w=w, share=1.0), 1.0, R) for w in (100.0, 1e4))
-        assert slow == fast
-        assert slow.radius == pytest.approx(1.0, abs=1e-4)
-        assert not slow.holds
-        assert current_of(amb.current.DeadBeat(share=1.0), 0.0, R).holds
-    # explicit steps use w, and not share
-    assert current_of(amb.current.DeadBeat(w=3e3, share=1.0), 0.0, implicit=False).radius == pytest.approx(
-        0.7, rel=1e-9
-    )
 
 
 T0, SIGN = 1e-4, 2 / np.pi
@@ -251,34 +214,6 @@ def test_the_poles_of_a_law_are_those_of_its_theory(law, implicit, radius):
     assert found.implicit == (implicit and law.own_steps != ())
 
 
-RIG = amb.Plant(1.64, 0.0, 1.2566e-6, 208.0, 2.68e-4, 5e-4, 2.5, 1.0)
-POSITION = [kind for kind in KINDS["position"].values() if kind is not amb.position.LinearController]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("implicit", [True, False])
-@pytest.mark.parametrize("kind", POSITION)
-def test_the_slowest_pole_of_a_position_law_tends_to_that_in_continuous_time(kind, implicit):
-    """In continuous time, from the call of the law, not from its step; the rotor obeys the demanded force at once."""
-    law, T = default_law(kind, RIG), 1e-6
-
-    def rates(x):
-        motion = Measurement(x[0], x[1], jnp.zeros(()))
-        reference = Reference(*[jnp.zeros(())] * 3)
-        v, _ = law(RIG, (motion, reference), restore(x[2:]))
-        motion = motion._replace(i=RIG.current_for(x[0], v))
-        moved = law(RIG, (motion, reference), restore(x[2:]))[1]
-        return jnp.concatenate([jnp.stack([x[1], RIG.a * v - RIG.g]), ravel_pytree(moved)[0]])
-
-    start, restore = ravel_pytree(law.init(RIG))
-    poles = np.linalg.eigvals(jax.jacfwd(rates)(jnp.concatenate([jnp.zeros(2), start])))
-    slowest = max(pole.real for pole in poles if abs(pole) > 1e-6)
-    cascade = amb.Cascade(position=law, model=RIG, processor=Processor(0.0, implicit=implicit))
-    found = law_poles(cascade, amb.Clock(10, T))[0]
-    # the error of a step is about T times the fastest pole; the chain's are at 20 times the pole of the magnets
-    assert math.log(found.radius) / T == pytest.approx(slowest, rel=0.03)
-
-
 def test_a_sign_one_sample_late_is_unstable():
     hard, soft = cascade_of(*HARD, delay=1.0), cascade_of(*SOFT, delay=1.0, predict=False)
     late = dataclasses.replace(hard, processor=Processor(1.0, predict=False))
@@ -289,58 +224,6 @@ def test_a_sign_one_sample_late_is_unstable():
     (position, *_) = law_poles(cascade_of(3e4, 25.0, 2e6, 2000.0, 25.0), CLOCK)
     assert position.radius > 1.9
     assert not position.holds
-
-
-def test_parts_of_a_chain_that_are_off_have_no_poles():
-    """With explicit steps, the poles of a notch would be unstable; the notch is off, and nothing excites it."""
-    radius = {}
-    for w in (5e3, 4e4):
-        chain = amb.position.FilterChain(w_1=w, w_2=w)
-        cascade = amb.Cascade(position=chain, processor=Processor(0.0, implicit=False))
-        radius[w] = law_poles(cascade, CLOCK)[0].radius
-    assert radius[5e3] == radius[4e4] < 1
-
-
-def test_the_bands_are_reported_without_noise_and_with_it():
-    noisy = dataclasses.replace(WORLD, sensor=amb.Sensor(1e-6, 1e-4, 1e-4))
-    lines = sampled_report.check_sampled(cascade_of(*HARD, delay=1.0), noisy, CLOCK, 0.02).bands
-    assert [line.noise for line in lines] == [False] * 3 + [True] * 3
-    for one, other in zip(lines[:3], lines[3:], strict=True):
-        assert other.largest > 5 * one.largest
-        assert other.disturbance > 5 * one.disturbance
-
-
-@record
-class Static(InversionLaw):
-    """A static inversion without a step of its own: i_ref jumps at a sample, and i_ref' is that of continuous time."""
-
-    law: ClosedForm = ClosedForm()
-
-    def init(self, model):
-        return ()
-
-    def scale(self, model):
-        return ()
-
-    def slope(self, model):
-        return 0.0
-
-    def __call__(self, model, inputs, state):
-        return self.law(model, inputs, state)
-
-
-def test_an_alternating_voltage_is_reported():
-    world = dataclasses.replace(WORLD, u_max=200.0)
-    laws = {"chatters": Static(), "steps": amb.inversion.ClosedForm()}
-    found = {}
-    for name, law in laws.items():
-        cascade = dataclasses.replace(cascade_of(*HARD, delay=0.0), inversion=law)
-        found[name] = sampled_report.check_sampled(cascade, world, amb.Clock(1500, 1e-4), 0.05)
-    assert found["chatters"].alternating > 0.8
-    assert found["steps"].alternating < 0.01
-    for name, sampled in found.items():
-        said = " ".join(advice.processor_lines(sampled, Delays(2.0, None, None, 0.1), None))
-        assert ("The voltage alternates" in said) == (name == "chatters")
 
 
 def test_alternation_is_1_for_an_alternating_voltage_and_sin_squared_for_a_sine():
@@ -398,15 +281,6 @@ def test_the_delay_margin_without_a_known_delay_is_smaller():
     assert 1.0 < margin.held < margin.lost < 1.9
     gone = dataclasses.replace(WORLD, initial=amb.Initial(4e-3))
     assert delay_margin(cascade, gone, clock, known=False).held is None
-
-
-def test_an_assumed_delay_equal_to_the_delay_changes_nothing():
-    rows = [
-        amb.rollout(cascade_of(*HARD, delay=1.0, **more), WORLD, amb.Clock(100, 1e-4)).trajectory.rows.u
-        for more in ({}, {"assumed": 1.0})
-    ]
-    # a second part of no length is predicted, which moves nothing but another program's rounding: 1e-12 of 1.7 kV
-    np.testing.assert_allclose(*rows, rtol=0, atol=1e-9)
 
 
 def test_a_loss_in_a_narrow_interval_of_delays_is_found(monkeypatch):
@@ -488,41 +362,6 @@ duration = 0.03
 settle = 0.01
 [processor]
 """
-
-
-@pytest.mark.thorough
-@pytest.mark.usefixtures("elsewhere")
-def test_check_fails_if_an_explicit_law_is_unstable(capsys):
-    # gamma 2 p/pi T is 318, so a pole is -317;
-    # nothing loses the rotor in this time, the theorem's conditions hold, and the answer is no
-    assert main(["check", write(CASE + 'discretisation = "explicit"\npredict = false\n')]) == 1
-    said, _, theorem = capsys.readouterr().out.partition("Theorem 1:")
-    assert "The linearised loop is not stable" in said.partition("On the processor")[0]
-    assert "Yes, all 5" in theorem
-    assert "in continuous time" in theorem
-    assert "- inversion: the largest |pole| is 317.3 and must be less than 1" in said
-    assert "1 of 3 is not" in said
-    assert "The rotor is held." in said
-    assert "Delay margin" in said
-
-
-@pytest.mark.thorough
-@pytest.mark.usefixtures("elsewhere")
-def test_check_passes_for_a_stable_cascade_on_a_processor(capsys):
-    assert main(["check", write(CASE), "--json"]) == 0
-    out, progress = capsys.readouterr()
-    assert [progress.count(part) for part in ("Theorem 1", "on the processor", "delay margin")] == [1, 1, 2]
-    summary = json.loads(out)
-    assert summary["holds"]
-    assert [law["stage"] for law in summary["processor"]["laws"]] == ["position", "inversion", "current"]
-    assert set(summary["processor"]) == {
-        *("lost_at_s", "lost_why", "stalled", "laws", "bands", "distance_to_C", "distance_to_C_at_s"),
-        *("alternating", "alternates", "delay_margin", "delay_margin_unknown", "delay_margins_differ", "loss_cause"),
-        "alternation_cause",
-    }
-    margin = {"held": 2.0, "lost": None, "undecided": None, "resolution": None, "step": 1 / 256}
-    margin |= {"stable": 2.0, "swing_m": None, "current_A": None, "tested": DELAYS}
-    assert summary["processor"]["delay_margin"] == margin
 
 
 @pytest.mark.parametrize("guarded", [False, True])

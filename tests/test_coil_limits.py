@@ -13,10 +13,8 @@ from ambjax import RK4, Amplifier, Scenario, rollout
 from ambjax.cases.forces import forces
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
-from ambjax.cases.warned import warnings_of
 from ambjax.codegen.numbering import numbers_of
 from ambjax.commands.acceptance import machine
-from ambjax.linear.equilibrium import ideal
 from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.world.coil_limits import CoilLimits, difference
 from ambjax.world.coils import TwoCoil
@@ -104,17 +102,6 @@ def test_without_unidirectional_a_current_is_limited_in_both_directions():
     assert world(u_max=50.0).applied(u, state) == (u, u)
 
 
-def test_a_voltage_beyond_the_supply_is_limited():
-    # the gap of the upper coil closes at 1 m/s: keeping 4 A takes more than 10 V of back-EMF at L i v/s_0
-    plant = TwoCoil(**RIG)
-    state = at(plant, 4.0, 4.0, z_dot=-1.0)
-    need = 4.0 - plant.L * 4.0 / 5e-4
-    assert need < -10.0
-    free_voltage = world(plant, i_max=4.0).applied(jnp.asarray(30.0), state).upper
-    assert float(free_voltage) + 2.5 == pytest.approx(need, rel=1e-12)
-    assert float(world(plant, i_max=4.0, u_max=10.0).applied(jnp.asarray(30.0), state).upper) + 2.5 == -10.0
-
-
 @pytest.mark.parametrize(("i_max", "unidirectional"), [(4.0, True), (4.0, False), (None, True)])
 def test_the_current_reaches_its_limits_and_stays_within_one_step(i_max, unidirectional):
     u, scenario = 40.0, world(i_max=i_max, unidirectional=unidirectional)
@@ -135,30 +122,6 @@ def test_the_current_reaches_its_limits_and_stays_within_one_step(i_max, unidire
         assert float(longer.i_1) == pytest.approx(float(after.i_1), abs=step)
     if unidirectional:
         assert float(longer.i_2) == pytest.approx(float(after.i_2), abs=step)
-
-
-@pytest.mark.slow
-def test_gradients():
-    """The derivative di/du_max is (1 - exp(-R t/L))/R.
-
-    With all limits, the derivative with respect to R agrees with a finite difference.
-    """
-
-    def current(u_max):
-        return driven(world(u_max=u_max), 60.0, at(STILL, 2.5, 2.5)).i_1
-
-    expected = 1 - np.exp(-STEPS * STEP / L)
-    assert float(jax.grad(current)(40.0)) == pytest.approx(expected, rel=1e-11)
-
-    def force(R):
-        scenario = world(TwoCoil(**RIG | {"R": R}), u_max=40.0, i_max=9.0, unidirectional=True)
-        after = driven(scenario, 39.0, at(scenario.plant, 2.5, 2.5), 20)
-        return scenario.plant.signals(after).v
-
-    value, h = float(jax.grad(force)(1.0)), 1e-4
-    assert np.isfinite(value)
-    # central difference: h^2 of the third derivative, and rounding
-    assert value == pytest.approx(float(force(1.0 + h) - force(1.0 - h)) / (2 * h), rel=1e-6)
 
 
 def read(coil=None, actuator=None, **more):
@@ -183,11 +146,6 @@ def test_an_active_limit_acts_in_the_loop_and_an_inactive_one_does_not():
     # half of the rise within a substep, as for the limit of |i|
     assert 2.55 < np.max(held.i_2) < 2.55 + 50.5 / L * plain.clock.sample_period / 2
     assert held.u_peak.max() <= 48.0
-
-
-def test_the_linear_loop_has_no_limits():
-    limited = read({"u_max": 48.0, "i_max": 4.0, "unidirectional": True}).scenario
-    assert ideal(limited) == ideal(dataclasses.replace(limited, amplifier=None))
 
 
 def test_force_and_voltage_reserves_follow_from_the_limits():
@@ -252,14 +210,3 @@ def test_coil_limits_need_a_processor_and_a_voltage():
         case_from(laws | {"actuator": {"coil": {"i_max": 1.0}}})
     with pytest.raises(ValueError, match=r"actuator\.coil: an amplifier with mode = \"current\" has no such"):
         case_from(laws | {"actuator": {"mode": "current", "bandwidth": 1e3, "coil": {"i_max": 1.0}}})
-
-
-def test_a_useless_voltage_limit_causes_a_warning():
-    def coil_warnings(**given):
-        return [one for one in warnings_of(read(**given)) if "actuator" in one]
-
-    assert not coil_warnings(coil={"u_max": 48.0})
-    (beyond,) = coil_warnings(coil={"u_max": 30.0})
-    assert beyond.startswith("actuator.u_max = 48 V: the controller commands up to this voltage, but beyond ")
-    (unlimited,) = coil_warnings(coil={"u_max": 30.0}, actuator={"u_max": float("inf")})
-    assert unlimited.startswith("actuator.u_max is left out: ")

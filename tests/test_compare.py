@@ -9,7 +9,7 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
-from ambjax.commands import compare, comparison_report, comparison_tuning
+from ambjax.commands import compare, comparison_tuning
 from ambjax.ensemble.study import Study
 from ambjax.host import extensions
 from ambjax.linear import analyse, linearise
@@ -219,13 +219,3 @@ def test_a_missing_tuner_is_reported(monkeypatch, capsys):
     monkeypatch.setattr(extensions, "GROUP", "ambjax.none")
     assert main(["tune", "case.toml"]) == 2
     assert capsys.readouterr().err == "ambjax: tune: this command is not installed. Reinstall ambjax with pip.\n"
-
-
-@pytest.mark.parametrize(
-    ("changes", "poor"),
-    [({}, False), ({"lost": 1}, True), ({"stalled": 1}, True), ({"not_stable": 1}, True), ({"peak": None}, True)],
-)
-def test_the_text_names_the_cases_for_which_the_exit_code_is_1(changes, poor):
-    case = {"case": "soft", "lost": 0, "stalled": 0, "not_stable": 0, "peak": 2.0} | changes
-    words = comparison_report._words({"members": 8, "seed": 0, "cases": [case]})
-    assert ("not held or not stable, or a loop not stable at rest: soft" in words) == poor

@@ -16,7 +16,6 @@ import tuning.command
 import tuning.report.folder
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
-from ambjax.commands import comparison_tuning
 from ambjax.commands.comparison_tuning import tuned_cases
 from ambjax.host.interrupts import exit_on_interrupt
 
@@ -134,14 +133,6 @@ def test_a_case_without_gains_is_taken_as_it_is(world, capsys):
     assert position(found[0]) == pytest.approx(100.0, rel=0.01)
     assert capsys.readouterr().err.count("no gains to tune") == 2
     assert set(written()) == {"a"}
-
-
-def test_the_time_left_is_that_of_as_many_mean_cases():
-    words = comparison_tuning._progress("x", 2, 5, [300.0, 900.0])
-    assert "case 3 of 5" in words
-    assert "20 min" in words
-    assert "30 min left" in words
-    assert "left" not in comparison_tuning._progress("x", 0, 5, [])
 
 
 @pytest.mark.parametrize(

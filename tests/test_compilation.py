@@ -1,4 +1,4 @@
-"""Other numbers in the same structure are neither traced nor compiled again; stored values are computed once."""
+"""Other numbers in the same structure are neither traced nor compiled again."""
 
 import dataclasses
 
@@ -21,7 +21,6 @@ from ambjax import (
     position,
     rollout,
 )
-from ambjax.compiler.barrier import materialised
 
 NOISY = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.8, 1.3), sensor=Sensor(1e-6, 1e-4, 1e-4))
 SHORT = Clock(203, 1e-4, AdaptiveRodas3())
@@ -103,24 +102,3 @@ def test_integers_never_recompile(what, warm):
     before = Counting.traces
     rollout(Cascade(position=law), scenario, SHORT, every=0)
     assert Counting.traces == before
-
-
-def test_a_materialised_value_is_computed_once():
-    """Each of six rounds computes two products, and each product is used twice in the next round."""
-
-    def chain(x, y):
-        for _ in range(6):
-            x, y = materialised((x * y - y, x + y * y))
-        return x, y
-
-    x = jnp.linspace(0.1, 1.0, 64)
-    assert jax.jit(chain).lower(x, x).compile().as_text().count(" multiply(") == 12
-
-
-def test_materialising_changes_neither_value_nor_derivative():
-    x = jnp.linspace(0.1, 1.0, 8)
-    plain, kept = (lambda x: jnp.sin(x) * x), (lambda x: materialised(jnp.sin(x)) * materialised(x))
-    for way in (lambda f: f(x), lambda f: jax.vmap(f)(x), lambda f: jax.jvp(f, (x,), (x,)), lambda f: jax.jacrev(f)(x)):
-        found, expected = way(kept), way(plain)
-        # the last digit: products may be fused into sums
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=4e-16, atol=1e-16), found, expected)

@@ -176,7 +176,7 @@ LAWS = [
 
 
 # Laws that take long; the benchmark of the default gains contains every structure.
-LONG = ("super-twisting", "terminal-sliding-mode")
+LONG = ("super-twisting", "terminal-sliding-mode", "utkin-sliding-mode", "feedback-linearisation")
 
 
 @pytest.mark.parametrize(

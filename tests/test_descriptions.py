@@ -3,7 +3,6 @@
 import json
 import pathlib
 
-import numpy as np
 import pytest
 from test_end_to_end import CASES, COMMANDS, SAMPLED
 from texts import write
@@ -12,6 +11,13 @@ from ambjax.__main__ import main
 from ambjax.results import outputs
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
+EVERY = COMMANDS | SAMPLED
+EVERY |= {
+    "compare": (
+        ["compare", "case.toml", "second.toml", "--members", "4"],
+        ("compare.json", "compare.html", "compare.png"),
+    )
+}
 
 
 def broken(*_, **__):
@@ -47,10 +53,9 @@ def test_an_error_in_a_description_costs_only_that_description(name, monkeypatch
     monkeypatch.setattr(outputs, "STRICT", False)
     for function in FAILING[name]:
         monkeypatch.setattr(function, broken)
-    for file, text in zip(("first.toml", "second.toml"), CASES["bearing"], strict=True):
-        write(text, file)
-    words, names = COMMANDS[command]
-    words = [word for word in words if word not in ("--tune", "--resume")]
+    write(CASES["bearing"])
+    write(CASES["bearing"].replace("k_p = 2e5", "k_p = 3e5"), "second.toml")
+    words, names = EVERY[command]
     assert main([*words, "--out", "out"]) == 0
     out, err = capsys.readouterr()
     lines = [line for line in err.splitlines() if " is left out: " in line]
@@ -59,9 +64,8 @@ def test_an_error_in_a_description_costs_only_that_description(name, monkeypatch
         assert "TypeError: '>' not supported" in line
         assert "test_descriptions.py, line" in line
         assert "report it" in line
-    results = {name for name in names if not name.startswith("tuned-")}
     written = {path.name for path in pathlib.Path("out").iterdir()}
-    assert written >= results - missing
+    assert written >= set(names) - missing
     assert not written & missing
     assert not any(file in out for file in missing)
     for path in pathlib.Path("out").glob("*.json"):
@@ -71,8 +75,8 @@ def test_an_error_in_a_description_costs_only_that_description(name, monkeypatch
 def test_a_run_is_written_without_its_picture(monkeypatch, capsys):
     monkeypatch.setattr(outputs, "STRICT", False)
     monkeypatch.setattr("ambjax.pictures.overview.overview", broken)
-    write(CASES["bearing"][0], "first.toml")
-    assert main(["simulate", "first.toml", "--out", "out"]) == 0
+    write(CASES["bearing"])
+    assert main(["simulate", "case.toml", "--out", "out"]) == 0
     assert "overview.png is left out: TypeError" in capsys.readouterr().err
     assert {path.name for path in pathlib.Path("out").iterdir()} == {"trajectory.npz", "metrics.json"}
 
@@ -82,13 +86,13 @@ def test_a_verification_that_ends_with_an_error_is_not_a_proof(monkeypatch, caps
     monkeypatch.setattr(outputs, "STRICT", False)
     monkeypatch.setattr("ambjax.codegen.verify.verify", broken)
     monkeypatch.setattr("ambjax.codegen.verify.COUNT", 10)
-    write(CASES["bearing"][0], "first.toml")
+    write(CASES["bearing"])
     assert main([*SAMPLED["export"][0], "--out", "out"]) == 1
     out, err = capsys.readouterr()
     assert "the verification is left out: TypeError" in err
     assert "Some checks FAIL." in out
     assert json.loads(pathlib.Path("out/verify.json").read_text())["ok"] is False
-    assert pathlib.Path("out/first.c").stat().st_size > 0
+    assert pathlib.Path("out/amb_case.c").stat().st_size > 0
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
@@ -100,15 +104,3 @@ def test_an_error_that_concerns_the_result_too_is_raised(error, monkeypatch):
 
     with pytest.raises(type(error)):
         outputs.described("a picture", fail)
-
-
-def test_a_result_of_a_description_is_returned_and_errors_for_users_are_no_defects(monkeypatch, capsys):
-    monkeypatch.setattr(outputs, "STRICT", False)
-    assert outputs.described("a number", lambda: 3) == 3
-
-    def refuse():
-        raise ValueError("tune.front = 9: it must be at most 5")
-
-    assert outputs.described("the front", refuse) is None
-    assert capsys.readouterr().err == "the front is left out: tune.front = 9: it must be at most 5.\n"
-    assert np.isfinite(outputs.described("an array", lambda: np.ones(2))).all()

@@ -11,7 +11,7 @@ import re
 
 import numpy as np
 import pytest
-from reference import benchmarks, case_file, commands, fields, markdown, metrics, parser, site
+from reference import benchmarks, case_file, commands, metrics, site
 
 import ambjax
 from ambjax.__main__ import main
@@ -22,7 +22,6 @@ from ambjax.cases.table import Table
 from ambjax.control.guard import Guard
 from ambjax.numerics import declared
 from ambjax.numerics.declared import default_text
-from ambjax.results.outputs import table
 from ambjax.world.amplifier import CurrentAmplifier
 from ambjax.world.faults import Dropouts, Outliers
 from tuning.problem.config import tune_from
@@ -212,28 +211,6 @@ def test_the_python_of_the_readme_prints_the_loss_that_it_states(tmp_path, monke
     assert found == pytest.approx([first, last], abs=0.02)  # rounding errors grow: the signs have no boundary layer
 
 
-def test_text_is_escaped_in_markdown():
-    assert markdown.escaped("|z| < s_0 [m] $ `a|b`") == r"\|z\| \< s_0 \[m\] \$ `a\|b`"
-    assert markdown.table(("a", "b"), [("1", "2")], "keys")[2:5] == ["| a | b |", "|---|---|", "| 1 | 2 |"]
-
-
-def test_allowed_values_are_those_of_the_reader():
-    assert parser.rule("run.seed") == "a whole number from 0 to 4294967295"
-    assert parser.keys("initial") == ["z", "z_dot", "i"]
-    with pytest.raises(LookupError, match="allowed"):
-        parser.complaint("initial.z", 0.0)
-
-
-def test_attributes_are_documented_by_the_docstrings_below_them():
-    class Example:
-        x: float = 0.0
-        """a length, m"""
-        y: float = 0.0
-
-    assert fields.attribute_docs(Example) == {"x": "a length, m"}
-    assert [default_text(x) for x in (None, 0.5, math.inf, "auto", 1e-30)] == ["", "0.5", "inf", "auto", "1e-30"]
-
-
 def test_no_page_mentions_a_script_of_the_network():
     for path in itertools.chain(PAGES, (ROOT / "docs").glob("_*/*.*")):
         assert "://" not in path.read_text(), path
@@ -244,23 +221,3 @@ def test_the_committed_tables_are_current(name):
     path = site.FOLDER / name
     assert path.exists(), "run: python docs/reference/site.py"
     assert path.read_text(encoding="utf-8") == site.tables()[name], "run: python docs/reference/site.py"
-
-
-@pytest.mark.slow  # the slow tests run with Sphinx installed
-def test_a_printed_table_is_parsed_to_the_same_cells(monkeypatch):
-    """A table printed with `outputs.table` has the same cells in the page; the text around it is kept."""
-    pytest.importorskip("sphinx")
-    monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
-    split = importlib.import_module("printed_tables").split
-    titles, rows = (
-        ["loop", "rms error", "note"],
-        [["A, explicit", "", "lost"], ["b", "1.2 um", "two  spaces, at the end"]],
-    )
-    printed = table(titles, rows)
-    assert split(f"before\n\n{printed}\n\nafter: one two three") == [
-        "before\n",
-        [titles, *rows],
-        "\nafter: one two three",
-    ]
-    assert split(printed) == [[titles, *rows]]
-    assert split("a list\n- one\n--\n") == ["a list\n- one\n--"]

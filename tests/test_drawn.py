@@ -4,7 +4,6 @@ No figure is rendered here. Factors from SI are read from the unit that an axis 
 """
 
 import dataclasses
-import json
 import math
 import pathlib
 import re
@@ -20,7 +19,7 @@ from ambjax.commands import map as map_command
 from ambjax.ensemble.maps import PERIOD, Axis, Map
 from ambjax.pictures import fans, figures, heatmaps, histograms
 from ambjax.pictures.overview import overview
-from ambjax.pictures.thinning import BINS, envelope, stretch_of, thin
+from ambjax.pictures.thinning import BINS, thin
 from ambjax.pictures.tornado import Bar, tornado
 from ambjax.results import case_map
 from ambjax.simulation.trajectory import ALIVE, TOUCHED, Row, Trajectory
@@ -92,56 +91,6 @@ def test_a_thinned_curve_keeps_its_ends_and_the_extremes_of_every_bin(n):
             np.testing.assert_array_equal(extreme.reduceat(v, np.searchsorted(at, edges)), extreme.reduceat(y, edges))
 
 
-@pytest.mark.parametrize(
-    "gap", [slice(0, 3), slice(4711, 4712), slice(4711, 4716), slice(5000, 9000), slice(9590, 9600)]
-)
-def test_a_thinned_curve_keeps_its_gaps(gap):
-    t, y = np.arange(9600.0), a_signal(9600, 0)
-    y[gap] = np.nan
-    y[100] = -np.inf
-    x, v = thin(t, y)
-    inside = (x >= gap.start) & (x < gap.stop)
-    assert inside.any()
-    assert np.isnan(v[inside]).all()
-    # the curve ends at the last value before the gap, and begins with the first one after it
-    for beside in (gap.start - 1, gap.stop):
-        if 0 <= beside < 9600:
-            assert np.isfinite(v[x == beside]).all()
-            assert beside in x
-    finite = np.isfinite(y)
-    assert (np.nanmin(v[np.isfinite(v)]), np.nanmax(v)) == (y[finite].min(), y[finite].max())
-    assert not np.isfinite(v[x == 100]).any()
-    assert 100 in x
-
-
-@pytest.mark.parametrize(("n", "bins"), [(9600, BINS), (8001, BINS), (2001, 500), (20_011, 500), (100, BINS)])
-def test_an_envelope_encloses_every_sample_from_the_first_to_the_last(n, bins):
-    t, low = 1e-4 * np.arange(n), a_signal(n, 1)
-    high = low + np.abs(a_signal(n, 2))
-    x, lower, upper = envelope(t, low, high, bins)
-    assert (x[0], x[-1]) == (t[0], t[-1])
-    assert np.all(np.diff(x) >= 0)
-    assert (lower.min(), upper.max()) == (low.min(), high.max())
-    if n > 4 * bins:
-        of = np.searchsorted(x[::2], t, side="right") - 1  # the bin in which a sample is drawn
-        assert np.all((lower[::2][of] <= low) & (high <= upper[::2][of]))
-        assert set(of) == set(range(bins))
-        # and nothing that no sample of the bin has
-        for k in (0, bins // 2, bins - 1):
-            assert (lower[2 * k], upper[2 * k]) == (low[of == k].min(), high[of == k].max())
-    else:
-        assert (lower is low, upper is high) == (True, True)
-
-
-def test_an_interval_includes_both_ends_in_spite_of_rounding():
-    t = 1e-4 * np.arange(20_000)
-    assert t[13] > 0.0013  # by rounding
-    for low, high, first, last in ((0.0, 1.9999, 0, 19_999), (0.0005, 0.0013, 5, 13), (0.10003, 0.29997, 1000, 3000)):
-        part = np.arange(20_000)[stretch_of(t, low, high)]
-        assert part[0] in (first, first - 1)
-        assert part[-1] in (last, last + 1)
-
-
 # ---------------------------------------------------------------- runs
 
 
@@ -174,14 +123,6 @@ def test_a_figure_of_the_paper_shows_the_signals_of_its_run(number, n, lost_at, 
             (line,) = inset.lines
             np.testing.assert_allclose(line.get_xdata(), 1e3 * t[:101], rtol=ROUNDING)  # the first 10 ms
             np.testing.assert_array_equal(line.get_ydata(), run.rows.v_tilde[:101])
-
-
-def test_a_loss_after_the_last_sample_is_within_the_figure(drawn):
-    run = a_run(100, lost_at=0.00995)
-    figures.paper_figure(3, run, "", NOWHERE)
-    line = drawn[0].axes[0].lines[0]
-    assert line.get_xdata()[-1] == run.rows.t[-1]
-    assert drawn[0].axes[0].get_xlim()[1] == 0.00995
 
 
 def test_the_picture_of_the_readings_shows_their_runs(drawn):
@@ -273,17 +214,6 @@ def test_a_fan_shows_the_quantiles_of_the_members(n, drawn):
     x, y = line.get_data()
     assert (x[0], x[-1]) == (t[0], t[-1])
     np.testing.assert_allclose(y, factor * bands[50][np.searchsorted(t, x)], rtol=ROUNDING)
-
-
-def test_a_fan_ends_when_the_last_member_is_lost(drawn):
-    t, bands = np.linspace(0, 1, 101), bands_of(101)
-    for values in bands.values():
-        values[31:] = np.nan
-    fans.fan(t, {"z - r": bands}, {}, "", NOWHERE, lost_at=np.array([0.302, 0.1]))
-    ax = drawn[0].axes[0]
-    assert all(box(band)[:, 0].max() == t[30] for band in ax.collections)
-    x, y = ax.lines[0].get_data()
-    assert x[np.isfinite(y)][-1] == t[30]
 
 
 @pytest.mark.parametrize("motion", ["noise", "signs", "once per revolution", "step"])
@@ -472,14 +402,6 @@ def test_the_picture_of_the_convergence_shows_the_history_of_the_search(kept):
     ]
 
 
-def test_a_goal_far_beyond_its_limits_is_cut_in_the_convergence(kept):
-    value = np.array([[700.0, -3.0], [-5.0, -5.5]])
-    history = {"value": value, "gains": np.ones((2, 2, 1)), "members": np.array([4, 4])}
-    left = tuned.convergence(history, ["controller.position.c"]).axes[0]
-    np.testing.assert_allclose(left.lines[0].get_ydata(), np.exp([np.log(1e9) - 5.5, -5.0]), rtol=ROUNDING)
-    assert left.get_ylabel() == "objective (cut at 1e+09 times the least)"
-
-
 def test_the_picture_of_the_slices_shows_the_computed_values(kept):
     gains = np.stack([np.geomspace(1, 9, 13), np.geomspace(100, 900, 13)])
     goals = np.stack([np.linspace(-1, 6, 13) ** 2 / 9, np.linspace(2, -1, 13)])
@@ -498,15 +420,6 @@ def test_the_picture_of_the_slices_shows_the_computed_values(kept):
             np.testing.assert_array_equal(crosses.get_xdata(), gains[j, lost[j] > 0])
 
 
-def test_the_panels_of_many_gains_stand_in_rows_of_at_most_five(kept):
-    values = np.geomspace(1, 4, 13) * np.ones((7, 1))
-    figure = tuned.landscape(
-        Slices(values, values, np.zeros((7, 13), int), values), [f"controller.{x}" for x in "abcdefg"]
-    )
-    assert [ax.get_xlabel() for ax in figure.axes] == list("abcdefg")
-    assert {ax.get_subplotspec().get_gridspec().get_geometry() for ax in figure.axes} == {(2, 4)}
-
-
 def test_points_of_the_front_that_lose_members_are_marked(kept):
     rows = [
         {"settled_rms_error_m": e, "settled_rms_u_V": u, "lost": lost, "stalled": 0, "taken": e == 2e-7}
@@ -523,16 +436,3 @@ def test_points_of_the_front_that_lose_members_are_marked(kept):
 
 
 # ---------------------------------------------------------------- benchmarks
-
-
-def test_the_picture_of_the_benchmark_shows_its_results(drawn):
-    import work_precision
-
-    results = json.loads((ROOT / "benchmarks" / "results" / "work_precision.json").read_text())["cases"]
-    work_precision.draw(results)
-    for ax, (case, result) in zip(drawn[0].axes, results.items(), strict=True):
-        assert ax.get_title() == case
-        for line, (name, rows) in zip(ax.lines, result["methods"].items(), strict=False):
-            taken = [(1e3 * row["seconds"], row["error_m"]) for row in rows if row]
-            assert line.get_label() == name
-            np.testing.assert_array_equal(np.transpose(line.get_data()), taken)

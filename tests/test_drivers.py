@@ -33,14 +33,6 @@ def test_intervals_cover_the_indices_of_ishigami(n):
     assert np.all(hits > 0.95 - 0.038)
 
 
-def test_indices_of_a_sum_are_its_parts_of_the_variance():
-    weights = np.array([3.0, 2.0, 1.0, 0.0])
-    x = RNG.uniform(-1, 1, (4, 50_000))
-    found = shares(list(x), [weights @ x])
-    # the cosines miss 0.02 % of a line; the estimate's own error is 0.4 %
-    np.testing.assert_allclose(found.share[:, 0], weights**2 / np.sum(weights**2), atol=0.013)
-
-
 @pytest.mark.parametrize("n", [64, 200, 5000])
 def test_a_symmetric_effect_without_correlation_is_found(n):
     x, other = RNG.uniform(-1, 1, (2, n))
@@ -104,8 +96,3 @@ def test_a_case_without_a_spread_and_an_ensemble_with_few_members():
         for row in ranked["error"]:
             assert 0 <= row["low"] <= row["share"] <= row["high"] <= 1
             assert 0 <= row["p"] <= 1
-
-
-def test_shares_refuse_infinite_values():
-    with pytest.raises(ValueError, match="not finite"):
-        shares([np.arange(9.0)], [np.array([np.inf] * 9)])

@@ -10,7 +10,6 @@ import pytest
 
 import ambjax as amb
 from ambjax.control.processor import Processor
-from ambjax.ensemble import run_ensemble
 from ambjax.simulation.edges import Edges, most_inside
 from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.world.signals import edges_of, knots_of
@@ -112,27 +111,6 @@ def test_the_number_of_edges_inside_a_sample(scenario, most):
     assert amb.with_method(amb.Clock(10, T), SOFT, scenario).cuts == most
     clock = amb.Clock(10, T, cuts=1)  # counted for the whole of which this is a part
     assert amb.with_method(clock, SOFT, scenario).cuts == max(most, 1)
-
-
-def test_edges_of_several_periods():
-    assert most_inside(world(0.1, 0.7), np.array([1e-4, 2e-4])) == 0
-    assert most_inside(world(0.1001, 0.7), np.array([1e-4, 2e-4])) == 1
-
-
-@pytest.mark.thorough
-def test_edges_may_differ_between_members():
-    """Each member moves as in a run of its own, also if the edges are traced."""
-    starts, clock = np.array([0.002, 0.00203, 0.00217]), amb.Clock(40, T, amb.RK4(1), cuts=1)
-
-    def z(start):
-        return amb.rollout(SOFT, world(start, start + 1e-3), clock).trajectory.rows.z
-
-    alone = [z(start) for start in starts]
-    together = run_ensemble(SOFT, world(starts, starts + 1e-3), clock, fold=None, every=1).trajectory.rows.z
-    # Of 1e-5 m: rounding, which grows with the unstable pole.
-    np.testing.assert_allclose(together, alone, rtol=0, atol=1e-18)
-    traced = jax.jit(jax.vmap(z))(starts)
-    np.testing.assert_allclose(traced, alone, rtol=0, atol=1e-18)
 
 
 def test_derivatives_in_the_time_of_an_edge():

@@ -12,7 +12,6 @@ import pytest
 from test_export import compiled
 
 from ambjax import RK4, Clock, Constant, Pulse, Sensor, Sine, rollout
-from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.codegen.c99.source import Origin
@@ -135,21 +134,6 @@ def test_a_disturbance_acts_in_the_step_that_integrates_its_sample():
     np.testing.assert_allclose(x["r"], 1e-5 * np.sin(2 * np.pi * 50 * 5e-5 * (np.arange(8) + ahead)), atol=1e-15)
 
 
-@pytest.mark.slow
-def test_noise_and_disturbances_are_in_their_units():
-    sensor = Sensor(std=1e-6, std_i=1e-3, velocity=False)
-    _, _, (_, quiet, _) = plant_step(sensor=sensor)
-    _, _, (_, noisy, _) = plant_step(sensor=sensor, w_z=2.0, w_i=-1.0, w_z_dot=5.0)
-    assert noisy.z - quiet.z == pytest.approx(2e-6, rel=1e-9)
-    assert noisy.i - quiet.i == pytest.approx(-1e-3, rel=1e-9)
-    assert noisy.z_dot == 0.0  # not measured
-    period = blocks("rig")["plant"].period
-    _, _, (_, pushed, _) = plant_step(sensor=sensor, q_z=3.0, q_i=7.0)
-    # in a period of 50 us, the current that q_i drives adds 0.6 % to a constant acceleration
-    assert pushed.z_dot_true - quiet.z_dot_true == pytest.approx(3.0 * period, rel=1e-2)
-    assert pushed.i_true - quiet.i_true == pytest.approx(7.0 * period, rel=1e-2)
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -202,14 +186,3 @@ def test_the_c_of_each_block_passes_all_checks(what, name):
     mutant = re.sub(r"params->plant\.m\b", "(1.0000001 * params->plant.m)", one.files["amb.c"])
     broken = verify({"double": dataclasses.replace(one, files={**one.files, "amb.c": mutant})}, None)
     assert {x.name for x in broken if not x.ok} >= {"one step, numbers", "test program"}
-
-
-@pytest.mark.slow
-def test_the_written_files_name_the_exported_part(elsewhere, tmp_path):
-    (tmp_path / "rig.toml").write_text(template("rig"))
-    out = tmp_path / "c"
-    assert main(["export", str(tmp_path / "rig.toml"), "--what", "plant", "--out", str(out), "--json"]) == 0
-    text, header = ((out / name).read_text() for name in ("README.md", "rig.h"))
-    assert text.startswith("# rig: the plant of case 'rig' as C99")
-    assert "input.w_z_dot" not in text  # a velocity that is not measured
-    assert "rig_real w_z; /* [1] standard normal number: noise of z, divided by sensor.std */" in header

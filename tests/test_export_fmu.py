@@ -1,10 +1,8 @@
 """FMUs, run by fmpy: controller and plant in a loop are the simulator's; parameters, reset, NaN, instances, sources."""
 
 import contextlib
-import dataclasses
 import functools
 import pathlib
-import tomllib
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -12,12 +10,10 @@ import pytest
 from test_export import compiled
 from test_export_blocks import rig
 
-from ambjax import Cascade, Processor, Scenario, rollout
+from ambjax import rollout
 from ambjax.__main__ import main
-from ambjax.cases.reader import case_from, read_case
-from ambjax.cases.template_text import template
+from ambjax.cases.reader import read_case
 from ambjax.codegen.c99.source import Origin
-from ambjax.codegen.fmi import cross_check
 from ambjax.codegen.fmi.archive import packed, sources
 from ambjax.codegen.fmi.cross_check import files_of
 from ambjax.codegen.fmi.description import description, variables
@@ -26,20 +22,9 @@ from ambjax.codegen.of_case import block_of, blocks_of
 from ambjax.codegen.series import series
 from ambjax.codegen.trace import trace
 from ambjax.codegen.twins import LoopCase, horizons
-from ambjax.results.case_export import guarded_for
-from ambjax.simulation.clock import Clock
 
 ORIGIN = Origin("test", "0" * 64, [])
 F20 = pathlib.Path(__file__).parents[1] / "benchmarks" / "tasks" / "sampled" / "F20.toml"
-
-
-def test_units_are_products_of_base_units():
-    assert exponents("A^2/m^2/s") == {"m": -2, "s": -1, "A": 2}
-    assert exponents("N/A^2") == {"kg": 1, "m": 1, "s": -2, "A": -2}  # henry per metre
-    assert exponents("V s") == {"kg": 1, "m": 2, "s": -2, "A": -1}  # weber
-    assert exponents("ohm") == {"kg": 1, "m": 2, "s": -3, "A": -2}
-    assert exponents("1") == exponents("samples") == {}
-    assert exponents("furlong") is None
 
 
 @functools.cache
@@ -66,93 +51,6 @@ def test_the_description_lists_every_number_that_the_block_reads(version):
     assert all(exponents(unit) is not None for unit in units)
     references = [row.get("valueReference") for row in rows]
     assert len(set(references)) == len(references)
-
-
-def test_an_infinite_start_value_is_written_as_xml_allows():
-    cascade = Cascade(processor=Processor(1.0))
-    one = trace(block_of("controller", cascade, Scenario(), Clock(10)), "double")
-    assert 'start="INF"' in description(one, "amb", "x", "{1}", [], 3)
-    assert 'start="1e300"' in description(one, "amb", "x", "{1}", [], 2)
-
-
-def declared(record, path):
-    """The metadata of a field by its dotted name, read from the records themselves."""
-    *parts, name = path.split(".")
-    for part in parts:
-        record = getattr(record, part)
-    return next(field.metadata for field in dataclasses.fields(record) if field.name == name)
-
-
-@pytest.mark.parametrize("version", [2, 3])
-@pytest.mark.parametrize("what", ["controller", "plant", "loop"])
-def test_every_parameter_has_the_bounds_that_its_record_declares(what, version):
-    one = traced(what)
-    root = ET.fromstring(description(one, "amb", "rig", "{1}", ["amb.c"], version))
-    rows = {row.get("name"): row.find("Real") if version == 2 else row for row in root.find("ModelVariables")}
-    parts = {"controller": one.block} if what != "loop" else {"controller": one.block.controller}
-    checked = 0
-    for x in one.parameters:
-        if x.allowed == "not read":
-            continue
-        row = rows[x.name]
-        low, high, start = (row.get(name) and float(row.get(name)) for name in ("min", "max", "start"))
-        # an importer that writes the start values is not refused
-        assert low is None or low <= start
-        assert high is None or start <= high
-        name = x.name.removeprefix("controller.") if what == "loop" else x.name
-        if what == "plant" or name.startswith(("limits.", "processor.")) or (what == "loop" and name == x.name):
-            continue
-        meta = declared(parts["controller"].parameters.controller, name)
-        checked += 1
-        if meta.get("above") is not None:
-            assert low > meta["above"] >= np.nextafter(low, -1)
-        else:
-            assert low == meta.get("at_least")
-        assert high == (None if meta.get("infinite") and not meta.get("steepness") else meta.get("at_most"))
-    assert checked > 10 or what == "plant"
-    assert float(rows["processor.delay" if what == "controller" else "delay"].get("max")) in (1.0, 2.0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("fault", ["runout", "current drive", "dropouts"])
-def test_the_reference_of_a_controller_does_not_depend_on_what_a_plant_can_export(fault):
-    """The controller contains no runout, no faults of the sensor and no coil."""
-    raw = tomllib.loads(template("rig"))
-    if fault == "runout":
-        raw["sensor"]["runout"] = {"speed": 6000.0, "harmonics": [{"number": 1, "amplitude": 2e-6}]}
-    elif fault == "dropouts":
-        raw["sensor"]["dropouts"] = {"rate": 20.0}
-    else:
-        raw["actuator"] = {"mode": "current", "bandwidth": 1e3}
-        raw["controller"]["current"] = {"kind": "amplifier"}
-    raw["clock"]["duration"] = 0.01
-    del raw["run"]["settle"]
-    case = case_from(raw)
-    cascade = guarded_for(case)
-    block = block_of("controller", cascade, case.scenario, case.clock)
-    given, found = cross_check.reference(block, cascade, case.scenario, case.clock)
-    assert np.isfinite(found).all()
-    assert np.ptp(found[1:, 1]) > 0
-    # its commands in the loop of the case: the readings differ only by the noise of the current and rounding
-    u = rollout(case.cascade, case.scenario, case.clock).trajectory.rows
-    assert np.array_equal(given[:, 1], u.z_measured)
-
-
-@pytest.mark.slow
-def test_every_input_of_the_reference_acts_in_the_step_from_its_time_on():
-    """The reference of the plant is repeated by hand. Row k acts from t_k on, and its result is in row k + 1."""
-    cascade, scenario, clock = rig()
-    block = block_of("loop", cascade, scenario, clock)
-    files = files_of(block, "amb", frozenset(block.inputs), cascade, scenario, clock)
-    given, found = (np.genfromtxt(files[f"amb_{x}.csv"].splitlines()[1:], delimiter=",") for x in ("in", "ref"))
-    assert len(found) == len(given) + 1 == 201
-    np.testing.assert_array_equal(found[:-1, 0], given[:, 0])
-    rows = rollout(cascade, scenario, clock).trajectory.rows
-    # noise of the first reading is that of the first row, so that one sample differs; its force is felt for a while
-    column = 1 + list(block.outputs).index("z_true")
-    np.testing.assert_allclose(found[:2, column], rows.z[:2], rtol=0, atol=1e-15)
-    w = series(cascade, scenario, clock, 201)["w_z"]
-    np.testing.assert_array_equal(given[:, 1 + list(block.inputs).index("w_z")], w[1:])
 
 
 # --- run by fmpy ---

@@ -12,7 +12,7 @@ from test_sampled import DIFFERENCE, KALMAN, NOISE, TRACKING, World, hard, loop_
 
 import ambjax as amb
 from ambjax.cases.reader import case_from
-from ambjax.control.guard import Guard, guarded, simulated
+from ambjax.control.guard import Guard, guarded
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
 from ambjax.simulation.folds import Count, Named, Rms
@@ -141,21 +141,6 @@ def test_default_limits_accept_every_reading_of_a_sensor_without_faults():
         assert max(ends[1] - ends[0], ends[3] - ends[2]) <= guard.noise * (1 + 1e-9)
 
 
-def test_a_guard_that_cannot_act_is_removed():
-    for faults, guard, acts in (
-        ({}, Guard(), False),
-        ({}, None, False),
-        ({}, Guard(samples=5.0), True),
-        ({"outliers": Outliers()}, Guard(), True),
-        ({"outliers": Outliers()}, None, False),
-    ):
-        cascade, scenario = struck(guard, **faults)
-        assert (simulated(cascade, scenario, T).processor.guard is not None) == acts
-    settled = simulated(*struck(outliers=Outliers()), T).processor.guard
-    assert all(np.isfinite(x) for x in jax.tree.leaves(settled))
-    assert len(jax.tree.leaves(settled)) == len(dataclasses.fields(Guard))
-
-
 def test_the_laws_start_at_the_first_accepted_reading():
     cascade, scenario = struck(dropouts=Dropouts(at=0.0, duration=3 * T, value="nan"))
     scenario = dataclasses.replace(scenario, initial=amb.Initial(1e-4))
@@ -198,23 +183,6 @@ def test_the_readings_during_a_dropout(value):
     assert np.asarray(rows.alive).all()
     # the reading 0 is wrong by 157 um; a held reading is plausible
     assert np.asarray(rows.refused)[50:54].all() == (value != "hold")
-
-
-@pytest.mark.parametrize("guard", [Guard(), None], ids=["guard", "none"])
-@pytest.mark.slow
-def test_derivatives_are_finite_for_all_readings(guard):
-    cascade, scenario = struck(guard, outliers=Outliers(at=1e-3, size=1e-3), dropouts=Dropouts(at=4e-3, value="nan"))
-    cascade, clock = cascade.on_processor(), amb.Clock(60, T, amb.RK4(1))
-
-    def loss(c):
-        made = dataclasses.replace(cascade, position=dataclasses.replace(cascade.position, c=c))
-        outcome = amb.rollout(made, scenario, clock, fold=Rms("e_z"), every=0)
-        return 1e9 * outcome.measured, outcome.trajectory.lost_at
-
-    slope, lost_at = jax.jit(jax.grad(loss, has_aux=True))(1440.0)
-    assert np.isfinite(slope)
-    assert slope != 0
-    assert np.isfinite(lost_at) == (guard is None)
 
 
 CASE = {"processor": {}, "clock": {"duration": 0.01}, "sensor": {"outliers": {"rate": 3.0}}}

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from ambjax.control import inversion, position
 from ambjax.control.observer import Kalman
 from ambjax.control.processor import Processor
 from ambjax.linear import Zones, frequency_lines, injected, injected_members, linearise, peak
-from ambjax.linear.member_responses import PADDED, _padded
 from ambjax.linear.multisine import multisine
 from ambjax.simulation.sliding import Slide
 
@@ -195,35 +193,6 @@ def test_a_slow_observer_starts_at_rest_under_noise():
     assert found.lost == 0
 
 
-@pytest.mark.slow
-def test_measurements_with_other_lines_and_members_share_a_program(caplog):
-    cascade, clock = Cascade(**SMOOTH, processor=Processor(0.0)), Clock(4000, T)
-    sensor = Sensor(1e-10, 0.0, 0.0)
-    jax.config.update("jax_log_compiles", True)
-    try:
-        found = [
-            injected_members(cascade, Scenario(sensor=sensor, member=np.arange(n)), clock, f, amplitude=1e-6)
-            for n, f in ((8, [20.0, 30.0, 50.0]), (24, [20.0, 30.0, 50.0, 80.0, 100.0]))
-        ]
-    finally:
-        jax.config.update("jax_log_compiles", False)
-    names = ("Compiling jit(marked)", "Compiling jit(_blocks)")  # on the fast path, and without it
-    assert sum(message.startswith(names) for message in caplog.messages) == 1
-    # the sizes of the lines differ between the waves, but the loop is linear at this amplitude
-    assert found[1].peak[:8] == pytest.approx(found[0].peak, rel=0.01)
-
-
-@pytest.mark.parametrize("count", [1, 15, 16, 17])
-def test_lines_that_extend_a_wave_add_nothing(count):
-    """The padding's cosines are 6e-17."""
-    wave = multisine(np.arange(1, count + 1), 1000, T, 1.0)
-    extended = _padded(wave)
-    assert len(extended.harmonics) % PADDED == 0
-    for n in (0, 1, 123):
-        assert float(extended.at(jnp.asarray(n))) == pytest.approx(float(wave.at(jnp.asarray(n))), abs=1e-14)
-        assert float(extended(n * T)) == pytest.approx(float(wave(n * T)), abs=1e-14)
-
-
 def test_the_wave_repeats_exactly_and_has_the_stated_amplitude():
     wave = multisine(np.array([1, 7, 333]), 1000, T, 2e-5)
     e = np.array([wave.at(jnp.asarray(n)) for n in range(0, 3000, 10)])
@@ -232,12 +201,6 @@ def test_the_wave_repeats_exactly_and_has_the_stated_amplitude():
     assert np.abs(wave.size * every).max() == pytest.approx(2e-5, rel=1e-12)
     assert e[:100] == pytest.approx(wave.size * every[::10], abs=1e-17)
     assert float(wave(7 * T)) == pytest.approx(wave.size * every[7], abs=1e-16)
-
-
-def test_schroeder_phases_lower_the_crest_of_the_wave():
-    """The largest value of 30 lines is below 2.5 times the effective value; with equal phases it is 7.7 times."""
-    wave = multisine(np.arange(1, 31), 1000, T, 1.0)
-    assert 1 / (wave.size * np.sqrt(15)) < 2.5
 
 
 def test_lines_are_dense_near_the_peak_and_whole_harmonics():

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import RK4, AdaptiveRodas3, Plant, simulate
+from ambjax import RK4, Plant, simulate
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.world.coils import TwoCoil
@@ -72,25 +72,6 @@ def test_the_voltage_of_a_coil_is_the_rate_of_its_flux_linkage():
         assert float(moved) == pytest.approx(side * u + plant.R * (plant.i_0 - i), rel=1e-11)
 
 
-def test_saturation_scales_the_inductance_and_the_motional_voltage_of_one_current_alike():
-    """The linkage of the lower gap with the slope of saturation, and with the factor 2 of Eq. (2) for the motion."""
-    plant = made(Plant, saturation=LIMIT, leakage=1.1)
-    z, z_dot, i, u = 1e-4, 0.3, 1.5, 20.0
-    rate = plant.rates(plant.start(Measurement(*map(jnp.asarray, (z, z_dot, i)))), u).i
-
-    def linkage(i, z):  # of ideal iron: kappa i/2 (1/(s_0 + z) + 0.1/s_0)
-        return 1.2566e-6 * 208**2 * 2.68e-4 / 2 * i * (1 / (5e-4 + z) + 0.1 / 5e-4)
-
-    def density(b):
-        return b * (AIR + (1 - AIR) * (1 + (b / LIMIT) ** 4) ** -0.25)
-
-    cores = (1.2566e-6 * 208 / 2 * x * (1 / gap + 0.1 / 5e-4) for x, gap in ((4.0, 4e-4), (1.0, 6e-4)))
-    slope = sum(jax.grad(density)(b) for b in cores) / 2
-    assert slope < 0.7  # saturated
-    by_current, by_motion = (jax.grad(linkage, k)(i, z) for k in (0, 1))
-    assert float(slope * (by_current * rate + 2 * by_motion * z_dot)) == pytest.approx(u - plant.R * i, rel=1e-11)
-
-
 @PLANTS
 def test_leakage_increases_the_time_constant_but_not_the_force(kind):
     bare, leaky = kind(**RIG), made(kind, leakage=1.25)
@@ -98,14 +79,6 @@ def test_leakage_increases_the_time_constant_but_not_the_force(kind):
     ours, theirs = (jax.grad(lambda u, p=p: p.measurement(p.rates(state, u)).i)(3.0) for p in (leaky, bare))
     assert float(theirs / ours) == pytest.approx(1.25, rel=1e-12)
     assert float(leaky.signals(state).v) == pytest.approx(float(bare.signals(state).v), rel=1e-14)
-
-
-@PLANTS
-def test_ideal_iron_changes_nothing(kind):
-    bare, ideal = kind(**RIG), made(kind)
-    state = bare.start(Measurement(*map(jnp.asarray, (1e-4, 0.2, 0.7))))
-    for ours, theirs in zip(ideal.rates(state, 5.0), bare.rates(state, 5.0), strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-12)
 
 
 @PLANTS
@@ -137,12 +110,6 @@ def test_the_chosen_step_resolves_the_lag_of_the_flux(eddy, most):
     z, reference = (np.asarray(simulate(one).trajectory.rows.z) for one in (case, finer))
     np.testing.assert_allclose(z, reference, rtol=0, atol=1.3e-11)
     assert np.ptp(z) > 1e-6
-
-
-def test_a_very_short_lag_selects_a_stiff_method():
-    raw = tomllib.loads(template("rig"))
-    raw["plant"]["iron"] = {"eddy": 1e-7}
-    assert isinstance(case_from(raw).clock.method, AdaptiveRodas3)
 
 
 def test_the_iron_of_a_case_is_not_in_the_model_of_the_controller():

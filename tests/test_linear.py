@@ -1,7 +1,6 @@
 """Linear analysis: matrices against the simulation, margins against python-control, gradients, equilibria."""
 
 import dataclasses
-import tomllib
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +9,6 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from ambjax import Cascade, Clock, Plant, Scenario, Sensor
-from ambjax.cases.reader import case_from
-from ambjax.cases.template_text import template
 from ambjax.compiler.short_compilation import QUICKEST, supported
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.processor import Processor
@@ -20,18 +17,14 @@ from ambjax.linear import (
     Zones,
     analyse,
     linearise,
-    linearise_members,
     loop_quantities,
     margins_of,
     noise_gain,
     peak,
 )
 from ambjax.linear.equilibrium import ideal
-from ambjax.linear.margins import _margins, scan
-from ambjax.linear.matrices import loop_matrices
-from ambjax.numerics.records import canonical
-from ambjax.simulation.explicit import DOP853, RK4
-from ambjax.simulation.rollout import prepare, rollout
+from ambjax.simulation.explicit import DOP853
+from ambjax.simulation.rollout import prepare
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.coils import TwoCoil
 from ambjax.world.sensor import Errors
@@ -55,11 +48,6 @@ LOOPS = {
     "lags": (Processor(1.0), {"observer": observer.Kalman(w=1000.0)},
              Scenario(sensor=SLUGGISH, amplifier=Amplifier(bandwidth=1500.0, slew=1e6, dead_band=0.1)), 5e-4),
 }  # fmt: skip
-
-
-def test_options_that_this_version_of_xla_does_not_support_are_left_out():
-    level = {"xla_backend_optimization_level": 0}
-    assert supported(level | {"xla_no_such_option": True}) == level
 
 
 def loop_of(name):
@@ -173,26 +161,6 @@ def test_margins_agree_with_python_control(name):
         assert found.phase_deg == pytest.approx(abs(phase), rel=1e-9)
 
 
-@pytest.mark.slow
-def test_a_loop_without_response_at_half_the_sampling_rate_has_margins():
-    """L = 0.7 (1 + 1/z)/(z - 0.9) is exactly 0 there. The logarithm of 0 must not warn (all warnings are errors)."""
-
-    class Loop:
-        period = 1e-3
-
-        def poles(self):  # of 1 + L: z^2 - 0.2 z + 0.7 = 0
-            return np.roots([1.0, -0.2, 0.7])
-
-        def loop_transfer(self, f, place):
-            z = np.where(f == 0.5 / self.period, -1.0, np.exp(2j * np.pi * f * self.period))
-            return 0.7 * (1 + 1 / z) / (z - 0.9)
-
-    found = _margins(Loop(), "reading", scan(Loop(), 1e-3, 500.0))
-    # z^2 + (0.7 g - 0.9) z + 0.7 g = 0 has a root on the unit circle for 0.7 g = 1
-    assert found.gain_high == pytest.approx(1 / 0.7, rel=1e-6)
-    assert 0 < found.phase_deg < 90
-
-
 def test_python_control_gets_the_same_system():
     cascade, scenario, r = loop_of("true signs")
     system = linearise(cascade, scenario, CLOCK, r)
@@ -201,21 +169,6 @@ def test_python_control_gets_the_same_system():
     assert exported.dt == T
     response = exported(np.exp(2j * np.pi * f * T)).transpose(2, 0, 1)
     assert response == pytest.approx(np.asarray(system.response(f)), rel=1e-8)
-
-
-@pytest.mark.parametrize("delay", [0.0, pytest.param(1.0, marks=pytest.mark.thorough)])
-def test_the_static_stiffness_of_an_integrating_law(delay):
-    """Infinite, or 2 m / T^2 if the law integrates a prediction, which is off by T^2/2 times a constant acceleration.
-
-    Tolerance: the magnets' acceleration over the prediction, (pole T)^2 / 6.
-    """
-    raw = tomllib.loads(template("bearing"))
-    raw["processor"]["delay"] = delay
-    case = case_from(raw)
-    T, plant = float(case.clock.sample_period), case.scenario.plant
-    found = analyse(linearise(case.cascade, case.scenario, case.clock), plant.m, T).stiffness
-    expected = 2 * plant.m / T**2 if delay else np.inf
-    assert found == pytest.approx(expected, rel=(plant.pole * T) ** 2 / 6)
 
 
 def test_the_loop_becomes_unstable_at_the_delay_margin():
@@ -258,48 +211,6 @@ def test_the_noise_gain_agrees_with_a_long_run():
     assert np.std(z) == pytest.approx(noise_gain(system, T), rel=0.03)
 
 
-def peak_of(cascade, scenario):
-    system, _ = loop_matrices(cascade, scenario, jnp.asarray(T), jnp.asarray(5e-4))
-    return jnp.max(jnp.abs(system.sensitivity(jnp.geomspace(1.0, 2000.0, 50))))
-
-
-@pytest.mark.thorough
-def test_the_peak_is_differentiable_in_the_gains_and_the_plant():
-    """Forward mode, reverse mode and central differences agree along one direction.
-
-    They include the shift of the equilibrium.
-    """
-    cascade = Cascade(**SMOOTH, processor=Processor(1.0)).on_processor()
-    scenario = Scenario(plant=Plant(m=0.6, A=0.12))
-    x, restore = ravel_pytree(canonical((cascade.position, cascade.inversion.gamma, scenario.plant.A)))
-    direction = x * jnp.asarray([0.3, -0.2, 0.5, 1.0, 0.1])
-
-    def loss(x):
-        law, gamma, A = restore(x)
-        moved = dataclasses.replace(cascade.inversion, gamma=gamma)
-        world = dataclasses.replace(scenario, plant=dataclasses.replace(scenario.plant, A=A))
-        return peak_of(dataclasses.replace(cascade, position=law, inversion=moved), world)
-
-    forward = jax.jit(lambda x: jax.jvp(loss, (x,), (direction,)), compiler_options=QUICK)
-    reverse = jax.jit(jax.grad(loss), compiler_options=QUICK)
-    slope, h = float(forward(x)[1]), 1e-4
-    assert slope == pytest.approx(float(reverse(x) @ direction), rel=1e-9)
-    # central differences: h^2 = 1e-8 of the third derivative, rounding 1e-12
-    high, low = (float(forward(x + sign * h * direction)[0]) for sign in (1, -1))
-    assert (high - low) / (2 * h) == pytest.approx(slope, rel=1e-5)
-
-
-@pytest.mark.slow
-def test_an_ensemble_is_linearised_as_its_single_members():
-    scenario = Scenario(plant=Plant(m=np.array([0.55, 0.65])))
-    systems, found = linearise_members(Cascade(**SMOOTH), scenario, CLOCK)
-    assert found.all()
-    for k, m in enumerate((0.55, 0.65)):
-        alone = linearise(Cascade(**SMOOTH), Scenario(plant=Plant(m=m)), CLOCK)
-        for a, b in zip(systems[:5], alone[:5], strict=True):
-            assert a[k] == pytest.approx(b, rel=1e-7, abs=1e-12)
-
-
 def test_a_missing_equilibrium_is_reported_in_one_line():
     """The rotor is heavier than the model by 6 m/s^2 of force, and the switching gain gives 5."""
     heavy, laws = Scenario(plant=Plant(m=1.5)), SMOOTH | {"position": position.SlidingMode(c=200.0, k=5.0, p=5.0)}
@@ -328,13 +239,3 @@ def test_an_unstable_loop_has_no_margins():
     assert analysis.zone == "D"
     assert analysis.margins.phase_deg == 0
     assert analysis.noise == np.inf
-
-
-def test_the_step_of_the_case_has_no_effect_on_the_linearisation():
-    """The tuner linearises tuned gains with the clock of the case. Its step may be far too coarse for these gains."""
-    coarse = dataclasses.replace(Clock(samples=100), method=RK4(substeps=1))
-    stiff = Cascade(inversion=inversion.Adaptive(gamma=1.8e7))
-    with pytest.raises(ValueError, match="stable only up to"):
-        rollout(stiff, Scenario(), coarse)
-    A, same = (np.asarray(linearise(stiff, Scenario(), clock).A) for clock in (coarse, Clock(samples=100)))
-    np.testing.assert_array_equal(A, same)

@@ -9,7 +9,6 @@ import importlib.resources
 import json
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from javascript import run_rows, with_node
@@ -22,7 +21,7 @@ from ambjax.control import current, inversion
 from ambjax.control.base import default_law
 from ambjax.control.processor import Processor
 from ambjax.control.sampling import Sampling
-from ambjax.linear import StateSpace, linearise, loop_quantities
+from ambjax.linear import StateSpace, linearise
 from ambjax.numerics.records import canonical
 from ambjax.page.functions import PRELUDE
 from ambjax.page.linear_script import linear_script
@@ -83,23 +82,6 @@ def test_a_small_deviation_decays_if_and_only_if_the_linear_loop_is_stable(mode,
         # a deviation that grows may end in a small limit cycle of the signs
         decays = np.max(size[-200:]) < np.max(size[:200]) < 1e6
         assert decays if system.stable else np.max(size) > 10, (growth, np.max(size), np.max(size[-200:]))
-
-
-@pytest.mark.slow
-def test_a_state_that_never_changes_is_no_mode_of_the_tuner_s_loop():
-    """Two stable modes, -3 and -5 1/s, and a constant that the second drives nothing with: its growth is not 0."""
-    A = np.array([[-3.0, 0.0, 2.0], [0.0, -5.0, 1.0], [0.0, 0.0, 0.0]])
-    B, C = np.array([[1.0] * 3, [0.5] * 3, [0.0] * 3]), np.ones((4, 3))
-    system = StateSpace(*map(jnp.asarray, (A, B, C, np.eye(4, 3), np.ones(3))))
-    assert system.idle().tolist() == [False, False, True]
-    smaller = system.without_idle()
-    assert smaller.stable
-    smaller = jax.tree.map(jnp.asarray, smaller)
-    numbers = jnp.asarray(True), 1.0, 10.0, 1.0
-    whole, part = (loop_quantities(one, *numbers, delay=False) for one in (system, smaller))
-    assert float(whole.growth) == pytest.approx(-3.0, rel=1e-12)
-    # the peak of the smaller system, found by the same scan
-    assert float(whole.sensitivity) == pytest.approx(float(part.sensitivity), rel=1e-9)
 
 
 def test_a_pole_on_the_border_is_stable_only_up_to_rounding_errors():

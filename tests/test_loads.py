@@ -11,7 +11,6 @@ import pytest
 import ambjax as amb
 from ambjax.cases.reader import case_from, read_case
 from ambjax.commands.sensitivity import references
-from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import apply
 from ambjax.linear import linearise
 from tuning.report.tuned import tuned_case
@@ -45,15 +44,6 @@ def test_disturbances_of_several_units_act_together():
     np.testing.assert_allclose(one.acceleration(T), expected, rtol=1e-12, atol=1e-12)
     assert one.edges() == (0.1,)
     assert one.undisturbed().acceleration(0.2) == 0
-
-
-def test_paths_of_disturbances_in_one_unit_and_in_several():
-    def paths(q_z):
-        return {p for p in places(amb.Cascade(), world(disturbance={"q_z": q_z})) if p.startswith("disturbance.q_")}
-
-    assert {"disturbance.q_z.amplitude", "disturbance.q_z.shift"} <= paths(STEP | {"unit": "N"})
-    assert "disturbance.q_z.terms.1.frequency" in paths([STEP | {"unit": "N"}, SINE | {"unit": "N"}])
-    assert {"disturbance.q_z.frequency", "disturbance.q_f.start"} <= paths([STEP | {"unit": "N"}, SINE])
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,7 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.commands import map as commands
 from ambjax.ensemble import Normal, Spread, maps, wilson
-from ambjax.ensemble.maps import PERIOD, Axis, grid, with_method_for_axes
-from ambjax.ensemble.store import MANIFEST
+from ambjax.ensemble.maps import Axis, grid
 from ambjax.ensemble.study import Study
 from ambjax.simulation.folds import Peak
 
@@ -81,31 +80,6 @@ def test_one_member_is_the_nominal_case():
     several = grid(dataclasses.replace(wide, members=2), x, y)
     assert several.drawn == ("initial.z",)
     assert np.all(several.error > 10 * nominal.error)  # thrown off by 100 times what noise does
-
-
-@pytest.mark.slow
-def test_stalled_runs_are_counted_separately():
-    # two trials a sample are too few for the transient from 10 um at these gains, and enough from the balance
-    clock = Clock(20, 1e-4, AdaptiveRodas3(1e-8, 2))
-    study = dataclasses.replace(basin("repaired"), clock=clock)
-    z = Axis("initial.z", np.array([0.0, 1e-4]))
-    found = grid(study, z, Axis("plant.m", np.array([0.588])))
-    np.testing.assert_array_equal(found.survival + found.lost + found.stalled, 1)  # each run has one status
-    assert found.stalled[0, 1] == 1
-    assert found.lost.sum() == 0
-
-
-@pytest.mark.thorough
-def test_the_sample_period_can_be_either_axis():
-    period, std = Axis(PERIOD, np.array([1e-4, 5e-4])), Axis("sensor.std", np.array([1e-8, 1e-7, 1e-6]))
-    one, other = grid(SMALL, std, period), grid(SMALL, period, std)
-    np.testing.assert_array_equal(one.survival, other.survival.T)
-    np.testing.assert_array_equal(one.error, other.error.T)
-    slow = dataclasses.replace(SMALL, clock=dataclasses.replace(SMALL.clock, samples=10, sample_period=5e-4))
-    alone = grid(slow, std, Axis("plant.m", np.array([0.588])))
-    np.testing.assert_allclose(
-        one.error[1], alone.error[0], rtol=1e-11
-    )  # the mass is shared in one, an array in the other
 
 
 CASE = """
@@ -177,28 +151,6 @@ def test_the_axes_are_checked_for_every_case_before_any_run(x, y, words, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("kind", ["a file", "a study"])
-def test_an_unusable_output_folder_is_refused_before_any_run(kind, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(maps, "run_ensemble", None)
-    (tmp_path / "case.toml").write_text(CASE)
-    out = tmp_path / "out"
-    if kind == "a file":
-        out.touch()
-    else:
-        out.mkdir()
-        (out / MANIFEST).touch()
-    assert main(["map", str(tmp_path / "case.toml"), "--x", X, "--y", Y, "--out", str(out)]) == 2
-    assert f"--out {out}: " in capsys.readouterr().err.splitlines()[-1]
-
-
-def test_a_whole_number_may_be_an_axis_of_whole_numbers():
-    study = dataclasses.replace(SMALL, scenario=dataclasses.replace(NOISY, sensor=Sensor(1e-7, bits=12.0)))
-    mass = Axis("plant.m", np.array([0.588]))
-    assert with_method_for_axes(study, Axis("sensor.bits", np.linspace(2, 14, 13)), mass) == study
-    with pytest.raises(ValueError, match=r"sensor.bits must be a whole number"):
-        with_method_for_axes(study, Axis("sensor.bits", np.linspace(2, 14, 12)), mass)
-
-
 def made(survival, members, **changes):
     """Return a map with these survivals [ny, nx]."""
     survival = np.asarray(survival, float)
@@ -224,17 +176,6 @@ def test_confidence_is_stated_if_the_number_of_members_allows_it(members):
     assert "surely" not in commands._text([case], [alike])
     assert "all runs of a cell are the same" in commands._text([case], [alike])
     assert commands._summary(case, alike)["decisive"] is False
-
-
-def test_the_reported_surviving_interval_has_no_gap():
-    assert made([[1, 0, 1, 1, 1, 0]], 1).reach() == (2.0, 4.0)
-    assert made([[0, 0.9]], 10).reach() is None
-    assert made([[0, 0], [1, 1], [0, 0], [1, 1]], 1).reach() == (0.0, 1.0)  # of the two middle rows, the lower
-    # an end of the interval at an end of the map is not a limit of the rotor
-    ends = {(1, 0, 1, 1, 1, 0): "", (1, 1, 0): " (lower end of the map)", (1, 1): " (lower and upper end of the map)"}
-    for survival, words in ends.items():
-        one = made([survival], 1)
-        assert commands._open_ends(one, one.reach()) == words
 
 
 @pytest.mark.slow

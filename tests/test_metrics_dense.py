@@ -2,10 +2,7 @@
 
 import dataclasses
 import functools
-import json
-import pathlib
 
-import numpy as np
 import pytest
 from dense import metrics
 from oracle import World
@@ -141,42 +138,3 @@ def test_every_metric_agrees_with_a_dense_solution(name, method):
         else:
             rel = max(TOLERANCES.get(key, SMOOTH), least_tolerance(name, method))
             assert ours == pytest.approx(theirs, rel=rel, abs=1e-12), key
-
-
-TASKS = pathlib.Path(__file__).parents[1] / "benchmarks"
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", ["A", "C"])
-def test_settled_metrics_of_the_tuned_gains_of_the_benchmarks_agree_with_a_dense_solution(name):
-    """The gains are those of results/tasks.json.
-
-    The metrics count from 0.2 s on, as in the tables of the benchmarks.
-    """
-    gains = json.loads((TASKS / "results" / "tasks.json").read_text())["tasks"][name]["gains"]
-    c, k, gamma, k_i, *pole = gains.values()
-    observer = ("complementary", {"l": pole[0], "z_hat": 0.0}) if pole else None
-    laws = {"position": smc(c, k), "inversion": adaptive(gamma), "current": current(k_i)} | (
-        {"observer": observer} if pole else {}
-    )
-    world = World(**laws, reference=sine(), u_max=200.0)  # the disturbance comes later
-    std = (3.1623e-4, 0.0, 0.0) if pole else (1e-6, 1e-4, 1e-4)
-    samples, first = 2200, 2000
-    found, noise = numbers(world, std, samples, first * PERIOD, Slide(3 * REFINEMENT))
-    expected = metrics(world, samples, PERIOD, first * PERIOD, noise)
-    for key in ("rms_u_V", "settled_rms_u_V"):
-        assert found[key] == pytest.approx(expected[key], rel=0.01), key  # seen: 0.8 %
-    # seen: 3e-9 m, of a drift within so short a window
-    assert found["settled_rms_error_m"] == pytest.approx(expected["settled_rms_error_m"], abs=5e-9)
-
-
-@pytest.mark.slow
-def test_the_rms_voltage_includes_the_voltage_between_samples():
-    """At the samples, where the noise jumps, u is always at the limit of the supply; between samples it is lower."""
-    world, std = LOOPS["stiff under noise, limited supply"]
-    cascade, scenario, _ = in_ambjax(Case("", world, samples=200))
-    scenario = dataclasses.replace(scenario, sensor=Sensor(*std))
-    out = rollout(cascade, scenario, Clock(200, PERIOD, AdaptiveRodas3()), fold=Standard(5e-3))
-    instants = np.sqrt(np.mean(np.asarray(out.trajectory.rows.u)[50:] ** 2))
-    assert instants > 190
-    assert out.measured["settled_rms_u_V"] < 60

@@ -1,4 +1,4 @@
-"""A custom plant and a custom law, defined in this file: simulated, checked, spread, mapped and tuned.
+"""A custom plant and a custom law, defined in this file: simulated, checked and spread.
 
 The plant has a coil with its own current on each side; the law a boundary layer in place of a smoothed sign, and gains
 of its own names. Nothing in the package knows either.
@@ -6,7 +6,6 @@ of its own names. Nothing in the package knows either.
 
 import dataclasses
 import itertools
-import math
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -19,7 +18,6 @@ from ambjax import (
     AdaptiveRodas3,
     Cascade,
     Clock,
-    Constant,
     Initial,
     Pulse,
     Scenario,
@@ -29,10 +27,7 @@ from ambjax import (
     inversion,
     rollout,
 )
-from ambjax.cases.reader import Case
-from ambjax.cases.table import Table
-from ambjax.ensemble import Normal, Percent, Spread, run_ensemble
-from ambjax.ensemble.maps import Axis, grid
+from ambjax.ensemble import Normal, Percent, Spread
 from ambjax.ensemble.study import Study
 from ambjax.extend import (
     Bearing,
@@ -51,9 +46,6 @@ from ambjax.extend import (
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.metrics import standard_for
 from ambjax.theorem.conditions import check
-from tuning.problem.config import tune_from
-from tuning.problem.tuning_problem import problem_of
-from tuning.rounds import rounds
 
 
 class Coils(NamedTuple):
@@ -179,15 +171,6 @@ def test_a_custom_law_and_plant_are_simulated():
 
 
 @pytest.mark.slow
-def test_a_lost_custom_plant_is_frozen():
-    weak = dataclasses.replace(CASCADE, inversion=inversion.Adaptive(1e3, 25e-6))
-    outcome = rollout(weak, SCENARIO, CLOCK.with_method(AdaptiveRodas3()), fold=standard_for(0.01, SCENARIO))
-    assert bool(outcome.measured["lost"])
-    assert abs(float(outcome.trajectory.rows.z[-1])) == SCENARIO.touchdown
-    assert all(np.all(np.isfinite(x)) for x in outcome.trajectory.rows)
-
-
-@pytest.mark.slow
 def test_a_custom_law_and_plant_are_checked():
     report = check(CASCADE, SCENARIO, CLOCK)
     assert report.holds
@@ -217,66 +200,6 @@ def test_the_numbers_of_a_custom_law_and_plant_are_spread():
     # the same arithmetic in another order
     assert float(alone["rms_error_m"]) == pytest.approx(columns["rms_error_m"][5], rel=1e-9)
     assert study.fingerprint()["plant.kind"] == "TwoCoils"
-
-
-@pytest.mark.slow
-def test_the_numbers_of_a_custom_law_and_plant_are_axes_of_a_map():
-    study = Study(CASCADE, NOISY, Clock(200, 1e-4, METHOD), 0.01, Spread(), seed=3, members=1)
-    found = grid(study, Axis(RHO, np.array([10.0, 40.0])), Axis(SKEW, np.array([-0.1, 0.0, 0.1])))
-    assert found.survival.shape == (3, 2)
-    assert np.all(found.survival == 1)
-    both = np.array([10.0, 40.0])
-    cascade = dataclasses.replace(CASCADE, position=dataclasses.replace(CASCADE.position, rho=both))
-    scenario = dataclasses.replace(NOISY, seed=3, plant=TwoCoils(skew=0.1))
-    alone = run_ensemble(cascade, scenario, study.clock, fold=standard_for(0.01, scenario)).measured
-    np.testing.assert_allclose(found.error[2], alone["settled_max_abs_error_m"], rtol=1e-9)
-
-
-def tuning_problem():
-    """A tuning problem with the custom parts, its settings and its case."""
-    scenario = dataclasses.replace(NOISY, q_v=Constant(), initial=Initial())
-    slow = dataclasses.replace(CASCADE, position=BoundaryLayer(rho=5.0))
-    case = Case("own", slow, scenario, Clock(200, 1e-4), 0.005, Spread(((SKEW, Normal(0.02)),)))
-    paths = [f"controller.{path}" for path in ("position.decay", "position.rho", "position.width")]
-    budget = {
-        "objective": "least_error",
-        "limits": {"sensitivity": math.inf},
-        "members": 4,
-        "stressed": 2,
-        "validation": 8,
-        "held_out": 8,
-        "screen": 4,
-        "starts": 1,
-        "iterations": 3,
-    }
-    tune = tune_from(Table({"gains": paths, **budget}), case)
-    return problem_of(case, tune), tune, case
-
-
-def test_the_gains_of_a_custom_law_have_paths_and_ranges():
-    problem, tune, case = tuning_problem()
-    every = tune_from(Table({}), case).space.paths
-    assert every == [*tune.space.paths, "controller.inversion.gamma", "controller.current.k_i"]
-    assert (
-        problem_of(case, tune, finer=2).objective.clock.method.substeps == 2 * problem.objective.clock.method.substeps
-    )
-    rho = problem.ranges[1]
-    assert rho.source.startswith("slope rho/width from w/3")
-    width = problem.ranges[2]  # of which the law says nothing
-    assert (width.low, width.high) == pytest.approx((0.05 / 30, 0.05 * 30))
-    assert next(bound for bound in problem.goal.conditions if bound.path == RHO).symbol == "Q_z"
-
-
-@pytest.mark.thorough
-def test_a_search_improves_the_gains_of_a_custom_law(tmp_path):
-    problem, tune, case = tuning_problem()
-    start = tune.space.values(case.cascade)
-    answer = rounds(problem, start, tmp_path, {"case": "own parts"}, False)
-    history = answer.history["value"]
-    assert np.nanmin(history) < history[0].max()
-    gains = np.asarray(answer.problem.objective.space.gains_at(answer.x))
-    assert np.all(np.isfinite(gains))
-    assert np.any(gains != start)
 
 
 def test_a_law_without_the_base_class_is_refused():

@@ -80,15 +80,6 @@ def test_ranges_contain_the_values_of_every_preset(case):
             assert one.low <= value <= one.high, one.path
 
 
-def test_the_ranges_of_the_clearance_and_of_the_start_contain_values_close_to_the_gap(case):
-    plant, stop = case.scenario.plant, 0.99 * float(case.scenario.plant.s_0)
-    initial = dataclasses.replace(case.scenario.initial, z=0.98 * stop)
-    wide = dataclasses.replace(case, scenario=dataclasses.replace(case.scenario, clearance=stop, initial=initial))
-    found = {one.path: (one.low, one.high) for one in sliders(wide, [])}
-    assert plant.s_0 > found["run.clearance"][1] >= stop
-    assert found["initial.z"] == (-0.98 * stop, 0.98 * stop)
-
-
 def test_a_case_without_a_processor_is_refused_in_one_line(tmp_path, capsys):
     path = tmp_path / "paper.toml"
     path.write_text(case_template("tracking"))
@@ -228,22 +219,6 @@ def test_a_fractional_delay_equals_the_simulator(fresh):
     typed(fresh, "processor.delay", "0.5")
     other = rig(RIG.replace("delay = 1.0", "delay = 0.5"))
     np.testing.assert_allclose(signal(fresh, "z"), simulate(other).trajectory.rows.z, rtol=0, atol=1e-12)
-
-
-@pytest.mark.thorough
-@in_browser
-def test_the_page_of_a_case_with_a_delay_of_several_samples_equals_the_simulator(tmp_path):
-    case = rig(RIG.replace("delay = 1.0", "delay = 3.4"))
-    (tmp_path / "page.html").write_text(page(case, [], "rig.toml"), encoding="utf-8")
-    with browser.browser(tmp_path) as tab:
-        tab.open(tmp_path / "page.html")
-        settled(tab)
-        for delay in ("3.4", "1", "4"):
-            typed(tab, "processor.delay", delay)
-            other = rig(RIG.replace("delay = 1.0", f"delay = {delay}"))
-            np.testing.assert_allclose(signal(tab, "z"), simulate(other).trajectory.rows.z, rtol=0, atol=1e-12)
-            S, system = tab.run("({...ambjax.state.answer.S})"), linearise(other.cascade, other.scenario, other.clock)
-            np.testing.assert_allclose(S["size"], np.abs(system.sensitivity(np.array(S["f"]))), rtol=1e-7)
 
 
 @in_browser

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from ambjax import AdaptiveRodas3, paper, rollout
+from ambjax import paper
 from ambjax.__main__ import main
 from ambjax.paper import claims, findings
-from ambjax.paper.evidence import NOISE_STDS, STEPS, Evidence, Noise, Run, Survival, Uncertain, survival_of
+from ambjax.paper.evidence import NOISE_STDS, Evidence, Noise, Run, Survival, Uncertain, survival_of
 from ambjax.paper.ledger import judge_claims, ledger_markdown, noise_table, processor_table
 from ambjax.simulation.trajectory import STALLED, Row, Trajectory
 from ambjax.theorem.conditions import Condition, Report
@@ -166,17 +166,6 @@ def test_reproduce(tmp_path, monkeypatch):
     }
     page = (out / "ledger.md").read_text()
     assert all(dataclasses.asdict(c)["says"] in page for c in claims.CLAIMS)
-
-
-@pytest.mark.slow
-def test_the_step_of_the_tuned_reading_is_small_enough():
-    cascade, scenario = paper.cascade("tuned"), paper.scenario("tracking", "tuned")
-    runs = [
-        rollout(cascade, scenario, paper.CLOCK.with_method(step)) for step in (STEPS["tuned"], AdaptiveRodas3(1e-8))
-    ]
-    rows, exact = (np.asarray(run.trajectory.rows.z) for run in runs)
-    # a thousandth of the largest error that the ledger reports of this reading
-    np.testing.assert_allclose(rows, exact, rtol=0, atol=4e-9)
 
 
 def coarse(image):

@@ -22,12 +22,9 @@ from ambjax.ensemble import run_ensemble
 from ambjax.ensemble.maps import Axis, with_method_for_axes
 from ambjax.results.spread_runs import study_of
 from ambjax.simulation.folds import Named
-from ambjax.simulation.method import DRIVEN, choose_method
 from ambjax.world.amplifier import Amplifier, CoilResponse
 from ambjax.world.sensor import Errors, Measurement, Sensor, converted
 from tuning.problem.quantities import Typical
-
-NONE = Errors(*np.zeros(3))
 
 
 def motion(z=1e-3, z_dot=0.2, i=0.1):
@@ -58,18 +55,6 @@ def test_a_reading_is_scaled_offset_and_noisy_and_a_velocity_not_measured_is_zer
     seen = Sensor(gain=1.1, offset=1e-5).reading(motion(), errors)
     np.testing.assert_allclose(seen, [1.1e-3 + 1e-5 + 1e-6, 0.2 + 2e-6, 0.1 + 3e-6], rtol=1e-14)
     assert float(Sensor(velocity=False).reading(motion(), errors).z_dot) == 0.0
-
-
-@pytest.mark.parametrize("bandwidth", [1.0, 100.0, 1e4, 1e7])
-def test_the_low_pass_is_exact_for_a_cubic(bandwidth):
-    h, (c_0, c_1, c_2, c_3) = 1e-4, (1e-3, 0.1, 30.0, -4e4)
-    z, z_dot = (lambda s: ((c_3 * s + c_2) * s + c_1) * s + c_0), (lambda s: (3 * c_3 * s + 2 * c_2) * s + c_1)
-    ends = [motion(z=z(s), z_dot=z_dot(s)) for s in (0.0, h)]
-    w, y_0 = 2 * np.pi * bandwidth, 1.2e-3
-    run = solve_ivp(lambda s, y: w * (z(s) - y), (0, h), [y_0], "Radau", jac=[[-w]], rtol=1e-11, atol=1e-17)
-    got = Sensor(bandwidth=bandwidth).lagged(jnp.asarray(y_0), *ends, h)
-    # the tolerance of SciPy, relative to 1e-3 m
-    np.testing.assert_allclose(got, run.y[0, -1], rtol=0, atol=1e-13)
 
 
 SHORTNESS = np.concatenate([[0.0], np.geomspace(1e-18, 1e3, 64), [0.999, 1.001]])
@@ -190,49 +175,6 @@ def test_the_largest_voltage_is_that_at_the_coils_and_within_the_supply():
     np.testing.assert_allclose(found.measured["search"], np.mean(u_peak**16) ** (1 / 16), rtol=1e-12)
 
 
-@pytest.mark.slow
-def test_more_steps_per_sample_change_the_result_negligibly():
-    """A step ends at the corner of the slew rate, and the voltage inside the step is exact."""
-    amplifier = Amplifier(bandwidth=2e3, slew=4e6)
-    steps = choose_method(laws().on_processor(), dataclasses.replace(WORLD, amplifier=amplifier), 1e-4).substeps
-    assert steps == math.ceil(2 * np.pi * 2e3 * 1e-4 / DRIVEN)
-    coarse, fine = (
-        run(amplifier=amplifier, clock=amb.Clock(30, 1e-4, amb.RK4(n)), delay=0.5) for n in (steps, 8 * steps)
-    )
-    np.testing.assert_allclose(coarse.z, fine.z, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(coarse.i, fine.i, rtol=0, atol=1e-8)
-
-
-PARTS = {
-    "converter": ({"bits": 14.0}, None),
-    "sensor": ({"bandwidth": 1e4, "offset": 1e-6, "gain": 1.01}, None),
-    "amplifier": (None, Amplifier(bandwidth=3e3, slew=5e6, dead_band=0.5, i_max=0.5)),
-}
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(("name", "delay"), [("sensor", 1.0), ("amplifier", 0.5)])
-def test_gradients_forward_and_reverse(name, delay):
-    sensor, amplifier = PARTS[name]
-    scenario = dataclasses.replace(
-        WORLD, amplifier=amplifier, sensor=dataclasses.replace(WORLD.sensor, **(sensor or {}))
-    )
-    settled = laws(delay=delay).on_processor()
-
-    def loss(x):
-        cascade = dataclasses.replace(settled, position=dataclasses.replace(settled.position, c=1440.0 * jnp.exp(x)))
-        fold = amb.simulation.folds.Rms("e_z")
-        return 1e9 * amb.rollout(cascade, scenario, amb.Clock(60, 1e-4, amb.RK4(2)), fold=fold, every=0).measured
-
-    # compiled as a whole, because tracing each call separately takes twice as long as the rest
-    forward, reverse = jax.jit(lambda x: jax.jvp(loss, (x,), (1.0,))[1])(0.1), jax.jit(jax.grad(loss))(0.1)
-    assert forward != 0
-    np.testing.assert_allclose(forward, reverse, rtol=1e-10)
-    # central differences: step^2 of a third derivative
-    value = jax.jit(loss)
-    np.testing.assert_allclose(forward, (value(0.1 + 1e-5) - value(0.1 - 1e-5)) / 2e-5, rtol=1e-6)
-
-
 CASE = {"processor": {}, "clock": {"duration": 0.01}}
 
 
@@ -309,15 +251,6 @@ def test_the_bearing_of_the_data_sheet_is_plausible_and_without_warnings():
     assert np.isinf(found["lost_at_s"]).all()
     # 1.5 um over the whole run; the transient of the step of force is a third of what is averaged here
     assert np.max(found["settled_rms_error_m"]) < 3e-6
-
-
-def test_parts_can_be_spread():
-    raw = {
-        "actuator": {"bandwidth": 1e3},
-        "sensor": {"offset": 0.0},
-        "spread": {"actuator": {"bandwidth": {"percent": 10}}},
-    }
-    assert case_from(CASE | raw).spread.paths == ("actuator.bandwidth",)
 
 
 def test_the_step_is_small_enough_for_the_ends_of_an_amplifier_s_spread():

@@ -88,25 +88,6 @@ def test_derivatives_are_those_of_the_equation(function):
     np.testing.assert_allclose(forward, slope, rtol=1e-12)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("p", [25.0, None])
-def test_relax_is_odd_and_its_derivatives_are_finite_for_extreme_values(p):
-    values = jnp.array([0.0, 1e-300, 1.0, 1e12])
-    for function in (lambda w: relax(w, 2.0, p), lambda w: share(w, 2.0, p), lambda w: twist(w, 2.0, 0.1, p)[0]):
-        np.testing.assert_array_equal(function(-values), -function(values))
-        slopes = jax.jit(jax.vmap(jax.grad(function)))(jnp.concatenate([-values, values]))
-        assert np.isfinite(slopes).all()
-
-
-def test_float32_keeps_six_digits():
-    rng = np.random.default_rng(3)
-    w, h, p = (np.exp(rng.normal(0, 3, 1000)) for _ in range(3))
-    exact = share(w, h, p)
-    rough = share(*(x.astype(np.float32) for x in (w, h, p)))
-    assert rough.dtype == np.float32
-    np.testing.assert_allclose(rough, exact, atol=2e-6)
-
-
 def test_an_integrator_behind_the_relay_ends_at_the_disturbance():
     """The system is x+ = x + T (u + w) with |w| < k.
 

@@ -6,11 +6,9 @@ common. So a replay in other arithmetic, even if that is as exact, is another ru
 
 import dataclasses
 import json
-import os
 import pathlib
 import re
 import shlex
-import subprocess
 import sys
 
 import numpy as np
@@ -26,7 +24,6 @@ from ambjax.ensemble import replay as replaying
 from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
-from ambjax.simulation.folds import Named, Variation
 from ambjax.simulation.metrics import standard_for
 from tuning.__main__ import parser as tuner
 
@@ -183,47 +180,7 @@ class _Nothing:
         path.touch()
 
 
-def test_the_reported_deviation_is_the_largest_over_the_metrics():
-    relative = replaying._relative
-    assert [relative(*pair) for pair in ((1.0, 1.0), (2.0, 1.0), (-1.0, 1.0))] == [0.0, 0.5, 2.0]
-    assert [relative(*pair) for pair in ((np.inf, np.inf), (np.inf, 1.0), (True, False))] == [0.0, 1.0, 1.0]
-    assert relative(0.0, 0.0) == relative(np.nan, np.nan) == 0.0
-    assert relative(np.nan, 1.0) == 1.0
-
-
 # --- other loops ---
-
-LOOPS = {
-    "two-coil, delay of 0.6": {"[plant]\n": '[plant]\nkind = "two-coil"\n', "delay = 1.0 ": "delay = 0.6 "},
-    "amplifier": {"i_max = 2.5 ": "bandwidth = 3e3\nslew = 1e6\ndead_band = 0.2\ni_max = 2.5 "},
-    "no spread": {"[spread]\n": "[tune]\n", "plant.m = {": "# {", "plant.A = {": "# {", "plant.R = {": "# {"},
-    "differentiator": {'kind = "kalman"\nw = 1000.0 ': 'kind = "ired-2"\nL = 1e3 '},
-}
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(
-    "loop",
-    [pytest.param(x, marks=pytest.mark.slow if x.startswith("two-coil") else pytest.mark.thorough) for x in LOOPS],
-)
-def test_members_of_other_loops_are_replayed_bit_by_bit(loop):
-    study = study_of(changed(CASE, LOOPS[loop]))
-    columns = chunk(study, 0, 64, 64)
-    for member in (5, 63):
-        found = replaying.replay(study, member)
-        same_bits({k: v if np.isfinite(v) else None for k, v in found.metrics.items()}, columns, member)
-        assert found.deviation <= found.rounding
-
-
-@pytest.mark.slow
-def test_recorded_rows_and_other_folds_do_not_change_a_bit_of_the_loop():
-    study = study_of(CASE)
-    columns = chunk(study, 0, 64, 64)
-    cascade, scenario = study.batch(np.arange(8))
-    folds = Named({"more": Variation(0.03), "metrics": standard_for(study.settle, scenario)})
-    other = run_ensemble(cascade, scenario, study.clock, fold=folds, every=7, call=CALL).measured["metrics"]
-    for name in ("settled_max_abs_error_m", "max_abs_i_A", "lost_at_s"):
-        np.testing.assert_array_equal(other[name], columns[name][:8])
 
 
 @pytest.mark.slow
@@ -234,78 +191,6 @@ def test_processes_and_chunks_do_not_change_a_bit_of_a_chaotic_loop(printed, mon
     argv = ["ensemble", "case.toml", "--members", str(MEMBERS), "--seed", str(SEED)]
     assert main([*argv, "--out", "cut", "--chunk", "20", "--processes", "2"]) == 0
     assert pathlib.Path("cut/members.npz").read_bytes() == (folder / "out/members.npz").read_bytes()
-
-
-@pytest.mark.thorough
-def test_single_precision_replays_too():
-    code = """
-import numpy as np
-from test_replay import *
-study = study_of(CASE)
-columns = chunk(study, 0, 64, 64)
-found = replaying.replay(study, 5)
-assert columns["rms_error_m"].dtype == np.float32
-for name, value in found.metrics.items():
-    assert value == columns[name][5], name
-assert found.deviation <= found.rounding < 1e-3
-"""
-    env = os.environ | {"JAX_ENABLE_X64": "0", "PYTHONPATH": str(pathlib.Path(__file__).parent)}
-    subprocess.run([sys.executable, "-c", code], env=env, check=True)
-
-
-@pytest.mark.thorough
-def test_check_on_a_processor_uses_the_run_of_simulate(monkeypatch, capsys):
-    no_pictures(monkeypatch)
-    write(CASE)
-    main(["check", "case.toml", "--json"])
-    summary = json.loads(capsys.readouterr().out)["processor"]
-    bands = summary["bands"]
-    assert [slope["stage"] for slope in summary["slopes"]] == ["observer", "position", "inversion", "current"]
-    assert set(summary["delay_margin"]) == {"held", "lost", "undecided", "resolution", "step"}
-    assert main(["simulate", "case.toml", "--out", "out"]) == 0
-    with np.load("out/trajectory.npz") as rows:
-        largest = np.abs(rows["sigma"][rows["t"] >= 0.02]).max()
-    (found,) = [band["largest"] for band in bands if band["signal"] == "sigma" and band["noise"]]
-    # the same state at every sample, from which sigma is computed in another program
-    assert found == pytest.approx(largest, rel=1e-12)
-
-
-TUNE = """
-[tune]
-objective = "least_error"
-limits.sensitivity = inf
-gains = ["controller.position.c", "controller.position.k"]
-screen = 4
-starts = 1
-iterations = 2
-members = 4
-stressed = 2
-validation = 4
-held_out = 70
-"""
-
-
-@pytest.mark.thorough
-def test_the_numbers_of_the_tuner_equal_those_of_the_commands(monkeypatch, capsys):
-    no_pictures(monkeypatch)
-    write(CASE + TUNE)
-    assert main(["tune", "case.toml", "--out", "tuned"]) in (0, 1)
-    report = json.loads(pathlib.Path("tuned/report.json").read_text())
-    monkeypatch.chdir("tuned")
-    for name in ("report.md", "report.html"):
-        text = pathlib.Path(name).read_text().replace("<code>", "`").replace("</code>", "`")
-        assert report["worst_member"]["replay"] in commands(text)
-    capsys.readouterr()
-    assert run(report["worst_member"]["replay"] + " --json --out alone") in (0, 1)
-    metrics = json.loads(capsys.readouterr().out)
-    assert metrics["settled_max_abs_error_m"] == report["worst_member"]["settled_max_abs_error_m"]
-    assert metrics["settled_max_abs_error_m"] == report["after"]["settled_max_abs_error_m"]
-    belongs(metrics, "alone", 0.02)
-    members = ["--members", "70", "--seed", str(report["held_out_seed"])]
-    assert main(["ensemble", "tuned.toml", *members, "--out", "all"]) in (0, 1)
-    with np.load("all/members.npz") as columns:
-        for ours, theirs in (("max_abs_i_A", "max_abs_i_A.largest"), ("settled_rms_u_V", "settled_rms_u_V.largest")):
-            assert columns[ours].max() == report["after"][theirs]
 
 
 # --- commands in messages and files ---

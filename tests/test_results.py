@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 
 import ambjax
-import tuning
 from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.linear import linearise
-from ambjax.simulation.metrics import standard_for
-from ambjax.simulation.trajectory import NOT_SAVED, SIGNAL_UNITS, STALLED, Row
+from ambjax.simulation.trajectory import STALLED
 from tuning.__main__ import main as tune_main
 from tuning.command import TunedCase
 
@@ -70,28 +68,6 @@ def test_the_dataset_has_the_signals_with_units(run):
     assert data["z"].attrs["units"] == "m"
     assert np.array_equal(data["z"].sel(t=0.01, method="nearest"), run.to_pandas()["z"].iloc[100])
     assert {name: data[name].attrs["units"] for name in data} == run.to_pandas().attrs["units"]
-
-
-def test_every_saved_signal_has_the_unit_of_its_description():
-    from reference.fields import attribute_docs
-
-    words = {name: text.rpartition(", ")[2] for name, text in attribute_docs(Row).items() if name not in NOT_SAVED}
-    assert set(words) == set(SIGNAL_UNITS)
-    for name, unit in SIGNAL_UNITS.items():
-        assert words[name].split(". Eq.")[0] == unit
-
-
-@pytest.mark.thorough
-def test_members_equal_those_of_the_command(path, members, tmp_path):
-    main(["ensemble", str(path), "--members", "8", "--seed", "3", "--json", "--out", str(tmp_path / "out")])
-    frame = members.to_pandas()
-    with np.load(tmp_path / "out" / "members.npz") as saved:
-        assert np.array_equal(frame.index, saved["index"])
-        for name in frame.columns:
-            assert np.array_equal(frame[name], saved[name]), name
-    assert frame.attrs["units"]["settled_rms_error_m"] == "m"
-    assert members.survivors == 8
-    assert members.summary()["survivors"] == 8
 
 
 def test_the_pictures_show_the_results(run, members):
@@ -196,36 +172,6 @@ def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
     assert given[0] == given[1]
 
 
-def test_messages_name_python_arguments_instead_of_options(path, tmp_path):
-    """Each message is that of the command, with its options replaced by arguments."""
-    case, folder = ambjax.read_case(path), tmp_path / "none"
-    X, Y = "plant.m=0.5:0.6:2", "plant.R=1:2:2"
-    for call, said in (
-        (lambda: ambjax.survival_map(case, X, "plant.q=1:2"), "y = plant.q: "),
-        (lambda: ambjax.survival_map(case, X, X), "y = plant.m: x has the same quantity"),
-        (lambda: ambjax.survival_map(case, X, Y, members=0), "members = 0: it must be a whole number"),
-        (lambda: ambjax.survival_map(case, X, Y, seed=-1), "seed = -1: it must be a whole number"),
-        (
-            lambda: ambjax.tune(path, resume=True),
-            "resume=True: the directory of the search is missing. Give it as out.",
-        ),
-        (
-            lambda: ambjax.tune(path, folder, resume=True),
-            f"resume=True: out {folder} contains no search. Check out, or leave out resume=True.",
-        ),
-        (lambda: ambjax.tune(path, minutes=0.0), "minutes = 0: it must be above 0"),
-        (lambda: ambjax.tune(path, ""), "out: the name of the directory is empty. Give a name, '.' for this"),
-    ):
-        with pytest.raises(ValueError) as refused:  # noqa: PT011 - the whole message is compared
-            call()
-        assert str(refused.value).startswith(said)
-
-
-def test_tune_refuses_bad_input_by_name(tmp_path):
-    with pytest.raises(ValueError, match=r"no\.toml"):
-        tuning.tune(tmp_path / "no.toml")
-
-
 @pytest.mark.slow
 def test_the_vector_field_gives_the_solution_of_simulate():
     """The solution by SciPy agrees with that by adaptive steps of ambjax to 1e-8 of the sizes of the states."""
@@ -241,15 +187,6 @@ def test_the_vector_field_gives_the_solution_of_simulate():
     assert float(motion.i) == pytest.approx(float(rows.i[49]), abs=1e-5)
     with pytest.raises(ValueError, match="vector_field: this controller runs on a processor"):
         ambjax.vector_field(case_from({"processor": {"delay": 1.0}}))
-
-
-def test_the_vector_field_has_no_noise():
-    noisy, quiet = (
-        ambjax.vector_field(case_from({"sensor": {"std": std, "offset": 1e-6}, "initial": {"z": 1e-4}}))
-        for std in (1e-4, 0.0)
-    )
-    # the same numbers in the same program
-    assert np.array_equal(noisy.f(0.0, noisy.y_0), quiet.f(0.0, quiet.y_0))
 
 
 def test_derivatives_with_respect_to_named_gains_only():
@@ -290,15 +227,3 @@ def test_a_notebook_shows_the_case(path):
     assert "<td>spread</td><td>plant.m</td>" in page
     assert "model" not in page  # that of the plant
     assert "q_z" not in page  # zero
-
-
-def test_a_notebook_shows_the_members(members):
-    page = members._repr_html_()
-    assert "8 of 8 members are held" in page
-    largest = members.columns["rms_u_V"].max()
-    assert f"<td>{largest:.6g}</td><td>V</td>" in page
-
-
-def test_the_metrics_of_a_case_follow_from_its_scenario(path):
-    case = ambjax.read_case(path)
-    assert ambjax.Standard.for_case(case) == standard_for(case.settle, case.scenario)

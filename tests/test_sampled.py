@@ -72,33 +72,18 @@ DIFFERENCE, KALMAN, IRED2 = ("difference", {"w": 2000.0}), ("kalman", {"w": 800.
 PI = ("pi", {"k_p": 3e5, "k_int": 1e8, "k_aw": 200.0})
 WRONG = {"m": 0.65, "R": 45.0, "n": 1400.0}
 CASES = [
-    Case("repaired, delay 1", World(**TRACKING)),
-    Case("repaired, not predicted", World(**TRACKING, predict=False)),
-    Case("repaired, no delay", World(**TRACKING, delay=0.0)),
     Case(
         "edges between samples", World(**SHIFTED, q_i=pulse(0.5, 0.03004, 0.10008), initial=(2e-5, 0.0, 0.0), **soft())
     ),
     Case("half a sample", World(**TRACKING, delay=0.5, **soft())),
-    Case("one and a half", World(**TRACKING, delay=1.5, **soft())),
     Case("two samples", World(**TRACKING, delay=2.0, **soft())),
     Case("explicit", World(**EXPLICIT), 4500),
-    Case("explicit, half a sample", World(**EXPLICIT, delay=0.5), 6000),
-    Case("explicit, one and a half, not predicted", World(**EXPLICIT, delay=1.5, predict=False), 6000),
-    Case("explicit, noise, 100 V", World(**EXPLICIT, u_max=100.0), 6000, std=NOISE),
-    Case("the sign itself", World(**TRACKING, **hard())),
-    Case("the sign itself, one and a half", World(**TRACKING, delay=1.5, **hard())),
-    Case("the sign itself, 20 kHz, 0.3 samples", World(**TRACKING, delay=0.3, period=5e-5, **hard()), 4000),
     Case("the sign itself, noise", World(**TRACKING, u_max=2e3, **hard(k_i=500.0)), std=NOISE),
     Case("wrong model", World(**TRACKING, model=WRONG, **soft())),
     Case("supply of 70 V", World(**TRACKING, u_max=70.0, **soft())),
-    Case("observer under noise", World(**TRACKING, observer=SLOW, u_max=200.0, **soft()), std=(3e-6, 0.0, 1e-4)),
-    Case("current pulse, off centre", World(q_i=pulse(1.0, 0.05, 0.1), initial=(2e-5, 0.0, 0.0), **soft())),
     Case("PI", World(current=PI, u_max=300.0, reference=smoothstep(1e-3, 0.02, 0.1), **soft())),
     Case("super-twisting, the sign itself", World(**TRACKING, position=twisting(k_1=10.0, p=INF), **soft())),
     Case("two coils", World(kind="two-coil", **TRACKING, **soft())),
-    Case(
-        "two coils, one and a half, wrong model", World(kind="two-coil", model=WRONG, delay=1.5, **TRACKING, **soft())
-    ),
     Case("two coils, current pulse", World(kind="two-coil", q_i=pulse(1.0, 0.05002, 0.1), **hard()), std=NOISE),
     # Within a step of the converter nothing holds two programs together: they part at the rate of the unstable pole.
     Case(
@@ -111,46 +96,19 @@ CASES = [
     Case("a real amplifier", World(**EARLY, amplifier={"bandwidth": 2e3, "slew": 1e5}, delay=0.5, **soft()), 600),
     Case("dead band", World(kind="two-coil", **TRACKING, amplifier={"dead_band": 2.0}, **soft())),
     Case("difference", World(**TRACKING, observer=DIFFERENCE, **soft())),
-    Case("difference, explicit", World(**EXPLICIT, observer=DIFFERENCE), 2000),
     Case("Kalman under noise", World(**TRACKING, observer=KALMAN, u_max=2e3, **hard(k_i=500.0)), std=NOISE),
-    Case("Kalman, wrong model, half a sample", World(**TRACKING, observer=KALMAN, model=WRONG, delay=0.5, **soft())),
-    Case("Kalman, two coils, one and a half", World("two-coil", observer=KALMAN, delay=1.5, **TRACKING, **soft())),
-    Case("Kalman, explicit, off centre", World(**EXPLICIT, observer=KALMAN, initial=(2e-5, 0.0, 0.0)), 2000),
     Case("IRED of order 1 under noise", World(observer=("ired-1", {"L": 50.0}), u_max=300.0, **soft()), std=NOISE),
     # under more noise, or on less voltage, its loop is chaotic: rounding grows tenfold in 70 samples
     Case("IRED of order 2 under noise", World(**TRACKING, observer=IRED2, u_max=3e3, **soft()), 300, (1e-7, 0.0, 1e-4)),
-    Case("super-twisting, explicit", World(**EXPLICIT, position=twisting()), 6000),
     Case("closed form, no delay, 400 V", World(reference=sine(), **hard() | CLOSED, delay=0.0, u_max=400.0), 600),
-    Case("closed form, wrong model, noise", World(**TRACKING | CLOSED, model=WRONG, delay=0.5), std=NOISE),
     Case("closed form, explicit", World(**EXPLICIT | CLOSED), 2000),
 ]
-# Each law, part and delay stands in a case of the fast or slow tests; these combine them otherwise.
+# The fast tests; each law, part and delay stands in a case of the fast or slow tests.
 FAST = {
     "explicit",
     "a real position sensor",
     "Kalman under noise",
     "closed form, explicit",
-}
-COMBINED = {
-    "repaired, delay 1",
-    "observer under noise",
-    "repaired, not predicted",
-    "repaired, no delay",
-    "one and a half",
-    "explicit, half a sample",
-    "explicit, one and a half, not predicted",
-    "explicit, noise, 100 V",
-    "the sign itself",
-    "the sign itself, one and a half",
-    "the sign itself, 20 kHz, 0.3 samples",
-    "current pulse, off centre",
-    "two coils, one and a half, wrong model",
-    "difference, explicit",
-    "Kalman, wrong model, half a sample",
-    "Kalman, two coils, one and a half",
-    "Kalman, explicit, off centre",
-    "super-twisting, explicit",
-    "closed form, wrong model, noise",
 }
 
 
@@ -194,7 +152,7 @@ def noise_of(scenario, samples):
 
 
 def how_slow(name):
-    return () if name in FAST else pytest.mark.thorough if name in COMBINED else pytest.mark.slow
+    return () if name in FAST else pytest.mark.slow
 
 
 # The plant's integration is what differs: DOP853 at 1e-12 against the package's RK4.

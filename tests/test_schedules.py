@@ -1,7 +1,6 @@
 """Gain schedules: interpolation, laws of every stage, gradients, tuning, the theorem and the export."""
 
 import dataclasses
-import json
 import re
 import tomllib
 
@@ -11,13 +10,10 @@ import numpy as np
 import pytest
 
 from ambjax import Schedule
-from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.cases.table import Table
 from ambjax.control.cascade_state import Sample
-from ambjax.control.schedule import OVER, extremes, with_gains_at
-from ambjax.ensemble.paths import kinds, places
-from ambjax.linear import loop_matrices
+from ambjax.control.schedule import OVER
 from ambjax.numerics.records import validate
 from ambjax.theorem.conditions import constant_sigma, required
 from ambjax.world.sensor import Measurement
@@ -125,14 +121,6 @@ def test_a_constant_schedule_equals_the_plain_gain(more):
     assert all(np.all(x != y) for x, y in zip(a[:1] + a[3:], b[:1] + b[3:], strict=True))
 
 
-def test_a_law_without_a_schedule_is_unchanged():
-    law = loop().cascade.position
-    assert with_gains_at(law, 0.0, Reference(*[jnp.zeros(())] * 3)) is law
-    assert extremes(law) == (law,)
-    law = loop(k=table(25.0, 10.0, 60.0)).cascade.position
-    assert [one.k for one in extremes(law)] == [10.0, 60.0]
-
-
 def test_gradients_with_respect_to_the_knots_in_three_ways():
     gains = {"k": table(25.0, 50.0), "gamma": table(7.5e4, 9e4, over="reference-speed"), "k_i": table(152.0, 200.0)}
     leaves, tree = jax.tree.flatten(loop(**gains).cascade)
@@ -158,12 +146,9 @@ def test_gradients_with_respect_to_the_knots_in_three_ways():
 BAD = {
     '{ over = "error", at = [0.0, 1e-5], values = [1.0, 2.0], x = 1 }': "controller.position.k.x = 1: unknown key",
     '{ over = "speed", at = [0.0, 1e-5], values = [1.0, 2.0] }': 'controller.position.k.over = "speed": it must be one',
-    "{ at = [0.0, 1e-5], values = [1.0, 2.0] }": "controller.position.k.over is missing",
-    '{ over = "error", values = [1.0, 2.0] }': "controller.position.k.at is missing",
     '{ over = "error", at = 1.0, values = [1.0, 2.0] }': "controller.position.k.at = 1.0: it must be a list",
     '{ over = "error", at = [0.0], values = [1.0] }': "controller.position.k.at = [0]: it must be 2 to 50 increasing",
     '{ over = "error", at = [1e-5, 0.0], values = [1.0, 2.0] }': "controller.position.k.at = [1e-05, 0]",
-    '{ over = "error", at = [-1.0, 0.0], values = [1.0, 2.0] }': "controller.position.k.at = [-1, 0]",
     '{ over = "error", at = [0.0, nan], values = [1.0, 2.0] }': "controller.position.k.at = [0, nan]",
     '{ over = "error", at = [0.0, 1e-5], values = [1.0] }': "controller.position.k.values has 1 numbers",
     '{ over = "error", at = [0.0, 1e-5], values = [1.0, -2.0] }': "controller.position.k.values[1] = -2: it must be",
@@ -187,18 +172,6 @@ def test_only_finite_gains_have_schedules():
     law = dataclasses.replace(loop().cascade.position, k=Schedule((1.0, -2.0), at=AT[:2]))
     with pytest.raises(ValueError, match=r"position\.k\.values\[1\] = -2"):
         validate(law, "position")
-
-
-def test_each_knot_has_a_path():
-    case = loop(k=table(25.0, 50.0), more="[spread]\ncontroller.position.k.1 = { percent = 10 }")
-    known = places(case.cascade, case.scenario)
-    assert [known[f"controller.position.k.{knot}"].value for knot in (0, 1)] == [25.0, 50.0]
-    assert "controller.position.k" not in known
-    assert list(case.spread.paths) == ["controller.position.k.1"]
-    # the knots and the signal are part of the fingerprint of a study
-    other = dict(kinds(loop(k=table(25.0, 50.0, over="reference")).cascade))
-    assert dict(kinds(case.cascade))["position.k.over"] != other["position.k.over"]
-    assert dict(kinds(case.cascade))["position.k.at"] == "(0.0, 1e-05)"
 
 
 SCHEDULED = GAINS | {"c": table(17.0, 20.0, 30.0), "k": table(25.0, 50.0)}
@@ -272,27 +245,3 @@ def test_the_theorem_uses_the_smallest_value_and_requires_a_constant_sigma():
     assert "c constant" in line.requires
     (line,) = constant_sigma(loop(c=table(17.0, 17.0)).cascade.position)
     assert line.holds
-
-
-@pytest.mark.thorough
-def test_the_linear_loop_at_rest_uses_the_first_value():
-    """At z = r the derivative of |z - r| is 0, so the linear loop depends on the values at the error 0 only."""
-    first = {name: x if name == "l" else table(x, 10 * x) for name, x in GAINS.items()}
-    found = []
-    for one in (loop(SAMPLED), loop(SAMPLED, **first)):
-        scenario, period = one.scenario, one.clock.sample_period
-        found.append(jax.jit(loop_matrices)(one.cascade.on_processor(), scenario, period, 0.0))
-    assert found[0][1]
-    assert found[1][1]
-    # the equilibrium is known to 1e-9 of the sizes of the states
-    for a, b in zip(found[0][0][:4], found[1][0][:4], strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-7 * np.max(np.abs(a)))
-
-
-@pytest.mark.thorough
-def test_the_exported_schedules_agree_with_jax(tmp_path, capsys):
-    path = tmp_path / "case.toml"
-    path.write_text(LOOP.format(more=SAMPLED, **SCHEDULED))
-    assert main(["export", str(path), "--out", str(tmp_path / "out"), "--verify", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["ok"]
-    assert "knot_2" in (tmp_path / "out" / "amb_case.h").read_text()

@@ -15,7 +15,7 @@ from ambjax.cases.table import Table
 from ambjax.ensemble.batching import map_members, size
 from ambjax.ensemble.distributions import Choice
 from ambjax.ensemble.paths import places
-from ambjax.ensemble.spread import Spread, apply, corners, draw
+from ambjax.ensemble.spread import Spread, apply, draw
 from ambjax.extend import canonical, leaf, record, validate
 from ambjax.numerics.records import part
 from ambjax.numerics.shapes import map_varying, varying
@@ -86,12 +86,6 @@ def test_members_that_differ_in_one_entry_are_each_solved_alone(case):
     _, twice = apply(cascade, scenario, {"plant.rotor.M.2.2": 4.0})
     np.testing.assert_array_equal(twice.plant.rotor.M[:, 0, 1], values[path])
     assert np.all(twice.plant.rotor.M[:, 2, 2] == 4.0)
-
-
-def test_every_combination_of_the_ends_of_two_entries_is_a_matrix(case):
-    spread = Spread((("plant.rotor.M.0.0", Choice((1.0, 2.0))), ("plant.rotor.M.1.1", Choice((3.0, 5.0)))))
-    ends = np.asarray(corners(spread, *case)[1].plant.rotor.M).reshape(4, 3, 3)
-    assert {(m[0, 0], m[1, 1]) for m in ends} == {(1, 3), (1, 5), (2, 3), (2, 5)}
 
 
 def test_an_ensemble_of_a_plant_with_a_matrix_is_its_rollouts(case):

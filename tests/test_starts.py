@@ -94,8 +94,10 @@ def test_the_first_command_from_rest_is_that_of_the_static_law(name, sampled):
     assert float(found) == pytest.approx(wanted, rel=5e-3 if sampled else 1e-9)
 
 
-@pytest.mark.parametrize("watch", OBSERVERS)
-@pytest.mark.parametrize("name", POSITIONS)
+@pytest.mark.parametrize(
+    ("name", "watch"),
+    [*((name, "kalman") for name in POSITIONS), *(("state-feedback", name) for name in OBSERVERS if name != "kalman")],
+)
 def test_a_constant_reading_gives_a_constant_command(name, watch):
     """At the equilibrium, with the error 0: no state of an observer, filter or law changes from the first sample on."""
     cascade = Cascade(

@@ -1,18 +1,13 @@
-"""Independent random streams: of different sensors, of sensors and keys, of designs and signals."""
+"""Independent random streams: of different sensors, and of sensors and keys."""
 
 import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from ambjax import Scenario, Sensor
-from ambjax.ensemble.design import BITS, design_points
 from ambjax.numerics.gaussian import normals, threefry
-from ambjax.world.scenario import SLOTS
-
-MEMBERS = 40
 
 
 def test_the_noise_of_different_sensors_is_independent():
@@ -41,23 +36,3 @@ def test_noise_and_keys_use_different_random_words():
     own = np.asarray(jax.vmap(lambda n: jnp.stack(scenario.sensor.noise(scenario.words(), n)))(jnp.arange(200)))
     for made in (radius * np.cos(turn), radius * np.sin(turn)):
         assert np.abs(own - made[:, None]).min() > 1e-9  # 600 numbers of order 1; equal ones agree to 1e-15
-
-
-class Listening:
-    """A signal that stores the key from which it would draw."""
-
-    def realised(self, key):
-        return jax.random.key_data(key)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("slot", SLOTS)
-def test_designs_and_signals_share_no_random_words(slot):
-    """A number drawn with the key of a signal does not occur among the coordinates of the member in the design."""
-    design = design_points("random", 5, len(SLOTS) + 2, np.arange(MEMBERS), MEMBERS)
-    for member in range(MEMBERS):
-        scenario = Scenario(seed=5, member=member, **{slot: Listening()})
-        key = jax.random.wrap_key_data(getattr(scenario.realised(), slot))
-        high, low = (int(word) for word in jax.random.bits(key, (2,), jnp.uint32))
-        coordinate = (((high << 32 | low) >> (64 - BITS)) + 0.5) * 2.0**-BITS
-        assert np.abs(design - coordinate).min() > 1e-12

@@ -139,13 +139,6 @@ def test_the_default_gains_depend_on_the_sample_period():
     assert (found.k_int, found.k_p, found.k_d) == (wanted[0], 200.0, wanted[2])
 
 
-def test_a_state_feedback_at_rest_on_the_reference_demands_the_equilibrium_of_the_linearised_magnets():
-    law, model, r = position.StateFeedback(), Plant(), Reference(1e-3, 0.02, 0.3)
-    v_star, _ = law(model, (Measurement(r.r, r.r_dot, 0.0), r), 0.0)
-    rest = 2 * model.k_z / model.m * r.r + model.a * v_star - model.g
-    np.testing.assert_allclose(rest, r.r_ddot, rtol=1e-10)
-
-
 # --- feedback linearisation ---
 
 
@@ -234,17 +227,6 @@ def test_a_notch_beyond_the_nyquist_frequency_stays_stable():
     poles = np.abs(np.linalg.eigvals(jax.jacfwd(after)(flat)))
     assert np.sum(poles > 1 - 1e-9) == 1  # the integral
     assert np.max(poles) < 1 + 1e-9
-
-
-def test_inactive_parts_of_the_chain_change_nothing():
-    chain = position.FilterChain()
-    state = jax.tree.map(lambda x: x + 0.01, chain.init(Plant()))
-    state = state._replace(lead_lag=(0.0, 0.0), notch_1=(0.0, 0.0), notch_2=(0.0, 0.0))
-    inputs = Measurement(1e-4, 0.0, 0.0), STILL
-    for _, moved in (chain(Plant(), inputs, state), chain.step(Plant(), inputs, state, 1e-4)):
-        for pair in (moved.notch_1, moved.notch_2):
-            assert pair == (0.0, 0.0)
-        np.testing.assert_allclose(moved.lead_lag, 0.0, atol=1e-12)
 
 
 def test_the_integral_of_the_chain_does_not_wind_up_while_the_supply_is_limited():

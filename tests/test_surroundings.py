@@ -1,16 +1,12 @@
 """The environment does not affect a run: streams, links, other runs, a matplotlibrc, a missing home folder."""
 
 import argparse
-import ast
-import concurrent.futures
-import contextlib
 import errno
 import io
 import os
 import pathlib
 import sys
 import warnings
-from concurrent.futures.process import BrokenProcessPool
 
 import jax
 import matplotlib
@@ -20,19 +16,17 @@ from texts import write
 from tqdm import tqdm
 
 from ambjax.__main__ import main, parser, run_command
-from ambjax.commands import ensemble, reproduce, simulate
+from ambjax.commands import simulate
 from ambjax.ensemble import worker
-from ambjax.host import interrupts
 from ambjax.host.lock import LOCK, locked
 from ambjax.host.sealed import write_whole
-from ambjax.host.streams import lenient, open_streams
+from ambjax.host.streams import open_streams
 from ambjax.pictures import tornado
 from ambjax.results import outputs
 from tuning.__main__ import main as tune
 
 SHORT = "[clock]\nduration = 0.01\n"
 STUDY = SHORT + "[sensor]\nstd = 1e-9\n"
-ROOT = pathlib.Path(__file__).parent.parent
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -77,32 +71,12 @@ def test_help_and_version_with_a_failing_stdout(number, code, flag, monkeypatch,
     assert capsys.readouterr().err.count("\n") == (code == 2)
 
 
-def test_a_broken_pipe_of_the_computation_is_an_error(capsys):
-    def run(args):
-        raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
-
-    assert answered(["template"], run) == 2
-    assert "Broken pipe" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("number", [pytest.param(errno.EPIPE, marks=pytest.mark.slow), errno.ENOSPC])
 def test_a_failing_stderr_does_not_stop_the_command(number, monkeypatch):
     monkeypatch.setattr(sys, "stderr", Stuck(number))
     monkeypatch.setattr(simulate, "tqdm", lambda **options: tqdm(**options | {"delay": 0, "mininterval": 0}))
     assert main(["simulate", write(SHORT), "--out", "there"]) == 0
     assert sorted(p.name for p in pathlib.Path("there").iterdir()) == sorted(simulate.WRITTEN)
-
-
-def test_a_stream_that_failed_is_not_written_again(monkeypatch):
-    """Python's flush at exit is also avoided: it would fail again and change the exit code."""
-    stuck = Stuck(errno.ENOSPC)
-    monkeypatch.setattr(sys, "stdout", stuck)
-    with lenient() as stdout:
-        print("lost")
-        stuck.write = stuck.flush = None
-        print("lost too")
-        assert stdout.failure().errno == errno.ENOSPC
-    sys.stdout.flush()
 
 
 def test_characters_that_the_encoding_lacks_are_escaped(monkeypatch):
@@ -121,14 +95,6 @@ def test_an_error_of_the_device_is_reported_in_one_line(said, capsys):
 
     assert answered(["template"], run) == 2
     assert capsys.readouterr().err == f"ambjax: {said[:13] or 'RuntimeError'}\n"
-
-
-def test_an_internal_error_keeps_its_traceback():
-    def run(args):
-        raise NotImplementedError
-
-    with pytest.raises(NotImplementedError):
-        answered(["template"], run)
 
 
 # --- other runs ---
@@ -153,16 +119,6 @@ def test_two_runs_without_a_given_folder_use_two_folders(monkeypatch):
     assert [outputs.directory(None, "a").name for _ in range(2)] == ["a", "a-2"]
 
 
-def test_a_study_in_a_folder_in_use_is_refused(capsys):
-    argv = ["ensemble", write(STUDY), "--members", "2", "--out", "out"]
-    out = pathlib.Path("out")
-    out.mkdir()
-    with locked(out):
-        assert main(argv) == 2
-        assert "--out out: another run is using this directory" in capsys.readouterr().err
-        assert os.listdir(out) == [LOCK]  # noqa: PTH208
-
-
 def test_a_search_in_a_folder_in_use_is_refused_and_changes_nothing(capsys):
     out = pathlib.Path("out")
     (out / "checkpoints").mkdir(parents=True)
@@ -174,37 +130,6 @@ def test_a_search_in_a_folder_in_use_is_refused_and_changes_nothing(capsys):
     assert (out / "checkpoints" / "round-1.npz").exists()
 
 
-def test_a_study_that_another_run_has_started_meanwhile_is_refused(monkeypatch, capsys):
-    @contextlib.contextmanager
-    def late(out):
-        write("{}", "out/study.json")
-        yield
-
-    monkeypatch.setattr(ensemble, "locked", late)
-    assert main(["ensemble", write(STUDY), "--members", "2", "--out", "out"]) == 2
-    assert "it already holds a study" in capsys.readouterr().err
-    assert os.listdir("out") == ["study.json"]  # noqa: PTH208
-
-
-@pytest.mark.slow
-def test_a_killed_worker_is_reported_in_one_line(monkeypatch, capsys):
-    class Dead:
-        def submit(self, *_):
-            future = concurrent.futures.Future()
-            future.set_exception(BrokenProcessPool("gone"))
-            return future
-
-    for name, part in (
-        ("processes", lambda _: contextlib.nullcontext(Dead())),
-        ("gather", lambda *_: None),
-        ("_paper_figures", lambda *_: None),
-    ):
-        monkeypatch.setattr(reproduce, name, part)
-    assert main(["reproduce", "--out", "out"]) == 2
-    assert "a worker process died" in capsys.readouterr().err
-    assert not pathlib.Path("out").exists()
-
-
 # --- folders and links ---
 
 
@@ -214,33 +139,6 @@ def test_a_folder_in_place_of_a_file_is_refused_before_the_computation(name, mon
     pathlib.Path("out", name).mkdir(parents=True)
     assert main(["simulate", write(SHORT), "--out", "out"]) == 2
     assert f"--out out: {name} exists and is a folder. Move it, or choose" in capsys.readouterr().err
-
-
-def test_either_all_files_are_moved_or_none(monkeypatch):
-    out, moved = pathlib.Path(), []
-    replace = pathlib.Path.replace
-    monkeypatch.setattr(
-        pathlib.Path, "replace", lambda a, b: (moved.append(interrupts._handler.busy.locked()), replace(a, b))
-    )
-
-    def put():
-        with outputs.files(out) as part:
-            for name in "ab":
-                (part / name / "c").parent.mkdir()
-                (part / name / "c").write_text("new")
-
-    for obstacle, words in (("b/c/", "b/c exists and is a folder"), ("b", "b exists and is not a folder")):
-        if obstacle.endswith("/"):
-            pathlib.Path(obstacle).mkdir(parents=True)
-        else:
-            os.removedirs("b/c")
-            pathlib.Path(obstacle).touch()
-        with pytest.raises(ValueError, match=words):
-            put()
-        assert os.listdir() == ["b"]  # noqa: PTH208
-    pathlib.Path("b").unlink()
-    put()
-    assert moved == [True, True]  # Ctrl-C waits for the second
 
 
 def test_nothing_is_written_through_a_link():
@@ -300,10 +198,3 @@ def test_pictures_do_not_depend_on_a_matplotlibrc():
         tornado.tornado(bars, "rms_u_V", "all", pathlib.Path("theirs.png"))
     tornado.tornado(bars, "rms_u_V", "all", pathlib.Path("ours.png"))
     assert pathlib.Path("theirs.png").read_bytes() == pathlib.Path("ours.png").read_bytes()
-
-
-@pytest.mark.parametrize("path", [*ROOT.glob("ambjax/pictures/*.py"), ROOT / "tuning/report/pictures.py"], ids=str)
-def test_every_picture_has_its_own_style(path):
-    for node in ast.parse(path.read_text()).body:
-        if isinstance(node, ast.FunctionDef) and "Figure(" in ast.unparse(node):
-            assert [ast.unparse(one) for one in node.decorator_list] == ["own_style"], node.name

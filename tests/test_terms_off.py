@@ -4,7 +4,6 @@ import dataclasses
 import tomllib
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_structures import RIG
@@ -13,13 +12,10 @@ from ambjax import Cascade, Clock, Scenario
 from ambjax.cases.reader import case_from
 from ambjax.control import current, inversion, position
 from ambjax.control.base import default_law
-from ambjax.control.laws import CurrentDemand, CurrentInputs
 from ambjax.control.processor import Processor
 from ambjax.control.sampling import Sampling
 from ambjax.linear import analyse, linearise
 from ambjax.linear.equilibrium import equilibrium, ideal
-from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
 
 T = 5e-5
 # A bearing with a current amplifier: chain without observer, PD unless k_int is given.
@@ -129,25 +125,6 @@ def test_a_loop_without_a_term_is_the_limit_of_loops_with_a_small_one(kind, name
     assert found[0] == pytest.approx(found[1], rel=1e-3)
 
 
-@pytest.mark.parametrize("kind", [position.PID, position.StateFeedback, position.FilterChain])
-def test_the_anti_windup_charges_nothing_without_an_integral(kind):
-    """The current is far from the demanded one, as while the supply limits u."""
-    law = dataclasses.replace(default_law(kind, RIG), k_int=0.0)
-    inputs = Measurement(*map(jnp.asarray, (1e-4, 0.01, 2.0))), Reference(*[jnp.zeros(())] * 3)
-    state = law.init(RIG)
-    rates, after = law(RIG, inputs, state)[1], law.step(RIG, inputs, state, T)[1]
-    for one in (rates, after):
-        assert float(getattr(one, "integral", one)) == 0.0
-    charged = dataclasses.replace(law, k_int=1e-9)(RIG, inputs, state)[1]
-    assert float(getattr(charged, "integral", charged)) != 0.0
-
-
-def test_the_current_loop_charges_nothing_without_an_integral():
-    law = dataclasses.replace(default_law(current.ProportionalIntegral, RIG), k_int=0.0)
-    measured, demand = Measurement(*[jnp.zeros(())] * 3), CurrentDemand(jnp.asarray(1.0), jnp.zeros(()))
-    assert float(law(RIG, CurrentInputs(measured, demand, 1.0), jnp.zeros(()))[1]) == 0.0
-
-
 def test_a_pd_controller_has_the_static_stiffness_of_the_textbook():
     """k_i k_p - k_s at the current i that carries the rotor: there, k_s is larger by the factor 1 + (i/i_0)^2."""
     case = bearing()
@@ -214,14 +191,3 @@ def test_a_measured_velocity_is_needed_only_by_laws_that_use_it(changes, reads):
             case_from(given)
     else:
         case_from(given)
-
-
-@pytest.mark.parametrize("processor", [None, Processor(0.0), Processor(1.0, predict=False, implicit=False)])
-def test_the_motional_term_of_a_current_law_uses_the_velocity(processor):
-    """The dead-beat law cancels the motional voltage; the PI law does not know the velocity."""
-    chain = position.FilterChain()
-    for law, reads in ((current.DeadBeat(), True), (current.ProportionalIntegral(), processor is None)):
-        cascade = Cascade(position=chain, inversion=inversion.Linearised(), current=law, processor=processor)
-        # in continuous time the rate of i_ref, which the PI law adds, is computed from the velocity
-        assert cascade.reads_velocity(T) == reads
-    assert Cascade(processor=processor).reads_velocity(T)

@@ -8,10 +8,9 @@ from scipy.integrate import solve_ivp
 
 import ambjax as amb
 from ambjax.cases.reader import case_from
-from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import apply
 from ambjax.numerics.runge_kutta import rk4_step
-from ambjax.simulation.method import TOUCHED, slopes
+from ambjax.simulation.method import TOUCHED
 from ambjax.world.sensor import Measurement
 from ambjax.world.touchdown import DAMPING_DEPTH
 
@@ -106,18 +105,6 @@ def test_the_step_of_a_stop_resolves_its_contact(damping, largest):
     error = np.max(np.abs(coarse - fine)) / 0.1
     assert largest / 2 < error < largest
     assert np.all(fine < -0.08)
-
-
-def test_the_step_resolves_the_contact():
-    case = case_from({"run": STOP | {"stop_damping": 10.0}})
-    assert slopes(case.cascade, case.scenario)["rotor on its stop"] == pytest.approx(np.sqrt(2e5 / 0.588) + 10 / 0.588)
-    assert case_from({"processor": {}, "run": STOP | {"stop_stiffness": 1e8}}).clock.method.substeps == 27
-
-
-def test_the_numbers_of_the_stop_have_paths():
-    case = case_from({"run": STOP, "spread": {"run": {"stop_stiffness": {"percent": 10}}}})
-    assert case.spread.paths == ("run.stop_stiffness",)
-    assert {"run.stop_stiffness", "run.stop_damping"} <= set(places(case.cascade, case.scenario))
 
 
 @pytest.mark.parametrize(
