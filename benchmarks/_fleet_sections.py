@@ -15,8 +15,9 @@ def fleet() -> list[str]:
         f"`ambjax tune --budget {data['minutes']:g}` on {len(rows)} of 24 bearings, drawn as data sheets would give",
         "them: 0.3 to 50 kg, gap 0.25 to 0.8 mm, bias flux density 0.3 to 0.65 T, largest force 5 to 15 weights, 10 to",
         "25 kHz, 12 to 16 bits, mass, pole area and resistance known to 10 %. The default limits apply: |S| at most 3,",
-        "rms voltage at most 60 % of the supply. The tuner was developed on bearings with an even number. Other",
-        "programs ran on the machine.",
+        "rms voltage at most 60 % of the supply. The tuner was developed on bearings with an even number, 0 to 6. Other",
+        "programs ran on the machine. Bearings with one core were tuned within 8 minutes, 14 of them at the same time,",
+        "on an Intel Xeon with 16 cores (Python 3.12.3, jax 0.11.2), by the tuner without restarts.",
         f"{good} of {len(rows)} answers hold every held-out member within all limits.",
         "",
     ]
@@ -29,11 +30,12 @@ def fleet() -> list[str]:
             _number(row.get("u_V"), ".3g"),
             _number(row.get("sensitivity"), ".3g"),
             f"{row['minutes']:.1f}",
+            str(row.get("cores", 2)),
             "met" if row["good"] else "; ".join(row["against"]),
         ]
         for number, row in rows.items()
     ]
-    head = "bearing | position law | lost | settled rms error (m) | u rms (V) | peak of S | minutes | requirements"
+    head = "bearing | position law | lost | settled rms error (m) | u rms (V) | peak of S | minutes | cores | requirements"
     return lines + table(head, cells)
 
 
@@ -44,7 +46,9 @@ def ablation() -> list[str]:
     lines += [
         '`ambjax tune` with `objective = "least_error"` on one core. Each cell: settled rms error of the held-out',
         "members, relative to that of the complete tuner with the same seed; seconds of the search, relative to the",
-        "same; and requirements that are not met. Medians over the seeds.",
+        "same; and requirements that are not met. One seed; -: not measured. The tuner was that with restarts. Because",
+        "of these figures, these mechanisms were removed: restarts, growth of the penalty, members with large errors",
+        "join, earlier points, additional noise, and limits judged only near them.",
         "",
     ]
     tasks = list(dict.fromkeys(task for _, task, _ in rows))
