@@ -17,7 +17,7 @@ from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.reader import case_from, read_case
 from ambjax.cases.template_text import template
 from ambjax.linear import linearise
-from ambjax.linear.machine_sensitivity import linearise_machine, machine_sensitivity
+from ambjax.linear.linear_machine import linearise_machine, machine_sensitivity
 from ambjax.numerics.records import canonical
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.runs import simulate

@@ -9,7 +9,7 @@ import tomlkit
 from machine_cases import MACHINES
 
 from ambjax.cases.machine_case import machine_from
-from ambjax.linear.machine_sensitivity import machine_sensitivity
+from ambjax.linear.linear_machine import machine_sensitivity
 from ambjax.results.machine_run import simulate_machine
 
 # The fast tests take the machines with the most features.

@@ -8,7 +8,7 @@ from tqdm import tqdm
 
 from ambjax.cases.machine_case import MachineCase
 from ambjax.host.heartbeat import say
-from ambjax.linear.machine_sensitivity import MachineSensitivity, machine_sensitivity
+from ambjax.linear.linear_machine import MachineSensitivity, machine_sensitivity
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
 
