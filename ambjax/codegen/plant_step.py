@@ -149,10 +149,8 @@ class PlantStep(Block):
         u, q_z, q_i, *w = (jnp.where(jnp.isfinite(x), x, 0.0) for x in inputs)
         system = self.system(parameters, period, q_z, q_i)
         kept = choose(memory.started, self._advanced(system, memory, limited(u, parameters.u_max)), self._begun(system))
-        sensor, true = parameters.sensor, parameters.plant.measurement(kept.motion)
-        stds = (0.0, 0.0, 0.0) if sensor is None else (sensor.std, sensor.std_z_dot, sensor.std_i)
-        errors = Errors(*(jnp.asarray(std) * x for std, x in zip(stds, w, strict=True)))
-        measured = system.measured(kept.motion, kept.z_filtered, errors)
+        true = parameters.plant.measurement(kept.motion)
+        measured = system.measured(kept.motion, kept.z_filtered, system.loop.scenario.sensors.scaled(w))
         invalid = ~functools.reduce(jnp.logical_and, fine, jnp.asarray(True))
         status = PlantStatus(kept.lost == TOUCHED, kept.lost == DIVERGED, invalid)
         return kept, PlantOutputs(*measured, *true), status
@@ -175,11 +173,12 @@ class PlantStep(Block):
         """Return the memory at the first sample."""
         scenario, zero = system.loop.scenario, jnp.zeros(())
         motion = scenario.plant.start(scenario.initial.measurement())
-        slow = scenario.amplifier is not None and scenario.amplifier.slow
         z_filtered = scenario.plant.measurement(motion).z if lags(system.loop) else ()
         lost = _real(plant_status(system.loop, motion))
         last, *before = system.processor.constant_past(zero)
-        return PlantMemory(motion, last, tuple(before), z_filtered, zero if slow else (), lost, jnp.asarray(True))
+        return PlantMemory(
+            motion, last, tuple(before), z_filtered, zero if scenario.actuator.slow else (), lost, jnp.asarray(True)
+        )
 
     def start(self) -> PlantMemory:
         begun = self._begun(self.system(self.parameters, self.period))
@@ -258,9 +257,8 @@ def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object
             'actuator.mode = "current": the exported plant takes a voltage. Export the controller, or use '
             'mode = "voltage".'
         )
-    sensor = scenario.sensor
     for part in ("outliers", "dropouts", "runout"):
-        if getattr(sensor, part, None) is not None:
+        if getattr(scenario.sensors, part) is not None:
             raise ValueError(
                 f"sensor.{part}: the exported plant does not model this error. Remove it, and add it to the output z."
             )
@@ -272,7 +270,7 @@ def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object
     resolved = cascade.on_processor()
     machine = PlantParameters(
         scenario.plant,
-        sensor,
+        scenario.sensor,
         scenario.amplifier,
         scenario.stop,
         scenario.initial,

@@ -77,8 +77,8 @@ class _Linear:
         self.scenario = tuple(jax.vmap(ideal)(loop.scenario) for loop in loops)
         self.cascade = tuple(_unguarded(loop.cascade) for loop in loops)
         self.rotor = self.machine.rotor
-        self.low_passed = [one.sensor is not None and one.sensor.bandwidth is not None for one in self.scenario]
-        self.lagged = [one.amplifier is not None and one.amplifier.slow for one in self.scenario]
+        self.low_passed = [one.sensors.bandwidth is not None for one in self.scenario]
+        self.lagged = [one.actuator.slow for one in self.scenario]
 
     @property
     def sampled(self) -> bool:
@@ -184,11 +184,11 @@ class _Linear:
             q, q_dot, plant, filtered, own = restore(x)
             z_rates, u_rates, applied = [], [], []
             for k, (scenario, z) in enumerate(zip(self.scenario, self.sensed(q), strict=True)):
-                sensor, amplifier = scenario.sensor, scenario.amplifier
-                low = () if sensor is None or sensor.bandwidth is None else 2 * jnp.pi * jnp.asarray(sensor.bandwidth)
+                bandwidth, amplifier = scenario.sensors.bandwidth, scenario.actuator
+                low = () if bandwidth is None else 2 * jnp.pi * jnp.asarray(bandwidth)
                 z_rates.append(() if isinstance(low, tuple) else low * (z - filtered[k]))
-                slow = amplifier is not None and self.lagged[k]
-                u_rates.append(jnp.asarray(amplifier.slope()) * (u[k] - own[k]) if amplifier and slow else ())
+                slow = self.lagged[k]
+                u_rates.append(jnp.asarray(amplifier.slope()) * (u[k] - own[k]) if slow else ())
                 applied.append(own[k] if slow else u[k])
             after = self.rates(q, q_dot, plant, tuple(applied))
             return ravel_pytree((after.q, after.q_dot, _plants(after.axes), tuple(z_rates), tuple(u_rates)))[0]

@@ -99,13 +99,13 @@ def _values(numbers: Numbers, x: LoopPoint) -> PointValues:
     scenario: Any = numbers.scenario
     lagged: Any = x.lagged
     motion = scenario.plant.measurement(lagged.plant)
-    sensor, amplifier, lags = scenario.sensor, scenario.amplifier, LagState((), (), ())
+    sensor, amplifier, lags = scenario.sensors, scenario.actuator, LagState((), (), ())
     u: Any = x.acting
     read = motion
-    if sensor is not None and sensor.bandwidth is not None:
+    if sensor.bandwidth is not None:
         lags = lags._replace(z_filtered=2 * jnp.pi * sensor.bandwidth * (motion.z - lagged.z_filtered))
         read = motion._replace(z=jnp.asarray(lagged.z_filtered))
-    if amplifier is not None:
+    if amplifier.slow:
         lags = lags._replace(u_a=amplifier.slope() * (u - lagged.u_a))
         u = lagged.u_a
     measured = reading(scenario, read, (x.e, 0.0))
@@ -123,9 +123,8 @@ def _ideal(numbers: Numbers) -> Numbers:
 
 def _with_lags(scenario: Scenario, point: Point) -> EquilibriumPoint:
     """Return an equilibrium with the states of the lags added, at rest."""
-    sensor, z = scenario.sensor, scenario.plant.measurement(point.plant).z
-    low_passed = sensor is not None and sensor.bandwidth is not None
-    lags = z if low_passed else (), point.u if scenario.amplifier is not None else ()
+    low_passed, z = scenario.sensors.bandwidth is not None, scenario.plant.measurement(point.plant).z
+    lags = z if low_passed else (), point.u if scenario.actuator.slow else ()
     return LagState(point.plant, *lags), point.u, point.control
 
 

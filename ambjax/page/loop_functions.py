@@ -39,11 +39,7 @@ class GivenNoise(Realised):
     normals: tuple[Array, Array, Array]
 
     def sensor_errors(self, sample: Scalar) -> Errors:
-        sensor = self.scenario.sensor
-        if sensor is None:
-            return super().sensor_errors(sample)
-        stds = sensor.std, sensor.std_z_dot, sensor.std_i
-        return Errors(*(std * normal for std, normal in zip(stds, self.normals, strict=True)))
+        return self.scenario.sensors.scaled(self.normals)
 
 
 @dataclasses.dataclass(frozen=True)

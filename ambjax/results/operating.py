@@ -81,8 +81,7 @@ def sensitivity(case: Case, r: float = 0.0) -> Analysis:
 
 def _velocity_sensor(case: Case) -> bool:
     """Return whether the velocity is measured and the laws use this measurement."""
-    sensor = case.scenario.sensor
-    return (sensor is None or sensor.velocity) and case.cascade.reads_velocity(case.clock.sample_period)
+    return case.scenario.sensors.velocity and case.cascade.reads_velocity(case.clock.sample_period)
 
 
 def _analysis(case: Case, system: StateSpace, m: float, velocity: bool) -> Analysis:

@@ -108,9 +108,8 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
     fixed_only, noisy = _fixed_only(cascade, scenario), _noisy(scenario)
     if cascade.processor is not None:
         settled = math.ceil(sample_period * max(named[COILS] / SETTLED, named[FLUX] / LAGGED))
-        amplifier = scenario.amplifier
-        slow = amplifier is not None and amplifier.slow
-        rate = float(np.max(np.asarray(amplifier.slope()))) if amplifier is not None and slow else 0.0
+        amplifier = scenario.actuator
+        rate = float(np.max(np.asarray(amplifier.slope()))) if amplifier.slow else 0.0
         touched = named.get(STOP, 0.0) / TOUCHED
         driven = math.ceil(sample_period * max(named[PLANT] / SAMPLED, touched, rate / DRIVEN))
         substeps, fixed = max(driven, settled, 1), max(driven, MOST_SETTLED)
@@ -138,8 +137,7 @@ def _tolerance(wanted: float) -> float:
 
 def _noisy(scenario: Scenario) -> bool:
     """Return whether a sensor has noise. Traced values count as noise."""
-    noises = () if scenario.sensor is None else scenario.sensor.noises
-    return any(is_traced(std) or bool(np.any(np.asarray(std))) for std in noises)
+    return any(is_traced(std) or bool(np.any(np.asarray(std))) for std in scenario.sensors.noises)
 
 
 def _smooth_inside(cascade: Cascade, scenario: Scenario, sample_period: float) -> bool:
@@ -149,7 +147,7 @@ def _smooth_inside(cascade: Cascade, scenario: Scenario, sample_period: float) -
     u_max = scenario.u_max
     limited = is_traced(u_max) or bool(np.any(np.isfinite(np.asarray(u_max))))
     inside = most_inside(scenario, sample_period, reference=True)
-    return not limited and scenario.amplifier is None and scenario.stop is None and inside == 0
+    return not limited and scenario.drive == "voltage" and scenario.stop is None and inside == 0
 
 
 def _fixed_only(cascade: Cascade, scenario: Scenario) -> bool:

@@ -29,8 +29,7 @@ def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> 
             f"{scenario.drive}, or change the mode."
         )
     _check_coils(scenario)
-    sensor = scenario.sensor
-    if sensor is not None and not sensor.velocity and cascade.reads_velocity(sample_period):
+    if not scenario.sensors.velocity and cascade.reads_velocity(sample_period):
         raise ValueError(
             "sensor.velocity = false: the velocity is not measured, controller.observer does not estimate it, and the "
             'laws or the prediction use it. Choose an observer that estimates it, for example kind = "kalman", or laws '
@@ -40,8 +39,8 @@ def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> 
 
 def _check_coils(scenario: Scenario) -> None:
     """Raise ValueError for limits of each coil if both coils have one current, or if |i| is limited too."""
-    amplifier = scenario.amplifier
-    if amplifier is None or amplifier.coil is None:
+    amplifier = scenario.actuator
+    if amplifier.coil is None:
         return
     if not scenario.plant.two_voltages:
         raise ValueError(

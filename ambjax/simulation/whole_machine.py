@@ -333,17 +333,13 @@ class SampledMachine(Machine):
         found = []
         sensed = [self.at_sensors(state) for state in states]
         for k, loop in enumerate(self.loops()):
-            z, sensor, motions = axes[k].z_filtered, loop.scenario.sensor, list[Measurement]()
-            if sensor is None or not lags(loop):
+            z, sensor, motions = axes[k].z_filtered, loop.scenario.sensors, list[Measurement]()
+            if not lags(loop):
                 found.append(z)
                 continue
             for own, n in zip(sensed, range(len(durations) + 1), strict=True):
                 motion = Measurement(own[k].plant.z, own[k].plant.z_dot, z)
-                if sensor.runout is not None:
-                    at = jnp.broadcast_to(t + sum(durations[:n]), motion.z.shape)
-                    runout, rate = jax.jvp(sensor.runout, (at,), (jnp.ones_like(at),))
-                    motion = motion._replace(z=motion.z + runout, z_dot=motion.z_dot + rate)
-                motions.append(motion)
+                motions.append(sensor.over_surface(motion, jnp.broadcast_to(t + sum(durations[:n]), motion.z.shape)))
             for before, after, time in zip(motions, motions[1:], durations, strict=False):
                 z = sensor.lagged(z, before, after, time)
             found.append(z)

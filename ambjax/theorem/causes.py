@@ -13,6 +13,7 @@ import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.simulation.clock import Clock
+from ambjax.world.amplifier import Amplifier
 from ambjax.world.scenario import SLOTS, Scenario
 from ambjax.world.signals import reference_at
 
@@ -95,35 +96,29 @@ def parts(cascade: Cascade, scenario: Scenario, clock: Clock) -> Iterator[Part]:
 
 
 def _sensors(scenario: Scenario) -> Iterator[tuple[str, str, Scenario]]:
-    sensor: Any = scenario.sensor
-    if sensor is None:
-        return
+    sensor = scenario.sensors
 
-    def without(**fields: object) -> Scenario:
-        return dataclasses.replace(scenario, sensor=dataclasses.replace(sensor, **fields))
-
-    if (quiet := sensor.louder(0.0)) != sensor:
-        loud = dataclasses.replace(scenario, sensor=quiet)
-        yield "the noise of the sensors", "Lower it, or choose an observer that attenuates it more.", loud
+    if (quiet := scenario.louder(0.0)).sensor != scenario.sensor:
+        yield "the noise of the sensors", "Lower it, or choose an observer that attenuates it more.", quiet
     if sensor.bits is not None:
         name = f"the converter (sensor.bits = {float(np.max(sensor.bits)):g})"
-        yield name, "Give more bits, or a smaller range_z or range_i.", without(bits=FINE_BITS)
+        yield name, "Give more bits, or a smaller range_z or range_i.", scenario.with_sensor(bits=FINE_BITS)
     if sensor.faulty:
-        yield "the faults of the position sensor", "", without(outliers=None, dropouts=None)
+        yield "the faults of the position sensor", "", scenario.with_sensor(outliers=None, dropouts=None)
     if sensor.bandwidth is not None:
-        yield "the low-pass of the position sensor", "Raise sensor.bandwidth.", without(bandwidth=None)
+        yield "the low-pass of the position sensor", "Raise sensor.bandwidth.", scenario.with_sensor(bandwidth=None)
 
 
 def _supply(scenario: Scenario) -> Iterator[tuple[str, str, Scenario]]:
-    amplifier: Any = scenario.amplifier
+    amplifier = scenario.actuator
     if np.any(np.isfinite(np.asarray(scenario.u_max))):
         name = f"the limit of the voltage (actuator.u_max = {float(np.min(scenario.u_max)):g} V)"
         unlimited = dataclasses.replace(scenario, u_max=jnp.inf)
-        if amplifier is not None and amplifier.coil is not None:
+        if amplifier.coil is not None:
             coil = dataclasses.replace(amplifier.coil, u_max=None)
             unlimited = dataclasses.replace(unlimited, amplifier=dataclasses.replace(amplifier, coil=coil))
         yield name, "Raise it, or reduce the gains, the noise or the loads.", unlimited
-    if amplifier is not None and scenario.drive == "voltage":
+    if isinstance(scenario.amplifier, Amplifier):
         ideal = dataclasses.replace(scenario, amplifier=None)
         yield "the amplifier (its lag, dead band and current limits)", "Change [actuator].", ideal
 
@@ -163,7 +158,7 @@ def _motion(scenario: Scenario, clock: Clock) -> Iterator[tuple[str, str, Scenar
     end = float(clock.duration)
     loads = [getattr(scenario, slot) for slot in SLOTS if slot != "reference"]
     acts = any(load is not None and any(load.span(end)) for load in loads)
-    if acts or (scenario.sensor is not None and scenario.sensor.runout is not None):
+    if acts or scenario.sensors.runout is not None:
         yield "the disturbances and the runout", "", scenario.undisturbed()
     r, r_dot, *_ = (np.asarray(x) for x in reference_at(scenario.reference, jnp.zeros(())))
     initial = scenario.initial
