@@ -94,7 +94,7 @@ def _limits(case: Case) -> Iterator[str]:
 def _rates(case: Case) -> Iterator[str]:
     scenario, pole = case.scenario, float(case.scenario.plant.pole)
     samples = 1 / (float(case.clock.sample_period) * pole)
-    if case.cascade.processor is not None and 1 <= samples < LEAST_SAMPLES:
+    if case.cascade.sampled and 1 <= samples < LEAST_SAMPLES:
         yield (
             f"clock.sample_period = {float(case.clock.sample_period):g} s: the time constant of the unstable rotor has "
             f"only {samples:.2g} samples. Give at least {LEAST_SAMPLES:g}; usable margins need 10 or more."
@@ -121,9 +121,9 @@ def _converter(case: Case) -> Iterator[str]:
 
 
 def _delay(case: Case) -> Iterator[str]:
-    processor = case.cascade.processor
-    if processor is not None and 0 < float(processor.delay) < LEAST_DELAY:
-        yield f"processor.delay = {float(processor.delay):g} samples is close to 0. Is it in seconds?"
+    delay = float(case.cascade.timing.delay)
+    if 0 < delay < LEAST_DELAY:
+        yield f"processor.delay = {delay:g} samples is close to 0. Is it in seconds?"
 
 
 def _runout(case: Case) -> Iterator[str]:

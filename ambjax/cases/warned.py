@@ -77,7 +77,7 @@ def _noise(case: Case) -> Iterator[str]:
 
 
 def _velocity(case: Case) -> Iterator[str]:
-    sensor, sampled = case.scenario.sensors, case.scenario.sensor or case.cascade.processor
+    sensor, sampled = case.scenario.sensors, case.scenario.sensor or case.cascade.sampled
     if sensor.velocity and sensor.std_z_dot == 0 and sampled and case.cascade.reads_velocity(case.clock.sample_period):
         yield (
             "sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ERROR, unlike by any real sensor. Set "

@@ -124,15 +124,11 @@ class PlantStep(Block):
     @property
     def longest(self) -> int:
         """The longest delay that the plant can be set to, samples."""
-        processor = self.cascade.processor
-        assert processor is not None
-        return len(processor.constant_past(jnp.zeros(())))
+        return len(self.cascade.timing.constant_past(jnp.zeros(())))
 
     def system(self, machine: PlantParameters, period: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Sampled:
         """Return the simulator's loop with the parameters `machine` and constant disturbances (m/s^2, A/s)."""
-        given: Any = self.cascade.processor
-        given = dataclasses.replace(given, delay=machine.delay, assumed=None, predict=False, guard=None)
-        cascade = dataclasses.replace(self.cascade, processor=given)
+        cascade = self.cascade.with_processor(delay=machine.delay, assumed=None, predict=False, guard=None)
         return Sampled(ClosedLoop(cascade, machine.scenario(q_z, q_i)), period, 0)
 
     def step(
@@ -187,8 +183,7 @@ class PlantStep(Block):
     def numbers(self) -> list[Number]:
         found = list(numbers_of(self.parameters))
         assert [x.value for x in found] == [float(x) for x in jax.tree.leaves(self.parameters)]
-        whole: Any = self.cascade.processor
-        most, words = float(self.longest), "whole: rounded down" if whole.whole else ""
+        most, words = float(self.longest), "whole: rounded down" if self.cascade.timing.whole else ""
         allowed = ", ".join(filter(None, (f"from 0 to {most:g}", words)))
         delay = {"allowed": allowed, "ends": (0.0, most, most + 0.5, -0.5, math.nan), "most": most}
         return [x._replace(**delay) if x.name == "delay" else x for x in found]
@@ -247,7 +242,7 @@ def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object
     Raises ValueError for a cascade in continuous time, an amplifier that controls the current, faults or a runout of
     the sensor, and an adaptive method.
     """
-    if cascade.processor is None:
+    if not cascade.sampled:
         raise ValueError(
             "[processor] is missing: the exported plant takes a voltage that is held over a sample, and this case "
             "is in continuous time. Add [processor], tune the gains for it, and export the tuned case."
@@ -276,7 +271,7 @@ def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object
         scenario.initial,
         scenario.u_max,
         scenario.clearance,
-        resolved.processor.delay if resolved.processor else 0.0,
+        resolved.timing.delay,
     )
     plain = jax.tree.map(lambda x: float(x) if jnp.shape(x) == () else x, machine)
     return PlantStep(plain, float(period), resolved, method)

@@ -169,12 +169,10 @@ def expected(driven: Callable[[Array, State], State], at: State, u: Array, perio
 def guarded(cascade: C, scenario: Scenario, period: Scalar) -> C:
     """Return the cascade with the numbers of its guard set for a scenario; unchanged if it has no guard."""
     one: Any = cascade
-    processor = one.processor
-    if processor is None or processor.guard is None:
+    if one.timing.guard is None:
         return cascade
-    estimated = one.observer.estimates_velocity
-    guard = processor.guard.with_limits(one.model, scenario, period, estimated)
-    return dataclasses.replace(one, processor=dataclasses.replace(processor, guard=guard))
+    guard = one.timing.guard.with_limits(one.model, scenario, period, one.observer.estimates_velocity)
+    return one.with_processor(guard=guard)
 
 
 def simulated(cascade: C, scenario: Scenario, period: Scalar) -> C:
@@ -184,8 +182,7 @@ def simulated(cascade: C, scenario: Scenario, period: Scalar) -> C:
     removed. Otherwise the numbers of the guard are set (`guarded`).
     """
     one: Any = cascade
-    processor = one.processor
-    idle = processor.guard is not None and processor.guard.derived
+    idle = one.timing.guard is not None and one.timing.guard.derived
     if idle and not scenario.sensors.faulty:
-        return dataclasses.replace(one, processor=dataclasses.replace(processor, guard=None))
+        return one.with_processor(guard=None)
     return guarded(cascade, scenario, period)

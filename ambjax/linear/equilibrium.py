@@ -211,11 +211,11 @@ def _residual(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, p
     u = scenario.coil_voltage(point.u, point.plant) if scenario.drive == "current" else point.u
     moved = jax.tree.map(lambda x: x / plant.pole, plant.rates(point.plant, u))
     measured, reference = reading(scenario, plant.measurement(point.plant), (0.0, 0.0)), at_rest(r)
-    if cascade.processor is None:
+    if not cascade.sampled:
         command, rates = cascade(measured, point.control, reference, u_max)
         control = jax.tree.map(lambda x: x / plant.pole, rates)
     else:
-        sample = Sample(reference, period, u_max, cascade.processor.constant_past(point.u))
+        sample = Sample(reference, period, u_max, cascade.timing.constant_past(point.u))
         command, after, _ = cascade.step(measured, point.control, sample)
         control = jax.tree.map(lambda a, b: b - a, point.control, after)
     change = Point(moved, control, command.u - point.u)

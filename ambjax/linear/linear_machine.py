@@ -1,6 +1,5 @@
 """Linearisation of a whole machine at rest and constant speed: all loops are closed, each axis has a test signal."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
@@ -75,7 +74,7 @@ class _Linear:
         self.machine, self.W, self.period = machine.realised(), W, period
         loops = self.machine.loops()
         self.scenario = tuple(jax.vmap(ideal)(loop.scenario) for loop in loops)
-        self.cascade = tuple(_unguarded(loop.cascade) for loop in loops)
+        self.cascade = tuple(loop.cascade.with_processor(guard=None) for loop in loops)
         self.rotor = self.machine.rotor
         self.low_passed = [one.sensors.bandwidth is not None for one in self.scenario]
         self.lagged = [one.actuator.slow for one in self.scenario]
@@ -138,8 +137,8 @@ class _Linear:
 
     def past(self, u: Groups) -> Groups:
         """Return the commands on their way under constant commands u; () in continuous time."""
-        processors = [cascade.processor for cascade in self.cascade]
-        return tuple(() if p is None else p.constant_past(own) for p, own in zip(processors, u, strict=True))
+        pasts = (one.timing.constant_past(own) for one, own in zip(self.cascade, u, strict=True))
+        return tuple(past if self.sampled else () for past in pasts)
 
     def sensed(self, q: Array) -> Groups:
         """Return the displacements at the sensors, for the groups with a low-pass."""
@@ -222,11 +221,10 @@ class _Linear:
     def _sampled(
         self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, moved: Callable, read: Callable
     ) -> tuple:
-        past, processor = self.past(point.u), self.cascade[0].processor
-        assert processor is not None
+        past, delay = self.past(point.u), jnp.asarray(self.cascade[0].timing.delay)[0]
         A, B = jax.jacfwd(lambda x, u: moved(x, self.machine.split(u)), (0, 1))(body, self.machine.join(point.u))
         kept = len(past[0])
-        transition, driven = _held(A, B, self.period, jnp.asarray(processor.delay)[0], kept)
+        transition, driven = _held(A, B, self.period, delay, kept)
         x, restore = ravel_pytree((body, point.control, past))
 
         def step(x: Array, e: Array) -> tuple[Array, Array]:
@@ -241,13 +239,6 @@ class _Linear:
 
         scale = ravel_pytree((body_sizes, sizes.control, self.past(sizes.u)))[0]
         return jax.jacfwd(step, (0, 1))(x, jnp.zeros(self.machine.count, x.dtype)), scale
-
-
-def _unguarded(cascade: Cascade) -> Cascade:
-    """Return the cascade without its guard."""
-    if cascade.processor is None:
-        return cascade
-    return dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=None))
 
 
 def _plants(axes: Sequence) -> Groups:

@@ -178,8 +178,8 @@ def with_stability(margin: "Delays", cascade: Cascade, scenario: Scenario, clock
 
     if margin.held is None:
         return margin
-    own: Any = cascade.processor
-    first = float(own.delay) if margin.held >= float(own.delay) else 0.0
+    own = float(cascade.timing.delay)
+    first = own if margin.held >= own else 0.0
 
     def tried(low: float, high: float) -> tuple[np.ndarray, Stability]:
         delays = np.linspace(low, high, DELAYS)

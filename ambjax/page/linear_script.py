@@ -4,7 +4,6 @@ From these, sensitivity.js computes the equilibrium by Newton's method, and the 
 does.
 """
 
-import dataclasses
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -116,9 +115,7 @@ def _values(numbers: Numbers, x: LoopPoint) -> PointValues:
 
 def _ideal(numbers: Numbers) -> Numbers:
     """Return the numbers without parts that cannot be linearised: limits, noise, converters, guard."""
-    processor: Any = numbers.cascade.processor
-    cascade = dataclasses.replace(numbers.cascade, processor=dataclasses.replace(processor, guard=None))
-    return numbers._replace(cascade=cascade, scenario=ideal(numbers.scenario))
+    return numbers._replace(cascade=numbers.cascade.with_processor(guard=None), scenario=ideal(numbers.scenario))
 
 
 def _with_lags(scenario: Scenario, point: Point) -> EquilibriumPoint:
@@ -137,9 +134,7 @@ def linear_script(case: Case) -> LinearScript:
         numbers = canonical(loop_parameters(case, any_delay=True))
         (lagged, u, control), _ = jax.eval_shape(_start, numbers)
         zero = jnp.zeros(())
-        processor = numbers.cascade.processor
-        assert processor is not None
-        x = LoopPoint(lagged, u, control, processor.constant_past(zero), zero)
+        x = LoopPoint(lagged, u, control, numbers.cascade.timing.constant_past(zero), zero)
         x = jax.tree.map(lambda _: zero, x)
         start = piece_of(_start, "p", (numbers,))
         point = piece_of(_columns, "px", (numbers, x))

@@ -90,6 +90,4 @@ def loop_parameters(case: Case, any_delay: bool = False) -> Numbers:
 
 def longest_delay(case: Case) -> float:
     """Return the longest delay that the page admits, samples: the number of commands that its programs keep."""
-    processor = case.cascade.on_processor().processor
-    assert processor is not None
-    return float(len(processor.constant_past(jnp.zeros(()))))
+    return float(len(case.cascade.on_processor().timing.constant_past(jnp.zeros(()))))

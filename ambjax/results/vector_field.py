@@ -33,7 +33,7 @@ def vector_field(case: Case) -> VectorField:
     Raises ValueError for a controller on a processor, because its loop is not a differential equation.
     """
     require_case(case)
-    if case.cascade.processor is not None:
+    if case.cascade.sampled:
         raise ValueError(
             "vector_field: this controller runs on a processor, so its loop is not a differential equation. Remove "
             "[processor] from the case, or use ambjax.simulate."

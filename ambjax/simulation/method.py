@@ -76,7 +76,7 @@ def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
     has no value, because a fixed step can be chosen only from numbers.
     """
     # On a processor the laws have discrete steps, and only the plant is integrated.
-    laws = {} if cascade.processor else {f"{stage} law": slope for stage, slope in cascade.slopes().items()}
+    laws = {} if cascade.sampled else {f"{stage} law": slope for stage, slope in cascade.slopes().items()}
     plant = scenario.plant
     named = laws | {PLANT: plant.slope(), COILS: scenario.current_slope, FLUX: plant.flux_slope()}
     named |= {} if scenario.stop is None else {STOP: scenario.stop.slope(plant.m)}
@@ -106,7 +106,7 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
     named = slopes(cascade, scenario)
     slope = max(named.values())
     fixed_only, noisy = _fixed_only(cascade, scenario), _noisy(scenario)
-    if cascade.processor is not None:
+    if cascade.sampled:
         settled = math.ceil(sample_period * max(named[COILS] / SETTLED, named[FLUX] / LAGGED))
         amplifier = scenario.actuator
         rate = float(np.max(np.asarray(amplifier.slope()))) if amplifier.slow else 0.0
@@ -125,7 +125,7 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
         return RK4(substeps)
     if reverse or fixed_only:
         return Rodas3(fixed)
-    stiff = cascade.processor is not None or sample_period * slope > EXPLICIT
+    stiff = cascade.sampled or sample_period * slope > EXPLICIT
     tolerance = (TOLERANCE if noisy else QUIET_TOLERANCE) if stiff else (TIGHT if noisy else QUIET_TIGHT)
     return AdaptiveRodas3(_tolerance(tolerance)) if stiff else AdaptiveCashKarp(_tolerance(tolerance))
 
@@ -152,7 +152,7 @@ def _smooth_inside(cascade: Cascade, scenario: Scenario, sample_period: float) -
 
 def _fixed_only(cascade: Cascade, scenario: Scenario) -> bool:
     """Return whether the loop requires a fixed number of steps: XLA aborts when it compiles the adaptive method."""
-    return cascade.processor is None and scenario.drive == "current"
+    return not cascade.sampled and scenario.drive == "current"
 
 
 def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: bool = False) -> Clock:
@@ -186,7 +186,7 @@ def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: 
         )
     elif clock.method.limit is not None:
         _check_limit(clock, clock.method.limit, cascade, scenario)
-    if cascade.processor is None or (cuts := most_inside(scenario, clock.sample_period)) is None:
+    if not cascade.sampled or (cuts := most_inside(scenario, clock.sample_period)) is None:
         return clock
     return dataclasses.replace(clock, cuts=max(cuts, clock.cuts or 0))
 

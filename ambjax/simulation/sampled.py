@@ -48,9 +48,7 @@ class Sampled:
     @property
     def processor(self) -> Processor:
         """The processor of the cascade."""
-        processor = self.loop.cascade.processor
-        assert processor is not None
-        return processor
+        return self.loop.cascade.timing
 
     def realised(self) -> Self:
         """Return the loop of one member, with its random signals drawn."""

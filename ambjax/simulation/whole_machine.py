@@ -281,8 +281,7 @@ class SampledMachine(Machine):
         The second result contains the amplifiers' outputs at the end (V). With a low-pass of a sensor, pieces also end
         at the jumps of loads.
         """
-        processor = loop_of(self.axes[0]).cascade.processor
-        assert processor is not None
+        processor = loop_of(self.axes[0]).cascade.timing
         delay, whole = jnp.asarray(processor.delay)[0], bool(processor.whole)
         commands = [acting((own.command.u, *own.past), delay, period, whole) for own in axes]
         low_passed = any(map(lags, self.loops()))

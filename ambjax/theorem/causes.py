@@ -6,7 +6,7 @@ each of them, no cause is named: it may be the gains of the laws, or several par
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -87,7 +87,7 @@ def parts(cascade: Cascade, scenario: Scenario, clock: Clock) -> Iterator[Part]:
         yield Part(name, remedy, controller, scenario, clock)
     for name, remedy, world in _motion(scenario, clock):
         yield Part(name, remedy, cascade, world, clock)
-    if cascade.processor is not None:
+    if cascade.sampled:
         finer = dataclasses.replace(
             clock, samples=FINER * clock.samples, sample_period=float(clock.sample_period) / FINER
         )
@@ -124,25 +124,17 @@ def _supply(scenario: Scenario) -> Iterator[tuple[str, str, Scenario]]:
 
 
 def _processor(cascade: Cascade) -> Iterator[tuple[str, str, Cascade]]:
-    processor: Any = cascade.processor
-    if processor is not None and not processor.implicit:
-        yield "the explicit steps", 'Set discretisation = "implicit".', _on(cascade, implicit=True)
-    if processor is not None and processor.guard is not None:
-        yield "the guard of the readings", "Change [processor.guard].", _on(cascade, guard=None)
+    if not cascade.timing.implicit:
+        yield "the explicit steps", 'Set discretisation = "implicit".', cascade.with_processor(implicit=True)
+    if cascade.timing.guard is not None:
+        yield "the guard of the readings", "Change [processor.guard].", cascade.with_processor(guard=None)
 
 
 def _delay(cascade: Cascade) -> Iterator[tuple[str, str, Cascade]]:
-    processor: Any = cascade.processor
-    if processor is not None and float(np.max(processor.delay)) > 0:
-        remedy = "Reduce the delay or the gains." if processor.predicts else "Set predict = true, or reduce the delay."
-        name = f"the delay of {float(np.max(processor.delay)):g} samples"
-        yield name, remedy, _on(cascade, delay=0.0, assumed=None)
-
-
-def _on(cascade: Cascade, **fields: object) -> Cascade:
-    """Return the cascade with other fields of its processor."""
-    processor: Any = cascade.processor
-    return dataclasses.replace(cascade, processor=dataclasses.replace(processor, **fields))
+    timing = cascade.timing
+    if (delay := float(np.max(timing.delay))) > 0:
+        remedy = "Reduce the delay or the gains." if timing.predicts else "Set predict = true, or reduce the delay."
+        yield f"the delay of {delay:g} samples", remedy, cascade.with_processor(delay=0.0, assumed=None)
 
 
 def _model(cascade: Cascade, scenario: Scenario) -> Iterator[tuple[str, str, Cascade]]:

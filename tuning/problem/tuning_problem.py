@@ -58,7 +58,7 @@ class TuningProblem:
     @property
     def sampled(self) -> bool:
         """Whether the laws run on a processor, so that only the plant is integrated."""
-        return self.case.cascade.processor is not None
+        return self.case.cascade.sampled
 
     @property
     def sliding(self) -> bool:
