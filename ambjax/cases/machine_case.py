@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ambjax.cases.machine_spread import axis_table, fastest_rotor, machine_spread
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
 from ambjax.cases.rotor_tables import (
     COORDINATES,
@@ -23,6 +24,7 @@ from ambjax.cases.rotor_tables import (
     vector,
 )
 from ambjax.cases.table import Table, load, show
+from ambjax.ensemble.spread import Spread
 from ambjax.linear.analysis import Zones
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
@@ -50,8 +52,8 @@ class MachineCase:
 
     `machine`: rotor and axes, for a rollout with `clock`. `axes`: names of the axes. `coordinates`: names of the
     rotor's coordinates. `cases`: the case of each axis, with the mass and the weight that it carries. `settle`: time
-    from which "settled" metrics count, s. `zones`, `speeds`: range, limits and speeds (rpm) of the sensitivity. `text`:
-    the file as read.
+    from which "settled" metrics count, s. `zones`, `speeds`: range, limits and speeds (rpm) of the sensitivity.
+    `spread`: the numbers that vary between the members of an ensemble. `text`: the file as read.
     """
 
     name: str
@@ -63,6 +65,7 @@ class MachineCase:
     settle: float
     zones: Zones
     speeds: tuple[float, ...]
+    spread: Spread = Spread()
     text: str = ""
 
 
@@ -95,9 +98,8 @@ def machine_from(
     """Return the machine of a parsed TOML document. Raises ValueError, one line, for an invalid one."""
     top = Table(raw)
     top.only([*TABLES, *MACHINE_TABLES, "tune"])
-    for table, instead in (("disturbance", "[[load]]"), ("spread", "one case for each value")):
-        if table in raw:
-            raise ValueError(f"[{table}]: a machine with [rotor] does not take it yet. Use {instead} instead.")
+    if "disturbance" in raw:
+        raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] instead.")
     body, bearings = body_from(top), tables_of(top, "bearing")
     if not bearings:
         raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
@@ -106,28 +108,33 @@ def machine_from(
     q, currents = _start(top.table("initial"), rotor, len(axes))
     _check_rank(rotor, axes)
     masses, forces = _shares(rotor)
+    names = [table.raw.get("name", f"bearing{k + 1}") for k, table in enumerate(bearings)]
     cases = []
     for axis, m, force, i in zip(axes, masses, forces, currents, strict=True):
         own = _axis_raw(raw, bearings[axis.bearing], m, force, {"z": float(axis.magnet @ q), "i": i})
         try:
-            case = case_from(own, axis.name, "", folder)
+            case = case_from(own | axis_table(raw, axis, names[axis.bearing]), axis.name, "", folder)
         except ValueError as error:
             raise ValueError(f"axis {axis.name}: {error}") from None
         _check_force(case, axis, force)
         cases.append(case)
-    clock = _clock(cases, rotor, fixed=not isinstance(raw.get("clock", {}).get("dt", "auto"), str))
+    spread = machine_spread(top, rotor, axes, names, cases)
+    clock = _clock(
+        cases, fastest_rotor(rotor, spread), fixed=not isinstance(raw.get("clock", {}).get("dt", "auto"), str)
+    )
     systems = [canonical(prepare(case.cascade, case.scenario, clock)[0]) for case in cases]
-    names = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
+    coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
     return MachineCase(
         name=safe_name(name),
         machine=machine_of(rotor, systems, jnp.asarray(q)),
         clock=clock,
         axes=tuple(axis.name for axis in axes),
-        coordinates=names,
+        coordinates=coordinates,
         cases=tuple(cases),
         settle=cases[0].settle,
         zones=cases[0].zones,
         speeds=_speeds(top.table("sensitivity"), rotor, float(clock.duration)),
+        spread=spread,
         text=text,
     )
 
@@ -193,7 +200,8 @@ def _check_force(case: Case, axis: BearingAxis, force: float) -> None:
 
 def _axis_raw(raw: dict[str, Any], bearing: Table, m: float, force: float, initial: dict[str, float]) -> dict[str, Any]:
     """Return the case of one axis: the common tables, what the bearing changes, and the rotor's share."""
-    own = copy.deepcopy({key: value for key, value in raw.items() if key not in (*MACHINE_TABLES, "initial", "tune")})
+    apart = (*MACHINE_TABLES, "initial", "tune", "spread")
+    own = copy.deepcopy({key: value for key, value in raw.items() if key not in apart})
     for table in OWN:
         if table in bearing.raw:
             own[table] = _merged(own.get(table, {}), bearing.table(table).raw)
