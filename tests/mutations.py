@@ -398,8 +398,8 @@ MUTATIONS = [
     M(
         "the voltages of the two previous samples are exchanged",
         "ambjax/simulation/sampled.py",
-        "past = self.loop.cascade, self.processor.remembered(state.command.u, *state.past)",
-        "past = self.loop.cascade, self.processor.remembered(*state.past, state.command.u)",
+        "past = self.processor.remembered(state.command.u, *state.past)",
+        "past = self.processor.remembered(*state.past, state.command.u)",
         "tests/test_sampled.py::test_the_voltage_of_a_sample_acts_after_the_delay",
     ),
     M(
