@@ -66,7 +66,7 @@ def rounds(
         if not found.failed or course.over or len(answers) >= MOST_ROUNDS:
             break
         course.members = joining(course, found)
-        x = course.search(course.around(x))
+        x, _ = course.again(x)
     if not answers:
         return course.answer(x, None, budget.validation)
     best = _best_of(answers)
