@@ -194,8 +194,8 @@ def _check_force(case: Case, axis: BearingAxis, force: float) -> None:
 def _axis_raw(raw: dict[str, Any], bearing: Table, m: float, force: float, initial: dict[str, float]) -> dict[str, Any]:
     """Return the case of one axis: the common tables, what the bearing changes, and the rotor's share."""
     own = copy.deepcopy({key: value for key, value in raw.items() if key not in (*MACHINE_TABLES, "initial", "tune")})
-    own["rotor"] = {key: raw["rotor"][key] for key in ("speed", "acceleration") if key in raw["rotor"]}
-    own["rotor"].setdefault("speed", 0.0)
+    if turning := {key: raw["rotor"][key] for key in ("speed", "acceleration") if key in raw["rotor"]}:
+        own["rotor"] = {"speed": 0.0, **turning}
     for table in OWN:
         if table in bearing.raw:
             own[table] = _merged(own.get(table, {}), bearing.table(table).raw)
