@@ -28,13 +28,13 @@ class OrderCarry(NamedTuple):
 
     - `now`, `whole`: sums of the products of each basis function, then of each signal, with each basis function; over
       all samples, and over those up to the last whole revolution.
-    - `first`, `count`: angle of the first sample, in turns, and number of whole revolutions since then; -1: no sample.
+    - `first`, `turns`: angle of the first sample, in turns, and number of whole revolutions since then; -1: no sample.
     """
 
     now: Array
     whole: Array
     first: Array
-    count: Array
+    turns: Array
 
 
 @record
@@ -55,22 +55,22 @@ class Orders:
         return OrderCarry(none, none, zero, -jnp.ones_like(zero))
 
     def update(self, carry: OrderCarry, row: Row, span: Span) -> OrderCarry:
-        counts, turns = (row.t >= self.after) & row.alive, self.rotor.turns(row.t)
-        first = jnp.where(carry.count < 0, turns, carry.first)
-        count = jnp.where(counts, jnp.floor(jnp.abs(turns - first) + ROUNDED), carry.count)
-        waves = (x for k in ORDERS for x in (sine(k * turns + 0.25), sine(k * turns)))
-        basis = jnp.stack([jnp.ones_like(turns), *waves])
+        counts, angle = (row.t >= self.after) & row.alive, self.rotor.turns(row.t)
+        first = jnp.where(carry.turns < 0, angle, carry.first)
+        turns = jnp.where(counts, jnp.floor(jnp.abs(angle - first) + ROUNDED), carry.turns)
+        waves = (x for k in ORDERS for x in (sine(k * angle + 0.25), sine(k * angle)))
+        basis = jnp.stack([jnp.ones_like(angle), *waves])
         signals = jnp.stack([jnp.asarray(getattr(row, name)) for name in SIGNALS])
         more = jnp.concatenate([basis, signals])[:, None] * basis
-        whole = jnp.where(count > carry.count, carry.now, carry.whole)
-        return OrderCarry(carry.now + jnp.where(counts, more, 0.0), whole, first, count)
+        whole = jnp.where(turns > carry.turns, carry.now, carry.whole)
+        return OrderCarry(carry.now + jnp.where(counts, more, 0.0), whole, first, turns)
 
     def result(self, carry: OrderCarry, ending: Ending) -> dict[str, Array]:
         """Return amplitude and phase by the names of UNITS."""
         # the last revolution is complete if the run ends with it
         turns = jnp.abs(self.rotor.turns(jnp.minimum(ending.duration, ending.lost_at)) - carry.first)
-        sums = jnp.where(jnp.floor(turns + ROUNDED) > carry.count, carry.now, carry.whole)
-        size, found = sums.shape[1], (turns + ROUNDED >= 1) & (carry.count >= 0)
+        sums = jnp.where(jnp.floor(turns + ROUNDED) > carry.turns, carry.now, carry.whole)
+        size, found = sums.shape[1], (turns + ROUNDED >= 1) & (carry.turns >= 0)
         products = jnp.where(found, sums[:size], jnp.eye(size, dtype=sums.dtype))
         x = solve(products[None], jnp.where(found, sums[size:], 0.0).T[None])[0]
         numbers = {}
