@@ -95,7 +95,7 @@ def machine_from(
 ) -> MachineCase:
     """Return the machine of a parsed TOML document. Raises ValueError, one line, for an invalid one."""
     top = Table(raw)
-    top.only([*TABLES, *MACHINE_TABLES, "tune"])
+    top.only([*TABLES, *MACHINE_TABLES[1:], "tune"])
     for table, instead in (("disturbance", "[[load]]"), ("spread", "one case for each value")):
         if table in raw:
             raise ValueError(f"[{table}]: a machine with [rotor] does not take it yet. Use {instead} instead.")
@@ -202,6 +202,8 @@ def _check_force(case: Case, axis: BearingAxis, force: float) -> None:
 def _axis_raw(raw: dict[str, Any], bearing: Table, m: float, force: float, initial: dict[str, float]) -> dict[str, Any]:
     """Return the case of one axis: the common tables, what the bearing changes, and the rotor's share."""
     own = copy.deepcopy({key: value for key, value in raw.items() if key not in (*MACHINE_TABLES, "initial", "tune")})
+    if turning := {key: raw["rotor"][key] for key in ("speed", "acceleration") if key in raw["rotor"]}:
+        own["rotor"] = {"speed": 0.0, **turning}
     for table in OWN:
         if table in bearing.raw:
             own[table] = merged(own.get(table, {}), bearing.table(table).raw)

@@ -127,7 +127,7 @@ def _delay(case: Case) -> Iterator[str]:
 
 
 def _runout(case: Case) -> Iterator[str]:
-    sensor, stop = case.scenario.sensor, float(case.scenario.touchdown)
+    sensor, stop = case.scenario.turning().sensor, float(case.scenario.touchdown)
     if sensor is None or sensor.runout is None:
         return
     most = max(abs(float(one)) for one in sensor.runout.span(float(case.clock.duration)))
@@ -161,7 +161,7 @@ def _loads(case: Case) -> Iterator[str]:
 
 def _aliases(case: Case) -> Iterator[str]:
     half = 0.5 / float(case.clock.sample_period)
-    parts = _signals(case)
+    parts = _signals(case) | {"rotor": case.scenario.rotor}
     if case.scenario.sensor is not None:
         parts["sensor.runout"] = case.scenario.sensor.runout
     for path, signal in parts.items():
@@ -183,5 +183,5 @@ def _frequencies(node: object) -> Iterator[tuple[str, float]]:
             value = getattr(node, field.name)
             if field.name in FREQUENCIES and value is not None:
                 yield field.name, FREQUENCIES[field.name] * float(np.max(np.asarray(value)))
-            elif isinstance(value, tuple):
+            elif isinstance(value, tuple) or dataclasses.is_dataclass(value):
                 yield from _frequencies(value)

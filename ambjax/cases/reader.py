@@ -36,6 +36,7 @@ from ambjax.world.scenario import Scenario
 PLANTS: dict[str, type] = {"lumped": Plant, "two-coil": TwoCoil}
 TABLES = [
     "plant",
+    "rotor",
     "controller",
     "processor",
     "reference",

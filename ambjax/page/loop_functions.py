@@ -60,8 +60,12 @@ class LoopFunctions:
         clock = dataclasses.replace(self.clock, sample_period=numbers.period)
         built: Any = system_of(numbers.cascade, numbers.scenario, clock)
         word = jnp.zeros((), jnp.uint32)
-        loop = GivenNoise(built.loop.cascade, numbers.scenario, (word, word), normals)
-        return dataclasses.replace(built, loop=loop), clock, standard_for(numbers.settle, numbers.scenario)
+        loop = GivenNoise(built.loop.cascade, numbers.scenario.turning(), (word, word), normals)
+        return dataclasses.replace(built, loop=loop), clock, self._fold(numbers)
+
+    def _fold(self, numbers: Numbers) -> Standard:
+        """Return the metrics without those once per revolution, which compute with arrays."""
+        return standard_for(numbers.settle, dataclasses.replace(numbers.scenario, rotor=None))
 
     def start(self, numbers: Numbers, normals: Any) -> RolloutState:
         """Return the state of the run before the first sample."""
@@ -77,7 +81,7 @@ class LoopFunctions:
 
     def result(self, numbers: Numbers, progress: RolloutState) -> dict[str, Array]:
         """Return the metrics of a run that ended in this state."""
-        fold = standard_for(numbers.settle, numbers.scenario)
+        fold = self._fold(numbers)
         return fold.result(progress.fold, progress.ending)
 
 

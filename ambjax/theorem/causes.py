@@ -161,7 +161,7 @@ def _model(cascade: Cascade, scenario: Scenario) -> Iterator[tuple[str, str, Cas
 
 def _motion(scenario: Scenario, clock: Clock) -> Iterator[tuple[str, str, Scenario]]:
     end = float(clock.duration)
-    loads = [getattr(scenario, slot) for slot in SLOTS if slot != "reference"]
+    loads = [getattr(scenario.turning(), slot) for slot in SLOTS if slot != "reference"]
     acts = any(load is not None and any(load.span(end)) for load in loads)
     if acts or (scenario.sensor is not None and scenario.sensor.runout is not None):
         yield "the disturbances and the runout", "", scenario.undisturbed()
