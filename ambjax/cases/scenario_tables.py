@@ -234,7 +234,7 @@ def check_start(scenario: Scenario) -> None:
 
 def _check_coils(scenario: Scenario) -> None:
     """Raise ValueError unless the limits of a coil contain its bias and its current at the start."""
-    coil = None if scenario.amplifier is None else scenario.amplifier.coil
+    coil = scenario.actuator.coil
     if coil is None:
         return
     i_0, bias, i = scenario.plant.i_0, scenario.plant.R * scenario.plant.i_0, scenario.initial.i

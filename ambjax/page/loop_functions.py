@@ -39,11 +39,7 @@ class GivenNoise(Realised):
     normals: tuple[Array, Array, Array]
 
     def sensor_errors(self, sample: Scalar) -> Errors:
-        sensor = self.scenario.sensor
-        if sensor is None:
-            return super().sensor_errors(sample)
-        stds = sensor.std, sensor.std_z_dot, sensor.std_i
-        return Errors(*(std * normal for std, normal in zip(stds, self.normals, strict=True)))
+        return self.scenario.sensors.scaled(self.normals)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,6 +94,4 @@ def loop_parameters(case: Case, any_delay: bool = False) -> Numbers:
 
 def longest_delay(case: Case) -> float:
     """Return the longest delay that the page admits, samples: the number of commands that its programs keep."""
-    processor = case.cascade.on_processor().processor
-    assert processor is not None
-    return float(len(processor.constant_past(jnp.zeros(()))))
+    return float(len(case.cascade.on_processor().timing.constant_past(jnp.zeros(()))))

@@ -302,8 +302,7 @@ class SampledMachine(Machine):
         The second result contains the amplifiers' outputs at the end (V). With a low-pass of a sensor, pieces also end
         at the jumps of loads.
         """
-        processor = loop_of(self.axes[0]).cascade.processor
-        assert processor is not None
+        processor = loop_of(self.axes[0]).cascade.timing
         delay, whole = jnp.asarray(processor.delay)[0], bool(processor.whole)
         commands = [acting((own.command.u, *own.past), delay, period, whole) for own in axes]
         low_passed = any(map(lags, self.loops()))
@@ -354,17 +353,13 @@ class SampledMachine(Machine):
         found = []
         sensed = [self.at_sensors(state) for state in states]
         for k, loop in enumerate(self.loops()):
-            z, sensor, motions = axes[k].z_filtered, loop.scenario.sensor, list[Measurement]()
-            if sensor is None or not lags(loop):
+            z, sensor, motions = axes[k].z_filtered, loop.scenario.sensors, list[Measurement]()
+            if not lags(loop):
                 found.append(z)
                 continue
             for own, n in zip(sensed, range(len(durations) + 1), strict=True):
                 motion = Measurement(own[k].plant.z, own[k].plant.z_dot, z)
-                if sensor.runout is not None:
-                    at = jnp.broadcast_to(t + sum(durations[:n]), motion.z.shape)
-                    runout, rate = jax.jvp(sensor.runout, (at,), (jnp.ones_like(at),))
-                    motion = motion._replace(z=motion.z + runout, z_dot=motion.z_dot + rate)
-                motions.append(motion)
+                motions.append(sensor.over_surface(motion, jnp.broadcast_to(t + sum(durations[:n]), motion.z.shape)))
             for before, after, time in zip(motions, motions[1:], durations, strict=False):
                 z = sensor.lagged(z, before, after, time)
             found.append(z)

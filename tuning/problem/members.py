@@ -147,5 +147,4 @@ class Objective:
 
 def _with_noise(scenario: Scenario, noise_factor: Any) -> Scenario:
     """Return the scenario with `noise_factor` times the sensor noise."""
-    sensor = scenario.sensor
-    return scenario if sensor is None else dataclasses.replace(scenario, sensor=sensor.louder(noise_factor))
+    return scenario.louder(noise_factor)
