@@ -56,6 +56,7 @@ from ambjax.world.ramps import Trapezoid as Trapezoid
 from ambjax.world.recorded import Recorded as Recorded
 from ambjax.world.recorded import Samples as Samples
 from ambjax.world.rotation import Harmonic as Harmonic
+from ambjax.world.rotation import Rotation as Rotation
 from ambjax.world.rotation import Runout as Runout
 from ambjax.world.rotation import Unbalance as Unbalance
 from ambjax.world.rotation import UnbalanceGrade as UnbalanceGrade

@@ -1,7 +1,7 @@
 """The table [spread] of a machine: distributions of numbers of the rotor, and of each axis."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -46,6 +46,15 @@ def axis_table(raw: dict[str, Any], axis: BearingAxis, name: str) -> dict[str, A
         if isinstance(merged.get("plant"), dict) and key in merged["plant"]:
             raise ValueError(f"spread.plant.{key}: the rotor gives it. Spread rotor.m instead.")
     return {"spread": merged} if merged else {}
+
+
+def refuse_unused(spread: Spread) -> None:
+    """Raise ValueError for a number of the laws of an axis, for a machine whose law demands the forces of all axes."""
+    for path, _ in spread.entries:
+        if any(f".controller.{part}." in path for part in ("observer", "position", "model")):
+            raise ValueError(
+                f"spread.{path}: one law demands the forces of all axes, so an axis has none. Leave it out."
+            )
 
 
 def _joined(common: dict[str, Any], own: Any) -> dict[str, Any]:
@@ -93,10 +102,10 @@ def machine_places(rotor: Rotor, names: Sequence[str], cases: Sequence[Case]) ->
     return table
 
 
-def axis_values(values: Mapping[str, object], name: str) -> dict[str, object]:
-    """Return the values of one axis by the paths of its case. `name`: of the axis."""
+def axis_values(values: Mapping[str, object], name: str, known: Iterable[str]) -> dict[str, object]:
+    """Return the values of one axis by the paths of its case, `known`. `name`: of the axis."""
     own = f"{OF_BEARING}.{name}."
-    common = {path: x for path, x in values.items() if path.startswith(COMMON)}
+    common = {path: x for path, x in values.items() if path in known}
     return common | {path.removeprefix(own): x for path, x in values.items() if path.startswith(own)}
 
 

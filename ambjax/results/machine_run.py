@@ -12,7 +12,7 @@ import numpy as np
 from ambjax.cases.machine_case import MachineCase
 from ambjax.ensemble.replay import SEGMENT
 from ambjax.numerics.records import canonical
-from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.metrics import UNITS, standard_for
 from ambjax.simulation.rollout import begin, finish, recorded_segment
 from ambjax.simulation.trajectory import SIGNAL_UNITS, STATUSES
 from ambjax.simulation.whole_machine import PerAxis, stack_axes
@@ -85,5 +85,6 @@ def simulate_machine(case: MachineCase, progress: Callable[[int], object] = lamb
 
 
 def worst_of(measured: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return each metric [..., c] of the worst axis."""
-    return {name: np.min(x, -1) if name in SMALLEST else np.max(x, -1) for name, x in measured.items()}
+    """Return each metric [..., c] of the worst axis; without phases, of which none is the worst."""
+    sized = {name: x for name, x in measured.items() if UNITS.get(name) != "deg"}
+    return {name: np.min(x, -1) if name in SMALLEST else np.max(x, -1) for name, x in sized.items()}

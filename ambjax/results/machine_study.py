@@ -8,10 +8,11 @@ import jax
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase
+from ambjax.cases.machine_controller import inner
 from ambjax.cases.machine_spread import axis_values, machine_places, varied_rotors
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
-from ambjax.ensemble.paths import kinds, with_values
+from ambjax.ensemble.paths import kinds, places, with_values
 from ambjax.ensemble.spread import Spread, drawn
 from ambjax.ensemble.study import SPREAD, AnyStudy
 from ambjax.linear import linearise_machine, poles_in_s
@@ -23,6 +24,7 @@ from ambjax.simulation.folds import Fold
 from ambjax.simulation.metrics import standard_for
 from ambjax.simulation.rollout import Outcome, prepare, run
 from ambjax.simulation.whole_machine import Machine, PerAxis, machine_of, stack_axes
+from ambjax.world.rotor import Rotor
 from ambjax.world.scenario import Scenario
 
 # Multiple of the clearance by which the rotor of a `lost` call is displaced along x and y.
@@ -80,16 +82,19 @@ class MachineStudy(AnyStudy):
         """
         values = self.drawn(members)
         parts = [self._axis(values, k, members) for k in range(len(self.case.axes))]
-        machine = machine_of(
-            varied_rotors(self.case.machine.rotor, values),
-            [canonical(prepare(*part, self.clock)[0]) for part in parts],
-            self.case.machine.start_q,
-        )
+        machine = self._machine(varied_rotors(self.case.machine.rotor, values), parts)
         return machine, PerAxis(stack_axes([canonical(standard_for(self.settle, scenario)) for _, scenario in parts]))
+
+    def _machine(self, rotor: Rotor, parts: list[tuple[Cascade, Scenario]]) -> Machine:
+        law = self.case.machine.law
+        systems = [prepare(*part, self.clock)[0] for part in parts]
+        systems = [canonical(system if law is None else inner(system)) for system in systems]
+        return machine_of(rotor, systems, self.case.machine.start_q, law)
 
     def _axis(self, values: dict[str, Any], k: int, member: Any) -> tuple[Cascade, Scenario]:
         one = self.case.cases[k]
-        cascade, scenario = with_values(one.cascade, one.scenario, axis_values(values, self.case.axes[k]))
+        own = axis_values(values, self.case.axes[k], places(one.cascade, one.scenario))
+        cascade, scenario = with_values(one.cascade, one.scenario, own)
         return cascade, dataclasses.replace(scenario, seed=self.seed, member=member)
 
     def member(self, index: int) -> MachineCase:
@@ -99,12 +104,11 @@ class MachineStudy(AnyStudy):
         for k, one in enumerate(self.case.cases):
             cascade, scenario = self._axis(numbers, k, index)
             cases.append(dataclasses.replace(one, cascade=cascade, scenario=scenario))
-        systems = [canonical(prepare(one.cascade, one.scenario, self.clock)[0]) for one in cases]
         rotor = self.case.machine.rotor
         rotors = varied_rotors(rotor, values)
         if rotors is not rotor:
             rotor = jax.tree.map(lambda x: x[0], rotors)
-        machine = machine_of(rotor, systems, self.case.machine.start_q)
+        machine = self._machine(rotor, [(one.cascade, one.scenario) for one in cases])
         name = f"{self.case.name}-{index}"
         return dataclasses.replace(self.case, name=name, machine=machine, cases=tuple(cases))
 
@@ -137,8 +141,8 @@ class MachineStudy(AnyStudy):
         for k, one in enumerate(self.case.cases):
             at = f"bearing.{self.case.axes[k]}."
             facts |= {**dict(kinds(one.cascade, f"{at}controller.")), **dict(kinds(one.scenario, at))}
-        places = machine_places(self.case.machine.rotor, self.case.axes, self.case.cases)
-        facts |= {path: str(place.value) for path, place in places.items()}
+        known = machine_places(self.case.machine.rotor, self.case.axes, self.case.cases)
+        facts |= {path: str(place.value) for path, place in known.items()}
         for x in jax.tree.leaves((self.case.machine.rotor, self.case.machine.start_q)):
             digest.update(np.asarray(x).tobytes())
         return facts | {"rotor": digest.hexdigest()}
