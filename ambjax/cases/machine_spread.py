@@ -52,9 +52,7 @@ def refuse_unused(spread: Spread) -> None:
     """Raise ValueError for a number of the laws of an axis, for a machine whose law demands the forces of all axes."""
     for path, _ in spread.entries:
         if any(f".controller.{part}." in path for part in ("observer", "position", "model")):
-            raise ValueError(
-                f"spread.{path}: one law demands the forces of all axes, so an axis has none. Leave it out."
-            )
+            raise ValueError(f"spread.{path}: one law commands all axes, so an axis has none. Leave it out.")
 
 
 def _joined(common: dict[str, Any], own: Any) -> dict[str, Any]:

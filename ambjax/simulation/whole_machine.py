@@ -435,7 +435,8 @@ def machine_of(
 ) -> Machine:
     """Return the machine of a rotor and the loops of its axes. `start_q` [n]: coordinates at t = 0.
 
-    Axes with the same kinds of parts form a group. Leaves may have an axis of members. `law`: demands the forces of all axes; None: each has its own laws.
+    Axes with the same kinds of parts form a group. Leaves may have an axis of members. `law`: demands the forces of all
+    axes; None: each has its own laws.
     """
     numbers: dict[object, list[int]] = {}
     for k, axis in enumerate(axes):
