@@ -11,7 +11,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import Scalar, record
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import Realised
-from ambjax.simulation.metrics import Standard, standard_for
+from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import RolloutState, begin, one_sample
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
@@ -56,12 +56,12 @@ class LoopFunctions:
 
     clock: Clock
 
-    def _system(self, numbers: Numbers, normals: Any) -> tuple[Sampled, Clock, Standard]:
+    def _system(self, numbers: Numbers, normals: Any) -> tuple[Sampled, Clock, Metrics]:
         clock = dataclasses.replace(self.clock, sample_period=numbers.period)
         built: Any = system_of(numbers.cascade, numbers.scenario, clock)
         word = jnp.zeros((), jnp.uint32)
         loop = GivenNoise(built.loop.cascade, numbers.scenario, (word, word), normals)
-        return dataclasses.replace(built, loop=loop), clock, standard_for(numbers.settle, numbers.scenario)
+        return dataclasses.replace(built, loop=loop), clock, Metrics.of(numbers.settle, numbers.scenario)
 
     def start(self, numbers: Numbers, normals: Any) -> RolloutState:
         """Return the state of the run before the first sample."""
@@ -77,7 +77,7 @@ class LoopFunctions:
 
     def result(self, numbers: Numbers, progress: RolloutState) -> dict[str, Array]:
         """Return the metrics of a run that ended in this state."""
-        fold = standard_for(numbers.settle, numbers.scenario)
+        fold = Metrics.of(numbers.settle, numbers.scenario)
         return fold.result(progress.fold, progress.ending)
 
 

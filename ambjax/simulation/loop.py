@@ -18,7 +18,7 @@ from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED, Row
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
-from ambjax.world.signals import Reference, reference_at
+from ambjax.world.waveforms import Reference, reference_at
 
 # A state that exceeds its scale by this factor counts as diverged. For such a state the model is not valid, but the
 # numbers are still finite.

@@ -61,7 +61,7 @@ def delay_test(problem: TuningProblem, x: np.ndarray, seed: int, columns: Mappin
         return None
     late = dataclasses.replace(processor, delay=delay, assumed=processor.ahead, predict=processor.predicts)
     cascade = dataclasses.replace(cascade, processor=late)
-    ended = run_ensemble(cascade, scenario, problem.case.clock, fold=None, every=0)
+    ended = run_ensemble(cascade, scenario, problem.case.clock, fold=None, record_every=0)
     lost = np.isfinite(ended.trajectory.lost_at)
     unstable = ~lost & ~stability_of(cascade, scenario, problem.case.clock).stable
     return DelayTest(len(members.member), int(lost.sum()), int(unstable.sum()))
