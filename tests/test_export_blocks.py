@@ -142,7 +142,7 @@ def test_a_disturbance_acts_in_the_step_that_integrates_its_sample():
     [
         ({"sensor": Sensor(outliers=Outliers(at=1e-3))}, "sensor.outliers: the exported plant"),
         ({"sensor": Sensor(dropouts=Dropouts(at=1e-3))}, "sensor.dropouts: the exported plant"),
-        ({"sensor": Sensor(runout=Runout(100.0))}, "sensor.runout: the exported plant"),
+        ({"sensor": Sensor(runout=Runout())}, "sensor.runout: the exported plant"),
     ],
 )
 def test_parts_that_an_exported_plant_lacks_are_refused_in_one_line(change, says):

@@ -385,7 +385,7 @@ def test_an_answer_within_the_limits_is_preferred_to_one_of_less_error(monkeypat
     errors, within = iter([4e-3, 2e-3]), iter([True, False])
 
     def validated(course, x, error):
-        return Validation(course.answer(x, error, 1, next(errors)), error, np.arange(1))
+        return Validation(course.answer(x, error, 1, next(errors, math.inf)), error, np.arange(1), np.zeros(0, int))
 
     monkeypatch.setattr(tuning.rounds, "search_within_limits", lambda course, x: (x, next(within)))
     monkeypatch.setattr(tuning.rounds, "validated", validated)

@@ -24,6 +24,8 @@ COLUMNS = {
     "rms_u_V": "rms u, V",
     "max_abs_u_V": "largest |u|, V",
     "force_used": "share of force",
+    "z_1x_m": "z at 1x, m",
+    "i_1x_A": "i at 1x, A",
 }
 
 
@@ -53,8 +55,9 @@ def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]
         described("overview.png", lambda: machine_picture(case, run.signals, title, part / "overview.png"))
         names = [name for name in SIMULATED if (part / name).exists()]
     if not args.json:
-        rows = [(axis, *(f"{own[name]:.4g}" for name in COLUMNS)) for axis, own in run.metrics["axes"].items()]
-        print(table(("axis", *COLUMNS.values()), rows))
+        shown = {name: words for name, words in COLUMNS.items() if name in run.metrics}
+        rows = [(axis, *(f"{own[name]:.4g}" for name in shown)) for axis, own in run.metrics["axes"].items()]
+        print(table(("axis", *shown.values()), rows))
         written(out, ", ".join(names))
     if run.lost:
         lost = run.metrics["lost_at_s"]

@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     names = (*WRITTEN, *html)
     out = directory(args.out, f"simulate-{case.name}", names, args.force)
     say(f"method: {case.clock.method}")
-    if case.cascade.processor is not None:
+    if case.cascade.sampled:
         say(f"on a processor: {case.cascade.processor}")
     replayed = None if study is None else _replay(case, study, args.member)
     trajectory, numbers = _simulated(case) if replayed is None else (replayed.trajectory, replayed.metrics)
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     if ended:
         from ambjax.theorem import advice
 
-        remedy = advice.STALLED if case.cascade.processor is None else advice.STALLED_PLANT
+        remedy = advice.STALLED_PLANT if case.cascade.sampled else advice.STALLED
         words = advice.status(metrics["lost_at_s"], trajectory.lost_why, metrics["stalled"], remedy)
         which = "" if study is None else " for the nominal case"
         look = (

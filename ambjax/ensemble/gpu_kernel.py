@@ -63,7 +63,7 @@ def run_on_gpu(
     _, clock = prepare(cascade, scenario, clock)
     if not isinstance(clock.method, RK4):
         raise ValueError(f"clock.method = {clock.method}: run_on_gpu integrates with RK4 only. Use RK4(substeps).")
-    if cascade.processor is not None:
+    if cascade.sampled:
         raise ValueError("processor: run_on_gpu simulates cascades in continuous time only. Use run_ensemble.")
     if block < WARP or block & (block - 1):
         raise ValueError(f"block = {block}: it must be a power of two, at least {WARP}. Use {BLOCK}, for example.")

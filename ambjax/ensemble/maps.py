@@ -138,7 +138,7 @@ def with_method_for_axes(study: Study, x: Axis, y: Axis) -> Study:
     _check(study, x, y)
     cascade, scenario, clock = study.cascade, study.scenario, study.clock
     usual = choose_method(*corners(study.spread, cascade, scenario), float(clock.sample_period))
-    if cascade.processor is None or clock.method != usual:
+    if not cascade.sampled or clock.method != usual:
         return study
     axes = {axis.path: (float(axis.values[0]), float(axis.values[-1])) for axis in (x, y)}
     period = axes.pop(PERIOD, (clock.sample_period,))[-1]

@@ -47,6 +47,7 @@ def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
     names = {
         "plant": "plant",
         "reference": "reference",
+        "rotor": "rotor",
         "disturbance.q_i": "q_i",
         "sensor": "sensor",
         "actuator": "amplifier",

@@ -21,7 +21,7 @@ from ambjax.world.scenario import POLE, Scenario
 
 # Prefixes of the paths whose values affect the choice of the integration step. Disturbances are among them because
 # steps end at their jumps. Sensors and the other numbers of amplifiers are solved exactly, without integration steps.
-STEP_PATHS = ("plant.", "controller.", "actuator.bandwidth", "run.clearance", "run.stop", "disturbance.")
+STEP_PATHS = ("plant.", "controller.", "actuator.bandwidth", "run.clearance", "run.stop", "disturbance.", "rotor.")
 
 
 @dataclasses.dataclass(frozen=True)

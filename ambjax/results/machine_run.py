@@ -12,7 +12,7 @@ import numpy as np
 from ambjax.cases.machine_case import MachineCase
 from ambjax.ensemble.replay import SEGMENT
 from ambjax.numerics.records import canonical
-from ambjax.simulation.metrics import Metrics
+from ambjax.simulation.metrics import UNITS, Metrics
 from ambjax.simulation.rollout import begin, finish, recorded_segment
 from ambjax.simulation.trajectory import SIGNAL_UNITS, STATUSES
 from ambjax.simulation.whole_machine import PerAxis
@@ -81,5 +81,6 @@ def simulate_machine(case: MachineCase, progress: Callable[[int], object] = lamb
     signals |= {"lost_at": np.asarray(status.lost_at), "lost_why": np.asarray(why)}
     measured = {name: np.asarray(x) for name, x in outcome.metrics.items()}
     by_axis = {axis: {name: x[k].item() for name, x in measured.items()} for k, axis in enumerate(case.axes)}
-    worst = {name: (x.min() if name in SMALLEST else x.max()).item() for name, x in measured.items()}
+    sized = {name: x for name, x in measured.items() if UNITS.get(name) != "deg"}  # no phase is the worst
+    worst = {name: (x.min() if name in SMALLEST else x.max()).item() for name, x in sized.items()}
     return MachineRun(case, signals, worst | {"axes": by_axis}, why)

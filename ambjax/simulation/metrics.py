@@ -10,11 +10,13 @@ from typing import Protocol
 
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, record
-from ambjax.simulation.folds import Count, Driven, Ending, Named, Peak, Reaching, Rms, Variation
+from ambjax.numerics.records import Scalar, leaf, part, record
+from ambjax.simulation import orders
+from ambjax.simulation.folds import Count, Driven, Ending, Fold, Named, Peak, Reaching, Rms, Variation
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import ALIVE, STALLED, Row
 from ambjax.world.plant import Plant
+from ambjax.world.rotation import Rotation
 from ambjax.world.scenario import Scenario
 
 # Unit of each metric by name. Other metrics are shares and counts.
@@ -43,6 +45,7 @@ UNITS = {
     "lost_at_s": "s",
     "singular_at_s": "s",
     "settle_s": "s",
+    **orders.UNITS,
 }
 # Times at which a signal first comes within its band; inf: never.
 REACHED = ("sigma_reached_s", "v_tilde_reached_s", "current_error_reached_s")
@@ -81,6 +84,9 @@ class Metrics:
         infinite=True,
         doc="largest magnetic force; `force_used` is |force| as a share of it; inf: unknown",
     )
+    rotor: Rotation | None = part(
+        default=None, doc="speed of the rotor, for amplitude and phase once and twice per revolution; None: none"
+    )
 
     @classmethod
     def of(cls, settle: Scalar, scenario: Scenario) -> "Metrics":
@@ -97,6 +103,7 @@ class Metrics:
             usual.v_tilde_band * (plant.v_size / paper.v_size),
             usual.e_band * (plant.i_0 / paper.i_0),
             scenario.largest_force,
+            scenario.rotor,
         )
 
     @classmethod
@@ -107,8 +114,10 @@ class Metrics:
     def _folds(self) -> Named:
         """Return the fold of each metric by name."""
         late = self.settle
+        turning: dict[str, Fold] = {} if self.rotor is None else {"orders": orders.Orders(self.rotor, late)}
         return Named(
-            {
+            turning
+            | {
                 "max_abs_error_m": Peak("e_z"),
                 "rms_error_m": Rms("e_z"),
                 "settled_max_abs_error_m": Peak("e_z", late),
@@ -147,6 +156,7 @@ class Metrics:
     def result(self, carry: dict[str, object], ending: Ending) -> dict[str, Array]:
         """Return each metric by name, in the units of UNITS."""
         numbers = self._folds().result(carry, ending)
+        numbers |= numbers.pop("orders", {})
         for name in ("clearance_used", "settled_clearance_used"):
             numbers[name] = numbers[name] / self.touchdown
         numbers["force_used"] = numbers["max_abs_force_N"] / self.largest_force

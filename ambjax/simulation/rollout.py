@@ -139,8 +139,7 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
                 f"ambjax.extend.{base.__name__}."
             )
     validate(dataclasses.replace(cascade, processor=None), "controller")
-    if cascade.processor is not None:
-        validate(cascade.processor, "processor")
+    validate(cascade.processor, "processor")
     check_parts(cascade, scenario, clock.sample_period)
     validate(scenario, "scenario")
     validate(clock, "clock")

@@ -160,7 +160,7 @@ def slides(cascade: Cascade, scenario: Scenario) -> bool:
     """Return whether this step applies to the cascade and the scenario."""
     slow = not cascade.observer.stiff  # Heun's method integrates the observer
     paper = scenario.plant.lumped and scenario.drive == "voltage" and scenario.stop is None
-    return cascade.processor is None and cascade.inversion.slides and slow and paper
+    return not cascade.sampled and cascade.inversion.slides and slow and paper
 
 
 @record

@@ -137,7 +137,7 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float = 0.
     does.
     """
     check_inputs(cascade, scenario, clock)
-    if cascade.processor is not None:
+    if cascade.sampled:
         cascade, clock = cascade.in_continuous_time(), dataclasses.replace(clock, method=None)
         scenario = scenario.in_continuous_time()
     loop: Any

@@ -109,8 +109,7 @@ def _reached(A: np.ndarray, signals: int) -> np.ndarray:
 
 def sampling_of(cascade: Cascade, clock: Clock) -> Sampling:
     """Return the sampling of the laws of a cascade with a processor."""
-    processor: Any = cascade.on_processor().processor
-    return processor.sampling(clock.sample_period)
+    return cascade.on_processor().timing.sampling(clock.sample_period)
 
 
 def _advance(law: Law, model: Plant, sampling: Sampling) -> Callable[..., Any]:

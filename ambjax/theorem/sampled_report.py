@@ -244,8 +244,8 @@ def alternation(u: np.ndarray) -> float:
 
 def _without_noise(scenario: Scenario) -> Scenario:
     """Return the scenario without sensor noise; the same object if it has none. Faults and random signals remain."""
-    quiet = None if scenario.sensor is None else scenario.sensor.louder(0.0)
-    return scenario if quiet in (None, scenario.sensor) else dataclasses.replace(scenario, sensor=quiet)
+    quiet = scenario.louder(0.0)
+    return scenario if quiet.sensor == scenario.sensor else quiet
 
 
 def _bands(cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, rows: Any, noise: bool) -> list[Band]:
