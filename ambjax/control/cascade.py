@@ -17,7 +17,9 @@ from ambjax.compiler.barrier import materialised
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.base import default_law, set_valued_signs, with_default_steepness, with_set_valued_signs
 from ambjax.control.cascade_state import CascadeState, Command, Sample
-from ambjax.control.laws import (
+from ambjax.control.processor import Processor, predicted_over_delay
+from ambjax.control.schedule import extremes, with_gains_at
+from ambjax.control.stages import (
     CurrentInputs,
     CurrentLaw,
     ForceDemand,
@@ -28,13 +30,11 @@ from ambjax.control.laws import (
     begin_law,
     step_law,
 )
-from ambjax.control.processor import Processor, predicted_over_delay
-from ambjax.control.schedule import extremes, with_gains_at
 from ambjax.numerics.records import Scalar, is_traced, part, record
 from ambjax.world.plant import Plant
 from ambjax.world.plant import State as NominalState
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 # In place of a processor in continuous time: no delay, no prediction and no guard.
 _CONTINUOUS = Processor(delay=0.0, predict=False, guard=None)

@@ -12,7 +12,7 @@ from ambjax.host.imports import digest_of
 from ambjax.numerics.records import is_traced, leaf
 from ambjax.numerics.shapes import axes_of, with_entry
 from ambjax.world.scenario import Scenario
-from ambjax.world.signals import Constant
+from ambjax.world.waveforms import Constant
 
 SHIFT = "shift"
 TIME = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="time by which start and stop are shifted together")

@@ -16,7 +16,7 @@ from ambjax.ensemble.paths import kinds, places
 from ambjax.ensemble.spread import Spread, apply, draw
 from ambjax.host.sealed import provenance
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.world.scenario import Scenario
 
@@ -147,10 +147,10 @@ class Study(AnyStudy):
         if lost:
             far = np.full(np.shape(scenario.initial.z), 2 * np.max(np.asarray(scenario.limit)))
             scenario = dataclasses.replace(scenario, initial=dataclasses.replace(scenario.initial, z=far))
-        fold = standard_for(self.settle, scenario)
+        fold = Metrics.of(self.settle, scenario)
         outcome = run_ensemble(cascade, scenario, self.clock, fold=fold, threads=threads, call=call)
         values = {SPREAD + path: x for path, x in self.drawn(members).items()}
-        return {"index": members, "lost_at": outcome.trajectory.lost_at, **outcome.measured, **values}
+        return {"index": members, "lost_at": outcome.trajectory.lost_at, **outcome.metrics, **values}
 
     def bands(self, members: int, times: int, until: float = math.inf) -> Bands:
         """Compute the data of a fan chart of the first `members` members, up to time `until` (s) or the end of the run.
@@ -164,8 +164,8 @@ class Study(AnyStudy):
         cascade, scenario = self.batch(np.arange(min(members, self.members)))
         fold = Blocks(tuple(FAN_SIGNALS.values()), every, count, period)
         clock = dataclasses.replace(self.clock, samples=samples)
-        outcome = run_ensemble(cascade, scenario, clock, fold=fold, every=every)
-        rows, folded = outcome.trajectory.rows, outcome.measured
+        outcome = run_ensemble(cascade, scenario, clock, fold=fold, record_every=every)
+        rows, folded = outcome.trajectory.rows, outcome.metrics
         # Add the last sample, unless the last block begins there.
         ends = [(samples - 1) * period] if (samples - 1) % every else []
         t = np.append(np.asarray(rows.t[0]), ends)

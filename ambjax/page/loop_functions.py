@@ -11,7 +11,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import Scalar, record
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import Realised
-from ambjax.simulation.metrics import Standard, standard_for
+from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import RolloutState, begin, one_sample
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
@@ -52,16 +52,16 @@ class LoopFunctions:
 
     clock: Clock
 
-    def _system(self, numbers: Numbers, normals: Any) -> tuple[Sampled, Clock, Standard]:
+    def _system(self, numbers: Numbers, normals: Any) -> tuple[Sampled, Clock, Metrics]:
         clock = dataclasses.replace(self.clock, sample_period=numbers.period)
         built: Any = system_of(numbers.cascade, numbers.scenario, clock)
         word = jnp.zeros((), jnp.uint32)
         loop = GivenNoise(built.loop.cascade, numbers.scenario.turning(), (word, word), normals)
         return dataclasses.replace(built, loop=loop), clock, self._fold(numbers)
 
-    def _fold(self, numbers: Numbers) -> Standard:
+    def _fold(self, numbers: Numbers) -> Metrics:
         """Return the metrics without those once per revolution, which compute with arrays."""
-        return standard_for(numbers.settle, dataclasses.replace(numbers.scenario, rotor=None))
+        return Metrics.of(numbers.settle, dataclasses.replace(numbers.scenario, rotor=None))
 
     def start(self, numbers: Numbers, normals: Any) -> RolloutState:
         """Return the state of the run before the first sample."""

@@ -21,7 +21,7 @@ from ambjax.numerics.records import canonical
 from ambjax.results.machine_run import worst_of
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
-from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import Outcome, prepare, run
 from ambjax.simulation.whole_machine import Machine, PerAxis, machine_of, stack_axes
 from ambjax.world.rotor import Rotor
@@ -83,7 +83,7 @@ class MachineStudy(AnyStudy):
         values = self.drawn(members)
         parts = [self._axis(values, k, members) for k in range(len(self.case.axes))]
         machine = self._machine(varied_rotors(self.case.machine.rotor, values), parts)
-        return machine, PerAxis(stack_axes([canonical(standard_for(self.settle, scenario)) for _, scenario in parts]))
+        return machine, PerAxis(stack_axes([canonical(Metrics.of(self.settle, scenario)) for _, scenario in parts]))
 
     def _machine(self, rotor: Rotor, parts: list[tuple[Cascade, Scenario]]) -> Machine:
         law = self.case.machine.law
@@ -125,7 +125,7 @@ class MachineStudy(AnyStudy):
         # plain: within one kernel, arrays of axes take minutes to compile
         outcome = map_members(_simulated, tree, threads=threads, call=call, plain=True, quick=False)
         values = {SPREAD + path: x for path, x in self.drawn(members).items()}
-        return {"index": members, "lost_at": outcome.trajectory.lost_at, **worst_of(outcome.measured), **values}
+        return {"index": members, "lost_at": outcome.trajectory.lost_at, **worst_of(outcome.metrics), **values}
 
     def findings(self, index: np.ndarray) -> Findings:
         """Test whether the linear loops of the first MOST_TESTED of these members are stable at their first speed."""

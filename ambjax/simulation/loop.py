@@ -9,7 +9,7 @@ from jax import Array
 
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
-from ambjax.control.laws import ForceDemand
+from ambjax.control.stages import ForceDemand
 from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.smooth import larger, limited
 from ambjax.simulation.edges import Edges
@@ -19,7 +19,7 @@ from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED, Row
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
-from ambjax.world.signals import Reference, reference_at
+from ambjax.world.waveforms import Reference, reference_at
 
 # A state that exceeds its scale by this factor counts as diverged. For such a state the model is not valid, but the
 # numbers are still finite.

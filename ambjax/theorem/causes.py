@@ -15,7 +15,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.simulation.clock import Clock
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.scenario import SLOTS, Scenario
-from ambjax.world.signals import reference_at
+from ambjax.world.waveforms import reference_at
 
 # Resolution that stands for an ideal converter, bits. With a number instead of None, the compiled program is the same.
 FINE_BITS = 32

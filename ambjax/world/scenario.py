@@ -16,8 +16,8 @@ from ambjax.world.plant import Plant
 from ambjax.world.recorded import Knots
 from ambjax.world.rotation import Rotation, turned
 from ambjax.world.sensor import IdealSensor, Measurement, Sensor
-from ambjax.world.signals import Constant, Signal, edges_of, is_random, knots_of, realised
 from ambjax.world.touchdown import Stop
+from ambjax.world.waveforms import Constant, Signal, edges_of, is_random, knots_of, realised
 
 # Numbers that are folded into a member's key, for the random streams of the design and of the signals. The sensors use
 # other streams of this key (`numerics.gaussian.STREAMS`, `faults`), with the sample number as counter.

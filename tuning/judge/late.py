@@ -59,7 +59,7 @@ def delay_test(problem: TuningProblem, x: np.ndarray, seed: int, columns: Mappin
     if np.max(delay) > MOST_DELAY:
         return None
     cascade = cascade.with_processor(delay=delay, assumed=processor.ahead, predict=processor.predicts)
-    ended = run_ensemble(cascade, scenario, problem.case.clock, fold=None, every=0)
+    ended = run_ensemble(cascade, scenario, problem.case.clock, fold=None, record_every=0)
     lost = np.isfinite(ended.trajectory.lost_at)
     unstable = ~lost & ~stability_of(cascade, scenario, problem.case.clock).stable
     return DelayTest(len(members.member), int(lost.sum()), int(unstable.sum()))
