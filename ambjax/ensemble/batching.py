@@ -90,6 +90,7 @@ def map_members(
     call: int | None = None,
     block: int | None = None,
     plain: bool = False,
+    quick: bool = True,
     vectorised: bool = False,
 ) -> Mapped:
     """Return function(member) for every member of an ensemble.
@@ -109,6 +110,8 @@ def map_members(
     - `block`: members that run together in vector instructions (None: as many as fit the first-level cache,
       fewer in a small ensemble).
     - `plain`: compile without the fast path, which does not support the functions of LAPACK, such as eigenvalues.
+    - `quick`: whether a plain program is compiled with `short_compilation.QUICK`, which the large program of a machine
+      must not be: that takes many minutes.
     - `vectorised`: whether the function is vectorised already. It then receives the tree of a block of members, and the
       tree `in_axes` of `jax.vmap` (0 or None for each leaf). Each leaf of its result has a leading axis of the block.
 
@@ -116,7 +119,8 @@ def map_members(
 
     Raises ValueError if the lengths of two leaves differ, or if no leaf is an array.
     """
-    return _Engine(function, tree, threads, call, block, plain, vectorised).results()
+    compiled = one_kernel if not plain else compiled_quickly if quick else jax.jit
+    return _Engine(function, tree, threads, call, block, compiled, vectorised).results()
 
 
 def size(tree: object) -> int:
@@ -144,7 +148,7 @@ class _Engine(Generic[Mapped]):
         threads: int | None,
         call: int | None,
         block: int | None,
-        plain: bool,
+        compiled: Callable[..., Callable],
         vectorised: bool,
     ) -> None:
         leaves, self.tree = jax.tree.flatten(tree)
@@ -162,7 +166,7 @@ class _Engine(Generic[Mapped]):
         self.block = block or block_length(per_call)
         multiple = self.block * len(self.devices)
         self.call = -(-per_call // multiple) * multiple
-        self.program = _program(len(self.devices), plain)
+        self.program = _program(len(self.devices), compiled)
 
     def results(self) -> Mapped:
         """Run all calls and concatenate their results in member order."""
@@ -214,15 +218,13 @@ def _blocks(
 
 
 STATIC = ("function", "moves", "tree", "block", "vectorised")
-_fast = one_kernel(_blocks, static_argnames=STATIC)
-_plain = compiled_quickly(_blocks, static_argnames=STATIC)
 
 
 @functools.cache
-def _program(devices: int, plain: bool) -> Callable[..., Any]:
-    """Return the compiled program: for one device, or with members sharded over several devices."""
+def _program(devices: int, compiled: Callable[..., Callable]) -> Callable[..., Any]:
+    """Return the program that `compiled` makes: for one device, or with members sharded over several devices."""
     if devices == 1:
-        return _plain if plain else _fast
+        return compiled(_blocks, static_argnames=STATIC)
     mesh = Mesh(np.asarray(jax.devices()[:devices]), (MEMBERS,))
     by_member, replicated = PartitionSpec(MEMBERS), PartitionSpec()
 
@@ -232,7 +234,6 @@ def _program(devices: int, plain: bool) -> Callable[..., Any]:
         where = {"mesh": mesh, "in_specs": (Parts(by_member, replicated),), "out_specs": by_member, "check_vma": False}
         return jax.shard_map(one, **where)(parts)
 
-    compiled = compiled_quickly if plain else one_kernel
     kernel = compiled(sharded, static_argnames=STATIC)
 
     def placed(parts: Parts, **static: object) -> object:
