@@ -26,7 +26,7 @@ from ambjax.numerics.shapes import varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import RK4
 from ambjax.simulation.folds import Fold
-from ambjax.simulation.loop import Realised
+from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.rollout import Result, prepare, run
 from ambjax.world.scenario import Scenario
 
@@ -86,7 +86,7 @@ def _in_one_kernel(
 ) -> Result:
     """Build the kernel, run it on all members, and return their outcomes [N]."""
     scenario, key = _with_draws(scenario, members)
-    whole = Realised(cascade, scenario, key), clock, fold
+    whole = ClosedLoop(cascade, scenario, key), clock, fold
     (leaves, tree), axes = jax.tree.flatten(whole), [0 if varies else None for varies in varying(whole)]
     traced, results = _traced(leaves, tree, axes, block)
     programs = -(-members // block)
