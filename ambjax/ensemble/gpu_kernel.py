@@ -28,6 +28,7 @@ from ambjax.simulation.explicit import RK4
 from ambjax.simulation.folds import Fold
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.rollout import Result, prepare, run
+from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 
 # Threads of a warp, and largest number of warps of a program. A thread simulates one member, or block/1024 members in
@@ -36,6 +37,7 @@ WARP, MOST_WARPS = 32, 32
 BLOCK = 128
 
 
+@takes_case
 def run_on_gpu(
     cascade: Cascade,
     scenario: Scenario,

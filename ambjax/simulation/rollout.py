@@ -22,6 +22,7 @@ from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.span import Span
 from ambjax.simulation.system import check_parts, system_of
 from ambjax.simulation.trajectory import ALIVE, Row, Trajectory, first_time
+from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 
 # Types of the state of a system, of the errors of its sensors, and of its row.
@@ -88,10 +89,11 @@ class RolloutState(NamedTuple):
     fold: Any
 
 
+@takes_case
 def rollout(
     cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | None = None, record_every: int = 1
 ) -> Result:
-    """Simulate `scenario.plant` under `cascade` for `clock.samples` sample periods.
+    """Simulate `scenario.plant` under `cascade` for `clock.samples` sample periods. `rollout(case)` works too.
 
     - `fold`: accumulated at every sample, so that metrics need no stored trajectory; None: no metrics.
     - `record_every`: a row is recorded at the start of the first of so many samples; 0: no rows.
