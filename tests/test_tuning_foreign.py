@@ -13,10 +13,12 @@ import pytest
 from texts import problem_from
 from tomlkit import dumps
 
-from ambjax import Cascade, Plant, position
+from ambjax import Cascade
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.control.base import default_law
+from ambjax.laws import position
+from ambjax.plants import Plant
 from tuning.__main__ import main
 from tuning.problem.space import read
 from tuning.report.folder import all_laws

@@ -8,7 +8,7 @@ import pytest
 from bowl import S_0, World, study
 
 import tuning.rounds
-from ambjax import Slide
+from ambjax.solvers import Slide
 from tuning.problem.config import seeds
 from tuning.problem.loss import TERMS
 from tuning.rounds import rounds

@@ -14,9 +14,13 @@ import optax
 import pytest
 from texts import case_and_tune
 
-from ambjax import Cascade, Clock, Initial, Scenario, Sensor, Sine, Slide, inversion, rollout
+from ambjax import Cascade, Clock, Initial, Scenario, rollout
 from ambjax.__main__ import main as simulated
 from ambjax.ensemble import Percent, Spread
+from ambjax.laws import inversion
+from ambjax.sensors import Sensor
+from ambjax.signals import Sine
+from ambjax.solvers import Slide
 from tuning.__main__ import main
 from tuning.optimisers import BACKTRACK, JUMP, NAMES, bfgs, optimiser
 from tuning.problem.goal import Goal
@@ -82,7 +86,7 @@ def test_lanes_equal_rollouts(engines):
     scenario = dataclasses.replace(
         SCENARIO, member=k, seed=3, plant=dataclasses.replace(SCENARIO.plant, m=float(members.values["plant.m"][k]))
     )
-    alone = rollout(CASCADE, scenario, problem.clock, fold=problem.loss, every=0).measured
+    alone = rollout(CASCADE, scenario, problem.clock, fold=problem.loss, record_every=0).metrics
     for name in TERMS:  # the same operations, fused differently
         assert terms[name][0, k] == pytest.approx(float(alone[name]), rel=1e-9)
 
@@ -108,7 +112,9 @@ def test_a_lane_has_the_delay_of_its_member(delays):
     for lane, delay in zip(tracking, delays, strict=True):
         processor = dataclasses.replace(case.cascade.processor, delay=float(delay), whole=None, most=None)
         cascade = dataclasses.replace(case.cascade, processor=processor)
-        alone = rollout(cascade, case.scenario, problem.objective.clock, fold=problem.objective.loss, every=0).measured
+        alone = rollout(
+            cascade, case.scenario, problem.objective.clock, fold=problem.objective.loss, record_every=0
+        ).metrics
         assert lane == pytest.approx(float(alone["tracking"]), rel=1e-9)  # the same operations, fused differently
 
 

@@ -1,8 +1,7 @@
 """Linearisation of a whole machine at rest and constant speed: all loops are closed, each axis has a test signal."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -12,17 +11,21 @@ from jax.flatten_util import ravel_pytree
 
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Sample
+from ambjax.control.machine_law import MachineInputs
 from ambjax.linear.analysis import Zones
 from ambjax.linear.equilibrium import TOLERANCE, at_rest, ideal, newton_of, reading, sizes_of, start_of
 from ambjax.linear.margins import ResponsePeak, peak, poles_in_s, whole_end
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar, canonical
-from ambjax.numerics.small_matrices import exponential
-from ambjax.simulation.whole_machine import Machine, MachineState, PlantOnly, SampledMachine, still, times
+from ambjax.numerics.small_matrices import exponential, times
+from ambjax.simulation.joint_laws import forces, inputs_of
+from ambjax.simulation.whole_machine import Machine, MachineState, PlantOnly, SampledMachine, still
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
 
 T = TypeVar("T")
+# Stands for a demand that no law of the machine makes.
+ABSENT: Any = None
 # Parts of a point or of its rates: one stacked pytree for each group.
 Groups = tuple
 
@@ -60,12 +63,16 @@ class MachineSensitivity(NamedTuple):
 
 
 class _Rest(NamedTuple):
-    """A point of the machine at rest: coordinates [n]; plants, laws and commands [c_g] of each group."""
+    """A point of the machine at rest: coordinates [n]; plants, laws and commands [c_g] of each group.
+
+    `law`: state of the law of the machine, () without one.
+    """
 
     q: Array
     plant: Groups
     control: Groups
     u: Groups
+    law: object = ()
 
 
 class _Linear:
@@ -75,10 +82,10 @@ class _Linear:
         self.machine, self.W, self.period = machine.realised(), W, period
         loops = self.machine.loops()
         self.scenario = tuple(jax.vmap(ideal)(loop.scenario) for loop in loops)
-        self.cascade = tuple(_unguarded(loop.cascade) for loop in loops)
+        self.cascade = tuple(loop.cascade.with_processor(guard=None) for loop in loops)
         self.rotor = self.machine.rotor
-        self.low_passed = [one.sensor is not None and one.sensor.bandwidth is not None for one in self.scenario]
-        self.lagged = [one.amplifier is not None and one.amplifier.slow for one in self.scenario]
+        self.low_passed = [one.sensors.bandwidth is not None for one in self.scenario]
+        self.lagged = [one.actuator.slow for one in self.scenario]
 
     @property
     def sampled(self) -> bool:
@@ -96,7 +103,12 @@ class _Linear:
         q = jnp.zeros_like(jnp.asarray(self.rotor.gravity))
         size = self.machine.scale(sizes)
         first = _Rest(q, *_parts(points))
-        return first, jax.tree.map(lambda x, s: jnp.zeros_like(x) + s, first, _Rest(size.q, *_parts(sizes)))
+        if self.machine.law is not None:
+            e = tuple(jnp.zeros_like(u) for u in first.u)
+            measured = self.read(q, jnp.zeros_like(q), first.plant, self.sensed(q), e)
+            law = self.machine.law.begin(self.machine.join(measured), self.inputs(self.past(first.u)))
+            first = first._replace(law=jax.tree.map(lambda x: jnp.asarray(x, q.dtype), law))
+        return first, jax.tree.map(lambda x, s: jnp.zeros_like(x) + s, first, _Rest(size.q, *_parts(sizes), size.law))
 
     def read(
         self, q: Array, q_dot: Array, plant: Groups, z: Sequence[object], e: Sequence[object]
@@ -120,26 +132,51 @@ class _Linear:
         moved = self.each(one, states, u)
         return self.machine.coupled((jnp.asarray(self.rotor.gravity), self.W), MachineState(q, q_dot, ()), moved)
 
-    def laws(self, measured: Sequence[Measurement], control: Groups, past: Sequence[object]) -> tuple[Groups, Groups]:
-        """Return the commands of the groups, and the next states of the laws, or their rates in continuous time."""
+    def inputs(self, past: Sequence[Any]) -> MachineInputs:
+        """Return the inputs of the law of the machine. `past`: commands on their way, of the groups."""
+        count = self.machine.count
+        reference = jax.tree.map(lambda x: jnp.zeros(count) + x, at_rest(0.0))
+        return inputs_of(
+            self.machine, reference, self.W, jnp.full(count, jnp.inf), self.machine.join(past), self.period
+        )
+
+    def laws(
+        self, measured: Sequence[Measurement], control: Groups, law: object, past: Sequence[Any]
+    ) -> tuple[Groups, Groups, object]:
+        """Return the commands of the groups, and the next states of the laws, or their rates in continuous time.
+
+        `control`: states of the laws of the groups. `law`: state of the law of the machine.
+        """
         reference, unlimited = at_rest(0.0), jnp.asarray(jnp.inf)
+        demands: Groups = (None,) * len(self.cascade)
+        whole = self.machine.law
+        if whole is not None:
+            act = whole.step if self.sampled else whole
+            demanded, law = act(self.machine.join(measured), law, self.inputs(past))
+            demands = forces(self.machine, demanded)
 
         def one(
-            cascade: Cascade, _: object, measured: Measurement, control: CascadeState, past: tuple[Array, ...]
+            cascade: Cascade, _: object, measured: Measurement, control: CascadeState, past: tuple, demand: Any
         ) -> tuple[Array, CascadeState]:
-            if not self.sampled:
-                command, rates = cascade(measured, control, reference, unlimited)
-                return command.u, rates
-            command, after, _ = cascade.step(measured, control, Sample(reference, self.period, unlimited, past))
+            force, estimate = demand or 2 * (ABSENT,)
+            sample = Sample(reference, self.period, unlimited, past)
+            if not self.sampled and force is None:
+                command, after = cascade(measured, control, reference, unlimited)
+            elif not self.sampled:
+                command, after = cascade.command_rates(force, estimate, control, reference, unlimited)
+            elif force is None:
+                command, after, _ = cascade.step(measured, control, sample)
+            else:
+                command, after = cascade.commanded(force, estimate, control, sample)
             return command.u, after
 
-        found = self.each(one, measured, control, past)
-        return tuple(u for u, _ in found), tuple(after for _, after in found)
+        found = self.each(one, measured, control, past, demands)
+        return tuple(u for u, _ in found), tuple(after for _, after in found), law
 
     def past(self, u: Groups) -> Groups:
         """Return the commands on their way under constant commands u; () in continuous time."""
-        processors = [cascade.processor for cascade in self.cascade]
-        return tuple(() if p is None else p.constant_past(own) for p, own in zip(processors, u, strict=True))
+        pasts = (one.timing.constant_past(own) for one, own in zip(self.cascade, u, strict=True))
+        return tuple(past if self.sampled else () for past in pasts)
 
     def sensed(self, q: Array) -> Groups:
         """Return the displacements at the sensors, for the groups with a low-pass."""
@@ -152,15 +189,17 @@ class _Linear:
         moved = self.rates(point.q, zero, point.plant, point.u)
         poles = [scenario.plant.pole for scenario in self.scenario]
         measured = self.read(point.q, zero, point.plant, self.sensed(point.q), e)
-        u, after = self.laws(measured, point.control, self.past(point.u))
+        u, after, law = self.laws(measured, point.control, point.law, self.past(point.u))
+        fastest = jnp.max(self.machine.join(poles))
         if self.sampled:
             change = jax.tree.map(lambda a, b: b - a, point.control, after)
+            law = jax.tree.map(lambda a, b: b - a, point.law, law)
         else:
             change = tuple(jax.tree.map(lambda x, w=w: x / w, own) for own, w in zip(after, poles, strict=True))
+            law = jax.tree.map(lambda x: x / fastest, law)
         axes = zip(moved.axes, poles, strict=True)
         plant = tuple(jax.tree.map(lambda x, w=w: x / w, own.plant) for own, w in axes)
-        fastest = jnp.max(self.machine.join(poles))
-        return _Rest(moved.q_dot / fastest**2, plant, change, jax.tree.map(jnp.subtract, u, point.u))
+        return _Rest(moved.q_dot / fastest**2, plant, change, jax.tree.map(jnp.subtract, u, point.u), law)
 
     def rest(self) -> tuple[_Rest, _Rest, Array]:
         """Return the equilibrium, the sizes of the states, and whether it was found."""
@@ -184,11 +223,11 @@ class _Linear:
             q, q_dot, plant, filtered, own = restore(x)
             z_rates, u_rates, applied = [], [], []
             for k, (scenario, z) in enumerate(zip(self.scenario, self.sensed(q), strict=True)):
-                sensor, amplifier = scenario.sensor, scenario.amplifier
-                low = () if sensor is None or sensor.bandwidth is None else 2 * jnp.pi * jnp.asarray(sensor.bandwidth)
+                bandwidth, amplifier = scenario.sensors.bandwidth, scenario.actuator
+                low = () if bandwidth is None else 2 * jnp.pi * jnp.asarray(bandwidth)
                 z_rates.append(() if isinstance(low, tuple) else low * (z - filtered[k]))
-                slow = amplifier is not None and self.lagged[k]
-                u_rates.append(jnp.asarray(amplifier.slope()) * (u[k] - own[k]) if amplifier and slow else ())
+                slow = self.lagged[k]
+                u_rates.append(jnp.asarray(amplifier.slope()) * (u[k] - own[k]) if slow else ())
                 applied.append(own[k] if slow else u[k])
             after = self.rates(q, q_dot, plant, tuple(applied))
             return ravel_pytree((after.q, after.q_dot, _plants(after.axes), tuple(z_rates), tuple(u_rates)))[0]
@@ -208,46 +247,38 @@ class _Linear:
     def _continuous(
         self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, moved: Callable, read: Callable
     ) -> tuple:
-        x, restore = ravel_pytree((body, point.control))
+        x, restore = ravel_pytree((body, point.control, point.law))
 
         def field(x: Array, e: Array) -> tuple[Array, Array]:
-            at, control = restore(x)
+            at, control, law = restore(x)
             measured = read(at, e)
-            u, rates = self.laws(measured, control, self.past(point.u))
-            return ravel_pytree((moved(at, u), rates))[0], self.outputs(measured, u)
+            u, *rates = self.laws(measured, control, law, self.past(point.u))
+            return ravel_pytree((moved(at, u), tuple(rates)))[0], self.outputs(measured, u)
 
-        scale = ravel_pytree((body_sizes, sizes.control))[0]
+        scale = ravel_pytree((body_sizes, sizes.control, sizes.law))[0]
         return jax.jacfwd(field, (0, 1))(x, jnp.zeros(self.machine.count, x.dtype)), scale
 
     def _sampled(
         self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, moved: Callable, read: Callable
     ) -> tuple:
-        past, processor = self.past(point.u), self.cascade[0].processor
-        assert processor is not None
+        past, delay = self.past(point.u), jnp.asarray(self.cascade[0].timing.delay)[0]
         A, B = jax.jacfwd(lambda x, u: moved(x, self.machine.split(u)), (0, 1))(body, self.machine.join(point.u))
         kept = len(past[0])
-        transition, driven = _held(A, B, self.period, jnp.asarray(processor.delay)[0], kept)
-        x, restore = ravel_pytree((body, point.control, past))
+        transition, driven = _held(A, B, self.period, delay, kept)
+        x, restore = ravel_pytree((body, point.control, point.law, past))
 
         def step(x: Array, e: Array) -> tuple[Array, Array]:
-            at, control, past = restore(x)
+            at, control, law, past = restore(x)
             measured = read(at, e)
-            u, after = self.laws(measured, control, past)
+            u, after, law = self.laws(measured, control, law, past)
             commands = [self.machine.join([(own, *old)[lag] for own, old in zip(u, past, strict=True)])
                         for lag in range(kept + 1)]  # fmt: skip
             end = transition @ at + sum(effect @ one for effect, one in zip(driven, commands, strict=True))
             kept_now = tuple((own, *old)[:kept] for own, old in zip(u, past, strict=True))
-            return ravel_pytree((end, after, kept_now))[0], self.outputs(measured, u)
+            return ravel_pytree((end, after, law, kept_now))[0], self.outputs(measured, u)
 
-        scale = ravel_pytree((body_sizes, sizes.control, self.past(sizes.u)))[0]
+        scale = ravel_pytree((body_sizes, sizes.control, sizes.law, self.past(sizes.u)))[0]
         return jax.jacfwd(step, (0, 1))(x, jnp.zeros(self.machine.count, x.dtype)), scale
-
-
-def _unguarded(cascade: Cascade) -> Cascade:
-    """Return the cascade without its guard."""
-    if cascade.processor is None:
-        return cascade
-    return dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=None))
 
 
 def _plants(axes: Sequence) -> Groups:

@@ -141,11 +141,10 @@ class Objective:
         cascade, scenario = self.world(members)
         cascade = self.space.decode(x + members.shift, cascade)
         if in_parts:
-            return rolled_in_parts(*prepare(cascade, scenario, self.clock), fold).measured
-        return rollout(cascade, scenario, self.clock, fold=fold, every=0).measured
+            return rolled_in_parts(*prepare(cascade, scenario, self.clock), fold).metrics
+        return rollout(cascade, scenario, self.clock, fold=fold, record_every=0).metrics
 
 
 def _with_noise(scenario: Scenario, noise_factor: Any) -> Scenario:
     """Return the scenario with `noise_factor` times the sensor noise."""
-    sensor = scenario.sensor
-    return scenario if sensor is None else dataclasses.replace(scenario, sensor=sensor.louder(noise_factor))
+    return scenario.louder(noise_factor)
