@@ -419,7 +419,7 @@ MUTATIONS = [
     M(
         "with prediction, the laws act on the current estimate instead of the predicted one",
         "ambjax/control/cascade.py",
-        "if processor.predicts:",
+        "if self.timing.predicts:",
         "if False:",
         "tests/test_sampled.py::test_sampled_loops_agree_with_the_independent_simulator[two samples]",
     ),
@@ -461,7 +461,7 @@ MUTATIONS = [
     M(
         "a delay beyond the exported one is not reported",
         "ambjax/codegen/controller.py",
-        ", processor.delay <= processor.most]",
+        ", processor.delay <= (processor.most or 0)]",
         "]",
         "tests/test_export.py::test_a_delay_beyond_the_exported_one_is_refused",
     ),

@@ -142,7 +142,7 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
             function(wrong)
     with pytest.raises(ValueError, match="cascade = Scenario: it must be a Cascade"):
         ambjax.rollout(case.scenario, case.cascade, case.clock)  # pyright: ignore[reportArgumentType]
-    late = dataclasses.replace(case.scenario, q_z=ambjax.Pulse(1.0, 2.0, 1.0))
+    late = dataclasses.replace(case.scenario, q_z=ambjax.signals.Pulse(1.0, 2.0, 1.0))
     with pytest.raises(ValueError, match=r"q_z.stop = 1.0: it must not be less than start = 2.0"):
         ambjax.rollout(case.cascade, late, case.clock)
     for samples in (0, 10.5):

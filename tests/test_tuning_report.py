@@ -17,7 +17,7 @@ from texts import problem_from
 
 from ambjax import rollout
 from ambjax.cases.reader import safe_name
-from ambjax.simulation.metrics import Standard
+from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.trajectory import STALLED, TOUCHED
 from ambjax.text.web_page import escape_markdown, render_page
 from tuning.__main__ import main
@@ -141,9 +141,9 @@ def test_accurate_values_agree_with_adaptive_rollouts():
         cascade, scenario = study.objective.world(type(one)(*({p: v[0] for p, v in field.items()} if isinstance(
             field, dict) else field[0] for field in one)))  # fmt: skip
         clock = dataclasses.replace(study.case.clock, method=study.reference.objective.clock.method)
-        fold = Standard(study.case.settle, study.case.scenario.touchdown)
+        fold = Metrics(study.case.settle, study.case.scenario.touchdown)
         cascade = study.objective.space.decode(jnp.asarray(x), cascade)
-        found.append(rollout(cascade, scenario, clock, fold=fold, every=0).measured)
+        found.append(rollout(cascade, scenario, clock, fold=fold, record_every=0).metrics)
     error = math.sqrt(np.mean([float(m["settled_rms_error_m"]) ** 2 for m in found]))
     chatter = np.mean([float(m["chatter_V"]) for m in found])
     # the same adaptive steps in another program: where a step ends depends on rounding, by less than its tolerance

@@ -1,4 +1,4 @@
-"""Optimisers by name, as optax transformations: optax's first-order methods, and a BFGS for a few gains.
+"""Optimisers by name, as optax transformations: optax's Adam, and a BFGS for a few gains.
 
 `update(gradient, state, x, value=...)` receives the value and the gradient at x, the point of the last trial. The state
 contains the best point so far and its value. After a rejected trial, the next step starts at the best point.
@@ -12,11 +12,7 @@ import optax
 from jax import Array
 
 BFGS = "bfgs"
-# optax's optimisers that need only gradients and a learning rate.
-FIRST_ORDER = (
-    "adabelief", "adagrad", "adam", "adamax", "adan", "lamb", "lion", "nadam", "radam", "rmsprop", "sgd",
-)  # fmt: skip
-NAMES = (BFGS, *FIRST_ORDER)
+NAMES = (BFGS, "adam")
 
 # Trust radius of the BFGS: its largest value (1: a factor e of one gain), and its value for the first step, which has
 # no estimate of the curvature.
@@ -41,13 +37,6 @@ class BFGSState(NamedTuple):
     radius: Array
     trials: Array
 
-    def restarted(self, fresh: "BFGSState") -> "BFGSState":
-        """Return the state `fresh` with the inverse Hessian of this state, for a function of similar curvature.
-
-        The trust radius is LARGEST_RADIUS.
-        """
-        return fresh._replace(inverse=self.inverse, radius=jnp.full_like(self.radius, LARGEST_RADIUS))
-
 
 class FirstOrderState(NamedTuple):
     """State of a first-order optimiser with backtracking: best point [m], its value, and optax's state, `inner`."""
@@ -56,14 +45,10 @@ class FirstOrderState(NamedTuple):
     value: Array
     inner: Any
 
-    def restarted(self, fresh: "FirstOrderState") -> "FirstOrderState":
-        """Return the state `fresh`."""
-        return fresh
-
 
 def optimiser(name: str, learning_rate: float) -> optax.GradientTransformationExtraArgs:
     """Return the optimiser of this name, one of NAMES. The BFGS does not use `learning_rate`."""
-    return bfgs() if name == BFGS else backtracking(getattr(optax, name)(learning_rate))
+    return bfgs() if name == BFGS else backtracking(optax.adam(learning_rate))
 
 
 def bfgs() -> optax.GradientTransformationExtraArgs:
@@ -103,7 +88,7 @@ def _updated_inverse(state: BFGSState, s: Array, y: Array, smooth: Array) -> Arr
     curvature = s @ y
     usable = (state.trials > 0) & smooth & (curvature > 1e-10 * jnp.sqrt((s @ s) * (y @ y)))
     rho = 1 / jnp.where(usable, curvature, 1.0)
-    # The first pair (s, y) of a search sets the scale of the inverse Hessian, also of one kept from an earlier search.
+    # The first pair (s, y) of a search sets the scale of the inverse Hessian.
     scale = jnp.where(state.trials == 1, curvature / jnp.where(usable, y @ y, 1.0), 1.0)
     left = jnp.eye(len(s), dtype=s.dtype) - rho * jnp.outer(s, y)
     return jnp.where(usable, scale * left @ state.inverse @ left.T + rho * jnp.outer(s, s), state.inverse)

@@ -217,7 +217,7 @@ def linearisation_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> 
     `clock` has no effect: it may be too coarse for this cascade. Raises ValueError as `rollout` does otherwise.
     """
     system, clock = prepare(cascade, scenario, dataclasses.replace(clock, method=None))
-    if cascade.processor is not None:
+    if cascade.sampled:
         cascade = system.loop.cascade  # pyright: ignore[reportAttributeAccessIssue]
     return dataclasses.replace(cascade), scenario, clock.sample_period
 

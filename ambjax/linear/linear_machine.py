@@ -1,6 +1,5 @@
 """Linearisation of a whole machine at rest and constant speed: all loops are closed, each axis has a test signal."""
 
-import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, TypeVar
 
@@ -83,10 +82,10 @@ class _Linear:
         self.machine, self.W, self.period = machine.realised(), W, period
         loops = self.machine.loops()
         self.scenario = tuple(jax.vmap(ideal)(loop.scenario) for loop in loops)
-        self.cascade = tuple(_unguarded(loop.cascade) for loop in loops)
+        self.cascade = tuple(loop.cascade.with_processor(guard=None) for loop in loops)
         self.rotor = self.machine.rotor
-        self.low_passed = [one.sensor is not None and one.sensor.bandwidth is not None for one in self.scenario]
-        self.lagged = [one.amplifier is not None and one.amplifier.slow for one in self.scenario]
+        self.low_passed = [one.sensors.bandwidth is not None for one in self.scenario]
+        self.lagged = [one.actuator.slow for one in self.scenario]
 
     @property
     def sampled(self) -> bool:
@@ -176,8 +175,8 @@ class _Linear:
 
     def past(self, u: Groups) -> Groups:
         """Return the commands on their way under constant commands u; () in continuous time."""
-        processors = [cascade.processor for cascade in self.cascade]
-        return tuple(() if p is None else p.constant_past(own) for p, own in zip(processors, u, strict=True))
+        pasts = (one.timing.constant_past(own) for one, own in zip(self.cascade, u, strict=True))
+        return tuple(past if self.sampled else () for past in pasts)
 
     def sensed(self, q: Array) -> Groups:
         """Return the displacements at the sensors, for the groups with a low-pass."""
@@ -229,11 +228,11 @@ class _Linear:
             q, q_dot, plant, filtered, own = restore(x)
             z_rates, u_rates, applied = [], [], []
             for k, (scenario, z) in enumerate(zip(self.scenario, self.sensed(q), strict=True)):
-                sensor, amplifier = scenario.sensor, scenario.amplifier
-                low = () if sensor is None or sensor.bandwidth is None else 2 * jnp.pi * jnp.asarray(sensor.bandwidth)
+                bandwidth, amplifier = scenario.sensors.bandwidth, scenario.actuator
+                low = () if bandwidth is None else 2 * jnp.pi * jnp.asarray(bandwidth)
                 z_rates.append(() if isinstance(low, tuple) else low * (z - filtered[k]))
-                slow = amplifier is not None and self.lagged[k]
-                u_rates.append(jnp.asarray(amplifier.slope()) * (u[k] - own[k]) if amplifier and slow else ())
+                slow = self.lagged[k]
+                u_rates.append(jnp.asarray(amplifier.slope()) * (u[k] - own[k]) if slow else ())
                 applied.append(own[k] if slow else u[k])
             after = self.rates(q, q_dot, plant, tuple(applied))
             return ravel_pytree((after.q, after.q_dot, _plants(after.axes), tuple(z_rates), tuple(u_rates)))[0]
@@ -270,10 +269,9 @@ class _Linear:
     def _sampled(
         self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, free: tuple[Array, Array], read: Callable
     ) -> tuple:
-        past, processor = self.past(point.u), self.cascade[0].processor
-        assert processor is not None
+        past, delay = self.past(point.u), jnp.asarray(self.cascade[0].timing.delay)[0]
         (A, B), kept = free, len(past[0])
-        transition, driven = _held(A, B, self.period, jnp.asarray(processor.delay)[0], kept)
+        transition, driven = _held(A, B, self.period, delay, kept)
         x, restore = ravel_pytree((body, point.control, point.law, past))
 
         def step(x: Array, e: Array) -> tuple[Array, Array]:
@@ -288,13 +286,6 @@ class _Linear:
 
         scale = ravel_pytree((body_sizes, sizes.control, sizes.law, self.past(sizes.u)))[0]
         return jax.jacfwd(step, (0, 1))(x, jnp.zeros(self.machine.count, x.dtype)), scale
-
-
-def _unguarded(cascade: Cascade) -> Cascade:
-    """Return the cascade without its guard."""
-    if cascade.processor is None:
-        return cascade
-    return dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=None))
 
 
 def _plants(axes: Sequence) -> Groups:

@@ -14,7 +14,7 @@ from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.trajectory import Row
 from ambjax.world.sensor import Errors, FaultyErrors, Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 # Reading to which e is added: z (m) or z_dot (m/s).
 Reading = Literal["z", "z_dot"]

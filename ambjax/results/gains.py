@@ -12,8 +12,10 @@ from ambjax.ensemble.spread import no_such_number
 from ambjax.world.scenario import Scenario
 
 
-def gains_of(cascade: Cascade, paths: Iterable[str]) -> dict[str, Array]:
+def gains_of(cascade: Cascade, paths: Iterable[str] | None = None) -> dict[str, Array]:
     """Return the numbers of a cascade at dotted paths, such as "controller.position.c", as a dict of scalars.
+
+    None: all numbers of the cascade that have a value.
 
     The dict is a pytree: `jax.grad(lambda gains: f(with_gains(cascade, gains)))(gains_of(cascade, paths))` returns the
     derivative with respect to these gains only. Raises ValueError for a path that does not exist.
@@ -22,12 +24,12 @@ def gains_of(cascade: Cascade, paths: Iterable[str]) -> dict[str, Array]:
         raise ValueError(f'paths = "{paths}": it must be a list. Write ["{paths}"].')
     if not isinstance(cascade, Cascade):
         raise ValueError(f"cascade = {type(cascade).__name__}: it must be a Cascade, such as `case.cascade`.")
-    if not isinstance(paths, Iterable):
+    if paths is not None and not isinstance(paths, Iterable):
         raise ValueError(f"paths = {paths!r}: it must be a list of dotted paths, such as controller.position.c.")
     known = places(cascade, Scenario())
     own = [path for path in known if path.startswith(("controller.", "processor."))]
     found = {}
-    for path in paths:
+    for path in [one for one in own if known[one].value is not None] if paths is None else paths:
         if path not in own:
             raise ValueError(f"{path}: {no_such_number(path, own)}")
         found[path] = jnp.asarray(known[path].value, jnp.result_type(float))

@@ -9,7 +9,7 @@ from jax import Array
 
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
-from ambjax.control.laws import ForceDemand
+from ambjax.control.stages import ForceDemand
 from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.smooth import larger, limited
 from ambjax.simulation.edges import Edges
@@ -19,7 +19,7 @@ from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED, Row
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
-from ambjax.world.signals import Reference, reference_at
+from ambjax.world.waveforms import Reference, reference_at
 
 # A state that exceeds its scale by this factor counts as diverged. For such a state the model is not valid, but the
 # numbers are still finite.
@@ -89,10 +89,8 @@ class ClosedLoop:
         return self.scenario.words()
 
     def sensor_errors(self, sample: Scalar) -> Errors:
-        """Return the errors of all sensors in sample number `sample`; zeros without a sensor model."""
-        if self.scenario.sensor is None:
-            return Errors(*[jnp.zeros(())] * 3)
-        return self.scenario.sensor.noise(self.words(), sample)
+        """Return the errors of all sensors in sample number `sample`; zeros for ideal sensors."""
+        return self.scenario.sensors.noise(self.words(), sample)
 
     def start(self) -> LoopState:
         """Return the state at t = 0."""
@@ -103,8 +101,7 @@ class ClosedLoop:
 
     def measured(self, plant: object, errors: Errors) -> Measurement:
         """Return the readings of the sensors for a state of the plant, without the runout."""
-        motion, sensor = self.scenario.plant.measurement(plant), self.scenario.sensor
-        return motion if sensor is None else sensor.reading(motion, errors)
+        return self.scenario.sensors.reading(self.scenario.plant.measurement(plant), errors)
 
     def scale(self) -> LoopState:
         """Return the characteristic size of each component of the state; integration errors are relative to it."""
@@ -120,8 +117,8 @@ class ClosedLoop:
 
     def inputs(self, t: Scalar) -> ExternalInputs:
         """Return the reference, the disturbances and the runout at time t, s."""
-        scenario, sensor = self.scenario, self.scenario.sensor
-        runout = () if sensor is None or sensor.runout is None else sensor.runout(t)
+        scenario, runout = self.scenario, self.scenario.sensors.runout
+        runout = () if runout is None else runout(t)
         return ExternalInputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t), runout)
 
     def received(self, inputs: Any, plant: Any, errors: Errors) -> Measurement:
@@ -129,10 +126,10 @@ class ClosedLoop:
 
         `inputs`: the external inputs at this instant (method `inputs`).
         """
-        measured, sensor = self.measured(plant, errors), self.scenario.sensor
-        if sensor is None or isinstance(inputs.runout, tuple):
+        measured = self.measured(plant, errors)
+        if isinstance(inputs.runout, tuple):
             return measured
-        return measured._replace(z=measured.z + sensor.gain * inputs.runout)
+        return measured._replace(z=measured.z + self.scenario.sensors.gain * inputs.runout)
 
     def command(
         self,
@@ -227,7 +224,7 @@ class ClosedLoop:
         step = functools.partial(slide, self, errors) if slides(self.cascade, self.scenario) else None
         rates = lambda inputs, x: self.rates(inputs, x, errors)  # noqa: E731
         observed = lambda inputs, x: self.observed(inputs, x, errors)  # noqa: E731
-        jumps = self.scenario.sensor is not None and sum(map(jnp.abs, self.scenario.sensor.noises)) > 0
+        jumps = sum(map(jnp.abs, self.scenario.sensors.noises)) > 0
         edges = Edges(self.scenario.edges(reference=True), 0, self.scenario.knots(reference=True))
         return InitialValueProblem(
             self.inputs,

@@ -29,7 +29,7 @@ from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import DIVERGED, Row
 from ambjax.world.faults import Sensed
 from ambjax.world.sensor import Errors, FaultyErrors, Measurement
-from ambjax.world.signals import Reference, reference_at
+from ambjax.world.waveforms import Reference, reference_at
 
 
 @record
@@ -48,9 +48,7 @@ class Sampled:
     @property
     def processor(self) -> Processor:
         """The processor of the cascade."""
-        processor = self.loop.cascade.processor
-        assert processor is not None
-        return processor
+        return self.loop.cascade.timing
 
     def realised(self) -> Self:
         """Return the loop of one member, with its random signals drawn."""
@@ -61,11 +59,11 @@ class Sampled:
 
         With a low-pass, the runout is not included: the low-pass receives it (`sensed_motion`).
         """
-        drawn, sensor = self.loop.sensor_errors(sample), self.loop.scenario.sensor
-        if sensor is not None and sensor.runout is not None and not lags(self.loop):
+        drawn, sensor = self.loop.sensor_errors(sample), self.loop.scenario.sensors
+        if sensor.runout is not None and not lags(self.loop):
             runout = sensor.runout(jnp.asarray(sample, jnp.result_type(float)) * self.period)
             drawn = drawn._replace(z=drawn.z + sensor.gain * runout)
-        if sensor is None or not sensor.faulty:
+        if not sensor.faulty:
             return drawn
         return FaultyErrors(*drawn, sensor.fault_onsets(self.loop.words(), sample, self.period))
 
@@ -74,10 +72,9 @@ class Sampled:
         scenario, zero = self.loop.scenario, jnp.zeros(())
         plant = scenario.plant.start(scenario.initial.measurement())
         z_filtered = sensed_motion(self.loop, plant, zero).z if lags(self.loop) else ()
-        slow = scenario.amplifier is not None and scenario.amplifier.slow
         measured = self.measured(plant, z_filtered, self.sensor_errors(0))
         command, past, guard = Command(*[zero] * 5), self.processor.constant_past(zero), self.processor.guard
-        faulty = scenario.sensor is not None and scenario.sensor.faulty
+        faulty = scenario.sensors.faulty
         cascade = self.loop.cascade
         sample = self.sample(self.reference(0.0), past)
         return SampledState(
@@ -87,7 +84,7 @@ class Sampled:
             past,
             jnp.ones(()),
             z_filtered,
-            zero if slow else (),
+            zero if scenario.actuator.slow else (),
             guard.start() if guard else (),
             zero if guard and faulty else (),
             Sensed(measured.z, zero) if faulty else (),
@@ -98,10 +95,8 @@ class Sampled:
 
         `z_filtered`: output of the low-pass of the position sensor, m.
         """
-        true, sensor = self.loop.scenario.plant, self.loop.scenario.sensor
+        true, sensor = self.loop.scenario.plant, self.loop.scenario.sensors
         motion = true.measurement(plant)
-        if sensor is None:
-            return motion
         if lags(self.loop):
             motion = motion._replace(z=z_filtered)
         return sensor.converted(sensor.reading(motion, errors), true.s_0, true.i_0)
@@ -124,8 +119,8 @@ class Sampled:
         self, measured: Measurement, state: SampledState, errors: Errors | FaultyErrors
     ) -> tuple[SampledState, Measurement]:
         """Apply the faults of the position sensor. Return the new state and the readings."""
-        sensor, sensed = self.loop.scenario.sensor, state.sensed
-        if sensor is None or not sensed or not isinstance(errors, FaultyErrors):
+        sensor, sensed = self.loop.scenario.sensors, state.sensed
+        if not sensed or not isinstance(errors, FaultyErrors):
             return state, measured
         sensed = sensor.sensed(measured.z, sensed, errors.onsets, self.period, self.loop.scenario.plant.s_0)
         z = jnp.where(jnp.isnan(sensed.z), 0.0, sensed.z)
@@ -226,7 +221,7 @@ class Sampled:
         code = jnp.where((code == 0) & (state.finite == 0), DIVERGED, code)
         delay, whole = jnp.asarray(self.processor.delay), bool(self.processor.whole)
         commanded = acting((state.command.u, *state.past), delay, period, whole)
-        voltages, u_a = amplified(self.loop.scenario.amplifier, jnp.asarray(t), state.u_a, commanded)
+        voltages, u_a = amplified(self.loop.scenario.actuator, jnp.asarray(t), state.u_a, commanded)
         parts = subproblems(self.loop, state.plant, state.command, jnp.asarray(t), voltages, self.cuts)
         reached = in_turn(method, parts, t, state.plant, memory, code)
         z_filtered = self._lagged(t, state, [after.state for after in reached], [time for _, time in parts])
@@ -240,8 +235,8 @@ class Sampled:
         the lengths of the parts, s.
         """
         z_filtered: Any = state.z_filtered
-        sensor = self.loop.scenario.sensor
-        if sensor is None or not lags(self.loop):
+        sensor = self.loop.scenario.sensors
+        if not lags(self.loop):
             return z_filtered
         instants = itertools.accumulate(times, initial=t)
         states = (state.plant, *reached)

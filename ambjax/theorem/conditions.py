@@ -15,8 +15,8 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.cascade import DEFAULT_LAWS, Cascade
-from ambjax.control.laws import PositionLaw
 from ambjax.control.schedule import extremes, schedules
+from ambjax.control.stages import PositionLaw
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Lowest, Named, Peak
@@ -27,7 +27,7 @@ from ambjax.theorem.proof import Monitored
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference, Signal, reference_at
+from ambjax.world.waveforms import Reference, Signal, reference_at
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,14 +137,14 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float = 0.
     does.
     """
     check_inputs(cascade, scenario, clock)
-    if cascade.processor is not None:
+    if cascade.sampled:
         cascade, clock = cascade.in_continuous_time(), dataclasses.replace(clock, method=None)
         scenario = scenario.in_continuous_time()
     loop: Any
     loop, clock = prepare(cascade, scenario, clock)
     method = str(clock.method)
     system, clock, fold = canonical((Monitored(loop), clock, _monitors(settle)))
-    trajectory, extremes = roll(system, clock, fold, every=0)
+    trajectory, extremes = roll(system, clock, fold, record_every=0)
     worst = {name: (float(value), float(at)) for name, (value, at) in extremes.items()}
     on_reference = delta_1_on_reference(cascade, scenario, clock)
     conditions = _conditions(cascade, worst, on_reference)

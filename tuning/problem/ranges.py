@@ -98,8 +98,7 @@ def _context(objective: Objective, conditions: tuple[Bound, ...]) -> SearchConte
             fall, "D", f"D = dv/dz w z = {fall:.3g} A^2/m^2/s, required by Eq. (7) if the rotor falls from z = {where}"
         )
     )
-    processor = objective.cascade.processor
-    stepped = processor is not None and processor.implicit
+    stepped = objective.cascade.sampled and objective.cascade.timing.implicit
     return SearchContext(model, w, float(objective.clock.sample_period), bounds, needed, stepped)
 
 

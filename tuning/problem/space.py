@@ -163,7 +163,7 @@ def tunable(cascade: Cascade, *, steepness: bool = True, idle: bool = False) -> 
     `steepness`: whether to include the steepness of smoothed signs. `idle`: whether to include gains without effect
     under the processor of the cascade, or without one.
     """
-    paths, implicit = [], None if cascade.processor is None else cascade.processor.implicit
+    paths, implicit = [], cascade.timing.implicit if cascade.sampled else None
     for stage in STAGES:
         law = getattr(cascade, stage)
         left_out = () if idle else law.idle_gains(implicit)

@@ -58,7 +58,7 @@ class TuningProblem:
     @property
     def sampled(self) -> bool:
         """Whether the laws run on a processor, so that only the plant is integrated."""
-        return self.case.cascade.processor is not None
+        return self.case.cascade.sampled
 
     @property
     def sliding(self) -> bool:
@@ -146,10 +146,9 @@ class TuningProblem:
         error of the integration steps.
         """
         scenario = self.objective.scenario
-        if scenario.sensor is None or scenario.sensor.bits is None:
+        if scenario.sensors.bits is None:
             return self.engine, self.reference
-        sensor = dataclasses.replace(scenario.sensor, bits=None)
-        objective = dataclasses.replace(self.objective, scenario=dataclasses.replace(scenario, sensor=sensor))
+        objective = dataclasses.replace(self.objective, scenario=scenario.with_sensor(bits=None))
         exact = dataclasses.replace(self, objective=objective)
         return exact._stepping(objective.clock.integrator, lanes=REFERENCE_MEMBERS), exact.reference
 

@@ -69,26 +69,21 @@ def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarra
 
 @own_style
 def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
-    """Draw the goal of each starting point, and the gains of the best one, over the iterations, as PNG."""
-    value, gains, members = (np.asarray(history[name]) for name in ("value", "gains", "members"))
+    """Draw the goal and the gains of the best point over the iterations, as PNG."""
+    value, gains = history["value"], history["gains"]
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    steps, best = np.arange(1, len(value) + 1), np.argmin(value, axis=1)
+    steps = np.arange(1, len(value) + 1)
     cut = np.minimum(value, value.min() + np.log(LARGEST_GOAL))
-    for s in range(cut.shape[1]):
-        left.plot(steps, shown(cut[:, s]), "0.75", lw=1)
-    left.plot(steps, shown(cut.min(axis=1)), "C0", lw=1.8)
-    title = "blue: best starting point; grey: the others; dotted: the training ensemble changes"
+    left.plot(steps, shown(cut))
     label = "objective" if (cut == value).all() else f"objective (cut at {LARGEST_GOAL:.0e} times the least)"
-    left.set(xlabel="iteration", ylabel=label, yscale="log", title=title)
-    for j, path in enumerate(paths):
-        right.plot(steps, gains[steps - 1, best, j] / gains[-1, best[-1], j], label=path.removeprefix("controller."))
-    right.set(xlabel="iteration", ylabel="gain / its final value", yscale="log", title="gains of the best start")
+    left.set(xlabel="iteration", ylabel=label, yscale="log", title="dotted: the training ensemble changes")
+    right.plot(steps, gains / gains[-1], label=[path.removeprefix("controller.") for path in paths])
+    right.set(xlabel="iteration", ylabel="gain / its final value", yscale="log", title="gains of the best point")
     right.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))  # beside the curves
-    for at in np.flatnonzero(np.diff(members)):
-        for ax in (left, right):
-            ax.axvline(at + 1.5, color="0.5", ls=":", lw=1)
     for ax in (left, right):
+        for at in np.flatnonzero(np.diff(history["members"])):
+            ax.axvline(at + 1.5, color="0.5", ls=":", lw=1)
         ax.grid(alpha=0.3)
     return _png(figure)
 

@@ -27,7 +27,7 @@ class CmaState(NamedTuple):
     drift: Any
     """evolution path of the mean, which adapts the covariance"""
     drawn: Any
-    """number of populations so far; -1: the start does not use CMA-ES"""
+    """number of populations so far; -1: the search does not use CMA-ES"""
     level: Any
     """lowest weighted mean of the better half of a population, updated only if it falls by STALL"""
     stale: Any
@@ -87,10 +87,9 @@ def initial_state(mean: np.ndarray) -> CmaState:
     )
 
 
-def idle_states(starts: int, m: int) -> CmaState:
-    """Return the distributions of several starts in m dimensions, leaves [starts, ...], none of them in use."""
-    one = initial_state(np.zeros(m))._replace(drawn=np.array(-1))
-    return CmaState(*(np.repeat(np.asarray(leaf)[None], starts, axis=0) for leaf in one))
+def idle_state(m: int) -> CmaState:
+    """Return a distribution in m dimensions that is not in use."""
+    return initial_state(np.zeros(m))._replace(drawn=np.array(-1))
 
 
 def next_population(state: CmaState, seed: int) -> np.ndarray:
