@@ -22,7 +22,7 @@ from ambjax.results.machine_run import worst_of
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
 from ambjax.simulation.metrics import Metrics
-from ambjax.simulation.rollout import Outcome, prepare, run
+from ambjax.simulation.rollout import Result, prepare, run
 from ambjax.simulation.whole_machine import Machine, PerAxis, machine_of, stack_axes
 from ambjax.world.rotor import Rotor
 from ambjax.world.scenario import Scenario
@@ -148,5 +148,5 @@ class MachineStudy(AnyStudy):
         return facts | {"rotor": digest.hexdigest()}
 
 
-def _simulated(tree: tuple[Machine, Clock, Fold]) -> Outcome:
+def _simulated(tree: tuple[Machine, Clock, Fold]) -> Result:
     return run(*tree, 0)
