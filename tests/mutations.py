@@ -356,8 +356,8 @@ MUTATIONS = [
     M(
         "members that accurate steps lose after the judgement do not refute the answer",
         "tuning/report/judging.py",
-        'refuted or (again["refuted"] if again else "")',
-        "refuted",
+        "(error or answer.error).refuted if",
+        "answer.error.refuted if",
         "tests/test_tuning_study.py::test_a_member_that_accurate_steps_do_not_hold_is_not_a_survivor",
     ),
     M(
@@ -398,8 +398,8 @@ MUTATIONS = [
     M(
         "the voltages of the two previous samples are exchanged",
         "ambjax/simulation/sampled.py",
-        "past = self.loop.cascade, self.processor.remembered(state.command.u, *state.past)",
-        "past = self.loop.cascade, self.processor.remembered(*state.past, state.command.u)",
+        "past = self.processor.remembered(state.command.u, *state.past)",
+        "past = self.processor.remembered(*state.past, state.command.u)",
         "tests/test_sampled.py::test_the_voltage_of_a_sample_acts_after_the_delay",
     ),
     M(

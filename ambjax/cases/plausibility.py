@@ -127,7 +127,7 @@ def _delay(case: Case) -> Iterator[str]:
 
 
 def _runout(case: Case) -> Iterator[str]:
-    runout, stop = case.scenario.sensors.runout, float(case.scenario.touchdown)
+    runout, stop = case.scenario.turning().sensors.runout, float(case.scenario.touchdown)
     if runout is None:
         return
     most = max(abs(float(one)) for one in runout.span(float(case.clock.duration)))
@@ -161,7 +161,8 @@ def _loads(case: Case) -> Iterator[str]:
 
 def _aliases(case: Case) -> Iterator[str]:
     half = 0.5 / float(case.clock.sample_period)
-    for path, signal in (_signals(case) | {"sensor.runout": case.scenario.sensors.runout}).items():
+    parts = _signals(case) | {"rotor": case.scenario.rotor, "sensor.runout": case.scenario.sensors.runout}
+    for path, signal in parts.items():
         for name, high in _frequencies(signal):
             if high > half:
                 yield (
@@ -180,5 +181,5 @@ def _frequencies(node: object) -> Iterator[tuple[str, float]]:
             value = getattr(node, field.name)
             if field.name in FREQUENCIES and value is not None:
                 yield field.name, FREQUENCIES[field.name] * float(np.max(np.asarray(value)))
-            elif isinstance(value, tuple):
+            elif isinstance(value, tuple) or dataclasses.is_dataclass(value):
                 yield from _frequencies(value)

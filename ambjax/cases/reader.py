@@ -36,6 +36,7 @@ from ambjax.world.scenario import Scenario
 PLANTS: dict[str, type] = {"lumped": Plant, "two-coil": TwoCoil}
 TABLES = [
     "plant",
+    "rotor",
     "controller",
     "processor",
     "reference",
@@ -136,7 +137,7 @@ def case_from(
     if is_machine(raw):
         raise ValueError(
             "[rotor], [[bearing]]: a whole machine, and this takes one axis. `ambjax simulate`, `check`, "
-            "`sensitivity` and `campbell` take machines; in Python, read_machine does."
+            "`sensitivity`, `campbell` and `ensemble` take machines; in Python, read_machine does."
         )
     top.only([*TABLES, *OTHERS])
     plant = _plant(top.table("plant"))

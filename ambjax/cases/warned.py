@@ -4,7 +4,8 @@ import dataclasses
 import math
 import pathlib
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -23,14 +24,19 @@ GRAVITY = "g"
 MOST_NOISE = 0.1
 
 
-def read_case(path: str | pathlib.Path) -> Case:
-    """Read and check the case file at `path`, and return the case.
+def read_case(path: str | pathlib.Path | Mapping[str, Any]) -> Case:
+    """Read and check the case file at `path`, and return the case. A dict of tables, as from TOML, works too.
 
     A value that is valid but probably unintended, such as millimetres given as metres, causes a UserWarning. Raises
-    ValueError, one line, if `path` is not a path, if the file cannot be read, or if any part of it is invalid.
+    ValueError, one line, if `path` is neither, if the file cannot be read, or if any part of it is invalid.
     """
-    case = reader.read_case(path)
-    for text in warnings_of_file(case, path):
+    if isinstance(path, Mapping):
+        case = reader.case_from(dict(path))
+        texts = warnings_of(case)
+    else:
+        case = reader.read_case(path)
+        texts = warnings_of_file(case, path)
+    for text in texts:
         warnings.warn(text, stacklevel=2)
     return case
 

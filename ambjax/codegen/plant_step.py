@@ -41,8 +41,8 @@ from ambjax.world.amplifier import Amplifier, CurrentAmplifier
 from ambjax.world.bearing import Bearing
 from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Errors, Sensor
-from ambjax.world.signals import Constant
 from ambjax.world.touchdown import Stop
+from ambjax.world.waveforms import Constant
 
 FIELDS = {field.name: field.metadata for field in dataclasses.fields(Scenario)}
 

@@ -28,7 +28,7 @@ from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.system import system_of
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors
-from ambjax.world.signals import Constant
+from ambjax.world.waveforms import Constant
 
 T = TypeVar("T")
 
@@ -183,7 +183,7 @@ def _together(twin: Twin, clock: Clock, units: Array, seeds: Array) -> tuple[tup
 
     def one(unit: Array, seed: Array) -> tuple[tuple[Array, ...], Array, Scalar]:
         system: Any = dataclasses.replace(twin, unit=unit, seed=seed)
-        made = run(system, clock, None, every=1).trajectory
+        made = run(system, clock, None, record_every=1).trajectory
         return tuple(getattr(made.rows, name) for name in SIGNALS), made.rows.r, made.lost_at
 
     return jax.vmap(one)(units, seeds)

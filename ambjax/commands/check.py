@@ -126,7 +126,7 @@ def _results(case: Case) -> tuple[Report, tuple[Summary, str], _OnProcessor | No
 
 
 def _is_lost(cascade: Cascade, scenario: Scenario, clock: Clock) -> bool:
-    return bool(np.isfinite(rollout(cascade, scenario, clock, every=0).trajectory.lost_at))
+    return bool(np.isfinite(rollout(cascade, scenario, clock, record_every=0).trajectory.lost_at))
 
 
 def _sampled(case: Case) -> SampledReport:

@@ -17,7 +17,9 @@ from ambjax.compiler.barrier import materialised
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.base import default_law, set_valued_signs, with_default_steepness, with_set_valued_signs
 from ambjax.control.cascade_state import CascadeState, Command, Sample
-from ambjax.control.laws import (
+from ambjax.control.processor import Processor, predicted_over_delay
+from ambjax.control.schedule import extremes, with_gains_at
+from ambjax.control.stages import (
     CurrentInputs,
     CurrentLaw,
     ForceDemand,
@@ -28,13 +30,11 @@ from ambjax.control.laws import (
     begin_law,
     step_law,
 )
-from ambjax.control.processor import Processor, predicted_over_delay
-from ambjax.control.schedule import extremes, with_gains_at
 from ambjax.numerics.records import Scalar, is_traced, part, record
 from ambjax.world.plant import Plant
 from ambjax.world.plant import State as NominalState
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 # In place of a processor in continuous time: no delay, no prediction and no guard.
 _CONTINUOUS = Processor(delay=0.0, predict=False, guard=None)
@@ -176,7 +176,7 @@ class Cascade:
         z_ddot = self.model.z_ddot(estimate.z, estimate.i)
         if self.observer.estimates_velocity:
             point = (estimate, z_ddot, reference, state.position, positioned_rate)
-            z_rate, v_star_rate = _rates(self._demanded, *point)
+            z_rate, v_star_rate = rates_along(self._demanded, *point)
         else:
             along = (reference.rate(), measured.z_dot, z_ddot, observed_rate, positioned_rate)
             z_rate, v_star_rate = jax.jvp(lambda *x: demanded(*x)[0], point, along)[1]
@@ -256,12 +256,23 @@ class Cascade:
         Returns the estimate for the other laws (with prediction: at the end of the delay), the next state of the
         observer, and the estimate at the sample itself.
         """
-        now, state = self._advance(sample)(with_gains_at(self.observer, measured.z, sample.reference), measured, state)
+        now, state = self.observed(measured, state, sample)
         estimate = now
         if self.timing.predicts:
             steps = self.timing.prediction_steps(sample.period)
             estimate = predicted_over_delay(self.model, self.driven, now, sample.past, steps)
         return estimate, state, now
+
+    def observed(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State]:
+        """Step the observer on a processor. Return the estimate at the sample, and the next state of the observer."""
+        return self._advance(sample)(with_gains_at(self.observer, measured.z, sample.reference), measured, state)
+
+    def positioned(
+        self, sample: Sample, estimate: Measurement, reference: Reference, state: State
+    ) -> tuple[Array, State]:
+        """Step the position law on a processor. Return v_star (A^2/m^2), and the next state of the law."""
+        law = with_gains_at(self.position, estimate.z, reference)
+        return self._advance(sample)(law, (estimate, reference), state)
 
     def step(
         self, measured: Measurement, state: CascadeState, sample: Sample
@@ -272,10 +283,7 @@ class Cascade:
         With prediction, all laws except the observer use the estimate at the end of the delay. Returns the command, the
         next states of the laws, and the observer's estimate at the sample itself.
         """
-        advance = self._advance(sample)
-
-        def force_for(estimate: Measurement, reference: Reference, state: object) -> tuple[Array, Any]:
-            return advance(with_gains_at(self.position, estimate.z, reference), (estimate, reference), state)
+        force_for = functools.partial(self.positioned, sample)
 
         def demanded(
             reference: Reference, z: Array, z_dot: Array, observed: object, positioned: object
@@ -293,19 +301,30 @@ class Cascade:
             lambda a, b: (b - a) / sample.period, (state.observer, state.position), (observed, positioned)
         )
         if self.observer.estimates_velocity:
-            z_rate, v_star_rate = _rates(force_for, estimate, z_ddot, sample.reference, state.position, rates[1])
+            z_rate, v_star_rate = rates_along(force_for, estimate, z_ddot, sample.reference, state.position, rates[1])
         else:
             along = (sample.reference.rate(), measured.z_dot, z_ddot, *rates)
             z_rate, v_star_rate = jax.jvp(lambda *x: demanded(*x)[0], point, along)[1]
         v_star = materialised(v_star)
         force = ForceDemand(z, z_rate, v_star, v_star_rate, self.model.gaps(z))
-        inversion = with_gains_at(self.inversion, z, sample.reference)
-        current = with_gains_at(self.current, z, sample.reference)
+        command, after = self.commanded(force, estimate, state, sample)
+        return command, after._replace(observer=observed, position=positioned), now
+
+    def commanded(
+        self, force: ForceDemand, estimate: Measurement, state: CascadeState, sample: Sample
+    ) -> tuple[Command, CascadeState]:
+        """Step inversion and current law on a processor, for a demanded force.
+
+        `estimate`: estimated motion and current. The states of observer and position law do not change.
+        """
+        advance = self._advance(sample)
+        inversion = with_gains_at(self.inversion, force.z, sample.reference)
+        current = with_gains_at(self.current, force.z, sample.reference)
         demand, inverted = advance(inversion, force, state.inversion)
         u, driven = advance(current, CurrentInputs(estimate, demand, sample.u_max, force.gaps), state.current)
-        v_tilde = v_star - self.model.v_and_dv_di(z, demand.i_ref, force.gaps)[0]
-        after = CascadeState(observed, positioned, inverted, driven)
-        return Command(v_star, v_tilde, demand.i_ref, demand.i_ref_dot, u), after, now
+        v_tilde = force.v_star - self.model.v_and_dv_di(force.z, demand.i_ref, force.gaps)[0]
+        after = state._replace(inversion=inverted, current=driven)
+        return Command(force.v_star, v_tilde, demand.i_ref, demand.i_ref_dot, u), after
 
     def __call__(
         self, measured: Measurement, state: CascadeState, reference: Reference, u_max: Scalar
@@ -316,20 +335,30 @@ class Cascade:
         `u_max`: limit of u: of the supply, V, or of the commanded current, A; inf: none.
         """
         force, estimate, rates = self.demand(measured, state, reference)
+        command, inner = self.command_rates(force, estimate, state, reference, u_max)
+        return command, rates._replace(inversion=inner.inversion, current=inner.current)
+
+    def command_rates(
+        self, force: ForceDemand, estimate: Measurement, state: CascadeState, reference: Reference, u_max: Scalar
+    ) -> tuple[Command, CascadeState]:
+        """Return the command in continuous time for a demanded force, and the rates of inversion and current law.
+
+        The rates of observer and position law are ().
+        """
         inversion = with_gains_at(self.inversion, force.z, reference)
         current = with_gains_at(self.current, force.z, reference)
         demand, inversion_rate = inversion(self.model, force, state.inversion)
         u, current_rate = current(self.model, CurrentInputs(estimate, demand, u_max, force.gaps), state.current)
         v_tilde = force.v_star - self.model.v_and_dv_di(force.z, demand.i_ref, force.gaps)[0]
         command = Command(force.v_star, v_tilde, demand.i_ref, demand.i_ref_dot, u)
-        return command, rates._replace(inversion=inversion_rate, current=current_rate)
+        return command, CascadeState((), (), inversion_rate, current_rate)
 
 
 def _chosen(condition: Array, yes: State, no: State) -> State:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
-def _rates(
+def rates_along(
     law: Callable[..., tuple[Array, State]],
     estimate: Measurement,
     z_ddot: Array,

@@ -20,7 +20,7 @@ from ambjax.control.cascade_state import CascadeState, Sample
 from ambjax.numerics.records import Scalar
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
-from ambjax.world.signals import Constant, Reference, reference_at
+from ambjax.world.waveforms import Constant, Reference, reference_at
 
 # Largest number of Newton trials. Near the equilibrium, five suffice. Far outside the boundary layer of a smoothed
 # sign, more are necessary.

@@ -18,7 +18,7 @@ from ambjax.simulation.rollout import prepare, run
 from ambjax.simulation.sliding import Slide
 from ambjax.simulation.trajectory import ALIVE
 from ambjax.world.scenario import Initial, Scenario
-from ambjax.world.signals import Constant
+from ambjax.world.waveforms import Constant
 
 # Default amplitude of e, as a share of the gap s_0; at the velocity sensor, of s_0 times the plant's pole.
 AMPLITUDE = 0.01
@@ -89,7 +89,7 @@ def _member(tree: Any) -> tuple[Any, Any]:
     """Return the `FourierSums` and the status code of one member."""
     system, clock, response = tree
     outcome = run(dataclasses.replace(system, wave=response.wave), clock, response, 0)
-    return outcome.measured, outcome.trajectory.lost_code
+    return outcome.metrics, outcome.trajectory.lost_code
 
 
 def _padded(wave: MultiSine) -> MultiSine:

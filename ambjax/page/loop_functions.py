@@ -11,7 +11,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import Scalar
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop
-from ambjax.simulation.metrics import Standard, standard_for
+from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import RolloutState, begin, one_sample
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
@@ -41,12 +41,16 @@ class LoopFunctions:
 
     clock: Clock
 
-    def _system(self, numbers: Numbers, normals: Any) -> tuple[Sampled, Clock, Standard]:
+    def _system(self, numbers: Numbers, normals: Any) -> tuple[Sampled, Clock, Metrics]:
         clock = dataclasses.replace(self.clock, sample_period=numbers.period)
         built: Any = system_of(numbers.cascade, numbers.scenario, clock)
         word = jnp.zeros((), jnp.uint32)
-        loop = ClosedLoop(built.loop.cascade, numbers.scenario, (word, word), normals)
-        return dataclasses.replace(built, loop=loop), clock, standard_for(numbers.settle, numbers.scenario)
+        loop = ClosedLoop(built.loop.cascade, numbers.scenario.turning(), (word, word), normals)
+        return dataclasses.replace(built, loop=loop), clock, self._fold(numbers)
+
+    def _fold(self, numbers: Numbers) -> Metrics:
+        """Return the metrics without those once per revolution, which compute with arrays."""
+        return Metrics.of(numbers.settle, dataclasses.replace(numbers.scenario, rotor=None))
 
     def start(self, numbers: Numbers, normals: Any) -> RolloutState:
         """Return the state of the run before the first sample."""
@@ -62,7 +66,7 @@ class LoopFunctions:
 
     def result(self, numbers: Numbers, progress: RolloutState) -> dict[str, Array]:
         """Return the metrics of a run that ended in this state."""
-        fold = standard_for(numbers.settle, numbers.scenario)
+        fold = self._fold(numbers)
         return fold.result(progress.fold, progress.ending)
 
 

@@ -15,7 +15,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method
-from ambjax.simulation.metrics import Standard
+from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import rollout
 from ambjax.simulation.rosenbrock import AdaptiveRodas3
 from ambjax.simulation.sliding import Slide
@@ -170,7 +170,7 @@ def _simulate(reading: str, cascade: Cascade, scenario: Scenario) -> Run:
     clock = paper.CLOCK
     if not cascade.sampled:
         clock = clock.with_method(STEPS.get(reading, AdaptiveRodas3()))
-    trajectory, metrics = rollout(cascade, scenario, clock, fold=Standard(paper.SETTLE))
+    trajectory, metrics = rollout(cascade, scenario, clock, fold=Metrics(paper.SETTLE))
     return Run(jax.tree.map(np.asarray, trajectory), {name: float(value) for name, value in metrics.items()})
 
 
@@ -209,8 +209,8 @@ def _scan(cascade: Cascade, scenarios: Scenario, clock: Clock) -> dict[str, np.n
 
     Members run one by one, because every member of a batch would take as many steps as the stiffest one.
     """
-    fold = Standard(0.4 * clock.duration)
-    return jax.lax.map(lambda s: rollout(cascade, s, clock, fold=fold, every=0).measured, scenarios)
+    fold = Metrics(0.4 * clock.duration)
+    return jax.lax.map(lambda s: rollout(cascade, s, clock, fold=fold, record_every=0).metrics, scenarios)
 
 
 def _batch(one: object, size: int, **leaves: object) -> Any:

@@ -11,6 +11,7 @@ from jax import Array
 
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
+from ambjax.control.stages import ForceDemand
 from ambjax.numerics.records import Scalar, part, record
 from ambjax.numerics.smooth import larger, limited
 from ambjax.simulation.edges import Edges
@@ -20,7 +21,7 @@ from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED, Row
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
-from ambjax.world.signals import Reference, reference_at
+from ambjax.world.waveforms import Reference, reference_at
 
 # A state that exceeds its scale by this factor counts as diverged. For such a state the model is not valid, but the
 # numbers are still finite.
@@ -152,15 +153,24 @@ class ClosedLoop(WholeState):
         return with_signal(measured, self.wave, inputs.e)
 
     def command(
-        self, inputs: ExternalInputs, state: LoopState, errors: Errors, sensed: object = None
+        self,
+        inputs: ExternalInputs,
+        state: LoopState,
+        errors: Errors,
+        sensed: object = None,
+        demanded: tuple[ForceDemand, Measurement] | None = None,
     ) -> tuple[Command, CascadeState, Array]:
         """Return the command of the cascade, the rates of its states, and the voltage at the coils, V.
 
-        `sensed`: state of the plant at the place of the sensor; None: that of `state`.
+        `sensed`: state of the plant at the place of the sensor; None: that of `state`. `demanded`: the demanded force
+        and the estimate, if another law computes them; None: observer and position law of the cascade do.
         """
         u_max = jnp.asarray(self.scenario.command_limit)
-        measured = self.received(inputs, state.plant if sensed is None else sensed, errors)
-        command, rates = self.cascade(measured, state.control, inputs.reference, u_max)
+        if demanded is None:
+            measured = self.received(inputs, state.plant if sensed is None else sensed, errors)
+            command, rates = self.cascade(measured, state.control, inputs.reference, u_max)
+        else:
+            command, rates = self.cascade.command_rates(*demanded, state.control, inputs.reference, u_max)
         return command, rates, self.scenario.coil_voltage(limited(command.u, u_max), state.plant, inputs.q_i)
 
     def rates(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> LoopState:
@@ -169,10 +179,15 @@ class ClosedLoop(WholeState):
         return self.derivative(inputs, state, control, u)
 
     def observed(
-        self, inputs: ExternalInputs, state: LoopState, errors: Errors, sensed: object = None
+        self,
+        inputs: ExternalInputs,
+        state: LoopState,
+        errors: Errors,
+        sensed: object = None,
+        demanded: tuple[ForceDemand, Measurement] | None = None,
     ) -> tuple[LoopState, Instant]:
-        """Return the rates of the state, and the signals to record at this instant. `sensed`: as in `command`."""
-        command, control, u = self.command(inputs, state, errors, sensed)
+        """Return the rates of the state, and the signals to record now. `sensed`, `demanded`: as in `command`."""
+        command, control, u = self.command(inputs, state, errors, sensed, demanded)
         signals = self.instant(inputs.reference, state.plant, command.i_ref, command.v_tilde, u)
         return self.derivative(inputs, state, control, u), signals
 
@@ -247,10 +262,20 @@ class ClosedLoop(WholeState):
             self.scenario.limit,
         )
 
-    def row(self, t: Scalar, state: LoopState, errors: Errors, alive: Array) -> Row:
-        """Return the signals at time t (s), with u_mean = u_peak = 0. The drive of a lost rotor is off: u = 0."""
+    def row(
+        self,
+        t: Scalar,
+        state: LoopState,
+        errors: Errors,
+        alive: Array,
+        demanded: tuple[ForceDemand, Measurement] | None = None,
+    ) -> Row:
+        """Return the signals at time t (s), with u_mean = u_peak = 0. The drive of a lost rotor is off: u = 0.
+
+        `demanded`: as in `command`.
+        """
         inputs = self.inputs(t)
-        command, _, u = self.command(inputs, state, errors)
+        command, _, u = self.command(inputs, state, errors, None, demanded)
         measured = self.received(inputs, state.plant, errors)
         return self.signals(t, inputs, state.plant, command._replace(u=u), measured, alive)
 

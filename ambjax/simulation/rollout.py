@@ -11,7 +11,7 @@ from jax import Array, lax
 
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.control.cascade import Cascade
-from ambjax.control.laws import STAGES
+from ambjax.control.stages import STAGES
 from ambjax.numerics.records import Scalar, canonical, validate
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Ending, Fold
@@ -22,6 +22,7 @@ from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.span import Span
 from ambjax.simulation.system import check_parts, system_of
 from ambjax.simulation.trajectory import ALIVE, Row, Trajectory, first_time
+from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 
 # Types of the state of a system, of the errors of its sensors, and of its row.
@@ -30,15 +31,15 @@ E = TypeVar("E")
 R = TypeVar("R")
 
 
-class Outcome(NamedTuple):
+class Result(NamedTuple):
     """Result of a rollout: the trajectory, and the result of the fold.
 
     - `trajectory`: rows and status of the rotor; the rows are None if none were recorded.
-    - `measured`: result of the fold; None without a fold.
+    - `metrics`: result of the fold; None without a fold.
     """
 
     trajectory: Trajectory
-    measured: Any
+    metrics: Any
 
 
 class System(Protocol[S, E, R]):
@@ -88,13 +89,16 @@ class RolloutState(NamedTuple):
     fold: Any
 
 
-def rollout(cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | None = None, every: int = 1) -> Outcome:
-    """Simulate `scenario.plant` under `cascade` for `clock.samples` sample periods.
+@takes_case
+def rollout(
+    cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | None = None, record_every: int = 1
+) -> Result:
+    """Simulate `scenario.plant` under `cascade` for `clock.samples` sample periods. `rollout(case)` works too.
 
     - `fold`: accumulated at every sample, so that metrics need no stored trajectory; None: no metrics.
-    - `every`: a row is recorded at the start of every `every`-th sample; 0: no rows.
+    - `record_every`: a row is recorded at the start of the first of so many samples; 0: no rows.
 
-    Returns an `Outcome`. The state is frozen if |z| reaches `Scenario.limit`, a state leaves the range of the model
+    Returns a `Result`. The state is frozen if |z| reaches `Scenario.limit`, a state leaves the range of the model
     (`loop.DIVERGENCE`), or the integrator stalls. `Trajectory.lost_code` then gives the reason, and values and
     derivatives stay finite.
 
@@ -103,7 +107,7 @@ def rollout(cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | 
     Raises ValueError for an invalid gain, parameter or clock, and as `with_method` does.
     """
     loop, clock, fold = canonical((*prepare(cascade, scenario, clock), fold))
-    return roll(loop, clock, fold, every=every)
+    return roll(loop, clock, fold, record_every=record_every)
 
 
 def prepare(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[ClosedLoop | Sampled, Clock]:
@@ -140,13 +144,13 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
         raise ValueError(f"clock.samples = {clock.samples}: it must be a whole number of at least 1.")
 
 
-def run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome:
+def run(system: System, clock: Clock, fold: Fold | None, record_every: int) -> Result:
     """Simulate a whole rollout without checks. The function is not jitted; `roll` is its compiled form."""
-    progress, rows = segment(system, clock, fold, begin(system, clock, fold), 0, clock.samples, every)
+    progress, rows = segment(system, clock, fold, begin(system, clock, fold), 0, clock.samples, record_every)
     return finish(progress, rows, fold)
 
 
-roll = one_kernel(run, static_argnames=("every",))
+roll = one_kernel(run, static_argnames=("record_every",))
 
 
 def begin(system: System, clock: Clock, fold: Fold | None) -> RolloutState:
@@ -162,11 +166,17 @@ def begin(system: System, clock: Clock, fold: Fold | None) -> RolloutState:
 
 
 def segment(
-    system: System, clock: Clock, fold: Fold | None, progress: RolloutState, first: Scalar, count: int, every: int
+    system: System,
+    clock: Clock,
+    fold: Fold | None,
+    progress: RolloutState,
+    first: Scalar,
+    count: int,
+    record_every: int,
 ) -> tuple[RolloutState, Row | None]:
-    """Simulate `count` samples from number `first` on, and record a row at every `every`-th sample.
+    """Simulate `count` samples from number `first` on, and record a row at every `record_every`-th sample.
 
-    Returns the new state and the rows; the rows are None if every = 0.
+    Returns the new state and the rows; the rows are None if record_every = 0.
     """
     step = functools.partial(one_sample, system.realised(), clock, fold)
 
@@ -179,11 +189,11 @@ def segment(
             progress = unrecorded(progress, k + 1, length - 1)
         return progress, row
 
-    if every == 0:
+    if record_every == 0:
         return unrecorded(progress, first, count), None
-    starts = first + every * jnp.arange(count // every)
-    progress, rows = lax.scan(functools.partial(block, length=every), progress, starts)
-    if rest := count % every:
+    starts = first + record_every * jnp.arange(count // record_every)
+    progress, rows = lax.scan(functools.partial(block, length=record_every), progress, starts)
+    if rest := count % record_every:
         progress, last = block(progress, jnp.asarray(first + count - rest), rest)
         rows = jax.tree.map(lambda many, one: jnp.concatenate([many, one[None]]), rows, last)
     return progress, rows
@@ -206,11 +216,11 @@ def recorded_segment(
     return lax.scan(sample, progress, first + jnp.arange(count))
 
 
-def finish(progress: RolloutState, rows: Row | None, fold: Fold | None) -> Outcome:
+def finish(progress: RolloutState, rows: Row | None, fold: Fold | None) -> Result:
     """Return the outcome of a rollout from the state after the last sample and the rows."""
     lost_code, lost_at, singular_at, _ = progress.ending
-    measured = None if fold is None else fold.result(progress.fold, progress.ending)
-    return Outcome(Trajectory(cast(Row, rows), lost_at, lost_code, singular_at), measured)
+    metrics = None if fold is None else fold.result(progress.fold, progress.ending)
+    return Result(Trajectory(cast(Row, rows), lost_at, lost_code, singular_at), metrics)
 
 
 def one_sample(

@@ -29,7 +29,7 @@ from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import DIVERGED, Row
 from ambjax.world.faults import Sensed
 from ambjax.world.sensor import Errors, Measurement
-from ambjax.world.signals import Reference, reference_at
+from ambjax.world.waveforms import Reference, reference_at
 
 
 @record
@@ -137,10 +137,29 @@ class Sampled:
         `measured`: the readings, before the guard. `reference`: see `Sample`. The exported C is traced from this
         function.
         """
-        cascade, past = self.loop.cascade, self.processor.remembered(state.command.u, *state.past)
+        sample, checked, measured, laws = self.received(measured, reference, state)
+        return self.accepted(state, sample, checked, self.loop.cascade.step(measured, laws, sample))[0]
+
+    def received(
+        self, measured: Measurement, reference: Reference, state: SampledState
+    ) -> tuple[Sample, GuardResult | None, Measurement, CascadeState]:
+        """Return what the laws step with: the inputs of the sample, and the results of `inputs_of_laws`."""
+        past = self.processor.remembered(state.command.u, *state.past)
         sample = self.sample(reference, past)
-        checked, measured, laws = self.inputs_of_laws(measured, sample, state)
-        command, control, estimate = cascade.step(measured, laws, sample)
+        return sample, *self.inputs_of_laws(measured, sample, state)
+
+    def accepted(
+        self,
+        state: SampledState,
+        sample: Sample,
+        checked: GuardResult | None,
+        stepped: tuple[Command, CascadeState, Measurement],
+    ) -> tuple[SampledState, Array]:
+        """Return the state with the results of the laws, and whether they are kept.
+
+        `checked`: result of the guard. `stepped`: command, next states of the laws, and the estimate at the sample.
+        """
+        (command, control, estimate), past = stepped, sample.past
         command = command._replace(u=limited(command.u, sample.u_max))
         new = materialised((control, command, self._next_guard_state(checked, estimate, (command.u, *past))))
         # The sum is 0 only if every number is finite: 0 times NaN or infinity is NaN.
@@ -156,7 +175,8 @@ class Sampled:
             command, finite = command._replace(u=jnp.where(checked.steps, command.u, 0.0)), finite | ~checked.steps
             watch = watch._replace(left=checked.left)
         finite = jnp.where(finite, state.finite, 0.0)
-        return state._replace(control=control, command=command, past=past, finite=finite, watch=watch, started=started)
+        state = state._replace(control=control, command=command, past=past, finite=finite, watch=watch, started=started)
+        return state, jnp.asarray(keeps)
 
     def sample(self, reference: Reference, past: tuple[Array, ...]) -> Sample:
         """Return the inputs of the cascade at a sample. `past`: u of the samples before, the most recent first."""

@@ -23,8 +23,8 @@ from jax import Array
 
 from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.control.cascade import Cascade
-from ambjax.control.laws import CurrentDemand, CurrentInputs
 from ambjax.control.schedule import with_gains_at
+from ambjax.control.stages import CurrentDemand, CurrentInputs
 from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.smooth import limited
 from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, Times, axpy

@@ -15,7 +15,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.simulation.clock import Clock
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.scenario import SLOTS, Scenario
-from ambjax.world.signals import reference_at
+from ambjax.world.waveforms import reference_at
 
 # Resolution that stands for an ideal converter, bits. With a number instead of None, the compiled program is the same.
 FINE_BITS = 32
@@ -148,7 +148,7 @@ def _model(cascade: Cascade, scenario: Scenario) -> Iterator[tuple[str, str, Cas
 
 def _motion(scenario: Scenario, clock: Clock) -> Iterator[tuple[str, str, Scenario]]:
     end = float(clock.duration)
-    loads = [getattr(scenario, slot) for slot in SLOTS if slot != "reference"]
+    loads = [getattr(scenario.turning(), slot) for slot in SLOTS if slot != "reference"]
     acts = any(load is not None and any(load.span(end)) for load in loads)
     if acts or scenario.sensors.runout is not None:
         yield "the disturbances and the runout", "", scenario.undisturbed()

@@ -18,7 +18,7 @@ from ambjax.simulation.integrate import InitialValueProblem, WholeState
 from ambjax.simulation.loop import ClosedLoop, ExternalInputs, LoopState
 from ambjax.simulation.span import Span
 from ambjax.world.sensor import Errors, Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 
 class Identities(NamedTuple):

@@ -14,9 +14,10 @@ from ambjax.world.bearing import Bearing
 from ambjax.world.coil_limits import CoilVoltages
 from ambjax.world.plant import Plant
 from ambjax.world.recorded import Knots
+from ambjax.world.rotation import Rotation, turned
 from ambjax.world.sensor import IdealSensor, Measurement, Sensor
-from ambjax.world.signals import Constant, Signal, edges_of, is_random, knots_of, realised
 from ambjax.world.touchdown import Stop
+from ambjax.world.waveforms import Constant, Signal, edges_of, is_random, knots_of, realised
 
 # Numbers that are folded into a member's key, for the random streams of the design and of the signals. The sensors use
 # other streams of this key (`numerics.gaussian.STREAMS`, `faults`), with the sample number as counter.
@@ -62,6 +63,9 @@ class Scenario:
     base: Signal | None = part(
         default=None,
         doc="acceleration of the housing, m/s^2: adds -base to q_z, because z is relative to the housing; None: 0",
+    )
+    rotor: Rotation | None = part(
+        default=None, doc="speed of the rotor, which unbalance and runout follow; None: not turning"
     )
     sensor: Sensor | None = part(default=None, doc="errors of the sensors; None: no errors")
     initial: Initial = part(default=Initial(), doc="state of the plant at t = 0")
@@ -204,7 +208,16 @@ class Scenario:
         return tuple(one for signal in self._signals(reference) for one in knots_of(signal))
 
     def _signals(self, reference: bool) -> tuple[Signal | None, ...]:
-        return tuple(getattr(self, slot) for slot in SLOTS if reference or slot != "reference")
+        turning = self.turning()
+        return tuple(getattr(turning, slot) for slot in SLOTS if reference or slot != "reference")
+
+    def turning(self) -> "Scenario":
+        """Return the scenario in which unbalances and runout have the speed of the rotor."""
+        if self.rotor is None:
+            return self
+        signals = {slot: turned(getattr(self, slot), self.rotor) for slot in SLOTS}
+        sensor = self.sensor and dataclasses.replace(self.sensor, runout=turned(self.sensor.runout, self.rotor))
+        return dataclasses.replace(self, sensor=sensor, **signals)
 
     def undisturbed(self) -> "Scenario":
         """Return the scenario without disturbances and runout."""
@@ -222,10 +235,11 @@ class Scenario:
         return high, low
 
     def realised(self) -> "Scenario":
-        """Return the scenario with its random signals drawn for the member."""
-        random = {slot: signal for slot in SLOTS if hasattr(signal := getattr(self, slot), "realised")}
+        """Return the scenario of the member: `turning`, with its random signals drawn."""
+        turning = self.turning()
+        random = {slot: signal for slot in SLOTS if hasattr(signal := getattr(turning, slot), "realised")}
         if not random:
-            return self
+            return turning
         key = jax.random.fold_in(self.key(), SIGNAL_STREAM)
         draws = {slot: realised(signal, jax.random.fold_in(key, SLOTS.index(slot))) for slot, signal in random.items()}
-        return dataclasses.replace(self, **draws)
+        return dataclasses.replace(turning, **draws)
