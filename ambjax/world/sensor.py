@@ -53,6 +53,8 @@ class Sensor:
     converter and the faults then act on the sum, in this order; the result is the reading. Low-pass, converter and
     faults require a processor. Without a processor, the laws receive the measurement at every instant, not only at the
     samples.
+
+    Use it in every case that a real bearing must follow: `Scenario(sensor=sensors.Sensor(std=1e-7, velocity=False))`.
     """
 
     std: Scalar = leaf(default=0.0, unit="m", at_least=0, at_most=1.0, doc="standard deviation of the noise of z")
