@@ -141,6 +141,10 @@ class Sensor:
         """Return the end of the converter's range of z (m) for a plant with the gap s_0 (m)."""
         return s_0 if self.range_z is None else self.range_z
 
+    def current_end(self, i_0: Scalar) -> Scalar:
+        """Return the end of the converter's range of i (A) for a plant with the bias current i_0 (A)."""
+        return 2 * i_0 if self.range_i is None else self.range_i
+
     def louder(self, factor: Scalar) -> "Sensor":
         """Return the sensor with `factor` times the noise."""
         stds = {"std": self.std, "std_z_dot": self.std_z_dot, "std_i": self.std_i}
@@ -166,9 +170,9 @@ class Sensor:
         """Return the converted readings; s_0 (m) and i_0 (A) of the plant give the ranges that are left out."""
         if self.bits is None:
             return reading
-        range_i = 2 * i_0 if self.range_i is None else self.range_i
         return reading._replace(
-            z=converted(reading.z, self.bits, self.ends(s_0)), i=converted(reading.i, self.bits, range_i)
+            z=converted(reading.z, self.bits, self.ends(s_0)),
+            i=converted(reading.i, self.bits, self.current_end(i_0)),
         )
 
     def lagged(self, y: Array, before: Measurement, after: Measurement, h: Scalar) -> Array:
