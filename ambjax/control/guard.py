@@ -19,8 +19,8 @@ from ambjax.world.sensor import Measurement
 # Type of a cascade. Its class cannot be imported here, because its module imports this one.
 C = TypeVar("C")
 
-# Default limits of velocity (gaps per sample) and current (bias currents).
-GAPS, CURRENTS = 2.0, 100.0
+# Default limits of velocity (gaps per sample) and current: bias currents, or with a converter a share of its range.
+GAPS, CURRENTS, BEYOND = 2.0, 100.0, 1.1
 
 
 def _limit(unit: str, doc: str, least: float = 1e-30) -> Any:
@@ -63,7 +63,7 @@ class Guard:
         "m", "largest |z|; none: clearance times sensor gain, plus |offset|, plus the largest error of the sensor"
     )
     z_dot: Scalar | None = _limit("m/s", "largest |z_dot|; none: two gaps per sample, 2 s_0/T")
-    i: Scalar | None = _limit("A", "largest |i|; none: 100 i_0")
+    i: Scalar | None = _limit("A", "largest |i|; none: 100 i_0, or 1.1 times the range of the converter")
     noise: Scalar | None = _limit(
         "m",
         "largest difference of two readings of one position; none: 13.6 sensor.std, plus a step of the converter, plus "
@@ -109,7 +109,7 @@ class Guard:
         values = {
             "z": sensor.largest_reading(limit, scenario.plant.s_0),
             "z_dot": GAPS * model.s_0 / period,
-            "i": CURRENTS * model.i_0,
+            "i": CURRENTS * model.i_0 if sensor.bits is None else BEYOND * sensor.current_end(scenario.plant.i_0),
             "noise": 2 * sensor.largest_error(scenario.plant.s_0),
             "speed": LARGEST_NORMAL * sensor.std_z_dot + velocity_error * fall,
             "samples": jnp.maximum(1 / (model.pole * period) // 1, 1.0),

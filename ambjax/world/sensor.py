@@ -50,6 +50,8 @@ class Sensor:
     converter and the faults then act on the sum, in this order; the result is the reading. Low-pass, converter and
     faults require a processor. Without a processor, the laws receive the measurement at every instant, not only at the
     samples.
+
+    Use it in every case that a real bearing must follow: `Scenario(sensor=sensors.Sensor(std=1e-7, velocity=False))`.
     """
 
     std: Scalar = leaf(default=0.0, unit="m", at_least=0, at_most=1.0, doc="standard deviation of the noise of z")
@@ -171,6 +173,10 @@ class Sensor:
         """Return the sensor without the effects that a linear system cannot contain."""
         return dataclasses.replace(self.louder(0.0), bits=None, outliers=None, dropouts=None)
 
+    def current_end(self, i_0: Scalar) -> Scalar:
+        """Return the end of the converter's range of i (A) for a plant with the bias current i_0 (A)."""
+        return 2 * i_0 if self.range_i is None else self.range_i
+
     def louder(self, factor: Scalar) -> "Sensor":
         """Return the sensor with `factor` times the noise."""
         stds = {"std": self.std, "std_z_dot": self.std_z_dot, "std_i": self.std_i}
@@ -198,9 +204,9 @@ class Sensor:
         """Return the converted readings; s_0 (m) and i_0 (A) of the plant give the ranges that are left out."""
         if self.bits is None:
             return reading
-        range_i = 2 * i_0 if self.range_i is None else self.range_i
         return reading._replace(
-            z=converted(reading.z, self.bits, self.ends(s_0)), i=converted(reading.i, self.bits, range_i)
+            z=converted(reading.z, self.bits, self.ends(s_0)),
+            i=converted(reading.i, self.bits, self.current_end(i_0)),
         )
 
     def lagged(self, y: Array, before: Measurement, after: Measurement, h: Scalar) -> Array:
