@@ -5,9 +5,12 @@ import tomllib
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_are
 
 from ambjax.cases.machine_case import machine_from
 from ambjax.cases.template_text import template
+from ambjax.control.lqg import LinearCoils, RotorModel, design, sampled_model
+from ambjax.control.regulator import doubled
 from ambjax.results.machine_run import simulate_machine
 
 MACHINE = tomllib.loads(template("machine"))
@@ -84,3 +87,54 @@ def test_a_bearing_has_no_position_law_of_its_own_in_rigid_body_coordinates():
     raw["bearing"][0]["controller"] = {"position": {"c": 300.0}}
     with pytest.raises(ValueError, match=r"bearing\[0\]\.controller\.position: in rigid-body coordinates"):
         machine_from(raw)
+
+
+@pytest.mark.slow
+def test_a_diagonal_controller_of_a_file_equals_one_controller_on_each_axis(tmp_path):
+    """K = 2e4 (1 + s/500)/(1 + s/5e3) A/m, continuous; the states start at the reading."""
+    raw = UNCOUPLED | {"processor": {"delay": 1.0, "predict": False}, "sensor": {}}
+    A, B, C, D = -5e3, 1.0, -9 * 2e4 * 5e3, 10 * 2e4
+    np.savez(tmp_path / "one.npz", A=A, B=B, C=C, D=D)
+    np.savez(tmp_path / "all.npz", **{name: x * np.eye(5) for name, x in zip("ABCD", (A, B, C, D), strict=True)})
+    one = {"position": {"kind": "linear", "file": "one.npz"}, "current": {"kind": "pi"}}
+    one["inversion"] = {"kind": "linearised"}
+    alone, whole = (
+        simulate_machine(machine_from(raw | {"controller": controller}, "case", "", tmp_path)).signals
+        for controller in (one, {"kind": "linear", "file": "all.npz"})
+    )
+    assert not np.isfinite(alone["lost_at"])
+    for name in ("z", "i", "u"):
+        np.testing.assert_allclose(whole[name], alone[name], rtol=0, atol=1e-9 * np.abs(alone[name]).max())
+
+
+def test_the_riccati_equation_is_solved_as_by_scipy():
+    rng = np.random.default_rng(1)
+    A, B = rng.normal(size=(9, 9)) / 2, rng.normal(size=(9, 3))  # some poles are outside the unit circle
+    Q, R = np.diag(rng.uniform(0.1, 1, 9)), np.diag([1.0, 2.0, 3.0])
+    np.testing.assert_allclose(doubled(A, B, Q, R), solve_discrete_are(A, B, Q, R), rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.5, 1.0, 1.5, 2.0])
+def test_the_loop_of_an_lqg_has_the_poles_of_its_feedback_and_of_its_filter(delay):
+    """Separation: each pole of the loop belongs to one of them, so that all are stable; a load leaves no offset."""
+    rotor = RotorModel(
+        M=np.diag([3.0, 0.12, 1.0]), D=np.diag([0.0, 0.0, 6.0]), K=np.diag([0.0, 0.0, 600.0**2]),
+        B=np.array([[1.0, -0.2, -0.4], [1.0, 0.25, 0.5]]), C=np.array([[1.0, -0.25, -0.6], [1.0, 0.3, 0.7]]),
+        constant=np.array([0.0, 0.0, 5.0]),
+    )  # fmt: skip
+    coils = LinearCoils(*(np.full(2, x) for x in (1e5, 50.0, 1.0, 0.01, 0.0)))
+    weights = {"error": 1e-5, "current": 0.2, "noise": 2e-7, "force": 80.0, "drift": 1e4, "bending": 0.3}
+    T = 1e-4
+    law, plant = design(rotor, coils, weights, 250.0, T, delay), sampled_model(rotor, coils, T, delay)
+    signs = np.diag([-1.0, -1.0, 1.0, 1.0]) @ plant.H
+    loop = np.block([[plant.F + plant.G @ law.D @ signs, plant.G @ law.C], [law.B @ signs, law.A]])
+    poles, n = np.linalg.eigvals(loop), len(plant.F)
+    assert np.abs(poles).max() < 1 - 1e-5
+    # an error of the estimate moves as without feedback: its poles are those of A - G C, with G the effect of u
+    filter_poles = np.linalg.eigvals(law.A + law.B @ np.zeros((4, n + 2)) - law.E @ law.C)
+    for pole in filter_poles:
+        assert np.abs(poles - pole).min() < 1e-6
+    load = np.concatenate([plant.f + plant.pushed @ [20.0, -10.0] + plant.G @ law.b, law.a])
+    rest = np.linalg.solve(np.eye(len(loop)) - loop, load)
+    assert np.abs(rotor.B @ rest[:3]).max() < 1e-12  # the magnets are centred, and the shaft is bent
+    assert abs(rest[2]) > 1e-6
