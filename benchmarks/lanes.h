@@ -1,8 +1,9 @@
 /* What the C programs share: members in lanes, their arctangent and their noise.
 
-   Vectors of 64 bytes (8 double or 16 float; -DREAL=float) by GCC's vector extensions, two of them interleaved so that
-   one chain's latency hides behind the other's work. Noise is Box-Muller on a hash of (seed, member, sample), drawn
-   here and held over the sample: Gaussian, but not the numbers that jax.random draws. */
+   Vectors of BYTES bytes by GCC's vector extensions (with AVX-512: 64, 8 double or 16 float with -DREAL=float; without:
+   32), two of them interleaved so that one chain's latency hides behind the other's work. Noise is Box-Muller on a hash
+   of (seed, member, sample), drawn here and held over the sample: Gaussian, but not the numbers that jax.random draws.
+*/
 
 #ifndef LANES_H
 #define LANES_H
@@ -17,20 +18,26 @@
 #define REAL double
 #endif
 
-#define LANES ((int)(64 / sizeof(REAL)))
+/* Wider vectors than the processor's own are emulated by pairs of them, which is four times slower. */
+#ifdef __AVX512F__
+#define BYTES 64
+#else
+#define BYTES 32
+#endif
+#define LANES ((int)(BYTES / sizeof(REAL)))
 #define CHAINS 2
 #define GROUP (CHAINS * LANES)
 #define BLOCK 256 /* members per block: their state fits the first-level cache */
 #define INLINE static inline __attribute__((always_inline))
 #define EACH for (int j = 0; j < CHAINS; j++)
 
-typedef REAL vec __attribute__((vector_size(64)));
+typedef REAL vec __attribute__((vector_size(BYTES)));
 typedef struct { vec v[CHAINS]; } wide;
 
 #ifdef SINGLE
-typedef int32_t whole __attribute__((vector_size(64)));
+typedef int32_t whole __attribute__((vector_size(BYTES)));
 #else
-typedef int64_t whole __attribute__((vector_size(64)));
+typedef int64_t whole __attribute__((vector_size(BYTES)));
 #endif
 
 /* a < b ? yes : no. Written bitwise, GCC turns it into twice the work where there are mask registers. */

@@ -1,7 +1,6 @@
 /* The machine's limit: the benchmarks' closed loop in C with SIMD, as fast as we know how to write it.
 
-   Vectors of 64 bytes (8 double or 16 float; -DREAL=float) by GCC's vector extensions, two of them
-   interleaved so that one chain's latency hides behind the other's work. The state stays in registers over a
+   Vectors by GCC's vector extensions, interleaved in chains as lanes.h says. The state stays in registers over a
    sample; there are three divisions per evaluation, all else being merged into them; the arctangent is a rational
    function of its own. A rotor that touches down is frozen. The guards that no levitated rotor meets (gap and
    gradient floors, an infinite supply's limit) are left out.

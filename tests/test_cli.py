@@ -223,7 +223,6 @@ def test_every_kind_can_be_given_in_a_case_file():
         "std": 1e-3,
         "f_low": 1.0,
         "f_high": 2.0,
-        "speed": 60.0,
         "service_speed": 60.0,
         "unbalance": 1.0,
         "grade": 2.5,
@@ -237,8 +236,8 @@ def test_every_kind_can_be_given_in_a_case_file():
             pathlib.Path("table.csv").write_text("0,0\n1,1e-3\n")
             table = {"file": "table.csv"}
         if hasattr(signal, "unit"):
-            slot = {"N": "q_f", "m/s^2": "q_z"}[signal.unit]
-            made = getattr(case_from({"disturbance": {"q_z": {"kind": kind, **table}}}).scenario, slot)
+            slot, load = {"N": "q_f", "m/s^2": "q_z"}[signal.unit], {"kind": kind, **table}
+            made = getattr(case_from({"rotor": {"speed": 60.0}, "disturbance": {"q_z": load}}).scenario, slot)
         else:
             made = case_from({"reference": {"kind": kind, **table}}).scenario.reference
         assert isinstance(made, signal)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from test_export import compiled
 
-from ambjax import RK4, Clock, Constant, Pulse, Sensor, Sine, rollout
+from ambjax import Clock, rollout
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.codegen.c99.source import Origin
@@ -23,9 +23,12 @@ from ambjax.codegen.trace import arguments
 from ambjax.codegen.twins import LoopCase
 from ambjax.codegen.verify import draft, verify
 from ambjax.control.processor import Processor
+from ambjax.sensors import Sensor
+from ambjax.signals import Constant, Pulse, Sine
 from ambjax.simulation.integrate import FixedSteps
 from ambjax.simulation.rosenbrock import AdaptiveRodas3
 from ambjax.simulation.trajectory import TOUCHED
+from ambjax.solvers import RK4
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.coils import TwoCoil
 from ambjax.world.faults import Dropouts, Outliers
@@ -139,7 +142,7 @@ def test_a_disturbance_acts_in_the_step_that_integrates_its_sample():
     [
         ({"sensor": Sensor(outliers=Outliers(at=1e-3))}, "sensor.outliers: the exported plant"),
         ({"sensor": Sensor(dropouts=Dropouts(at=1e-3))}, "sensor.dropouts: the exported plant"),
-        ({"sensor": Sensor(runout=Runout(100.0))}, "sensor.runout: the exported plant"),
+        ({"sensor": Sensor(runout=Runout())}, "sensor.runout: the exported plant"),
     ],
 )
 def test_parts_that_an_exported_plant_lacks_are_refused_in_one_line(change, says):

@@ -13,6 +13,7 @@ from ambjax.cases.reader import case_from, read_case
 from ambjax.commands.sensitivity import references
 from ambjax.ensemble.spread import apply
 from ambjax.linear import linearise
+from ambjax.world.rotation import Rotation
 from tuning.report.tuned import tuned_case
 
 STEP = {"kind": "step", "amplitude": 20.0, "start": 0.1}
@@ -67,9 +68,12 @@ RPM = 2 * np.pi / 60
 @pytest.mark.parametrize(
     ("signal", "knots"),
     [
-        (amb.Ramp(3.0, 0.1, 0.2), [(0, 0), (0.1, 0), (0.3, 3), (9, 3)]),
-        (amb.Trapezoid(-2.0, 0.1, 0.05, 0.1, 0.2), [(0, 0), (0.1, 0), (0.15, -2), (0.25, -2), (0.45, 0), (9, 0)]),
-        (amb.Trapezoid(2.0, 0.1, 0.05, 0.0, 0.2), [(0, 0), (0.1, 0), (0.15, 2), (0.35, 0), (9, 0)]),
+        (amb.signals.Ramp(3.0, 0.1, 0.2), [(0, 0), (0.1, 0), (0.3, 3), (9, 3)]),
+        (
+            amb.signals.Trapezoid(-2.0, 0.1, 0.05, 0.1, 0.2),
+            [(0, 0), (0.1, 0), (0.15, -2), (0.25, -2), (0.45, 0), (9, 0)],
+        ),
+        (amb.signals.Trapezoid(2.0, 0.1, 0.05, 0.0, 0.2), [(0, 0), (0.1, 0), (0.15, 2), (0.35, 0), (9, 0)]),
     ],
 )
 def test_piecewise_linear_signals_pass_through_their_corners(signal, knots):
@@ -84,10 +88,10 @@ def test_piecewise_linear_signals_pass_through_their_corners(signal, knots):
 def test_the_force_of_an_unbalance_by_hand():
     # 120 g mm at 6000 rpm: 1.2e-4 kg m (628 1/s)^2 = 47.4 N
     t = np.linspace(0, 0.05, 40)
-    force = amb.Unbalance(120.0, 6000.0, phase=0.4)(t)
+    force = amb.signals.Unbalance(120.0, 0.4, Rotation(6000.0))(t)
     np.testing.assert_allclose(force, 1.2e-4 * (6000 * RPM) ** 2 * np.sin(6000 * RPM * t + 0.4), rtol=0, atol=1e-10)
     # G 2.5 at 6000 rpm: e = 2.5e-3/628 = 3.98 um, and twice the service speed is four times the acceleration
-    acceleration = amb.UnbalanceGrade(2.5, 6000.0, 12000.0)(t)
+    acceleration = amb.signals.UnbalanceGrade(2.5, 6000.0, rotation=Rotation(12000.0))(t)
     expected = 4 * 2.5e-3 * 6000 * RPM * np.sin(2 * 6000 * RPM * t)
     np.testing.assert_allclose(acceleration, expected, rtol=0, atol=1e-11)
 
@@ -95,7 +99,8 @@ def test_the_force_of_an_unbalance_by_hand():
 def test_the_phase_of_a_run_up_is_the_integral_of_the_speed():
     from scipy.integrate import quad
 
-    run_up = amb.Unbalance(120.0, 600.0, 3000.0, 0.2, 0.3)
+    # 2400 rpm in 0.2 s
+    run_up = amb.signals.Unbalance(120.0, 0.3, Rotation(600.0, 12000.0, 3000.0))
 
     def speed(t):  # 1/s
         return RPM * (600 + (3000 - 600) * min(t / 0.2, 1.0))
@@ -114,8 +119,9 @@ LINEAR = {
 # Forces of 1e-4 of the weight and a runout of 5 nm: products of them are below 1e-6 of the response.
 ROTATING = {
     "controller": LINEAR,
-    "disturbance": {"q_z": {"kind": "unbalance", "unbalance": 0.05, "speed": 3000.0, "phase": 0.2}},
-    "sensor": {"runout": {"speed": 3000.0, "harmonics": [{"number": 2, "amplitude": 5e-9, "phase": -0.5}]}},
+    "rotor": {"speed": 3000.0},
+    "disturbance": {"q_z": {"kind": "unbalance", "unbalance": 0.05, "phase": 0.2}},
+    "sensor": {"runout": {"harmonics": [{"number": 2, "amplitude": 5e-9, "phase": -0.5}]}},
     "clock": {"duration": 0.2, "sample_period": 1e-4},
 }
 
@@ -140,6 +146,28 @@ def test_the_response_to_unbalance_and_runout_agrees_with_the_linear_loop():
     np.testing.assert_allclose(lines(rows, "z"), expected, rtol=1e-5)
     # the sensor reads the sum; the true position does not contain it
     np.testing.assert_allclose(lines(rows, "z_measured")[1], expected[1] + runout, rtol=1e-5)
+
+
+def test_unbalance_and_runout_share_the_angle_of_the_rotor():
+    """One number changes the speed of everything; keys of each load, in a case without [rotor], mean the same."""
+    rotor = {"speed": 600.0, "acceleration": 12000.0, "speed_end": 3000.0}
+    case, t = case_from(ROTATING | {"rotor": rotor}), np.linspace(0, 0.35, 8)
+    own = {"speed": 600.0, "speed_end": 3000.0, "duration": 0.2}
+    each = {
+        "disturbance": {"q_z": ROTATING["disturbance"]["q_z"] | own},
+        "sensor": {"runout": ROTATING["sensor"]["runout"] | own},
+    }
+    apart = case_from({name: table for name, table in (ROTATING | each).items() if name != "rotor"})
+    faster = apply(case.cascade, case.scenario, {"rotor.speed": 1200.0})[1]
+    for one in (case.scenario, apart.scenario, faster):
+        one = one.realised()
+        start = 1200.0 if one.rotor is not None and one.rotor.speed == 1200.0 else 600.0
+        rise = (3000.0 - start) / 12000.0
+        turned = start * np.minimum(t, rise) + 6000.0 * np.minimum(t, rise) ** 2 + 3000.0 * np.maximum(t - rise, 0)
+        speed = np.minimum(start + 12000.0 * t, 3000.0)
+        force = 0.05e-6 * (RPM * speed) ** 2 * np.sin(RPM * turned + 0.2)
+        np.testing.assert_allclose(one.acceleration(t), force / one.plant.m, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(one.sensor.runout(t), 5e-9 * np.sin(2 * RPM * turned - 0.5), rtol=0, atol=1e-17)
 
 
 def test_the_low_pass_of_the_sensor_acts_on_the_runout():
@@ -170,14 +198,14 @@ def test_a_table_reproduces_the_sampled_signal(name, tmp_path):
     load = {"kind": "table", "file": name, "unit": "N", "scale": 2.0, "start": 0.5}
     case = case_from({"disturbance": {"q_z": load}}, folder=tmp_path)
     t = np.linspace(0, 1.5, 151)
-    np.testing.assert_allclose(case.scenario.q_f(t), amb.Ramp(6.0, 0.6, 0.2)(t), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(case.scenario.q_f(t), amb.signals.Ramp(6.0, 0.6, 0.2)(t), rtol=0, atol=1e-13)
     assert case.scenario.q_f.span(1.0) == (0, 6)
     # held: each value until the next time, at which it jumps
     held = case_from({"disturbance": {"q_z": load | {"interpolation": "held"}}}, folder=tmp_path).scenario.q_f
     np.testing.assert_array_equal(held(0.5 + np.array([-1, 0.2, 0.2999, 0.3, 9])), [0, 0, 0, 6, 6])
     # the file is a part of the structure: equal numbers give an equal tree, other numbers another
     assert jax.tree.structure(held) == jax.tree.structure(held.shifted(1.0))
-    other = dataclasses.replace(held, samples=amb.Samples(knots, knots))
+    other = dataclasses.replace(held, samples=amb.signals.Samples(knots, knots))
     assert jax.tree.structure(held) != jax.tree.structure(other)
 
 
@@ -302,6 +330,12 @@ def test_parquet_needs_its_extra(tmp_path):
             {"disturbance": {"q_z": {"kind": "unbalance", "unbalance": 1.0, "speed": 1.0, "unit": "m/s^2"}}},
             "gives N, but a signal in m/s\\^2",
         ),
+        (
+            ROTATING | {"disturbance": {"q_z": {"kind": "unbalance", "unbalance": 1.0, "speed": 1.0}}},
+            "disturbance.q_z.speed: it turns with",
+        ),
+        ({"disturbance": {"q_z": {"kind": "unbalance", "unbalance": 1.0}}}, r"\[rotor\] is missing: disturbance.q_z"),
+        ({"rotor": {"speed": 1.0, "speed_end": 2.0}}, "rotor.speed_end = 2: from speed = 1 rpm, an acceleration of 0"),
         (
             {"sensor": {"runout": {"speed": 1.0}}},
             "sensor.runout.harmonics is missing: it must be a list of 1 to 100 tables",

@@ -18,7 +18,7 @@ from ambjax.commands.reading import read_with_warnings
 @pytest.mark.parametrize(
     ("tables", "said"),
     [
-        ({"rotor": {"m": 1.0}}, "rotor = .*unknown key. Did you mean 'plant'"),
+        ({"rotor": {"m": 1.0}}, "rotor.m = 1.0: unknown key. Did you mean 'plant.m'"),
         (
             {"controller": {"position": {"k_p": 1.0, "k_d": 1.0, "w_f": 1.0}}},
             "position.kind is left out, so the law is 'sliding-mode', .* These keys fit 'pid'",

@@ -11,7 +11,7 @@ from ambjax.numerics.records import GainFunction
 from ambjax.numerics.shapes import axes_of
 from ambjax.simulation.clock import Clock
 from ambjax.world.scenario import SLOTS, Scenario
-from ambjax.world.signals import Constant
+from ambjax.world.waveforms import Constant
 
 # Unit of each signal of a scenario.
 UNITS = {"reference": "m", "q_z": "m/s^2", "q_v": "A^2/m^2", "q_i": "A/s", "q_f": "N", "base": "m/s^2"}
@@ -27,7 +27,7 @@ def parts_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> dict[str, st
     signals = {f"{slot} ({UNITS[slot]})": one for slot, one in given.items() if one != Constant()}
     same = _numbers_of(cascade.model) == _numbers_of(scenario.plant)
     model = None if same else cascade.model
-    world = {"sensor": scenario.sensor, "actuator": scenario.amplifier, "stop": scenario.stop}
+    world = {"rotor": scenario.rotor, "sensor": scenario.sensor, "actuator": scenario.amplifier, "stop": scenario.stop}
     parts = {"plant": scenario.plant, "model": model, **laws, "processor": cascade.processor, **signals, **world}
     parts_text = {name: _described(one) for name, one in parts.items() if one is not None}
     supply, period = float(np.max(scenario.u_max)), float(clock.sample_period)

@@ -19,7 +19,7 @@ def forces(case: Case) -> Forces:
     The largest force is that at z = 0 for i = i_0, where one magnet is off. If the amplifier or the limit of a coil
     limits |i| to less, it is the force at this limit. The load is the sum of the bounds of all signals that disturb z.
     """
-    scenario, plant = case.scenario, case.scenario.plant
+    scenario, plant = case.scenario.turning(), case.scenario.plant
     m, largest = float(plant.m), float(scenario.largest_force)
     factors = {"q_z": m, "q_v": m * float(plant.a), "q_f": 1.0, "base": m}
     signals = {slot: signal for slot in factors if (signal := getattr(scenario, slot)) is not None}

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.machine_controller import axis_controller, inner, law_from, merged
+from ambjax.cases.machine_spread import axis_table, fastest_rotor, machine_spread, refuse_unused
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
 from ambjax.cases.rotor_tables import (
     COORDINATES,
@@ -24,6 +25,7 @@ from ambjax.cases.rotor_tables import (
     vector,
 )
 from ambjax.cases.table import Table, load, show
+from ambjax.ensemble.spread import Spread
 from ambjax.linear.analysis import Zones
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
@@ -51,8 +53,8 @@ class MachineCase:
 
     `machine`: rotor and axes, for a rollout with `clock`. `axes`: names of the axes. `coordinates`: names of the
     rotor's coordinates. `cases`: the case of each axis, with the mass and the weight that it carries. `settle`: time
-    from which "settled" metrics count, s. `zones`, `speeds`: range, limits and speeds (rpm) of the sensitivity. `text`:
-    the file as read.
+    from which "settled" metrics count, s. `zones`, `speeds`: range, limits and speeds (rpm) of the sensitivity.
+    `spread`: the numbers that vary between the members of an ensemble. `text`: the file as read.
     """
 
     name: str
@@ -64,6 +66,7 @@ class MachineCase:
     settle: float
     zones: Zones
     speeds: tuple[float, ...]
+    spread: Spread = Spread()
     text: str = ""
 
 
@@ -95,10 +98,9 @@ def machine_from(
 ) -> MachineCase:
     """Return the machine of a parsed TOML document. Raises ValueError, one line, for an invalid one."""
     top = Table(raw)
-    top.only([*TABLES, *MACHINE_TABLES, "tune"])
-    for table, instead in (("disturbance", "[[load]]"), ("spread", "one case for each value")):
-        if table in raw:
-            raise ValueError(f"[{table}]: a machine with [rotor] does not take it yet. Use {instead} instead.")
+    top.only([*TABLES, *MACHINE_TABLES[1:], "tune"])
+    if "disturbance" in raw:
+        raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] instead.")
     body, bearings = body_from(top), tables_of(top, "bearing")
     if not bearings:
         raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
@@ -114,28 +116,34 @@ def machine_from(
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
 
+    names = [table.raw.get("name", f"bearing{k + 1}") for k, table in enumerate(bearings)]
     cases = []
     for axis, m, force, i in zip(axes, masses, forces, currents, strict=True):
         own = _axis_raw(raw, bearings[axis.bearing], m, force, {"z": float(axis.magnet @ q), "i": i})
+        own |= axis_table(raw, axis, names[axis.bearing])
         case = read(own, f"axis {axis.name}")
         _check_force(case, axis, force)
         cases.append(case)
     law, parts, demand = law_from(top, rotor, bearings, cases, read, folder)
+    spread = machine_spread(top, rotor, axes, names, cases)
+    if law is not None:
+        refuse_unused(spread)
     fixed = not isinstance(raw.get("clock", {}).get("dt", "auto"), str)
-    clock = _clock([*cases, *parts], rotor, fixed)
+    clock = _clock([*cases, *parts], fastest_rotor(rotor, spread), fixed)
     systems = [prepare(case.cascade, case.scenario, clock)[0] for case in cases]
     systems = [canonical(system if law is None else inner(system, demand)) for system in systems]
-    names = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
+    coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
     return MachineCase(
         name=safe_name(name),
         machine=machine_of(rotor, systems, jnp.asarray(q), law),
         clock=clock,
         axes=tuple(axis.name for axis in axes),
-        coordinates=names,
+        coordinates=coordinates,
         cases=tuple(cases),
         settle=cases[0].settle,
         zones=cases[0].zones,
         speeds=_speeds(top.table("sensitivity"), rotor, float(clock.duration)),
+        spread=spread,
         text=text,
     )
 
@@ -201,7 +209,10 @@ def _check_force(case: Case, axis: BearingAxis, force: float) -> None:
 
 def _axis_raw(raw: dict[str, Any], bearing: Table, m: float, force: float, initial: dict[str, float]) -> dict[str, Any]:
     """Return the case of one axis: the common tables, what the bearing changes, and the rotor's share."""
-    own = copy.deepcopy({key: value for key, value in raw.items() if key not in (*MACHINE_TABLES, "initial", "tune")})
+    apart = (*MACHINE_TABLES, "initial", "tune", "spread")
+    own = copy.deepcopy({key: value for key, value in raw.items() if key not in apart})
+    if turning := {key: raw["rotor"][key] for key in ("speed", "acceleration") if key in raw["rotor"]}:
+        own["rotor"] = {"speed": 0.0, **turning}
     for table in OWN:
         if table in bearing.raw:
             own[table] = merged(own.get(table, {}), bearing.table(table).raw)

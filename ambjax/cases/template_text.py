@@ -66,10 +66,12 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 # at = 0.1                    # s; time of an additional dropout (left out: none)
 # value = "hold"              # reading during a dropout: the last one ("hold"), "nan", "zero" or "full-scale"
 
-# [sensor.runout]             # runout of the surface that the position sensor reads (left out: none)
-# speed = 6000.0              # rpm
-# speed_end = 12000.0         # rpm; speed after a linear run-up (left out: constant speed)
-# duration = 1.0              # s; time of the run-up
+# [rotor]                     # speed of everything that turns: unbalance, runout, notch (left out: nothing turns)
+# speed = 6000.0              # rpm; speed at t = 0
+# acceleration = 3000.0       # rpm/s; rate of the speed (left out: 0)
+# speed_end = 12000.0         # rpm; speed at which a run-up or run-down ends (left out: it never ends)
+
+# [sensor.runout]             # runout of the surface that the position sensor reads, with [rotor] (left out: none)
 # harmonics = [{{ number = 1, amplitude = 1e-6, phase = 0.0 }}]  # waves per turn, m, rad
 
 # [processor]                 # the laws run on a processor, one step per sample (left out: in continuous time)

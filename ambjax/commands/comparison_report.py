@@ -14,6 +14,7 @@ from ambjax.linear import Findings
 from ambjax.linear.stability import MOST_TESTED
 from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks
 from ambjax.results.outputs import table
+from ambjax.simulation import orders
 from ambjax.text import web_page
 
 
@@ -41,8 +42,8 @@ class Compared:
 
     def of(self, name: str, reduce: Callable[[np.ndarray], Any]) -> float | None:
         """Return a metric reduced over the members that are held; None without them."""
-        values = np.asarray(self.columns[name])[self.held]
-        return float(reduce(values)) if values.size else None
+        values = np.asarray(self.columns.get(name, ()))
+        return float(reduce(values[self.held])) if values.size and self.held.any() else None
 
 
 class Quantity(NamedTuple):
@@ -88,6 +89,11 @@ QUANTITIES = (
     Quantity("disk_margin", "disk margin", "1", less=False),
     Quantity("stiffness_N_per_m", "static stiffness", "N/m", less=False),
     Quantity("flops", "cost of a step", "flops"),
+    *(
+        Quantity(name, f"{words} of {name.rpartition('_')[0].replace('_', ' at ')}", unit, None if phase else True)
+        for name, unit in orders.UNITS.items()
+        for phase, words in [(unit == "deg", "mean phase" if unit == "deg" else "median amplitude")]
+    ),
 )
 
 
@@ -120,6 +126,7 @@ def _values(one: Compared, first: Compared) -> dict[str, object]:
         "chatter_V_per_s": None if chatter is None else chatter / settled,
         "clearance_used": used,
         "clearance_zone": zone,
+        **{name: one.of(name, _mean_phase if unit == "deg" else np.median) for name, unit in orders.UNITS.items()},
         **_loop(one),
         "flops": one.flops,
     }
@@ -158,6 +165,10 @@ def _loop(one: Compared) -> dict[str, object]:
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
+
+
+def _mean_phase(degrees: np.ndarray) -> float:
+    return float(np.degrees(np.angle(np.mean(np.exp(1j * np.radians(degrees))))))
 
 
 def _laws(case: Case) -> dict[str, dict[str, object]]:

@@ -24,6 +24,8 @@ COLUMNS = {
     "rms_u_V": "rms u, V",
     "max_abs_u_V": "largest |u|, V",
     "force_used": "share of force",
+    "z_1x_m": "z at 1x, m",
+    "i_1x_A": "i at 1x, A",
 }
 
 
@@ -36,7 +38,7 @@ def refuse(args: argparse.Namespace, names: tuple[str, ...]) -> None:
 
 def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]:
     """Simulate a machine and write its files. Exit code 1 if the rotor is lost."""
-    refuse(args, ("member", "members", "seed", "begin", "end", "page"))
+    refuse(args, ("begin", "end", "page"))
     out = directory(args.out, f"simulate-{case.name}", SIMULATED, args.force)
     say(f"method: {case.clock.method}; axes: {', '.join(case.axes)}")
     with tqdm(total=case.clock.samples, unit="sample", unit_scale=True, delay=2, leave=False, desc="simulate") as bar:
@@ -53,8 +55,9 @@ def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]
         described("overview.png", lambda: machine_picture(case, run.signals, title, part / "overview.png"))
         names = [name for name in SIMULATED if (part / name).exists()]
     if not args.json:
-        rows = [(axis, *(f"{own[name]:.4g}" for name in COLUMNS)) for axis, own in run.metrics["axes"].items()]
-        print(table(("axis", *COLUMNS.values()), rows))
+        shown = {name: words for name, words in COLUMNS.items() if name in run.metrics}
+        rows = [(axis, *(f"{own[name]:.4g}" for name in shown)) for axis, own in run.metrics["axes"].items()]
+        print(table(("axis", *shown.values()), rows))
         written(out, ", ".join(names))
     if run.lost:
         lost = run.metrics["lost_at_s"]

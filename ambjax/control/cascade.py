@@ -17,7 +17,9 @@ from ambjax.compiler.barrier import materialised
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.base import default_law, set_valued_signs, with_default_steepness, with_set_valued_signs
 from ambjax.control.cascade_state import CascadeState, Command, Sample
-from ambjax.control.laws import (
+from ambjax.control.processor import Processor, predicted_over_delay
+from ambjax.control.schedule import extremes, with_gains_at
+from ambjax.control.stages import (
     CurrentInputs,
     CurrentLaw,
     ForceDemand,
@@ -28,14 +30,14 @@ from ambjax.control.laws import (
     begin_law,
     step_law,
 )
-from ambjax.control.processor import Processor, predicted_over_delay
-from ambjax.control.schedule import extremes, with_gains_at
 from ambjax.numerics.records import Scalar, is_traced, part, record
 from ambjax.world.plant import Plant
 from ambjax.world.plant import State as NominalState
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
+# In place of a processor in continuous time: no delay, no prediction and no guard.
+_CONTINUOUS = Processor(delay=0.0, predict=False, guard=None)
 # Marks a law that is not given. `Cascade.__post_init__` replaces it by the default law.
 _LEFT_OUT: Any = None
 # The default law of each stage.
@@ -78,7 +80,7 @@ class Cascade:
         """
         observed = extremes(self.observer)[0].init(self.model, measured)
         rest = [extremes(law)[0] for law in self.laws[1:]]
-        if self.processor is not None:
+        if self.sampled:
             return CascadeState(observed, *(law.init_sampled(self.model) for law in rest))
         states = [law.init(self.model) for law in rest]
         if reference is not None:
@@ -93,18 +95,16 @@ class Cascade:
         They are `laws` if `started`; otherwise the initial states for these readings. The position law starts from its
         first estimate (`laws.begin_law`).
         """
-        implicit = self.processor is not None and self.processor.implicit
         laws = _chosen(started, laws, self.init(measured))
         estimate, *_ = self.estimate(measured, laws.observer, sample)
         position = with_gains_at(self.position, estimate.z, sample.reference)
-        begun = begin_law(
-            position, (estimate, sample.reference), model=self.model, period=sample.period, implicit=implicit
-        )
+        inputs, implicit = (estimate, sample.reference), self.timing.implicit
+        begun = begin_law(position, inputs, model=self.model, period=sample.period, implicit=implicit)
         return laws._replace(position=_chosen(started, laws.position, begun))
 
     def scale(self) -> CascadeState:
         """Return the characteristic size of each state of the laws; integration errors are relative to it."""
-        if self.processor is None:
+        if not self.sampled:
             return CascadeState(*(extremes(law)[0].scale(self.model) for law in self.laws))
         return CascadeState(*(extremes(law)[0].scale_sampled(self.model) for law in self.laws))
 
@@ -126,6 +126,20 @@ class Cascade:
     def laws(self) -> tuple[Observer, PositionLaw, InversionLaw, CurrentLaw]:
         """The four laws in order."""
         return self.observer, self.position, self.inversion, self.current
+
+    @property
+    def sampled(self) -> bool:
+        """Whether the laws run on a processor."""
+        return self.processor is not None
+
+    @property
+    def timing(self) -> Processor:
+        """The field `processor`; in continuous time, a processor without delay, prediction and guard."""
+        return _CONTINUOUS if self.processor is None else self.processor
+
+    def with_processor(self, **fields: object) -> "Cascade":
+        """Return the cascade with other fields of its processor. In continuous time, it does not change."""
+        return dataclasses.replace(self, processor=self.processor and dataclasses.replace(self.processor, **fields))
 
     def driven(self, u: Array, state: NominalState) -> NominalState:
         """Return the rates of the nominal plant under the command u, V or A."""
@@ -179,9 +193,8 @@ class Cascade:
         A sign with steepness inf becomes set-valued. The program also supports the delays `delays` (samples) and, if
         `between` is true, every delay between them. Raises ValueError as `Processor.resolved` does.
         """
-        assert self.processor is not None
         laws = {stage: with_set_valued_signs(getattr(self, stage)) for stage in DEFAULT_LAWS}
-        return dataclasses.replace(self, **laws, processor=self.processor.resolved(*delays, between=between))
+        return dataclasses.replace(self, **laws, processor=self.timing.resolved(*delays, between=between))
 
     def reads_velocity(self, period: Scalar) -> bool:
         """Return whether the command or a state of a law depends on the measured velocity.
@@ -189,11 +202,11 @@ class Cascade:
         `period`: sample period, s. True if a number is traced, because the laws are then not evaluated. Otherwise the
         laws of the first member are evaluated at three velocities, and the results compared.
         """
-        if self.observer.estimates_velocity or (self.processor is not None and self.processor.predicts):
+        if self.observer.estimates_velocity or self.timing.predicts:
             return not self.observer.estimates_velocity
         if any(map(is_traced, jax.tree.leaves((self, period)))):
             return True
-        one = self if self.processor is None else self.on_processor()
+        one = self.on_processor() if self.sampled else self
         one, period = jax.tree.map(lambda x: np.ravel(np.asarray(x, float))[0], (one, period))
         z, z_dot, i = (float(x) for x in one.model.sizes())
         results = [
@@ -207,10 +220,10 @@ class Cascade:
         zero = jnp.zeros(())
         reference, still = Reference(zero, zero, zero), measured._replace(z_dot=zero)
         state = self.init(still, reference)
-        if self.processor is None:
+        if not self.sampled:
             command, after = self(measured, state, reference, jnp.inf)
         else:
-            sample = Sample(reference, period, jnp.inf, self.processor.constant_past(zero))
+            sample = Sample(reference, period, jnp.inf, self.timing.constant_past(zero))
             command, after, _ = self.step(measured, state, sample)
         return command.u, after
 
@@ -234,8 +247,7 @@ class Cascade:
 
     def _advance(self, sample: Sample) -> Callable[..., Any]:
         """Return `laws.step_law` with the model and the discretisation of this cascade, and the period of `sample`."""
-        implicit = self.processor is not None and self.processor.implicit
-        return functools.partial(step_law, model=self.model, period=sample.period, implicit=implicit)
+        return functools.partial(step_law, model=self.model, period=sample.period, implicit=self.timing.implicit)
 
     def estimate(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State, Measurement]:
         """Step the observer on a processor.
@@ -244,13 +256,11 @@ class Cascade:
         Returns the estimate for the other laws (with prediction: at the end of the delay), the next state of the
         observer, and the estimate at the sample itself.
         """
-        processor: Any = self.processor
         now, state = self.observed(measured, state, sample)
         estimate = now
-        if processor.predicts:
-            estimate = predicted_over_delay(
-                self.model, self.driven, now, sample.past, processor.prediction_steps(sample.period)
-            )
+        if self.timing.predicts:
+            steps = self.timing.prediction_steps(sample.period)
+            estimate = predicted_over_delay(self.model, self.driven, now, sample.past, steps)
         return estimate, state, now
 
     def observed(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State]:

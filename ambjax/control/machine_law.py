@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 from jax import Array
 
-from ambjax.control.laws import ForceDemand
+from ambjax.control.stages import ForceDemand
 from ambjax.numerics.records import Scalar
 from ambjax.world.plant import State
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 
 class MachineInputs(NamedTuple):

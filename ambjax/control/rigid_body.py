@@ -10,15 +10,15 @@ from jax import Array
 
 from ambjax.control.cascade import Cascade, rates_along
 from ambjax.control.cascade_state import CascadeState, Sample
-from ambjax.control.laws import ForceDemand, begin_law
 from ambjax.control.machine_law import Demanded, MachineInputs, MachineLaw
 from ambjax.control.schedule import extremes, with_gains_at
+from ambjax.control.stages import ForceDemand, begin_law
 from ambjax.numerics.records import leaf, part, record
 from ambjax.numerics.runge_kutta import rk4_step
 from ambjax.numerics.small_matrices import times
 from ambjax.world.plant import State
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 
 def _matrix(shape: str, doc: str) -> Any:

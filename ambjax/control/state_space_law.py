@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.control.laws import ForceDemand
 from ambjax.control.machine_law import Demanded, MachineInputs, MachineLaw
+from ambjax.control.stages import ForceDemand
 from ambjax.numerics.records import leaf, record, static
 from ambjax.numerics.small_matrices import times
 from ambjax.numerics.smooth import limited

@@ -16,6 +16,7 @@ from matplotlib.ticker import (
     NullFormatter,
 )
 
+from ambjax.simulation import orders
 from ambjax.simulation.metrics import UNITS
 
 # Labels of metrics without their units.
@@ -48,6 +49,9 @@ LABELS = {
     "lost_at_s": "lost at",
     "singular_at_s": "singular at",
 }
+for _name, _unit in orders.UNITS.items():
+    _signal, _order, _ = _name.split("_")
+    LABELS[_name] = f"{'phase' if _unit == 'deg' else 'amplitude'} of {_signal} at {_order}"
 # Metrics that are shown in another unit than that of `UNITS`: the factor to this unit, and the unit.
 AXIS_UNITS = {
     "clearance_used": (100.0, "%"),

@@ -11,15 +11,15 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.cascade import Cascade
-from ambjax.control.laws import ForceDemand
 from ambjax.control.machine_law import Demanded, MachineInputs, MachineLaw
+from ambjax.control.stages import ForceDemand
 from ambjax.numerics.records import Scalar
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.world.plant import State
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 T = TypeVar("T")
 

@@ -10,11 +10,13 @@ from typing import Protocol
 
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, record
-from ambjax.simulation.folds import Count, Driven, Ending, Named, Peak, Reaching, Rms, Variation
+from ambjax.numerics.records import Scalar, leaf, part, record
+from ambjax.simulation import orders
+from ambjax.simulation.folds import Count, Driven, Ending, Fold, Named, Peak, Reaching, Rms, Variation
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import ALIVE, STALLED, Row
 from ambjax.world.plant import Plant
+from ambjax.world.rotation import Rotation
 from ambjax.world.scenario import Scenario
 
 # Unit of each metric by name. Other metrics are shares and counts.
@@ -43,6 +45,7 @@ UNITS = {
     "lost_at_s": "s",
     "singular_at_s": "s",
     "settle_s": "s",
+    **orders.UNITS,
 }
 # Times at which a signal first comes within its band; inf: never.
 REACHED = ("sigma_reached_s", "v_tilde_reached_s", "current_error_reached_s")
@@ -58,10 +61,10 @@ class SettledCase(Protocol):
 
 
 @record
-class Standard:
+class Metrics:
     """The metrics of metrics.json: a dict of numbers whose names include their units.
 
-    The defaults are for the plant of Table 1; `standard_for` scales them to another plant.
+    The defaults are for the plant of Table 1; `Metrics.of` scales them to another plant.
     """
 
     settle: Scalar = leaf(
@@ -81,17 +84,40 @@ class Standard:
         infinite=True,
         doc="largest magnetic force; `force_used` is |force| as a share of it; inf: unknown",
     )
+    rotor: Rotation | None = part(
+        default=None, doc="speed of the rotor, for amplitude and phase once and twice per revolution; None: none"
+    )
 
     @classmethod
-    def for_case(cls, case: SettledCase) -> "Standard":
-        """Return the metrics for a case of `read_case`: `standard_for` with its settling time and its scenario."""
-        return standard_for(case.settle, case.scenario)
+    def of(cls, settle: Scalar, scenario: Scenario) -> "Metrics":
+        """Return the metrics for a scenario: its clearance and largest force, and bands by the sizes of its plant.
+
+        `settle`: start of the evaluation of the settled metrics, s. The ratios of the bands are those of the plant of
+        Table 1: 4e-4 of the size of sigma, 4e-5 of the size of v, and 4e-3 of i_0.
+        """
+        plant, usual, paper = scenario.plant, Metrics(), Plant()
+        return Metrics(
+            settle,
+            scenario.touchdown,
+            usual.sigma_band * (plant.sigma_size / paper.sigma_size),
+            usual.v_tilde_band * (plant.v_size / paper.v_size),
+            usual.e_band * (plant.i_0 / paper.i_0),
+            scenario.largest_force,
+            scenario.rotor,
+        )
+
+    @classmethod
+    def for_case(cls, case: SettledCase) -> "Metrics":
+        """Return the metrics for a case of `read_case`: `Metrics.of` with its settling time and its scenario."""
+        return Metrics.of(case.settle, case.scenario)
 
     def _folds(self) -> Named:
         """Return the fold of each metric by name."""
         late = self.settle
+        turning: dict[str, Fold] = {} if self.rotor is None else {"orders": orders.Orders(self.rotor, late)}
         return Named(
-            {
+            turning
+            | {
                 "max_abs_error_m": Peak("e_z"),
                 "rms_error_m": Rms("e_z"),
                 "settled_max_abs_error_m": Peak("e_z", late),
@@ -130,6 +156,7 @@ class Standard:
     def result(self, carry: dict[str, object], ending: Ending) -> dict[str, Array]:
         """Return each metric by name, in the units of UNITS."""
         numbers = self._folds().result(carry, ending)
+        numbers |= numbers.pop("orders", {})
         for name in ("clearance_used", "settled_clearance_used"):
             numbers[name] = numbers[name] / self.touchdown
         numbers["force_used"] = numbers["max_abs_force_N"] / self.largest_force
@@ -140,20 +167,3 @@ class Standard:
             "singular_at_s": ending.singular_at,
         }
         return numbers | status
-
-
-def standard_for(settle: Scalar, scenario: Scenario) -> Standard:
-    """Return the metrics for a scenario: its clearance and largest force, and bands in proportion to its plant's sizes.
-
-    `settle`: start of the evaluation of the settled metrics, s. The ratios of the bands are those of the plant of Table
-    1: 4e-4 of the size of sigma, 4e-5 of the size of v, and 4e-3 of i_0.
-    """
-    plant, usual, paper = scenario.plant, Standard(), Plant()
-    return Standard(
-        settle,
-        scenario.touchdown,
-        usual.sigma_band * (plant.sigma_size / paper.sigma_size),
-        usual.v_tilde_band * (plant.v_size / paper.v_size),
-        usual.e_band * (plant.i_0 / paper.i_0),
-        scenario.largest_force,
-    )

@@ -17,13 +17,14 @@ from jax import Array
 
 from ambjax.control.machine_law import MachineLaw
 from ambjax.numerics.records import Scalar, leaf, part, record, static
+from ambjax.numerics.shapes import varying
 from ambjax.numerics.small_matrices import solve, times
 from ambjax.simulation.between import acting, lags, plant_status, under
 from ambjax.simulation.edges import NO_EDGES, Edges
 from ambjax.simulation.folds import Ending
-from ambjax.simulation.integrate import Advanced, InitialValueProblem, Integrator, in_turn
+from ambjax.simulation.integrate import Advanced, InitialValueProblem, Integrator, WholeState, in_turn
 from ambjax.simulation.joint_laws import begun, demanded_now, jumped
-from ambjax.simulation.loop import INSTANT_TREE, ClosedLoop, ExternalInputs, LoopState, Realised
+from ambjax.simulation.loop import INSTANT_TREE, ClosedLoop, ExternalInputs, LoopState
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.span import Instant, Span
@@ -302,8 +303,7 @@ class SampledMachine(Machine):
         The second result contains the amplifiers' outputs at the end (V). With a low-pass of a sensor, pieces also end
         at the jumps of loads.
         """
-        processor = loop_of(self.axes[0]).cascade.processor
-        assert processor is not None
+        processor = loop_of(self.axes[0]).cascade.timing
         delay, whole = jnp.asarray(processor.delay)[0], bool(processor.whole)
         commands = [acting((own.command.u, *own.past), delay, period, whole) for own in axes]
         low_passed = any(map(lags, self.loops()))
@@ -354,17 +354,13 @@ class SampledMachine(Machine):
         found = []
         sensed = [self.at_sensors(state) for state in states]
         for k, loop in enumerate(self.loops()):
-            z, sensor, motions = axes[k].z_filtered, loop.scenario.sensor, list[Measurement]()
-            if sensor is None or not lags(loop):
+            z, sensor, motions = axes[k].z_filtered, loop.scenario.sensors, list[Measurement]()
+            if not lags(loop):
                 found.append(z)
                 continue
             for own, n in zip(sensed, range(len(durations) + 1), strict=True):
                 motion = Measurement(own[k].plant.z, own[k].plant.z_dot, z)
-                if sensor.runout is not None:
-                    at = jnp.broadcast_to(t + sum(durations[:n]), motion.z.shape)
-                    runout, rate = jax.jvp(sensor.runout, (at,), (jnp.ones_like(at),))
-                    motion = motion._replace(z=motion.z + runout, z_dot=motion.z_dot + rate)
-                motions.append(motion)
+                motions.append(sensor.over_surface(motion, jnp.broadcast_to(t + sum(durations[:n]), motion.z.shape)))
             for before, after, time in zip(motions, motions[1:], durations, strict=False):
                 z = sensor.lagged(z, before, after, time)
             found.append(z)
@@ -372,7 +368,7 @@ class SampledMachine(Machine):
 
 
 @record
-class ContinuousMachine(Machine):
+class ContinuousMachine(WholeState, Machine):
     """A machine whose cascades run in continuous time."""
 
     def demands(self, t: Scalar, state: MachineState, errors: Sequence[object]) -> Groups:
@@ -419,19 +415,32 @@ def _realised(axis: Sampled | ClosedLoop, number: Array) -> Sampled | ClosedLoop
     """Return the loop of one axis with its random signals drawn, and with the random key of this axis."""
     loop = loop_of(axis.realised())
     high, low = jax.random.key_data(jax.random.fold_in(loop.scenario.key(), number))
-    return _with_loop(axis, Realised(loop.cascade, loop.scenario, (high, low)))
+    return _with_loop(axis, dataclasses.replace(loop, key=(high, low)))
+
+
+def stack_axes(axes: Sequence[T]) -> T:
+    """Return the pytrees of axes as one, each leaf [c, ...]; [N, c, ...] if it varies between members on any axis."""
+    flags = np.any([varying(axis) for axis in axes], 0)
+    parts = [jax.tree.leaves(axis) for axis in axes]
+    leaves = []
+    for k, varies in enumerate(flags):
+        own = [np.asarray(one[k]) for one in parts]
+        most = max((x.shape for x in own), key=len)
+        leaves.append(np.stack([np.broadcast_to(x, most) for x in own], 1) if varies else np.stack(own))
+    return jax.tree.unflatten(jax.tree.structure(axes[0]), leaves)
 
 
 def machine_of(
     rotor: Rotor, axes: Sequence[Sampled | ClosedLoop], start_q: Array, law: MachineLaw | None = None
 ) -> Machine:
-    """Return the machine of a rotor and the loops of its axes, of one member. `start_q` [n]: coordinates at t = 0.
+    """Return the machine of a rotor and the loops of its axes. `start_q` [n]: coordinates at t = 0.
 
-    Axes with the same kinds of parts form a group. `law`: demands the forces of all axes; None: each has its own laws.
+    Axes with the same kinds of parts form a group. Leaves may have an axis of members. `law`: demands the forces of all
+    axes; None: each has its own laws.
     """
     numbers: dict[object, list[int]] = {}
     for k, axis in enumerate(axes):
         numbers.setdefault(jax.tree.structure(axis), []).append(k)
-    stacked = [jax.tree.map(lambda *x: np.stack(x), *(axes[k] for k in group)) for group in numbers.values()]
+    stacked = [stack_axes([axes[k] for k in group]) for group in numbers.values()]
     kind = SampledMachine if isinstance(axes[0], Sampled) else ContinuousMachine
     return kind(rotor, tuple(stacked), start_q, tuple(map(tuple, numbers.values())), law=law)

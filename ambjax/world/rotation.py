@@ -1,6 +1,7 @@
 """Unbalance and runout of a turning rotor, as functions of the angle, which is the integral of the speed."""
 
-from typing import Any, ClassVar, Protocol
+import dataclasses
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,70 +9,93 @@ from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, part, record
 from ambjax.numerics.smooth import TWO_PI, sine
-from ambjax.world.signals import hull
+from ambjax.world.waveforms import Sum, hull
 
 # Hz per rpm; kg m per g mm; m per mm.
 PER_MINUTE, GRAM_MM, MM = 1 / 60, 1e-6, 1e-3
 
 
-def _speed() -> Any:
-    return leaf(unit="rpm", at_least=0, at_most=1e7, doc="speed of the rotor at t = 0")
-
-
-def _speed_end() -> Any:
-    return leaf(
-        default=None,
-        unit="rpm",
-        at_least=0,
-        at_most=1e7,
-        optional=True,
-        doc="speed from t = duration on, after a linear run-up or run-down; none: constant speed",
-    )
-
-
-def _duration() -> Any:
-    return leaf(default=1.0, unit="s", at_least=1e-9, at_most=1e9, doc="duration of the run-up")
+def _rpm(at_least: float, doc: str, **more: Any) -> Any:
+    return leaf(unit="rpm", at_least=at_least, at_most=1e7, doc=doc, **more)
 
 
 def _phase() -> Any:
     return leaf(default=0.0, unit="rad", at_least=-1e9, at_most=1e9, doc="phase at t = 0")
 
 
-class Turning(Protocol):
-    """Protocol of a signal of a turning rotor: its speeds (rpm) and the duration of its run-up (s)."""
+@record
+class Rotation:
+    """Speed of a rotor over time. Its angle is the integral of the speed, and 0 at t = 0.
 
-    @property
-    def speed(self) -> Scalar: ...
-    @property
-    def speed_end(self) -> Scalar | None: ...
-    @property
-    def duration(self) -> Scalar: ...
+    All unbalances and the runout of a scenario share this angle.
+    """
+
+    speed: Scalar = _rpm(-1e7, "speed at t = 0")
+    acceleration: Scalar = leaf(default=0.0, unit="rpm/s", at_least=-1e9, at_most=1e9, doc="rate of the speed")
+    speed_end: Scalar | None = _rpm(
+        -1e7, "speed at which the run-up or run-down ends; none: it never ends", default=None, optional=True
+    )
+
+    def check(self, path: str) -> None:
+        """Raise ValueError if the speed never reaches speed_end. `path`: dotted path, for the message."""
+        if self.speed_end is not None and not (self.speed_end - self.speed) * self.acceleration > 0:
+            raise ValueError(
+                f"{path}.speed_end = {self.speed_end:g}: from speed = {self.speed:g} rpm, an acceleration of "
+                f"{self.acceleration:g} rpm/s never leads to it. Change the sign of {path}.acceleration, or leave "
+                "speed_end out."
+            )
+
+    def edges(self) -> tuple[Scalar, ...]:
+        """Return the end of the run-up, s; empty if it never ends."""
+        if self.speed_end is None:
+            return ()
+        return (jnp.maximum((self.speed_end - self.speed) / self.acceleration, 0.0),)
+
+    def _sweep(self, t: Array) -> Array:
+        """Return the time for which the speed has changed, s."""
+        return jnp.minimum(t, *edges) if (edges := self.edges()) else t
+
+    def rpm(self, t: Scalar) -> Array:
+        """Return the speed at time t (s), rpm."""
+        t = jnp.asarray(t, jnp.result_type(float))
+        return self.speed + self.acceleration * self._sweep(t)
+
+    def omega(self, t: Scalar) -> Array:
+        """Return the speed at time t (s), rad/s."""
+        return TWO_PI * PER_MINUTE * self.rpm(t)
+
+    def turns(self, t: Scalar) -> Array:
+        """Return the angle at time t (s), in turns: the integral of the speed from 0 to t, in closed form."""
+        t = jnp.asarray(t, jnp.result_type(float))
+        sweep = self._sweep(t)
+        return PER_MINUTE * (self.speed * t + self.acceleration * sweep * (t - sweep / 2))
+
+    def fastest(self, end: Scalar) -> float:
+        """Return the largest |speed| between 0 and `end` (s), rad/s."""
+        return max(float(np.max(np.abs(self.omega(t)))) for t in (0.0, end))
 
 
-def frequency(rotor: Turning, t: Scalar) -> Array:
-    """Return the speed at time t (s), Hz."""
-    t = jnp.asarray(t, jnp.result_type(float))
-    if rotor.speed_end is None:
-        return jnp.broadcast_to(jnp.asarray(rotor.speed * PER_MINUTE, t.dtype), t.shape)
-    share = jnp.clip(t / rotor.duration, 0.0, 1.0)
-    return PER_MINUTE * (rotor.speed + (rotor.speed_end - rotor.speed) * share)
+def _rotation() -> Any:
+    return part(default=None, doc="speed; None: that of the scenario")
 
 
-def turns(rotor: Turning, t: Scalar) -> Array:
-    """Return the angle at time t (s), in turns: the integral of the speed from 0 to t, in closed form."""
-    t = jnp.asarray(t, jnp.result_type(float))
-    if rotor.speed_end is None:
-        return PER_MINUTE * rotor.speed * t
-    sweep = jnp.minimum(t, rotor.duration)
-    gain = (rotor.speed_end - rotor.speed) / rotor.duration
-    return PER_MINUTE * (rotor.speed * sweep + gain * sweep**2 / 2 + rotor.speed_end * (t - sweep))
+def _known(rotation: Rotation | None) -> Rotation:
+    if rotation is None:
+        raise ValueError("a turning load or runout has no speed: give Scenario(rotor=Rotation(speed)), or a rotation.")
+    return rotation
 
 
-def _bound(rotor: Turning, size: Scalar) -> tuple[float, float]:
-    """Return bounds of `size` omega^2 sin(...) over all speeds of the rotor. `size`: at least 0, in kg m or m."""
-    fastest = rotor.speed if rotor.speed_end is None else np.maximum(rotor.speed, rotor.speed_end)
-    peak = np.asarray(size) * (TWO_PI * PER_MINUTE * np.asarray(fastest)) ** 2
+def _bound(rotation: Rotation | None, size: Scalar, end: float) -> tuple[float, float]:
+    """Return bounds of `size` omega^2 sin(...) from 0 to `end` (s). `size`: at least 0, in kg m or m."""
+    peak = np.asarray(size) * _known(rotation).fastest(end) ** 2
     return hull(-peak, peak)
+
+
+def turned(node: Any, rotation: Rotation) -> Any:
+    """Return a signal or a runout in which each part without a speed of its own has this one."""
+    if isinstance(node, Sum):
+        return Sum(tuple(turned(term, rotation) for term in node.terms))
+    return dataclasses.replace(node, rotation=rotation) if getattr(node, "rotation", rotation) is None else node
 
 
 @record
@@ -79,29 +103,27 @@ class Unbalance:
     """Force of an unbalance U, in N: U omega^2 sin(angle + phase).
 
     U is the unbalance mass times its distance from the axis. omega is the speed in rad/s; the angle is its integral.
-    The speed is constant, or changes linearly from `speed` to `speed_end` in `duration`. The force due to the angular
-    acceleration is neglected.
+    The force due to the angular acceleration is neglected.
     """
 
     unbalance: Scalar = leaf(
         unit="g mm", at_least=0, at_most=1e9, doc="unbalance mass times its distance from the axis"
     )
-    speed: Scalar = _speed()
-    speed_end: Scalar | None = _speed_end()
-    duration: Scalar = _duration()
     phase: Scalar = _phase()
+    rotation: Rotation | None = _rotation()
     unit: ClassVar = "N"
 
     def __call__(self, t: Scalar) -> Array:
-        omega = TWO_PI * frequency(self, t)
-        return GRAM_MM * self.unbalance * omega**2 * sine(turns(self, t) + self.phase / TWO_PI)
+        rotation = _known(self.rotation)
+        omega = rotation.omega(t)
+        return GRAM_MM * self.unbalance * omega**2 * sine(rotation.turns(t) + self.phase / TWO_PI)
 
     def span(self, end: float) -> tuple[float, float]:
-        return _bound(self, GRAM_MM * self.unbalance)
+        return _bound(self.rotation, GRAM_MM * self.unbalance, end)
 
     def edges(self) -> tuple[Scalar, ...]:
-        """Return the end of the run-up, s, where the slope of the speed jumps; empty without a run-up."""
-        return () if self.speed_end is None else (self.duration,)
+        """Return the end of the run-up, s, where the slope of the speed jumps; empty without such an end."""
+        return _known(self.rotation).edges()
 
 
 @record
@@ -115,10 +137,8 @@ class UnbalanceGrade:
 
     grade: Scalar = leaf(unit="mm/s", at_least=0, at_most=1e5, doc="balance quality grade; G 2.5 is 2.5 mm/s")
     service_speed: Scalar = leaf(unit="rpm", at_least=1e-3, at_most=1e7, doc="speed for which the grade is given")
-    speed: Scalar = _speed()
-    speed_end: Scalar | None = _speed_end()
-    duration: Scalar = _duration()
     phase: Scalar = _phase()
+    rotation: Rotation | None = _rotation()
     unit: ClassVar = "m/s^2"
 
     @property
@@ -127,15 +147,16 @@ class UnbalanceGrade:
         return MM * self.grade / (TWO_PI * PER_MINUTE * self.service_speed)
 
     def __call__(self, t: Scalar) -> Array:
-        omega = TWO_PI * frequency(self, t)
-        return self.eccentricity * omega**2 * sine(turns(self, t) + self.phase / TWO_PI)
+        rotation = _known(self.rotation)
+        omega = rotation.omega(t)
+        return self.eccentricity * omega**2 * sine(rotation.turns(t) + self.phase / TWO_PI)
 
     def span(self, end: float) -> tuple[float, float]:
-        return _bound(self, self.eccentricity)
+        return _bound(self.rotation, self.eccentricity, end)
 
     def edges(self) -> tuple[Scalar, ...]:
-        """Return the end of the run-up, s, where the slope of the speed jumps; empty without a run-up."""
-        return () if self.speed_end is None else (self.duration,)
+        """Return the end of the run-up, s, where the slope of the speed jumps; empty without such an end."""
+        return _known(self.rotation).edges()
 
 
 @record
@@ -154,13 +175,11 @@ class Runout:
     The sensor reads the position plus the runout; low-pass and gain follow. The true position does not contain it.
     """
 
-    speed: Scalar = _speed()
     harmonics: tuple[Harmonic, ...] = part(default=(), doc="the harmonics")
-    speed_end: Scalar | None = _speed_end()
-    duration: Scalar = _duration()
+    rotation: Rotation | None = _rotation()
 
     def __call__(self, t: Scalar) -> Array:
-        angle, total = turns(self, t), jnp.zeros_like(jnp.asarray(t, jnp.result_type(float)))
+        angle, total = _known(self.rotation).turns(t), jnp.zeros_like(jnp.asarray(t, jnp.result_type(float)))
         for one in self.harmonics:
             total = total + one.amplitude * sine(one.number * angle + one.phase / TWO_PI)
         return total

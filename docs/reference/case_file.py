@@ -22,7 +22,7 @@ from ambjax.world.coil_limits import CoilLimits
 from ambjax.world.faults import Dropouts, Outliers
 from ambjax.world.iron import Iron
 from ambjax.world.plant import Plant
-from ambjax.world.rotation import Runout
+from ambjax.world.rotation import Rotation, Runout
 from ambjax.world.scenario import Initial
 from ambjax.world.sensor import Sensor
 from reference.fields import Facts, facts
@@ -31,6 +31,7 @@ from reference.parser import keys, remarks, rule
 
 TITLES = ("key", "unit", "default", "allowed", "meaning")
 RECORDS: dict[str, type] = {"plant": Plant, "processor": Processor, "initial": Initial, "sensor": Sensor}
+RECORDS["rotor"] = Rotation
 RECORDS |= {"actuator": Amplifier, "actuator.coil": CoilLimits, "processor.guard": Guard, "sensitivity": Zones}
 RECORDS |= {"plant.iron": Iron, "sensor.outliers": Outliers, "sensor.dropouts": Dropouts, "sensor.runout": Runout}
 SETTINGS: dict[str, dataclasses.Field] = {
@@ -54,6 +55,9 @@ WORDS = {
     "relative to the folder of the case file",
     "controller.position.output": "quantity that the controller returns: a current (A) or a voltage (V)",
     "controller.model": "Parameters of the controller's model that differ from the plant: any key of `[plant]`.",
+    "rotor": "The speed of the rotor. Unbalance, runout and the notch of the controller share its angle. Default: the "
+    "rotor does not turn. See [once per revolution](../loads.md#unbalance). With `kind`, the table describes "
+    "the rotor of a [whole machine](../machine.md).",
     "processor": "The processor of the controller: all laws make one step per sample. Their voltage acts after "
     "a delay and is held for one sample. Default: continuous time, as in the paper. See "
     "[the processor](../processor.md).",

@@ -2,8 +2,9 @@
 
 from typing import Any
 
+from ambjax.simulation import orders
 from ambjax.simulation.folds import Count, Driven, Peak, Reaching, Rms, Variation
-from ambjax.simulation.metrics import UNITS, Standard
+from ambjax.simulation.metrics import UNITS, Metrics
 from ambjax.simulation.trajectory import NOT_SAVED, Row
 from reference.fields import attribute_docs
 from reference.markdown import code, escaped, table
@@ -40,6 +41,12 @@ OTHERS = {
     "trajectory_deviation": "with --member: largest relative difference between the ensemble's metrics and those of "
     "trajectory.npz",
 }
+# Metrics of a case with [rotor].
+for _name in orders.UNITS:
+    _signal, _order, _kind = _name.split("_")
+    OTHERS[_name] = f"with `[rotor]`: {'phase' if _kind == 'deg' else 'amplitude'} of {_signal} at {_order[0]} " + (
+        "times the speed, from the fit A cos(k angle + phase) over the whole revolutions from `run.settle` on"
+    )
 SHARE = {
     "clearance_used": "z as a share of the clearance",
     "settled_clearance_used": "z as a share of the clearance",
@@ -64,7 +71,7 @@ def pages() -> dict[str, str]:
 
 def rows() -> list[tuple[str, str, str]]:
     """Return a row for each metric: name, unit and meaning."""
-    folds = Standard()._folds().folds
+    folds = Metrics()._folds().folds
     meanings = {name: _meaning(name, fold) for name, fold in folds.items()} | OTHERS
     return [(code(name), escaped(UNITS.get(name, "")), escaped(meaning)) for name, meaning in meanings.items()]
 

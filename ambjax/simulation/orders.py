@@ -1,0 +1,83 @@
+"""Amplitude and phase of signals at the speed of the rotor and at twice the speed, as a fold."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from ambjax.numerics.records import Scalar, leaf, part, record
+from ambjax.numerics.small_matrices import solve
+from ambjax.numerics.smooth import TWO_PI, safe_sqrt, sine
+from ambjax.simulation.folds import Ending
+from ambjax.simulation.span import Span
+from ambjax.simulation.trajectory import Row
+from ambjax.world.rotation import Rotation
+
+# Signals and their units, and orders: multiples of the speed.
+SIGNALS, ORDERS = {"z": "m", "i": "A", "u": "V", "force": "N"}, (1, 2)
+# Unit of each metric by name: amplitude of a signal at an order, and its phase.
+UNITS = {
+    f"{signal}_{order}x_{kind}": kind for signal, unit in SIGNALS.items() for order in ORDERS for kind in (unit, "deg")
+}
+# A revolution counts as complete if this part of it is missing: the rounding error of an angle.
+ROUNDED = 1e-9
+
+
+class OrderCarry(NamedTuple):
+    """Sums over the samples so far.
+
+    - `now`, `whole`: sums of the products of each basis function, then of each signal, with each basis function; over
+      all samples, and over those up to the last whole revolution.
+    - `first`, `turns`: angle of the first sample, in turns, and number of whole revolutions since then; -1: no sample.
+    """
+
+    now: Array
+    whole: Array
+    first: Array
+    turns: Array
+
+
+@record
+class Orders:
+    """Amplitude A and phase phi of a + sum of A cos(k angle + phi), k = 1 and 2: the least-squares fit to each signal.
+
+    The fit extends over the whole revolutions from `after` (s) on, until the rotor is lost. It is exact for a signal
+    that contains these orders alone. At a constant speed it equals the Fourier sums, if a revolution has a whole number
+    of samples. Without a whole revolution, all results are 0.
+    """
+
+    rotor: Rotation = part(doc="speed of the rotor")
+    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6, doc="start of the evaluation")
+
+    def init(self) -> OrderCarry:
+        zero, size = jnp.zeros((), jnp.result_type(float)), 1 + 2 * len(ORDERS)
+        none = jnp.zeros((size + len(SIGNALS), size), zero.dtype)
+        return OrderCarry(none, none, zero, -jnp.ones_like(zero))
+
+    def update(self, carry: OrderCarry, row: Row, span: Span) -> OrderCarry:
+        counts, angle = (row.t >= self.after) & row.alive, self.rotor.turns(row.t)
+        first = jnp.where(carry.turns < 0, angle, carry.first)
+        turns = jnp.where(counts, jnp.floor(jnp.abs(angle - first) + ROUNDED), carry.turns)
+        waves = (x for k in ORDERS for x in (sine(k * angle + 0.25), sine(k * angle)))
+        basis = jnp.stack([jnp.ones_like(angle), *waves])
+        signals = jnp.stack([jnp.asarray(getattr(row, name)) for name in SIGNALS])
+        more = jnp.concatenate([basis, signals])[:, None] * basis
+        whole = jnp.where(turns > carry.turns, carry.now, carry.whole)
+        return OrderCarry(carry.now + jnp.where(counts, more, 0.0), whole, first, turns)
+
+    def result(self, carry: OrderCarry, ending: Ending) -> dict[str, Array]:
+        """Return amplitude and phase by the names of UNITS."""
+        # the last revolution is complete if the run ends with it
+        turns = jnp.abs(self.rotor.turns(jnp.minimum(ending.duration, ending.lost_at)) - carry.first)
+        sums = jnp.where(jnp.floor(turns + ROUNDED) > carry.turns, carry.now, carry.whole)
+        size, found = sums.shape[1], (turns + ROUNDED >= 1) & (carry.turns >= 0)
+        products = jnp.where(found, sums[:size], jnp.eye(size, dtype=sums.dtype))
+        x = solve(products[None], jnp.where(found, sums[size:], 0.0).T[None])[0]
+        numbers = {}
+        for n, (name, unit) in enumerate(SIGNALS.items()):
+            for k in ORDERS:
+                a, b = x[2 * k - 1, n], x[2 * k, n]
+                still = (a == 0) & (b == 0)
+                numbers[f"{name}_{k}x_{unit}"] = safe_sqrt(a * a + b * b)
+                numbers[f"{name}_{k}x_deg"] = 360 / TWO_PI * jnp.arctan2(-b, jnp.where(still, 1.0, a))
+        return numbers

@@ -1,0 +1,111 @@
+"""Amplitude and phase once and twice per revolution, and the fold that computes them."""
+
+import json
+import tomllib
+
+import jax
+import numpy as np
+import pytest
+
+from ambjax.__main__ import main
+from ambjax.cases.machine_case import machine_from
+from ambjax.cases.template_text import template
+from ambjax.results.machine_run import simulate_machine
+from ambjax.signals import Rotation
+from ambjax.simulation.folds import Ending
+from ambjax.simulation.orders import SIGNALS, UNITS, Orders
+from ambjax.simulation.trajectory import Row
+
+T, NEVER = 1e-4, np.inf
+
+
+def folded(fold, signal, samples, alive=None):
+    """Return the result of the fold for a signal(t), the same in all channels."""
+    nothing = Row(*[np.zeros(samples)] * len(Row._fields))
+    t = T * np.arange(samples)
+    held = np.ones(samples, bool) if alive is None else alive(t)
+    rows = nothing._replace(t=t, alive=held, **dict.fromkeys(SIGNALS, signal(t)))
+    carry, _ = jax.lax.scan(lambda carry, row: (fold.update(carry, row, None), None), fold.init(), rows)
+    return fold.result(carry, Ending(0, t[~held].min(initial=NEVER), NEVER, samples * T))
+
+
+def angle(rotor, t):
+    return 2 * np.pi * (rotor.speed * t + rotor.acceleration * t**2 / 2) / 60
+
+
+@pytest.mark.parametrize("rotor", [Rotation(2971.0), Rotation(-2971.0), Rotation(2000.0, 3e4)])
+def test_the_fit_is_exact_for_a_signal_of_these_orders(rotor):
+    """No whole number of samples in a revolution, an offset, an angle at the start that is not 0, a rotor lost."""
+
+    def signal(t):
+        return 0.7 + 3.0 * np.cos(angle(rotor, t) - 2.0) + 0.2 * np.cos(2 * angle(rotor, t) + 0.5)
+
+    for alive in (None, lambda t: t < 0.15):
+        found = folded(Orders(rotor, 0.0123), signal, 2000, alive)
+        assert found.keys() == UNITS.keys()
+        for name, expected in (("z_1x_m", 3.0), ("z_2x_m", 0.2), ("i_1x_A", 3.0)):
+            assert found[name] == pytest.approx(expected, rel=1e-10)
+        assert found["z_1x_deg"] == pytest.approx(np.degrees(-2.0), rel=1e-9)
+        assert found["u_2x_deg"] == pytest.approx(np.degrees(0.5), rel=1e-9)
+
+
+def test_other_orders_do_not_leak_into_the_fit():
+    """At 40 samples in a revolution, over whole revolutions, the third order is orthogonal to the first two."""
+    rotor = Rotation(60 / (40 * T))
+    found = folded(Orders(rotor, 0.0), lambda t: np.cos(angle(rotor, t)) + np.cos(3 * angle(rotor, t) + 1), 1999)
+    assert found["z_1x_m"] == pytest.approx(1.0, rel=1e-10)
+    assert found["z_2x_m"] == pytest.approx(0.0, abs=1e-10)
+
+
+def test_without_a_whole_revolution_nothing_is_known():
+    found = folded(Orders(Rotation(60.0), 0.0), np.cos, 2000)
+    assert not any(found.values())
+
+
+TURNING = """
+[rotor]
+speed = 6000.0
+
+[disturbance.q_z]
+kind = "unbalance"
+unbalance = 5.0
+
+[clock]
+duration = 0.1
+sample_period = 1e-4
+"""
+
+
+@pytest.mark.slow
+def test_simulate_and_compare_state_them(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.toml").write_text(TURNING)
+    (tmp_path / "b.toml").write_text(TURNING.replace("5.0", "2.5"))
+    assert main(["simulate", "a.toml", "--out", "a"]) == 0
+    metrics, run = json.loads((tmp_path / "a/metrics.json").read_text()), np.load(tmp_path / "a/trajectory.npz")
+    settled = run["t"] > 0.03
+    turn = np.exp(-2j * np.pi * 100.0 * run["t"][settled])
+    for name in SIGNALS:
+        amplitude = 2 * np.mean(run[name][settled] * turn)
+        assert metrics[f"{name}_1x_{SIGNALS[name]}"] == pytest.approx(abs(amplitude), rel=0.02)
+        assert metrics[f"{name}_1x_deg"] == pytest.approx(np.degrees(np.angle(amplitude)), abs=2.0)
+    assert main(["compare", "a.toml", "b.toml", "--members", "1", "--out", "c"]) == 0
+    first, second = json.loads((tmp_path / "c/compare.json").read_text())["cases"]
+    assert first["z_1x_m"] == pytest.approx(metrics["z_1x_m"], rel=1e-9)
+    assert first["z_1x_m"] / second["z_1x_m"] == pytest.approx(2.0, rel=0.1)
+    assert "median amplitude of z at 1x" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_every_axis_of_a_machine_has_them():
+    raw = tomllib.loads(template("machine"))
+    turning = {"rotor": raw["rotor"] | {"speed": 6000.0}, "clock": raw["clock"] | {"duration": 0.05}}
+    case = machine_from(raw | turning | {"run": {"settle": 0.02}}, "m")
+    run = simulate_machine(case)
+    settled = run.signals["t"] >= 0.02  # three revolutions
+    turn = 2 * np.pi * 100.0 * run.signals["t"][settled]
+    basis = np.stack([np.ones_like(turn), *(f(k * turn) for k in (1, 2) for f in (np.cos, np.sin))], 1)
+    fits = np.linalg.lstsq(basis, run.signals["z"][settled], rcond=None)[0]
+    for k, own in enumerate(run.metrics["axes"][name] for name in case.axes):
+        assert own["z_1x_m"] == pytest.approx(np.hypot(*fits[1:3, k]), rel=1e-9, abs=1e-15)
+    assert run.metrics["z_1x_m"] == max(own["z_1x_m"] for own in run.metrics["axes"].values())
