@@ -1,4 +1,4 @@
-"""Controllers of a whole machine: in rigid-body coordinates."""
+"""Controllers of a whole machine: in rigid-body coordinates, linear ones of several outputs, and LQG."""
 
 import copy
 import tomllib
@@ -11,6 +11,7 @@ from ambjax.cases.machine_case import machine_from
 from ambjax.cases.template_text import template
 from ambjax.control.lqg import LinearCoils, RotorModel, design, sampled_model
 from ambjax.control.regulator import doubled
+from ambjax.linear.linear_machine import machine_sensitivity
 from ambjax.results.machine_run import simulate_machine
 
 MACHINE = tomllib.loads(template("machine"))
@@ -67,9 +68,41 @@ def test_rigid_body_coordinates_in_continuous_time_equal_the_axes():
         np.testing.assert_allclose(rigid[name], axes[name], rtol=0, atol=1e-9 * np.abs(axes[name]).max())
 
 
+def munich(left, right, modes, **tables):
+    """The rig with its real sensors, and an LQG of its own modes, designed for three speeds."""
+    raw = tomllib.loads(template("machine-flexible"))
+    raw["rotor"] |= {"modes": modes} | tables.get("rotor", {})
+    raw["bearing"][0]["sensor_at"], raw["bearing"][1]["sensor_at"] = left, right
+    raw["controller"] = {"kind": "lqg", "lqg": {"speeds": [0.0, 3000.0, 6000.0]}}
+    return machine_from(raw | {key: value for key, value in tables.items() if key != "rotor"}, "munich")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensors", [(0.155, 0.581), (0.071, 0.665)])
+def test_an_lqg_holds_the_munich_rig_with_sensors_beside_its_magnets(sensors):
+    """|S| in zone A between two speeds of the design, with 12 modes. With each of these pairs, a PID is unstable."""
+    case = munich(*sensors, 12)
+    found = machine_sensitivity(case.machine, case.axes, case.clock.sample_period, 1500.0, case.zones)
+    assert found.stable
+    assert {axis.zone for axis in found.axes} == {"A"}
+
+
+@pytest.mark.slow
+def test_an_lqg_holds_the_munich_rig_in_a_run():
+    """Without weight: a shaft that starts unbent is far from its sag. The unbalance moves it by about 10 um."""
+    run = simulate_machine(munich(0.155, 0.581, 6, rotor={"gravity": [0.0] * 3}))
+    assert not run.lost
+    assert run.metrics["settled_max_abs_error_m"] < 2e-5
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
+        ({"kind": "lqr"}, "controller.kind = .*must be one of"),
+        ({"kind": "lqg", "lqg": {"speeds": [10.0, 0.0]}}, "controller.lqg.speeds = .*ascending order"),
+        ({"kind": "lqg", "lqg": {"errors": 1.0}}, "controller.lqg.errors"),
+        ({"kind": "linear"}, "controller.file is missing"),
+        ({"file": "a.npz"}, 'controller.file is for kind = "linear"'),
         ({"coordinates": "modal"}, "controller.coordinates = .*must be one of"),
         ({"tilt": {"position": {"k_p": 1.0}}}, r'controller\.tilt is for coordinates = "rigid-body"'),
         ({"coordinates": "rigid-body", "tilt": {"current": {}}}, r"controller\.tilt\.current"),
@@ -77,8 +110,11 @@ def test_rigid_body_coordinates_in_continuous_time_equal_the_axes():
     ],
 )
 def test_bad_keys_are_refused_in_one_line(change, said):
+    raw = changed(MACHINE, **change)
+    if "kind" in change:
+        raw["controller"] = change
     with pytest.raises(ValueError, match=said) as refused:
-        machine_from(changed(MACHINE, **change))
+        machine_from(raw)
     assert "\n" not in str(refused.value)
 
 
