@@ -3,7 +3,8 @@
 import contextlib
 import pathlib
 import zipfile
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from ambjax.control.realisation import Matrices, Realisation, realisation
 NAMES, OPTIONAL = ("A", "B", "C", "D"), "dt"
 ENDINGS = (".npz", ".mat")
 KEY = "controller.position.file"
+T = TypeVar("T")
 
 
 class ControllerFile(NamedTuple):
@@ -29,10 +31,16 @@ class ControllerFile(NamedTuple):
 
 
 def controller_file(table: Table, folder: pathlib.Path) -> ControllerFile:
-    """Read the controller that the key `file` names; a relative path starts at `folder`, that of the case file.
+    """Read the controller that the key `file` names, as `contents_of` does."""
+    written, path, contents = contents_of(table, folder, realisation)
+    return ControllerFile(written, path, contents)
 
-    Raises ValueError, one line, if the key is missing or the file does not contain a controller. The message gives the
-    dotted path and, if known, the file and the array.
+
+def contents_of(table: Table, folder: pathlib.Path, convert: Callable[..., T]) -> tuple[str, pathlib.Path, T]:
+    """Return the path that the key `file` gives, the absolute path, and convert(A, B, C, D, dt) of the file.
+
+    A relative path starts at `folder`, that of the case file. Raises ValueError, one line, if the key is missing or the
+    file does not contain a controller. The message gives the dotted path and, if known, the file and the array.
     """
     written = table.raw.get("file")
     if written is None:
@@ -41,7 +49,7 @@ def controller_file(table: Table, folder: pathlib.Path) -> ControllerFile:
         raise ValueError(f"{table.at('file')} = {show(written)}: it must be the path of an .npz or .mat file.")
     path = (folder / written).resolve()
     try:
-        return ControllerFile(written, path, realisation(**read_controller(path)))
+        return written, path, convert(**read_controller(path))
     except ValueError as error:
         raise ValueError(f"{table.at('file')} = {show(written)}: {error}") from None
 

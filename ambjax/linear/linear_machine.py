@@ -382,8 +382,17 @@ def machine_sensitivity(
     low, high = zones.range(None if system.period is None else float(system.period), max(end, 2 * float(zones.f_low)))
     stable, one = system.stable, np.eye(c)
 
+    responses: dict[bytes, np.ndarray] = {}
+
+    def response(f: np.ndarray) -> np.ndarray:
+        """Return the response at frequencies f (Hz). All peaks scan the same frequencies."""
+        key = np.asarray(f).tobytes()
+        if key not in responses:
+            responses[key] = np.asarray(system.response(f))
+        return responses[key]
+
     def largest(magnitude: Callable) -> ResponsePeak:
-        return peak(system, lambda f: magnitude(np.asarray(system.response(f))), low, high, end)
+        return peak(system, lambda f: magnitude(response(f)), low, high, end)
 
     axes = []
     for k, name in enumerate(names):
