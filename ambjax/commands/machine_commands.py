@@ -13,7 +13,8 @@ from ambjax.results.machine_run import simulate_machine
 from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
 
 Summary = dict[str, object]
-SIMULATED = ("trajectory.npz", "metrics.json", "overview.png")
+# runup.png: only if the speed changes.
+SIMULATED = ("trajectory.npz", "metrics.json", "overview.png", "runup.png")
 ANALYSED = ("sensitivity.json", "sensitivity.png")
 # Metrics of the printed table, with their headings.
 COLUMNS = {
@@ -47,12 +48,15 @@ def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]
         "lost_why": run.lost_why, "method": str(case.clock.method), "settle_s": case.settle,
     }  # fmt: skip
     from ambjax.pictures.machine_pictures import machine_picture
+    from ambjax.pictures.run_up_picture import run_up_picture
 
     with files(out) as part:
         run.save(part / "trajectory.npz")
         write_json(part / "metrics.json", metrics)
         title = f"{case.name}: {case.clock.method}"
         described("overview.png", lambda: machine_picture(case, run.signals, title, part / "overview.png"))
+        if np.ptp(run.signals["speed_rpm"]) > 0:
+            described("runup.png", lambda: run_up_picture(case, run.signals, part / "runup.png"))
         names = [name for name in SIMULATED if (part / name).exists()]
     if not args.json:
         shown = {name: words for name, words in COLUMNS.items() if name in run.metrics}
