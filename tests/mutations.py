@@ -356,8 +356,8 @@ MUTATIONS = [
     M(
         "members that accurate steps lose after the judgement do not refute the answer",
         "tuning/report/judging.py",
-        'refuted or (again["refuted"] if again else "")',
-        "refuted",
+        "(error or answer.error).refuted if",
+        "answer.error.refuted if",
         "tests/test_tuning_study.py::test_a_member_that_accurate_steps_do_not_hold_is_not_a_survivor",
     ),
     M(
@@ -551,9 +551,9 @@ MUTATIONS = [
     ),
     M(
         "the injected wave is subtracted from the reading",
-        "ambjax/linear/multisine.py",
-        "_added(measured, self.wave.reading, self.injected(t))",
-        "_added(measured, self.wave.reading, -self.injected(t))",
+        "ambjax/simulation/sampled.py",
+        "with_signal(measured, self.wave, self.wave.at(",
+        "with_signal(measured, self.wave, -self.wave.at(",
         "tests/test_injection.py::test_the_peak_agrees_with_the_independent_simulator[complementary]",
     ),
     M(
