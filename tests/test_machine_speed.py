@@ -11,7 +11,7 @@ from ambjax.__main__ import main
 from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.template_text import template
 from ambjax.commands import campbell
-from ambjax.linear.linear_machine import turning_machines
+from ambjax.linear.linear_machine import machine_sensitivity, turning_machines
 from ambjax.linear.rotor_modes import modes_of, springs_critical
 from ambjax.linear.unbalance_response import UnbalanceResponse, critical_speeds, separation, unbalance_response
 from ambjax.pictures.run_up_picture import waterfall
@@ -151,3 +151,13 @@ def test_the_commands_write_what_an_engineer_looks_at(tmp_path, capsys):
     shares = [axis["force_carried"] * most for axis, most in zip(checked["axes"].values(), largest, strict=True)]
     assert sum(shares) == pytest.approx(weight)
     assert all(axis["force_reserve"] <= 1 - axis["force_carried"] for axis in checked["axes"].values())
+
+
+def test_the_margins_of_an_axis_follow_from_its_sensitivity(rigid):
+    found = machine_sensitivity(rigid.machine, rigid.axes, rigid.clock.sample_period, 9000.0, rigid.zones)
+    f = np.geomspace(1.0, 1e4, 20_001)
+    for k, axis in enumerate(found.axes):
+        L = 1 / np.asarray(found.system.response(f))[:, k, k] - 1
+        crossing = np.flatnonzero(np.diff(np.sign(np.abs(L) - 1)))
+        phases = np.abs(np.abs(np.angle(L[crossing], deg=True)) - 180)
+        assert axis.margins.phase_deg == pytest.approx(phases.min(), abs=0.05)  # a step of f is 0.05 %
