@@ -247,8 +247,10 @@ class _Linear:
 
         u = self.machine.join(point.u)
         free = jax.jacfwd(lambda x, u: moved(x, self.machine.split(u)), (0, 1))(body, u)
-        build = self._sampled if self.sampled else self._continuous
-        ((A, B), (C, D)), scale = build(point, sizes, body, body_sizes, free if self.sampled else moved, read)
+        if self.sampled:
+            ((A, B), (C, D)), scale = self._sampled(point, sizes, body, body_sizes, free, read)
+        else:
+            ((A, B), (C, D)), scale = self._continuous(point, sizes, body, body_sizes, moved, read)
         return StateSpace(A, B, C, D, scale, jnp.asarray(self.period) if self.sampled else None), free[0], found
 
     def outputs(self, measured: Sequence[Measurement], u: Groups, x: Array) -> Array:
