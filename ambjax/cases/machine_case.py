@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ambjax.cases.notch_table import notch_from
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
 from ambjax.cases.rotor_tables import (
     COORDINATES,
@@ -24,6 +25,7 @@ from ambjax.cases.rotor_tables import (
 )
 from ambjax.cases.table import Table, load, show
 from ambjax.linear.analysis import Zones
+from ambjax.linear.notch_design import machine_notch_gains, notch_speeds
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
@@ -116,11 +118,19 @@ def machine_from(
         _check_force(case, axis, force)
         cases.append(case)
     clock = _clock(cases, rotor, fixed=not isinstance(raw.get("clock", {}).get("dt", "auto"), str))
-    systems = [canonical(prepare(case.cascade, case.scenario, clock)[0]) for case in cases]
+    machine = _machine(rotor, cases, clock, q)
+    if (found := notch_from(top, cases[0].scenario)) is not None:
+        notch, phase = found
+        speeds = notch_speeds(cases[0].scenario.rotor, notch, float(clock.duration))
+        gains = machine_notch_gains(machine, notch, speeds, clock.sample_period, phase)
+        notches = [dataclasses.replace(notch, gains=own) for own in gains]
+        laws = [dataclasses.replace(case.cascade, notch=one) for case, one in zip(cases, notches, strict=True)]
+        cases = [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
+        machine = _machine(rotor, cases, clock, q)
     names = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
     return MachineCase(
         name=safe_name(name),
-        machine=machine_of(rotor, systems, jnp.asarray(q)),
+        machine=machine,
         clock=clock,
         axes=tuple(axis.name for axis in axes),
         coordinates=names,
@@ -130,6 +140,11 @@ def machine_from(
         speeds=_speeds(top.table("sensitivity"), rotor, float(clock.duration)),
         text=text,
     )
+
+
+def _machine(rotor: Rotor, cases: list[Case], clock: Clock, q: np.ndarray) -> Machine:
+    systems = [canonical(prepare(case.cascade, case.scenario, clock)[0]) for case in cases]
+    return machine_of(rotor, systems, jnp.asarray(q))
 
 
 def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:
@@ -208,6 +223,8 @@ def _axis_raw(raw: dict[str, Any], bearing: Table, m: float, force: float, initi
     if isinstance(controller, dict) and "coordinates" in controller:
         Table(controller, "controller").choice("coordinates", ["axes"])
         del controller["coordinates"]
+    if isinstance(controller, dict):
+        controller.pop("notch", None)  # its gains are those of the machine
     if isinstance(own.get("sensitivity"), dict):
         own["sensitivity"].pop("speeds", None)
     return own | {"initial": initial}

@@ -18,7 +18,9 @@ from ambjax.linear.margins import ResponsePeak, peak, poles_in_s, whole_end
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar, canonical
 from ambjax.numerics.small_matrices import exponential
+from ambjax.numerics.smooth import TWO_PI
 from ambjax.simulation.whole_machine import Machine, MachineState, PlantOnly, SampledMachine, still, times
+from ambjax.world.rotation import PER_MINUTE
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
 
@@ -43,7 +45,7 @@ class MachineSensitivity(NamedTuple):
     - `speed`: rpm. `stable`: whether no mode grows. If one does, the peaks have no physical meaning, and zones are D.
     - `axes`: the peaks of each axis. `sigma`: peak of the largest singular value of the matrix S.
     - `poles`: poles of the machine, 1/s, in the order of decreasing real part.
-    - `system`: the linear system, with inputs e_k at the sensors, and outputs: readings z_k, then commands u_k.
+    - `system`: the linear system, with inputs e_k at the sensors, and outputs: z_k read, commands u_k, i_k read.
     """
 
     speed: float
@@ -75,7 +77,7 @@ class _Linear:
         self.machine, self.W, self.period = machine.realised(), W, period
         loops = self.machine.loops()
         self.scenario = tuple(jax.vmap(ideal)(loop.scenario) for loop in loops)
-        self.cascade = tuple(_unguarded(loop.cascade) for loop in loops)
+        self.cascade = tuple(_unguarded(loop.cascade.at_speed(W / (TWO_PI * PER_MINUTE))) for loop in loops)
         self.rotor = self.machine.rotor
         self.low_passed = [one.sensor is not None and one.sensor.bandwidth is not None for one in self.scenario]
         self.lagged = [one.amplifier is not None and one.amplifier.slow for one in self.scenario]
@@ -202,8 +204,9 @@ class _Linear:
         return StateSpace(A, B, C, D, scale, jnp.asarray(self.period) if self.sampled else None), found
 
     def outputs(self, measured: Sequence[Measurement], u: Groups) -> Array:
-        """Return the outputs of the linear system: readings, then commands, in the order of the axes."""
-        return jnp.concatenate([self.machine.join([one.z for one in measured]), self.machine.join(u)])
+        """Return the outputs of the linear system: readings of z, commands, readings of i, in the order of the axes."""
+        z, i = ([getattr(one, name) for one in measured] for name in ("z", "i"))
+        return jnp.concatenate([self.machine.join(z), self.machine.join(u), self.machine.join(i)])
 
     def _continuous(
         self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, moved: Callable, read: Callable
@@ -283,9 +286,9 @@ def _matrices(machine: Machine, W: Scalar, period: Scalar) -> tuple[StateSpace, 
 def linearise_machine(machine: Machine, period: Scalar, speed: float) -> StateSpace:
     """Linearise a machine at its equilibrium at a constant speed (rpm). `period`: sample period, s.
 
-    The linear system has a test signal e_k at the sensor of each axis as its inputs, and the readings z_k and the
-    commands u_k as its outputs. It contains what that of one axis contains (`linearise`). Raises ValueError if no
-    equilibrium is found, and if a law has no derivative there.
+    The linear system has a test signal e_k at the sensor of each axis as its inputs, and the readings z_k, the
+    commands u_k and the readings i_k as its outputs. It contains what that of one axis contains (`linearise`). Raises
+    ValueError if no equilibrium is found, and if a law has no derivative there.
     """
     system, found = _matrices(*canonical((machine, speed * np.pi / 30, period)))
     if not found:

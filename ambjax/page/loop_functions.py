@@ -60,7 +60,8 @@ class LoopFunctions:
         clock = dataclasses.replace(self.clock, sample_period=numbers.period)
         built: Any = system_of(numbers.cascade, numbers.scenario, clock)
         word = jnp.zeros((), jnp.uint32)
-        loop = GivenNoise(built.loop.cascade, numbers.scenario.turning(), (word, word), normals)
+        cascade = built.loop.cascade.turning(numbers.scenario.rotor)
+        loop = GivenNoise(cascade, numbers.scenario.turning(), (word, word), normals)
         return dataclasses.replace(built, loop=loop), clock, self._fold(numbers)
 
     def _fold(self, numbers: Numbers) -> Standard:

@@ -81,7 +81,8 @@ class ClosedLoop:
 
     def realised(self) -> "Realised":
         """Return the loop of one member, with its random signals drawn and the random key of its sensors."""
-        return Realised(self.cascade, self.scenario.realised(), self.scenario.words())
+        cascade = self.cascade.turning(self.scenario.rotor)
+        return Realised(cascade, self.scenario.realised(), self.scenario.words())
 
     def words(self) -> tuple[Scalar, Scalar]:
         """Return the random key of the member as two 32-bit words."""
