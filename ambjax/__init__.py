@@ -25,7 +25,7 @@ def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module 'ambjax' has no attribute '{name}'")
     home = _MODULES[name]
-    if home in ("ambjax", "ambjax.control"):  # these names are modules
+    if home == "ambjax":  # the name is a module
         return importlib.import_module(f"{home}.{name}")
     return getattr(importlib.import_module(home), name)
 

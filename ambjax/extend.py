@@ -1,13 +1,16 @@
-"""Names for custom laws and plants, in addition to those of `ambjax`.
+"""Names for custom laws, plants and metrics, in addition to those of the other namespaces.
 
 Laws subclass `Observer`, `PositionLaw`, `InversionLaw` or `CurrentLaw`; plants subclass `Bearing`. Both are records:
-frozen dataclasses whose fields are declared by `gain`, `leaf` or `static`.
+frozen dataclasses whose fields are declared by `gain`, `leaf` or `static`. A metric is a `Fold` over the rows of a run,
+such as `Peak` or `Rms` of a signal, or several `Named` folds.
 """
 
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.control.base import Law, Requirement
-from ambjax.control.force import force_for, sliding_variable
-from ambjax.control.laws import (
+from ambjax.control.force import force_for, linear_mechanics, sliding_variable
+from ambjax.control.sampling import Relay
+from ambjax.control.search import Interval, SearchContext, manifold, rate
+from ambjax.control.stages import (
     CurrentDemand,
     CurrentInputs,
     CurrentLaw,
@@ -17,14 +20,15 @@ from ambjax.control.laws import (
     PositionLaw,
     Relaxation,
 )
-from ambjax.control.sampling import Relay
-from ambjax.control.search import Interval, SearchContext, manifold, rate
 from ambjax.numerics.records import GAINS, Scalar, canonical, gain, leaf, record, static, validate
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
+from ambjax.simulation.folds import Fold, Lowest, Named, Peak, Rms
+from ambjax.simulation.span import Span
+from ambjax.simulation.trajectory import Row, Trajectory
 from ambjax.world.bearing import Bearing, Signals
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference, Signal
+from ambjax.world.waveforms import Reference, Signal, reference_at
 
 __all__ = [
     "GAINS",
@@ -33,29 +37,39 @@ __all__ = [
     "CurrentDemand",
     "CurrentInputs",
     "CurrentLaw",
+    "Fold",
     "ForceDemand",
     "Interval",
     "InversionLaw",
     "Law",
+    "Lowest",
     "Measurement",
+    "Named",
     "Observer",
+    "Peak",
     "PositionLaw",
     "Reference",
     "Relaxation",
     "Relay",
     "Requirement",
+    "Rms",
+    "Row",
     "Scalar",
     "SearchContext",
     "Signal",
     "Signals",
+    "Span",
+    "Trajectory",
     "canonical",
     "force_for",
     "gain",
     "leaf",
+    "linear_mechanics",
     "manifold",
     "one_kernel",
     "rate",
     "record",
+    "reference_at",
     "share",
     "sliding_variable",
     "smooth_sign",

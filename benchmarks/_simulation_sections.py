@@ -56,9 +56,9 @@ def throughput() -> list[str]:
     lines += [
         f"RK4 with steps of 10 us. A run has {data['samples']} samples of 10 steps, or {data['samples_of_few']:,}",
         "samples if there are fewer than 256 members. Times are in ns per member and step, without compilation. The",
-        f"limit is a C program (`limit.c`) with vectors of {width} bytes, two of them interleaved; the two programs run",
-        "alternately. A single member is a `rollout`. Speed-up: speed relative to one core; in brackets, the speed-up of the limit. Held noise is",
-        "constant over a sample.",
+        f"limit is a C program (`limit.c`) with vectors of {width} bytes, two of them interleaved. The two programs",
+        "run alternately. A single member is a `rollout`. Speed-up: speed relative to one core; in brackets, that of",
+        "the limit. Held noise is constant over a sample.",
         "",
     ]
     rows = []

@@ -21,7 +21,7 @@ import tasks
 import tomlkit
 
 from ambjax.cases.template_text import template
-from tuning import optimisers
+from tuning import optimisers, validate
 from tuning.__main__ import main as tune
 from tuning.solve import multipliers, refine
 
@@ -55,23 +55,17 @@ def by_values(raw: dict[str, Any]) -> None:
 # What is switched off, and how.
 MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "nothing": lambda raw: None,
-    "screen: the first points are refined": constant(refine, screen=lambda engine, members, x, keep, goal: x),
+    "screen: the first points are refined": constant(refine, screen=lambda engine, members, x, goal: x),
     "starting points: only the case's gains": setting(screen=0),
     "several starts: only the best of the screen": setting(starts=1),
-    "halvings of the starts": constant(refine, HALVINGS=(NEVER,)),
-    "first phase on a quarter of the members": constant(refine, FEW=refine.FEW._replace(part=1)),
-    "points of the first phase tried on all members": constant(refine, PATH_POINTS=1),
-    "CMA-ES": lambda raw: (
-        constant(refine, STEEP=math.inf, FEW=refine.FEW._replace(gradient_limit=math.inf))(raw),
-        constant(refine, ALL=refine.ALL._replace(gradient_limit=math.inf))(raw),
-    )[0],
+    "CMA-ES": constant(refine, STEEP=math.inf, CONVERGED=math.inf),
     "descent: CMA-ES only": by_values,
     "BFGS: Adam instead": setting(optimiser="adam"),
-    "curvature kept between phases": constant(optimisers.BFGSState, restarted=lambda self, fresh: fresh),
     "jumps known to the BFGS": constant(optimisers, JUMP=math.inf),
     "stressed members": setting(stressed=0),
     "conditions of Theorem 1 in the goal": lambda raw: raw["tune"].setdefault("weights", {}).update(conditions=0.0),
     "validation": setting(validation=0),
+    "members of large errors join": constant(validate, LARGER=math.inf),
     "updates of the multipliers": constant(multipliers, MOST_UPDATES=0),
 }
 

@@ -17,13 +17,14 @@ import _measure
 import cortex
 import numpy as np
 
-from ambjax import Cascade, current, inversion, observer, position
+from ambjax import Cascade
 from ambjax.codegen.c99 import machine
 from ambjax.codegen.c99.package import files_of_trace
 from ambjax.codegen.c99.source import Origin
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
 from ambjax.control.processor import Processor
+from ambjax.laws import current, inversion, observer, position
 
 HARD = np.inf
 NOW, LATER = Processor(1.0, predict=False), Processor(1.0)

@@ -46,7 +46,7 @@ def measure(dtype: str, members: tuple[int, ...], samples: int) -> list[dict[str
             blocks = BLOCKS if n == max(members) and not noise else ()
             for name, block in {KERNEL: BLOCK, **{f"{KERNEL}, block = {block}": block for block in blocks}}.items():
                 kernel = functools.partial(run_on_gpu, *work, fold=workload.FOLD, block=block)
-                runs[name] = lambda kernel=kernel: kernel().measured
+                runs[name] = lambda kernel=kernel: kernel().metrics
         else:
             runs[PROCESSOR] = functools.partial(workload.by_ambjax, work, os.cpu_count() or 1)
         times, error = _measure.alternating(runs, repeats=3), 0.0

@@ -23,8 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 import workload
 
-from ambjax import Cascade, Initial, current, inversion, position, rollout
+from ambjax import Cascade, Initial, rollout
 from ambjax.compiler.fast_path import one_kernel
+from ambjax.laws import current, inversion, position
 from ambjax.simulation.folds import Rms
 from ambjax.simulation.parts import rolled_in_parts
 from ambjax.simulation.rollout import prepare
@@ -55,8 +56,8 @@ def loss_of(work: workload.Workload) -> Callable[..., Any]:
         if in_parts:
             done = rolled_in_parts(*prepare(cascade, alone, work.clock), Rms("e_z"))
         else:
-            done = rollout(cascade, alone, work.clock, fold=Rms("e_z"), every=0)
-        return (done.measured / 5e-3) ** 2
+            done = rollout(cascade, alone, work.clock, fold=Rms("e_z"), record_every=0)
+        return (done.metrics / 5e-3) ** 2
 
     return loss
 

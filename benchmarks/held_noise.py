@@ -17,9 +17,11 @@ import _measure
 import numpy as np
 import workload
 
-from ambjax import DOP853, RK4, Sensor, paper
+from ambjax import paper
 from ambjax.ensemble import run_ensemble
+from ambjax.sensors import Sensor
 from ambjax.simulation.folds import Peak
+from ambjax.solvers import DOP853, RK4
 
 TARGET = 1e-6
 NOISES = {
@@ -39,7 +41,7 @@ def measure(noise: str) -> dict[str, Any]:
     def run(method: Any, every: int) -> Any:
         clock = dataclasses.replace(work.clock, method=method)
         fold = None if every else Peak("e_z")
-        return run_ensemble(work.cascade, scenario, clock, fold=fold, every=every, threads=1)
+        return run_ensemble(work.cascade, scenario, clock, fold=fold, record_every=every, threads=1)
 
     reference = run(RK4(100), 1).trajectory.rows.z
     rows = []

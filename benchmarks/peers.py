@@ -31,8 +31,8 @@ import workload
 from scipy.integrate import solve_ivp
 from workload import PERIOD, Workload
 
-from ambjax import DOP853, RK4
 from ambjax.ensemble import run_ensemble
+from ambjax.solvers import DOP853, RK4
 
 MEMBERS, SAMPLES, INSTANTS, CHECKED = 1024, 500, 10, 8
 TOLERANCE = 1e-6
@@ -60,7 +60,7 @@ def instants(work: Workload) -> np.ndarray:
 
 def by_ambjax(work: Workload) -> Any:
     every = work.clock.samples // INSTANTS
-    found = run_ensemble(*work.lasting(work.clock.samples + 1), fold=None, every=every, threads=1)
+    found = run_ensemble(*work.lasting(work.clock.samples + 1), fold=None, record_every=every, threads=1)
     return found.trajectory.rows.z[:, 1:].T
 
 

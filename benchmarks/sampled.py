@@ -25,12 +25,13 @@ import numpy as np
 import workload
 from workload import Workload
 
-from ambjax import Cascade, Clock, Initial, current, inversion, position, rollout
+from ambjax import Cascade, Clock, Initial, rollout
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
+from ambjax.laws import current, inversion, position
 from ambjax.simulation.folds import Rms
 from ambjax.simulation.method import with_method
-from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.metrics import Metrics
 
 # c, k, gamma, k_i: they hold the rotor with either sign.
 GAINS = np.array([200.0, 25.0, 2e6, 2000.0])
@@ -109,7 +110,9 @@ def gradient(p: float) -> float:
     def loss(logs: Any, lanes: Any) -> Any:
         z, member = lanes
         alone = dataclasses.replace(work.scenario, initial=Initial(z=z), member=member)
-        return (rollout(cascade(GAINS * jnp.exp(logs), p), alone, work.clock, fold=Rms("e_z"), every=0).measured) ** 2
+        return (
+            rollout(cascade(GAINS * jnp.exp(logs), p), alone, work.clock, fold=Rms("e_z"), record_every=0).metrics
+        ) ** 2
 
     lanes = np.asarray(work.scenario.initial.z), np.asarray(work.scenario.member)
     compiled = gradients.programs(loss, TANGENTS_OF, (0, 0))
@@ -123,7 +126,7 @@ def measure(name: str) -> dict[str, Any]:
     p = SIGNS[name]
     work = sampled(MEMBERS, SAMPLES, p)
     row: dict[str, Any] = {"p": name, "members": MEMBERS, "samples": SAMPLES, "substeps": workload.substeps(work.clock)}
-    every = standard_for(0.05, work.scenario)
+    every = Metrics.of(0.05, work.scenario)
     runs = {
         "ambjax": functools.partial(workload.by_ambjax, work),
         "all_metrics": lambda: run_ensemble(*work, fold=every, threads=1),

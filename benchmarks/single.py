@@ -24,7 +24,10 @@ import numpy as np
 import workload
 from scipy.integrate import solve_ivp
 
-from ambjax import AdaptiveRodas3, Cascade, Clock, Plant, inversion, paper, rollout
+from ambjax import Cascade, Clock, paper, rollout
+from ambjax.laws import inversion
+from ambjax.plants import Plant
+from ambjax.solvers import AdaptiveRodas3
 
 TARGET = 1e-8
 PERIOD, SAMPLES = 1e-2, 200

@@ -18,7 +18,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from ambjax import RK4, AdaptiveRodas3, Clock, Euler, Rodas3, Sensor, inversion, paper, rollout
+from ambjax import Clock, paper, rollout
+from ambjax.laws import inversion
+from ambjax.sensors import Sensor
+from ambjax.solvers import RK4, AdaptiveRodas3, Euler, Rodas3
 
 SAMPLES = 2_000
 CASES = {

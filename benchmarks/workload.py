@@ -13,9 +13,14 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax import RK4, Cascade, Clock, Initial, Plant, Pulse, Scenario, Sensor, inversion, paper, rollout
+from ambjax import Cascade, Clock, Initial, Scenario, paper, rollout
 from ambjax.ensemble import run_ensemble
+from ambjax.laws import inversion
+from ambjax.plants import Plant
+from ambjax.sensors import Sensor
+from ambjax.signals import Pulse
 from ambjax.simulation.folds import Peak
+from ambjax.solvers import RK4
 
 GAMMA, P_V = 1e9, 25e-6
 PERIOD, SUBSTEPS = 1e-4, 10
@@ -86,10 +91,10 @@ def workload(members: int, samples: int, *, noise: bool = False) -> Workload:
 def by_ambjax(work: Workload, threads: int = 1, **options: Any) -> Any:
     """Return the largest |z - r| of each member by ambjax: the ensemble engine, or `rollout` for one member."""
     if work.members > 1:
-        return run_ensemble(*work, fold=FOLD, threads=threads, **options).measured
+        return run_ensemble(*work, fold=FOLD, threads=threads, **options).metrics
     first = float(np.ravel(work.scenario.initial.z)[0])
     alone = dataclasses.replace(work.scenario, initial=Initial(z=first), member=0)
-    return rollout(work.cascade, alone, work.clock, fold=FOLD, every=0).measured
+    return rollout(work.cascade, alone, work.clock, fold=FOLD, record_every=0).metrics
 
 
 def right_side(gamma: float, p_v: float, xp: Any) -> Callable[..., Any]:

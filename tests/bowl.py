@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from texts import case_and_tune
 
-from ambjax import AdaptiveRodas3
+from ambjax.solvers import AdaptiveRodas3
 from tuning.problem.limits import PREFIX
 from tuning.problem.loss import TERMS, outcomes
 

@@ -1,4 +1,4 @@
-"""Six machines as case dictionaries, all held: what `machine_oracle` and another program are compared on."""
+"""Seven machines as case dictionaries, all held: what `machine_oracle` and another program are compared on."""
 
 RIG = {"mu_0": 1.2566e-6, "n": 208.0, "A": 2.68e-4, "s_0": 5e-4, "i_0": 2.5, "R": 1.0}
 PID = {"position": {"kind": "pid"}, "inversion": {"kind": "linearised"}, "current": {"kind": "pi"}}
@@ -111,6 +111,33 @@ MACHINES = {
             }
         ],
         "initial": {"q": [1e-5, 1e-5, 0.0, 2e-5, 2e-5]},
+        "clock": CLOCK,
+    },
+    # rigid-body coordinates: PID on translation, tilt and axial motion, with other gains for each; Kalman observers;
+    # a disc at 9,000 rpm, of which the gyroscopic terms are compensated; three kinds of magnets; one axis at an angle
+    "coordinates": {
+        "plant": RIG,
+        "rotor": {"kind": "rigid", "m": 4.0, "I_t": 0.05, "I_p": 0.07, "speed": 9000.0, "gravity": [1.0, -9.0, -3.8]},
+        "bearing": [
+            LEFT | {"at": -0.12, "sensor_at": -0.135, "angle": 30.0},
+            RIGHT | {"at": 0.15, "plant": {"A": 3.2e-4, "s_0": 6e-4}},
+            THRUST | {"plant": {"A": 4e-4, "i_0": 2.0}},
+        ],
+        "controller": {
+            "coordinates": "rigid-body",
+            "compensate_gyroscopics": True,
+            "observer": {"kind": "kalman", "w": 2000.0},
+            "position": {"kind": "pid", "k_p": 5e5, "k_int": 5e7, "k_d": 1200.0, "w_f": 12000.0, "k_aw": 30.0},
+            "tilt": {"observer": {"w": 2500.0}, "position": {"k_p": 7e5, "k_d": 1700.0}},
+            "axial": {"position": {"k_int": 3e7}},
+            "inversion": {"kind": "closed-form"},
+            "current": {"kind": "pi"},
+        },
+        "sensor": {"velocity": False},
+        "processor": processor(delay=1.0),
+        "actuator": {"u_max": 40.0},
+        "unbalance": [{"at": 0.1, "amount": 40.0, "phase": 30.0}],
+        "initial": {"q": [2e-5, -3e-5, 1e-5, 1e-4, 5e-5]},
         "clock": CLOCK,
     },
 }  # fmt: skip

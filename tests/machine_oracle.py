@@ -86,6 +86,8 @@ class World:
         self.u_max = math.inf if still else case.get("actuator", {}).get("u_max", math.inf)
         each = zip(parts.tables, parts.m_k, parts.g_k, strict=True)
         self.laws = [Laws(case, tables, m, g) for tables, m, g in each]
+        rigid = case.get("controller", {}).get("coordinates") == "rigid-body"
+        self.act = RigidLaws(case, parts, self.laws).step if rigid else self.by_axis
         models = [PAPER | tables["plant"] for tables in parts.tables]
         self.magnet = Magnet({name: np.array([one[name] for one in models]) for name in PAPER})
         self.coils = 2 if case.get("plant", {}).get("kind") == "two-coil" else 1
@@ -127,16 +129,20 @@ class World:
         q_ddot = (force - (parts.D + W * parts.G) @ q_dot - parts.K @ q) / parts.M
         return np.concatenate([q_dot, q_ddot, self.magnet.rates(z, z_dot, currents, u).ravel()])
 
+    def by_axis(self, states, readings, past, u_max, W):
+        steps = [
+            law.step(state, reading, past[:, k], u_max)
+            for k, (law, state, reading) in enumerate(zip(self.laws, states, readings, strict=True))
+        ]
+        return tuple(zip(*steps, strict=True))
+
     def sample(self, n, y, states, past, e=0.0, substeps=8):
         """Return y, the laws' states and the voltages [lags, axes] of sample n + 1, the row, the time of a loss."""
         parts, (q, q_dot, currents) = self.parts, self.split(y)
         i = currents[0] if self.coils == 1 else (currents[0] - currents[1]) / 2
         readings = zip(parts.c @ q + e, parts.c @ q_dot, i, strict=True)
-        steps = [
-            law.step(state, reading, past[:, k], self.u_max)
-            for k, (law, state, reading) in enumerate(zip(self.laws, states, readings, strict=True))
-        ]
-        u, states, i_ref = zip(*steps, strict=True)
+        W = self.speed + self.gain * n * self.T
+        u, states, i_ref = self.act(states, list(readings), past, self.u_max, W)
         given = np.vstack([u, past])
         edges = [edge / self.T - n for one, _ in self.loads for edge in (one.get("start"), one.get("stop")) if edge]
         for start, stop, lag in spans(self.delay, 1.0):
@@ -149,6 +155,74 @@ class World:
                     if (abs(np.real(parts.b @ y[: len(parts.M)])) >= self.stop).any():
                         return y, states, given[:-1], (i, i_ref, u), (n + a) * self.T + (k + 1) * h
         return y, states, given[:-1], (i, i_ref, u), None
+
+
+class Coordinate(Laws):
+    """Observer and position law of one rigid coordinate, which demand an acceleration. All gains are given.
+
+    In the place of a current stands the acceleration that the currents of all magnets give, without the weight.
+    """
+
+    def __init__(self, case, weight, name):
+        controller, self.T = case["controller"], case["clock"]["sample_period"]
+        tables = {stage: controller.get(stage, {}) for stage in ("observer", "position")}
+        part = {"beta_x": "tilt", "beta_y": "tilt", "z": "axial"}.get(name)
+        tables = merge(tables, controller.get(part, {}))
+        self.kind = {"observer": tables["observer"].get("kind", "direct"), "position": tables["position"]["kind"]}
+        self.gains, self.implicit = tables, case["processor"].get("discretisation", "implicit") == "implicit"
+        self.model = SimpleNamespace(a=1.0, g=-weight, v=lambda z, acceleration: acceleration)
+
+
+class RigidLaws:
+    """Rigid-body coordinates: readings to coordinates, accelerations to forces, then the inner loops of the axes.
+
+    The prediction integrates the rigid rotor with its nominal magnets, without gyroscopic terms unless they are
+    compensated; W is that of the sample. The PID unwinds towards the acceleration by the measured currents.
+    """
+
+    def __init__(self, case, parts, laws):
+        self.axes, controller, names = laws, case["controller"], ("x", "y", "z", "beta_x", "beta_y")
+        held = np.flatnonzero((parts.b[:, :5] != 0).any(0))
+        self.B, self.C, self.M = parts.b[:, held], parts.c[:, held], parts.M[held]
+        self.weight, self.G = (parts.gravity / parts.M)[held], parts.G[np.ix_(held, held)]
+        self.G = self.G * controller.get("compensate_gyroscopics", False)
+        self.laws = [Coordinate(case, weight, names[k]) for k, weight in zip(held, self.weight, strict=True)]
+        self.kappa = np.array([law.model.kappa for law in laws])
+
+    def by_magnets(self, z, i):
+        v = np.array([law.model.v(*each) for law, *each in zip(self.axes, z, i, strict=True)])
+        return self.B.T @ (self.kappa / 4 * v) / self.M
+
+    def rates(self, y, u, W):
+        n = len(self.M)
+        q, v, i = y[:n], y[n : 2 * n], y[2 * n :]
+        z, z_dot = self.B @ q, self.B @ v
+        moved = [law.model.rates(*each)[0] for law, *each in zip(self.axes, z, z_dot, i[:, None], u, strict=True)]
+        return np.concatenate([v, self.by_magnets(z, i) + self.weight - W * self.G @ v / self.M, moved])
+
+    def step(self, states, readings, past, u_max, W):
+        c, n, first = len(self.axes), len(self.laws), self.axes[0]
+        states = [dict(state) for state in states] + [{} for _ in range(c + n - len(states))]
+        y, y_dot, i = np.array(readings).T
+        q, v = np.linalg.pinv(self.C) @ y, np.linalg.pinv(self.C) @ y_dot
+        given = zip(self.laws, states[c:], q, v, self.by_magnets(self.B @ q, i), strict=True)
+        q, v, _ = np.array([law.observe(state, each) for law, state, *each in given]).T
+        if first.predict:
+            x = np.concatenate([q, v, i])
+            for a, b, lag in spans(first.delay, first.delay):
+                x = rk4(lambda _, x, u=past[lag - 1]: self.rates(x, u, W), 0.0, x, (b - a) * first.T)
+            q, v, i = x[:n], x[n : 2 * n], x[2 * n :]
+        z, z_dot = self.B @ q, self.B @ v
+        given = zip(self.laws, states[c:], q, v, self.by_magnets(z, i), strict=True)
+        wanted = np.array([law.position(state, *each) for law, state, *each in given])
+        F = np.linalg.pinv(self.B.T) @ (self.M * wanted + W * self.G @ v)
+        u, i_ref = [], []
+        for k, (law, state) in enumerate(zip(self.axes, states, strict=False)):
+            following = law.inversion(state, z[k], F[k] / (law.model.kappa / 4))
+            i_ref.append(state.get("i_ref", following))
+            u.append(law.current(state, z[k], z_dot[k], i[k], i_ref[k], (following - i_ref[k]) / law.T, u_max))
+            state["i_ref"] = following
+        return u, states, i_ref
 
 
 def signal(one, t, middle):
@@ -192,6 +266,7 @@ class Loop:
         )
         y, past = self.world.place(0 * parts.M, i), np.tile(magnets.R * i, (math.ceil(self.world.delay), 1))
         _, self.states, *_ = self.world.sample(0, y, [{"i_ref": one} for one in i], past, substeps=1)
+        self.axes = len(parts.names)
         self.guess = self.pack(y, self.states, past)
         n = len(parts.M)
         held = (parts.b != 0).any(0) | (parts.K.diagonal() != 0)
@@ -206,20 +281,20 @@ class Loop:
         for state in self.states:
             states.append(dict(zip(state, x, strict=False)))
             x = x[len(state) :]
-        past = x.reshape(-1, len(self.states))
+        past = x.reshape(-1, self.axes)
         y, states, past, *_ = self.world.sample(0, y, states, past, e, self.substeps)
         states = [{name: new[name] for name in old} for old, new in zip(self.states, states, strict=True)]
         return self.pack(y, states, past)
 
     def jacobian(self, x):
         """Return A and B of x+ = A x + B e, by complex steps."""
-        n, axes, tiny = len(x), len(self.states), 1e-30
+        n, axes, tiny = len(x), self.axes, 1e-30
         ways = np.eye(n + axes) * tiny * 1j
         columns = [self(x + way[:n], way[n:]).imag / tiny for way in ways]
         return np.split(np.array(columns).T, [n], axis=1)
 
     def equilibrium(self):
-        x, none, kept = self.guess, np.zeros(len(self.states)), self.kept
+        x, none, kept = self.guess, np.zeros(self.axes), self.kept
         for _ in range(20):
             A, _ = self.jacobian(x)
             change = (self(x, none) - x)[kept]

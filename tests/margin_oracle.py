@@ -19,7 +19,7 @@ from scipy.special import factorial
 from ambjax.control.cascade_state import Sample
 from ambjax.linear.analysis import linearisation_inputs
 from ambjax.linear.equilibrium import equilibrium, ideal
-from ambjax.world.signals import Constant, reference_at
+from ambjax.world.waveforms import Constant, reference_at
 
 # Order of the Pade approximation of a delay in continuous time. Its error is below 1e-6 up to a phase of pi.
 PADE = 8

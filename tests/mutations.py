@@ -356,8 +356,8 @@ MUTATIONS = [
     M(
         "members that accurate steps lose after the judgement do not refute the answer",
         "tuning/report/judging.py",
-        'refuted or (again["refuted"] if again else "")',
-        "refuted",
+        "(error or answer.error).refuted if",
+        "answer.error.refuted if",
         "tests/test_tuning_study.py::test_a_member_that_accurate_steps_do_not_hold_is_not_a_survivor",
     ),
     M(
@@ -398,8 +398,8 @@ MUTATIONS = [
     M(
         "the voltages of the two previous samples are exchanged",
         "ambjax/simulation/sampled.py",
-        "past = self.loop.cascade, self.processor.remembered(state.command.u, *state.past)",
-        "past = self.loop.cascade, self.processor.remembered(*state.past, state.command.u)",
+        "past = self.processor.remembered(state.command.u, *state.past)",
+        "past = self.processor.remembered(*state.past, state.command.u)",
         "tests/test_sampled.py::test_the_voltage_of_a_sample_acts_after_the_delay",
     ),
     M(
@@ -419,7 +419,7 @@ MUTATIONS = [
     M(
         "with prediction, the laws act on the current estimate instead of the predicted one",
         "ambjax/control/cascade.py",
-        "if processor.predicts:",
+        "if self.timing.predicts:",
         "if False:",
         "tests/test_sampled.py::test_sampled_loops_agree_with_the_independent_simulator[two samples]",
     ),
@@ -461,7 +461,7 @@ MUTATIONS = [
     M(
         "a delay beyond the exported one is not reported",
         "ambjax/codegen/controller.py",
-        ", processor.delay <= processor.most]",
+        ", processor.delay <= (processor.most or 0)]",
         "]",
         "tests/test_export.py::test_a_delay_beyond_the_exported_one_is_refused",
     ),
@@ -551,9 +551,9 @@ MUTATIONS = [
     ),
     M(
         "the injected wave is subtracted from the reading",
-        "ambjax/linear/multisine.py",
-        "_added(measured, self.wave.reading, self.injected(t))",
-        "_added(measured, self.wave.reading, -self.injected(t))",
+        "ambjax/simulation/sampled.py",
+        "with_signal(measured, self.wave, self.wave.at(",
+        "with_signal(measured, self.wave, -self.wave.at(",
         "tests/test_injection.py::test_the_peak_agrees_with_the_independent_simulator[complementary]",
     ),
     M(

@@ -71,7 +71,7 @@ def test_fixed_steps_under_noise_are_accurate_for_analytic_laws_and_only_chosen_
     raw = {key: value for key, value in raw.items() if key not in ("actuator", "disturbance", "reference")}
     raw["controller"] |= {"position": {"kind": "pid"}, "inversion": {"kind": "closed-form"}}
     case = case_from(raw)
-    assert case.clock.method == amb.DOP853(1)
+    assert case.clock.method == amb.solvers.DOP853(1)
     assert error_of(case)[0] <= 1e-10
     raw["controller"]["observer"] = {"kind": "ired-2"}
-    assert not isinstance(case_from(raw).clock.method, amb.DOP853)
+    assert not isinstance(case_from(raw).clock.method, amb.solvers.DOP853)

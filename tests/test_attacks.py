@@ -34,7 +34,7 @@ from ambjax.world.coils import TwoCoil
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Sensor
-from ambjax.world.signals import Chirp, Pulse, Sine, SmoothStep, Step
+from ambjax.world.waveforms import Chirp, Pulse, Sine, SmoothStep, Step
 from tuning.__main__ import main as tune
 from tuning.problem.config import read_tune, settings
 from tuning.problem.loss import Loss

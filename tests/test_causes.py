@@ -120,7 +120,7 @@ def rig(**change):
 
 def is_lost(raw):
     case = case_from(raw)
-    return bool(np.isfinite(amb.rollout(case.cascade, case.scenario, case.clock, every=0).trajectory.lost_at))
+    return bool(np.isfinite(amb.rollout(case.cascade, case.scenario, case.clock, record_every=0).trajectory.lost_at))
 
 
 def report_of(raw):

@@ -18,7 +18,7 @@ from ambjax.ensemble import delays as searched
 from ambjax.ensemble.delays import DELAYS, delay_margin
 from ambjax.linear.stability import quiet
 from ambjax.results.operating import sensitivity
-from ambjax.simulation.rollout import Outcome, prepare, rollout
+from ambjax.simulation.rollout import Result, prepare, rollout
 from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Trajectory
 from ambjax.theorem import advice, sampled_report
 from ambjax.theorem.law_poles import law_poles
@@ -85,16 +85,16 @@ def test_a_sign_law_stays_in_its_band_and_reaches_its_ends(implicit, p):
 
 def cascade_of(c, k, gamma, k_i, p, **how):
     return amb.Cascade(
-        position=amb.position.SlidingMode(c, k, p),
-        inversion=amb.inversion.Adaptive(gamma, p),
-        current=amb.current.SlidingMode(k_i, p),
+        position=amb.laws.position.SlidingMode(c, k, p),
+        inversion=amb.laws.inversion.Adaptive(gamma, p),
+        current=amb.laws.current.SlidingMode(k_i, p),
         processor=Processor(**how),
     )
 
 
 HARD, SOFT = (200.0, 25.0, 2e6, 2000.0, INF), (17.0, 25.0, 2e5, 152.0, 25.0)
-WORLD = amb.Scenario(reference=amb.Sine(2.5e-3, 2.0))
-CLOCK, LONG = (amb.Clock(samples, 1e-4, amb.RK4(4)) for samples in (600, 3000))
+WORLD = amb.Scenario(reference=amb.signals.Sine(2.5e-3, 2.0))
+CLOCK, LONG = (amb.Clock(samples, 1e-4, amb.solvers.RK4(4)) for samples in (600, 3000))
 
 
 def random_loop(name, draw):
@@ -104,17 +104,17 @@ def random_loop(name, draw):
     """
     c, k, k_i = 10 ** draw.uniform(1.2, 3.0), 10 ** draw.uniform(0.5, 2.5), 10 ** draw.uniform(2.3, 3.5)
     gamma, p = 10 ** draw.uniform(5.0, 7.0), 10 ** draw.uniform(0.5, 2.0)
-    world = {"reference": amb.Sine(draw.uniform(0.5e-3, 2.5e-3), 2.0), "u_max": draw.uniform(100.0, 2e3)}
+    world = {"reference": amb.signals.Sine(draw.uniform(0.5e-3, 2.5e-3), 2.0), "u_max": draw.uniform(100.0, 2e3)}
     if name == "estimated, two coils":
         cascade = cascade_of(c, k, gamma, k_i, INF, delay=draw.uniform(0.1, 0.9))
-        cascade = dataclasses.replace(cascade, observer=amb.observer.Kalman(draw.uniform(300.0, 1500.0)))
-        sensor = amb.Sensor(10 ** draw.uniform(-8, -6), 0.0, 1e-5, bits=16, velocity=False)
+        cascade = dataclasses.replace(cascade, observer=amb.laws.observer.Kalman(draw.uniform(300.0, 1500.0)))
+        sensor = amb.sensors.Sensor(10 ** draw.uniform(-8, -6), 0.0, 1e-5, bits=16, velocity=False)
         return cascade, amb.Scenario(plant=TwoCoil(m=draw.uniform(0.5, 0.7)), sensor=sensor, **world)
     if name == "late, amplifier":
         cascade = cascade_of(c, k, gamma, k_i, p, delay=draw.uniform(0.1, 0.9), predict=False)
-        cascade = dataclasses.replace(cascade, observer=amb.observer.Complementary(draw.uniform(1.0, 50.0)))
+        cascade = dataclasses.replace(cascade, observer=amb.laws.observer.Complementary(draw.uniform(1.0, 50.0)))
         amplifier = Amplifier(bandwidth=draw.uniform(1e3, 5e3))
-        return cascade, amb.Scenario(sensor=amb.Sensor(1e-6, 1e-4, 1e-4), amplifier=amplifier, **world)
+        return cascade, amb.Scenario(sensor=amb.sensors.Sensor(1e-6, 1e-4, 1e-4), amplifier=amplifier, **world)
     return cascade_of(c, k, gamma, k_i, p, implicit=False, delay=draw.uniform(0.1, 0.9), predict=True), amb.Scenario(
         initial=amb.Initial(draw.uniform(-1e-4, 1e-4)), **world
     )
@@ -153,8 +153,11 @@ def test_bounds_are_tight_without_an_estimate():
 
 def current_of(law, late, R=0.0, implicit=True):
     """Return the poles of a current law of a coil with the resistance R; only the current law has gains."""
-    model = amb.Plant(R=R)
-    others = {"position": amb.position.LinearController(output="voltage"), "inversion": amb.inversion.Linearised()}
+    model = amb.plants.Plant(R=R)
+    others = {
+        "position": amb.laws.position.LinearController(output="voltage"),
+        "inversion": amb.laws.inversion.Linearised(),
+    }
     processor = Processor(late, implicit=implicit, predict=False)
     (found,) = law_poles(amb.Cascade(current=law, model=model, processor=processor, **others), CLOCK)
     return found
@@ -164,7 +167,7 @@ def current_of(law, late, R=0.0, implicit=True):
 def test_the_poles_of_a_current_law_are_those_of_the_delayed_recursion(late):
     """Without resistance, the law that removes a share of the error makes x_{n+1} = x_n - share x(n - late)."""
     for share in (0.2, 0.6, 1.0):
-        found, z = current_of(amb.current.DeadBeat(share=share), late), roots(share, late)
+        found, z = current_of(amb.laws.current.DeadBeat(share=share), late), roots(share, late)
         assert found.radius == pytest.approx(np.abs(z).max(), abs=1e-7)  # a double root is exact to 1e-8
         s = np.log(z[np.abs(z) > 1e-9] + 0j)
         assert found.damping == pytest.approx((-s.real / np.abs(s)).min(initial=1.0), abs=1e-6)
@@ -173,29 +176,29 @@ def test_the_poles_of_a_current_law_are_those_of_the_delayed_recursion(late):
 T0, SIGN = 1e-4, 2 / np.pi
 # Poles that the theory of each law gives, for T = 1e-4 s without delay: law, implicit steps, largest |pole|.
 KNOWN = [
-    (amb.observer.Complementary(l=300.0), True, 1 - 300 * T0),
-    (amb.observer.Difference(w=2e3), True, math.exp(-0.2)),
-    (amb.observer.Difference(w=2e3), False, 0.8),
-    (amb.observer.Kalman(w=500.0), True, math.exp(-0.05)),
-    (amb.observer.Kalman(w=500.0), False, 0.95),
-    (amb.inversion.Adaptive(2e5, 0.1), True, 1 / (1 + SIGN * 2e5 * 0.1 * T0)),
-    (amb.inversion.Adaptive(2e5, 0.1), False, abs(1 - SIGN * 2e5 * 0.1 * T0)),
-    (amb.inversion.FeedForwardAdaptive(2e5, 0.1), True, 1 / (1 + SIGN * 2e5 * 0.1 * T0)),
-    (amb.inversion.Adaptive(2e5, INF), True, 0.0),
-    (amb.inversion.Adaptive(2e5, INF), False, INF),
-    (amb.current.SlidingMode(200.0, 10.0), True, 1 / (1 + SIGN * 200 * 10 * T0)),
-    (amb.current.SlidingMode(200.0, 10.0), False, 1 - SIGN * 200 * 10 * T0),
-    (amb.current.SlidingMode(200.0, INF), True, 0.0),
-    (amb.current.SlidingMode(200.0, INF), False, INF),
+    (amb.laws.observer.Complementary(l=300.0), True, 1 - 300 * T0),
+    (amb.laws.observer.Difference(w=2e3), True, math.exp(-0.2)),
+    (amb.laws.observer.Difference(w=2e3), False, 0.8),
+    (amb.laws.observer.Kalman(w=500.0), True, math.exp(-0.05)),
+    (amb.laws.observer.Kalman(w=500.0), False, 0.95),
+    (amb.laws.inversion.Adaptive(2e5, 0.1), True, 1 / (1 + SIGN * 2e5 * 0.1 * T0)),
+    (amb.laws.inversion.Adaptive(2e5, 0.1), False, abs(1 - SIGN * 2e5 * 0.1 * T0)),
+    (amb.laws.inversion.FeedForwardAdaptive(2e5, 0.1), True, 1 / (1 + SIGN * 2e5 * 0.1 * T0)),
+    (amb.laws.inversion.Adaptive(2e5, INF), True, 0.0),
+    (amb.laws.inversion.Adaptive(2e5, INF), False, INF),
+    (amb.laws.current.SlidingMode(200.0, 10.0), True, 1 / (1 + SIGN * 200 * 10 * T0)),
+    (amb.laws.current.SlidingMode(200.0, 10.0), False, 1 - SIGN * 200 * 10 * T0),
+    (amb.laws.current.SlidingMode(200.0, INF), True, 0.0),
+    (amb.laws.current.SlidingMode(200.0, INF), False, INF),
     # L = 33.13 H: x+ = x + T (u - k_p x)/L, u+ = u - T k_int x
-    (amb.current.ProportionalIntegral(3e4, 1e6, 0.0), True,
+    (amb.laws.current.ProportionalIntegral(3e4, 1e6, 0.0), True,
      max(abs(np.linalg.eigvals([[1 - T0 * 3e4 / 33.1298, T0 / 33.1298], [-T0 * 1e6, 1]])))),
     # sigma decays by the sign, and z on the manifold: z+ = z + T z_dot + T^2/2 z_ddot
-    (amb.position.SlidingMode(200.0, 30.0, 5.0), False, None),
-    (amb.position.FeedbackLinearisation(4e4, 500.0), True,
+    (amb.laws.position.SlidingMode(200.0, 30.0, 5.0), False, None),
+    (amb.laws.position.FeedbackLinearisation(4e4, 500.0), True,
      max(abs(np.linalg.eigvals([[1 - T0**2 / 2 * 4e4, T0 - T0**2 / 2 * 500], [-T0 * 4e4, 1 - T0 * 500]])))),
-    (amb.position.SlidingMode(200.0, 30.0, INF), False, INF),
-    (amb.position.SuperTwisting(17.0, 40.0, 50.0, INF), False, INF),
+    (amb.laws.position.SlidingMode(200.0, 30.0, INF), False, INF),
+    (amb.laws.position.SuperTwisting(17.0, 40.0, 50.0, INF), False, INF),
 ]  # fmt: skip
 
 
@@ -203,7 +206,7 @@ KNOWN = [
 def test_the_poles_of_a_law_are_those_of_its_theory(law, implicit, radius):
     stage = type(law).__module__.rpartition(".")[2]
     stage = stage if stage in ("observer", "inversion", "current") else "position"
-    cascade = amb.Cascade(**{stage: law}, model=amb.Plant(R=0.0), processor=Processor(0.0, implicit=implicit))
+    cascade = amb.Cascade(**{stage: law}, model=amb.plants.Plant(R=0.0), processor=Processor(0.0, implicit=implicit))
     (found,) = (one for one in law_poles(cascade, CLOCK) if one.stage == stage)
     if radius is None:  # with the slope K = 2/pi k p: z_ddot = -c z_dot - K (z_dot + c z)
         rate, K = np.array([0.0, -200.0]), SIGN * 30 * 5
@@ -236,7 +239,9 @@ def test_alternation_is_1_for_an_alternating_voltage_and_sin_squared_for_a_sine(
 
 
 # The noise of the velocity turns a sign of 1000 m/s^2 over: forces that no current gives at 2 mm are wanted.
-BEYOND = amb.Scenario(reference=amb.Constant(2e-3), initial=amb.Initial(2e-3, 0.0, -0.1), sensor=amb.Sensor(0.0, 1e-2))
+BEYOND = amb.Scenario(
+    reference=amb.signals.Constant(2e-3), initial=amb.Initial(2e-3, 0.0, -0.1), sensor=amb.sensors.Sensor(0.0, 1e-2)
+)
 
 
 def test_the_distance_to_the_singular_curve_is_that_of_the_sampled_run():
@@ -252,14 +257,14 @@ def test_the_distance_to_the_singular_curve_is_that_of_the_sampled_run():
     assert any(
         line.startswith("Does (z/s_0, i_ref/i_0) stay off the singular curve C") and " No: " in line for line in said
     )
-    world = dataclasses.replace(world, sensor=amb.Sensor(0.0, 1e-4))
+    world = dataclasses.replace(world, sensor=amb.sensors.Sensor(0.0, 1e-4))
     calm = sampled_report.check_sampled(crossing, world, clock, 0.005)
     assert calm.holds
     assert calm.distance[0] > 0
 
 
 def test_the_margin_is_between_a_delay_that_holds_and_one_that_does_not():
-    cascade, clock = cascade_of(*HARD, delay=0.0, predict=False), amb.Clock(600, 1e-4, amb.RK4(1))
+    cascade, clock = cascade_of(*HARD, delay=0.0, predict=False), amb.Clock(600, 1e-4, amb.solvers.RK4(1))
     margin = delay_margin(cascade, WORLD, clock)
     # the sign itself, one sample late: an oscillation that does not decay, and the steps of the position law on top
     assert 0.5 < margin.held < margin.lost <= 1.0
@@ -267,7 +272,7 @@ def test_the_margin_is_between_a_delay_that_holds_and_one_that_does_not():
     assert margin.resolution == pytest.approx(margin.step / (DELAYS - 1))
     for delay, lost in zip(margin[:2], (False, True), strict=True):
         late = cascade_of(*HARD, delay=delay, predict=False)
-        assert np.isfinite(amb.rollout(late, WORLD, clock, every=0).trajectory.lost_at) == lost
+        assert np.isfinite(amb.rollout(late, WORLD, clock, record_every=0).trajectory.lost_at) == lost
     # if the rotor is lost at the delay of the case, the answer names the delays at which it is held
     beyond = delay_margin(cascade_of(*HARD, delay=1.5, predict=False), WORLD, clock)
     assert 0.5 < beyond.held < beyond.lost < 1.1
@@ -275,7 +280,7 @@ def test_the_margin_is_between_a_delay_that_holds_and_one_that_does_not():
 
 @pytest.mark.slow
 def test_the_delay_margin_without_a_known_delay_is_smaller():
-    cascade, clock = cascade_of(*HARD, delay=1.0), amb.Clock(600, 1e-4, amb.RK4(1))
+    cascade, clock = cascade_of(*HARD, delay=1.0), amb.Clock(600, 1e-4, amb.solvers.RK4(1))
     margin = delay_margin(cascade, WORLD, clock, known=False)
     # a prediction that knows it holds the rotor up to 2 samples and more
     assert 1.0 < margin.held < margin.lost < 1.9
@@ -287,7 +292,7 @@ def test_a_loss_in_a_narrow_interval_of_delays_is_found(monkeypatch):
     """The loop is replaced by one that is lost from 0.704 to 0.716 samples only, and stalls at one delay."""
     monkeypatch.setattr(searched, "run_ensemble", delays)
     delays.stalled, delays.lost = (-1.0, -1.0), (0.704, 0.716)
-    cascade, clock = cascade_of(*HARD, delay=0.0), amb.Clock(300, 1e-4, amb.RK4(1))
+    cascade, clock = cascade_of(*HARD, delay=0.0), amb.Clock(300, 1e-4, amb.solvers.RK4(1))
     margin = delay_margin(cascade, WORLD, clock)
     assert 0.704 - 2 / 256**2 <= margin.held < 0.704 <= margin.lost < 0.704 + 2 / 256**2
     # beyond two samples the steps are longer, and the result says so
@@ -305,7 +310,7 @@ def test_a_delay_whose_run_stalls_is_neither_held_nor_lost(monkeypatch):
     delays.stalled, delays.lost = (0.6, 0.9), (1.5, INF)
 
     def margin(own):
-        return delay_margin(cascade_of(*HARD, delay=own), WORLD, amb.Clock(300, 1e-4, amb.RK4(1)))
+        return delay_margin(cascade_of(*HARD, delay=own), WORLD, amb.Clock(300, 1e-4, amb.solvers.RK4(1)))
 
     near = 2 / 256**2
     assert margin(0.0)[:3] == (
@@ -328,7 +333,7 @@ def delays(cascade, scenario, clock, *, fold):
     late, (begin, end) = np.asarray(cascade.processor.delay), delays.stalled
     lost = (delays.lost[0] <= late) & (late <= delays.lost[1])
     code = np.where((begin <= late) & (late <= end), STALLED, np.where(lost, TOUCHED, ALIVE))
-    return Outcome(Trajectory(None, np.where(code == ALIVE, np.inf, 0.01), code, np.inf), None)
+    return Result(Trajectory(None, np.where(code == ALIVE, np.inf, 0.01), code, np.inf), None)
 
 
 @pytest.mark.slow
@@ -340,7 +345,7 @@ def test_a_stalled_run_on_a_processor_is_reported_as_undecided():
     assert "lost" not in said
     assert "gamma" not in said  # laws that are stepped stall no integrator
     # one trial step a sample, where the tolerance takes more
-    stalling = amb.Clock(10, 1e-4, amb.AdaptiveRodas3(1e-12, most_steps=1))
+    stalling = amb.Clock(10, 1e-4, amb.solvers.AdaptiveRodas3(1e-12, most_steps=1))
     found = sampled_report.check_sampled(cascade_of(*HARD, delay=1.0), WORLD, stalling, 0.0)
     assert found.stalled
     assert not found.bands
@@ -371,7 +376,7 @@ def test_the_computed_signals_are_those_of_the_readings_that_the_laws_receive(gu
     processor = Processor(guard=Guard(speed=1e-3) if guarded else None)
     cascade = dataclasses.replace(amb.paper.cascade("sampled"), processor=processor, observer=Direct())
     cascade = dataclasses.replace(cascade, position=dataclasses.replace(cascade.position, c=c))
-    scenario = amb.Scenario(sensor=amb.Sensor(outliers=Outliers(rate=0.0, size=size, at=at * 1e-4)))
+    scenario = amb.Scenario(sensor=amb.sensors.Sensor(outliers=Outliers(rate=0.0, size=size, at=at * 1e-4)))
     loop, clock = prepare(cascade, scenario, amb.Clock(80, 1e-4))
     rows = rolled(LawSignalsRecorder(loop), clock).trajectory.rows
     apart = np.asarray(rows.computed.sigma - rows.true.sigma)

@@ -9,13 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import RK4, Amplifier, Scenario, rollout
+from ambjax import Scenario, rollout
+from ambjax.actuators import Amplifier
 from ambjax.cases.forces import forces
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.codegen.numbering import numbers_of
 from ambjax.commands.acceptance import machine
 from ambjax.simulation.integrate import InitialValueProblem
+from ambjax.solvers import RK4
 from ambjax.world.coil_limits import CoilLimits, difference
 from ambjax.world.coils import TwoCoil
 from ambjax.world.iron import Iron

@@ -7,20 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import (
-    AdaptiveRodas3,
-    Cascade,
-    Clock,
-    Plant,
-    Pulse,
-    Scenario,
-    Sensor,
-    Sine,
-    Slide,
-    inversion,
-    position,
-    rollout,
-)
+from ambjax import Cascade, Clock, Scenario, rollout
+from ambjax.laws import inversion, position
+from ambjax.plants import Plant
+from ambjax.sensors import Sensor
+from ambjax.signals import Pulse, Sine
+from ambjax.solvers import AdaptiveRodas3, Slide
 
 NOISY = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.8, 1.3), sensor=Sensor(1e-6, 1e-4, 1e-4))
 SHORT = Clock(203, 1e-4, AdaptiveRodas3())
@@ -56,7 +48,7 @@ def variations():
 def compiled(caplog, *case):
     """Kernels that a rollout compiles."""
     with jax.log_compiles(), caplog.at_level("WARNING"):
-        rollout(*case, every=0)
+        rollout(*case, record_every=0)
     # the name of a rollout on the fast path, and without it
     return [
         message for message in caplog.messages if message.startswith(("Compiling jit(marked)", "Compiling jit(run)"))
@@ -66,7 +58,7 @@ def compiled(caplog, *case):
 @pytest.fixture(scope="module")
 def warm():
     """One rollout with the counting law, compiled."""
-    return rollout(Cascade(position=Counting()), NOISY, SHORT, every=0)
+    return rollout(Cascade(position=Counting()), NOISY, SHORT, record_every=0)
 
 
 @pytest.mark.parametrize("what", list(variations()), ids=lambda x: x[0])
@@ -100,5 +92,5 @@ def test_a_change_of_structure_recompiles(caplog):
 def test_integers_never_recompile(what, warm):
     law, scenario = what
     before = Counting.traces
-    rollout(Cascade(position=law), scenario, SHORT, every=0)
+    rollout(Cascade(position=law), scenario, SHORT, record_every=0)
     assert Counting.traces == before

@@ -6,24 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import (
-    AdaptiveCashKarp,
-    AdaptiveRodas3,
-    Cascade,
-    Clock,
-    Initial,
-    Plant,
-    Processor,
-    Scenario,
-    rollout,
-    with_method,
-)
+from ambjax import Cascade, Clock, Initial, Processor, Scenario, rollout
 from ambjax.cases.reader import case_from
 from ambjax.codegen.controller import controller_of
 from ambjax.control import current, inversion, observer, position
 from ambjax.linear import injected, linearise, loop_matrices
+from ambjax.plants import Plant
 from ambjax.simulation.integrate import FixedSteps
 from ambjax.simulation.sliding import Slide, slides
+from ambjax.solvers import AdaptiveCashKarp, AdaptiveRodas3, with_method
 from ambjax.world.amplifier import CurrentAmplifier
 from ambjax.world.coils import TwoCoil
 from ambjax.world.sensor import Measurement
@@ -97,7 +88,7 @@ def sampled(**more):
 @EACH
 def test_a_held_command_is_followed_exactly_between_samples(kind):
     """With one sample of delay, i_{n+1} = c_{n-1} + (i_n - c_{n-1}) exp(-w T), and i_ref of a row is c_{n-1}."""
-    outcome = rollout(sampled(), world(kind, initial=Initial(5e-5)), Clock(160, PERIOD), every=1)
+    outcome = rollout(sampled(), world(kind, initial=Initial(5e-5)), Clock(160, PERIOD), record_every=1)
     rows = outcome.trajectory.rows
     assert np.isinf(outcome.trajectory.lost_at)
     i, c = np.asarray(rows.i), np.asarray(rows.i_ref)
@@ -109,7 +100,7 @@ def test_a_held_command_is_followed_exactly_between_samples(kind):
 
 def test_the_command_is_limited():
     def largest(i_max):
-        outcome = rollout(sampled(), world(i_max=i_max, initial=Initial(5e-5)), Clock(160, PERIOD), every=1)
+        outcome = rollout(sampled(), world(i_max=i_max, initial=Initial(5e-5)), Clock(160, PERIOD), record_every=1)
         return np.max(np.abs(np.asarray(outcome.trajectory.rows.i)))
 
     assert largest(None) > 0.3

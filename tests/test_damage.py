@@ -349,12 +349,12 @@ def descent():
 
 
 def search_of(descent, starts=STARTS, gains=GAINS):
-    row = {"value": (starts,), "x": (starts, gains), "gains": (starts, gains), "lost": (starts,), "members": ()}
-    row |= {"terms": (starts, 6), "quantities": (starts, 1), "rollouts": ()}
+    row = {"value": (), "x": (gains,), "gains": (gains,), "lost": (), "members": ()}
+    row |= {"terms": (6,), "quantities": (1,), "rollouts": ()}
     dice = np.random.default_rng(1)
     past = {name: [dice.random(shape) for _ in range(ITERATIONS)] for name, shape in row.items()}
     x = jnp.asarray(dice.random((starts, gains)))
-    return SearchState(descent.begin(x), np.arange(starts) > 0, past, ITERATIONS, phase=1, since=1, seconds=2.5)
+    return SearchState(descent.begin(x), np.arange(starts) > 0, past, seconds=2.5)
 
 
 @pytest.fixture
@@ -369,7 +369,7 @@ def test_a_loaded_checkpoint_equals_the_saved_search(checkpoint, descent):
     for a, b in zip(jax.tree.leaves(before.starts), jax.tree.leaves(after.starts), strict=True):
         np.testing.assert_array_equal(a, b)
         assert a.dtype == b.dtype
-    assert (after.iteration, after.phase, after.since, after.earlier) == (ITERATIONS, 1, 1, 2.5)
+    assert (after.iteration, after.earlier) == (ITERATIONS, 2.5)
     assert after.ended
     np.testing.assert_array_equal(before.active, after.active)
     assert before.history.keys() == after.history.keys()
@@ -380,13 +380,13 @@ def no_state(arrays, facts):
     del arrays["leaf_0"]
 
 
-def no_counts(arrays, facts):
-    facts["counts"] = {}
+def no_seconds(arrays, facts):
+    del facts["seconds"]
 
 
 CHECKPOINT_STRANGE = {
     "no state": rewritten(no_state, again=True),
-    "no counts": rewritten(no_counts, again=True),
+    "no seconds": rewritten(no_seconds, again=True),
     "no facts": rewritten(unnamed, again=True),
 }
 

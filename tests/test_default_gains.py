@@ -10,14 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import Cascade, Plant, current, inversion, observer, position, sensitivity, simulate
+from ambjax import Cascade, sensitivity, simulate
 from ambjax.cases.controller_tables import KINDS
 from ambjax.cases.reader import case_from
 from ambjax.control.base import default_law
-from ambjax.control.laws import CurrentDemand, CurrentInputs
 from ambjax.control.sampling import Sampling
+from ambjax.control.stages import CurrentDemand, CurrentInputs
+from ambjax.laws import current, inversion, observer, position
+from ambjax.plants import Plant
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 BLOWER = (pathlib.Path(__file__).parent / "cases" / "machines" / "blower.toml").read_text()
 RIG = Plant(1.64, 0.0, 1.2566e-6, 208.0, 2.68e-4, 5e-4, 2.5, 1.0)

@@ -19,11 +19,8 @@ from ambjax.cases.controller_tables import KINDS
 from ambjax.cases.reader import OTHERS, TABLES, case_from
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.table import Table
-from ambjax.control.guard import Guard
 from ambjax.numerics import declared
 from ambjax.numerics.declared import default_text
-from ambjax.world.amplifier import CurrentAmplifier
-from ambjax.world.faults import Dropouts, Outliers
 from tuning.problem.config import tune_from
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -33,10 +30,10 @@ ROLE = re.compile(r"\{py:(\w+)\}`(?:[^`<]*<)?~?([\w.]+)>?`")
 ELSEWHERE = ("controller", "reference", "disturbance", "spread")
 # Records that a user of the Python interface constructs.
 LAWS = {kind for kinds in KINDS.values() for kind in kinds.values()}
-PUBLIC = {getattr(ambjax, name) for name in ambjax.__all__ if isinstance(getattr(ambjax, name), type)}
+SPACES = (ambjax, ambjax.signals, ambjax.plants, ambjax.sensors, ambjax.actuators, ambjax.solvers)
+PUBLIC = {one for space in SPACES for name in space.__all__ if isinstance(one := getattr(space, name), type)}
 RECORDS = sorted(
-    {kind for kind in PUBLIC if hasattr(kind, "__post_init__")}
-    | {Guard, CurrentAmplifier, Outliers, Dropouts, *LAWS, *SIGNALS.values()},
+    {kind for kind in PUBLIC if hasattr(kind, "__post_init__")} | {*LAWS, *SIGNALS.values()},
     key=lambda kind: f"{kind.__module__}.{kind.__qualname__}",
 )
 ROWS = [(name, {}) for name in [*TABLES, *OTHERS, "tune.weights", "tune.limits"] if name not in ELSEWHERE]

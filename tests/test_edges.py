@@ -12,14 +12,14 @@ import ambjax as amb
 from ambjax.control.processor import Processor
 from ambjax.simulation.edges import Edges, most_inside
 from ambjax.simulation.integrate import InitialValueProblem
-from ambjax.world.signals import edges_of, knots_of
+from ambjax.world.waveforms import edges_of, knots_of
 
 T = 1e-4
-SOFT = amb.Cascade(inversion=amb.inversion.Adaptive(2e5), processor=Processor(0.5))
+SOFT = amb.Cascade(inversion=amb.laws.inversion.Adaptive(2e5), processor=Processor(0.5))
 
 
 def world(start, stop, **more):
-    return amb.Scenario(q_z=amb.Pulse(5.0, start, stop), **more)
+    return amb.Scenario(q_z=amb.signals.Pulse(5.0, start, stop), **more)
 
 
 def walked(edges, t, h, count):
@@ -53,7 +53,7 @@ def test_steps_cover_the_whole_period_if_there_are_more_edges_than_counted():
 # Irregular times; two of the values and two of the slopes are equal, so that these times are no edges.
 RECORD = np.array([0.9, 1.037, 1.1, 1.137, 1.25, 1.33, 1.642, 1.9, 2.5])
 VALUES = np.array([1.0, 3.0, 3.0, -2.0, 4.0, 4.0 + 8 * 0.08 / 0.312, 12.0 + 8 * 0.08 / 0.312, 0.5, 2.0])
-HELD = amb.Recorded(amb.Samples(RECORD - 0.5, VALUES), held=True, start=0.5)
+HELD = amb.signals.Recorded(amb.signals.Samples(RECORD - 0.5, VALUES), held=True, start=0.5)
 LINEAR = dataclasses.replace(HELD, held=False)
 AREA = {  # from 1 to 2
     "held": np.sum(np.diff([1.0, *RECORD[1:8], 2.0]) * VALUES[:8]),
@@ -63,19 +63,26 @@ AREA = {  # from 1 to 2
 
 @pytest.mark.parametrize(
     "method",
-    [amb.Euler(3), amb.RK4(3), amb.DOP853(3), amb.Rodas3(3), amb.AdaptiveRodas3(), amb.AdaptiveCashKarp()],
+    [
+        amb.solvers.Euler(3),
+        amb.solvers.RK4(3),
+        amb.solvers.DOP853(3),
+        amb.solvers.Rodas3(3),
+        amb.solvers.AdaptiveRodas3(),
+        amb.solvers.AdaptiveCashKarp(),
+    ],
     ids=str,
 )
 @pytest.mark.parametrize("name", ["pulse", "held", "linear"])
 def test_an_integral_is_exact_wherever_the_rate_jumps_or_has_a_kink(method, name):
-    signal = {"pulse": amb.Pulse(2.0, 1.137, 1.642), "held": HELD, "linear": LINEAR}[name]
+    signal = {"pulse": amb.signals.Pulse(2.0, 1.137, 1.642), "held": HELD, "linear": LINEAR}[name]
     knots = knots_of(signal)
     edges = Edges(edges_of(signal), len(edges_of(signal)) + sum(len(one.times) for one in knots), knots)
     rates = lambda inputs, state: signal(inputs)  # noqa: E731
     problem = InitialValueProblem(lambda t: t, rates, 1.0, lambda state: jnp.int32(0), edges=edges)
     end = method.advance(problem, 1.0, 1.0, jnp.zeros(()), method.start(1.0))
     assert float(end.t) == 2.0
-    if name == "linear" and isinstance(method, amb.Euler):
+    if name == "linear" and isinstance(method, amb.solvers.Euler):
         return  # not exact for a straight line
     # A rate that is constant or linear over each step: rounding of some 10 steps, and the inset of the stages, a few
     # units in the last place of t.
@@ -99,27 +106,36 @@ def spread(**values):
         (world(np.array([0.1, 0.2]), 0.7), 1),  # between them, too
         (world(**spread(start=[0.1, 0.3], stop=[0.4, 0.5])), 1),
         (world(**spread(start=[0.1, 0.3], stop=[0.2, 0.5])), 2),  # as near as one wishes
-        (amb.Scenario(q_z=amb.Ramp(1.0, 0.10001, 3e-5)), 2),  # both kinks
-        (amb.Scenario(q_z=amb.Recorded(amb.Samples(0.1 + T * np.arange(9), np.arange(9.0) ** 2))), 0),
-        (amb.Scenario(q_z=amb.Recorded(amb.Samples(T / 2.5 * np.arange(99), np.arange(99.0) ** 2))), 2),
-        (amb.Scenario(q_z=amb.Recorded(amb.Samples(T / 2.5 * np.arange(99), np.arange(99.0)))), 1),  # a straight line
-        (amb.Scenario(q_v=amb.Step(1.0, 0.10003), q_i=amb.Sum((amb.Sine(1.0, 2.0), amb.Step(1.0, 0.10005)))), 2),
+        (amb.Scenario(q_z=amb.signals.Ramp(1.0, 0.10001, 3e-5)), 2),  # both kinks
+        (amb.Scenario(q_z=amb.signals.Recorded(amb.signals.Samples(0.1 + T * np.arange(9), np.arange(9.0) ** 2))), 0),
+        (amb.Scenario(q_z=amb.signals.Recorded(amb.signals.Samples(T / 2.5 * np.arange(99), np.arange(99.0) ** 2))), 2),
+        (
+            amb.Scenario(q_z=amb.signals.Recorded(amb.signals.Samples(T / 2.5 * np.arange(99), np.arange(99.0)))),
+            1,
+        ),  # a straight line
+        (
+            amb.Scenario(
+                q_v=amb.signals.Step(1.0, 0.10003),
+                q_i=amb.signals.Sum((amb.signals.Sine(1.0, 2.0), amb.signals.Step(1.0, 0.10005))),
+            ),
+            2,
+        ),
     ],
 )
 def test_the_number_of_edges_inside_a_sample(scenario, most):
     assert most_inside(scenario, T) == most
-    assert amb.with_method(amb.Clock(10, T), SOFT, scenario).cuts == most
+    assert amb.solvers.with_method(amb.Clock(10, T), SOFT, scenario).cuts == most
     clock = amb.Clock(10, T, cuts=1)  # counted for the whole of which this is a part
-    assert amb.with_method(clock, SOFT, scenario).cuts == max(most, 1)
+    assert amb.solvers.with_method(clock, SOFT, scenario).cuts == max(most, 1)
 
 
 def test_derivatives_in_the_time_of_an_edge():
     """The equation is y' = A - y from the edge on."""
 
     def end(start):
-        rates = lambda t, y: amb.Step(2.0, start)(t) - y  # noqa: E731
+        rates = lambda t, y: amb.signals.Step(2.0, start)(t) - y  # noqa: E731
         problem = InitialValueProblem(lambda t: t, rates, 1.0, lambda state: jnp.int32(0), edges=Edges((start,), 1))
-        return amb.RK4(20).advance(problem, 1.0, 1.0, jnp.zeros(()), ()).state
+        return amb.solvers.RK4(20).advance(problem, 1.0, 1.0, jnp.zeros(()), ()).state
 
     at = 1.337
     slopes = [derivative(end)(at) for derivative in (jax.jacfwd, jax.grad)]
@@ -133,13 +149,13 @@ def test_a_record_inside_samples_costs_no_accuracy(held):
     """Against 20 times as many steps. Without edges at the times of the record, the errors are 1e-9 to 1e-8 m."""
     rng = np.random.default_rng(3)
     times = np.sort(rng.uniform(0, 40 * T, 60))
-    record = amb.Recorded(amb.Samples(times, rng.normal(size=60)), held=held, scale=5.0)
-    for sensor in (None, amb.Sensor(bandwidth=5e3)):
+    record = amb.signals.Recorded(amb.signals.Samples(times, rng.normal(size=60)), held=held, scale=5.0)
+    for sensor in (None, amb.sensors.Sensor(bandwidth=5e3)):
         scenario = amb.Scenario(q_z=record, sensor=sensor)
-        clock = amb.with_method(amb.Clock(40, T), SOFT, scenario)
+        clock = amb.solvers.with_method(amb.Clock(40, T), SOFT, scenario)
         assert clock.cuts > 2
         z, exact = (
-            amb.rollout(SOFT, scenario, clock.with_method(amb.RK4(n * clock.method.substeps))).trajectory.rows.z
+            amb.rollout(SOFT, scenario, clock.with_method(amb.solvers.RK4(n * clock.method.substeps))).trajectory.rows.z
             for n in (1, 20)
         )
         assert np.abs(exact).max() > 1e-6

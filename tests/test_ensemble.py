@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import RK4, Cascade, Clock, Initial, Scenario, Sensor, Sine, Standard, inversion, rollout
+from ambjax import Cascade, Clock, Initial, Metrics, Scenario, rollout
 from ambjax.compiler import fast_path
 from ambjax.control.processor import Processor
 from ambjax.ensemble import Normal, Percent, Spread, map_members, run_ensemble
@@ -19,12 +19,16 @@ from ambjax.ensemble.batching import size
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
 from ambjax.host.sealed import difference
+from ambjax.laws import inversion
+from ambjax.sensors import Sensor
+from ambjax.signals import Sine
 from ambjax.simulation.folds import Rms
+from ambjax.solvers import RK4
 
 SMOOTH = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))
 NOISY = Scenario(reference=Sine(2.5e-3, 2.0), sensor=Sensor(1e-7, 1e-5, 1e-5), seed=7)
 SHORT = Clock(40, 1e-4, RK4(2))
-FOLD = Standard(2e-3)
+FOLD = Metrics(2e-3)
 
 
 def members(n, **leaves):
@@ -60,8 +64,8 @@ def same(a, b, rtol):
 def test_results_do_not_depend_on_calls_threads_or_other_members():
     n = 150  # no multiple of a block
     whole = run_ensemble(SMOOTH, members(n), SHORT, fold=FOLD, threads=1)
-    assert whole.measured["rms_error_m"].shape == (n,)
-    assert len(set(whole.measured["rms_error_m"])) == n
+    assert whole.metrics["rms_error_m"].shape == (n,)
+    assert len(set(whole.metrics["rms_error_m"])) == n
     for threads, call in ((2, 64), (1, 128), (3, None)):
         # same operations on other lanes: only where XLA fuses differently may a last digit move
         same(run_ensemble(SMOOTH, members(n), SHORT, fold=FOLD, threads=threads, call=call), whole, 1e-12)
@@ -107,7 +111,7 @@ jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
 import numpy as np
 from test_ensemble import *
 assert len(jax.devices()) == int(sys.argv[1])
-np.save(sys.argv[2], run_ensemble(SMOOTH, members(70), SHORT, fold=Rms("e_z")).measured)
+np.save(sys.argv[2], run_ensemble(SMOOTH, members(70), SHORT, fold=Rms("e_z")).metrics)
 """
     env = os.environ | {"JAX_ENABLE_X64": "1", "PYTHONPATH": os.path.dirname(__file__)}  # noqa: PTH120
     for n in (1, 2):
@@ -178,11 +182,11 @@ def test_members_npz_has_a_row_per_member_and_every_metric(tmp_path):
     with np.load(run(STUDY, tmp_path)) as kept:
         columns = dict(kept)
     alone = rollout(*STUDY.member(77), SHORT, fold=FOLD)
-    assert set(columns) == {"index", "lost_at", "spread.plant.m", "spread.initial.z", *alone.measured}
+    assert set(columns) == {"index", "lost_at", "spread.plant.m", "spread.initial.z", *alone.metrics}
     np.testing.assert_array_equal(columns["index"], np.arange(150))
     assert len(columns) <= COLUMNS
     assert all(len(x) == 150 for x in columns.values())
-    np.testing.assert_allclose(columns["rms_error_m"][77], alone.measured["rms_error_m"], rtol=1e-12)
+    np.testing.assert_allclose(columns["rms_error_m"][77], alone.metrics["rms_error_m"], rtol=1e-12)
     assert STUDY.member(77)[1].plant.m == columns["spread.plant.m"][77]
 
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from ambjax import Plant, paper
+from ambjax import paper
 from ambjax.paper import evidence
+from ambjax.plants import Plant
 
 
 @pytest.mark.parametrize("fragile", ["m -10 %", "m +10 %", "k_z -10 %", "R +10 %", "A -10 %"])

@@ -19,7 +19,7 @@ from profiles import THOROUGH
 from texts import piped
 
 import ambjax
-from ambjax import RK4, Cascade, Clock, Plant, Scenario, Sensor, Sine
+from ambjax import Cascade, Clock, Scenario
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
 from ambjax.codegen.c99 import machine
@@ -38,7 +38,11 @@ from ambjax.control.guard import Guard
 from ambjax.control.processor import Processor
 from ambjax.extend import PositionLaw
 from ambjax.numerics.records import gain, record
+from ambjax.plants import Plant
 from ambjax.results.case_export import VERIFIED
+from ambjax.sensors import Sensor
+from ambjax.signals import Sine
+from ambjax.solvers import RK4
 
 compiled = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 INF = np.inf

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from test_export import compiled
 
-from ambjax import RK4, Clock, Constant, Pulse, Sensor, Sine, rollout
+from ambjax import Clock, rollout
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.codegen.c99.source import Origin
@@ -23,9 +23,12 @@ from ambjax.codegen.trace import arguments
 from ambjax.codegen.twins import LoopCase
 from ambjax.codegen.verify import draft, verify
 from ambjax.control.processor import Processor
+from ambjax.sensors import Sensor
+from ambjax.signals import Constant, Pulse, Sine
 from ambjax.simulation.integrate import FixedSteps
 from ambjax.simulation.rosenbrock import AdaptiveRodas3
 from ambjax.simulation.trajectory import TOUCHED
+from ambjax.solvers import RK4
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.coils import TwoCoil
 from ambjax.world.faults import Dropouts, Outliers

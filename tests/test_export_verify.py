@@ -9,7 +9,7 @@ import pytest
 from profiles import examples
 from test_export import PERIOD, compiled, drafts, failed, hard
 
-from ambjax import RK4, Clock, Scenario, Sensor, Sine
+from ambjax import Clock, Scenario
 from ambjax.cases.reader import read_case
 from ambjax.codegen import closed_loop
 from ambjax.codegen.c99 import machine
@@ -20,6 +20,9 @@ from ambjax.codegen.twins import LEAST, SIGNALS, Horizon, LoopCase
 from ambjax.codegen.verify import Check, _looped, _stepped, checks_page, checks_verdict, holds, verify
 from ambjax.control import position
 from ambjax.control.processor import Processor
+from ambjax.sensors import Sensor
+from ambjax.signals import Sine
+from ambjax.solvers import RK4
 
 INF = np.inf
 

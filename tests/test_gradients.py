@@ -11,23 +11,13 @@ import numpy as np
 import pytest
 from profiles import examples
 
-from ambjax import (
-    RK4,
-    Cascade,
-    Clock,
-    Initial,
-    Pulse,
-    Rodas3,
-    Scenario,
-    Sensor,
-    Sine,
-    current,
-    inversion,
-    position,
-    rollout,
-)
+from ambjax import Cascade, Clock, Initial, Scenario, rollout
 from ambjax.compiler.fast_path import one_kernel
+from ambjax.laws import current, inversion, position
+from ambjax.sensors import Sensor
+from ambjax.signals import Pulse, Sine
 from ambjax.simulation.folds import Rms
+from ambjax.solvers import RK4, Rodas3
 
 TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.01, 0.03), sensor=Sensor(0.0))
 NOISE = np.array([0.0, 1e-6])
@@ -42,8 +32,8 @@ def run(gains, p, std, clock):
         position=position.SlidingMode(c, k), inversion=inversion.Adaptive(gamma, p), current=current.SlidingMode(k_i)
     )
     scenario = dataclasses.replace(TRACKING, sensor=Sensor(std))
-    out = rollout(cascade, scenario, clock, fold=Rms("e_z"), every=0)
-    return (out.measured / 5e-3) ** 2, out.trajectory
+    out = rollout(cascade, scenario, clock, fold=Rms("e_z"), record_every=0)
+    return (out.metrics / 5e-3) ** 2, out.trajectory
 
 
 def derivatives(nominal, p, clock):
@@ -146,6 +136,11 @@ TRANSFORMS = {
 IN_A_PROCESS_OF_ITS_OWN = """
 import jax, numpy as np
 from ambjax import *
+from ambjax.laws import *
+from ambjax.plants import *
+from ambjax.sensors import *
+from ambjax.signals import *
+from ambjax.solvers import *
 from ambjax.compiler import fast_path
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.numerics.records import canonical
@@ -154,7 +149,7 @@ from ambjax.simulation.folds import Rms
 
 def loss(cascade):
     # squared: the cotangent of the rollout is no constant
-    return rollout(cascade, Scenario(), Clock(20, 1e-4, Euler(1)), fold=Rms("e_z"), every=0).measured ** 2
+    return rollout(cascade, Scenario(), Clock(20, 1e-4, Euler(1)), fold=Rms("e_z"), record_every=0).metrics ** 2
 
 smooth = canonical(Cascade(inversion=inversion.Adaptive(1e9, 25e-6)))
 transforms = [{transforms}]

@@ -16,35 +16,35 @@ from ambjax.control.guard import Guard, guarded
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
 from ambjax.simulation.folds import Count, Named, Rms
-from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.system import system_of
 from ambjax.world.faults import VALUES, Dropouts, Outliers
 from ambjax.world.sensor import Errors, Measurement, Sensor
-from ambjax.world.signals import reference_at
+from ambjax.world.waveforms import reference_at
 
 T = 1e-4
-CLOCK = amb.Clock(160, T, amb.RK4(3))
+CLOCK = amb.Clock(160, T, amb.solvers.RK4(3))
 SHARES = np.concatenate([[0.98, 1.2, 1.5, 1.98], [-1.2, -1.5, -1.98]])
 
 
 def struck(guard=Guard(), observer=None, **faults):
     """Return a case with a faulty sensor: the gains of docs/export.md, or gains for a Kalman filter."""
-    laws = amb.position.SlidingMode(1440.0, 2.307, math.inf), amb.inversion.Adaptive(7.97e5, math.inf)
+    laws = amb.laws.position.SlidingMode(1440.0, 2.307, math.inf), amb.laws.inversion.Adaptive(7.97e5, math.inf)
     cascade = amb.Cascade(
-        observer or amb.observer.Direct(),
+        observer or amb.laws.observer.Direct(),
         *laws,
-        amb.current.SlidingMode(870.6, math.inf),
+        amb.laws.current.SlidingMode(870.6, math.inf),
         processor=Processor(guard=guard),
     )
     sensor = Sensor(*NOISE, velocity=observer is None, **faults)
-    return cascade, amb.Scenario(reference=amb.Sine(2.5e-3, 2.0), sensor=sensor, u_max=200.0, seed=3)
+    return cascade, amb.Scenario(reference=amb.signals.Sine(2.5e-3, 2.0), sensor=sensor, u_max=200.0, seed=3)
 
 
 @pytest.mark.parametrize(
     "observer",
     [
         pytest.param(None, id="direct"),
-        pytest.param(amb.observer.Kalman(500.0), id="Kalman", marks=pytest.mark.thorough),
+        pytest.param(amb.laws.observer.Kalman(500.0), id="Kalman", marks=pytest.mark.thorough),
     ],
 )
 def test_one_impossible_reading_is_refused_and_the_rotor_is_held(observer):
@@ -53,9 +53,9 @@ def test_one_impossible_reading_is_refused_and_the_rotor_is_held(observer):
     for guard in (Guard(), None):
         at = T * (60 + np.arange(SHARES.size))
         cascade, scenario = struck(guard, observer, outliers=Outliers(0.0, np.abs(SHARES) * 5e-3, at))
-        fold = standard_for(0.0, scenario)
+        fold = Metrics.of(0.0, scenario)
         many = dataclasses.replace(scenario, member=np.arange(SHARES.size))
-        found[guard is None] = run_ensemble(cascade, many, CLOCK, fold=fold).measured
+        found[guard is None] = run_ensemble(cascade, many, CLOCK, fold=fold).metrics
     assert found[True]["lost"].sum() > SHARES.size / 2
     assert not found[False]["lost"].any()
     np.testing.assert_array_equal(found[False]["refused"], 1.0)
@@ -89,7 +89,7 @@ def test_guard_and_faults_agree_with_the_independent_simulator(name):
         guard = dataclasses.replace(guard, samples=samples)
         own = dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=guard))
         fold = Count("refused")
-        rows, measured = (lambda x: (x.trajectory.rows, x.measured))(amb.rollout(own, world, clock, fold=fold))
+        rows, measured = (lambda x: (x.trajectory.rows, x.metrics))(amb.rollout(own, world, clock, fold=fold))
         words, read = world.words(), {"nan": math.nan, "full-scale": 5e-3}[value]
         outlier = float(world.sensor.fault_onsets(words, 60, T).outlier)
         assert abs(outlier) == 9.9e-3
@@ -131,7 +131,7 @@ def test_default_limits_accept_every_reading_of_a_sensor_without_faults():
         bits, std = float(rng.integers(6, 20)), 10 ** rng.uniform(-8, -4)
         sensor = Sensor(std, gain=rng.uniform(0.8, 1.2), offset=rng.normal() * 1e-5, bits=bits, range_z=1e-2)
         scenario = amb.Scenario(sensor=sensor)
-        guard = Guard().with_limits(amb.Plant(), scenario, T, False)
+        guard = Guard().with_limits(amb.plants.Plant(), scenario, T, False)
         ends = [
             float(sensor.converted(sensor.reading(Measurement(z, 0.0, 0.0), Errors(e, 0.0, 0.0)), 5e-3, 0.25).z)
             for z in (-4.5e-3, 4.5e-3)
@@ -165,8 +165,8 @@ def test_faults_depend_on_the_member_and_the_sample_only():
     cascade, scenario = struck(outliers=Outliers(500.0, 9e-3), dropouts=Dropouts(200.0, 3e-4, value="nan"))
     fold = Named({"refused": Count("refused"), "rms": Rms("z_measured")})
     many = dataclasses.replace(scenario, member=np.arange(5))
-    together = run_ensemble(cascade, many, CLOCK, fold=fold, threads=1).measured
-    alone = amb.rollout(cascade, dataclasses.replace(scenario, member=3), CLOCK, fold=fold, every=0).measured
+    together = run_ensemble(cascade, many, CLOCK, fold=fold, threads=1).metrics
+    alone = amb.rollout(cascade, dataclasses.replace(scenario, member=3), CLOCK, fold=fold, record_every=0).metrics
     assert together["refused"][3] == alone["refused"] > 5
     np.testing.assert_allclose(together["rms"][3], alone["rms"], rtol=1e-9)
     assert len(set(together["refused"])) > 1

@@ -11,13 +11,14 @@ from sampled_oracle import Lumped, World, current_for, simulate
 from test_oracle import adaptive, current, smc
 from test_sampled import loop_of
 
-from ambjax import Cascade, Clock, Scenario, Sensor, paper
+from ambjax import Cascade, Clock, Scenario, paper
 from ambjax.control import current as current_laws
 from ambjax.control import inversion, position
 from ambjax.control.observer import Kalman
 from ambjax.control.processor import Processor
 from ambjax.linear import Zones, frequency_lines, injected, injected_members, linearise, peak
 from ambjax.linear.multisine import multisine
+from ambjax.sensors import Sensor
 from ambjax.simulation.sliding import Slide
 
 T = 1e-4

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ambjax import Plant, current, inversion
-from ambjax.control.laws import CurrentDemand, CurrentInputs, ForceDemand
+from ambjax.control.stages import CurrentDemand, CurrentInputs, ForceDemand
+from ambjax.laws import current, inversion
 from ambjax.numerics.smooth import smooth_sign
+from ambjax.plants import Plant
 from ambjax.world.sensor import Measurement
 
 MODEL = Plant()

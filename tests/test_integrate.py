@@ -18,10 +18,10 @@ from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.method import QUIET_TIGHT, QUIET_TOLERANCE, TIGHT, TOLERANCE
 from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED
 
-FIXED = {"Euler": (amb.Euler, 1), "RK4": (amb.RK4, 4), "Rodas3": (amb.Rodas3, 3)}
+FIXED = {"Euler": (amb.solvers.Euler, 1), "RK4": (amb.solvers.RK4, 4), "Rodas3": (amb.solvers.Rodas3, 3)}
 REPAIRED = amb.Cascade()
-SMOOTH = amb.Cascade(inversion=amb.inversion.Adaptive(gamma=1e9, p=25e-6))
-TRACKING = amb.Scenario(reference=amb.Sine(2.5e-3, 2.0), q_v=amb.Pulse(1.0, 0.01, 0.02))
+SMOOTH = amb.Cascade(inversion=amb.laws.inversion.Adaptive(gamma=1e9, p=25e-6))
+TRACKING = amb.Scenario(reference=amb.signals.Sine(2.5e-3, 2.0), q_v=amb.signals.Pulse(1.0, 0.01, 0.02))
 
 
 def problem(rates, scale=1.0, status=lambda state: jnp.zeros((), jnp.int32)):
@@ -55,7 +55,14 @@ def slope(x, y):
 every_fixed = pytest.mark.parametrize(("method", "order"), FIXED.values(), ids=FIXED)
 every_method = pytest.mark.parametrize(
     "method",
-    [amb.Euler(3), amb.RK4(3), amb.DOP853(3), amb.Rodas3(3), amb.AdaptiveRodas3(), amb.AdaptiveCashKarp()],
+    [
+        amb.solvers.Euler(3),
+        amb.solvers.RK4(3),
+        amb.solvers.DOP853(3),
+        amb.solvers.Rodas3(3),
+        amb.solvers.AdaptiveRodas3(),
+        amb.solvers.AdaptiveCashKarp(),
+    ],
     ids=str,
 )
 
@@ -71,7 +78,7 @@ def test_order_on_a_problem_with_known_solution(method, order):
 def test_dop853_on_a_problem_with_known_solution():
     # From the first steps whose error falls steadily to the last with one well above rounding (2e-13); few points.
     substeps = np.array([4, 6, 8, 12])
-    errors = [curved_error(amb.DOP853(2), n // 2) for n in substeps]
+    errors = [curved_error(amb.solvers.DOP853(2), n // 2) for n in substeps]
     assert slope(1 / substeps, errors) == pytest.approx(8, abs=0.7)
 
 
@@ -103,7 +110,7 @@ def test_order_on_the_closed_loop(name, substeps):
 
 @every_fixed
 def test_a_jump_on_the_edge_of_a_step_keeps_the_order(method, order):
-    pulse = amb.Pulse(2.0, 0.3, 0.6)  # neither is a binary fraction: 3 * 0.1 > 0.3 in floating point
+    pulse = amb.signals.Pulse(2.0, 0.3, 0.6)  # neither is a binary fraction: 3 * 0.1 > 0.3 in floating point
 
     def pulsed(t, y):
         return -(y**2) * jnp.cos(t) + pulse(t)
@@ -123,7 +130,7 @@ def test_a_jump_on_the_edge_of_a_step_keeps_the_order(method, order):
     ends = [float(end_of(method(10 * int(n)), pulsed, 0.0, 1.0, jnp.asarray(1.0))) for n in substeps]
     # The same steps, so only rounding differs (80 of them), and the inset of the stages: 1e-15 of a step.
     assert ends == pytest.approx([split(method, int(n)) for n in substeps], rel=1e-13)
-    errors = np.abs(np.array(ends) - split(amb.RK4, 1000))
+    errors = np.abs(np.array(ends) - split(amb.solvers.RK4, 1000))
     assert slope(1 / substeps, errors) == pytest.approx(order, abs=0.3)  # steps from 0.1 on: coarse
 
 
@@ -132,19 +139,19 @@ def test_rodas3_damps_infinitely_fast_decay_in_one_step():
         return -1e12 * y
 
     # R(z) falls like 1/z for a stiffly accurate method: 1e-12 times a small constant.
-    assert abs(float(end_of(amb.Rodas3(1), decay, 0.0, 1.0, jnp.asarray(1.0)))) < 1e-11
+    assert abs(float(end_of(amb.solvers.Rodas3(1), decay, 0.0, 1.0, jnp.asarray(1.0)))) < 1e-11
 
 
 def test_rodas3_follows_a_slow_solution_of_a_stiff_problem():
     def prothero_robinson(t, y):
         return -1e8 * (y - jnp.sin(t)) + jnp.cos(t)
 
-    end = float(end_of(amb.Rodas3(100), prothero_robinson, 0.0, 1.0, jnp.asarray(0.0)))
+    end = float(end_of(amb.solvers.Rodas3(100), prothero_robinson, 0.0, 1.0, jnp.asarray(0.0)))
     # Rounding of the right-hand side, 1e8 eps, and an error that stiffness cannot amplify: h^2 / 1e8 at worst.
     assert end == pytest.approx(math.sin(1.0), abs=1e-10)
 
 
-@pytest.mark.parametrize("method", [amb.Euler, amb.RK4], ids=lambda m: m.__name__)
+@pytest.mark.parametrize("method", [amb.solvers.Euler, amb.solvers.RK4], ids=lambda m: m.__name__)
 @pytest.mark.parametrize(("share", "grows"), [(0.97, False), (1.03, True)])
 def test_the_stability_limit_separates_decay_from_growth(method, share, grows):
     def decay(t, y):
@@ -161,7 +168,7 @@ def test_a_step_of_length_0_does_not_change_the_state(method):
     assert end_of(method, curved, 0.2, 0.0, state) == state
 
 
-@pytest.mark.parametrize("method", [amb.AdaptiveRodas3, amb.AdaptiveCashKarp])
+@pytest.mark.parametrize("method", [amb.solvers.AdaptiveRodas3, amb.solvers.AdaptiveCashKarp])
 def test_adaptive_error_falls_with_the_tolerance(method):
     tolerances = np.array([1e-5, 1e-6, 1e-7, 1e-8, 1e-9])
     errors = [curved_error(method(tolerance=tol)) for tol in tolerances]
@@ -171,14 +178,18 @@ def test_adaptive_error_falls_with_the_tolerance(method):
 
 
 def test_a_stalled_rollout_has_the_status_stalled_and_finite_values():
-    clock = amb.Clock(50, 1e-4, amb.AdaptiveRodas3(tolerance=1e-12, most_steps=3))
+    clock = amb.Clock(50, 1e-4, amb.solvers.AdaptiveRodas3(tolerance=1e-12, most_steps=3))
     trajectory = amb.rollout(REPAIRED, TRACKING, clock).trajectory
     assert trajectory.lost_why.startswith("stalled")
     assert 0 < float(trajectory.lost_at) <= 1e-4
     assert all(np.isfinite(x).all() for x in trajectory.rows)
 
 
-@pytest.mark.parametrize("method", [amb.Euler(10), amb.RK4(10), amb.Rodas3(10), amb.AdaptiveRodas3()], ids=str)
+@pytest.mark.parametrize(
+    "method",
+    [amb.solvers.Euler(10), amb.solvers.RK4(10), amb.solvers.Rodas3(10), amb.solvers.AdaptiveRodas3()],
+    ids=str,
+)
 def test_integration_stops_at_the_first_invalid_state_and_returns_the_last_valid_one(method):
     def status(y):
         return jnp.where(y < 0.55, 0, 2).astype(jnp.int32)
@@ -194,7 +205,13 @@ def test_integration_stops_at_the_first_invalid_state_and_returns_the_last_valid
 
 @pytest.mark.parametrize(
     "method",
-    [amb.RK4(3), amb.DOP853(3), amb.Rodas3(3), amb.AdaptiveRodas3(), amb.AdaptiveCashKarp(1e-3)],
+    [
+        amb.solvers.RK4(3),
+        amb.solvers.DOP853(3),
+        amb.solvers.Rodas3(3),
+        amb.solvers.AdaptiveRodas3(),
+        amb.solvers.AdaptiveCashKarp(1e-3),
+    ],
     ids=str,
 )
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -219,7 +236,7 @@ def test_the_time_of_a_touchdown_is_that_of_the_crossing_inside_a_step(method, s
 
 
 # Not Rodas3 with three steps: a fixed implicit step may leap over the pole and never see it.
-@pytest.mark.parametrize("method", [amb.Euler(3), amb.RK4(3), amb.AdaptiveRodas3()], ids=str)
+@pytest.mark.parametrize("method", [amb.solvers.Euler(3), amb.solvers.RK4(3), amb.solvers.AdaptiveRodas3()], ids=str)
 def test_a_divergent_solution_ends_with_a_status_and_a_finite_state(method):
     def status(y):
         return jnp.where(jnp.abs(y) < 1e3, 0, 2).astype(jnp.int32)
@@ -230,52 +247,60 @@ def test_a_divergent_solution_ends_with_a_status_and_a_finite_state(method):
     assert np.isfinite(float(out.state))
 
 
-@pytest.mark.parametrize("method", [amb.Euler(1), amb.RK4(1)], ids=str)
+@pytest.mark.parametrize("method", [amb.solvers.Euler(1), amb.solvers.RK4(1)], ids=str)
 def test_an_explicit_step_beyond_its_limit_is_refused(method):
     limit = method.limit / (2 / math.pi * 7.5e4 * 25.0)
     with pytest.raises(ValueError, match=rf"stable only up to {limit:.3g} s.*inversion law has slope 1\.19e\+06"):
         amb.rollout(REPAIRED, TRACKING, amb.Clock(10, 1e-4, method))
     just_inside = amb.Clock(10, 0.99 * limit, method)
-    assert amb.with_method(just_inside, REPAIRED, TRACKING) is just_inside
+    assert amb.solvers.with_method(just_inside, REPAIRED, TRACKING) is just_inside
 
 
 def test_method_choice():
-    noisy = dataclasses.replace(TRACKING, sensor=amb.Sensor(1e-6))
-    for quiet in (None, amb.Sensor(), amb.Sensor(gain=1.1, offset=1e-6)):  # a sensor without noise changes nothing
+    noisy = dataclasses.replace(TRACKING, sensor=amb.sensors.Sensor(1e-6))
+    for quiet in (
+        None,
+        amb.sensors.Sensor(),
+        amb.sensors.Sensor(gain=1.1, offset=1e-6),
+    ):  # a sensor without noise changes nothing
         scenario = dataclasses.replace(TRACKING, sensor=quiet)
-        assert amb.choose_method(SMOOTH, scenario, 1e-4) == amb.AdaptiveCashKarp(QUIET_TIGHT)
-        assert amb.choose_method(REPAIRED, scenario, 1e-4) == amb.AdaptiveRodas3(QUIET_TOLERANCE)
-    assert amb.choose_method(SMOOTH, noisy, 1e-4) == amb.DOP853(1)
-    for kink in ({"u_max": 100.0}, {"q_z": amb.Pulse(1.0, 0.01003, 0.02)}, {"reference": amb.Step(1e-4, 0.00103)}):
+        assert amb.solvers.choose_method(SMOOTH, scenario, 1e-4) == amb.solvers.AdaptiveCashKarp(QUIET_TIGHT)
+        assert amb.solvers.choose_method(REPAIRED, scenario, 1e-4) == amb.solvers.AdaptiveRodas3(QUIET_TOLERANCE)
+    assert amb.solvers.choose_method(SMOOTH, noisy, 1e-4) == amb.solvers.DOP853(1)
+    for kink in (
+        {"u_max": 100.0},
+        {"q_z": amb.signals.Pulse(1.0, 0.01003, 0.02)},
+        {"reference": amb.signals.Step(1e-4, 0.00103)},
+    ):
         one = dataclasses.replace(noisy, **kink)
-        assert amb.choose_method(SMOOTH, one, 1e-4) == amb.AdaptiveCashKarp(TIGHT)
-    assert amb.choose_method(REPAIRED, noisy, 1e-4) == amb.AdaptiveRodas3(TOLERANCE)
-    assert isinstance(amb.choose_method(REPAIRED, TRACKING, 1e-4), amb.AdaptiveRodas3)
-    assert isinstance(amb.choose_method(REPAIRED, TRACKING, 1e-4, reverse=True), amb.Rodas3)
-    assert isinstance(amb.choose_method(SMOOTH, TRACKING, 1e-4, reverse=True), amb.RK4)
-    mine = amb.Clock(method=amb.Rodas3(4))
-    assert amb.with_method(mine, REPAIRED, TRACKING) is mine
+        assert amb.solvers.choose_method(SMOOTH, one, 1e-4) == amb.solvers.AdaptiveCashKarp(TIGHT)
+    assert amb.solvers.choose_method(REPAIRED, noisy, 1e-4) == amb.solvers.AdaptiveRodas3(TOLERANCE)
+    assert isinstance(amb.solvers.choose_method(REPAIRED, TRACKING, 1e-4), amb.solvers.AdaptiveRodas3)
+    assert isinstance(amb.solvers.choose_method(REPAIRED, TRACKING, 1e-4, reverse=True), amb.solvers.Rodas3)
+    assert isinstance(amb.solvers.choose_method(SMOOTH, TRACKING, 1e-4, reverse=True), amb.solvers.RK4)
+    mine = amb.Clock(method=amb.solvers.Rodas3(4))
+    assert amb.solvers.with_method(mine, REPAIRED, TRACKING) is mine
 
 
 # R / L of a wide gap times the sample is 12: two substeps, which suffice for the motion, are unstable
 LIGHT = {"n": 50.0, "A": 1e-4, "mu_0": 1.2566e-6, "s_0": 5e-4, "i_0": 1.0, "m": 0.1, "R": 10.0, "k_z": 0.0}
 
 
-@pytest.mark.parametrize("kind", [amb.Plant, amb.TwoCoil])
+@pytest.mark.parametrize("kind", [amb.plants.Plant, amb.plants.TwoCoil])
 def test_the_chosen_step_resolves_coils_that_settle_within_a_sample(kind):
     plant, period = kind(**LIGHT), 2e-4
     sampled, world = amb.Cascade(processor=amb.Processor()), amb.Scenario(plant=plant)
     at = lambda z: jax.jacfwd(plant.rates)(plant.start(amb.world.sensor.Measurement(z, 0.0, 0.0)), 0.0)  # noqa: E731
     steepest = max(np.abs(np.linalg.eigvals(_matrix(at(z)))).max() for z in (-0.9 * 5e-4, 0.9 * 5e-4))
-    method = amb.choose_method(sampled, world, period)
-    assert isinstance(method, amb.RK4)
+    method = amb.solvers.choose_method(sampled, world, period)
+    assert isinstance(method, amb.solvers.RK4)
     assert 0.4 < steepest * method.step_size(period) < 0.5
-    wide = amb.Cascade(inversion=amb.inversion.Adaptive(1e3, 25.0))
+    wide = amb.Cascade(inversion=amb.laws.inversion.Adaptive(1e3, 25.0))
     for cascade in (sampled, wide):
         with pytest.raises(
             ValueError, match=r"only up to 4.6e-05 s, because the current in the coils has slope 6.05e\+04"
         ):
-            amb.with_method(amb.Clock(10, period, amb.RK4(2)), cascade, world)
+            amb.solvers.with_method(amb.Clock(10, period, amb.solvers.RK4(2)), cascade, world)
 
     @functools.partial(jax.jit, static_argnums=0)
     def moved(substeps):
@@ -283,13 +308,13 @@ def test_the_chosen_step_resolves_coils_that_settle_within_a_sample(kind):
             lambda t: (), lambda _, x: plant.rates(x, 10.0), plant.scale(), lambda x: jnp.int32(0)
         )
         start = plant.start(amb.world.sensor.Measurement(*map(jnp.asarray, (1e-4, 0.0, -0.2))))
-        return plant.measurement(amb.RK4(substeps).advance(held, 0.0, period, start, ()).state)
+        return plant.measurement(amb.solvers.RK4(substeps).advance(held, 0.0, period, start, ()).state)
 
     error = np.abs(np.subtract(moved(method.substeps), moved(20 * method.substeps)))
     np.testing.assert_array_less(error, [1e-11, 1e-6, 1e-6])
     stiff = dataclasses.replace(world, plant=dataclasses.replace(plant, R=1e4))
-    assert isinstance(amb.choose_method(sampled, stiff, period), amb.AdaptiveRodas3)
-    assert amb.choose_method(sampled, stiff, period, reverse=True) == amb.Rodas3(64)
+    assert isinstance(amb.solvers.choose_method(sampled, stiff, period), amb.solvers.AdaptiveRodas3)
+    assert amb.solvers.choose_method(sampled, stiff, period, reverse=True) == amb.solvers.Rodas3(64)
 
 
 def _matrix(jacobian):
@@ -300,9 +325,12 @@ def _matrix(jacobian):
 @pytest.mark.parametrize("p", [1e3, 1e6, 1e9])
 def test_a_sign_as_steep_as_a_relay_does_not_stall_the_adaptive_method(p):
     """The limit p -> infinity exists (the sliding mode). The layer narrows as 1/p, here from 1e-8 A to 1e-14 A."""
-    noisy = dataclasses.replace(TRACKING, sensor=amb.Sensor(1e-6))
-    cascade = amb.Cascade(inversion=amb.inversion.Adaptive(p=p))
-    found = [amb.rollout(cascade, noisy, amb.Clock(300, 1e-4, step)) for step in (amb.AdaptiveRodas3(), amb.Slide(64))]
+    noisy = dataclasses.replace(TRACKING, sensor=amb.sensors.Sensor(1e-6))
+    cascade = amb.Cascade(inversion=amb.laws.inversion.Adaptive(p=p))
+    found = [
+        amb.rollout(cascade, noisy, amb.Clock(300, 1e-4, step))
+        for step in (amb.solvers.AdaptiveRodas3(), amb.solvers.Slide(64))
+    ]
     assert not np.isfinite(found[0].trajectory.lost_at)
     z, expected = (np.asarray(f.trajectory.rows.z) for f in found)
     # of a motion of 1e-3 m; both methods have errors of this size here
@@ -343,8 +371,8 @@ def test_optax_reduces_an_error_over_the_gains_of_a_law_with_the_default_clock()
 
 def test_a_fixed_number_of_steps_is_not_chosen_from_traced_values():
     def chosen(gamma):
-        cascade = amb.Cascade(inversion=amb.inversion.Adaptive(gamma=gamma, p=25e-6))
-        return amb.with_method(amb.Clock(10), cascade, TRACKING, reverse=True).sample_period
+        cascade = amb.Cascade(inversion=amb.laws.inversion.Adaptive(gamma=gamma, p=25e-6))
+        return amb.solvers.with_method(amb.Clock(10), cascade, TRACKING, reverse=True).sample_period
 
     with pytest.raises(ValueError, match=r"with_method\(clock, cascade, scenario, reverse=True\)"):
         jax.jit(chosen)(1e9)

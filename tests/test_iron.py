@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import RK4, Plant, simulate
+from ambjax import simulate
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
+from ambjax.plants import Plant
+from ambjax.solvers import RK4
 from ambjax.world.coils import TwoCoil
 from ambjax.world.iron import AIR, Iron
 from ambjax.world.sensor import Measurement

@@ -13,18 +13,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import AdaptiveRodas3, Cascade, Clock, Plant, Pulse, Scenario, Sine, rollout
+from ambjax import Cascade, Clock, Scenario, rollout
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.base import Law, scaled_steepness
 from ambjax.control.force import linear_mechanics
-from ambjax.control.laws import CurrentDemand, CurrentInputs, ForceDemand
 from ambjax.control.pid import PIDState
 from ambjax.control.search import LowerBound, SearchContext
+from ambjax.control.stages import CurrentDemand, CurrentInputs, ForceDemand
 from ambjax.numerics.records import validate
 from ambjax.numerics.smooth import smooth_sign
+from ambjax.plants import Plant
+from ambjax.signals import Pulse, Sine
+from ambjax.solvers import AdaptiveRodas3
 from ambjax.world.amplifier import CurrentAmplifier
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference, reference_at
+from ambjax.world.waveforms import Reference, reference_at
 
 # stage, law
 LAWS = [

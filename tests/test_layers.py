@@ -14,7 +14,8 @@ ROOT = pathlib.Path(__file__).parent.parent
 # The layers of each package, the lowest first: each is a folder, or a module beside these folders. A module
 # imports only from lower layers or from its own, without a cycle.
 LAYERS = {
-    "ambjax": "_version text compiler numerics host world control simulation extend codegen theorem ensemble linear "
+    "ambjax": "_version text compiler numerics host world control simulation "
+    "extend laws signals plants sensors actuators solvers codegen theorem ensemble linear "
     "paper pictures cases results page commands __init__ __main__",
     "tuning": "events optimisers problem judge solve validate front rounds report command __init__ __main__",
 }
@@ -24,7 +25,7 @@ FILES = sorted([*ROOT.glob("ambjax/**/*.py"), *ROOT.glob("tuning/**/*.py")])
 
 
 def module_of(path):
-    """Dotted name of a file: ambjax.control.laws; a package's own file is the package."""
+    """Dotted name of a file: ambjax.control.stages; a package's own file is the package."""
     parts = path.relative_to(ROOT).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from ambjax import Cascade, Clock, Plant, Scenario, Sensor
+from ambjax import Cascade, Clock, Scenario
 from ambjax.compiler.short_compilation import QUICKEST, supported
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.processor import Processor
@@ -23,6 +23,8 @@ from ambjax.linear import (
     peak,
 )
 from ambjax.linear.equilibrium import ideal
+from ambjax.plants import Plant
+from ambjax.sensors import Sensor
 from ambjax.simulation.explicit import DOP853
 from ambjax.simulation.rollout import prepare
 from ambjax.world.amplifier import Amplifier

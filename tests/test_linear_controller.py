@@ -12,14 +12,16 @@ import numpy as np
 import pytest
 import scipy.io
 
-from ambjax import Cascade, Clock, Plant, Processor, Scenario, current, inversion, position, save_controller
+from ambjax import Cascade, Clock, Processor, Scenario, save_controller
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
 from ambjax.control.realisation import MOST_STATES, realisation
 from ambjax.ensemble.paths import kinds
+from ambjax.laws import current, inversion, position
 from ambjax.linear import linearise
+from ambjax.plants import Plant
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 from tuning.report.tuned import tuned_case
 
 MODEL, PERIOD = Plant(), 1e-4

@@ -14,7 +14,7 @@ import pytest
 from javascript import run_rows, with_node
 from profiles import THOROUGH
 
-from ambjax import Cascade, Clock, Plant, Scenario, rollout
+from ambjax import Cascade, Clock, Scenario, rollout
 from ambjax.cases.controller_tables import KINDS
 from ambjax.cases.reader import case_from
 from ambjax.control import current, inversion
@@ -26,6 +26,7 @@ from ambjax.numerics.records import canonical
 from ambjax.page.functions import PRELUDE
 from ambjax.page.linear_script import linear_script
 from ambjax.page.loop_functions import loop_parameters
+from ambjax.plants import Plant
 from ambjax.world.scenario import Initial
 
 RIG = Plant(1.64, 0.0, 1.2566e-6, 208.0, 2.68e-4, 5e-4, 2.5, 1.0, 0.0)

@@ -68,9 +68,12 @@ RPM = 2 * np.pi / 60
 @pytest.mark.parametrize(
     ("signal", "knots"),
     [
-        (amb.Ramp(3.0, 0.1, 0.2), [(0, 0), (0.1, 0), (0.3, 3), (9, 3)]),
-        (amb.Trapezoid(-2.0, 0.1, 0.05, 0.1, 0.2), [(0, 0), (0.1, 0), (0.15, -2), (0.25, -2), (0.45, 0), (9, 0)]),
-        (amb.Trapezoid(2.0, 0.1, 0.05, 0.0, 0.2), [(0, 0), (0.1, 0), (0.15, 2), (0.35, 0), (9, 0)]),
+        (amb.signals.Ramp(3.0, 0.1, 0.2), [(0, 0), (0.1, 0), (0.3, 3), (9, 3)]),
+        (
+            amb.signals.Trapezoid(-2.0, 0.1, 0.05, 0.1, 0.2),
+            [(0, 0), (0.1, 0), (0.15, -2), (0.25, -2), (0.45, 0), (9, 0)],
+        ),
+        (amb.signals.Trapezoid(2.0, 0.1, 0.05, 0.0, 0.2), [(0, 0), (0.1, 0), (0.15, 2), (0.35, 0), (9, 0)]),
     ],
 )
 def test_piecewise_linear_signals_pass_through_their_corners(signal, knots):
@@ -85,10 +88,10 @@ def test_piecewise_linear_signals_pass_through_their_corners(signal, knots):
 def test_the_force_of_an_unbalance_by_hand():
     # 120 g mm at 6000 rpm: 1.2e-4 kg m (628 1/s)^2 = 47.4 N
     t = np.linspace(0, 0.05, 40)
-    force = amb.Unbalance(120.0, 0.4, Rotation(6000.0))(t)
+    force = amb.signals.Unbalance(120.0, 0.4, Rotation(6000.0))(t)
     np.testing.assert_allclose(force, 1.2e-4 * (6000 * RPM) ** 2 * np.sin(6000 * RPM * t + 0.4), rtol=0, atol=1e-10)
     # G 2.5 at 6000 rpm: e = 2.5e-3/628 = 3.98 um, and twice the service speed is four times the acceleration
-    acceleration = amb.UnbalanceGrade(2.5, 6000.0, rotation=Rotation(12000.0))(t)
+    acceleration = amb.signals.UnbalanceGrade(2.5, 6000.0, rotation=Rotation(12000.0))(t)
     expected = 4 * 2.5e-3 * 6000 * RPM * np.sin(2 * 6000 * RPM * t)
     np.testing.assert_allclose(acceleration, expected, rtol=0, atol=1e-11)
 
@@ -97,7 +100,7 @@ def test_the_phase_of_a_run_up_is_the_integral_of_the_speed():
     from scipy.integrate import quad
 
     # 2400 rpm in 0.2 s
-    run_up = amb.Unbalance(120.0, 0.3, Rotation(600.0, 12000.0, 3000.0))
+    run_up = amb.signals.Unbalance(120.0, 0.3, Rotation(600.0, 12000.0, 3000.0))
 
     def speed(t):  # 1/s
         return RPM * (600 + (3000 - 600) * min(t / 0.2, 1.0))
@@ -195,14 +198,14 @@ def test_a_table_reproduces_the_sampled_signal(name, tmp_path):
     load = {"kind": "table", "file": name, "unit": "N", "scale": 2.0, "start": 0.5}
     case = case_from({"disturbance": {"q_z": load}}, folder=tmp_path)
     t = np.linspace(0, 1.5, 151)
-    np.testing.assert_allclose(case.scenario.q_f(t), amb.Ramp(6.0, 0.6, 0.2)(t), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(case.scenario.q_f(t), amb.signals.Ramp(6.0, 0.6, 0.2)(t), rtol=0, atol=1e-13)
     assert case.scenario.q_f.span(1.0) == (0, 6)
     # held: each value until the next time, at which it jumps
     held = case_from({"disturbance": {"q_z": load | {"interpolation": "held"}}}, folder=tmp_path).scenario.q_f
     np.testing.assert_array_equal(held(0.5 + np.array([-1, 0.2, 0.2999, 0.3, 9])), [0, 0, 0, 6, 6])
     # the file is a part of the structure: equal numbers give an equal tree, other numbers another
     assert jax.tree.structure(held) == jax.tree.structure(held.shifted(1.0))
-    other = dataclasses.replace(held, samples=amb.Samples(knots, knots))
+    other = dataclasses.replace(held, samples=amb.signals.Samples(knots, knots))
     assert jax.tree.structure(held) != jax.tree.structure(other)
 
 

@@ -8,8 +8,10 @@ from dense import costs, metrics
 from oracle import World
 from test_oracle import Case, adaptive, current, in_ambjax, noise_of, pulse, sine, smc
 
-from ambjax import AdaptiveRodas3, Clock, Sensor, rollout
+from ambjax import Clock, rollout
+from ambjax.sensors import Sensor
 from ambjax.simulation.folds import Named
+from ambjax.solvers import AdaptiveRodas3
 from tuning.problem.limits import measures
 from tuning.problem.loss import Loss
 from tuning.problem.quantities import LimitContext
@@ -47,7 +49,7 @@ def both(name):
     context = LimitContext(settle, float(clock.duration), float(scenario.touchdown), band)
     folds = measures(("chatter_V_per_s", "settling_s", "overshoot_m"), (), context)
     fold = Named({"loss": Loss(settle, 0.0, S_0, U, near), "limits": Named(folds)})
-    found = rollout(cascade, scenario, clock, fold=fold, every=0).measured
+    found = rollout(cascade, scenario, clock, fold=fold, record_every=0).metrics
     ours = {key: float(value) for part in found.values() for key, value in part.items()}
     numbers = functools.partial(costs, s_0=S_0, u_scale=U, near=near, band=band)
     return ours, metrics(world, samples, PERIOD, settle, noise_of(case, scenario), numbers=numbers)

@@ -250,7 +250,7 @@ def test_a_machine_is_differentiable_and_an_ensemble_has_one_entry_per_member(ma
     def displacement(amount):
         one = dataclasses.replace(whole.rotor.unbalances[0], amount=amount)
         moved = dataclasses.replace(whole, rotor=dataclasses.replace(whole.rotor, unbalances=(one,)))
-        return run(moved, clock, fold, every=0).measured[0]
+        return run(moved, clock, fold, record_every=0).metrics[0]
 
     at, h = 20.0, 1e-2
     slope = float(jax.grad(displacement)(at))

@@ -13,7 +13,7 @@ from ambjax.linear.linear_machine import machine_sensitivity
 from ambjax.results.machine_run import simulate_machine
 
 # The fast tests take the machines with the most features.
-FAST = ("five", "bending")
+FAST = ("bending", "coordinates")
 NAMES = [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in MACHINES]
 
 

@@ -8,14 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import Cascade, Initial, Plant, Scenario, Sine, position
+from ambjax import Cascade, Initial, Scenario
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
+from ambjax.laws import position
 from ambjax.linear import linearise
 from ambjax.numerics.smooth import smooth_sign
+from ambjax.plants import Plant
+from ambjax.signals import Sine
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 MODEL, STILL = Plant(), Reference(0.0, 0.0, 0.0)
 

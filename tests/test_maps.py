@@ -7,14 +7,18 @@ import numpy as np
 import pytest
 
 import ambjax
-from ambjax import RK4, AdaptiveRodas3, Cascade, Clock, Initial, Plant, Scenario, Sensor, inversion, paper, rollout
+from ambjax import Cascade, Clock, Initial, Scenario, paper, rollout
 from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.commands import map as commands
 from ambjax.ensemble import Normal, Spread, maps, wilson
 from ambjax.ensemble.maps import Axis, grid
 from ambjax.ensemble.study import Study
+from ambjax.laws import inversion
+from ambjax.plants import Plant
+from ambjax.sensors import Sensor
 from ambjax.simulation.folds import Peak
+from ambjax.solvers import RK4, AdaptiveRodas3
 
 PLANT = Plant()
 CURRENT = float(PLANT.equilibrium(0.0)[0])
@@ -60,7 +64,9 @@ def test_a_cell_equals_an_ensemble_of_its_own_case():
         cascade, scenario = SMALL.member(k)
         plant, sensor = dataclasses.replace(scenario.plant, m=0.7), Sensor(1e-7, 0.0, 0.0)
         world = dataclasses.replace(scenario, plant=plant, sensor=sensor)
-        errors.append(float(rollout(cascade, world, SMALL.clock, fold=Peak("e_z", SMALL.settle), every=0).measured))
+        errors.append(
+            float(rollout(cascade, world, SMALL.clock, fold=Peak("e_z", SMALL.settle), record_every=0).metrics)
+        )
     # the same members in another program: rounding
     np.testing.assert_allclose(found.error[1, 2], np.median(errors), rtol=1e-11)
     assert found.survival.shape == (2, 3)
@@ -217,9 +223,9 @@ def test_the_command_states_the_drawn_outlines_and_the_undecided_cells(tmp_path,
 
     def stalling(*args, **options):
         outcome = run(*args, **options)
-        first = np.arange(len(outcome.measured["lost_at_s"])) == 0
+        first = np.arange(len(outcome.metrics["lost_at_s"])) == 0
         status = {"lost_at_s": np.where(first, 1e-3, np.inf), "stalled": first}
-        return outcome._replace(measured=outcome.measured | status)
+        return outcome._replace(metrics=outcome.metrics | status)
 
     monkeypatch.setattr(maps, "run_ensemble", stalling)
     assert main([*argv, "--members", "2"]) == 0

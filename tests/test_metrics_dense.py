@@ -8,8 +8,10 @@ from dense import metrics
 from oracle import World
 from test_oracle import BUMP, Case, adaptive, current, in_ambjax, noise_of, pulse, sine, smc
 
-from ambjax import AdaptiveRodas3, Clock, Sensor, Slide, rollout
-from ambjax.simulation.metrics import Standard
+from ambjax import Clock, rollout
+from ambjax.sensors import Sensor
+from ambjax.simulation.metrics import Metrics
+from ambjax.solvers import AdaptiveRodas3, Slide
 from tuning.problem.tuning_problem import REFINEMENT
 
 PERIOD = 1e-4
@@ -58,7 +60,7 @@ def numbers(world, std, samples, settle, method):
     cascade, scenario, _ = in_ambjax(case)
     if any(std):
         scenario = dataclasses.replace(scenario, sensor=Sensor(*std))
-    found = rollout(cascade, scenario, Clock(samples, PERIOD, method), fold=Standard(settle), every=0).measured
+    found = rollout(cascade, scenario, Clock(samples, PERIOD, method), fold=Metrics(settle), record_every=0).metrics
     return {name: float(x) for name, x in found.items()}, noise_of(case, scenario)
 
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ambjax import Scenario, Sensor
+from ambjax import Scenario
 from ambjax.numerics.gaussian import normals, threefry
+from ambjax.sensors import Sensor
 
 NOISY = Scenario(sensor=Sensor(1e-6, 1e-4, 1e-4))
 

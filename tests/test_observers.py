@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ambjax import Cascade, Clock, Plant, Scenario, Sensor, Sine, rollout
+from ambjax import Cascade, Clock, Scenario, rollout
 from ambjax.cases.reader import case_from
 from ambjax.control import inversion
 from ambjax.control.cascade_state import Sample
@@ -15,8 +15,11 @@ from ambjax.control.inversion import StaticInversionState
 from ambjax.control.observer import IRED1, IRED2, Difference, Direct, Kalman, Predicted
 from ambjax.control.processor import Processor
 from ambjax.numerics import differentiator
+from ambjax.plants import Plant
+from ambjax.sensors import Sensor
+from ambjax.signals import Sine
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import reference_at
+from ambjax.world.waveforms import reference_at
 
 MODEL = Plant()
 T = 1e-4

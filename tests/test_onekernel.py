@@ -8,27 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import (
-    RK4,
-    AdaptiveRodas3,
-    Cascade,
-    Clock,
-    Constant,
-    Initial,
-    Pulse,
-    Recorded,
-    Samples,
-    Scenario,
-    Sensor,
-    Sine,
-    Standard,
-    inversion,
-    observer,
-    position,
-)
+from ambjax import Cascade, Clock, Initial, Metrics, Scenario
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble, run_on_gpu
+from ambjax.laws import inversion, observer, position
+from ambjax.sensors import Sensor
+from ambjax.signals import Constant, Pulse, Recorded, Samples, Sine
 from ambjax.simulation.folds import Named, Peak, Variation
+from ambjax.solvers import RK4, AdaptiveRodas3
 from ambjax.world.band_noise import BandNoise
 
 MEMBERS, CLOCK = 37, Clock(5, 1e-4, RK4(2))
@@ -84,7 +71,7 @@ def test_the_kernel_compiles_for_a_gpu(laws, x64, changes, monkeypatch):
     scenario = dataclasses.replace(SCENARIO, **changes)
     with jax.enable_x64(x64):
         run = jax.jit(
-            lambda z: run_on_gpu(LAWS[laws], dataclasses.replace(scenario, initial=z), CLOCK, fold=Standard(2e-4))
+            lambda z: run_on_gpu(LAWS[laws], dataclasses.replace(scenario, initial=z), CLOCK, fold=Metrics(2e-4))
         )
         lowered = run.trace(scenario.initial).lower(lowering_platforms=("cuda",)).as_text()
     assert lowered.count("custom_call @__gpu$xla.gpu.triton") == 1

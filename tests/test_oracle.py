@@ -13,12 +13,17 @@ from oracle import REST, TABLE_1, World, solve
 import ambjax as amb
 
 KINDS = {
-    "observer": {"direct": amb.observer.Direct, "complementary": amb.observer.Complementary},
-    "position": {"sliding-mode": amb.position.SlidingMode, "super-twisting": amb.position.SuperTwisting},
-    "inversion": {"adaptive": amb.inversion.Adaptive, "closed-form": amb.inversion.ClosedForm},
-    "current": {"sliding-mode": amb.current.SlidingMode, "pi": amb.current.ProportionalIntegral},
+    "observer": {"direct": amb.laws.observer.Direct, "complementary": amb.laws.observer.Complementary},
+    "position": {"sliding-mode": amb.laws.position.SlidingMode, "super-twisting": amb.laws.position.SuperTwisting},
+    "inversion": {"adaptive": amb.laws.inversion.Adaptive, "closed-form": amb.laws.inversion.ClosedForm},
+    "current": {"sliding-mode": amb.laws.current.SlidingMode, "pi": amb.laws.current.ProportionalIntegral},
 }
-SIGNALS = {"constant": amb.Constant, "sine": amb.Sine, "smoothstep": amb.SmoothStep, "pulse": amb.Pulse}
+SIGNALS = {
+    "constant": amb.signals.Constant,
+    "sine": amb.signals.Sine,
+    "smoothstep": amb.signals.SmoothStep,
+    "pulse": amb.signals.Pulse,
+}
 
 
 @dataclass(frozen=True)
@@ -28,7 +33,7 @@ class Case:
     samples: int = 3000
     std: float = 0.0  # of the position sensor, m
     solver: str = "Radau"
-    tight: Any = amb.AdaptiveRodas3(tolerance=1e-9)
+    tight: Any = amb.solvers.AdaptiveRodas3(tolerance=1e-9)
 
 
 def sine(amplitude=2.5e-3, frequency=2.0):
@@ -98,7 +103,7 @@ CASES = [
     SLOW(Case("supply limited on the way", World(u_max=108.0, reference=sine()))),
     Case("held noise", World(reference=sine()), samples=200, std=1e-6, solver="DOP853"),
     SLOW(Case("super-twisting", World(position=twisting(), reference=sine(), q_v=BUMP))),
-    SLOW(Case("closed form", World(inversion=CLOSED, reference=sine(), q_v=BUMP), tight=amb.RK4(4))),
+    SLOW(Case("closed form", World(inversion=CLOSED, reference=sine(), q_v=BUMP), tight=amb.solvers.RK4(4))),
     SLOW(Case("PI current, wound up at the start", World(current=pi(k_aw=2000.0), u_max=45.0), samples=1000)),
     SLOW(Case("complementary observer", World(
         observer=("complementary", {"l": 10.0}), initial=(1e-4, 0.0, 0.0), inversion=adaptive(2e5), reference=sine(),
@@ -122,13 +127,13 @@ CASES += [
 def in_ambjax(case):
     world = case.world
     laws = {stage: kinds[getattr(world, stage)[0]](**getattr(world, stage)[1]) for stage, kinds in KINDS.items()}
-    cascade = amb.Cascade(**laws, model=amb.Plant(**(TABLE_1 | world.plant | world.model)))
+    cascade = amb.Cascade(**laws, model=amb.plants.Plant(**(TABLE_1 | world.plant | world.model)))
     signals = {name: getattr(world, name) for name in ("reference", "q_z", "q_v", "q_i")}
     scenario = amb.Scenario(
-        plant=amb.Plant(**(TABLE_1 | world.plant)),
+        plant=amb.plants.Plant(**(TABLE_1 | world.plant)),
         initial=amb.Initial(*world.initial),
         u_max=world.u_max,
-        sensor=amb.Sensor(std=case.std) if case.std else None,
+        sensor=amb.sensors.Sensor(std=case.std) if case.std else None,
         seed=7,
         **{name: SIGNALS[kind](**p) for name, (kind, p) in signals.items()},
     )

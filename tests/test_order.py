@@ -5,9 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import Cascade, Sine, inversion, observer
+from ambjax import Cascade
+from ambjax.laws import inversion, observer
+from ambjax.signals import Sine
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import reference_at
+from ambjax.world.waveforms import reference_at
 
 
 @pytest.mark.slow

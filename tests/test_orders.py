@@ -7,11 +7,11 @@ import jax
 import numpy as np
 import pytest
 
-from ambjax import Rotation
 from ambjax.__main__ import main
 from ambjax.cases.machine_case import machine_from
 from ambjax.cases.template_text import template
 from ambjax.results.machine_run import simulate_machine
+from ambjax.signals import Rotation
 from ambjax.simulation.folds import Ending
 from ambjax.simulation.orders import SIGNALS, UNITS, Orders
 from ambjax.simulation.trajectory import Row

@@ -14,19 +14,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ambjax import (
-    AdaptiveRodas3,
-    Cascade,
-    Clock,
-    Initial,
-    Pulse,
-    Scenario,
-    Sensor,
-    Sine,
-    choose_method,
-    inversion,
-    rollout,
-)
+from ambjax import Cascade, Clock, Initial, Scenario, rollout
 from ambjax.ensemble import Normal, Percent, Spread
 from ambjax.ensemble.study import Study
 from ambjax.extend import (
@@ -43,8 +31,12 @@ from ambjax.extend import (
     record,
     sliding_variable,
 )
+from ambjax.laws import inversion
+from ambjax.sensors import Sensor
+from ambjax.signals import Pulse, Sine
 from ambjax.simulation.loop import ClosedLoop
-from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.metrics import Metrics
+from ambjax.solvers import AdaptiveRodas3, choose_method
 from ambjax.theorem.conditions import check
 
 
@@ -196,7 +188,7 @@ def test_the_numbers_of_a_custom_law_and_plant_are_spread():
     cascade, scenario = study.member(5)
     assert scenario.plant.skew == columns["spread." + SKEW][5]
     assert cascade.position.rho == columns["spread." + RHO][5]
-    alone = rollout(cascade, scenario, study.clock, fold=standard_for(0.01, scenario)).measured
+    alone = rollout(cascade, scenario, study.clock, fold=Metrics.of(0.01, scenario)).metrics
     # the same arithmetic in another order
     assert float(alone["rms_error_m"]) == pytest.approx(columns["rms_error_m"][5], rel=1e-9)
     assert study.fingerprint()["plant.kind"] == "TwoCoils"

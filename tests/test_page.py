@@ -193,7 +193,7 @@ def test_the_metrics_equal_the_simulator(fresh, case):
 def test_the_members_equal_those_of_the_ensemble(fresh, case):
     study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, MEMBERS)
     errors = np.asarray(
-        run_ensemble(*study.batch(np.arange(MEMBERS)), case.clock, fold=None, every=1).trajectory.rows.e_z
+        run_ensemble(*study.batch(np.arange(MEMBERS)), case.clock, fold=None, record_every=1).trajectory.rows.e_z
     )
     low, high = (np.array(fresh.run(f"Array.from(ambjax.state.envelope.{end})")) for end in ("low", "high"))
     np.testing.assert_allclose([low, high], [errors.min(axis=0), errors.max(axis=0)], rtol=0, atol=1e-12)

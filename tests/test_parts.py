@@ -4,10 +4,14 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from ambjax import RK4, Cascade, Clock, Scenario, Sensor, Sine, current, inversion, position
+from ambjax import Cascade, Clock, Scenario
+from ambjax.laws import current, inversion, position
+from ambjax.sensors import Sensor
+from ambjax.signals import Sine
 from ambjax.simulation.folds import Rms
 from ambjax.simulation.parts import part_length, rolled_in_parts
 from ambjax.simulation.rollout import prepare
+from ambjax.solvers import RK4
 from tuning.problem.tuning_problem import cheaper_mode
 
 
@@ -26,7 +30,7 @@ def gradient_in_parts(samples):
             inversion=inversion.Adaptive(1e9, 25e-6),
             current=current.SlidingMode(152.0),
         )
-        return rolled_in_parts(*prepare(cascade, scenario, clock), Rms("e_z")).measured ** 2
+        return rolled_in_parts(*prepare(cascade, scenario, clock), Rms("e_z")).metrics ** 2
 
     return jax.jit(jax.value_and_grad(loss)).lower(0.0).compile()
 

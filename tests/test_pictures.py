@@ -14,7 +14,7 @@ from ambjax.pictures import fans, heatmaps, histograms
 from ambjax.pictures.scales import AXIS_UNITS, LABELS, axis_of, edges, label_of, prefix_of
 from ambjax.pictures.tornado import Bar, tornado
 from ambjax.simulation import orders
-from ambjax.simulation.metrics import UNITS, Standard
+from ambjax.simulation.metrics import UNITS, Metrics
 
 PERCENTS = (0, 5, 25, 50, 75, 95, 100)
 
@@ -72,7 +72,7 @@ def test_the_prefix_of_a_unit(unit, size, expected):
 
 
 def test_every_metric_has_its_unit():
-    names = [*Standard()._folds().folds, *orders.UNITS, "force_used", "lost_at_s", "singular_at_s"]
+    names = [*Metrics()._folds().folds, *orders.UNITS, "force_used", "lost_at_s", "singular_at_s"]
     assert set(names) == set(LABELS)
     assert set(UNITS) | set(AXIS_UNITS) == {*names, "settle_s"}
     for name, unit in UNITS.items():  # the name of a metric ends in its unit

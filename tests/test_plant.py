@@ -6,9 +6,10 @@ import jax
 import numpy as np
 import pytest
 
-from ambjax import Plant, Scenario
+from ambjax import Scenario
 from ambjax.cases.reader import case_from
-from ambjax.simulation.metrics import Standard, standard_for
+from ambjax.plants import Plant
+from ambjax.simulation.metrics import Metrics
 from ambjax.world.coils import Currents, TwoCoil
 from ambjax.world.iron import Iron
 from ambjax.world.sensor import Measurement
@@ -197,16 +198,16 @@ def test_finite_with_finite_derivatives_at_and_beyond_the_gap(function):
 
 def test_thresholds_follow_the_plant():
     """The bands are the same share of the sizes of sigma, v and i for every plant; the defaults are of Table 1."""
-    paper = standard_for(0.5, Scenario(clearance=4.5e-3))
-    assert dataclasses.replace(paper, largest_force=np.inf) == Standard()
+    paper = Metrics.of(0.5, Scenario(clearance=4.5e-3))
+    assert dataclasses.replace(paper, largest_force=np.inf) == Metrics()
     assert float(paper.largest_force) == pytest.approx(PLANT.k_i * PLANT.i_0, rel=1e-12)
     small = Plant(m=1.2, s_0=4e-4, i_0=1.5, n=180.0, A=4e-4, R=0.9, k_z=0.0)
-    bands = standard_for(0.5, Scenario(plant=small))
+    bands = Metrics.of(0.5, Scenario(plant=small))
     assert bands.touchdown == 0.9 * small.s_0
     # gap x pole, with the pole of k_s = kappa i_0^2 / s_0^3 over m
     kappa = small.mu_0 * 180.0**2 * 4e-4
     pole = (kappa * 1.5**2 / 4e-4**3 / 1.2) ** 0.5
-    assert bands.sigma_band / (pole * 4e-4) == pytest.approx(Standard().sigma_band / (528.0 * 5e-3), rel=6e-3)
+    assert bands.sigma_band / (pole * 4e-4) == pytest.approx(Metrics().sigma_band / (528.0 * 5e-3), rel=6e-3)
     assert bands.v_tilde_band == pytest.approx(0.1 * (1.5 / 4e-4) ** 2 / (0.25 / 5e-3) ** 2)
     assert bands.e_band == pytest.approx(1e-3 * 1.5 / 0.25)
 

@@ -132,14 +132,14 @@ def test_dead_band_and_current_limit():
 
 def laws(p=math.inf, **processor):
     return amb.Cascade(
-        position=amb.position.SlidingMode(1440.0, 2.3, p),
-        inversion=amb.inversion.Adaptive(8e5, p),
-        current=amb.current.SlidingMode(870.0, p),
+        position=amb.laws.position.SlidingMode(1440.0, 2.3, p),
+        inversion=amb.laws.inversion.Adaptive(8e5, p),
+        current=amb.laws.current.SlidingMode(870.0, p),
         processor=Processor(**processor),
     )
 
 
-WORLD = amb.Scenario(reference=amb.Sine(2.5e-3, 2.0), sensor=Sensor(1e-6, 1e-4, 1e-4), u_max=200.0, seed=3)
+WORLD = amb.Scenario(reference=amb.signals.Sine(2.5e-3, 2.0), sensor=Sensor(1e-6, 1e-4, 1e-4), u_max=200.0, seed=3)
 CLOCK = amb.Clock(400, 1e-4)
 
 
@@ -163,16 +163,16 @@ def test_the_largest_voltage_is_that_at_the_coils_and_within_the_supply():
     case = case_from(tomllib.loads(template("rig")))
     # fast away from the wider gap, at the limit: 78 V less would keep the current
     falling = dataclasses.replace(case.scenario, initial=amb.Initial(-2e-4, 0.2, 2.5))
-    clock, fold = dataclasses.replace(case.clock, samples=4), amb.Standard()
-    assert amb.rollout(case.cascade, falling, clock, fold=fold).measured["max_abs_u_V"] == 48.0
+    clock, fold = dataclasses.replace(case.clock, samples=4), amb.Metrics()
+    assert amb.rollout(case.cascade, falling, clock, fold=fold).metrics["max_abs_u_V"] == 48.0
     # 1 V per sample, and one sample late
     slow = dataclasses.replace(falling, amplifier=Amplifier(slew=2e4), initial=amb.Initial(1e-4))
     found = amb.rollout(case.cascade, slow, clock, fold=Named({"judge": fold, "search": Typical("u_peak", 3.0)}))
     assert np.abs(found.trajectory.rows.u).max() > 10
     u_peak = found.trajectory.rows.u_peak
     np.testing.assert_allclose(u_peak, [0.0, 1.0, 2.0, 3.0], rtol=0, atol=1e-9)
-    assert found.measured["judge"]["max_abs_u_V"] == u_peak.max()
-    np.testing.assert_allclose(found.measured["search"], np.mean(u_peak**16) ** (1 / 16), rtol=1e-12)
+    assert found.metrics["judge"]["max_abs_u_V"] == u_peak.max()
+    np.testing.assert_allclose(found.metrics["search"], np.mean(u_peak**16) ** (1 / 16), rtol=1e-12)
 
 
 CASE = {"processor": {}, "clock": {"duration": 0.01}}
@@ -221,8 +221,8 @@ def test_the_rig_holds_its_rotors_with_the_velocity_estimated():
         case.scenario, initial=amb.Initial(z=np.array([-1e-4, 0.0, 1e-4])), member=np.arange(3)
     )
     heavy = dataclasses.replace(spread.plant, m=spread.plant.m * np.array([0.9, 1.1, 1.1]))
-    clock, fold = dataclasses.replace(case.clock, samples=2000), amb.Standard(0.05)
-    found = run_ensemble(case.cascade, dataclasses.replace(spread, plant=heavy), clock, fold=fold).measured
+    clock, fold = dataclasses.replace(case.clock, samples=2000), amb.Metrics(0.05)
+    found = run_ensemble(case.cascade, dataclasses.replace(spread, plant=heavy), clock, fold=fold).metrics
     assert np.isinf(found["lost_at_s"]).all()
     assert np.max(found["settled_rms_error_m"]) < 5e-7  # 0.25 um on average over 1,000, of which none is lost
 
@@ -245,9 +245,7 @@ def test_the_bearing_of_the_data_sheet_is_plausible_and_without_warnings():
     clock = dataclasses.replace(case.clock, samples=2000)
     spread = dataclasses.replace(scenario, initial=amb.Initial(z=np.array([-1e-4, 1e-4])), member=np.arange(2))
     heavy = dataclasses.replace(spread.plant, m=plant.m * np.array([0.9, 1.1]))
-    found = run_ensemble(
-        case.cascade, dataclasses.replace(spread, plant=heavy), clock, fold=amb.Standard(0.05)
-    ).measured
+    found = run_ensemble(case.cascade, dataclasses.replace(spread, plant=heavy), clock, fold=amb.Metrics(0.05)).metrics
     assert np.isinf(found["lost_at_s"]).all()
     # 1.5 um over the whole run; the transient of the step of force is a third of what is averaged here
     assert np.max(found["settled_rms_error_m"]) < 3e-6
@@ -256,18 +254,18 @@ def test_the_bearing_of_the_data_sheet_is_plausible_and_without_warnings():
 def test_the_step_is_small_enough_for_the_ends_of_an_amplifier_s_spread():
     raw = CASE | {"actuator": {"bandwidth": 1e3}}
     wide = case_from(raw | {"spread": {"actuator": {"bandwidth": {"log-uniform": [500.0, 2e4]}}}}).clock.method
-    assert wide == case_from(CASE | {"actuator": {"bandwidth": 2e4}}).clock.method == amb.RK4(26)
+    assert wide == case_from(CASE | {"actuator": {"bandwidth": 2e4}}).clock.method == amb.solvers.RK4(26)
     case = case_from(raw)
     study, bandwidth = study_of(case, None, 1), Axis("actuator.bandwidth", np.array([500.0, 2e4]))
-    assert case.clock.method == amb.RK4(3)
+    assert case.clock.method == amb.solvers.RK4(3)
     assert with_method_for_axes(study, bandwidth, Axis("initial.z", np.zeros(2))).clock.method == wide
     assert with_method_for_axes(
         study, bandwidth, Axis("clock.sample_period", np.array([5e-5, 2e-4]))
-    ).clock.method == amb.RK4(51)
+    ).clock.method == amb.solvers.RK4(51)
     given = case_from(CASE | raw | {"clock": {"duration": 0.01, "dt": 2e-5}})
     assert with_method_for_axes(
         study_of(given, None, 1), bandwidth, Axis("initial.z", np.zeros(2))
-    ).clock.method == amb.RK4(5)
+    ).clock.method == amb.solvers.RK4(5)
 
 
 @pytest.mark.parametrize(

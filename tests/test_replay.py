@@ -24,7 +24,7 @@ from ambjax.ensemble import replay as replaying
 from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
-from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.metrics import Metrics
 from tuning.__main__ import parser as tuner
 
 # 16 kHz, converters of 14 bits, a Kalman observer, signs without a layer, a plant off by up to 10 %.
@@ -149,10 +149,8 @@ def test_results_of_a_chaotic_loop_do_not_depend_on_the_division_of_the_ensemble
             np.testing.assert_array_equal(column, columns[name][few], err_msg=name)
     cascade, scenario = study.batch(few)
     nudged = dataclasses.replace(scenario.plant, m=np.nextafter(scenario.plant.m, np.inf))
-    fold = standard_for(study.settle, scenario)
-    near = run_ensemble(
-        cascade, dataclasses.replace(scenario, plant=nudged), study.clock, fold=fold, call=CALL
-    ).measured
+    fold = Metrics.of(study.settle, scenario)
+    near = run_ensemble(cascade, dataclasses.replace(scenario, plant=nudged), study.clock, fold=fold, call=CALL).metrics
     ratio = near["settled_max_abs_error_m"] / columns["settled_max_abs_error_m"][few]
     # from 1e-16 of the mass to per cents of the error: what is equal above is equal for a reason
     assert np.median(np.abs(ratio - 1)) > 1e-3

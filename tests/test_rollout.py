@@ -11,30 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import (
-    RK4,
-    AdaptiveRodas3,
-    Cascade,
-    Clock,
-    Initial,
-    Plant,
-    Pulse,
-    Scenario,
-    Sensor,
-    Sine,
-    Standard,
-    inversion,
-    position,
-    rollout,
-)
+from ambjax import Cascade, Clock, Initial, Metrics, Scenario, rollout
 from ambjax.compiler import fast_path
 from ambjax.compiler.fast_path import one_kernel
+from ambjax.laws import inversion, position
 from ambjax.numerics.records import record, static
+from ambjax.plants import Plant
+from ambjax.sensors import Sensor
+from ambjax.signals import Pulse, Sine
 from ambjax.simulation.explicit import Euler
 from ambjax.simulation.folds import Driven, Lowest, Named, Peak, Reaching, Rms, Variation
 from ambjax.simulation.loop import INSTANT_TREE
 from ambjax.simulation.span import blank
 from ambjax.simulation.trajectory import DIVERGED, TOUCHED, Row
+from ambjax.solvers import RK4, AdaptiveRodas3
 
 ROOT = pathlib.Path(__file__).parent.parent
 REPAIRED = Cascade()
@@ -72,7 +62,7 @@ FOLDS = Named(
         "mean": Driven("heat"),
         "variation": Variation(5.05e-3),
         "reaching": Reaching("v_tilde", 0.1),
-        "standard": Standard(settle=0.01),
+        "standard": Metrics(settle=0.01),
         "spans": Spans(203),
     }
 )
@@ -82,9 +72,9 @@ LIGHT_FOLDS = Named({"rms": Rms("e_z"), "variation": Variation(2e-3), "lowest": 
 LIGHT = Clock(203, 5e-5, Euler(1))
 
 
-def light(scenario=None, clock=None, every=1):
+def light(scenario=None, clock=None, record_every=1):
     """A rollout with little computation."""
-    return rollout(SMOOTH, scenario or NOISY, clock or LIGHT, fold=LIGHT_FOLDS, every=every)
+    return rollout(SMOOTH, scenario or NOISY, clock or LIGHT, fold=LIGHT_FOLDS, record_every=record_every)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +92,7 @@ def lost():
 @pytest.fixture(scope="module")
 def tracking():
     """The paper's tracking scenario, gains repaired."""
-    return rollout(REPAIRED, TRACKING, Clock(20_000, 1e-4, AdaptiveRodas3()), fold=Standard())
+    return rollout(REPAIRED, TRACKING, Clock(20_000, 1e-4, AdaptiveRodas3()), fold=Metrics())
 
 
 def same(a, b):
@@ -148,15 +138,15 @@ def test_rows_are_consistent_with_the_plant_and_the_scenario(short):
 @pytest.mark.parametrize("every", [7, 10, 500])
 def test_every_nth_row_is_the_row_of_that_sample(every):
     # 203 = 29 * 7 divides, 10 leaves 3, 500 leaves all; the loops differ, so XLA may round differently: 1e-9
-    dense, sparse = light(), light(every=every)
+    dense, sparse = light(), light(record_every=every)
     near(sparse.trajectory.rows, jax.tree.map(lambda x: x[::every], dense.trajectory.rows), 1e-9)
-    near(sparse.measured, dense.measured, 1e-9)
+    near(sparse.metrics, dense.metrics, 1e-9)
 
 
 def test_no_rows_without_recording():
-    dense, nothing = light(), light(every=0)
+    dense, nothing = light(), light(record_every=0)
     assert nothing.trajectory.rows is None
-    near(nothing.measured, dense.measured, 1e-9)
+    near(nothing.metrics, dense.metrics, 1e-9)
     same(nothing.trajectory.lost_at, dense.trajectory.lost_at)
 
 
@@ -202,24 +192,24 @@ def by_numpy(rows, spans):
 def test_folds_equal_numpy_on_what_was_recorded(run, request):
     """The standard metrics are compared in tests/test_metrics_dense.py."""
     out = request.getfixturevalue(run)
-    for name, value in by_numpy(out.trajectory.rows, out.measured["spans"]).items():
+    for name, value in by_numpy(out.trajectory.rows, out.metrics["spans"]).items():
         # sums in another order: 203 terms
-        np.testing.assert_allclose(out.measured[name], value, rtol=1e-12, err_msg=name)
+        np.testing.assert_allclose(out.metrics[name], value, rtol=1e-12, err_msg=name)
 
 
 def test_a_row_has_the_voltage_s_average_over_its_sample(short, lost):
     for out in (short, lost):
-        span, on = out.measured["spans"], np.asarray(out.measured["spans"].time) > 0
+        span, on = out.metrics["spans"], np.asarray(out.metrics["spans"].time) > 0
         np.testing.assert_allclose(out.trajectory.rows.u_mean[on], (span.densities.u / span.time)[on], rtol=1e-12)
         assert np.all(np.asarray(out.trajectory.rows.u_mean)[~on] == 0)
 
 
 def test_a_span_ends_when_the_rotor_is_lost(short, lost):
-    time = np.asarray(short.measured["spans"].time)
+    time = np.asarray(short.metrics["spans"].time)
     np.testing.assert_allclose(time, 1e-4, rtol=1e-12)  # a sum of some ten steps
     lost_at = float(lost.trajectory.lost_at)
     # the step that loses the rotor counts up to the crossing of the clearance
-    np.testing.assert_allclose(np.sum(lost.measured["spans"].time), lost_at, rtol=1e-9)
+    np.testing.assert_allclose(np.sum(lost.metrics["spans"].time), lost_at, rtol=1e-9)
 
 
 # --- members ---
@@ -244,7 +234,7 @@ def test_vmap_equals_the_loop_over_members():
         # a sum and move last bits: 1e-16 grows in this loop (peak sensitivity 41) to 1e-12 at most
         near(jax.tree.map(lambda x, m=m: x[m], batch), alone, 1e-9)
         same(batch.trajectory.rows.t[m], alone.trajectory.rows.t)
-    assert len({float(x) for x in batch.measured["rms"]}) == 3
+    assert len({float(x) for x in batch.metrics["rms"]}) == 3
 
 
 # --- the status of the rotor ---
@@ -282,7 +272,7 @@ def test_a_rotor_that_starts_against_the_stop_is_lost_at_once():
     assert not np.any(out.trajectory.rows.alive)
     assert np.all(np.asarray(out.trajectory.rows.u) == 0)
     assert all(np.all(np.isfinite(x)) for x in out.trajectory.rows)
-    assert out.measured["standard"]["lost"]
+    assert out.metrics["standard"]["lost"]
 
 
 def test_a_state_outside_the_range_of_the_model_is_reported():
@@ -310,13 +300,13 @@ def test_repaired_tracking_meets_the_paper_s_claims(tracking):
     # paper: zero within 10 ms. Below 0.1 in 2.2 ms; then tan(pi/2 d/gamma)/p, 0.21 at the largest d = 6.6e4
     assert np.any(np.abs(rows.v_tilde[rows.t <= 5e-3]) < 0.1)
     assert np.all(np.abs(rows.v_tilde[rows.t >= 5e-3]) < 0.22)
-    assert tracking.measured["settled_rms_u_V"] < 70  # the reference alone requires L max|di_ref/dt|, 33 H * 2 A/s
+    assert tracking.metrics["settled_rms_u_V"] < 70  # the reference alone requires L max|di_ref/dt|, 33 H * 2 A/s
 
 
 def test_repaired_regulation_offset_in_the_pulse(tracking):
     # the same structure and numbers of the same type: the compiled tracking run is used again
     regulation = dataclasses.replace(TRACKING, reference=Sine(0.0, 2.0))
-    out = rollout(REPAIRED, regulation, Clock(20_000, 1e-4, AdaptiveRodas3()), fold=Standard()).trajectory
+    out = rollout(REPAIRED, regulation, Clock(20_000, 1e-4, AdaptiveRodas3()), fold=Metrics()).trajectory
     at_stop = int(np.argmin(np.abs(np.asarray(out.rows.t) - 1.2999)))
     # at rest a q_v = k S(c z): z = tan(pi/2 a/k)/(c p) = 2.08e-5 m, up to a few time constants c
     steady = np.tan(np.pi / 2 * Plant().a / 25.0) / (17 * 25)
@@ -390,11 +380,16 @@ IN_FLOAT32 = """
 import sys
 import numpy as np
 from ambjax import *
+from ambjax.laws import *
+from ambjax.plants import *
+from ambjax.sensors import *
+from ambjax.signals import *
+from ambjax.solvers import *
 tracking = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.8, 1.3))
 smooth = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))
 out = {}
 for name, cascade, method in (("repaired", Cascade(), AdaptiveRodas3()), ("smooth", smooth, RK4(4))):
-    trajectory = rollout(cascade, tracking, Clock(20_000, 1e-4, method), every=10).trajectory
+    trajectory = rollout(cascade, tracking, Clock(20_000, 1e-4, method), record_every=10).trajectory
     assert trajectory.rows.z.dtype == np.float32
     assert trajectory.lost_at == np.inf
     out[name] = np.asarray(trajectory.rows.z)
@@ -408,7 +403,7 @@ def test_float32_is_within_20_nm_of_float64(tracking, tmp_path):
     subprocess.run(
         [sys.executable, "-c", IN_FLOAT32, str(path)], cwd=ROOT, env=os.environ | {"JAX_ENABLE_X64": "0"}, check=True
     )
-    smooth = rollout(SMOOTH, TRACKING, Clock(20_000, 1e-4, RK4(4)), every=10).trajectory
+    smooth = rollout(SMOOTH, TRACKING, Clock(20_000, 1e-4, RK4(4)), record_every=10).trajectory
     # measured: 0.96e-8 m repaired, 1.04e-8 m smooth, of 2.5e-3 m: t = 2 s is rounded to 6e-8 s, and r moves at 31 mm/s
     with np.load(path) as single:
         assert np.max(np.abs(single["repaired"] - tracking.trajectory.rows.z[::10])) < 2e-8
@@ -421,7 +416,7 @@ def test_float32_is_within_20_nm_of_float64(tracking, tmp_path):
 def end_of(c):
     """Return a number at the end of the light rollout as a function of one gain."""
     cascade = dataclasses.replace(SMOOTH, position=position.SlidingMode(c=c))
-    return rollout(cascade, NOISY, LIGHT, fold=LIGHT_FOLDS, every=0).measured["rms"]
+    return rollout(cascade, NOISY, LIGHT, fold=LIGHT_FOLDS, record_every=0).metrics["rms"]
 
 
 @pytest.mark.parametrize(

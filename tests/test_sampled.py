@@ -21,18 +21,23 @@ from ambjax.world.coils import TwoCoil
 
 KINDS = {
     "observer": {
-        "direct": amb.observer.Direct,
-        "complementary": amb.observer.Complementary,
-        "difference": amb.observer.Difference,
-        "kalman": amb.observer.Kalman,
-        "ired-1": amb.observer.IRED1,
-        "ired-2": amb.observer.IRED2,
+        "direct": amb.laws.observer.Direct,
+        "complementary": amb.laws.observer.Complementary,
+        "difference": amb.laws.observer.Difference,
+        "kalman": amb.laws.observer.Kalman,
+        "ired-1": amb.laws.observer.IRED1,
+        "ired-2": amb.laws.observer.IRED2,
     },
-    "position": {"sliding-mode": amb.position.SlidingMode, "super-twisting": amb.position.SuperTwisting},
-    "inversion": {"adaptive": amb.inversion.Adaptive, "closed-form": amb.inversion.ClosedForm},
-    "current": {"sliding-mode": amb.current.SlidingMode, "pi": amb.current.ProportionalIntegral},
+    "position": {"sliding-mode": amb.laws.position.SlidingMode, "super-twisting": amb.laws.position.SuperTwisting},
+    "inversion": {"adaptive": amb.laws.inversion.Adaptive, "closed-form": amb.laws.inversion.ClosedForm},
+    "current": {"sliding-mode": amb.laws.current.SlidingMode, "pi": amb.laws.current.ProportionalIntegral},
 }
-SIGNALS = {"constant": amb.Constant, "sine": amb.Sine, "smoothstep": amb.SmoothStep, "pulse": amb.Pulse}
+SIGNALS = {
+    "constant": amb.signals.Constant,
+    "sine": amb.signals.Sine,
+    "smoothstep": amb.signals.SmoothStep,
+    "pulse": amb.signals.Pulse,
+}
 INF = math.inf
 
 
@@ -122,14 +127,14 @@ def sensor_of(world, std):
     given = {name: getattr(world, name) for name in names if getattr(world, name) != getattr(World, name)}
     if world.observer[0] not in ("direct", "complementary"):
         given["velocity"] = False
-    return amb.Sensor(*std, **given) if any(std) or given else None
+    return amb.sensors.Sensor(*std, **given) if any(std) or given else None
 
 
 def loop_of(world, samples, std):
     """Return the same scenario as objects of ambjax."""
     laws = {stage: record_of(kinds, getattr(world, stage)) for stage, kinds in KINDS.items()}
-    plant = {"lumped": amb.Plant, "two-coil": TwoCoil}[world.kind](**world.plant)
-    model = amb.Plant(**(world.plant | world.model))
+    plant = {"lumped": amb.plants.Plant, "two-coil": TwoCoil}[world.kind](**world.plant)
+    model = amb.plants.Plant(**(world.plant | world.model))
     processor = Processor(world.delay, world.discretisation == "implicit", world.predict)
     signals = {name: record_of(SIGNALS, getattr(world, name)) for name in ("reference", "q_z", "q_v", "q_i")}
     scenario = amb.Scenario(
@@ -176,9 +181,9 @@ def cascade_of(p=INF, **processor):
     """Gains that hold the rotor at 10 kHz with a sample of delay, under noise and on 200 V."""
     c, k, gamma, k_i = 1440.0, 2.3, 8e5, 870.0
     return amb.Cascade(
-        position=amb.position.SlidingMode(c, k, p),
-        inversion=amb.inversion.Adaptive(gamma, p),
-        current=amb.current.SlidingMode(k_i, p),
+        position=amb.laws.position.SlidingMode(c, k, p),
+        inversion=amb.laws.inversion.Adaptive(gamma, p),
+        current=amb.laws.current.SlidingMode(k_i, p),
         processor=Processor(**processor),
     )
 
@@ -192,7 +197,7 @@ def test_a_delay_of_several_samples_agrees_with_the_independent_simulator(wrong)
     np.testing.assert_allclose(rows.u, run.u, rtol=0, atol=1e-8 * np.abs(run.u).max())
 
 
-NOISY = amb.Scenario(reference=amb.Sine(2.5e-3, 2.0), sensor=amb.Sensor(*NOISE), u_max=200.0, seed=3)
+NOISY = amb.Scenario(reference=amb.signals.Sine(2.5e-3, 2.0), sensor=amb.sensors.Sensor(*NOISE), u_max=200.0, seed=3)
 SHORT = amb.Clock(300, 1e-4)
 
 
@@ -212,7 +217,7 @@ def test_the_voltage_of_a_sample_acts_after_the_delay(delay):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "inversion",
-    [amb.inversion.Adaptive(8e5, INF), pytest.param(amb.inversion.ClosedForm(), marks=pytest.mark.thorough)],
+    [amb.laws.inversion.Adaptive(8e5, INF), pytest.param(amb.laws.inversion.ClosedForm(), marks=pytest.mark.thorough)],
     ids=lambda law: type(law).__name__,
 )
 def test_a_member_equals_its_rollout_for_any_delays_of_the_others(inversion):
@@ -220,11 +225,11 @@ def test_a_member_equals_its_rollout_for_any_delays_of_the_others(inversion):
     scenario = dataclasses.replace(NOISY, member=np.arange(3))
     cascade = dataclasses.replace(cascade_of(delay=delays), inversion=inversion)
     fold = amb.simulation.folds.Rms("e_z")
-    together = run_ensemble(cascade, scenario, SHORT, fold=fold).measured
+    together = run_ensemble(cascade, scenario, SHORT, fold=fold).metrics
     for member, delay in enumerate(delays):
         one = dataclasses.replace(NOISY, member=member)
         cascade = dataclasses.replace(cascade_of(delay=delay, predict=True), inversion=inversion)
-        alone = amb.rollout(cascade, one, SHORT, fold=fold).measured
+        alone = amb.rollout(cascade, one, SHORT, fold=fold).metrics
         # a sample is integrated in two parts, one of them empty, instead of in one: rounding
         np.testing.assert_allclose(together[member], alone, rtol=1e-9)
 
@@ -248,7 +253,9 @@ def test_a_delay_that_is_set_later_is_predicted():
     none = cascade_of(delay=0.0).on_processor()
     late = dataclasses.replace(none, processor=dataclasses.replace(none.processor, delay=1.0))
     fold = amb.simulation.folds.Rms("e_z")
-    found, expected = (amb.rollout(c, NOISY, SHORT, fold=fold, every=0).measured for c in (late, cascade_of(delay=1.0)))
+    found, expected = (
+        amb.rollout(c, NOISY, SHORT, fold=fold, record_every=0).metrics for c in (late, cascade_of(delay=1.0))
+    )
     assert found == expected
 
 
@@ -260,10 +267,12 @@ def loss_of(clock, p, closed=False):
         cascade = dataclasses.replace(
             settled,
             position=dataclasses.replace(settled.position, c=c, k=k),
-            inversion=amb.inversion.ClosedForm() if closed else dataclasses.replace(settled.inversion, gamma=gamma),
+            inversion=amb.laws.inversion.ClosedForm()
+            if closed
+            else dataclasses.replace(settled.inversion, gamma=gamma),
             current=dataclasses.replace(settled.current, k_i=k_i),
         )
-        return 1e9 * amb.rollout(cascade, NOISY, clock, fold=amb.simulation.folds.Rms("e_z"), every=0).measured
+        return 1e9 * amb.rollout(cascade, NOISY, clock, fold=amb.simulation.folds.Rms("e_z"), record_every=0).metrics
 
     return loss
 
@@ -279,7 +288,11 @@ def loss_of(clock, p, closed=False):
 )
 def test_gradients_three_ways_and_finite_over_six_decades_of_gains(p, closed):
     """All cases share one program in reverse mode, because tracing takes most of the time."""
-    loss, at, step = loss_of(amb.Clock(100, 1e-4, amb.RK4(2)), p, closed), np.array([0.1, -0.2, 0.05, 0.1]), 1e-5
+    loss, at, step = (
+        loss_of(amb.Clock(100, 1e-4, amb.solvers.RK4(2)), p, closed),
+        np.array([0.1, -0.2, 0.05, 0.1]),
+        1e-5,
+    )
     near = at + step * np.concatenate([0 * np.eye(4)[:1], np.eye(4), -np.eye(4)])
     points = np.concatenate([near, np.random.default_rng(4).uniform(-6.9, 6.9, (491, 4))])
     values, slopes = jax.jit(jax.vmap(jax.value_and_grad(loss)))(points)
@@ -295,7 +308,7 @@ def test_gradients_three_ways_and_finite_over_six_decades_of_gains(p, closed):
 
 
 def test_a_lost_rotor_is_frozen_with_its_drive_off():
-    cascade = dataclasses.replace(cascade_of(25.0), inversion=amb.inversion.Adaptive(1000.0))
+    cascade = dataclasses.replace(cascade_of(25.0), inversion=amb.laws.inversion.Adaptive(1000.0))
     trajectory = amb.rollout(cascade, NOISY, SHORT).trajectory
     assert 0 < trajectory.lost_at < 0.03
     rows = trajectory.rows
@@ -309,7 +322,7 @@ def test_a_lost_rotor_is_frozen_with_its_drive_off():
 
 def test_a_divergent_loop_is_a_loss_with_finite_values():
     scenario = dataclasses.replace(NOISY, initial=amb.Initial(1e-3), u_max=math.inf)
-    wild = dataclasses.replace(cascade_of(), current=amb.current.ProportionalIntegral(1e30, 1e30, 1e30))
+    wild = dataclasses.replace(cascade_of(), current=amb.laws.current.ProportionalIntegral(1e30, 1e30, 1e30))
     trajectory = amb.rollout(wild, scenario, amb.Clock(20, 1e-4)).trajectory
     assert np.isfinite(trajectory.lost_at)
     for name, signal in trajectory.rows._asdict().items():
@@ -320,7 +333,7 @@ def test_a_large_gain_of_a_set_valued_sign_does_not_change_the_run():
     """An implicit step uses only the share of the gain that the error requires: 1e6 and 1e30 A/s give the same run."""
     scenario = dataclasses.replace(NOISY, u_max=math.inf)
     runs = [
-        amb.rollout(dataclasses.replace(cascade_of(), current=amb.current.SlidingMode(k_i, INF)), scenario, SHORT)
+        amb.rollout(dataclasses.replace(cascade_of(), current=amb.laws.current.SlidingMode(k_i, INF)), scenario, SHORT)
         for k_i in (1e6, 1e30)
     ]
     z = [np.asarray(run.trajectory.rows.z) for run in runs]
@@ -334,16 +347,21 @@ def test_a_law_whose_result_is_not_finite_keeps_its_state():
     after = system.jump(0.0, lost, system.sensor_errors(0))
     assert after.finite == 0
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((after.control, after.command)))
-    assert system.advance(amb.RK4(1), system.sensor_errors(0), 0.0, 1e-4, after, (), jnp.asarray(0)).code == DIVERGED
+    assert (
+        system.advance(amb.solvers.RK4(1), system.sensor_errors(0), 0.0, 1e-4, after, (), jnp.asarray(0)).code
+        == DIVERGED
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("implicit", [True, False])
 def test_the_sampled_loop_converges_to_the_continuous_one(implicit):
     """The order in the period is 1, without delay and noise, and with smooth signs."""
-    laws = {"inversion": amb.inversion.Adaptive(7.5e4, 0.5)}
-    scenario = amb.Scenario(reference=amb.Sine(1e-3, 2.0), initial=amb.Initial(1e-5))
-    exact = amb.rollout(amb.Cascade(**laws), scenario, amb.Clock(50, 1e-3, amb.AdaptiveRodas3(1e-9))).trajectory.rows.z
+    laws = {"inversion": amb.laws.inversion.Adaptive(7.5e4, 0.5)}
+    scenario = amb.Scenario(reference=amb.signals.Sine(1e-3, 2.0), initial=amb.Initial(1e-5))
+    exact = amb.rollout(
+        amb.Cascade(**laws), scenario, amb.Clock(50, 1e-3, amb.solvers.AdaptiveRodas3(1e-9))
+    ).trajectory.rows.z
     errors = []
     for divisor in (20, 40, 80):
         cascade = amb.Cascade(**laws, processor=Processor(0.0, implicit))
@@ -354,17 +372,17 @@ def test_the_sampled_loop_converges_to_the_continuous_one(implicit):
 
 
 def test_a_set_valued_sign_is_refused_in_continuous_time():
-    hard_sign = amb.Cascade(position=amb.position.SlidingMode(17.0, 25.0, INF))
+    hard_sign = amb.Cascade(position=amb.laws.position.SlidingMode(17.0, 25.0, INF))
     with pytest.raises(ValueError, match=r"controller.position.p = inf: in continuous time a sign must be smoothed"):
         amb.rollout(hard_sign, NOISY, SHORT)
-    mixed = dataclasses.replace(cascade_of(), current=amb.current.SlidingMode(870.0, np.array([25.0, INF])))
+    mixed = dataclasses.replace(cascade_of(), current=amb.laws.current.SlidingMode(870.0, np.array([25.0, INF])))
     with pytest.raises(ValueError, match="inf for some members"):
         run_ensemble(mixed, dataclasses.replace(NOISY, member=np.arange(2)), SHORT, fold=None)
 
 
 def test_a_traced_delay_is_refused_if_its_program_is_not_chosen():
     def run(delay):
-        return amb.rollout(cascade_of(delay=delay), NOISY, amb.Clock(3, 1e-4, amb.RK4(1))).trajectory.lost_at
+        return amb.rollout(cascade_of(delay=delay), NOISY, amb.Clock(3, 1e-4, amb.solvers.RK4(1))).trajectory.lost_at
 
     with pytest.raises(ValueError, match=r"processor\.delay is traced"):
         jax.jit(run)(0.5)

@@ -17,8 +17,10 @@ from tuning.problem.space import Gain, Space, tunable
 
 # Three decades up and down of the law's own gains.
 DECADES, POINTS = 3 * math.log(10), 1000
-WORLD = amb.Scenario(reference=amb.Sine(2.5e-3, 2.0), sensor=amb.Sensor(1e-6, 1e-4, 1e-4), u_max=200.0, seed=3)
-CLOCK = amb.Clock(40, 1e-4, amb.RK4(1))
+WORLD = amb.Scenario(
+    reference=amb.signals.Sine(2.5e-3, 2.0), sensor=amb.sensors.Sensor(1e-6, 1e-4, 1e-4), u_max=200.0, seed=3
+)
+CLOCK = amb.Clock(40, 1e-4, amb.solvers.RK4(1))
 # Without a law that takes a voltage only: it stands with no other position law.
 KINDS = {
     stage: {kind: law for kind, law in kinds.items() if "force" in getattr(law, "accepts", ("force",))}
@@ -44,7 +46,7 @@ CASES = [
 
 def cascade_of(laws, smooth):
     """Return the cascade with one sample of delay and prediction, with smoothed or set-valued signs."""
-    made = {stage: default_law(KINDS[stage][kind], amb.Plant()) for stage, kind in laws.items()}
+    made = {stage: default_law(KINDS[stage][kind], amb.plants.Plant()) for stage, kind in laws.items()}
     if not smooth:
         for stage, law in made.items():
             steep = [field.name for field in dataclasses.fields(law) if field.metadata.get("steepness")]
@@ -63,7 +65,7 @@ def test_values_and_derivatives_are_finite_over_six_decades_of_every_gain(laws, 
     world = dataclasses.replace(WORLD, amplifier=amplifier)
 
     def loss(x):
-        value = amb.rollout(space.decode(x, cascade), world, CLOCK, fold=Rms("e_z"), every=0).measured
+        value = amb.rollout(space.decode(x, cascade), world, CLOCK, fold=Rms("e_z"), record_every=0).metrics
         return value, value
 
     points = start + np.random.default_rng(4).uniform(-DECADES, DECADES, (POINTS, len(space)))

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import Schedule
 from ambjax.cases.reader import case_from
 from ambjax.cases.table import Table
 from ambjax.control.cascade_state import Sample
 from ambjax.control.schedule import OVER
+from ambjax.laws import Schedule
 from ambjax.numerics.records import validate
 from ambjax.theorem.conditions import constant_sigma, required
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 from tuning.problem.config import tune_from
 from tuning.problem.ranges import from_unit_cube
 from tuning.problem.shortfalls import Bound, shortfall

@@ -11,7 +11,7 @@ from ambjax.commands import acceptance
 from ambjax.commands.sensitivity_report import _measured_numbers, _measured_text
 from ambjax.linear import MemberPeaks, Zones, analyse, linearise
 from ambjax.pictures.frequency import MeasuredPoints, NamedLoop, frequency_figure
-from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import rollout
 
 CASE = """
@@ -258,8 +258,8 @@ def test_check_gives_the_zone_of_the_clearance(tmp_path, capsys):
     main(["check", str(path), "--json"])
     found = json.loads(capsys.readouterr().out)
     case = read_case(path)
-    fold = standard_for(case.settle, case.scenario)
-    used = rollout(case.cascade, case.scenario, case.clock, fold=fold, every=0).measured["settled_clearance_used"]
+    fold = Metrics.of(case.settle, case.scenario)
+    used = rollout(case.cascade, case.scenario, case.clock, fold=fold, record_every=0).metrics["settled_clearance_used"]
     assert found["clearance_used"] == pytest.approx(float(used), rel=1e-3)  # extremes of other steps
     assert found["clearance_used"] == pytest.approx(1 / 4.5, rel=0.03)  # the error of tracking
     assert found["clearance_zone"] == "C"

@@ -9,17 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import RK4, Cascade, Plant, Scenario, inversion, rollout, run_ensemble
+from ambjax import Cascade, Scenario, rollout
 from ambjax.cases.case_table import parts_of
 from ambjax.cases.table import Table
+from ambjax.ensemble import run_ensemble
 from ambjax.ensemble.batching import map_members, size
 from ambjax.ensemble.distributions import Choice
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import Spread, apply, draw
 from ambjax.extend import canonical, leaf, record, validate
+from ambjax.laws import inversion
 from ambjax.numerics.records import part
 from ambjax.numerics.shapes import map_varying, varying
+from ambjax.plants import Plant
 from ambjax.simulation.clock import Clock
+from ambjax.solvers import RK4
 
 CASCADE = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))
 M = np.array([[3.0, 0.5, 0.0], [0.5, 2.0, 0.1], [0.0, 0.1, 1.0]])
@@ -91,7 +95,7 @@ def test_members_that_differ_in_one_entry_are_each_solved_alone(case):
 def test_an_ensemble_of_a_plant_with_a_matrix_is_its_rollouts(case):
     clock = Clock(40, 1e-4, RK4(2))
     cascade, scenario = apply(*case, {"plant.rotor.M.0.0": np.array([1.0, 2.0]), "plant.m": np.array([0.5, 0.6])})
-    ended = run_ensemble(cascade, scenario, clock, fold=None, every=1).trajectory.rows.z
+    ended = run_ensemble(cascade, scenario, clock, fold=None, record_every=1).trajectory.rows.z
     alone = rollout(case[0], apply(*case, {"plant.m": 0.6})[1], clock).trajectory.rows.z
     np.testing.assert_allclose(ended[1], alone, rtol=1e-9)
 

@@ -7,24 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import (
-    RK4,
-    BandNoise,
-    Cascade,
-    Chirp,
-    Clock,
-    Constant,
-    Pulse,
-    Scenario,
-    Sine,
-    SmoothStep,
-    Step,
-    Sum,
-    inversion,
-    rollout,
-)
+from ambjax import Cascade, Clock, Scenario, rollout
+from ambjax.laws import inversion
+from ambjax.signals import BandNoise, Chirp, Constant, Pulse, Sine, SmoothStep, Step, Sum
+from ambjax.solvers import RK4
 from ambjax.world.band_noise import LINES
-from ambjax.world.signals import reference_at
+from ambjax.world.waveforms import reference_at
 
 T = np.array([0.0, 0.013, 0.1, 0.2501, 0.77, 3.0])
 W = 2 * np.pi * 2.0

@@ -7,25 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import (
-    AdaptiveRodas3,
-    Cascade,
-    Clock,
-    Initial,
-    Pulse,
-    Scenario,
-    Sensor,
-    Sine,
-    Slide,
-    current,
-    inversion,
-    observer,
-    position,
-    rollout,
-)
+from ambjax import Cascade, Clock, Initial, Scenario, rollout
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.ensemble import run_ensemble
+from ambjax.laws import current, inversion, observer, position
+from ambjax.sensors import Sensor
+from ambjax.signals import Pulse, Sine
 from ambjax.simulation.folds import Rms
+from ambjax.solvers import AdaptiveRodas3, Slide
 
 TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.01, 0.02), u_max=200.0)
 
@@ -58,7 +47,7 @@ def test_stiff_gains_under_held_noise_agree_with_error_control(case):
     scenario = dataclasses.replace(TRACKING, sensor=sensor, u_max=u_max, member=np.arange(32))
     fold = Rms("e_z", 0.01)
     found = [
-        np.sqrt(np.mean(run_ensemble(gains, scenario, Clock(400, 1e-4, method), fold=fold).measured ** 2))
+        np.sqrt(np.mean(run_ensemble(gains, scenario, Clock(400, 1e-4, method), fold=fold).metrics ** 2))
         for method in (AdaptiveRodas3(1e-6), Slide(4))
     ]
     # measured 1 % and less, and a third of that over four times the horizon
@@ -69,9 +58,13 @@ def test_stiff_gains_under_held_noise_agree_with_error_control(case):
 def test_the_slow_motion_is_of_second_order():
     gains = cascade(60.0, 1.0, 1e8, 20.0, p=1.0)
     scenario = Scenario(reference=Sine(1e-3, 10.0), initial=Initial(1e-4), u_max=1e9)
-    reference = rollout(gains, scenario, Clock(100, 1e-3, AdaptiveRodas3(1e-9)), every=1).trajectory.rows.z
+    reference = rollout(gains, scenario, Clock(100, 1e-3, AdaptiveRodas3(1e-9)), record_every=1).trajectory.rows.z
     errors = [
-        float(np.abs(rollout(gains, scenario, Clock(100, 1e-3, Slide(n)), every=1).trajectory.rows.z - reference).max())
+        float(
+            np.abs(
+                rollout(gains, scenario, Clock(100, 1e-3, Slide(n)), record_every=1).trajectory.rows.z - reference
+            ).max()
+        )
         for n in (2, 4, 8)
     ]
     order = np.polyfit(np.log([2, 4, 8]), -np.log(errors), 1)[0]
@@ -89,8 +82,8 @@ def test_values_and_derivatives_are_finite_over_six_decades_of_gains():
     scenario = dataclasses.replace(TRACKING, initial=Initial(1e-3))
 
     def loss(gains):
-        out = rollout(cascade(*gains), scenario, Clock(100, 1e-4, Slide(2)), fold=Rms("e_z"), every=0)
-        return out.measured, out.measured
+        out = rollout(cascade(*gains), scenario, Clock(100, 1e-4, Slide(2)), fold=Rms("e_z"), record_every=0)
+        return out.metrics, out.metrics
 
     slope, value = jax.jit(jax.vmap(jax.jacfwd(loss, has_aux=True)))(jnp.asarray(gains))
     assert np.all(np.isfinite(value))
@@ -105,8 +98,8 @@ def test_derivatives_agree_with_differences_under_noise():
 
     def error(x, member):
         world = dataclasses.replace(scenario, member=member)
-        out = rollout(cascade(*jnp.exp(x)), world, Clock(2000, 1e-4, Slide(3)), fold=Rms("e_z", 0.02), every=0)
-        return jnp.log(out.measured)
+        out = rollout(cascade(*jnp.exp(x)), world, Clock(2000, 1e-4, Slide(3)), fold=Rms("e_z", 0.02), record_every=0)
+        return jnp.log(out.metrics)
 
     members = jnp.arange(48)
     every = jax.vmap(error, (None, 0))

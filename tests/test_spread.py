@@ -8,26 +8,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ambjax import (
-    Cascade,
-    Clock,
-    Constant,
-    Pulse,
-    Scenario,
-    Sensor,
-    Sine,
-    SmoothStep,
-    Step,
-    Sum,
-    inversion,
-    observer,
-    rollout,
-)
+from ambjax import Cascade, Clock, Scenario, rollout
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.ensemble import Choice, LogUniform, Normal, Percent, Spread, Uniform, apply, draw
 from ambjax.ensemble.design import DESIGNS, design_points
 from ambjax.ensemble.spread import corners
+from ambjax.laws import inversion, observer
+from ambjax.sensors import Sensor
+from ambjax.signals import Constant, Pulse, Sine, SmoothStep, Step, Sum
 from ambjax.simulation.explicit import Euler
 
 CASCADE = Cascade()

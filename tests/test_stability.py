@@ -20,7 +20,7 @@ from ambjax.ensemble.blocks import BlockValues
 from ambjax.ensemble.delays import at_delays
 from ambjax.linear import stability as module
 from ambjax.linear.stability import SMALL, Findings, Stability, stability_of
-from ambjax.simulation.rollout import Outcome
+from ambjax.simulation.rollout import Result
 from ambjax.simulation.trajectory import Trajectory
 
 # Additional delays over which the model does not predict; the brute-force margin is 0.97 samples.
@@ -87,7 +87,7 @@ def test_noise_and_unbalance_do_not_make_a_loop_unstable():
 @pytest.mark.slow
 def test_the_chatter_of_signs_is_not_called_unstable():
     """Set-valued signs that act up to a sample late, and steep signs with explicit steps."""
-    delays, clock = np.array([0.25, 0.5, 0.75, 1.0]), amb.Clock(2000, 1e-4, amb.RK4(1))
+    delays, clock = np.array([0.25, 0.5, 0.75, 1.0]), amb.Clock(2000, 1e-4, amb.solvers.RK4(1))
     cascade = sampled.cascade_of(*sampled.HARD, delay=delays, predict=False).on_processor(2.0, 0.0, between=True)
     world = dataclasses.replace(sampled.WORLD, member=np.zeros(4, int))
     found = stability_of(cascade, world, clock)
@@ -111,7 +111,7 @@ def test_only_an_oscillation_that_the_linear_loop_does_not_explain_is_sustained(
     values = BlockValues(
         {"z": z.min(1)[None], "i": -np.ones((1, 4))}, {"z": z.max(1)[None], "i": np.ones((1, 4))}, None, None
     )
-    run = Outcome(Trajectory(None, np.array([np.inf]), np.zeros(1), None), values)
+    run = Result(Trajectory(None, np.array([np.inf]), np.zeros(1), None), values)
     monkeypatch.setattr(module, "run_ensemble", lambda *_, **__: run)
     rate = -0.2 / float(case.clock.duration) if motion == "slow decay" else -50.0
     monkeypatch.setattr(module, "_growth", lambda *_: np.array([rate]))

@@ -10,18 +10,20 @@ import pytest
 import scipy.linalg
 import scipy.signal
 
-from ambjax import Cascade, Plant, Processor, Scenario, current, inversion, observer, position
+from ambjax import Cascade, Processor, Scenario
 from ambjax.cases.controller_tables import KINDS
 from ambjax.control.base import default_law
 from ambjax.control.cascade_state import Sample
-from ambjax.control.laws import CurrentDemand, CurrentInputs, CurrentLaw, step_law
 from ambjax.control.realisation import realisation
 from ambjax.control.sampling import Sampling
+from ambjax.control.stages import CurrentDemand, CurrentInputs, CurrentLaw, step_law
+from ambjax.laws import current, inversion, observer, position
+from ambjax.plants import Plant
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.sampled import Sampled
 from ambjax.world.scenario import Initial
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Constant, Reference
+from ambjax.world.waveforms import Constant, Reference
 
 RIG = Plant(1.64, 0.0, 1.2566e-6, 208.0, 2.68e-4, 5e-4, 2.5, 1.0)
 T, Z = 5e-5, 4e-5

@@ -47,7 +47,9 @@ def test_a_command_imports_only_the_packages_that_it_needs(tmp_path, command, un
 
 def test_every_name_of_the_stub_is_public():
     assert "rollout" in ambjax.__all__
-    assert {*ambjax.__all__, "ensemble", "paper"} == set(ambjax._MODULES) <= set(dir(ambjax))
+    modules = {name for name, home in ambjax._MODULES.items() if home == "ambjax"}
+    assert {*ambjax.__all__, *modules} == set(ambjax._MODULES) <= set(dir(ambjax))
+    assert {"laws", "signals", "plants", "sensors", "actuators", "solvers", "extend", "linear", "theorem"} <= modules
     for name, home in ambjax._MODULES.items():
         exec(f"from {home} import {name}", own := {})
         assert getattr(ambjax, name) is own[name]

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax import Scenario, Sensor
+from ambjax import Scenario
 from ambjax.numerics.gaussian import normals, threefry
+from ambjax.sensors import Sensor
 
 
 def test_the_noise_of_different_sensors_is_independent():

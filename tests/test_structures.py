@@ -11,14 +11,16 @@ import pytest
 import scipy.linalg
 import scipy.signal
 
-from ambjax import Plant, current, position, rollout, simulate
+from ambjax import rollout, simulate
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.control import regulator
 from ambjax.control.base import default_law
 from ambjax.control.sampling import Sampling
+from ambjax.laws import current, position
+from ambjax.plants import Plant
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 RIG = Plant(1.64, 0.0, 1.2566e-6, 208.0, 2.68e-4, 5e-4, 2.5, 1.0)
 MODELS = pytest.mark.parametrize("model", [Plant(), RIG], ids=["paper", "rig"])

@@ -6,7 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import AdaptiveRodas3, Cascade, Clock, Plant, Pulse, Sensor, SmoothStep, inversion, paper, position, rollout
+from ambjax import Cascade, Clock, paper, rollout
+from ambjax.laws import inversion, position
+from ambjax.plants import Plant
+from ambjax.sensors import Sensor
+from ambjax.signals import Pulse, SmoothStep
+from ambjax.solvers import AdaptiveRodas3
 from ambjax.theorem.conditions import check, delta_1_on_reference
 
 CLOCK = Clock(1000, 1e-4, AdaptiveRodas3(1e-8))

@@ -47,7 +47,7 @@ def motion(loops, method, start=0.0, speed=0.0):
     `speed` (m/s) is added to the velocity within a sample.
     """
     cascade, scenario = case_of(loops, start, speed)
-    found = run_ensemble(cascade, scenario, amb.Clock(SAMPLES, T, method), fold=None, every=1).trajectory
+    found = run_ensemble(cascade, scenario, amb.Clock(SAMPLES, T, method), fold=None, record_every=1).trajectory
     held = np.isinf(found.lost_at)[:, None]
     return np.where(held, found.rows.z, np.nan), np.where(held, found.rows.z_dot, np.nan)
 
@@ -55,15 +55,15 @@ def motion(loops, method, start=0.0, speed=0.0):
 def case_of(loops, start=0.0, speed=0.0):
     """Return the cascade and the scenario of all loops."""
     cascade = amb.Cascade(
-        position=amb.position.SlidingMode(loops.c, loops.k, loops.p),
-        inversion=amb.inversion.Adaptive(np.pi / 2 * loops.slope / loops.p_v, loops.p_v),
-        current=amb.current.SlidingMode(loops.k_i, loops.p_i),
+        position=amb.laws.position.SlidingMode(loops.c, loops.k, loops.p),
+        inversion=amb.laws.inversion.Adaptive(np.pi / 2 * loops.slope / loops.p_v, loops.p_v),
+        current=amb.laws.current.SlidingMode(loops.k_i, loops.p_i),
     )
     none = np.zeros_like(loops.z)
     scenario = amb.Scenario(
         initial=amb.Initial(z=loops.z),
-        reference=amb.SmoothStep(loops.amplitude, loops.start, loops.duration),
-        q_z=amb.Pulse(none + speed / T, none + start, none + start + T),
+        reference=amb.signals.SmoothStep(loops.amplitude, loops.start, loops.duration),
+        q_z=amb.signals.Pulse(none + speed / T, none + start, none + start + T),
     )
     return cascade, scenario
 
@@ -76,9 +76,9 @@ def far(z, exact):
 @pytest.mark.slow
 def test_the_automatic_choice_is_within_1e8_of_the_drops_that_amplify_most():
     """These loops are not stiff. The reference's third derivative jumps inside two samples; steps end there."""
-    clock = amb.with_method(amb.Clock(SAMPLES, T), *case_of(HARD))
-    assert isinstance(clock.method, amb.AdaptiveCashKarp)
-    exact = motion(HARD, amb.AdaptiveCashKarp(1e-11))[0]
-    independent = motion(HARD, amb.AdaptiveRodas3(1e-10))[0]
+    clock = amb.solvers.with_method(amb.Clock(SAMPLES, T), *case_of(HARD))
+    assert isinstance(clock.method, amb.solvers.AdaptiveCashKarp)
+    exact = motion(HARD, amb.solvers.AdaptiveCashKarp(1e-11))[0]
+    independent = motion(HARD, amb.solvers.AdaptiveRodas3(1e-10))[0]
     assert far(independent, exact).max() < 2e-9  # RODAS3 falls with its tolerance to the same motion
     assert far(motion(HARD, clock.method)[0], exact).max() <= 5e-9

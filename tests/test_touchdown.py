@@ -22,7 +22,7 @@ def force(stop, z, z_dot):
 
 
 def test_the_elastic_force_is_the_slope_of_its_energy():
-    stop = amb.Stop(2e5)
+    stop = amb.plants.Stop(2e5)
     z = np.array([-2.5e-3, -2.1e-3, -1e-3, 0.0, 1.9e-3, 2.2e-3])
     h = 1e-8  # of a quadratic: exact but for rounding, 1e-16 of 0.025 J / h
     energy = [2e5 / 2 * np.maximum(np.abs(z + s * h) - GAP, 0) ** 2 for s in (-1, 1)]
@@ -32,7 +32,7 @@ def test_the_elastic_force_is_the_slope_of_its_energy():
 
 
 def test_the_stop_pushes_and_never_pulls():
-    stop = amb.Stop(2e5, 50.0)
+    stop = amb.plants.Stop(2e5, 50.0)
     deep = GAP * (1 + 10 * DAMPING_DEPTH)
     coming, rest, leaving, fleeing = (force(stop, -deep, v) for v in (-0.01, 0.0, 0.01, 1.0))
     assert (coming - rest, rest - leaving) == pytest.approx((0.5, 0.5))  # 50 N s/m at 0.01 m/s
@@ -92,7 +92,7 @@ def test_the_step_of_a_stop_resolves_its_contact(damping, largest):
     `largest`: relative error of the velocity after the contact, as stated at `simulation.method.TOUCHED`. The error
     exceeds half of it, so that the statement is not too cautious either.
     """
-    stop, m, gap = amb.Stop(1e7, damping), 2.4, 2.5e-4
+    stop, m, gap = amb.plants.Stop(1e7, damping), 2.4, 2.5e-4
     slope = float(stop.slope(m))
 
     def rebound(phase, step):

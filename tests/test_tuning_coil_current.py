@@ -69,7 +69,7 @@ def measured(case):
     """Return the rms current of a coil as the search computes it, and the recorded signals."""
     context = LimitContext(case.settle, float(case.clock.duration), float(case.scenario.touchdown), 45e-6)
     outcome = rollout(case.cascade, case.scenario, case.clock, fold=Named(measures(["rms_coil_A"], (), context)))
-    return outcome.measured["rms_coil_A"], outcome.trajectory.rows
+    return outcome.metrics["rms_coil_A"], outcome.trajectory.rows
 
 
 @pytest.mark.parametrize("kind", ["lumped", "two-coil"])

@@ -18,7 +18,7 @@ import tuning.rounds
 from ambjax import rollout
 from ambjax.numerics.records import is_traced
 from ambjax.simulation.folds import Named
-from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.metrics import Metrics
 from tuning.judge.peaks import MemberPeak, Sensitivity
 from tuning.problem import config
 from tuning.problem.config import LimitSettings, settings
@@ -163,8 +163,8 @@ def test_the_search_computes_the_quantities_of_the_judge():
     case = made.case
     context = LimitContext(case.settle, float(case.clock.duration), float(case.scenario.touchdown), 45e-6)
     folds = measures([limit.name for limit in made.limits], made.limits, context)
-    fold = Named({"ours": Named(folds), "theirs": standard_for(case.settle, case.scenario)})
-    both = rollout(case.cascade, case.scenario, case.clock, fold=fold, every=0).measured
+    fold = Named({"ours": Named(folds), "theirs": Metrics.of(case.settle, case.scenario)})
+    both = rollout(case.cascade, case.scenario, case.clock, fold=fold, record_every=0).metrics
     ours, theirs = ({name: float(value) for name, value in both[part].items()} for part in ("ours", "theirs"))
     assert set(ours) == {name for name, kind in KINDS.items() if kind.fold is not None}
     for name, kind in KINDS.items():
@@ -333,7 +333,7 @@ def test_members_that_break_a_limit_on_the_worst_member_join(monkeypatch):
     assert set(more.seed) == {config.seeds(problem.tune.budget)[1]}
     course.members = course.members.joined(more, stressed=False)
     assert course.members.searched.member[:2].tolist() == [1, 4]
-    assert course.members.part(4).member[:2].tolist() == [1, 4]
+    assert course.members.part.member[:2].tolist() == [1, 4]
     assert breaking(course, [(0.6, 3.0)], columns) is None
     assert breaking(course, [(0.6, 0.5)], columns) is None  # it is held
 
@@ -385,7 +385,7 @@ def test_an_answer_within_the_limits_is_preferred_to_one_of_less_error(monkeypat
     errors, within = iter([4e-3, 2e-3]), iter([True, False])
 
     def validated(course, x, error):
-        return Validation(course.answer(x, error, 1, next(errors)), error, np.arange(1))
+        return Validation(course.answer(x, error, 1, next(errors, math.inf)), error, np.arange(1), np.zeros(0, int))
 
     monkeypatch.setattr(tuning.rounds, "search_within_limits", lambda course, x: (x, next(within)))
     monkeypatch.setattr(tuning.rounds, "validated", validated)

@@ -11,24 +11,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from texts import case_and_tune
 
-from ambjax import (
-    Cascade,
-    Clock,
-    Initial,
-    Processor,
-    Pulse,
-    Scenario,
-    Sine,
-    Slide,
-    current,
-    inversion,
-    position,
-    rollout,
-)
+from ambjax import Cascade, Clock, Initial, Processor, Scenario, rollout
 from ambjax.cases.template_text import template
+from ambjax.laws import current, inversion, position
+from ambjax.signals import Pulse, Sine
 from ambjax.simulation.folds import Rms
 from ambjax.simulation.loop import INSTANT_TREE, Densities
 from ambjax.simulation.span import blank
+from ambjax.solvers import Slide
 from ambjax.theorem.conditions import delta_1_on_reference
 from tuning.problem.config import read_tune
 from tuning.problem.gains_table import off
@@ -199,7 +189,7 @@ CLOCK = Clock(400, 1e-4, Slide(2))
 
 
 def terms(cascade, scenario, fold, clock=CLOCK):
-    return rollout(cascade, scenario, clock, fold=fold, every=0).measured
+    return rollout(cascade, scenario, clock, fold=fold, record_every=0).metrics
 
 
 def test_tracking_is_the_settled_mean_square():

@@ -14,7 +14,7 @@ import tuning.command
 from ambjax import rollout
 from ambjax.extend import canonical
 from ambjax.simulation.folds import Named
-from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.metrics import Metrics
 from ambjax.world.coil_limits import difference
 from ambjax.world.coils import Currents
 from tuning.problem.limits import measures
@@ -102,8 +102,8 @@ def test_no_run_exceeds_the_bounds(processor):
     bounds = bounds_of(case)
     context = LimitContext(case.settle / 2, float(case.clock.duration), float(case.scenario.touchdown), 45e-6)
     names = [name for name in bounds if KINDS[name].fold is not None]
-    fold = Named({"ours": Named(measures(names, (), context)), "theirs": standard_for(0.0, case.scenario)})
-    found = rollout(case.cascade, case.scenario, case.clock, fold=canonical(fold), every=0).measured
+    fold = Named({"ours": Named(measures(names, (), context)), "theirs": Metrics.of(0.0, case.scenario)})
+    found = rollout(case.cascade, case.scenario, case.clock, fold=canonical(fold), record_every=0).metrics
     for name in names:
         exact = KINDS[name].exact
         value = float(found["theirs"][exact] if exact else found["ours"][name])

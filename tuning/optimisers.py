@@ -1,4 +1,4 @@
-"""Optimisers by name, as optax transformations: optax's first-order methods, and a BFGS for a few gains.
+"""Optimisers by name, as optax transformations: optax's Adam, and a BFGS for a few gains.
 
 `update(gradient, state, x, value=...)` receives the value and the gradient at x, the point of the last trial. The state
 contains the best point so far and its value. After a rejected trial, the next step starts at the best point.
@@ -12,23 +12,18 @@ import optax
 from jax import Array
 
 BFGS = "bfgs"
-# optax's optimisers that need only gradients and a learning rate.
-FIRST_ORDER = (
-    "adabelief", "adagrad", "adam", "adamax", "adan", "lamb", "lion", "nadam", "radam", "rmsprop", "sgd",
-)  # fmt: skip
-NAMES = (BFGS, *FIRST_ORDER)
+NAMES = (BFGS, "adam")
 
 # Trust radius of the BFGS: its largest value (1: a factor e of one gain), and its value for the first step, which has
 # no estimate of the curvature.
 LARGEST_RADIUS, FIRST_RADIUS = 1.0, 0.3
-# After a rejected trial, the trust radius is the length of its step times CONTRACTION, or times CONTRACTION_AT_JUMP if
-# the trial lies beyond a jump of the function.
-CONTRACTION, CONTRACTION_AT_JUMP = 0.5, 0.25
+# After a rejected trial, the trust radius is the length of its step times CONTRACTION, or times BACKTRACK if the trial
+# lies beyond a jump of the function. Adam repeats a rejected step with its length multiplied by BACKTRACK.
+CONTRACTION = 0.5
+BACKTRACK = CONTRACTION**2
 # A trial lies beyond a jump if its value, a logarithm, exceeds the best value by this or more, or if its value or
 # gradient is not finite.
 JUMP = 1.0
-# A first-order optimiser repeats a rejected step with its length multiplied by this factor.
-BACKTRACK = 0.25
 
 
 class BFGSState(NamedTuple):
@@ -41,13 +36,6 @@ class BFGSState(NamedTuple):
     radius: Array
     trials: Array
 
-    def restarted(self, fresh: "BFGSState") -> "BFGSState":
-        """Return the state `fresh` with the inverse Hessian of this state, for a function of similar curvature.
-
-        The trust radius is LARGEST_RADIUS.
-        """
-        return fresh._replace(inverse=self.inverse, radius=jnp.full_like(self.radius, LARGEST_RADIUS))
-
 
 class FirstOrderState(NamedTuple):
     """State of a first-order optimiser with backtracking: best point [m], its value, and optax's state, `inner`."""
@@ -56,14 +44,10 @@ class FirstOrderState(NamedTuple):
     value: Array
     inner: Any
 
-    def restarted(self, fresh: "FirstOrderState") -> "FirstOrderState":
-        """Return the state `fresh`."""
-        return fresh
-
 
 def optimiser(name: str, learning_rate: float) -> optax.GradientTransformationExtraArgs:
     """Return the optimiser of this name, one of NAMES. The BFGS does not use `learning_rate`."""
-    return bfgs() if name == BFGS else backtracking(getattr(optax, name)(learning_rate))
+    return bfgs() if name == BFGS else backtracking(optax.adam(learning_rate))
 
 
 def bfgs() -> optax.GradientTransformationExtraArgs:
@@ -85,7 +69,7 @@ def bfgs() -> optax.GradientTransformationExtraArgs:
         inverse = _updated_inverse(state, s, y, smooth)
         tried = jnp.sqrt(s @ s)
         wider = jnp.minimum(jnp.maximum(state.radius, 2 * tried), LARGEST_RADIUS)
-        narrower = jnp.where(smooth, CONTRACTION, CONTRACTION_AT_JUMP) * tried
+        narrower = jnp.where(smooth, CONTRACTION, BACKTRACK) * tried
         radius = jnp.where(state.trials == 0, state.radius, jnp.where(accept, wider, narrower))
         best, slope = jnp.where(accept, x, state.best), jnp.where(accept, gradient, state.gradient)
         step = -inverse @ slope
@@ -103,7 +87,7 @@ def _updated_inverse(state: BFGSState, s: Array, y: Array, smooth: Array) -> Arr
     curvature = s @ y
     usable = (state.trials > 0) & smooth & (curvature > 1e-10 * jnp.sqrt((s @ s) * (y @ y)))
     rho = 1 / jnp.where(usable, curvature, 1.0)
-    # The first pair (s, y) of a search sets the scale of the inverse Hessian, also of one kept from an earlier search.
+    # The first pair (s, y) of a search sets the scale of the inverse Hessian.
     scale = jnp.where(state.trials == 1, curvature / jnp.where(usable, y @ y, 1.0), 1.0)
     left = jnp.eye(len(s), dtype=s.dtype) - rho * jnp.outer(s, y)
     return jnp.where(usable, scale * left @ state.inverse @ left.T + rho * jnp.outer(s, s), state.inverse)

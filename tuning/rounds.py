@@ -2,13 +2,15 @@
 
 If the error of the integration steps at the optimum is too large, the search
 continues with finer steps. If a limit is not met, it continues with other multipliers. The answer is then validated.
-If it is not `SearchResult.good`, two kinds of members join the training ensemble for the next round: validation members
-that are lost, and members that are lost with accurate steps. If tune.objective or --pareto requires it, the front of
-error against voltage is traced at the end.
+The members that fail join the training ensemble for the next round (`validate.joining`). If the gains of the case are
+better than every answer, they are the answer. If tune.objective or --pareto requires it, the front of error against
+voltage is traced at the end.
 """
 
 import dataclasses
+import math
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,8 +21,8 @@ from tuning.front import trace_front
 from tuning.judge.evaluate import StepError, describe, step_error
 from tuning.problem.tuning_problem import TuningProblem, problem_of
 from tuning.solve.course import Course, SearchResult, first_search, training
-from tuning.solve.multipliers import search_within_limits
-from tuning.validate import joining, validated
+from tuning.solve.multipliers import judged_at, search_within_limits
+from tuning.validate import joining, terms_at, validated
 
 # Largest number of rounds, and of halvings of the step.
 MOST_ROUNDS, MOST_HALVINGS = 12, 2
@@ -59,23 +61,42 @@ def rounds(
         limited, within = search_within_limits(course, x)
         if limited is not x:
             x, error = limited, None
-        answer, error, lost = validated(course, x, error)
-        answers.append(dataclasses.replace(answer, within=within))
-        if answer.good or course.over or len(answers) >= MOST_ROUNDS:
+        found = validated(course, x, error)
+        answers.append(dataclasses.replace(found.result, within=within))
+        if not found.failed or course.over or len(answers) >= MOST_ROUNDS:
             break
-        course.members = course.members.joined(joining(course.problem, lost, error))
-        course.tell(
-            "lost members, and members lost with accurate steps, join the training ensemble; the search continues"
-        )
-        x = course.search(course.around(x))
+        course.members = joining(course, found)
+        x, _ = course.again(x)
     if not answers:
         return course.answer(x, None, budget.validation)
-    best = min(answers, key=lambda one: (not one.confirmed, one.lost, not one.within, one.validation_error))
+    best = _best_of(answers)
+    if not course.over:
+        best = _best_of([best, *_given(course, start, best)])
     if problem.front and best.good and not course.over:
         course.members = best.members
         best = described("the front of error against voltage", lambda: trace_front(course, best)) or best
     last = course.answer(x, None, 0)
     return dataclasses.replace(best, seconds=last.seconds, complete=last.complete)
+
+
+def _best_of(answers: Sequence[SearchResult]) -> SearchResult:
+    """Return the best answer: confirmed, with the fewest lost members, within all limits, of least error."""
+    return min(answers, key=lambda one: (not one.confirmed, one.lost, not one.within, one.validation_error))
+
+
+def _given(course: Course, start: np.ndarray, best: SearchResult) -> list[SearchResult]:
+    """Return the gains of the case, `start` [m], as a validated answer if their error is less than that of `best`.
+
+    The error on the training members decides whether they are validated.
+    """
+    space = course.problem.objective.space
+    x = space.encode(space.clip(start))
+    terms = terms_at(course.problem, x, course.members)
+    error = math.sqrt(terms["tracking"][: course.members.ordinary].mean())
+    if (terms["survival"] > 0).any() or error >= best.validation_error:
+        return []
+    within = judged_at(course, x).holds(course.problem.limits)
+    return [dataclasses.replace(validated(course, x).result, within=within)]
 
 
 def with_fine_steps(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepError]:

@@ -11,21 +11,29 @@ from tuning.problem.config import seeds
 from tuning.problem.members import Members
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.course import Course, SearchResult
+from tuning.solve.multipliers import MOST_JOINING, largest_unseen
 
-# Largest number of lost members that join the training ensemble at once.
-MOST_LOST = 16
+# If the rms error of the validation members exceeds that of the training members by more than this factor, the training
+# ensemble lacks members with large errors.
+LARGER = 1.5
 
 
 class Validation(NamedTuple):
     """Result of `validated`.
 
     `result`: the answer. `error`: its step error. `lost`: numbers of the validation members that are lost, the earliest
-    loss first.
+    loss first. `large`: numbers of members with larger errors than the training members have.
     """
 
     result: SearchResult
     error: StepError
     lost: np.ndarray
+    large: np.ndarray
+
+    @property
+    def failed(self) -> bool:
+        """Whether members join the training ensemble (`joining`)."""
+        return not self.result.good or self.large.size > 0
 
 
 def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> Validation:
@@ -37,10 +45,11 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
     problem, budget = course.problem, course.problem.tune.budget
     error = step_error(problem, x) if error is None else error
     if course.interrupted or not budget.validation:
-        return Validation(course.answer(x, error, error.unconfirmed), error, np.zeros(0, int))
+        none = np.zeros(0, int)
+        return Validation(course.answer(x, error, error.unconfirmed), error, none, none)
     count = budget.validation
     course.tell(f"validating the answer on {count} members")
-    terms = _terms(problem, x, problem.objective.chosen(seeds(budget)[1], np.arange(count), count))
+    terms = terms_at(problem, x, problem.objective.chosen(seeds(budget)[1], np.arange(count), count))
     share = terms["survival"]
     lost = np.argsort(-share, kind="stable")[: int((share > 0).sum())]
     if not lost.size and not error.refuted and not problem.sampled:
@@ -49,23 +58,30 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
         course.tell(f"accurate steps, with the worst of {count} validation members: {describe(error)}")
     if lost.size:
         course.tell(f"{lost.size} of {count} validation members are lost")
-    errors = np.sqrt(terms["tracking"][share <= 0])
-    overall = rms(errors) if errors.size else math.inf
-    return Validation(course.answer(x, error, lost.size + error.unconfirmed, overall), error, lost)
+    errors = np.where(share > 0, -math.inf, np.sqrt(terms["tracking"]))
+    overall = rms(errors[share <= 0]) if (share <= 0).any() else math.inf
+    found = course.answer(x, error, lost.size + error.unconfirmed, overall)
+    trained = terms_at(problem, x, course.members)["tracking"][: course.members.ordinary]
+    large = largest_unseen(course, errors) if overall > LARGER * math.sqrt(trained.mean()) else np.zeros(0, int)
+    return Validation(found, error, lost, large)
 
 
-def joining(problem: TuningProblem, lost: np.ndarray, error: StepError) -> Members:
-    """Return the members that join the training ensemble.
+def joining(course: Course, found: Validation) -> Members:
+    """Return the training ensemble with the members that failed.
 
-    They are the first MOST_LOST of the `lost` validation members, and the members that are lost or stall with accurate
-    steps. They join with half of the additional noise of stressed members, as a margin.
+    The first MOST_JOINING of the lost members, and the members that are lost or stall with accurate steps, join as
+    stressed ones with half of the additional noise of these, as a margin. Members with large errors join as ordinary
+    ones.
     """
-    budget = problem.tune.budget
-    those = problem.objective.chosen(seeds(budget)[1], lost[:MOST_LOST], budget.validation)
-    both: Members = jax.tree.map(lambda a, b: np.concatenate([a, b]), those, error.unheld)
-    return both._replace(noise_factor=both.noise_factor * (1 + problem.tune.stress) / 2)
+    problem, budget = course.problem, course.problem.tune.budget
+    those = problem.objective.chosen(seeds(budget)[1], found.lost[:MOST_JOINING], budget.validation)
+    both: Members = jax.tree.map(lambda a, b: np.concatenate([a, b]), those, found.error.unheld)
+    members = course.members.joined(both._replace(noise_factor=both.noise_factor * (1 + problem.tune.stress) / 2))
+    course.tell(f"{len(both.member)} lost members and {found.large.size} of large errors join the training ensemble")
+    large = problem.objective.chosen(seeds(budget)[1], found.large, budget.validation)
+    return members.joined(large, stressed=False)
 
 
-def _terms(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, np.ndarray]:
+def terms_at(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, np.ndarray]:
     """Return the terms of the loss by name, each [N], of members [N] at x [m]."""
     return {name: values[0] for name, values in problem.engine.terms(x[None], members).items()}

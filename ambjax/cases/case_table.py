@@ -11,7 +11,7 @@ from ambjax.numerics.records import GainFunction
 from ambjax.numerics.shapes import axes_of
 from ambjax.simulation.clock import Clock
 from ambjax.world.scenario import SLOTS, Scenario
-from ambjax.world.signals import Constant
+from ambjax.world.waveforms import Constant
 
 # Unit of each signal of a scenario.
 UNITS = {"reference": "m", "q_z": "m/s^2", "q_v": "A^2/m^2", "q_i": "A/s", "q_f": "N", "base": "m/s^2"}

@@ -94,7 +94,7 @@ def cascade_from(
     command = drive(actuator)
     table.only(["model", "notch", *KINDS])
     model = table.table("model").record(Plant, base=plant)  # always lumped, even for a two-coil plant
-    sampling = None if processor is None or period is None else processor.sampling(period)
+    sampling = processor.sampling(period) if processor and period else None
     laws, own, matrices = {}, [], None
     for stage, kinds in KINDS.items():
         law = table.table(stage)

@@ -9,6 +9,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ambjax.cases.machine_controller import inner, law_from, merged, without_keys
+from ambjax.cases.machine_spread import axis_table, fastest_rotor, machine_spread, refuse_unused
 from ambjax.cases.notch_table import notch_from
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
 from ambjax.cases.rotor_tables import (
@@ -24,6 +26,8 @@ from ambjax.cases.rotor_tables import (
     vector,
 )
 from ambjax.cases.table import Table, load, show
+from ambjax.control.machine_law import MachineLaw
+from ambjax.ensemble.spread import Spread
 from ambjax.linear.analysis import Zones
 from ambjax.linear.notch_design import machine_notch_gains, notch_speeds
 from ambjax.numerics.records import canonical
@@ -33,7 +37,7 @@ from ambjax.simulation.method import ACCURATE, slopes
 from ambjax.simulation.rollout import prepare
 from ambjax.simulation.whole_machine import Machine, machine_of
 from ambjax.text.words import one_line
-from ambjax.world.rotation import PER_MINUTE
+from ambjax.world.rotation import PER_MINUTE, known
 from ambjax.world.rotor import Rotor
 
 MACHINE_TABLES = ("rotor", "bearing", "unbalance", "load")
@@ -52,8 +56,8 @@ class MachineCase:
 
     `machine`: rotor and axes, for a rollout with `clock`. `axes`: names of the axes. `coordinates`: names of the
     rotor's coordinates. `cases`: the case of each axis, with the mass and the weight that it carries. `settle`: time
-    from which "settled" metrics count, s. `zones`, `speeds`: range, limits and speeds (rpm) of the sensitivity. `text`:
-    the file as read.
+    from which "settled" metrics count, s. `zones`, `speeds`: range, limits and speeds (rpm) of the sensitivity.
+    `spread`: the numbers that vary between the members of an ensemble. `text`: the file as read.
     """
 
     name: str
@@ -65,6 +69,7 @@ class MachineCase:
     settle: float
     zones: Zones
     speeds: tuple[float, ...]
+    spread: Spread = Spread()
     text: str = ""
 
 
@@ -97,9 +102,8 @@ def machine_from(
     """Return the machine of a parsed TOML document. Raises ValueError, one line, for an invalid one."""
     top = Table(raw)
     top.only([*TABLES, *MACHINE_TABLES[1:], "tune"])
-    for table, instead in (("disturbance", "[[load]]"), ("spread", "one case for each value")):
-        if table in raw:
-            raise ValueError(f"[{table}]: a machine with [rotor] does not take it yet. Use {instead} instead.")
+    if "disturbance" in raw:
+        raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] instead.")
     body, bearings = body_from(top), tables_of(top, "bearing")
     if not bearings:
         raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
@@ -108,43 +112,68 @@ def machine_from(
     q, currents = _start(top.table("initial"), rotor, len(axes))
     _check_rank(rotor, axes)
     masses, forces = _shares(rotor)
+
+    def read(raw: dict[str, Any], name: str) -> Case:
+        try:
+            return case_from(raw, name, "", folder)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+
+    names = [table.raw.get("name", f"bearing{k + 1}") for k, table in enumerate(bearings)]
     cases = []
     for axis, m, force, i in zip(axes, masses, forces, currents, strict=True):
         own = _axis_raw(raw, bearings[axis.bearing], m, force, {"z": float(axis.magnet @ q), "i": i})
-        try:
-            case = case_from(own, axis.name, "", folder)
-        except ValueError as error:
-            raise ValueError(f"axis {axis.name}: {error}") from None
+        own |= axis_table(raw, axis, names[axis.bearing])
+        case = read(own, f"axis {axis.name}")
         _check_force(case, axis, force)
         cases.append(case)
-    clock = _clock(cases, rotor, fixed=not isinstance(raw.get("clock", {}).get("dt", "auto"), str))
-    machine = _machine(rotor, cases, clock, q)
-    if (found := notch_from(top, cases[0].scenario)) is not None:
-        notch, phase = found
-        speeds = notch_speeds(cases[0].scenario.rotor, notch, float(clock.duration))
-        gains = machine_notch_gains(machine, notch, speeds, clock.sample_period, phase)
-        notches = [dataclasses.replace(notch, gains=own) for own in gains]
-        laws = [dataclasses.replace(case.cascade, notch=one) for case, one in zip(cases, notches, strict=True)]
-        cases = [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
-        machine = _machine(rotor, cases, clock, q)
-    names = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
+    law, parts = law_from(top, rotor, bearings, cases, read)
+    spread = machine_spread(top, rotor, axes, names, cases)
+    if law is not None:
+        refuse_unused(spread)
+    fixed = not isinstance(raw.get("clock", {}).get("dt", "auto"), str)
+    clock = _clock([*cases, *parts], fastest_rotor(rotor, spread), fixed)
+    cases = _with_notches(top, rotor, cases, clock, q, law)
+    coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
     return MachineCase(
         name=safe_name(name),
-        machine=machine,
+        machine=_machine(rotor, cases, clock, q, law),
         clock=clock,
         axes=tuple(axis.name for axis in axes),
-        coordinates=names,
+        coordinates=coordinates,
         cases=tuple(cases),
         settle=cases[0].settle,
         zones=cases[0].zones,
         speeds=_speeds(top.table("sensitivity"), rotor, float(clock.duration)),
+        spread=spread,
         text=text,
     )
 
 
-def _machine(rotor: Rotor, cases: list[Case], clock: Clock, q: np.ndarray) -> Machine:
-    systems = [canonical(prepare(case.cascade, case.scenario, clock)[0]) for case in cases]
-    return machine_of(rotor, systems, jnp.asarray(q))
+def _machine(rotor: Rotor, cases: list[Case], clock: Clock, q: np.ndarray, law: MachineLaw | None) -> Machine:
+    systems = [prepare(case.cascade, case.scenario, clock)[0] for case in cases]
+    systems = [canonical(system if law is None else inner(system)) for system in systems]
+    return machine_of(rotor, systems, jnp.asarray(q), law)
+
+
+def _with_notches(
+    top: Table, rotor: Rotor, cases: list[Case], clock: Clock, q: np.ndarray, law: MachineLaw | None
+) -> list[Case]:
+    """Return the cases of the axes with the notch of [controller.notch], whose gains are those of the machine."""
+    found = notch_from(top, cases[0].scenario)
+    if found is None:
+        return cases
+    if law is not None:
+        raise ValueError('[controller.notch] acts on axes. Leave it out, or use controller.coordinates = "axes".')
+    notch, phase = found
+    speeds = notch_speeds(known(notch.rotor), notch, float(clock.duration))
+    machine = _machine(rotor, cases, clock, q, None)
+    gains = machine_notch_gains(machine, notch, speeds, clock.sample_period, phase)
+    laws = [
+        dataclasses.replace(case.cascade, notch=dataclasses.replace(notch, gains=own))
+        for case, own in zip(cases, gains, strict=True)
+    ]
+    return [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
 
 
 def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:
@@ -208,36 +237,22 @@ def _check_force(case: Case, axis: BearingAxis, force: float) -> None:
 
 def _axis_raw(raw: dict[str, Any], bearing: Table, m: float, force: float, initial: dict[str, float]) -> dict[str, Any]:
     """Return the case of one axis: the common tables, what the bearing changes, and the rotor's share."""
-    own = copy.deepcopy({key: value for key, value in raw.items() if key not in (*MACHINE_TABLES, "initial", "tune")})
+    apart = (*MACHINE_TABLES, "initial", "tune", "spread")
+    own = copy.deepcopy({key: value for key, value in raw.items() if key not in apart})
     if turning := {key: raw["rotor"][key] for key in ("speed", "acceleration") if key in raw["rotor"]}:
         own["rotor"] = {"speed": 0.0, **turning}
     for table in OWN:
         if table in bearing.raw:
-            own[table] = _merged(own.get(table, {}), bearing.table(table).raw)
+            own[table] = merged(own.get(table, {}), bearing.table(table).raw)
     plant = own.setdefault("plant", {})
     for name in ("m", "k_z", "g"):
         if isinstance(plant, dict) and name in plant:
             raise ValueError(f"plant.{name} = {show(plant[name])}: the rotor gives it. Leave it out beside [rotor].")
     own["plant"] = plant | {"m": m, "k_z": 0.0, "g": force / m}
-    controller = own.get("controller")
-    if isinstance(controller, dict) and "coordinates" in controller:
-        Table(controller, "controller").choice("coordinates", ["axes"])
-        del controller["coordinates"]
-    if isinstance(controller, dict):
-        controller.pop("notch", None)  # its gains are those of the machine
+    without_keys(own)
     if isinstance(own.get("sensitivity"), dict):
         own["sensitivity"].pop("speeds", None)
     return own | {"initial": initial}
-
-
-def _merged(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """Return the common table with the keys of another one, recursively. Another `kind` replaces the whole table."""
-    if "kind" in own and own["kind"] != common.get("kind", own["kind"]):
-        return own
-    both = dict(common)
-    for key, value in own.items():
-        both[key] = _merged(both[key], value) if isinstance(value, dict) and isinstance(both.get(key), dict) else value
-    return both
 
 
 def _clock(cases: list[Case], rotor: Rotor, fixed: bool) -> Clock:

@@ -13,7 +13,7 @@ import jax
 from ambjax.cases.table import quoted, show
 from ambjax.cases.trial import try_law
 from ambjax.control.base import Law
-from ambjax.control.laws import STAGES
+from ambjax.control.stages import STAGES
 from ambjax.host.imports import digest_of, line_of, module_of_file, module_of_name, pickle_with_source
 from ambjax.world.plant import Plant
 

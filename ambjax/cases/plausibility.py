@@ -83,7 +83,7 @@ def _flux(case: Case) -> Iterator[str]:
 
 
 def _limits(case: Case) -> Iterator[str]:
-    amplifier, bias = case.scenario.amplifier, float(case.scenario.plant.i_0)
+    amplifier, bias = case.scenario.actuator, float(case.scenario.plant.i_0)
     for path, part in (("actuator", amplifier), ("actuator.coil", getattr(amplifier, "coil", None))):
         limit = getattr(part, "i_max", None)
         if limit is not None and float(limit) > MOST_CURRENT * bias:
@@ -94,13 +94,13 @@ def _limits(case: Case) -> Iterator[str]:
 def _rates(case: Case) -> Iterator[str]:
     scenario, pole = case.scenario, float(case.scenario.plant.pole)
     samples = 1 / (float(case.clock.sample_period) * pole)
-    if case.cascade.processor is not None and 1 <= samples < LEAST_SAMPLES:
+    if case.cascade.sampled and 1 <= samples < LEAST_SAMPLES:
         yield (
             f"clock.sample_period = {float(case.clock.sample_period):g} s: the time constant of the unstable rotor has "
             f"only {samples:.2g} samples. Give at least {LEAST_SAMPLES:g}; usable margins need 10 or more."
         )
-    for name, part in (("sensor", scenario.sensor), ("actuator", scenario.amplifier)):
-        bandwidth = getattr(part, "bandwidth", None)
+    for name, part in (("sensor", scenario.sensors), ("actuator", scenario.actuator)):
+        bandwidth = part.bandwidth
         if bandwidth is not None and 2 * math.pi * float(bandwidth) < LEAST_BANDWIDTH * pole:
             yield (
                 f"{name}.bandwidth = {float(bandwidth):g} Hz is less than twice the unstable pole, {pole:.4g} 1/s = "
@@ -109,8 +109,8 @@ def _rates(case: Case) -> Iterator[str]:
 
 
 def _converter(case: Case) -> Iterator[str]:
-    sensor = case.scenario.sensor
-    if sensor is None or sensor.bits is None or not sensor.std:
+    sensor = case.scenario.sensors
+    if sensor.bits is None or not sensor.std:
         return
     step = 2 * float(sensor.ends(case.scenario.plant.s_0)) / 2 ** float(sensor.bits)
     if step > MOST_STEP * float(sensor.std):
@@ -121,16 +121,16 @@ def _converter(case: Case) -> Iterator[str]:
 
 
 def _delay(case: Case) -> Iterator[str]:
-    processor = case.cascade.processor
-    if processor is not None and 0 < float(processor.delay) < LEAST_DELAY:
-        yield f"processor.delay = {float(processor.delay):g} samples is close to 0. Is it in seconds?"
+    delay = float(case.cascade.timing.delay)
+    if 0 < delay < LEAST_DELAY:
+        yield f"processor.delay = {delay:g} samples is close to 0. Is it in seconds?"
 
 
 def _runout(case: Case) -> Iterator[str]:
-    sensor, stop = case.scenario.turning().sensor, float(case.scenario.touchdown)
-    if sensor is None or sensor.runout is None:
+    runout, stop = case.scenario.turning().sensors.runout, float(case.scenario.touchdown)
+    if runout is None:
         return
-    most = max(abs(float(one)) for one in sensor.runout.span(float(case.clock.duration)))
+    most = max(abs(float(one)) for one in runout.span(float(case.clock.duration)))
     if most > MOST_RUNOUT * stop:
         yield (
             f"sensor.runout: the harmonics reach {most:.3g} m, {100 * most / stop:.3g} % of run.clearance. Are the "
@@ -161,9 +161,7 @@ def _loads(case: Case) -> Iterator[str]:
 
 def _aliases(case: Case) -> Iterator[str]:
     half = 0.5 / float(case.clock.sample_period)
-    parts = _signals(case) | {"rotor": case.scenario.rotor}
-    if case.scenario.sensor is not None:
-        parts["sensor.runout"] = case.scenario.sensor.runout
+    parts = _signals(case) | {"rotor": case.scenario.rotor, "sensor.runout": case.scenario.sensors.runout}
     for path, signal in parts.items():
         for name, high in _frequencies(signal):
             if high > half:

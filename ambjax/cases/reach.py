@@ -13,7 +13,7 @@ from ambjax.world.band_noise import BandNoise
 from ambjax.world.ramps import Trapezoid
 from ambjax.world.recorded import Recorded
 from ambjax.world.scenario import Scenario
-from ambjax.world.signals import Sum
+from ambjax.world.waveforms import Sum
 
 # Signals whose bound (`span`) need not be reached within the run.
 BOUNDED = (Sum, BandNoise, Recorded, Trapezoid)

@@ -138,13 +138,13 @@ def case_from(
     if is_machine(raw):
         raise ValueError(
             "[rotor], [[bearing]]: a whole machine, and this takes one axis. `ambjax simulate`, `check`, "
-            "`sensitivity` and `campbell` take machines; in Python, read_machine does."
+            "`sensitivity`, `campbell` and `ensemble` take machines; in Python, read_machine does."
         )
     top.only([*TABLES, *OTHERS])
     plant = _plant(top.table("plant"))
     processor = processor_from(top.table("processor")) if "processor" in top.raw else None
     clock, duration = clock_from(top.table("clock"))
-    period = None if processor is None else clock.sample_period
+    period = clock.sample_period if processor else None
     files = Files(folder, known.own_laws if known else (), known.controller_file if known else None)
     cascade, own, matrices = cascade_from(top, plant, processor, period, files)
     recordings = Recordings(folder, known.recorded if known else ())
@@ -165,11 +165,12 @@ def case_from(
     spread = spread_from(top, cascade, scenario)
     check_reference(spread, cascade, scenario, clock)
     clock = with_method(clock, *corners(spread, cascade, scenario))
-    if (late := ends(spread, cascade, scenario, ("processor.",))[0].processor) is not None:
-        cascade = cascade.on_processor(late.delay, between="processor.delay" in spread.paths)
+    if cascade.sampled:
+        latest = ends(spread, cascade, scenario, ("processor.",))[0].timing.delay
+        cascade = cascade.on_processor(latest, between="processor.delay" in spread.paths)
     assumed = _left_out(top.table("plant"), plant)
     zones = top.table("sensitivity").record(Zones)
-    zones.check(None if cascade.processor is None else clock.sample_period)
+    zones.check(clock.sample_period if cascade.sampled else None)
     read = tuple(recordings.read)
     return Case(safe_name(name), cascade, scenario, clock, settle, spread, text, assumed, own, matrices, zones, read)
 

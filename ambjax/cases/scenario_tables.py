@@ -9,7 +9,7 @@ from ambjax.cases.table import Table, show
 from ambjax.cases.turning import OWN_SPEED, check_turning, rotation_from, turning_from
 from ambjax.numerics.records import leaf
 from ambjax.simulation.clock import Clock
-from ambjax.world import signals
+from ambjax.world import waveforms
 from ambjax.world.amplifier import Amplifier, CurrentAmplifier
 from ambjax.world.band_noise import BandNoise
 from ambjax.world.bearing import Bearing
@@ -24,19 +24,19 @@ from ambjax.world.touchdown import Stop
 
 # The signals by kind.
 SIGNALS: dict[str, type] = {
-    "constant": signals.Constant,
-    "step": signals.Step,
-    "pulse": signals.Pulse,
-    "sine": signals.Sine,
-    "smoothstep": signals.SmoothStep,
-    "chirp": signals.Chirp,
+    "constant": waveforms.Constant,
+    "step": waveforms.Step,
+    "pulse": waveforms.Pulse,
+    "sine": waveforms.Sine,
+    "smoothstep": waveforms.SmoothStep,
+    "chirp": waveforms.Chirp,
     "band-noise": BandNoise,
     "ramp": Ramp,
     "trapezoid": Trapezoid,
     "table": Recorded,
     "unbalance": Unbalance,
     "unbalance-grade": UnbalanceGrade,
-    "sum": signals.Sum,
+    "sum": waveforms.Sum,
 }
 # Units of the signals that fix their unit.
 FIXED_UNITS = {kind: signal.unit for kind, signal in SIGNALS.items() if hasattr(signal, "unit")}
@@ -64,7 +64,7 @@ def signal_from(table: Table, unit: str, recordings: Recordings, extra: tuple[st
         if len(terms) > MOST_TERMS:
             raise ValueError(f"{table.at('terms')}: {len(terms)} terms are too many; give at most {MOST_TERMS}.")
         parts = [Table(term, f"{table.at('terms')}[{n}]") for n, term in enumerate(terms)]
-        return signals.Sum(tuple(signal_from(part, unit, recordings) for part in parts))
+        return waveforms.Sum(tuple(signal_from(part, unit, recordings) for part in parts))
     if kind == "table":
         return recordings.signal(table, extra)
     turns = "rotation" in {field.name for field in dataclasses.fields(SIGNALS[kind])}
@@ -84,7 +84,7 @@ def _disturbances(table: Table, recordings: Recordings) -> dict[str, Any]:
             own = [unit for unit in slots if unit == FIXED_UNITS.get(str(one.raw.get("kind")))]
             unit = one.choice("unit", list(slots), [*own, *slots][0])
             found.setdefault(slots[unit], []).append(signal_from(one, unit, recordings, extra=("unit",)))
-    return {slot: made[0] if len(made) == 1 else signals.Sum(tuple(made)) for slot, made in found.items()}
+    return {slot: made[0] if len(made) == 1 else waveforms.Sum(tuple(made)) for slot, made in found.items()}
 
 
 def _each(table: Table, name: str) -> list[Table]:
@@ -106,7 +106,7 @@ def scenario_from(top: Table, plant: Bearing, recordings: Recordings) -> tuple[S
         plant=plant,
         reference=signal_from(top.table("reference"), "m", recordings)
         if "reference" in top.raw
-        else signals.Constant(),
+        else waveforms.Constant(),
         rotor=rotation_from(top.table("rotor")) if "rotor" in top.raw else None,
         sensor=_sensor(top.table("sensor")) if "sensor" in top.raw else None,
         initial=top.table("initial").record(Initial),
@@ -234,7 +234,7 @@ def check_start(scenario: Scenario) -> None:
 
 def _check_coils(scenario: Scenario) -> None:
     """Raise ValueError unless the limits of a coil contain its bias and its current at the start."""
-    coil = None if scenario.amplifier is None else scenario.amplifier.coil
+    coil = scenario.actuator.coil
     if coil is None:
         return
     i_0, bias, i = scenario.plant.i_0, scenario.plant.R * scenario.plant.i_0, scenario.initial.i

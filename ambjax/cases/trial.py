@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from ambjax.control.base import Law
-from ambjax.control.laws import CurrentDemand, CurrentInputs, ForceDemand
+from ambjax.control.stages import CurrentDemand, CurrentInputs, ForceDemand
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 # Outputs of the stages in words.
 OUTPUTS = {

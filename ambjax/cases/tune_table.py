@@ -32,7 +32,7 @@ NUMBERS: dict[str, dataclasses.Field] = {
     "gain_margin": leaf(
         1.25, above=0, at_most=1e6, doc="each gain of a stressed member is multiplied or divided by this factor"
     ),
-    "learning_rate": leaf(0.1, above=0, at_most=1e3, doc="step size of an optimiser of optax"),
+    "learning_rate": leaf(0.1, above=0, at_most=1e3, doc="step size of Adam"),
     "minutes": leaf(
         math.inf,
         above=0,
@@ -87,7 +87,7 @@ class Budget:
     seed: int = _whole(1, 0, "seed of the training members and of the screen; the other ensembles have other seeds")
     screen: int = _members(128, 0, "number of starting points that are screened; 0: only the gains of the case")
     starts: int = _whole(4, 1, "number of the best of these points that are refined")
-    iterations: int = _whole(40, 1, "largest number of iterations in each phase of the refinement")
+    iterations: int = _whole(40, 1, "largest number of iterations of a search")
     substeps: int = _whole(3, 1, "integration steps per sample")
     front: int = leaf(
         3,
@@ -133,7 +133,7 @@ def template_lines() -> Iterator[Line]:
     yield from _defaults("", {name: BUDGET[name] for name in ("members", "stressed")})
     yield from _defaults("", {name: NUMBERS[name] for name in ("stress", "gain_margin")})
     yield from _defaults("", {name: field for name, field in BUDGET.items() if name not in ("members", "stressed")})
-    yield Line(f'optimiser = "{OPTIMISER}"', 'or one of optax, such as "adam"')
+    yield Line(f'optimiser = "{OPTIMISER}"', 'or "adam"')
     yield from _defaults("", {name: NUMBERS[name] for name in ("learning_rate", "minutes")})
 
 

@@ -58,21 +58,27 @@ def spread_from(top: Table, cascade: Cascade, scenario: Scenario) -> Spread:
     table = top.table("spread")
     design = table.choice("design", list(DESIGNS), Spread.design)
     known = list(places(cascade, scenario))
-    entries = _entries({key: value for key, value in table.raw.items() if key != "design"}, "", known)
+    entries = entries_of({key: value for key, value in table.raw.items() if key != "design"}, "", known)
     spread = Spread(tuple(entries), design)
     _refuse_nothing_in_two_units(spread, top)
     check_spread(spread, cascade, scenario)
     return spread
 
 
-def _entries(raw: dict[str, Any], prefix: str, known: list[str]) -> list[tuple[str, Distribution]]:
+def is_distribution(value: object) -> bool:
+    """Return whether a value of [spread] is a distribution, and not a table of further paths."""
+    return not isinstance(value, dict) or not value or bool(set(value) & {*DISTRIBUTIONS, "shape"})
+
+
+def entries_of(raw: dict[str, Any], prefix: str, known: list[str]) -> list[tuple[str, Distribution]]:
+    """Return the paths and distributions of a nested table. `prefix`: its path. `known`: all paths that there are."""
     entries = []
     for key, value in raw.items():
         path = prefix + key
         if path in known:
             entries.append((path, _distribution(value, path)))
-        elif isinstance(value, dict) and value and not set(value) & {*DISTRIBUTIONS, "shape"}:
-            entries += _entries(value, path + ".", known)
+        elif not is_distribution(value):
+            entries += entries_of(value, path + ".", known)
         else:
             require_path(path, known, show(value))
     return entries

@@ -4,7 +4,8 @@ import dataclasses
 import math
 import pathlib
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -23,14 +24,19 @@ GRAVITY = "g"
 MOST_NOISE = 0.1
 
 
-def read_case(path: str | pathlib.Path) -> Case:
-    """Read and check the case file at `path`, and return the case.
+def read_case(path: str | pathlib.Path | Mapping[str, Any]) -> Case:
+    """Read and check the case file at `path`, and return the case. A dict of tables, as from TOML, works too.
 
     A value that is valid but probably unintended, such as millimetres given as metres, causes a UserWarning. Raises
-    ValueError, one line, if `path` is not a path, if the file cannot be read, or if any part of it is invalid.
+    ValueError, one line, if `path` is neither, if the file cannot be read, or if any part of it is invalid.
     """
-    case = reader.read_case(path)
-    for text in warnings_of_file(case, path):
+    if isinstance(path, Mapping):
+        case = reader.case_from(dict(path))
+        texts = warnings_of(case)
+    else:
+        case = reader.read_case(path)
+        texts = warnings_of_file(case, path)
+    for text in texts:
         warnings.warn(text, stacklevel=2)
     return case
 
@@ -70,17 +76,15 @@ def _sizes(case: Case) -> Iterator[str]:
 
 
 def _noise(case: Case) -> Iterator[str]:
-    sensor, gap = case.scenario.sensor, case.scenario.plant.s_0
-    if sensor is not None and sensor.std > MOST_NOISE * gap:
+    sensor, gap = case.scenario.sensors, case.scenario.plant.s_0
+    if sensor.std > MOST_NOISE * gap:
         share = 100 * sensor.std / gap
         yield f"sensor.std = {sensor.std:g} m is {share:.3g} % of the gap, {gap:g} m. Is it in another unit?"
 
 
 def _velocity(case: Case) -> Iterator[str]:
-    sensor = case.scenario.sensor
-    perfect = sensor is None or (sensor.velocity and sensor.std_z_dot == 0)
-    sampled = sensor is not None or case.cascade.processor is not None
-    if perfect and sampled and case.cascade.reads_velocity(case.clock.sample_period):
+    sensor, sampled = case.scenario.sensors, case.scenario.sensor or case.cascade.sampled
+    if sensor.velocity and sensor.std_z_dot == 0 and sampled and case.cascade.reads_velocity(case.clock.sample_period):
         yield (
             "sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ERROR, unlike by any real sensor. Set "
             "sensor.std_z_dot, or set sensor.velocity = false and use an observer that estimates the velocity."
@@ -89,10 +93,10 @@ def _velocity(case: Case) -> Iterator[str]:
 
 def idealised(case: Case) -> str:
     """Return a line that lists the idealisations of a case and the keys that remove them; '' if there are none."""
-    sensor, parts = case.scenario.sensor, []
+    parts = []
     if case.scenario.plant.one_current:
         parts.append("one current for both coils (plant.kind = 'two-coil' gives each its own)")
-    if (sensor is None or sensor.velocity) and case.cascade.reads_velocity(case.clock.sample_period):
+    if case.scenario.sensors.velocity and case.cascade.reads_velocity(case.clock.sample_period):
         parts.append("a measured velocity (sensor.velocity = false, and an observer that estimates it)")
     return f"Idealisations of this case, unlike a real bearing: {' and '.join(parts)}." if parts else ""
 
@@ -135,7 +139,7 @@ def _coil_voltage(scenario: Scenario, least: float) -> Iterator[str]:
     There are two: the limit minus the bias voltage is below the voltage that holds the rotor, `least` (V); the command
     may exceed the voltage at which both coils are at the limit.
     """
-    coil = None if scenario.amplifier is None else scenario.amplifier.coil
+    coil = scenario.actuator.coil
     if coil is None or coil.u_max is None:
         return
     bias = float(scenario.plant.R * scenario.plant.i_0)
@@ -158,7 +162,7 @@ def _coil_voltage(scenario: Scenario, least: float) -> Iterator[str]:
 def _motion(case: Case) -> Iterator[str]:
     scenario, clock, plant = case.scenario, case.clock, case.scenario.plant
     period, fall = float(clock.sample_period), 1 / math.sqrt(plant.k_s / plant.m)
-    if scenario.sensor is not None and period > fall:
+    if scenario.sensor and period > fall:
         yield (
             f"clock.sample_period = {period:g} s, for which each measurement error is held, is longer than the time "
             f"constant of the unstable rotor, {fall:.3g} s. Is it in milliseconds or microseconds?"

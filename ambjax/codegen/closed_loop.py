@@ -19,7 +19,7 @@ from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.system import system_of
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 FAULTS = [1 << k for k, name in enumerate(BITS) if name in ("invalid", "failed")]
 (REFUSED,) = (1 << k for k, name in enumerate(BITS) if name == "refused")
@@ -61,8 +61,8 @@ class Machines:
 class CompiledLoop(Sampled):
     """The sampled loop whose laws are the compiled controller `which` of `machines`."""
 
-    which: Scalar
-    machines: Machines = static()
+    which: Scalar = 0.0
+    machines: Machines = static(default=None)
 
     def start(self) -> SampledState:
         zero = jnp.zeros(())
@@ -102,7 +102,7 @@ class LoopComparison(NamedTuple):
 TIMES = 2.0
 # Samples per call, until the horizon is reached.
 BLOCK = 1000
-begin_jit, segment_jit = jax.jit(begin), jax.jit(segment, static_argnames=("count", "every"))
+begin_jit, segment_jit = jax.jit(begin), jax.jit(segment, static_argnames=("count", "record_every"))
 
 
 def compare_loops(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, LoopComparison]:
@@ -110,7 +110,8 @@ def compare_loops(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, Lo
     given: Any = system_of(case.cascade, case.scenario, case.clock)
     host, found = Machines(*machines.values()), {}
     for which, (precision, horizon) in enumerate(horizons(case, list(machines)).items()):
-        looped = CompiledLoop(ClosedLoop(given.loop.cascade, case.scenario), given.period, given.cuts, which, host)
+        loop = ClosedLoop(given.loop.cascade, case.scenario)
+        looped = CompiledLoop(loop, given.period, given.cuts, which=which, machines=host)
         found[precision] = LoopComparison(
             horizon, times_of(_displacement(looped, case.clock, horizon.samples), horizon)
         )
@@ -133,6 +134,6 @@ def _displacement(system: CompiledLoop, clock: Clock, count: int) -> np.ndarray:
     system, clock = canonical((system, clock))
     progress, rows, block = begin_jit(system, clock, None), [], min(BLOCK, clock.samples)
     for first in range(0, max(count, 1), block):
-        progress, row = segment_jit(system, clock, None, progress, first, count=block, every=1)
+        progress, row = segment_jit(system, clock, None, progress, first, count=block, record_every=1)
         rows.append(np.asarray(row.z))
     return np.concatenate(rows)

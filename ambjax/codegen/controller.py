@@ -27,7 +27,7 @@ from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 T = TypeVar("T")
 
@@ -114,9 +114,9 @@ class Controller(Block):
         fine = [
             jnp.abs(getattr(inputs, name)) <= getattr(limits, name) for name in StepInputs._fields[3:] if name in read
         ]
-        processor: Any = cascade.processor
+        processor = cascade.timing
         if processor.predicts or processor.guard is not None:  # the number of prediction steps is fixed at export
-            fine += [processor.delay >= 0, processor.delay <= processor.most]
+            fine += [processor.delay >= 0, processor.delay <= (processor.most or 0)]
         fine += [jnp.isfinite(p) for p in _steepnesses(cascade)]  # p = inf needs another program
         valid = functools.reduce(jnp.logical_and, fine, jnp.asarray(True))
         system = Sampled(ClosedLoop(cascade, Scenario(u_max=limits.u_max)), period, 0)
@@ -125,7 +125,7 @@ class Controller(Block):
         after = system.with_command(measured, Reference(*inputs[3:]), state)
         last = choose(valid, after.command, memory.last)
         watch, refused, safe = after.watch, jnp.asarray(False), jnp.asarray(False)
-        if processor.guard is not None:
+        if processor.guard and memory.watch:
             refused, safe = processor.guard.refused(memory.watch, watch)
         assert not isinstance(after.started, tuple)  # an array in the state stays an array
         laws, started = choose(valid, (after.control, after.started), (memory.laws, memory.started))
@@ -145,8 +145,7 @@ class Controller(Block):
     def start(self) -> Memory:
         """Return the memory before the first step: zero commands, zero states of the laws, no predicted readings."""
         cascade, zero = self.parameters.controller, jnp.zeros(())
-        processor = cascade.processor
-        assert processor is not None
+        processor = cascade.timing
         laws = jax.tree.map(jnp.zeros_like, cascade.init(Measurement(zero, zero, zero)))
         before, watch = processor.constant_past(zero)[1:], processor.guard.start() if processor.guard else ()
         return Memory(laws, Command(*[zero] * 5), before, watch, jnp.asarray(False))
@@ -157,11 +156,11 @@ class Controller(Block):
             *numbers_of(self.parameters.limits, "limits."),
         ]
         assert [x.value for x in found] == [float(x) for x in jax.tree.leaves(self.parameters)]
-        processor: Any = self.parameters.controller.processor
+        processor = self.parameters.controller.timing
         if self.commands == "current":
             u_max = {"unit": "A", "doc": "limit of the commanded current; inf: none"}
             found = [x._replace(**u_max) if x.name == "limits.u_max" else x for x in found]
-        most = float(processor.most)
+        most = float(processor.most or 0)
         ends = (0.0, most, most + 0.5, -0.5, math.nan)
         delay = {"allowed": f"from 0 to {processor.most}", "ends": ends, "least": 0.0, "most": most}
         return [x._replace(**delay) if x.name == "processor.delay" else x for x in found]
@@ -199,7 +198,7 @@ class Controller(Block):
         if self.commands == "voltage":
             weight *= float(model.R)
         u = float(limits.u_max) if math.isfinite(limits.u_max) else 10 * weight + 1.0
-        guard: Any = cascade.processor.guard if cascade.processor else None
+        guard: Any = cascade.timing.guard
         watch = [z, z_dot, i, float(guard.samples)] if guard else []
         # commands are in the order of their pytree
         states = [*scales(cascade.scale()), v, v, i, i * pole, u, *[u] * len(self.start().before), *watch]
@@ -219,7 +218,7 @@ def controller_of(cascade: Cascade, u_max: Scalar, period: float, scenario: Scen
     clearance and sensors determine those limits of the guard that the case does not give. None: the model's clearance,
     and sensors without error.
     """
-    if cascade.processor is None:
+    if not cascade.sampled:
         raise ValueError(
             "[processor] is missing: only a controller on a processor can be exported, and this case is in continuous "
             "time. Add [processor], tune the gains for it, and export the tuned case."

@@ -41,8 +41,8 @@ from ambjax.world.amplifier import Amplifier, CurrentAmplifier
 from ambjax.world.bearing import Bearing
 from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Errors, Sensor
-from ambjax.world.signals import Constant
 from ambjax.world.touchdown import Stop
+from ambjax.world.waveforms import Constant
 
 FIELDS = {field.name: field.metadata for field in dataclasses.fields(Scenario)}
 
@@ -124,15 +124,11 @@ class PlantStep(Block):
     @property
     def longest(self) -> int:
         """The longest delay that the plant can be set to, samples."""
-        processor = self.cascade.processor
-        assert processor is not None
-        return len(processor.constant_past(jnp.zeros(())))
+        return len(self.cascade.timing.constant_past(jnp.zeros(())))
 
     def system(self, machine: PlantParameters, period: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Sampled:
         """Return the simulator's loop with the parameters `machine` and constant disturbances (m/s^2, A/s)."""
-        given: Any = self.cascade.processor
-        given = dataclasses.replace(given, delay=machine.delay, assumed=None, predict=False, guard=None)
-        cascade = dataclasses.replace(self.cascade, processor=given)
+        cascade = self.cascade.with_processor(delay=machine.delay, assumed=None, predict=False, guard=None)
         return Sampled(ClosedLoop(cascade, machine.scenario(q_z, q_i)), period, 0)
 
     def step(
@@ -149,10 +145,8 @@ class PlantStep(Block):
         u, q_z, q_i, *w = (jnp.where(jnp.isfinite(x), x, 0.0) for x in inputs)
         system = self.system(parameters, period, q_z, q_i)
         kept = choose(memory.started, self._advanced(system, memory, limited(u, parameters.u_max)), self._begun(system))
-        sensor, true = parameters.sensor, parameters.plant.measurement(kept.motion)
-        stds = (0.0, 0.0, 0.0) if sensor is None else (sensor.std, sensor.std_z_dot, sensor.std_i)
-        errors = Errors(*(jnp.asarray(std) * x for std, x in zip(stds, w, strict=True)))
-        measured = system.measured(kept.motion, kept.z_filtered, errors)
+        true = parameters.plant.measurement(kept.motion)
+        measured = system.measured(kept.motion, kept.z_filtered, system.loop.scenario.sensors.scaled(w))
         invalid = ~functools.reduce(jnp.logical_and, fine, jnp.asarray(True))
         status = PlantStatus(kept.lost == TOUCHED, kept.lost == DIVERGED, invalid)
         return kept, PlantOutputs(*measured, *true), status
@@ -175,11 +169,12 @@ class PlantStep(Block):
         """Return the memory at the first sample."""
         scenario, zero = system.loop.scenario, jnp.zeros(())
         motion = scenario.plant.start(scenario.initial.measurement())
-        slow = scenario.amplifier is not None and scenario.amplifier.slow
         z_filtered = scenario.plant.measurement(motion).z if lags(system.loop) else ()
         lost = _real(plant_status(system.loop, motion))
         last, *before = system.processor.constant_past(zero)
-        return PlantMemory(motion, last, tuple(before), z_filtered, zero if slow else (), lost, jnp.asarray(True))
+        return PlantMemory(
+            motion, last, tuple(before), z_filtered, zero if scenario.actuator.slow else (), lost, jnp.asarray(True)
+        )
 
     def start(self) -> PlantMemory:
         begun = self._begun(self.system(self.parameters, self.period))
@@ -188,8 +183,7 @@ class PlantStep(Block):
     def numbers(self) -> list[Number]:
         found = list(numbers_of(self.parameters))
         assert [x.value for x in found] == [float(x) for x in jax.tree.leaves(self.parameters)]
-        whole: Any = self.cascade.processor
-        most, words = float(self.longest), "whole: rounded down" if whole.whole else ""
+        most, words = float(self.longest), "whole: rounded down" if self.cascade.timing.whole else ""
         allowed = ", ".join(filter(None, (f"from 0 to {most:g}", words)))
         delay = {"allowed": allowed, "ends": (0.0, most, most + 0.5, -0.5, math.nan), "most": most}
         return [x._replace(**delay) if x.name == "delay" else x for x in found]
@@ -248,7 +242,7 @@ def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object
     Raises ValueError for a cascade in continuous time, an amplifier that controls the current, faults or a runout of
     the sensor, and an adaptive method.
     """
-    if cascade.processor is None:
+    if not cascade.sampled:
         raise ValueError(
             "[processor] is missing: the exported plant takes a voltage that is held over a sample, and this case "
             "is in continuous time. Add [processor], tune the gains for it, and export the tuned case."
@@ -258,9 +252,8 @@ def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object
             'actuator.mode = "current": the exported plant takes a voltage. Export the controller, or use '
             'mode = "voltage".'
         )
-    sensor = scenario.sensor
     for part in ("outliers", "dropouts", "runout"):
-        if getattr(sensor, part, None) is not None:
+        if getattr(scenario.sensors, part) is not None:
             raise ValueError(
                 f"sensor.{part}: the exported plant does not model this error. Remove it, and add it to the output z."
             )
@@ -272,13 +265,13 @@ def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object
     resolved = cascade.on_processor()
     machine = PlantParameters(
         scenario.plant,
-        sensor,
+        scenario.sensor,
         scenario.amplifier,
         scenario.stop,
         scenario.initial,
         scenario.u_max,
         scenario.clearance,
-        resolved.processor.delay if resolved.processor else 0.0,
+        resolved.timing.delay,
     )
     plain = jax.tree.map(lambda x: float(x) if jnp.shape(x) == () else x, machine)
     return PlantStep(plain, float(period), resolved, method)

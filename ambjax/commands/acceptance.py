@@ -79,13 +79,13 @@ def _loop_facts(loop: Analysis) -> list[Fact]:
 
 def machine(case: Case) -> list[Fact]:
     """Return the numbers of the plant, its supply and its converters."""
-    plant, sensor = case.scenario.plant, case.scenario.sensor
+    plant, sensor = case.scenario.plant, case.scenario.sensors
     (force, weight, load), period = forces(case), float(case.clock.sample_period)
     (u_max, reserve), step = _voltages(case), None
     slew = None if u_max is None else u_max / float(plant.L)
-    if sensor is not None and sensor.bits is not None:
+    if sensor.bits is not None:
         step = 2 * float(sensor.ends(plant.s_0)) / 2 ** float(sensor.bits)
-    std = None if sensor is None else float(sensor.std)
+    std = float(sensor.std)
     return [
         Fact("force_reserve", "largest force / weight", force / weight if weight else None, "1"),
         Fact("load_reserve", "largest force / (weight + largest load)", force / (weight + load) if load else None, "1"),
@@ -114,7 +114,7 @@ def _voltages(case: Case) -> tuple[float | None, float | None]:
     The largest u is half the difference of the voltages of the coils, each within its limit, for a command of u_max.
     """
     scenario, bias = case.scenario, case.scenario.plant.R * case.scenario.plant.i_0
-    coil = None if scenario.amplifier is None else scenario.amplifier.coil
+    coil = scenario.actuator.coil
     u_max, reserve = float(scenario.u_max), math.inf
     if coil is not None:
         u_max = float(difference(coil.supplied(jnp.asarray(u_max), bias)))

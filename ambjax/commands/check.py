@@ -116,17 +116,17 @@ def _results(case: Case) -> tuple[Report, tuple[Summary, str], _OnProcessor | No
         theorem = pool.submit(check, case.cascade, case.scenario, case.clock, case.settle)
         say("linearising the loop")
         loop, on_processor = acceptance(case), None
-        if case.cascade.processor is not None:
+        if case.cascade.sampled:
             on_processor = _OnProcessor(_sampled(case), *_margins(case))
         report = theorem.result()
-    if report.lost and case.cascade.processor is None:
+    if report.lost and not case.cascade.sampled:
         cause = find_cause(_is_lost, case.cascade, case.scenario, case.clock, say)
         report = dataclasses.replace(report, cause=cause)
     return report, loop, on_processor
 
 
 def _is_lost(cascade: Cascade, scenario: Scenario, clock: Clock) -> bool:
-    return bool(np.isfinite(rollout(cascade, scenario, clock, every=0).trajectory.lost_at))
+    return bool(np.isfinite(rollout(cascade, scenario, clock, record_every=0).trajectory.lost_at))
 
 
 def _sampled(case: Case) -> SampledReport:
@@ -179,8 +179,7 @@ def _processor_summary(case: Case, args: argparse.Namespace, results: _OnProcess
     sampled, margin, unknown = results
     places: Any = loop.get("margins") or {}
     linear = places.get("command", {}).get("delay_margin_s")
-    processor: Any = case.cascade.processor
-    sizes = float(processor.delay), float(case.clock.sample_period)
+    sizes = float(case.cascade.timing.delay), float(case.clock.sample_period)
     differs = advice.delay_difference(linear, unknown or margin, *sizes)
     if not args.json:
         print(f"\nOn the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s.\n")

@@ -166,7 +166,7 @@ def _flops(case: Case) -> int | None:
 
     None in continuous time, or if a law cannot be exported.
     """
-    if case.cascade.processor is None:
+    if not case.cascade.sampled:
         return None
     try:
         controller = controller_of(guarded_for(case), case.scenario.command_limit, float(case.clock.sample_period))

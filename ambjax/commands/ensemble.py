@@ -6,16 +6,18 @@ from concurrent.futures import Executor
 
 import numpy as np
 
+from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
 from ambjax.commands.pace import Pace, error_words, pilot, print_estimate, sliding_error
-from ambjax.commands.reading import read_with_warnings
+from ambjax.commands.reading import read_any_with_warnings
 from ambjax.commands.study_report import WRITTEN, write_report
 from ambjax.commands.workers import AHEAD, compute, executor_of
 from ambjax.ensemble.store import Store
-from ambjax.ensemble.study import COLUMNS, Study
+from ambjax.ensemble.study import COLUMNS, AnyStudy, Study
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.host.interrupts import reporting, uninterrupted
 from ambjax.host.lock import locked
+from ambjax.results.machine_study import MachineStudy
 from ambjax.results.outputs import check_places, make, target
 from ambjax.results.spread_runs import study_of
 from ambjax.simulation.sliding import Slide
@@ -29,7 +31,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
 
     The exit code is 1 if a member is lost, stalled or not stable.
     """
-    case = read_with_warnings(args.case)
+    case = read_any_with_warnings(args.case)
     study, store = _study_and_store(case, args)
     out = store.directory
     with reporting(lambda: _state_words(store)), contextlib.ExitStack() as stack:
@@ -41,7 +43,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
             fresh = not store.begun()
             store.begin()
             say(f"method: {case.clock.method}; writing to {out}")
-            if isinstance(case.clock.method, Slide):
+            if isinstance(study, Study) and isinstance(case.clock.method, Slide):
                 with doing(f"comparing sliding with adaptive steps; {FIRST_RUN}"):
                     error = sliding_error(study)
                 say(error_words(error))
@@ -54,7 +56,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
         return write_report(case, study, args, out, error)
 
 
-def _study_and_store(case: Case, args: argparse.Namespace) -> tuple[Study, Store]:
+def _study_and_store(case: Case | MachineCase, args: argparse.Namespace) -> tuple[Study | MachineStudy, Store]:
     """Return the study and its store without writing anything. Raises ValueError for an invalid option."""
     study = study_of(case, args.seed, args.members)
     if args.chunk is not None and args.chunk < 1:
@@ -71,12 +73,12 @@ def _study_and_store(case: Case, args: argparse.Namespace) -> tuple[Study, Store
     return study, store
 
 
-def _check(study: Study, store: Store, args: argparse.Namespace) -> None:
+def _check(study: AnyStudy, store: Store, args: argparse.Namespace) -> None:
     store.check(COLUMNS + len(study.spread.entries), args.resume)
     check_places(store.directory, WRITTEN)
 
 
-def _pilot(study: Study, store: Store, executor: tuple[Executor, int] | None) -> None:
+def _pilot(study: AnyStudy, store: Store, executor: tuple[Executor, int] | None) -> None:
     """Time the simulation of the first members, and write the chunks that they fill.
 
     Prints the expected duration of a long study, and chooses the chunk size if none is set.

@@ -38,7 +38,7 @@ def refuse(args: argparse.Namespace, names: tuple[str, ...]) -> None:
 
 def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]:
     """Simulate a machine and write its files. Exit code 1 if the rotor is lost."""
-    refuse(args, ("member", "members", "seed", "begin", "end", "page"))
+    refuse(args, ("begin", "end", "page"))
     out = directory(args.out, f"simulate-{case.name}", SIMULATED, args.force)
     say(f"method: {case.clock.method}; axes: {', '.join(case.axes)}")
     with tqdm(total=case.clock.samples, unit="sample", unit_scale=True, delay=2, leave=False, desc="simulate") as bar:

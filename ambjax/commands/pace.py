@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.ensemble.batching import cores
-from ambjax.ensemble.study import Study
+from ambjax.ensemble.study import AnyStudy, Study
 from ambjax.ensemble.worker import CALL, chunk
 from ambjax.host.heartbeat import say
 from ambjax.simulation.method import TOLERANCE
@@ -52,7 +52,7 @@ class Pace(NamedTuple):
         return min(max(-(-count // unit), 1) * unit, members)
 
 
-def pilot(study: Study) -> tuple[dict[str, np.ndarray], float]:
+def pilot(study: AnyStudy) -> tuple[dict[str, np.ndarray], float]:
     """Simulate the first members: one call of CALL members on each core. Return their columns and the duration in s.
 
     A first run, in which all rotors are lost at the start, compiles the program at little cost. A message is printed
@@ -67,14 +67,15 @@ def pilot(study: Study) -> tuple[dict[str, np.ndarray], float]:
     return {name: np.asarray(x) for name, x in columns.items()}, time.perf_counter() - began
 
 
-def print_estimate(study: Study, pace: Pace) -> None:
+def print_estimate(study: AnyStudy, pace: Pace) -> None:
     """Print a duration of at least SHORT. Above LONG, suggest the sliding step if it applies."""
     seconds = study.members / pace.whole
     if seconds < SHORT:
         return
     rate = f"{pace.whole:.2g}" if pace.whole < 10 else f"{pace.whole:,.0f}"
     words = f"about {duration(seconds)} for {study.members:,} members ({rate} a second)"
-    if seconds > LONG and isinstance(study.clock.method, AdaptiveRodas3) and slides(study.cascade, study.scenario):
+    adaptive = isinstance(study.clock.method, AdaptiveRodas3)
+    if seconds > LONG and adaptive and isinstance(study, Study) and slides(study.cascade, study.scenario):
         words += '; clock.method = "sliding" would be faster; its error is measured and printed'
     say(words)
 

@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
         points, missing = _points(case)
     spread = None if study is None else _spread(case, study, points[0])
     measured = None
-    if args.inject or case.cascade.processor is not None:
+    if args.inject or case.cascade.sampled:
         with doing(f"measuring the sensitivity by injection into the simulation; {FIRST_RUN}"):
             measured = _injections(case, points[0])
     out = directory(args.out, f"sensitivity-{case.name}", WRITTEN, args.force)

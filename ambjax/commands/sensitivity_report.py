@@ -27,7 +27,7 @@ def set_valued(case: Case) -> list[str]:
 
     The linear loop describes these laws only inside their bands.
     """
-    if case.cascade.processor is None:
+    if not case.cascade.sampled:
         return []
     return [f"controller.{stage}" for stage in DEFAULT_LAWS if set_valued_signs(getattr(case.cascade, stage))]
 

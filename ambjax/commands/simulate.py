@@ -4,7 +4,7 @@ import argparse
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from tqdm import tqdm
@@ -24,6 +24,9 @@ from ambjax.simulation.metrics import UNITS
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.text.words import command
 
+if TYPE_CHECKING:
+    from ambjax.results.machine_study import MachineStudy
+
 Summary = dict[str, object]
 SIMULATING = f"simulating the case; {FIRST_RUN}"
 WRITTEN = ("trajectory.npz", "metrics.json", "overview.png")
@@ -33,7 +36,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """Simulate a case or one member of its ensemble. Exit code 1 if the rotor is lost or the integrator stalls."""
     case = read_any_with_warnings(args.case)
     if isinstance(case, MachineCase):
-        return machine_commands.simulate(args, case)
+        members = _study(case, args)
+        return machine_commands.simulate(args, case if members is None else members.member(args.member))
     study = _study(case, args)
     if study is not None:
         cascade, scenario = study.member(args.member)
@@ -42,7 +46,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     names = (*WRITTEN, *html)
     out = directory(args.out, f"simulate-{case.name}", names, args.force)
     say(f"method: {case.clock.method}")
-    if case.cascade.processor is not None:
+    if case.cascade.sampled:
         say(f"on a processor: {case.cascade.processor}")
     replayed = None if study is None else _replay(case, study, args.member)
     trajectory, numbers = _simulated(case) if replayed is None else (replayed.trajectory, replayed.metrics)
@@ -78,7 +82,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     if ended:
         from ambjax.theorem import advice
 
-        remedy = advice.STALLED if case.cascade.processor is None else advice.STALLED_PLANT
+        remedy = advice.STALLED_PLANT if case.cascade.sampled else advice.STALLED
         words = advice.status(metrics["lost_at_s"], trajectory.lost_why, metrics["stalled"], remedy)
         which = "" if study is None else " for the nominal case"
         look = (
@@ -122,7 +126,11 @@ def _window(case: Case, args: argparse.Namespace) -> tuple[float, float] | None:
     return begin, end
 
 
-def _study(case: Case, args: argparse.Namespace) -> Study | None:
+@overload
+def _study(case: Case, args: argparse.Namespace) -> Study | None: ...
+@overload
+def _study(case: MachineCase, args: argparse.Namespace) -> "MachineStudy | None": ...
+def _study(case: Case | MachineCase, args: argparse.Namespace) -> "Study | MachineStudy | None":
     """Return the study that contains member --member, or None without it. Raises ValueError for invalid options."""
     if args.member is None:
         if args.seed is not None or args.members is not None:

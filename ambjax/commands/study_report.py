@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
 from ambjax.cases.warned import reversal
 from ambjax.ensemble import statistics
-from ambjax.ensemble.study import Study
+from ambjax.ensemble.study import AnyStudy, Study
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.linear import Findings, stability_of, suspects
+from ambjax.results.machine_study import MachineStudy
 from ambjax.results.outputs import described, files, plain, table, write_json, written
 from ambjax.text.words import one_line
 
@@ -26,7 +28,11 @@ METRICS = ("settled_max_abs_error_m", "settled_rms_error_m", "max_abs_error_m", 
 
 
 def write_report(
-    case: Case, study: Study, args: argparse.Namespace, out: pathlib.Path, error: dict[str, Any] | None
+    case: Case | MachineCase,
+    study: Study | MachineStudy,
+    args: argparse.Namespace,
+    out: pathlib.Path,
+    error: dict[str, Any] | None,
 ) -> tuple[int, dict[str, object]]:
     """Write and print the results of a finished study. Return the exit code and the summary.
 
@@ -54,13 +60,14 @@ def write_report(
         tables = None if summary is None else described("the table", lambda: study_tables(summary, findings.words()))
         print(tables or "{survivors} of {members} members survive".format(**survivors))
         written(out, ", ".join(["members.npz", *names]))
-    for warning in reversal(case, float(np.max(columns["max_abs_i_A"], initial=0.0, where=held))):
+    one = case if isinstance(case, Case) else case.cases[0]
+    for warning in reversal(one, float(np.max(columns["max_abs_i_A"], initial=0.0, where=held))):
         say(warning)
     good = held.all() and findings.stable
     return int(not good), plain(summary or survivors) | {"out": str(out)}
 
 
-def _summary(case: Case, study: Study, columns: dict[str, np.ndarray], path: str) -> dict[str, Any]:
+def _summary(case: Case | MachineCase, study: AnyStudy, columns: dict[str, np.ndarray], path: str) -> dict[str, Any]:
     facts = {
         "case": case.name,
         "method": str(case.clock.method),
@@ -73,22 +80,29 @@ def _summary(case: Case, study: Study, columns: dict[str, np.ndarray], path: str
     return facts | numbers
 
 
-def findings_of(study: Study, columns: dict[str, np.ndarray]) -> Findings:
+def findings_of(study: Study | MachineStudy, columns: dict[str, np.ndarray]) -> Findings:
     """Test whether the loops of the surviving members with the largest settled errors are stable."""
     index = suspects(columns[statistics.DECIDING], ~np.isfinite(columns["lost_at"]))
     if not index.size:
         return Findings(0, 0)
+    if isinstance(study, MachineStudy):
+        return study.findings(index[np.argsort(-columns[statistics.DECIDING][index])])
     say(f"testing whether the loops of {index.size} members are stable: simulating them without noise and loads")
     return stability_of(*study.batch(index), study.clock).findings()
 
 
 def _pictures(
-    case: Case, study: Study, columns: dict[str, np.ndarray], summary: dict[str, Any] | None, out: pathlib.Path
+    case: Case | MachineCase,
+    study: AnyStudy,
+    columns: dict[str, np.ndarray],
+    summary: dict[str, Any] | None,
+    out: pathlib.Path,
 ) -> None:
     """Draw the pictures into the folder `out`. One that cannot be drawn is left out."""
     from ambjax.pictures import histograms
 
-    described("fan.png", lambda: _fan(case, study, columns, out / "fan.png"))
+    if isinstance(case, Case) and isinstance(study, Study):
+        described("fan.png", lambda: _fan(case, study, columns, out / "fan.png"))
     described("histograms.png", lambda: histograms.histograms(columns, out / "histograms.png"))
     if summary is not None and summary["drivers"][statistics.DECIDING]:  # there are none if no member survives
         described("tornado.png", lambda: _tornado(summary, out / "tornado.png"))

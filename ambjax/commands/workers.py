@@ -9,7 +9,7 @@ from typing import Any
 from tqdm import tqdm
 
 from ambjax.ensemble.store import Store
-from ambjax.ensemble.study import Study
+from ambjax.ensemble.study import AnyStudy
 from ambjax.ensemble.worker import chunk, ignore_sigint, processes, work
 from ambjax.host.heartbeat import say
 from ambjax.host.interrupts import uninterrupted
@@ -53,7 +53,7 @@ def executor_of(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | Non
         yield None
 
 
-def compute(study: Study, store: Store, executor: tuple[Executor, int] | None) -> None:
+def compute(study: AnyStudy, store: Store, executor: tuple[Executor, int] | None) -> None:
     """Compute the missing chunks and write each to disk as soon as it is finished."""
     missing, remarks = store.survey()
     for remark in remarks:
@@ -70,12 +70,12 @@ def compute(study: Study, store: Store, executor: tuple[Executor, int] | None) -
 Results = Iterator[tuple[tuple[int, int], dict[str, Any]]]
 
 
-def _run_here(study: Study, store: Store, missing: list[tuple[int, int]]) -> Results:
+def _run_here(study: AnyStudy, store: Store, missing: list[tuple[int, int]]) -> Results:
     for span in missing:
         yield span, chunk(study, *span, store.chunk)
 
 
-def _run_on(study: Study, store: Store, missing: list[tuple[int, int]], pool: Executor, ahead: int) -> Results:
+def _run_on(study: AnyStudy, store: Store, missing: list[tuple[int, int]], pool: Executor, ahead: int) -> Results:
     queue, running = list(reversed(missing)), dict[Future, tuple[int, int]]()
     while queue or running:
         while queue and len(running) < ahead:

@@ -1,6 +1,6 @@
 """The base class of all laws, with default methods, so that callers do not depend on the type of a law.
 
-The classes of `control.laws` add the inputs and outputs of each stage.
+The classes of `control.stages` add the inputs and outputs of each stage.
 """
 
 import dataclasses

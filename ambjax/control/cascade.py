@@ -17,7 +17,9 @@ from ambjax.compiler.barrier import materialised
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.base import default_law, set_valued_signs, with_default_steepness, with_set_valued_signs
 from ambjax.control.cascade_state import CascadeState, Command, Sample
-from ambjax.control.laws import (
+from ambjax.control.processor import Processor, predicted_over_delay
+from ambjax.control.schedule import extremes, with_gains_at
+from ambjax.control.stages import (
     CurrentInputs,
     CurrentLaw,
     ForceDemand,
@@ -28,16 +30,16 @@ from ambjax.control.laws import (
     begin_law,
     step_law,
 )
-from ambjax.control.processor import Processor, predicted_over_delay
-from ambjax.control.schedule import extremes, with_gains_at
 from ambjax.control.synchronous_notch import SynchronousNotch
 from ambjax.numerics.records import Scalar, is_traced, part, record
 from ambjax.world.plant import Plant
 from ambjax.world.plant import State as NominalState
 from ambjax.world.rotation import Rotation
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
+# In place of a processor in continuous time: no delay, no prediction and no guard.
+_CONTINUOUS = Processor(delay=0.0, predict=False, guard=None)
 # Marks a law that is not given. `Cascade.__post_init__` replaces it by the default law.
 _LEFT_OUT: Any = None
 # The default law of each stage.
@@ -82,7 +84,7 @@ class Cascade:
         observed: Any = extremes(self.observer)[0].init(self.model, measured)
         observed = observed if self.notch is None else (observed, self.notch.init(measured))
         rest = [extremes(law)[0] for law in self.laws[1:]]
-        if self.processor is not None:
+        if self.sampled:
             return CascadeState(observed, *(law.init_sampled(self.model) for law in rest))
         states = [law.init(self.model) for law in rest]
         if reference is not None:
@@ -97,19 +99,17 @@ class Cascade:
         They are `laws` if `started`; otherwise the initial states for these readings. The position law starts from its
         first estimate (`laws.begin_law`).
         """
-        implicit = self.processor is not None and self.processor.implicit
         laws = _chosen(started, laws, self.init(measured))
         estimate, *_ = self.estimate(measured, laws.observer, sample)
         position = with_gains_at(self.position, estimate.z, sample.reference)
-        begun = begin_law(
-            position, (estimate, sample.reference), model=self.model, period=sample.period, implicit=implicit
-        )
+        inputs, implicit = (estimate, sample.reference), self.timing.implicit
+        begun = begin_law(position, inputs, model=self.model, period=sample.period, implicit=implicit)
         return laws._replace(position=_chosen(started, laws.position, begun))
 
     def scale(self) -> CascadeState:
         """Return the characteristic size of each state of the laws; integration errors are relative to it."""
         laws = [extremes(law)[0] for law in self.laws]
-        sizes = [(one.scale if self.processor is None else one.scale_sampled)(self.model) for one in laws]
+        sizes = [(one.scale_sampled if self.sampled else one.scale)(self.model) for one in laws]
         if self.notch is not None:
             sizes[0] = sizes[0], self.notch.scale(self.model)
         return CascadeState(*sizes)
@@ -146,6 +146,20 @@ class Cascade:
         """Return the cascade whose notch has a constant speed (rpm); None: that at t = 0."""
         return self if self.notch is None else dataclasses.replace(self, notch=self.notch.at(speed))
 
+    @property
+    def sampled(self) -> bool:
+        """Whether the laws run on a processor."""
+        return self.processor is not None
+
+    @property
+    def timing(self) -> Processor:
+        """The field `processor`; in continuous time, a processor without delay, prediction and guard."""
+        return _CONTINUOUS if self.processor is None else self.processor
+
+    def with_processor(self, **fields: object) -> "Cascade":
+        """Return the cascade with other fields of its processor. In continuous time, it does not change."""
+        return dataclasses.replace(self, processor=self.processor and dataclasses.replace(self.processor, **fields))
+
     def driven(self, u: Array, state: NominalState) -> NominalState:
         """Return the rates of the nominal plant under the command u, V or A."""
         return self.current.driven(self.model, u, state)
@@ -180,7 +194,7 @@ class Cascade:
         z_ddot = self.model.z_ddot(estimate.z, estimate.i)
         if self.observer.estimates_velocity:
             point = (estimate, z_ddot, reference, state.position, positioned_rate)
-            z_rate, v_star_rate = _rates(self._demanded, *point)
+            z_rate, v_star_rate = rates_along(self._demanded, *point)
         else:
             along = (reference.rate(), measured.z_dot, z_ddot, self._observer_rate(observed_rate), positioned_rate)
             z_rate, v_star_rate = jax.jvp(lambda *x: demanded(*x)[0], point, along)[1]
@@ -195,7 +209,7 @@ class Cascade:
         Returns the estimate, and the next states of both; in continuous time (`sample` is None), their rates.
         """
         observer = with_gains_at(self.observer, measured.z, reference)
-        own, notched = (state, ()) if self.notch is None else state
+        own, notched = state if self.notch is not None else (state, state)
         if self.notch is not None:
             through = self.notch if sample is None else functools.partial(self.notch.step, period=sample.period)
             z, notched = through(measured, notched)
@@ -220,9 +234,8 @@ class Cascade:
         A sign with steepness inf becomes set-valued. The program also supports the delays `delays` (samples) and, if
         `between` is true, every delay between them. Raises ValueError as `Processor.resolved` does.
         """
-        assert self.processor is not None
         laws = {stage: with_set_valued_signs(getattr(self, stage)) for stage in DEFAULT_LAWS}
-        return dataclasses.replace(self, **laws, processor=self.processor.resolved(*delays, between=between))
+        return dataclasses.replace(self, **laws, processor=self.timing.resolved(*delays, between=between))
 
     def reads_velocity(self, period: Scalar) -> bool:
         """Return whether the command or a state of a law depends on the measured velocity.
@@ -230,11 +243,11 @@ class Cascade:
         `period`: sample period, s. True if a number is traced, because the laws are then not evaluated. Otherwise the
         laws of the first member are evaluated at three velocities, and the results compared.
         """
-        if self.observer.estimates_velocity or (self.processor is not None and self.processor.predicts):
+        if self.observer.estimates_velocity or self.timing.predicts:
             return not self.observer.estimates_velocity
         if any(map(is_traced, jax.tree.leaves((self, period)))):
             return True
-        one = self if self.processor is None else self.on_processor()
+        one = self.on_processor() if self.sampled else self
         one, period = jax.tree.map(lambda x: np.ravel(np.asarray(x, float))[0], (one, period))
         z, z_dot, i = (float(x) for x in one.model.sizes())
         results = [
@@ -248,10 +261,10 @@ class Cascade:
         zero = jnp.zeros(())
         reference, still = Reference(zero, zero, zero), measured._replace(z_dot=zero)
         state = self.init(still, reference)
-        if self.processor is None:
+        if not self.sampled:
             command, after = self(measured, state, reference, jnp.inf)
         else:
-            sample = Sample(reference, period, jnp.inf, self.processor.constant_past(zero))
+            sample = Sample(reference, period, jnp.inf, self.timing.constant_past(zero))
             command, after, _ = self.step(measured, state, sample)
         return command.u, after
 
@@ -275,8 +288,7 @@ class Cascade:
 
     def _advance(self, sample: Sample) -> Callable[..., Any]:
         """Return `laws.step_law` with the model and the discretisation of this cascade, and the period of `sample`."""
-        implicit = self.processor is not None and self.processor.implicit
-        return functools.partial(step_law, model=self.model, period=sample.period, implicit=implicit)
+        return functools.partial(step_law, model=self.model, period=sample.period, implicit=self.timing.implicit)
 
     def estimate(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State, Measurement]:
         """Step the observer on a processor.
@@ -285,14 +297,23 @@ class Cascade:
         Returns the estimate for the other laws (with prediction: at the end of the delay), the next state of the
         observer, and the estimate at the sample itself.
         """
-        processor: Any = self.processor
-        now, state = self._observed(measured, state, sample.reference, sample)
+        now, state = self.observed(measured, state, sample)
         estimate = now
-        if processor.predicts:
-            estimate = predicted_over_delay(
-                self.model, self.driven, now, sample.past, processor.prediction_steps(sample.period)
-            )
+        if self.timing.predicts:
+            steps = self.timing.prediction_steps(sample.period)
+            estimate = predicted_over_delay(self.model, self.driven, now, sample.past, steps)
         return estimate, state, now
+
+    def observed(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State]:
+        """Step the observer on a processor. Return the estimate at the sample, and the next state of the observer."""
+        return self._observed(measured, state, sample.reference, sample)
+
+    def positioned(
+        self, sample: Sample, estimate: Measurement, reference: Reference, state: State
+    ) -> tuple[Array, State]:
+        """Step the position law on a processor. Return v_star (A^2/m^2), and the next state of the law."""
+        law = with_gains_at(self.position, estimate.z, reference)
+        return self._advance(sample)(law, (estimate, reference), state)
 
     def step(
         self, measured: Measurement, state: CascadeState, sample: Sample
@@ -303,10 +324,7 @@ class Cascade:
         With prediction, all laws except the observer use the estimate at the end of the delay. Returns the command, the
         next states of the laws, and the observer's estimate at the sample itself.
         """
-        advance = self._advance(sample)
-
-        def force_for(estimate: Measurement, reference: Reference, state: object) -> tuple[Array, Any]:
-            return advance(with_gains_at(self.position, estimate.z, reference), (estimate, reference), state)
+        force_for = functools.partial(self.positioned, sample)
 
         def demanded(
             reference: Reference, z: Array, z_dot: Array, observed: object, positioned: object
@@ -324,19 +342,30 @@ class Cascade:
             lambda a, b: (b - a) / sample.period, (state.observer, state.position), (observed, positioned)
         )
         if self.observer.estimates_velocity:
-            z_rate, v_star_rate = _rates(force_for, estimate, z_ddot, sample.reference, state.position, rates[1])
+            z_rate, v_star_rate = rates_along(force_for, estimate, z_ddot, sample.reference, state.position, rates[1])
         else:
             along = (sample.reference.rate(), measured.z_dot, z_ddot, self._observer_rate(rates[0]), rates[1])
             z_rate, v_star_rate = jax.jvp(lambda *x: demanded(*x)[0], point, along)[1]
         v_star = materialised(v_star)
         force = ForceDemand(z, z_rate, v_star, v_star_rate, self.model.gaps(z))
-        inversion = with_gains_at(self.inversion, z, sample.reference)
-        current = with_gains_at(self.current, z, sample.reference)
+        command, after = self.commanded(force, estimate, state, sample)
+        return command, after._replace(observer=observed, position=positioned), now
+
+    def commanded(
+        self, force: ForceDemand, estimate: Measurement, state: CascadeState, sample: Sample
+    ) -> tuple[Command, CascadeState]:
+        """Step inversion and current law on a processor, for a demanded force.
+
+        `estimate`: estimated motion and current. The states of observer and position law do not change.
+        """
+        advance = self._advance(sample)
+        inversion = with_gains_at(self.inversion, force.z, sample.reference)
+        current = with_gains_at(self.current, force.z, sample.reference)
         demand, inverted = advance(inversion, force, state.inversion)
         u, driven = advance(current, CurrentInputs(estimate, demand, sample.u_max, force.gaps), state.current)
-        v_tilde = v_star - self.model.v_and_dv_di(z, demand.i_ref, force.gaps)[0]
-        after = CascadeState(observed, positioned, inverted, driven)
-        return Command(v_star, v_tilde, demand.i_ref, demand.i_ref_dot, u), after, now
+        v_tilde = force.v_star - self.model.v_and_dv_di(force.z, demand.i_ref, force.gaps)[0]
+        after = state._replace(inversion=inverted, current=driven)
+        return Command(force.v_star, v_tilde, demand.i_ref, demand.i_ref_dot, u), after
 
     def __call__(
         self, measured: Measurement, state: CascadeState, reference: Reference, u_max: Scalar
@@ -347,20 +376,30 @@ class Cascade:
         `u_max`: limit of u: of the supply, V, or of the commanded current, A; inf: none.
         """
         force, estimate, rates = self.demand(measured, state, reference)
+        command, inner = self.command_rates(force, estimate, state, reference, u_max)
+        return command, rates._replace(inversion=inner.inversion, current=inner.current)
+
+    def command_rates(
+        self, force: ForceDemand, estimate: Measurement, state: CascadeState, reference: Reference, u_max: Scalar
+    ) -> tuple[Command, CascadeState]:
+        """Return the command in continuous time for a demanded force, and the rates of inversion and current law.
+
+        The rates of observer and position law are ().
+        """
         inversion = with_gains_at(self.inversion, force.z, reference)
         current = with_gains_at(self.current, force.z, reference)
         demand, inversion_rate = inversion(self.model, force, state.inversion)
         u, current_rate = current(self.model, CurrentInputs(estimate, demand, u_max, force.gaps), state.current)
         v_tilde = force.v_star - self.model.v_and_dv_di(force.z, demand.i_ref, force.gaps)[0]
         command = Command(force.v_star, v_tilde, demand.i_ref, demand.i_ref_dot, u)
-        return command, rates._replace(inversion=inversion_rate, current=current_rate)
+        return command, CascadeState((), (), inversion_rate, current_rate)
 
 
 def _chosen(condition: Array, yes: State, no: State) -> State:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
-def _rates(
+def rates_along(
     law: Callable[..., tuple[Array, State]],
     estimate: Measurement,
     z_ddot: Array,

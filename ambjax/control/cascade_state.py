@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 from jax import Array
 
 from ambjax.numerics.records import Scalar
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 
 class CascadeState(NamedTuple):

@@ -10,15 +10,15 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.force import force_of_current, linear_mechanics, resting_current, sliding_variable
-from ambjax.control.laws import PositionLaw, unwinding
 from ambjax.control.regulator import optimal_gains
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
+from ambjax.control.stages import PositionLaw, unwinding
 from ambjax.numerics.biquad import Biquad, lead_lag, low_pass, notch
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 
 class ChainState(NamedTuple):

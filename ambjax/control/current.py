@@ -8,9 +8,9 @@ from jax import Array
 
 from ambjax.control.base import Requirement, scaled_steepness
 from ambjax.control.defaults import current_rate
-from ambjax.control.laws import CurrentInputs, CurrentLaw, unwinding
 from ambjax.control.sampling import Relay, Sampling, non_oscillating
 from ambjax.control.search import Interval, SearchContext, authority, rate, steepness, switch
+from ambjax.control.stages import CurrentInputs, CurrentLaw, unwinding
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, limited, smooth_sign

@@ -5,9 +5,9 @@ from typing import ClassVar, Self
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.laws import Observer
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
+from ambjax.control.stages import Observer
 from ambjax.numerics import differentiator
 from ambjax.numerics.records import Scalar
 from ambjax.world.plant import Plant

@@ -7,7 +7,7 @@ from jax import Array
 from ambjax.numerics.records import Scalar
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 
 def sliding_variable(c: Scalar, motion: Measurement, reference: Reference) -> Array:

@@ -13,7 +13,7 @@ from jax import Array
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.world.plant import Plant, State
 from ambjax.world.scenario import Scenario
-from ambjax.world.sensor import Measurement, Sensor
+from ambjax.world.sensor import Measurement
 
 # Type of a cascade. Its class cannot be imported here, because its module imports this one.
 C = TypeVar("C")
@@ -104,7 +104,7 @@ class Guard:
         The derivation uses the gap, the pole and the bias current of `model`. Of `scenario`, it uses the sensor, the
         gap and the |z| at which the rotor is lost.
         """
-        sensor = Sensor() if scenario.sensor is None else scenario.sensor
+        sensor = scenario.sensors
         limit, clearance = scenario.limit, scenario.limit / scenario.plant.s_0 * model.s_0
         step = 0.0 if sensor.bits is None else 2 * sensor.ends(scenario.plant.s_0) / 2.0**sensor.bits
         runout = 0.0 if sensor.runout is None else sum(abs(one.amplitude) for one in sensor.runout.harmonics)
@@ -169,12 +169,10 @@ def expected(driven: Callable[[Array, State], State], at: State, u: Array, perio
 def guarded(cascade: C, scenario: Scenario, period: Scalar) -> C:
     """Return the cascade with the numbers of its guard set for a scenario; unchanged if it has no guard."""
     one: Any = cascade
-    processor = one.processor
-    if processor is None or processor.guard is None:
+    if one.timing.guard is None:
         return cascade
-    estimated = one.observer.estimates_velocity
-    guard = processor.guard.with_limits(one.model, scenario, period, estimated)
-    return dataclasses.replace(one, processor=dataclasses.replace(processor, guard=guard))
+    guard = one.timing.guard.with_limits(one.model, scenario, period, one.observer.estimates_velocity)
+    return one.with_processor(guard=guard)
 
 
 def simulated(cascade: C, scenario: Scenario, period: Scalar) -> C:
@@ -184,8 +182,7 @@ def simulated(cascade: C, scenario: Scenario, period: Scalar) -> C:
     removed. Otherwise the numbers of the guard are set (`guarded`).
     """
     one: Any = cascade
-    processor = one.processor
-    idle = processor.guard is not None and processor.guard.derived
-    if idle and not (scenario.sensor is not None and scenario.sensor.faulty):
-        return dataclasses.replace(one, processor=dataclasses.replace(processor, guard=None))
+    idle = one.timing.guard is not None and one.timing.guard.derived
+    if idle and not scenario.sensors.faulty:
+        return one.with_processor(guard=None)
     return guarded(cascade, scenario, period)

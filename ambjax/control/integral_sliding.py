@@ -7,15 +7,15 @@ from jax import Array
 
 from ambjax.control.defaults import switching_gain, switching_steepness
 from ambjax.control.force import force_for, sliding_variable
-from ambjax.control.laws import PositionLaw
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, manifold, position_switch, rate, steepness
+from ambjax.control.stages import PositionLaw
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 
 @record

@@ -11,9 +11,9 @@ from jax import Array
 
 from ambjax.control.base import Requirement, scaled_steepness
 from ambjax.control.defaults import adaptation_gain
-from ambjax.control.laws import CurrentDemand, ForceDemand, InversionLaw, Relaxation
 from ambjax.control.sampling import Relay, Sampling
 from ambjax.control.search import Interval, SearchContext, steepness
+from ambjax.control.stages import CurrentDemand, ForceDemand, InversionLaw, Relaxation
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.numerics.relax import relax, relaxation
 from ambjax.numerics.smooth import TWO_OVER_PI, away_from_zero, smooth_sign

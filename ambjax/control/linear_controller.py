@@ -7,14 +7,14 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.force import force_of_current, linear_mechanics, sliding_variable
-from ambjax.control.laws import PositionLaw
 from ambjax.control.realisation import FREQUENCIES, Matrices, Realisation, realisation
 from ambjax.control.search import Interval, SearchContext
+from ambjax.control.stages import PositionLaw
 from ambjax.numerics import records
 from ambjax.numerics.records import Scalar, is_traced, record, static
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 # Allowed values of `output`; largest relative difference between the sample periods of controller and processor.
 OUTPUTS, SAME_PERIOD = ("current", "voltage"), 1e-6

@@ -13,15 +13,15 @@ from jax import Array
 from ambjax.control.base import scaled_steepness
 from ambjax.control.defaults import switching_gain, switching_steepness
 from ambjax.control.force import force_for, sliding_variable
-from ambjax.control.laws import PositionLaw
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, position_switch, rate, steepness
+from ambjax.control.stages import PositionLaw
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, safe_sqrt, smooth_root, smooth_sign
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 # Speed below which the root of `TerminalSlidingMode` is smoothed, as a share of c l.
 WIDTH = 0.01

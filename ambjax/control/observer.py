@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.exact import DERIVATIVES, ExactDifferentiator
-from ambjax.control.laws import Observer
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
+from ambjax.control.stages import Observer
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement

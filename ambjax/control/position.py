@@ -10,7 +10,6 @@ from ambjax.control.chain import FilterChain as FilterChain
 from ambjax.control.defaults import switching_gain, switching_steepness
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.integral_sliding import IntegralSlidingMode as IntegralSlidingMode
-from ambjax.control.laws import PositionLaw
 from ambjax.control.linear_controller import LinearController as LinearController
 from ambjax.control.manifolds import TerminalSlidingMode as TerminalSlidingMode
 from ambjax.control.manifolds import UtkinSlidingMode as UtkinSlidingMode
@@ -18,13 +17,14 @@ from ambjax.control.pid import PID as PID
 from ambjax.control.pid import FeedbackLinearisation as FeedbackLinearisation
 from ambjax.control.sampling import Relay, Sampling
 from ambjax.control.search import Interval, SearchContext, authority, manifold, position_switch, rate, steepness
+from ambjax.control.stages import PositionLaw
 from ambjax.control.state_feedback import StateFeedback as StateFeedback
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share, twist
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_root, smooth_sign
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 
 @record

@@ -17,7 +17,7 @@ from jax import Array
 from ambjax.control.base import Law
 from ambjax.numerics.declared import check_number
 from ambjax.numerics.records import GainFunction, Scalar, is_traced, part, record, static
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 L = TypeVar("L", bound=Law)
 

@@ -108,9 +108,9 @@ class SynchronousNotch:
         moving = self._nulled(measured) - state.mean
         drive = -2 * self.rate * moving
         moved = -W * state.imaginary + real * drive, W * state.real + imaginary * drive
-        rates = [on * new - (1 - on) * self.rate * old for new, old in zip(moved, state[:2], strict=True)]
+        a, b = (on * new - (1 - on) * self.rate * old for new, old in zip(moved, state[:2], strict=True))
         t = () if isinstance(state.t, tuple) else jnp.ones_like(state.t)
-        return measured.z + on * state.real, NotchState(*rates, self.rate * moving, t)
+        return measured.z + on * state.real, NotchState(a, b, self.rate * moving, t)
 
     def step(self, measured: Measurement, state: NotchState, period: Scalar) -> tuple[Array, NotchState]:
         """Return z with the signal of the notch, m, and the state at the next sample. `period`: sample period, s."""
@@ -124,5 +124,5 @@ class SynchronousNotch:
             later = later + period
             turn = known(self.rotor).turns(later) - known(self.rotor).turns(later - period)
         c, s = jnp.cos(TWO_PI * turn), jnp.sin(TWO_PI * turn)
-        after = [on * (a * c - b * s), on * (a * s + b * c)]
-        return measured.z + on * state.real, NotchState(*after, state.mean + self.rate * period * moving, later)
+        a, b = on * (a * c - b * s), on * (a * s + b * c)
+        return measured.z + on * state.real, NotchState(a, b, state.mean + self.rate * period * moving, later)

@@ -23,7 +23,8 @@ from ambjax.numerics.records import canonical
 from ambjax.numerics.shapes import varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
-from ambjax.simulation.rollout import Outcome, System, prepare, run
+from ambjax.simulation.rollout import Result, System, prepare, run
+from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 
 # Largest number of members in one call of the compiled program, if the argument `call` is None.
@@ -34,8 +35,8 @@ LEAST_BYTES = 256
 # Name of the mesh axis over which members are distributed.
 MEMBERS = "members"
 
-# Result of the mapped function: a pytree, of one member, of a block or of the whole ensemble.
-Result = TypeVar("Result")
+# What the mapped function returns: a pytree, of one member, of a block or of the whole ensemble.
+Mapped = TypeVar("Mapped")
 
 
 class Parts(NamedTuple):
@@ -45,53 +46,55 @@ class Parts(NamedTuple):
     shared: Any
 
 
+@takes_case
 def run_ensemble(
     cascade: Cascade,
     scenario: Scenario,
     clock: Clock,
     *,
     fold: Fold | None,
-    every: int = 0,
+    record_every: int = 0,
     threads: int | None = None,
     call: int | None = None,
-) -> Outcome:
+) -> Result:
     """Simulate every member of an ensemble.
 
     A leaf of `cascade`, `scenario` and `fold` that has the shape its field declares (a number, if none is declared) is
     shared by all members. With one axis more, [N, ...], it has one entry per member. At least one leaf must have this
     axis, for example `scenario.member`, which selects the noise of a member.
-    `fold` is updated at every sample; None: no metrics. Rows are recorded at every `every`-th sample (0: none).
+    `fold` is updated at every sample; None: no metrics. Rows are recorded at every `record_every`-th sample (0: none).
     `threads` and `call` are those of `map_members`.
 
-    Returns an Outcome in member order: every leaf has a leading axis [N], rows have shape [N, rows].
+    Returns a Result in member order: every leaf has a leading axis [N], rows have shape [N, rows].
 
     Raises ValueError as `rollout` does, if the lengths of two leaves differ, and if no leaf is an array.
     """
     tree = canonical((*prepare(cascade, scenario, clock), fold))
-    return map_members(_rollout(every), tree, threads=threads, call=call)
+    return map_members(_rollout(record_every), tree, threads=threads, call=call)
 
 
 @functools.cache
-def _rollout(every: int) -> Callable[[tuple[System, Clock, Fold | None]], Outcome]:
+def _rollout(record_every: int) -> Callable[[tuple[System, Clock, Fold | None]], Result]:
     """Return the function that simulates one member. It is cached, so that JAX compiles it once."""
 
-    def one(tree: tuple[System, Clock, Fold | None]) -> Outcome:
+    def one(tree: tuple[System, Clock, Fold | None]) -> Result:
         system, clock, fold = tree
-        return run(system, clock, fold, every)
+        return run(system, clock, fold, record_every)
 
     return one
 
 
 def map_members(
-    function: Callable[..., Result],
+    function: Callable[..., Mapped],
     tree: object,
     *,
     threads: int | None = None,
     call: int | None = None,
     block: int | None = None,
     plain: bool = False,
+    quick: bool = True,
     vectorised: bool = False,
-) -> Result:
+) -> Mapped:
     """Return function(member) for every member of an ensemble.
 
     A leaf of `tree` is shared by all members, or an array [N, ...] with one entry per member. In a record, it has this
@@ -109,6 +112,8 @@ def map_members(
     - `block`: members that run together in vector instructions (None: as many as fit the first-level cache,
       fewer in a small ensemble).
     - `plain`: compile without the fast path, which does not support the functions of LAPACK, such as eigenvalues.
+    - `quick`: whether a plain program is compiled with `short_compilation.QUICK`, which the large program of a machine
+      must not be: that takes many minutes.
     - `vectorised`: whether the function is vectorised already. It then receives the tree of a block of members, and the
       tree `in_axes` of `jax.vmap` (0 or None for each leaf). Each leaf of its result has a leading axis of the block.
 
@@ -116,7 +121,8 @@ def map_members(
 
     Raises ValueError if the lengths of two leaves differ, or if no leaf is an array.
     """
-    return _Engine(function, tree, threads, call, block, plain, vectorised).results()
+    compiled = one_kernel if not plain else compiled_quickly if quick else jax.jit
+    return _Engine(function, tree, threads, call, block, compiled, vectorised).results()
 
 
 def size(tree: object) -> int:
@@ -134,17 +140,17 @@ def size(tree: object) -> int:
     return lengths.pop()
 
 
-class _Engine(Generic[Result]):
+class _Engine(Generic[Mapped]):
     """One ensemble, split into calls of one program. All calls have the same shape, so JAX compiles it once."""
 
     def __init__(
         self,
-        function: Callable[..., Result],
+        function: Callable[..., Mapped],
         tree: object,
         threads: int | None,
         call: int | None,
         block: int | None,
-        plain: bool,
+        compiled: Callable[..., Callable],
         vectorised: bool,
     ) -> None:
         leaves, self.tree = jax.tree.flatten(tree)
@@ -162,9 +168,9 @@ class _Engine(Generic[Result]):
         self.block = block or block_length(per_call)
         multiple = self.block * len(self.devices)
         self.call = -(-per_call // multiple) * multiple
-        self.program = _program(len(self.devices), plain)
+        self.program = _program(len(self.devices), compiled)
 
-    def results(self) -> Result:
+    def results(self) -> Mapped:
         """Run all calls and concatenate their results in member order."""
         starts = range(0, self.members, self.call)
         workers = min(self.workers, len(starts))
@@ -176,7 +182,7 @@ class _Engine(Generic[Result]):
         whole = jax.tree.map(lambda *xs: np.concatenate(xs), *parts)
         return jax.tree.map(lambda x: x[: self.members], whole)
 
-    def _one(self, start: int) -> Result:
+    def _one(self, start: int) -> Mapped:
         """Run one call: members from `start` on; the last member is repeated to fill the call."""
         index = np.minimum(np.arange(start, start + self.call), self.members - 1)
         parts = Parts(tuple(x[index] for x in self.moving), self.shared)
@@ -192,16 +198,16 @@ def cores() -> int:
 def _blocks(
     parts: Parts,
     *,
-    function: Callable[..., Result],
+    function: Callable[..., Mapped],
     moves: tuple[bool, ...],
     tree: Any,
     block: int,
     vectorised: bool,
-) -> Result:
+) -> Mapped:
     """Run all members of a call: on a CPU, in a loop over blocks, vectorised over a block; elsewhere, all at once."""
     axes = jax.tree.unflatten(tree, [0 if varies else None for varies in moves])
 
-    def together(moving: tuple[Array, ...]) -> Result:
+    def together(moving: tuple[Array, ...]) -> Mapped:
         own, common = iter(moving), iter(parts.shared)
         members = jax.tree.unflatten(tree, [next(own) if varies else next(common) for varies in moves])
         return function(members, axes) if vectorised else jax.vmap(function, (axes,))(members)
@@ -214,15 +220,13 @@ def _blocks(
 
 
 STATIC = ("function", "moves", "tree", "block", "vectorised")
-_fast = one_kernel(_blocks, static_argnames=STATIC)
-_plain = compiled_quickly(_blocks, static_argnames=STATIC)
 
 
 @functools.cache
-def _program(devices: int, plain: bool) -> Callable[..., Any]:
-    """Return the compiled program: for one device, or with members sharded over several devices."""
+def _program(devices: int, compiled: Callable[..., Callable]) -> Callable[..., Any]:
+    """Return the program that `compiled` makes: for one device, or with members sharded over several devices."""
     if devices == 1:
-        return _plain if plain else _fast
+        return compiled(_blocks, static_argnames=STATIC)
     mesh = Mesh(np.asarray(jax.devices()[:devices]), (MEMBERS,))
     by_member, replicated = PartitionSpec(MEMBERS), PartitionSpec()
 
@@ -232,7 +236,6 @@ def _program(devices: int, plain: bool) -> Callable[..., Any]:
         where = {"mesh": mesh, "in_specs": (Parts(by_member, replicated),), "out_specs": by_member, "check_vma": False}
         return jax.shard_map(one, **where)(parts)
 
-    compiled = compiled_quickly if plain else one_kernel
     kernel = compiled(sharded, static_argnames=STATIC)
 
     def placed(parts: Parts, **static: object) -> object:

@@ -1,8 +1,6 @@
 """The delay margin of a cascade on a processor: the largest delay up to which the rotor survives."""
 
-import dataclasses
 import itertools
-from typing import Any
 
 import numpy as np
 
@@ -36,8 +34,7 @@ def delay_margin(cascade: Cascade, scenario: Scenario, clock: Clock, *, known: b
 
     Returns the Delays, in samples. Raises ValueError as `rollout` does.
     """
-    processor: Any = cascade.processor
-    own = float(processor.delay)
+    own = float(cascade.timing.delay)
 
     def tried(*ends: float) -> Delays:
         runs = []
@@ -65,11 +62,10 @@ def delay_margin(cascade: Cascade, scenario: Scenario, clock: Clock, *, known: b
 def at_delays(cascade: Cascade, delays: np.ndarray, *, known: bool) -> Cascade:
     """Return the cascade with these delays [N] (samples) of its processor. `known`: as in `delay_margin`."""
     end = next(end for end in ENDS if np.max(delays) <= end)
-    processor: Any = cascade.on_processor(0.0, end).processor
+    cascade = cascade.on_processor(0.0, end)
     # an array in both cases, so that both use the same compiled program
-    assumed = delays if known else np.full(len(delays), float(processor.ahead))
-    late = dataclasses.replace(processor, predict=processor.predict is not False, delay=delays, assumed=assumed)
-    return dataclasses.replace(cascade, processor=late)
+    assumed = delays if known else np.full(len(delays), float(cascade.timing.ahead))
+    return cascade.with_processor(predict=cascade.timing.predict is not False, delay=delays, assumed=assumed)
 
 
 def _read(delays: np.ndarray, lost_at: np.ndarray, code: np.ndarray) -> Delays:

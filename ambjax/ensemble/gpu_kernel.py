@@ -26,8 +26,9 @@ from ambjax.numerics.shapes import varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import RK4
 from ambjax.simulation.folds import Fold
-from ambjax.simulation.loop import Realised
-from ambjax.simulation.rollout import Outcome, prepare, run
+from ambjax.simulation.loop import ClosedLoop
+from ambjax.simulation.rollout import Result, prepare, run
+from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 
 # Threads of a warp, and largest number of warps of a program. A thread simulates one member, or block/1024 members in
@@ -36,6 +37,7 @@ WARP, MOST_WARPS = 32, 32
 BLOCK = 128
 
 
+@takes_case
 def run_on_gpu(
     cascade: Cascade,
     scenario: Scenario,
@@ -44,7 +46,7 @@ def run_on_gpu(
     fold: Fold | None,
     block: int = BLOCK,
     interpret: bool = False,
-) -> Outcome:
+) -> Result:
     """Simulate every member of an ensemble on a GPU, in one kernel.
 
     Arguments and results are those of `run_ensemble`, without rows: each leaf of `cascade`, `scenario` and `fold` is a
@@ -54,7 +56,7 @@ def run_on_gpu(
     - `block`: members of one Pallas program, a power of two, at least 32.
     - `interpret`: run the kernel in Pallas's interpreter, which works on any device but is slow. For tests.
 
-    Returns an Outcome whose leaves have shape [N], in member order. JAX deprecated Pallas's Triton back end in 0.11.0.
+    Returns a Result whose leaves have shape [N], in member order. JAX deprecated Pallas's Triton back end in 0.11.0.
     If the installed JAX has none, a UserWarning says so, and `run_ensemble` simulates the members.
 
     Raises ValueError as `run_ensemble` does, and if there is no GPU, for another method, a cascade on a processor, a
@@ -63,7 +65,7 @@ def run_on_gpu(
     _, clock = prepare(cascade, scenario, clock)
     if not isinstance(clock.method, RK4):
         raise ValueError(f"clock.method = {clock.method}: run_on_gpu integrates with RK4 only. Use RK4(substeps).")
-    if cascade.processor is not None:
+    if cascade.sampled:
         raise ValueError("processor: run_on_gpu simulates cascades in continuous time only. Use run_ensemble.")
     if block < WARP or block & (block - 1):
         raise ValueError(f"block = {block}: it must be a power of two, at least {WARP}. Use {BLOCK}, for example.")
@@ -83,10 +85,10 @@ def run_on_gpu(
 @functools.partial(jax.jit, static_argnames=("members", "block", "interpret"))
 def _in_one_kernel(
     cascade: Cascade, scenario: Scenario, clock: Clock, fold: Fold | None, *, members: int, block: int, interpret: bool
-) -> Outcome:
+) -> Result:
     """Build the kernel, run it on all members, and return their outcomes [N]."""
     scenario, key = _with_draws(scenario, members)
-    whole = Realised(cascade, scenario, key), clock, fold
+    whole = ClosedLoop(cascade, scenario, key), clock, fold
     (leaves, tree), axes = jax.tree.flatten(whole), [0 if varies else None for varies in varying(whole)]
     traced, results = _traced(leaves, tree, axes, block)
     programs = -(-members // block)
@@ -104,11 +106,11 @@ def _in_one_kernel(
 
 
 def _traced(leaves: Sequence[Array], tree: Any, axes: Sequence[int | None], block: int) -> tuple[ClosedJaxpr, Any]:
-    """Trace the rollouts of `block` members. Return the trace, and the shapes of the Outcome.
+    """Trace the rollouts of `block` members. Return the trace, and the shapes of the Result.
 
     Raises ValueError for a recorded signal: a kernel cannot contain its samples.
     """
-    member = jax.vmap(lambda *leaves: run(*jax.tree.unflatten(tree, leaves), every=0), in_axes=axes)
+    member = jax.vmap(lambda *leaves: run(*jax.tree.unflatten(tree, leaves), record_every=0), in_axes=axes)
     shapes = [
         jax.ShapeDtypeStruct(x.shape if axis is None else (block, *x.shape[1:]), x.dtype)
         for x, axis in zip(leaves, axes, strict=True)

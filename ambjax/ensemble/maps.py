@@ -17,7 +17,7 @@ from ambjax.ensemble.study import Study
 from ambjax.numerics.shapes import map_varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import choose_method
-from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.metrics import Metrics
 from ambjax.world.scenario import Scenario
 
 PERIOD = "clock.sample_period"
@@ -138,7 +138,7 @@ def with_method_for_axes(study: Study, x: Axis, y: Axis) -> Study:
     _check(study, x, y)
     cascade, scenario, clock = study.cascade, study.scenario, study.clock
     usual = choose_method(*corners(study.spread, cascade, scenario), float(clock.sample_period))
-    if cascade.processor is None or clock.method != usual:
+    if not cascade.sampled or clock.method != usual:
         return study
     axes = {axis.path: (float(axis.values[0]), float(axis.values[-1])) for axis in (x, y)}
     period = axes.pop(PERIOD, (clock.sample_period,))[-1]
@@ -193,7 +193,7 @@ def _cells(study: Study, x: Axis, y: Axis | None, stable: StabilityTest | None) 
     values = dataclasses.replace(study, spread=Spread(entries, study.spread.design)).drawn(np.arange(study.members))
     cascade, scenario = _batch(study.cascade, study.scenario, {k: v[member] for k, v in values.items()} | axes)
     scenario = dataclasses.replace(scenario, seed=study.seed, member=member)
-    metrics = run_ensemble(cascade, scenario, study.clock, fold=standard_for(study.settle, scenario)).measured
+    metrics = run_ensemble(cascade, scenario, study.clock, fold=Metrics.of(study.settle, scenario)).metrics
     ended, stalled, error = np.isfinite(metrics["lost_at_s"]), metrics["stalled"], metrics["settled_max_abs_error_m"]
     one, world = map_varying(lambda x: x[:: study.members], (cascade, scenario))
     unstable = np.zeros(shape[:2], bool).ravel() if stable is None else ~stable(one, world, study.clock)

@@ -12,7 +12,7 @@ from ambjax.host.imports import digest_of
 from ambjax.numerics.records import is_traced, leaf
 from ambjax.numerics.shapes import axes_of, with_entry
 from ambjax.world.scenario import Scenario
-from ambjax.world.signals import Constant
+from ambjax.world.waveforms import Constant
 
 SHIFT = "shift"
 TIME = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="time by which start and stop are shifted together")
@@ -158,3 +158,13 @@ def _set(node: Any, route: tuple[int | str, ...], value: Any) -> Any:
             return (*node[:step], _set(node[step], tuple(rest), value), *node[step + 1 :])
         return with_entry(node, route, value)
     return dataclasses.replace(node, **{step: _set(getattr(node, step), tuple(rest), value)})
+
+
+def numbers_in(node: object, path: str) -> dict[str, Place]:
+    """Return every number in a record and its nested records by dotted path. `path`: of the record."""
+    return dict(_below(node, path, ()))
+
+
+def with_number(node: Any, route: tuple[int | str, ...], value: Any) -> Any:
+    """Return the record `node` with the number at the route of a `Place` of `numbers_in` replaced."""
+    return _set(node, route, value)

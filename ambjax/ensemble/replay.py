@@ -21,8 +21,8 @@ from ambjax.ensemble.worker import CALL, chunk
 from ambjax.numerics.records import Scalar, canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
-from ambjax.simulation.metrics import standard_for
-from ambjax.simulation.rollout import Outcome, RolloutState, System, begin, finish, prepare, recorded_segment
+from ambjax.simulation.metrics import Metrics
+from ambjax.simulation.rollout import Result, RolloutState, System, begin, finish, prepare, recorded_segment
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.world.scenario import Scenario
 
@@ -57,13 +57,13 @@ def record_member(
     *,
     fold: Fold | None = None,
     tell: Callable[[int], object] = lambda _: None,
-) -> Outcome:
+) -> Result:
     """Simulate one member with the rounding of an ensemble's block, and record every sample.
 
     Leaves are numbers, except that leaves which vary in the ensemble are arrays [1], as `Study.batch` returns them.
     `tell` is called with the number of new samples after each part of the run.
 
-    Returns the Outcome of `rollout`, with rows [samples]. On a CPU the rows are bit for bit those of the ensemble
+    Returns the Result of `rollout`, with rows [samples]. On a CPU the rows are bit for bit those of the ensemble
     (tests/test_replay.py); a sum in a fold may differ in the last bit.
 
     Raises ValueError as `rollout` does.
@@ -74,11 +74,11 @@ def record_member(
 
 def record_system(
     system: System, clock: Clock, *, fold: Fold | None = None, tell: Callable[[int], object] = lambda _: None
-) -> Outcome:
+) -> Result:
     """Do the work of `record_member` for a `rollout.System`, without checks. At least one leaf must be an array [1]."""
     tree = canonical((system, clock, fold))
     count = min(SEGMENT, clock.samples)
-    progress, rows, outcomes = map_members(_begun, tree, threads=1, call=CALL), [], list[Outcome]()
+    progress, rows, outcomes = map_members(_begun, tree, threads=1, call=CALL), [], list[Result]()
     for first in range(0, clock.samples, count):
         progress, outcome = map_members(_recorded_segment(count), (*tree, progress, first), threads=1, call=CALL)
         outcomes = [jax.tree.map(lambda x: x[0], outcome)]
@@ -98,9 +98,9 @@ def replay(study: Study, index: int, tell: Callable[[int], object] = lambda _: N
     """
     columns = chunk(study, index, index + 1, CALL, threads=1)
     cascade, scenario = study.batch(np.array([index]))
-    outcome = record_member(cascade, scenario, study.clock, fold=standard_for(study.settle, scenario), tell=tell)
-    metrics = {name: columns[name][0] for name in outcome.measured}
-    deviation = max(_relative(metrics[name], x) for name, x in outcome.measured.items())
+    outcome = record_member(cascade, scenario, study.clock, fold=Metrics.of(study.settle, scenario), tell=tell)
+    metrics = {name: columns[name][0] for name in outcome.metrics}
+    deviation = max(_relative(metrics[name], x) for name, x in outcome.metrics.items())
     eps = float(np.finfo(np.asarray(metrics["rms_error_m"]).dtype).eps)
     return Replay(outcome.trajectory, metrics, deviation, study.clock.samples * eps)
 
@@ -120,10 +120,10 @@ def _begun(tree: tuple[System, Clock, Fold | None]) -> RolloutState:
 @functools.cache
 def _recorded_segment(
     count: int,
-) -> Callable[[tuple[System, Clock, Fold | None, RolloutState, Scalar]], tuple[RolloutState, Outcome]]:
+) -> Callable[[tuple[System, Clock, Fold | None, RolloutState, Scalar]], tuple[RolloutState, Result]]:
     """Return the simulation of `count` samples. The function is cached, so that it compiles once."""
 
-    def one(tree: tuple[System, Clock, Fold | None, RolloutState, Scalar]) -> tuple[RolloutState, Outcome]:
+    def one(tree: tuple[System, Clock, Fold | None, RolloutState, Scalar]) -> tuple[RolloutState, Result]:
         system, clock, fold, progress, first = tree
         progress, rows = recorded_segment(system, clock, fold, progress, first, count)
         return progress, finish(progress, rows, fold)

@@ -50,7 +50,13 @@ def draw(
     Returns the values by dotted path, float64 [n]. The values of member k depend only on (seed, k), and for a Latin
     hypercube on the total. Raises ValueError as `check_spread` does.
     """
-    known = check_spread(spread, cascade, scenario)
+    return drawn(spread, check_spread(spread, cascade, scenario), seed, members, total)
+
+
+def drawn(
+    spread: Spread, known: Mapping[str, Place], seed: int, members: np.ndarray, total: int
+) -> dict[str, np.ndarray]:
+    """Draw the values as `draw` does. `known`: the numbers of a checked spread by dotted path."""
     u = design_points(spread.design, seed, len(spread.entries), members, total)
     return {path: kind.quantile(u[:, n], _nominal(known[path])) for n, (path, kind) in enumerate(spread.entries)}
 
@@ -107,16 +113,21 @@ def check_spread(spread: Spread, cascade: Cascade, scenario: Scenario) -> dict[s
     Raises ValueError if the spread is not valid for them. The message is one line with the path, the value, the allowed
     range and the fix.
     """
+    known = places(cascade, scenario)
+    check_entries(spread, known)
+    _check_together(dict(spread.entries), known, cascade, scenario)
+    return known
+
+
+def check_entries(spread: Spread, known: Mapping[str, Place]) -> None:
+    """Raise ValueError if the design is unknown, or if an entry is not valid for its number in `known`."""
     if spread.design not in DESIGNS:
         raise ValueError(f"spread.design = {spread.design!r}: it must be one of {', '.join(map(repr, DESIGNS))}.")
-    known = places(cascade, scenario)
     for path, kind in spread.entries:
         require_path(path, known)
         if spread.paths.count(path) > 1:
             raise ValueError(f"spread.{path} is given {spread.paths.count(path)} times. Keep one of them.")
         _check_one(path, kind, known[path])
-    _check_together(dict(spread.entries), known, cascade, scenario)
-    return known
 
 
 def require_path(path: str, known: Iterable[str], value: str = "") -> None:

@@ -1,5 +1,6 @@
 """A study: a case, its spread, a seed and a number of members. Its members can run in any order, on any machine."""
 
+import abc
 import dataclasses
 import math
 import shlex
@@ -15,7 +16,7 @@ from ambjax.ensemble.paths import kinds, places
 from ambjax.ensemble.spread import Spread, apply, draw
 from ambjax.host.sealed import provenance
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.world.scenario import Scenario
 
@@ -46,8 +47,64 @@ class Bands(NamedTuple):
     extremes: dict[str, tuple[np.ndarray, np.ndarray]]
 
 
+class AnyStudy(abc.ABC):
+    """A study of one axis or of a machine: `Study`, whose attributes have the same meaning, or `MachineStudy`."""
+
+    clock: Clock
+    settle: float
+    spread: Spread
+    seed: int
+    members: int
+
+    @property
+    @abc.abstractmethod
+    def random(self) -> bool:
+        """Whether the members have random signals of their own."""
+
+    @property
+    def varies(self) -> bool:
+        """Whether the members differ."""
+        return bool(self.spread.entries) or self.random
+
+    @abc.abstractmethod
+    def drawn(self, members: np.ndarray) -> dict[str, np.ndarray]:
+        """Draw the spread quantities of these members (integers [n]); arrays [n] by dotted path."""
+
+    @abc.abstractmethod
+    def columns(
+        self, start: int, stop: int, *, call: int | None = None, threads: int | None = None, lost: bool = False
+    ) -> dict[str, Any]:
+        """Simulate members start <= k < stop and return their columns, each [stop - start], by name.
+
+        The columns are index, lost_at (s), every metric, and spread.PATH for each spread quantity. `call` and `threads`
+        are those of `map_members`. `lost`: start every rotor outside its clearance, so that it is lost at once. Such a
+        call compiles the program of the study without the cost of a run.
+        """
+
+    def facts(self) -> dict[str, object]:
+        """Return the part of the fingerprint that does not describe the system."""
+        facts: dict[str, object] = {**provenance(), "members": self.members, "seed": self.seed}
+        facts |= {"clock.samples": self.clock.samples, "clock.sample_period": str(self.clock.sample_period)}
+        facts |= {"clock.method": str(self.clock.method), "run.settle": self.settle}
+        facts |= {"spread.design": self.spread.design}
+        return facts | {SPREAD + path: repr(kind) for path, kind in self.spread.entries}
+
+    @abc.abstractmethod
+    def fingerprint(self) -> dict[str, object]:
+        """Return everything that determines the results of the study, by name, as values that JSON can hold."""
+
+    def command(self, case: str, index: int) -> str:
+        """Return the command line that simulates one member alone; `case` is the path of the case file."""
+        words = ["ambjax", "simulate", case]
+        if self.varies:
+            words += ["--member", str(index), "--seed", str(self.seed)]
+        if self.spread.design == "latin-hypercube":
+            words += ["--members", str(self.members)]
+        return shlex.join(words)
+
+
 @dataclasses.dataclass(frozen=True)
-class Study:
+class Study(AnyStudy):
     """The definition of an ensemble. Member k depends on (seed, k) and, in a Latin hypercube, on `members`.
 
     - `clock`: its method must be valid for every member. `cases.reader` chooses it for the extremes of the spread.
@@ -65,12 +122,10 @@ class Study:
     members: int
 
     @property
-    def varies(self) -> bool:
-        """Whether the members differ."""
-        return bool(self.spread.entries) or self.scenario.random
+    def random(self) -> bool:
+        return self.scenario.random
 
     def drawn(self, members: np.ndarray) -> dict[str, np.ndarray]:
-        """Draw the spread quantities of these members (integers [n]); arrays [n] by dotted path."""
         return draw(self.spread, self.cascade, self.scenario, self.seed, members, self.members)
 
     def batch(self, members: np.ndarray) -> tuple[Cascade, Scenario]:
@@ -84,33 +139,18 @@ class Study:
         cascade, scenario = apply(self.cascade, self.scenario, values)
         return cascade, dataclasses.replace(scenario, seed=self.seed, member=index)
 
-    def command(self, case: str, index: int) -> str:
-        """Return the command line that simulates one member alone; `case` is the path of the case file."""
-        words = ["ambjax", "simulate", case]
-        if self.varies:
-            words += ["--member", str(index), "--seed", str(self.seed)]
-        if self.spread.design == "latin-hypercube":
-            words += ["--members", str(self.members)]
-        return shlex.join(words)
-
     def columns(
         self, start: int, stop: int, *, call: int | None = None, threads: int | None = None, lost: bool = False
     ) -> dict[str, Any]:
-        """Simulate members start <= k < stop and return their columns, each [stop - start], by name.
-
-        The columns are index, lost_at (s), every metric, and spread.PATH for each spread quantity. `call` and `threads`
-        are those of `map_members`. `lost`: start every rotor outside its clearance, so that it is lost at once. Such a
-        call compiles the program of the study without the cost of a run.
-        """
         members = np.arange(start, stop)
         cascade, scenario = self.batch(members)
         if lost:
             far = np.full(np.shape(scenario.initial.z), 2 * np.max(np.asarray(scenario.limit)))
             scenario = dataclasses.replace(scenario, initial=dataclasses.replace(scenario.initial, z=far))
-        fold = standard_for(self.settle, scenario)
+        fold = Metrics.of(self.settle, scenario)
         outcome = run_ensemble(cascade, scenario, self.clock, fold=fold, threads=threads, call=call)
         values = {SPREAD + path: x for path, x in self.drawn(members).items()}
-        return {"index": members, "lost_at": outcome.trajectory.lost_at, **outcome.measured, **values}
+        return {"index": members, "lost_at": outcome.trajectory.lost_at, **outcome.metrics, **values}
 
     def bands(self, members: int, times: int, until: float = math.inf) -> Bands:
         """Compute the data of a fan chart of the first `members` members, up to time `until` (s) or the end of the run.
@@ -124,8 +164,8 @@ class Study:
         cascade, scenario = self.batch(np.arange(min(members, self.members)))
         fold = Blocks(tuple(FAN_SIGNALS.values()), every, count, period)
         clock = dataclasses.replace(self.clock, samples=samples)
-        outcome = run_ensemble(cascade, scenario, clock, fold=fold, every=every)
-        rows, folded = outcome.trajectory.rows, outcome.measured
+        outcome = run_ensemble(cascade, scenario, clock, fold=fold, record_every=every)
+        rows, folded = outcome.trajectory.rows, outcome.metrics
         # Add the last sample, unless the last block begins there.
         ends = [(samples - 1) * period] if (samples - 1) % every else []
         t = np.append(np.asarray(rows.t[0]), ends)
@@ -140,14 +180,10 @@ class Study:
         return Bands(t, outcome.trajectory, signals | {"variation of u": rate}, extremes)
 
     def fingerprint(self) -> dict[str, object]:
-        """Return everything that determines the results of the study, by name, as values that JSON can hold."""
-        facts: dict[str, object] = {**provenance(), "members": self.members, "seed": self.seed}
+        facts = self.facts()
         facts |= {**dict(kinds(self.cascade, "controller.")), **dict(kinds(self.scenario))}
         facts |= {path: str(place.value) for path, place in places(self.cascade, self.scenario).items()}
-        facts |= {"clock.samples": self.clock.samples, "clock.sample_period": str(self.clock.sample_period)}
-        facts |= {"clock.method": str(self.clock.method), "run.settle": self.settle}
-        facts |= {"spread.design": self.spread.design}
-        return facts | {SPREAD + path: repr(kind) for path, kind in self.spread.entries}
+        return facts
 
 
 def _beside(blocks: np.ndarray, combine: Callable[[np.ndarray, np.ndarray], np.ndarray], instants: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 
 import numpy as np
 
-from ambjax.ensemble.study import Study
+from ambjax.ensemble.study import AnyStudy
 
 # Members in one call of the compiled program on a CPU. The last digit of a result may depend on it. It is fixed, so
 # that no result depends on the number of cores or on the process that computes a chunk.
@@ -52,7 +52,7 @@ def configure_jax() -> None:
 
 
 def chunk(
-    study: Study, start: int, stop: int, size: int, threads: int | None = None, *, lost: bool = False
+    study: AnyStudy, start: int, stop: int, size: int, threads: int | None = None, *, lost: bool = False
 ) -> dict[str, np.ndarray]:
     """Simulate members start <= k < stop of a study, and return their columns.
 
@@ -65,7 +65,7 @@ def chunk(
     return study.columns(start, stop, call=call, threads=threads, lost=lost)
 
 
-def work(study: Study, start: int, stop: int, size: int) -> dict[str, np.ndarray]:
+def work(study: AnyStudy, start: int, stop: int, size: int) -> dict[str, np.ndarray]:
     """Simulate a chunk of a study in a worker process, on one core, and return its columns."""
     configure_jax()
     return chunk(study, start, stop, size, threads=1)

@@ -18,10 +18,10 @@ from jax.flatten_util import ravel_pytree
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Sample
 from ambjax.numerics.records import Scalar
-from ambjax.world.amplifier import Amplifier
+from ambjax.world.amplifier import Amplifier, CurrentAmplifier
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
-from ambjax.world.signals import Constant, Reference, reference_at
+from ambjax.world.waveforms import Constant, Reference, reference_at
 
 # Largest number of Newton trials. Near the equilibrium, five suffice. Far outside the boundary layer of a smoothed
 # sign, more are necessary.
@@ -63,16 +63,14 @@ def ideal(scenario: Scenario) -> Scenario:
 
     The sensor keeps its gain, offset and bandwidth, the amplifier its bandwidth.
     """
-    scenario = scenario.undisturbed()
-    sensor, amplifier = scenario.sensor, scenario.amplifier
-    if sensor is not None:
-        sensor = dataclasses.replace(sensor.louder(0.0), bits=None, outliers=None, dropouts=None)
+    scenario = scenario.undisturbed().louder(0.0).with_sensor(bits=None, outliers=None, dropouts=None)
+    amplifier = scenario.amplifier
     if isinstance(amplifier, Amplifier):
         amplifier = dataclasses.replace(amplifier, slew=None, dead_band=None, i_max=None, coil=None)
         amplifier = None if amplifier.bandwidth is None else amplifier
-    elif amplifier is not None:
+    elif isinstance(amplifier, CurrentAmplifier):
         amplifier = dataclasses.replace(amplifier, i_max=None)
-    return dataclasses.replace(scenario, sensor=sensor, amplifier=amplifier, u_max=jnp.inf)
+    return dataclasses.replace(scenario, amplifier=amplifier, u_max=jnp.inf)
 
 
 def reading(scenario: Scenario, motion: Measurement, injected: tuple[Scalar, Scalar]) -> Measurement:
@@ -81,11 +79,8 @@ def reading(scenario: Scenario, motion: Measurement, injected: tuple[Scalar, Sca
     The signal on z_dot has no effect if the velocity is not measured.
     """
     zero = jnp.zeros(())
-    if scenario.sensor is not None:
-        motion = scenario.sensor.reading(motion, Errors(zero, zero, zero))
-    z_dot = motion.z_dot + injected[1]
-    if scenario.sensor is not None and not scenario.sensor.velocity:
-        z_dot = motion.z_dot
+    motion = scenario.sensors.reading(motion, Errors(zero, zero, zero))
+    z_dot = motion.z_dot + injected[1] if scenario.sensors.velocity else motion.z_dot
     return motion._replace(z=motion.z + injected[0], z_dot=z_dot)
 
 
@@ -216,11 +211,11 @@ def _residual(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, p
     u = scenario.coil_voltage(point.u, point.plant) if scenario.drive == "current" else point.u
     moved = jax.tree.map(lambda x: x / plant.pole, plant.rates(point.plant, u))
     measured, reference = reading(scenario, plant.measurement(point.plant), (0.0, 0.0)), at_rest(r)
-    if cascade.processor is None:
+    if not cascade.sampled:
         command, rates = cascade(measured, point.control, reference, u_max)
         control = jax.tree.map(lambda x: x / plant.pole, rates)
     else:
-        sample = Sample(reference, period, u_max, cascade.processor.constant_past(point.u))
+        sample = Sample(reference, period, u_max, cascade.timing.constant_past(point.u))
         command, after, _ = cascade.step(measured, point.control, sample)
         control = jax.tree.map(lambda a, b: b - a, point.control, after)
     change = Point(moved, control, command.u - point.u)

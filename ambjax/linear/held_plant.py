@@ -40,8 +40,8 @@ class Lagged:
 
     def __init__(self, scenario: Scenario, point: Point):
         self.scenario = scenario
-        self.low_passed = scenario.sensor is not None and scenario.sensor.bandwidth is not None
-        self.lagged = scenario.amplifier is not None and scenario.amplifier.slow
+        self.low_passed = scenario.sensors.bandwidth is not None
+        self.lagged = scenario.actuator.slow
         z = scenario.plant.measurement(point.plant).z
         lags = [z] * self.low_passed + [point.u] * self.lagged
         self.start, self.restore = ravel_pytree((point.plant, lags))
@@ -58,11 +58,11 @@ class Lagged:
 
     def rates(self, x: Array, u: Scalar, q_z: Scalar) -> Array:
         """Return the time derivative of the state under a command u (V or A) and a disturbance q_z (m/s^2)."""
-        (plant, lags), sensor, amplifier, lag_rates = self.restore(x), self.scenario.sensor, self.scenario.amplifier, []
-        if sensor is not None and sensor.bandwidth is not None:
+        (plant, lags), sensor, amplifier, lag_rates = self.restore(x), self.scenario.sensors, self.scenario.actuator, []
+        if sensor.bandwidth is not None:
             z = self.scenario.plant.measurement(plant).z
             lag_rates.append(2 * jnp.pi * sensor.bandwidth * (z - lags[0]))
-        if amplifier is not None and self.lagged:
+        if self.lagged:
             lag_rates.append(amplifier.slope() * (u - lags[-1]))
             u = lags[-1]
         u = self.scenario.coil_voltage(jnp.asarray(u), plant)

@@ -1,8 +1,7 @@
 """Linearisation of a whole machine at rest and constant speed: all loops are closed, each axis has a test signal."""
 
-import dataclasses
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeVar
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -12,19 +11,23 @@ from jax.flatten_util import ravel_pytree
 
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Sample
+from ambjax.control.machine_law import MachineInputs
 from ambjax.linear.analysis import Zones
 from ambjax.linear.equilibrium import TOLERANCE, at_rest, ideal, newton_of, reading, sizes_of, start_of
 from ambjax.linear.margins import ResponsePeak, peak, poles_in_s, whole_end
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar, canonical
-from ambjax.numerics.small_matrices import exponential
+from ambjax.numerics.small_matrices import exponential, times
 from ambjax.numerics.smooth import TWO_PI
-from ambjax.simulation.whole_machine import Machine, MachineState, PlantOnly, SampledMachine, still, times
+from ambjax.simulation.joint_laws import forces, inputs_of
+from ambjax.simulation.whole_machine import Machine, MachineState, PlantOnly, SampledMachine, still
 from ambjax.world.rotation import PER_MINUTE
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
 
 T = TypeVar("T")
+# Stands for a demand that no law of the machine makes.
+ABSENT: Any = None
 # Parts of a point or of its rates: one stacked pytree for each group.
 Groups = tuple
 
@@ -45,7 +48,7 @@ class MachineSensitivity(NamedTuple):
     - `speed`: rpm. `stable`: whether no mode grows. If one does, the peaks have no physical meaning, and zones are D.
     - `axes`: the peaks of each axis. `sigma`: peak of the largest singular value of the matrix S.
     - `poles`: poles of the machine, 1/s, in the order of decreasing real part.
-    - `system`: the linear system, with inputs e_k at the sensors, and outputs: z_k read, commands u_k, i_k read.
+    - `system`: the linear system, with inputs e_k at the sensors, and outputs as of `linearise_machine`.
     """
 
     speed: float
@@ -62,12 +65,16 @@ class MachineSensitivity(NamedTuple):
 
 
 class _Rest(NamedTuple):
-    """A point of the machine at rest: coordinates [n]; plants, laws and commands [c_g] of each group."""
+    """A point of the machine at rest: coordinates [n]; plants, laws and commands [c_g] of each group.
+
+    `law`: state of the law of the machine, () without one.
+    """
 
     q: Array
     plant: Groups
     control: Groups
     u: Groups
+    law: object = ()
 
 
 class _Linear:
@@ -77,10 +84,12 @@ class _Linear:
         self.machine, self.W, self.period = machine.realised(), W, period
         loops = self.machine.loops()
         self.scenario = tuple(jax.vmap(ideal)(loop.scenario) for loop in loops)
-        self.cascade = tuple(_unguarded(loop.cascade.at_speed(W / (TWO_PI * PER_MINUTE))) for loop in loops)
+        speed = W / (TWO_PI * PER_MINUTE)
+        laws = [jax.vmap(lambda cascade: cascade.at_speed(speed))(loop.cascade) for loop in loops]
+        self.cascade = tuple(cascade.with_processor(guard=None) for cascade in laws)
         self.rotor = self.machine.rotor
-        self.low_passed = [one.sensor is not None and one.sensor.bandwidth is not None for one in self.scenario]
-        self.lagged = [one.amplifier is not None and one.amplifier.slow for one in self.scenario]
+        self.low_passed = [one.sensors.bandwidth is not None for one in self.scenario]
+        self.lagged = [one.actuator.slow for one in self.scenario]
 
     @property
     def sampled(self) -> bool:
@@ -98,7 +107,12 @@ class _Linear:
         q = jnp.zeros_like(jnp.asarray(self.rotor.gravity))
         size = self.machine.scale(sizes)
         first = _Rest(q, *_parts(points))
-        return first, jax.tree.map(lambda x, s: jnp.zeros_like(x) + s, first, _Rest(size.q, *_parts(sizes)))
+        if self.machine.law is not None:
+            e = tuple(jnp.zeros_like(u) for u in first.u)
+            measured = self.read(q, jnp.zeros_like(q), first.plant, self.sensed(q), e)
+            law = self.machine.law.begin(self.machine.join(measured), self.inputs(self.past(first.u)))
+            first = first._replace(law=jax.tree.map(lambda x: jnp.asarray(x, q.dtype), law))
+        return first, jax.tree.map(lambda x, s: jnp.zeros_like(x) + s, first, _Rest(size.q, *_parts(sizes), size.law))
 
     def read(
         self, q: Array, q_dot: Array, plant: Groups, z: Sequence[object], e: Sequence[object]
@@ -122,26 +136,51 @@ class _Linear:
         moved = self.each(one, states, u)
         return self.machine.coupled((jnp.asarray(self.rotor.gravity), self.W), MachineState(q, q_dot, ()), moved)
 
-    def laws(self, measured: Sequence[Measurement], control: Groups, past: Sequence[object]) -> tuple[Groups, Groups]:
-        """Return the commands of the groups, and the next states of the laws, or their rates in continuous time."""
+    def inputs(self, past: Sequence[Any]) -> MachineInputs:
+        """Return the inputs of the law of the machine. `past`: commands on their way, of the groups."""
+        count = self.machine.count
+        reference = jax.tree.map(lambda x: jnp.zeros(count) + x, at_rest(0.0))
+        return inputs_of(
+            self.machine, reference, self.W, jnp.full(count, jnp.inf), self.machine.join(past), self.period
+        )
+
+    def laws(
+        self, measured: Sequence[Measurement], control: Groups, law: object, past: Sequence[Any]
+    ) -> tuple[Groups, Groups, object]:
+        """Return the commands of the groups, and the next states of the laws, or their rates in continuous time.
+
+        `control`: states of the laws of the groups. `law`: state of the law of the machine.
+        """
         reference, unlimited = at_rest(0.0), jnp.asarray(jnp.inf)
+        demands: Groups = (None,) * len(self.cascade)
+        whole = self.machine.law
+        if whole is not None:
+            act = whole.step if self.sampled else whole
+            demanded, law = act(self.machine.join(measured), law, self.inputs(past))
+            demands = forces(self.machine, demanded)
 
         def one(
-            cascade: Cascade, _: object, measured: Measurement, control: CascadeState, past: tuple[Array, ...]
+            cascade: Cascade, _: object, measured: Measurement, control: CascadeState, past: tuple, demand: Any
         ) -> tuple[Array, CascadeState]:
-            if not self.sampled:
-                command, rates = cascade(measured, control, reference, unlimited)
-                return command.u, rates
-            command, after, _ = cascade.step(measured, control, Sample(reference, self.period, unlimited, past))
+            force, estimate = demand or 2 * (ABSENT,)
+            sample = Sample(reference, self.period, unlimited, past)
+            if not self.sampled and force is None:
+                command, after = cascade(measured, control, reference, unlimited)
+            elif not self.sampled:
+                command, after = cascade.command_rates(force, estimate, control, reference, unlimited)
+            elif force is None:
+                command, after, _ = cascade.step(measured, control, sample)
+            else:
+                command, after = cascade.commanded(force, estimate, control, sample)
             return command.u, after
 
-        found = self.each(one, measured, control, past)
-        return tuple(u for u, _ in found), tuple(after for _, after in found)
+        found = self.each(one, measured, control, past, demands)
+        return tuple(u for u, _ in found), tuple(after for _, after in found), law
 
     def past(self, u: Groups) -> Groups:
         """Return the commands on their way under constant commands u; () in continuous time."""
-        processors = [cascade.processor for cascade in self.cascade]
-        return tuple(() if p is None else p.constant_past(own) for p, own in zip(processors, u, strict=True))
+        pasts = (one.timing.constant_past(own) for one, own in zip(self.cascade, u, strict=True))
+        return tuple(past if self.sampled else () for past in pasts)
 
     def sensed(self, q: Array) -> Groups:
         """Return the displacements at the sensors, for the groups with a low-pass."""
@@ -154,26 +193,33 @@ class _Linear:
         moved = self.rates(point.q, zero, point.plant, point.u)
         poles = [scenario.plant.pole for scenario in self.scenario]
         measured = self.read(point.q, zero, point.plant, self.sensed(point.q), e)
-        u, after = self.laws(measured, point.control, self.past(point.u))
+        u, after, law = self.laws(measured, point.control, point.law, self.past(point.u))
+        fastest = jnp.max(self.machine.join(poles))
         if self.sampled:
             change = jax.tree.map(lambda a, b: b - a, point.control, after)
+            law = jax.tree.map(lambda a, b: b - a, point.law, law)
         else:
             change = tuple(jax.tree.map(lambda x, w=w: x / w, own) for own, w in zip(after, poles, strict=True))
+            law = jax.tree.map(lambda x: x / fastest, law)
         axes = zip(moved.axes, poles, strict=True)
         plant = tuple(jax.tree.map(lambda x, w=w: x / w, own.plant) for own, w in axes)
-        fastest = jnp.max(self.machine.join(poles))
-        return _Rest(moved.q_dot / fastest**2, plant, change, jax.tree.map(jnp.subtract, u, point.u))
+        return _Rest(moved.q_dot / fastest**2, plant, change, jax.tree.map(jnp.subtract, u, point.u), law)
 
-    def rest(self) -> tuple[_Rest, _Rest, Array]:
-        """Return the equilibrium, the sizes of the states, and whether it was found."""
+    def rest(self) -> _Rest:
+        """Return the equilibrium, or the point nearest to it that was found."""
         start, sizes = self.start()
         scale, (flat, restore) = ravel_pytree(sizes)[0], ravel_pytree(start)
-        newton = newton_of(lambda y: ravel_pytree(self.residual(restore(y * scale)))[0] / scale, flat / scale)
-        return restore(newton.y * scale), sizes, newton.error <= TOLERANCE * jnp.finfo(flat.dtype).eps
+        return restore(newton_of(lambda y: self.deviation(restore(y * scale), scale), flat / scale).y * scale)
 
-    def system(self) -> tuple[StateSpace, Array]:
-        """Return the state space, and whether an equilibrium was found."""
-        point, sizes, found = self.rest()
+    def deviation(self, point: _Rest, scale: Array) -> Array:
+        """Return the residual relative to the sizes of the states."""
+        return ravel_pytree(self.residual(point))[0] / scale
+
+    def system(self, point: _Rest) -> tuple[StateSpace, Array, Array]:
+        """Return the state space at a point, its A under constant commands, and whether the machine rests there."""
+        sizes = self.start()[1]
+        deviation = self.deviation(point, ravel_pytree(sizes)[0])
+        found = jnp.max(jnp.abs(deviation)) <= TOLERANCE * jnp.finfo(deviation.dtype).eps
         amplified = tuple(u if on else () for u, on in zip(point.u, self.lagged, strict=True))
         body, restore = ravel_pytree((point.q, jnp.zeros_like(point.q), point.plant, self.sensed(point.q), amplified))
         fastest = jnp.max(self.machine.join([scenario.plant.pole for scenario in self.scenario]))
@@ -186,11 +232,11 @@ class _Linear:
             q, q_dot, plant, filtered, own = restore(x)
             z_rates, u_rates, applied = [], [], []
             for k, (scenario, z) in enumerate(zip(self.scenario, self.sensed(q), strict=True)):
-                sensor, amplifier = scenario.sensor, scenario.amplifier
-                low = () if sensor is None or sensor.bandwidth is None else 2 * jnp.pi * jnp.asarray(sensor.bandwidth)
+                bandwidth, amplifier = scenario.sensors.bandwidth, scenario.actuator
+                low = () if bandwidth is None else 2 * jnp.pi * jnp.asarray(bandwidth)
                 z_rates.append(() if isinstance(low, tuple) else low * (z - filtered[k]))
-                slow = amplifier is not None and self.lagged[k]
-                u_rates.append(jnp.asarray(amplifier.slope()) * (u[k] - own[k]) if amplifier and slow else ())
+                slow = self.lagged[k]
+                u_rates.append(jnp.asarray(amplifier.slope()) * (u[k] - own[k]) if slow else ())
                 applied.append(own[k] if slow else u[k])
             after = self.rates(q, q_dot, plant, tuple(applied))
             return ravel_pytree((after.q, after.q_dot, _plants(after.axes), tuple(z_rates), tuple(u_rates)))[0]
@@ -199,58 +245,51 @@ class _Linear:
             q, q_dot, plant, filtered, _ = restore(x)
             return self.read(q, q_dot, plant, filtered, self.machine.split(e))
 
+        u = self.machine.join(point.u)
+        free = jax.jacfwd(lambda x, u: moved(x, self.machine.split(u)), (0, 1))(body, u)
         build = self._sampled if self.sampled else self._continuous
-        ((A, B), (C, D)), scale = build(point, sizes, body, body_sizes, moved, read)
-        return StateSpace(A, B, C, D, scale, jnp.asarray(self.period) if self.sampled else None), found
+        ((A, B), (C, D)), scale = build(point, sizes, body, body_sizes, free if self.sampled else moved, read)
+        return StateSpace(A, B, C, D, scale, jnp.asarray(self.period) if self.sampled else None), free[0], found
 
-    def outputs(self, measured: Sequence[Measurement], u: Groups) -> Array:
-        """Return the outputs of the linear system: readings of z, commands, readings of i, in the order of the axes."""
-        z, i = ([getattr(one, name) for one in measured] for name in ("z", "i"))
-        return jnp.concatenate([self.machine.join(z), self.machine.join(u), self.machine.join(i)])
+    def outputs(self, measured: Sequence[Measurement], u: Groups, x: Array) -> Array:
+        """Return the outputs of the linear system: readings, commands, and currents of the axes, and coordinates."""
+        z, i = (self.machine.join([getattr(one, name) for one in measured]) for name in ("z", "i"))
+        return jnp.concatenate([z, self.machine.join(u), i, x[: len(jnp.asarray(self.rotor.gravity))]])
 
     def _continuous(
         self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, moved: Callable, read: Callable
     ) -> tuple:
-        x, restore = ravel_pytree((body, point.control))
+        x, restore = ravel_pytree((body, point.control, point.law))
 
         def field(x: Array, e: Array) -> tuple[Array, Array]:
-            at, control = restore(x)
+            at, control, law = restore(x)
             measured = read(at, e)
-            u, rates = self.laws(measured, control, self.past(point.u))
-            return ravel_pytree((moved(at, u), rates))[0], self.outputs(measured, u)
+            u, *rates = self.laws(measured, control, law, self.past(point.u))
+            return ravel_pytree((moved(at, u), tuple(rates)))[0], self.outputs(measured, u, at)
 
-        scale = ravel_pytree((body_sizes, sizes.control))[0]
+        scale = ravel_pytree((body_sizes, sizes.control, sizes.law))[0]
         return jax.jacfwd(field, (0, 1))(x, jnp.zeros(self.machine.count, x.dtype)), scale
 
     def _sampled(
-        self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, moved: Callable, read: Callable
+        self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, free: tuple[Array, Array], read: Callable
     ) -> tuple:
-        past, processor = self.past(point.u), self.cascade[0].processor
-        assert processor is not None
-        A, B = jax.jacfwd(lambda x, u: moved(x, self.machine.split(u)), (0, 1))(body, self.machine.join(point.u))
-        kept = len(past[0])
-        transition, driven = _held(A, B, self.period, jnp.asarray(processor.delay)[0], kept)
-        x, restore = ravel_pytree((body, point.control, past))
+        past, delay = self.past(point.u), jnp.asarray(self.cascade[0].timing.delay)[0]
+        (A, B), kept = free, len(past[0])
+        transition, driven = _held(A, B, self.period, delay, kept)
+        x, restore = ravel_pytree((body, point.control, point.law, past))
 
         def step(x: Array, e: Array) -> tuple[Array, Array]:
-            at, control, past = restore(x)
+            at, control, law, past = restore(x)
             measured = read(at, e)
-            u, after = self.laws(measured, control, past)
+            u, after, law = self.laws(measured, control, law, past)
             commands = [self.machine.join([(own, *old)[lag] for own, old in zip(u, past, strict=True)])
                         for lag in range(kept + 1)]  # fmt: skip
             end = transition @ at + sum(effect @ one for effect, one in zip(driven, commands, strict=True))
             kept_now = tuple((own, *old)[:kept] for own, old in zip(u, past, strict=True))
-            return ravel_pytree((end, after, kept_now))[0], self.outputs(measured, u)
+            return ravel_pytree((end, after, law, kept_now))[0], self.outputs(measured, u, at)
 
-        scale = ravel_pytree((body_sizes, sizes.control, self.past(sizes.u)))[0]
+        scale = ravel_pytree((body_sizes, sizes.control, sizes.law, self.past(sizes.u)))[0]
         return jax.jacfwd(step, (0, 1))(x, jnp.zeros(self.machine.count, x.dtype)), scale
-
-
-def _unguarded(cascade: Cascade) -> Cascade:
-    """Return the cascade without its guard."""
-    if cascade.processor is None:
-        return cascade
-    return dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=None))
 
 
 def _plants(axes: Sequence) -> Groups:
@@ -279,26 +318,58 @@ def _held(A: Array, B: Array, period: Scalar, delay: Scalar, kept: int) -> tuple
 
 
 @jax.jit
-def _matrices(machine: Machine, W: Scalar, period: Scalar) -> tuple[StateSpace, Array]:
-    return _Linear(machine, W, period).system()
+def _at_rest(machine: Machine, W: Scalar, period: Scalar) -> _Rest:
+    return _Linear(machine, W, period).rest()
+
+
+@jax.jit
+def _matrices(machine: Machine, W: Scalar, period: Scalar, point: _Rest) -> tuple[StateSpace, Array, Array]:
+    return _Linear(machine, W, period).system(point)
+
+
+class TurningMachine(NamedTuple):
+    """The linear machine at one speed.
+
+    - `system`: inputs e_k (m) at the sensor of each axis; outputs: readings z_k, commands u_k, currents i_k, and the
+      coordinates q of the rotor. The first n states are q, the next n their rates.
+    - `free` [N, N]: matrix A in continuous time, under constant commands, of the first N states: rotor, coils,
+      low-passes and amplifiers.
+    - `W`: speed, rad/s.
+    """
+
+    system: StateSpace
+    free: np.ndarray
+    W: float
 
 
 def linearise_machine(machine: Machine, period: Scalar, speed: float) -> StateSpace:
     """Linearise a machine at its equilibrium at a constant speed (rpm). `period`: sample period, s.
 
-    The linear system has a test signal e_k at the sensor of each axis as its inputs, and the readings z_k, the
-    commands u_k and the readings i_k as its outputs. It contains what that of one axis contains (`linearise`). Raises
-    ValueError if no equilibrium is found, and if a law has no derivative there.
+    The linear system has a test signal e_k at the sensor of each axis as its inputs. Its outputs are the readings z_k,
+    the commands u_k, the currents i_k and the coordinates of the rotor. It contains what that of one axis contains
+    (`linearise`). Raises ValueError if no equilibrium is found, and if a law has no derivative there.
     """
-    system, found = _matrices(*canonical((machine, speed * np.pi / 30, period)))
-    if not found:
-        raise ValueError(
-            "no equilibrium of the machine was found, so it has no linearisation: `ambjax simulate` shows whether the "
-            "rotor is held."
-        )
-    if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(system)):
-        raise ValueError("the machine has no linearisation: the derivative of a law or of a magnet is not finite.")
-    return system.without_idle()
+    return next(turning_machines(machine, period, [speed])).system.without_idle()
+
+
+def turning_machines(machine: Machine, period: Scalar, speeds: Iterable[float]) -> Iterator[TurningMachine]:
+    """Linearise a machine at speeds (rpm) as `linearise_machine` does, with the states that no test signal reaches."""
+    point, (machine, period) = None, canonical((machine, period))
+    for speed in speeds:
+        W = canonical(speed * np.pi / 30)
+        found = None if point is None else _matrices(machine, W, period, point)
+        if found is None or not found[-1]:  # the point of rest does not depend on the speed, or hardly
+            point = _at_rest(machine, W, period)
+            found = _matrices(machine, W, period, point)
+        system, free, rests = found
+        if not rests:
+            raise ValueError(
+                "no equilibrium of the machine was found, so it has no linearisation: `ambjax simulate` shows whether "
+                "the rotor is held."
+            )
+        if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(system)):
+            raise ValueError("the machine has no linearisation: the derivative of a law or of a magnet is not finite.")
+        yield TurningMachine(jax.tree.map(np.asarray, system), np.asarray(free), float(W))
 
 
 def machine_sensitivity(

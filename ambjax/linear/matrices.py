@@ -1,8 +1,5 @@
 """Linearisation of the closed loop at an equilibrium: of the map of one sample period, or of the vector field."""
 
-import dataclasses
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -30,7 +27,7 @@ def loop_matrices(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scala
     """
     cascade, scenario = _linear_parts(cascade, scenario)
     point, found, _ = equilibrium(cascade, scenario, period, r)
-    build = _continuous if cascade.processor is None else _sampled
+    build = _sampled if cascade.sampled else _continuous
     return build(cascade, scenario, period, r, point), found
 
 
@@ -42,9 +39,7 @@ def rest(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> Equ
 def _linear_parts(cascade: Cascade, scenario: Scenario) -> tuple[Cascade, Scenario]:
     """Return the cascade without its guard, at the speed of t = 0, and the scenario as a linear system contains it."""
     cascade = cascade.turning(scenario.rotor).at_speed()
-    if cascade.processor is not None:
-        cascade = dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=None))
-    return cascade, ideal(scenario)
+    return cascade.with_processor(guard=None), ideal(scenario)
 
 
 def _continuous(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, point: Point) -> StateSpace:
@@ -73,8 +68,7 @@ def _continuous(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar,
 
 def _sampled(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, point: Point) -> StateSpace:
     """Return the state space of one sample period, with the state (plant and lags, laws, u_{n-1}, u_{n-2}, ...)."""
-    processor: Any = cascade.processor
-    plant, reference = Lagged(scenario, point), at_rest(r)
+    processor, plant, reference = cascade.timing, Lagged(scenario, point), at_rest(r)
     past = processor.constant_past(point.u)
     held = plant.held(point, period, processor.delay, len(past))
     laws, restore = ravel_pytree(point.control)

@@ -11,14 +11,14 @@ from ambjax.compiler.fast_path import SHORTEST
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members, size
 from ambjax.linear.equilibrium import ideal, reading
-from ambjax.linear.multisine import MultiSine, Reading, Response, multisine, with_wave
+from ambjax.linear.multisine import MultiSine, Reading, Response, multisine
 from ambjax.numerics.records import Scalar, canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import prepare, run
 from ambjax.simulation.sliding import Slide
 from ambjax.simulation.trajectory import ALIVE
 from ambjax.world.scenario import Initial, Scenario
-from ambjax.world.signals import Constant
+from ambjax.world.waveforms import Constant
 
 # Default amplitude of e, as a share of the gap s_0; at the velocity sensor, of s_0 times the plant's pole.
 AMPLITUDE = 0.01
@@ -88,8 +88,8 @@ def member_responses(
 def _member(tree: Any) -> tuple[Any, Any]:
     """Return the `FourierSums` and the status code of one member."""
     system, clock, response = tree
-    outcome = run(with_wave(system, response.wave), clock, response, 0)
-    return outcome.measured, outcome.trajectory.lost_code
+    outcome = run(dataclasses.replace(system, wave=response.wave), clock, response, 0)
+    return outcome.metrics, outcome.trajectory.lost_code
 
 
 def _padded(wave: MultiSine) -> MultiSine:

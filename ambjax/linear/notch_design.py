@@ -42,7 +42,7 @@ def with_notch_gains(cascade: Cascade, scenario: Scenario, clock: Clock, phase: 
     assert scenario.rotor is not None
     system = linearise(dataclasses.replace(cascade, notch=None), scenario, clock)
     speeds = notch_speeds(scenario.rotor, cascade.notch, float(clock.duration))
-    response = system.response(PER_MINUTE * np.array(speeds))
+    response = np.asarray(system.response(PER_MINUTE * np.array(speeds)))
     nulled = response[:, 5, 0] if NULLED[cascade.notch.removes] == "i" else response[:, 0, 0] - 1
     gains = notch_gains(speeds, nulled, phase)
     notch = dataclasses.replace(cascade.notch, gains=gains, rotor=scenario.rotor)
@@ -65,5 +65,5 @@ def machine_notch_gains(
     c, responses = machine.count, []
     for speed in speeds:
         H = linearise_machine(machine, period, speed).response(np.array([PER_MINUTE * speed]))[0]
-        responses.append(np.diag(H[2 * c :]) if NULLED[notch.removes] == "i" else np.diag(H[:c]) - 1)
+        responses.append(np.diag(H[2 * c : 3 * c]) if NULLED[notch.removes] == "i" else np.diag(H[:c]) - 1)
     return [notch_gains(speeds, np.array([one[k] for one in responses]), phase) for k in range(c)]

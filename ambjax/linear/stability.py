@@ -24,8 +24,9 @@ from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.blocks import Blocks
 from ambjax.linear.analysis import linearise_members
 from ambjax.simulation.clock import Clock
+from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
-from ambjax.world.signals import Constant, Signal, is_random
+from ambjax.world.waveforms import Constant, Signal, is_random
 
 if TYPE_CHECKING:  # `ambjax simulate` imports this module, and does not need Theorem 1
     from ambjax.theorem.sampled_report import Delays
@@ -140,6 +141,7 @@ class Findings(NamedTuple):
         return f"{many}: without noise and loads, the motion does not decay ({size}).{why}"
 
 
+@takes_case
 def stability_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> Stability:
     """Compute the stability of the members of an ensemble, whose varying leaves are arrays [N].
 
@@ -178,8 +180,8 @@ def with_stability(margin: "Delays", cascade: Cascade, scenario: Scenario, clock
 
     if margin.held is None:
         return margin
-    own: Any = cascade.processor
-    first = float(own.delay) if margin.held >= float(own.delay) else 0.0
+    own = float(cascade.timing.delay)
+    first = own if margin.held >= own else 0.0
 
     def tried(low: float, high: float) -> tuple[np.ndarray, Stability]:
         delays = np.linspace(low, high, DELAYS)
@@ -232,8 +234,8 @@ def _quiet_run(cascade: Cascade, scenario: Scenario, clock: Clock) -> _QuietRun:
     """Simulate the quiet runs."""
     every = max(clock.samples // QUARTERS, 1)
     fold = Blocks(("z", "i"), every, -(-clock.samples // every), clock.sample_period)
-    run = run_ensemble(cascade, quiet(scenario), clock, fold=fold, every=0)
-    low, high = ({name: x[:, :QUARTERS] for name, x in part.items()} for part in (run.measured.low, run.measured.high))
+    run = run_ensemble(cascade, quiet(scenario), clock, fold=fold, record_every=0)
+    low, high = ({name: x[:, :QUARTERS] for name, x in part.items()} for part in (run.metrics.low, run.metrics.high))
     swings = np.zeros((len(low["z"]), QUARTERS))
     swings[:, : low["z"].shape[1]] = np.maximum(high["z"] - low["z"], 0.0) / 2
     common = np.minimum(high["z"][:, -1], high["z"][:, -2:][:, 0]) - np.maximum(low["z"][:, -1], low["z"][:, -2:][:, 0])
@@ -247,15 +249,12 @@ def _quiet_run(cascade: Cascade, scenario: Scenario, clock: Clock) -> _QuietRun:
 def quiet(scenario: Scenario) -> Scenario:
     """Return the scenario of the quiet run. The start is displaced by KICK of the clearance, towards z = 0."""
     calm = scenario.undisturbed()
-    sensor: Any = calm.sensor
-    if sensor is not None:
-        bits = None if sensor.bits is None else FINE_BITS
-        sensor = dataclasses.replace(sensor.louder(0.0), bits=bits, outliers=None, dropouts=None)
+    bits = None if calm.sensors.bits is None else FINE_BITS
+    calm = calm.louder(0.0).with_sensor(bits=bits, outliers=None, dropouts=None)
     initial, z = scenario.initial, np.asarray(scenario.initial.z, float)
     z = z + np.where(z > 0, -1.0, 1.0) * KICK * np.asarray(scenario.touchdown)
     return dataclasses.replace(
         calm,
-        sensor=sensor,
         reference=Constant(_at_start(scenario.reference)),
         initial=dataclasses.replace(initial, z=z),
     )

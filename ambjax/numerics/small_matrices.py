@@ -35,6 +35,11 @@ def solve(A: Array, B: Array) -> Array:
     return jnp.moveaxis(lax.fori_loop(0, n, eliminated, jnp.moveaxis(both, 0, 2))[:, n:], 2, 0)
 
 
+def times(matrix: Array | None, x: Array) -> Array:
+    """Return matrix @ x as a sum of products, which XLA compiles within one kernel."""
+    return jnp.sum(jnp.asarray(matrix) * x, -1)
+
+
 def exponential(A: Array) -> Array:
     """Return the exponential of A [n, n], by scaling, a Taylor polynomial and repeated squaring."""
     size = lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(A), 0)))

@@ -80,7 +80,7 @@ def pages(cases: Sequence[Case], paths: Sequence[str]) -> dict[str, str]:
 
 def check_processor(case: Case, path: str) -> None:
     """Raise ValueError if the case has no processor. `path`: name of the case file, for the message."""
-    if case.cascade.processor is None:
+    if not case.cascade.sampled:
         raise ValueError(
             f"{path}: the page runs a controller on a processor, and this case has none. Add the table [processor]."
         )
@@ -200,7 +200,7 @@ def _check_structure(case: Case, other: Case, path: str) -> None:
 
 def _alike(case: Case, other: Case) -> bool:
     """Return whether two cases differ in numbers only."""
-    same = other.cascade.processor is not None and other.clock.samples == case.clock.samples
+    same = other.cascade.sampled and other.clock.samples == case.clock.samples
     return same and jax.tree.structure(loop_parameters(other)) == jax.tree.structure(loop_parameters(case))
 
 

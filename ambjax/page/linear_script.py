@@ -4,7 +4,6 @@ From these, sensitivity.js computes the equilibrium by Newton's method, and the 
 does.
 """
 
-import dataclasses
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -99,13 +98,13 @@ def _values(numbers: Numbers, x: LoopPoint) -> PointValues:
     scenario: Any = numbers.scenario
     lagged: Any = x.lagged
     motion = scenario.plant.measurement(lagged.plant)
-    sensor, amplifier, lags = scenario.sensor, scenario.amplifier, LagState((), (), ())
+    sensor, amplifier, lags = scenario.sensors, scenario.actuator, LagState((), (), ())
     u: Any = x.acting
     read = motion
-    if sensor is not None and sensor.bandwidth is not None:
+    if sensor.bandwidth is not None:
         lags = lags._replace(z_filtered=2 * jnp.pi * sensor.bandwidth * (motion.z - lagged.z_filtered))
         read = motion._replace(z=jnp.asarray(lagged.z_filtered))
-    if amplifier is not None:
+    if amplifier.slow:
         lags = lags._replace(u_a=amplifier.slope() * (u - lagged.u_a))
         u = lagged.u_a
     measured = reading(scenario, read, (x.e, 0.0))
@@ -116,16 +115,13 @@ def _values(numbers: Numbers, x: LoopPoint) -> PointValues:
 
 def _ideal(numbers: Numbers) -> Numbers:
     """Return the numbers without parts that cannot be linearised: limits, noise, converters, guard."""
-    processor: Any = numbers.cascade.processor
-    cascade = dataclasses.replace(numbers.cascade, processor=dataclasses.replace(processor, guard=None))
-    return numbers._replace(cascade=cascade, scenario=ideal(numbers.scenario))
+    return numbers._replace(cascade=numbers.cascade.with_processor(guard=None), scenario=ideal(numbers.scenario))
 
 
 def _with_lags(scenario: Scenario, point: Point) -> EquilibriumPoint:
     """Return an equilibrium with the states of the lags added, at rest."""
-    sensor, z = scenario.sensor, scenario.plant.measurement(point.plant).z
-    low_passed = sensor is not None and sensor.bandwidth is not None
-    lags = z if low_passed else (), point.u if scenario.amplifier is not None else ()
+    low_passed, z = scenario.sensors.bandwidth is not None, scenario.plant.measurement(point.plant).z
+    lags = z if low_passed else (), point.u if scenario.actuator.slow else ()
     return LagState(point.plant, *lags), point.u, point.control
 
 
@@ -138,9 +134,7 @@ def linear_script(case: Case) -> LinearScript:
         numbers = canonical(loop_parameters(case, any_delay=True))
         (lagged, u, control), _ = jax.eval_shape(_start, numbers)
         zero = jnp.zeros(())
-        processor = numbers.cascade.processor
-        assert processor is not None
-        x = LoopPoint(lagged, u, control, processor.constant_past(zero), zero)
+        x = LoopPoint(lagged, u, control, numbers.cascade.timing.constant_past(zero), zero)
         x = jax.tree.map(lambda _: zero, x)
         start = piece_of(_start, "p", (numbers,))
         point = piece_of(_columns, "px", (numbers, x))

@@ -8,16 +8,15 @@ from jax import Array
 
 from ambjax.cases.reader import Case
 from ambjax.control.cascade import Cascade
-from ambjax.numerics.records import Scalar, record
+from ambjax.numerics.records import Scalar
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.loop import Realised
-from ambjax.simulation.metrics import Standard, standard_for
+from ambjax.simulation.loop import ClosedLoop
+from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import RolloutState, begin, one_sample
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import Row
 from ambjax.world.scenario import Scenario
-from ambjax.world.sensor import Errors
 
 
 class Numbers(NamedTuple):
@@ -32,20 +31,6 @@ class Numbers(NamedTuple):
     period: Scalar
 
 
-@record
-class GivenNoise(Realised):
-    """The closed loop of one member, in which the three normal numbers of a sample are given instead of drawn."""
-
-    normals: tuple[Array, Array, Array]
-
-    def sensor_errors(self, sample: Scalar) -> Errors:
-        sensor = self.scenario.sensor
-        if sensor is None:
-            return super().sensor_errors(sample)
-        stds = sensor.std, sensor.std_z_dot, sensor.std_i
-        return Errors(*(std * normal for std, normal in zip(stds, self.normals, strict=True)))
-
-
 @dataclasses.dataclass(frozen=True)
 class LoopFunctions:
     """The functions of the loop, which JAX traces.
@@ -56,17 +41,17 @@ class LoopFunctions:
 
     clock: Clock
 
-    def _system(self, numbers: Numbers, normals: Any) -> tuple[Sampled, Clock, Standard]:
+    def _system(self, numbers: Numbers, normals: Any) -> tuple[Sampled, Clock, Metrics]:
         clock = dataclasses.replace(self.clock, sample_period=numbers.period)
         built: Any = system_of(numbers.cascade, numbers.scenario, clock)
         word = jnp.zeros((), jnp.uint32)
         cascade = built.loop.cascade.turning(numbers.scenario.rotor)
-        loop = GivenNoise(cascade, numbers.scenario.turning(), (word, word), normals)
+        loop = ClosedLoop(cascade, numbers.scenario.turning(), (word, word), normals)
         return dataclasses.replace(built, loop=loop), clock, self._fold(numbers)
 
-    def _fold(self, numbers: Numbers) -> Standard:
+    def _fold(self, numbers: Numbers) -> Metrics:
         """Return the metrics without those once per revolution, which compute with arrays."""
-        return standard_for(numbers.settle, dataclasses.replace(numbers.scenario, rotor=None))
+        return Metrics.of(numbers.settle, dataclasses.replace(numbers.scenario, rotor=None))
 
     def start(self, numbers: Numbers, normals: Any) -> RolloutState:
         """Return the state of the run before the first sample."""
@@ -99,6 +84,4 @@ def loop_parameters(case: Case, any_delay: bool = False) -> Numbers:
 
 def longest_delay(case: Case) -> float:
     """Return the longest delay that the page admits, samples: the number of commands that its programs keep."""
-    processor = case.cascade.on_processor().processor
-    assert processor is not None
-    return float(len(processor.constant_past(jnp.zeros(()))))
+    return float(len(case.cascade.on_processor().timing.constant_past(jnp.zeros(()))))

@@ -15,7 +15,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method
-from ambjax.simulation.metrics import Standard
+from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import rollout
 from ambjax.simulation.rosenbrock import AdaptiveRodas3
 from ambjax.simulation.sliding import Slide
@@ -140,7 +140,7 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
     runs, checks = {}, {}
     with ThreadPoolExecutor() as pool:  # compilation and compiled programs release the GIL
         say(f"{reading}: noise")
-        periods = (float(paper.CLOCK.sample_period),) if cascade.processor else NOISE_PERIODS
+        periods = (float(paper.CLOCK.sample_period),) if cascade.sampled else NOISE_PERIODS
         first = pool.submit(_noise, cascade, reading, periods[0])
         for name in ("regulation", "tracking"):
             say(f"{reading}: theorem, {name}")
@@ -153,7 +153,7 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
         if reading not in paper.NOISY:  # the tracking scenario of the others has the noise already
             noisy = _simulate(reading, cascade, paper.noisy(paper.scenario("tracking", reading))).trajectory
         say(f"{reading}: on a processor")
-        on_processor = {True: runs["tracking"]} if cascade.processor else _on_processor(reading)
+        on_processor = {True: runs["tracking"]} if cascade.sampled else _on_processor(reading)
         # The first scan compiled the program that these reuse.
         noise = [first.result(), *pool.map(lambda period: _noise(cascade, reading, period), periods[1:])]
     say(f"{reading}: basin of attraction")
@@ -168,9 +168,9 @@ def _simulate(reading: str, cascade: Cascade, scenario: Scenario) -> Run:
     if scenario.sensor is None:  # a sensor without error, so that the program is the same as under noise
         scenario = dataclasses.replace(scenario, sensor=Sensor())
     clock = paper.CLOCK
-    if cascade.processor is None:
+    if not cascade.sampled:
         clock = clock.with_method(STEPS.get(reading, AdaptiveRodas3()))
-    trajectory, metrics = rollout(cascade, scenario, clock, fold=Standard(paper.SETTLE))
+    trajectory, metrics = rollout(cascade, scenario, clock, fold=Metrics(paper.SETTLE))
     return Run(jax.tree.map(np.asarray, trajectory), {name: float(value) for name, value in metrics.items()})
 
 
@@ -209,8 +209,8 @@ def _scan(cascade: Cascade, scenarios: Scenario, clock: Clock) -> dict[str, np.n
 
     Members run one by one, because every member of a batch would take as many steps as the stiffest one.
     """
-    fold = Standard(0.4 * clock.duration)
-    return jax.lax.map(lambda s: rollout(cascade, s, clock, fold=fold, every=0).measured, scenarios)
+    fold = Metrics(0.4 * clock.duration)
+    return jax.lax.map(lambda s: rollout(cascade, s, clock, fold=fold, record_every=0).metrics, scenarios)
 
 
 def _batch(one: object, size: int, **leaves: object) -> Any:
@@ -220,7 +220,7 @@ def _batch(one: object, size: int, **leaves: object) -> Any:
 
 
 def _scanned(cascade: Cascade, scenarios: Scenario, period: float) -> tuple[Cascade, Scenario, Clock]:
-    if cascade.processor is not None:
+    if cascade.sampled:
         return cascade.on_processor(), scenarios, with_method(Clock(NOISE_SAMPLES, period), cascade, scenarios)
     # With this tolerance sigma's radius differs from that at 1e-6 by at most 1 % at all noise levels, at half the cost.
     return cascade, scenarios, Clock(NOISE_SAMPLES, period, AdaptiveRodas3(1e-4))

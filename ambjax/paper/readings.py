@@ -24,7 +24,7 @@ from ambjax.control.processor import Processor
 from ambjax.simulation.clock import Clock
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Sensor
-from ambjax.world.signals import Pulse, Sine
+from ambjax.world.waveforms import Pulse, Sine
 
 
 class Table2(NamedTuple):

@@ -229,10 +229,7 @@ def guarded_for(case: Case) -> Cascade:
     """Return the cascade of a case, with guard limits wide enough for the sensor at both ends of every spread."""
     widest = ends(case.spread, case.cascade, case.scenario, ("sensor.", "run.clearance", "plant.s_0"))[1]
     cascade = guarded(case.cascade, widest, float(case.clock.sample_period))
-    if cascade.processor is None or cascade.processor.guard is None:
-        return cascade
-    guard = jax.tree.map(lambda x: float(np.max(x)), cascade.processor.guard)
-    return dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=guard))
+    return cascade.with_processor(guard=jax.tree.map(lambda x: float(np.max(x)), cascade.timing.guard))
 
 
 def _prefix(option: str | None, name: str) -> str:

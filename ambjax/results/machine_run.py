@@ -12,10 +12,10 @@ import numpy as np
 from ambjax.cases.machine_case import MachineCase
 from ambjax.ensemble.replay import SEGMENT
 from ambjax.numerics.records import canonical
-from ambjax.simulation.metrics import UNITS, standard_for
+from ambjax.simulation.metrics import UNITS, Metrics
 from ambjax.simulation.rollout import begin, finish, recorded_segment
 from ambjax.simulation.trajectory import SIGNAL_UNITS, STATUSES
-from ambjax.simulation.whole_machine import PerAxis
+from ambjax.simulation.whole_machine import PerAxis, stack_axes
 
 # Metrics of which the smallest value of the axes is the worst.
 SMALLEST = ("singular_at_s", "lost_at_s")
@@ -62,8 +62,7 @@ def simulate_machine(case: MachineCase, progress: Callable[[int], object] = lamb
     `progress`: called with the number of new samples after each part of the run. A lost rotor is no error: see
     `MachineRun.lost`. Raises ValueError as `rollout` does.
     """
-    folds = [canonical(standard_for(case.settle, one.scenario)) for one in case.cases]
-    fold = PerAxis(jax.tree.map(lambda *x: np.stack(x), *folds))
+    fold = PerAxis(stack_axes([canonical(Metrics.of(case.settle, one.scenario)) for one in case.cases]))
     machine, clock, fold = canonical((case.machine, case.clock, fold))
     state, parts, count = _begun(machine, clock, fold), [], min(SEGMENT, clock.samples)
     for first in range(0, clock.samples, count):
@@ -79,8 +78,13 @@ def simulate_machine(case: MachineCase, progress: Callable[[int], object] = lamb
     status = outcome.trajectory
     why = STATUSES[int(status.lost_code)]
     signals |= {"lost_at": np.asarray(status.lost_at), "lost_why": np.asarray(why)}
-    measured = {name: np.asarray(x) for name, x in outcome.measured.items()}
+    measured = {name: np.asarray(x) for name, x in outcome.metrics.items()}
     by_axis = {axis: {name: x[k].item() for name, x in measured.items()} for k, axis in enumerate(case.axes)}
-    sized = {name: x for name, x in measured.items() if UNITS.get(name) != "deg"}  # no phase is the worst
-    worst = {name: (x.min() if name in SMALLEST else x.max()).item() for name, x in sized.items()}
+    worst = {name: x.item() for name, x in worst_of(measured).items()}
     return MachineRun(case, signals, worst | {"axes": by_axis}, why)
+
+
+def worst_of(measured: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return each metric [..., c] of the worst axis; without phases, of which none is the worst."""
+    sized = {name: x for name, x in measured.items() if UNITS.get(name) != "deg"}
+    return {name: np.min(x, -1) if name in SMALLEST else np.max(x, -1) for name, x in sized.items()}

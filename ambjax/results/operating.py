@@ -81,8 +81,7 @@ def sensitivity(case: Case, r: float = 0.0) -> Analysis:
 
 def _velocity_sensor(case: Case) -> bool:
     """Return whether the velocity is measured and the laws use this measurement."""
-    sensor = case.scenario.sensor
-    return (sensor is None or sensor.velocity) and case.cascade.reads_velocity(case.clock.sample_period)
+    return case.scenario.sensors.velocity and case.cascade.reads_velocity(case.clock.sample_period)
 
 
 def _analysis(case: Case, system: StateSpace, m: float, velocity: bool) -> Analysis:
@@ -136,7 +135,7 @@ def one_period(case: Case) -> Clock:
 
 def shown_band(case: Case, systems: list[StateSpace]) -> tuple[float, float]:
     """Return the band (Hz) of a picture of these loops: that of the case, by default until |S - 1| has decayed."""
-    if case.cascade.processor is not None:
+    if case.cascade.sampled:
         return case.zones.range(case.clock.sample_period)
     low = float(case.zones.f_low)
     return case.zones.range(None, max([decayed_end(system, low) for system in systems], default=1e3 * low))

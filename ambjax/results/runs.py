@@ -11,7 +11,7 @@ import numpy as np
 from ambjax.cases.reader import Case, require_case
 from ambjax.ensemble.replay import record_member
 from ambjax.host.optional import extra
-from ambjax.simulation.metrics import UNITS, standard_for
+from ambjax.simulation.metrics import UNITS, Metrics
 from ambjax.simulation.trajectory import SIGNAL_UNITS, Trajectory
 
 
@@ -117,7 +117,7 @@ def simulate(case: Case, progress: Callable[[int], object] = lambda samples: Non
     require_case(case)
     if not callable(progress):
         raise ValueError(f"progress = {progress!r}: it must be a function of the number of new samples.")
-    fold = standard_for(case.settle, case.scenario)
+    fold = Metrics.of(case.settle, case.scenario)
     outcome = record_member(case.cascade, case.scenario, case.clock, fold=fold, tell=progress)
-    metrics = {name: np.asarray(x).item() for name, x in outcome.measured.items()}
+    metrics = {name: np.asarray(x).item() for name, x in outcome.metrics.items()}
     return CaseRun(case, outcome.trajectory, metrics)

@@ -2,16 +2,18 @@
 
 import dataclasses
 import numbers
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
+from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case, require_case
 from ambjax.ensemble import statistics
 from ambjax.ensemble.design import MOST_MEMBERS
-from ambjax.ensemble.study import Study
+from ambjax.ensemble.study import AnyStudy, Study
 from ambjax.host.arguments import names_arguments
 from ambjax.host.optional import extra
+from ambjax.results.machine_study import MachineStudy
 from ambjax.simulation.metrics import UNITS
 
 
@@ -22,7 +24,7 @@ class MembersRun:
     The columns are index, lost_at, every metric, and "spread." + path for each quantity of the spread.
     """
 
-    study: Study
+    study: AnyStudy
     columns: dict[str, np.ndarray]
 
     @property
@@ -69,7 +71,9 @@ class MembersRun:
 
 
 @names_arguments()
-def simulate_members(case: Case, members: int, *, seed: int | None = None, threads: int | None = None) -> MembersRun:
+def simulate_members(
+    case: Case | MachineCase, members: int, *, seed: int | None = None, threads: int | None = None
+) -> MembersRun:
     """Simulate members 0 to members - 1 of the spread of a case, as `ambjax ensemble` does.
 
     - `members`: number of members.
@@ -79,17 +83,27 @@ def simulate_members(case: Case, members: int, *, seed: int | None = None, threa
     The results stay in memory; `ambjax ensemble` writes them in parts and can be resumed. Raises ValueError for
     anything but a case, and for a number of members or a seed out of range.
     """
-    require_case(case)
+    if not isinstance(case, MachineCase):
+        require_case(case)
     study = study_of(case, seed, members)
     columns = {name: np.asarray(x) for name, x in study.columns(0, members, threads=threads).items()}
     return MembersRun(study, columns)
 
 
-def study_of(case: Case, seed: int | None, members: int) -> Study:
+@overload
+def study_of(case: Case, seed: int | None, members: int) -> Study: ...
+@overload
+def study_of(case: MachineCase, seed: int | None, members: int) -> MachineStudy: ...
+@overload
+def study_of(case: Case | MachineCase, seed: int | None, members: int) -> Study | MachineStudy: ...
+def study_of(case: Case | MachineCase, seed: int | None, members: int) -> Study | MachineStudy:
     """Return the study of a case. Raises ValueError for a member count or seed out of range."""
     if not isinstance(members, numbers.Integral) or not 1 <= members <= MOST_MEMBERS:
         raise ValueError(f"--members {members!r}: it must be a whole number from 1 to {MOST_MEMBERS:,}.")
-    seed = int(case.scenario.seed) if seed is None else seed
+    one = case if isinstance(case, Case) else case.cases[0]
+    seed = int(one.scenario.seed) if seed is None else seed
     if not isinstance(seed, numbers.Integral) or not 0 <= seed < 2**32:
         raise ValueError(f"--seed {seed!r}: it must be a whole number from 0 to 4294967295.")
+    if isinstance(case, MachineCase):
+        return MachineStudy(case, seed, members)
     return Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, seed, members)

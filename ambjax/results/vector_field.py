@@ -1,6 +1,5 @@
 """The closed loop as a function of time and state, for solvers of other packages."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -34,16 +33,14 @@ def vector_field(case: Case) -> VectorField:
     Raises ValueError for a controller on a processor, because its loop is not a differential equation.
     """
     require_case(case)
-    if case.cascade.processor is not None:
+    if case.cascade.sampled:
         raise ValueError(
             "vector_field: this controller runs on a processor, so its loop is not a differential equation. Remove "
             "[processor] from the case, or use ambjax.simulate."
         )
     scenario = case.scenario.in_continuous_time()
     cascade, scenario = canonical((case.cascade, scenario))
-    sensor = scenario.sensor
-    quiet = None if sensor is None else sensor.louder(0.0)
-    loop = ClosedLoop(cascade, dataclasses.replace(scenario, sensor=quiet)).realised()
+    loop = ClosedLoop(cascade, scenario.louder(0.0)).realised()
     errors = loop.sensor_errors(0)
     y_0, named = ravel_pytree(loop.start())
 

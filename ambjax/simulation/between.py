@@ -94,18 +94,12 @@ def subproblems(
 
 def lags(loop: ClosedLoop) -> bool:
     """Return whether the position sensor has a low-pass."""
-    sensor = loop.scenario.sensor
-    return sensor is not None and sensor.bandwidth is not None
+    return loop.scenario.sensors.bandwidth is not None
 
 
 def sensed_motion(loop: ClosedLoop, plant: Any, t: Scalar) -> Measurement:
     """Return the motion of the surface that the position sensor reads at t (s): that of the plant, plus the runout."""
-    motion, sensor = loop.scenario.plant.measurement(plant), loop.scenario.sensor
-    if sensor is None or sensor.runout is None:
-        return motion
-    t = jnp.asarray(t, jnp.result_type(float))
-    runout, rate = jax.jvp(sensor.runout, (t,), (jnp.ones_like(t),))
-    return motion._replace(z=motion.z + runout, z_dot=motion.z_dot + rate)
+    return loop.scenario.sensors.over_surface(loop.scenario.plant.measurement(plant), t)
 
 
 def plant_status(loop: ClosedLoop, state: object) -> Array:

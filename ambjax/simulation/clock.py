@@ -18,11 +18,11 @@ class Clock:
         at_most=1e6,
         doc="sample period; each measurement error is held for this time",
     )
-    method: Integrator | None = part(default=None, doc="the integrator; None: `ambjax.with_method` chooses it")
+    method: Integrator | None = part(default=None, doc="the integrator; None: `ambjax.solvers.with_method` chooses it")
     cuts: int | None = static(
         default=None,
-        doc="largest number of edges of disturbances inside one sample, on a processor. `ambjax.with_method` computes "
-        "it; None: the number of all edges",
+        doc="largest number of edges of disturbances inside one sample, on a processor. `ambjax.solvers.with_method` "
+        "computes it; None: the number of all edges",
     )
 
     @property

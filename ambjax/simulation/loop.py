@@ -1,7 +1,9 @@
 """The closed loop as one system of ordinary differential equations: plant and cascade together."""
 
+import dataclasses
 import functools
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol, Self
 
 import jax
 import jax.numpy as jnp
@@ -9,16 +11,17 @@ from jax import Array
 
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
-from ambjax.numerics.records import Scalar, record
+from ambjax.control.stages import ForceDemand
+from ambjax.numerics.records import Scalar, part, record
 from ambjax.numerics.smooth import larger, limited
 from ambjax.simulation.edges import Edges
-from ambjax.simulation.integrate import InitialValueProblem
+from ambjax.simulation.integrate import InitialValueProblem, WholeState
 from ambjax.simulation.sliding import slide, slides
 from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED, Row
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
-from ambjax.world.signals import Reference, reference_at
+from ambjax.world.waveforms import Reference, reference_at
 
 # A state that exceeds its scale by this factor counts as diverged. For such a state the model is not valid, but the
 # numbers are still finite.
@@ -28,14 +31,15 @@ DIVERGENCE = 1e6
 class ExternalInputs(NamedTuple):
     """External inputs of the loop at one instant.
 
-    The reference, the disturbances q_z (m/s^2) and q_i (A/s), and the runout (m). The runout is () if the sensor has
-    none.
+    The reference, the disturbances q_z (m/s^2) and q_i (A/s), the runout (m), and a test signal e (m or m/s). The
+    runout is () if the sensor has none; e is () without a test signal.
     """
 
     reference: Reference
     q_z: Array
     q_i: Array
     runout: Array | tuple[()]
+    e: Array | tuple[()] = ()
 
 
 class Sizes(NamedTuple):
@@ -69,42 +73,59 @@ class LoopState(NamedTuple):
     control: CascadeState
 
 
+class AddedSignal(Protocol):
+    """A test signal e (m or m/s) that is added to a reading. `reading`: the name of this reading, z or z_dot."""
+
+    @property
+    def reading(self) -> str: ...
+    def at(self, sample: Array) -> Array: ...
+    def __call__(self, t: Scalar) -> Array: ...
+
+
 @record
-class ClosedLoop:
+class ClosedLoop(WholeState):
     """The closed loop of a cascade in a scenario, in continuous time.
 
-    The argument `errors` of its methods contains the measurement errors, which are constant over a sample.
+    The argument `errors` of its methods contains the measurement errors, which are constant over a sample. With a test
+    signal, `z_measured` of a row is the reading to which it is added, and the integrator `Slide` does not apply.
     """
 
     cascade: Cascade
     scenario: Scenario
+    key: tuple[Scalar, Scalar] | None = part(
+        default=None, doc="random key of the member as two 32-bit words; None: signals are not drawn yet"
+    )
+    normals: Sequence[Array] | None = part(
+        default=None, doc="the three normal numbers of the sensors' noise in a sample; None: drawn from the key"
+    )
+    wave: AddedSignal | None = part(default=None, doc="test signal; None: none")
 
-    def realised(self) -> "Realised":
+    def realised(self) -> Self:
         """Return the loop of one member, with its random signals drawn and the random key of its sensors."""
-        cascade = self.cascade.turning(self.scenario.rotor)
-        return Realised(cascade, self.scenario.realised(), self.scenario.words())
+        if self.key is not None:
+            return self
+        cascade, scenario = self.cascade.turning(self.scenario.rotor), self.scenario.realised()
+        return dataclasses.replace(self, cascade=cascade, scenario=scenario, key=self.scenario.words())
 
     def words(self) -> tuple[Scalar, Scalar]:
         """Return the random key of the member as two 32-bit words."""
-        return self.scenario.words()
+        return self.scenario.words() if self.key is None else self.key
 
     def sensor_errors(self, sample: Scalar) -> Errors:
-        """Return the errors of all sensors in sample number `sample`; zeros without a sensor model."""
-        if self.scenario.sensor is None:
-            return Errors(*[jnp.zeros(())] * 3)
-        return self.scenario.sensor.noise(self.words(), sample)
+        """Return the errors of all sensors in sample number `sample`; zeros for ideal sensors."""
+        sensors = self.scenario.sensors
+        return sensors.noise(self.words(), sample) if self.normals is None else sensors.scaled(self.normals)
 
     def start(self) -> LoopState:
         """Return the state at t = 0."""
         plant = self.scenario.plant.start(self.scenario.initial.measurement())
-        inputs = self.inputs(0.0)
-        measured = ClosedLoop.received(self, inputs, plant, self.sensor_errors(0))
+        inputs = self.inputs(0.0)._replace(e=())
+        measured = self.received(inputs, plant, self.sensor_errors(0))
         return LoopState(plant, self.cascade.init(measured, inputs.reference))
 
     def measured(self, plant: object, errors: Errors) -> Measurement:
         """Return the readings of the sensors for a state of the plant, without the runout."""
-        motion, sensor = self.scenario.plant.measurement(plant), self.scenario.sensor
-        return motion if sensor is None else sensor.reading(motion, errors)
+        return self.scenario.sensors.reading(self.scenario.plant.measurement(plant), errors)
 
     def scale(self) -> LoopState:
         """Return the characteristic size of each component of the state; integration errors are relative to it."""
@@ -119,31 +140,41 @@ class ClosedLoop:
         return jax.tree.map(jnp.asarray, LoopState(plant, self.cascade.layer()))
 
     def inputs(self, t: Scalar) -> ExternalInputs:
-        """Return the reference, the disturbances and the runout at time t, s."""
-        scenario, sensor = self.scenario, self.scenario.sensor
-        runout = () if sensor is None or sensor.runout is None else sensor.runout(t)
-        return ExternalInputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t), runout)
+        """Return the reference, the disturbances, the runout and the test signal at time t, s."""
+        scenario, runout = self.scenario, self.scenario.sensors.runout
+        runout = () if runout is None else runout(t)
+        e = () if self.wave is None else self.wave(t)
+        return ExternalInputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t), runout, e)
 
-    def received(self, inputs: Any, plant: Any, errors: Errors) -> Measurement:
-        """Return the readings that the controller receives, with the runout.
+    def received(self, inputs: ExternalInputs, plant: object, errors: Errors) -> Measurement:
+        """Return the readings that the controller receives, with the runout and the test signal.
 
         `inputs`: the external inputs at this instant (method `inputs`).
         """
-        measured, sensor = self.measured(plant, errors), self.scenario.sensor
-        if sensor is None or isinstance(inputs.runout, tuple):
-            return measured
-        return measured._replace(z=measured.z + sensor.gain * inputs.runout)
+        measured = self.measured(plant, errors)
+        if not isinstance(inputs.runout, tuple):
+            measured = measured._replace(z=measured.z + self.scenario.sensors.gain * inputs.runout)
+        return with_signal(measured, self.wave, inputs.e)
 
     def command(
-        self, inputs: ExternalInputs, state: LoopState, errors: Errors, sensed: object = None
+        self,
+        inputs: ExternalInputs,
+        state: LoopState,
+        errors: Errors,
+        sensed: object = None,
+        demanded: tuple[ForceDemand, Measurement] | None = None,
     ) -> tuple[Command, CascadeState, Array]:
         """Return the command of the cascade, the rates of its states, and the voltage at the coils, V.
 
-        `sensed`: state of the plant at the place of the sensor; None: that of `state`.
+        `sensed`: state of the plant at the place of the sensor; None: that of `state`. `demanded`: the demanded force
+        and the estimate, if another law computes them; None: observer and position law of the cascade do.
         """
         u_max = jnp.asarray(self.scenario.command_limit)
-        measured = self.received(inputs, state.plant if sensed is None else sensed, errors)
-        command, rates = self.cascade(measured, state.control, inputs.reference, u_max)
+        if demanded is None:
+            measured = self.received(inputs, state.plant if sensed is None else sensed, errors)
+            command, rates = self.cascade(measured, state.control, inputs.reference, u_max)
+        else:
+            command, rates = self.cascade.command_rates(*demanded, state.control, inputs.reference, u_max)
         return command, rates, self.scenario.coil_voltage(limited(command.u, u_max), state.plant, inputs.q_i)
 
     def rates(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> LoopState:
@@ -152,10 +183,15 @@ class ClosedLoop:
         return self.derivative(inputs, state, control, u)
 
     def observed(
-        self, inputs: ExternalInputs, state: LoopState, errors: Errors, sensed: object = None
+        self,
+        inputs: ExternalInputs,
+        state: LoopState,
+        errors: Errors,
+        sensed: object = None,
+        demanded: tuple[ForceDemand, Measurement] | None = None,
     ) -> tuple[LoopState, Instant]:
-        """Return the rates of the state, and the signals to record at this instant. `sensed`: as in `command`."""
-        command, control, u = self.command(inputs, state, errors, sensed)
+        """Return the rates of the state, and the signals to record now. `sensed`, `demanded`: as in `command`."""
+        command, control, u = self.command(inputs, state, errors, sensed, demanded)
         signals = self.instant(inputs.reference, state.plant, command.i_ref, command.v_tilde, u)
         return self.derivative(inputs, state, control, u), signals
 
@@ -213,7 +249,7 @@ class ClosedLoop:
         step = functools.partial(slide, self, errors) if slides(self.cascade, self.scenario) else None
         rates = lambda inputs, x: self.rates(inputs, x, errors)  # noqa: E731
         observed = lambda inputs, x: self.observed(inputs, x, errors)  # noqa: E731
-        jumps = self.scenario.sensor is not None and sum(map(jnp.abs, self.scenario.sensor.noises)) > 0
+        jumps = sum(map(jnp.abs, self.scenario.sensors.noises)) > 0
         edges = Edges(self.scenario.edges(reference=True), 0, self.scenario.knots(reference=True))
         return InitialValueProblem(
             self.inputs,
@@ -230,10 +266,20 @@ class ClosedLoop:
             self.scenario.limit,
         )
 
-    def row(self, t: Scalar, state: LoopState, errors: Errors, alive: Array) -> Row:
-        """Return the signals at time t (s), with u_mean = u_peak = 0. The drive of a lost rotor is off: u = 0."""
+    def row(
+        self,
+        t: Scalar,
+        state: LoopState,
+        errors: Errors,
+        alive: Array,
+        demanded: tuple[ForceDemand, Measurement] | None = None,
+    ) -> Row:
+        """Return the signals at time t (s), with u_mean = u_peak = 0. The drive of a lost rotor is off: u = 0.
+
+        `demanded`: as in `command`.
+        """
         inputs = self.inputs(t)
-        command, _, u = self.command(inputs, state, errors)
+        command, _, u = self.command(inputs, state, errors, None, demanded)
         measured = self.received(inputs, state.plant, errors)
         return self.signals(t, inputs, state.plant, command._replace(u=u), measured, alive)
 
@@ -267,7 +313,7 @@ class ClosedLoop:
             r=inputs.reference.r,
             q_z=inputs.q_z,
             q_i=inputs.q_i,
-            z_measured=measured.z,
+            z_measured=measured.z if self.wave is None else getattr(measured, self.wave.reading),
             heat=jnp.where(alive, signals.heat, 0.0),
             refused=jnp.zeros_like(alive),
             alive=alive,
@@ -283,14 +329,8 @@ class ClosedLoop:
         return self.scenario.plant.singularity(row.z, row.i_ref)
 
 
-@record
-class Realised(ClosedLoop):
-    """The closed loop of one member. `key`: the random key of the member as two 32-bit words."""
-
-    key: tuple[Scalar, Scalar]
-
-    def realised(self) -> "Realised":
-        return self
-
-    def words(self) -> tuple[Scalar, Scalar]:
-        return self.key
+def with_signal(measured: Measurement, wave: AddedSignal | None, e: Array | tuple[()]) -> Measurement:
+    """Return the readings with e (m or m/s), the value of `wave`, added to one of them."""
+    if wave is None or isinstance(e, tuple):
+        return measured
+    return measured._replace(**{wave.reading: getattr(measured, wave.reading) + e})

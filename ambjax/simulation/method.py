@@ -76,7 +76,7 @@ def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
     has no value, because a fixed step can be chosen only from numbers.
     """
     # On a processor the laws have discrete steps, and only the plant is integrated.
-    laws = {} if cascade.processor else {f"{stage} law": slope for stage, slope in cascade.slopes().items()}
+    laws = {} if cascade.sampled else {f"{stage} law": slope for stage, slope in cascade.slopes().items()}
     plant = scenario.plant
     named = laws | {PLANT: plant.slope(), COILS: scenario.current_slope, FLUX: plant.flux_slope()}
     named |= {} if scenario.stop is None else {STOP: scenario.stop.slope(plant.m)}
@@ -106,11 +106,10 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
     named = slopes(cascade, scenario)
     slope = max(named.values())
     fixed_only, noisy = _fixed_only(cascade, scenario), _noisy(scenario)
-    if cascade.processor is not None:
+    if cascade.sampled:
         settled = math.ceil(sample_period * max(named[COILS] / SETTLED, named[FLUX] / LAGGED))
-        amplifier = scenario.amplifier
-        slow = amplifier is not None and amplifier.slow
-        rate = float(np.max(np.asarray(amplifier.slope()))) if amplifier is not None and slow else 0.0
+        amplifier = scenario.actuator
+        rate = float(np.max(np.asarray(amplifier.slope()))) if amplifier.slow else 0.0
         touched = named.get(STOP, 0.0) / TOUCHED
         driven = math.ceil(sample_period * max(named[PLANT] / SAMPLED, touched, rate / DRIVEN))
         substeps, fixed = max(driven, settled, 1), max(driven, MOST_SETTLED)
@@ -126,7 +125,7 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
         return RK4(substeps)
     if reverse or fixed_only:
         return Rodas3(fixed)
-    stiff = cascade.processor is not None or sample_period * slope > EXPLICIT
+    stiff = cascade.sampled or sample_period * slope > EXPLICIT
     tolerance = (TOLERANCE if noisy else QUIET_TOLERANCE) if stiff else (TIGHT if noisy else QUIET_TIGHT)
     return AdaptiveRodas3(_tolerance(tolerance)) if stiff else AdaptiveCashKarp(_tolerance(tolerance))
 
@@ -138,8 +137,7 @@ def _tolerance(wanted: float) -> float:
 
 def _noisy(scenario: Scenario) -> bool:
     """Return whether a sensor has noise. Traced values count as noise."""
-    noises = () if scenario.sensor is None else scenario.sensor.noises
-    return any(is_traced(std) or bool(np.any(np.asarray(std))) for std in noises)
+    return any(is_traced(std) or bool(np.any(np.asarray(std))) for std in scenario.sensors.noises)
 
 
 def _smooth_inside(cascade: Cascade, scenario: Scenario, sample_period: float) -> bool:
@@ -149,12 +147,12 @@ def _smooth_inside(cascade: Cascade, scenario: Scenario, sample_period: float) -
     u_max = scenario.u_max
     limited = is_traced(u_max) or bool(np.any(np.isfinite(np.asarray(u_max))))
     inside = most_inside(scenario, sample_period, reference=True)
-    return not limited and scenario.amplifier is None and scenario.stop is None and inside == 0
+    return not limited and scenario.drive == "voltage" and scenario.stop is None and inside == 0
 
 
 def _fixed_only(cascade: Cascade, scenario: Scenario) -> bool:
     """Return whether the loop requires a fixed number of steps: XLA aborts when it compiles the adaptive method."""
-    return cascade.processor is None and scenario.drive == "current"
+    return not cascade.sampled and scenario.drive == "current"
 
 
 def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: bool = False) -> Clock:
@@ -188,7 +186,7 @@ def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: 
         )
     elif clock.method.limit is not None:
         _check_limit(clock, clock.method.limit, cascade, scenario)
-    if cascade.processor is None or (cuts := most_inside(scenario, clock.sample_period)) is None:
+    if not cascade.sampled or (cuts := most_inside(scenario, clock.sample_period)) is None:
         return clock
     return dataclasses.replace(clock, cuts=max(cuts, clock.cuts or 0))
 

@@ -61,10 +61,10 @@ class SettledCase(Protocol):
 
 
 @record
-class Standard:
+class Metrics:
     """The metrics of metrics.json: a dict of numbers whose names include their units.
 
-    The defaults are for the plant of Table 1; `standard_for` scales them to another plant.
+    The defaults are for the plant of Table 1; `Metrics.of` scales them to another plant.
     """
 
     settle: Scalar = leaf(
@@ -89,9 +89,27 @@ class Standard:
     )
 
     @classmethod
-    def for_case(cls, case: SettledCase) -> "Standard":
-        """Return the metrics for a case of `read_case`: `standard_for` with its settling time and its scenario."""
-        return standard_for(case.settle, case.scenario)
+    def of(cls, settle: Scalar, scenario: Scenario) -> "Metrics":
+        """Return the metrics for a scenario: its clearance and largest force, and bands by the sizes of its plant.
+
+        `settle`: start of the evaluation of the settled metrics, s. The ratios of the bands are those of the plant of
+        Table 1: 4e-4 of the size of sigma, 4e-5 of the size of v, and 4e-3 of i_0.
+        """
+        plant, usual, paper = scenario.plant, Metrics(), Plant()
+        return Metrics(
+            settle,
+            scenario.touchdown,
+            usual.sigma_band * (plant.sigma_size / paper.sigma_size),
+            usual.v_tilde_band * (plant.v_size / paper.v_size),
+            usual.e_band * (plant.i_0 / paper.i_0),
+            scenario.largest_force,
+            scenario.rotor,
+        )
+
+    @classmethod
+    def for_case(cls, case: SettledCase) -> "Metrics":
+        """Return the metrics for a case of `read_case`: `Metrics.of` with its settling time and its scenario."""
+        return Metrics.of(case.settle, case.scenario)
 
     def _folds(self) -> Named:
         """Return the fold of each metric by name."""
@@ -149,21 +167,3 @@ class Standard:
             "singular_at_s": ending.singular_at,
         }
         return numbers | status
-
-
-def standard_for(settle: Scalar, scenario: Scenario) -> Standard:
-    """Return the metrics for a scenario: its clearance and largest force, and bands in proportion to its plant's sizes.
-
-    `settle`: start of the evaluation of the settled metrics, s. The ratios of the bands are those of the plant of Table
-    1: 4e-4 of the size of sigma, 4e-5 of the size of v, and 4e-3 of i_0.
-    """
-    plant, usual, paper = scenario.plant, Standard(), Plant()
-    return Standard(
-        settle,
-        scenario.touchdown,
-        usual.sigma_band * (plant.sigma_size / paper.sigma_size),
-        usual.v_tilde_band * (plant.v_size / paper.v_size),
-        usual.e_band * (plant.i_0 / paper.i_0),
-        scenario.largest_force,
-        scenario.rotor,
-    )

@@ -10,10 +10,10 @@ from jax import Array, lax
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
-from ambjax.simulation.rollout import Outcome, RolloutState, System, begin, finish, segment
+from ambjax.simulation.rollout import Result, RolloutState, System, begin, finish, segment
 
 
-def rolled_in_parts(system: System, clock: Clock, fold: Fold) -> Outcome:
+def rolled_in_parts(system: System, clock: Clock, fold: Fold) -> Result:
     """Simulate a rollout without rows. Reverse mode recomputes each part (`jax.checkpoint`).
 
     Reverse mode stores the state at the start of each part and, for one part at a time, the state at each sample. The

@@ -11,17 +11,18 @@ from jax import Array, lax
 
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.control.cascade import Cascade
-from ambjax.control.laws import STAGES
+from ambjax.control.stages import STAGES
 from ambjax.numerics.records import Scalar, canonical, validate
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Ending, Fold
-from ambjax.simulation.integrate import Advanced, choose
+from ambjax.simulation.integrate import Advanced, Integrator, choose
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.method import with_method
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.span import Span
 from ambjax.simulation.system import check_parts, system_of
 from ambjax.simulation.trajectory import ALIVE, Row, Trajectory, first_time
+from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 
 # Types of the state of a system, of the errors of its sensors, and of its row.
@@ -30,15 +31,15 @@ E = TypeVar("E")
 R = TypeVar("R")
 
 
-class Outcome(NamedTuple):
+class Result(NamedTuple):
     """Result of a rollout: the trajectory, and the result of the fold.
 
     - `trajectory`: rows and status of the rotor; the rows are None if none were recorded.
-    - `measured`: result of the fold; None without a fold.
+    - `metrics`: result of the fold; None without a fold.
     """
 
     trajectory: Trajectory
-    measured: Any
+    metrics: Any
 
 
 class System(Protocol[S, E, R]):
@@ -53,20 +54,11 @@ class System(Protocol[S, E, R]):
     - `completed(row, span)`: the row with the signals that are known only at the end of the sample.
     - `singularity(row)`: a number that is positive on the admissible side of the singular curve C. Eq. (9)
 
-    A system whose state jumps at the start of a sample, such as a controller on a processor, also has
+    - `jump(t, state, errors)`: the state after the jump at the start of the sample at t (s), such as a step of a
+      controller on a processor. The row and the integrator use it. The state of a lost rotor does not jump.
+    - `advance(method, errors, t, period, state, memory, code)`: the result of the method at the end of the sample.
 
-        jump(t, state, errors) -> state
-
-    `jump` is called at the start of a sample. The row and the integrator use its result. The state of a lost
-    rotor does not jump. A system that integrates its whole state, as one problem per sample, has
-
-        problem(errors) -> InitialValueProblem
-
-    A system that integrates only a part of its state, or several problems per sample, has instead
-
-        advance(method, errors, t, period, state, memory, code) -> Advanced
-
-    which replaces `method.advance(problem(errors), ...)`, for example by means of `integrate.in_turn`.
+    `integrate.WholeState` has the last two for a system that integrates its whole state as one problem per sample.
     """
 
     def realised(self) -> Self: ...
@@ -77,6 +69,10 @@ class System(Protocol[S, E, R]):
     def row(self, t: Scalar, state: S, errors: E, alive: Array) -> R: ...
     def completed(self, row: R, span: Span) -> R: ...
     def singularity(self, row: R) -> Array: ...
+    def jump(self, t: Scalar, state: S, errors: E) -> S: ...
+    def advance(
+        self, method: Integrator, errors: E, t: Scalar, period: Scalar, state: S, memory: object, code: Array
+    ) -> Advanced: ...
 
 
 class RolloutState(NamedTuple):
@@ -93,13 +89,16 @@ class RolloutState(NamedTuple):
     fold: Any
 
 
-def rollout(cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | None = None, every: int = 1) -> Outcome:
-    """Simulate `scenario.plant` under `cascade` for `clock.samples` sample periods.
+@takes_case
+def rollout(
+    cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | None = None, record_every: int = 1
+) -> Result:
+    """Simulate `scenario.plant` under `cascade` for `clock.samples` sample periods. `rollout(case)` works too.
 
     - `fold`: accumulated at every sample, so that metrics need no stored trajectory; None: no metrics.
-    - `every`: a row is recorded at the start of every `every`-th sample; 0: no rows.
+    - `record_every`: a row is recorded at the start of the first of so many samples; 0: no rows.
 
-    Returns an `Outcome`. The state is frozen if |z| reaches `Scenario.limit`, a state leaves the range of the model
+    Returns a `Result`. The state is frozen if |z| reaches `Scenario.limit`, a state leaves the range of the model
     (`loop.DIVERGENCE`), or the integrator stalls. `Trajectory.lost_code` then gives the reason, and values and
     derivatives stay finite.
 
@@ -108,7 +107,7 @@ def rollout(cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | 
     Raises ValueError for an invalid gain, parameter or clock, and as `with_method` does.
     """
     loop, clock, fold = canonical((*prepare(cascade, scenario, clock), fold))
-    return roll(loop, clock, fold, every=every)
+    return roll(loop, clock, fold, record_every=record_every)
 
 
 def prepare(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[ClosedLoop | Sampled, Clock]:
@@ -137,8 +136,7 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
                 f"ambjax.extend.{base.__name__}."
             )
     validate(dataclasses.replace(cascade, processor=None), "controller")
-    if cascade.processor is not None:
-        validate(cascade.processor, "processor")
+    validate(cascade.processor, "processor")
     check_parts(cascade, scenario, clock.sample_period)
     validate(scenario, "scenario")
     validate(clock, "clock")
@@ -146,13 +144,13 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
         raise ValueError(f"clock.samples = {clock.samples}: it must be a whole number of at least 1.")
 
 
-def run(system: System, clock: Clock, fold: Fold | None, every: int) -> Outcome:
+def run(system: System, clock: Clock, fold: Fold | None, record_every: int) -> Result:
     """Simulate a whole rollout without checks. The function is not jitted; `roll` is its compiled form."""
-    progress, rows = segment(system, clock, fold, begin(system, clock, fold), 0, clock.samples, every)
+    progress, rows = segment(system, clock, fold, begin(system, clock, fold), 0, clock.samples, record_every)
     return finish(progress, rows, fold)
 
 
-roll = one_kernel(run, static_argnames=("every",))
+roll = one_kernel(run, static_argnames=("record_every",))
 
 
 def begin(system: System, clock: Clock, fold: Fold | None) -> RolloutState:
@@ -168,11 +166,17 @@ def begin(system: System, clock: Clock, fold: Fold | None) -> RolloutState:
 
 
 def segment(
-    system: System, clock: Clock, fold: Fold | None, progress: RolloutState, first: Scalar, count: int, every: int
+    system: System,
+    clock: Clock,
+    fold: Fold | None,
+    progress: RolloutState,
+    first: Scalar,
+    count: int,
+    record_every: int,
 ) -> tuple[RolloutState, Row | None]:
-    """Simulate `count` samples from number `first` on, and record a row at every `every`-th sample.
+    """Simulate `count` samples from number `first` on, and record a row at every `record_every`-th sample.
 
-    Returns the new state and the rows; the rows are None if every = 0.
+    Returns the new state and the rows; the rows are None if record_every = 0.
     """
     step = functools.partial(one_sample, system.realised(), clock, fold)
 
@@ -185,11 +189,11 @@ def segment(
             progress = unrecorded(progress, k + 1, length - 1)
         return progress, row
 
-    if every == 0:
+    if record_every == 0:
         return unrecorded(progress, first, count), None
-    starts = first + every * jnp.arange(count // every)
-    progress, rows = lax.scan(functools.partial(block, length=every), progress, starts)
-    if rest := count % every:
+    starts = first + record_every * jnp.arange(count // record_every)
+    progress, rows = lax.scan(functools.partial(block, length=record_every), progress, starts)
+    if rest := count % record_every:
         progress, last = block(progress, jnp.asarray(first + count - rest), rest)
         rows = jax.tree.map(lambda many, one: jnp.concatenate([many, one[None]]), rows, last)
     return progress, rows
@@ -212,21 +216,11 @@ def recorded_segment(
     return lax.scan(sample, progress, first + jnp.arange(count))
 
 
-def finish(progress: RolloutState, rows: Row | None, fold: Fold | None) -> Outcome:
+def finish(progress: RolloutState, rows: Row | None, fold: Fold | None) -> Result:
     """Return the outcome of a rollout from the state after the last sample and the rows."""
     lost_code, lost_at, singular_at, _ = progress.ending
-    measured = None if fold is None else fold.result(progress.fold, progress.ending)
-    return Outcome(Trajectory(cast(Row, rows), lost_at, lost_code, singular_at), measured)
-
-
-def _advanced(
-    system: Any, clock: Clock, errors: object, t: Array, state: object, memory: object, code: Array
-) -> Advanced:
-    """Advance the system over the sample that begins at t (s)."""
-    method, period = clock.integrator, clock.sample_period
-    if hasattr(system, "advance"):
-        return system.advance(method, errors, t, period, state, memory, code)
-    return method.advance(system.problem(errors), t, period, state, memory, code)
+    metrics = None if fold is None else fold.result(progress.fold, progress.ending)
+    return Result(Trajectory(cast(Row, rows), lost_at, lost_code, singular_at), metrics)
 
 
 def one_sample(
@@ -248,10 +242,11 @@ def one_sample(
         # Signals are evaluated just after t. A signal that jumps at this instant then has its value after the jump,
         # even if t was rounded down.
         just_after = t * (1 + 4 * jnp.finfo(dtype).eps)
-        if hasattr(system, "jump"):
-            state = choose(alive, system.jump(just_after, state, errors), state)
+        jumped = system.jump(just_after, state, errors)
+        state = state if jumped is state else choose(alive, jumped, state)
         row = system.row(just_after, state, errors, alive)._replace(t=t)
-        after = _advanced(system, clock, errors, t, state, memory, ending.lost_code)
+        method, period = clock.integrator, clock.sample_period
+        after = system.advance(method, errors, t, period, state, memory, ending.lost_code)
         row = system.completed(row, after.span)
         folded = folded if fold is None else fold.update(folded, row, after.span)
         lost_now = alive & (after.code != ALIVE)

@@ -23,13 +23,13 @@ from ambjax.numerics.records import Scalar, record, static
 from ambjax.numerics.smooth import limited
 from ambjax.simulation.between import acting, amplified, lags, plant_status, sensed_motion, subproblems
 from ambjax.simulation.integrate import Advanced, Integrator, in_turn
-from ambjax.simulation.loop import ClosedLoop, LoopState
+from ambjax.simulation.loop import AddedSignal, ClosedLoop, LoopState, with_signal
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import DIVERGED, Row
 from ambjax.world.faults import Sensed
 from ambjax.world.sensor import Errors, FaultyErrors, Measurement
-from ambjax.world.signals import Reference, reference_at
+from ambjax.world.waveforms import Reference, reference_at
 
 
 @record
@@ -39,18 +39,19 @@ class Sampled:
     - `loop`: the closed loop in continuous time.
     - `period`: sample period, s.
     - `cuts`: largest number of jumps (edges) of disturbances inside one sample; None: the number of all edges.
+    - `wave`: test signal, added to a reading after the converter and the faults; None: none. `z_measured` of a row is
+      then the sum of this reading and e.
     """
 
     loop: ClosedLoop
     period: Scalar
     cuts: int | None = static()
+    wave: AddedSignal | None = None
 
     @property
     def processor(self) -> Processor:
         """The processor of the cascade."""
-        processor = self.loop.cascade.processor
-        assert processor is not None
-        return processor
+        return self.loop.cascade.timing
 
     def realised(self) -> Self:
         """Return the loop of one member, with its random signals drawn."""
@@ -61,11 +62,11 @@ class Sampled:
 
         With a low-pass, the runout is not included: the low-pass receives it (`sensed_motion`).
         """
-        drawn, sensor = self.loop.sensor_errors(sample), self.loop.scenario.sensor
-        if sensor is not None and sensor.runout is not None and not lags(self.loop):
+        drawn, sensor = self.loop.sensor_errors(sample), self.loop.scenario.sensors
+        if sensor.runout is not None and not lags(self.loop):
             runout = sensor.runout(jnp.asarray(sample, jnp.result_type(float)) * self.period)
             drawn = drawn._replace(z=drawn.z + sensor.gain * runout)
-        if sensor is None or not sensor.faulty:
+        if not sensor.faulty:
             return drawn
         return FaultyErrors(*drawn, sensor.fault_onsets(self.loop.words(), sample, self.period))
 
@@ -74,10 +75,9 @@ class Sampled:
         scenario, zero = self.loop.scenario, jnp.zeros(())
         plant = scenario.plant.start(scenario.initial.measurement())
         z_filtered = sensed_motion(self.loop, plant, zero).z if lags(self.loop) else ()
-        slow = scenario.amplifier is not None and scenario.amplifier.slow
         measured = self.measured(plant, z_filtered, self.sensor_errors(0))
         command, past, guard = Command(*[zero] * 5), self.processor.constant_past(zero), self.processor.guard
-        faulty = scenario.sensor is not None and scenario.sensor.faulty
+        faulty = scenario.sensors.faulty
         cascade = self.loop.cascade
         sample = self.sample(self.reference(0.0), past)
         return SampledState(
@@ -87,7 +87,7 @@ class Sampled:
             past,
             jnp.ones(()),
             z_filtered,
-            zero if slow else (),
+            zero if scenario.actuator.slow else (),
             guard.start() if guard else (),
             zero if guard and faulty else (),
             Sensed(measured.z, zero) if faulty else (),
@@ -98,10 +98,8 @@ class Sampled:
 
         `z_filtered`: output of the low-pass of the position sensor, m.
         """
-        true, sensor = self.loop.scenario.plant, self.loop.scenario.sensor
+        true, sensor = self.loop.scenario.plant, self.loop.scenario.sensors
         motion = true.measurement(plant)
-        if sensor is None:
-            return motion
         if lags(self.loop):
             motion = motion._replace(z=z_filtered)
         return sensor.converted(sensor.reading(motion, errors), true.s_0, true.i_0)
@@ -109,7 +107,13 @@ class Sampled:
     def jump(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors) -> SampledState:
         """Step the laws at time t (s): return the state with the new command and the next states of the laws."""
         state, measured = self.read(state, errors)
-        return self.with_command(measured, self.reference(t), state)
+        return self.with_command(self._injected(measured, t), self.reference(t), state)
+
+    def _injected(self, measured: Measurement, t: Scalar) -> Measurement:
+        """Return the readings with the test signal of the sample that begins at t (s)."""
+        if self.wave is None:
+            return measured
+        return with_signal(measured, self.wave, self.wave.at(jnp.round(jnp.asarray(t) / self.period).astype(int)))
 
     def read(self, state: SampledState, errors: Errors | FaultyErrors) -> tuple[SampledState, Measurement]:
         """Return the state with the new state of the faulty sensor, and the readings of the sensors, with faults."""
@@ -124,8 +128,8 @@ class Sampled:
         self, measured: Measurement, state: SampledState, errors: Errors | FaultyErrors
     ) -> tuple[SampledState, Measurement]:
         """Apply the faults of the position sensor. Return the new state and the readings."""
-        sensor, sensed = self.loop.scenario.sensor, state.sensed
-        if sensor is None or not sensed or not isinstance(errors, FaultyErrors):
+        sensor, sensed = self.loop.scenario.sensors, state.sensed
+        if not sensed or not isinstance(errors, FaultyErrors):
             return state, measured
         sensed = sensor.sensed(measured.z, sensed, errors.onsets, self.period, self.loop.scenario.plant.s_0)
         z = jnp.where(jnp.isnan(sensed.z), 0.0, sensed.z)
@@ -141,10 +145,29 @@ class Sampled:
         `measured`: the readings, before the guard. `reference`: see `Sample`. The exported C is traced from this
         function.
         """
-        cascade, past = self.loop.cascade, self.processor.remembered(state.command.u, *state.past)
+        sample, checked, measured, laws = self.received(measured, reference, state)
+        return self.accepted(state, sample, checked, self.loop.cascade.step(measured, laws, sample))[0]
+
+    def received(
+        self, measured: Measurement, reference: Reference, state: SampledState
+    ) -> tuple[Sample, GuardResult | None, Measurement, CascadeState]:
+        """Return what the laws step with: the inputs of the sample, and the results of `inputs_of_laws`."""
+        past = self.processor.remembered(state.command.u, *state.past)
         sample = self.sample(reference, past)
-        checked, measured, laws = self.inputs_of_laws(measured, sample, state)
-        command, control, estimate = cascade.step(measured, laws, sample)
+        return sample, *self.inputs_of_laws(measured, sample, state)
+
+    def accepted(
+        self,
+        state: SampledState,
+        sample: Sample,
+        checked: GuardResult | None,
+        stepped: tuple[Command, CascadeState, Measurement],
+    ) -> tuple[SampledState, Array]:
+        """Return the state with the results of the laws, and whether they are kept.
+
+        `checked`: result of the guard. `stepped`: command, next states of the laws, and the estimate at the sample.
+        """
+        (command, control, estimate), past = stepped, sample.past
         command = command._replace(u=limited(command.u, sample.u_max))
         new = materialised((control, command, self._next_guard_state(checked, estimate, (command.u, *past))))
         # The sum is 0 only if every number is finite: 0 times NaN or infinity is NaN.
@@ -160,7 +183,8 @@ class Sampled:
             command, finite = command._replace(u=jnp.where(checked.steps, command.u, 0.0)), finite | ~checked.steps
             watch = watch._replace(left=checked.left)
         finite = jnp.where(finite, state.finite, 0.0)
-        return state._replace(control=control, command=command, past=past, finite=finite, watch=watch, started=started)
+        state = state._replace(control=control, command=command, past=past, finite=finite, watch=watch, started=started)
+        return state, jnp.asarray(keeps)
 
     def sample(self, reference: Reference, past: tuple[Array, ...]) -> Sample:
         """Return the inputs of the cascade at a sample. `past`: u of the samples before, the most recent first."""
@@ -206,7 +230,7 @@ class Sampled:
         code = jnp.where((code == 0) & (state.finite == 0), DIVERGED, code)
         delay, whole = jnp.asarray(self.processor.delay), bool(self.processor.whole)
         commanded = acting((state.command.u, *state.past), delay, period, whole)
-        voltages, u_a = amplified(self.loop.scenario.amplifier, jnp.asarray(t), state.u_a, commanded)
+        voltages, u_a = amplified(self.loop.scenario.actuator, jnp.asarray(t), state.u_a, commanded)
         parts = subproblems(self.loop, state.plant, state.command, jnp.asarray(t), voltages, self.cuts)
         reached = in_turn(method, parts, t, state.plant, memory, code)
         z_filtered = self._lagged(t, state, [after.state for after in reached], [time for _, time in parts])
@@ -220,8 +244,8 @@ class Sampled:
         the lengths of the parts, s.
         """
         z_filtered: Any = state.z_filtered
-        sensor = self.loop.scenario.sensor
-        if sensor is None or not lags(self.loop):
+        sensor = self.loop.scenario.sensors
+        if not lags(self.loop):
             return z_filtered
         instants = itertools.accumulate(times, initial=t)
         states = (state.plant, *reached)
@@ -253,7 +277,10 @@ class Sampled:
         inputs, command = self.loop.inputs(t), state.command
         if self.loop.scenario.drive == "current":
             command = command._replace(u=self.loop.scenario.coil_voltage(command.u, state.plant, inputs.q_i))
+        measured = self._injected(measured, t)
         row = self.loop.signals(t, inputs, state.plant, command, measured, alive)
+        if self.wave is not None:
+            row = row._replace(z_measured=getattr(measured, self.wave.reading))
         guard = self.processor.guard
         return row if guard is None else row._replace(refused=alive & guard.refused(state.watch, state.watch)[0])
 

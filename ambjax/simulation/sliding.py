@@ -23,8 +23,8 @@ from jax import Array
 
 from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.control.cascade import Cascade
-from ambjax.control.laws import CurrentDemand, CurrentInputs
 from ambjax.control.schedule import with_gains_at
+from ambjax.control.stages import CurrentDemand, CurrentInputs
 from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.smooth import limited
 from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, Times, axpy
@@ -160,7 +160,7 @@ def slides(cascade: Cascade, scenario: Scenario) -> bool:
     """Return whether this step applies to the cascade and the scenario."""
     slow = not cascade.observer.stiff  # Heun's method integrates the observer
     paper = scenario.plant.lumped and scenario.drive == "voltage" and scenario.stop is None
-    return cascade.processor is None and cascade.inversion.slides and slow and paper
+    return not cascade.sampled and cascade.inversion.slides and slow and paper
 
 
 @record

@@ -15,7 +15,7 @@ from ambjax.world.scenario import Scenario
 def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> None:
     """Raise ValueError, with the path and the fix, for parts of a loop that are not compatible. `sample_period`: s."""
     _check_laws(cascade, sample_period)
-    if cascade.processor is None:
+    if not cascade.sampled:
         cascade.check_smooth()
         if (path := scenario.on_processor) is not None:
             raise ValueError(
@@ -29,8 +29,7 @@ def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> 
             f"{scenario.drive}, or change the mode."
         )
     _check_coils(scenario)
-    sensor = scenario.sensor
-    if sensor is not None and not sensor.velocity and cascade.reads_velocity(sample_period):
+    if not scenario.sensors.velocity and cascade.reads_velocity(sample_period):
         raise ValueError(
             "sensor.velocity = false: the velocity is not measured, controller.observer does not estimate it, and the "
             'laws or the prediction use it. Choose an observer that estimates it, for example kind = "kalman", or laws '
@@ -40,8 +39,8 @@ def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> 
 
 def _check_coils(scenario: Scenario) -> None:
     """Raise ValueError for limits of each coil if both coils have one current, or if |i| is limited too."""
-    amplifier = scenario.amplifier
-    if amplifier is None or amplifier.coil is None:
+    amplifier = scenario.actuator
+    if amplifier.coil is None:
         return
     if not scenario.plant.two_voltages:
         raise ValueError(
@@ -57,11 +56,11 @@ def _check_coils(scenario: Scenario) -> None:
 
 def _check_laws(cascade: Cascade, sample_period: Scalar) -> None:
     """Raise ValueError for a law that does not fit the model, the sample period, or the demand of the position law."""
-    known = cascade.processor is not None and not is_traced(sample_period)
+    known = cascade.sampled and not is_traced(sample_period)
     period = float(np.max(np.asarray(sample_period))) if known else None
     for stage, law in zip(CascadeState._fields, cascade.laws, strict=True):
         try:
-            if known or cascade.processor is None:
+            if known or not cascade.sampled:
                 law.check_use(cascade.model, period)
         except ValueError as error:
             raise ValueError(f"controller.{stage}: {error}") from None
@@ -76,7 +75,7 @@ def _check_laws(cascade: Cascade, sample_period: Scalar) -> None:
 
 def system_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> ClosedLoop | Sampled:
     """Return the closed loop of the cascade, in continuous time or on its processor."""
-    if cascade.processor is None:
+    if not cascade.sampled:
         return ClosedLoop(cascade, scenario)
     period = clock.sample_period
     return Sampled(ClosedLoop(simulated(cascade.on_processor(), scenario, period), scenario), period, clock.cuts)

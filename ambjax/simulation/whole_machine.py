@@ -6,6 +6,7 @@ each magnet and each sensor, and the forces of the magnets accelerate the coordi
 """
 
 import dataclasses
+import functools
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Self, TypeVar
@@ -15,18 +16,22 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.control.machine_law import MachineLaw
 from ambjax.numerics.records import Scalar, leaf, part, record, static
-from ambjax.numerics.small_matrices import solve
+from ambjax.numerics.shapes import varying
+from ambjax.numerics.small_matrices import solve, times
 from ambjax.simulation.between import acting, lags, plant_status, under
 from ambjax.simulation.edges import NO_EDGES, Edges
 from ambjax.simulation.folds import Ending
-from ambjax.simulation.integrate import Advanced, InitialValueProblem, Integrator, in_turn
-from ambjax.simulation.loop import INSTANT_TREE, ClosedLoop, ExternalInputs, LoopState, Realised
+from ambjax.simulation.integrate import Advanced, InitialValueProblem, Integrator, WholeState, in_turn
+from ambjax.simulation.joint_laws import begun, demanded_now, jumped
+from ambjax.simulation.loop import INSTANT_TREE, ClosedLoop, ExternalInputs, LoopState
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import DIVERGED, Row
 from ambjax.world.amplifier import Amplifier
+from ambjax.world.rotation import Rotation
 from ambjax.world.rotor import Rotor
 from ambjax.world.sensor import Errors, FaultyErrors, Measurement
 
@@ -42,11 +47,13 @@ class MachineState(NamedTuple):
 
     - `q`, `q_dot` [n]: coordinates of the rotor and their rates.
     - `axes`: states of the groups, without displacement and velocity, which follow from q and q_dot.
+    - `law`: state of the law of the machine, () without one.
     """
 
     q: Array
     q_dot: Array
     axes: Groups
+    law: Any = ()
 
 
 class MachineRow(NamedTuple):
@@ -95,6 +102,7 @@ class Machine:
     inverse: Array | None = leaf(
         default=None, shape="n n", at_least=-1e30, at_most=1e30, optional=True, doc="inverse of the mass matrix"
     )
+    law: Any = part(default=None, doc="law that demands the forces of all axes; none: each axis has its own laws")
 
     @property
     def count(self) -> int:
@@ -133,7 +141,8 @@ class Machine:
         n = self.rotor.M.shape[-1]
         key = jax.tree.map(lambda x: x[0], self.loops()[0].scenario).key()
         inverse = solve(jnp.asarray(self.rotor.M)[None], jnp.eye(n, dtype=jnp.result_type(float))[None])[0]
-        axes = tuple(self.each(_realised, self.split(jnp.arange(self.count))))
+        realised = functools.partial(_realised, Rotation(self.rotor.speed, self.rotor.acceleration))
+        axes = tuple(self.each(realised, self.split(jnp.arange(self.count))))
         return dataclasses.replace(self, rotor=self.rotor.realised(key), axes=axes, inverse=inverse)
 
     def sensor_errors(self, sample: Scalar) -> tuple[Errors | FaultyErrors, ...]:
@@ -149,7 +158,9 @@ class Machine:
             scenario = dataclasses.replace(loop.scenario, initial=begin)
             return _with_loop(axis, dataclasses.replace(loop, scenario=scenario)).start()
 
-        return MachineState(q, jnp.zeros_like(q), still(self.each(one, z)))
+        axes = self.each(one, z)
+        law = begun(self, self.rotor.speed_at(0.0), axes, self.sensor_errors(0))
+        return MachineState(q, jnp.zeros_like(q), still(axes), law)
 
     def moving(self, rows: Array, q: Array, q_dot: Array, axes: Groups) -> Groups:
         """Return the states of the groups with the motion at the places of `rows` [c, n]."""
@@ -160,24 +171,26 @@ class Machine:
 
     def at_magnets(self, state: MachineState) -> Groups:
         """Return the states of the groups with the motion at the magnets."""
-        return self.moving(self.rotor.at_magnets, *state)
+        return self.moving(self.rotor.at_magnets, *state[:3])
 
     def at_sensors(self, state: MachineState) -> Groups:
         """Return the states of the groups with the motion at the sensors."""
-        return self.moving(self.rotor.at_sensors, *state)
+        return self.moving(self.rotor.at_sensors, *state[:3])
 
-    def coupled(self, outside: tuple[Array, Scalar], state: MachineState, rates: Sequence) -> MachineState:
+    def coupled(
+        self, outside: tuple[Array, Scalar], state: MachineState, rates: Sequence, law: object = ()
+    ) -> MachineState:
         """Return the rates of the machine.
 
         `outside`: other forces [n] and the speed (rad/s). `rates`: rates of the groups, of which each axis has its own
-        mass and weight.
+        mass and weight. `law`: rates of the state of the law.
         """
         (others, W), rotor = outside, self.rotor
         accelerations = self.join([own.plant.z_dot for own in rates])
         magnets = self.plants("m") * (accelerations + self.plants("g"))
         forces = jnp.sum(rotor.at_magnets * magnets[:, None], 0) + others
         forces = forces - times(rotor.D + W * rotor.G, state.q_dot) - times(rotor.K, state.q)
-        return MachineState(state.q_dot, times(self.inverse, forces), still(rates))
+        return MachineState(state.q_dot, times(self.inverse, forces), still(rates), law)
 
     def outside(self, t: Scalar) -> tuple[Array, Array]:
         """Return the forces on the coordinates other than the magnets' [n], and the speed (rad/s), at t (s)."""
@@ -196,11 +209,18 @@ class Machine:
 
     def rest(self, state: MachineState, code: Array) -> MachineState:
         axes = self.each(lambda axis, own: axis.rest(own, code), self.at_sensors(state))
-        return MachineState(state.q, jnp.zeros_like(state.q_dot), still(axes))
+        return MachineState(state.q, jnp.zeros_like(state.q_dot), still(axes), state.law)
+
+    def demands(self, t: Scalar, state: MachineState, errors: Sequence[object]) -> Groups:
+        """Return further arguments of the row of each group: the demanded forces, if the row computes the command."""
+        return ((),) * len(self.groups)
 
     def row(self, t: Scalar, state: MachineState, errors: Sequence[object], alive: Array) -> MachineRow:
+        demands = self.demands(t, state, errors)
+
         def rows(axes: Groups) -> Row:
-            return self.join(self.each(lambda axis, own, error: axis.row(t, own, error, alive), axes, errors))
+            one = lambda axis, own, error, demand: axis.row(t, own, error, alive, *demand)  # noqa: E731
+            return self.join(self.each(one, axes, errors, demands))
 
         row, sensed = rows(self.at_magnets(state)), rows(self.at_sensors(state))
         row = row._replace(z_measured=sensed.z_measured, refused=sensed.refused)
@@ -222,7 +242,8 @@ class Machine:
         rows = jnp.max(jnp.abs(self.rotor.at_magnets) + jnp.abs(self.rotor.at_sensors), 0)
         # a coordinate that no axis sees, such as the axial one without a thrust bearing, has the size of the others
         rows = jnp.where(rows > 0, rows, 1.0)
-        return MachineState(jnp.max(z) / rows, jnp.max(z_dot) / rows, still(own))
+        law = () if self.law is None else self.law.scale()
+        return MachineState(jnp.max(z) / rows, jnp.max(z_dot) / rows, still(own), law)
 
     def problem_of(self, inputs: Callable, observed: Callable, scale: Sequence) -> InitialValueProblem:
         """Return the initial value problem with these inputs, rates with signals, and sizes of the groups' states."""
@@ -248,6 +269,10 @@ class SampledMachine(Machine):
 
     def jump(self, t: Scalar, state: MachineState, errors: Sequence[object]) -> MachineState:
         """Step the laws of all axes at time t (s)."""
+        if self.law is not None:
+            W, at = self.rotor.speed_at(t), self.at_sensors(state)
+            axes, law = jumped(self, t, W, at, state.law, errors)
+            return state._replace(axes=still(axes), law=law)
         axes = self.each(lambda axis, own, error: axis.jump(t, own, error), self.at_sensors(state), errors)
         return state._replace(axes=still(axes))
 
@@ -273,7 +298,7 @@ class SampledMachine(Machine):
         end = reached[-1].state
         ended = zip(state.axes, end.axes, z_filtered, u_a, strict=True)
         axes = tuple(own._replace(plant=at.plant, z_filtered=z, u_a=u) for own, at, z, u in ended)
-        return reached[-1]._replace(state=MachineState(end.q, end.q_dot, axes))
+        return reached[-1]._replace(state=MachineState(end.q, end.q_dot, axes, state.law))
 
     def _pieces(self, t: Array, period: Scalar, axes: Groups) -> tuple[list[tuple[Voltages, Scalar]], Voltages]:
         """Divide a sample. Return the groups' voltages as functions of time, with the durations (s) of the pieces.
@@ -281,8 +306,7 @@ class SampledMachine(Machine):
         The second result contains the amplifiers' outputs at the end (V). With a low-pass of a sensor, pieces also end
         at the jumps of loads.
         """
-        processor = loop_of(self.axes[0]).cascade.processor
-        assert processor is not None
+        processor = loop_of(self.axes[0]).cascade.timing
         delay, whole = jnp.asarray(processor.delay)[0], bool(processor.whole)
         commands = [acting((own.command.u, *own.past), delay, period, whole) for own in axes]
         low_passed = any(map(lags, self.loops()))
@@ -333,17 +357,13 @@ class SampledMachine(Machine):
         found = []
         sensed = [self.at_sensors(state) for state in states]
         for k, loop in enumerate(self.loops()):
-            z, sensor, motions = axes[k].z_filtered, loop.scenario.sensor, list[Measurement]()
-            if sensor is None or not lags(loop):
+            z, sensor, motions = axes[k].z_filtered, loop.scenario.sensors, list[Measurement]()
+            if not lags(loop):
                 found.append(z)
                 continue
             for own, n in zip(sensed, range(len(durations) + 1), strict=True):
                 motion = Measurement(own[k].plant.z, own[k].plant.z_dot, z)
-                if sensor.runout is not None:
-                    at = jnp.broadcast_to(t + sum(durations[:n]), motion.z.shape)
-                    runout, rate = jax.jvp(sensor.runout, (at,), (jnp.ones_like(at),))
-                    motion = motion._replace(z=motion.z + runout, z_dot=motion.z_dot + rate)
-                motions.append(motion)
+                motions.append(sensor.over_surface(motion, jnp.broadcast_to(t + sum(durations[:n]), motion.z.shape)))
             for before, after, time in zip(motions, motions[1:], durations, strict=False):
                 z = sensor.lagged(z, before, after, time)
             found.append(z)
@@ -351,8 +371,15 @@ class SampledMachine(Machine):
 
 
 @record
-class ContinuousMachine(Machine):
+class ContinuousMachine(WholeState, Machine):
     """A machine whose cascades run in continuous time."""
+
+    def demands(self, t: Scalar, state: MachineState, errors: Sequence[object]) -> Groups:
+        if self.law is None:
+            return super().demands(t, state, errors)
+        own, sensed = self.each(lambda axis: axis.inputs(t)), tuple(one.plant for one in self.at_sensors(state))
+        found = demanded_now(self, self.rotor.speed_at(t), own, sensed, state.law, errors)[0]
+        return tuple((one,) for one in found)
 
     def problem(self, errors: Sequence[object]) -> InitialValueProblem:
         """Return the initial value problem of one sample, with the measurement errors held."""
@@ -362,17 +389,15 @@ class ContinuousMachine(Machine):
 
         def observed(inputs: Any, state: MachineState) -> tuple[MachineState, Instant]:
             outside, own = inputs
-            sensed = tuple(one.plant for one in self.at_sensors(state))
+            sensed, law = tuple(one.plant for one in self.at_sensors(state)), ()
+            demands: Groups = (None,) * len(self.groups)
+            if self.law is not None:
+                demands, law = demanded_now(self, outside[1], own, sensed, state.law, errors)
             observe = lambda axis, *now: axis.observed(*now)  # noqa: E731
-            parts = self.each(observe, own, self.at_magnets(state), errors, sensed)
-            return self.coupled(outside, state, [rates for rates, _ in parts]), self.join([x for _, x in parts])
+            parts = self.each(observe, own, self.at_magnets(state), errors, sensed, demands)
+            return self.coupled(outside, state, [rates for rates, _ in parts], law), self.join([x for _, x in parts])
 
         return self.problem_of(inputs, observed, self.each(lambda axis: axis.scale()))
-
-
-def times(matrix: Array | None, x: Array) -> Array:
-    """Return matrix @ x as a sum of products, which XLA compiles within one kernel."""
-    return jnp.sum(jnp.asarray(matrix) * x, -1)
 
 
 def still(axes: Sequence) -> Groups:
@@ -389,21 +414,39 @@ def _with_loop(axis: Sampled | ClosedLoop, loop: ClosedLoop) -> Sampled | Closed
     return dataclasses.replace(axis, loop=loop) if isinstance(axis, Sampled) else loop
 
 
-def _realised(axis: Sampled | ClosedLoop, number: Array) -> Sampled | ClosedLoop:
-    """Return the loop of one axis with its random signals drawn, and with the random key of this axis."""
-    loop = loop_of(axis.realised())
+def _realised(rotation: Rotation, axis: Sampled | ClosedLoop, number: Array) -> Sampled | ClosedLoop:
+    """Return the loop of one axis with the rotor's speed, its random signals drawn, and the random key of this axis."""
+    loop = loop_of(axis)
+    if loop.scenario.rotor is not None:
+        loop = dataclasses.replace(loop, scenario=dataclasses.replace(loop.scenario, rotor=rotation))
+    loop = loop.realised()
     high, low = jax.random.key_data(jax.random.fold_in(loop.scenario.key(), number))
-    return _with_loop(axis, Realised(loop.cascade, loop.scenario, (high, low)))
+    return _with_loop(axis, dataclasses.replace(loop, key=(high, low)))
 
 
-def machine_of(rotor: Rotor, axes: Sequence[Sampled | ClosedLoop], start_q: Array) -> Machine:
-    """Return the machine of a rotor and the loops of its axes, of one member. `start_q` [n]: coordinates at t = 0.
+def stack_axes(axes: Sequence[T]) -> T:
+    """Return the pytrees of axes as one, each leaf [c, ...]; [N, c, ...] if it varies between members on any axis."""
+    flags = np.any([varying(axis) for axis in axes], 0)
+    parts = [jax.tree.leaves(axis) for axis in axes]
+    leaves = []
+    for k, varies in enumerate(flags):
+        own = [np.asarray(one[k]) for one in parts]
+        most = max((x.shape for x in own), key=len)
+        leaves.append(np.stack([np.broadcast_to(x, most) for x in own], 1) if varies else np.stack(own))
+    return jax.tree.unflatten(jax.tree.structure(axes[0]), leaves)
 
-    Axes with the same kinds of parts form a group.
+
+def machine_of(
+    rotor: Rotor, axes: Sequence[Sampled | ClosedLoop], start_q: Array, law: MachineLaw | None = None
+) -> Machine:
+    """Return the machine of a rotor and the loops of its axes. `start_q` [n]: coordinates at t = 0.
+
+    Axes with the same kinds of parts form a group. Leaves may have an axis of members. `law`: demands the forces of all
+    axes; None: each has its own laws.
     """
     numbers: dict[object, list[int]] = {}
     for k, axis in enumerate(axes):
         numbers.setdefault(jax.tree.structure(axis), []).append(k)
-    stacked = [jax.tree.map(lambda *x: np.stack(x), *(axes[k] for k in group)) for group in numbers.values()]
+    stacked = [stack_axes([axes[k] for k in group]) for group in numbers.values()]
     kind = SampledMachine if isinstance(axes[0], Sampled) else ContinuousMachine
-    return kind(rotor, tuple(stacked), start_q, tuple(map(tuple, numbers.values())))
+    return kind(rotor, tuple(stacked), start_q, tuple(map(tuple, numbers.values())), law=law)

@@ -6,15 +6,16 @@ each of them, no cause is named: it may be the gains of the laws, or several par
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.simulation.clock import Clock
+from ambjax.world.amplifier import Amplifier
 from ambjax.world.scenario import SLOTS, Scenario
-from ambjax.world.signals import reference_at
+from ambjax.world.waveforms import reference_at
 
 # Resolution that stands for an ideal converter, bits. With a number instead of None, the compiled program is the same.
 FINE_BITS = 32
@@ -86,7 +87,7 @@ def parts(cascade: Cascade, scenario: Scenario, clock: Clock) -> Iterator[Part]:
         yield Part(name, remedy, controller, scenario, clock)
     for name, remedy, world in _motion(scenario, clock):
         yield Part(name, remedy, cascade, world, clock)
-    if cascade.processor is not None:
+    if cascade.sampled:
         finer = dataclasses.replace(
             clock, samples=FINER * clock.samples, sample_period=float(clock.sample_period) / FINER
         )
@@ -95,59 +96,45 @@ def parts(cascade: Cascade, scenario: Scenario, clock: Clock) -> Iterator[Part]:
 
 
 def _sensors(scenario: Scenario) -> Iterator[tuple[str, str, Scenario]]:
-    sensor: Any = scenario.sensor
-    if sensor is None:
-        return
+    sensor = scenario.sensors
 
-    def without(**fields: object) -> Scenario:
-        return dataclasses.replace(scenario, sensor=dataclasses.replace(sensor, **fields))
-
-    if (quiet := sensor.louder(0.0)) != sensor:
-        loud = dataclasses.replace(scenario, sensor=quiet)
-        yield "the noise of the sensors", "Lower it, or choose an observer that attenuates it more.", loud
+    if (quiet := scenario.louder(0.0)).sensor != scenario.sensor:
+        yield "the noise of the sensors", "Lower it, or choose an observer that attenuates it more.", quiet
     if sensor.bits is not None:
         name = f"the converter (sensor.bits = {float(np.max(sensor.bits)):g})"
-        yield name, "Give more bits, or a smaller range_z or range_i.", without(bits=FINE_BITS)
+        yield name, "Give more bits, or a smaller range_z or range_i.", scenario.with_sensor(bits=FINE_BITS)
     if sensor.faulty:
-        yield "the faults of the position sensor", "", without(outliers=None, dropouts=None)
+        yield "the faults of the position sensor", "", scenario.with_sensor(outliers=None, dropouts=None)
     if sensor.bandwidth is not None:
-        yield "the low-pass of the position sensor", "Raise sensor.bandwidth.", without(bandwidth=None)
+        yield "the low-pass of the position sensor", "Raise sensor.bandwidth.", scenario.with_sensor(bandwidth=None)
 
 
 def _supply(scenario: Scenario) -> Iterator[tuple[str, str, Scenario]]:
-    amplifier: Any = scenario.amplifier
+    amplifier = scenario.actuator
     if np.any(np.isfinite(np.asarray(scenario.u_max))):
         name = f"the limit of the voltage (actuator.u_max = {float(np.min(scenario.u_max)):g} V)"
         unlimited = dataclasses.replace(scenario, u_max=jnp.inf)
-        if amplifier is not None and amplifier.coil is not None:
+        if amplifier.coil is not None:
             coil = dataclasses.replace(amplifier.coil, u_max=None)
             unlimited = dataclasses.replace(unlimited, amplifier=dataclasses.replace(amplifier, coil=coil))
         yield name, "Raise it, or reduce the gains, the noise or the loads.", unlimited
-    if amplifier is not None and scenario.drive == "voltage":
+    if isinstance(scenario.amplifier, Amplifier):
         ideal = dataclasses.replace(scenario, amplifier=None)
         yield "the amplifier (its lag, dead band and current limits)", "Change [actuator].", ideal
 
 
 def _processor(cascade: Cascade) -> Iterator[tuple[str, str, Cascade]]:
-    processor: Any = cascade.processor
-    if processor is not None and not processor.implicit:
-        yield "the explicit steps", 'Set discretisation = "implicit".', _on(cascade, implicit=True)
-    if processor is not None and processor.guard is not None:
-        yield "the guard of the readings", "Change [processor.guard].", _on(cascade, guard=None)
+    if not cascade.timing.implicit:
+        yield "the explicit steps", 'Set discretisation = "implicit".', cascade.with_processor(implicit=True)
+    if cascade.timing.guard is not None:
+        yield "the guard of the readings", "Change [processor.guard].", cascade.with_processor(guard=None)
 
 
 def _delay(cascade: Cascade) -> Iterator[tuple[str, str, Cascade]]:
-    processor: Any = cascade.processor
-    if processor is not None and float(np.max(processor.delay)) > 0:
-        remedy = "Reduce the delay or the gains." if processor.predicts else "Set predict = true, or reduce the delay."
-        name = f"the delay of {float(np.max(processor.delay)):g} samples"
-        yield name, remedy, _on(cascade, delay=0.0, assumed=None)
-
-
-def _on(cascade: Cascade, **fields: object) -> Cascade:
-    """Return the cascade with other fields of its processor."""
-    processor: Any = cascade.processor
-    return dataclasses.replace(cascade, processor=dataclasses.replace(processor, **fields))
+    timing = cascade.timing
+    if (delay := float(np.max(timing.delay))) > 0:
+        remedy = "Reduce the delay or the gains." if timing.predicts else "Set predict = true, or reduce the delay."
+        yield f"the delay of {delay:g} samples", remedy, cascade.with_processor(delay=0.0, assumed=None)
 
 
 def _model(cascade: Cascade, scenario: Scenario) -> Iterator[tuple[str, str, Cascade]]:
@@ -163,7 +150,7 @@ def _motion(scenario: Scenario, clock: Clock) -> Iterator[tuple[str, str, Scenar
     end = float(clock.duration)
     loads = [getattr(scenario.turning(), slot) for slot in SLOTS if slot != "reference"]
     acts = any(load is not None and any(load.span(end)) for load in loads)
-    if acts or (scenario.sensor is not None and scenario.sensor.runout is not None):
+    if acts or scenario.sensors.runout is not None:
         yield "the disturbances and the runout", "", scenario.undisturbed()
     r, r_dot, *_ = (np.asarray(x) for x in reference_at(scenario.reference, jnp.zeros(())))
     initial = scenario.initial

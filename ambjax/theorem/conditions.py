@@ -15,19 +15,20 @@ import numpy as np
 from jax import Array
 
 from ambjax.control.cascade import DEFAULT_LAWS, Cascade
-from ambjax.control.laws import PositionLaw
 from ambjax.control.schedule import extremes, schedules
+from ambjax.control.stages import PositionLaw
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Lowest, Named, Peak
 from ambjax.simulation.rollout import check_inputs, prepare, roll
 from ambjax.simulation.trajectory import STALLED, STATUSES
+from ambjax.simulation.triple import takes_case
 from ambjax.theorem.causes import Cause
 from ambjax.theorem.proof import Monitored
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference, Signal, reference_at
+from ambjax.world.waveforms import Reference, Signal, reference_at
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,6 +130,7 @@ def _monitors(settle: float) -> Named:
     return Named(peaks | {name: Lowest(name) for name in ("distance", "V_margin")})
 
 
+@takes_case
 def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float = 0.0) -> Report:
     """Simulate the loop once in continuous time and evaluate the conditions of Theorem 1 along the run.
 
@@ -137,14 +139,14 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float = 0.
     does.
     """
     check_inputs(cascade, scenario, clock)
-    if cascade.processor is not None:
+    if cascade.sampled:
         cascade, clock = cascade.in_continuous_time(), dataclasses.replace(clock, method=None)
         scenario = scenario.in_continuous_time()
     loop: Any
     loop, clock = prepare(cascade, scenario, clock)
     method = str(clock.method)
     system, clock, fold = canonical((Monitored(loop), clock, _monitors(settle)))
-    trajectory, extremes = roll(system, clock, fold, every=0)
+    trajectory, extremes = roll(system, clock, fold, record_every=0)
     worst = {name: (float(value), float(at)) for name, (value, at) in extremes.items()}
     on_reference = delta_1_on_reference(cascade, scenario, clock)
     conditions = _conditions(cascade, worst, on_reference)
@@ -153,6 +155,7 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float = 0.
     return Report(conditions, _proof(worst), lost_at, STATUSES[code], method, code == STALLED, largest)
 
 
+@takes_case
 def delta_1_on_reference(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[float, float]:
     """Return the largest |v_star' - (dv/dz) r_dot| on the ideal motion z = r (A^2/m^2/s), and its time (s).
 

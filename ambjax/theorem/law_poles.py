@@ -21,13 +21,13 @@ from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.control.base import Law, set_valued_signs
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState
-from ambjax.control.laws import CurrentDemand, CurrentInputs, ForceDemand, step_law
 from ambjax.control.sampling import Sampling
 from ambjax.control.schedule import extremes
+from ambjax.control.stages import CurrentDemand, CurrentInputs, ForceDemand, step_law
 from ambjax.simulation.clock import Clock
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 # A pole closer to 1 than this number is at rest, as that of an integral with a negligible gain.
 ROUNDING = 1e-9
@@ -109,8 +109,7 @@ def _reached(A: np.ndarray, signals: int) -> np.ndarray:
 
 def sampling_of(cascade: Cascade, clock: Clock) -> Sampling:
     """Return the sampling of the laws of a cascade with a processor."""
-    processor: Any = cascade.on_processor().processor
-    return processor.sampling(clock.sample_period)
+    return cascade.on_processor().timing.sampling(clock.sample_period)
 
 
 def _advance(law: Law, model: Plant, sampling: Sampling) -> Callable[..., Any]:

@@ -20,10 +20,11 @@ from ambjax.control.sampling import band, disturbance
 from ambjax.control.schedule import schedules
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.rollout import Outcome, System, prepare, roll
+from ambjax.simulation.rollout import Result, System, prepare, roll
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
+from ambjax.simulation.triple import takes_case
 from ambjax.theorem.causes import Cause, find_cause
 from ambjax.theorem.law_poles import LawPoles, law_poles, sampling_of
 from ambjax.theorem.law_signals import LawSignalsRecorder
@@ -138,17 +139,18 @@ class Delays(NamedTuple):
         return None if self.held is None or self.lost is None else self.lost - self.held
 
 
-def rolled(system: System, clock: Clock) -> Outcome:
+def rolled(system: System, clock: Clock) -> Result:
     """Roll out a system and record every sample."""
-    return roll(*canonical((system, clock)), None, every=1)
+    return roll(*canonical((system, clock)), None, record_every=1)
 
 
+@takes_case
 def check_sampled(
     cascade: Cascade,
     scenario: Scenario,
     clock: Clock,
     settle: float,
-    run: Callable[[System, Clock], Outcome] = rolled,
+    run: Callable[[System, Clock], Result] = rolled,
 ) -> SampledReport:
     """Return the report on a cascade with a processor. It is computed from a run without sensor noise and, if the case
     has noise, from a run with it.
@@ -184,7 +186,7 @@ def with_causes(
     scenario: Scenario,
     clock: Clock,
     settle: float,
-    run: Callable[[System, Clock], Outcome] = rolled,
+    run: Callable[[System, Clock], Result] = rolled,
     tell: Callable[[str], object] = lambda _: None,
 ) -> SampledReport:
     """Return the report with the causes of a lost rotor and of an alternating voltage (`causes.find_cause`).
@@ -213,7 +215,7 @@ def with_causes(
     return report
 
 
-def _simulated(loop: System, clock: Clock, run: Callable[[System, Clock], Outcome]) -> Trajectory:
+def _simulated(loop: System, clock: Clock, run: Callable[[System, Clock], Result]) -> Trajectory:
     """Simulate a loop on a processor and record the rows of `LawSignalsRecorder`."""
     assert isinstance(loop, Sampled)
     return run(LawSignalsRecorder(loop), clock).trajectory
@@ -244,8 +246,8 @@ def alternation(u: np.ndarray) -> float:
 
 def _without_noise(scenario: Scenario) -> Scenario:
     """Return the scenario without sensor noise; the same object if it has none. Faults and random signals remain."""
-    quiet = None if scenario.sensor is None else scenario.sensor.louder(0.0)
-    return scenario if quiet in (None, scenario.sensor) else dataclasses.replace(scenario, sensor=quiet)
+    quiet = scenario.louder(0.0)
+    return scenario if quiet.sensor == scenario.sensor else quiet
 
 
 def _bands(cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, rows: Any, noise: bool) -> list[Band]:

@@ -7,7 +7,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record
-from ambjax.world.signals import hull
+from ambjax.world.waveforms import hull
 
 
 def _share(t: Scalar, start: Scalar, duration: Scalar) -> Array:

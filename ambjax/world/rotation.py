@@ -9,7 +9,7 @@ from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, part, record
 from ambjax.numerics.smooth import TWO_PI, sine
-from ambjax.world.signals import Sum, hull
+from ambjax.world.waveforms import Sum, hull
 
 # Hz per rpm; kg m per g mm; m per mm.
 PER_MINUTE, GRAM_MM, MM = 1 / 60, 1e-6, 1e-3

@@ -11,7 +11,7 @@ from ambjax.numerics.records import Scalar, leaf, part, record
 from ambjax.numerics.smooth import TWO_PI, sine
 from ambjax.world.rotation import GRAM_MM, PER_MINUTE
 from ambjax.world.scenario import SIGNAL_STREAM, SLOTS
-from ambjax.world.signals import Signal, edges_of, realised
+from ambjax.world.waveforms import Signal, edges_of, realised
 
 
 def _matrix(shape: str, unit: str, doc: str) -> Any:

@@ -15,9 +15,9 @@ from ambjax.world.coil_limits import CoilVoltages
 from ambjax.world.plant import Plant
 from ambjax.world.recorded import Knots
 from ambjax.world.rotation import Rotation, turned
-from ambjax.world.sensor import Measurement, Sensor
-from ambjax.world.signals import Constant, Signal, edges_of, is_random, knots_of, realised
+from ambjax.world.sensor import IdealSensor, Measurement, Sensor
 from ambjax.world.touchdown import Stop
+from ambjax.world.waveforms import Constant, Signal, edges_of, is_random, knots_of, realised
 
 # Numbers that are folded into a member's key, for the random streams of the design and of the signals. The sensors use
 # other streams of this key (`numerics.gaussian.STREAMS`, `faults`), with the sample number as counter.
@@ -28,6 +28,9 @@ SLOTS = ("reference", "q_z", "q_v", "q_i", "q_f", "base")
 # |z| at which a rotor with an elastic stop is lost, as a share of s_0. The lower bound of the gaps (GAP_FLOOR) acts
 # only at a larger |z|.
 POLE = 0.99
+
+# An amplifier without any of its fields applies the command at once, and without a limit of its own.
+_IDEAL_SENSOR, _IDEAL_AMPLIFIER = IdealSensor(), Amplifier()
 
 
 @record
@@ -97,14 +100,24 @@ class Scenario:
         return self.touchdown if self.stop is None else POLE * self.plant.s_0
 
     @property
+    def sensors(self) -> Sensor:
+        """The field `sensor`, or ideal sensors."""
+        return _IDEAL_SENSOR if self.sensor is None else self.sensor
+
+    @property
+    def actuator(self) -> Amplifier | CurrentAmplifier:
+        """The field `amplifier`, or an ideal amplifier."""
+        return _IDEAL_AMPLIFIER if self.amplifier is None else self.amplifier
+
+    @property
     def drive(self) -> str:
         """What the controller commands: "voltage" or "current"."""
-        return "voltage" if self.amplifier is None else self.amplifier.mode
+        return self.actuator.mode
 
     @property
     def command_limit(self) -> Scalar:
         """Limit of the command: of the voltage (V) or of the current (A)."""
-        return self.u_max if self.amplifier is None else self.amplifier.command_limit(self.u_max)
+        return self.actuator.command_limit(self.u_max)
 
     def coil_voltage(self, command: Array, state: Any, q_i: Scalar = 0.0) -> Array:
         """Return the voltage at the coils, V.
@@ -113,41 +126,35 @@ class Scenario:
         `q_i`: disturbance of the current's rate, A/s.
         """
         plant = self.plant
-        if self.amplifier is None:
-            return command
 
         def response() -> CoilResponse:
             still, driven = (plant.measurement(plant.rates(state, volt, 0.0, q_i)).i for volt in (0.0, 1.0))
             return CoilResponse(still, driven - still)  # i' is linear in u
 
-        return self.amplifier.at_coil(command, plant.measurement(state).i, self.u_max, response)
+        return self.actuator.at_coil(command, plant.measurement(state).i, self.u_max, response)
 
     def applied(self, u: Array, state: Any, q_i: Scalar = 0.0) -> Array | CoilVoltages:
         """Return the result of `coil_voltage` or, if each coil has limits, the limited voltages of both coils."""
-        u = self.coil_voltage(u, state, q_i)
-        coil = None if self.amplifier is None else self.amplifier.coil
+        u, coil = self.coil_voltage(u, state, q_i), self.actuator.coil
         return u if coil is None else coil.applied(self.plant, state, u, q_i)
 
     @property
     def voltage_limit(self) -> Scalar:
         """The |u| (V) at which the supply or the voltage of a coil is at its limit."""
-        if self.amplifier is None or self.amplifier.coil is None:
-            return self.u_max
-        return jnp.minimum(self.u_max, self.amplifier.coil.reserve(self.plant.R * self.plant.i_0))
+        coil = self.actuator.coil
+        return self.u_max if coil is None else jnp.minimum(self.u_max, coil.reserve(self.plant.R * self.plant.i_0))
 
     @property
     @jax.jit  # compiles one program instead of one for each operation
     def largest_force(self) -> Scalar:
         """The magnetic force (N) at z = 0 for i = i_0, or for the limit of |i| if it is below i_0."""
-        return self.plant.largest_force(self.amplifier and self.amplifier.current_limit(self.plant.i_0))
+        return self.plant.largest_force(self.actuator.current_limit(self.plant.i_0))
 
     @property
     def current_slope(self) -> Scalar:
         """The fastest rate of the current, 1/s: R/L of a coil, or that of the amplifier's current loop if greater."""
         coils = self.plant.coil_slope(self.limit)
-        if self.amplifier is None or self.drive == "voltage":
-            return coils
-        return jnp.maximum(jnp.asarray(coils), self.amplifier.slope())
+        return coils if self.drive == "voltage" else jnp.maximum(jnp.asarray(coils), self.actuator.slope())
 
     def pushed(self, q_z: Array, motion: Measurement) -> Array:
         """Return the disturbance q_z (m/s^2) plus the acceleration by the stop, for the true motion of the rotor."""
@@ -156,20 +163,18 @@ class Scenario:
     @property
     def random(self) -> bool:
         """Whether the scenario has sensor noise, random sensor faults or a random signal. A spread does not count."""
-        sensor = self.sensor
-        noisy = sensor is not None and any(map(np.any, sensor.noises))
-        if sensor is not None:
-            noisy = noisy or any(np.any(x.rate) for x in (sensor.outliers, sensor.dropouts) if x is not None)
-        return noisy or any(is_random(getattr(self, slot)) for slot in SLOTS)
+        sensor = self.sensors
+        rates = [x.rate for x in (sensor.outliers, sensor.dropouts) if x is not None]
+        return any(map(np.any, (*sensor.noises, *rates))) or any(is_random(getattr(self, slot)) for slot in SLOTS)
 
     @property
     def on_processor(self) -> str | None:
         """The dotted path of a part that requires a processor; None if there is none."""
-        if self.amplifier is not None and self.drive == "voltage":
+        if isinstance(self.amplifier, Amplifier):
             given = (field.name for field in dataclasses.fields(self.amplifier))
             return f"actuator.{next((name for name in given if getattr(self.amplifier, name) is not None), '')}"
         names = ("bits", "bandwidth", "outliers", "dropouts")
-        named = [name for name in names if getattr(self.sensor, name, None) is not None]
+        named = [name for name in names if getattr(self.sensors, name) is not None]
         return f"sensor.{named[0]}" if named else None
 
     def in_continuous_time(self) -> "Scenario":
@@ -178,8 +183,16 @@ class Scenario:
         They are the low-pass, the converter and the faults of the sensor, and an amplifier that applies a voltage.
         """
         none = {"bits": None, "bandwidth": None, "outliers": None, "dropouts": None}
-        sensor = self.sensor and dataclasses.replace(self.sensor, **none)
-        return dataclasses.replace(self, sensor=sensor, amplifier=self.amplifier if self.drive == "current" else None)
+        amplifier = self.amplifier if self.drive == "current" else None
+        return dataclasses.replace(self.with_sensor(**none), amplifier=amplifier)
+
+    def with_sensor(self, **fields: object) -> "Scenario":
+        """Return the scenario with other fields of its sensor. Ideal sensors do not change."""
+        return dataclasses.replace(self, sensor=self.sensor and dataclasses.replace(self.sensor, **fields))
+
+    def louder(self, factor: Scalar) -> "Scenario":
+        """Return the scenario with `factor` times the noise of its sensor."""
+        return dataclasses.replace(self, sensor=self.sensor and self.sensor.louder(factor))
 
     def acceleration(self, t: Scalar) -> Array:
         """Return the total disturbance of Eq. (1) at time t: q_z + a q_v + q_f / m - base, m/s^2."""
@@ -211,8 +224,8 @@ class Scenario:
     def undisturbed(self) -> "Scenario":
         """Return the scenario without disturbances and runout."""
         none = Constant()
-        sensor = self.sensor and dataclasses.replace(self.sensor, runout=None)
-        return dataclasses.replace(self, q_z=none, q_v=none, q_i=none, q_f=None, base=None, sensor=sensor)
+        calm = dataclasses.replace(self, q_z=none, q_v=none, q_i=none, q_f=None, base=None)
+        return calm.with_sensor(runout=None)
 
     def key(self) -> Array:
         """The member's random key: fold_in(key(seed), member)."""

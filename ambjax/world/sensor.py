@@ -2,8 +2,10 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -102,7 +104,7 @@ class Sensor:
     )
 
     @property
-    def noises(self) -> tuple[Scalar, Scalar, Scalar]:
+    def noises(self) -> tuple[Scalar, ...]:
         """The standard deviations of the noise of z (m), z_dot (m/s) and i (A)."""
         return self.std, self.std_z_dot, self.std_i
 
@@ -113,8 +115,11 @@ class Sensor:
 
     def noise(self, key: tuple[Scalar, Scalar], sample: Scalar) -> Errors:
         """Return the errors at sample number `sample`. `key`: random key of the member (`Scenario.words`)."""
-        w = normals(key, sample)
-        return Errors(self.std * w[0], self.std_z_dot * w[1], self.std_i * w[2])
+        return self.scaled(normals(key, sample))
+
+    def scaled(self, normals: Sequence[Array]) -> Errors:
+        """Return the errors for three normal random numbers."""
+        return Errors(*(std * x for std, x in zip(self.noises, normals, strict=True)))
 
     def fault_onsets(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> FaultOnsets:
         """Return the faults that begin at sample number `sample`. `key`: as in `noise`. `period`: sample period, s."""
@@ -138,6 +143,14 @@ class Sensor:
         """Return the sensor with `factor` times the noise."""
         stds = {"std": self.std, "std_z_dot": self.std_z_dot, "std_i": self.std_i}
         return dataclasses.replace(self, **{name: std * factor for name, std in stds.items()})
+
+    def over_surface(self, motion: Measurement, t: Scalar) -> Measurement:
+        """Return the motion of the surface that the position sensor reads at t (s): the rotor's, plus the runout."""
+        if self.runout is None:
+            return motion
+        t = jnp.asarray(t, jnp.result_type(float))
+        runout, rate = jax.jvp(self.runout, (t,), (jnp.ones_like(t),))
+        return motion._replace(z=motion.z + runout, z_dot=motion.z_dot + rate)
 
     def reading(self, motion: Measurement, errors: Errors | FaultyErrors) -> Measurement:
         """Return the readings of a motion with these errors. `motion.z`: after the low-pass.
@@ -167,6 +180,23 @@ class Sensor:
         c_2, c_3 = 3 * rise - 2 * c_1 - end, c_1 + end - 2 * rise
         m_0, m_1, m_2, m_3 = _moments(2 * jnp.pi * self.bandwidth * jnp.asarray(h))
         return y + (m_0 * (before.z - y) + m_1 * c_1 + m_2 * c_2 + m_3 * c_3)
+
+
+class IdealSensor(Sensor):
+    """Sensors without error. They add no operation to a program."""
+
+    @property
+    def noises(self) -> tuple[Scalar, ...]:
+        return ()
+
+    def noise(self, key: tuple[Scalar, Scalar], sample: Scalar) -> Errors:
+        return self.scaled(())
+
+    def scaled(self, normals: Sequence[Array]) -> Errors:
+        return Errors(*[jnp.zeros(())] * 3)
+
+    def reading(self, motion: Measurement, errors: Errors | FaultyErrors) -> Measurement:
+        return motion
 
 
 def _moments(b: Array) -> tuple[Array, Array, Array, Array]:

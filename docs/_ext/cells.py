@@ -1,10 +1,12 @@
-"""Cells of shell commands: `%%shell` runs them, and the page shows the commands."""
+"""Cells of shell commands: `%%shell` runs them, and the page shows the commands. `table` prints rows for the pages."""
 
 import subprocess
 from typing import Any
 
 from docutils import nodes
 from sphinx.application import Sphinx
+
+from ambjax.results.outputs import table as table
 
 MAGIC = "%%shell"
 

@@ -4,16 +4,23 @@ import inspect
 from typing import Any
 
 import ambjax
-from ambjax import ensemble, extend, linear, paper
+from ambjax import actuators, ensemble, extend, laws, linear, paper, plants, sensors, signals, solvers, theorem
 from reference.layers import ROOT, layers
 from reference.markdown import code, escaped, first_paragraph, table
 
 PUBLIC = {
     "ambjax": (ambjax, "Cases, simulation, tuning and export."),
+    "ambjax.laws": (laws, "Laws by stage, and schedules of gains."),
+    "ambjax.signals": (signals, "References, loads and disturbances."),
+    "ambjax.plants": (plants, "Bearings, coils, iron and stops."),
+    "ambjax.sensors": (sensors, "Sensors, runout and faults."),
+    "ambjax.actuators": (actuators, "Amplifiers and limits of coils."),
+    "ambjax.solvers": (solvers, "Integration methods."),
     "ambjax.ensemble": (ensemble, "Ensembles."),
     "ambjax.linear": (linear, "Linear analysis of the loop."),
+    "ambjax.theorem": (theorem, "Theorem 1 along a run."),
     "ambjax.paper": (paper, "The simulation study of the paper."),
-    "ambjax.extend": (extend, "Names for custom laws and plants."),
+    "ambjax.extend": (extend, "Names for custom laws, plants and metrics."),
 }
 # Names without a docstring of their own.
 CONSTANTS = {

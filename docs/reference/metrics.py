@@ -4,7 +4,7 @@ from typing import Any
 
 from ambjax.simulation import orders
 from ambjax.simulation.folds import Count, Driven, Peak, Reaching, Rms, Variation
-from ambjax.simulation.metrics import UNITS, Standard
+from ambjax.simulation.metrics import UNITS, Metrics
 from ambjax.simulation.trajectory import NOT_SAVED, Row
 from reference.fields import attribute_docs
 from reference.markdown import code, escaped, table
@@ -71,7 +71,7 @@ def pages() -> dict[str, str]:
 
 def rows() -> list[tuple[str, str, str]]:
     """Return a row for each metric: name, unit and meaning."""
-    folds = Standard()._folds().folds
+    folds = Metrics()._folds().folds
     meanings = {name: _meaning(name, fold) for name, fold in folds.items()} | OTHERS
     return [(code(name), escaped(UNITS.get(name, "")), escaped(meaning)) for name, meaning in meanings.items()]
 

@@ -1,8 +1,7 @@
 """Test of the limit on the delay margin: members are simulated with the limit as an additional delay."""
 
-import dataclasses
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,11 +9,10 @@ from ambjax.control.processor import MOST_DELAY
 from ambjax.ensemble import run_ensemble
 from ambjax.linear import stability_of
 from tuning.problem.limits import PREFIX, Limit
+from tuning.problem.quantities import LOOPS
 from tuning.problem.tuning_problem import TuningProblem
 
 DELAY_MARGIN = "delay_margin_s"
-# Number of members tested: those with the smallest linear margins.
-TESTED = 16
 
 
 class DelayTest(NamedTuple):
@@ -32,17 +30,17 @@ class DelayTest(NamedTuple):
 
 def not_simulated(problem: TuningProblem, limit: Limit) -> str:
     """Return why the additional delay of the limit is not simulated; '' if it is."""
-    processor = problem.case.cascade.processor
-    if processor is None:
+    cascade, period = problem.case.cascade, float(problem.case.clock.sample_period)
+    if not cascade.sampled:
         return "the controller runs in continuous time"
-    total = float(np.max(np.asarray(processor.delay))) + limit.threshold / float(problem.case.clock.sample_period)
+    total = float(np.max(np.asarray(cascade.timing.delay))) + limit.threshold / period
     if total > MOST_DELAY:
         return f"the total delay of {total:.3g} samples exceeds the {MOST_DELAY:g} samples that can be simulated"
     return ""
 
 
 def delay_test(problem: TuningProblem, x: np.ndarray, seed: int, columns: Mapping[str, np.ndarray]) -> DelayTest | None:
-    """Simulate the held members of least linear delay margin, with the limit on this margin as an additional delay.
+    """Simulate the LOOPS held members of least delay margin, with the limit on it as an additional delay.
 
     The prediction of the controller assumes the delay of the case. `x`: coordinates of the m gains [m]. `columns` [N]:
     result of `judge` for the ensemble with this `seed`. Returns None without such a limit, if `not_simulated` gives a
@@ -53,15 +51,14 @@ def delay_test(problem: TuningProblem, x: np.ndarray, seed: int, columns: Mappin
     if limit is None or not_simulated(problem, limit) or not alive.size:
         return None
     order = np.argsort(columns[f"loss.{PREFIX}{DELAY_MARGIN}"][alive], kind="stable")
-    members = problem.objective.chosen(seed, alive[order[:TESTED]], len(columns["lost_at_s"]))
+    members = problem.objective.chosen(seed, alive[order[:LOOPS]], len(columns["lost_at_s"]))
     cascade, scenario = problem.objective.fixed(x, members)
-    processor: Any = cascade.processor
+    processor = cascade.timing
     delay = np.asarray(processor.delay) + limit.threshold / float(problem.case.clock.sample_period)
     if np.max(delay) > MOST_DELAY:
         return None
-    late = dataclasses.replace(processor, delay=delay, assumed=processor.ahead, predict=processor.predicts)
-    cascade = dataclasses.replace(cascade, processor=late)
-    ended = run_ensemble(cascade, scenario, problem.case.clock, fold=None, every=0)
+    cascade = cascade.with_processor(delay=delay, assumed=processor.ahead, predict=processor.predicts)
+    ended = run_ensemble(cascade, scenario, problem.case.clock, fold=None, record_every=0)
     lost = np.isfinite(ended.trajectory.lost_at)
     unstable = ~lost & ~stability_of(cascade, scenario, problem.case.clock).stable
     return DelayTest(len(members.member), int(lost.sum()), int(unstable.sum()))

@@ -58,7 +58,7 @@ def _default_gains(case: Case) -> list[str]:
     Gains that switch a term off, 0 or p = inf, are left out.
     """
     cascade = case.cascade
-    return [path for path in tunable(cascade, steepness=cascade.processor is not None) if not _off(cascade, path)]
+    return [path for path in tunable(cascade, steepness=cascade.sampled) if not _off(cascade, path)]
 
 
 def off(cascade: Cascade) -> list[str]:

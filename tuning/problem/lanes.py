@@ -21,7 +21,7 @@ from ambjax.ensemble import map_members
 from ambjax.extend import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Named
-from ambjax.simulation.metrics import standard_for
+from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import rollout
 from ambjax.world.scenario import Scenario
 from tuning.problem.limits import PREFIX
@@ -35,7 +35,7 @@ LANES = 64
 # Lanes of one kernel call with derivatives. Most iterations need 16 to 64 lanes. With calls of 32 lanes, two cores can
 # share 64. In sequence, two such calls take 14 % longer than one of 64 lanes. A call of 16 lanes takes 0.63 of the time
 # of one of 32; a second kernel for few lanes would take longer to compile than it saves in a search.
-GRADIENT_LANES = 32
+GRADIENT_LANES = LANES // 2
 
 
 class Lane(NamedTuple):
@@ -66,7 +66,7 @@ class LaneFold:
 def measured(world: tuple[Cascade, Scenario, Clock, Any]) -> Any:
     """Return the result of a fold over the rollout of one member. `world`: cascade, scenario, clock and fold."""
     cascade, scenario, clock, fold = world
-    return rollout(cascade, scenario, clock, fold=fold, every=0).measured
+    return rollout(cascade, scenario, clock, fold=fold, record_every=0).metrics
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,7 +125,7 @@ class Engine:
         self.objective, self.mode, self.settle, self.threads, self.lanes = objective, mode, settle, threads, lanes
         self.rollouts = 0
         self._world: Any = canonical((objective.cascade, objective.scenario, objective.clock, objective.loss))
-        self._standard = canonical(Named({"loss": objective.loss, "metrics": standard_for(settle, objective.scenario)}))
+        self._standard = canonical(Named({"loss": objective.loss, "metrics": Metrics.of(settle, objective.scenario)}))
 
     def terms(self, x: np.ndarray, members: Members) -> dict[str, np.ndarray]:
         """Return the terms of the loss by name, each [S, N], at coordinates x [S, m] for members [N].

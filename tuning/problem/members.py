@@ -18,8 +18,8 @@ from tuning.problem.loss import Loss
 from tuning.problem.quantities import LOOPS
 from tuning.problem.space import Space
 
-# Smallest number of ordinary members, and of stressed members, in a part.
-LEAST_PART = 4
+# The screen simulates one member in PART, but at least PART ordinary and PART stressed members.
+PART = 4
 
 
 class LoopRange(NamedTuple):
@@ -64,18 +64,16 @@ class Members(NamedTuple):
     def joined(self, others: "Members", stressed: bool = True) -> "Members":
         """Return these members with `others`, which become stressed or, in front of all members, ordinary.
 
-        In front, they are in every part, and among the members whose loops the search evaluates.
+        In front, they are in the screen, and among the members whose loops the search evaluates.
         """
         more, n = others._replace(stressed=np.full(len(others.stressed), stressed)), self.ordinary * stressed
         return jax.tree.map(lambda a, b: np.concatenate([a[:n], b, a[n:]]), self, more)
 
-    def part(self, share: int, held: int | None = None) -> "Members":
-        """Return the first 1/`share` of the ordinary members, and the first 1/`held` of the stressed ones.
-
-        `held`: default `share`. Of each kind, at least LEAST_PART members are kept, or all if there are fewer.
-        """
-        kinds = (self.ordinary, share), (len(self.stressed) - self.ordinary, held or share)
-        few, some = (max(count // each, min(LEAST_PART, count)) for count, each in kinds)
+    @property
+    def part(self) -> "Members":
+        """The first 1/PART of the ordinary and of the stressed members, at least PART of each kind."""
+        kinds = self.ordinary, len(self.stressed) - self.ordinary
+        few, some = (max(count // PART, min(PART, count)) for count in kinds)
         index = np.concatenate([np.arange(few), np.arange(self.ordinary, self.ordinary + some)])
         return jax.tree.map(lambda a: a[index], self)
 
@@ -143,11 +141,10 @@ class Objective:
         cascade, scenario = self.world(members)
         cascade = self.space.decode(x + members.shift, cascade)
         if in_parts:
-            return rolled_in_parts(*prepare(cascade, scenario, self.clock), fold).measured
-        return rollout(cascade, scenario, self.clock, fold=fold, every=0).measured
+            return rolled_in_parts(*prepare(cascade, scenario, self.clock), fold).metrics
+        return rollout(cascade, scenario, self.clock, fold=fold, record_every=0).metrics
 
 
 def _with_noise(scenario: Scenario, noise_factor: Any) -> Scenario:
     """Return the scenario with `noise_factor` times the sensor noise."""
-    sensor = scenario.sensor
-    return scenario if sensor is None else dataclasses.replace(scenario, sensor=sensor.louder(noise_factor))
+    return scenario.louder(noise_factor)

@@ -41,7 +41,7 @@ def bounds_of(case: Case) -> dict[str, Ceiling]:
 
 def _voltage(scenario: Scenario) -> tuple[float, str]:
     """Return the largest |u| (V) that the drive can apply, inf if it has no limit, and the key that sets it."""
-    supply, coil = float(np.max(scenario.u_max)), scenario.amplifier and scenario.amplifier.coil
+    supply, coil = float(np.max(scenario.u_max)), scenario.actuator.coil
     if coil is None:
         return supply, "actuator.u_max"
     each = math.inf if coil.u_max is None else float(np.max(coil.u_max))

@@ -13,10 +13,8 @@ import numpy as np
 
 from ambjax.host.sealed import DamagedError, difference, flat, provenance, seal, unseal, write_whole
 from tuning.solve.descent import Descent, Starts
-from tuning.solve.evolution import CmaState, idle_states
+from tuning.solve.evolution import CmaState, idle_state
 
-# Scalar fields of SearchState in a checkpoint.
-COUNTS = ("iteration", "phase", "since", "seconds")
 NAME = re.compile(r"round-[0-9]+\.npz")
 # Subfolder of the output directory, and the file in it that marks a search before its first checkpoint.
 FOLDER, MARK = "checkpoints", "search.json"
@@ -27,40 +25,32 @@ LEAF, PAST, ACTIVE = "leaf_", "history_", "active"
 class SearchState:
     """State of a search.
 
-    `active` [S]: whether each start continues. `history`: one row per iteration. `iteration`: number of iterations so
-    far; `since`: their number before the current phase. `seconds`: duration so far, s; `earlier`: the part of it before
-    the search was resumed.
+    `active` [S]: whether each start continues. `history`: one row per iteration, of the best point so far. `seconds`:
+    duration so far, s; `earlier`: the part of it before the search was resumed.
     """
 
     starts: Starts
     active: np.ndarray
     history: dict[str, list[Any]] = dataclasses.field(default_factory=dict)
-    iteration: int = 0
-    phase: int = 0
-    since: int = 0
     seconds: float = 0.0
     earlier: float = 0.0
     interrupted: bool = False
-    cma_states: CmaState = None  # pyright: ignore[reportAssignmentType]
-    """CMA-ES distributions of the starts, leaves [S, ...]"""
+    cma: CmaState = None  # pyright: ignore[reportAssignmentType]
+    """distribution of CMA-ES, which continues from the best point of the descents"""
 
     def __post_init__(self) -> None:
-        if self.cma_states is None:
-            self.cma_states = idle_states(*self.starts.best.shape)
+        if self.cma is None:
+            self.cma = idle_state(self.starts.best.shape[1])
 
     @property
-    def evolving(self) -> np.ndarray:
-        """Whether each start uses CMA-ES [S]."""
-        return self.cma_states.drawn >= 0
+    def iteration(self) -> int:
+        """Number of iterations so far."""
+        return len(self.history.get("value", ()))
 
-    def cma_state(self, at: int | np.integer) -> CmaState:
-        """Return the distribution of one start."""
-        return CmaState(*(leaf[at] for leaf in self.cma_states))
-
-    def set_cma_state(self, at: int | np.integer, state: CmaState) -> None:
-        """Set the distribution of one start."""
-        for whole, part in zip(self.cma_states, state, strict=True):
-            whole[at] = part
+    @property
+    def evolving(self) -> bool:
+        """Whether the search uses CMA-ES."""
+        return bool(self.cma.drawn >= 0)
 
     @property
     def ended(self) -> bool:
@@ -92,12 +82,10 @@ class CheckpointFile:
             return
         _make(self.path.parent)
         leaves = {
-            f"{LEAF}{n}": np.asarray(leaf)
-            for n, leaf in enumerate(jax.tree.leaves((progress.starts, progress.cma_states)))
+            f"{LEAF}{n}": np.asarray(leaf) for n, leaf in enumerate(jax.tree.leaves((progress.starts, progress.cma)))
         }
         past = {f"{PAST}{name}": np.asarray(rows) for name, rows in progress.history.items()}
-        counts = {name: getattr(progress, name) for name in COUNTS}
-        facts = {"fingerprint": self.fingerprint, "counts": counts}
+        facts = {"fingerprint": self.fingerprint, "seconds": progress.seconds}
         seal(self.path, {**leaves, **past, ACTIVE: progress.active}, facts)
 
     def load(self, descent: Descent, starts: int, m: int) -> SearchState | None:
@@ -116,12 +104,12 @@ class CheckpointFile:
                     f"--resume: {self.path} belongs to another search: {differs}. "
                     "Use another --out, or leave out --resume to start a new search."
                 )
-            tree = jax.tree.structure((jax.eval_shape(descent.begin, jnp.zeros((starts, m))), idle_states(starts, m)))
+            tree = jax.tree.structure((jax.eval_shape(descent.begin, jnp.zeros((starts, m))), idle_state(m)))
             state, drawn = jax.tree.unflatten(tree, [arrays[f"{LEAF}{n}"] for n in range(tree.num_leaves)])
-            counts = {name: facts["counts"][name] for name in COUNTS}
             past = {name.removeprefix(PAST): list(rows) for name, rows in arrays.items() if name.startswith(PAST)}
             state, active = jax.tree.map(jnp.asarray, state), arrays[ACTIVE]
-            return SearchState(state, active, past, **counts, earlier=counts["seconds"], cma_states=drawn)
+            spent = float(facts["seconds"])
+            return SearchState(state, active, past, spent, spent, cma=drawn)
         except DamagedError as error:
             why = str(error)
         except KeyError:

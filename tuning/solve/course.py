@@ -4,21 +4,20 @@ import dataclasses
 import math
 import pathlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from tuning.events import Event, Listener
+from tuning.events import Event, Listener, Reached, Standing
 from tuning.judge.evaluate import StepError
 from tuning.problem.loops import check_loops
+from tuning.problem.loss import TERMS
 from tuning.problem.members import Members
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.checkpoint import CheckpointFile, SearchState, checkpoint
-from tuning.solve.iteration import standing_of
 from tuning.solve.refine import best_of, search
-from tuning.solve.screen import around, initial_points
+from tuning.solve.screen import initial_points
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,10 +137,6 @@ class Course:
 
         return send
 
-    def around(self, x: np.ndarray) -> np.ndarray:
-        """Return x [m] and tune.screen quasi-random points around it, [K, m], for the next search."""
-        return around(x, self.problem.tune.budget.screen, self.seed + len(self.past))
-
     @property
     def interrupted(self) -> bool:
         """Whether the last search was interrupted by Ctrl-C."""
@@ -156,7 +151,7 @@ class Course:
     def all_lost(self) -> bool:
         """Whether every member is lost at the best point of the last search."""
         past = self.past[-1].history
-        return int(past["lost"][-1][int(np.argmin(past["value"][-1]))]) == past["members"][-1]
+        return int(past["lost"][-1]) == past["members"][-1]
 
     def answer(
         self, x: np.ndarray, error: StepError | None, lost: int, validation_error: float = math.inf
@@ -200,15 +195,23 @@ def _best(progress: SearchState) -> np.ndarray:
 
 
 def _joined(past: list[SearchState]) -> dict[str, np.ndarray]:
-    """Concatenate the histories of all searches by name.
+    """Concatenate the histories of all searches by name."""
+    return {name: np.array([row for one in past for row in one.history.get(name, ())]) for name in past[0].history}
 
-    If a search has fewer starts than another, only its first start is kept, and is repeated.
-    """
-    width = max(len(one.active) for one in past)
 
-    def wide(rows: npt.ArrayLike) -> np.ndarray:
-        rows = np.asarray(rows)
-        return rows if rows.ndim < 2 or rows.shape[1] == width else np.repeat(rows[:, :1], width, axis=1)
-
-    names = past[0].history
-    return {name: np.concatenate([wide(one.history[name]) for one in past if one.history]) for name in names}
+def standing_of(problem: TuningProblem, progress: SearchState, number: int, spent: Sequence[float]) -> Standing:
+    """Return the standing of a search. `spent`: durations of its iterations so far, s."""
+    last = {name: rows[-1] for name, rows in progress.history.items()}
+    loss, most = problem.objective.loss, problem.tune.budget.iterations
+    terms = dict(zip(TERMS, last["terms"], strict=True))
+    quantities = dict(zip(problem.goal.quantities, last["quantities"], strict=True))
+    volts = quantities.get("rms_u_V", float(np.asarray(loss.u_scale)) * math.sqrt(terms["effort"]))
+    values = [(one, one.ratio * float(quantities[one.name])) for one in problem.limits]
+    limits = tuple(Reached(one.name, value, one.threshold, one.holds(value)) for one, value in values)
+    members, starts = int(last["members"]), int(progress.active.sum())
+    # the first iteration compiles
+    left = (most - progress.iteration) * float(np.median(spent[1:])) if len(spent) > 1 else math.nan
+    return Standing(
+        number, progress.iteration, most, starts, float(np.asarray(loss.s_0)) * math.sqrt(terms["tracking"]), volts,
+        members - int(last["lost"]), members, limits, left, float(last["value"]), int(last["rollouts"]),
+    )  # fmt: skip

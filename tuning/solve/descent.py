@@ -62,12 +62,6 @@ class Descent:
         infinite = jnp.full(len(x), jnp.inf, x.dtype)
         return Starts(x, state, infinite, infinite)
 
-    @jax.jit
-    def restarted(self, x: Array, starts: Starts) -> Starts:
-        """Return the initial state at coordinates x [S, m] with the curvature of `starts`, for a similar goal."""
-        begun = self.begin(x)
-        return begun._replace(state=jax.vmap(lambda old, fresh: old.restarted(fresh))(starts.state, begun.state))
-
     @functools.partial(jax.jit, static_argnums=1)
     def step(self, ordinary: int, starts: Starts, outcomes: Array, slopes: Array, on: Array) -> Starts:
         """Return the starts after one step. `on` [S]: whether each start makes the step.

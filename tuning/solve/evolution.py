@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-# Standard deviation of the first population in each coordinate: a factor of e^0.3 of a gain.
-SIZE = 0.3
+from tuning.optimisers import FIRST_RADIUS
+
 # A search has converged if PATIENCE populations in a row do not lower `CmaState.level`, a logarithm, by STALL.
 STALL, PATIENCE = 0.01, 6
 
@@ -27,7 +27,7 @@ class CmaState(NamedTuple):
     drift: Any
     """evolution path of the mean, which adapts the covariance"""
     drawn: Any
-    """number of populations so far; -1: the start does not use CMA-ES"""
+    """number of populations so far; -1: the search does not use CMA-ES"""
     level: Any
     """lowest weighted mean of the better half of a population, updated only if it falls by STALL"""
     stale: Any
@@ -80,17 +80,16 @@ def population(m: int) -> int:
 
 
 def initial_state(mean: np.ndarray) -> CmaState:
-    """Return the initial distribution around a point [m]."""
+    """Return the initial distribution around a point [m]. Its step size is that of the first step of a descent."""
     m = len(mean)
     return CmaState(
-        mean, np.array(SIZE), np.eye(m), np.zeros(m), np.zeros(m), np.array(0), np.array(np.inf), np.array(0)
+        mean, np.array(FIRST_RADIUS), np.eye(m), np.zeros(m), np.zeros(m), np.array(0), np.array(np.inf), np.array(0)
     )
 
 
-def idle_states(starts: int, m: int) -> CmaState:
-    """Return the distributions of several starts in m dimensions, leaves [starts, ...], none of them in use."""
-    one = initial_state(np.zeros(m))._replace(drawn=np.array(-1))
-    return CmaState(*(np.repeat(np.asarray(leaf)[None], starts, axis=0) for leaf in one))
+def idle_state(m: int) -> CmaState:
+    """Return a distribution in m dimensions that is not in use."""
+    return initial_state(np.zeros(m))._replace(drawn=np.array(-1))
 
 
 def next_population(state: CmaState, seed: int) -> np.ndarray:

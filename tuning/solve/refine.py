@@ -1,9 +1,12 @@
-"""The search: a screen, then the simultaneous refinement of several starts. A search can be interrupted and resumed."""
+"""The search: a screen, a few steps from each of its best points, then descent or CMA-ES from the best one.
+
+A search can be interrupted and resumed.
+"""
 
 import math
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,43 +15,27 @@ from ambjax.host.interrupts import deferred, raise_if_interrupted
 from tuning.optimisers import BFGS
 from tuning.problem.goal import Goal
 from tuning.problem.lanes import Engine
+from tuning.problem.limits import PREFIX
+from tuning.problem.loss import TERMS
 from tuning.problem.members import Members
+from tuning.problem.quantities import KINDS
 from tuning.solve.checkpoint import CheckpointFile, SearchState
 from tuning.solve.descent import Descent
-from tuning.solve.evolution import idle_states, initial_state
-from tuning.solve.iteration import iterate
+from tuning.solve.evolution import initial_state, next_population, updated
 from tuning.solve.screen import screen
 
-# A start has converged if its next step, in coordinates, is shorter than this.
+# Number of iterations after which only the best start continues.
+RACE = 5
+# A search has converged if its next step, in coordinates, is shorter than this: 0.1 % of a gain.
 SHORTEST = 1e-3
-# Numbers of iterations of a phase after which only the better half of the starts continues.
-HALVINGS = (4, 10)
-# Number of points of the first phase that are then evaluated on all members.
-PATH_POINTS = 12
-
-
-class Phase(NamedTuple):
-    """A phase of the search.
-
-    It simulates 1/`part` of the ordinary members. It simulates all stressed members, because the goal jumps where one
-    of these is lost. A descent ends if the goal falls by less than `stall` over `patience` iterations. If the norm of
-    its gradient is then `gradient_limit` or more, the start continues with CMA-ES.
-    """
-
-    part: int
-    stall: float
-    patience: int
-    gradient_limit: float
-
-
-# A start with a gradient above STEEP uses CMA-ES at once. Such a gradient predicts that the goal, a logarithm, changes
-# by more than 1 within the shortest step.
+# A descent switches to CMA-ES at once if its gradient predicts a change of the goal by more than 1 within such a step.
 STEEP = 1 / SHORTEST
-# The first phase uses few members: their optimum is close to that of all members, at less than half of the cost. In
-# the last phase, `gradient_limit` distinguishes converged descents from those that stop early. In benchmarks/tasks, the
-# former end with gradients of norm 0.001 to 0.02, the latter with 0.36 to 1e127. The norm is the change of the goal, a
-# logarithm, per factor e of a gain.
-FEW, ALL = Phase(4, 0.02, 3, STEEP), Phase(1, 1e-3, 4, 0.1)
+# A descent ends if the goal, a logarithm, falls by less than STALL over PATIENCE iterations.
+STALL, PATIENCE = 1e-3, 4
+# At the end of a descent, the norm of the gradient distinguishes converged descents from those that stop early. In
+# benchmarks/tasks, the former have norms of 0.001 to 0.02, the latter of 0.36 to 1e127. The norm is the change of the
+# goal per factor e of a gain.
+CONVERGED = 0.1
 # Message at the first Ctrl-C.
 INTERRUPT_MESSAGE = "the search ends after this iteration; its best gains are then judged and written."
 
@@ -69,43 +56,32 @@ def search(
     until: float = math.inf,
     on_iteration: Callable[[SearchState, float], None] = lambda search, seconds: None,
 ) -> SearchState:
-    """Refine the best `keep` of these points, coordinates [K, m]. Ctrl-C ends the search early.
+    """Refine the best `keep` of these points, coordinates [K, m], which a screen selects. Ctrl-C ends the search early.
 
-    With at most `keep` points, all are refined on all members. With more, they are screened, and the best `keep` are
-    refined on a part of the members. At most PATH_POINTS points of this phase, and the first of `points`, are then
-    evaluated on all members, and the best of them is refined further. Each phase has at most `iterations`. A start
-    descends by the optimiser `name` with the learning rate `rate`. If its gradient does not lead to a minimum, it
-    continues with CMA-ES.
+    The starts descend by the optimiser `name` with the learning rate `rate`. After RACE iterations, only the best one
+    continues. If its gradient does not lead to a minimum, it continues with CMA-ES. The search ends after `iterations`.
 
     `seed`: seed of the populations of CMA-ES. `on_iteration`: called after each iteration with the search and the
     duration of the iteration in s. `until`: time of `time.perf_counter` after which the search ends at its next
     iteration.
     """
-    descent = Descent(goal, name, rate)
+    descent, began = Descent(goal, name, rate), time.perf_counter()
     checkpoint_file = checkpoint_file or CheckpointFile(None, {})
-    phases = [FEW, ALL] if len(points) > keep else [ALL]
-    given, began = points[0], time.perf_counter()
     progress = checkpoint_file.load(descent, min(keep, len(points)), points.shape[1]) if resume else None
     if progress is not None:
         engine.rollouts = int(progress.history["rollouts"][-1])
     else:
         if len(points) > keep:
-            points = screen(engine, members, points, keep, goal)[:keep]
-        starts = descent.begin(jnp.asarray(points))
-        progress = SearchState(starts, np.ones(len(points), bool))
+            points = screen(engine, members, points, goal)[:keep]
+        progress = SearchState(descent.begin(jnp.asarray(points)), np.ones(len(points), bool))
     try:
-        while True:
+        while progress.active.any() and progress.iteration < iterations:
             # Before the first iteration, the search has no result to judge, so Ctrl-C ends the process.
             with deferred(INTERRUPT_MESSAGE if progress.history else ""):
                 raise_if_interrupted()
                 before = progress.seconds
-                if not progress.active.any() or progress.iteration - progress.since >= iterations:
-                    if progress.phase + 1 == len(phases):
-                        break
-                    _begin_full_phase(engine, goal, members, progress, descent, given)
-                phase = phases[progress.phase]
-                iterate(engine, goal, members.part(phase.part, 1), progress, descent, seed=seed)
-                _switch(progress, phase)
+                iterate(engine, goal, members, progress, descent, seed)
+                _advance(progress)
                 progress.seconds = progress.earlier + time.perf_counter() - began
                 checkpoint_file.save(progress)
                 on_iteration(progress, progress.seconds - before)
@@ -116,80 +92,88 @@ def search(
     return progress
 
 
-def _switch(progress: SearchState, phase: Phase) -> None:
-    """Select the starts that continue, and those that switch to CMA-ES.
-
-    A start ends if its step is at most SHORTEST. A descent also ends if its goal stalls, and CMA-ES if it has
-    converged. The worse half ends after the iterations HALVINGS. A descent switches to CMA-ES at once if the norm of
-    its gradient is STEEP or more. A descent that would end switches if the norm is `gradient_limit` or more. There are
-    two causes of such a gradient: in a chaotic loop the derivatives grow with time and do not describe the goal; and a
-    descent stops early at a jump of the goal, beyond which members are lost.
-    """
-    starts, count = progress.starts, progress.iteration - progress.since
-    value, norm, active = np.asarray(starts.value), np.asarray(starts.gradient_norm), progress.active
-    evolving = progress.evolving
-    ended = np.asarray(starts.length) <= SHORTEST
-    converged = np.array([progress.cma_state(at).converged for at in range(len(active))])
-    # in the first phase, CMA-ES only helps to choose among the starts, and ends with the last halving
-    chosen = phase.part > 1 and count >= HALVINGS[-1]
-    ended |= np.where(evolving, converged | chosen, _stalled(progress, phase.patience, phase.stall))
-    turns = active & ~evolving & ~((norm < STEEP) & ((norm < phase.gradient_limit) | ~ended))
-    active = active & (~ended | turns)
-    if count in HALVINGS:
-        order = np.argsort(np.where(active, value, np.inf), kind="stable")
-        active[order[max((int(active.sum()) + 1) // 2, 1) :]] = False
-    for at in np.flatnonzero(turns & active):
-        progress.set_cma_state(at, initial_state(np.asarray(starts.best)[at]))
-    progress.active = active
-
-
-def _stalled(progress: SearchState, patience: int, stall: float) -> np.ndarray:
-    """Return whether the goal of each start [S] fell by less than `stall` over `patience` iterations of this phase."""
-    if progress.iteration - progress.since <= patience:
-        return np.zeros(len(progress.active), bool)
-    past, value = progress.history["value"][-1 - patience], np.asarray(progress.starts.value)
-    return np.isfinite(past) & (past - np.where(np.isfinite(value), value, 0.0) < stall)
-
-
-def _begin_full_phase(
-    engine: Engine,
-    goal: Goal,
-    members: Members,
-    progress: SearchState,
-    descent: Descent,
-    given: np.ndarray,
+def iterate(
+    engine: Engine, goal: Goal, members: Members, progress: SearchState, descent: Descent, seed: int = 0
 ) -> None:
-    """Begin the phase on all members.
+    """Make one step of each active start, or draw one population of CMA-ES, and add the best point to the history."""
+    if progress.evolving:
+        x, value, terms = _evolved(engine, goal, members, progress, seed)
+    else:
+        x, value, terms = _descended(engine, goal, members, progress, descent)
+    past, n = progress.history, members.ordinary
+    if past and not value < past["value"][-1]:
+        row = {name: past[name][-1] for name in ("value", "x", "gains", "lost", "terms", "quantities")}
+    else:
+        tuned = [float(KINDS[name].tuned(jnp.asarray(terms[PREFIX + name][:n]))) for name in goal.quantities]
+        row = {
+            "value": np.array(value),
+            "x": x,
+            "gains": np.asarray(engine.objective.space.gains_at(jnp.asarray(x))),
+            "lost": np.array(int((terms["survival"] > 0).sum())),
+            "terms": np.array([terms[name][:n].mean() for name in TERMS]),
+            "quantities": np.array(tuned),
+        }
+    row |= {"members": np.array(len(members.member)), "rollouts": np.array(engine.rollouts)}
+    for key, one in row.items():
+        past.setdefault(key, []).append(one)
 
-    It has one start: the best of `given` and of at most PATH_POINTS points that the first phase visited. The optimum of
-    the first phase may lose members that the phase did not simulate; an earlier point is then better.
+
+def _descended(
+    engine: Engine, goal: Goal, members: Members, progress: SearchState, descent: Descent
+) -> tuple[np.ndarray, float, dict[str, Any]]:
+    """Make one step of each active start. Return the best point so far [m], its goal, and the terms [N] at its trial.
+
+    If the best point is older than this step, the terms are those of the last trial of its start.
     """
-    x, value = (np.array(progress.history[name][progress.since :]) for name in ("x", "value"))
-    starts = value.shape[1]
-    x, value = x.reshape(-1, x.shape[-1]), value.ravel()
-    chosen = ranked(value, PATH_POINTS)
-    tried = np.concatenate([x[chosen], given[None]])
-    best = int(np.argsort(goal.score(tried, engine.terms(tried, members), members), kind="stable")[0])
-    start = int(chosen[best] % starts) if best < len(chosen) else 0
-    at = np.array(progress.starts.best)
-    at[start] = tried[best]
-    progress.starts = descent.restarted(jnp.asarray(at), progress.starts)
-    progress.cma_states = idle_states(*at.shape)
-    progress.active = np.arange(starts) == start
-    progress.phase, progress.since = progress.phase + 1, progress.iteration
+    starts, active = progress.starts, np.flatnonzero(progress.active)
+    losses, slopes, terms = engine.gradient(np.asarray(starts.trial)[active], members, goal.weights)
+    full = [np.full((len(progress.active), *one.shape[1:]), np.nan) for one in (losses, slopes)]
+    for whole, part in zip(full, (losses, slopes), strict=True):
+        whole[active] = part
+    progress.starts = descent.step(members.ordinary, starts, *full, progress.active)
+    best = active[int(np.argmin(np.asarray(progress.starts.value)[active]))]
+    row = int(np.flatnonzero(active == best)[0])
+    found = np.asarray(progress.starts.best)[best], float(progress.starts.value[best])
+    return *found, {name: one[row] for name, one in terms.items()}
 
 
-def ranked(value: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices of at most `count` different values, the best first.
+def _evolved(
+    engine: Engine, goal: Goal, members: Members, progress: SearchState, seed: int
+) -> tuple[np.ndarray, float, dict[str, Any]]:
+    """Draw one population and update the distribution. Return the best of its points [m], its goal and terms [N]."""
+    points = next_population(progress.cma, seed)
+    terms = engine.terms(points, members)
+    values = goal.score(points, terms, members)
+    progress.cma = updated(progress.cma, points, values)
+    first = int(np.argmin(values))
+    return points[first], float(values[first]), {name: one[first] for name, one in terms.items()}
 
-    The spacing of their ranks increases, so most of them are good ones.
+
+def _advance(progress: SearchState) -> None:
+    """Select the starts that continue, let the last one switch to CMA-ES, or end it.
+
+    A descent ends if its step is at most SHORTEST, or if the goal stalls. It switches if the gradient is then
+    CONVERGED or more, and at once if it is STEEP. There are two causes of such gradients: in a chaotic loop the
+    derivatives grow with time and do not describe the goal; and a descent stops early at a jump of the goal, beyond
+    which members are lost.
     """
-    _, first = np.unique(np.where(np.isfinite(value), value, np.inf), return_index=True)
-    return first[np.unique((np.linspace(0, np.sqrt(len(first) - 1), count).round(6) ** 2).astype(int))]
+    if progress.evolving:
+        progress.active &= not (progress.cma.reach <= SHORTEST or progress.cma.converged)
+        return
+    best = int(np.argmin(np.asarray(progress.starts.value)))
+    if progress.iteration >= RACE:
+        progress.active = np.arange(len(progress.active)) == best
+    if progress.active.sum() > 1:
+        return
+    norm, values = float(progress.starts.gradient_norm[best]), progress.history["value"]
+    stalled = len(values) > PATIENCE and values[-1] > values[-1 - PATIENCE] - STALL
+    ended = stalled or float(progress.starts.length[best]) <= SHORTEST
+    if not norm < STEEP or (ended and norm >= CONVERGED):
+        progress.cma = initial_state(progress.history["x"][-1])
+    elif ended:
+        progress.active = np.zeros_like(progress.active)
 
 
 def best_of(progress: SearchState) -> tuple[np.ndarray, float]:
-    """Return the coordinates [m] and the goal of the best point of this phase."""
-    value = np.asarray(progress.starts.value)
-    at = int(np.argmin(value))
-    return np.asarray(progress.starts.best)[at], float(value[at])
+    """Return the coordinates [m] and the goal of the best point."""
+    return progress.history["x"][-1], float(progress.history["value"][-1])

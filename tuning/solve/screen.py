@@ -1,4 +1,4 @@
-"""Starting points of a search, and the screen, which selects the best of them.
+"""Starting points of a search, and the screen, which orders them.
 
 The points are the case's gains, the middle of the search ranges, and quasi-random points.
 """
@@ -11,12 +11,6 @@ from tuning.problem.lanes import Engine
 from tuning.problem.members import Members, Objective
 from tuning.problem.ranges import from_unit_cube, ranges
 from tuning.problem.shortfalls import Bound
-
-# Rounds of the screen (a, b): one member in a is simulated, and one point in b is kept, but at least 2 `keep` points
-# and at least the members that `Members.part` keeps.
-ROUNDS = (8, 4), (4, 1)
-# Half-widths of the two neighbourhoods of a point, in coordinates: factors of e^1.5 and e^3 of each gain.
-NEAR, FAR = 1.5, 3.0
 
 
 def initial_points(
@@ -36,22 +30,7 @@ def initial_points(
     return np.stack([space.encode(space.clip(g)) for g in gains])
 
 
-def around(x: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Return coordinates [count + 1, m]: x [m], and quasi-random points, alternately within NEAR and FAR of x."""
-    if not count:
-        return x[None]
-    cube = design_points("sobol", seed, len(x), np.arange(count), count)
-    reach = np.where(np.arange(count) % 2, FAR, NEAR)[:, None]
-    return np.concatenate([x[None], x + reach * (2 * cube - 1)])
-
-
-def screen(engine: Engine, members: Members, x: np.ndarray, keep: int, goal: Goal) -> np.ndarray:
-    """Return the best of points x [K, m], at least `keep`, best first, by successive halving over members.
-
-    Each round includes stressed members.
-    """
-    for part, left in ROUNDS:
-        some = members.part(part)
-        values = goal.score(x, engine.terms(x, some), some)
-        x = x[np.argsort(values, kind="stable")[: max(len(x) // left, 2 * keep)]]
-    return x
+def screen(engine: Engine, members: Members, x: np.ndarray, goal: Goal) -> np.ndarray:
+    """Return the points x [K, m] in the order of their goals on a part of the members, the best first."""
+    some = members.part
+    return x[np.argsort(goal.score(x, engine.terms(x, some), some), kind="stable")]

@@ -83,7 +83,7 @@ def _of_plant(trace: Trace) -> list[str]:
 def order_of_work(trace: Trace) -> list[str]:
     """Return lines on the order of operations of a controller in every sample."""
     block = trace.block
-    processor: Any = block.parameters.controller.processor
+    processor = block.parameters.controller.timing
     delay, unit = processor.delay, block.outputs["u"][0]
     lines = [
         f"Every T = {block.period:g} s: read the sensors, call the step at once, and apply output->u",

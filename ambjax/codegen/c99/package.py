@@ -21,7 +21,7 @@ from ambjax.codegen.program import PRECISIONS
 from ambjax.codegen.reference import Results, results
 from ambjax.codegen.trace import Trace, trace
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 # Points of the test program.
 VECTORS = 100

@@ -27,7 +27,7 @@ from ambjax.world.gaps import Gaps
 from ambjax.world.plant import Plant
 from ambjax.world.plant import State as NominalState
 from ambjax.world.sensor import Measurement
-from ambjax.world.signals import Reference
+from ambjax.world.waveforms import Reference
 
 # State of a law: any pytree of scalars; () if the law has none.
 State = TypeVar("State")

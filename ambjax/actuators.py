@@ -1,0 +1,11 @@
+"""Amplifiers and the limits of coils.
+
+from ambjax import Scenario, actuators
+
+Scenario(u_max=48.0, amplifier=actuators.Amplifier(bandwidth=2e3))
+"""
+
+from ambjax.world.amplifier import Amplifier, CurrentAmplifier
+from ambjax.world.coil_limits import CoilLimits
+
+__all__ = ["Amplifier", "CoilLimits", "CurrentAmplifier"]

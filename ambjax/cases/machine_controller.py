@@ -1,0 +1,158 @@
+"""Readers of the controllers of a whole machine: keys of [controller] that one axis does not have."""
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ambjax.cases.reader import Case
+from ambjax.cases.rotor_tables import COORDINATES, RIGID
+from ambjax.cases.table import Table
+from ambjax.control.machine_law import MachineLaw
+from ambjax.control.observer import Direct
+from ambjax.control.position import FeedbackLinearisation
+from ambjax.control.rigid_body import RigidBody
+from ambjax.numerics.records import canonical
+from ambjax.simulation.loop import ClosedLoop
+from ambjax.simulation.rollout import prepare
+from ambjax.simulation.sampled import Sampled
+from ambjax.world.rotor import Rotor
+
+# Keys of [controller] for a machine. The tables replace keys of the common ones for the tilts and for the axial motion.
+TABLES = {"tilt": ("beta_x", "beta_y"), "axial": ("z",)}
+KEYS = ("coordinates", "compensate_gyroscopics", *TABLES)
+WAYS = ["axes", "rigid-body"]
+
+
+class NominalPlant(NamedTuple):
+    """One magnet in the place of all magnets that act on a coordinate. `A`: for the given mu_0 and n."""
+
+    A: float
+    s_0: float
+    i_0: float
+
+
+def merged(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """Return the common table with the keys of another one, recursively. Another `kind` replaces the whole table."""
+    if "kind" in own and own["kind"] != common.get("kind", own["kind"]):
+        return own
+    both = dict(common)
+    for key, value in own.items():
+        both[key] = merged(both[key], value) if isinstance(value, dict) and isinstance(both.get(key), dict) else value
+    return both
+
+
+def without_keys(raw: dict[str, Any]) -> None:
+    """Remove the keys of a machine from the [controller] of a case."""
+    controller = raw.get("controller")
+    if isinstance(controller, dict):
+        for key in (*KEYS, "notch"):
+            controller.pop(key, None)
+
+
+def law_from(
+    top: Table, rotor: Rotor, bearings: list[Table], cases: list[Case], read: Callable[[dict, str], Case]
+) -> tuple[MachineLaw | None, list[Case]]:
+    """Return the law of all axes, None if each axis has its own, and the cases of its parts.
+
+    `cases`: of the axes. `read`: reads a raw case with a name.
+    """
+    table = top.table("controller")
+    way = table.choice("coordinates", WAYS, WAYS[0])
+    compensated = table.switch("compensate_gyroscopics")
+    if way == WAYS[0]:
+        for key in KEYS[1:]:
+            if key in table.raw:
+                raise ValueError(f'{table.at(key)} is for coordinates = "rigid-body". Set it, or leave {key} out.')
+        return None, []
+    for bearing in bearings:
+        own = bearing.table("controller")
+        for key in ("observer", "position"):
+            if key in own.raw:
+                raise ValueError(
+                    f"{own.at(key)}: in rigid-body coordinates no bearing has its own {key}. Use [controller.tilt."
+                    f"{key}] or [controller.axial.{key}]."
+                )
+    return rigid_body(top, rotor, cases, read, bool(compensated))
+
+
+def rigid_body(
+    top: Table, rotor: Rotor, cases: list[Case], read: Callable[[dict, str], Case], compensated: bool
+) -> tuple[RigidBody, list[Case]]:
+    """Return the law in rigid-body coordinates, and the cases of the coordinates."""
+    B, C, M, G = (np.asarray(x, float) for x in (rotor.at_magnets, rotor.at_sensors, rotor.M, rotor.G))
+    held = [k for k in range(RIGID) if np.any(B[:, k])]
+    B, C, M = B[:, held], C[:, held], np.diag(M)[held]
+    models = [case.cascade.model for case in cases]
+    kappa, s_0, i_0, m, g = (
+        np.array([float(getattr(model, name)) for model in models]) for name in ("kappa", "s_0", "i_0", "m", "g")
+    )
+    weight = np.asarray(rotor.gravity, float)[held] / M
+    parts = []
+    for number, k in enumerate(held):
+        plant = nominal(models[0], B[:, number], kappa, s_0, i_0)
+        numbers = {name: float(getattr(models[0], name)) for name in ("mu_0", "n", "R")}
+        given = numbers | plant._asdict() | {"m": float(M[number]), "k_z": 0.0, "g": float(-weight[number])}
+        parts.append(_coordinate(top, COORDINATES[k], given, read))
+    laws = [canonical(inner_cascade(prepare(part.cascade, part.scenario, part.clock)[0])) for part in parts]
+    if len({jax.tree.structure(law) for law in laws}) > 1:
+        raise ValueError("controller.tilt, controller.axial: the laws must be of the same kind in all coordinates.")
+    law = RigidBody(
+        laws=jax.tree.map(lambda *x: np.stack(x), *laws),
+        from_sensors=jnp.asarray(np.linalg.pinv(C)),
+        at_sensors=jnp.asarray(C),
+        at_magnets=jnp.asarray(B),
+        accelerations=jnp.asarray(B.T * m / M[:, None]),
+        weights=jnp.asarray(g),
+        forces=jnp.asarray(np.linalg.pinv(B.T) * M / (kappa / 4)[:, None]),
+        gyroscopic=jnp.asarray(G[np.ix_(held, held)] / M[:, None]) if compensated else None,
+    )
+    return law, parts
+
+
+def nominal(model: Any, b: np.ndarray, kappa: np.ndarray, s_0: np.ndarray, i_0: np.ndarray) -> NominalPlant:
+    """Return the magnet whose stiffness, force per current and largest force are those of all magnets on a coordinate.
+
+    `b`: displacements at the magnets [c] per unit of the coordinate. The others: numbers of the magnets [c].
+    """
+    stiffness, lever = kappa * i_0**2 / s_0**3, np.abs(b)
+    force, per_current = lever @ (stiffness * s_0), lever @ (stiffness * s_0 / i_0)
+    gap, bias = force / (b**2 @ stiffness), force / per_current
+    return NominalPlant(float(force * gap**2 / bias**2 / (model.mu_0 * model.n**2)), float(gap), float(bias))
+
+
+def _coordinate(top: Table, name: str, plant: dict[str, float], read: Callable[[dict, str], Case]) -> Case:
+    """Return the case of one coordinate, with the controller of the tables."""
+    controller = copy.deepcopy(top.raw.get("controller", {}))
+    for table, names in TABLES.items():
+        own = top.table("controller").table(table)
+        own.only(["observer", "position"])
+        if name in names:
+            controller = merged(controller, own.raw)
+    for key in ("model", "notch"):
+        controller.pop(key, None)
+    raw = {"plant": plant, "controller": controller}
+    raw |= {key: copy.deepcopy(top.raw[key]) for key in ("processor", "clock") if key in top.raw}
+    for key, names in (("sensor", ("velocity",)), ("actuator", ("mode", "bandwidth"))):
+        raw[key] = {name: top.raw[key][name] for name in names if name in top.raw.get(key, {})}
+    without_keys(raw)
+    return read(raw, f"coordinate {name}")
+
+
+def inner_cascade(system: Sampled | ClosedLoop) -> Any:
+    """Return the cascade of a system."""
+    return (system.loop if isinstance(system, Sampled) else system).cascade
+
+
+def inner(system: Any) -> Any:
+    """Return the loop of an axis whose observer and position law never act: without their states."""
+    loop = system.loop if isinstance(system, Sampled) else system
+    cascade = loop.cascade
+    position = FeedbackLinearisation().designed(cascade.model, None)
+    cascade = dataclasses.replace(cascade, observer=Direct(), position=position)
+    loop = dataclasses.replace(loop, cascade=cascade)
+    return dataclasses.replace(system, loop=loop) if isinstance(system, Sampled) else loop

@@ -1,0 +1,13 @@
+"""Bearings and what belongs to them: coils, iron, and the stop of a touchdown bearing.
+
+from ambjax import Scenario, plants
+
+Scenario(plant=plants.TwoCoil(m=1.64, iron=plants.Iron(saturation=1.4)), stop=plants.Stop(k=1e7))
+"""
+
+from ambjax.world.coils import TwoCoil
+from ambjax.world.iron import Iron
+from ambjax.world.plant import Plant
+from ambjax.world.touchdown import Stop
+
+__all__ = ["Iron", "Plant", "Stop", "TwoCoil"]

@@ -1,0 +1,114 @@
+"""Ensembles of whole machines: each member is a machine of its own."""
+
+import copy
+import json
+import tomllib
+
+import numpy as np
+import pytest
+
+from ambjax.__main__ import main
+from ambjax.cases.machine_case import machine_from
+from ambjax.cases.machine_spread import rotor_places, varied_rotor
+from ambjax.cases.template_text import template
+from ambjax.results.machine_run import simulate_machine
+from ambjax.results.spread_runs import simulate_members, study_of
+
+MACHINE = tomllib.loads(template("machine"))
+SPREAD = {
+    "plant": {"A": {"percent": 10}},
+    "bearing": {"left": {"plant": {"A": {"percent": 1}}, "x": {"plant": {"R": {"uniform": [0.9, 1.1]}}}}},
+    "rotor": {"m": {"percent": 5}, "speed": {"uniform": [0.0, 12000.0]}},
+    "unbalance": {"0": {"amount": {"percent": 50}}},
+    "processor": {"delay": {"uniform": [0.5, 1.0]}},
+}
+
+
+def case(spread, **tables):
+    clock = {"duration": 1e-3, "sample_period": 5e-5}
+    raw = copy.deepcopy(MACHINE) | {"spread": spread, "clock": clock, "run": {"settle": 0.0}} | tables
+    return machine_from(raw, "machine")
+
+
+def test_draws():
+    study = study_of(case(SPREAD), 3, 1000)
+    drawn = study.drawn(np.arange(1000))
+    areas = {name: drawn[f"bearing.{name}.plant.A"] for name in study.case.axes}
+    # the magnet of each axis varies alone; a bearing replaces the common distribution
+    for name, x in areas.items():
+        spread = np.abs(x / 7.6e-5 - 1).max()
+        assert spread == pytest.approx(0.01 if name.startswith("left") else 0.1, rel=0.05)
+    assert abs(np.corrcoef(areas["right.x"], areas["right.y"])[0, 1]) < 0.1
+    assert "bearing.left.x.plant.R" in drawn
+    assert "bearing.left.y.plant.R" not in drawn
+    # the processor is common to all axes
+    assert [path for path in drawn if path.endswith("delay")] == ["processor.delay"]
+
+
+@pytest.mark.slow  # compiles the rollout of the ensemble and that of one machine
+def test_members_are_machines():
+    found = simulate_members(case(SPREAD), 3, seed=3)
+    study = found.study
+    for k in range(3):
+        alone = simulate_machine(study.member(k))
+        for name in ("rms_error_m", "max_abs_i_A", "rms_u_V", "clearance_used"):
+            assert found.columns[name][k] == pytest.approx(alone.metrics[name], rel=1e-6), name
+    assert np.ptp(found.columns["rms_error_m"]) > 0
+
+
+def test_numbers_of_the_rotor():
+    raw = copy.deepcopy(MACHINE)
+    raw["rotor"] |= {"kind": "modal", "modes": [{"frequency": 80.0, "damping": 0.01}, {"frequency": 300.0}]}
+    for bearing in raw["bearing"][:2]:
+        bearing |= {"modes": [0.5, 0.4], "sensor_modes": [0.4, 0.2]}
+    rotor = machine_from(raw).machine.rotor
+    values = {"rotor.m": 3.0, "rotor.I_t": 0.07, "rotor.I_p": 1e-3, "rotor.modes.1.frequency": 250.0}
+    values |= {"rotor.modes.0.damping": 0.02, "unbalance.0.amount": 7.0, "load.0.start": 0.2, "rotor.speed": 10.0}
+    other = varied_rotor(rotor, values)
+    nominal, found = rotor_places(rotor), rotor_places(other)
+    for path, place in found.items():
+        assert float(np.asarray(place.value)) == pytest.approx(values.get(path, float(np.asarray(nominal[path].value))))
+    # the weight follows the mass; a free bending mode has the given frequency and damping
+    assert np.asarray(other.gravity)[1] == pytest.approx(-9.81 * 3.0)
+    k = other.K[7, 7] / other.M[7, 7]
+    assert np.sqrt(k) == pytest.approx(2 * np.pi * 250)
+    assert other.D[5, 5] == pytest.approx(2 * 0.02 * 2 * np.pi * 80)
+
+
+@pytest.mark.parametrize(
+    ("spread", "words"),
+    [
+        ({"plant": {"m": {"percent": 1}}}, "rotor.m"),
+        ({"initial": {"z": {"percent": 1}}}, "spread.initial"),
+        ({"bearing": {"top": {"plant": {"A": {"percent": 1}}}}}, "left, right, thrust"),
+        ({"bearing": {"thrust": {"x": {"plant": {"A": {"percent": 1}}}}}}, "bearing.thrust.x"),
+        ({"rotor": {"kind": {"percent": 1}}}, "spread.rotor.kind"),
+        ({"rotor": {"m": {"uniform": [-1.0, 2.0]}}}, "rotor.m"),
+        ({"plant": {"B": {"percent": 1}}}, "plant.B"),
+    ],
+)
+def test_refused(spread, words):
+    with pytest.raises(ValueError, match=words):
+        case(spread)
+
+
+def test_steps_resolve_the_fastest_member():
+    few = case({}, clock={"duration": 2e-3, "sample_period": 1e-3}).clock.method.substeps
+    speeds = {"rotor": {"speed": {"uniform": [0.0, 4e6]}}}
+    assert case(speeds, clock={"duration": 2e-3, "sample_period": 1e-3}).clock.method.substeps > 2 * few
+
+
+@pytest.mark.slow
+def test_command(tmp_path, capsys):
+    text = template("machine").replace("duration = 0.2", "duration = 2e-3").replace("settle = 0.05", "settle = 0.0")
+    path = tmp_path / "m.toml"
+    path.write_text(text + "\n[spread]\nrotor.speed = { uniform = [0.0, 12000.0] }\n")
+    main(["ensemble", str(path), "--members", "3", "--out", str(tmp_path / "e"), "--json"])
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["survivors"] == 3
+    columns = np.load(tmp_path / "e" / "members.npz")
+    main(["simulate", str(path), "--member", "2", "--seed", "0", "--out", str(tmp_path / "s"), "--json"])
+    alone = json.loads(capsys.readouterr().out)
+    assert alone["rms_error_m"] == pytest.approx(columns["rms_error_m"][2], rel=1e-6)
+    speed = np.load(tmp_path / "s" / "trajectory.npz")["speed_rpm"][0]
+    assert speed == pytest.approx(columns["spread.rotor.speed"][2])
