@@ -7,10 +7,12 @@ import numpy as np
 from tqdm import tqdm
 
 from ambjax.cases.machine_case import MachineCase
+from ambjax.commands.speed_text import running_facts
 from ambjax.host.heartbeat import say
 from ambjax.linear.linear_machine import MachineSensitivity, machine_sensitivity
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
+from ambjax.world.rotation import PER_MINUTE
 
 Summary = dict[str, object]
 SIMULATED = ("trajectory.npz", "metrics.json", "overview.png")
@@ -133,4 +135,7 @@ def sensitivity_text(points: list[MachineSensitivity]) -> str:
         words = "stable" if point.stable else "NOT STABLE: the peaks have no physical meaning"
         parts.append(f"{point.speed:g} rpm: {words}; largest real part of a pole {slow:.4g} 1/s")
         parts.append(table(("axis", "peak of |S|", "Hz", "zone", "peak of |T|"), rows))
+        for k, axis in enumerate(point.axes):
+            speeds = (abs(point.speed) * PER_MINUTE,) if point.speed else ()
+            parts += running_facts(speeds, point.system, axis.S, k, f"|S| of {axis.name}")[1]
     return "\n".join(parts)
