@@ -9,7 +9,10 @@ import pytest
 
 from ambjax.__main__ import main
 from ambjax.cases.machine_case import machine_from
+from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
+from ambjax.commands.acceptance import acceptance
+from ambjax.linear import analyse, linearise
 from ambjax.results.machine_run import simulate_machine
 from ambjax.signals import Rotation
 from ambjax.simulation.folds import Ending
@@ -109,3 +112,19 @@ def test_every_axis_of_a_machine_has_them():
     for k, own in enumerate(run.metrics["axes"][name] for name in case.axes):
         assert own["z_1x_m"] == pytest.approx(np.hypot(*fits[1:3, k]), rel=1e-9, abs=1e-15)
     assert run.metrics["z_1x_m"] == max(own["z_1x_m"] for own in run.metrics["axes"].values())
+
+
+@pytest.mark.slow
+def test_a_peak_of_the_sensitivity_near_the_speed_is_named():
+    laws = {"position": {"kind": "pid"}, "inversion": {"kind": "closed-form"}, "current": {"kind": "pi"}}
+    clock = {"duration": 0.01, "sample_period": 1e-4}
+    case = case_from({"controller": laws, "clock": clock})
+    system = linearise(case.cascade, case.scenario, case.clock)
+    peak = analyse(system, case.scenario.plant.m, case.clock.sample_period).S.frequency
+    for factor, named in ((0.95, True), (1.05, True), (0.85, False), (1.15, False)):
+        turning = case_from({"controller": laws, "clock": clock, "rotor": {"speed": 60 * factor * peak}})
+        summary, text = acceptance(turning)
+        (at,) = summary["running_speed"]
+        expected = abs(system.sensitivity(np.array([factor * peak]))[0])
+        assert at == {"frequency_hz": pytest.approx(factor * peak), "S": pytest.approx(expected, rel=1e-9)}
+        assert ("WARNING: the peak of |S|" in text) == named

@@ -92,7 +92,7 @@ def cascade_from(
     """
     table, actuator = top.table("controller"), top.table("actuator")
     command = drive(actuator)
-    table.only(["model", *KINDS])
+    table.only(["model", "notch", *KINDS])
     model = table.table("model").record(Plant, base=plant)  # always lumped, even for a two-coil plant
     sampling = processor.sampling(period) if processor and period else None
     laws, own, matrices = {}, [], None

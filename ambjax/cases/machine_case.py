@@ -11,6 +11,7 @@ import numpy as np
 
 from ambjax.cases.machine_controller import axis_controller, inner, law_from, merged
 from ambjax.cases.machine_spread import axis_table, fastest_rotor, machine_spread, refuse_unused
+from ambjax.cases.notch_table import notch_from
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
 from ambjax.cases.rotor_tables import (
     COORDINATES,
@@ -25,8 +26,10 @@ from ambjax.cases.rotor_tables import (
     vector,
 )
 from ambjax.cases.table import Table, load, show
+from ambjax.control.machine_law import MachineLaw
 from ambjax.ensemble.spread import Spread
 from ambjax.linear.analysis import Zones
+from ambjax.linear.notch_design import machine_notch_gains, notch_speeds
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
@@ -34,7 +37,7 @@ from ambjax.simulation.method import ACCURATE, slopes
 from ambjax.simulation.rollout import prepare
 from ambjax.simulation.whole_machine import Machine, machine_of
 from ambjax.text.words import one_line
-from ambjax.world.rotation import PER_MINUTE
+from ambjax.world.rotation import PER_MINUTE, known
 from ambjax.world.rotor import Rotor
 
 MACHINE_TABLES = ("rotor", "bearing", "unbalance", "load")
@@ -124,18 +127,17 @@ def machine_from(
         case = read(own, f"axis {axis.name}")
         _check_force(case, axis, force)
         cases.append(case)
-    law, parts, demand = law_from(top, rotor, bearings, cases, read, folder)
+    law, parts = law_from(top, rotor, bearings, cases, read, folder)
     spread = machine_spread(top, rotor, axes, names, cases)
     if law is not None:
         refuse_unused(spread)
     fixed = not isinstance(raw.get("clock", {}).get("dt", "auto"), str)
     clock = _clock([*cases, *parts], fastest_rotor(rotor, spread), fixed)
-    systems = [prepare(case.cascade, case.scenario, clock)[0] for case in cases]
-    systems = [canonical(system if law is None else inner(system, demand)) for system in systems]
+    cases = _with_notches(top, rotor, cases, clock, q, law)
     coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
     return MachineCase(
         name=safe_name(name),
-        machine=machine_of(rotor, systems, jnp.asarray(q), law),
+        machine=_machine(rotor, cases, clock, q, law),
         clock=clock,
         axes=tuple(axis.name for axis in axes),
         coordinates=coordinates,
@@ -146,6 +148,32 @@ def machine_from(
         spread=spread,
         text=text,
     )
+
+
+def _machine(rotor: Rotor, cases: list[Case], clock: Clock, q: np.ndarray, law: MachineLaw | None) -> Machine:
+    systems = [prepare(case.cascade, case.scenario, clock)[0] for case in cases]
+    systems = [canonical(system if law is None else inner(system, law)) for system in systems]
+    return machine_of(rotor, systems, jnp.asarray(q), law)
+
+
+def _with_notches(
+    top: Table, rotor: Rotor, cases: list[Case], clock: Clock, q: np.ndarray, law: MachineLaw | None
+) -> list[Case]:
+    """Return the cases of the axes with the notch of [controller.notch], whose gains are those of the machine."""
+    found = notch_from(top, cases[0].scenario)
+    if found is None:
+        return cases
+    if law is not None:
+        raise ValueError('[controller.notch] acts on axes. Leave it out, or use controller.coordinates = "axes".')
+    notch, phase = found
+    speeds = notch_speeds(known(notch.rotor), notch, float(clock.duration))
+    machine = _machine(rotor, cases, clock, q, None)
+    gains = machine_notch_gains(machine, notch, speeds, clock.sample_period, phase)
+    laws = [
+        dataclasses.replace(case.cascade, notch=dataclasses.replace(notch, gains=own))
+        for case, own in zip(cases, gains, strict=True)
+    ]
+    return [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
 
 
 def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:

@@ -60,7 +60,7 @@ def axis_controller(raw: dict[str, Any]) -> None:
     if not isinstance(controller, dict):
         return
     kind = kind_of(raw)
-    for key in KEYS:
+    for key in (*KEYS, "notch"):
         controller.pop(key, None)
     if kind == LAWS[0]:
         return
@@ -81,17 +81,16 @@ def law_from(
     cases: list[Case],
     read: Callable[[dict, str], Case],
     folder: pathlib.Path,
-) -> tuple[MachineLaw | None, list[Case], str]:
-    """Return the law of all axes, None if each axis has its own; the cases of its parts; and what it demands.
+) -> tuple[MachineLaw | None, list[Case]]:
+    """Return the law of all axes, None if each axis has its own, and the cases of its parts.
 
-    `cases`: of the axes. `read`: reads a raw case with a name. The demand is a "force", "current" or "voltage".
+    `cases`: of the axes. `read`: reads a raw case with a name.
     """
     table = top.table("controller")
     if (kind := kind_of(top.raw)) != LAWS[0]:
         for bearing in bearings:
             bearing.table("controller").only(["model", *(["current"] if kind == "linear" else [])])
-        law, output = linear(top, cases, folder) if kind == "linear" else lqg(top, cases, rotor)
-        return law, [], output
+        return (linear(top, cases, folder) if kind == "linear" else lqg(top, cases, rotor)), []
     for key in ("file", "output", "lqg"):
         if key in table.raw:
             raise ValueError(f'{table.at(key)} is for kind = "{"lqg" if key == "lqg" else "linear"}". Set it.')
@@ -101,7 +100,7 @@ def law_from(
         for key in ("compensate_gyroscopics", *TABLES):
             if key in table.raw:
                 raise ValueError(f'{table.at(key)} is for coordinates = "rigid-body". Set it, or leave {key} out.')
-        return None, [], "force"
+        return None, []
     for bearing in bearings:
         own = bearing.table("controller")
         for key in ("observer", "position"):
@@ -110,7 +109,7 @@ def law_from(
                     f"{own.at(key)}: in rigid-body coordinates no bearing has its own {key}. Use [controller.tilt."
                     f"{key}] or [controller.axial.{key}]."
                 )
-    return *rigid_body(top, rotor, cases, read, bool(compensated)), "force"
+    return rigid_body(top, rotor, cases, read, bool(compensated))
 
 
 def rigid_body(
@@ -166,7 +165,8 @@ def _coordinate(top: Table, name: str, plant: dict[str, float], read: Callable[[
         own.only(["observer", "position"])
         if name in names:
             controller = merged(controller, own.raw)
-    controller.pop("model", None)
+    for key in ("model", "notch"):
+        controller.pop(key, None)
     raw = {"plant": plant, "controller": controller}
     raw |= {key: copy.deepcopy(top.raw[key]) for key in ("processor", "clock") if key in top.raw}
     for key, names in (("sensor", ("velocity",)), ("actuator", ("mode", "bandwidth"))):
@@ -180,16 +180,16 @@ def inner_cascade(system: Sampled | ClosedLoop) -> Any:
     return (system.loop if isinstance(system, Sampled) else system).cascade
 
 
-def inner(system: Any, demand: str) -> Any:
-    """Return the loop of an axis whose observer and position law never act: without their states.
+def inner(system: Any, law: MachineLaw) -> Any:
+    """Return the loop of an axis whose observer and position law never act, because of a law of the machine.
 
-    `demand`: what the law of the machine demands. A voltage goes to the coils as it is.
+    Their states are left out. A demanded voltage goes to the coils as it is.
     """
     loop = system.loop if isinstance(system, Sampled) else system
     cascade = loop.cascade
     position = FeedbackLinearisation().designed(cascade.model, None)
     cascade = dataclasses.replace(cascade, observer=Direct(), position=position)
-    if demand == "voltage":
+    if law.output == "voltage":
         cascade = dataclasses.replace(cascade, current=OpenLoop())
     loop = dataclasses.replace(loop, cascade=cascade)
     return dataclasses.replace(system, loop=loop) if isinstance(system, Sampled) else loop

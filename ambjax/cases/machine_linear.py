@@ -40,8 +40,8 @@ def magnets(cases: Sequence[Case], voltage: bool) -> dict[str, Any]:
     return {name: jnp.asarray(x) for name, x in found.items()}
 
 
-def linear(top: Table, cases: list[Case], folder: pathlib.Path) -> tuple[StateSpaceLaw, str]:
-    """Return the controller of a file, and what its outputs are."""
+def linear(top: Table, cases: list[Case], folder: pathlib.Path) -> StateSpaceLaw:
+    """Return the controller of a file."""
     table, c = top.table("controller"), len(cases)
     table.only(["kind", "file", "output", "model", "current"])
     output = table.choice("output", list(OUTPUTS), OUTPUTS[0])
@@ -56,7 +56,7 @@ def linear(top: Table, cases: list[Case], folder: pathlib.Path) -> tuple[StateSp
         )
     A, B, C, D = matrices if period is None else bilinear(matrices, period)
     n = len(A)
-    law = StateSpaceLaw(
+    return StateSpaceLaw(
         A=jnp.asarray(A)[None],
         B=jnp.asarray(B)[None],
         C=jnp.asarray(C)[None],
@@ -70,8 +70,8 @@ def linear(top: Table, cases: list[Case], folder: pathlib.Path) -> tuple[StateSp
         speeds=jnp.zeros(1),
         **magnets(cases, output == OUTPUTS[1]),
         inputs=ERROR if B.shape[1] == c else BOTH,
+        output=output,
     )
-    return law, output
 
 
 def bilinear(matrices: tuple[np.ndarray, ...], period: float) -> tuple[np.ndarray, ...]:
@@ -81,15 +81,14 @@ def bilinear(matrices: tuple[np.ndarray, ...], period: float) -> tuple[np.ndarra
     return 2 * P - np.eye(len(A)), period * P @ B, C @ P, D + period / 2 * C @ P @ B
 
 
-def lqg(top: Table, cases: list[Case], rotor: Rotor) -> tuple[StateSpaceLaw, str]:
-    """Return the LQG of a rotor, and what its outputs are."""
+def lqg(top: Table, cases: list[Case], rotor: Rotor) -> StateSpaceLaw:
+    """Return the LQG of a rotor."""
     table = top.table("controller")
     table.only(["kind", "model", "lqg"])
     own, processor = table.table("lqg"), cases[0].cascade.processor
     if processor is None:
         raise ValueError(f'{table.at("kind")} = "lqg": it is designed for a processor. Add [processor].')
     voltage = cases[0].scenario.drive == "voltage"
-    output = OUTPUTS[1 if voltage else 0]
     given = own.record(LqgWeights, extra=("speeds", "modes"))
     known = (len(rotor.gravity) - RIGID) // 2
     count = min(own.whole("modes", MODES) if "modes" in own.raw else known, known)
@@ -113,8 +112,8 @@ def lqg(top: Table, cases: list[Case], rotor: Rotor) -> tuple[StateSpaceLaw, str
     steady, start, n = jnp.asarray(found[0].steady), jnp.asarray(found[0].start), len(found[0].a)
     return StateSpaceLaw(
         **tables, steady=steady, start=start, sizes=jnp.ones(n), speeds=jnp.asarray(speeds), **magnets(cases, voltage),
-        inputs=CURRENTS,
-    ), output  # fmt: skip
+        inputs=CURRENTS, output=OUTPUTS[1 if voltage else 0],
+    )  # fmt: skip
 
 
 def _speeds(table: Table, default: float) -> list[float]:

@@ -12,6 +12,7 @@ from typing import Any
 from ambjax.cases.case_table import case_table, parts_of
 from ambjax.cases.controller_file import ControllerFile
 from ambjax.cases.controller_tables import KINDS, Files, cascade_from, processor_from
+from ambjax.cases.notch_table import with_notch
 from ambjax.cases.own_laws import OwnLaw
 from ambjax.cases.reach import check_reference
 from ambjax.cases.recordings import RecordedFile, Recordings
@@ -159,6 +160,7 @@ def case_from(
             'an observer other than "ired-1" and "ired-2", and actuator.mode = "voltage". Leave out clock.method.'
         )
     check_start(scenario)
+    cascade = with_notch(top, cascade, scenario, clock)
     settle = duration / 4 if settle is None else settled(settle, clock)
     spread = spread_from(top, cascade, scenario)
     check_reference(spread, cascade, scenario, clock)

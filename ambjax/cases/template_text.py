@@ -71,6 +71,12 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 # acceleration = 3000.0       # rpm/s; rate of the speed (left out: 0)
 # speed_end = 12000.0         # rpm; speed at which a run-up or run-down ends (left out: it never ends)
 
+# [controller.notch]          # notch at the speed of [rotor] (left out: no notch)
+# kind = "force-free"         # removes this speed from the current, or, with "displacement-free", from z
+# rate = 10.0                 # 1/s; rate at which the notch converges
+# min_speed = 3000.0          # rpm; speed from which the notch is on (left out: 0)
+# phase = 30.0                # degrees; phase of the response that it inverts (left out: that of the linear loop)
+
 # [sensor.runout]             # runout of the surface that the position sensor reads, with [rotor] (left out: none)
 # harmonics = [{{ number = 1, amplitude = 1e-6, phase = 0.0 }}]  # waves per turn, m, rad
 

@@ -177,7 +177,10 @@ class Controller(Block):
         cascade, memory = self.parameters.controller, self.start()
         found = []
         for stage, law, state in zip(CascadeState._fields, cascade.laws, memory.laws, strict=True):
-            entries = memory_of(law, state)
+            notch = cascade.notch if stage == "observer" else None
+            entries = memory_of(law, state if notch is None else state[0])
+            if notch is not None:
+                entries += [(f"notch_{name}", unit, doc) for name, unit, doc in notch.memory()]
             assert len(entries) == len(jax.tree.leaves(state)), f"{type(law).__name__}.memory: one entry for each state"
             if any(jnp.shape(x) != () for x in jax.tree.leaves(state)):
                 raise ValueError(
@@ -228,7 +231,7 @@ def controller_of(cascade: Cascade, u_max: Scalar, period: float, scenario: Scen
             "[processor] is missing: only a controller on a processor can be exported, and this case is in continuous "
             "time. Add [processor], tune the gains for it, and export the tuned case."
         )
-    cascade, period = cascade.on_processor(), float(period)
+    cascade, period = cascade.on_processor().turning(scenario and scenario.rotor), float(period)
     model = cascade.model
     cascade = guarded(cascade, scenario or Scenario(plant=model), period)
     limits = StepLimits(u_max, NEAR, *(GAPS * float(model.s_0) / period**n for n in range(4)))

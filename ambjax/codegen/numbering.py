@@ -55,6 +55,9 @@ def numbers_of(node: Any, path: str = "", home: str = "") -> Iterator[Number]:
             for knot, (at, x) in enumerate(zip(value.at, value.values, strict=True)):
                 number = _number(f"{name}.knot_{knot}", finite(field), float(x))
                 yield number._replace(doc=f"{number.doc}; at {signal} = {at:g} {unit}")
+        elif isinstance(value, tuple):
+            for k, one in enumerate(value):
+                yield from numbers_of(one, f"{name}_{k}.", home)
         elif dataclasses.is_dataclass(value):
             yield from numbers_of(value, f"{name}.", home)
         elif jnp.shape(value) == ():

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from ambjax.cases.forces import bias_flux, forces
 from ambjax.cases.reader import Case
 from ambjax.commands.band_text import band_lines, band_numbers
+from ambjax.commands.speed_text import running_facts, running_speeds
 from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import DEFAULT_LAWS
 from ambjax.linear import PLACES, Analysis, analyse, linearise
@@ -46,6 +47,9 @@ def acceptance(case: Case) -> tuple[dict[str, object], list[str], str]:
     if loop.stable:
         summary |= {"frequency_hz": loop.S.frequency, **band_numbers(loop, case.zones), "margins": margin_numbers(loop)}
         lines += band_lines("Nominal loop", loop, case.zones)
+        speeds = running_speeds(case.scenario.rotor, float(case.clock.duration))
+        summary["running_speed"], more = running_facts(speeds, system, loop.S)
+        lines += more
     return summary, lines, _facts_table(facts)
 
 

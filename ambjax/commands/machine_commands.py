@@ -7,11 +7,13 @@ import numpy as np
 from tqdm import tqdm
 
 from ambjax.cases.machine_case import MachineCase
+from ambjax.commands.speed_text import running_facts
 from ambjax.host.heartbeat import say
 from ambjax.linear.linear_machine import MachineSensitivity, sensitivity_of, turning_machines
 from ambjax.linear.margins import Margins
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
+from ambjax.world.rotation import PER_MINUTE
 
 Summary = dict[str, object]
 # runup.png: only if the speed changes.
@@ -152,4 +154,7 @@ def sensitivity_text(points: list[MachineSensitivity]) -> str:
         parts.append(
             table(("axis", "peak of |S|", "Hz", "zone", "peak of |T|", "gain margin", "phase margin, deg"), rows)
         )
+        for k, axis in enumerate(point.axes):
+            speeds = (abs(point.speed) * PER_MINUTE,) if point.speed else ()
+            parts += running_facts(speeds, point.system, axis.S, k, f"|S| of {axis.name}")[1]
     return "\n".join(parts)

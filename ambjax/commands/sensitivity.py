@@ -9,6 +9,7 @@ from ambjax.cases.reader import Case
 from ambjax.commands import machine_commands
 from ambjax.commands.reading import read_any_with_warnings
 from ambjax.commands.sensitivity_report import Injections, sensitivity_summary, set_valued, text_of
+from ambjax.commands.speed_text import running_facts, running_speeds
 from ambjax.ensemble.study import Study
 from ambjax.host.heartbeat import FIRST_RUN, doing
 from ambjax.linear import Injection, frequency_lines, injected
@@ -50,13 +51,15 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
             measured = _injections(case, points[0])
     out = directory(args.out, f"sensitivity-{case.name}", WRITTEN, args.force)
     summary = sensitivity_summary(points, spread, measured, case.zones, missing)
+    speeds, first = running_speeds(case.scenario.rotor, float(case.clock.duration)), points[0]
+    summary["running_speed"], lines = running_facts(speeds, first.system, first.analysis.S)
     with files(out) as part:
         write_json(part / "sensitivity.json", summary)
         described("sensitivity.png", lambda: _draw(case, points, spread, measured, part / "sensitivity.png"))
         names = [name for name in WRITTEN if (part / name).exists()]
     if not args.json:
         tables = described("the table", lambda: text_of(case, points, spread, measured)) or ""
-        print("\n".join([tables, *(f"{name}: {missing[name]}" for name in missing)]))
+        print("\n".join([tables, *(f"{name}: {missing[name]}" for name in missing), *lines]))
         written(out, ", ".join(names))
     stable = all(point.analysis.stable for point in points) and (spread is None or spread.stable == spread.members)
     return int(bool(missing) or not stable), plain(summary | {"out": str(out)})

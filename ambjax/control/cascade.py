@@ -30,9 +30,11 @@ from ambjax.control.stages import (
     begin_law,
     step_law,
 )
+from ambjax.control.synchronous_notch import SynchronousNotch
 from ambjax.numerics.records import Scalar, is_traced, part, record
 from ambjax.world.plant import Plant
 from ambjax.world.plant import State as NominalState
+from ambjax.world.rotation import Rotation
 from ambjax.world.sensor import Measurement
 from ambjax.world.waveforms import Reference
 
@@ -65,6 +67,7 @@ class Cascade:
     current: CurrentLaw = part(default=_LEFT_OUT, doc="law that computes u; default: `SlidingMode`")
     model: Plant = part(default=Plant(), doc="the nominal plant")
     processor: Processor | None = part(default=None, doc="processor of the controller; None: continuous time")
+    notch: SynchronousNotch | None = part(default=None, doc="notch at the speed of the rotor; None: no notch")
 
     def __post_init__(self) -> None:
         for stage, kind in DEFAULT_LAWS.items():
@@ -78,13 +81,14 @@ class Cascade:
         t = 0; in continuous time, the initial state of the position law may depend on them (`PositionLaw.begin`). On a
         processor, `begun` gives the states of the first sample.
         """
-        observed = extremes(self.observer)[0].init(self.model, measured)
+        observed: Any = extremes(self.observer)[0].init(self.model, measured)
+        observed = observed if self.notch is None else (observed, self.notch.init(measured))
         rest = [extremes(law)[0] for law in self.laws[1:]]
         if self.sampled:
             return CascadeState(observed, *(law.init_sampled(self.model) for law in rest))
         states = [law.init(self.model) for law in rest]
         if reference is not None:
-            estimate, _ = with_gains_at(self.observer, measured.z, reference)(self.model, measured, observed)
+            estimate, _ = self._observed(measured, observed, reference)
             position = with_gains_at(self.position, estimate.z, reference)
             states[0] = position.begin(self.model, (estimate, reference))
         return CascadeState(observed, *states)
@@ -104,14 +108,19 @@ class Cascade:
 
     def scale(self) -> CascadeState:
         """Return the characteristic size of each state of the laws; integration errors are relative to it."""
-        if not self.sampled:
-            return CascadeState(*(extremes(law)[0].scale(self.model) for law in self.laws))
-        return CascadeState(*(extremes(law)[0].scale_sampled(self.model) for law in self.laws))
+        laws = [extremes(law)[0] for law in self.laws]
+        sizes = [(one.scale_sampled if self.sampled else one.scale)(self.model) for one in laws]
+        if self.notch is not None:
+            sizes[0] = sizes[0], self.notch.scale(self.model)
+        return CascadeState(*sizes)
 
     def layer(self) -> CascadeState:
         """Return `Law.layer` of all laws; with schedules, the smaller of the two values of `extremes`."""
         layers = ([one.layer(self.model) for one in extremes(law)] for law in self.laws)
-        return CascadeState(*(jax.tree.map(lambda *x: functools.reduce(jnp.minimum, x), *each) for each in layers))
+        least = [jax.tree.map(lambda *x: functools.reduce(jnp.minimum, x), *each) for each in layers]
+        if self.notch is not None:
+            least[0] = least[0], jax.tree.map(lambda x: jnp.inf * jnp.ones_like(x), self.notch.scale(self.model))
+        return CascadeState(*least)
 
     def slopes(self) -> dict[str, Scalar]:
         """Return the fastest rate of each law in closed loop (slope), 1/s, by the name of its stage."""
@@ -126,6 +135,16 @@ class Cascade:
     def laws(self) -> tuple[Observer, PositionLaw, InversionLaw, CurrentLaw]:
         """The four laws in order."""
         return self.observer, self.position, self.inversion, self.current
+
+    def turning(self, rotor: Rotation | None) -> "Cascade":
+        """Return the cascade whose notch has the speed of this rotor; None, or no notch: the cascade itself."""
+        if self.notch is None or rotor is None:
+            return self
+        return dataclasses.replace(self, notch=dataclasses.replace(self.notch, rotor=rotor))
+
+    def at_speed(self, speed: Scalar | None = None) -> "Cascade":
+        """Return the cascade whose notch has a constant speed (rpm); None: that at t = 0."""
+        return self if self.notch is None else dataclasses.replace(self, notch=self.notch.at(speed))
 
     @property
     def sampled(self) -> bool:
@@ -162,8 +181,7 @@ class Cascade:
         def demanded(
             reference: Reference, z: Array, z_dot: Array, observed: object, positioned: object
         ) -> tuple[tuple[Array, Array], tuple[Measurement, object, object]]:
-            observer = with_gains_at(self.observer, z, reference)
-            estimate, observed_rate = observer(self.model, Measurement(z, z_dot, measured.i), observed)
+            estimate, observed_rate = self._observed(Measurement(z, z_dot, measured.i), observed, reference)
             if self.observer.estimates_velocity:
                 # XLA aborts when it compiles a one-kernel rollout (`compiler.fast_path`) in which z_dot is unused
                 estimate = estimate._replace(z_dot=estimate.z_dot + 0.0 * z_dot)
@@ -178,10 +196,33 @@ class Cascade:
             point = (estimate, z_ddot, reference, state.position, positioned_rate)
             z_rate, v_star_rate = rates_along(self._demanded, *point)
         else:
-            along = (reference.rate(), measured.z_dot, z_ddot, observed_rate, positioned_rate)
+            along = (reference.rate(), measured.z_dot, z_ddot, self._observer_rate(observed_rate), positioned_rate)
             z_rate, v_star_rate = jax.jvp(lambda *x: demanded(*x)[0], point, along)[1]
         rates = CascadeState(observed_rate, positioned_rate, (), ())
         return ForceDemand(z, z_rate, v_star, v_star_rate, gaps), estimate, rates
+
+    def _observed(
+        self, measured: Measurement, state: Any, reference: Reference, sample: Sample | None = None
+    ) -> tuple[Measurement, Any]:
+        """Pass the readings through the notch and the observer.
+
+        Returns the estimate, and the next states of both; in continuous time (`sample` is None), their rates.
+        """
+        observer = with_gains_at(self.observer, measured.z, reference)
+        own, notched = state if self.notch is not None else (state, state)
+        if self.notch is not None:
+            through = self.notch if sample is None else functools.partial(self.notch.step, period=sample.period)
+            z, notched = through(measured, notched)
+            measured = measured._replace(z=z)
+        if sample is None:
+            estimate, own = observer(self.model, measured, own)
+        else:
+            estimate, own = self._advance(sample)(observer, measured, own)
+        return estimate, own if self.notch is None else (own, notched)
+
+    def _observer_rate(self, rate: Any) -> Any:
+        """Return the rate of the states of observer and notch for the rate of z: a notch adds no motion."""
+        return rate if self.notch is None else (rate[0], jax.tree.map(jnp.zeros_like, rate[1]))
 
     def _demanded(self, estimate: Measurement, reference: Reference, state: State) -> tuple[Array, State]:
         """Return v_star (A^2/m^2) and the rate of the state of the position law."""
@@ -265,7 +306,7 @@ class Cascade:
 
     def observed(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State]:
         """Step the observer on a processor. Return the estimate at the sample, and the next state of the observer."""
-        return self._advance(sample)(with_gains_at(self.observer, measured.z, sample.reference), measured, state)
+        return self._observed(measured, state, sample.reference, sample)
 
     def positioned(
         self, sample: Sample, estimate: Measurement, reference: Reference, state: State
@@ -303,7 +344,7 @@ class Cascade:
         if self.observer.estimates_velocity:
             z_rate, v_star_rate = rates_along(force_for, estimate, z_ddot, sample.reference, state.position, rates[1])
         else:
-            along = (sample.reference.rate(), measured.z_dot, z_ddot, *rates)
+            along = (sample.reference.rate(), measured.z_dot, z_ddot, self._observer_rate(rates[0]), rates[1])
             z_rate, v_star_rate = jax.jvp(lambda *x: demanded(*x)[0], point, along)[1]
         v_star = materialised(v_star)
         force = ForceDemand(z, z_rate, v_star, v_star_rate, self.model.gaps(z))

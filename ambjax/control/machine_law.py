@@ -51,7 +51,12 @@ class Demanded(NamedTuple):
 
 
 class MachineLaw(abc.ABC):
-    """Base class of a law of a machine. `measured`: readings of all axes [c], in m, m/s and A."""
+    """Base class of a law of a machine. `measured`: readings of all axes [c], in m, m/s and A.
+
+    `output`: what the law demands of each axis, a "force", "current" or "voltage".
+    """
+
+    output: str = "force"
 
     @abc.abstractmethod
     def begin(self, measured: Measurement, inputs: MachineInputs) -> Any:

@@ -49,6 +49,7 @@ class StateSpaceLaw(MachineLaw):
     resting: Array = _matrix("c", "currents that carry the weight, A")
     resistance: Array = _matrix("c", "commands per current: 1, or the resistance for outputs in V")
     inputs: str = static(default=ERROR, doc="inputs of the controller")
+    output: str = static(default="current", doc="its outputs: current or voltage")
 
     def scale(self) -> Array:
         return jnp.asarray(self.sizes)

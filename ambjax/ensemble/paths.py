@@ -44,6 +44,8 @@ def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
     for stage in ("model", "observer", "position", "inversion", "current"):
         table |= _below(getattr(cascade, stage), f"controller.{stage}", (0, stage))
     table |= _below(cascade.processor, "processor", (0, "processor"))
+    notch = _below(cascade.notch, "controller.notch", (0, "notch"))
+    table |= {path: place for path, place in notch if "rotor" not in place.route}  # that of the scenario replaces it
     names = {
         "plant": "plant",
         "reference": "reference",

@@ -18,8 +18,10 @@ from ambjax.linear.margins import Margins, ResponsePeak, peak, poles_in_s, readi
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar, canonical
 from ambjax.numerics.small_matrices import exponential, times
+from ambjax.numerics.smooth import TWO_PI
 from ambjax.simulation.joint_laws import forces, inputs_of
 from ambjax.simulation.whole_machine import Machine, MachineState, PlantOnly, SampledMachine, still
+from ambjax.world.rotation import PER_MINUTE
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
 
@@ -86,7 +88,9 @@ class _Linear:
         self.machine, self.W, self.period = machine.realised(), W, period
         loops = self.machine.loops()
         self.scenario = tuple(jax.vmap(ideal)(loop.scenario) for loop in loops)
-        self.cascade = tuple(loop.cascade.with_processor(guard=None) for loop in loops)
+        speed = W / (TWO_PI * PER_MINUTE)
+        laws = [jax.vmap(lambda cascade: cascade.at_speed(speed))(loop.cascade) for loop in loops]
+        self.cascade = tuple(cascade.with_processor(guard=None) for cascade in laws)
         self.rotor = self.machine.rotor
         self.low_passed = [one.sensors.bandwidth is not None for one in self.scenario]
         self.lagged = [one.actuator.slow for one in self.scenario]
@@ -386,16 +390,10 @@ def machine_sensitivity(
 
 def sensitivity_of(point: TurningMachine, names: tuple[str, ...], speed: float, zones: Zones) -> MachineSensitivity:
     """Return the sensitivity of a linear machine. `speed`: rpm. The others as for `machine_sensitivity`."""
-    system, c, found = point.system.without_idle(), len(names), dict[bytes, np.ndarray]()
+    system, c = point.system.without_idle(), len(names)
     end = whole_end(system)
     low, high = zones.range(None if system.period is None else float(system.period), max(end, 2 * float(zones.f_low)))
     stable = system.stable
-
-    def response(f: np.ndarray) -> np.ndarray:
-        key = f.tobytes()  # all peaks are searched at the same frequencies first
-        if key not in found:
-            found[key] = np.asarray(system.response(f))
-        return found[key]
 
     responses: dict[bytes, np.ndarray] = {}
 

@@ -37,7 +37,8 @@ def rest(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> Equ
 
 
 def _linear_parts(cascade: Cascade, scenario: Scenario) -> tuple[Cascade, Scenario]:
-    """Return the cascade without its guard, and the scenario without the parts that a linear system cannot contain."""
+    """Return the cascade without its guard, at the speed of t = 0, and the scenario as a linear system contains it."""
+    cascade = cascade.turning(scenario.rotor).at_speed()
     return cascade.with_processor(guard=None), ideal(scenario)
 
 
@@ -51,7 +52,7 @@ def _continuous(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar,
         measured = reading(scenario, plant.measurement(state), (w[0], w[1]))
         command, rates = cascade(measured, control, reference, jnp.asarray(jnp.inf))
         u = scenario.coil_voltage(command.u, state)
-        outputs = jnp.stack([measured.z, measured.z_dot, u, plant.measurement(state).z, command.u])
+        outputs = jnp.stack([measured.z, measured.z_dot, u, plant.measurement(state).z, command.u, measured.i])
         moved = plant.rates(state, u, w[2])
         return ravel_pytree((moved, rates))[0], outputs
 
@@ -82,7 +83,7 @@ def _sampled(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, po
         moved = held.transition @ at + commands @ held.driven + held.disturbed * w[2]
         after = jnp.concatenate([moved, ravel_pytree(after)[0], commands[: len(past)]])
         u = plant.voltage(at, command.u)
-        return after, jnp.stack([measured.z, measured.z_dot, u, plant.motion(at).z, command.u])
+        return after, jnp.stack([measured.z, measured.z_dot, u, plant.motion(at).z, command.u, measured.i])
 
     x = ravel_pytree((plant.start, laws, past))[0]
     (A, B), (C, D) = jax.jacfwd(step, (0, 1))(x, jnp.zeros(3, x.dtype))

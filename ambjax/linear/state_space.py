@@ -18,8 +18,8 @@ PLACES: tuple[Place, ...] = ("reading", "command")
 # Inputs: test signals added to the readings of z (m) and z_dot (m/s), and a disturbance q_z (m/s^2).
 INPUTS = ("e_z", "e_z_dot", "q_z")
 # Outputs: the readings of z (m) and z_dot (m/s), test signals included, the voltage u (V), the true position z (m), and
-# the command of the laws (V, or A for a commanded current).
-OUTPUTS = ("z_read", "z_dot_read", "u", "z", "command")
+# the command of the laws (V, or A for a commanded current), and the reading of i (A).
+OUTPUTS = ("z_read", "z_dot_read", "u", "z", "command", "i_read")
 
 
 class CommandPath(NamedTuple):
@@ -54,7 +54,7 @@ NEUTRAL = 1e-12
 class StateSpace(NamedTuple):
     """The linear system x' = A x + B w, y = C x + D w, or x_{n+1} = A x_n + B w_n on a processor.
 
-    - `A` [N, N], `B` [N, 3], `C` [5, N], `D` [5, 3]: matrices in SI units, with the inputs INPUTS and the outputs
+    - `A` [N, N], `B` [N, 3], `C` [6, N], `D` [6, 3]: matrices in SI units, with the inputs INPUTS and the outputs
       OUTPUTS. On a processor the disturbance q_z is held over a sample.
     - `sizes` [N]: characteristic sizes of the states, with which `scaled` improves the conditioning.
     - `period`: sample period, s; None in continuous time.
@@ -94,7 +94,7 @@ class StateSpace(NamedTuple):
         return one._replace(A=A, B=B, C=C, sizes=sizes)
 
     def response(self, frequency: Array | np.ndarray) -> Array:
-        """Return the complex frequency response at frequencies [F] in Hz, as an array [F, 5 outputs, 3 inputs].
+        """Return the complex frequency response at frequencies [F] in Hz, as an array [F, 6 outputs, 3 inputs].
 
         If the matrices are NumPy arrays, NumPy computes the response, without compilation. If they are JAX arrays, it
         is differentiable.

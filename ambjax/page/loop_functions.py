@@ -45,7 +45,8 @@ class LoopFunctions:
         clock = dataclasses.replace(self.clock, sample_period=numbers.period)
         built: Any = system_of(numbers.cascade, numbers.scenario, clock)
         word = jnp.zeros((), jnp.uint32)
-        loop = ClosedLoop(built.loop.cascade, numbers.scenario.turning(), (word, word), normals)
+        cascade = built.loop.cascade.turning(numbers.scenario.rotor)
+        loop = ClosedLoop(cascade, numbers.scenario.turning(), (word, word), normals)
         return dataclasses.replace(built, loop=loop), clock, self._fold(numbers)
 
     def _fold(self, numbers: Numbers) -> Metrics:

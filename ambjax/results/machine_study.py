@@ -88,7 +88,7 @@ class MachineStudy(AnyStudy):
     def _machine(self, rotor: Rotor, parts: list[tuple[Cascade, Scenario]]) -> Machine:
         law = self.case.machine.law
         systems = [prepare(*part, self.clock)[0] for part in parts]
-        systems = [canonical(system if law is None else inner(system)) for system in systems]
+        systems = [canonical(system if law is None else inner(system, law)) for system in systems]
         return machine_of(rotor, systems, self.case.machine.start_q, law)
 
     def _axis(self, values: dict[str, Any], k: int, member: Any) -> tuple[Cascade, Scenario]:

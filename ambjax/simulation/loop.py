@@ -104,7 +104,8 @@ class ClosedLoop(WholeState):
         """Return the loop of one member, with its random signals drawn and the random key of its sensors."""
         if self.key is not None:
             return self
-        return dataclasses.replace(self, scenario=self.scenario.realised(), key=self.scenario.words())
+        cascade, scenario = self.cascade.turning(self.scenario.rotor), self.scenario.realised()
+        return dataclasses.replace(self, cascade=cascade, scenario=scenario, key=self.scenario.words())
 
     def words(self) -> tuple[Scalar, Scalar]:
         """Return the random key of the member as two 32-bit words."""

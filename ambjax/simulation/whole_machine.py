@@ -6,6 +6,7 @@ each magnet and each sensor, and the forces of the magnets accelerate the coordi
 """
 
 import dataclasses
+import functools
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Self, TypeVar
@@ -30,6 +31,7 @@ from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import DIVERGED, Row
 from ambjax.world.amplifier import Amplifier
+from ambjax.world.rotation import Rotation
 from ambjax.world.rotor import Rotor
 from ambjax.world.sensor import Errors, Measurement
 
@@ -139,7 +141,8 @@ class Machine:
         n = self.rotor.M.shape[-1]
         key = jax.tree.map(lambda x: x[0], self.loops()[0].scenario).key()
         inverse = solve(jnp.asarray(self.rotor.M)[None], jnp.eye(n, dtype=jnp.result_type(float))[None])[0]
-        axes = tuple(self.each(_realised, self.split(jnp.arange(self.count))))
+        realised = functools.partial(_realised, Rotation(self.rotor.speed, self.rotor.acceleration))
+        axes = tuple(self.each(realised, self.split(jnp.arange(self.count))))
         return dataclasses.replace(self, rotor=self.rotor.realised(key), axes=axes, inverse=inverse)
 
     def sensor_errors(self, sample: Scalar) -> tuple[Errors, ...]:
@@ -411,9 +414,12 @@ def _with_loop(axis: Sampled | ClosedLoop, loop: ClosedLoop) -> Sampled | Closed
     return dataclasses.replace(axis, loop=loop) if isinstance(axis, Sampled) else loop
 
 
-def _realised(axis: Sampled | ClosedLoop, number: Array) -> Sampled | ClosedLoop:
-    """Return the loop of one axis with its random signals drawn, and with the random key of this axis."""
-    loop = loop_of(axis.realised())
+def _realised(rotation: Rotation, axis: Sampled | ClosedLoop, number: Array) -> Sampled | ClosedLoop:
+    """Return the loop of one axis with the rotor's speed, its random signals drawn, and the random key of this axis."""
+    loop = loop_of(axis)
+    if loop.scenario.rotor is not None:
+        loop = dataclasses.replace(loop, scenario=dataclasses.replace(loop.scenario, rotor=rotation))
+    loop = loop.realised()
     high, low = jax.random.key_data(jax.random.fold_in(loop.scenario.key(), number))
     return _with_loop(axis, dataclasses.replace(loop, key=(high, low)))
 

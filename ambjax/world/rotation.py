@@ -81,7 +81,8 @@ def _rotation() -> Any:
     return part(default=None, doc="speed; None: that of the scenario")
 
 
-def _known(rotation: Rotation | None) -> Rotation:
+def known(rotation: Rotation | None) -> Rotation:
+    """Return a speed that must be given. Raises ValueError for None."""
     if rotation is None:
         raise ValueError("a turning load or runout has no speed: give Scenario(rotor=Rotation(speed)), or a rotation.")
     return rotation
@@ -89,7 +90,7 @@ def _known(rotation: Rotation | None) -> Rotation:
 
 def _bound(rotation: Rotation | None, size: Scalar, end: float) -> tuple[float, float]:
     """Return bounds of `size` omega^2 sin(...) from 0 to `end` (s). `size`: at least 0, in kg m or m."""
-    peak = np.asarray(size) * _known(rotation).fastest(end) ** 2
+    peak = np.asarray(size) * known(rotation).fastest(end) ** 2
     return hull(-peak, peak)
 
 
@@ -119,7 +120,7 @@ class Unbalance:
     unit: ClassVar = "N"
 
     def __call__(self, t: Scalar) -> Array:
-        rotation = _known(self.rotation)
+        rotation = known(self.rotation)
         omega = rotation.omega(t)
         return GRAM_MM * self.unbalance * omega**2 * sine(rotation.turns(t) + self.phase / TWO_PI)
 
@@ -128,7 +129,7 @@ class Unbalance:
 
     def edges(self) -> tuple[Scalar, ...]:
         """Return the end of the run-up, s, where the slope of the speed jumps; empty without such an end."""
-        return _known(self.rotation).edges()
+        return known(self.rotation).edges()
 
 
 @record
@@ -155,7 +156,7 @@ class UnbalanceGrade:
         return MM * self.grade / (TWO_PI * PER_MINUTE * self.service_speed)
 
     def __call__(self, t: Scalar) -> Array:
-        rotation = _known(self.rotation)
+        rotation = known(self.rotation)
         omega = rotation.omega(t)
         return self.eccentricity * omega**2 * sine(rotation.turns(t) + self.phase / TWO_PI)
 
@@ -164,7 +165,7 @@ class UnbalanceGrade:
 
     def edges(self) -> tuple[Scalar, ...]:
         """Return the end of the run-up, s, where the slope of the speed jumps; empty without such an end."""
-        return _known(self.rotation).edges()
+        return known(self.rotation).edges()
 
 
 @record
@@ -193,7 +194,7 @@ class Runout:
     rotation: Rotation | None = _rotation()
 
     def __call__(self, t: Scalar) -> Array:
-        angle, total = _known(self.rotation).turns(t), jnp.zeros_like(jnp.asarray(t, jnp.result_type(float)))
+        angle, total = known(self.rotation).turns(t), jnp.zeros_like(jnp.asarray(t, jnp.result_type(float)))
         for one in self.harmonics:
             total = total + one.amplitude * sine(one.number * angle + one.phase / TWO_PI)
         return total

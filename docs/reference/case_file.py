@@ -6,6 +6,7 @@ import tomllib
 from typing import Any
 
 from ambjax.cases.controller_tables import KINDS
+from ambjax.cases.notch_table import PHASE
 from ambjax.cases.reader import OTHERS, TABLES, case_from
 from ambjax.cases.scenario_tables import FIELDS, SETTLE, SIGNALS, STOP
 from ambjax.cases.table import Table
@@ -14,6 +15,7 @@ from ambjax.cases.timing import DURATION
 from ambjax.cases.variation import DISTRIBUTIONS
 from ambjax.control.guard import Guard
 from ambjax.control.processor import Processor
+from ambjax.control.synchronous_notch import SynchronousNotch
 from ambjax.ensemble.distributions import SHAPES
 from ambjax.ensemble.paths import places
 from ambjax.linear import Zones
@@ -31,7 +33,7 @@ from reference.parser import keys, remarks, rule
 
 TITLES = ("key", "unit", "default", "allowed", "meaning")
 RECORDS: dict[str, type] = {"plant": Plant, "processor": Processor, "initial": Initial, "sensor": Sensor}
-RECORDS["rotor"] = Rotation
+RECORDS |= {"rotor": Rotation, "controller.notch": SynchronousNotch}
 RECORDS |= {"actuator": Amplifier, "actuator.coil": CoilLimits, "processor.guard": Guard, "sensitivity": Zones}
 RECORDS |= {"plant.iron": Iron, "sensor.outliers": Outliers, "sensor.dropouts": Dropouts, "sensor.runout": Runout}
 SETTINGS: dict[str, dataclasses.Field] = {
@@ -42,6 +44,7 @@ SETTINGS: dict[str, dataclasses.Field] = {
     "run.settle": SETTLE,
     "run.stop_stiffness": STOP["stiffness"],
     "run.stop_damping": STOP["damping"],
+    "controller.notch.phase": PHASE,
 }
 # Meaning of each table, and its default.
 WORDS = {
@@ -56,8 +59,10 @@ WORDS = {
     "controller.position.output": "quantity that the controller returns: a current (A) or a voltage (V)",
     "controller.model": "Parameters of the controller's model that differ from the plant: any key of `[plant]`.",
     "rotor": "The speed of the rotor. Unbalance, runout and the notch of the controller share its angle. Default: the "
-    "rotor does not turn. See [once per revolution](../loads.md#unbalance). With `kind`, the table describes "
+    "rotor does not turn. See [once per revolution](../loads.md#once-per-revolution). With `kind`, the table describes "
     "the rotor of a [whole machine](../machine.md).",
+    "controller.notch": "The synchronous notch: it removes the speed of `[rotor]` from the current or from z. Default: "
+    "no notch. See [once per revolution](../loads.md#notch).",
     "processor": "The processor of the controller: all laws make one step per sample. Their voltage acts after "
     "a delay and is held for one sample. Default: continuous time, as in the paper. See "
     "[the processor](../processor.md).",

@@ -1,0 +1,43 @@
+"""The table [controller.notch]: the notch at the speed of the rotor."""
+
+import dataclasses
+
+from ambjax.cases.table import Table
+from ambjax.control.cascade import Cascade
+from ambjax.control.synchronous_notch import NULLED, SynchronousNotch
+from ambjax.linear.notch_design import with_notch_gains
+from ambjax.numerics.records import leaf
+from ambjax.simulation.clock import Clock
+from ambjax.world.scenario import Scenario
+
+PHASE = leaf(
+    default=None, unit="degrees", at_least=-360.0, at_most=360.0, optional=True,
+    doc="phase of the response that the notch inverts; none: that of the linear loop at each speed",
+)  # fmt: skip
+
+
+def notch_from(top: Table, scenario: Scenario) -> tuple[SynchronousNotch, float | None] | None:
+    """Return the notch of [controller.notch] without its gains, and the key `phase`; None without the table."""
+    controller = top.table("controller")
+    if "notch" not in controller.raw:
+        return None
+    table, rotor = controller.table("notch"), scenario.rotor
+    table.only(["kind", "rate", "min_speed", "phase"])
+    kind, phase = table.choice("kind", list(NULLED), next(iter(NULLED))), table.leaf("phase", PHASE)
+    if rotor is None or (rotor.speed == 0 and rotor.acceleration == 0):
+        raise ValueError("[controller.notch]: it follows the speed of the rotor. Give rotor.speed, in rpm.")
+    given = Table({key: table.raw[key] for key in ("rate", "min_speed") if key in table.raw}, table.path)
+    notch = given.record(SynchronousNotch)
+    return dataclasses.replace(notch, removes=kind, rotor=rotor, varying=rotor.acceleration != 0), phase
+
+
+def with_notch(top: Table, cascade: Cascade, scenario: Scenario, clock: Clock) -> Cascade:
+    """Return the cascade with the notch of [controller.notch]. Raises ValueError if its loop has no linearisation."""
+    found = notch_from(top, scenario)
+    if found is None:
+        return cascade
+    notch, phase = found
+    try:
+        return with_notch_gains(dataclasses.replace(cascade, notch=notch), scenario, clock, phase)
+    except ValueError as error:
+        raise ValueError(f"[controller.notch]: its gain cannot be computed: {error}") from None

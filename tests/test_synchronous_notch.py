@@ -1,0 +1,137 @@
+"""The notch at the speed of the rotor: what it removes, how fast, and in every form of the controller."""
+
+import dataclasses
+import tomllib
+
+import numpy as np
+import pytest
+
+from ambjax.cases.machine_case import machine_from
+from ambjax.cases.reader import case_from
+from ambjax.cases.template_text import template
+from ambjax.codegen.c99.source import Origin
+from ambjax.codegen.of_case import block_of
+from ambjax.codegen.verify import draft, holds, verify
+from ambjax.linear import linearise
+from ambjax.linear.margins import poles_in_s
+from ambjax.results.machine_run import simulate_machine
+from ambjax.results.runs import simulate
+
+RATE, RPM = 20.0, 6000.0
+LAWS = {
+    "position": {"kind": "pid", "k_p": 1e5, "k_d": 800.0, "k_int": 1e-3},
+    "inversion": {"kind": "closed-form"},
+    "current": {"kind": "pi"},
+}
+# A force of 1e-4 of the weight: the nonlinear loop is its linearisation to 1e-6.
+TURNING = {
+    "controller": LAWS,
+    "rotor": {"speed": RPM},
+    "disturbance": {"q_z": {"kind": "unbalance", "unbalance": 0.05, "phase": 0.2}},
+    "clock": {"duration": 0.7, "sample_period": 1e-4},
+    "run": {"settle": 0.65},
+}
+ON_PROCESSOR = TURNING | {"processor": {"delay": 1.0}}
+
+
+def with_notch(raw, kind, **more):
+    notch = {"kind": kind, "rate": RATE} | more
+    return raw | {"controller": raw.get("controller", {}) | {"notch": notch}}
+
+
+@pytest.fixture(scope="module")
+def without():
+    return {name: simulate(case_from(raw)).metrics for name, raw in (("c", TURNING), ("p", ON_PROCESSOR))}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "nulled"), [("force-free", "i_1x_A"), ("displacement-free", "z_1x_m")])
+@pytest.mark.parametrize(("which", "raw"), [("c", TURNING), ("p", ON_PROCESSOR)])
+def test_the_notch_removes_the_speed_from_one_signal(without, which, raw, kind, nulled):
+    run = simulate(case_from(with_notch(raw, kind)))
+    # exp(-20 * 0.65) = 2e-6 of what the start contains
+    assert run.metrics[nulled] < 1e-4 * without[which][nulled]
+    other = {"i_1x_A": "z_1x_m", "z_1x_m": "i_1x_A"}[nulled]
+    assert run.metrics[other] > 0.3 * without[which][other]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("raw", [TURNING, ON_PROCESSOR])
+def test_the_linear_loop_contains_the_notch(raw):
+    """A pole at -rate +- j W for a small rate; no response of the nulled reading at the speed."""
+    for rate in (0.2, 2.0):
+        case = case_from(with_notch(raw, "force-free", rate=rate))
+        system = linearise(case.cascade, case.scenario, case.clock)
+        assert np.max(np.abs(system.response(np.array([RPM / 60]))[0, 5])) < 1e-9 * np.max(
+            np.abs(linearise(dataclasses.replace(case.cascade, notch=None), case.scenario, case.clock)
+                   .response(np.array([RPM / 60]))[0, 5])
+        )  # fmt: skip
+        poles = poles_in_s(system)
+        # the loop changes G within the band `rate`: an error of the order of rate^2
+        expected = -rate + 2j * np.pi * RPM / 60
+        assert np.min(np.abs(poles - expected)) < 0.003 * rate**2 + 1e-4 * rate
+
+
+@pytest.mark.slow
+def test_the_phase_must_be_right_within_a_quarter_of_a_turn():
+    """A notch with a phase 80 degrees off converges, at 100 degrees it is not stable; `phase` replaces the phase."""
+    case = case_from(with_notch(ON_PROCESSOR, "displacement-free", rate=1.0))
+    (gain,) = case.cascade.notch.gains
+    right = -np.degrees(np.angle(complex(gain.real, gain.imaginary)))
+    for off, stable in ((80.0, True), (100.0, False), (-80.0, True), (-100.0, False)):
+        phase = (right + off + 180) % 360 - 180
+        one = case_from(with_notch(ON_PROCESSOR, "displacement-free", rate=1.0, phase=phase))
+        assert linearise(one.cascade, one.scenario, one.clock).stable == stable
+
+
+@pytest.mark.slow
+def test_a_run_up_switches_the_notch_on_without_a_kick():
+    rotor = {"speed": 600.0, "acceleration": 9000.0, "speed_end": RPM}
+    times = {"clock": {"duration": 1.2, "sample_period": 1e-4}, "run": {"settle": 1.1}}
+    plain = case_from(ON_PROCESSOR | times | {"rotor": rotor})
+    notched = case_from(with_notch(ON_PROCESSOR | times | {"rotor": rotor}, "force-free", min_speed=3000.0))
+    alone, run = simulate(plain), simulate(notched)
+    t = np.asarray(run.trajectory.rows.t)
+    below, on = t < 0.26, (t > 0.26) & (t < 0.5)  # 3000 rpm at 0.267 s
+    i, i_alone = (np.asarray(x.trajectory.rows.i) for x in (run, alone))
+    np.testing.assert_allclose(i[below], i_alone[below], rtol=0, atol=1e-12)
+    assert np.ptp(i[on]) < 1.2 * np.ptp(i_alone[on])
+    assert run.metrics["i_1x_A"] < 1e-4 * alone.metrics["i_1x_A"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rotor", [{"speed": RPM}, {"speed": 3000.0, "acceleration": 1e4}])
+def test_the_exported_notch_equals_the_simulated_one(tmp_path, rotor):
+    case = case_from(with_notch(ON_PROCESSOR | {"rotor": rotor}, "force-free"))
+    controller = block_of("controller", case.cascade, case.scenario, case.clock)
+    names = [number.name for number in controller.numbers()]
+    assert "controller.notch.rotor.speed" in names or "notch.rotor.speed" in names
+    made = draft(controller, "double", "notch", Origin("test", "0" * 64, controller.described()), 2000)
+    assert holds(verify({"double": made}, None))
+
+
+@pytest.mark.slow
+def test_every_axis_of_a_machine_is_freed_of_force():
+    raw = tomllib.loads(template("machine"))
+    raw["rotor"] |= {"speed": RPM}
+    raw |= {"clock": raw["clock"] | {"duration": 0.5}, "run": {"settle": 0.45}, "load": [],
+            "sensor": {"velocity": False}, "unbalance": [{"at": 0.05, "amount": 0.1}]}  # fmt: skip
+    alone = simulate_machine(machine_from(raw)).metrics["axes"]
+    freed = simulate_machine(machine_from(with_notch(raw, "force-free"))).metrics["axes"]
+    radial = [axis for axis in alone if not axis.endswith(".z")]
+    assert len(radial) == 4
+    for axis in radial:
+        assert freed[axis]["i_1x_A"] < 1e-2 * alone[axis]["i_1x_A"]
+
+
+@pytest.mark.parametrize(
+    ("raw", "said"),
+    [
+        ({"controller": {"notch": {"kind": "force-free"}}}, r"\[controller.notch\]: it follows the speed of the rotor"),
+        (TURNING | {"controller": {"notch": {"kind": "free"}}}, "controller.notch.kind = .*one of 'force-free'"),
+        (with_notch(TURNING, "force-free", rate=0.0), "controller.notch.rate = 0: it must be"),
+    ],
+)
+def test_a_wrong_notch_is_refused(raw, said):
+    with pytest.raises(ValueError, match=said):
+        case_from(raw)
