@@ -81,10 +81,8 @@ def machine(case: Case) -> list[Fact]:
     """Return the numbers of the plant, its supply and its converters."""
     plant, sensor = case.scenario.plant, case.scenario.sensors
     (force, weight, load), period = forces(case), float(case.clock.sample_period)
-    (u_max, reserve), step = _voltages(case), None
+    (u_max, reserve), step = _voltages(case), float(sensor.step(plant.s_0)) or None
     slew = None if u_max is None else u_max / float(plant.L)
-    if sensor.bits is not None:
-        step = 2 * float(sensor.ends(plant.s_0)) / 2 ** float(sensor.bits)
     std = float(sensor.std)
     return [
         Fact("force_reserve", "largest force / weight", force / weight if weight else None, "1"),

@@ -72,6 +72,10 @@ class Amplifier:
         """Whether the output voltage is a state, because the bandwidth or the slew rate is limited."""
         return self.bandwidth is not None or self.slew is not None
 
+    def linear(self) -> "Amplifier":
+        """Return the amplifier without the effects that a linear system cannot contain."""
+        return Amplifier(self.bandwidth)
+
     def slope(self) -> Scalar:
         """Return the rate w of the output voltage, 1/s; 0 if the bandwidth is not limited."""
         return 0.0 if self.bandwidth is None else 2 * jnp.pi * self.bandwidth
@@ -131,6 +135,10 @@ class CurrentAmplifier:
     mode: ClassVar[str] = "current"
     slow: ClassVar[bool] = False
     coil: ClassVar[None] = None
+
+    def linear(self) -> "CurrentAmplifier":
+        """Return the amplifier without its limit."""
+        return CurrentAmplifier(self.bandwidth)
 
     def slope(self) -> Scalar:
         """Return the rate w of the current, 1/s."""
