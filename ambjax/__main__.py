@@ -6,7 +6,7 @@ import sys
 
 from ambjax._version import __version__
 from ambjax.host.command_line import Parser, complain, run_command
-from ambjax.host.heartbeat import Heartbeat
+from ambjax.host.heartbeat import FIRST_RUN, Heartbeat, doing
 from ambjax.host.interrupts import exit_on_interrupt
 from ambjax.host.streams import open_streams
 
@@ -182,7 +182,7 @@ def _run(args: argparse.Namespace) -> tuple[int, object]:
     from ambjax.ensemble import worker
 
     worker.configure_jax()
-    with Heartbeat():
+    with Heartbeat(), doing(f"{args.command} is running; {FIRST_RUN}"):
         return importlib.import_module(f"ambjax.commands.{args.command}").run(args)
 
 

@@ -41,9 +41,7 @@ class Bearing(Generic[S]):
         at_most=1e12,
         doc="axial stiffness of one passive bearing; negative: restoring",
     )
-    mu_0: Scalar = leaf(
-        default=1.25e-6, unit="N/A^2", at_least=1e-8, at_most=1e-4, doc="vacuum permeability, as the paper prints it"
-    )
+    mu_0: Scalar = leaf(default=1.25e-6, unit="N/A^2", at_least=1e-8, at_most=1e-4, doc="permeability of the air gap")
     n: Scalar = leaf(default=1480.0, unit="1", at_least=1, at_most=1e6, doc="turns of each coil")
     A: Scalar = leaf(default=0.121, unit="m^2", at_least=1e-9, at_most=100.0, doc="area of a pole")
     s_0: Scalar = leaf(default=5e-3, unit="m", at_least=1e-6, at_most=1.0, doc="air gap at z = 0")

@@ -92,7 +92,13 @@ def order_of_work(trace: Trace) -> list[str]:
     ]
     ahead = f"{processor.ahead:g} T after the reading" if processor.predicts else "of the reading"
     lines.append(f"The reference is that of the instant {ahead}.")
-    return lines
+    model = block.parameters.controller.model
+    rest = f"R i_0 = {model.R * model.i_0:.6g} V" if unit == "V" else f"i_0 = {model.i_0:.6g} A"
+    return [
+        *lines,
+        "With two coils, coil 1 pulls towards z > 0, coil 2 towards z < 0, and i = (i_1 - i_2)/2. With",
+        f"{rest}, coil 1 gets {rest.partition(' =')[0]} + u, and coil 2 gets {rest.partition(' =')[0]} - u.",
+    ]
 
 
 def fixed(trace: Trace) -> list[str]:
