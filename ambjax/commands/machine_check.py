@@ -69,7 +69,10 @@ def _spill_over(case: MachineCase) -> dict[str, float]:
     raw = tomllib.loads(case.text) if case.text else {}
     if raw.get("rotor", {}).get("kind") != "shaft" or isinstance(raw["rotor"].get("damping"), list):
         return {}
-    raw["rotor"]["modes"] = (len(case.coordinates) - 5) // 2 + MORE
+    known = (len(case.coordinates) - 5) // 2
+    raw["rotor"]["modes"] = known + MORE
+    if raw.get("controller", {}).get("kind") == "lqg":  # the same controller
+        raw["controller"]["lqg"] = {"modes": known} | raw["controller"].get("lqg", {})
     more = machine_from(raw, case.name)
     points = turning_machines(more.machine, case.clock.sample_period, case.speeds)
     growth = [float(np.max(np.real(poles_in_s(point.system.without_idle())))) for point in points]
