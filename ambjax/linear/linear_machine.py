@@ -386,16 +386,10 @@ def machine_sensitivity(
 
 def sensitivity_of(point: TurningMachine, names: tuple[str, ...], speed: float, zones: Zones) -> MachineSensitivity:
     """Return the sensitivity of a linear machine. `speed`: rpm. The others as for `machine_sensitivity`."""
-    system, c, found = point.system.without_idle(), len(names), dict[bytes, np.ndarray]()
+    system, c = point.system.without_idle(), len(names)
     end = whole_end(system)
     low, high = zones.range(None if system.period is None else float(system.period), max(end, 2 * float(zones.f_low)))
     stable = system.stable
-
-    def response(f: np.ndarray) -> np.ndarray:
-        key = f.tobytes()  # all peaks are searched at the same frequencies first
-        if key not in found:
-            found[key] = np.asarray(system.response(f))
-        return found[key]
 
     responses: dict[bytes, np.ndarray] = {}
 
