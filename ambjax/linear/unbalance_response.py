@@ -144,15 +144,12 @@ def _peaks(found: UnbalanceResponse, axis: int, operating: tuple[float, float]) 
     """Return the peaks of the response of one axis."""
     speeds, size, peaks = found.speeds, np.abs(found.sensors[:, axis]), []
     for k in np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] >= size[2:])) + 1:
-        left, right = (_half_power(speeds, size, int(k), step) for step in (-1, 1))
-        if left is None and right is None:
-            continue  # a shoulder of a larger peak
         N = float(speeds[k])
-        # a side that another peak hides has the width of the other one
-        width = (right if right is not None else 2 * N - float(left or 0)) - (left if left is not None else 0.0)
-        if left is None:
-            width = 2 * (float(right or 0) - N)
-        AF = N / width
+        ends = [_half_power(speeds, size, int(k), step) for step in (-1, 1)]
+        sides = [abs(end - N) for end in ends if end is not None]
+        if not sides:
+            continue  # a shoulder of a larger peak
+        AF = N / (sum(sides) * 2 / len(sides))  # a side that another peak hides has the width of the other one
         peaks.append(CriticalSpeed(N, axis, 2 * float(size[k]), AF, *separation(N, AF, operating)))
     return peaks
 
