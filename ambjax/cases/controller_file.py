@@ -59,15 +59,20 @@ def read_controller(path: pathlib.Path) -> dict[str, np.ndarray]:
 
     Raises ValueError if the file cannot be read or lacks an array.
     """
-    try:
-        arrays = _of_npz(path) if path.suffix == ".npz" else _of_mat(path)
-    except OSError as error:
-        why = error.strerror or "is it a file?"
-        raise ValueError(f"{path} cannot be read ({why}). A path is relative to the folder of the case file.") from None
+    arrays = arrays_of(path)
     if missing := [name for name in NAMES if name not in arrays]:
         found = ", ".join(name for name in arrays if not name.startswith("_")) or "none"
         raise ValueError(f"the array {missing[0]} is missing. The file must contain {_needed()}; it has {found}.")
     return {name: arrays[name] for name in (*NAMES, OPTIONAL) if name in arrays}
+
+
+def arrays_of(path: pathlib.Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an .npz or .mat file. Raises ValueError if it cannot be read."""
+    try:
+        return _of_npz(path) if path.suffix == ".npz" else _of_mat(path)
+    except OSError as error:
+        why = error.strerror or "is it a file?"
+        raise ValueError(f"{path} cannot be read ({why}). A path is relative to the folder of the case file.") from None
 
 
 def _needed() -> str:
@@ -79,7 +84,7 @@ def _of_npz(path: pathlib.Path) -> dict[str, np.ndarray]:
         with np.load(path) as file:
             return {name: file[name] for name in file.files}
     except (ValueError, TypeError, EOFError, AttributeError, zipfile.BadZipFile):  # no archive, or pickled objects
-        raise ValueError("not an .npz file of plain numbers. Write it with save_controller or numpy.savez.") from None
+        raise ValueError("not an .npz file of plain numbers. Write it with numpy.savez.") from None
 
 
 def _of_mat(path: pathlib.Path) -> dict[str, np.ndarray]:
@@ -92,7 +97,7 @@ def _of_mat(path: pathlib.Path) -> dict[str, np.ndarray]:
     except OSError:
         raise
     except Exception:  # SciPy raises errors of many types for a damaged file
-        raise ValueError("not a .mat file. Save the arrays with: save FILE.mat A B C D dt -v7.") from None
+        raise ValueError("not a .mat file. Save the arrays with MATLAB's save and the option -v7.") from None
     with contextlib.suppress(KeyError):  # MATLAB stores a number as a matrix
         arrays[OPTIONAL] = arrays[OPTIONAL].squeeze()
     return arrays

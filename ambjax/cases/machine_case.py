@@ -101,7 +101,7 @@ def machine_from(
     top.only([*TABLES, *MACHINE_TABLES[1:], "tune"])
     if "disturbance" in raw:
         raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] instead.")
-    body, bearings = body_from(top), tables_of(top, "bearing")
+    body, bearings = body_from(top, folder), tables_of(top, "bearing")
     if not bearings:
         raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
     axes = axes_from(bearings, body)
