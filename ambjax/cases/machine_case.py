@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.cases.machine_controller import inner, law_from, merged, without_keys
+from ambjax.cases.machine_controller import axis_controller, inner, law_from, merged
 from ambjax.cases.machine_spread import axis_table, fastest_rotor, machine_spread, refuse_unused
 from ambjax.cases.notch_table import notch_from
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
@@ -104,7 +104,7 @@ def machine_from(
     top.only([*TABLES, *MACHINE_TABLES[1:], "tune"])
     if "disturbance" in raw:
         raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] instead.")
-    body, bearings = body_from(top), tables_of(top, "bearing")
+    body, bearings = body_from(top, folder), tables_of(top, "bearing")
     if not bearings:
         raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
     axes = axes_from(bearings, body)
@@ -127,7 +127,7 @@ def machine_from(
         case = read(own, f"axis {axis.name}")
         _check_force(case, axis, force)
         cases.append(case)
-    law, parts = law_from(top, rotor, bearings, cases, read)
+    law, parts, demand = law_from(top, rotor, bearings, cases, read, folder)
     spread = machine_spread(top, rotor, axes, names, cases)
     if law is not None:
         refuse_unused(spread)
@@ -137,7 +137,7 @@ def machine_from(
     coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
     return MachineCase(
         name=safe_name(name),
-        machine=_machine(rotor, cases, clock, q, law),
+        machine=_machine(rotor, cases, clock, q, law, demand),
         clock=clock,
         axes=tuple(axis.name for axis in axes),
         coordinates=coordinates,
@@ -150,9 +150,11 @@ def machine_from(
     )
 
 
-def _machine(rotor: Rotor, cases: list[Case], clock: Clock, q: np.ndarray, law: MachineLaw | None) -> Machine:
+def _machine(
+    rotor: Rotor, cases: list[Case], clock: Clock, q: np.ndarray, law: MachineLaw | None = None, demand: str = "force"
+) -> Machine:
     systems = [prepare(case.cascade, case.scenario, clock)[0] for case in cases]
-    systems = [canonical(system if law is None else inner(system)) for system in systems]
+    systems = [canonical(system if law is None else inner(system, demand)) for system in systems]
     return machine_of(rotor, systems, jnp.asarray(q), law)
 
 
@@ -167,7 +169,7 @@ def _with_notches(
         raise ValueError('[controller.notch] acts on axes. Leave it out, or use controller.coordinates = "axes".')
     notch, phase = found
     speeds = notch_speeds(known(notch.rotor), notch, float(clock.duration))
-    machine = _machine(rotor, cases, clock, q, None)
+    machine = _machine(rotor, cases, clock, q)
     gains = machine_notch_gains(machine, notch, speeds, clock.sample_period, phase)
     laws = [
         dataclasses.replace(case.cascade, notch=dataclasses.replace(notch, gains=own))
@@ -249,7 +251,7 @@ def _axis_raw(raw: dict[str, Any], bearing: Table, m: float, force: float, initi
         if isinstance(plant, dict) and name in plant:
             raise ValueError(f"plant.{name} = {show(plant[name])}: the rotor gives it. Leave it out beside [rotor].")
     own["plant"] = plant | {"m": m, "k_z": 0.0, "g": force / m}
-    without_keys(own)
+    axis_controller(own)
     if isinstance(own.get("sensitivity"), dict):
         own["sensitivity"].pop("speeds", None)
     return own | {"initial": initial}

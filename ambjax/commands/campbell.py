@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     criticals = [] if found is None else critical_speeds(found, operating)
     summary = {
         "speeds_rpm": speeds, "stable": not unstable, "unstable_at_rpm": unstable, "growth_per_s": growth,
-        "poles_per_s": [[[float(p.real), float(p.imag)] for p in own[np.argsort(-own.real)]] for own in poles],
+        "poles_per_s": [[[float(p.real), float(p.imag)] for p in own[np.argsort(-np.real(own))]] for own in poles],
         "modes": [[mode.numbers() for mode in own] for own in modes],
         "unbalance": None if found is None else _unbalance(case, found, criticals, operating),
     }  # fmt: skip

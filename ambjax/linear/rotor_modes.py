@@ -57,7 +57,8 @@ def modes_of(point: TurningMachine, rotor: Rotor) -> list[Mode]:
     values, vectors = np.linalg.eig(np.asarray(system.A))
     if system.period is not None:
         # a negative real pole alternates from sample to sample: it is no oscillation of the rotor
-        kept = (np.abs(values) > DELAY) & ((np.abs(values.imag) > REAL * np.abs(values)) | (values.real > 0))
+        size = np.abs(values)
+        kept = (size > DELAY) & ((np.abs(np.imag(values)) > REAL * size) | (np.real(values) > 0))
         values, vectors = np.log(values[kept] + 0j) / float(system.period), vectors[:, kept]
     n, masses = len(np.asarray(rotor.gravity)), np.diag(np.asarray(rotor.M))
     shapes = np.asarray(system.C)[-n:] @ vectors

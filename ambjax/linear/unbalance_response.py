@@ -84,7 +84,7 @@ def _near_crossings(speeds: np.ndarray, points: Sequence[TurningMachine]) -> np.
     lines, found = [], []
     for point in points:
         poles = poles_in_s(point.system.without_idle())
-        lines.append(poles[(poles.imag > 0) & (np.abs(poles.real) < DAMPED * np.abs(poles))] * 30 / np.pi)
+        lines.append(poles[(np.imag(poles) > 0) & (np.abs(np.real(poles)) < DAMPED * np.abs(poles))] * 30 / np.pi)
     for k in range(len(points) - 1):
         for pole in lines[k] if len(lines[k + 1]) else ():
             after = lines[k + 1][np.argmin(np.abs(lines[k + 1] - pole))]
