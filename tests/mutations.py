@@ -551,9 +551,9 @@ MUTATIONS = [
     ),
     M(
         "the injected wave is subtracted from the reading",
-        "ambjax/linear/multisine.py",
-        "_added(measured, self.wave.reading, self.injected(t))",
-        "_added(measured, self.wave.reading, -self.injected(t))",
+        "ambjax/simulation/sampled.py",
+        "with_signal(measured, self.wave, self.wave.at(",
+        "with_signal(measured, self.wave, -self.wave.at(",
         "tests/test_injection.py::test_the_peak_agrees_with_the_independent_simulator[complementary]",
     ),
     M(

@@ -119,7 +119,7 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
         (lambda r: ambjax.sensitivity(case, r), "a", "r = 'a': it must be a number"),
         (lambda paths: ambjax.gains_of(case.cascade, paths), 3, "paths = 3: it must be a list"),
         (lambda gains: ambjax.with_gains(case.cascade, gains), 3, "gains = 3: it must be a dict"),
-        (lambda cascade: ambjax.gains_of(cascade, []), case, "cascade = Case: it must be a Cascade"),
+        (lambda loop: ambjax.gains_of(loop, []), 3, "loop = int: it must be a Case"),
         (lambda progress: ambjax.simulate(case, progress), 3, "progress = 3: it must be a function"),
         (lambda prefix: ambjax.export(case, prefix=prefix), 3, "prefix = 3: it must be a C identifier"),
     )
@@ -203,6 +203,18 @@ def test_derivatives_with_respect_to_named_gains_only():
     assert {path: float(x) for path, x in slopes.items()} == {paths[0]: pytest.approx(2 * c * k_i), paths[1]: c**2}
     with pytest.raises(ValueError, match=r"^controller\.position\.cc: .*Did you mean 'controller\.position\.c'"):
         ambjax.gains_of(cascade, ["controller.position.cc"])
+
+
+def test_a_case_stands_for_its_cascade_scenario_and_clock():
+    case = ambjax.read_case({"initial": {"z": 1e-4}, "clock": {"duration": 0.005, "method": "adaptive"}})
+    faster = ambjax.with_gains(case, {"controller.position.c": 50.0})
+    assert (float(faster.cascade.position.c), faster.clock) == (50.0, case.clock)
+    assert ambjax.gains_of(faster) == ambjax.gains_of(faster.cascade)
+    one, other = ambjax.rollout(faster), ambjax.rollout(faster.cascade, case.scenario, case.clock)
+    np.testing.assert_array_equal(one.trajectory.rows.z, other.trajectory.rows.z)
+    assert ambjax.rollout(case, record_every=0).trajectory.rows is None
+    loop = ambjax.linear.linearise(case, r=1e-5)
+    np.testing.assert_array_equal(loop.A, ambjax.linear.linearise(case.cascade, case.scenario, case.clock, 1e-5).A)
 
 
 def test_a_run_is_saved_for_other_programs(run, tmp_path):

@@ -61,8 +61,8 @@ class Machines:
 class CompiledLoop(Sampled):
     """The sampled loop whose laws are the compiled controller `which` of `machines`."""
 
-    which: Scalar
-    machines: Machines = static()
+    which: Scalar = 0.0
+    machines: Machines = static(default=None)
 
     def start(self) -> SampledState:
         zero = jnp.zeros(())
@@ -110,7 +110,8 @@ def compare_loops(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, Lo
     given: Any = system_of(case.cascade, case.scenario, case.clock)
     host, found = Machines(*machines.values()), {}
     for which, (precision, horizon) in enumerate(horizons(case, list(machines)).items()):
-        looped = CompiledLoop(ClosedLoop(given.loop.cascade, case.scenario), given.period, given.cuts, which, host)
+        loop = ClosedLoop(given.loop.cascade, case.scenario)
+        looped = CompiledLoop(loop, given.period, given.cuts, which=which, machines=host)
         found[precision] = LoopComparison(
             horizon, times_of(_displacement(looped, case.clock, horizon.samples), horizon)
         )

@@ -75,8 +75,8 @@ class Twin(Sampled):
     The change of a number is `unit` times its magnitude or its scale, whichever is larger.
     """
 
-    seed: Scalar
-    unit: Scalar
+    seed: Scalar = 0.0
+    unit: Scalar = 0.0
     held: bool = static(default=False, doc="disturbances are constant over each sample")
 
     def jump(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors) -> SampledState:
@@ -149,7 +149,7 @@ def horizons(case: LoopCase, precisions: list[str], *, held: bool = False) -> di
     `held`: hold the disturbances over each sample, as an exported plant does.
     """
     given: Any = system_of(case.cascade, case.scenario, case.clock)
-    twin, clock = canonical((Twin(given.loop, given.period, given.cuts, 0.0, 0.0, held), case.clock))
+    twin, clock = canonical((Twin(given.loop, given.period, given.cuts, held=held), case.clock))
     units = [0.0] + [float(np.finfo(PRECISIONS[x]).eps) for x in precisions for _ in range(TWINS)]
     signals, r, lost_at = _together(twin, clock, jnp.asarray(units), jnp.arange(len(units)))
     z_and_u = {name: np.asarray(x) for name, x in zip(SIGNALS, signals, strict=True)}

@@ -24,6 +24,7 @@ from ambjax.numerics.shapes import varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
 from ambjax.simulation.rollout import Result, System, prepare, run
+from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 
 # Largest number of members in one call of the compiled program, if the argument `call` is None.
@@ -45,6 +46,7 @@ class Parts(NamedTuple):
     shared: Any
 
 
+@takes_case
 def run_ensemble(
     cascade: Cascade,
     scenario: Scenario,

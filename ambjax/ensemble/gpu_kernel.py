@@ -26,8 +26,9 @@ from ambjax.numerics.shapes import varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import RK4
 from ambjax.simulation.folds import Fold
-from ambjax.simulation.loop import Realised
+from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.rollout import Result, prepare, run
+from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 
 # Threads of a warp, and largest number of warps of a program. A thread simulates one member, or block/1024 members in
@@ -36,6 +37,7 @@ WARP, MOST_WARPS = 32, 32
 BLOCK = 128
 
 
+@takes_case
 def run_on_gpu(
     cascade: Cascade,
     scenario: Scenario,
@@ -86,7 +88,7 @@ def _in_one_kernel(
 ) -> Result:
     """Build the kernel, run it on all members, and return their outcomes [N]."""
     scenario, key = _with_draws(scenario, members)
-    whole = Realised(cascade, scenario, key), clock, fold
+    whole = ClosedLoop(cascade, scenario, key), clock, fold
     (leaves, tree), axes = jax.tree.flatten(whole), [0 if varies else None for varies in varying(whole)]
     traced, results = _traced(leaves, tree, axes, block)
     programs = -(-members // block)

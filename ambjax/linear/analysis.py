@@ -26,6 +26,7 @@ from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar, canonical, leaf, record
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import prepare
+from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 
 _matrices = compiled_quickly(loop_matrices, options=QUICKEST)
@@ -160,6 +161,7 @@ class Analysis(NamedTuple):
     margins_at: LoopMargins
 
 
+@takes_case
 def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.0) -> StateSpace:
     """Linearise the loop at the equilibrium of the constant reference r (m).
 
@@ -194,6 +196,7 @@ def checked(system: StateSpace, found: Any, r: Scalar, moving: str = "") -> Stat
     return system.without_idle()
 
 
+@takes_case
 def linearise_members(
     cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.0
 ) -> tuple[StateSpace, np.ndarray]:

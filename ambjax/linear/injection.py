@@ -18,6 +18,7 @@ from ambjax.linear.member_responses import Responses, member_responses
 from ambjax.linear.multisine import Reading
 from ambjax.numerics.records import Scalar
 from ambjax.simulation.clock import Clock
+from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 
 # LINES: number of logarithmically spaced lines. NEAR: number of lines near a peak. AROUND: their range as multiples of
@@ -69,6 +70,7 @@ def frequency_lines(zones: Zones, clock: Clock, peak: float | None = None) -> np
     return np.unique(np.clip(harmonics, 1, (clock.samples - 1) // 2)) / float(clock.duration)
 
 
+@takes_case
 def injected(
     cascade: Cascade,
     scenario: Scenario,
@@ -124,6 +126,7 @@ class MemberPeaks(NamedTuple):
     lost: np.ndarray
 
 
+@takes_case
 def injected_members(
     cascade: Cascade,
     scenario: Scenario,

@@ -208,9 +208,9 @@ class _Linear:
         newton = newton_of(lambda y: ravel_pytree(self.residual(restore(y * scale)))[0] / scale, flat / scale)
         return restore(newton.y * scale), sizes, newton.error <= TOLERANCE * jnp.finfo(flat.dtype).eps
 
-    def system(self) -> tuple[StateSpace, Array]:
-        """Return the state space, and whether an equilibrium was found."""
-        point, sizes, found = self.rest()
+    def system(self, rest: tuple[_Rest, _Rest, Array] | None = None) -> tuple[StateSpace, Array]:
+        """Return the state space, and whether an equilibrium was found. `rest`: result of `rest`, if it is known."""
+        point, sizes, found = rest or self.rest()
         amplified = tuple(u if on else () for u, on in zip(point.u, self.lagged, strict=True))
         body, restore = ravel_pytree((point.q, jnp.zeros_like(point.q), point.plant, self.sensed(point.q), amplified))
         fastest = jnp.max(self.machine.join([scenario.plant.pole for scenario in self.scenario]))
@@ -309,6 +309,20 @@ def _held(A: Array, B: Array, period: Scalar, delay: Scalar, kept: int) -> tuple
 @jax.jit
 def _matrices(machine: Machine, W: Scalar, period: Scalar) -> tuple[StateSpace, Array]:
     return _Linear(machine, W, period).system()
+
+
+@jax.jit
+def machine_rest(machine: Machine, period: Scalar) -> tuple[_Rest, _Rest, Array]:
+    """Return the equilibrium of a machine, the sizes of its states, and whether it was found."""
+    return _Linear(machine, 0.0, period).rest()
+
+
+def machine_loop(machine: Machine, W: Scalar, period: Scalar, rest: tuple[_Rest, _Rest, Array]) -> StateSpace:
+    """Return the linear system of `linearise_machine` at the speed W (rad/s) and at a known equilibrium.
+
+    It works under jit, vmap and differentiation. States that no input reaches are not left out.
+    """
+    return _Linear(machine, W, period).system(rest)[0]
 
 
 def linearise_machine(machine: Machine, period: Scalar, speed: float) -> StateSpace:

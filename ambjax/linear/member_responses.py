@@ -11,7 +11,7 @@ from ambjax.compiler.fast_path import SHORTEST
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members, size
 from ambjax.linear.equilibrium import ideal, reading
-from ambjax.linear.multisine import MultiSine, Reading, Response, multisine, with_wave
+from ambjax.linear.multisine import MultiSine, Reading, Response, multisine
 from ambjax.numerics.records import Scalar, canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import prepare, run
@@ -88,7 +88,7 @@ def member_responses(
 def _member(tree: Any) -> tuple[Any, Any]:
     """Return the `FourierSums` and the status code of one member."""
     system, clock, response = tree
-    outcome = run(with_wave(system, response.wave), clock, response, 0)
+    outcome = run(dataclasses.replace(system, wave=response.wave), clock, response, 0)
     return outcome.metrics, outcome.trajectory.lost_code
 
 

@@ -1,4 +1,4 @@
-"""The multi-sine, the closed loops that add it to a sensor's reading, and the Fourier coefficients of the response."""
+"""The multi-sine, which a closed loop adds to a sensor's reading, and the Fourier coefficients of the response."""
 
 from typing import Any, Literal, NamedTuple
 
@@ -6,15 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.control.cascade_state import Command
 from ambjax.numerics.records import Scalar, leaf, record, static
 from ambjax.simulation.folds import Ending
-from ambjax.simulation.loop import ClosedLoop, Realised
-from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.sampled_state import SampledState
-from ambjax.simulation.trajectory import Row
-from ambjax.world.sensor import Errors, FaultyErrors, Measurement
-from ambjax.world.waveforms import Reference
 
 # Reading to which e is added: z (m) or z_dot (m/s).
 Reading = Literal["z", "z_dot"]
@@ -65,78 +58,6 @@ def multisine(
     largest = np.max(np.abs(np.fft.irfft(spectrum, samples)))
     size = amplitude / largest
     return MultiSine(np.asarray(harmonics, float), size, phases, period, samples, reading)  # pyright: ignore
-
-
-class InjectedInputs(NamedTuple):
-    """The `ExternalInputs` of the loop, and the test signal e (m or m/s)."""
-
-    reference: Reference
-    q_z: Array
-    q_i: Array
-    runout: Array | tuple[()]
-    e: Array
-
-
-def _added(measured: Measurement, reading: Reading, e: Array) -> Measurement:
-    """Return the readings with e added to one of them."""
-    return measured._replace(**{reading: getattr(measured, reading) + e})
-
-
-@record
-class InjectedLoop(Realised):
-    """The closed loop of one member in continuous time, with e(t) added to a reading.
-
-    `z_measured` of its rows is the sum of that reading and e, also at the velocity sensor. The integrator `Slide` does
-    not apply, because it evaluates the laws without e.
-    """
-
-    wave: MultiSine
-
-    def inputs(self, t: Scalar) -> Any:
-        return InjectedInputs(*super().inputs(t), self.wave(t))
-
-    def received(self, inputs: Any, plant: Any, errors: Errors) -> Measurement:
-        return _added(super().received(inputs, plant, errors), self.wave.reading, inputs.e)
-
-    def signals(
-        self, t: Scalar, inputs: Any, state: object, command: Command, measured: Measurement, alive: Array
-    ) -> Row:
-        row = super().signals(t, inputs, state, command, measured, alive)
-        return row._replace(z_measured=getattr(measured, self.wave.reading))
-
-
-@record
-class InjectedSampled(Sampled):
-    """The closed loop on a processor, with e_n added to a reading after the converter and the faults.
-
-    `z_measured` of its rows is the sum of that reading and e_n, also at the velocity sensor.
-    """
-
-    wave: MultiSine
-
-    def injected(self, t: Scalar) -> Array:
-        """Return e (m or m/s) at the sample that begins at t (s)."""
-        return self.wave.at(jnp.round(jnp.asarray(t) / self.period).astype(int))
-
-    def jump(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors) -> SampledState:
-        state, measured = self.read(state, errors)
-        return self.with_command(_added(measured, self.wave.reading, self.injected(t)), self.reference(t), state)
-
-    def row(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors, alive: Array) -> Row:
-        row = super().row(t, state, errors, alive)
-        reads = row.z_measured
-        if self.wave.reading == "z_dot":
-            reads = self.measured(state.plant, state.z_filtered, errors).z_dot
-        return row._replace(z_measured=reads + self.injected(t))
-
-
-def with_wave(system: ClosedLoop | Sampled, wave: MultiSine) -> Any:
-    """Return the system of one member, for a rollout, with e added to a reading."""
-    system = system.realised()
-    if isinstance(system, Sampled):
-        return InjectedSampled(system.loop, system.period, system.cuts, wave)
-    assert isinstance(system, Realised)
-    return InjectedLoop(system.cascade, system.scenario, system.key, wave)
 
 
 class FourierSums(NamedTuple):

@@ -24,6 +24,7 @@ from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.blocks import Blocks
 from ambjax.linear.analysis import linearise_members
 from ambjax.simulation.clock import Clock
+from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 from ambjax.world.waveforms import Constant, Signal, is_random
 
@@ -140,6 +141,7 @@ class Findings(NamedTuple):
         return f"{many}: without noise and loads, the motion does not decay ({size}).{why}"
 
 
+@takes_case
 def stability_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> Stability:
     """Compute the stability of the members of an ensemble, whose varying leaves are arrays [N].
 

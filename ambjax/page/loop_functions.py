@@ -8,16 +8,15 @@ from jax import Array
 
 from ambjax.cases.reader import Case
 from ambjax.control.cascade import Cascade
-from ambjax.numerics.records import Scalar, record
+from ambjax.numerics.records import Scalar
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.loop import Realised
+from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import RolloutState, begin, one_sample
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import Row
 from ambjax.world.scenario import Scenario
-from ambjax.world.sensor import Errors
 
 
 class Numbers(NamedTuple):
@@ -30,16 +29,6 @@ class Numbers(NamedTuple):
     scenario: Scenario
     settle: Scalar
     period: Scalar
-
-
-@record
-class GivenNoise(Realised):
-    """The closed loop of one member, in which the three normal numbers of a sample are given instead of drawn."""
-
-    normals: tuple[Array, Array, Array]
-
-    def sensor_errors(self, sample: Scalar) -> Errors:
-        return self.scenario.sensors.scaled(self.normals)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +45,7 @@ class LoopFunctions:
         clock = dataclasses.replace(self.clock, sample_period=numbers.period)
         built: Any = system_of(numbers.cascade, numbers.scenario, clock)
         word = jnp.zeros((), jnp.uint32)
-        loop = GivenNoise(built.loop.cascade, numbers.scenario.turning(), (word, word), normals)
+        loop = ClosedLoop(built.loop.cascade, numbers.scenario.turning(), (word, word), normals)
         return dataclasses.replace(built, loop=loop), clock, self._fold(numbers)
 
     def _fold(self, numbers: Numbers) -> Metrics:

@@ -23,7 +23,7 @@ from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
 from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import Result, prepare, run
-from ambjax.simulation.whole_machine import Machine, PerAxis, machine_of, stack_axes
+from ambjax.simulation.whole_machine import ContinuousMachine, Machine, PerAxis, SampledMachine, machine_of, stack_axes
 from ambjax.world.rotor import Rotor
 from ambjax.world.scenario import Scenario
 
@@ -148,5 +148,5 @@ class MachineStudy(AnyStudy):
         return facts | {"rotor": digest.hexdigest()}
 
 
-def _simulated(tree: tuple[Machine, Clock, Fold]) -> Result:
+def _simulated(tree: tuple[SampledMachine | ContinuousMachine, Clock, Fold]) -> Result:
     return run(*tree, 0)

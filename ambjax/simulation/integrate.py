@@ -170,6 +170,24 @@ def axpy(state: State, *terms: tuple[Scalar, State]) -> State:
     return state
 
 
+class WholeState:
+    """Base class of a system (`rollout.System`) whose whole state is integrated, as one problem per sample."""
+
+    def problem(self, errors: Any) -> InitialValueProblem:
+        """Return the initial value problem of one sample, with the measurement errors held."""
+        raise NotImplementedError
+
+    def jump(self, t: Scalar, state: State, errors: object) -> State:
+        """Return the state: it does not jump at the start of a sample."""
+        return state
+
+    def advance(
+        self, method: Integrator, errors: object, t: Scalar, period: Scalar, state: State, memory: object, code: Array
+    ) -> Advanced[State]:
+        """Integrate the system from the sample at t (s) to the next one."""
+        return method.advance(self.problem(errors), t, period, state, memory, code)
+
+
 def choose(condition: Array, yes: State, no: State) -> State:
     """Apply jnp.where to every leaf of two states."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -1,7 +1,9 @@
 """The closed loop as one system of ordinary differential equations: plant and cascade together."""
 
+import dataclasses
 import functools
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol, Self
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +12,10 @@ from jax import Array
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
 from ambjax.control.stages import ForceDemand
-from ambjax.numerics.records import Scalar, record
+from ambjax.numerics.records import Scalar, part, record
 from ambjax.numerics.smooth import larger, limited
 from ambjax.simulation.edges import Edges
-from ambjax.simulation.integrate import InitialValueProblem
+from ambjax.simulation.integrate import InitialValueProblem, WholeState
 from ambjax.simulation.sliding import slide, slides
 from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED, Row
@@ -29,14 +31,15 @@ DIVERGENCE = 1e6
 class ExternalInputs(NamedTuple):
     """External inputs of the loop at one instant.
 
-    The reference, the disturbances q_z (m/s^2) and q_i (A/s), and the runout (m). The runout is () if the sensor has
-    none.
+    The reference, the disturbances q_z (m/s^2) and q_i (A/s), the runout (m), and a test signal e (m or m/s). The
+    runout is () if the sensor has none; e is () without a test signal.
     """
 
     reference: Reference
     q_z: Array
     q_i: Array
     runout: Array | tuple[()]
+    e: Array | tuple[()] = ()
 
 
 class Sizes(NamedTuple):
@@ -70,33 +73,53 @@ class LoopState(NamedTuple):
     control: CascadeState
 
 
+class AddedSignal(Protocol):
+    """A test signal e (m or m/s) that is added to a reading. `reading`: the name of this reading, z or z_dot."""
+
+    @property
+    def reading(self) -> str: ...
+    def at(self, sample: Array) -> Array: ...
+    def __call__(self, t: Scalar) -> Array: ...
+
+
 @record
-class ClosedLoop:
+class ClosedLoop(WholeState):
     """The closed loop of a cascade in a scenario, in continuous time.
 
-    The argument `errors` of its methods contains the measurement errors, which are constant over a sample.
+    The argument `errors` of its methods contains the measurement errors, which are constant over a sample. With a test
+    signal, `z_measured` of a row is the reading to which it is added, and the integrator `Slide` does not apply.
     """
 
     cascade: Cascade
     scenario: Scenario
+    key: tuple[Scalar, Scalar] | None = part(
+        default=None, doc="random key of the member as two 32-bit words; None: signals are not drawn yet"
+    )
+    normals: Sequence[Array] | None = part(
+        default=None, doc="the three normal numbers of the sensors' noise in a sample; None: drawn from the key"
+    )
+    wave: AddedSignal | None = part(default=None, doc="test signal; None: none")
 
-    def realised(self) -> "Realised":
+    def realised(self) -> Self:
         """Return the loop of one member, with its random signals drawn and the random key of its sensors."""
-        return Realised(self.cascade, self.scenario.realised(), self.scenario.words())
+        if self.key is not None:
+            return self
+        return dataclasses.replace(self, scenario=self.scenario.realised(), key=self.scenario.words())
 
     def words(self) -> tuple[Scalar, Scalar]:
         """Return the random key of the member as two 32-bit words."""
-        return self.scenario.words()
+        return self.scenario.words() if self.key is None else self.key
 
     def sensor_errors(self, sample: Scalar) -> Errors:
         """Return the errors of all sensors in sample number `sample`; zeros for ideal sensors."""
-        return self.scenario.sensors.noise(self.words(), sample)
+        sensors = self.scenario.sensors
+        return sensors.noise(self.words(), sample) if self.normals is None else sensors.scaled(self.normals)
 
     def start(self) -> LoopState:
         """Return the state at t = 0."""
         plant = self.scenario.plant.start(self.scenario.initial.measurement())
-        inputs = self.inputs(0.0)
-        measured = ClosedLoop.received(self, inputs, plant, self.sensor_errors(0))
+        inputs = self.inputs(0.0)._replace(e=())
+        measured = self.received(inputs, plant, self.sensor_errors(0))
         return LoopState(plant, self.cascade.init(measured, inputs.reference))
 
     def measured(self, plant: object, errors: Errors) -> Measurement:
@@ -116,20 +139,21 @@ class ClosedLoop:
         return jax.tree.map(jnp.asarray, LoopState(plant, self.cascade.layer()))
 
     def inputs(self, t: Scalar) -> ExternalInputs:
-        """Return the reference, the disturbances and the runout at time t, s."""
+        """Return the reference, the disturbances, the runout and the test signal at time t, s."""
         scenario, runout = self.scenario, self.scenario.sensors.runout
         runout = () if runout is None else runout(t)
-        return ExternalInputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t), runout)
+        e = () if self.wave is None else self.wave(t)
+        return ExternalInputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t), runout, e)
 
-    def received(self, inputs: Any, plant: Any, errors: Errors) -> Measurement:
-        """Return the readings that the controller receives, with the runout.
+    def received(self, inputs: ExternalInputs, plant: object, errors: Errors) -> Measurement:
+        """Return the readings that the controller receives, with the runout and the test signal.
 
         `inputs`: the external inputs at this instant (method `inputs`).
         """
         measured = self.measured(plant, errors)
-        if isinstance(inputs.runout, tuple):
-            return measured
-        return measured._replace(z=measured.z + self.scenario.sensors.gain * inputs.runout)
+        if not isinstance(inputs.runout, tuple):
+            measured = measured._replace(z=measured.z + self.scenario.sensors.gain * inputs.runout)
+        return with_signal(measured, self.wave, inputs.e)
 
     def command(
         self,
@@ -288,7 +312,7 @@ class ClosedLoop:
             r=inputs.reference.r,
             q_z=inputs.q_z,
             q_i=inputs.q_i,
-            z_measured=measured.z,
+            z_measured=measured.z if self.wave is None else getattr(measured, self.wave.reading),
             heat=jnp.where(alive, signals.heat, 0.0),
             refused=jnp.zeros_like(alive),
             alive=alive,
@@ -304,14 +328,8 @@ class ClosedLoop:
         return self.scenario.plant.singularity(row.z, row.i_ref)
 
 
-@record
-class Realised(ClosedLoop):
-    """The closed loop of one member. `key`: the random key of the member as two 32-bit words."""
-
-    key: tuple[Scalar, Scalar]
-
-    def realised(self) -> "Realised":
-        return self
-
-    def words(self) -> tuple[Scalar, Scalar]:
-        return self.key
+def with_signal(measured: Measurement, wave: AddedSignal | None, e: Array | tuple[()]) -> Measurement:
+    """Return the readings with e (m or m/s), the value of `wave`, added to one of them."""
+    if wave is None or isinstance(e, tuple):
+        return measured
+    return measured._replace(**{wave.reading: getattr(measured, wave.reading) + e})

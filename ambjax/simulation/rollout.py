@@ -15,13 +15,14 @@ from ambjax.control.stages import STAGES
 from ambjax.numerics.records import Scalar, canonical, validate
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Ending, Fold
-from ambjax.simulation.integrate import Advanced, choose
+from ambjax.simulation.integrate import Advanced, Integrator, choose
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.method import with_method
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.span import Span
 from ambjax.simulation.system import check_parts, system_of
 from ambjax.simulation.trajectory import ALIVE, Row, Trajectory, first_time
+from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 
 # Types of the state of a system, of the errors of its sensors, and of its row.
@@ -53,20 +54,11 @@ class System(Protocol[S, E, R]):
     - `completed(row, span)`: the row with the signals that are known only at the end of the sample.
     - `singularity(row)`: a number that is positive on the admissible side of the singular curve C. Eq. (9)
 
-    A system whose state jumps at the start of a sample, such as a controller on a processor, also has
+    - `jump(t, state, errors)`: the state after the jump at the start of the sample at t (s), such as a step of a
+      controller on a processor. The row and the integrator use it. The state of a lost rotor does not jump.
+    - `advance(method, errors, t, period, state, memory, code)`: the result of the method at the end of the sample.
 
-        jump(t, state, errors) -> state
-
-    `jump` is called at the start of a sample. The row and the integrator use its result. The state of a lost
-    rotor does not jump. A system that integrates its whole state, as one problem per sample, has
-
-        problem(errors) -> InitialValueProblem
-
-    A system that integrates only a part of its state, or several problems per sample, has instead
-
-        advance(method, errors, t, period, state, memory, code) -> Advanced
-
-    which replaces `method.advance(problem(errors), ...)`, for example by means of `integrate.in_turn`.
+    `integrate.WholeState` has the last two for a system that integrates its whole state as one problem per sample.
     """
 
     def realised(self) -> Self: ...
@@ -77,6 +69,10 @@ class System(Protocol[S, E, R]):
     def row(self, t: Scalar, state: S, errors: E, alive: Array) -> R: ...
     def completed(self, row: R, span: Span) -> R: ...
     def singularity(self, row: R) -> Array: ...
+    def jump(self, t: Scalar, state: S, errors: E) -> S: ...
+    def advance(
+        self, method: Integrator, errors: E, t: Scalar, period: Scalar, state: S, memory: object, code: Array
+    ) -> Advanced: ...
 
 
 class RolloutState(NamedTuple):
@@ -93,10 +89,11 @@ class RolloutState(NamedTuple):
     fold: Any
 
 
+@takes_case
 def rollout(
     cascade: Cascade, scenario: Scenario, clock: Clock, *, fold: Fold | None = None, record_every: int = 1
 ) -> Result:
-    """Simulate `scenario.plant` under `cascade` for `clock.samples` sample periods.
+    """Simulate `scenario.plant` under `cascade` for `clock.samples` sample periods. `rollout(case)` works too.
 
     - `fold`: accumulated at every sample, so that metrics need no stored trajectory; None: no metrics.
     - `record_every`: a row is recorded at the start of the first of so many samples; 0: no rows.
@@ -226,16 +223,6 @@ def finish(progress: RolloutState, rows: Row | None, fold: Fold | None) -> Resul
     return Result(Trajectory(cast(Row, rows), lost_at, lost_code, singular_at), metrics)
 
 
-def _advanced(
-    system: Any, clock: Clock, errors: object, t: Array, state: object, memory: object, code: Array
-) -> Advanced:
-    """Advance the system over the sample that begins at t (s)."""
-    method, period = clock.integrator, clock.sample_period
-    if hasattr(system, "advance"):
-        return system.advance(method, errors, t, period, state, memory, code)
-    return method.advance(system.problem(errors), t, period, state, memory, code)
-
-
 def one_sample(
     system: Any, clock: Clock, fold: Fold | None, progress: RolloutState, k: Array
 ) -> tuple[RolloutState, Row]:
@@ -255,10 +242,11 @@ def one_sample(
         # Signals are evaluated just after t. A signal that jumps at this instant then has its value after the jump,
         # even if t was rounded down.
         just_after = t * (1 + 4 * jnp.finfo(dtype).eps)
-        if hasattr(system, "jump"):
-            state = choose(alive, system.jump(just_after, state, errors), state)
+        jumped = system.jump(just_after, state, errors)
+        state = state if jumped is state else choose(alive, jumped, state)
         row = system.row(just_after, state, errors, alive)._replace(t=t)
-        after = _advanced(system, clock, errors, t, state, memory, ending.lost_code)
+        method, period = clock.integrator, clock.sample_period
+        after = system.advance(method, errors, t, period, state, memory, ending.lost_code)
         row = system.completed(row, after.span)
         folded = folded if fold is None else fold.update(folded, row, after.span)
         lost_now = alive & (after.code != ALIVE)

@@ -23,7 +23,7 @@ from ambjax.numerics.records import Scalar, record, static
 from ambjax.numerics.smooth import limited
 from ambjax.simulation.between import acting, amplified, lags, plant_status, sensed_motion, subproblems
 from ambjax.simulation.integrate import Advanced, Integrator, in_turn
-from ambjax.simulation.loop import ClosedLoop, LoopState
+from ambjax.simulation.loop import AddedSignal, ClosedLoop, LoopState, with_signal
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import DIVERGED, Row
@@ -39,11 +39,14 @@ class Sampled:
     - `loop`: the closed loop in continuous time.
     - `period`: sample period, s.
     - `cuts`: largest number of jumps (edges) of disturbances inside one sample; None: the number of all edges.
+    - `wave`: test signal, added to a reading after the converter and the faults; None: none. `z_measured` of a row is
+      then the sum of this reading and e.
     """
 
     loop: ClosedLoop
     period: Scalar
     cuts: int | None = static()
+    wave: AddedSignal | None = None
 
     @property
     def processor(self) -> Processor:
@@ -104,7 +107,13 @@ class Sampled:
     def jump(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors) -> SampledState:
         """Step the laws at time t (s): return the state with the new command and the next states of the laws."""
         state, measured = self.read(state, errors)
-        return self.with_command(measured, self.reference(t), state)
+        return self.with_command(self._injected(measured, t), self.reference(t), state)
+
+    def _injected(self, measured: Measurement, t: Scalar) -> Measurement:
+        """Return the readings with the test signal of the sample that begins at t (s)."""
+        if self.wave is None:
+            return measured
+        return with_signal(measured, self.wave, self.wave.at(jnp.round(jnp.asarray(t) / self.period).astype(int)))
 
     def read(self, state: SampledState, errors: Errors | FaultyErrors) -> tuple[SampledState, Measurement]:
         """Return the state with the new state of the faulty sensor, and the readings of the sensors, with faults."""
@@ -268,7 +277,10 @@ class Sampled:
         inputs, command = self.loop.inputs(t), state.command
         if self.loop.scenario.drive == "current":
             command = command._replace(u=self.loop.scenario.coil_voltage(command.u, state.plant, inputs.q_i))
+        measured = self._injected(measured, t)
         row = self.loop.signals(t, inputs, state.plant, command, measured, alive)
+        if self.wave is not None:
+            row = row._replace(z_measured=getattr(measured, self.wave.reading))
         guard = self.processor.guard
         return row if guard is None else row._replace(refused=alive & guard.refused(state.watch, state.watch)[0])
 

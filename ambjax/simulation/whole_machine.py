@@ -22,9 +22,9 @@ from ambjax.numerics.small_matrices import solve, times
 from ambjax.simulation.between import acting, lags, plant_status, under
 from ambjax.simulation.edges import NO_EDGES, Edges
 from ambjax.simulation.folds import Ending
-from ambjax.simulation.integrate import Advanced, InitialValueProblem, Integrator, in_turn
+from ambjax.simulation.integrate import Advanced, InitialValueProblem, Integrator, WholeState, in_turn
 from ambjax.simulation.joint_laws import begun, demanded_now, jumped
-from ambjax.simulation.loop import INSTANT_TREE, ClosedLoop, ExternalInputs, LoopState, Realised
+from ambjax.simulation.loop import INSTANT_TREE, ClosedLoop, ExternalInputs, LoopState
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.span import Instant, Span
@@ -368,7 +368,7 @@ class SampledMachine(Machine):
 
 
 @record
-class ContinuousMachine(Machine):
+class ContinuousMachine(WholeState, Machine):
     """A machine whose cascades run in continuous time."""
 
     def demands(self, t: Scalar, state: MachineState, errors: Sequence[object]) -> Groups:
@@ -415,7 +415,7 @@ def _realised(axis: Sampled | ClosedLoop, number: Array) -> Sampled | ClosedLoop
     """Return the loop of one axis with its random signals drawn, and with the random key of this axis."""
     loop = loop_of(axis.realised())
     high, low = jax.random.key_data(jax.random.fold_in(loop.scenario.key(), number))
-    return _with_loop(axis, Realised(loop.cascade, loop.scenario, (high, low)))
+    return _with_loop(axis, dataclasses.replace(loop, key=(high, low)))
 
 
 def stack_axes(axes: Sequence[T]) -> T:

@@ -2,7 +2,7 @@
 
 from ambjax.theorem import check
 
-report = check(case.cascade, case.scenario, case.clock, case.settle)
+report = check(case, settle=case.settle)
 [line.name for line in report.conditions if line.holds is False]
 """
 

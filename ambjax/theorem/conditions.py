@@ -22,6 +22,7 @@ from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Lowest, Named, Peak
 from ambjax.simulation.rollout import check_inputs, prepare, roll
 from ambjax.simulation.trajectory import STALLED, STATUSES
+from ambjax.simulation.triple import takes_case
 from ambjax.theorem.causes import Cause
 from ambjax.theorem.proof import Monitored
 from ambjax.world.plant import Plant
@@ -129,6 +130,7 @@ def _monitors(settle: float) -> Named:
     return Named(peaks | {name: Lowest(name) for name in ("distance", "V_margin")})
 
 
+@takes_case
 def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float = 0.0) -> Report:
     """Simulate the loop once in continuous time and evaluate the conditions of Theorem 1 along the run.
 
@@ -153,6 +155,7 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float = 0.
     return Report(conditions, _proof(worst), lost_at, STATUSES[code], method, code == STALLED, largest)
 
 
+@takes_case
 def delta_1_on_reference(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[float, float]:
     """Return the largest |v_star' - (dv/dz) r_dot| on the ideal motion z = r (A^2/m^2/s), and its time (s).
 

@@ -14,7 +14,7 @@ from jax import Array
 
 from ambjax.control.schedule import with_gains_at
 from ambjax.numerics.records import Scalar, record
-from ambjax.simulation.integrate import InitialValueProblem
+from ambjax.simulation.integrate import InitialValueProblem, WholeState
 from ambjax.simulation.loop import ClosedLoop, ExternalInputs, LoopState
 from ambjax.simulation.span import Span
 from ambjax.world.sensor import Errors, Measurement
@@ -83,7 +83,7 @@ class MonitoredState(NamedTuple):
 
 
 @record
-class Monitored:
+class Monitored(WholeState):
     """System of the closed loop and the integrals of the proof's right-hand sides."""
 
     loop: ClosedLoop

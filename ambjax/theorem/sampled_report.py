@@ -24,6 +24,7 @@ from ambjax.simulation.rollout import Result, System, prepare, roll
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
+from ambjax.simulation.triple import takes_case
 from ambjax.theorem.causes import Cause, find_cause
 from ambjax.theorem.law_poles import LawPoles, law_poles, sampling_of
 from ambjax.theorem.law_signals import LawSignalsRecorder
@@ -143,6 +144,7 @@ def rolled(system: System, clock: Clock) -> Result:
     return roll(*canonical((system, clock)), None, record_every=1)
 
 
+@takes_case
 def check_sampled(
     cascade: Cascade,
     scenario: Scenario,

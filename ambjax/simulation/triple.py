@@ -1,0 +1,47 @@
+"""A case in place of its cascade, scenario and clock, as the first argument of a function."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, cast, overload
+
+from ambjax.control.cascade import Cascade
+from ambjax.simulation.clock import Clock
+from ambjax.world.scenario import Scenario
+
+P = ParamSpec("P")
+R = TypeVar("R", covariant=True)
+
+
+class Triple(Protocol):
+    """A case: a cascade, its scenario and its clock, such as that of `read_case`."""
+
+    @property
+    def cascade(self) -> Cascade: ...
+    @property
+    def scenario(self) -> Scenario: ...
+    @property
+    def clock(self) -> Clock: ...
+
+
+class TakesCase(Protocol[P, R]):
+    """A function of a cascade, a scenario and a clock, or of a case."""
+
+    @overload
+    def __call__(self, case: Triple, /, *args: P.args, **kwargs: P.kwargs) -> R: ...
+    @overload
+    def __call__(
+        self, cascade: Cascade, scenario: Scenario, clock: Clock, /, *args: P.args, **kwargs: P.kwargs
+    ) -> R: ...
+
+
+def takes_case(function: Callable[Concatenate[Cascade, Scenario, Clock, P], R]) -> TakesCase[P, R]:
+    """Return the function, which then also accepts a case in place of its first three arguments."""
+
+    @functools.wraps(function)
+    def called(*args: Any, **named: Any) -> R:
+        if args and all(hasattr(args[0], name) for name in ("cascade", "scenario", "clock")):
+            case = args[0]
+            args = (case.cascade, case.scenario, case.clock, *args[1:])
+        return function(*args, **named)
+
+    return cast(TakesCase[P, R], called)
