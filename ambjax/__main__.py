@@ -88,8 +88,12 @@ def parser() -> Parser:
         "fails"
     )
     command("check", summary, case=True)
-    campbell = command("campbell", "poles of a machine against its speed: campbell.json, campbell.png", True, True)
-    campbell.add_argument("--to", type=float, metavar="RPM", help="largest speed (default: 1.2 times that of the case)")
+    summary = (
+        "modes, critical speeds and unbalance response of a machine against its speed: campbell.json, campbell.png, "
+        "rotor.png, unbalance.png"
+    )
+    campbell = command("campbell", summary, case=True, out=True)
+    campbell.add_argument("--to", type=float, metavar="RPM", help="largest speed (default: 1.3 times that of the case)")
     summary = "sensitivity peaks with ISO 14839-3 zones, margins, stiffness: sensitivity.json, sensitivity.png"
     sensitivity = command("sensitivity", summary, case=True, out=True)
     sensitivity.add_argument("--members", type=int, metavar="N", help="members of [spread] to analyse (default: 100)")

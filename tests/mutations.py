@@ -356,8 +356,8 @@ MUTATIONS = [
     M(
         "members that accurate steps lose after the judgement do not refute the answer",
         "tuning/report/judging.py",
-        'refuted or (again["refuted"] if again else "")',
-        "refuted",
+        "(error or answer.error).refuted if",
+        "answer.error.refuted if",
         "tests/test_tuning_study.py::test_a_member_that_accurate_steps_do_not_hold_is_not_a_survivor",
     ),
     M(

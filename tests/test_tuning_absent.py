@@ -136,7 +136,7 @@ def unjudged(tmp_path_factory):
 # Facts that may be absent, and their values then.
 ABSENT = {
     "conditions": [], "advice_on_conditions": [], "step_error": None,
-    "worst_step_error": None, "worst_member": None, "accurate": None, "front": None, "beside": None,
+    "worst_step_error": None, "worst_member": None, "front": None, "beside": None,
     "slices": None, "sensitivity": None, "stability": None,
 }  # fmt: skip
 

@@ -333,7 +333,7 @@ def test_members_that_break_a_limit_on_the_worst_member_join(monkeypatch):
     assert set(more.seed) == {config.seeds(problem.tune.budget)[1]}
     course.members = course.members.joined(more, stressed=False)
     assert course.members.searched.member[:2].tolist() == [1, 4]
-    assert course.members.part(4).member[:2].tolist() == [1, 4]
+    assert course.members.part.member[:2].tolist() == [1, 4]
     assert breaking(course, [(0.6, 3.0)], columns) is None
     assert breaking(course, [(0.6, 0.5)], columns) is None  # it is held
 

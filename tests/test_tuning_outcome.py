@@ -47,9 +47,9 @@ OUTCOMES = {
     "lost, as may be": (lambda: losing(2), {"limits": {"survival": 0.8}}, HELD, HELD, True),
     "not decided": (lambda: World(stalls=lambda s, n, _: (s, n) == (HELD_OUT, 2)), {}, BROKEN, HELD, False),
     "a limit not met": (World, {"limits": {"rms_u_V": 0.2}}, HELD, BROKEN, False),
-    "not verified": (lambda: losing(5, accurate=True), {}, UNVERIFIED, UNVERIFIED, False),
+    "not verified": (lambda: losing(1, accurate=True), {}, UNVERIFIED, UNVERIFIED, False),
     "lost and not verified": (
-        lambda: World(limit=lambda s, n, _, f: 40.0 if s == HELD_OUT and (n == 2 or (n == 5 and f)) else math.inf),
+        lambda: World(limit=lambda s, n, _, f: 40.0 if s == HELD_OUT and (n == 2 or (n == 1 and f)) else math.inf),
         {}, BROKEN, UNVERIFIED, False,
     ),
     "every one lost": (lambda: losing(*range(6)), {}, BROKEN, BROKEN, False),

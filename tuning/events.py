@@ -33,10 +33,10 @@ class Reached(NamedTuple):
 class Standing(NamedTuple):
     """The best point of a search, on the members that the search simulates.
 
-    `number`: of the search, from 1. `iteration`, `most`: number of iterations of this phase, and their largest number.
+    `number`: of the search, from 1. `iteration`, `most`: number of its iterations, and their largest number.
     `starts`: number of starts that continue. `error_m`, `u_V`: settled rms error (m) and rms voltage (V). `held`,
     `members`: number of members that are held, and of all. `limits`: the limits. `left_s`: largest time left in this
-    phase, s; NaN if it is not known yet. `goal`: the minimised number. `rollouts`: number of rollouts of all searches
+    search, s; NaN if it is not known yet. `goal`: the minimised number. `rollouts`: number of rollouts of all searches
     so far.
     """
 
@@ -58,7 +58,7 @@ class Standing(NamedTuple):
         """The standing in one line."""
         beyond = [one.text for one in self.limits if not one.holds]
         met = ", ".join(beyond) if beyond else "limits met" if self.limits else ""
-        left = "" if math.isnan(self.left_s) else f"at most {duration(self.left_s)} left in this phase"
+        left = "" if math.isnan(self.left_s) else f"at most {duration(self.left_s)} left in this search"
         starts = "1 start" if self.starts == 1 else f"{self.starts} starts"
         parts = [
             f"search {self.number}: iteration {self.iteration} of at most {self.most}, {starts}",

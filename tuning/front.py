@@ -23,8 +23,6 @@ from tuning.validate import validated
 # tune.front factors are used, and further ones until there are tune.front points besides that of least error.
 KNEE = 1.25
 FACTORS = (KNEE, 1.1, 1.5, 2.0, 1.05, 3.0)
-# Largest number of answers that are validated.
-MOST_VALIDATIONS = 4
 
 
 class FrontPoint(NamedTuple):
@@ -128,7 +126,7 @@ def _validated_point(course: Course, answer: SearchResult, seen: list[FrontPoint
     tune.objective determines which point is the best. Points that are not confirmed are removed from `seen`.
     """
     knee = answer.problem.tune.objective == "knee"
-    for _ in range(MOST_VALIDATIONS):
+    while True:
         best = chosen(seen, KNEE) if knee else least_of(seen)
         if best is seen[0]:
             return answer
@@ -139,7 +137,6 @@ def _validated_point(course: Course, answer: SearchResult, seen: list[FrontPoint
             f"the answer of {best.volts:.4g} V is rejected: it loses members, or accurate steps do not confirm it"
         )
         seen[:] = [point for point in seen if point is not best]
-    return answer
 
 
 def _point(course: Course, factor: float, one: Judged) -> FrontPoint:

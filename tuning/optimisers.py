@@ -17,14 +17,13 @@ NAMES = (BFGS, "adam")
 # Trust radius of the BFGS: its largest value (1: a factor e of one gain), and its value for the first step, which has
 # no estimate of the curvature.
 LARGEST_RADIUS, FIRST_RADIUS = 1.0, 0.3
-# After a rejected trial, the trust radius is the length of its step times CONTRACTION, or times CONTRACTION_AT_JUMP if
-# the trial lies beyond a jump of the function.
-CONTRACTION, CONTRACTION_AT_JUMP = 0.5, 0.25
+# After a rejected trial, the trust radius is the length of its step times CONTRACTION, or times BACKTRACK if the trial
+# lies beyond a jump of the function. Adam repeats a rejected step with its length multiplied by BACKTRACK.
+CONTRACTION = 0.5
+BACKTRACK = CONTRACTION**2
 # A trial lies beyond a jump if its value, a logarithm, exceeds the best value by this or more, or if its value or
 # gradient is not finite.
 JUMP = 1.0
-# A first-order optimiser repeats a rejected step with its length multiplied by this factor.
-BACKTRACK = 0.25
 
 
 class BFGSState(NamedTuple):
@@ -70,7 +69,7 @@ def bfgs() -> optax.GradientTransformationExtraArgs:
         inverse = _updated_inverse(state, s, y, smooth)
         tried = jnp.sqrt(s @ s)
         wider = jnp.minimum(jnp.maximum(state.radius, 2 * tried), LARGEST_RADIUS)
-        narrower = jnp.where(smooth, CONTRACTION, CONTRACTION_AT_JUMP) * tried
+        narrower = jnp.where(smooth, CONTRACTION, BACKTRACK) * tried
         radius = jnp.where(state.trials == 0, state.radius, jnp.where(accept, wider, narrower))
         best, slope = jnp.where(accept, x, state.best), jnp.where(accept, gradient, state.gradient)
         step = -inverse @ slope

@@ -11,10 +11,8 @@ from tuning.problem.config import seeds
 from tuning.problem.members import Members
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.course import Course, SearchResult
-from tuning.solve.multipliers import largest_unseen
+from tuning.solve.multipliers import MOST_JOINING, largest_unseen
 
-# Largest number of lost members that join the training ensemble at once.
-MOST_LOST = 16
 # If the rms error of the validation members exceeds that of the training members by more than this factor, the training
 # ensemble lacks members with large errors.
 LARGER = 1.5
@@ -71,12 +69,12 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
 def joining(course: Course, found: Validation) -> Members:
     """Return the training ensemble with the members that failed.
 
-    The first MOST_LOST of the lost members, and the members that are lost or stall with accurate steps, join as
+    The first MOST_JOINING of the lost members, and the members that are lost or stall with accurate steps, join as
     stressed ones with half of the additional noise of these, as a margin. Members with large errors join as ordinary
     ones.
     """
     problem, budget = course.problem, course.problem.tune.budget
-    those = problem.objective.chosen(seeds(budget)[1], found.lost[:MOST_LOST], budget.validation)
+    those = problem.objective.chosen(seeds(budget)[1], found.lost[:MOST_JOINING], budget.validation)
     both: Members = jax.tree.map(lambda a, b: np.concatenate([a, b]), those, found.error.unheld)
     members = course.members.joined(both._replace(noise_factor=both.noise_factor * (1 + problem.tune.stress) / 2))
     course.tell(f"{len(both.member)} lost members and {found.large.size} of large errors join the training ensemble")

@@ -1,52 +1,160 @@
-"""`ambjax campbell`: poles of the closed loops of a machine against its speed."""
+"""`ambjax campbell`: modes, critical speeds and response to unbalance of a machine against its speed."""
 
 import argparse
+import pathlib
 
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, read_machine
+from ambjax.cases.rotor_drawing import drawing_of
 from ambjax.host.heartbeat import say
-from ambjax.linear import linearise_machine, poles_in_s
-from ambjax.results.outputs import described, directory, files, plain, write_json, written
+from ambjax.linear.linear_machine import turning_machines
+from ambjax.linear.margins import poles_in_s
+from ambjax.linear.rotor_modes import modes_of, springs_critical
+from ambjax.linear.unbalance_response import (
+    CriticalSpeed,
+    UnbalanceResponse,
+    a1_limit,
+    critical_speeds,
+    unbalance_response,
+)
+from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
 
-WRITTEN = ("campbell.json", "campbell.png")
-# Number of speeds, and the end of their range as a multiple of the largest speed of the case.
-SPEEDS, BEYOND = 31, 1.2
+WRITTEN = ("campbell.json", "campbell.png", "rotor.png", "unbalance.png")
+# Number of speeds, and the end of their range as a multiple of the largest speed of the case: a critical speed up to
+# 26 % above it needs a separation margin.
+SPEEDS, BEYOND = 31, 1.3
 # End of the range for a rotor that does not turn, rpm.
 SLOWEST = 6000.0
+# Range of the stiffness in the critical-speed map, as shares of |k_s|, and its number of points.
+SOFTEST, STIFFEST, STIFFNESSES = 1e-2, 1e2, 81
+# Damping ratios below which the shape of a mode is drawn: LIGHT, or DAMPED if no mode is lightly damped.
+LIGHT, DAMPED = 0.35, 0.95
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
-    """Compute the poles at speeds from 0 on, and draw them. Exit code 1 if the machine is unstable at one of them."""
+    """Analyse a machine at speeds from 0 on, and draw it. Exit code 1 if the machine is unstable at one of them."""
     case = read_machine(args.case)
     fastest = max(abs(speed) for speed in case.speeds)
     end = args.to if args.to is not None else BEYOND * fastest or SLOWEST
     if not end > 0:
         raise ValueError(f"--to {end:g}: it must be above 0 rpm.")
     out = directory(args.out, f"campbell-{case.name}", WRITTEN, args.force)
-    say(f"linearising the machine at {SPEEDS} speeds; the first one compiles for some seconds")
+    say(f"linearising the machine at {SPEEDS} speeds or more; the first one compiles for some seconds")
     speeds = np.linspace(0.0, end, SPEEDS)
-    poles = [poles_at(case, float(speed)) for speed in speeds]
+    points = list(turning_machines(case.machine, case.clock.sample_period, speeds))
+    poles = [poles_in_s(point.system.without_idle()) for point in points]
+    modes = [modes_of(point, case.machine.rotor) for point in points]
     growth = np.array([float(np.max(np.real(own))) for own in poles])
     unstable = [float(speed) for speed, rate in zip(speeds, growth, strict=True) if rate > 0]
+    operating = operating_range(case)
+    found = unbalance_response(case.machine, case.clock.sample_period, end) if case.machine.rotor.unbalances else None
+    criticals = [] if found is None else critical_speeds(found, operating)
     summary = {
         "speeds_rpm": speeds, "stable": not unstable, "unstable_at_rpm": unstable, "growth_per_s": growth,
-        "poles_per_s": [[[float(p.real), float(p.imag)] for p in own] for own in poles],
+        "poles_per_s": [[[float(p.real), float(p.imag)] for p in own[np.argsort(-np.real(own))]] for own in poles],
+        "modes": [[mode.numbers() for mode in own] for own in modes],
+        "unbalance": None if found is None else _unbalance(case, found, criticals, operating),
     }  # fmt: skip
-    from ambjax.pictures.machine_pictures import campbell_picture
-
     with files(out) as part:
         write_json(part / "campbell.json", summary)
-        described("campbell.png", lambda: campbell_picture(case.name, speeds, poles, part / "campbell.png"))
+        _pictures(case, (speeds, modes, criticals), found, part)
         names = [name for name in WRITTEN if (part / name).exists()]
     if not args.json:
         words = f"unstable at {', '.join(f'{speed:g}' for speed in unstable)} rpm" if unstable else "stable"
         print(f"0 to {end:g} rpm: {words}; largest real part of a pole {growth.max():.4g} 1/s")
+        if found is not None:
+            print(_text(case, found, criticals, operating))
         written(out, ", ".join(names))
     return int(bool(unstable)), plain(summary | {"out": str(out)})
 
 
-def poles_at(case: MachineCase, speed: float) -> np.ndarray:
-    """Return the poles at a speed (rpm), 1/s, in the order of decreasing real part."""
-    poles = poles_in_s(linearise_machine(case.machine, case.clock.sample_period, speed))
-    return poles[np.argsort(-np.real(poles))]
+def operating_range(case: MachineCase) -> tuple[float, float]:
+    """Return the lowest and the highest operating speed, rpm: the speeds of the case above 0.
+
+    A run-up, or the speed 0 beside others, counts as a transient: only its end counts.
+    """
+    speeds = [abs(speed) for speed in case.speeds if speed != 0]
+    first, rotor = abs(float(case.machine.rotor.speed)), case.machine.rotor
+    if float(rotor.acceleration) != 0 and len(case.speeds) == 2 and len(speeds) == 2 and first == speeds[0]:
+        speeds = speeds[1:]
+    return (min(speeds), max(speeds)) if speeds else (0.0, 0.0)
+
+
+def _unbalance(
+    case: MachineCase, found: UnbalanceResponse, criticals: list[CriticalSpeed], operating: tuple[float, float]
+) -> dict[str, object]:
+    """Return the response to unbalance as plain data."""
+    limit, largest = _vibration(found, operating)
+    return {
+        "operating_rpm": list(operating),
+        "critical_speeds": [
+            {
+                "speed_rpm": one.speed, "axis": case.axes[one.axis], "peak_to_peak_m": one.peak_to_peak,
+                "amplification_factor": one.amplification, "separation_required_percent": one.required,
+                "separation_percent": one.present, "separated": one.separated,
+            }
+            for one in criticals
+        ],
+        "a1_limit_m": limit,
+        "largest_peak_to_peak_m": largest,
+        "speeds_rpm": found.speeds,
+        "amplitudes": {
+            name: {axis: np.abs(getattr(found, name)[:, k]) for k, axis in enumerate(case.axes)}
+            for name in ("sensors", "magnets", "current", "command")
+        },
+    }  # fmt: skip
+
+
+def _vibration(found: UnbalanceResponse, operating: tuple[float, float]) -> tuple[float, float]:
+    """Return A1 at the highest operating speed, and the largest displacement at a sensor at operating speeds, m."""
+    size = 2 * np.abs(found.sensors).max(1)
+    between = (found.speeds > operating[0]) & (found.speeds < operating[1])
+    ends = np.interp(operating, found.speeds, size)
+    return float(a1_limit(operating[1])), float(max(*ends, *size[between]))
+
+
+def _pictures(case: MachineCase, analysed: tuple, found: UnbalanceResponse | None, part: pathlib.Path) -> None:
+    """Draw Campbell diagram, rotor and response to unbalance. `analysed`: speeds, modes and critical speeds."""
+    from ambjax.pictures.machine_pictures import campbell_picture
+    from ambjax.pictures.rotor_pictures import rotor_picture, unbalance_picture
+
+    speeds, modes, criticals = analysed
+    described("campbell.png", lambda: campbell_picture(case.name, speeds, modes, part / "campbell.png"))
+    operating = operating_range(case)
+    point = next(turning_machines(case.machine, case.clock.sample_period, operating[1:]))
+    drawn = [mode for mode in modes_of(point, case.machine.rotor) if mode.name != "axial" and mode.damping < DAMPED]
+    light = [mode for mode in drawn if mode.damping < LIGHT]
+    radial = [own for name, own in zip(case.axes, case.cases, strict=True) if not name.endswith(".z")]
+    k_s = abs(float(radial[0].scenario.plant.k_s))
+    stiffness = k_s * np.geomspace(SOFTEST, STIFFEST, STIFFNESSES)
+    map_of = (stiffness, springs_critical(case.machine.rotor, stiffness), k_s)
+    picture = part / "rotor.png"
+    described(
+        picture.name,
+        lambda: rotor_picture(case.name, drawing_of(case), light or drawn, map_of, operating[1], picture),
+    )
+    if found is not None:
+        path = part / "unbalance.png"
+        described(path.name, lambda: unbalance_picture(case, found, criticals, operating, path))
+
+
+def _text(
+    case: MachineCase, found: UnbalanceResponse, criticals: list[CriticalSpeed], operating: tuple[float, float]
+) -> str:
+    """Return the critical speeds and the vibration at operating speeds as text."""
+    rows = [
+        (
+            f"{one.speed:.0f}", case.axes[one.axis], f"{1e6 * one.peak_to_peak:.3g}", f"{one.amplification:.3g}",
+            "none" if one.required is None else f"{one.required:.3g}", f"{one.present:.3g}",
+            "yes" if one.separated else "NO",
+        )
+        for one in criticals
+    ]  # fmt: skip
+    limit, largest = _vibration(found, operating)
+    header = ("critical speed, rpm", "axis", "um p-p", "AF", "margin required, %", "present, %", "enough")
+    low, high = operating
+    speeds = f"{low:g} to {high:g} rpm" if low != high else f"{high:g} rpm"
+    last = f"unbalance at {speeds}: {1e6 * largest:.3g} um peak to peak at the sensors; limit A1 {1e6 * limit:.3g} um"
+    last += ", exceeded" if largest > limit else ""
+    return "\n".join([table(header, rows) if rows else "no critical speed with a peak", *([last] if high else [])])

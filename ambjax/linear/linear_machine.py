@@ -1,6 +1,6 @@
 """Linearisation of a whole machine at rest and constant speed: all loops are closed, each axis has a test signal."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -46,7 +46,7 @@ class MachineSensitivity(NamedTuple):
     - `speed`: rpm. `stable`: whether no mode grows. If one does, the peaks have no physical meaning, and zones are D.
     - `axes`: the peaks of each axis. `sigma`: peak of the largest singular value of the matrix S.
     - `poles`: poles of the machine, 1/s, in the order of decreasing real part.
-    - `system`: the linear system, with inputs e_k at the sensors, and outputs: readings z_k, then commands u_k.
+    - `system`: the linear system, with inputs e_k at the sensors, and outputs as of `linearise_machine`.
     """
 
     speed: float
@@ -201,16 +201,21 @@ class _Linear:
         plant = tuple(jax.tree.map(lambda x, w=w: x / w, own.plant) for own, w in axes)
         return _Rest(moved.q_dot / fastest**2, plant, change, jax.tree.map(jnp.subtract, u, point.u), law)
 
-    def rest(self) -> tuple[_Rest, _Rest, Array]:
-        """Return the equilibrium, the sizes of the states, and whether it was found."""
+    def rest(self) -> _Rest:
+        """Return the equilibrium, or the point nearest to it that was found."""
         start, sizes = self.start()
         scale, (flat, restore) = ravel_pytree(sizes)[0], ravel_pytree(start)
-        newton = newton_of(lambda y: ravel_pytree(self.residual(restore(y * scale)))[0] / scale, flat / scale)
-        return restore(newton.y * scale), sizes, newton.error <= TOLERANCE * jnp.finfo(flat.dtype).eps
+        return restore(newton_of(lambda y: self.deviation(restore(y * scale), scale), flat / scale).y * scale)
 
-    def system(self, rest: tuple[_Rest, _Rest, Array] | None = None) -> tuple[StateSpace, Array]:
-        """Return the state space, and whether an equilibrium was found. `rest`: result of `rest`, if it is known."""
-        point, sizes, found = rest or self.rest()
+    def deviation(self, point: _Rest, scale: Array) -> Array:
+        """Return the residual relative to the sizes of the states."""
+        return ravel_pytree(self.residual(point))[0] / scale
+
+    def system(self, point: _Rest) -> tuple[StateSpace, Array, Array]:
+        """Return the state space at a point, its A under constant commands, and whether the machine rests there."""
+        sizes = self.start()[1]
+        deviation = self.deviation(point, ravel_pytree(sizes)[0])
+        found = jnp.max(jnp.abs(deviation)) <= TOLERANCE * jnp.finfo(deviation.dtype).eps
         amplified = tuple(u if on else () for u, on in zip(point.u, self.lagged, strict=True))
         body, restore = ravel_pytree((point.q, jnp.zeros_like(point.q), point.plant, self.sensed(point.q), amplified))
         fastest = jnp.max(self.machine.join([scenario.plant.pole for scenario in self.scenario]))
@@ -236,13 +241,18 @@ class _Linear:
             q, q_dot, plant, filtered, _ = restore(x)
             return self.read(q, q_dot, plant, filtered, self.machine.split(e))
 
-        build = self._sampled if self.sampled else self._continuous
-        ((A, B), (C, D)), scale = build(point, sizes, body, body_sizes, moved, read)
-        return StateSpace(A, B, C, D, scale, jnp.asarray(self.period) if self.sampled else None), found
+        u = self.machine.join(point.u)
+        free = jax.jacfwd(lambda x, u: moved(x, self.machine.split(u)), (0, 1))(body, u)
+        if self.sampled:
+            ((A, B), (C, D)), scale = self._sampled(point, sizes, body, body_sizes, free, read)
+        else:
+            ((A, B), (C, D)), scale = self._continuous(point, sizes, body, body_sizes, moved, read)
+        return StateSpace(A, B, C, D, scale, jnp.asarray(self.period) if self.sampled else None), free[0], found
 
-    def outputs(self, measured: Sequence[Measurement], u: Groups) -> Array:
-        """Return the outputs of the linear system: readings, then commands, in the order of the axes."""
-        return jnp.concatenate([self.machine.join([one.z for one in measured]), self.machine.join(u)])
+    def outputs(self, measured: Sequence[Measurement], u: Groups, x: Array) -> Array:
+        """Return the outputs of the linear system: readings, commands, and currents of the axes, and coordinates."""
+        z, i = (self.machine.join([getattr(one, name) for one in measured]) for name in ("z", "i"))
+        return jnp.concatenate([z, self.machine.join(u), i, x[: len(jnp.asarray(self.rotor.gravity))]])
 
     def _continuous(
         self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, moved: Callable, read: Callable
@@ -253,17 +263,16 @@ class _Linear:
             at, control, law = restore(x)
             measured = read(at, e)
             u, *rates = self.laws(measured, control, law, self.past(point.u))
-            return ravel_pytree((moved(at, u), tuple(rates)))[0], self.outputs(measured, u)
+            return ravel_pytree((moved(at, u), tuple(rates)))[0], self.outputs(measured, u, at)
 
         scale = ravel_pytree((body_sizes, sizes.control, sizes.law))[0]
         return jax.jacfwd(field, (0, 1))(x, jnp.zeros(self.machine.count, x.dtype)), scale
 
     def _sampled(
-        self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, moved: Callable, read: Callable
+        self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, free: tuple[Array, Array], read: Callable
     ) -> tuple:
         past, delay = self.past(point.u), jnp.asarray(self.cascade[0].timing.delay)[0]
-        A, B = jax.jacfwd(lambda x, u: moved(x, self.machine.split(u)), (0, 1))(body, self.machine.join(point.u))
-        kept = len(past[0])
+        (A, B), kept = free, len(past[0])
         transition, driven = _held(A, B, self.period, delay, kept)
         x, restore = ravel_pytree((body, point.control, point.law, past))
 
@@ -275,7 +284,7 @@ class _Linear:
                         for lag in range(kept + 1)]  # fmt: skip
             end = transition @ at + sum(effect @ one for effect, one in zip(driven, commands, strict=True))
             kept_now = tuple((own, *old)[:kept] for own, old in zip(u, past, strict=True))
-            return ravel_pytree((end, after, law, kept_now))[0], self.outputs(measured, u)
+            return ravel_pytree((end, after, law, kept_now))[0], self.outputs(measured, u, at)
 
         scale = ravel_pytree((body_sizes, sizes.control, sizes.law, self.past(sizes.u)))[0]
         return jax.jacfwd(step, (0, 1))(x, jnp.zeros(self.machine.count, x.dtype)), scale
@@ -307,40 +316,71 @@ def _held(A: Array, B: Array, period: Scalar, delay: Scalar, kept: int) -> tuple
 
 
 @jax.jit
-def _matrices(machine: Machine, W: Scalar, period: Scalar) -> tuple[StateSpace, Array]:
-    return _Linear(machine, W, period).system()
+def _at_rest(machine: Machine, W: Scalar, period: Scalar) -> _Rest:
+    return _Linear(machine, W, period).rest()
 
 
 @jax.jit
-def machine_rest(machine: Machine, period: Scalar) -> tuple[_Rest, _Rest, Array]:
-    """Return the equilibrium of a machine, the sizes of its states, and whether it was found."""
-    return _Linear(machine, 0.0, period).rest()
+def _matrices(machine: Machine, W: Scalar, period: Scalar, point: _Rest) -> tuple[StateSpace, Array, Array]:
+    return _Linear(machine, W, period).system(point)
 
 
-def machine_loop(machine: Machine, W: Scalar, period: Scalar, rest: tuple[_Rest, _Rest, Array]) -> StateSpace:
+def machine_rest(machine: Machine, period: Scalar) -> _Rest:
+    """Return the equilibrium of a machine at speed 0, or the point nearest to it that was found."""
+    return _at_rest(machine, 0.0, period)
+
+
+def machine_loop(machine: Machine, W: Scalar, period: Scalar, point: _Rest) -> StateSpace:
     """Return the linear system of `linearise_machine` at the speed W (rad/s) and at a known equilibrium.
 
     It works under jit, vmap and differentiation. States that no input reaches are not left out.
     """
-    return _Linear(machine, W, period).system(rest)[0]
+    return _Linear(machine, W, period).system(point)[0]
+
+
+class TurningMachine(NamedTuple):
+    """The linear machine at one speed.
+
+    - `system`: inputs e_k (m) at the sensor of each axis; outputs: readings z_k, commands u_k, currents i_k, and the
+      coordinates q of the rotor. The first n states are q, the next n their rates.
+    - `free` [N, N]: matrix A in continuous time, under constant commands, of the first N states: rotor, coils,
+      low-passes and amplifiers.
+    - `W`: speed, rad/s.
+    """
+
+    system: StateSpace
+    free: np.ndarray
+    W: float
 
 
 def linearise_machine(machine: Machine, period: Scalar, speed: float) -> StateSpace:
     """Linearise a machine at its equilibrium at a constant speed (rpm). `period`: sample period, s.
 
-    The linear system has a test signal e_k at the sensor of each axis as its inputs, and the readings z_k and the
-    commands u_k as its outputs. It contains what that of one axis contains (`linearise`). Raises ValueError if no
-    equilibrium is found, and if a law has no derivative there.
+    The linear system has a test signal e_k at the sensor of each axis as its inputs. Its outputs are the readings z_k,
+    the commands u_k, the currents i_k and the coordinates of the rotor. It contains what that of one axis contains
+    (`linearise`). Raises ValueError if no equilibrium is found, and if a law has no derivative there.
     """
-    system, found = _matrices(*canonical((machine, speed * np.pi / 30, period)))
-    if not found:
-        raise ValueError(
-            "no equilibrium of the machine was found, so it has no linearisation: `ambjax simulate` shows whether the "
-            "rotor is held."
-        )
-    if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(system)):
-        raise ValueError("the machine has no linearisation: the derivative of a law or of a magnet is not finite.")
-    return system.without_idle()
+    return next(turning_machines(machine, period, [speed])).system.without_idle()
+
+
+def turning_machines(machine: Machine, period: Scalar, speeds: Iterable[float]) -> Iterator[TurningMachine]:
+    """Linearise a machine at speeds (rpm) as `linearise_machine` does, with the states that no test signal reaches."""
+    point, (machine, period) = None, canonical((machine, period))
+    for speed in speeds:
+        W = canonical(speed * np.pi / 30)
+        found = None if point is None else _matrices(machine, W, period, point)
+        if found is None or not found[-1]:  # the point of rest does not depend on the speed, or hardly
+            point = _at_rest(machine, W, period)
+            found = _matrices(machine, W, period, point)
+        system, free, rests = found
+        if not rests:
+            raise ValueError(
+                "no equilibrium of the machine was found, so it has no linearisation: `ambjax simulate` shows whether "
+                "the rotor is held."
+            )
+        if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(system)):
+            raise ValueError("the machine has no linearisation: the derivative of a law or of a magnet is not finite.")
+        yield TurningMachine(jax.tree.map(np.asarray, system), np.asarray(free), float(W))
 
 
 def machine_sensitivity(

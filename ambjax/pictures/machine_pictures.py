@@ -12,6 +12,8 @@ from ambjax.pictures.style import own_style
 
 # Largest number of points of a drawn curve.
 MOST_POINTS = 4000
+# Damping ratio below which a mode counts as lightly damped.
+LIGHT = 0.3
 
 
 @own_style
@@ -103,28 +105,41 @@ def machine_sensitivity_picture(points: Sequence[Any], limits: Sequence[float], 
 
 
 @own_style
-def campbell_picture(title: str, speeds: np.ndarray, poles: Sequence[np.ndarray], path: pathlib.Path) -> None:
-    """Write the frequencies of the poles against speed, coloured by their damping ratio, with the line of the speed.
+def campbell_picture(title: str, speeds: np.ndarray, modes: Sequence[Sequence[Any]], path: pathlib.Path) -> None:
+    """Write the frequencies of the modes against speed, coloured by their damping ratio, with the line of the speed.
 
-    `speeds`: rpm. `poles`: of each speed, 1/s. Unstable poles are red crosses.
+    `speeds`: rpm. `modes`: the `Mode`s at each speed. Triangles up are forward modes, triangles down backward ones;
+    unstable modes are red crosses. The lightly damped modes are named at the last speed.
     """
-    figure = Figure(figsize=(10.0, 6.4), layout="constrained")
+    figure = Figure(figsize=(11.0, 6.8), layout="constrained")
     ax = figure.add_subplot()
-    points = [(speed, p.imag / (2 * np.pi), -p.real / abs(p)) for speed, own in zip(speeds, poles, strict=True)
-              for p in own if p.imag > 1e-6 * abs(p)]  # fmt: skip
-    x, y, damping = (np.array(values) for values in zip(*points, strict=True))
-    stable = damping > 0
-    shown = ax.scatter(x[stable], y[stable], c=np.log10(damping[stable]), s=9, cmap="viridis", vmin=-3, vmax=0)
-    ax.scatter(x[~stable], y[~stable], c="r", marker="x", s=18)
-    ax.plot(speeds, speeds / 60, "k--", linewidth=0.8)
-    ax.annotate("1x", (speeds[-1], speeds[-1] / 60), fontsize="small")
-    light = y[damping < 0.3]
-    ax.set_ylim(0, 1.15 * max(float(np.max(light, initial=0.0)), speeds[-1] / 60))
+    points = [(speed, mode) for speed, own in zip(speeds, modes, strict=True) for mode in own]
+    shown, stable = None, [(speed, mode) for speed, mode in points if mode.damping > 0]
+    for whirls, marker in ((("forward",), "^"), (("backward",), "v"), (("planar", ""), "o")):
+        own = [(speed, mode.frequency, np.log10(mode.damping)) for speed, mode in stable if mode.whirl in whirls]
+        x, y, ratio = np.reshape(own, (-1, 3)).T
+        shown = ax.scatter(x, y, c=ratio, s=16, marker=marker, cmap="viridis", vmin=-3, vmax=0)
+        ax.plot([], [], marker, color="0.4", label=whirls[0])
+    wrong = [(speed, mode.frequency) for speed, mode in points if mode.damping <= 0]
+    if wrong:
+        ax.scatter(*zip(*wrong, strict=True), c="r", marker="x", s=30, label="unstable")
+    ax.plot(speeds, speeds / 60, "k--", linewidth=0.8, label="1x: the speed")
+    light = [mode for mode in modes[-1] if mode.damping < LIGHT]
+    top = 1.1 * max([mode.frequency for own in modes for mode in own if mode.damping < LIGHT] + [speeds[-1] / 60])
+    ax.set_ylim(0, top)
+    below = -np.inf
+    for mode in light:  # the names of close modes are moved apart
+        below = max(mode.frequency, below + top / 45)
+        ax.annotate(
+            mode.label, (speeds[-1], mode.frequency), (1.02 * speeds[-1], below), fontsize="x-small", va="center"
+        )
+    ax.set_xlim(right=1.2 * speeds[-1])
     ax.set_xlabel("speed, rpm")
-    ax.set_ylabel("frequency of the pole, Hz")
+    ax.set_ylabel("frequency of the mode, Hz")
     bar = figure.colorbar(shown, ticks=[-3, -2, -1, 0])
     bar.ax.set_yticklabels(["0.001", "0.01", "0.1", "1"])
     bar.set_label("damping ratio")
     ax.grid(True, alpha=0.3)
-    ax.set_title(f"{title}: poles of the closed loops" + (", unstable ones as red crosses" if not stable.all() else ""))
+    figure.legend(fontsize="small", loc="outside lower center", ncols=5)
+    ax.set_title(f"{title}: modes of the closed loops")
     figure.savefig(path, dpi=130)

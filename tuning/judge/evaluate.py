@@ -12,16 +12,11 @@ from ambjax.ensemble.study import Study
 from tuning.problem.config import seeds
 from tuning.problem.lanes import Engine
 from tuning.problem.members import Members
-from tuning.problem.tuning_problem import REFERENCE_MEMBERS, TuningProblem
+from tuning.problem.tuning_problem import REFERENCE_MEMBERS, REFERENCE_TOLERANCE, TuningProblem
 
-# Largest number of members that the judge simulates in one call.
-CHUNK = 1024
 # Largest relative difference of the settled rms errors with the search's steps and with accurate ones. Above it, the
 # steps are refined and the search continues.
 RESOLVED = 0.1
-# Share of the gap. A difference of the errors below it does not count, because it is within the accuracy of the
-# reference.
-NEGLIGIBLE = 1e-6
 
 
 def judge(problem: TuningProblem, x: np.ndarray, seed: int, count: int) -> dict[str, np.ndarray]:
@@ -30,12 +25,9 @@ def judge(problem: TuningProblem, x: np.ndarray, seed: int, count: int) -> dict[
     `TuningProblem.judging` defines the steps. In continuous time they are finer than those of the search; on a
     processor they are those of the case, unless the search has refined its steps.
     """
-    parts = []
-    for first in range(0, count, CHUNK):
-        members = problem.objective.chosen(seed, np.arange(first, min(first + CHUNK, count)), count)
-        metrics = problem.judging.metrics(x[None], members)
-        parts.append({**metrics["metrics"], **{f"loss.{name}": v for name, v in metrics["loss"].items()}})
-    return {name: np.concatenate([part[name][0] for part in parts]) for name in parts[0]}
+    metrics = problem.judging.metrics(x[None], problem.objective.chosen(seed, np.arange(count), count))
+    both = metrics["metrics"] | {f"loss.{name}": values for name, values in metrics["loss"].items()}
+    return {name: values[0] for name, values in both.items()}
 
 
 def worst(problem: TuningProblem, judged: dict[str, np.ndarray], seed: int) -> dict[str, Any]:
@@ -80,7 +72,7 @@ class StepError(NamedTuple):
     stalled: int
     unheld: Members
     negligible_m: float
-    """difference of the errors (m) below which the steps count as resolved"""
+    """difference of the errors (m) within the accuracy of the reference, below which the steps count as resolved"""
 
     @property
     def unconfirmed(self) -> int:
@@ -158,7 +150,7 @@ def compare_metrics(
     )
     relative = search_m / reference_m - 1 if reference_m > 0 else math.nan
     unheld: Members = jax.tree.map(lambda a: a[unconfirmed], members)
-    negligible = NEGLIGIBLE * float(np.asarray(problem.objective.loss.s_0))
+    negligible = REFERENCE_TOLERANCE * float(np.asarray(problem.objective.loss.s_0))
     both, lost = int(held.sum()), int((unconfirmed & ~stalled).sum())
     return StepError(search_m, reference_m, relative, both, len(held), lost, int(stalled.sum()), unheld, negligible)
 

@@ -9,11 +9,10 @@ from ambjax.control.processor import MOST_DELAY
 from ambjax.ensemble import run_ensemble
 from ambjax.linear import stability_of
 from tuning.problem.limits import PREFIX, Limit
+from tuning.problem.quantities import LOOPS
 from tuning.problem.tuning_problem import TuningProblem
 
 DELAY_MARGIN = "delay_margin_s"
-# Number of members tested: those with the smallest linear margins.
-TESTED = 16
 
 
 class DelayTest(NamedTuple):
@@ -41,7 +40,7 @@ def not_simulated(problem: TuningProblem, limit: Limit) -> str:
 
 
 def delay_test(problem: TuningProblem, x: np.ndarray, seed: int, columns: Mapping[str, np.ndarray]) -> DelayTest | None:
-    """Simulate the held members of least linear delay margin, with the limit on this margin as an additional delay.
+    """Simulate the LOOPS held members of least delay margin, with the limit on it as an additional delay.
 
     The prediction of the controller assumes the delay of the case. `x`: coordinates of the m gains [m]. `columns` [N]:
     result of `judge` for the ensemble with this `seed`. Returns None without such a limit, if `not_simulated` gives a
@@ -52,7 +51,7 @@ def delay_test(problem: TuningProblem, x: np.ndarray, seed: int, columns: Mappin
     if limit is None or not_simulated(problem, limit) or not alive.size:
         return None
     order = np.argsort(columns[f"loss.{PREFIX}{DELAY_MARGIN}"][alive], kind="stable")
-    members = problem.objective.chosen(seed, alive[order[:TESTED]], len(columns["lost_at_s"]))
+    members = problem.objective.chosen(seed, alive[order[:LOOPS]], len(columns["lost_at_s"]))
     cascade, scenario = problem.objective.fixed(x, members)
     processor = cascade.timing
     delay = np.asarray(processor.delay) + limit.threshold / float(problem.case.clock.sample_period)

@@ -14,6 +14,7 @@ from ambjax.control.cascade import DEFAULT_LAWS
 from ambjax.linear import Analysis, Injection, analyse, frequency_lines, linearise
 from ambjax.linear.injection import injection_of
 from ambjax.linear.member_responses import Responses, member_responses
+from ambjax.linear.stability import MOST_TESTED
 from ambjax.results.operating import one_period
 from tuning.problem.limits import PREFIX, Limit
 from tuning.problem.tuning_problem import TuningProblem
@@ -21,10 +22,6 @@ from tuning.problem.tuning_problem import TuningProblem
 # INJECTED: number of members, those with the largest peaks, with an injected signal. REPETITIONS: number of
 # injections into each of them, with different noise.
 INJECTED, REPETITIONS = 3, 8
-# If only injections decide, the linear peaks do not show which members have the largest peaks. The first SCREENED held
-# members then have one injection each. They run in blocks of 16, one per core: on four cores, this takes as long as the
-# measurement of one member.
-SCREENED = 64
 UNSTABLE = "its linearised loop is not stable"
 # Limited quantities that an injection measures.
 BY_INJECTION = {"sensitivity": "S", "complementary": "T", "control_sensitivity": "KS"}
@@ -84,8 +81,8 @@ def injections(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[s
 
     `columns` [N]: result of `judge` for the ensemble with this `seed`. The members are those with the largest linear
     peak of the first quantity of BY_INJECTION that has a limit. If only injections decide, they are those with the
-    largest injected peak, by one injection into each of the first SCREENED held members. Returns None if no quantity of
-    BY_INJECTION has a limit, or if no member is held.
+    largest injected peak, by one injection into each of the first MOST_TESTED held members. Returns None if no quantity
+    of BY_INJECTION has a limit, or if no member is held.
     """
     name = next((name for name in BY_INJECTION if f"loss.{PREFIX}{name}" in columns), None)
     alive = np.flatnonzero(~np.isfinite(columns["lost_at_s"]))
@@ -98,7 +95,7 @@ def injections(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[s
     first = of.analysis(order[0])
     peak = None if isinstance(first, str) else first.S.frequency
     if decides(problem):
-        once = of.responses(alive[:SCREENED], 1, peak)
+        once = of.responses(alive[:MOST_TESTED], 1, peak)
         response = {"S": once.S, "T": once.S - 1, "KS": once.KS}[BY_INJECTION[name]]
         size = np.where(once.held, np.abs(response).max(axis=1), np.inf)
         order = alive[np.argsort(-size, kind="stable")]

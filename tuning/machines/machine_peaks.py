@@ -42,8 +42,6 @@ class Peaks:
         machine, self.sampled = canonical(case.machine), case.cases[0].cascade.sampled
         speeds = 2 * np.pi * PER_MINUTE * np.array(case.speeds)
         rest = machine_rest(machine, self.period)
-        if not rest[-1]:
-            raise ValueError("no equilibrium of the machine was found: `ambjax simulate` shows whether it is held.")
 
         def system(x: Array, W: Array, known: Any) -> StateSpace:
             found = machine_loop(space.decode(x, known[0]), W, self.period, known[1]).scaled()

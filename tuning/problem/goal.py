@@ -16,8 +16,8 @@ from tuning.problem.risk import Risk
 from tuning.problem.shortfalls import Bound, shortfall
 from tuning.problem.space import Space
 
-# Largest goal, a logarithm, that is shown; exp overflows above 709.
-MOST = 700.0
+# Largest goal, a logarithm, whose exponential does not overflow.
+MOST = np.log(np.finfo(float).max)
 
 
 def shown(goal: np.ndarray | float) -> np.ndarray:

@@ -35,7 +35,7 @@ LANES = 64
 # Lanes of one kernel call with derivatives. Most iterations need 16 to 64 lanes. With calls of 32 lanes, two cores can
 # share 64. In sequence, two such calls take 14 % longer than one of 64 lanes. A call of 16 lanes takes 0.63 of the time
 # of one of 32; a second kernel for few lanes would take longer to compile than it saves in a search.
-GRADIENT_LANES = 32
+GRADIENT_LANES = LANES // 2
 
 
 class Lane(NamedTuple):

@@ -34,8 +34,6 @@ LEAST_MARGIN = 0.002
 FRONT = "the front"
 # An infinite judged value is replaced by this factor times the larger of the limit and the search's value.
 LOST_FACTOR = 10.0
-# Intervals of the integral in `Limit.error_reduction`.
-PRICE_INTERVALS = 200
 
 
 @record
@@ -150,7 +148,8 @@ class Limit:
         side = -1.0 if self.kind.at_least else 1.0
         logs, multipliers = np.array(sorted((side * math.log(reached), one) for reached, one in self.history)).T
         begin = side * math.log(self.history[-1][0])
-        at = np.linspace(begin, begin + math.log1p(more), PRICE_INTERVALS + 1)
+        ends = np.array([begin, begin + math.log1p(more)])
+        at = np.sort([*ends, *logs[(logs > ends[0]) & (logs < ends[1])]])
         return -math.expm1(-float(np.trapezoid(np.interp(at, logs, multipliers), at)) / 2)
 
     def reached(self, columns: Mapping[str, np.ndarray]) -> float:

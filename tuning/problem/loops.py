@@ -14,10 +14,8 @@ from ambjax.extend import Scalar, canonical
 from ambjax.linear import LoopQuantities, linearisation_inputs, loop_matrices, loop_quantities
 from ambjax.world.scenario import Scenario
 from tuning.problem.members import LoopRange, Members, Objective
+from tuning.problem.quantities import LOOPS
 from tuning.problem.space import Space
-
-# Lanes of one call of the compiled program.
-LANES = 8
 
 
 class LoopLane(NamedTuple):
@@ -67,7 +65,7 @@ def loops(
     lane = lane._replace(x=np.asarray(x, jnp.result_type(float))[start])
     function = LaneLoop(objective.space, objective.loop)
     # one call at a time: XLA runs LAPACK on its own threads, and two calls wait for each other for ever
-    values, slopes = map_members(function, lane, threads=1, call=LANES, block=LANES, plain=True)
+    values, slopes = map_members(function, lane, threads=1, call=LOOPS, block=LOOPS, plain=True)
     names = (*objective.loop.names, *also)
     return (
         {name: getattr(values, name).reshape(count, n) for name in names},

@@ -15,10 +15,8 @@ from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import ALIVE, Row
 from ambjax.world.scenario import Scenario
 from tuning.problem.limits import PREFIX
+from tuning.problem.quantities import NORM
 
-# Exponent of the power mean that approximates a maximum. Over 1e4 samples of noise, the maximum is 1.2 to 1.6 times the
-# power mean.
-NORM = 16
 # Weights of the terms, in the order of TERMS; values of a term, for one member or for many [N].
 Weights = Sequence[float] | np.ndarray | Array
 Values = TypeVar("Values", Array, np.ndarray)

@@ -18,8 +18,8 @@ from tuning.problem.loss import Loss
 from tuning.problem.quantities import LOOPS
 from tuning.problem.space import Space
 
-# The screen simulates one member in SCREENED, but at least LEAST_PART ordinary and LEAST_PART stressed members.
-SCREENED, LEAST_PART = 4, 4
+# The screen simulates one member in PART, but at least PART ordinary and PART stressed members.
+PART = 4
 
 
 class LoopRange(NamedTuple):
@@ -71,9 +71,9 @@ class Members(NamedTuple):
 
     @property
     def part(self) -> "Members":
-        """The first 1/SCREENED of the ordinary and of the stressed members, at least LEAST_PART of each kind."""
+        """The first 1/PART of the ordinary and of the stressed members, at least PART of each kind."""
         kinds = self.ordinary, len(self.stressed) - self.ordinary
-        few, some = (max(count // SCREENED, min(LEAST_PART, count)) for count in kinds)
+        few, some = (max(count // PART, min(PART, count)) for count in kinds)
         index = np.concatenate([np.arange(few), np.arange(self.ordinary, self.ordinary + some)])
         return jax.tree.map(lambda a: a[index], self)
 

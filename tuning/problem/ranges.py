@@ -7,18 +7,15 @@ import numpy as np
 from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import extremes
 from ambjax.control.search import Interval, LowerBound, SearchContext
+from ambjax.linear.stability import KICK
 from tuning.problem.members import Objective
 from tuning.problem.shortfalls import Bound
 from tuning.problem.space import Gain, Space
 
-# Least initial displacement that is assumed, as a share of the clearance, even if the rotor starts closer to z = 0.
-LEAST_DISPLACEMENT = 0.01
 # Default upper bound of a gain: this factor times the larger of the upper end of its range and its value in the case.
 END_FACTOR = 3.0
 # Range of a gain for which the law defines none: its value divided and multiplied by this factor.
 DEFAULT_FACTOR = 30.0
-# Ratio of the ends of a range if the law's range lies beyond the only bound of [tune.bounds]; it then begins there.
-OPEN_RATIO = 1e3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +84,7 @@ def _context(objective: Objective, conditions: tuple[Bound, ...]) -> SearchConte
     places = [
         (abs(float(scenario.initial.z)), "initial.z"),
         (abs(float(scenario.initial.z_dot)) / w, "initial.z_dot / w"),
-        (LEAST_DISPLACEMENT * float(scenario.touchdown), f"{100 * LEAST_DISPLACEMENT:g} % of the clearance"),
+        (KICK * float(scenario.touchdown), f"{100 * KICK:g} % of the clearance"),
     ]
     z, where = max(places)
     delta, fall = bounds.get("Delta_1", 0.0), growth * z
@@ -136,9 +133,9 @@ def _range(gain: Gain, value: float, interval: Interval) -> Range:
         source += "; within tune.bounds"
     low, high = max(low, gain.low * 1.05), min(high, gain.high / 1.05)
     if low >= high and gain.low > 0:
-        high = low * OPEN_RATIO
+        high = low * DEFAULT_FACTOR**2
     elif low >= high:
-        low = high / OPEN_RATIO
+        low = high / DEFAULT_FACTOR**2
     if np.isfinite(gain.high):
         return Range(low, high, gain.high, source)
     most = max(high, value) * (1 if interval.firm else END_FACTOR)

@@ -26,9 +26,8 @@ SHARP = 4.0
 # Largest distance of a coordinate beyond a bound at the start of a search. There, the gain is 3 % away from the bound,
 # and a change of the coordinate changes its logarithm by an eighth of that.
 BEYOND = 0.5
-# Distance of `Gain.inner` from the bounds: a share of the bound, the distance from 0 in units of the gain, and the
-# largest share of the interval in logarithms.
-MARGIN, MARGIN_OF_ZERO, SHARE = 0.02, 1e-12, 0.1
+# Distance of `Gain.inner` from the bounds: a share of the bound, and the largest share of the interval in logarithms.
+MARGIN, SHARE = 0.02, 0.1
 # Smallest relative distance of two bounds. Closer bounds leave an interval of the size of the rounding error.
 CLOSEST = 1e-6
 ROOT = "controller"
@@ -78,7 +77,7 @@ class Gain:
     def inner(self) -> tuple[float, float]:
         """An interval (low, high) well within the bounds."""
         if self.low == 0.0:
-            return MARGIN_OF_ZERO * min(self.high, 1.0), self.high / (1 + MARGIN)
+            return CLOSEST**2 * min(self.high, 1.0), self.high / (1 + MARGIN)
         aside = min(1 + MARGIN, (self.high / self.low) ** SHARE)
         return self.low * aside, self.high / aside
 

@@ -25,8 +25,8 @@ from tuning.problem.shortfalls import bounds
 # for the accurate steps, and the judge makes the steps of the case. On the tuned loops of tests/test_metrics_dense.py,
 # 24 steps a sample have an error of at most 0.8 % in the settled rms voltage, 12 steps 4.6 %, 3 steps 56 %.
 REFINEMENT = 8
-# Accurate reference: number of members, relative tolerance, largest number of attempted steps in a sample.
-REFERENCE_MEMBERS, REFERENCE_TOLERANCE, MOST_TRIALS = 4, 1e-6, 10_000
+# Accurate reference: number of members, relative tolerance of the steps.
+REFERENCE_MEMBERS, REFERENCE_TOLERANCE = 4, 1e-6
 # Quantities that the front of error against voltage needs.
 TRACED = ("rms_error_m", "rms_u_V")
 # Initial multiplier of the limit on the error in the searches for the front, which minimise the voltage. It corresponds
@@ -71,7 +71,7 @@ class TuningProblem:
 
         Adaptive RODAS3 or, on a processor, REFINEMENT times as many steps as in the search.
         """
-        accurate = AdaptiveRodas3(REFERENCE_TOLERANCE, most_steps=MOST_TRIALS)
+        accurate = AdaptiveRodas3(REFERENCE_TOLERANCE)
         return self._stepping(self._fine if self.sampled else accurate, lanes=REFERENCE_MEMBERS)
 
     @functools.cached_property

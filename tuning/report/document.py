@@ -10,9 +10,6 @@ from tuning.report import front_table, held_out, limit_table, sensitivity_table
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.limit_table import broken, prices
 
-# Relative decrease of the objective below which a point of a slice counts as equal to the answer.
-AS_GOOD = 0.01
-
 
 def report_markdown(facts: TuningFacts) -> str:
     """Return the text of report.md: the answer in five lines, the front, and all details.
@@ -160,16 +157,10 @@ def _lower_point(beside: Row) -> str:
     """Return a sentence on the point of the slices with the lowest objective."""
     if beside["lower"] == 0:
         return "No point of these slices has a lower objective without losing more members than the answer."
-    where = f"{100 * beside['lower']:.2g} % lower, at {beside['path']} = {beside['gain']:.4g}"
-    if beside["lower"] <= AS_GOOD:
-        return (
-            f"The lowest point of these slices is {where}, and loses no more members. This difference is within the "
-            "tolerance of the search."
-        )
     return (
-        f"**The lowest point of these slices is {where}**, and loses no more members: the search did not reach it. "
-        "That point was not verified on the validation ensemble or with accurate steps. To continue from it, set the "
-        "gain in tuned.toml and tune that file."
+        f"The lowest point of these slices is {100 * beside['lower']:.2g} % lower, at {beside['path']} = "
+        f"{beside['gain']:.4g}, and loses no more members. It was not verified. To continue from it, set the gain in "
+        "tuned.toml and tune that file."
     )
 
 

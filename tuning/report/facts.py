@@ -17,7 +17,7 @@ SUMMARY_METRICS = (
     "clearance_used.largest",
 )
 # Fields that report.json leaves out if they are None.
-OPTIONAL = ("accurate", "front", "sensitivity", "stability")
+OPTIONAL = ("front", "sensitivity", "stability")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,7 +25,7 @@ class TuningFacts:
     """What a search found. Each field is a key of report.json.
 
     `before`, `after`: the held-out members under the case's gains and the tuned ones. `refuted`: why accurate steps
-    contradict the answer; '' if they confirm it. `accurate`: some members with accurate steps.
+    contradict the answer; '' if they confirm it.
     `stability`: of the held-out members with the largest settled errors (`ambjax.linear.Findings`); None if
     no member was judged. `front`: of error against voltage; None if it was not traced. `front_written`: whether each of
     its points has a case file. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it.
@@ -53,7 +53,6 @@ class TuningFacts:
     verified_reason: str
     lost_in_validation: int
     search: Row
-    accurate: Row | None
     gains: list[Row]
     front: list[Row] | None
     beside: Row | None

@@ -17,10 +17,9 @@ from tuning.judge.evaluate import describe, held, judge, step_error, summarise, 
 from tuning.judge.late import delay_test
 from tuning.judge.peaks import injections
 from tuning.problem.config import seeds, settings
-from tuning.problem.tuning_problem import TuningProblem
+from tuning.problem.tuning_problem import REFERENCE_MEMBERS, TuningProblem
 from tuning.report import front_table, limit_table, outcome, sensitivity_table
 from tuning.report.facts import Row, TuningFacts
-from tuning.report.held_out import COMPARED, compare_steps
 from tuning.report.slices import Slices
 from tuning.report.slices import slices as slices_through
 from tuning.solve.course import SearchResult
@@ -120,17 +119,13 @@ def _steps(answer: SearchResult, judged: dict[str, np.ndarray], held_out: int, t
     In continuous time, the worst and the first of the held-out members are simulated again with accurate steps.
     `judged`: metrics of these members [N]; empty if there are none. `held_out`: their seed.
     """
-    problem, error, again = answer.problem, None, None
-    if judged and not problem.sampled:
-        count, those = len(judged["lost_at_s"]), np.flatnonzero(held(judged))
-        if answer.confirmed and those.size:
-            those = those[worst_of(judged["settled_max_abs_error_m"][those])]
-            error = step_error(problem, answer.x, problem.objective.chosen(held_out, those, count))
-            tell(f"accurate steps on the worst of them: {describe(error)}")
-        tell(f"{min(COMPARED, count)} of these members again with accurate steps")
-        again = compare_steps(problem, answer.x, held_out, count)
+    problem, error = answer.problem, None
+    if judged and not problem.sampled and answer.confirmed and (alive := np.flatnonzero(held(judged))).size:
+        worst = alive[worst_of(judged["settled_max_abs_error_m"][alive])]
+        those = np.union1d(worst, alive[:REFERENCE_MEMBERS])
+        error = step_error(problem, answer.x, problem.objective.chosen(held_out, those, len(judged["lost_at_s"])))
+        tell(f"accurate steps on the worst and the first of them: {describe(error)}")
     refuted = (error or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
-    refuted = refuted or (again["refuted"] if again else "")
     confirmed = "; ".join(f"accurate steps: {describe(one)}" for one in (error, answer.error) if one)
     return {
         "step_error": answer.error.facts() if answer.error else None,
@@ -140,7 +135,6 @@ def _steps(answer: SearchResult, judged: dict[str, np.ndarray], held_out: int, t
         "refuted": refuted,
         "verified": not refuted,
         "verified_reason": refuted or confirmed,
-        "accurate": again,
     }
 
 

@@ -14,8 +14,6 @@ from tuning.problem.tuning_problem import TuningProblem
 Facts = dict[str, Any]
 # Share by which a limit is loosened to compute the effect.
 MORE = 0.1
-# Share of saturated samples above which an injection describes the saturated loop.
-MOST_SATURATED = 0.02
 # Verdicts on a limit.
 HELD, BROKEN, UNVERIFIED, UNJUDGED = "held", "NOT HELD", "not verified", "not judged"
 UNBREAKABLE = "cannot be broken"
@@ -44,24 +42,21 @@ def facts(
       limit is not active.
     """
     members, held, settings = summary["members"], summary["held"], problem.tune.limits
-    share = held / members if members else None
     price_unit = "V" if problem.goal.minimised else "m"
-    survival = _without_price("survival", settings.survival, price_unit) | {"reached": share, "at_least": True}
-    survival |= _verdict(None if share is None else members - held <= settings.may_lose(members), refuted)
-    unbreakable = [
-        _without_price(limit.name, limit.threshold, price_unit, limit.kind)
-        | {"source": f"{limit.source}; {UNBREAKABLE}: {why}", "held": True, "verdict": UNBREAKABLE}
-        for limit, why in settings.unbreakable
-    ]
-    numbers = columns, summary, refuted, injected, price_unit
-    rows = [
-        _tested(_row(limit, *numbers), delayed, refuted, not_simulated(problem, limit)) for limit in _asked(problem)
-    ]
-    return [*rows, *unbreakable, survival]
+    rows = [_row(limit, columns, summary, refuted, injected, price_unit) for limit in _asked(problem)]
+    rows = [_tested(row, delayed, refuted, _not_simulated(problem, row["name"])) for row in rows]
+    for limit, why in settings.unbreakable:
+        source = f"{limit.source}; {UNBREAKABLE}: {why}"
+        rows.append(_blank(limit.name, limit.threshold, price_unit, limit.kind, source=source, verdict=UNBREAKABLE))
+        rows[-1]["held"] = True
+    share = held / members if members else None
+    kept = None if share is None else members - held <= settings.may_lose(members)
+    survival = _blank("survival", settings.survival, price_unit, reached=share, at_least=True)
+    return [*rows, survival | _verdict(kept, refuted)]
 
 
-def _without_price(name: str, threshold: float, price_unit: str, kind: Kind | None = None) -> Facts:
-    """Return the row of a limit without a price and a value reached. `kind`: None for survival."""
+def _blank(name: str, threshold: float, price_unit: str, kind: Kind | None = None, **found: Any) -> Facts:
+    """Return the row of a limit without a value reached, with the fields `found`. `kind`: None for survival."""
     return {
         "name": name,
         "unit": kind.unit if kind else "",
@@ -69,14 +64,11 @@ def _without_price(name: str, threshold: float, price_unit: str, kind: Kind | No
         "at_least": False,
         "source": "tune.limits",
         "what": f"{kind.words}; {kind.over}" if kind else "share of members held",
-        "reached": None,
-        "worst": None,
+        **dict.fromkeys(("reached", "worst", "multiplier", "price")),
         "margin": 0.0,
         "active": False,
-        "multiplier": None,
-        "price": None,
         "price_unit": price_unit,
-    }
+    } | found
 
 
 def _verdict(kept: bool | None, refuted: str) -> Facts:
@@ -105,23 +97,23 @@ def _row(
     active, found = limit.active(reached), _verdict(kept, refuted)
     minimised = {"m": "settled_rms_error_m", "V": "settled_rms_u_V.mean"}[price_unit]
     price = summary[minimised] * limit.error_reduction(MORE) if active and judged else 0.0
-    row = _without_price(limit.name, limit.threshold, price_unit, limit.kind)
-    return (
-        row
-        | {
-            "at_least": limit.kind.at_least,
-            "source": limit.source,
-            "what": row["what"] + _by_injection(limit, injected),
-            "saturated": _saturated(limit, reached, injected),
-            "reached": reached,
-            "worst": reached if limit.kind.fold is None or not judged else limit.worst(columns),
-            "margin": limit.margin,
-            "active": active,
-            "multiplier": limit.multiplier,
-            "price": price if found["held"] else None,
-        }
-        | found
-    )
+    row = _blank(limit.name, limit.threshold, price_unit, limit.kind, source=limit.source, **found)
+    return row | {
+        "at_least": limit.kind.at_least,
+        "what": row["what"] + _by_injection(limit, injected),
+        "saturated": _saturated(limit, reached, injected),
+        "reached": reached,
+        "worst": reached if limit.kind.fold is None or not judged else limit.worst(columns),
+        "margin": limit.margin,
+        "active": active,
+        "multiplier": limit.multiplier,
+        "price": price if found["held"] else None,
+    }
+
+
+def _not_simulated(problem: TuningProblem, name: str) -> str:
+    """Return why the delay of the limit on the delay margin is not simulated; '' if it is, and for other limits."""
+    return next((not_simulated(problem, one) for one in _asked(problem) if one.name == name == DELAY_MARGIN), "")
 
 
 def _tested(row: Facts, delayed: DelayTest | None, refuted: str, reason: str = "") -> Facts:
@@ -129,16 +121,16 @@ def _tested(row: Facts, delayed: DelayTest | None, refuted: str, reason: str = "
 
     `reason`: why there was no test (`not_simulated`).
     """
-    if row["name"] != DELAY_MARGIN:
+    if row["name"] != DELAY_MARGIN or (delayed is None and not reason):
         return row
-    if delayed is None:
-        words = f"; the linear margins decide, because {reason}: the additional delay was not simulated"
-        return row | {"what": row["what"] + words} if reason else row
-    words = (
-        f"{row['what']}; with this additional delay {delayed.lost} of {delayed.members} of the worst members are lost, "
-        f"and {delayed.unstable} held but not stable"
-    )
-    return row | {"what": words} | (_verdict(False, refuted) | {"price": None} if delayed.fails else {})
+    words = f"the linear margins decide, because {reason}: the additional delay was not simulated"
+    if delayed is not None:
+        words = (
+            f"with this additional delay {delayed.lost} of {delayed.members} of the worst members are lost, and "
+            f"{delayed.unstable} held but not stable"
+        )
+    fails = delayed is not None and delayed.fails
+    return row | {"what": f"{row['what']}; {words}"} | (_verdict(False, refuted) | {"price": None} if fails else {})
 
 
 def _asked(problem: TuningProblem) -> list[Limit]:
@@ -164,7 +156,7 @@ def _saturated(limit: Limit, reached: float | None, injected: Sensitivity | None
 def _at_the_supply(row: Facts) -> str:
     """Return a warning if the supply limited u during the injection; '' if it did not."""
     share = row.get("saturated")
-    if share is None or share <= MOST_SATURATED:
+    if not share:
         return ""
     return (
         f"; by an injection while the supply limits u in {100 * share:.2g} % of the samples: set a smaller "
@@ -176,8 +168,9 @@ def _at_the_supply(row: Facts) -> str:
 def broken(rows: list[Facts]) -> list[str]:
     """Return a sentence for each limit that is not held, including survival."""
     return [
-        f"tune.limits.{row['name']} is {BROKEN}: {_reached(row)}, {_side(row)} {row['threshold']:g} ({row['source']})"
-        f"{_at_the_supply(row)}"
+        f"tune.limits.{row['name']} is {BROKEN}: "
+        f"{'no member is held' if row['reached'] is None else _number(row['reached'], row)}, {_side(row)} "
+        f"{row['threshold']:g} ({row['source']}){_at_the_supply(row)}"
         for row in rows
         if row["verdict"] == BROKEN
     ]
@@ -186,7 +179,7 @@ def broken(rows: list[Facts]) -> list[str]:
 def prices(rows: list[Facts]) -> list[str]:
     """Return a sentence for each limit that is active and held."""
     return [
-        f"{row['name']} = {row['reached']:.4g}{_unit(row)} is at its limit, {row['threshold']:g}: a limit "
+        f"{row['name']} = {_number(row['reached'], row)} is at its limit, {row['threshold']:g}: a limit "
         f"{100 * MORE:g} % {'lower' if row['at_least'] else 'higher'} would reduce the settled rms "
         f"{'voltage' if row['price_unit'] == 'V' else 'error'} by about {row['price']:.2g} {row['price_unit']}"
         for row in rows
@@ -198,50 +191,30 @@ def section(rows: list[Facts]) -> list[str]:
     """Return the section on limits."""
     if not rows:
         return []
-    cells = [
-        [
-            f"`{row['name']}`",
-            f"{_side(row)} {row['threshold']:g}{_unit(row)}",
-            _number(row["reached"], row),
-            _number(row["worst"], row),
-            f"**{row['verdict']}**" if row["verdict"] in EMPHASISED else row["verdict"],
-            "active" if row["active"] else "-",
-            "-" if row["price"] is None or row["name"] == "survival" else f"{row['price']:.2g} {row['price_unit']}",
-        ]
-        for row in rows
-    ]
-    head = [
-        "quantity",
-        "limit",
-        "reached",
-        "worst member",
-        "verdict",
-        "at the optimum",
-        f"effect if {100 * MORE:g} % looser",
-    ]
-    lines = ["## Limits", "", *markdown_table(head, cells), ""]
-    lines += [f"- {row['name']}: {row['what']}. Source: {row['source']}." for row in rows]
-    return [
-        *lines,
-        "",
+    columns = {
+        "quantity": lambda row: f"`{row['name']}`",
+        "limit": lambda row: f"{_side(row)} {row['threshold']:g} {row['unit']}".rstrip(),
+        "reached": lambda row: _number(row["reached"], row),
+        "worst member": lambda row: _number(row["worst"], row),
+        "verdict": lambda row: f"**{row['verdict']}**" if row["verdict"] in EMPHASISED else row["verdict"],
+        "at the optimum": lambda row: "active" if row["active"] else "-",
+        f"effect if {100 * MORE:g} % looser": lambda row: (
+            "-" if row["price"] is None else f"{row['price']:.2g} {row['price_unit']}"
+        ),
+    }
+    table = markdown_table(list(columns), [[column(row) for column in columns.values()] for row in rows])
+    sources = [f"- {row['name']}: {row['what']}. Source: {row['source']}." for row in rows]
+    words = (
         "The values are those of the held-out members that are held. The last column shows by how much the minimised "
         f"settled rms error or voltage would decrease if the limit were {100 * MORE:g} % looser. It is estimated from "
-        "the Lagrange multipliers of the optima along the search.",
-        "",
-    ]
-
-
-def _reached(row: Facts) -> str:
-    return "no member is held" if row["reached"] is None else _number(row["reached"], row)
+        "the Lagrange multipliers of the optima along the search."
+    )
+    return ["## Limits", "", *table, "", *sources, "", words, ""]
 
 
 def _side(row: Facts) -> str:
     return "at least" if row["at_least"] else "at most"
 
 
-def _unit(row: Facts) -> str:
-    return f" {row['unit']}" if row["unit"] else ""
-
-
 def _number(value: float | None, row: Facts) -> str:
-    return "-" if value is None else f"{value:.4g}{_unit(row)}"
+    return "-" if value is None else f"{value:.4g} {row['unit']}".rstrip()

@@ -1,6 +1,7 @@
 """Pictures of a search and its answer, as PNG."""
 
 import io
+import math
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,9 @@ from tuning.problem.goal import shown
 from tuning.report.front_table import letter
 from tuning.report.slices import Slices
 
-# Largest plotted goal along a gain, relative to that of the answer. A lost member raises the goal by about 1e6, which
-# would hide the other values.
+# Largest plotted goal, relative to the least. A lost member raises the goal by about 1e6, and violated limits by up to
+# 1e300, which would hide the other values.
 HIGHEST = 30.0
-# Largest number of panels in a row of `landscape`.
-GAINS_PER_ROW = 5
-# Largest value of the goal in `convergence`, relative to the least. Strongly violated limits give values above 1e300.
-LARGEST_GOAL = 1e9
 # FAINTEST: smallest plotted amplitude, as a share of the largest. FEWEST: smallest number of samples of a spectrum.
 FAINTEST, FEWEST = 1e-5, 16
 
@@ -74,9 +71,9 @@ def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     steps = np.arange(1, len(value) + 1)
-    cut = np.minimum(value, value.min() + np.log(LARGEST_GOAL))
+    cut = np.minimum(value, value.min() + np.log(HIGHEST))
     left.plot(steps, shown(cut))
-    label = "objective" if (cut == value).all() else f"objective (cut at {LARGEST_GOAL:.0e} times the least)"
+    label = "objective" if (cut == value).all() else f"objective (cut at {HIGHEST:g} times the least)"
     left.set(xlabel="iteration", ylabel=label, yscale="log", title="dotted: the training ensemble changes")
     right.plot(steps, gains / gains[-1], label=[path.removeprefix("controller.") for path in paths])
     right.set(xlabel="iteration", ylabel="gain / its final value", yscale="log", title="gains of the best point")
@@ -92,8 +89,8 @@ def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
 def landscape(slices: Slices, paths: list[str]) -> bytes:
     """Draw the goal as a function of each gain as PNG. The other gains have their values in the answer."""
     m = len(paths)
-    lines = -(-m // GAINS_PER_ROW)
-    columns = -(-m // lines)
+    columns = math.ceil(math.sqrt(2 * m))
+    lines = -(-m // columns)
     figure = Figure(figsize=(2.4 * columns + 1, 2.6 * lines + 0.6), layout="constrained")
     grid = figure.subplots(lines, columns, sharey=True, squeeze=False)
     axes = grid.flat[:m]

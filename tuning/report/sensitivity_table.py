@@ -3,8 +3,9 @@
 import dataclasses
 from typing import Any
 
+from ambjax.linear.stability import MOST_TESTED
 from ambjax.text.web_page import escape_markdown, markdown_table
-from tuning.judge.peaks import SCREENED, Sensitivity, injects
+from tuning.judge.peaks import Sensitivity, injects
 from tuning.problem.tuning_problem import TuningProblem
 
 Facts = dict[str, Any]
@@ -81,7 +82,7 @@ def section(found: Facts | None) -> list[str]:
     a, b, c = found["zones"]
     which = "The held-out members with the largest linear peaks."
     if found["decides"]:
-        which = f"The members with the largest peaks, by one injection into each of up to {SCREENED} members."
+        which = f"The members with the largest peaks, by one injection into each of up to {MOST_TESTED} members."
     words = [f"{which} Zone A is below {a:g}, B below {b:g}, C below {c:g}."]
     if found["decides"]:
         words.append("A sign is set-valued: the injected peak decides, because no linear loop describes chattering.")

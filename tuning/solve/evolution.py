@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-# Standard deviation of the first population in each coordinate: a factor of e^0.3 of a gain.
-SIZE = 0.3
+from tuning.optimisers import FIRST_RADIUS
+
 # A search has converged if PATIENCE populations in a row do not lower `CmaState.level`, a logarithm, by STALL.
 STALL, PATIENCE = 0.01, 6
 
@@ -80,10 +80,10 @@ def population(m: int) -> int:
 
 
 def initial_state(mean: np.ndarray) -> CmaState:
-    """Return the initial distribution around a point [m]."""
+    """Return the initial distribution around a point [m]. Its step size is that of the first step of a descent."""
     m = len(mean)
     return CmaState(
-        mean, np.array(SIZE), np.eye(m), np.zeros(m), np.zeros(m), np.array(0), np.array(np.inf), np.array(0)
+        mean, np.array(FIRST_RADIUS), np.eye(m), np.zeros(m), np.zeros(m), np.array(0), np.array(np.inf), np.array(0)
     )
 
 

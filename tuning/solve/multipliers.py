@@ -22,12 +22,8 @@ from tuning.solve.course import Course
 MOST_UPDATES = 6
 # Largest number of members on which averages are judged. Limits on worst members need the whole ensemble.
 AVERAGING_MEMBERS = 256
-
-
-# Largest number of members that join because they have large values of a limited mean.
-MOST_LARGE = 8
-# Largest number of members that join because they break a limit on the worst member.
-MOST_BREAKING = 4
+# Largest number of members that join at once for each reason.
+MOST_JOINING = 8
 # If the judged mean of a limited quantity exceeds its expected value by more than this share, the training ensemble
 # lacks members with large values.
 UNEXPECTED = 0.1
@@ -114,15 +110,15 @@ def join_breaking(course: Course, one: Judged) -> bool:
     return True
 
 
-def largest_unseen(course: Course, values: np.ndarray, most: int = MOST_LARGE) -> np.ndarray:
-    """Return the numbers of at most `most` validation members, not in the training ensemble, with the largest values.
+def largest_unseen(course: Course, values: np.ndarray) -> np.ndarray:
+    """Return the numbers of the MOST_JOINING validation members of largest values, not in the training ensemble.
 
     `values` [N]: of the validation members; -inf for a member that is left out.
     """
     members, seed = course.members, seeds(course.problem.tune.budget)[1]
     values = values.copy()
     values[members.unstressed.member[members.unstressed.seed == seed]] = -math.inf
-    largest = np.argsort(-values, kind="stable")[:most]
+    largest = np.argsort(-values, kind="stable")[:MOST_JOINING]
     return largest[np.isfinite(values[largest])]
 
 
@@ -131,7 +127,7 @@ def breaking(
 ) -> Members | None:
     """Return the validation members that explain a broken limit and are not in the training ensemble, or None.
 
-    For a limit on the worst member, they are at most MOST_BREAKING members that break it, if the judged value lacks
+    For a limit on the worst member, they are members that break it, if the judged value lacks
     reserve. For a limit on a mean, they are the members with the largest values, if the judged value breaks the limit
     and exceeds its expected value, the search's value times `Limit.ratio`, by more than UNEXPECTED.
 
@@ -144,7 +140,7 @@ def breaking(
     for limit, (tuned, judged) in zip(problem.limits, numbers, strict=True):
         excess = np.where(held(columns), limit.log_excesses(columns), -math.inf)
         if limit.kind.worst and not limit.has_reserve(judged):
-            found = np.append(found, largest_unseen(course, np.where(excess > 0, excess, -math.inf), MOST_BREAKING))
+            found = np.append(found, largest_unseen(course, np.where(excess > 0, excess, -math.inf)))
         elif not limit.kind.worst and not limit.holds(judged) and judged > (1 + UNEXPECTED) * limit.ratio * tuned:
             found = np.append(found, largest_unseen(course, excess))
     total = len(columns["lost_at_s"])

@@ -1,0 +1,62 @@
+"""What is drawn of a rotor: its outline, the planes of its parts, and the places at which its modes are known."""
+
+import tomllib
+from typing import NamedTuple
+
+import numpy as np
+
+from ambjax.cases.machine_case import MachineCase
+from ambjax.cases.rotor_tables import RIGID, body_from, tables_of
+from ambjax.cases.table import Table
+from ambjax.world.rotor import Rotor
+
+# Number of places at which a shaft is drawn.
+PLACES = 71
+
+
+class RotorDrawing(NamedTuple):
+    """A rotor from the side. Places are measured from the centre of mass, m.
+
+    - `planes`: kind ("magnet", "sensor" or "unbalance") and place.
+    - `at` [P], `shapes` [P, k]: places, ascending, and shapes of the bending modes there.
+    - `sections`: begin, end and diameter (m) of each section of a shaft. `discs`: places of its discs.
+    """
+
+    planes: tuple[tuple[str, float], ...]
+    at: np.ndarray
+    shapes: np.ndarray
+    sections: tuple[tuple[float, float, float], ...] = ()
+    discs: tuple[float, ...] = ()
+
+
+def drawing_of(case: MachineCase) -> RotorDrawing:
+    """Return the drawing of the rotor of a case. Only a shaft is known between the planes."""
+    planes, shapes = zip(*_planes(case.machine.rotor), strict=True)
+    places = np.array([at for _, at in planes])
+    raw = tomllib.loads(case.text) if case.text else {}
+    if raw.get("rotor", {}).get("kind") != "shaft":
+        order = np.unique(places, return_index=True)[1]
+        return RotorDrawing(planes, places[order], np.stack(shapes)[order])
+    ends = np.cumsum([0.0, *(one["length"] for one in raw["rotor"]["elements"])])
+    at = np.linspace(0.0, ends[-1], PLACES)
+    top = Table(raw | {"load": [{"at": float(x)} for x in at]})  # so that each place is a node
+    body, table = body_from(top), top.table("rotor")
+    shape_at, diameters = body.shapes, [one.raw["diameter"] for one in tables_of(table, "elements")]
+    assert shape_at is not None
+    sections = tuple(zip(ends[:-1] - body.centre, ends[1:] - body.centre, diameters, strict=True))
+    discs = tuple(one.raw["at"] - body.centre for one in tables_of(table, "discs"))
+    return RotorDrawing(planes, at - body.centre, np.stack([shape_at(x) for x in at]), sections, discs)
+
+
+def _planes(rotor: Rotor) -> list[tuple[tuple[str, float], np.ndarray]]:
+    """Return kind, place and mode shapes of each plane of the rotor, without repetition."""
+    rows = [("magnet", row) for row in np.asarray(rotor.at_magnets)]
+    rows += [("sensor", row) for row in np.asarray(rotor.at_sensors)]
+    rows += [("unbalance", np.asarray(one.along_x)) for one in rotor.unbalances]
+    found: dict[tuple[str, float], np.ndarray] = {}
+    for kind, row in rows:
+        d, own = row[:2], row[RIGID:].reshape(-1, 2)
+        if np.any(d):  # radial: the row of a displacement along d at l
+            place = round(float((row[4] * d[0] - row[3] * d[1]) / (d @ d)), 12)
+            found.setdefault((kind, place), own @ d / (d @ d))
+    return list(found.items())

@@ -1,0 +1,114 @@
+"""Machines against their speed: response to unbalance, critical speeds, and modes, against closed forms."""
+
+import tomllib
+
+import numpy as np
+import pytest
+
+from ambjax import save_controller
+from ambjax.cases.machine_case import machine_from
+from ambjax.cases.template_text import template
+from ambjax.linear.linear_machine import turning_machines
+from ambjax.linear.rotor_modes import modes_of, springs_critical
+from ambjax.linear.unbalance_response import UnbalanceResponse, critical_speeds, separation, unbalance_response
+from ambjax.results.machine_run import simulate_machine
+
+MASS, I_T, I_P, HALF = 3.0, 0.1, 0.04, 0.25
+S_0, I_0, K_I, K_S = 0.78e-3, 1.56, 50.0, 1e5
+MAGNET = {"mu_0": 1.2566e-6, "n": 208.0, "A": K_I * S_0**2 / I_0 / 1.2566e-6 / 208.0**2, "s_0": S_0, "i_0": I_0}
+
+
+class Pid:
+    """A current of 5000 A/m, 1500 A/(m s) and 5 A s/m, with a pole of its derivative at 3e6 1/s."""
+
+    w = 3e6
+    A, B = np.array([[0.0, 0.0], [0.0, -w]]), np.array([[1.0], [1.0]])
+    C, D = np.array([[1500.0, -5.0 * w * w]]), np.array([[5000.0 + 5.0 * w]])
+
+
+@pytest.fixture(scope="module")
+def rigid(tmp_path_factory):
+    """A rigid rotor on two equal bearings, in continuous time; its unbalance beside the centre of mass."""
+    folder = tmp_path_factory.mktemp("rigid")
+    save_controller(folder / "pid.npz", Pid)
+    raw = {
+        "rotor": {"kind": "rigid", "m": MASS, "I_t": I_T, "I_p": I_P, "gravity": [0.0] * 3},
+        "bearing": [{"name": n, "kind": "radial", "at": at} for n, at in (("left", -HALF), ("right", HALF))],
+        "unbalance": [{"at": 0.1, "amount": 10.0, "phase": 30.0}],
+        "plant": MAGNET | {"R": 0.0},
+        "actuator": {"mode": "current", "bandwidth": 1e6},
+        "controller": {"position": {"kind": "linear", "file": "pid.npz", "output": "current"},
+                       "current": {"kind": "amplifier", "bandwidth": 1e6}},
+        "clock": {"duration": 1e-3, "sample_period": 1e-6},
+    }  # fmt: skip
+    return machine_from(raw, "rigid", "", folder)
+
+
+def test_the_unbalance_response_of_a_rigid_rotor_is_the_closed_form(rigid):
+    found = unbalance_response(rigid.machine, rigid.clock.sample_period, 9000.0)
+    W = found.speeds[1:] * np.pi / 30
+    stiffness = 2 * (K_I * (5000 + 1500 / (1j * W) + 5j * W) - K_S)  # of both bearings
+    force = 1e-5 * W**2 * np.exp(1j * np.pi / 6)
+    x = force / (stiffness - MASS * W**2)
+    tilt = 0.1 * force / (stiffness * HALF**2 - (I_T - I_P) * W**2)  # forward whirl
+    for axis, place in ((0, -HALF), (2, HALF)):
+        # the amplifier of 1 MHz delays the current by 1.6e-7 s
+        np.testing.assert_allclose(found.magnets[1:, axis], x + place * tilt, rtol=1e-3)
+        # y follows x by a quarter of a turn
+        np.testing.assert_allclose(found.sensors[1:, axis + 1], -1j * (x + place * tilt), rtol=1e-3)
+    current = -(stiffness / 2 + K_S) / K_I * found.magnets[1:, 0]
+    np.testing.assert_allclose(found.current[1:, 0], current, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_the_unbalance_response_is_that_of_the_simulation_at_constant_speed():
+    raw = tomllib.loads(template("machine")) | {"load": [], "sensor": {"velocity": False}}
+    raw["unbalance"] = [{"at": 0.05, "amount": 2.0}]
+    case = machine_from(raw, "machine")
+    run, (found, *_) = simulate_machine(case), [unbalance_response(case.machine, 5e-5, 6000.0)]
+    t = run.signals["t"]
+    last = t >= 0.16  # whole turns; the slowest radial transient has decayed to 1e-7
+    turning = np.exp(-2j * np.pi * 100.0 * t[last])[:, None]
+    for name, ours in (("z", found.magnets), ("i", found.current), ("u", found.command)):
+        simulated = 2 * np.mean(run.signals[name][last, :4] * turning, 0)
+        # the run is not linear: the magnets, and the boundary layer of the law
+        np.testing.assert_allclose(simulated, ours[-1, :4], rtol=0.01)
+
+
+@pytest.mark.parametrize("damping", [0.01, 0.05])
+def test_the_amplification_factor_of_one_mode_is_that_of_its_damping(damping):
+    speeds = 3000 * np.unique(np.concatenate([np.linspace(0, 2, 121), 1 + 4 * damping * np.linspace(-1, 1, 33)]))
+    r = speeds / 3000
+    response = (1e-6 * r**2 / (1 - r**2 + 2j * damping * r))[:, None]
+    (one,) = critical_speeds(UnbalanceResponse(speeds, response, response, response, response), (6000.0, 8000.0))
+    assert one.speed == pytest.approx(3000, rel=3 * damping**2)
+    assert one.amplification == pytest.approx(1 / (2 * damping), rel=0.02)
+    assert one.peak_to_peak == pytest.approx(1e-6 / damping, rel=0.02)
+    assert one.present == pytest.approx(50, abs=1)
+
+
+def test_separation_margins_of_api_684():
+    # AF 5: 17 (1 - 1/3.5) below, 10 more above; at most 16 and 26; none below AF 2.5
+    assert separation(900.0, 5.0, (1000.0, 2000.0)) == pytest.approx((12.142857, 10.0))
+    assert separation(2400.0, 5.0, (1000.0, 2000.0)) == pytest.approx((22.142857, 20.0))
+    assert separation(1500.0, 50.0, (1000.0, 2000.0)) == (26.0, 0.0)
+    assert separation(900.0, 50.0, (1000.0, 2000.0))[0] == 16.0
+    assert separation(900.0, 2.4, (1000.0, 2000.0))[0] is None
+
+
+def test_critical_speeds_of_a_rigid_rotor_on_springs(rigid):
+    k = np.array([1e4, 1e6])
+    found = np.array(springs_critical(rigid.machine.rotor, k))
+    expected = np.sort([np.sqrt(2 * k / MASS), np.sqrt(2 * k * HALF**2 / (I_T - I_P))], 0).T * 30 / np.pi
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_modes_have_the_names_and_directions_of_the_motion(rigid):
+    (still, turning) = turning_machines(rigid.machine, rigid.clock.sample_period, (0.0, 9000.0))
+    slow = [mode for mode in modes_of(still, rigid.machine.rotor) if 1 < mode.frequency < 1e3]
+    assert [mode.name for mode in slow] == ["translation"] * 2 + ["tilt"] * 2
+    stiffness, damping = 2 * (K_I * 5000 - K_S), 2 * K_I * 5
+    assert slow[0].damping == pytest.approx(damping / 2 / np.sqrt(stiffness * MASS), rel=5e-3)
+    fast = [mode for mode in modes_of(turning, rigid.machine.rotor) if 1 < mode.frequency < 1e3]
+    tilts = [mode for mode in fast if mode.name == "tilt"]
+    assert [mode.whirl for mode in tilts] == ["backward", "forward"]  # nutation is forward, and faster
