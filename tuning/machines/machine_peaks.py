@@ -8,9 +8,9 @@ import numpy as np
 from jax import Array
 
 from ambjax.cases.machine_case import MachineCase
+from ambjax.extend import canonical
 from ambjax.linear.linear_machine import machine_loop, machine_rest
 from ambjax.linear.state_space import StateSpace
-from ambjax.numerics.records import canonical
 from ambjax.world.rotation import PER_MINUTE
 from tuning.machines.machine_gains import MachineSpace
 from tuning.machines.nonsmooth import Value

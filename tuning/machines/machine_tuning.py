@@ -94,7 +94,10 @@ def tune_machine(path: str, out: str | None, force: bool, minutes: float | None,
     best = searched(peaks, settings, start, tell)
     gains = np.asarray(settings.space.space.gains_at(best.x))
     written = {gain.where: float(x) for gain, x in zip(settings.space.gains, gains, strict=True)}
-    found = machine_from(tomllib.loads(tuned(text, written, case.name, "")), case.name, text, folder)
+    first = tuned(text, written, case.name, "The tuned gains are not judged.")
+    found = machine_from(tomllib.loads(first), case.name, first, folder)
+    with files(place) as part:
+        (part / "tuned.toml").write_text(first, encoding="utf-8")
     tell(f"simulating {settings.held_out} members with the tuned gains")
     facts = judged(case, found, settings.limits, settings.seed, settings.held_out)
     facts["gains"] = [
@@ -102,14 +105,18 @@ def tune_machine(path: str, out: str | None, force: bool, minutes: float | None,
         for own, a, b in zip(settings.space.space.gains, start.tolist(), gains.tolist(), strict=True)
     ]
     text = tuned(text, written, case.name, facts["verdict"])
+    _put(place, text, facts)
+    return MachineTuning(dataclasses.replace(found, text=text), facts["outcome"]["good"], plain(facts), place)
+
+
+def _put(place: pathlib.Path, text: str, facts: dict[str, Any]) -> None:
+    """Write the case with the tuned gains and the report."""
+    words = report_text(facts)
     with files(place) as part:
         (part / "tuned.toml").write_text(text, encoding="utf-8")
         write_json(part / "report.json", facts)
-        words = report_text(facts)
         (part / "report.md").write_text(words, encoding="utf-8")
-        (part / "report.html").write_text(render_page(words, {}, f"Tuning of {case.name}"), encoding="utf-8")
-    found = dataclasses.replace(found, text=text)
-    return MachineTuning(found, facts["outcome"]["good"], plain(facts), place)
+        (part / "report.html").write_text(render_page(words, {}, f"Tuning of {facts['case']}"), encoding="utf-8")
 
 
 def searched(peaks: Peaks, settings: Settings, start: np.ndarray, tell: Tell) -> Value:
