@@ -77,8 +77,8 @@ class Peaks:
     def stability(self, x: np.ndarray) -> Value:
         """Return the largest growth rate of a pole at any speed."""
         rates = [self.rates(loop) for loop in self.loops(x)]
-        n = int(np.argmax([np.max(one.real) for one in rates]))
-        loop, k = self.loops(x)[n], int(np.argmax(rates[n].real))
+        n = int(np.argmax([np.max(np.real(one)) for one in rates]))
+        loop, k = self.loops(x)[n], int(np.argmax(np.real(rates[n])))
         if not np.isfinite(rates[n][k]):
             return Value(x, np.inf, np.zeros(len(x)))
         left, right = np.linalg.inv(loop.vectors)[k], loop.vectors[:, k]
@@ -103,8 +103,8 @@ class Peaks:
         """Return the points s or z at which S is evaluated: on a logarithmic axis, and beside lightly damped poles."""
         highest = HIGHEST / (2 * self.period) if self.sampled else max(1e4, np.abs(rates).max() / 2)
         size = np.maximum(np.abs(rates), 1e-12)
-        damping = -rates.real / size
-        light = (rates.imag > 0) & (damping < LIGHT)
+        damping = -np.real(rates) / size
+        light = (np.imag(rates) > 0) & (damping < LIGHT)
         beside = np.outer(size[light] / (2 * np.pi), np.ones(len(BESIDE))) * (1 + np.outer(damping[light], BESIDE))
         f = np.concatenate([np.geomspace(self.low, highest, POINTS), beside.ravel()])
         s = 2j * np.pi * np.unique(f[(f >= self.low) & (f <= highest)])

@@ -28,7 +28,7 @@ def judged(case: MachineCase, found: MachineCase, limits: dict[str, float], seed
     held = np.isposinf(columns["lost_at"])
     values: dict[str, Any] = {name: _worst(columns[metric], held) for name, (_, metric) in LIMITS.items() if metric}
     values["sensitivity"] = after["peak"] if after["stable"] else math.inf
-    rows = [
+    rows: list[dict[str, Any]] = [
         {"name": name, "meaning": LIMITS[name][0], "value": values[name], "threshold": most}
         | {"holds": bool(values[name] <= most)}
         for name, most in limits.items()
