@@ -87,7 +87,9 @@ def parser() -> Parser:
         "check sensitivity, margins and the stability conditions of a case; exit code 1 if a condition that applies "
         "fails"
     )
-    command("check", summary, case=True)
+    checks = command("check", summary, case=True)
+    meaning = "also print what does not affect the verdict (a case of one axis)"
+    checks.add_argument("--full", action="store_true", help=meaning)
     summary = (
         "modes, critical speeds and unbalance response of a machine against its speed: campbell.json, campbell.png, "
         "rotor.png, unbalance.png"

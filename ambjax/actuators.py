@@ -1,8 +1,10 @@
 """Amplifiers and the limits of coils.
 
-from ambjax import Scenario, actuators
+For example:
 
-Scenario(u_max=48.0, amplifier=actuators.Amplifier(bandwidth=2e3))
+    from ambjax import Scenario, actuators
+
+    Scenario(u_max=48.0, amplifier=actuators.Amplifier(bandwidth=2e3))
 """
 
 from ambjax.world.amplifier import Amplifier, CurrentAmplifier

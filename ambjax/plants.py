@@ -1,8 +1,10 @@
 """Bearings and what belongs to them: coils, iron, and the stop of a touchdown bearing.
 
-from ambjax import Scenario, plants
+For example:
 
-Scenario(plant=plants.TwoCoil(m=1.64, iron=plants.Iron(saturation=1.4)), stop=plants.Stop(k=1e7))
+    from ambjax import Scenario, plants
+
+    Scenario(plant=plants.TwoCoil(m=1.64, iron=plants.Iron(saturation=1.4)), stop=plants.Stop(stiffness=1e7))
 """
 
 from ambjax.world.coils import TwoCoil

@@ -1,8 +1,10 @@
 """Sensors, their runout and faults, and the reading that an observer receives.
 
-from ambjax import Scenario, sensors
+For example:
 
-Scenario(sensor=sensors.Sensor(std=1e-7, outliers=sensors.Outliers(rate=1.0)))
+    from ambjax import Scenario, sensors
+
+    Scenario(sensor=sensors.Sensor(std=1e-7, outliers=sensors.Outliers(rate=1.0)))
 """
 
 from ambjax.world.faults import Dropouts, Outliers

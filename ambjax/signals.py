@@ -1,8 +1,10 @@
 """Signals in time: references, loads and disturbances of a `Scenario`.
 
-from ambjax import Scenario, signals
+For example:
 
-Scenario(reference=signals.Sine(1e-4, 20.0), q_z=signals.Step(0.5, start=0.1))
+    from ambjax import Scenario, signals
+
+    Scenario(reference=signals.Sine(1e-4, 20.0), q_z=signals.Step(0.5, start=0.1))
 """
 
 from ambjax.world.band_noise import BandNoise

@@ -1,8 +1,10 @@
 """Integration methods of a `Clock`, and their choice.
 
-from ambjax import Clock, solvers
+For example:
 
-Clock(samples=2000, sample_period=1e-4, method=solvers.RK4(4))
+    from ambjax import Clock, solvers
+
+    Clock(samples=2000, sample_period=1e-4, method=solvers.RK4(4))
 """
 
 from ambjax.simulation.explicit import DOP853, RK4, AdaptiveCashKarp, Euler

@@ -46,10 +46,14 @@ def ablation() -> list[str]:
     lines = ["## The tuner without one mechanism (`ablation.py`)", "", facts(data["machine"])]
     lines += [
         '`ambjax tune` with `objective = "least_error"` on one core. Each cell: settled rms error of the held-out',
-        "members, relative to that of the complete tuner with the same seed; seconds of the search, relative to the",
-        "same; and requirements that are not met. One seed; -: not measured. The tuner was that with restarts. Because",
-        "of these figures, these mechanisms were removed: restarts, growth of the penalty, members with large errors",
-        "join, earlier points, additional noise, and limits judged only near them.",
+        "members, relative to that of the complete tuner with the same seed; rollouts of the search, relative to the",
+        "same; and requirements not met. One seed; -: not measured. The complete tuner was that with restarts.",
+        "Because of these figures, these mechanisms were removed: restarts, growth of the penalty, earlier points,",
+        "additional noise, limits judged only near them, halvings of the starts, and the first phase with all that",
+        "belongs to it. The last row is the tuner of today. Members with large errors join again: in the case of the",
+        "tutorial, with one start, the error is otherwise four times as large as with the initial gains. On C10-signs,",
+        "the rotor of every answer runs away from a small displacement that it does not know, because the task's",
+        "observer needs no position sensor: the verdict is right.",
         "",
     ]
     tasks = list(dict.fromkeys(task for _, task, _ in rows))
@@ -70,12 +74,12 @@ def _against(rows: dict[tuple[str, ...], dict[str, Any]], off: str, task: str) -
     done = [(row, whole) for row, whole in pairs if row.get("settled_rms_error_m") and whole.get("settled_rms_error_m")]
     if not done:
         return "-"
-    errors, seconds = (
+    errors, rollouts = (
         statistics.median(row[key] / whole[key] - 1 for row, whole in done)
-        for key in ("settled_rms_error_m", "seconds")
+        for key in ("settled_rms_error_m", "rollouts")
     )
     against = sorted({word for row, _ in done for word in row["against"]})
-    return f"{100 * errors:+.1f} %, {100 * seconds:+.0f} % s" + "".join(f"; **{word}**" for word in against)
+    return f"{100 * errors:+.1f} %, {100 * rollouts:+.0f} %" + "".join(f"; **{word}**" for word in against)
 
 
 def _number(value: float | None, form: str) -> str:

@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import importlib
+import inspect
 import itertools
 import json
 import math
@@ -63,6 +64,26 @@ def test_the_help_of_a_record_lists_its_fields():
             unit = field.metadata.get("unit", "")
             words = default_text(field.default), "" if unit == "1" else unit, declared.allowed(field)
             assert all(word in items[field.name] for word in words), f"{kind.__qualname__}.{field.name}"
+
+
+NAMESPACES = {name: getattr(ambjax, name) for name in ["laws", "signals", "plants", "sensors", "actuators", "solvers"]}
+STAGES = {stage: getattr(ambjax.laws, stage) for stage in KINDS}
+USED = [one for space in (*STAGES.values(), *NAMESPACES.values()) for one in vars(space).values()]
+USED = [*NAMESPACES.values(), *dict.fromkeys(one for one in USED if isinstance(one, type) and one in RECORDS)]
+
+
+@pytest.mark.parametrize("thing", USED, ids=lambda thing: thing.__name__)
+def test_the_lines_of_use_in_a_docstring_run(thing):
+    if thing is ambjax.laws.position.LinearController:
+        pytest.skip("its line has matrices of the reader")
+    text = str(thing.__doc__)
+    lines = re.findall(r"`((?:[a-z]\w*\.)*[A-Z]\w*\([^`]*)`", " ".join(text.split()))
+    if inspect.ismodule(thing):
+        lines = [line.strip() for line in text.splitlines() if re.match("    [A-Z]", line)]
+    assert lines
+    names = {name: getattr(ambjax, name) for name in ambjax.__all__} | NAMESPACES | STAGES | {"np": np}
+    for line in lines:
+        eval(line, names)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -138,6 +138,8 @@ def test_default_limits_accept_every_reading_of_a_sensor_without_faults():
             for e in (-6.8 * std, 6.8 * std)
         ]
         assert np.abs(ends).max() <= guard.z
+        high = sensor.converted(Measurement(0.0, 0.0, 1e3), 5e-3, 0.25).i
+        assert float(high) < float(guard.i) <= 1.2 * 2 * 0.25  # a range of two bias currents
         assert max(ends[1] - ends[0], ends[3] - ends[2]) <= guard.noise * (1 + 1e-9)
 
 

@@ -93,7 +93,7 @@ def test_imports_have_no_cycles():
 
 # Ensembles, linear analysis, the design of default gains, and controllers in files.
 SCIPY = ("ambjax.ensemble", "ambjax.linear", "ambjax.control.regulator", "ambjax.results.runs")
-SCIPY += ("ambjax.control.realisation", "ambjax.cases.controller_file")
+SCIPY += ("ambjax.control.realisation", "ambjax.control.lqg", "ambjax.cases.controller_file")
 
 
 @pytest.mark.parametrize("module", [m for m in MODULES if m.startswith("ambjax")])

@@ -1,13 +1,17 @@
-"""Controllers of a whole machine: in rigid-body coordinates."""
+"""Controllers of a whole machine: in rigid-body coordinates, linear ones of several outputs, and LQG."""
 
 import copy
 import tomllib
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_are
 
 from ambjax.cases.machine_case import machine_from
 from ambjax.cases.template_text import template
+from ambjax.control.lqg import LinearCoils, RotorModel, design, sampled_model
+from ambjax.control.regulator import doubled
+from ambjax.linear.linear_machine import machine_sensitivity
 from ambjax.results.machine_run import simulate_machine
 
 MACHINE = tomllib.loads(template("machine"))
@@ -64,9 +68,41 @@ def test_rigid_body_coordinates_in_continuous_time_equal_the_axes():
         np.testing.assert_allclose(rigid[name], axes[name], rtol=0, atol=1e-9 * np.abs(axes[name]).max())
 
 
+def munich(left, right, modes, **tables):
+    """The rig with its real sensors, and an LQG of its own modes, designed for three speeds."""
+    raw = tomllib.loads(template("machine-flexible"))
+    raw["rotor"] |= {"modes": modes} | tables.get("rotor", {})
+    raw["bearing"][0]["sensor_at"], raw["bearing"][1]["sensor_at"] = left, right
+    raw["controller"] = {"kind": "lqg", "lqg": {"speeds": [0.0, 3000.0, 6000.0]}}
+    return machine_from(raw | {key: value for key, value in tables.items() if key != "rotor"}, "munich")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensors", [(0.155, 0.581), (0.071, 0.665)])
+def test_an_lqg_holds_the_munich_rig_with_sensors_beside_its_magnets(sensors):
+    """|S| in zone A between two speeds of the design, with 12 modes. With each of these pairs, a PID is unstable."""
+    case = munich(*sensors, 12)
+    found = machine_sensitivity(case.machine, case.axes, case.clock.sample_period, 1500.0, case.zones)
+    assert found.stable
+    assert {axis.zone for axis in found.axes} == {"A"}
+
+
+@pytest.mark.slow
+def test_an_lqg_holds_the_munich_rig_in_a_run():
+    """Without weight: a shaft that starts unbent is far from its sag. The unbalance moves it by about 10 um."""
+    run = simulate_machine(munich(0.155, 0.581, 6, rotor={"gravity": [0.0] * 3}))
+    assert not run.lost
+    assert run.metrics["settled_max_abs_error_m"] < 2e-5
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
+        ({"kind": "lqr"}, "controller.kind = .*must be one of"),
+        ({"kind": "lqg", "lqg": {"speeds": [10.0, 0.0]}}, "controller.lqg.speeds = .*ascending order"),
+        ({"kind": "lqg", "lqg": {"errors": 1.0}}, "controller.lqg.errors"),
+        ({"kind": "linear"}, "controller.file is missing"),
+        ({"file": "a.npz"}, 'controller.file is for kind = "linear"'),
         ({"coordinates": "modal"}, "controller.coordinates = .*must be one of"),
         ({"tilt": {"position": {"k_p": 1.0}}}, r'controller\.tilt is for coordinates = "rigid-body"'),
         ({"coordinates": "rigid-body", "tilt": {"current": {}}}, r"controller\.tilt\.current"),
@@ -74,8 +110,11 @@ def test_rigid_body_coordinates_in_continuous_time_equal_the_axes():
     ],
 )
 def test_bad_keys_are_refused_in_one_line(change, said):
+    raw = changed(MACHINE, **change)
+    if "kind" in change:
+        raw["controller"] = change
     with pytest.raises(ValueError, match=said) as refused:
-        machine_from(changed(MACHINE, **change))
+        machine_from(raw)
     assert "\n" not in str(refused.value)
 
 
@@ -84,3 +123,54 @@ def test_a_bearing_has_no_position_law_of_its_own_in_rigid_body_coordinates():
     raw["bearing"][0]["controller"] = {"position": {"c": 300.0}}
     with pytest.raises(ValueError, match=r"bearing\[0\]\.controller\.position: in rigid-body coordinates"):
         machine_from(raw)
+
+
+@pytest.mark.slow
+def test_a_diagonal_controller_of_a_file_equals_one_controller_on_each_axis(tmp_path):
+    """K = 2e4 (1 + s/500)/(1 + s/5e3) A/m, continuous; the states start at the reading."""
+    raw = UNCOUPLED | {"processor": {"delay": 1.0, "predict": False}, "sensor": {}}
+    A, B, C, D = -5e3, 1.0, -9 * 2e4 * 5e3, 10 * 2e4
+    np.savez(tmp_path / "one.npz", A=A, B=B, C=C, D=D)
+    np.savez(tmp_path / "all.npz", **{name: x * np.eye(5) for name, x in zip("ABCD", (A, B, C, D), strict=True)})
+    one = {"position": {"kind": "linear", "file": "one.npz"}, "current": {"kind": "pi"}}
+    one["inversion"] = {"kind": "linearised"}
+    alone, whole = (
+        simulate_machine(machine_from(raw | {"controller": controller}, "case", "", tmp_path)).signals
+        for controller in (one, {"kind": "linear", "file": "all.npz"})
+    )
+    assert not np.isfinite(alone["lost_at"])
+    for name in ("z", "i", "u"):
+        np.testing.assert_allclose(whole[name], alone[name], rtol=0, atol=1e-9 * np.abs(alone[name]).max())
+
+
+def test_the_riccati_equation_is_solved_as_by_scipy():
+    rng = np.random.default_rng(1)
+    A, B = rng.normal(size=(9, 9)) / 2, rng.normal(size=(9, 3))  # some poles are outside the unit circle
+    Q, R = np.diag(rng.uniform(0.1, 1, 9)), np.diag([1.0, 2.0, 3.0])
+    np.testing.assert_allclose(doubled(A, B, Q, R), solve_discrete_are(A, B, Q, R), rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.5, 1.0, 1.5, 2.0])
+def test_the_loop_of_an_lqg_has_the_poles_of_its_feedback_and_of_its_filter(delay):
+    """Separation: each pole of the loop belongs to one of them, so that all are stable; a load leaves no offset."""
+    rotor = RotorModel(
+        M=np.diag([3.0, 0.12, 1.0]), D=np.diag([0.0, 0.0, 6.0]), K=np.diag([0.0, 0.0, 600.0**2]),
+        B=np.array([[1.0, -0.2, -0.4], [1.0, 0.25, 0.5]]), C=np.array([[1.0, -0.25, -0.6], [1.0, 0.3, 0.7]]),
+        constant=np.array([0.0, 0.0, 5.0]),
+    )  # fmt: skip
+    coils = LinearCoils(*(np.full(2, x) for x in (1e5, 50.0, 1.0, 0.01, 0.0)))
+    weights = {"error": 1e-5, "current": 0.2, "noise": 2e-7, "force": 80.0, "drift": 1e4, "bending": 0.3}
+    T = 1e-4
+    law, plant = design(rotor, coils, weights, 250.0, T, delay), sampled_model(rotor, coils, T, delay)
+    signs = np.diag([-1.0, -1.0, 1.0, 1.0]) @ plant.H
+    loop = np.block([[plant.F + plant.G @ law.D @ signs, plant.G @ law.C], [law.B @ signs, law.A]])
+    poles, n = np.linalg.eigvals(loop), len(plant.F)
+    assert np.abs(poles).max() < 1 - 1e-5
+    # an error of the estimate moves as without feedback: its poles are those of A - G C, with G the effect of u
+    filter_poles = np.linalg.eigvals(law.A + law.B @ np.zeros((4, n + 2)) - law.E @ law.C)
+    for pole in filter_poles:
+        assert np.abs(poles - pole).min() < 1e-6
+    load = np.concatenate([plant.f + plant.pushed @ [20.0, -10.0] + plant.G @ law.b, law.a])
+    rest = np.linalg.solve(np.eye(len(loop)) - loop, load)
+    assert np.abs(rotor.B @ rest[:3]).max() < 1e-12  # the magnets are centred, and the shaft is bent
+    assert abs(rest[2]) > 1e-6

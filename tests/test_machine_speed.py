@@ -1,16 +1,20 @@
 """Machines against their speed: response to unbalance, critical speeds, and modes, against closed forms."""
 
+import json
 import tomllib
 
 import numpy as np
 import pytest
 
 from ambjax import save_controller
-from ambjax.cases.machine_case import machine_from
+from ambjax.__main__ import main
+from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.template_text import template
-from ambjax.linear.linear_machine import turning_machines
+from ambjax.commands import campbell
+from ambjax.linear.linear_machine import machine_sensitivity, turning_machines
 from ambjax.linear.rotor_modes import modes_of, springs_critical
 from ambjax.linear.unbalance_response import UnbalanceResponse, critical_speeds, separation, unbalance_response
+from ambjax.pictures.run_up_picture import waterfall
 from ambjax.results.machine_run import simulate_machine
 
 MASS, I_T, I_P, HALF = 3.0, 0.1, 0.04, 0.25
@@ -112,3 +116,48 @@ def test_modes_have_the_names_and_directions_of_the_motion(rigid):
     fast = [mode for mode in modes_of(turning, rigid.machine.rotor) if 1 < mode.frequency < 1e3]
     tilts = [mode for mode in fast if mode.name == "tilt"]
     assert [mode.whirl for mode in tilts] == ["backward", "forward"]  # nutation is forward, and faster
+
+
+def test_the_waterfall_of_a_sweep_follows_its_frequency():
+    t = np.arange(0, 2.0, 1e-3)
+    speed = 60 * (10 + 40 * t)  # rpm: 10 to 90 Hz
+    found = waterfall(2e-6 * np.sin(2 * np.pi * (10 * t + 20 * t**2)), speed, 1e-3)
+    highest = found.frequency[np.argmax(found.amplitude, 1)]
+    # a window covers 1/12 of the sweep, 7 Hz, and lowers the peak of the spectrum
+    np.testing.assert_allclose(highest, found.speeds / 60, atol=2.0)
+    assert 0.6e-6 < found.amplitude.max() < 2e-6
+
+
+@pytest.mark.slow
+def test_the_commands_write_what_an_engineer_looks_at(tmp_path, capsys):
+    path, turning = tmp_path / "up.toml", "speed = 600.0\nacceleration = 60000.0"
+    text = template("machine").replace("speed = 6000.0", turning).replace("duration = 0.2", "duration = 0.05")
+    path.write_text(text.replace("settle = 0.05", "settle = 0.02"))
+    assert main(["simulate", str(path), "--out", str(tmp_path / "run")]) == 0
+    assert (tmp_path / "run" / "runup.png").stat().st_size > 10_000
+    assert main(["campbell", str(path), "--out", str(tmp_path / "c")]) == 0
+    assert {file.name for file in (tmp_path / "c").iterdir()} == set(campbell.WRITTEN)
+    found = json.loads((tmp_path / "c" / "campbell.json").read_text())
+    # by the closed form of the command's own definition: A1 at the highest speed of the case
+    assert found["unbalance"]["a1_limit_m"] == pytest.approx(25.4e-6)
+    capsys.readouterr()
+    assert main(["check", str(path), "--json"]) == 0
+    checked = json.loads(capsys.readouterr().out)
+    assert checked["clearance_used"] == max(axis["clearance_used"] for axis in checked["axes"].values())
+    assert checked["peak"] == max(axis["peak"] for axis in checked["axes"].values())
+    weight = 2.3 * 9.81
+    case = read_machine(path)
+    largest = [float(one.scenario.largest_force) for one in case.cases]
+    shares = [axis["force_carried"] * most for axis, most in zip(checked["axes"].values(), largest, strict=True)]
+    assert sum(shares) == pytest.approx(weight)
+    assert all(axis["force_reserve"] <= 1 - axis["force_carried"] for axis in checked["axes"].values())
+
+
+def test_the_margins_of_an_axis_follow_from_its_sensitivity(rigid):
+    found = machine_sensitivity(rigid.machine, rigid.axes, rigid.clock.sample_period, 9000.0, rigid.zones)
+    f = np.geomspace(1.0, 1e4, 20_001)
+    for k, axis in enumerate(found.axes):
+        L = 1 / np.asarray(found.system.response(f))[:, k, k] - 1
+        crossing = np.flatnonzero(np.diff(np.sign(np.abs(L) - 1)))
+        phases = np.abs(np.abs(np.angle(L[crossing], deg=True)) - 180)
+        assert axis.margins.phase_deg == pytest.approx(phases.min(), abs=0.05)  # a step of f is 0.05 %

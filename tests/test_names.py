@@ -177,7 +177,7 @@ def test_check_fails_if_the_magnets_cannot_carry_the_rotor(capsys, tmp_path, mon
     heavy = "\n".join(f"{name} = {value}" for name, value in (GOOD | {"m": 40.0}).items())
     pathlib.Path("case.toml").write_text(f"[plant]\n{heavy}\n[clock]\nduration = 0.001\n")
     assert main(["check", "case.toml"]) == 1
-    words = "The magnets cannot carry the rotor: their largest force is 364.2 N, below its weight of 392.4 N."
+    words = "the magnets cannot carry the rotor: their largest force is 364.2 N, below its weight of 392.4 N"
     assert words in capsys.readouterr().out
     assert main(["check", "case.toml", "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["holds"] is False

@@ -163,7 +163,16 @@ def test_check_begins_with_the_numbers_of_the_machine(tmp_path, capsys):
     assert loop["converter_step_m"] is None
     assert loop["delay_margin_s"] == min(loop["margins"][at]["delay_margin_s"] for at in ("reading", "command"))
     main(["check", str(path)])
-    assert capsys.readouterr().out.startswith("Sensitivity: zone D, peak 41.27 at 0 Hz.")
+    shown = capsys.readouterr().out
+    verdict = shown.partition("\n\n")[0].splitlines()
+    assert len(verdict) == 5
+    assert verdict[0] == "The check passes."
+    assert "Sensitivity: zone D, peak 41.27 at 0 Hz." in verdict
+    main(["check", str(path), "--full"])
+    full = capsys.readouterr().out
+    assert {line for line in shown.splitlines() if not line.startswith(("--", "condition "))} < set(full.splitlines())
+    assert "Eq. (14a)" in full
+    assert "Eq. (14a)" not in shown
 
 
 PROCESSOR = """

@@ -25,7 +25,7 @@ from tuning.problem.gains_table import off
 from tuning.problem.tuning_problem import TuningProblem, problem_of
 from tuning.report.folder import all_laws, put_answer, put_front, put_page, put_report
 from tuning.report.judging import examined
-from tuning.report.record import REPORT, TUNED, ended, record, search_facts
+from tuning.report.record import KEY, REPORT, TUNED, ended, record, search_facts
 from tuning.report.tuned import tuned_case
 from tuning.rounds import rounds
 from tuning.solve.checkpoint import can_resume, checkpoint, has_unfinished_search, mark_directory, remove_all
@@ -67,14 +67,20 @@ class Options(NamedTuple):
 class TuningPlan(NamedTuple):
     """The checked input of a tuning.
 
-    `raw`: content of the case file. `problem`: the tuning problem. `start`: initial gains [m], SI units. `out`: output
-    directory.
+    `facts`: what a checkpoint must match. `problem`: the tuning problem. `start`: initial gains [m], SI units. `out`:
+    output directory. `options`: of the command.
     """
 
-    raw: dict[str, Any]
+    facts: dict[str, Any]
     problem: TuningProblem
     start: np.ndarray
     out: pathlib.Path
+    options: Options
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The facts on which report.json depends: those of the search, and the options that add results."""
+        return self.facts | {"options": [self.options.pareto, self.options.page]}
 
 
 @names_arguments(budget="minutes")
@@ -128,12 +134,12 @@ def run(path: str, options: Options, listen: Listener) -> TunedCase:
     with locked(plan.out):
         if not options.resume:
             _clear(plan.out, options.force)
-        elif found := ended(search_facts(plan.raw, plan.problem), options, plan.out, WRITTEN):
+        elif found := ended(plan.record, plan.out, WRITTEN):
             teller(listen)(f"{plan.out}: this search has ended; its results are kept")
             return TunedCase(read_case(plan.out / TUNED), found["outcome"]["good"], found, plan.out)
         mark_directory(plan.out)
         with reporting(lambda: _kept(plan.out)):
-            return _tune(plan, path, options, listen)
+            return _tune(plan, path, listen)
 
 
 def _machine(path: str, options: Options, listen: Listener) -> TunedCase:
@@ -167,18 +173,19 @@ def _plan(path: str, options: Options) -> TuningPlan:
         tuned_case(case, all_laws(problem, {}), "", pathlib.Path())
     except ValueError as why:
         raise ValueError(one_line(f"{path}: {why}")) from None
-    return TuningPlan(raw, problem, start, directory(options.out, f"tune-{case.name}", WRITTEN, force=True))
+    out = directory(options.out, f"tune-{case.name}", WRITTEN, force=True)
+    return TuningPlan(search_facts(raw, case, tune), problem, start, out, options)
 
 
-def _tune(plan: TuningPlan, path: str, options: Options, listen: Listener) -> TunedCase:
+def _tune(plan: TuningPlan, path: str, listen: Listener) -> TunedCase:
     """Search, write the answer, judge it, and write the report.
 
     The answer is written before it is judged. If it cannot be judged, it is not good, and there is no report.
     """
-    answer = _searched(plan, options.resume, listen)
+    options, tell = plan.options, teller(listen)
+    answer = _searched(plan, listen)
     with files(plan.out) as part:
         case = put_answer(part, plan.out, answer, NOT_JUDGED)
-    tell = teller(listen)
     found = described("the judgement of the tuned gains", lambda: examined(answer, options.pareto, tell))
     if found is None:
         tell(f"the tuned gains are in {plan.out / TUNED}. To judge them, repeat the command with --resume.")
@@ -188,7 +195,7 @@ def _tune(plan: TuningPlan, path: str, options: Options, listen: Listener) -> Tu
         case = put_answer(part, plan.out, answer, facts.verdict)
         table = facts.table
         if answer.complete:
-            table |= record(search_facts(plan.raw, plan.problem), options, part)
+            table |= {KEY: record(plan.record, part)}
         write_json(part / REPORT, table)
         put_report(part, case.cascade, answer, facts, slices)
         if options.pareto:
@@ -198,15 +205,15 @@ def _tune(plan: TuningPlan, path: str, options: Options, listen: Listener) -> Tu
     return TunedCase(case, facts.outcome["good"], plain(table), plan.out)
 
 
-def _searched(plan: TuningPlan, resume: bool, listen: Listener) -> SearchResult:
-    """Search and return the result. `resume`: whether to continue from the checkpoints."""
+def _searched(plan: TuningPlan, listen: Listener) -> SearchResult:
+    """Search and return the result."""
     problem, tune, tell = plan.problem, plan.problem.tune, teller(listen)
     tell(
         f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {problem.objective.clock.method}"
     )
     if zero := off(problem.case.cascade):
         tell(f"not tuned, because they are 0 in the case, which switches their terms off: {', '.join(zero)}")
-    return rounds(problem, plan.start, plan.out, search_facts(plan.raw, problem), resume, listen)
+    return rounds(problem, plan.start, plan.out, plan.facts, plan.options.resume, listen)
 
 
 def _clear(out: pathlib.Path, force: bool) -> None:

@@ -59,7 +59,7 @@ class Standing(NamedTuple):
         beyond = [one.text for one in self.limits if not one.holds]
         met = ", ".join(beyond) if beyond else "limits met" if self.limits else ""
         left = "" if math.isnan(self.left_s) else f"at most {duration(self.left_s)} left in this search"
-        starts = "1 start" if self.starts == 1 else f"{self.starts} starts"
+        starts = {0: "converged", 1: "1 start"}.get(self.starts, f"{self.starts} starts")
         parts = [
             f"search {self.number}: iteration {self.iteration} of at most {self.most}, {starts}",
             f"best so far {self.error_m:.3g} m rms at {self.u_V:.3g} V rms",

@@ -3,7 +3,8 @@
 import contextlib
 import pathlib
 import zipfile
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from ambjax.control.realisation import Matrices, Realisation, realisation
 NAMES, OPTIONAL = ("A", "B", "C", "D"), "dt"
 ENDINGS = (".npz", ".mat")
 KEY = "controller.position.file"
+T = TypeVar("T")
 
 
 class ControllerFile(NamedTuple):
@@ -29,10 +31,16 @@ class ControllerFile(NamedTuple):
 
 
 def controller_file(table: Table, folder: pathlib.Path) -> ControllerFile:
-    """Read the controller that the key `file` names; a relative path starts at `folder`, that of the case file.
+    """Read the controller that the key `file` names, as `contents_of` does."""
+    written, path, contents = contents_of(table, folder, realisation)
+    return ControllerFile(written, path, contents)
 
-    Raises ValueError, one line, if the key is missing or the file does not contain a controller. The message gives the
-    dotted path and, if known, the file and the array.
+
+def contents_of(table: Table, folder: pathlib.Path, convert: Callable[..., T]) -> tuple[str, pathlib.Path, T]:
+    """Return the path that the key `file` gives, the absolute path, and convert(A, B, C, D, dt) of the file.
+
+    A relative path starts at `folder`, that of the case file. Raises ValueError, one line, if the key is missing or the
+    file does not contain a controller. The message gives the dotted path and, if known, the file and the array.
     """
     written = table.raw.get("file")
     if written is None:
@@ -41,7 +49,7 @@ def controller_file(table: Table, folder: pathlib.Path) -> ControllerFile:
         raise ValueError(f"{table.at('file')} = {show(written)}: it must be the path of an .npz or .mat file.")
     path = (folder / written).resolve()
     try:
-        return ControllerFile(written, path, realisation(**read_controller(path)))
+        return written, path, convert(**read_controller(path))
     except ValueError as error:
         raise ValueError(f"{table.at('file')} = {show(written)}: {error}") from None
 
@@ -51,15 +59,20 @@ def read_controller(path: pathlib.Path) -> dict[str, np.ndarray]:
 
     Raises ValueError if the file cannot be read or lacks an array.
     """
-    try:
-        arrays = _of_npz(path) if path.suffix == ".npz" else _of_mat(path)
-    except OSError as error:
-        why = error.strerror or "is it a file?"
-        raise ValueError(f"{path} cannot be read ({why}). A path is relative to the folder of the case file.") from None
+    arrays = arrays_of(path)
     if missing := [name for name in NAMES if name not in arrays]:
         found = ", ".join(name for name in arrays if not name.startswith("_")) or "none"
         raise ValueError(f"the array {missing[0]} is missing. The file must contain {_needed()}; it has {found}.")
     return {name: arrays[name] for name in (*NAMES, OPTIONAL) if name in arrays}
+
+
+def arrays_of(path: pathlib.Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an .npz or .mat file. Raises ValueError if it cannot be read."""
+    try:
+        return _of_npz(path) if path.suffix == ".npz" else _of_mat(path)
+    except OSError as error:
+        why = error.strerror or "is it a file?"
+        raise ValueError(f"{path} cannot be read ({why}). A path is relative to the folder of the case file.") from None
 
 
 def _needed() -> str:
@@ -71,7 +84,7 @@ def _of_npz(path: pathlib.Path) -> dict[str, np.ndarray]:
         with np.load(path) as file:
             return {name: file[name] for name in file.files}
     except (ValueError, TypeError, EOFError, AttributeError, zipfile.BadZipFile):  # no archive, or pickled objects
-        raise ValueError("not an .npz file of plain numbers. Write it with save_controller or numpy.savez.") from None
+        raise ValueError("not an .npz file of plain numbers. Write it with numpy.savez.") from None
 
 
 def _of_mat(path: pathlib.Path) -> dict[str, np.ndarray]:
@@ -84,7 +97,7 @@ def _of_mat(path: pathlib.Path) -> dict[str, np.ndarray]:
     except OSError:
         raise
     except Exception:  # SciPy raises errors of many types for a damaged file
-        raise ValueError("not a .mat file. Save the arrays with: save FILE.mat A B C D dt -v7.") from None
+        raise ValueError("not a .mat file. Save the arrays with MATLAB's save and the option -v7.") from None
     with contextlib.suppress(KeyError):  # MATLAB stores a number as a matrix
         arrays[OPTIONAL] = arrays[OPTIONAL].squeeze()
     return arrays

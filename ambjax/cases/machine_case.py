@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.cases.machine_controller import inner, law_from, merged, without_keys
+from ambjax.cases.machine_controller import axis_controller, inner, law_from, merged
 from ambjax.cases.machine_spread import axis_table, fastest_rotor, machine_spread, refuse_unused
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
 from ambjax.cases.rotor_tables import (
@@ -101,7 +101,7 @@ def machine_from(
     top.only([*TABLES, *MACHINE_TABLES[1:], "tune"])
     if "disturbance" in raw:
         raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] instead.")
-    body, bearings = body_from(top), tables_of(top, "bearing")
+    body, bearings = body_from(top, folder), tables_of(top, "bearing")
     if not bearings:
         raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
     axes = axes_from(bearings, body)
@@ -124,14 +124,14 @@ def machine_from(
         case = read(own, f"axis {axis.name}")
         _check_force(case, axis, force)
         cases.append(case)
-    law, parts = law_from(top, rotor, bearings, cases, read)
+    law, parts, demand = law_from(top, rotor, bearings, cases, read, folder)
     spread = machine_spread(top, rotor, axes, names, cases)
     if law is not None:
         refuse_unused(spread)
     fixed = not isinstance(raw.get("clock", {}).get("dt", "auto"), str)
     clock = _clock([*cases, *parts], fastest_rotor(rotor, spread), fixed)
     systems = [prepare(case.cascade, case.scenario, clock)[0] for case in cases]
-    systems = [canonical(system if law is None else inner(system)) for system in systems]
+    systems = [canonical(system if law is None else inner(system, demand)) for system in systems]
     coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
     return MachineCase(
         name=safe_name(name),
@@ -221,7 +221,7 @@ def _axis_raw(raw: dict[str, Any], bearing: Table, m: float, force: float, initi
         if isinstance(plant, dict) and name in plant:
             raise ValueError(f"plant.{name} = {show(plant[name])}: the rotor gives it. Leave it out beside [rotor].")
     own["plant"] = plant | {"m": m, "k_z": 0.0, "g": force / m}
-    without_keys(own)
+    axis_controller(own)
     if isinstance(own.get("sensitivity"), dict):
         own["sensitivity"].pop("speeds", None)
     return own | {"initial": initial}

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import pathlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,9 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ambjax.cases.machine_linear import linear, lqg
 from ambjax.cases.reader import Case
 from ambjax.cases.rotor_tables import COORDINATES, RIGID
 from ambjax.cases.table import Table
+from ambjax.control.current import OpenLoop
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.observer import Direct
 from ambjax.control.position import FeedbackLinearisation
@@ -24,8 +27,8 @@ from ambjax.world.rotor import Rotor
 
 # Keys of [controller] for a machine. The tables replace keys of the common ones for the tilts and for the axial motion.
 TABLES = {"tilt": ("beta_x", "beta_y"), "axial": ("z",)}
-KEYS = ("coordinates", "compensate_gyroscopics", *TABLES)
-WAYS = ["axes", "rigid-body"]
+KEYS = ("kind", "coordinates", "compensate_gyroscopics", *TABLES, "file", "output", "lqg")
+WAYS, LAWS = ["axes", "rigid-body"], ["cascade", "linear", "lqg"]
 
 
 class NominalPlant(NamedTuple):
@@ -46,29 +49,59 @@ def merged(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
     return both
 
 
-def without_keys(raw: dict[str, Any]) -> None:
-    """Remove the keys of a machine from the [controller] of a case."""
+def kind_of(raw: dict[str, Any]) -> str:
+    """Return controller.kind of a machine."""
+    return Table(raw).table("controller").choice("kind", LAWS, LAWS[0])
+
+
+def axis_controller(raw: dict[str, Any]) -> None:
+    """Change the [controller] and [processor] of a case of a machine to those of one axis."""
     controller = raw.get("controller")
-    if isinstance(controller, dict):
-        for key in KEYS:
-            controller.pop(key, None)
+    if not isinstance(controller, dict):
+        return
+    kind = kind_of(raw)
+    for key in KEYS:
+        controller.pop(key, None)
+    if kind == LAWS[0]:
+        return
+    # `inner` replaces observer and position law, which need no velocity here
+    outer = {"observer": {"kind": "kalman"}, "position": {"kind": "state-feedback"}}
+    inner = {"inversion": {"kind": "linearised"}}
+    if "current" not in controller and raw.get("actuator", {}).get("mode", "voltage") == "voltage":
+        inner["current"] = {"kind": "pi"}
+    raw["controller"] = controller | outer | inner
+    if isinstance(raw.get("processor"), dict):
+        raw["processor"]["predict"] = False
 
 
 def law_from(
-    top: Table, rotor: Rotor, bearings: list[Table], cases: list[Case], read: Callable[[dict, str], Case]
-) -> tuple[MachineLaw | None, list[Case]]:
-    """Return the law of all axes, None if each axis has its own, and the cases of its parts.
+    top: Table,
+    rotor: Rotor,
+    bearings: list[Table],
+    cases: list[Case],
+    read: Callable[[dict, str], Case],
+    folder: pathlib.Path,
+) -> tuple[MachineLaw | None, list[Case], str]:
+    """Return the law of all axes, None if each axis has its own; the cases of its parts; and what it demands.
 
-    `cases`: of the axes. `read`: reads a raw case with a name.
+    `cases`: of the axes. `read`: reads a raw case with a name. The demand is a "force", "current" or "voltage".
     """
     table = top.table("controller")
+    if (kind := kind_of(top.raw)) != LAWS[0]:
+        for bearing in bearings:
+            bearing.table("controller").only(["model", *(["current"] if kind == "linear" else [])])
+        law, output = linear(top, cases, folder) if kind == "linear" else lqg(top, cases, rotor)
+        return law, [], output
+    for key in ("file", "output", "lqg"):
+        if key in table.raw:
+            raise ValueError(f'{table.at(key)} is for kind = "{"lqg" if key == "lqg" else "linear"}". Set it.')
     way = table.choice("coordinates", WAYS, WAYS[0])
     compensated = table.switch("compensate_gyroscopics")
     if way == WAYS[0]:
-        for key in KEYS[1:]:
+        for key in ("compensate_gyroscopics", *TABLES):
             if key in table.raw:
                 raise ValueError(f'{table.at(key)} is for coordinates = "rigid-body". Set it, or leave {key} out.')
-        return None, []
+        return None, [], "force"
     for bearing in bearings:
         own = bearing.table("controller")
         for key in ("observer", "position"):
@@ -77,7 +110,7 @@ def law_from(
                     f"{own.at(key)}: in rigid-body coordinates no bearing has its own {key}. Use [controller.tilt."
                     f"{key}] or [controller.axial.{key}]."
                 )
-    return rigid_body(top, rotor, cases, read, bool(compensated))
+    return *rigid_body(top, rotor, cases, read, bool(compensated)), "force"
 
 
 def rigid_body(
@@ -138,7 +171,7 @@ def _coordinate(top: Table, name: str, plant: dict[str, float], read: Callable[[
     raw |= {key: copy.deepcopy(top.raw[key]) for key in ("processor", "clock") if key in top.raw}
     for key, names in (("sensor", ("velocity",)), ("actuator", ("mode", "bandwidth"))):
         raw[key] = {name: top.raw[key][name] for name in names if name in top.raw.get(key, {})}
-    without_keys(raw)
+    axis_controller(raw)
     return read(raw, f"coordinate {name}")
 
 
@@ -147,11 +180,16 @@ def inner_cascade(system: Sampled | ClosedLoop) -> Any:
     return (system.loop if isinstance(system, Sampled) else system).cascade
 
 
-def inner(system: Any) -> Any:
-    """Return the loop of an axis whose observer and position law never act: without their states."""
+def inner(system: Any, demand: str) -> Any:
+    """Return the loop of an axis whose observer and position law never act: without their states.
+
+    `demand`: what the law of the machine demands. A voltage goes to the coils as it is.
+    """
     loop = system.loop if isinstance(system, Sampled) else system
     cascade = loop.cascade
     position = FeedbackLinearisation().designed(cascade.model, None)
     cascade = dataclasses.replace(cascade, observer=Direct(), position=position)
+    if demand == "voltage":
+        cascade = dataclasses.replace(cascade, current=OpenLoop())
     loop = dataclasses.replace(loop, cascade=cascade)
     return dataclasses.replace(system, loop=loop) if isinstance(system, Sampled) else loop

@@ -112,7 +112,7 @@ def _converter(case: Case) -> Iterator[str]:
     sensor = case.scenario.sensors
     if sensor.bits is None or not sensor.std:
         return
-    step = 2 * float(sensor.ends(case.scenario.plant.s_0)) / 2 ** float(sensor.bits)
+    step = float(sensor.step(case.scenario.plant.s_0))
     if step > MOST_STEP * float(sensor.std):
         yield (
             f"sensor.bits = {float(sensor.bits):g}: a step of {step:.3g} m is {step / float(sensor.std):.3g} times the "

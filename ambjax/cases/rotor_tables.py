@@ -4,13 +4,27 @@ import dataclasses
 import itertools
 import math
 import pathlib
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.recordings import Recordings
+from ambjax.cases.rotor_body import (
+    DAMPING,
+    FREQUENCY,
+    I_P,
+    I_T,
+    MASS,
+    MODES,
+    PLACE,
+    RotorBody,
+    dampings_of,
+    needed,
+    tables_of,
+    vector,
+)
+from ambjax.cases.rotor_file import body_of_file
 from ambjax.cases.scenario_tables import signal_from
 from ambjax.cases.table import Table, show
 from ambjax.numerics.records import leaf
@@ -24,16 +38,9 @@ RIGID = len(COORDINATES)
 OWN = ("plant", "controller", "sensor", "actuator", "reference")
 # Longest finite element, as a share of the shaft's length: bending frequencies are then correct to 1e-5.
 LONGEST_ELEMENT = 1 / 70
-PLACE = leaf(default=0.0, unit="m", at_least=-100.0, at_most=100.0, doc="place on the shaft")
 ANGLE = leaf(default=0.0, unit="degrees", at_least=-360.0, at_most=360.0, doc="angle of the first axis from x")
 AMOUNT, PHASE = (field for field in dataclasses.fields(RotorUnbalance) if field.name in ("amount", "phase"))
 SPEED, ACCELERATION = (field for field in dataclasses.fields(Rotor) if field.name in ("speed", "acceleration"))
-MASS = leaf(unit="kg", at_least=1e-6, at_most=1e6, doc="mass")
-I_T = leaf(unit="kg m^2", at_least=0.0, at_most=1e9, doc="moment of inertia about an axis across the shaft")
-I_P = leaf(unit="kg m^2", at_least=0.0, at_most=1e9, doc="moment of inertia about the shaft")
-FREQUENCY = leaf(unit="Hz", at_least=1e-3, at_most=1e6, doc="frequency of a bending mode, free and at rest")
-DAMPING = leaf(default=0.005, unit="1", at_least=0.0, at_most=1.0, doc="damping ratio of the bending modes")
-MODES = leaf(default=4, at_least=0, at_most=20, whole=True, doc="number of bending modes")
 LENGTH = leaf(unit="m", at_least=1e-6, at_most=100.0, doc="length of a section")
 DIAMETER = leaf(unit="m", at_least=1e-6, at_most=100.0, doc="outer diameter of a section")
 INNER = leaf(default=0.0, unit="m", at_least=0.0, at_most=100.0, doc="inner diameter of a section")
@@ -53,71 +60,18 @@ class BearingAxis(NamedTuple):
     sensor: np.ndarray
 
 
-class RotorBody(NamedTuple):
-    """Mass, inertia and bending modes of a rotor. Places of the case file minus `centre` are those from the centre.
-
-    `gyroscopic` [2 + k, 2 + k]: as in `ShaftModel`. `shapes`: shapes [k] of the modes at a place of the case file;
-    None: the tables give them.
-    """
-
-    m: float
-    I_t: float
-    I_p: float
-    centre: float
-    frequencies: np.ndarray
-    dampings: np.ndarray
-    gyroscopic: np.ndarray
-    shapes: Callable[[float], np.ndarray] | None
-
-    def place(self, table: Table, key: str = "at", modes: str = "modes", other: Any = None) -> tuple[float, np.ndarray]:
-        """Return the distance (m) of a place from the centre of mass, and the shapes of the modes there.
-
-        `other`: place (m) and shapes that are used if the table gives none; None: 0 and no motion.
-        """
-        count = len(self.frequencies)
-        at, default = other or (self.centre, np.zeros(count))
-        found = table.leaf(key, PLACE, at)
-        if self.shapes is not None:
-            return found - self.centre, self.shapes(found)
-        needed = count and other is not None and found != at
-        return found - self.centre, vector(table, modes, count, None if needed else default)
-
-
-def tables_of(top: Table, name: str) -> list[Table]:
-    """Return the tables of a list, written as [[name]]."""
-    raw = top.raw.get(name, [])
-    if not isinstance(raw, list):
-        raise ValueError(f"{top.at(name)} = {show(raw)}: write [[{top.at(name)}]] above each.")
-    return [Table(one, f"{top.at(name)}[{k}]") for k, one in enumerate(raw)]
-
-
-def needed(table: Table, key: str, field: Any) -> float:
-    """Return a number that the table must give."""
-    if key not in table.raw:
-        raise ValueError(f"{table.at(key)} is missing: give the {field.metadata['doc']}, {field.metadata['unit']}.")
-    return table.leaf(key, field)
-
-
-def vector(table: Table, key: str, length: int, default: Any = None) -> np.ndarray:
-    """Return a list of `length` numbers; `default` if it is left out."""
-    if key not in table.raw and default is not None:
-        return np.asarray(default, float)
-    value = table.array(key, None, f"a list of {length} numbers")
-    if value is None or np.shape(value) != (length,) or not np.all(np.isfinite(np.asarray(value, float))):
-        given = "is missing" if key not in table.raw else f"= {show(table.raw[key])}"
-        raise ValueError(f"{table.at(key)} {given}: it must be a list of {length} numbers.")
-    return np.asarray(value, float)
-
-
-def body_from(top: Table) -> RotorBody:
-    """Return the masses and modes of [rotor]."""
+def body_from(top: Table, folder: pathlib.Path = pathlib.Path()) -> RotorBody:
+    """Return the masses and modes of [rotor]. `folder`: that of the case file."""
     table = top.table("rotor")
     kind = table.choice("kind", KINDS)
     common = ["kind", "gravity", "speed", "acceleration"]
     if kind == "shaft":
         table.only([*common, "elements", "discs", "sleeves", "modes", "damping", *MATERIAL])
         return _shaft(table, _places(top))
-    table.only([*common, "m", "I_t", "I_p", *(["modes"] if kind == "modal" else [])])
+    if kind == "modal" and "file" in table.raw:
+        table.only([*common, "file", "modes", "damping"])
+        return body_of_file(table, folder)
+    table.only([*common, "m", "I_t", "I_p", *(["modes", "Gm"] if kind == "modal" else [])])
     m, I_t, I_p = needed(table, "m", MASS), needed(table, "I_t", I_T), needed(table, "I_p", I_P)
     if not 0 < I_p <= 2 * I_t and I_p != 0:
         raise ValueError(f"{table.at('I_p')} = {I_p:g}: it must be at most 2 I_t = {2 * I_t:g} kg m^2, as of a disc.")
@@ -128,9 +82,33 @@ def body_from(top: Table) -> RotorBody:
         one.only(["frequency", "damping"])
     frequencies = np.array([needed(one, "frequency", FREQUENCY) for one in modes])
     dampings = np.array([one.leaf("damping", DAMPING, DAMPING.default) for one in modes])
-    gyroscopic = np.zeros((2 + len(modes), 2 + len(modes)))
-    gyroscopic[1, 1] = I_p
-    return RotorBody(m, I_t, I_p, 0.0, frequencies, dampings, gyroscopic, None)
+    return RotorBody(m, I_t, I_p, 0.0, frequencies, dampings, _gyroscopic(table, I_p, len(modes)), None)
+
+
+def _gyroscopic(table: Table, I_p: float, modes: int) -> np.ndarray:
+    """Return the gyroscopic matrix of translation, tilt and modes: `Gm` covers the modes, or all of them."""
+    whole = np.zeros((2 + modes, 2 + modes))
+    whole[1, 1] = I_p
+    if "Gm" not in table.raw:
+        return whole
+    given = table.array("Gm", None, "a list of rows")
+    Gm = np.asarray(given, float) if np.shape(given) in ((modes, modes), whole.shape) else np.full((1, 1), np.nan)
+    if not np.all(np.isfinite(Gm)):
+        raise ValueError(
+            f"{table.at('Gm')} = {show(table.raw['Gm'])}: it must be {modes} rows of {modes} numbers, for the modes, "
+            f"or {2 + modes} rows of {2 + modes}, for translation, tilt and modes."
+        )
+    if not np.allclose(Gm, Gm.T, rtol=1e-6, atol=1e-9 * np.abs(Gm).max()):
+        raise ValueError(f"{table.at('Gm')}: it must be symmetric.")
+    if len(Gm) == modes:
+        whole[2:, 2:] = Gm
+    elif np.abs(Gm[0]).max() > 1e-9 * np.abs(Gm).max() or not np.isclose(Gm[1, 1], I_p, rtol=1e-6):
+        raise ValueError(
+            f"{table.at('Gm')}: its first row must be 0, and Gm[1][1] = {Gm[1, 1]:g} must be I_p = {I_p:g}."
+        )
+    else:
+        whole = Gm
+    return whole
 
 
 def _places(top: Table) -> list[float]:
@@ -196,16 +174,9 @@ def _shaft(table: Table, places: list[float]) -> RotorBody:
     def at(place: float) -> np.ndarray:
         return shapes[int(np.argmin(np.abs(nodes - place)))]
 
-    dampings = np.full(count, DAMPING.default)
-    if isinstance(table.raw.get("damping"), list):
-        dampings = vector(table, "damping", count)
-        for x in dampings:
-            Table({"damping": float(x)}, table.path).leaf("damping", DAMPING)
-    elif "damping" in table.raw:
-        dampings = np.full(count, table.leaf("damping", DAMPING))
     return RotorBody(
         float(model.m), float(model.I_t), float(model.I_p), float(model.centre), np.asarray(model.frequencies),
-        dampings, np.asarray(model.gyroscopic), at,
+        dampings_of(table, np.full(count, DAMPING.default)), np.asarray(model.gyroscopic), at,
     )  # fmt: skip
 
 

@@ -121,7 +121,15 @@ class Controller(Block):
         valid = functools.reduce(jnp.logical_and, fine, jnp.asarray(True))
         system = Sampled(ClosedLoop(cascade, Scenario(u_max=limits.u_max)), period, 0)
         before, watch = memory.before, memory.watch
-        state = SampledState((), memory.laws, memory.last, before, jnp.ones(()), (), (), watch, memory.started, ())
+        state = SampledState(
+            plant=(),
+            control=memory.laws,
+            command=memory.last,
+            past=before,
+            finite=jnp.ones(()),
+            watch=watch,
+            started=memory.started,
+        )
         after = system.with_command(measured, Reference(*inputs[3:]), state)
         last = choose(valid, after.command, memory.last)
         watch, refused, safe = after.watch, jnp.asarray(False), jnp.asarray(False)

@@ -146,17 +146,23 @@ class PlantStep(Block):
         system = self.system(parameters, period, q_z, q_i)
         kept = choose(memory.started, self._advanced(system, memory, limited(u, parameters.u_max)), self._begun(system))
         true = parameters.plant.measurement(kept.motion)
-        measured = system.measured(kept.motion, kept.z_filtered, system.loop.scenario.sensors.scaled(w))
+        measured = system.measured(kept.motion, kept.z_filtered, Errors(*system.loop.scenario.sensors.scaled(w)))
         invalid = ~functools.reduce(jnp.logical_and, fine, jnp.asarray(True))
         status = PlantStatus(kept.lost == TOUCHED, kept.lost == DIVERGED, invalid)
         return kept, PlantOutputs(*measured, *true), status
 
     def _advanced(self, system: Sampled, memory: PlantMemory, u: Array) -> PlantMemory:
         """Return the memory at the next sample. `u`: voltage commanded at the last sample, V."""
-        zero = jnp.zeros(())
-        control: Any = ()
-        command, past = Command(zero, zero, zero, zero, u), (memory.last, *memory.before)
-        state = SampledState(memory.motion, control, command, past, jnp.ones(()), memory.z_filtered, memory.u_a)
+        zero, past = jnp.zeros(()), (memory.last, *memory.before)
+        state = SampledState(
+            plant=memory.motion,
+            control=(),
+            command=Command(zero, zero, zero, zero, u),
+            past=past,
+            finite=jnp.ones(()),
+            z_filtered=memory.z_filtered,
+            u_a=memory.u_a,
+        )
         code = jnp.where(memory.lost == TOUCHED, TOUCHED, jnp.where(memory.lost == ALIVE, ALIVE, DIVERGED))
         method: Any = self.method
         after = system.advance(method, Errors(zero, zero, zero), 0.0, system.period, state, (), code)

@@ -27,7 +27,7 @@ from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.system import system_of
 from ambjax.world.scenario import Scenario
-from ambjax.world.sensor import Errors, FaultyErrors
+from ambjax.world.sensor import Errors
 from ambjax.world.waveforms import Constant
 
 T = TypeVar("T")
@@ -79,7 +79,7 @@ class Twin(Sampled):
     unit: Scalar = 0.0
     held: bool = static(default=False, doc="disturbances are constant over each sample")
 
-    def jump(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors) -> SampledState:
+    def jump(self, t: Scalar, state: SampledState, errors: Errors) -> SampledState:
         """Change the states, compute the laws' step from them, and change the resulting command."""
         sample = jnp.rint(t / self.period).astype(jnp.int32)
         key = jax.random.fold_in(jax.random.key(jnp.asarray(self.seed, jnp.int32)), sample)
@@ -94,7 +94,7 @@ class Twin(Sampled):
     def advance(
         self,
         method: Integrator,
-        errors: Errors | FaultyErrors,
+        errors: Errors,
         t: Scalar,
         period: Scalar,
         state: SampledState,

@@ -28,8 +28,8 @@ class Fact(NamedTuple):
     unit: str
 
 
-def acceptance(case: Case) -> tuple[dict[str, object], str]:
-    """Return the JSON summary and the text: zone and margins of the loop linearised at r = 0, and the machine.
+def acceptance(case: Case) -> tuple[dict[str, object], list[str], str]:
+    """Return the JSON summary, the lines on the zone of the loop linearised at r = 0, and the table of its numbers.
 
     If the loop cannot be linearised, `zone` and `stable` are None, and `why` is the cause.
     """
@@ -38,7 +38,7 @@ def acceptance(case: Case) -> tuple[dict[str, object], str]:
     except ValueError as error:
         facts = machine(case)
         summary = {"stable": None, "zone": None, "why": str(error), **{fact.key: fact.value for fact in facts}}
-        return summary, f"No zone and no margins: {error}\n\n{_facts_table(facts)}"
+        return summary, [f"Sensitivity: no zone and no margins: {error}"], _facts_table(facts)
     loop = analyse(system, case.scenario.plant.m, case.clock.sample_period, case.zones)
     facts = [*_loop_facts(loop), *machine(case)]
     summary = {"stable": loop.stable, "zone": loop.zone, **{fact.key: fact.value for fact in facts if fact.key}}
@@ -46,12 +46,12 @@ def acceptance(case: Case) -> tuple[dict[str, object], str]:
     if loop.stable:
         summary |= {"frequency_hz": loop.S.frequency, **band_numbers(loop, case.zones), "margins": margin_numbers(loop)}
         lines += band_lines("Nominal loop", loop, case.zones)
-    return summary, "\n".join([*lines, "", _facts_table(facts)])
+    return summary, lines, _facts_table(facts)
 
 
 def _verdict(case: Case, loop: Analysis) -> str:
     if not loop.stable:
-        return "The linearised loop is not stable at r = 0."
+        return "Sensitivity: the linearised loop is not stable at r = 0."
     signs = any(set_valued_signs(getattr(case.cascade, stage)) for stage in DEFAULT_LAWS)
     inside = " (linear loop, valid inside the bands of the set-valued signs)" if signs else ""
     word = "largest |S|" if loop.S.at_edge else "peak"
@@ -81,10 +81,8 @@ def machine(case: Case) -> list[Fact]:
     """Return the numbers of the plant, its supply and its converters."""
     plant, sensor = case.scenario.plant, case.scenario.sensors
     (force, weight, load), period = forces(case), float(case.clock.sample_period)
-    (u_max, reserve), step = _voltages(case), None
+    (u_max, reserve), step = _voltages(case), float(sensor.step(plant.s_0)) or None
     slew = None if u_max is None else u_max / float(plant.L)
-    if sensor.bits is not None:
-        step = 2 * float(sensor.ends(plant.s_0)) / 2 ** float(sensor.bits)
     std = float(sensor.std)
     return [
         Fact("force_reserve", "largest force / weight", force / weight if weight else None, "1"),

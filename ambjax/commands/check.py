@@ -5,21 +5,21 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ambjax.cases.forces import forces
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
-from ambjax.cases.warned import idealised
 from ambjax.commands import machine_check
 from ambjax.commands.acceptance import acceptance
+from ambjax.commands.check_text import OnProcessor
 from ambjax.commands.reading import read_any_with_warnings
 from ambjax.control.cascade import Cascade
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.linear.stability import Findings, stability_of
-from ambjax.results.outputs import plain, table
+from ambjax.results.outputs import plain
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import rollout
 from ambjax.theorem.causes import Cause, find_cause
@@ -28,36 +28,23 @@ from ambjax.theorem.sampled_report import Delays, SampledReport
 from ambjax.world.scenario import Scenario
 
 Summary = dict[str, object]
-CONTINUOUS = (
-    "The tables of Theorem 1 are computed in continuous time, without the case's [processor] and without the low-pass, "
-    "the converters and the faults of the sensor. An amplifier is included only if it controls the current. A "
-    "set-valued sign is replaced by a sign with a boundary layer. These tables do not affect the verdict on this case."
-)
-
-BAND = (
-    "Evaluated at the samples after run.settle. Signal: the quantity that the law drives to zero. Disturbance: largest "
-    "difference between the rate of the computed signal and the rate that the sign function of the law commands. Band: "
-    "largest |computed signal| that such disturbances can cause. Difference: largest difference between the computed "
-    "signal and that of the plant. Bound: band plus difference; it bounds the signal of the plant. Largest: largest "
-    "|signal| of the plant."
-)
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
-    """Check a case. Print the results of the linearised loop, then those on the processor, then those of Theorem 1.
+    """Check a case. Print the verdict, then the tables that apply; with `--full` all tables.
 
     Returns the exit code and the summary. The exit code is 1 if a condition fails, if the rotor is lost, if the
     integrator stalls, if the rotor is held but the loop is not stable, if the magnets cannot carry the rotor, or if the
     loop cannot be linearised. On a processor, the conditions of Theorem 1 do not count. The zones and the margins of
     the linearised loop never count.
     """
-    from ambjax.theorem import advice
+    from ambjax.commands import check_text
 
     case = read_any_with_warnings(args.case)
     if isinstance(case, MachineCase):
         return machine_check.check(args, case)
     with doing(f"simulating and analysing the loop; {FIRST_RUN}"):
-        report, (loop, text), on_processor = _results(case)
+        report, (loop, sensitivity, machine), on_processor = _results(case)
     lost = report.lost_at if on_processor is None else on_processor.sampled.lost_at
     with doing(f"testing the stability of the loop; {FIRST_RUN}"):
         findings = _stability(case) if math.isinf(lost) else None
@@ -73,40 +60,23 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         "loop": loop,
         "stability": None if findings is None else findings._asdict(),
     }
-    if not args.json:
-        print(text)
-        if ideal := idealised(case):
-            print(f"\n{ideal}")
-    if findings is not None and not args.json:
-        print(f"\n{findings.words()}")
     largest, weight, _ = forces(case)
-    if not args.json and largest < weight:
-        words = f"their largest force is {largest:.4g} N, below its weight of {weight:.4g} N"
-        print(f"\nThe magnets cannot carry the rotor: {words}.")
+    differs = None
     if on_processor is not None:
-        summary |= _processor_summary(case, args, on_processor, loop)
-    else:
-        summary |= _clearance(case, args, report.largest_z)
-    if not args.json:
-        print("\nTheorem 1:\n")
-        _print_check(report.conditions, report.proof)
-        print("\n" + "\n".join(advice.theorem_lines(report, args.case)))
-        if on_processor is not None:
-            print(CONTINUOUS)
+        differs = _delays_differ(case, on_processor, loop)
+        summary |= _processor_summary(on_processor, differs)
+    used = report.largest_z if on_processor is None else on_processor.sampled.largest_z
+    summary |= _clearance(case, used)
     steady = findings is None or findings.stable
     summary["holds"] = bool(summary["holds"]) and largest >= weight and steady
+    if not args.json:
+        shown = check_text.Checked(case, args.case, report, findings, on_processor, differs, loop["stable"] is not None)
+        print("\n".join(check_text.verdict(shown, sensitivity[0], used)))
+        print("\n" + "\n\n".join(["\n".join([*sensitivity[1:], machine]), *check_text.details(shown, args.full)]))
     return int(not summary["holds"] or loop["stable"] is None), plain(summary)
 
 
-class _OnProcessor(NamedTuple):
-    """Results on the processor. `margin`, `unknown`: delay margins, see `_margins`."""
-
-    sampled: SampledReport
-    margin: Delays
-    unknown: Delays | None
-
-
-def _results(case: Case) -> tuple[Report, tuple[Summary, str], _OnProcessor | None]:
+def _results(case: Case) -> tuple[Report, tuple[Summary, list[str], str], OnProcessor | None]:
     """Return the report of Theorem 1, the summary and text of the linearised loop, and the results on the processor.
 
     Theorem 1 is checked in a second thread. Compilation and simulation release the GIL, so both threads run at once.
@@ -117,7 +87,7 @@ def _results(case: Case) -> tuple[Report, tuple[Summary, str], _OnProcessor | No
         say("linearising the loop")
         loop, on_processor = acceptance(case), None
         if case.cascade.sampled:
-            on_processor = _OnProcessor(_sampled(case), *_margins(case))
+            on_processor = OnProcessor(_sampled(case), *_margins(case))
         report = theorem.result()
     if report.lost and not case.cascade.sampled:
         cause = find_cause(_is_lost, case.cascade, case.scenario, case.clock, say)
@@ -169,25 +139,21 @@ def _stability(case: Case) -> Findings:
     return stability_of(case.cascade, as_member(case.scenario), case.clock).findings()
 
 
-def _processor_summary(case: Case, args: argparse.Namespace, results: _OnProcessor, loop: Summary) -> Summary:
-    """Print the results on the processor, and return their summary; "holds" is True if all conditions hold.
-
-    `loop`: summary of the linearised loop.
-    """
+def _delays_differ(case: Case, results: OnProcessor, loop: Summary) -> str:
+    """Return why the simulated loop is stable beyond the delay margin of the linearised `loop`; '' if it is not."""
     from ambjax.theorem import advice
 
-    sampled, margin, unknown = results
     places: Any = loop.get("margins") or {}
     linear = places.get("command", {}).get("delay_margin_s")
     sizes = float(case.cascade.timing.delay), float(case.clock.sample_period)
-    differs = advice.delay_difference(linear, unknown or margin, *sizes)
-    if not args.json:
-        print(f"\nOn the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s.\n")
-        _print_sampled(sampled)
-        print("\n" + "\n".join([*advice.processor_lines(sampled, margin, unknown), *([differs] if differs else [])]))
+    return advice.delay_difference(linear, results.unknown or results.margin, *sizes)
+
+
+def _processor_summary(results: OnProcessor, differs: str) -> Summary:
+    """Return the summary of the results on the processor; "holds" is True if all conditions hold."""
+    sampled, margin, unknown = results
     laws = [dataclasses.asdict(law) | {"holds": law.holds} for law in sampled.laws]
     return {
-        **_clearance(case, args, sampled.largest_z),
         "holds": sampled.holds,
         "processor": {
             "lost_at_s": sampled.lost_at,
@@ -208,22 +174,12 @@ def _processor_summary(case: Case, args: argparse.Namespace, results: _OnProcess
     }
 
 
-def _clearance(case: Case, args: argparse.Namespace, largest: float | None) -> Summary:
-    """Print and return the clearance zone.
-
-    `largest`: largest |z| after run.settle, m. None: the zone is D, and nothing is printed.
-    """
+def _clearance(case: Case, largest: float | None) -> Summary:
+    """Return the clearance zone of the largest |z| after run.settle, m; None: zone D."""
     if largest is None:
         return {"clearance_used": None, "clearance_zone": "D"}
     used = largest / float(np.min(np.asarray(case.scenario.touchdown)))
-    zone, zones = case.zones.clearance_zone(used), case.zones
-    if not args.json:
-        print(
-            f"\nClearance: zone {zone}. After run.settle |z| reaches {largest:.4g} m, {100 * used:.3g} % of the "
-            f"clearance (A below {100 * zones.clearance_a:g} %, B below {100 * zones.clearance_b:g} %, C below "
-            f"{100 * zones.clearance_c:g} %)."
-        )
-    return {"clearance_used": used, "clearance_zone": zone}
+    return {"clearance_used": used, "clearance_zone": case.zones.clearance_zone(used)}
 
 
 def _margin(margin: Delays) -> Mapping[str, object]:
@@ -236,61 +192,3 @@ def _cause(cause: Cause | None) -> Mapping[str, object] | None:
 
 def _condition(c: Condition) -> Mapping[str, object]:
     return dataclasses.asdict(c) | {"margin": c.margin}
-
-
-def _print_check(conditions: list[Condition], proof: list[Condition]) -> None:
-    verdicts = {True: "holds", False: "FAILS", None: "-"}
-
-    def number(x: float | None) -> str:
-        return "-" if x is None else f"{x:.5g}"
-
-    rows = [
-        (
-            c.requires,
-            number(c.gain),
-            number(c.against),
-            number(c.margin),
-            c.unit,
-            f"{c.at_s:.5g}",
-            verdicts[c.holds],
-            c.note,
-        )
-        for c in conditions
-    ]
-    print(table(("condition", "left", "right", "margin", "unit", "at (s)", "verdict", "note"), rows))
-    steps = [(c.name, c.requires, f"{c.against:.3g}", c.unit, f"{c.at_s:.5g}", c.note) for c in proof]
-    print("\n" + table(("proof", "statement", "worst", "unit", "at (s)", "meaning"), steps))
-
-
-def _print_sampled(sampled: SampledReport) -> None:
-    rows = [
-        (
-            law.stage,
-            "implicit" if law.implicit else "explicit",
-            f"{law.radius:.4g}",
-            f"{law.damping:.4g}",
-            "holds" if law.holds else "FAILS",
-        )
-        for law in sampled.laws
-    ]
-    head = ("law", "step", "largest |pole|", "least damping ratio", "verdict")
-    print(table(head, rows))
-
-    def number(x: float | None) -> str:
-        return "-" if x is None else "none" if math.isinf(x) else f"{x:.4g}"
-
-    bands = [
-        (
-            b.signal,
-            b.unit,
-            "the case's" if b.noise else "none",
-            *map(number, (b.gain, b.disturbance, b.band, b.difference, b.bound, b.largest)),
-            b.note,
-        )
-        for b in sampled.bands
-    ]
-    if bands:
-        values = ("gain, per s", "disturbance", "band", "difference", "bound", "largest")
-        print("\n" + table(("signal", "unit", "noise", *values, "note"), bands) + "\n" + BAND)
-    else:
-        print("\nNo bands, because every run ends early.")

@@ -8,12 +8,16 @@ import numpy as np
 from ambjax.cases.machine_case import MachineCase, machine_from
 from ambjax.commands.machine_commands import analysed
 from ambjax.host.heartbeat import say
-from ambjax.linear import linearise_machine, poles_in_s
+from ambjax.linear import MachineSensitivity, poles_in_s
+from ambjax.linear.linear_machine import turning_machines
+from ambjax.linear.rotor_modes import Mode, modes_of
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.outputs import plain, table
 
-# Modes that the second analysis adds to those of a shaft. Modes whose damping ratio is below LIGHT are listed.
-MORE, LIGHT = 4, 0.05
+# Modes that the second analysis adds to those of a shaft. Modes whose damping ratio is below LIGHT are listed, at most
+# MOST.
+MORE, LIGHT, MOST = 4, 0.3, 8
+AXIS_COLUMNS = ("axis", "|z|/clearance", "zone", "weight/force", "force reserve", "peak of |S|", "zone")
 
 
 def check(args: argparse.Namespace, case: MachineCase) -> tuple[int, dict[str, object]]:
@@ -26,23 +30,23 @@ def check(args: argparse.Namespace, case: MachineCase) -> tuple[int, dict[str, o
     say(f"linearising at {', '.join(f'{speed:g}' for speed in case.speeds)} rpm")
     points = analysed(case)
     share = float(run.metrics["settled_clearance_used"])
-    carried = {
-        axis: abs(float(one.scenario.plant.m * one.scenario.plant.g)) / float(one.scenario.largest_force)
-        for axis, one in zip(case.axes, case.cases, strict=True)
-    }
+    axes = {axis: _axis(case, k, run.metrics["axes"][axis], points) for k, axis in enumerate(case.axes)}
+    turning = turning_machines(case.machine, case.clock.sample_period, case.speeds)
+    modes = {point.speed: modes_of(own, case.machine.rotor) for point, own in zip(points, turning, strict=True)}
     spilled = _spill_over(case)
     worst = max(points, key=lambda point: (not point.stable, point.worst.S.height))
     summary = {
         "held": not run.lost,
         "lost_why": run.lost_why,
         "clearance_used": share,
-        "clearance_zone": case.zones.clearance_zone(share),
-        "force_carried": carried,
+        "clearance_zone": "D" if run.lost else case.zones.clearance_zone(share),
+        "axes": axes,
         "stable": {f"{point.speed:g}": point.stable for point in points},
         "zone": worst.worst.zone,
         "peak": worst.worst.S.height,
         "axis": worst.worst.name,
         "speed_rpm": worst.speed,
+        "modes": {f"{speed:g}": [mode.numbers() for mode in own] for speed, own in modes.items()},
         "growth_with_more_modes_per_s": spilled,
     }
     stable = all(point.stable for point in points) and all(rate <= 0 for rate in spilled.values())
@@ -54,9 +58,9 @@ def check(args: argparse.Namespace, case: MachineCase) -> tuple[int, dict[str, o
         print(
             f"stability: {'stable' if stable else 'NOT STABLE'} at {', '.join(summary['stable'])} rpm{_more(spilled)}"
         )
-        most = max(carried, key=lambda axis: carried[axis])
-        print(f"weight: the most loaded axis, {most}, carries {carried[most]:.3g} of the force of its magnet")
-        print(table(("pole, 1/s", "Hz", "damping ratio", "rpm"), _light(points)))
+        print(table(AXIS_COLUMNS, [(axis, *map(_short, own.values())) for axis, own in axes.items()]))
+        if light := _light(modes):
+            print(table(("lightly damped mode", "Hz", "damping ratio", "rpm"), light))
     return int(run.lost or not stable), plain(summary)
 
 
@@ -65,13 +69,14 @@ def _spill_over(case: MachineCase) -> dict[str, float]:
     raw = tomllib.loads(case.text) if case.text else {}
     if raw.get("rotor", {}).get("kind") != "shaft" or isinstance(raw["rotor"].get("damping"), list):
         return {}
-    raw["rotor"]["modes"] = (len(case.coordinates) - 5) // 2 + MORE
+    known = (len(case.coordinates) - 5) // 2
+    raw["rotor"]["modes"] = known + MORE
+    if raw.get("controller", {}).get("kind") == "lqg":  # the same controller
+        raw["controller"]["lqg"] = {"modes": known} | raw["controller"].get("lqg", {})
     more = machine_from(raw, case.name)
-    return {f"{speed:g}": float(np.max(np.real(_poles(more, speed)))) for speed in case.speeds}
-
-
-def _poles(case: MachineCase, speed: float) -> np.ndarray:
-    return poles_in_s(linearise_machine(case.machine, case.clock.sample_period, speed))
+    points = turning_machines(more.machine, case.clock.sample_period, case.speeds)
+    growth = [float(np.max(np.real(poles_in_s(point.system.without_idle())))) for point in points]
+    return {f"{speed:g}": rate for speed, rate in zip(case.speeds, growth, strict=True)}
 
 
 def _more(spilled: dict[str, float]) -> str:
@@ -80,12 +85,29 @@ def _more(spilled: dict[str, float]) -> str:
     return f"; with {MORE} more bending modes the largest growth rate is {max(spilled.values()):.3g} 1/s"
 
 
-def _light(points: list) -> list[tuple[str, ...]]:
-    """Return the rows of the lightly damped poles, at most six, the least damped first."""
-    rows = []
-    for point in points:
-        for pole in point.poles:
-            size = abs(pole)
-            if pole.imag > 0 and -pole.real < LIGHT * size:
-                rows.append((-pole.real / size, f"{pole.real:.4g}", f"{pole.imag / (2 * np.pi):.4g}", point.speed))
-    return [(real, hertz, f"{ratio:.3g}", f"{speed:g}") for ratio, real, hertz, speed in sorted(rows)[:6]]
+def _axis(case: MachineCase, k: int, metrics: dict[str, float], points: list[MachineSensitivity]) -> dict[str, object]:
+    """Return what is checked of one axis: clearance and force as shares, and the largest sensitivity at any speed."""
+    scenario, share = case.cases[k].scenario, float(metrics["settled_clearance_used"])
+    worst = max((point.axes[k] for point in points), key=lambda axis: (axis.zone, axis.S.height))
+    carried = abs(float(scenario.plant.m * scenario.plant.g)) / float(scenario.largest_force)
+    used = max(float(metrics["force_used"]), carried)
+    return {
+        "clearance_used": share, "clearance_zone": case.zones.clearance_zone(share), "force_carried": carried,
+        "force_reserve": 1 - used, "peak": worst.S.height, "zone": worst.zone,
+    }  # fmt: skip
+
+
+def _short(value: object) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _light(modes: dict[float, list[Mode]]) -> list[tuple[str, ...]]:
+    """Return the rows of the lightly damped modes, the least damped first: of each name, the least damped speed."""
+    found: dict[str, tuple[float, Mode]] = {}
+    for speed, own in modes.items():
+        for mode in own:
+            best = found.get(mode.label)
+            if mode.damping < LIGHT and (best is None or mode.damping < best[1].damping):
+                found[mode.label] = speed, mode
+    rows = sorted(found.values(), key=lambda row: row[1].damping)[:MOST]
+    return [(mode.label, f"{mode.frequency:.4g}", f"{mode.damping:.3g}", f"{speed:g}") for speed, mode in rows]

@@ -8,12 +8,14 @@ from tqdm import tqdm
 
 from ambjax.cases.machine_case import MachineCase
 from ambjax.host.heartbeat import say
-from ambjax.linear.linear_machine import MachineSensitivity, machine_sensitivity
+from ambjax.linear.linear_machine import MachineSensitivity, sensitivity_of, turning_machines
+from ambjax.linear.margins import Margins
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
 
 Summary = dict[str, object]
-SIMULATED = ("trajectory.npz", "metrics.json", "overview.png")
+# runup.png: only if the speed changes.
+SIMULATED = ("trajectory.npz", "metrics.json", "overview.png", "runup.png")
 ANALYSED = ("sensitivity.json", "sensitivity.png")
 # Metrics of the printed table, with their headings.
 COLUMNS = {
@@ -47,12 +49,15 @@ def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]
         "lost_why": run.lost_why, "method": str(case.clock.method), "settle_s": case.settle,
     }  # fmt: skip
     from ambjax.pictures.machine_pictures import machine_picture
+    from ambjax.pictures.run_up_picture import run_up_picture
 
     with files(out) as part:
         run.save(part / "trajectory.npz")
         write_json(part / "metrics.json", metrics)
         title = f"{case.name}: {case.clock.method}"
         described("overview.png", lambda: machine_picture(case, run.signals, title, part / "overview.png"))
+        if np.ptp(run.signals["speed_rpm"]) > 0:
+            described("runup.png", lambda: run_up_picture(case, run.signals, part / "runup.png"))
         names = [name for name in SIMULATED if (part / name).exists()]
     if not args.json:
         shown = {name: words for name, words in COLUMNS.items() if name in run.metrics}
@@ -67,8 +72,9 @@ def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]
 
 def analysed(case: MachineCase) -> list[MachineSensitivity]:
     """Return the sensitivities of a machine at its speeds."""
-    period = float(case.clock.sample_period)
-    return [machine_sensitivity(case.machine, case.axes, period, speed, case.zones) for speed in case.speeds]
+    points = turning_machines(case.machine, case.clock.sample_period, case.speeds)
+    both = zip(points, case.speeds, strict=True)
+    return [sensitivity_of(point, case.axes, speed, case.zones) for point, speed in both]
 
 
 def sensitivity(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]:
@@ -102,6 +108,7 @@ def sensitivity_summary(points: list[MachineSensitivity]) -> Summary:
                 {
                     "name": axis.name, "peak": axis.S.height, "frequency_hz": axis.S.frequency, "zone": axis.zone,
                     "peak_T": axis.T.height, "peak_KS": axis.KS.height,
+                    "margins": None if axis.margins is None else _margins(axis.margins),
                 }
                 for axis in point.axes
             ],
@@ -120,17 +127,29 @@ def sensitivity_summary(points: list[MachineSensitivity]) -> Summary:
     return first | {key: own[key] for key in ("axes", "sigma_max", "sigma_frequency_hz")} | {"speeds": at}
 
 
+def _margins(margins: Margins) -> dict[str, float]:
+    """Return the margins as plain data."""
+    return {
+        "gain_low": margins.gain_low, "gain_high": margins.gain_high, "phase_deg": margins.phase_deg,
+        "delay_s": margins.delay, "disk": margins.disk,
+    }  # fmt: skip
+
+
 def sensitivity_text(points: list[MachineSensitivity]) -> str:
     """Return the tables of the sensitivities, one for each speed."""
     parts = []
     for point in points:
         rows = [
-            (axis.name, f"{axis.S.height:.4g}", f"{axis.S.frequency:.4g}", axis.zone, f"{axis.T.height:.4g}")
+            (axis.name, f"{axis.S.height:.4g}", f"{axis.S.frequency:.4g}", axis.zone, f"{axis.T.height:.4g}",
+             *(["", ""] if axis.margins is None else [f"{axis.margins.gain:.3g}", f"{axis.margins.phase_deg:.3g}"]))
             for axis in point.axes
-        ]
-        rows.append(("largest singular value", f"{point.sigma.height:.4g}", f"{point.sigma.frequency:.4g}", "", ""))
+        ]  # fmt: skip
+        single = f"{point.sigma.height:.4g}", f"{point.sigma.frequency:.4g}"
+        rows.append(("largest singular value", *single, "", "", "", ""))
         slow = np.max(np.real(point.poles))
         words = "stable" if point.stable else "NOT STABLE: the peaks have no physical meaning"
         parts.append(f"{point.speed:g} rpm: {words}; largest real part of a pole {slow:.4g} 1/s")
-        parts.append(table(("axis", "peak of |S|", "Hz", "zone", "peak of |T|"), rows))
+        parts.append(
+            table(("axis", "peak of |S|", "Hz", "zone", "peak of |T|", "gain margin", "phase margin, deg"), rows)
+        )
     return "\n".join(parts)

@@ -208,6 +208,8 @@ class OpenLoop(CurrentLaw[tuple[()]]):
     Use it with a position law that demands a voltage, such as position.LinearController. With inversion.Linearised, u
     is then the demanded voltage. On a processor u = R (i_ref + T i_ref'), where i_ref + T i_ref' is the reference that
     the inversion computes at this sample.
+
+    `Cascade(current=current.OpenLoop())` applies it.
     """
 
     analytic = True
@@ -238,6 +240,8 @@ class AmplifierCurrent(CurrentLaw[tuple[()]]):
 
     On a processor u is the i_ref that the inversion has computed at this sample. The prediction over the delay and the
     guard use the nominal amplifier, i' = 2 pi bandwidth (u - i).
+
+    Use it with an amplifier that closes the current loop: `Cascade(current=current.AmplifierCurrent())`.
     """
 
     bandwidth: Scalar = leaf(

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.numerics.gaussian import LARGEST_NORMAL
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.world.plant import Plant, State
 from ambjax.world.scenario import Scenario
@@ -18,10 +19,8 @@ from ambjax.world.sensor import Measurement
 # Type of a cascade. Its class cannot be imported here, because its module imports this one.
 C = TypeVar("C")
 
-# Largest simulated noise in standard deviations: the bound of `numerics.gaussian.normals`.
-LARGEST_NORMAL = 6.8
-# Default limits of velocity (gaps per sample) and current (bias currents).
-GAPS, CURRENTS = 2.0, 100.0
+# Default limits of velocity (gaps per sample) and current: bias currents, or with a converter a share of its range.
+GAPS, CURRENTS, BEYOND = 2.0, 100.0, 1.1
 
 
 def _limit(unit: str, doc: str, least: float = 1e-30) -> Any:
@@ -64,7 +63,7 @@ class Guard:
         "m", "largest |z|; none: clearance times sensor gain, plus |offset|, plus the largest error of the sensor"
     )
     z_dot: Scalar | None = _limit("m/s", "largest |z_dot|; none: two gaps per sample, 2 s_0/T")
-    i: Scalar | None = _limit("A", "largest |i|; none: 100 i_0")
+    i: Scalar | None = _limit("A", "largest |i|; none: 100 i_0, or 1.1 times the range of the converter")
     noise: Scalar | None = _limit(
         "m",
         "largest difference of two readings of one position; none: 13.6 sensor.std, plus a step of the converter, plus "
@@ -106,16 +105,12 @@ class Guard:
         """
         sensor = scenario.sensors
         limit, clearance = scenario.limit, scenario.limit / scenario.plant.s_0 * model.s_0
-        step = 0.0 if sensor.bits is None else 2 * sensor.ends(scenario.plant.s_0) / 2.0**sensor.bits
-        runout = 0.0 if sensor.runout is None else sum(abs(one.amplitude) for one in sensor.runout.harmonics)
-        error, fall = LARGEST_NORMAL * sensor.std + step / 2 + sensor.gain * runout, model.pole * clearance
-        unknown = estimated or not sensor.velocity or sensor.bandwidth is not None
-        velocity_error = 1.0 if unknown else abs(sensor.gain - 1)
+        fall, velocity_error = model.pole * clearance, 1.0 if estimated else sensor.velocity_error
         values = {
-            "z": sensor.gain * limit + abs(sensor.offset) + error,
+            "z": sensor.largest_reading(limit, scenario.plant.s_0),
             "z_dot": GAPS * model.s_0 / period,
-            "i": CURRENTS * model.i_0,
-            "noise": 2 * error,
+            "i": CURRENTS * model.i_0 if sensor.bits is None else BEYOND * sensor.current_end(scenario.plant.i_0),
+            "noise": 2 * sensor.largest_error(scenario.plant.s_0),
             "speed": LARGEST_NORMAL * sensor.std_z_dot + velocity_error * fall,
             "samples": jnp.maximum(1 / (model.pole * period) // 1, 1.0),
         }

@@ -34,6 +34,9 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
     A continuous K is discretised by the bilinear (Tustin) transform at the period of a processor. A discrete K requires
     a processor with its own period. There is no anti-windup: the states of K do not depend on the supply's limit. The
     reported sigma is the rate of the error, m/s. `of` constructs the law from a state space of python-control or SciPy.
+
+    Use it for a controller designed elsewhere:
+    `position.LinearController.of(control.ss(A, B, C, D), output="current")`.
     """
 
     analytic = True

@@ -17,7 +17,10 @@ from ambjax.world.sensor import Measurement
 
 @record
 class Direct(Observer[tuple[()]]):
-    """No observer: the estimate is the measurement, as in the paper."""
+    """No observer: the estimate is the measurement, as in the paper.
+
+    Use it where position and velocity are measured with little noise: `Cascade(observer=observer.Direct())`.
+    """
 
     analytic = True
 

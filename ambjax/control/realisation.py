@@ -15,6 +15,8 @@ from ambjax.numerics.records import Scalar
 
 # Largest number of states. In continuous time an implicit step solves for all of them with scalar operations.
 MOST_STATES = 30
+# The same for the controller of a machine, which is computed with arrays.
+MOST_OF_MACHINE = 300
 # The states are scaled by their largest response to the inputs at these angular frequencies (1/s). The response is
 # evaluated at s = w (j + DAMPED), to the right of the imaginary axis, because an undamped pole may lie on it.
 FREQUENCIES, DAMPED = np.geomspace(10.0, 1e5, 81), 0.05
@@ -118,21 +120,25 @@ class Realisation:
 
 @functools.cache
 def _steady_states(of: Realisation) -> tuple[Row, ...]:
+    n = len(of.A)
+    return tuple(map(tuple, steady_states(np.reshape(of.A, (n, n)), np.reshape(of.B, (n, len(of.D)))).tolist()))
+
+
+def steady_states(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """Return the matrix [n, m] from constant inputs to the steady state of the modes faster than SLOWEST."""
-    n, m = len(of.A), len(of.D)
+    n = len(A)
     if not n:
-        return ()
+        return np.zeros(B.shape)
     import scipy.linalg
 
-    parts: Any = scipy.linalg.schur(np.array(of.A), sort=lambda re, im: np.hypot(re, im) > SLOWEST)
+    parts: Any = scipy.linalg.schur(A, sort=lambda re, im: np.hypot(re, im) > SLOWEST)
     T, Q, fast = parts
-    b = Q.T @ np.reshape(of.B, (n, m))
+    b = Q.T @ B
     # (I, Y; 0, I) separates the fast modes from the slow ones
     Y = np.zeros((fast, n - fast))
     if 0 < fast < n:
         Y = scipy.linalg.solve_sylvester(T[:fast, :fast], -T[fast:, fast:], -T[:fast, fast:])
-    states = -Q[:, :fast] @ np.linalg.solve(T[:fast, :fast], b[:fast] - Y @ b[fast:])
-    return tuple(map(tuple, states.tolist()))
+    return -Q[:, :fast] @ np.linalg.solve(T[:fast, :fast], b[:fast] - Y @ b[fast:])
 
 
 def _sum(row: Row, x: Sequence[Array]) -> Array:
@@ -153,16 +159,43 @@ def realisation(
     if a number is not finite, if n exceeds MOST_STATES, if `dt` is invalid, or if a discrete controller has a pole near
     z = -1.
     """
-    step = _period(dt)
-    a, b, c, d = _shaped(*(_numbers(name, x) for name, x in zip("ABCD", (A, B, C, D), strict=True)))
-    a, b, c = _balanced(a, b, c)
-    if step:
-        a, b, c, d = _continued(a, b, c, d, step)
+    (a, b, c, d), step = continuous((A, B, C, D), dt)
     a, b, c = _scaled(*_triangular(a, b, c))
-    if not all(np.isfinite(x).all() for x in (a, b, c, d)):
-        raise ValueError("A, B, C: their numbers span too many decades. Balance the state space before saving it.")
+    _require_finite(a, b, c, d)
     rows = [tuple(map(tuple, x.tolist())) for x in (a, b)]
     return Realisation(rows[0], rows[1], tuple(c[0].tolist()), tuple(d[0].tolist()), step)
+
+
+def continuous(
+    matrices: Sequence[npt.ArrayLike], dt: npt.ArrayLike | None, outputs: int = 1
+) -> tuple[tuple[np.ndarray, ...], float]:
+    """Return A, B, C, D of the controller in continuous time, balanced, and its sample period (s; 0: continuous).
+
+    For a discrete controller, they are those whose bilinear transform with this period it is. Raises ValueError as
+    `realisation` does.
+    """
+    step = _period(dt)
+    a, b, c, d = _shaped(outputs, *(_numbers(name, x) for name, x in zip("ABCD", matrices, strict=True)))
+    a, b, c = _balanced(a, b, c)
+    return (_continued(a, b, c, d, step) if step else (a, b, c, d)), step
+
+
+def several(
+    matrices: Sequence[npt.ArrayLike], dt: npt.ArrayLike | None, outputs: int
+) -> tuple[tuple[np.ndarray, ...], np.ndarray, float]:
+    """Return A, B, C, D of a controller of several outputs as `continuous` does, with scaled states.
+
+    Also returns the states [n, m] in the steady state per constant input (`Realisation.steady`), and the period.
+    """
+    (a, b, c, d), step = continuous(matrices, dt, outputs)
+    a, b, c = _scaled(a, b, c)
+    _require_finite(a, b, c, d)
+    return (a, b, c, d), steady_states(a, b), step
+
+
+def _require_finite(*matrices: np.ndarray) -> None:
+    if not all(np.isfinite(x).all() for x in matrices):
+        raise ValueError("A, B, C: their numbers span too many decades. Balance the state space before saving it.")
 
 
 def _period(dt: npt.ArrayLike | None) -> float:
@@ -187,16 +220,21 @@ def _numbers(name: str, given: npt.ArrayLike) -> np.ndarray:
     return x.astype(float)
 
 
-def _shaped(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return A [n, n], B [n, m], C [1, n] and D [1, m]. Raises ValueError if the given shapes do not match."""
+def _shaped(outputs: int, A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return A [n, n], B [n, m], C [outputs, n], D [outputs, m]. Raises ValueError if the given shapes do not match."""
     D = np.atleast_2d(D)
-    if D.shape not in ((1, 1), (1, 2)):
-        raise ValueError(f"D has the shape {D.shape}: it must be (1, 1), for the input r - z, or (1, 2), for r and z.")
+    if D.shape not in ((outputs, outputs), (outputs, 2 * outputs)):
+        one, two = ((outputs, k * outputs) for k in (1, 2))
+        raise ValueError(
+            f"D has the shape {D.shape}: it must be {one}, for the input r - z, or {two}, for r and z"
+            f"{'.' if outputs == 1 else f', of the {outputs} axes in order.'}"
+        )
     n = 0 if not A.size else len(np.atleast_2d(A))
-    if n > MOST_STATES:
-        raise ValueError(f"A has {n} rows: a controller may have at most {MOST_STATES} states. Reduce its order.")
+    most = MOST_STATES if outputs == 1 else MOST_OF_MACHINE
+    if n > most:
+        raise ValueError(f"A has {n} rows: a controller may have at most {most} states. Reduce its order.")
     made = []
-    for name, x, shape in (("A", A, (n, n)), ("B", B, (n, D.shape[1])), ("C", C, (1, n))):
+    for name, x, shape in (("A", A, (n, n)), ("B", B, (n, D.shape[1])), ("C", C, (outputs, n))):
         if x.shape != shape and (x.size != shape[0] * shape[1] or (x.ndim == 2 and x.size)):
             raise ValueError(
                 f"{name} has the shape {x.shape}: with {n} rows of A and D of shape {D.shape} it must be {shape}."

@@ -11,6 +11,8 @@ ERROR, CURRENT = 0.1, 0.1
 INTEGRAL = 0.2
 # Longest sample period for which gains are designed, times the fastest rate of the mechanics.
 LONGEST = 0.5
+# Most doublings of the horizon: 2^60 samples.
+MOST_DOUBLINGS = 60
 
 
 def state_space(model: Plant) -> tuple[np.ndarray, np.ndarray]:
@@ -38,6 +40,40 @@ def discretised(A: np.ndarray, B: np.ndarray, period: float) -> tuple[np.ndarray
     return F, G
 
 
+def riccati_gain(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray, continuous: bool = False) -> np.ndarray:
+    """Return K of the feedback u = -K x that minimises the integral, or sum, of x'Q x + u'R u for x' or x+ = A x + B u.
+
+    With A', B' and the covariances of the noises in the places of A, B, Q and R, K' is the gain of the Kalman filter.
+    Raises ValueError if the Riccati equation has no solution in floating-point numbers.
+    """
+    try:
+        if continuous:
+            import scipy.linalg
+
+            return np.linalg.solve(R, B.T @ scipy.linalg.solve_continuous_are(A, B, Q, R))
+        P = doubled(A, B, Q, R)
+        return np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    except (np.linalg.LinAlgError, ValueError):
+        raise ValueError("the model has no optimal gains: its Riccati equation has no finite solution") from None
+
+
+def doubled(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """Return the stabilising solution of the discrete Riccati equation, by doubling of the horizon.
+
+    E. K.-W. Chu, H.-Y. Fan, W.-W. Lin and C.-S. Wang, Int. J. Control 77 (2004) 767-788. Unlike SciPy's solver, it does
+    not reorder eigenvalues, which fails for lightly damped modes. Raises ValueError if it does not converge.
+    """
+    G, P, one = B @ np.linalg.solve(R, B.T), Q, np.eye(len(A))
+    for _ in range(MOST_DOUBLINGS):
+        W = np.linalg.solve(one + G @ P, np.hstack([A, G]))
+        change = A.T @ P @ W[:, : len(A)]
+        A, G, P = A @ W[:, : len(A)], G + A @ W[:, len(A) :] @ A.T, P + change
+        G, P = (G + G.T) / 2, (P + P.T) / 2
+        if np.linalg.norm(change) <= np.finfo(float).eps * np.linalg.norm(P):
+            return P
+    raise ValueError("no convergence")
+
+
 def optimal_gains(model: Plant, period: float | None = None) -> np.ndarray:
     """Return the gains K [3] of the feedback i = -K x that minimises the cost of `weights`.
 
@@ -45,8 +81,6 @@ def optimal_gains(model: Plant, period: float | None = None) -> np.ndarray:
     if it is longer; None: continuous time. Raises ValueError if the Riccati equation has no solution in floating-point
     numbers, or if a gain is not positive, as for a rotor on springs much stiffer than the magnets.
     """
-    import scipy.linalg
-
     A, B = state_space(model)
     Q, _ = weights(model)
     # unit of time 1/w and units of error and current from the weights: R is 1, all numbers are of order one
@@ -54,17 +88,10 @@ def optimal_gains(model: Plant, period: float | None = None) -> np.ndarray:
     units = np.array([1 / w, 1.0, w]) * ERROR * float(model.s_0)
     scaled_A, scaled_B = A * units / units[:, None] / w, B / units[:, None] / w * CURRENT * float(model.i_0)
     cost = Q * units * units[:, None]
-    try:
-        if period is None:
-            P = scipy.linalg.solve_continuous_are(scaled_A, scaled_B, cost, np.eye(1))
-            K = scaled_B.T @ P
-        else:
-            fastest = max(1.0, abs(scaled_A[2, 1]) ** 0.5)
-            F, G = discretised(scaled_A, scaled_B, min(period * w, LONGEST / fastest))
-            P = scipy.linalg.solve_discrete_are(F, G, cost, np.eye(1))
-            K = np.linalg.solve(np.eye(1) + G.T @ P @ G, G.T @ P @ F)
-    except (np.linalg.LinAlgError, ValueError):
-        raise ValueError("the model has no optimal gains: its Riccati equation has no finite solution") from None
+    if period is not None:
+        fastest = max(1.0, abs(scaled_A[2, 1]) ** 0.5)
+        scaled_A, scaled_B = discretised(scaled_A, scaled_B, min(period * w, LONGEST / fastest))
+    K = riccati_gain(scaled_A, scaled_B, cost, np.eye(1), period is None)
     gains = K[0] / units * CURRENT * float(model.i_0)
     if not np.all((gains > 0) & np.isfinite(gains)):
         raise ValueError(f"the model has no positive optimal gains: {', '.join(f'{x:.3g}' for x in gains)}")

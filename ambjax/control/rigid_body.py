@@ -70,10 +70,10 @@ class RigidBody(MachineLaw):
     def begin(self, measured: Measurement, inputs: MachineInputs) -> RigidState:
         now, reference = self._read(measured, inputs), self._reference(inputs)
         observed = jax.vmap(lambda law, m: extremes(law.observer)[0].init(law.model, m))(self.laws, now)
-        if self.laws.processor is None:
+        if not self.laws.sampled:
             states = jax.vmap(lambda law, m, r: law.init(m, r))(self.laws, now, reference)
             return RigidState(states.observer, states.position)
-        implicit, sample = self.laws.processor.implicit, self._sample(inputs)
+        implicit, sample = self.laws.timing.implicit, self._sample(inputs)
         estimate = jax.vmap(lambda law, m, own, r: law.observed(m, own, sample(r))[0])(
             self.laws, now, observed, reference
         )
@@ -134,11 +134,10 @@ class RigidBody(MachineLaw):
 
     def _predicted(self, now: Measurement, i: Array, inputs: MachineInputs) -> tuple[Measurement, Array]:
         """Return motion and currents at the end of the delay, and the currents of the axes there."""
-        processor: Any = self.laws.processor
-        if not processor.predicts:
+        if not self.laws.timing.predicts:
             return now, i
         laws = self.laws
-        lengths = jax.vmap(lambda law: law.processor.prediction_steps(inputs.period))(laws)
+        lengths = jax.vmap(lambda law: law.timing.prediction_steps(inputs.period))(laws)
         weight = jnp.asarray(laws.model.g)
 
         def rates(u: Array, x: tuple[Array, Array, State]) -> tuple[Array, Array, State]:

@@ -18,7 +18,6 @@ from jax.flatten_util import ravel_pytree
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Sample
 from ambjax.numerics.records import Scalar
-from ambjax.world.amplifier import Amplifier, CurrentAmplifier
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.waveforms import Constant, Reference, reference_at
@@ -63,14 +62,10 @@ def ideal(scenario: Scenario) -> Scenario:
 
     The sensor keeps its gain, offset and bandwidth, the amplifier its bandwidth.
     """
-    scenario = scenario.undisturbed().louder(0.0).with_sensor(bits=None, outliers=None, dropouts=None)
-    amplifier = scenario.amplifier
-    if isinstance(amplifier, Amplifier):
-        amplifier = dataclasses.replace(amplifier, slew=None, dead_band=None, i_max=None, coil=None)
-        amplifier = None if amplifier.bandwidth is None else amplifier
-    elif isinstance(amplifier, CurrentAmplifier):
-        amplifier = dataclasses.replace(amplifier, i_max=None)
-    return dataclasses.replace(scenario, amplifier=amplifier, u_max=jnp.inf)
+    scenario = scenario.undisturbed()
+    sensor, amplifier = scenario.sensor, scenario.amplifier
+    sensor, amplifier = sensor and sensor.linear(), amplifier and amplifier.linear()
+    return dataclasses.replace(scenario, sensor=sensor, amplifier=amplifier, u_max=jnp.inf)
 
 
 def reading(scenario: Scenario, motion: Measurement, injected: tuple[Scalar, Scalar]) -> Measurement:

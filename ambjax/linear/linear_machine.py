@@ -14,7 +14,7 @@ from ambjax.control.cascade_state import CascadeState, Sample
 from ambjax.control.machine_law import MachineInputs
 from ambjax.linear.analysis import Zones
 from ambjax.linear.equilibrium import TOLERANCE, at_rest, ideal, newton_of, reading, sizes_of, start_of
-from ambjax.linear.margins import ResponsePeak, peak, poles_in_s, whole_end
+from ambjax.linear.margins import Margins, ResponsePeak, peak, poles_in_s, reading_margins, whole_end
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar, canonical
 from ambjax.numerics.small_matrices import exponential, times
@@ -31,13 +31,17 @@ Groups = tuple
 
 
 class AxisSensitivity(NamedTuple):
-    """Peaks of an axis: of |S_kk| with its zone, of |T_kk| (1), and of |KS_kk| (V/m, or A/m for a current command)."""
+    """Peaks of an axis: of |S_kk| with its zone, of |T_kk| (1), and of |KS_kk| (V/m, or A/m for a current command).
+
+    `margins`: of the loop broken at the reading of this axis, with the others closed; None if the machine is unstable.
+    """
 
     name: str
     S: ResponsePeak
     T: ResponsePeak
     KS: ResponsePeak
     zone: str
+    margins: Margins | None
 
 
 class MachineSensitivity(NamedTuple):
@@ -390,20 +394,42 @@ def machine_sensitivity(
 
     `names`: of the axes. `period`: sample period, s. `zones`: frequency range and limits.
     """
-    system, c = linearise_machine(machine, period, speed), len(names)
+    return sensitivity_of(next(turning_machines(machine, period, [speed])), names, speed, zones)
+
+
+def sensitivity_of(point: TurningMachine, names: tuple[str, ...], speed: float, zones: Zones) -> MachineSensitivity:
+    """Return the sensitivity of a linear machine. `speed`: rpm. The others as for `machine_sensitivity`."""
+    system, c, found = point.system.without_idle(), len(names), dict[bytes, np.ndarray]()
     end = whole_end(system)
     low, high = zones.range(None if system.period is None else float(system.period), max(end, 2 * float(zones.f_low)))
-    stable, one = system.stable, np.eye(c)
+    stable = system.stable
+
+    def response(f: np.ndarray) -> np.ndarray:
+        key = f.tobytes()  # all peaks are searched at the same frequencies first
+        if key not in found:
+            found[key] = np.asarray(system.response(f))
+        return found[key]
+
+    responses: dict[bytes, np.ndarray] = {}
+
+    def response(f: np.ndarray) -> np.ndarray:
+        """Return the response at frequencies f (Hz). All peaks scan the same frequencies."""
+        key = np.asarray(f).tobytes()
+        if key not in responses:
+            responses[key] = np.asarray(system.response(f))
+        return responses[key]
 
     def largest(magnitude: Callable) -> ResponsePeak:
-        return peak(system, lambda f: magnitude(np.asarray(system.response(f))), low, high, end)
+        return peak(system, lambda f: magnitude(response(f)), low, high, end)
 
     axes = []
     for k, name in enumerate(names):
         S = largest(lambda H, k=k: np.abs(H[:, k, k]))
         T = largest(lambda H, k=k: np.abs(H[:, k, k] - 1))
         KS = largest(lambda H, k=k: np.abs(H[:, c + k, k]))
-        axes.append(AxisSensitivity(name, S, T, KS, zones.zone(S.height) if stable else "D"))
-    sigma = largest(lambda H: np.linalg.norm(H[:, :c], 2, axis=(1, 2)) * one[0, 0])
+        own = system._replace(B=system.B[:, [k]], C=system.C[[k]], D=system.D[[k]][:, [k]])
+        margins = reading_margins(own) if stable else None
+        axes.append(AxisSensitivity(name, S, T, KS, zones.zone(S.height) if stable else "D", margins))
+    sigma = largest(lambda H: np.linalg.norm(H[:, :c], 2, axis=(1, 2)))
     poles = poles_in_s(system)
     return MachineSensitivity(speed, stable, tuple(axes), sigma, poles[np.argsort(-np.real(poles))], system)

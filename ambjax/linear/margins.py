@@ -177,10 +177,20 @@ def margins_of(system: StateSpace) -> LoopMargins:
 
     The scan ends at half the sampling rate or, in continuous time, far above all poles.
     """
+    f = _scanned(system)
+    return LoopMargins(_margins(system, "reading", f), _margins(system, "command", f))
+
+
+def reading_margins(system: StateSpace) -> Margins:
+    """Return the margins of a stable loop, broken at the reading: output 0, to which input 0 is added."""
+    return _margins(system, "reading", _scanned(system))
+
+
+def _scanned(system: StateSpace) -> np.ndarray:
+    """Return the frequencies (Hz) at which crossings are searched."""
     fastest = float(np.max(np.abs(poles_in_s(system)), initial=1.0)) / (2 * math.pi)
     high = 100 * fastest if system.period is None else 0.5 / float(system.period)
-    f = scan(system, min(1e-3, 1e-6 * high), high)
-    return LoopMargins(_margins(system, "reading", f), _margins(system, "command", f))
+    return scan(system, min(1e-3, 1e-6 * high), high)
 
 
 def _margins(system: StateSpace, place: Place, scanned: np.ndarray) -> Margins:

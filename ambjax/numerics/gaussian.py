@@ -17,6 +17,8 @@ from ambjax.numerics.smooth import cosine, sine
 ROTATIONS = (13, 15, 26, 6), (17, 29, 16, 24)
 # First words of the counter. jax.random.fold_in uses 0, so these are other streams of the same key.
 STREAMS = 1, 2
+# Largest magnitude of a result of `normals`.
+LARGEST_NORMAL = 6.8
 LN_2, ROOT_HALF = float(np.log(2.0)), float(np.sqrt(0.5))
 # Number of terms of the series of atanh(s)/s, s^2 <= 0.0295, for an error at the level of rounding.
 ATANH_TERMS = {"float64": 10, "float32": 5}

@@ -12,6 +12,8 @@ from ambjax.pictures.style import own_style
 
 # Largest number of points of a drawn curve.
 MOST_POINTS = 4000
+# Share of a limit from which on the limit is drawn.
+NEAR = 0.5
 # Damping ratio below which a mode counts as lightly damped.
 LIGHT = 0.3
 
@@ -35,6 +37,7 @@ def machine_figure(case: Any, signals: dict[str, np.ndarray], title: str) -> Fig
             for k, axis in enumerate(axes):
                 ax.plot(t[shown], scale * signals[name][shown, k], label=axis, linewidth=0.9)
             ax.set_ylabel(words if column == 0 else "")
+            _limit_lines(ax, case, name, scale)
             ax.set_title(("whole run", "start of the run")[column] if row == 0 else "")
             ax.set_xlabel("time, s" if row == 2 else "")
             ax.xaxis.set_major_locator(MaxNLocator(5))
@@ -53,6 +56,17 @@ def machine_figure(case: Any, signals: dict[str, np.ndarray], title: str) -> Fig
     ended = str(signals["lost_why"])
     figure.suptitle(f"{title}: {ended}" if ended else title)
     return figure
+
+
+def _limit_lines(ax: Any, case: Any, name: str, scale: float) -> None:
+    """Draw the limits of a signal if they are near what is shown: the stop, the bias current, and the supply."""
+    scenario = case.cases[0].scenario
+    limits = {"z": scenario.limit, "i": scenario.plant.i_0, "u": scenario.voltage_limit}
+    limit, words = scale * float(limits[name]), {"z": "stop", "i": "bias", "u": "limit"}[name]
+    for edge, bound in zip(ax.get_ylim(), (-limit, limit), strict=True):
+        if NEAR * abs(bound) <= abs(edge):
+            ax.axhline(bound, color="r", linewidth=0.8, linestyle="--")
+            ax.annotate(words, (0.01, bound), xycoords=("axes fraction", "data"), color="r", fontsize="x-small")
 
 
 def orbits_of(axes: Sequence[str]) -> list[tuple[str, int, int]]:

@@ -15,7 +15,6 @@ from ambjax.simulation.loop import INSTANT_TREE, ClosedLoop, Densities, External
 from ambjax.simulation.span import Instant
 from ambjax.world.amplifier import Amplifier, CurrentAmplifier
 from ambjax.world.coil_limits import difference
-from ambjax.world.sensor import Measurement
 
 Voltage = Callable[[Scalar], Array]
 
@@ -95,11 +94,6 @@ def subproblems(
 def lags(loop: ClosedLoop) -> bool:
     """Return whether the position sensor has a low-pass."""
     return loop.scenario.sensors.bandwidth is not None
-
-
-def sensed_motion(loop: ClosedLoop, plant: Any, t: Scalar) -> Measurement:
-    """Return the motion of the surface that the position sensor reads at t (s): that of the plant, plus the runout."""
-    return loop.scenario.sensors.over_surface(loop.scenario.plant.measurement(plant), t)
 
 
 def plant_status(loop: ClosedLoop, state: object) -> Array:

@@ -89,7 +89,10 @@ class _Explicit(_Tableau, FixedSteps):
 
 @record
 class Euler(_Explicit):
-    """Explicit Euler, order 1."""
+    """Explicit Euler, order 1.
+
+    Use it only for comparisons, with many substeps: `Clock(1000, 1e-4, solvers.Euler(100))`.
+    """
 
     limit = 2.0
     TIMES = (0.0,)
@@ -101,7 +104,10 @@ class Euler(_Explicit):
 
 @record
 class RK4(_Explicit):
-    """The classical explicit Runge-Kutta method, order 4."""
+    """The classical explicit Runge-Kutta method, order 4.
+
+    Use it where a fixed number of steps is wanted and the loop is not stiff: `Clock(1000, 1e-4, solvers.RK4(4))`.
+    """
 
     limit = 2.785
     TIMES = (0.0, 1 / 2, 1 / 2, 1.0)
@@ -119,6 +125,8 @@ class DOP853(_Explicit):
 
     Coefficients: Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I (2nd ed., 1993), II.10. The
     error estimates are omitted, because the steps are fixed.
+
+    `Clock(1000, 1e-4, solvers.DOP853(1))` takes one step per sample.
     """
 
     limit = 6.39
@@ -160,6 +168,8 @@ class AdaptiveCashKarp(_Tableau, AdaptiveSteps):
 
     Coefficients: Cash and Karp, ACM Trans. Math. Softw. 16 (1990) 201-222. `ERROR`: the weights of the solution of
     order 5 minus those of order 4.
+
+    `Clock(1000, 1e-4, solvers.AdaptiveCashKarp(1e-8))` sets the allowed error.
     """
 
     ORDER = 5

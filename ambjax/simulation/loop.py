@@ -113,7 +113,9 @@ class ClosedLoop(WholeState):
     def sensor_errors(self, sample: Scalar) -> Errors:
         """Return the errors of all sensors in sample number `sample`; zeros for ideal sensors."""
         sensors = self.scenario.sensors
-        return sensors.noise(self.words(), sample) if self.normals is None else sensors.scaled(self.normals)
+        if self.normals is not None:
+            return Errors(*sensors.scaled(self.normals))
+        return Errors(*sensors.noise(self.words(), sample))
 
     def start(self) -> LoopState:
         """Return the state at t = 0."""
@@ -121,10 +123,6 @@ class ClosedLoop(WholeState):
         inputs = self.inputs(0.0)._replace(e=())
         measured = self.received(inputs, plant, self.sensor_errors(0))
         return LoopState(plant, self.cascade.init(measured, inputs.reference))
-
-    def measured(self, plant: object, errors: Errors) -> Measurement:
-        """Return the readings of the sensors for a state of the plant, without the runout."""
-        return self.scenario.sensors.reading(self.scenario.plant.measurement(plant), errors)
 
     def scale(self) -> LoopState:
         """Return the characteristic size of each component of the state; integration errors are relative to it."""
@@ -150,9 +148,8 @@ class ClosedLoop(WholeState):
 
         `inputs`: the external inputs at this instant (method `inputs`).
         """
-        measured = self.measured(plant, errors)
-        if not isinstance(inputs.runout, tuple):
-            measured = measured._replace(z=measured.z + self.scenario.sensors.gain * inputs.runout)
+        motion = self.scenario.plant.measurement(plant)
+        measured = self.scenario.sensors.reading(motion, errors._replace(runout=inputs.runout))
         return with_signal(measured, self.wave, inputs.e)
 
     def command(

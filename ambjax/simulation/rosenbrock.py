@@ -43,7 +43,10 @@ def rodas3_step(
 
 @record
 class Rodas3(FixedSteps):
-    """RODAS3 with equal substeps, for stiff loops that need reverse-mode differentiation."""
+    """RODAS3 with equal substeps, for stiff loops that need reverse-mode differentiation.
+
+    `Clock(1000, 1e-4, solvers.Rodas3(10))` takes ten substeps per sample.
+    """
 
     limit = None
 
@@ -68,6 +71,8 @@ class AdaptiveRodas3(AdaptiveSteps):
     to an impulse: the largest later change of z after a change of the velocity. At a tolerance of 1e-7, the error of z
     is at most 1e-8 m if a velocity change of 1 m/s moves z by at most 0.1 m. The response of a rotor that is nearly
     lost is larger.
+
+    Use it for stiff gains, and wherever the stiffness is not known: `Clock(1000, 1e-4, solvers.AdaptiveRodas3())`.
     """
 
     ORDER = 3

@@ -21,14 +21,14 @@ from ambjax.control.guard import GuardResult, Watch, expected
 from ambjax.control.processor import Processor
 from ambjax.numerics.records import Scalar, record, static
 from ambjax.numerics.smooth import limited
-from ambjax.simulation.between import acting, amplified, lags, plant_status, sensed_motion, subproblems
+from ambjax.simulation.between import acting, amplified, lags, plant_status, subproblems
 from ambjax.simulation.integrate import Advanced, Integrator, in_turn
 from ambjax.simulation.loop import AddedSignal, ClosedLoop, LoopState, with_signal
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import DIVERGED, Row
 from ambjax.world.faults import Sensed
-from ambjax.world.sensor import Errors, FaultyErrors, Measurement
+from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.waveforms import Reference, reference_at
 
 
@@ -57,24 +57,16 @@ class Sampled:
         """Return the loop of one member, with its random signals drawn."""
         return dataclasses.replace(self, loop=self.loop.realised())
 
-    def sensor_errors(self, sample: Scalar) -> Errors | FaultyErrors:
-        """Return the errors of all sensors in sample number `sample`: noise, runout and the onsets of faults.
-
-        With a low-pass, the runout is not included: the low-pass receives it (`sensed_motion`).
-        """
-        drawn, sensor = self.loop.sensor_errors(sample), self.loop.scenario.sensors
-        if sensor.runout is not None and not lags(self.loop):
-            runout = sensor.runout(jnp.asarray(sample, jnp.result_type(float)) * self.period)
-            drawn = drawn._replace(z=drawn.z + sensor.gain * runout)
-        if not sensor.faulty:
-            return drawn
-        return FaultyErrors(*drawn, sensor.fault_onsets(self.loop.words(), sample, self.period))
+    def sensor_errors(self, sample: Scalar) -> Errors:
+        """Return the errors of all sensors in sample number `sample`: noise, runout and the onsets of faults."""
+        drawn = self.loop.sensor_errors(sample)
+        return self.loop.scenario.sensors.on_processor(drawn, self.loop.words(), sample, self.period)
 
     def start(self) -> SampledState:
         """Return the state at t = 0."""
         scenario, zero = self.loop.scenario, jnp.zeros(())
         plant = scenario.plant.start(scenario.initial.measurement())
-        z_filtered = sensed_motion(self.loop, plant, zero).z if lags(self.loop) else ()
+        z_filtered = self._sensed(plant, zero).z if lags(self.loop) else ()
         measured = self.measured(plant, z_filtered, self.sensor_errors(0))
         command, past, guard = Command(*[zero] * 5), self.processor.constant_past(zero), self.processor.guard
         faulty = scenario.sensors.faulty
@@ -93,7 +85,7 @@ class Sampled:
             Sensed(measured.z, zero) if faulty else (),
         )
 
-    def measured(self, plant: object, z_filtered: Array | tuple[()], errors: Errors | FaultyErrors) -> Measurement:
+    def measured(self, plant: object, z_filtered: Array | tuple[()], errors: Errors) -> Measurement:
         """Return the readings of the sensors, before the faults of the position sensor are applied.
 
         `z_filtered`: output of the low-pass of the position sensor, m.
@@ -104,7 +96,7 @@ class Sampled:
             motion = motion._replace(z=z_filtered)
         return sensor.converted(sensor.reading(motion, errors), true.s_0, true.i_0)
 
-    def jump(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors) -> SampledState:
+    def jump(self, t: Scalar, state: SampledState, errors: Errors) -> SampledState:
         """Step the laws at time t (s): return the state with the new command and the next states of the laws."""
         state, measured = self.read(state, errors)
         return self.with_command(self._injected(measured, t), self.reference(t), state)
@@ -115,7 +107,7 @@ class Sampled:
             return measured
         return with_signal(measured, self.wave, self.wave.at(jnp.round(jnp.asarray(t) / self.period).astype(int)))
 
-    def read(self, state: SampledState, errors: Errors | FaultyErrors) -> tuple[SampledState, Measurement]:
+    def read(self, state: SampledState, errors: Errors) -> tuple[SampledState, Measurement]:
         """Return the state with the new state of the faulty sensor, and the readings of the sensors, with faults."""
         return self._with_faults(self.measured(state.plant, state.z_filtered, errors), state, errors)
 
@@ -125,11 +117,11 @@ class Sampled:
         return reference_at(self.loop.scenario.reference, t + late)
 
     def _with_faults(
-        self, measured: Measurement, state: SampledState, errors: Errors | FaultyErrors
+        self, measured: Measurement, state: SampledState, errors: Errors
     ) -> tuple[SampledState, Measurement]:
         """Apply the faults of the position sensor. Return the new state and the readings."""
         sensor, sensed = self.loop.scenario.sensors, state.sensed
-        if not sensed or not isinstance(errors, FaultyErrors):
+        if not sensed or not errors.onsets:
             return state, measured
         sensed = sensor.sensed(measured.z, sensed, errors.onsets, self.period, self.loop.scenario.plant.s_0)
         z = jnp.where(jnp.isnan(sensed.z), 0.0, sensed.z)
@@ -219,7 +211,7 @@ class Sampled:
     def advance(
         self,
         method: Integrator,
-        errors: Errors | FaultyErrors,
+        errors: Errors,
         t: Scalar,
         period: Scalar,
         state: SampledState,
@@ -249,10 +241,15 @@ class Sampled:
             return z_filtered
         instants = itertools.accumulate(times, initial=t)
         states = (state.plant, *reached)
-        motions = [sensed_motion(self.loop, *at) for at in zip(states, instants, strict=True)]
+        motions = [self._sensed(*at) for at in zip(states, instants, strict=True)]
         for before, after, time in zip(motions, motions[1:], times, strict=False):
             z_filtered = sensor.lagged(z_filtered, before, after, time)
         return z_filtered
+
+    def _sensed(self, plant: object, t: Scalar) -> Measurement:
+        """Return the motion of the surface that the position sensor reads at t (s)."""
+        scenario = self.loop.scenario
+        return scenario.sensors.over_surface(scenario.plant.measurement(plant), t)
 
     def status(self, state: SampledState) -> Array:
         """Return the status code of the rotor, an index of `trajectory.STATUSES`."""
@@ -266,7 +263,7 @@ class Sampled:
         off = state._replace(command=state.command._replace(u=zero), past=self.processor.constant_past(zero))
         return off._replace(plant=plant, z_filtered=z_filtered, u_a=jax.tree.map(jnp.zeros_like, state.u_a))
 
-    def row(self, t: Scalar, state: SampledState, errors: Errors | FaultyErrors, alive: Array) -> Row:
+    def row(self, t: Scalar, state: SampledState, errors: Errors, alive: Array) -> Row:
         """Return the signals of sample n: the plant's state, u_n, and i_ref before the step of the laws.
 
         If the command is a current, u_n is the voltage with which the amplifier produces this current in this state.

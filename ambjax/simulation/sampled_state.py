@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 from jax import Array
 
-from ambjax.control.cascade_state import CascadeState, Command
+from ambjax.control.cascade_state import Command
 from ambjax.world.faults import Sensed
 
 
@@ -24,12 +24,12 @@ class SampledState(NamedTuple):
     """
 
     plant: Any
-    control: CascadeState
+    control: Any
     command: Command
     past: tuple[Array, ...]
     finite: Array
-    z_filtered: Array | tuple[()]
-    u_a: Array | tuple[()]
+    z_filtered: Array | tuple[()] = ()
+    u_a: Array | tuple[()] = ()
     watch: Any = ()
     started: Array | tuple[()] = ()
     sensed: Sensed | tuple[()] = ()

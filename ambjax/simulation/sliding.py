@@ -171,6 +171,8 @@ class Slide(FixedSteps):
     continuous time, an inversion law with a method `slide`, such as `inversion.Adaptive`, a lumped plant, an observer
     that is not `stiff`, and a scenario with a voltage drive and without an elastic stop; otherwise a simulation raises
     ValueError.
+
+    Use it for long studies with stiff adaptive inversion: `Clock(1000, 1e-4, solvers.Slide(4))`.
     """
 
     limit = None

@@ -31,7 +31,7 @@ from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import DIVERGED, Row
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.rotor import Rotor
-from ambjax.world.sensor import Errors, FaultyErrors, Measurement
+from ambjax.world.sensor import Errors, Measurement
 
 T = TypeVar("T")
 # Voltages of the groups as functions of time, or outputs of their amplifiers.
@@ -142,7 +142,7 @@ class Machine:
         axes = tuple(self.each(_realised, self.split(jnp.arange(self.count))))
         return dataclasses.replace(self, rotor=self.rotor.realised(key), axes=axes, inverse=inverse)
 
-    def sensor_errors(self, sample: Scalar) -> tuple[Errors | FaultyErrors, ...]:
+    def sensor_errors(self, sample: Scalar) -> tuple[Errors, ...]:
         return tuple(self.each(lambda axis: axis.sensor_errors(sample)))
 
     def start(self) -> MachineState:

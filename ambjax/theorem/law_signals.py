@@ -10,7 +10,7 @@ from ambjax.simulation.integrate import Advanced, Integrator
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.span import Span
-from ambjax.world.sensor import Errors, FaultyErrors
+from ambjax.world.sensor import Errors
 
 
 class LawSignals(NamedTuple):
@@ -52,13 +52,13 @@ class LawSignalsRecorder:
     def realised(self) -> "LawSignalsRecorder":
         return LawSignalsRecorder(self.loop.realised())
 
-    def sensor_errors(self, sample: Scalar) -> Errors | FaultyErrors:
+    def sensor_errors(self, sample: Scalar) -> Errors:
         return self.loop.sensor_errors(sample)
 
     def start(self) -> LawSignalsState:
         return LawSignalsState(self.loop.start(), LawSignals(*[jnp.zeros(())] * 3))
 
-    def jump(self, t: Scalar, state: LawSignalsState, errors: Errors | FaultyErrors) -> LawSignalsState:
+    def jump(self, t: Scalar, state: LawSignalsState, errors: Errors) -> LawSignalsState:
         """Step the laws and store the signals that they computed."""
         loop, before = self.loop, state.loop
         cascade, after = loop.loop.cascade, loop.jump(t, before, errors)
@@ -72,7 +72,7 @@ class LawSignalsRecorder:
     def advance(
         self,
         method: Integrator,
-        errors: Errors | FaultyErrors,
+        errors: Errors,
         t: Scalar,
         period: Scalar,
         state: LawSignalsState,
@@ -88,7 +88,7 @@ class LawSignalsRecorder:
     def rest(self, state: LawSignalsState, code: Array) -> LawSignalsState:
         return state._replace(loop=self.loop.rest(state.loop, code))
 
-    def row(self, t: Scalar, state: LawSignalsState, errors: Errors | FaultyErrors, alive: Array) -> LawSignalsRow:
+    def row(self, t: Scalar, state: LawSignalsState, errors: Errors, alive: Array) -> LawSignalsRow:
         row = self.loop.row(t, state.loop, errors, alive)
         true = LawSignals(row.sigma, row.v_tilde, row.e)
         return LawSignalsRow(row.t, row.u, row.z, row.i_ref, state.computed, true)

@@ -33,6 +33,9 @@ class Amplifier:
     At the limit `i_max`, a voltage that would increase |i| is replaced by the voltage that keeps i constant. If the
     supply cannot provide that voltage, it provides its largest voltage, and |i| exceeds `i_max`. The limits `coil` of
     each coil act last; `i_max` and `coil` cannot be given together. A parameter that is None has no effect.
+
+    Use it where bandwidth, slew rate or dead time of the drive matter:
+    `Scenario(u_max=48.0, amplifier=actuators.Amplifier(bandwidth=2e3))`.
     """
 
     bandwidth: Scalar | None = leaf(
@@ -68,6 +71,10 @@ class Amplifier:
     def slow(self) -> bool:
         """Whether the output voltage is a state, because the bandwidth or the slew rate is limited."""
         return self.bandwidth is not None or self.slew is not None
+
+    def linear(self) -> "Amplifier":
+        """Return the amplifier without the effects that a linear system cannot contain."""
+        return Amplifier(self.bandwidth)
 
     def slope(self) -> Scalar:
         """Return the rate w of the output voltage, 1/s; 0 if the bandwidth is not limited."""
@@ -115,6 +122,8 @@ class CurrentAmplifier:
     voltage that the motion induces, and the inductive voltage for the rate w (i_command - i). The supply limits |u| to
     u_max; at this limit, the current follows more slowly. In the two-coil plant, i is half the difference of the two
     currents.
+
+    Use it with `current.AmplifierCurrent`: `Scenario(u_max=48.0, amplifier=actuators.CurrentAmplifier(bandwidth=1e3))`.
     """
 
     bandwidth: Scalar = leaf(
@@ -126,6 +135,10 @@ class CurrentAmplifier:
     mode: ClassVar[str] = "current"
     slow: ClassVar[bool] = False
     coil: ClassVar[None] = None
+
+    def linear(self) -> "CurrentAmplifier":
+        """Return the amplifier without its limit."""
+        return CurrentAmplifier(self.bandwidth)
 
     def slope(self) -> Scalar:
         """Return the rate w of the current, 1/s."""

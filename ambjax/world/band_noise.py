@@ -37,6 +37,8 @@ class BandNoise:
     equal parts of the band (after Shinozuka and Deodatis, Appl. Mech. Rev. 44, 1991). The autocovariance over members
     is exactly std^2 times the mean of cos(2 pi f tau) over the frequencies f of the band. The signal is smooth, so
     integrators keep their order.
+
+    Use it for a random load, such as that of a flow or a floor: `Scenario(q_f=signals.BandNoise(2.0, 10.0, 500.0))`.
     """
 
     std: Scalar = leaf(at_least=0, at_most=1e20, doc="standard deviation")

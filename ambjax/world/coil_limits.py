@@ -28,6 +28,8 @@ class CoilLimits:
     The voltage of a coil is limited to +-u_max. At a limit of its current, a voltage that would move the current
     further beyond the limit is replaced by the voltage that holds the current constant. If that voltage is outside
     +-u_max, it is limited too, and the current moves beyond its limit.
+
+    Use it where each coil has its own limit: `actuators.Amplifier(coil=actuators.CoilLimits(i_max=5.0))`.
     """
 
     u_max: Scalar | None = leaf(

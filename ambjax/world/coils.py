@@ -34,6 +34,8 @@ class TwoCoil(Bearing[Currents]):
     i is half the difference of the currents. With ideal iron, the flux linkage kappa i_1 / (2 (s_0 - z)) of the upper
     coil has the rate u + R (i_0 - i_1); that of the lower coil, kappa i_2 / (2 (s_0 + z)), has the rate
     R (i_0 - i_2) - u. In the paper, Eq. (2) has a single current and contains only the lower gap.
+
+    Use it for a real bearing: `Scenario(plant=plants.TwoCoil(m=1.6))`.
     """
 
     two_voltages = True

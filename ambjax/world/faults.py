@@ -50,7 +50,10 @@ def _at() -> Any:
 
 @record
 class Outliers:
-    """Single readings of z with an error of +-`size`, each sign with probability 1/2, after the converter."""
+    """Single readings of z with an error of +-`size`, each sign with probability 1/2, after the converter.
+
+    Use it to test the guard against single wrong readings: `sensors.Sensor(outliers=sensors.Outliers(10.0, 1e-4))`.
+    """
 
     rate: Scalar = _rate()
     size: Scalar = leaf(default=1e-3, unit="m", at_least=0, at_most=1.0, doc="error of a reading")
@@ -67,6 +70,8 @@ class Dropouts:
     """Intervals without a reading of z. `value` selects what is read instead.
 
     "hold": the last reading; "nan": NaN; "zero": 0 m; "full-scale": the end of the converter's range.
+
+    Use it to test the guard against a lost connection: `sensors.Sensor(dropouts=sensors.Dropouts(1.0, 1e-3))`.
     """
 
     rate: Scalar = _rate()

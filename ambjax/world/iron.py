@@ -30,6 +30,8 @@ class Iron:
     - Eddy currents. The flux of a coil follows its current with the time constant `eddy`. For a lamination of thickness
       d, it is d^2 sigma mu / 12, the first-order term of the diffusion of the flux (Zmood, Anand and Kirk, 1987). The
       voltage equations do not change.
+
+    Use it where the core saturates or its eddy currents matter: `plants.TwoCoil(iron=plants.Iron(saturation=1.4))`.
     """
 
     saturation: Scalar | None = leaf(

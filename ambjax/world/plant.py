@@ -26,7 +26,10 @@ class State(NamedTuple):
 
 @record
 class Plant(Bearing[State]):
-    """The plant of the paper, with the parameters of Table 1. Its state is (z, z_dot, i). Eqs. (1), (2)."""
+    """The plant of the paper, with the parameters of Table 1. Its state is (z, z_dot, i). Eqs. (1), (2).
+
+    Use it for comparisons with the paper: `Scenario(plant=plants.Plant(m=1.6))`. A real bearing is a `TwoCoil`.
+    """
 
     one_current = True
 

@@ -17,7 +17,10 @@ def _share(t: Scalar, start: Scalar, duration: Scalar) -> Array:
 
 @record
 class Ramp:
-    """0 until `start`, then a straight line to `amplitude` over `duration`, then `amplitude`."""
+    """0 until `start`, then a straight line to `amplitude` over `duration`, then `amplitude`.
+
+    Use it for a load that grows slowly: `Scenario(q_f=signals.Ramp(50.0, start=0.1, duration=0.5))`.
+    """
 
     amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="final value")
     start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="start of the rise")
@@ -41,7 +44,11 @@ class Ramp:
 
 @record
 class Trapezoid:
-    """0 until `start`, a straight line to `amplitude` over `rise`, `amplitude` for `hold`, a line to 0 over `fall`."""
+    """0 until `start`, a straight line to `amplitude` over `rise`, `amplitude` for `hold`, a line to 0 over `fall`.
+
+    Use it for a shock with a finite rise, as in tests of shock:
+    `Scenario(base=signals.Trapezoid(30.0, 0.1, 0.002, 0.005, 0.002))`.
+    """
 
     amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="largest value")
     start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="start of the rise")

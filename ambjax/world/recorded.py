@@ -26,7 +26,10 @@ class Knots(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Samples:
-    """Values [n] at increasing times [n] (s), float64, n >= 2. Two `Samples` are equal if their numbers are."""
+    """Values [n] at increasing times [n] (s), float64, n >= 2. Two `Samples` are equal if their numbers are.
+
+    Use it for the numbers of a `Recorded` signal: `signals.Samples(np.array([0.0, 0.1]), np.array([0.0, 5.0]))`.
+    """
 
     times: np.ndarray
     values: np.ndarray
@@ -50,6 +53,9 @@ class Recorded:
     Before the first time the value is the first one, and after the last time it is the last one. The samples are
     constants of the compiled program, so another file needs another compilation. Steps of the integrator end where the
     value jumps or its slope changes, so a record with many values per sample needs as many steps.
+
+    Use it for a measured load:
+    `Scenario(q_f=signals.Recorded(signals.Samples(np.array([0.0, 0.1]), np.array([0.0, 5.0]))))`.
     """
 
     samples: Samples = static(doc="times and values")

@@ -28,6 +28,8 @@ class Rotation:
     """Speed of a rotor over time. Its angle is the integral of the speed, and 0 at t = 0.
 
     All unbalances and the runout of a scenario share this angle.
+
+    Use it to give all that turns one speed: `Scenario(rotor=signals.Rotation(3000.0))`.
     """
 
     speed: Scalar = _rpm(-1e7, "speed at t = 0")
@@ -104,6 +106,9 @@ class Unbalance:
 
     U is the unbalance mass times its distance from the axis. omega is the speed in rad/s; the angle is its integral.
     The force due to the angular acceleration is neglected.
+
+    Use it where the unbalance in g mm is known:
+    `Scenario(q_f=signals.Unbalance(120.0), rotor=signals.Rotation(3000.0))`.
     """
 
     unbalance: Scalar = leaf(
@@ -133,6 +138,9 @@ class UnbalanceGrade:
     The grade G is the product of the eccentricity e and the service speed, so e = G / (2 pi `service_speed` / 60); the
     grade G 2.5 of ISO 21940-11 is 2.5 mm/s. The unbalance is e times the mass of the rotor, so the acceleration does
     not depend on the mass. omega and the angle are those of `Unbalance`.
+
+    Use it where only the balance quality is known:
+    `Scenario(q_z=signals.UnbalanceGrade(2.5, 6000.0), rotor=signals.Rotation(3000.0))`.
     """
 
     grade: Scalar = leaf(unit="mm/s", at_least=0, at_most=1e5, doc="balance quality grade; G 2.5 is 2.5 mm/s")
@@ -161,7 +169,10 @@ class UnbalanceGrade:
 
 @record
 class Harmonic:
-    """One harmonic of a runout, in m: amplitude sin(number angle + phase)."""
+    """One harmonic of a runout, in m: amplitude sin(number angle + phase).
+
+    Use it in a `Runout`: `sensors.Harmonic(2e-6)`.
+    """
 
     amplitude: Scalar = leaf(unit="m", at_least=-1.0, at_most=1.0, doc="amplitude, half of the peak-to-peak value")
     number: Scalar = leaf(default=1.0, at_least=1, at_most=1000, whole=True, doc="waves in one turn")
@@ -173,6 +184,9 @@ class Runout:
     """Runout of the surface that a position sensor reads, in m: a sum of harmonics of the rotor's angle.
 
     The sensor reads the position plus the runout; low-pass and gain follow. The true position does not contain it.
+
+    Use it where the sensor reads a turned surface:
+    `sensors.Sensor(runout=sensors.Runout((sensors.Harmonic(2e-6),)))`.
     """
 
     harmonics: tuple[Harmonic, ...] = part(default=(), doc="the harmonics")

@@ -173,8 +173,7 @@ class Scenario:
         if isinstance(self.amplifier, Amplifier):
             given = (field.name for field in dataclasses.fields(self.amplifier))
             return f"actuator.{next((name for name in given if getattr(self.amplifier, name) is not None), '')}"
-        names = ("bits", "bandwidth", "outliers", "dropouts")
-        named = [name for name in names if getattr(self.sensors, name) is not None]
+        named = [name for name in Sensor.sampled if getattr(self.sensors, name) is not None]
         return f"sensor.{named[0]}" if named else None
 
     def in_continuous_time(self) -> "Scenario":
@@ -182,9 +181,8 @@ class Scenario:
 
         They are the low-pass, the converter and the faults of the sensor, and an amplifier that applies a voltage.
         """
-        none = {"bits": None, "bandwidth": None, "outliers": None, "dropouts": None}
         amplifier = self.amplifier if self.drive == "current" else None
-        return dataclasses.replace(self.with_sensor(**none), amplifier=amplifier)
+        return dataclasses.replace(self.with_sensor(**dict.fromkeys(Sensor.sampled)), amplifier=amplifier)
 
     def with_sensor(self, **fields: object) -> "Scenario":
         """Return the scenario with other fields of its sensor. Ideal sensors do not change."""

@@ -3,13 +3,13 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from ambjax.numerics.gaussian import normals
+from ambjax.numerics.gaussian import LARGEST_NORMAL, normals
 from ambjax.numerics.records import Scalar, leaf, part, record, static
 from ambjax.numerics.smooth import polynomial
 from ambjax.world.faults import Dropouts, FaultOnsets, Outliers, Sensed
@@ -21,20 +21,17 @@ SERIES = tuple(math.factorial(3) * (-1) ** j / math.factorial(j + 4) for j in ra
 
 
 class Errors(NamedTuple):
-    """Errors of the sensors, constant over one sample: z (m), z_dot (m/s), i (A)."""
+    """Errors of the sensors, constant over one sample: noise of z (m), z_dot (m/s) and i (A).
+
+    `runout` (m) and `onsets`, the faults that begin at the sample, are () if the sensor has none. The runout is also ()
+    if a low-pass receives it.
+    """
 
     z: Array
     z_dot: Array
     i: Array
-
-
-class FaultyErrors(NamedTuple):
-    """`Errors` of a sensor that has faults, and the faults that begin at the sample."""
-
-    z: Array
-    z_dot: Array
-    i: Array
-    onsets: FaultOnsets
+    runout: Array | tuple[()] = ()
+    onsets: FaultOnsets | tuple[()] = ()
 
 
 class Measurement(NamedTuple):
@@ -53,6 +50,8 @@ class Sensor:
     converter and the faults then act on the sum, in this order; the result is the reading. Low-pass, converter and
     faults require a processor. Without a processor, the laws receive the measurement at every instant, not only at the
     samples.
+
+    Use it in every case that a real bearing must follow: `Scenario(sensor=sensors.Sensor(std=1e-7, velocity=False))`.
     """
 
     std: Scalar = leaf(default=0.0, unit="m", at_least=0, at_most=1.0, doc="standard deviation of the noise of z")
@@ -103,6 +102,9 @@ class Sensor:
         default=None, doc="runout of the surface that the position sensor reads; None: no runout"
     )
 
+    sampled: ClassVar[tuple[str, ...]] = ("bits", "bandwidth", "outliers", "dropouts")
+    """Fields that require a processor."""
+
     @property
     def noises(self) -> tuple[Scalar, ...]:
         """The standard deviations of the noise of z (m), z_dot (m/s) and i (A)."""
@@ -113,13 +115,23 @@ class Sensor:
         """Whether the position sensor has faults."""
         return self.outliers is not None or self.dropouts is not None
 
-    def noise(self, key: tuple[Scalar, Scalar], sample: Scalar) -> Errors:
-        """Return the errors at sample number `sample`. `key`: random key of the member (`Scenario.words`)."""
+    def noise(self, key: tuple[Scalar, Scalar], sample: Scalar) -> Measurement:
+        """Return the noise at sample number `sample`. `key`: random key of the member (`Scenario.words`)."""
         return self.scaled(normals(key, sample))
 
-    def scaled(self, normals: Sequence[Array]) -> Errors:
-        """Return the errors for three normal random numbers."""
-        return Errors(*(std * x for std, x in zip(self.noises, normals, strict=True)))
+    def scaled(self, normals: Sequence[Array]) -> Measurement:
+        """Return the noise for three normal random numbers."""
+        return Measurement(*(std * x for std, x in zip(self.noises, normals, strict=True)))
+
+    def on_processor(self, errors: Errors, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Errors:
+        """Return the errors of a sample with the runout and the faults that begin at this sample.
+
+        `key`, `sample`: as in `noise`. `period`: sample period, s.
+        """
+        if self.runout is not None and self.bandwidth is None:
+            t = jnp.asarray(sample, jnp.result_type(float)) * period
+            errors = errors._replace(runout=self.runout(t))
+        return errors._replace(onsets=self.fault_onsets(key, sample, period)) if self.faulty else errors
 
     def fault_onsets(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> FaultOnsets:
         """Return the faults that begin at sample number `sample`. `key`: as in `noise`. `period`: sample period, s."""
@@ -139,6 +151,32 @@ class Sensor:
         """Return the end of the converter's range of z (m) for a plant with the gap s_0 (m)."""
         return s_0 if self.range_z is None else self.range_z
 
+    def step(self, s_0: Scalar) -> Scalar:
+        """Return the step of the converter of z (m) for a plant with the gap s_0 (m); 0 without a converter."""
+        return 0.0 if self.bits is None else 2 * self.ends(s_0) / 2.0**self.bits
+
+    def largest_error(self, s_0: Scalar) -> Scalar:
+        """Return the largest error of a reading of z (m) besides gain and offset. `s_0`: gap of the plant, m."""
+        runout = 0.0 if self.runout is None else sum(abs(one.amplitude) for one in self.runout.harmonics)
+        return LARGEST_NORMAL * self.std + self.step(s_0) / 2 + self.gain * runout
+
+    def largest_reading(self, z: Scalar, s_0: Scalar) -> Scalar:
+        """Return the largest |reading| (m) for displacements up to z (m). `s_0`: gap of the plant, m."""
+        return self.gain * z + abs(self.offset) + self.largest_error(s_0)
+
+    @property
+    def velocity_error(self) -> Scalar:
+        """Largest relative difference of the measured velocity from the rate of the readings of z; 1 if unknown."""
+        return abs(self.gain - 1) if self.velocity and self.bandwidth is None else 1.0
+
+    def linear(self) -> "Sensor":
+        """Return the sensor without the effects that a linear system cannot contain."""
+        return dataclasses.replace(self.louder(0.0), bits=None, outliers=None, dropouts=None)
+
+    def current_end(self, i_0: Scalar) -> Scalar:
+        """Return the end of the converter's range of i (A) for a plant with the bias current i_0 (A)."""
+        return 2 * i_0 if self.range_i is None else self.range_i
+
     def louder(self, factor: Scalar) -> "Sensor":
         """Return the sensor with `factor` times the noise."""
         stds = {"std": self.std, "std_z_dot": self.std_z_dot, "std_i": self.std_i}
@@ -152,11 +190,13 @@ class Sensor:
         runout, rate = jax.jvp(self.runout, (t,), (jnp.ones_like(t),))
         return motion._replace(z=motion.z + runout, z_dot=motion.z_dot + rate)
 
-    def reading(self, motion: Measurement, errors: Errors | FaultyErrors) -> Measurement:
+    def reading(self, motion: Measurement, errors: Errors) -> Measurement:
         """Return the readings of a motion with these errors. `motion.z`: after the low-pass.
 
         z_dot is 0 if it is not measured.
         """
+        if not isinstance(errors.runout, tuple):
+            motion = motion._replace(z=motion.z + errors.runout)
         z_dot = motion.z_dot + errors.z_dot if self.velocity else jnp.zeros_like(motion.z_dot)
         return Measurement(self.gain * motion.z + self.offset + errors.z, z_dot, motion.i + errors.i)
 
@@ -164,9 +204,9 @@ class Sensor:
         """Return the converted readings; s_0 (m) and i_0 (A) of the plant give the ranges that are left out."""
         if self.bits is None:
             return reading
-        range_i = 2 * i_0 if self.range_i is None else self.range_i
         return reading._replace(
-            z=converted(reading.z, self.bits, self.ends(s_0)), i=converted(reading.i, self.bits, range_i)
+            z=converted(reading.z, self.bits, self.ends(s_0)),
+            i=converted(reading.i, self.bits, self.current_end(i_0)),
         )
 
     def lagged(self, y: Array, before: Measurement, after: Measurement, h: Scalar) -> Array:
@@ -189,13 +229,13 @@ class IdealSensor(Sensor):
     def noises(self) -> tuple[Scalar, ...]:
         return ()
 
-    def noise(self, key: tuple[Scalar, Scalar], sample: Scalar) -> Errors:
+    def noise(self, key: tuple[Scalar, Scalar], sample: Scalar) -> Measurement:
         return self.scaled(())
 
-    def scaled(self, normals: Sequence[Array]) -> Errors:
-        return Errors(*[jnp.zeros(())] * 3)
+    def scaled(self, normals: Sequence[Array]) -> Measurement:
+        return Measurement(*[jnp.zeros(())] * 3)
 
-    def reading(self, motion: Measurement, errors: Errors | FaultyErrors) -> Measurement:
+    def reading(self, motion: Measurement, errors: Errors) -> Measurement:
         return motion
 
 

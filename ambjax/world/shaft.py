@@ -81,6 +81,16 @@ def shaft_model(
         node = int(jnp.argmin(jnp.abs(nodes - disc.at)))
         M = M.at[2 * node, 2 * node].add(disc.m).at[2 * node + 1, 2 * node + 1].add(disc.I_t)
         G = G.at[2 * node + 1, 2 * node + 1].add(disc.I_p)
+    return reduced(M, G, K, nodes, [2 * place for place in places], modes)
+
+
+def reduced(M: Array, G: Array, K: Array, nodes: Array, rows: Sequence[int], modes: int) -> ShaftModel:
+    """Reduce the matrices of a free shaft in one plane to its rigid motions and its first bending modes.
+
+    `M`, `G`, `K` [2 N, 2 N]: for (displacement, slope) at each node. `nodes` [N]: places, m. `rows`: coordinates at
+    which the shapes are returned.
+    """
+    count = len(nodes)
     shift = jnp.stack([jnp.ones(count), jnp.zeros(count)], 1).ravel()
     m = shift @ M @ shift
     from_end = jnp.stack([nodes, jnp.ones(count)], 1).ravel()
@@ -95,7 +105,7 @@ def shaft_model(
     basis = jnp.concatenate([shift[:, None], tilt[:, None], bending], 1)
     return ShaftModel(
         m, tilt @ M @ tilt, tilt @ G @ tilt, centre, jnp.sqrt(values[2 : 2 + modes]) / (2 * jnp.pi),
-        basis.T @ G @ basis, bending[2 * jnp.asarray(places, int)] if places else jnp.zeros((0, modes)),
+        basis.T @ G @ basis, bending[jnp.asarray(rows, int)] if rows else jnp.zeros((0, modes)),
     )  # fmt: skip
 
 

@@ -17,6 +17,8 @@ class Stop:
     With the penetration d = |z| - gap > 0, the stiffness k and the damping c, its force is max(0, k d + c s d'). The
     share s rises from 0 to 1 as 3 x^2 - 2 x^3 with x = d / (DAMPING_DEPTH gap), so the force is continuous at the first
     contact. This is a Kelvin-Voigt contact force whose damping rises as in the multibody code ADAMS (Ryan, 1990).
+
+    Use it where the touchdown bearing is part of the run: `Scenario(stop=plants.Stop(1e7))`.
     """
 
     stiffness: Scalar = leaf(unit="N/m", at_least=1.0, at_most=1e12, doc="stiffness of the touchdown bearing")

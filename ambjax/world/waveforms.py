@@ -42,7 +42,11 @@ def _swing(amplitude: Scalar, first: Scalar | np.ndarray, last: Scalar | np.ndar
 
 @record
 class Constant:
-    """The same value at all times."""
+    """The same value at all times.
+
+    Use it for a fixed position, or for a load such as the weight of a part:
+    `Scenario(reference=signals.Constant(1e-4))`.
+    """
 
     value: Scalar = leaf(default=0.0, at_least=-1e20, at_most=1e20, doc="the value")
 
@@ -55,7 +59,11 @@ class Constant:
 
 @record
 class Step:
-    """0 before `start`, `amplitude` from then on."""
+    """0 before `start`, `amplitude` from then on.
+
+    Use it for a load that is applied at once:
+    `Scenario(q_f=signals.Step(5.0, start=0.1))`. A reference that moves the rotor should be smooth: see `SmoothStep`.
+    """
 
     amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="value after the jump")
     start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="time of the jump to `amplitude`")
@@ -78,7 +86,10 @@ class Step:
 
 @record
 class Pulse:
-    """`amplitude` in start <= t < stop, 0 elsewhere."""
+    """`amplitude` in start <= t < stop, 0 elsewhere.
+
+    Use it for a short load, such as a shock: `Scenario(q_f=signals.Pulse(20.0, start=0.1, stop=0.102))`.
+    """
 
     amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="value from `start` to `stop`")
     start: Scalar = leaf(unit="s", at_least=-1e9, at_most=1e9, doc="time of the jump to `amplitude`")
@@ -105,7 +116,11 @@ class Pulse:
 
 @record
 class Sine:
-    """amplitude sin(2 pi frequency t + phase)."""
+    """amplitude sin(2 pi frequency t + phase).
+
+    Use it for a periodic reference or load of known frequency:
+    `Scenario(reference=signals.Sine(1e-4, 5.0))`. The load of an unbalance is `Unbalance`.
+    """
 
     amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="amplitude, half of the peak-to-peak value")
     frequency: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="frequency")
@@ -125,6 +140,8 @@ class SmoothStep:
 
     During the rise, the value is amplitude (10 s^3 - 15 s^4 + 6 s^5) with s = (t - start)/duration. The signal has
     continuous first and second derivatives.
+
+    Use it to move the rotor: `Scenario(reference=signals.SmoothStep(1e-4, start=0.1, duration=0.02))`.
     """
 
     amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="final value")
@@ -151,7 +168,11 @@ class SmoothStep:
 
 @record
 class Chirp:
-    """A sine whose frequency changes linearly from `frequency` to `frequency_end` over `duration`, then stays."""
+    """A sine whose frequency changes linearly from `frequency` to `frequency_end` over `duration`, then stays.
+
+    Use it to pass through a range of frequencies in one run:
+    `Scenario(q_f=signals.Chirp(1.0, 10.0, 500.0, duration=2.0))`.
+    """
 
     amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="amplitude, half of the peak-to-peak value")
     frequency: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="frequency at t = 0")
@@ -177,7 +198,11 @@ class Chirp:
 
 @record
 class Sum:
-    """The sum of several signals."""
+    """The sum of several signals.
+
+    Use it where several loads act at once:
+    `Scenario(q_f=signals.Sum((signals.Constant(10.0), signals.Sine(1.0, 50.0))))`.
+    """
 
     terms: tuple[Signal, ...] = part(doc="the signals that are added")
 

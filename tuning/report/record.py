@@ -8,51 +8,44 @@ import pathlib
 from collections.abc import Iterable
 from typing import Any
 
-from ambjax.host.sealed import checksum_of
-from tuning.problem.config import settings
-from tuning.problem.tuning_problem import TuningProblem
+from ambjax.cases.reader import Case
+from ambjax.host.sealed import checksum_of, flat, provenance
+from tuning.problem.config import Tune, settings
 from tuning.report.facts import Row
-from tuning.solve.checkpoint import CheckpointFile, has_unfinished_search
+from tuning.solve.checkpoint import has_unfinished_search
 
 KEY, TUNED = "record", "tuned.toml"
 # This file is written after the search. The search has ended if the file is newer than all checkpoints.
 REPORT = "report.json"
-# Options that add results.
-OPTIONS = ("pareto", "page")
 
 
-def search_facts(raw: dict[str, Any], problem: TuningProblem) -> dict[str, Any]:
+def search_facts(raw: dict[str, Any], case: Case, tune: Tune) -> Row:
     """Return what a checkpoint must match: the case, [tune], and the contents of the other files of the case.
 
     `raw`: content of the case file.
     """
-    case = problem.case
     laws = {law.stage: law.digest for law in case.own_laws}
     if case.controller_file:
         laws["position"] = case.controller_file.contents.digest
     laws |= {one.key: one.samples.digest for one in case.recorded}
-    return {"case": raw, "tune": settings(problem.tune), "laws": laws}
+    return {"case": raw, "tune": settings(tune), "laws": laws}
 
 
-def record(facts: dict[str, Any], options: Any, folder: pathlib.Path) -> Row:
-    """Return the record: the SHA-256 of the facts, of the options, and of tuned.toml in `folder`."""
-    return {KEY: _checksum(facts, options, folder)}
+def record(facts: Row, folder: pathlib.Path) -> str:
+    """Return the SHA-256 of the facts, which include the options that add results, and of tuned.toml in `folder`."""
+    text = (folder / TUNED).read_text(encoding="utf-8")
+    return checksum_of(flat({**provenance(), **facts, "text": text}))
 
 
-def ended(facts: dict[str, Any], options: Any, out: pathlib.Path, names: Iterable[str]) -> Row | None:
-    """Return the content of report.json in `out` if a search with these facts and options has ended there, else None.
+def ended(facts: Row, out: pathlib.Path, names: Iterable[str]) -> Row | None:
+    """Return the content of report.json in `out` if a search with these facts (`record`) has ended there, else None.
 
     `out` must still contain the files `names`, and tuned.toml as it was written.
     """
     try:
         found = json.loads((out / REPORT).read_text(encoding="utf-8"))
-        same = found[KEY] == _checksum(facts, options, out)
+        same = found[KEY] == record(facts, out)
     except (OSError, ValueError, KeyError, TypeError):  # there is no such record
         return None
     whole = same and all((out / name).exists() for name in names)
     return found if whole and not has_unfinished_search(out, REPORT) else None
-
-
-def _checksum(facts: dict[str, Any], options: Any, folder: pathlib.Path) -> str:
-    more = {name: getattr(options, name) for name in OPTIONS} | {"text": (folder / TUNED).read_text(encoding="utf-8")}
-    return checksum_of(CheckpointFile(None, facts | more).fingerprint)

@@ -1,0 +1,156 @@
+"""Readers of linear controllers of a whole machine: from a file, and LQG."""
+
+import dataclasses
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ambjax.cases.controller_file import contents_of
+from ambjax.cases.reader import Case
+from ambjax.cases.rotor_tables import MODES, RIGID, SPEED
+from ambjax.cases.table import Table, show
+from ambjax.control.current import AmplifierCurrent
+from ambjax.control.linear_controller import OUTPUTS, SAME_PERIOD
+from ambjax.control.lqg import DesignedController, LinearCoils, LqgWeights, RotorModel, design
+from ambjax.control.realisation import several
+from ambjax.control.state_space_law import BOTH, CURRENTS, ERROR, StateSpaceLaw
+from ambjax.world.rotation import PER_MINUTE
+from ambjax.world.rotor import Rotor
+
+# Largest number of speeds for which an LQG is designed.
+MOST_DESIGNS = 50
+
+
+def numbers(cases: Sequence[Case], name: str) -> np.ndarray:
+    """Return a number of the nominal plant of every axis."""
+    return np.array([float(getattr(case.cascade.model, name)) for case in cases])
+
+
+def magnets(cases: Sequence[Case], voltage: bool) -> dict[str, Any]:
+    """Return the numbers of the linear magnets of `StateSpaceLaw`. Raises ValueError if a resistance is 0."""
+    kappa, s_0, i_0, m, g = (numbers(cases, name) for name in ("kappa", "s_0", "i_0", "m", "g"))
+    R = numbers(cases, "R") if voltage else np.ones(len(cases))
+    if not np.all(R > 0):
+        raise ValueError("plant.R = 0: a controller with voltages as outputs needs a coil resistance above 0.")
+    dv_di = 4 * i_0 / s_0**2
+    found = {"dv_dz": 4 * i_0**2 / s_0**3, "dv_di": dv_di, "resting": m * g / (kappa / 4 * dv_di), "resistance": R}
+    return {name: jnp.asarray(x) for name, x in found.items()}
+
+
+def linear(top: Table, cases: list[Case], folder: pathlib.Path) -> tuple[StateSpaceLaw, str]:
+    """Return the controller of a file, and what its outputs are."""
+    table, c = top.table("controller"), len(cases)
+    table.only(["kind", "file", "output", "model", "current"])
+    output = table.choice("output", list(OUTPUTS), OUTPUTS[0])
+    convert = lambda A, B, C, D, dt=0.0: several((A, B, C, D), dt, c)  # noqa: E731
+    matrices, steady, dt = contents_of(table, folder, convert)[2]
+    period = float(cases[0].clock.sample_period) if cases[0].cascade.processor is not None else None
+    if dt and (period is None or not abs(period / dt - 1) < SAME_PERIOD):
+        has = "in continuous time" if period is None else f"with a sample period of {period:g} s"
+        raise ValueError(
+            f"{table.at('file')} = {show(table.raw['file'])}: the controller is discrete, dt = {dt:g} s, and this case "
+            f"runs {has}. Set [processor] and clock.sample_period = {dt:g}, or give a continuous controller."
+        )
+    A, B, C, D = matrices if period is None else bilinear(matrices, period)
+    n = len(A)
+    law = StateSpaceLaw(
+        A=jnp.asarray(A)[None],
+        B=jnp.asarray(B)[None],
+        C=jnp.asarray(C)[None],
+        D=jnp.asarray(D)[None],
+        E=jnp.zeros((1, n, c)),
+        a=jnp.zeros((1, n)),
+        b=jnp.zeros((1, c)),
+        steady=jnp.asarray(steady),
+        start=jnp.zeros(n),
+        sizes=jnp.full(n, float(numbers(cases, "s_0").min()) / 50),
+        speeds=jnp.zeros(1),
+        **magnets(cases, output == OUTPUTS[1]),
+        inputs=ERROR if B.shape[1] == c else BOTH,
+    )
+    return law, output
+
+
+def bilinear(matrices: tuple[np.ndarray, ...], period: float) -> tuple[np.ndarray, ...]:
+    """Return the bilinear (Tustin) transform of a state space A, B, C, D. `period`: s."""
+    A, B, C, D = matrices
+    P = np.linalg.inv(np.eye(len(A)) - period / 2 * A)
+    return 2 * P - np.eye(len(A)), period * P @ B, C @ P, D + period / 2 * C @ P @ B
+
+
+def lqg(top: Table, cases: list[Case], rotor: Rotor) -> tuple[StateSpaceLaw, str]:
+    """Return the LQG of a rotor, and what its outputs are."""
+    table = top.table("controller")
+    table.only(["kind", "model", "lqg"])
+    own, processor = table.table("lqg"), cases[0].cascade.processor
+    if processor is None:
+        raise ValueError(f'{table.at("kind")} = "lqg": it is designed for a processor. Add [processor].')
+    voltage = cases[0].scenario.drive == "voltage"
+    output = OUTPUTS[1 if voltage else 0]
+    given = own.record(LqgWeights, extra=("speeds", "modes"))
+    known = (len(rotor.gravity) - RIGID) // 2
+    count = min(own.whole("modes", MODES) if "modes" in own.raw else known, known)
+    coils, w = _coils(cases, voltage), float(numbers(cases, "pole").max())
+    sizes = float(numbers(cases, "s_0").min()), float(numbers(cases, "i_0").min())
+    force = float(np.max(coils.k_i * numbers(cases, "i_0")))
+    usual = (sizes[0] / 400, sizes[1] / 10, sizes[0] / 2000, force, 0.03 * w * force)
+    weights = {field.name: getattr(given, field.name) for field in dataclasses.fields(LqgWeights)}
+    weights |= {name: x for name, x in zip(weights, usual, strict=False) if weights[name] is None}
+    speeds = _speeds(own, float(rotor.speed))
+    period, delay = float(cases[0].clock.sample_period), float(processor.delay)
+    try:
+        found = [design(_model(rotor, cases, count, speed), coils, weights, w, period, delay) for speed in speeds]
+    except ValueError as error:
+        raise ValueError(f"{own.path}: {error}. Change the weights, or the rotor's modes.") from None
+    tables = {
+        name: jnp.stack([getattr(one, name) for one in found])
+        for name in DesignedController._fields
+        if name not in ("steady", "start")
+    }
+    steady, start, n = jnp.asarray(found[0].steady), jnp.asarray(found[0].start), len(found[0].a)
+    return StateSpaceLaw(
+        **tables, steady=steady, start=start, sizes=jnp.ones(n), speeds=jnp.asarray(speeds), **magnets(cases, voltage),
+        inputs=CURRENTS,
+    ), output  # fmt: skip
+
+
+def _speeds(table: Table, default: float) -> list[float]:
+    """Return the speeds of the designs, rpm."""
+    value = table.raw.get("speeds", [default])
+    if not isinstance(value, list) or not 0 < len(value) <= MOST_DESIGNS:
+        raise ValueError(f"{table.at('speeds')} = {show(value)}: it must be a list of 1 to {MOST_DESIGNS} speeds, rpm.")
+    speeds = [Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(value)]
+    if sorted(set(speeds)) != speeds:
+        raise ValueError(f"{table.at('speeds')} = {show(value)}: the speeds must be in ascending order.")
+    return speeds
+
+
+def _coils(cases: list[Case], voltage: bool) -> LinearCoils:
+    """Return the linear magnets and coils at the current that carries the weight."""
+    m, a, R, L, s_0 = (numbers(cases, name) for name in ("m", "a", "R", "L", "s_0"))
+    models = [case.cascade.model for case in cases]
+    i = np.array([float(model.equilibrium()[0]) for model in models])
+    slopes = [
+        (float(model.dv_dz(0.0, one)), float(model.dv_di(0.0, one))) for model, one in zip(models, i, strict=True)
+    ]
+    dv_dz, dv_di = np.array(slopes).T
+    if voltage:
+        return LinearCoils(m * a * dv_dz, m * a * dv_di, R, L, 2 * i / s_0)
+    laws = [case.cascade.current for case in cases]
+    lags = [1 / (2 * np.pi * float(law.bandwidth)) for law in laws if isinstance(law, AmplifierCurrent)]
+    return LinearCoils(m * a * dv_dz, m * a * dv_di, np.ones(len(m)), np.array(lags), np.zeros(len(m)))
+
+
+def _model(rotor: Rotor, cases: list[Case], count: int, speed: float) -> RotorModel:
+    """Return the model of the rotor with `count` bending modes at a speed, rpm."""
+    B, C, M, D, K, G, gravity = (
+        np.asarray(x, float)
+        for x in (rotor.at_magnets, rotor.at_sensors, rotor.M, rotor.D, rotor.K, rotor.G, rotor.gravity)
+    )
+    kept = np.r_[np.flatnonzero(np.any(B[:, :RIGID] != 0, 0)), RIGID : RIGID + 2 * count]
+    square, W = np.ix_(kept, kept), 2 * np.pi * PER_MINUTE * speed
+    constant = gravity + B.T @ (numbers(cases, "m") * numbers(cases, "g"))
+    return RotorModel(M[square], (D + W * G)[square], K[square], B[:, kept], C[:, kept], constant[kept])

@@ -1,0 +1,85 @@
+"""A rotor as mass, inertia and bending modes, from whatever a case file gives; and readers of its numbers."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ambjax.cases.table import Table, show
+from ambjax.numerics.records import leaf
+
+PLACE = leaf(default=0.0, unit="m", at_least=-100.0, at_most=100.0, doc="place on the shaft")
+MASS = leaf(unit="kg", at_least=1e-6, at_most=1e6, doc="mass")
+I_T = leaf(unit="kg m^2", at_least=0.0, at_most=1e9, doc="moment of inertia about an axis across the shaft")
+I_P = leaf(unit="kg m^2", at_least=0.0, at_most=1e9, doc="moment of inertia about the shaft")
+FREQUENCY = leaf(unit="Hz", at_least=1e-3, at_most=1e6, doc="frequency of a bending mode, free and at rest")
+DAMPING = leaf(default=0.005, unit="1", at_least=0.0, at_most=1.0, doc="damping ratio of the bending modes")
+MODES = leaf(default=4, at_least=0, at_most=20, whole=True, doc="number of bending modes")
+
+
+class RotorBody(NamedTuple):
+    """Mass, inertia and bending modes of a rotor. Places of the case file minus `centre` are those from the centre.
+
+    `gyroscopic` [2 + k, 2 + k]: as in `ShaftModel`. `shapes`: shapes [k] of the modes at a place of the case file;
+    None: the tables give them.
+    """
+
+    m: float
+    I_t: float
+    I_p: float
+    centre: float
+    frequencies: np.ndarray
+    dampings: np.ndarray
+    gyroscopic: np.ndarray
+    shapes: Callable[[float], np.ndarray] | None
+
+    def place(self, table: Table, key: str = "at", modes: str = "modes", other: Any = None) -> tuple[float, np.ndarray]:
+        """Return the distance (m) of a place from the centre of mass, and the shapes of the modes there.
+
+        `other`: place (m) and shapes that are used if the table gives none; None: 0 and no motion.
+        """
+        count = len(self.frequencies)
+        at, default = other or (self.centre, np.zeros(count))
+        found = table.leaf(key, PLACE, at)
+        if self.shapes is not None:
+            return found - self.centre, self.shapes(found)
+        needed = count and other is not None and found != at
+        return found - self.centre, vector(table, modes, count, None if needed else default)
+
+
+def tables_of(top: Table, name: str) -> list[Table]:
+    """Return the tables of a list, written as [[name]]."""
+    raw = top.raw.get(name, [])
+    if not isinstance(raw, list):
+        raise ValueError(f"{top.at(name)} = {show(raw)}: write [[{top.at(name)}]] above each.")
+    return [Table(one, f"{top.at(name)}[{k}]") for k, one in enumerate(raw)]
+
+
+def needed(table: Table, key: str, field: Any) -> float:
+    """Return a number that the table must give."""
+    if key not in table.raw:
+        raise ValueError(f"{table.at(key)} is missing: give the {field.metadata['doc']}, {field.metadata['unit']}.")
+    return table.leaf(key, field)
+
+
+def vector(table: Table, key: str, length: int, default: Any = None) -> np.ndarray:
+    """Return a list of `length` numbers; `default` if it is left out."""
+    if key not in table.raw and default is not None:
+        return np.asarray(default, float)
+    value = table.array(key, None, f"a list of {length} numbers")
+    if value is None or np.shape(value) != (length,) or not np.all(np.isfinite(np.asarray(value, float))):
+        given = "is missing" if key not in table.raw else f"= {show(table.raw[key])}"
+        raise ValueError(f"{table.at(key)} {given}: it must be a list of {length} numbers.")
+    return np.asarray(value, float)
+
+
+def dampings_of(table: Table, default: np.ndarray) -> np.ndarray:
+    """Return the damping ratio of each mode: the key `damping`, one number or a list; `default` if it is left out."""
+    given = table.raw.get("damping")
+    if given is None:
+        return default
+    if not isinstance(given, list):
+        return np.full(len(default), table.leaf("damping", DAMPING))
+    for x in vector(table, "damping", len(default)):
+        Table({"damping": float(x)}, table.path).leaf("damping", DAMPING)
+    return vector(table, "damping", len(default))

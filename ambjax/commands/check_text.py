@@ -1,0 +1,196 @@
+"""The text of `ambjax check`: the verdict in a few lines, then the tables that apply."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ambjax.cases.forces import forces
+from ambjax.cases.reader import Case
+from ambjax.cases.warned import idealised
+from ambjax.linear.stability import Findings
+from ambjax.results.outputs import table
+from ambjax.theorem import advice
+from ambjax.theorem.conditions import Condition, Report
+from ambjax.theorem.sampled_report import Delays, SampledReport
+
+CONTINUOUS = (
+    "The tables of Theorem 1 are computed in continuous time, without the case's [processor] and without the low-pass, "
+    "the converters and the faults of the sensor. An amplifier is included only if it controls the current. A "
+    "set-valued sign is replaced by a sign with a boundary layer. These tables do not affect the verdict on this case."
+)
+
+BAND = (
+    "Evaluated at the samples after run.settle. Signal: the quantity that the law drives to zero. Disturbance: largest "
+    "difference between the rate of the computed signal and the rate that the sign function of the law commands. Band: "
+    "largest |computed signal| that such disturbances can cause. Difference: largest difference between the computed "
+    "signal and that of the plant. Bound: band plus difference; it bounds the signal of the plant. Largest: largest "
+    "|signal| of the plant."
+)
+
+
+class OnProcessor(NamedTuple):
+    """Results on the processor. `margin`, `unknown`: delay margins, see `check._margins`."""
+
+    sampled: SampledReport
+    margin: Delays
+    unknown: Delays | None
+
+
+class Checked(NamedTuple):
+    """Results of a check.
+
+    - `path`: name of the case file as given by the user.
+    - `findings`: stability of the loop; None: the rotor is lost. `linear`: whether the loop has a linearisation.
+    - `differs`: why simulated and linear delay margins differ, or empty.
+    """
+
+    case: Case
+    path: str
+    report: Report
+    findings: Findings | None
+    on_processor: OnProcessor | None
+    differs: str | None
+    linear: bool
+
+
+def verdict(checked: Checked, sensitivity: str, largest: float | None) -> list[str]:
+    """Return the verdict: what fails, the rotor, its stability, its `sensitivity`, and Theorem 1.
+
+    `largest`: largest |z| after run.settle, m; None: the run ends early.
+    """
+    case, report, findings = checked.case, checked.report, checked.findings
+    failures = list(_failures(checked))
+    lines = ["The check passes." if not failures else f"The check FAILS: {'; '.join(failures)}."]
+    if checked.on_processor is None:
+        status = advice.status(report.lost_at, report.lost_why, report.stalled)
+    else:
+        sampled = checked.on_processor.sampled
+        status = advice.status(sampled.lost_at, sampled.lost_why, sampled.stalled, advice.STALLED_PLANT)
+    lines.append(status + _clearance(case, largest))
+    lines += [] if findings is None else [findings.words()]
+    deciding = [line.holds for line in report.conditions if line.holds is not None]
+    where = (
+        "" if checked.on_processor is None else " in continuous time, without the processor; not part of the verdict"
+    )
+    theorem = f"Theorem 1: {sum(deciding)} of the {len(deciding)} conditions that apply to these laws hold{where}."
+    return [*lines, sensitivity, theorem]
+
+
+def _failures(checked: Checked) -> list[str]:
+    """Return what makes the check fail, a few words each."""
+    report, on_processor, found = checked.report, checked.on_processor, []
+    run = report if on_processor is None else on_processor.sampled
+    if math.isfinite(run.lost_at):
+        found.append("the run is not decided" if run.stalled else "the rotor is lost")
+    if checked.findings is not None and not checked.findings.stable:
+        found.append("the loop is not stable")
+    if on_processor is None:
+        found += [f"{line.requires} does not hold" for line in report.conditions if line.holds is False]
+    else:
+        found += [
+            f"the step of the {law.stage} law is not stable" for law in on_processor.sampled.laws if not law.holds
+        ]
+        found += ["the run reaches the singular curve C"] if on_processor.sampled.distance[0] <= 0 else []
+    if not checked.linear:
+        found.append("the loop cannot be linearised")
+    largest, weight, _ = forces(checked.case)
+    if largest < weight:
+        words = f"their largest force is {largest:.4g} N, below its weight of {weight:.4g} N"
+        found.append(f"the magnets cannot carry the rotor: {words}")
+    return found
+
+
+def _clearance(case: Case, largest: float | None) -> str:
+    if largest is None:
+        return ""
+    zones, used = case.zones, largest / float(np.min(np.asarray(case.scenario.touchdown)))
+    return (
+        f" After run.settle |z| reaches {largest:.4g} m, {100 * used:.3g} % of the clearance: clearance zone "
+        f"{zones.clearance_zone(used)} (A below {100 * zones.clearance_a:g} %, B below {100 * zones.clearance_b:g} %, "
+        f"C below {100 * zones.clearance_c:g} %)."
+    )
+
+
+def details(checked: Checked, full: bool) -> list[str]:
+    """Return the parts below the verdict. `full`: also what does not affect it."""
+    case, report, parts = checked.case, checked.report, []
+    if ideal := idealised(case):
+        parts.append(ideal)
+    if checked.on_processor is not None:
+        sampled, margin, unknown = checked.on_processor
+        parts += [f"On the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s."]
+        parts += [_laws(sampled), *([_bands(sampled)] if full else [])]
+        differs = [checked.differs] if checked.differs else []
+        parts.append("\n".join([*advice.processor_lines(sampled, margin, unknown), *differs]))
+    if checked.on_processor is None or full:
+        shown = [line for line in report.conditions if line.gain is not None and (full or line.holds is not None)]
+        parts += ["Theorem 1:", _conditions(shown), *([_proof(report.proof)] if full else [])]
+        parts.append("\n".join(advice.theorem_lines(report, checked.path)))
+        parts += [CONTINUOUS] if checked.on_processor is not None else []
+    return parts if full else [*parts, "--full prints every table."]
+
+
+def _conditions(conditions: list[Condition]) -> str:
+    """Return the table of conditions. One that is only informative has no verdict."""
+    verdicts = {True: "holds", False: "FAILS", None: ""}
+
+    def number(x: float | None) -> str:
+        return "-" if x is None else f"{x:.5g}"
+
+    rows = [
+        (
+            c.requires,
+            number(c.gain),
+            number(c.against),
+            number(c.margin),
+            c.unit,
+            f"{c.at_s:.5g}",
+            verdicts[c.holds],
+            c.note,
+        )
+        for c in conditions
+    ]
+    head = ("condition", "left", "right", "margin", "unit", "at (s)", "verdict", "note")
+    columns = len(head) - (not any(row[-1] for row in rows))  # without an empty column of notes
+    return table(head[:columns], [row[:columns] for row in rows])
+
+
+def _proof(proof: list[Condition]) -> str:
+    steps = [(c.name, c.requires, f"{c.against:.3g}", c.unit, f"{c.at_s:.5g}", c.note) for c in proof]
+    return table(("proof", "statement", "worst", "unit", "at (s)", "meaning"), steps)
+
+
+def _laws(sampled: SampledReport) -> str:
+    rows = [
+        (
+            law.stage,
+            "implicit" if law.implicit else "explicit",
+            f"{law.radius:.4g}",
+            f"{law.damping:.4g}",
+            "holds" if law.holds else "FAILS",
+        )
+        for law in sampled.laws
+    ]
+    head = ("law", "step", "largest |pole|", "least damping ratio", "verdict")
+    return table(head, rows)
+
+
+def _bands(sampled: SampledReport) -> str:
+    def number(x: float | None) -> str:
+        return "-" if x is None else "none" if math.isinf(x) else f"{x:.4g}"
+
+    if not sampled.bands:
+        return "No bands, because every run ends early."
+    bands = [
+        (
+            b.signal,
+            b.unit,
+            "the case's" if b.noise else "none",
+            *map(number, (b.gain, b.disturbance, b.band, b.difference, b.bound, b.largest)),
+            b.note,
+        )
+        for b in sampled.bands
+    ]
+    values = ("gain, per s", "disturbance", "band", "difference", "bound", "largest")
+    return table(("signal", "unit", "noise", *values, "note"), bands) + "\n" + BAND

@@ -1,0 +1,88 @@
+"""Linear controllers of a whole machine, with several inputs and outputs."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.control.machine_law import Demanded, MachineInputs, MachineLaw
+from ambjax.control.stages import ForceDemand
+from ambjax.numerics.records import leaf, record, static
+from ambjax.numerics.small_matrices import times
+from ambjax.numerics.smooth import limited
+from ambjax.world.rotation import PER_MINUTE
+from ambjax.world.sensor import Measurement
+
+# Inputs of a controller with c axes: the errors r - y; r and y; or r - y and the measured currents.
+ERROR, BOTH, CURRENTS = INPUTS = ("error", "both", "currents")
+
+
+def _matrix(shape: str, doc: str) -> Any:
+    return leaf(shape=shape, at_least=-1e30, at_most=1e30, doc=doc)
+
+
+@record
+class StateSpaceLaw(MachineLaw):
+    """x+ = A x + B w + a + E (clip(u) - u), y = C x + D w + b, for the c axes: a linear controller in state space.
+
+    In continuous time the first equation gives x'. The inputs w are r - y (m), r and y, or r - y and the currents (A),
+    of the axes in order. The outputs are currents (A) or voltages (V), to which the current that carries the weight is
+    added. u is the resulting command. There are matrices for s speeds, between which they are interpolated linearly.
+
+    With inversion.Linearised, the reference of the current law of each axis is the output, or output/R for a voltage.
+    """
+
+    A: Array = _matrix("s n n", "state matrices")
+    B: Array = _matrix("s n m", "input matrices")
+    C: Array = _matrix("s c n", "output matrices")
+    D: Array = _matrix("s c m", "matrices from inputs to outputs")
+    E: Array = _matrix("s n c", "anti-windup: what the limit of the command removes")
+    a: Array = _matrix("s n", "constant terms of the states")
+    b: Array = _matrix("s c", "constant terms of the outputs")
+    steady: Array = _matrix("n m", "states at the start per input")
+    start: Array = _matrix("n", "constant terms of the states at the start")
+    sizes: Array = _matrix("n", "characteristic sizes of the states")
+    speeds: Array = _matrix("s", "speeds of the designs in ascending order, rpm")
+    dv_dz: Array = _matrix("c", "slopes of the scaled forces of the linear magnets, A^2/m^3")
+    dv_di: Array = _matrix("c", "the same per current, A/m^2")
+    resting: Array = _matrix("c", "currents that carry the weight, A")
+    resistance: Array = _matrix("c", "commands per current: 1, or the resistance for outputs in V")
+    inputs: str = static(default=ERROR, doc="inputs of the controller")
+
+    def scale(self) -> Array:
+        return jnp.asarray(self.sizes)
+
+    def begin(self, measured: Measurement, inputs: MachineInputs) -> Array:
+        return self.start + times(self.steady, self._inputs(measured, inputs))
+
+    def step(self, measured: Measurement, state: Array, inputs: MachineInputs) -> tuple[Demanded, Array]:
+        demanded, after, excess = self._output(measured, state, inputs)
+        return demanded, after + times(self._at(self.E, inputs), excess)
+
+    def __call__(self, measured: Measurement, state: Array, inputs: MachineInputs) -> tuple[Demanded, Array]:
+        return self._output(measured, state, inputs)[:2]
+
+    def _at(self, table: Array, inputs: MachineInputs) -> Array:
+        """Return the entry of a table for the speed, interpolated between the designs and constant beyond them."""
+        table, speeds = jnp.asarray(table), 2 * np.pi * PER_MINUTE * jnp.asarray(self.speeds)
+        if len(table) == 1:
+            return table[0]
+        k = jnp.minimum(jnp.sum(speeds[1:] <= inputs.W), len(table) - 2)
+        share = jnp.clip((inputs.W - speeds[k]) / (speeds[k + 1] - speeds[k]), 0.0, 1.0)
+        return (1 - share) * table[k] + share * table[k + 1]
+
+    def _inputs(self, measured: Measurement, inputs: MachineInputs) -> Array:
+        r, y = jnp.asarray(inputs.reference.r), measured.z
+        parts = {ERROR: (r - y,), BOTH: (r, y), CURRENTS: (r - y, measured.i - self.resting)}
+        return jnp.concatenate(parts[self.inputs])
+
+    def _output(self, measured: Measurement, state: Array, inputs: MachineInputs) -> tuple[Demanded, Array, Array]:
+        w = self._inputs(measured, inputs)
+        A, B, C, D, a, b = (self._at(x, inputs) for x in (self.A, self.B, self.C, self.D, self.a, self.b))
+        i = self.resting + (times(C, state) + times(D, w) + b) / self.resistance
+        u = self.resistance * i
+        v_star = self.dv_dz * measured.z + self.dv_di * i
+        force = ForceDemand(measured.z, measured.z_dot, v_star, 0.0 * v_star)
+        after = times(A, state) + times(B, w) + a
+        return Demanded(force, measured, measured), after, limited(u, inputs.u_max) - u
