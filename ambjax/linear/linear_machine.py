@@ -410,15 +410,6 @@ def sensitivity_of(point: TurningMachine, names: tuple[str, ...], speed: float, 
             found[key] = np.asarray(system.response(f))
         return found[key]
 
-    responses: dict[bytes, np.ndarray] = {}
-
-    def response(f: np.ndarray) -> np.ndarray:
-        """Return the response at frequencies f (Hz). All peaks scan the same frequencies."""
-        key = np.asarray(f).tobytes()
-        if key not in responses:
-            responses[key] = np.asarray(system.response(f))
-        return responses[key]
-
     def largest(magnitude: Callable) -> ResponsePeak:
         return peak(system, lambda f: magnitude(response(f)), low, high, end)
 
