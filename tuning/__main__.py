@@ -92,7 +92,9 @@ def _print(tuned: "TunedCase") -> None:
     for row in tuned.report.get("gains", ()):
         bound = f" ({row['at_bound']})" if row["at_bound"] else ""
         print(f"  {row['path']}: {row['before']:.6g} -> {row['after']:.6g}{bound}")
-    written(tuned.directory, "tuned.toml, report.html, report.md, report.json, history.npz, *.png")
+    names = ["tuned.toml", "report.html", "report.md", "report.json", "history.npz"]
+    names = [name for name in names if (tuned.directory / name).exists()]
+    written(tuned.directory, ", ".join(names + ["*.png"] * any(tuned.directory.glob("*.png"))))
 
 
 if __name__ == "__main__":

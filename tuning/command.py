@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ambjax.cases.reader import Case, read_case, require_file
-from ambjax.cases.table import one_line
+from ambjax.cases.machine_case import MachineCase
+from ambjax.cases.reader import Case, is_machine, read_case, require_file
+from ambjax.cases.table import load, one_line
 from ambjax.commands.reading import print_warnings
 from ambjax.host.arguments import names_arguments
 from ambjax.host.heartbeat import say
@@ -18,6 +19,7 @@ from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
 from ambjax.results.outputs import check_new, described, directory, files, plain, write_json
 from tuning.events import Listener, Log, teller
+from tuning.machines.machine_tuning import tune_machine
 from tuning.problem.config import allowed_minutes, read_tune
 from tuning.problem.gains_table import off
 from tuning.problem.tuning_problem import TuningProblem, problem_of
@@ -44,7 +46,7 @@ class TunedCase:
     - `directory`: directory of tuned.toml, history.npz and the report.
     """
 
-    case: Case
+    case: Case | MachineCase
     good: bool
     report: dict[str, Any]
     directory: pathlib.Path
@@ -126,6 +128,8 @@ def run(path: str, options: Options, listen: Listener) -> TunedCase:
 
     Raises ValueError for bad input before anything is written, and in the search as `rounds` does.
     """
+    if is_machine(load(path)[0]):
+        return _machine(path, options, listen)
     plan = _plan(path, options)
     with locked(plan.out):
         if not options.resume:
@@ -136,6 +140,16 @@ def run(path: str, options: Options, listen: Listener) -> TunedCase:
         mark_directory(plan.out)
         with reporting(lambda: _kept(plan.out)):
             return _tune(plan, path, listen)
+
+
+def _machine(path: str, options: Options, listen: Listener) -> TunedCase:
+    """Tune a whole machine. Raises ValueError for an option that it does not take."""
+    for name, given in options._asdict().items():
+        if name in ("resume", "pareto", "page", "settings_of") and given:
+            raise ValueError(f"--{name.replace('_', '-')}: the tuning of a machine does not take it. Leave it out.")
+    minutes = None if options.minutes is None else allowed_minutes(options.minutes)
+    found = tune_machine(path, options.out, options.force, minutes, teller(listen))
+    return TunedCase(found.case, found.good, found.report, found.directory)
 
 
 def _plan(path: str, options: Options) -> TuningPlan:

@@ -333,6 +333,19 @@ def _matrices(machine: Machine, W: Scalar, period: Scalar, point: _Rest) -> tupl
     return _Linear(machine, W, period).system(point)
 
 
+def machine_rest(machine: Machine, period: Scalar) -> _Rest:
+    """Return the equilibrium of a machine at speed 0, or the point nearest to it that was found."""
+    return _at_rest(machine, 0.0, period)
+
+
+def machine_loop(machine: Machine, W: Scalar, period: Scalar, point: _Rest) -> StateSpace:
+    """Return the linear system of `linearise_machine` at the speed W (rad/s) and at a known equilibrium.
+
+    It works under jit, vmap and differentiation. States that no input reaches are not left out.
+    """
+    return _Linear(machine, W, period).system(point)[0]
+
+
 class TurningMachine(NamedTuple):
     """The linear machine at one speed.
 

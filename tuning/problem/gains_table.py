@@ -27,7 +27,7 @@ def space_from(table: Table, case: Case) -> Space:
     paths = table.raw.get("gains", default)
     if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
         raise ValueError(f'{table.at("gains")} = {show(paths)}: give a list of paths, as in ["controller.position.c"].')
-    bounds = _flat(table.table("bounds").raw)
+    bounds = flattened(table.table("bounds").raw)
     stems = dict.fromkeys(path.rpartition(".")[0] for path in known if path.count(".") > 2)
     whole = {stem: knots(case.cascade, stem) for stem in stems}  # the path of a scheduled gain stands for all its knots
     paths = [one for path in paths for one in whole.get(path, [path])]
@@ -48,7 +48,7 @@ def space_from(table: Table, case: Case) -> Space:
     clash = [path for path in paths if path in case.spread.paths]
     if clash:
         raise ValueError(f"spread.{clash[0]} is in tune.gains too. Remove it from one of them.")
-    return Space(tuple(Gain(path, *_bound(bounds.get(path), path, table)) for path in paths))
+    return Space(tuple(Gain(path, *bound_of(bounds.get(path), path, table)) for path in paths))
 
 
 def _default_gains(case: Case) -> list[str]:
@@ -71,15 +71,16 @@ def _off(cascade: Cascade, path: str) -> bool:
     return bool(np.any(value == 0) or np.isinf(np.max(value)))
 
 
-def _flat(raw: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flattened(raw: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Flatten nested tables to dotted keys. TOML reads controller.position.c = [1, 2] as nested tables."""
     flat: dict[str, Any] = {}
     for key, value in raw.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+        flat |= flattened(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
     return flat
 
 
-def _bound(raw: Any, path: str, table: Table) -> tuple[float, float]:
+def bound_of(raw: Any, path: str, table: Table) -> tuple[float, float]:
+    """Return the bounds of a gain from its value in tune.bounds; none if `raw` is None."""
     if raw is None:
         return 0.0, math.inf
     pair = isinstance(raw, list) and len(raw) == 2 and all(type(x) in (int, float) for x in raw)

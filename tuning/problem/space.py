@@ -152,7 +152,7 @@ class Space:
     def decode(self, x: Array, cascade: Cascade) -> Cascade:
         """Return the cascade with the gains at coordinates x [m]. All other leaves are the same objects."""
         for j, gain in enumerate(self.gains):
-            cascade = _write(cascade, gain.path, gain.decode(x[j]))
+            cascade = with_gain(cascade, gain.path, gain.decode(x[j]))
         return cascade
 
 
@@ -187,7 +187,8 @@ def read(cascade: Cascade, path: str) -> Any:
     return value.values[int(knot[0])] if knot else value
 
 
-def _write(cascade: Cascade, path: str, value: Scalar) -> Cascade:
+def with_gain(cascade: Cascade, path: str, value: Scalar) -> Cascade:
+    """Return the cascade with the gain at a dotted path replaced."""
     _, stage, name, *knot = path.split(".")
     law = getattr(cascade, stage)
     law = dataclasses.replace(law, **{name: getattr(law, name).with_knot(int(knot[0]), value) if knot else value})

@@ -98,11 +98,13 @@ def _table(table: Any, path: list[str]) -> Any:
 
     A table in the middle would take over the root keys that follow.
     """
-    document = table
+    document, nested = table, False
     for depth, word in enumerate(path):
         if isinstance(table, list):
-            table = table[int(word)]
+            table, nested = table[int(word)], True
             continue
+        if word not in table and nested and isinstance(table, Table):
+            table[word] = tomlkit.table()
         if word not in table and isinstance(table, InlineTable):
             table[word] = tomlkit.inline_table()
         elif word not in table:

@@ -1,0 +1,128 @@
+"""Tuning of whole machines: derivatives, gains of one bearing, and the command."""
+
+import json
+import tomllib
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import tuning
+from ambjax.cases.machine_case import machine_from, read_machine
+from ambjax.cases.table import Table
+from ambjax.cases.template_text import template
+from ambjax.commands.machine_commands import analysed
+from ambjax.linear.linear_machine import machine_sensitivity
+from tuning.__main__ import main
+from tuning.machines.machine_gains import machine_space
+from tuning.machines.machine_peaks import Peaks
+from tuning.machines.nonsmooth import Value, minimise
+
+PARTS = {"position": {"kind": "pid"}, "inversion": {"kind": "linearised"}, "current": {"kind": "pi"}}
+GAINS = ["controller.position.k_d", "bearing.left.controller.position.k_p", "bearing.right.controller.position.k_p"]
+
+
+def raw_case(**tune):
+    raw = tomllib.loads(template("machine"))
+    raw["controller"] |= PARTS
+    return raw | {"tune": tune}
+
+
+def space_of(raw):
+    case = machine_from(raw)
+    return case, machine_space(Table(raw).table("tune"), case, raw)
+
+
+@pytest.fixture(scope="module")
+def peaks():
+    case, space = space_of(raw_case(gains=GAINS))
+    return case, space, Peaks(case, space)
+
+
+@pytest.mark.slow  # compiles the loop and its derivatives
+def test_the_peak_is_that_of_the_sensitivity(peaks):
+    case, space, found = peaks
+    x = space.space.encode(space.values(case)) + np.array([0.3, -0.2, 0.1])
+    machine = space.decode(jnp.asarray(x), case.machine)
+    points = [machine_sensitivity(machine, case.axes, case.clock.sample_period, v, case.zones) for v in case.speeds]
+    worst = max(point.worst.S.height for point in points)
+    assert np.exp(found.peak(x).f) == pytest.approx(worst, rel=1e-3)
+    growth = max(np.max(np.real(point.poles)) for point in points)
+    assert found.stability(x).f == pytest.approx(growth, rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["peak", "stability"])
+def test_derivatives(peaks, name):
+    case, space, found = peaks
+    function = getattr(found, name)
+    x = space.space.encode(space.values(case)) + np.array([0.3, -0.2, 0.1])
+    h = 1e-5
+    steps = [(function(x + h * e).f - function(x - h * e).f) / (2 * h) for e in np.eye(3)]
+    # the frequencies of the grid move with the poles
+    np.testing.assert_allclose(function(x).gradient, steps, rtol=0.02, atol=0.02 * np.abs(steps).max())
+
+
+def test_a_gain_of_a_bearing_belongs_to_its_axes():
+    case, space = space_of(raw_case(gains=GAINS))
+    axes = {gain.path: [case.axes[k] for k in gain.axes] for gain in space.gains}
+    assert axes[GAINS[0]] == list(case.axes)
+    assert axes[GAINS[1]] == ["left.x", "left.y"]
+    x = space.space.encode([100.0, 2e5, 3e5])
+    position = space.decode(jnp.asarray(x), case.machine).axes[0].loop.cascade.position
+    np.testing.assert_allclose(position.k_p[:4], [2e5, 2e5, 3e5, 3e5])
+    np.testing.assert_allclose(position.k_d, 100.0)
+    before = case.machine.axes[0].loop.cascade.position
+    assert float(position.k_p[4]) == float(before.k_p[4])
+
+
+def test_bfgs_finds_the_minimum_of_a_function_that_is_not_smooth():
+    # |x - 1| + 8 |y - x^2|: its minimum lies on a curved ridge
+    def function(p):
+        x, y = p
+        a, b = np.sign(x - 1), 8 * np.sign(y - x**2)
+        return Value(p, abs(x - 1) + 8 * abs(y - x**2), np.array([a - 2 * x * b, b]))
+
+    found = minimise(function, function(np.array([-0.7, 0.6])), 500, lambda value: False)
+    assert found.f < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("tune", "words"),
+    [
+        ({"gains": ["controller.position.k_q"]}, "k_q"),
+        ({"gains": ["bearing.top.controller.position.k_p"]}, "bearing.top"),
+        ({"gains": ["controller.position.k_p", "bearing.left.controller.position.k_p"]}, "both"),
+        ({"gains": []}, "empty"),
+    ],
+)
+def test_refused_gains(tune, words):
+    with pytest.raises(ValueError, match=words):
+        space_of(raw_case(**tune))
+
+
+@pytest.mark.parametrize("options", [["--resume"], ["--pareto"]])
+def test_refused_options(tmp_path, capsys, options):
+    path = tmp_path / "m.toml"
+    path.write_text(template("machine"))
+    assert main([str(path), *options]) == 2
+    assert options[0] in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_command(tmp_path):
+    text = template("machine").replace("duration = 0.2", "duration = 2e-3").replace("settle = 0.05", "settle = 0.0")
+    text = text.replace('kind = "integral-sliding-mode"', 'kind = "pid"')
+    parts = '[controller.inversion]\nkind = "linearised"\n[controller.current]\nkind = "pi"\n'
+    tune = f"[tune]\ngains = {json.dumps(GAINS)}\nstarts = 1\niterations = 1\nheld_out = 2\nlimits.sensitivity = 2.5\n"
+    path = tmp_path / "m.toml"
+    path.write_text(f"{text}\n{parts}\n{tune}")
+    found = tuning.tune(path, tmp_path / "t")
+    before, after = found.report["before"], found.report["sensitivity"]
+    assert after["peak"] < before["peak"]
+    # the file is the answer, with the gains of each bearing in its table
+    again = read_machine(tmp_path / "t" / "tuned.toml")
+    assert max(point.worst.S.height for point in analysed(again)) == pytest.approx(after["peak"], rel=1e-6)
+    raw = tomllib.loads((tmp_path / "t" / "tuned.toml").read_text())
+    assert raw["bearing"][0]["controller"]["position"]["k_p"] == pytest.approx(found.report["gains"][1]["after"])
+    assert found.good == (after["peak"] <= 2.5)

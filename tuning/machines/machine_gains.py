@@ -1,0 +1,118 @@
+"""The gains of a machine that are tuned: common to all axes, or of one bearing."""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.cases.machine_case import MachineCase
+from ambjax.cases.rotor_tables import tables_of
+from ambjax.cases.table import Table, show
+from ambjax.ensemble.spread import no_such_number
+from ambjax.host.extensions import NothingToTuneError
+from ambjax.simulation.sampled import Sampled
+from ambjax.simulation.whole_machine import Machine, loop_of
+from tuning.problem.gains_table import bound_of, flattened
+from tuning.problem.space import Gain, Space, read, tunable, with_gain
+
+BEARING = "bearing."
+
+
+@dataclasses.dataclass(frozen=True)
+class MachineGain:
+    """A gain of the axes with these numbers. `path`: in [tune]. `inner`: in the cascade. `where`: in the case file."""
+
+    path: str
+    inner: str
+    where: str
+    axes: tuple[int, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class MachineSpace:
+    """The gains of a machine: a `Space`, of which each gain is written to its axes."""
+
+    space: Space
+    gains: tuple[MachineGain, ...]
+
+    def values(self, case: MachineCase) -> np.ndarray:
+        """Return the gains [m] of a case; of the axes of a gain, the geometric mean."""
+        each = [[float(read(case.cases[k].cascade, gain.inner)) for k in gain.axes] for gain in self.gains]
+        return np.array([math.exp(np.mean(np.log(one))) for one in each])
+
+    def decode(self, x: Array, machine: Machine) -> Machine:
+        """Return the machine with the gains at coordinates x [m]."""
+        groups = list(machine.axes)
+        for j, (own, gain) in enumerate(zip(self.gains, self.space.gains, strict=True)):
+            for n, group in enumerate(machine.groups):
+                at = np.array([k for k, axis in enumerate(group) if axis in own.axes], int)
+                if at.size:
+                    groups[n] = _written(groups[n], own.inner, at, gain.decode(x[j]))
+        return dataclasses.replace(machine, axes=tuple(groups))
+
+
+def _written(axis: Any, path: str, at: np.ndarray, value: Array) -> Any:
+    """Return the stacked loops of a group with a gain of the axes `at` replaced."""
+    loop = loop_of(axis)
+    cascade = with_gain(loop.cascade, path, jnp.asarray(read(loop.cascade, path)).at[at].set(value))
+    loop = dataclasses.replace(loop, cascade=cascade)
+    return dataclasses.replace(axis, loop=loop) if isinstance(axis, Sampled) else loop
+
+
+def machine_space(table: Table, case: MachineCase, raw: dict[str, Any]) -> MachineSpace:
+    """Return the gains of the table [tune] of a machine.
+
+    Without tune.gains, they are all gains of the position laws that are not 0, common to all axes. Raises ValueError
+    for an unknown gain or an invalid bound.
+    """
+    known = _known(case, raw)
+    default = [path for path in known if path.startswith("controller.position.") and _usable(known[path], case)]
+    paths = table.raw.get("gains", default)
+    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
+        raise ValueError(f'{table.at("gains")} = {show(paths)}: give a list of paths, as in ["controller.position.k"].')
+    if not paths:
+        raise NothingToTuneError('tune.gains is empty: name at least one, for example ["controller.position.k_p"].')
+    bounds = flattened(table.table("bounds").raw)
+    for path in [*paths, *bounds]:
+        if path not in known:
+            key = "gains" if path in paths else "bounds"
+            raise ValueError(f"{table.at(key)}: '{path}': {no_such_number(path, known, 'to tune in this machine')}")
+    for path in paths:
+        if not _usable(known[path], case):
+            raise ValueError(f"{table.at('gains')}: {path} is 0 or inf in this case. Give it a finite value above 0.")
+    if path := next((path for path in bounds if path not in paths), None):
+        raise ValueError(f"{table.at('bounds')}: {path} is not in tune.gains. Add it there or leave it out here.")
+    gains = tuple(known[path] for path in paths)
+    taken = [(gain.inner, k) for gain in gains for k in gain.axes]
+    for gain in gains:
+        if any(taken.count((gain.inner, k)) > 1 for k in gain.axes) and not gain.path.startswith(BEARING):
+            raise ValueError(f"{table.at('gains')}: {gain.path} and a bearing's own are both named. Keep one of them.")
+    return MachineSpace(Space(tuple(Gain(path, *bound_of(bounds.get(path), path, table)) for path in paths)), gains)
+
+
+def _usable(gain: MachineGain, case: MachineCase) -> bool:
+    return all(0 < float(read(case.cases[k].cascade, gain.inner)) < math.inf for k in gain.axes)
+
+
+def _known(case: MachineCase, raw: dict[str, Any]) -> dict[str, MachineGain]:
+    """Return every gain by path. A common gain belongs to the axes whose bearing does not give it itself."""
+    bearings = tables_of(Table(raw), "bearing")
+    names = [table.raw.get("name", f"bearing{k + 1}") for k, table in enumerate(bearings)]
+    each = [tunable(one.cascade, steepness=False) for one in case.cases]
+    found: dict[str, MachineGain] = {}
+    for path in dict.fromkeys(path for paths in each for path in paths):
+        of = [k for k, paths in enumerate(each) if path in paths]
+        common = []
+        for number, (name, table) in enumerate(zip(names, bearings, strict=True)):
+            axes = tuple(k for k in of if case.axes[k].rpartition(".")[0] == name)
+            own = f"{BEARING}{name}.{path}"
+            if axes:
+                found[own] = MachineGain(own, path, f"bearing[{number}].{path}", axes)
+            if path not in flattened({"controller": table.raw.get("controller", {})}):
+                common += axes
+        if common:
+            found[path] = MachineGain(path, path, path, tuple(common))
+    return found

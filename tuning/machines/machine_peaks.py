@@ -1,0 +1,129 @@
+"""The largest peak of |S_kk| of a machine over its axes and speeds, and its derivatives in the gains."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.cases.machine_case import MachineCase
+from ambjax.extend import canonical
+from ambjax.linear.linear_machine import machine_loop, machine_rest
+from ambjax.linear.state_space import StateSpace
+from ambjax.world.rotation import PER_MINUTE
+from tuning.machines.machine_gains import MachineSpace
+from tuning.machines.nonsmooth import Value
+
+# Numbers of frequencies on a logarithmic axis; offsets of further ones from each pole, in units of its damping; largest
+# damping ratio of these poles; share of the Nyquist frequency up to which peaks are sought.
+POINTS, BESIDE, LIGHT, HIGHEST = 250, (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0), 0.3, 0.98
+
+
+class Loop(NamedTuple):
+    """A linear system in NumPy, with its eigenvalues `values` and eigenvectors, and its derivatives `moves` [.., m]."""
+
+    system: StateSpace
+    moves: StateSpace
+    values: np.ndarray
+    vectors: np.ndarray
+    kept: np.ndarray
+
+
+class Peaks:
+    """Evaluation of the nominal machine of a case at its speeds.
+
+    `stability` and `peak` are functions of coordinates [m]. Both give a `Value`: the largest growth rate of a pole
+    (1/s); the logarithm of the largest peak of |S_kk|, inf if a pole grows. The equilibrium is that of the case.
+    """
+
+    def __init__(self, case: MachineCase, space: MachineSpace) -> None:
+        self.count, self.period, self.low = len(case.axes), float(case.clock.sample_period), float(case.zones.f_low)
+        machine, self.sampled = canonical(case.machine), case.cases[0].cascade.sampled
+        speeds = 2 * np.pi * PER_MINUTE * np.array(case.speeds)
+        rest = machine_rest(machine, self.period)
+
+        def system(x: Array, W: Array, known: Any) -> StateSpace:
+            found = machine_loop(space.decode(x, known[0]), W, self.period, known[1]).scaled()
+            return found._replace(C=found.C[: self.count], D=found.D[: self.count], period=None)
+
+        def both(x: Array, known: Any) -> tuple[StateSpace, StateSpace]:
+            one = lambda W: (system(x, W, known), jax.jacfwd(system)(x, W, known))  # noqa: E731
+            return jax.lax.map(one, jnp.asarray(speeds))
+
+        self._both: Any = jax.jit(both)
+        self._known = machine, rest  # arguments, because constants are not arrays of JAX
+        self._last: tuple[np.ndarray, list[Loop]] | None = None
+
+    def loops(self, x: np.ndarray) -> list[Loop]:
+        """Return the loops at coordinates x [m], one for each speed."""
+        if self._last is None or not np.array_equal(self._last[0], x):
+            found = jax.tree.map(np.asarray, self._both(jnp.asarray(x), self._known))
+            each = [jax.tree.map(lambda a, k=k: a[k], found) for k in range(len(found[0].A))]
+            self._last = x.copy(), [self._loop(*one) for one in each]
+        return self._last[1]
+
+    def _loop(self, system: StateSpace, moves: StateSpace) -> Loop:
+        kept = ~np.asarray(system.idle())
+        if not np.isfinite(system.A).all():
+            return Loop(system, moves, np.array([np.inf]), np.eye(1), kept)
+        return Loop(system, moves, *np.linalg.eig(system.A[kept][:, kept]), kept)
+
+    def rates(self, loop: Loop) -> np.ndarray:
+        """Return the poles, 1/s."""
+        values = np.asarray(loop.values, complex)
+        return np.log(np.where(values == 0, 1e-300, values)) / self.period if self.sampled else values
+
+    def stability(self, x: np.ndarray) -> Value:
+        """Return the largest growth rate of a pole at any speed."""
+        rates = [self.rates(loop) for loop in self.loops(x)]
+        n = int(np.argmax([np.max(np.real(one)) for one in rates]))
+        loop, k = self.loops(x)[n], int(np.argmax(np.real(rates[n])))
+        if not np.isfinite(rates[n][k]):
+            return Value(x, np.inf, np.zeros(len(x)))
+        left, right = np.linalg.inv(loop.vectors)[k], loop.vectors[:, k]
+        slope = np.einsum("i,ijm,j->m", left, loop.moves.A[loop.kept][:, loop.kept], right)
+        slope = slope / (loop.values[k] * self.period) if self.sampled else slope
+        return Value(x, float(rates[n][k].real), slope.real)
+
+    def peak(self, x: np.ndarray) -> Value:
+        """Return the logarithm of the largest peak of |S_kk| of any axis at any speed."""
+        if not self.stability(x).f <= 0:
+            return Value(x, np.inf, np.zeros(len(x)))
+        best: tuple[Any, ...] = (0.0,)
+        for loop in self.loops(x):
+            at = self._points(self.rates(loop))
+            S = self._response(loop, at)
+            k, axis = np.unravel_index(np.argmax(np.abs(S)), S.shape)
+            best = max(best, (abs(S[k, axis]), at[k], int(axis), loop, S[k, axis]), key=lambda one: one[0])
+        height, at, axis, loop, S = best
+        return Value(x, float(np.log(height)), np.real(np.conj(S) * self._slope(loop, at, axis)) / height**2)
+
+    def _points(self, rates: np.ndarray) -> np.ndarray:
+        """Return the points s or z at which S is evaluated: on a logarithmic axis, and beside lightly damped poles."""
+        highest = HIGHEST / (2 * self.period) if self.sampled else max(1e4, np.abs(rates).max() / 2)
+        size = np.maximum(np.abs(rates), 1e-12)
+        damping = -np.real(rates) / size
+        light = (np.imag(rates) > 0) & (damping < LIGHT)
+        beside = np.outer(size[light] / (2 * np.pi), np.ones(len(BESIDE))) * (1 + np.outer(damping[light], BESIDE))
+        f = np.concatenate([np.geomspace(self.low, highest, POINTS), beside.ravel()])
+        s = 2j * np.pi * np.unique(f[(f >= self.low) & (f <= highest)])
+        return np.exp(s * self.period) if self.sampled else s
+
+    def _response(self, loop: Loop, at: np.ndarray) -> np.ndarray:
+        """Return S_kk [points, axes]."""
+        _, B, C, D, *_ = loop.system
+        own = C[:, loop.kept] @ loop.vectors, np.linalg.solve(loop.vectors, B[loop.kept])
+        return np.einsum("ck,fk,kc->fc", own[0], 1 / (at[:, None] - loop.values), own[1]) + np.diagonal(D)
+
+    def _slope(self, loop: Loop, at: complex, axis: int) -> np.ndarray:
+        """Return the derivatives [m] of S_kk of an axis at a point."""
+        kept, (A, B, C, _, *_), moves = loop.kept, loop.system, loop.moves
+        matrix = at * np.eye(int(kept.sum())) - A[kept][:, kept]
+        right, left = np.linalg.solve(matrix, B[kept, axis] + 0j), np.linalg.solve(matrix.T, C[axis, kept] + 0j)
+        return (
+            moves.D[axis, axis]
+            + right @ moves.C[axis, kept]
+            + left @ moves.B[kept, axis]
+            + np.einsum("i,ijm,j->m", left, moves.A[kept][:, kept], right)
+        )

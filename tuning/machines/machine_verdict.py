@@ -1,0 +1,93 @@
+"""The verdict on the tuned gains of a machine: its sensitivity, members of its spread, the limits, and the report."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ambjax.cases.machine_case import MachineCase
+from ambjax.commands.machine_commands import analysed, sensitivity_summary
+from ambjax.results.machine_study import MachineStudy
+
+# Limits of [tune.limits], each with its meaning and the metric whose largest value counts; "": the sensitivity.
+LIMITS = {
+    "sensitivity": ("peak of \\|S\\| of the worst axis at any speed", ""),
+    "rms_u_V": ("rms voltage after run.settle, V", "settled_rms_u_V"),
+    "max_u_V": ("largest voltage, V", "max_abs_u_V"),
+    "max_abs_i_A": ("largest absolute current, A", "max_abs_i_A"),
+    "rms_error_m": ("rms error after run.settle, m", "settled_rms_error_m"),
+    "largest_error_m": ("largest error after run.settle, m", "settled_max_abs_error_m"),
+    "clearance_used": ("largest share of the clearance", "clearance_used"),
+}
+
+
+def judged(case: MachineCase, found: MachineCase, limits: dict[str, float], seed: int, members: int) -> dict[str, Any]:
+    """Return the content of report.json but the gains. `case`, `found`: before and after; `members`: to simulate."""
+    before, after = (sensitivity_summary(analysed(one)) for one in (case, found))
+    columns = MachineStudy(found, seed, members).columns(0, members)
+    held = np.isposinf(columns["lost_at"])
+    values: dict[str, Any] = {name: _worst(columns[metric], held) for name, (_, metric) in LIMITS.items() if metric}
+    values["sensitivity"] = after["peak"] if after["stable"] else math.inf
+    rows: list[dict[str, Any]] = [
+        {"name": name, "meaning": LIMITS[name][0], "value": values[name], "threshold": most}
+        | {"holds": bool(values[name] <= most)}
+        for name, most in limits.items()
+    ]
+    broken = [row["name"] for row in rows if not row["holds"]]
+    at = f"{after['axis']} at {after['speed_rpm']:g} rpm"
+    words = [
+        f"peak of |S| {after['peak']:.4g} ({at}), zone {after['zone']}" if after["stable"] else "NOT STABLE",
+        f"{int(held.sum())} of {members} members held",
+        "all limits met" if not broken else f"beyond the limits: {', '.join(broken)}",
+    ]
+    good = bool(after["stable"] and held.all() and not broken)
+    return {
+        "verdict": f"{'; '.join(words)}.",
+        "case": case.name,
+        "outcome": {"good": good, "held": int(held.sum()), "members": members},
+        "limits": rows,
+        "metrics": values,
+        "sensitivity": after,
+        "before": before,
+    }
+
+
+def _worst(values: np.ndarray, held: np.ndarray) -> float:
+    return float(np.max(values[held])) if held.any() else math.inf
+
+
+def report_text(facts: dict[str, Any]) -> str:
+    """Return the report in Markdown."""
+
+    def rows(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
+        return "\n".join("| " + " | ".join(row) + " |" for row in (head, ("---",) * len(head), *body))
+
+    speeds = zip(facts["before"]["speeds"], facts["sensitivity"]["speeds"], strict=True)
+    peaks = [
+        (
+            f"{b['speed_rpm']:g}",
+            axis["name"],
+            _peak(a, old),
+            _peak(b, axis),
+            f"{axis['frequency_hz']:.4g}",
+            axis["zone"],
+        )
+        for a, b in speeds
+        for old, axis in zip(a["axes"], b["axes"], strict=True)
+    ]
+    limits = [
+        (row["name"], row["meaning"], f"{row['value']:.4g}", f"{row['threshold']:.4g}", "yes" if row["holds"] else "NO")
+        for row in facts["limits"]
+    ]
+    gains = [(row["path"], f"{row['before']:.6g}", f"{row['after']:.6g}", row["at_bound"]) for row in facts["gains"]]
+    parts = [
+        f"# Tuning of {facts['case']}", facts["verdict"],
+        "## Limits", rows(("limit", "meaning", "value", "at most", "met"), limits),
+        "## Peaks of |S|", rows(("rpm", "axis", "before", "after", "Hz", "zone"), peaks),
+        "## Gains", rows(("gain", "before", "after", "at a bound"), gains),
+    ]  # fmt: skip
+    return "\n\n".join(parts) + "\n"
+
+
+def _peak(point: dict[str, Any], axis: dict[str, Any]) -> str:
+    return f"{axis['peak']:.4g}" if point["stable"] else "unstable"
