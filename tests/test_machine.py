@@ -292,7 +292,9 @@ def test_a_machine_is_differentiable_and_an_ensemble_has_one_entry_per_member(ma
     assert float(members[1]) == pytest.approx(float(displacement(20.0)), rel=1e-12)
 
 
-@pytest.mark.parametrize("name", ["machine", pytest.param("machine-flexible", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["machine", *(pytest.param(f"machine-{name}", marks=pytest.mark.slow) for name in ("flexible", "ufu"))]
+)
 def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys):
     path = tmp_path / f"{name}.toml"
     path.write_text(template(name))
