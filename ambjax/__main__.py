@@ -43,7 +43,7 @@ def parser() -> Parser:
 
     command("reproduce", "reproduce Section 4 of the paper: Figures 3 to 6, and a ledger of its claims", out=True)
     template = command("template", "print a case file with comments")
-    cases = ["tracking", "regulation", "rig", "bearing", "machine", "machine-flexible"]
+    cases = ["tracking", "regulation", "rig", "bearing", "machine", "machine-flexible", "machine-ufu"]
     meaning = (
         "the paper's tracking or regulation, a laboratory rig, a bearing from a data sheet, or a whole machine with a "
         "rigid or a flexible rotor"

@@ -231,13 +231,44 @@ def test_the_published_controller_of_the_munich_rig(tmp_path):
     assert found.sigma.frequency == pytest.approx(16.7, rel=2e-3)
 
 
-def test_real_sensors_beside_the_magnets_make_the_munich_rig_unstable(tmp_path):
-    found = munich(tmp_path, 0.071, 0.665)
+# The figures of the independent program are those of one pair; the others are unstable too.
+@pytest.mark.parametrize(
+    ("left", "right", "rate"),
+    [
+        (0.071, 0.665, (46, 173)),
+        *(pytest.param(left, right, None, marks=pytest.mark.slow)
+          for left, right in ((0.071, 0.581), (0.155, 0.581), (0.155, 0.665))),
+    ],
+)  # fmt: skip
+def test_real_sensors_beside_the_magnets_make_the_munich_rig_unstable(left, right, rate, tmp_path):
+    found = munich(tmp_path, left, right)
     worst = found.poles[0]
     assert not found.stable
-    assert worst.real == pytest.approx(46, abs=1)
-    assert abs(worst.imag) / (2 * np.pi) == pytest.approx(173, abs=1)
+    assert worst.real > 1
+    if rate is not None:
+        assert (worst.real, abs(worst.imag) / (2 * np.pi)) == pytest.approx(rate, abs=1)
     assert {axis.zone for axis in found.axes} == {"D"}
+
+
+def test_planes_share_the_unbalance_of_a_grade():
+    """G 2.5 of 2.3 kg at 6000 rpm: e = 2.5 mm/s / (200 pi/s), so U = m e = 9.15 g mm, half of it in each plane."""
+    planes = [{"at": at, "grade": 2.5, "service_speed": 6000.0} for at in (-0.1, 0.2)]
+    case = machine_from(changed(MACHINE, unbalance=[*planes, {"at": 0.0, "amount": 3.0}]))
+    half = 2.3 * 2.5e-3 / (2 * np.pi * 100.0) / 1e-6 / 2
+    np.testing.assert_allclose([one.amount for one in case.machine.rotor.unbalances], [half, half, 3.0], rtol=1e-12)
+
+
+def test_runout_turns_with_the_rotor():
+    """Over one turn, a sensor at rest reads the harmonic, with the angle of the unbalance."""
+    turning = MACHINE["rotor"] | {"speed": 600.0, "acceleration": 6000.0}
+    sensor = {"velocity": False, "runout": {"harmonics": [{"amplitude": 1e-6, "number": 2, "phase": 0.3}]}}
+    case = machine_from(short(MACHINE, rotor=turning, sensor=sensor))
+    t = np.linspace(0, 0.2, 9)
+    angle = 2 * np.pi * (10.0 * t + 100.0 * t * t / 2)
+    for one in case.cases:
+        runout = one.scenario.turning().sensors.runout
+        assert runout is not None
+        np.testing.assert_allclose([float(runout(x)) for x in t], 1e-6 * np.sin(2 * angle + 0.3), atol=1e-18)
 
 
 @pytest.mark.slow
@@ -261,7 +292,9 @@ def test_a_machine_is_differentiable_and_an_ensemble_has_one_entry_per_member(ma
     assert float(members[1]) == pytest.approx(float(displacement(20.0)), rel=1e-12)
 
 
-@pytest.mark.parametrize("name", ["machine", pytest.param("machine-flexible", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["machine", *(pytest.param(f"machine-{name}", marks=pytest.mark.slow) for name in ("flexible", "ufu"))]
+)
 def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys):
     path = tmp_path / f"{name}.toml"
     path.write_text(template(name))

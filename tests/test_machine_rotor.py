@@ -185,3 +185,41 @@ def test_a_rotor_on_springs_or_unlike_in_its_planes_is_refused(tmp_path):
 def test_a_place_without_shapes_is_refused(shaft, tmp_path):
     with pytest.raises(ValueError, match=r"no shapes at 0\.363 m.*0\.113, 0\.623 m"):
         of_file(tmp_path, modal_table(shaft))  # its unbalance is on the middle disc
+
+
+# The rig of the Federal University of Uberlandia, from amb_models.py of ROSS (Apache-2.0): lengths (m), diameters (mm)
+# of the sections, and places and widths (mm) of its laminations and of the three parts of its disc.
+SECTIONS = [(0.012, 6.35), (0.08, 32), (0.0733, 34.8), (0.0252, 49.9), (0.1675, 19.05), (0.0125, 54), (0.1651, 19.05),
+            (0.0251, 49.9), (0.0734, 34.8), (0.012, 6.35)]  # fmt: skip
+LAMINATIONS = [(112, 8.8), (120.8, 6.4), (127.2, 7.5), (134.8, 5.7), (140.5, 6.4), (146.9, 6.1), (153, 6.2),
+               (159.2, 6.2),
+               (566.9, 6.2), (573.1, 6.2), (579.2, 6.1), (585.6, 6.4), (591.3, 5.7), (598.9, 7.5), (605.3, 6.4),
+               (614.1, 8.8)]  # fmt: skip
+DISC = [(358, 4), (364, 7), (370.5, 14)]
+
+
+def ring(at, width, rho, inner, outer):
+    """A ring of a material: places and sizes in mm."""
+    a, b, w = inner * 1e-3, outer * 1e-3, width * 1e-3
+    m = rho * np.pi / 4 * (b**2 - a**2) * w
+    return {"at": at * 1e-3, "m": m, "I_t": m * (3 * (a**2 + b**2) + 4 * w**2) / 48, "I_p": m * (a**2 + b**2) / 8}
+
+
+def test_the_rotor_of_uberlandia_from_its_geometry():
+    """Mass, inertia, free frequencies, and their splits at 10,000 rpm: figures of an independent program."""
+    discs = [ring(*one, 7700, 34.8, 49.8) for one in LAMINATIONS] + [ring(*one, 7850, 54, 120) for one in DISC]
+    elements = [{"length": length, "diameter": d * 1e-3} for length, d in SECTIONS]
+    rotor = {"kind": "shaft", "E": 1.9e11, "rho": 7850.0, "modes": 8, "elements": elements, "discs": discs}
+    body = body_from(Table({"rotor": rotor, "bearing": [{"at": 0.153}, {"at": 0.5669}]}))
+    assert (body.m, body.I_t, body.I_p) == pytest.approx((5.936, 0.18586, 4.795e-3), rel=1e-4)
+    np.testing.assert_allclose(body.frequencies[:4], [104.2, 400.3, 768.2, 1117.6], atol=0.05)
+    assert body.shapes is not None
+    assert abs(body.shapes(0.5669)[1]) == pytest.approx(0.022, abs=5e-4)  # a node almost at the second magnet
+    n, W = len(body.gyroscopic), 10_000 * np.pi / 30
+    stiffness = np.diag([0.0, 0.0, *(2 * np.pi * body.frequencies) ** 2])
+    masses = np.diag([body.m, body.I_t, *np.ones(n - 2)])
+    # q'' - j W Gm q' + K q = 0
+    still, spin = np.linalg.solve(masses, stiffness), np.linalg.solve(masses, body.gyroscopic)
+    turning = np.linalg.eigvals(np.block([[np.zeros((n, n)), np.eye(n)], [-still, 1j * W * spin]])).imag / (2 * np.pi)
+    for expected in (106.4, 442.9, -102.0, -355.3):
+        assert np.abs(turning - expected).min() < 0.1

@@ -28,6 +28,7 @@ from ambjax.cases.rotor_file import body_of_file
 from ambjax.cases.scenario_tables import signal_from
 from ambjax.cases.table import Table, show
 from ambjax.numerics.records import leaf
+from ambjax.world.rotation import GRAM_MM, UnbalanceGrade
 from ambjax.world.rotor import Rotor, RotorLoad, RotorUnbalance
 from ambjax.world.shaft import Disc, Section, shaft_model
 
@@ -40,6 +41,7 @@ OWN = ("plant", "controller", "sensor", "actuator", "reference")
 LONGEST_ELEMENT = 1 / 70
 ANGLE = leaf(default=0.0, unit="degrees", at_least=-360.0, at_most=360.0, doc="angle of the first axis from x")
 AMOUNT, PHASE = (field for field in dataclasses.fields(RotorUnbalance) if field.name in ("amount", "phase"))
+GRADE = {field.name: field for field in dataclasses.fields(UnbalanceGrade)}
 SPEED, ACCELERATION = (field for field in dataclasses.fields(Rotor) if field.name in ("speed", "acceleration"))
 LENGTH = leaf(unit="m", at_least=1e-6, at_most=100.0, doc="length of a section")
 DIAMETER = leaf(unit="m", at_least=1e-6, at_most=100.0, doc="outer diameter of a section")
@@ -230,6 +232,8 @@ def _exact(x: float) -> float:
 def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pathlib.Path) -> Rotor:
     """Return the rotor of the tables [rotor], [[unbalance]] and [[load]]."""
     table, k = top.table("rotor"), len(body.frequencies)
+    unbalances = tables_of(top, "unbalance")
+    graded = sum("grade" in one.raw for one in unbalances)
     n, w = RIGID + 2 * k, 2 * np.pi * np.repeat(body.frequencies, 2)
     mass = np.concatenate([[body.m, body.m, body.m, body.I_t, body.I_t], np.ones(2 * k)])
     K, D = np.zeros(n), np.zeros(n)
@@ -251,16 +255,23 @@ def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pat
         gravity=jnp.asarray(gravity),
         speed=table.leaf("speed", SPEED, 0.0),
         acceleration=table.leaf("acceleration", ACCELERATION, 0.0),
-        unbalances=tuple(_unbalance(one, body) for one in tables_of(top, "unbalance")),
+        unbalances=tuple(_unbalance(one, body, graded) for one in unbalances),
         loads=tuple(_load(one, body, Recordings(folder, ())) for one in tables_of(top, "load")),
     )
 
 
-def _unbalance(table: Table, body: RotorBody) -> RotorUnbalance:
-    table.only(["at", "amount", "phase", *(["modes"] if body.shapes is None else [])])
+def _unbalance(table: Table, body: RotorBody, graded: int) -> RotorUnbalance:
+    """Return an unbalance. `graded`: number of planes that share the unbalance of a grade equally."""
+    own = ["grade", "service_speed"] if "grade" in table.raw else ["amount"]
+    table.only(["at", *own, "phase", *(["modes"] if body.shapes is None else [])])
     at, shapes = body.place(table)
     x, y = (jnp.asarray(row(at, d, shapes)) for d in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
-    return RotorUnbalance(needed(table, "amount", AMOUNT), x, y, table.leaf("phase", PHASE, 0.0))
+    if "grade" in table.raw:
+        grade = UnbalanceGrade(*(needed(table, key, GRADE[key]) for key in own))
+        amount = float(body.m * grade.eccentricity / GRAM_MM / graded)
+    else:
+        amount = needed(table, "amount", AMOUNT)
+    return RotorUnbalance(amount, x, y, table.leaf("phase", PHASE, 0.0))
 
 
 def _load(table: Table, body: RotorBody, recordings: Recordings) -> RotorLoad:

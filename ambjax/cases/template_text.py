@@ -10,12 +10,13 @@ from ambjax.cases.machine_templates import FLEXIBLE, MACHINE
 from ambjax.cases.reader import PLANTS
 from ambjax.cases.rig import RIG
 from ambjax.cases.scenario_tables import SIGNALS
+from ambjax.cases.ufu_template import UFU
 from ambjax.ensemble.design import DESIGNS
 from ambjax.paper.readings import PULSE, REFERENCE, TABLE_2
 from ambjax.world.plant import Plant
 
 # Templates of bearings other than the paper's, and of whole machines, by name.
-MACHINES = {"rig": RIG, "bearing": BEARING, "machine": MACHINE, "machine-flexible": FLEXIBLE}
+MACHINES = {"rig": RIG, "bearing": BEARING, "machine": MACHINE, "machine-flexible": FLEXIBLE, "machine-ufu": UFU}
 HEAD = """\
 # A case for ambjax: {title}.
 # Units are SI. A key that is left out has the value shown here, unless its comment says otherwise.
