@@ -128,9 +128,10 @@ def run(path: str, options: Options, listen: Listener) -> TunedCase:
 
     Raises ValueError for bad input before anything is written, and in the search as `rounds` does.
     """
-    if is_machine(load(path)[0]):
-        return _machine(path, options, listen)
-    plan = _plan(path, options)
+    loaded = load(path)  # once: a second read of a pipe would be empty
+    if is_machine(loaded[0]):
+        return _machine(path, options, listen, loaded)
+    plan = _plan(path, options, loaded)
     with locked(plan.out):
         if not options.resume:
             _clear(plan.out, options.force)
@@ -142,19 +143,19 @@ def run(path: str, options: Options, listen: Listener) -> TunedCase:
             return _tune(plan, path, listen)
 
 
-def _machine(path: str, options: Options, listen: Listener) -> TunedCase:
+def _machine(path: str, options: Options, listen: Listener, loaded: tuple[dict[str, Any], str]) -> TunedCase:
     """Tune a whole machine. Raises ValueError for an option that it does not take."""
     for name, given in options._asdict().items():
         if name in ("resume", "pareto", "page", "settings_of") and given:
             raise ValueError(f"--{name.replace('_', '-')}: the tuning of a machine does not take it. Leave it out.")
     minutes = None if options.minutes is None else allowed_minutes(options.minutes)
-    found = tune_machine(path, options.out, options.force, minutes, teller(listen))
+    found = tune_machine(path, options.out, options.force, minutes, teller(listen), loaded)
     return TunedCase(found.case, found.good, found.report, found.directory)
 
 
-def _plan(path: str, options: Options) -> TuningPlan:
+def _plan(path: str, options: Options, loaded: tuple[dict[str, Any], str]) -> TuningPlan:
     """Read the case and make the output directory. Raises ValueError for an invalid case or option."""
-    case, tune, raw = read_tune(path, options.settings_of)
+    case, tune, raw = read_tune(path, options.settings_of, loaded)
     if options.resume and options.out is None:
         raise ValueError("--resume: the directory of the search is missing. Give it as --out.")
     if options.resume and not can_resume(pathlib.Path(str(options.out))):

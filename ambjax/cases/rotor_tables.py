@@ -267,7 +267,8 @@ def _unbalance(table: Table, body: RotorBody, graded: int) -> RotorUnbalance:
     at, shapes = body.place(table)
     x, y = (jnp.asarray(row(at, d, shapes)) for d in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     if "grade" in table.raw:
-        grade = UnbalanceGrade(*(needed(table, key, GRADE[key]) for key in own))
+        G, service_speed = (needed(table, key, GRADE[key]) for key in own)
+        grade = UnbalanceGrade(G, service_speed)
         amount = float(body.m * grade.eccentricity / GRAM_MM / graded)
     else:
         amount = needed(table, "amount", AMOUNT)

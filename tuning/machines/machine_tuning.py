@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, machine_from
-from ambjax.cases.table import Table, load, one_line
+from ambjax.cases.table import Table, one_line
 from ambjax.cases.tune_table import BUDGET, NUMBERS
 from ambjax.extend import leaf
 from ambjax.results.outputs import directory, files, plain, write_json
@@ -74,9 +74,14 @@ def settings_from(raw: dict[str, Any], case: MachineCase) -> Settings:
     )
 
 
-def tune_machine(path: str, out: str | None, force: bool, minutes: float | None, tell: Tell) -> MachineTuning:
-    """Tune the machine of a case file and write tuned.toml and the report. Raises ValueError for invalid input."""
-    raw, text = load(path)
+def tune_machine(
+    path: str, out: str | None, force: bool, minutes: float | None, tell: Tell, loaded: tuple[dict[str, Any], str]
+) -> MachineTuning:
+    """Tune the machine of a case file and write tuned.toml and the report. Raises ValueError for invalid input.
+
+    `loaded`: document and text of the file.
+    """
+    raw, text = loaded
     folder = pathlib.Path(path).parent
     try:
         case = machine_from(raw, pathlib.Path(path).stem, text, folder)

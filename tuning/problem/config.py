@@ -100,14 +100,17 @@ class Tune:
 
 
 def read_tune(
-    path: str | pathlib.Path, settings_of: str | pathlib.Path | None = None
+    path: str | pathlib.Path,
+    settings_of: str | pathlib.Path | None = None,
+    loaded: tuple[dict[str, Any], str] | None = None,
 ) -> tuple[Case, Tune, dict[str, Any]]:
     """Return the case, [tune] and the raw document of a case file.
 
-    `settings_of`: a case file whose [tune] replaces that of the case, except for the keys `gains` and `bounds`. Raises
-    ValueError with a message of one line for an invalid file.
+    `settings_of`: a case file whose [tune] replaces that of the case, except for the keys `gains` and `bounds`.
+    `loaded`: document and text of the file; None: they are read. Raises ValueError with a message of one line for an
+    invalid file.
     """
-    raw, text = load(path)
+    raw, text = loaded or load(path)
     name = pathlib.Path(path).stem
     if settings_of is not None:
         raw = {**raw, "tune": _merged(raw.get("tune", {}), load(settings_of)[0].get("tune", {}))}
