@@ -84,11 +84,15 @@ def body_from(top: Table, folder: pathlib.Path = pathlib.Path()) -> RotorBody:
         one.only(["frequency", "damping"])
     frequencies = np.array([needed(one, "frequency", FREQUENCY) for one in modes])
     dampings = np.array([one.leaf("damping", DAMPING, DAMPING.default) for one in modes])
-    return RotorBody(m, I_t, I_p, 0.0, frequencies, dampings, _gyroscopic(table, I_p, len(modes)), None)
+    return RotorBody(m, I_t, I_p, 0.0, frequencies, dampings, _gyroscopic(table, (m, I_t, I_p), len(modes)), None)
 
 
-def _gyroscopic(table: Table, I_p: float, modes: int) -> np.ndarray:
-    """Return the gyroscopic matrix of translation, tilt and modes: `Gm` covers the modes, or all of them."""
+def _gyroscopic(table: Table, masses: tuple[float, float, float], modes: int) -> np.ndarray:
+    """Return the gyroscopic matrix of translation, tilt and modes. `masses`: m, I_t, I_p.
+
+    `Gm` covers the modes, or all coordinates. It is that of mass-normalised coordinates.
+    """
+    m, I_t, I_p = masses
     whole = np.zeros((2 + modes, 2 + modes))
     whole[1, 1] = I_p
     if "Gm" not in table.raw:
@@ -104,12 +108,13 @@ def _gyroscopic(table: Table, I_p: float, modes: int) -> np.ndarray:
         raise ValueError(f"{table.at('Gm')}: it must be symmetric.")
     if len(Gm) == modes:
         whole[2:, 2:] = Gm
-    elif np.abs(Gm[0]).max() > 1e-9 * np.abs(Gm).max() or not np.isclose(Gm[1, 1], I_p, rtol=1e-6):
+    elif np.abs(Gm[0]).max() > 1e-9 * np.abs(Gm).max() or not np.isclose(Gm[1, 1], I_p / I_t, rtol=1e-2):
         raise ValueError(
-            f"{table.at('Gm')}: its first row must be 0, and Gm[1][1] = {Gm[1, 1]:g} must be I_p = {I_p:g}."
+            f"{table.at('Gm')}: its first row must be 0, and Gm[1][1] = {Gm[1, 1]:g} must be I_p/I_t = {I_p / I_t:g}."
         )
     else:
-        whole = Gm
+        size = np.sqrt([m, I_t, *np.ones(modes)])
+        whole = Gm * np.outer(size, size)
     return whole
 
 
