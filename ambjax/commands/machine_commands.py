@@ -114,10 +114,12 @@ def worst_of_speeds(points: list[MachineSensitivity]) -> MachineSensitivity:
 def _injections(case: MachineCase, points: list[MachineSensitivity], everywhere: bool) -> Measured:
     """Measure the sensitivity of each axis by injection into the simulation.
 
-    On a processor at the speed with the largest peak; `everywhere`: at all speeds, also in continuous time.
+    On a processor at the speed with the largest peak; `everywhere`: at all speeds, also in continuous time. Not where the
+    machine is not stable.
     """
     sampled = isinstance(case.machine, SampledMachine)
     at = points if everywhere else [worst_of_speeds(points)] if sampled else []
+    at = [point for point in at if point.stable]  # otherwise the rotor swings by itself
     if not at:
         return {}
     with doing(f"measuring the sensitivity by injection into the simulation; {FIRST_RUN}"):
