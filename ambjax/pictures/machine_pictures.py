@@ -134,7 +134,7 @@ def machine_sensitivity_picture(
 def campbell_picture(title: str, speeds: np.ndarray, modes: Sequence[Sequence[Any]], path: pathlib.Path) -> None:
     """Write the frequencies of the modes against speed, coloured by their damping ratio, with the line of the speed.
 
-    `speeds`: rpm. `modes`: the `Mode`s at each speed. Triangles up are forward modes, triangles down backward ones;
+    `speeds`: rpm. `modes`: the modes at each speed. Triangles up are forward modes, triangles down backward ones;
     unstable modes are red crosses. The lightly damped modes are named at the last speed.
     """
     figure = Figure(figsize=(11.0, 6.8), layout="constrained")
