@@ -111,8 +111,9 @@ def sensitivity_summary(points: list[MachineSensitivity]) -> Summary:
                     "name": axis.name, "peak": axis.S.height, "frequency_hz": axis.S.frequency, "zone": axis.zone,
                     "peak_T": axis.T.height, "peak_KS": axis.KS.height,
                     "margins": None if axis.margins is None else _margins(axis.margins),
+                    "running_speed": facts,
                 }
-                for axis in point.axes
+                for axis, (facts, _) in zip(point.axes, once_per_revolution(point), strict=True)
             ],
             "sigma_max": point.sigma.height,
             "sigma_frequency_hz": point.sigma.frequency,
@@ -127,6 +128,12 @@ def sensitivity_summary(points: list[MachineSensitivity]) -> Summary:
     }  # fmt: skip
     own: dict[str, Any] = at[points.index(worst)]
     return first | {key: own[key] for key in ("axes", "sigma_max", "sigma_frequency_hz")} | {"speeds": at}
+
+
+def once_per_revolution(point: MachineSensitivity) -> list[tuple[list[Summary], list[str]]]:
+    """Return |S| of each axis at the speed, as `running_facts` does."""
+    speeds = (abs(point.speed) * PER_MINUTE,) if point.speed else ()
+    return [running_facts(speeds, point.system, axis.S, k, f"|S| of {axis.name}") for k, axis in enumerate(point.axes)]
 
 
 def _margins(margins: Margins) -> dict[str, float]:
@@ -154,7 +161,6 @@ def sensitivity_text(points: list[MachineSensitivity]) -> str:
         parts.append(
             table(("axis", "peak of |S|", "Hz", "zone", "peak of |T|", "gain margin", "phase margin, deg"), rows)
         )
-        for k, axis in enumerate(point.axes):
-            speeds = (abs(point.speed) * PER_MINUTE,) if point.speed else ()
-            parts += running_facts(speeds, point.system, axis.S, k, f"|S| of {axis.name}")[1]
+        for _, lines in once_per_revolution(point):
+            parts += lines
     return "\n".join(parts)
