@@ -144,6 +144,9 @@ def test_the_commands_write_what_an_engineer_looks_at(tmp_path, capsys):
     assert main(["check", str(path), "--json"]) == 0
     checked = json.loads(capsys.readouterr().out)
     assert checked["clearance_used"] == max(axis["clearance_used"] for axis in checked["axes"].values())
+    turning = [fact for facts in checked["running_speed"].values() for fact in facts]
+    assert len(turning) == len(checked["axes"]) * sum(speed != "0" for speed in checked["stable"])
+    assert all(0 < fact["S"] <= checked["peak"] for fact in turning)
     assert checked["peak"] == max(axis["peak"] for axis in checked["axes"].values())
     weight = 2.3 * 9.81
     case = read_machine(path)

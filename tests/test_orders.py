@@ -13,6 +13,7 @@ from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.commands.acceptance import acceptance
 from ambjax.linear import analyse, linearise
+from ambjax.pictures.order_picture import once_per_turn
 from ambjax.results.machine_run import simulate_machine
 from ambjax.signals import Rotation
 from ambjax.simulation.folds import Ending
@@ -128,3 +129,21 @@ def test_a_peak_of_the_sensitivity_near_the_speed_is_named():
         expected = abs(system.sensitivity(np.array([factor * peak]))[0])
         assert at == {"frequency_hz": pytest.approx(factor * peak), "S": pytest.approx(expected, rel=1e-9)}
         assert ("WARNING: the peak of |S|" in "\n".join(lines)) == named
+
+
+def test_the_amplitude_in_each_turn_of_a_run_up_is_that_of_the_signal():
+    rotor = Rotation(600.0, 12000.0)
+    t = np.arange(0.0, 1.0, 1e-4)
+    turns = np.asarray(rotor.turns(t))
+    found = once_per_turn(3e-6 * np.cos(2 * np.pi * turns + 0.4) + 1e-5 * turns, turns)
+    assert len(found) == int(turns[-1])
+    np.testing.assert_allclose(found, 3e-6, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_run_up_is_drawn_against_speed(tmp_path):
+    text = "[rotor]\nspeed = {}\n[clock]\nduration = 0.05\n[processor]\n"
+    for name, speed in (("up", "3000.0\nacceleration = 60000.0"), ("constant", "3000.0")):
+        (tmp_path / f"{name}.toml").write_text(text.format(speed))
+        assert main(["simulate", str(tmp_path / f"{name}.toml"), "--out", str(tmp_path / name)]) == 0
+        assert (tmp_path / name / "runup.png").exists() == (name == "up")

@@ -98,6 +98,14 @@ def test_a_signal_from_a_file_is_refused_in_one_line(tmp_path, capsys):
     assert 'disturbance.q_z: kind = "table": a page cannot contain a signal from a file.' in said
 
 
+def test_a_notch_is_refused_in_one_line(tmp_path, capsys):
+    notch = '[rotor]\nspeed = 6000.0\n[controller.notch]\nkind = "force-free"\n'
+    (tmp_path / "case.toml").write_text(f"{notch}[clock]\nduration = 0.01\n[processor]\n")
+    assert main(["page", str(tmp_path / "case.toml")]) == 2
+    (said,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ambjax")]
+    assert "[controller.notch]: a page cannot contain a notch" in said
+
+
 def test_a_case_with_another_structure_is_refused_as_a_preset(tmp_path, capsys):
     one, other = tmp_path / "rig.toml", tmp_path / "other.toml"
     one.write_text(RIG)

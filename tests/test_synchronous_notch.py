@@ -135,3 +135,12 @@ def test_every_axis_of_a_machine_is_freed_of_force():
 def test_a_wrong_notch_is_refused(raw, said):
     with pytest.raises(ValueError, match=said):
         case_from(raw)
+
+
+def test_a_notch_of_one_bearing_is_refused():
+    raw = tomllib.loads(template("machine"))
+    raw["rotor"] |= {"speed": RPM}
+    bearings = [dict(one) for one in raw["bearing"]]
+    bearings[1] = with_notch(bearings[1], "force-free")
+    with pytest.raises(ValueError, match=r"bearing.*controller.notch: no bearing has its own notch"):
+        machine_from(raw | {"bearing": bearings})

@@ -17,7 +17,7 @@ from tuning.problem.tuning_problem import problem_of
 
 
 def parsed(tune):
-    return case_and_tune({"sensor": {"std": 1e-6}, "tune": tune})[1]
+    return case_and_tune({"sensor": {"std": 1e-6}, "rotor": {"speed": 6000.0}, "tune": tune})[1]
 
 
 ENDS = NUMBERS | {f"weights.{name}": WEIGHTS[name] for name in [*TERMS, "conditions"]}

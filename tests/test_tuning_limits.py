@@ -155,13 +155,19 @@ largest_error_m = 1e-5
 settling_s = 0.1
 overshoot_m = 1e-5
 clearance_used = 0.6
+z_1x_m = 1e-6
+i_1x_A = 0.1
+[rotor]
+speed = 12000.0
 """
 
 
 def test_the_search_computes_the_quantities_of_the_judge():
     made = problem_from(SAMPLED)
     case = made.case
-    context = LimitContext(case.settle, float(case.clock.duration), float(case.scenario.touchdown), 45e-6)
+    context = LimitContext(
+        case.settle, float(case.clock.duration), float(case.scenario.touchdown), 45e-6, case.scenario.rotor
+    )
     folds = measures([limit.name for limit in made.limits], made.limits, context)
     fold = Named({"ours": Named(folds), "theirs": Metrics.of(case.settle, case.scenario)})
     both = rollout(case.cascade, case.scenario, case.clock, fold=fold, record_every=0).metrics

@@ -18,7 +18,7 @@ from tuning.problem.quantities import KINDS, LOOPS
 from tuning.problem.tuning_problem import problem_of
 from tuning.rounds import finer
 
-NAMES = ["complementary", "control_sensitivity", "delay_margin_s", "sensitivity"]
+NAMES = ["complementary", "control_sensitivity", "delay_margin_s", "sensitivity", "sensitivity_1x"]
 PATHS = ["controller.position.c", "controller.position.k", "controller.inversion.gamma", "controller.current.k_i"]
 GAINS = {
     "position": {"c": 200.0, "k": 63.0, "p": 5.0},
@@ -29,6 +29,7 @@ DOCUMENT = {
     "controller": GAINS,
     "processor": {"delay": 1.0, "discretisation": "explicit"},
     "sensor": {"std": 1e-6},
+    "rotor": {"speed": 6000.0},
     "clock": {"duration": 0.004, "sample_period": 1e-4},
     "run": {"settle": 0.002},
     "spread": {"plant": {"m": {"percent": 10}}},
@@ -38,7 +39,13 @@ DOCUMENT = {
         "bounds": {"controller.position.k": [1.0, 1e7]},
         "members": 12,
         "stressed": 2,
-        "limits": {"sensitivity": 4.0, "complementary": 4.0, "control_sensitivity": 1e8, "delay_margin_s": 1e-4},
+        "limits": {
+            "sensitivity": 4.0,
+            "complementary": 4.0,
+            "control_sensitivity": 1e8,
+            "delay_margin_s": 1e-4,
+            "sensitivity_1x": 2.0,
+        },
     },
 }
 

@@ -86,6 +86,9 @@ def law_from(
 
     `cases`: of the axes. `read`: reads a raw case with a name.
     """
+    for bearing in bearings:
+        if "notch" in (own := bearing.table("controller")).raw:
+            raise ValueError(f"{own.at('notch')}: no bearing has its own notch. Use [controller.notch], for all axes.")
     table = top.table("controller")
     if (kind := kind_of(top.raw)) != LAWS[0]:
         for bearing in bearings:

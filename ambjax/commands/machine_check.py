@@ -6,7 +6,7 @@ import tomllib
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, machine_from
-from ambjax.commands.machine_commands import analysed, worst_of_speeds
+from ambjax.commands.machine_commands import analysed, once_per_revolution, worst_of_speeds
 from ambjax.host.heartbeat import say
 from ambjax.linear import MachineSensitivity, poles_in_s
 from ambjax.linear.linear_machine import turning_machines
@@ -35,6 +35,7 @@ def check(args: argparse.Namespace, case: MachineCase) -> tuple[int, dict[str, o
     modes = {point.speed: modes_of(own, case.machine.rotor) for point, own in zip(points, turning, strict=True)}
     spilled = _spill_over(case)
     worst = worst_of_speeds(points)
+    at_speeds = [once_per_revolution(point) for point in points]
     summary = {
         "held": not run.lost,
         "lost_why": run.lost_why,
@@ -46,6 +47,9 @@ def check(args: argparse.Namespace, case: MachineCase) -> tuple[int, dict[str, o
         "peak": worst.worst.S.height,
         "axis": worst.worst.name,
         "speed_rpm": worst.speed,
+        "running_speed": {
+            axis: [fact for point in at_speeds for fact in point[k][0]] for k, axis in enumerate(case.axes)
+        },
         "modes": {f"{speed:g}": [mode.numbers() for mode in own] for speed, own in modes.items()},
         "growth_with_more_modes_per_s": spilled,
     }
@@ -59,6 +63,8 @@ def check(args: argparse.Namespace, case: MachineCase) -> tuple[int, dict[str, o
             f"stability: {'stable' if stable else 'NOT STABLE'} at {', '.join(summary['stable'])} rpm{_more(spilled)}"
         )
         print(table(AXIS_COLUMNS, [(axis, *map(_short, own.values())) for axis, own in axes.items()]))
+        if lines := [line for point in at_speeds for _, own in point for line in own]:
+            print("\n".join(lines))
         if light := _light(modes):
             print(table(("lightly damped mode", "Hz", "damping ratio", "rpm"), light))
     return int(run.lost or not stable), plain(summary)

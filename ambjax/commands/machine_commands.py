@@ -141,9 +141,12 @@ def sensitivity_summary(points: list[MachineSensitivity], measured: Measured) ->
                     "name": axis.name, "peak": axis.S.height, "frequency_hz": axis.S.frequency, "zone": axis.zone,
                     "peak_T": axis.T.height, "peak_KS": axis.KS.height,
                     "margins": None if axis.margins is None else _margins(axis.margins),
+                    "running_speed": facts,
                     **injected_numbers(point.system, one, k),
                 }
-                for k, (axis, one) in enumerate(zip(point.axes, _measured_at(point, measured), strict=True))
+                for k, (axis, one, (facts, _)) in enumerate(
+                    zip(point.axes, _measured_at(point, measured), once_per_revolution(point), strict=True)
+                )
             ],
             "sigma_max": point.sigma.height,
             "sigma_frequency_hz": point.sigma.frequency,
@@ -164,6 +167,12 @@ def sensitivity_summary(points: list[MachineSensitivity], measured: Measured) ->
 def _measured_at(point: MachineSensitivity, measured: Measured) -> tuple[Injection | None, ...]:
     """Return the measured sensitivity of each axis at the speed of a point; None where there is none."""
     return measured.get(point.speed, (None,) * len(point.axes))
+
+
+def once_per_revolution(point: MachineSensitivity) -> list[tuple[list[Summary], list[str]]]:
+    """Return |S| of each axis at the speed, as `running_facts` does."""
+    speeds = (abs(point.speed) * PER_MINUTE,) if point.speed else ()
+    return [running_facts(speeds, point.system, axis.S, k, f"|S| of {axis.name}") for k, axis in enumerate(point.axes)]
 
 
 def _margins(margins: Margins) -> dict[str, float]:
@@ -191,9 +200,8 @@ def sensitivity_text(points: list[MachineSensitivity], measured: Measured) -> st
         parts.append(
             table(("axis", "peak of |S|", "Hz", "zone", "peak of |T|", "gain margin", "phase margin, deg"), rows)
         )
-        for k, axis in enumerate(point.axes):
-            speeds = (abs(point.speed) * PER_MINUTE,) if point.speed else ()
-            parts += running_facts(speeds, point.system, axis.S, k, f"|S| of {axis.name}")[1]
+        for _, lines in once_per_revolution(point):
+            parts += lines
         for k, (axis, one) in enumerate(zip(point.axes, _measured_at(point, measured), strict=True)):
             parts += [] if one is None else [injection_text(point.system, one, k, f" at {axis.name}")]
     return "\n".join(parts)

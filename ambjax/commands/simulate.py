@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 Summary = dict[str, object]
 SIMULATING = f"simulating the case; {FIRST_RUN}"
-WRITTEN = ("trajectory.npz", "metrics.json", "overview.png")
+# runup.png: only if the speed of the rotor changes.
+WRITTEN = ("trajectory.npz", "metrics.json", "overview.png", "runup.png")
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
@@ -65,13 +66,17 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     }
     if replayed is not None:
         metrics["trajectory_deviation"] = replayed.deviation
+    from ambjax.pictures.order_picture import order_picture
     from ambjax.pictures.overview import overview
 
+    rotor = case.scenario.rotor
     with files(out) as part:
         trajectory.save(part / "trajectory.npz")
         write_json(part / "metrics.json", metrics)
         title, path = f"{case.name}: {case.clock.method}", part / "overview.png"
         described(path.name, lambda: overview(trajectory, title, path, window, case.settle))
+        if rotor is not None and rotor.acceleration != 0:
+            described("runup.png", lambda: order_picture(trajectory, rotor, title, part / "runup.png"))
         for name, page in html.items():
             (part / name).write_text(page, encoding="utf-8")
         names = [name for name in names if (part / name).exists()]

@@ -36,6 +36,7 @@ class LoopQuantities(NamedTuple):
     - `control_sensitivity`: peak of |KS|, V/m.
     - `delay_margin_s`: smallest additional delay, at the position reading or at the command, that makes the loop
       unstable, s.
+    - `sensitivity_1x`: the largest |S| at the speeds of the rotor.
     - `growth`: largest real part of a pole, 1/s; inf without an equilibrium. The loop is stable as in
       `StateSpace.stable`.
 
@@ -49,6 +50,7 @@ class LoopQuantities(NamedTuple):
     complementary: Array
     control_sensitivity: Array
     delay_margin_s: Array
+    sensitivity_1x: Array
     growth: Array
 
 
@@ -84,7 +86,14 @@ class _Loop(NamedTuple):
 
 
 def loop_quantities(
-    system: StateSpace, found: Array, low: Scalar, pole: Scalar, volts_per_metre: Scalar, *, delay: bool = True
+    system: StateSpace,
+    found: Array,
+    low: Scalar,
+    pole: Scalar,
+    volts_per_metre: Scalar,
+    *,
+    delay: bool = True,
+    speeds: Array | None = None,
 ) -> LoopQuantities:
     """Return the quantities of a loop from the matrices of `loop_matrices`.
 
@@ -94,6 +103,7 @@ def loop_quantities(
     - `pole`: unstable pole of the plant, 1/s.
     - `volts_per_metre`: unit of |KS|, V/m.
     - `delay`: whether the delay margin is computed; if not, it is inf.
+    - `speeds`: speeds [F] of the rotor, Hz. None: `sensitivity_1x` is 0.
 
     The frequency of each peak is found without derivatives, from the poles and zeros of the loop. The derivative of a
     peak is that of the response at this frequency (envelope theorem). The derivative of the delay margin is that of the
@@ -122,6 +132,7 @@ def loop_quantities(
     margin = jnp.asarray(jnp.inf)
     if delay:
         margin = jnp.minimum(_delay_margin(scaled, loop, low), command_delay(scaled, low, _fastest(loop, low)))
+    running = None if speeds is None else jnp.max(jnp.abs(scaled.response(speeds)[:, 0, 0]))
     fastest = jnp.max(jnp.abs(poles)) if system.period is None else 1 / system.period
     stable = fine & (growth < NEUTRAL * fastest)
     worse = MOST * jnp.where(fine, 1 + jnp.maximum(growth, 0.0) / pole, NO_EQUILIBRIUM)
@@ -134,6 +145,7 @@ def loop_quantities(
         bounded(heights[1]),
         loop.unit * bounded(heights[2] / loop.unit),
         1 / (pole * bounded(1 / (margin * pole))) if delay else margin,
+        jnp.zeros(()) if running is None else bounded(running),
         jnp.where(fine, growth, jnp.inf),
     )
 

@@ -102,8 +102,16 @@ def _library() -> list[str]:
     return [(folder / name).read_text(encoding="utf-8") for name in BOKEH]
 
 
-def _check_recorded(case: Case, path: str) -> None:
-    """Raise ValueError for a signal from a file, which the page's program cannot contain."""
+def _check_contents(case: Case, path: str) -> None:
+    """Raise ValueError for what a page cannot contain: a signal from a file, and a notch.
+
+    The gain of a notch follows from the linear loop at the speed, so it would have to change with each slider.
+    """
+    if case.cascade.notch is not None:
+        raise ValueError(
+            f"{path}: [controller.notch]: a page cannot contain a notch, whose gain depends on all numbers of the "
+            "loop. Remove it."
+        )
     for slot in SLOTS:
         signal = getattr(case.scenario, slot)
         if any(isinstance(one, Recorded) for one in getattr(signal, "terms", (signal,))):
@@ -117,7 +125,7 @@ def _check_recorded(case: Case, path: str) -> None:
 def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str, Any]]:
     """Return the script of the worker, and the data of the page for JSON."""
     check_processor(case, path)
-    _check_recorded(case, path)
+    _check_contents(case, path)
     for other in others:
         _check_structure(case, other, path)
     case = _finest(case, others)

@@ -23,7 +23,7 @@ LIMITS = {
 
 def judged(case: MachineCase, found: MachineCase, limits: dict[str, float], seed: int, members: int) -> dict[str, Any]:
     """Return the content of report.json but the gains. `case`, `found`: before and after; `members`: to simulate."""
-    before, after = (sensitivity_summary(analysed(one)) for one in (case, found))
+    before, after = (sensitivity_summary(analysed(one), {}) for one in (case, found))
     columns = MachineStudy(found, seed, members).columns(0, members)
     held = np.isposinf(columns["lost_at"])
     values: dict[str, Any] = {name: _worst(columns[metric], held) for name, (_, metric) in LIMITS.items() if metric}

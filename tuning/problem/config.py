@@ -164,10 +164,22 @@ def _weights(table: Table) -> tuple[tuple[float, ...], float]:
     return tuple(given[name] for name in TERMS), given["conditions"]
 
 
+def _check_speed(keys: list[str], case: Case) -> None:
+    """Raise ValueError if the case has limits at the speed of the rotor, and no such speed."""
+    rotor = case.scenario.rotor
+    if keys and (rotor is None or not (np.any(rotor.speed) or np.any(rotor.acceleration))):
+        raise ValueError(f"{', '.join(keys)}: it is a limit at the speed of the rotor. Give rotor.speed, in rpm.")
+    if keys and (spread := [path for path in case.spread.paths if path.startswith("rotor.")]):
+        raise ValueError(
+            f"{', '.join(keys)}: all members need the same speed. Remove {', '.join(spread)} from [spread]."
+        )
+
+
 def _limits(table: Table, case: Case) -> LimitSettings:
     beside = [*OTHER_KEYS, *NUMBERS, *BUDGET, *(f"weights.{name}" for name in WEIGHTS)]
     table.only([*KINDS, "survival", "margin", "settling_band_m"], [f"tune.{key}" for key in beside])
     thresholds = {name: table.leaf(name, OTHER_RANGES.get(name, LIMIT_RANGE)) for name in KINDS if name in table.raw}
+    _check_speed([table.at(name) for name, most in thresholds.items() if "_1x" in name and most < math.inf], case)
     u_max, source = float(np.max(np.asarray(case.scenario.u_max))), dict.fromkeys(thresholds, table.path)
     if "rms_u_V" not in thresholds and math.isfinite(u_max):
         thresholds["rms_u_V"], source["rms_u_V"] = (

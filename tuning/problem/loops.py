@@ -12,6 +12,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble import apply, map_members
 from ambjax.extend import Scalar, canonical
 from ambjax.linear import LoopQuantities, linearisation_inputs, loop_matrices, loop_quantities
+from ambjax.world.rotation import PER_MINUTE
 from ambjax.world.scenario import Scenario
 from tuning.problem.members import LoopRange, Members, Objective
 from tuning.problem.quantities import LOOPS
@@ -33,17 +34,24 @@ class LaneLoop:
 
     space: Space
     range: LoopRange
+    duration: float
 
     def __call__(self, lane: LoopLane) -> tuple[LoopQuantities, LoopQuantities]:
         def quantities(x: Array) -> tuple[LoopQuantities, LoopQuantities]:
             cascade = self.space.decode(x, lane.cascade)
             names, *numbers = self.range
             matrices = loop_matrices(cascade, lane.scenario, lane.period, 0.0)
-            found = loop_quantities(*matrices, *numbers, delay="delay_margin_s" in names)
+            speeds = self._speeds(lane.scenario) if "sensitivity_1x" in names else None
+            found = loop_quantities(*matrices, *numbers, delay="delay_margin_s" in names, speeds=speeds)
             return found, found
 
         slopes, values = jax.jacfwd(quantities, has_aux=True)(lane.x)
         return values, slopes
+
+    def _speeds(self, scenario: Scenario) -> Array:
+        """Return the speeds of the rotor at the start and at the end of the run, Hz."""
+        assert scenario.rotor is not None
+        return jnp.abs(jnp.stack([scenario.rotor.rpm(t) for t in (0.0, self.duration)])) * PER_MINUTE
 
 
 def loops(
@@ -63,7 +71,7 @@ def loops(
     start, member = np.divmod(np.arange(count * n), n)
     lane = jax.tree.map(lambda a: np.asarray(a)[member] if np.ndim(a) else a, canonical(lane))
     lane = lane._replace(x=np.asarray(x, jnp.result_type(float))[start])
-    function = LaneLoop(objective.space, objective.loop)
+    function = LaneLoop(objective.space, objective.loop, float(objective.clock.duration))
     # one call at a time: XLA runs LAPACK on its own threads, and two calls wait for each other for ever
     values, slopes = map_members(function, lane, threads=1, call=LOOPS, block=LOOPS, plain=True)
     names = (*objective.loop.names, *also)

@@ -1,7 +1,6 @@
 """Quantities of an ensemble that may be limited: their folds, and how they combine members."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -11,78 +10,15 @@ import numpy as np
 from jax import Array
 
 from ambjax.cases.tune_table import LOOP_MARGIN, MEAN_MARGIN, WORST_MARGIN
-from ambjax.extend import Scalar, leaf, record, static
-from ambjax.simulation.folds import Driven, Ending, Fold, Named, Peak, Rms, Variation
+from ambjax.simulation.folds import Driven, Fold, Named, Peak, Rms, Variation
+from ambjax.simulation.orders import Orders
 from ambjax.simulation.response import Overshoot, Settling
-from ambjax.simulation.span import Span
-from ambjax.simulation.trajectory import Row
+from ambjax.world.rotation import Rotation
+from tuning.problem.limit_folds import NORM, TINY, LargestOf, OneOf, Scaled, Typical
 
 # Largest number of members whose loops the search linearises. The judge linearises the loops of all its members, and
 # those that break a limit join the search. A loop takes about a tenth of the time of a rollout.
 LOOPS = 16
-# Exponent of the norms that approximate maxima. Over 1e4 samples of noise, the maximum is 1.2 to 1.6 times the norm.
-NORM = 16
-# Lower bound of the argument of a logarithm.
-TINY = 1e-30
-
-
-@record
-class Typical:
-    """Fold: the power mean with exponent 16 of |row.`of`| over the samples with the rotor held, a smooth maximum.
-
-    `size`: unit of the signal in the powers. The derivative of a saturated voltage is 0. The power mean also depends on
-    unsaturated samples, whose derivatives are not 0.
-    """
-
-    of: str = static()
-    size: Scalar = leaf(above=0, at_most=1e30)
-
-    def init(self) -> tuple[Array, Array]:
-        zero = jnp.zeros((), jnp.result_type(float))
-        return zero, zero
-
-    def update(self, carry: tuple[Array, Array], row: Row, span: Span) -> tuple[Array, Array]:
-        total, count = carry
-        return total + (jnp.abs(getattr(row, self.of)) / self.size) ** NORM, count + row.alive
-
-    def result(self, carry: tuple[Array, Array], ending: Ending) -> Array:
-        total, count = carry
-        mean = total / jnp.maximum(count, 1.0)
-        some = mean > TINY
-        return self.size * jnp.where(some, jnp.where(some, mean, 1.0) ** (1 / NORM), 0.0)
-
-
-@record
-class Scaled:
-    """Fold: the result of another fold, divided by `by`."""
-
-    fold: Fold
-    by: Scalar = leaf(above=0, at_most=1e30)
-
-    def init(self) -> object:
-        return self.fold.init()
-
-    def update(self, carry: object, row: Row, span: Span) -> object:
-        return self.fold.update(carry, row, span)
-
-    def result(self, carry: object, ending: Ending) -> Array:
-        return self.fold.result(carry, ending) / self.by
-
-
-@record
-class LargestOf:
-    """Fold: the largest of the results of other folds."""
-
-    folds: Named
-
-    def init(self) -> dict[str, object]:
-        return self.folds.init()
-
-    def update(self, carry: dict[str, object], row: Row, span: Span) -> dict[str, object]:
-        return self.folds.update(carry, row, span)
-
-    def result(self, carry: dict[str, object], ending: Ending) -> Array:
-        return functools.reduce(lambda a, b: jnp.where(a >= b, a, b), self.folds.result(carry, ending).values())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,13 +26,22 @@ class LimitContext:
     """Quantities of a case that the folds of limits depend on.
 
     `settle` (s): start of the settled part. `duration` (s): of the run. `touchdown` (m): clearance. `band` (m): of the
-    settling time.
+    settling time. `rotor`: None if nothing turns.
     """
 
     settle: float
     duration: float
     touchdown: float
     band: float
+    rotor: Rotation | None = None
+
+
+def _once(name: str) -> Callable[[LimitContext, float], Fold]:
+    def fold(context: LimitContext, threshold: float) -> Fold:
+        assert context.rotor is not None
+        return OneOf(Orders(context.rotor, context.settle), name)
+
+    return fold
 
 
 def pooled(values: Array) -> Array:
@@ -221,6 +166,23 @@ KINDS: dict[str, Kind] = {
         fold=lambda context, threshold: Scaled(Peak("z"), context.touchdown),
         exact="clearance_used",
         **_WORST,
+    ),
+    "z_1x_m": Kind(
+        "m",
+        "amplitude of z at the speed of [rotor], from run.settle on",
+        fold=_once("z_1x_m"),
+        exact="z_1x_m",
+        **_WORST,
+    ),
+    "i_1x_A": Kind(
+        "A",
+        "amplitude of the current at the speed of [rotor], from run.settle on",
+        fold=_once("i_1x_A"),
+        exact="i_1x_A",
+        **_WORST,
+    ),
+    "sensitivity_1x": Kind(
+        "", "|S| at the speed of [rotor], at the start and end of the run, of the loop at r = 0", **_LOOP
     ),
     "sensitivity": Kind("", "peak of |S| of the loop linearised at r = 0", **_LOOP),
     "complementary": Kind("", "peak of |T| of the loop linearised at r = 0", **_LOOP),

@@ -177,7 +177,9 @@ def problem_of(
     limits = tune.limits
     front = front or tune.objective == "knee"
     names = sorted({limit.name for limit in limits.each} | set(TRACED if front else ()))
-    context = LimitContext(case.settle, float(clock.duration), float(case.scenario.touchdown), limits.band)
+    context = LimitContext(
+        case.settle, float(clock.duration), float(case.scenario.touchdown), limits.band, case.scenario.rotor
+    )
     loss = loss_for(case.scenario, case.settle, tune.early, measures(names, limits.each, context))
     objective = Objective(
         tune.space, case.cascade, case.scenario, clock, loss, case.spread, _loop_range(case, limits.each)
