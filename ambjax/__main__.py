@@ -102,7 +102,7 @@ def parser() -> Parser:
     sensitivity.add_argument(
         "--inject",
         action="store_true",
-        help="inject a multi-sine also in continuous time; on a processor this is always done",
+        help="inject a multi-sine also in continuous time (always done on a processor); at all speeds of a machine",
     )
     _seed_option(sensitivity)
     summary = "compare cases on the same members: compare.html, compare.json, compare.png"

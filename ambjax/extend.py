@@ -27,7 +27,6 @@ from ambjax.simulation.folds import Fold, Lowest, Named, Peak, Rms
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import Row, Trajectory
 from ambjax.world.bearing import Bearing, Signals
-from ambjax.world.sensor import Measurement
 from ambjax.world.waveforms import Reference, Signal, reference_at
 
 __all__ = [
@@ -43,7 +42,6 @@ __all__ = [
     "InversionLaw",
     "Law",
     "Lowest",
-    "Measurement",
     "Named",
     "Observer",
     "Peak",

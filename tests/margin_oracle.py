@@ -148,8 +148,8 @@ def parts_of(cascade, scenario, clock, r=0.0):
         c = np.block([c, np.zeros((3, 1))])
         c[0] = np.eye(len(A))[-1]
         numbers[:3] = A, np.append(b, 0.0), c
-    if scenario.amplifier is not None and scenario.drive == "voltage":
-        w, (A, b, c) = 2 * np.pi * float(scenario.amplifier.bandwidth), numbers[:3]
+    if scenario.actuator.slow and scenario.drive == "voltage":
+        w, (A, b, c) = 2 * np.pi * float(scenario.actuator.bandwidth), numbers[:3]
         A = np.block([[A, b[:, None]], [np.zeros((1, len(b))), -w * np.ones((1, 1))]])
         numbers[:3] = A, np.append(0 * b, w), np.block([c, np.zeros((3, 1))])
     delay = float(cascade.processor.delay) if sampled else 0.0

@@ -162,7 +162,7 @@ def numbers_of(raw):
 @pytest.mark.slow
 def test_metrics_and_arrays_are_those_of_the_files(tmp_path):
     case = tmp_path / "short.toml"
-    case.write_text("[clock]\nduration = 0.01\n")
+    case.write_text("[clock]\nduration = 0.01\n[rotor]\nspeed = 30000.0\n")
     assert main(["simulate", str(case), "--out", str(tmp_path / "run")]) == 0
     written = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert {row[0].strip("`") for row in metrics.rows()} == {*written, "trajectory_deviation"}  # the last with --member

@@ -16,6 +16,7 @@ from ambjax.__main__ import main
 from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.reader import case_from, read_case
 from ambjax.cases.template_text import template
+from ambjax.commands import machine_commands
 from ambjax.linear import linearise
 from ambjax.linear.linear_machine import linearise_machine, machine_sensitivity
 from ambjax.numerics.records import canonical
@@ -295,7 +296,8 @@ def test_a_machine_is_differentiable_and_an_ensemble_has_one_entry_per_member(ma
 @pytest.mark.parametrize(
     "name", ["machine", *(pytest.param(f"machine-{name}", marks=pytest.mark.slow) for name in ("flexible", "ufu"))]
 )
-def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys):
+def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(machine_commands, "_injections", lambda *_: {})  # tests/test_machine_injection.py
     path = tmp_path / f"{name}.toml"
     path.write_text(template(name))
     assert main(["simulate", str(path), "--out", str(tmp_path / "run"), "--json"]) == 0

@@ -78,7 +78,7 @@ def munich(left, right, modes, **tables):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sensors", [(0.155, 0.581), (0.071, 0.665)])
+@pytest.mark.parametrize("sensors", [pytest.param((0.155, 0.581), marks=pytest.mark.thorough), (0.071, 0.665)])
 def test_an_lqg_holds_the_munich_rig_with_sensors_beside_its_magnets(sensors):
     """|S| in zone A between two speeds of the design, with 12 modes. With each of these pairs, a PID is unstable."""
     case = munich(*sensors, 12)

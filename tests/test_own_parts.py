@@ -20,7 +20,6 @@ from ambjax.ensemble.study import Study
 from ambjax.extend import (
     Bearing,
     Interval,
-    Measurement,
     PositionLaw,
     Requirement,
     Signals,
@@ -32,7 +31,7 @@ from ambjax.extend import (
     sliding_variable,
 )
 from ambjax.laws import inversion
-from ambjax.sensors import Sensor
+from ambjax.sensors import Measurement, Sensor
 from ambjax.signals import Pulse, Sine
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.metrics import Metrics

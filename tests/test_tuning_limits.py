@@ -197,7 +197,7 @@ def test_the_steps_of_judge_and_reference_on_a_processor():
     "iron",
     [
         pytest.param("", marks=pytest.mark.thorough),
-        pytest.param("[plant.iron]\nsaturation = 1.2\nleakage = 1.1\neddy = 1e-4\n", marks=pytest.mark.slow),
+        pytest.param("[plant.iron]\nsaturation = 1.2\nleakage = 1.1\neddy = 1e-4\n", marks=pytest.mark.thorough),
     ],
 )
 def test_derivatives_of_limited_quantities_agree_in_both_modes(iron):

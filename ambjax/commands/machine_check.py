@@ -6,7 +6,7 @@ import tomllib
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, machine_from
-from ambjax.commands.machine_commands import analysed, once_per_revolution
+from ambjax.commands.machine_commands import analysed, once_per_revolution, worst_of_speeds
 from ambjax.host.heartbeat import say
 from ambjax.linear import MachineSensitivity, poles_in_s
 from ambjax.linear.linear_machine import turning_machines
@@ -34,7 +34,7 @@ def check(args: argparse.Namespace, case: MachineCase) -> tuple[int, dict[str, o
     turning = turning_machines(case.machine, case.clock.sample_period, case.speeds)
     modes = {point.speed: modes_of(own, case.machine.rotor) for point, own in zip(points, turning, strict=True)}
     spilled = _spill_over(case)
-    worst = max(points, key=lambda point: (not point.stable, point.worst.S.height))
+    worst = worst_of_speeds(points)
     at_speeds = [once_per_revolution(point) for point in points]
     summary = {
         "held": not run.lost,

@@ -7,15 +7,21 @@ import numpy as np
 from tqdm import tqdm
 
 from ambjax.cases.machine_case import MachineCase
+from ambjax.commands.sensitivity_report import injected_numbers, injection_text
 from ambjax.commands.speed_text import running_facts
-from ambjax.host.heartbeat import say
+from ambjax.host.heartbeat import FIRST_RUN, doing, say
+from ambjax.linear import Injection, machine_injected
 from ambjax.linear.linear_machine import MachineSensitivity, sensitivity_of, turning_machines
 from ambjax.linear.margins import Margins
 from ambjax.results.machine_run import simulate_machine
+from ambjax.results.operating import one_period
 from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
+from ambjax.simulation.whole_machine import SampledMachine
 from ambjax.world.rotation import PER_MINUTE
 
 Summary = dict[str, object]
+# The measured sensitivity of each axis by speed, rpm.
+Measured = dict[float, tuple[Injection, ...]]
 # runup.png: only if the speed changes.
 SIMULATED = ("trajectory.npz", "metrics.json", "overview.png", "runup.png")
 ANALYSED = ("sensitivity.json", "sensitivity.png")
@@ -81,27 +87,51 @@ def analysed(case: MachineCase) -> list[MachineSensitivity]:
 
 def sensitivity(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]:
     """Analyse a machine at its speeds and write the files. Exit code 1 if it is not stable at one of them."""
-    refuse(args, ("members", "seed", "inject"))
+    refuse(args, ("members", "seed"))
     points = analysed(case)
+    measured = _injections(case, points, args.inject)
     out = directory(args.out, f"sensitivity-{case.name}", ANALYSED, args.force)
-    summary = sensitivity_summary(points)
+    summary = sensitivity_summary(points, measured)
     limits = [float(x) for x in (case.zones.zone_a, case.zones.zone_b, case.zones.zone_c)]
     from ambjax.pictures.machine_pictures import machine_sensitivity_picture
 
     with files(out) as part:
         write_json(part / "sensitivity.json", summary)
         path = part / "sensitivity.png"
-        described(path.name, lambda: machine_sensitivity_picture(points, limits, path, case.name))
+        described(path.name, lambda: machine_sensitivity_picture(points, limits, path, case.name, measured))
         names = [name for name in ANALYSED if (part / name).exists()]
     if not args.json:
-        print(sensitivity_text(points))
+        print(sensitivity_text(points, measured))
         written(out, ", ".join(names))
     return int(not all(point.stable for point in points)), plain(summary | {"out": str(out)})
 
 
-def sensitivity_summary(points: list[MachineSensitivity]) -> Summary:
+def worst_of_speeds(points: list[MachineSensitivity]) -> MachineSensitivity:
+    """Return the sensitivity at the speed with the largest peak; an unstable one first."""
+    return max(points, key=lambda point: (not point.stable, point.worst.S.height))
+
+
+def _injections(case: MachineCase, points: list[MachineSensitivity], everywhere: bool) -> Measured:
+    """Measure the sensitivity of each axis by injection into the simulation.
+
+    On a processor at the speed with the largest peak; `everywhere`: at all speeds, also in continuous time. An
+    unstable machine is not measured.
+    """
+    sampled = isinstance(case.machine, SampledMachine)
+    at = points if everywhere else [worst_of_speeds(points)] if sampled else []
+    at = [point for point in at if point.stable]  # otherwise the rotor swings by itself
+    if not at:
+        return {}
+    with doing(f"measuring the sensitivity by injection into the simulation; {FIRST_RUN}"):
+        peaks = [[axis.S.frequency for axis in point.axes] for point in at]
+        speeds = [point.speed for point in at]
+        found = machine_injected(case.machine, one_period(case), case.zones, speeds, peaks)
+    return dict(zip(speeds, found, strict=True))
+
+
+def sensitivity_summary(points: list[MachineSensitivity], measured: Measured) -> Summary:
     """Return the JSON of the sensitivities: the axis with the largest peak at any speed, and each speed."""
-    worst = max(points, key=lambda point: (not point.stable, point.worst.S.height))
+    worst = worst_of_speeds(points)
     at = [
         {
             "speed_rpm": point.speed,
@@ -111,9 +141,10 @@ def sensitivity_summary(points: list[MachineSensitivity]) -> Summary:
                     "name": axis.name, "peak": axis.S.height, "frequency_hz": axis.S.frequency, "zone": axis.zone,
                     "peak_T": axis.T.height, "peak_KS": axis.KS.height,
                     "margins": None if axis.margins is None else _margins(axis.margins),
-                    "running_speed": facts,
+                    "running_speed": once_per_revolution(point)[k][0],
+                    **injected_numbers(point.system, one, k),
                 }
-                for axis, (facts, _) in zip(point.axes, once_per_revolution(point), strict=True)
+                for k, (axis, one) in enumerate(zip(point.axes, _measured_at(point, measured), strict=True))
             ],
             "sigma_max": point.sigma.height,
             "sigma_frequency_hz": point.sigma.frequency,
@@ -127,6 +158,7 @@ def sensitivity_summary(points: list[MachineSensitivity]) -> Summary:
         "zone": axis.zone, "axis": axis.name, "speed_rpm": worst.speed,
     }  # fmt: skip
     own: dict[str, Any] = at[points.index(worst)]
+    first |= {key: x for key, x in own["axes"][worst.axes.index(axis)].items() if key.startswith("injected")}
     return first | {key: own[key] for key in ("axes", "sigma_max", "sigma_frequency_hz")} | {"speeds": at}
 
 
@@ -134,6 +166,11 @@ def once_per_revolution(point: MachineSensitivity) -> list[tuple[list[Summary], 
     """Return |S| of each axis at the speed, as `running_facts` does."""
     speeds = (abs(point.speed) * PER_MINUTE,) if point.speed else ()
     return [running_facts(speeds, point.system, axis.S, k, f"|S| of {axis.name}") for k, axis in enumerate(point.axes)]
+
+
+def _measured_at(point: MachineSensitivity, measured: Measured) -> tuple[Injection | None, ...]:
+    """Return the measured sensitivity of each axis at the speed of a point; None where there is none."""
+    return measured.get(point.speed, (None,) * len(point.axes))
 
 
 def _margins(margins: Margins) -> dict[str, float]:
@@ -144,7 +181,7 @@ def _margins(margins: Margins) -> dict[str, float]:
     }  # fmt: skip
 
 
-def sensitivity_text(points: list[MachineSensitivity]) -> str:
+def sensitivity_text(points: list[MachineSensitivity], measured: Measured) -> str:
     """Return the tables of the sensitivities, one for each speed."""
     parts = []
     for point in points:
@@ -163,4 +200,6 @@ def sensitivity_text(points: list[MachineSensitivity]) -> str:
         )
         for _, lines in once_per_revolution(point):
             parts += lines
+        for k, (axis, one) in enumerate(zip(point.axes, _measured_at(point, measured), strict=True)):
+            parts += [] if one is None else [injection_text(point.system, one, k, f" at {axis.name}")]
     return "\n".join(parts)

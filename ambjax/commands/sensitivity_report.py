@@ -10,7 +10,7 @@ from ambjax.cases.reader import Case
 from ambjax.commands.band_text import band_lines, band_numbers
 from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import DEFAULT_LAWS
-from ambjax.linear import PLACES, Injection, MemberPeaks, Zones
+from ambjax.linear import PLACES, Injection, MemberPeaks, StateSpace, Zones
 from ambjax.results.operating import OperatingPoint, SpreadPeaks, analysis_summary
 from ambjax.results.outputs import table
 
@@ -53,7 +53,7 @@ def sensitivity_summary(
     rows += [{"point": name, "stable": None, "zone": None, "why": why} for name, why in missing.items()]
     summary: dict[str, object] = {
         **numbers(points[0]),
-        **_injected_numbers(points[0], measured),
+        **_position_numbers(points[0], measured),
         "points": rows,
     }
     if spread is not None:
@@ -78,35 +78,44 @@ def _measured_numbers(peaks: MemberPeaks, zones: Zones) -> dict[str, object]:
     }
 
 
-def _injected_numbers(point: OperatingPoint, measured: Injections | None) -> dict[str, object]:
-    """Return the numbers of the measured sensitivity.
-
-    Without a measurement, only the peak and the ends of its interval are returned, each as None.
-    """
+def _position_numbers(point: OperatingPoint, measured: Injections | None) -> dict[str, object]:
+    """Return the numbers of the measured sensitivity at both sensors; those of `injected_numbers` without one."""
     if measured is None:
+        return injected_numbers(point.system, None)
+    velocity = measured.velocity
+    return injected_numbers(point.system, measured.position) | {
+        "injected_velocity_peak": None if velocity is None else velocity.peak,
+        "injected_velocity_frequency_hz": None if velocity is None else velocity.peak_frequency,
+    }
+
+
+def injected_numbers(system: StateSpace, one: Injection | None, channel: int = 0) -> dict[str, object]:
+    """Return the numbers of the measured sensitivity at one sensor.
+
+    `system`, `channel`: as in `_linear_there`. Without a measurement, only the peak and the ends of its interval are
+    returned, each as None.
+    """
+    if one is None:
         return {"injected_peak": None, "injected_low": None, "injected_high": None}
-    one = measured.position
     return {
         "injected_peak": one.peak,
         "injected_low": one.peak_low,
         "injected_high": one.peak_high,
         "injected_frequency_hz": one.peak_frequency,
         "injected_at_band_edge": _at_edge(one),
-        "injected_linear_there": _linear_there(point, one),
+        "injected_linear_there": _linear_there(system, one, channel),
         "injected_amplitude_m": one.amplitude,
         "injected_members": one.members,
         "injected_lost": one.lost,
         "injected_saturated": one.saturated,
-        "injected_velocity_peak": None if measured.velocity is None else measured.velocity.peak,
-        "injected_velocity_frequency_hz": None if measured.velocity is None else measured.velocity.peak_frequency,
     }
 
 
-def _linear_there(point: OperatingPoint, measured: Injection, channel: int = 0) -> float | None:
-    """Return the linear |S| at the frequency of the injected peak. `channel`: 0 position sensor, 1 velocity sensor."""
+def _linear_there(system: StateSpace, measured: Injection, channel: int) -> float | None:
+    """Return the linear |S| at the frequency of the injected peak. `channel`: number of the sensor's input."""
     if measured.peak_frequency is None:
         return None
-    return float(np.abs(point.system.response(np.array([measured.peak_frequency])))[0, channel, channel])
+    return float(np.abs(system.response(np.array([measured.peak_frequency])))[0, channel, channel])
 
 
 def _at_edge(measured: Injection) -> bool | None:
@@ -114,10 +123,12 @@ def _at_edge(measured: Injection) -> bool | None:
     return None if measured.peak is None else measured.peak_frequency in measured.frequency[[0, -1]]
 
 
-def _injection_text(point: OperatingPoint, measured: Injection, channel: int = 0) -> str:
-    """Describe the measured sensitivity at one sensor in one line. `channel` as in `_linear_there`."""
-    unit, sensor = (("m", ""), ("m/s", " at the velocity sensor"))[channel]
-    how = f"Injected{sensor} into the simulation (multi-sine of {measured.amplitude:.3g} {unit}"
+def injection_text(system: StateSpace, measured: Injection, channel: int = 0, at: str = "", unit: str = "m") -> str:
+    """Describe the measured sensitivity at one sensor in one line.
+
+    `system`, `channel`: as in `_linear_there`. `at`: words that name the sensor. `unit`: that of its reading.
+    """
+    how = f"Injected{at} into the simulation (multi-sine of {measured.amplitude:.3g} {unit}"
     how += f", {measured.members} members)" if measured.members > 1 else ")"
     if measured.peak is None:
         return f"{how}: the rotor is lost, so no sensitivity can be measured."
@@ -126,7 +137,7 @@ def _injection_text(point: OperatingPoint, measured: Injection, channel: int = 0
         text += ", an end of the measured band, so this value is not a peak"
     if measured.peak_low is not None and measured.members > 1:
         text += f" (95 % interval {measured.peak_low:.4g} to {measured.peak_high:.4g})"
-    text += f"; the linear value there is {_linear_there(point, measured, channel):.4g}."
+    text += f"; the linear value there is {_linear_there(system, measured, channel):.4g}."
     if measured.lost:
         text += f" {measured.lost} of {measured.members} members lose the rotor and are left out."
     if measured.saturated:
@@ -162,8 +173,9 @@ def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None
     if not one.stable:
         rows += ["The nominal loop is not stable: the rotor does not stay at this equilibrium."]
     if measured is not None:
-        rows += [_injection_text(points[0], measured.position)]
-        rows += [] if measured.velocity is None else [_injection_text(points[0], measured.velocity, channel=1)]
+        system, velocity = points[0].system, measured.velocity
+        rows += [injection_text(system, measured.position)]
+        rows += [] if velocity is None else [injection_text(system, velocity, 1, " at the velocity sensor", "m/s")]
     if spread is not None:
         rows += [
             f"Of {spread.members} members of [spread], {spread.stable} are stable and {spread.zone_a} are in zone A; "

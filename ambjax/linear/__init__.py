@@ -17,6 +17,7 @@ from ambjax.linear.analysis import Analysis, Zones, analyse, checked, linearisat
 from ambjax.linear.differentiable import LoopQuantities, loop_quantities
 from ambjax.linear.injection import Injection, MemberPeaks, frequency_lines, injected, injected_members
 from ambjax.linear.linear_machine import MachineSensitivity, linearise_machine, machine_sensitivity
+from ambjax.linear.machine_injection import machine_injected
 from ambjax.linear.margins import (
     LoopMargins,
     Margins,
@@ -59,6 +60,7 @@ __all__ = [
     "linearise_members",
     "loop_matrices",
     "loop_quantities",
+    "machine_injected",
     "machine_sensitivity",
     "margins_of",
     "noise_gain",

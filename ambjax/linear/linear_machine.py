@@ -68,7 +68,7 @@ class MachineSensitivity(NamedTuple):
         return max(self.axes, key=lambda axis: axis.S.height)
 
 
-class _Rest(NamedTuple):
+class MachineRest(NamedTuple):
     """A point of the machine at rest: coordinates [n]; plants, laws and commands [c_g] of each group.
 
     `law`: state of the law of the machine, () without one.
@@ -104,19 +104,21 @@ class _Linear:
         """Return function(cascade, scenario, ...) of every axis, stacked for each group."""
         return [jax.vmap(function)(*own) for own in zip(self.cascade, self.scenario, *groups, strict=True)]
 
-    def start(self) -> tuple[_Rest, _Rest]:
+    def start(self) -> tuple[MachineRest, MachineRest]:
         """Return the machine at q = 0, where each axis carries its share of the weight, and the sizes of the states."""
         points = self.each(lambda cascade, scenario: start_of(cascade, scenario, self.period, 0.0))
         sizes = self.each(lambda cascade, scenario, point: sizes_of(cascade, scenario, point), points)
         q = jnp.zeros_like(jnp.asarray(self.rotor.gravity))
         size = self.machine.scale(sizes)
-        first = _Rest(q, *_parts(points))
+        first = MachineRest(q, *_parts(points))
         if self.machine.law is not None:
             e = tuple(jnp.zeros_like(u) for u in first.u)
             measured = self.read(q, jnp.zeros_like(q), first.plant, self.sensed(q), e)
             law = self.machine.law.begin(self.machine.join(measured), self.inputs(self.past(first.u)))
             first = first._replace(law=jax.tree.map(lambda x: jnp.asarray(x, q.dtype), law))
-        return first, jax.tree.map(lambda x, s: jnp.zeros_like(x) + s, first, _Rest(size.q, *_parts(sizes), size.law))
+        return first, jax.tree.map(
+            lambda x, s: jnp.zeros_like(x) + s, first, MachineRest(size.q, *_parts(sizes), size.law)
+        )
 
     def read(
         self, q: Array, q_dot: Array, plant: Groups, z: Sequence[object], e: Sequence[object]
@@ -191,7 +193,7 @@ class _Linear:
         z = self.machine.split(times(self.rotor.at_sensors, q))
         return tuple(own if on else () for own, on in zip(z, self.low_passed, strict=True))
 
-    def residual(self, point: _Rest) -> _Rest:
+    def residual(self, point: MachineRest) -> MachineRest:
         """Return what is 0 at an equilibrium, in the units of the states."""
         zero, e = jnp.zeros_like(point.q), tuple(jnp.zeros_like(u) for u in point.u)
         moved = self.rates(point.q, zero, point.plant, point.u)
@@ -207,19 +209,19 @@ class _Linear:
             law = jax.tree.map(lambda x: x / fastest, law)
         axes = zip(moved.axes, poles, strict=True)
         plant = tuple(jax.tree.map(lambda x, w=w: x / w, own.plant) for own, w in axes)
-        return _Rest(moved.q_dot / fastest**2, plant, change, jax.tree.map(jnp.subtract, u, point.u), law)
+        return MachineRest(moved.q_dot / fastest**2, plant, change, jax.tree.map(jnp.subtract, u, point.u), law)
 
-    def rest(self) -> _Rest:
+    def rest(self) -> MachineRest:
         """Return the equilibrium, or the point nearest to it that was found."""
         start, sizes = self.start()
         scale, (flat, restore) = ravel_pytree(sizes)[0], ravel_pytree(start)
         return restore(newton_of(lambda y: self.deviation(restore(y * scale), scale), flat / scale).y * scale)
 
-    def deviation(self, point: _Rest, scale: Array) -> Array:
+    def deviation(self, point: MachineRest, scale: Array) -> Array:
         """Return the residual relative to the sizes of the states."""
         return ravel_pytree(self.residual(point))[0] / scale
 
-    def system(self, point: _Rest) -> tuple[StateSpace, Array, Array]:
+    def system(self, point: MachineRest) -> tuple[StateSpace, Array, Array]:
         """Return the state space at a point, its A under constant commands, and whether the machine rests there."""
         sizes = self.start()[1]
         deviation = self.deviation(point, ravel_pytree(sizes)[0])
@@ -263,7 +265,7 @@ class _Linear:
         return jnp.concatenate([z, self.machine.join(u), i, x[: len(jnp.asarray(self.rotor.gravity))]])
 
     def _continuous(
-        self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, moved: Callable, read: Callable
+        self, point: MachineRest, sizes: MachineRest, body: Array, body_sizes: Array, moved: Callable, read: Callable
     ) -> tuple:
         x, restore = ravel_pytree((body, point.control, point.law))
 
@@ -277,7 +279,13 @@ class _Linear:
         return jax.jacfwd(field, (0, 1))(x, jnp.zeros(self.machine.count, x.dtype)), scale
 
     def _sampled(
-        self, point: _Rest, sizes: _Rest, body: Array, body_sizes: Array, free: tuple[Array, Array], read: Callable
+        self,
+        point: MachineRest,
+        sizes: MachineRest,
+        body: Array,
+        body_sizes: Array,
+        free: tuple[Array, Array],
+        read: Callable,
     ) -> tuple:
         past, delay = self.past(point.u), jnp.asarray(self.cascade[0].timing.delay)[0]
         (A, B), kept = free, len(past[0])
@@ -324,21 +332,21 @@ def _held(A: Array, B: Array, period: Scalar, delay: Scalar, kept: int) -> tuple
 
 
 @jax.jit
-def _at_rest(machine: Machine, W: Scalar, period: Scalar) -> _Rest:
+def _at_rest(machine: Machine, W: Scalar, period: Scalar) -> MachineRest:
     return _Linear(machine, W, period).rest()
 
 
 @jax.jit
-def _matrices(machine: Machine, W: Scalar, period: Scalar, point: _Rest) -> tuple[StateSpace, Array, Array]:
+def _matrices(machine: Machine, W: Scalar, period: Scalar, point: MachineRest) -> tuple[StateSpace, Array, Array]:
     return _Linear(machine, W, period).system(point)
 
 
-def machine_rest(machine: Machine, period: Scalar) -> _Rest:
+def machine_rest(machine: Machine, period: Scalar) -> MachineRest:
     """Return the equilibrium of a machine at speed 0, or the point nearest to it that was found."""
     return _at_rest(machine, 0.0, period)
 
 
-def machine_loop(machine: Machine, W: Scalar, period: Scalar, point: _Rest) -> StateSpace:
+def machine_loop(machine: Machine, W: Scalar, period: Scalar, point: MachineRest) -> StateSpace:
     """Return the linear system of `linearise_machine` at the speed W (rad/s) and at a known equilibrium.
 
     It works under jit, vmap and differentiation. States that no input reaches are not left out.

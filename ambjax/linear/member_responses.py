@@ -1,6 +1,7 @@
 """The response of each member of an ensemble to a multi-sine that is injected into the nonlinear simulation."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -76,7 +77,7 @@ def member_responses(
     method = None if isinstance(clock.method, Slide) else clock.method
     longer = dataclasses.replace(clock, samples=skip + periods * clock.samples, method=method)
     system, longer = prepare(*_at_rest(cascade, scenario, r), longer)
-    response = Response(_padded(wave), scenario.voltage_limit, skip)
+    response = Response(padded(wave, PADDED * math.ceil(len(wave.harmonics) / PADDED)), scenario.voltage_limit, skip)
     tree = canonical((system, longer, response))
     sums, code = map_members(_member, tree, call=SHORTEST if size(tree) <= FEW else None)
     e = float(wave.size) * np.exp(1j * np.asarray(wave.phases))
@@ -92,12 +93,12 @@ def _member(tree: Any) -> tuple[Any, Any]:
     return outcome.metrics, outcome.trajectory.lost_code
 
 
-def _padded(wave: MultiSine) -> MultiSine:
-    """Return the wave with a number of lines that is a multiple of PADDED.
+def padded(wave: MultiSine, lines: int) -> MultiSine:
+    """Return the wave with this number of lines.
 
     The new lines have the frequency 0 and the phase pi/2, whose cosine is 0.
     """
-    padding = (0, -len(wave.harmonics) % PADDED)
+    padding = (0, lines - len(wave.harmonics))
     phases = np.pad(wave.phases, padding, constant_values=0.5 * np.pi)
     return dataclasses.replace(wave, harmonics=np.pad(wave.harmonics, padding), phases=phases)
 

@@ -1,7 +1,8 @@
 """Pictures of a machine: its axes over time and its orbits, and its sensitivity and poles against speed."""
 
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -82,10 +83,17 @@ def machine_picture(case: Any, signals: dict[str, np.ndarray], title: str, path:
 
 
 @own_style
-def machine_sensitivity_picture(points: Sequence[Any], limits: Sequence[float], path: pathlib.Path, title: str) -> None:
+def machine_sensitivity_picture(
+    points: Sequence[Any],
+    limits: Sequence[float],
+    path: pathlib.Path,
+    title: str,
+    measured: Mapping[float, Sequence[Any]] = MappingProxyType({}),
+) -> None:
     """Write |S_kk| of every axis and the largest singular value over frequency, a panel for each speed.
 
-    `points`: results of `machine_sensitivity`. `limits`: upper limits of the zones A, B and C.
+    `points`: results of `machine_sensitivity`. `limits`: upper limits of the zones A, B and C. `measured`: the
+    `Injection` of each axis by speed (rpm), drawn as points.
     """
     shown = list(points)[:4]
     figure = Figure(figsize=(13.0, 4.6 if len(shown) < 3 else 8.2), layout="constrained")
@@ -98,7 +106,11 @@ def machine_sensitivity_picture(points: Sequence[Any], limits: Sequence[float], 
         c = len(point.axes)
         S = np.asarray(point.system.response(f))[:, :c]
         for k, axis in enumerate(point.axes):
-            ax.loglog(f, np.abs(S[:, k, k]), label=f"{axis.name}: {axis.S.height:.3g}", linewidth=1.0)
+            (line,) = ax.loglog(f, np.abs(S[:, k, k]), label=f"{axis.name}: {axis.S.height:.3g}", linewidth=1.0)
+            one = measured[point.speed][k] if point.speed in measured else None
+            if one is not None and one.S is not None:
+                label = "injected" if k == len(point.axes) - 1 else None
+                ax.loglog(one.frequency, np.abs(one.S), ".", color=line.get_color(), markersize=4, label=label)
         ax.loglog(
             f, np.linalg.norm(S, 2, axis=(1, 2)), "k--", label=f"largest singular value: {point.sigma.height:.3g}"
         )
@@ -122,7 +134,7 @@ def machine_sensitivity_picture(points: Sequence[Any], limits: Sequence[float], 
 def campbell_picture(title: str, speeds: np.ndarray, modes: Sequence[Sequence[Any]], path: pathlib.Path) -> None:
     """Write the frequencies of the modes against speed, coloured by their damping ratio, with the line of the speed.
 
-    `speeds`: rpm. `modes`: the `Mode`s at each speed. Triangles up are forward modes, triangles down backward ones;
+    `speeds`: rpm. `modes`: the modes at each speed. Triangles up are forward modes, triangles down backward ones;
     unstable modes are red crosses. The lightly damped modes are named at the last speed.
     """
     figure = Figure(figsize=(11.0, 6.8), layout="constrained")

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case, require_case
 from ambjax.ensemble.study import Study
 from ambjax.linear import (
@@ -127,7 +128,7 @@ def measured_peaks(case: Case, study: Study, peak: float) -> MemberPeaks:
     return injected_members(cascade, scenario, clock, lines, amplitude=case.zones.amplitude)
 
 
-def one_period(case: Case) -> Clock:
+def one_period(case: Case | MachineCase) -> Clock:
     """Return the clock of one period of the multi-sine of an injection: the period of its lowest frequency."""
     period = float(case.clock.sample_period)
     return dataclasses.replace(case.clock, samples=math.ceil(1 / (float(case.zones.f_low) * period)))

@@ -71,6 +71,7 @@ def jumped(
 
     def read(axis: Sampled, own: SampledState, error: Any) -> tuple:
         own, measured = axis.read(own, error)
+        measured = axis.injected(measured, t)
         return own, *axis.received(measured, axis.reference(t), own)
 
     parts = machine.each(read, axes, errors)

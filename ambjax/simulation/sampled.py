@@ -99,9 +99,9 @@ class Sampled:
     def jump(self, t: Scalar, state: SampledState, errors: Errors) -> SampledState:
         """Step the laws at time t (s): return the state with the new command and the next states of the laws."""
         state, measured = self.read(state, errors)
-        return self.with_command(self._injected(measured, t), self.reference(t), state)
+        return self.with_command(self.injected(measured, t), self.reference(t), state)
 
-    def _injected(self, measured: Measurement, t: Scalar) -> Measurement:
+    def injected(self, measured: Measurement, t: Scalar) -> Measurement:
         """Return the readings with the test signal of the sample that begins at t (s)."""
         if self.wave is None:
             return measured
@@ -274,7 +274,7 @@ class Sampled:
         inputs, command = self.loop.inputs(t), state.command
         if self.loop.scenario.drive == "current":
             command = command._replace(u=self.loop.scenario.coil_voltage(command.u, state.plant, inputs.q_i))
-        measured = self._injected(measured, t)
+        measured = self.injected(measured, t)
         row = self.loop.signals(t, inputs, state.plant, command, measured, alive)
         if self.wave is not None:
             row = row._replace(z_measured=getattr(measured, self.wave.reading))

@@ -156,7 +156,7 @@ class Machine:
             loop = loop_of(axis)
             begin = dataclasses.replace(loop.scenario.initial, z=z, z_dot=jnp.zeros_like(z))
             scenario = dataclasses.replace(loop.scenario, initial=begin)
-            return _with_loop(axis, dataclasses.replace(loop, scenario=scenario)).start()
+            return with_loop(axis, dataclasses.replace(loop, scenario=scenario)).start()
 
         axes = self.each(one, z)
         law = begun(self, self.rotor.speed_at(0.0), axes, self.sensor_errors(0))
@@ -410,7 +410,8 @@ def loop_of(axis: Sampled | ClosedLoop) -> ClosedLoop:
     return axis.loop if isinstance(axis, Sampled) else axis
 
 
-def _with_loop(axis: Sampled | ClosedLoop, loop: ClosedLoop) -> Sampled | ClosedLoop:
+def with_loop(axis: Sampled | ClosedLoop, loop: ClosedLoop) -> Sampled | ClosedLoop:
+    """Return the axis with another loop in continuous time."""
     return dataclasses.replace(axis, loop=loop) if isinstance(axis, Sampled) else loop
 
 
@@ -421,7 +422,7 @@ def _realised(rotation: Rotation, axis: Sampled | ClosedLoop, number: Array) -> 
         loop = dataclasses.replace(loop, scenario=dataclasses.replace(loop.scenario, rotor=rotation))
     loop = loop.realised()
     high, low = jax.random.key_data(jax.random.fold_in(loop.scenario.key(), number))
-    return _with_loop(axis, dataclasses.replace(loop, key=(high, low)))
+    return with_loop(axis, dataclasses.replace(loop, key=(high, low)))
 
 
 def stack_axes(axes: Sequence[T]) -> T:

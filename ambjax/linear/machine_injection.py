@@ -1,0 +1,140 @@
+"""Measurement of the sensitivity of a whole machine by injection into the nonlinear simulation, one axis at a time.
+
+The multi-sine is added to the reading of the position sensor of one axis, with the loops of all axes closed
+(ISO 14839-3). All axes and speeds are simulated at once, as members of one ensemble.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ambjax.linear.analysis import Zones
+from ambjax.linear.injection import Injection, frequency_lines, injection_of
+from ambjax.linear.linear_machine import machine_rest
+from ambjax.linear.member_responses import AMPLITUDE, Responses, padded
+from ambjax.linear.multisine import FourierSums, MultiSine, Response, multisine
+from ambjax.numerics.records import Scalar, canonical, leaf, part, record
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.folds import Ending
+from ambjax.simulation.loop import ClosedLoop
+from ambjax.simulation.rollout import run
+from ambjax.simulation.sampled import Sampled
+from ambjax.simulation.trajectory import ALIVE
+from ambjax.simulation.whole_machine import Machine, PlantOnly, loop_of, with_loop
+from ambjax.world.waveforms import Constant
+
+
+class Readings(NamedTuple):
+    """Signals of one axis that a `Response` uses."""
+
+    z_measured: Array
+    u: Array
+
+
+# The axes of a machine share the number of samples.
+SHARED = FourierSums(None, -1, -1, 0)  # pyright: ignore[reportArgumentType]
+
+
+@record
+class MachineResponse:
+    """Fold: a `Response` for each axis. `u_max` [c]: limits of the supplies, V."""
+
+    response: Response = part(doc="the multi-sine and the samples that count")
+    u_max: Array = leaf(shape="c", unit="V", at_least=0, at_most=1e9, doc="limits of the supplies")
+
+    def init(self) -> FourierSums:
+        zero = jnp.zeros((*self.response.init().read.shape, len(self.u_max)))
+        return FourierSums(jnp.asarray(0), zero, zero, zero[0, 0])
+
+    def update(self, carry: FourierSums, row: Any, span: Any) -> FourierSums:
+        def one(carry: FourierSums, z: Array, u: Array, u_max: Array) -> FourierSums:
+            return dataclasses.replace(self.response, u_max=u_max).update(carry, Readings(z, u), span)
+
+        each = jax.vmap(one, in_axes=(SHARED, 0, 0, 0), out_axes=SHARED)
+        return each(carry, row.axes.z_measured, row.axes.u, self.u_max)
+
+    def result(self, carry: FourierSums, ending: Ending) -> FourierSums:
+        return self.response.result(carry, ending)
+
+
+class _Test(NamedTuple):
+    """A member: the speed (rpm), and the multi-sine with the amplitudes [c] of its cosines on each axis."""
+
+    speed: Scalar
+    wave: MultiSine
+    sizes: Array
+
+
+def machine_injected(
+    machine: Machine, clock: Clock, zones: Zones, speeds: Sequence[float], peaks: Sequence[Sequence[float]]
+) -> list[tuple[Injection, ...]]:
+    """Measure the sensitivity at the position sensor of each axis, at constant speeds (rpm).
+
+    - `clock`: its samples are one period of the multi-sine. The first period is not evaluated, the second one is.
+    - `zones`: frequency range, and `amplitude`; None: 1 % of the gap of the axis.
+    - `peaks`: frequencies (Hz) by speed and axis, at which there is a line, and near which there are more.
+
+    The rotor is at rest in its bearings under its weight, without unbalance, loads and runout. Returns an `Injection`
+    for each axis at each speed.
+    """
+    gaps = np.asarray(machine.plants("s_0"))
+    amplitudes = AMPLITUDE * gaps if zones.amplitude is None else np.full(len(gaps), float(zones.amplitude))
+    axes = [(speed, k, peak) for speed, own in zip(speeds, peaks, strict=True) for k, peak in enumerate(own)]
+    waves = []
+    for _, k, peak in axes:
+        f = frequency_lines(zones, clock, peak)
+        f = np.append(f, np.clip(peak, f[0], f[-1]))  # the peak of a bending mode is narrow
+        harmonics = np.unique(np.round(f * float(clock.duration)).astype(int))
+        waves.append(multisine(harmonics, clock.samples, float(clock.sample_period), float(amplitudes[k])))
+    most = max(len(wave.harmonics) for wave in waves)
+    tests = [
+        _Test(float(speed), padded(wave, most), np.where(np.arange(len(gaps)) == k, wave.size, 0.0))  # pyright: ignore
+        for (speed, k, _), wave in zip(axes, waves, strict=True)
+    ]
+    tests = jax.tree.map(lambda *x: np.stack(x), *canonical(tests))
+    sums, code = _responses(*canonical((machine, clock, tests)))
+    random = any(np.any(np.asarray(x)) for loop in machine.loops() for x in loop.scenario.sensors.noises)
+    found = []
+    for n, ((_, k, _), wave) in enumerate(zip(axes, waves, strict=True)):
+        count = len(wave.harmonics)
+        e = float(wave.size) * np.exp(1j * np.asarray(wave.phases))
+        S, KS = ((x[n, 0, :count, k] + 1j * x[n, 1, :count, k])[None] / e for x in map(np.asarray, sums[1:3]))
+        frequency, held = np.asarray(wave.harmonics) / float(clock.duration), np.asarray(code[n : n + 1]) == ALIVE
+        saturated = np.asarray(sums.saturated)[n : n + 1, k]
+        found.append(injection_of(Responses(frequency, S, KS, saturated, held, float(amplitudes[k])), random))
+    return [tuple(found[n : n + len(gaps)]) for n in range(0, len(found), len(gaps))]
+
+
+@jax.jit
+def _responses(machine: Machine, clock: Clock, tests: _Test) -> tuple[FourierSums, Array]:
+    """Return the `FourierSums` of all axes, and the status codes, of the members."""
+    point = machine_rest(machine, clock.sample_period)
+    zero = jnp.zeros_like(point.q)
+    rest = machine.moving(machine.rotor.at_magnets, point.q, zero, tuple(map(PlantOnly, point.plant)))
+    limits = machine.join([jnp.asarray(loop.scenario.voltage_limit) for loop in machine.loops()])
+    skip = clock.samples
+    longer = dataclasses.replace(clock, samples=2 * skip)
+
+    def one(test: _Test) -> tuple[FourierSums, Array]:
+        def calm(axis: Sampled | ClosedLoop, own: PlantOnly, size: Array) -> Sampled | ClosedLoop:
+            wave, loop = dataclasses.replace(test.wave, size=size), loop_of(axis)
+            i = loop.scenario.plant.measurement(own.plant).i
+            begin = dataclasses.replace(loop.scenario.initial, i=i)
+            scenario = dataclasses.replace(loop.scenario.undisturbed(), reference=Constant(0.0), initial=begin)
+            cascade = dataclasses.replace(loop.cascade, inversion=loop.cascade.inversion.started(i))
+            loop = with_loop(axis, dataclasses.replace(loop, cascade=cascade, scenario=scenario))
+            return dataclasses.replace(loop, wave=wave)
+
+        rotor = dataclasses.replace(machine.rotor.without_forces(), speed=test.speed, acceleration=jnp.zeros(()))
+        axes = tuple(machine.each(calm, rest, machine.split(test.sizes)))
+        turning = dataclasses.replace(machine, rotor=rotor, axes=axes, start_q=point.q)
+        fold = MachineResponse(Response(test.wave, jnp.zeros(()), skip), limits)
+        outcome = run(turning, longer, fold, 0)  # pyright: ignore[reportArgumentType]
+        return outcome.metrics, jnp.asarray(outcome.trajectory.lost_code)
+
+    return jax.vmap(one)(tests)

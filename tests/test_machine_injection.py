@@ -1,0 +1,53 @@
+"""The sensitivity of machines measured by injection into the simulation, against the linear one."""
+
+import dataclasses
+import json
+import tomllib
+
+import numpy as np
+import pytest
+from machine_cases import MACHINES
+
+from ambjax.__main__ import main
+from ambjax.cases.machine_case import machine_from
+from ambjax.cases.template_text import template
+from ambjax.linear import Zones, machine_injected, machine_sensitivity
+
+SPEED = 9000.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["five", "coordinates"])  # laws of the axes, in two groups; a law of the machine
+def test_the_injected_sensitivity_of_every_axis_is_the_linear_one(name):
+    """At all lines, within 1 % of the largest |S|: one period of 50 ms does not settle the integrals further.
+
+    The amplitude of 1e-7 m is 2e-4 of the gap, and the nonlinear terms are of this size.
+    """
+    case = machine_from(MACHINES[name])
+    zones, clock = Zones(f_low=20.0, f_high=2000.0, amplitude=1e-7), dataclasses.replace(case.clock, samples=1000)
+    linear = machine_sensitivity(case.machine, case.axes, clock.sample_period, SPEED, zones)
+    (found,) = machine_injected(case.machine, clock, zones, [SPEED], [[axis.S.frequency for axis in linear.axes]])
+    assert len(found) == len(case.axes)
+    for k, (one, axis) in enumerate(zip(found, linear.axes, strict=True)):
+        expected = np.asarray(linear.system.response(one.frequency))
+        assert np.abs(one.S - expected[:, k, k]).max() < 0.01 * axis.S.height
+        assert np.abs(one.KS - expected[:, len(found) + k, k]).max() < 0.01 * axis.KS.height
+        assert one.peak == pytest.approx(axis.S.height, rel=0.01)
+
+
+@pytest.mark.slow
+def test_the_command_reports_the_injected_beside_the_linear_peak(tmp_path, capsys):
+    text = template("machine").replace("std = 2e-7", "std = 1e-9")
+    text = text.replace("[sensitivity]", "[sensitivity]\nf_low = 20.0")
+    path = tmp_path / "m.toml"
+    path.write_text(text)
+    assert main(["sensitivity", str(path), "--out", str(tmp_path / "s"), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["injected_peak"] == pytest.approx(summary["injected_linear_there"], rel=0.05)
+    assert tomllib.loads(text)["sensitivity"]["speeds"] == [own["speed_rpm"] for own in summary["speeds"]]
+    for own in summary["speeds"]:
+        measured = [axis["injected_peak"] for axis in own["axes"]]
+        if own["speed_rpm"] == summary["speed_rpm"]:
+            assert summary["injected_peak"] in measured
+        else:  # only the speed with the largest peak is measured
+            assert measured == 5 * [None]
