@@ -111,13 +111,18 @@ def test_the_differentiable_quantities_agree_with_the_analysis(name):
     cascade, scenario, r = loop_of(name)
     system = linearise(cascade, scenario, CLOCK, r)
     expected = analyse(system, Plant().m, T)
-    find = jax.jit(lambda system: loop_quantities(system, jnp.asarray(True), 1.0, 5e2, 1e6), compiler_options=QUICK)
+    speeds = jnp.asarray([20.0, 150.0])
+    find = jax.jit(
+        lambda system: loop_quantities(system, jnp.asarray(True), 1.0, 5e2, 1e6, speeds=speeds), compiler_options=QUICK
+    )
     found = find(system)
     # a peak's frequency is found to 1e-5; the zeros of a deadbeat loop, all at 0, to 1e-5 too, and KS from them to 3e-4
     tolerance = 3e-4 if name == "true signs" else 1e-6
     peaks = (expected.S.height, expected.T.height, expected.KS.height)
     assert np.allclose(found[:3], peaks, rtol=tolerance)
     assert found.delay_margin_s == pytest.approx(expected.margins.delay, rel=1e-7)
+    at_speeds = np.abs(np.asarray(system.response(np.asarray(speeds)))[:, 0, 0])
+    assert found.sensitivity_1x == pytest.approx(at_speeds.max(), rel=1e-7)
     assert found.growth == pytest.approx(expected.poles[0].real, rel=1e-9)
 
 
