@@ -17,7 +17,6 @@ from ambjax.cases.rotor_tables import (
     COORDINATES,
     OWN,
     RIGID,
-    SPEED,
     BearingAxis,
     axes_from,
     body_from,
@@ -25,6 +24,7 @@ from ambjax.cases.rotor_tables import (
     tables_of,
     vector,
 )
+from ambjax.cases.speed_table import SPEED
 from ambjax.cases.table import Table, load, show
 from ambjax.control.machine_law import MachineLaw
 from ambjax.ensemble.spread import Spread
@@ -37,7 +37,7 @@ from ambjax.simulation.method import ACCURATE, slopes
 from ambjax.simulation.rollout import prepare
 from ambjax.simulation.whole_machine import Machine, machine_of
 from ambjax.text.words import one_line
-from ambjax.world.rotation import PER_MINUTE, known
+from ambjax.world.rotation import known
 from ambjax.world.rotor import Rotor
 
 MACHINE_TABLES = ("rotor", "bearing", "unbalance", "load")
@@ -177,11 +177,13 @@ def _with_notches(
 
 
 def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:
-    """Return sensitivity.speeds, rpm; by default those at the start and, after a run-up, at the end."""
+    """Return sensitivity.speeds, rpm; by default the first, the last and the largest of the run."""
     value = table.raw.get("speeds")
     if value is None:
-        first, last = float(rotor.speed), float(rotor.speed + rotor.acceleration * duration)
-        return (first,) if first == last else (first, last)
+        first, *between, last = (float(rotor.rotation.rpm(t)) for t in rotor.rotation.corners(duration))
+        ends = (first,) if first == last else (first, last)
+        most = max(between, key=abs, default=0.0)
+        return (*ends, most) if abs(most) > max(abs(first), abs(last)) else ends
     if not isinstance(value, list) or not 0 < len(value) <= MOST_SPEEDS:
         raise ValueError(f"{table.at('speeds')} = {show(value)}: it must be a list of 1 to {MOST_SPEEDS} speeds, rpm.")
     return tuple(Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(value))
@@ -268,7 +270,7 @@ def _clock(cases: list[Case], rotor: Rotor, fixed: bool) -> Clock:
     else:
         slope = max(max(slopes(case.cascade, case.scenario).values()) for case in cases)
         most = RK4(max(math.ceil(period * slope / ACCURATE), 1))
-    W = 2 * np.pi * PER_MINUTE * max(abs(rotor.speed), abs(rotor.speed + rotor.acceleration * float(clock.duration)))
+    W = rotor.rotation.fastest(float(clock.duration))
     M, K, G = (np.asarray(x) for x in (rotor.M, rotor.K, rotor.G))
     fastest = max(math.sqrt(float(np.max(np.diag(K) / np.diag(M)))), float(W * np.max(np.abs(G) / np.diag(M)[:, None])))
     substeps = most.substeps if fixed else max(most.substeps, math.ceil(period * fastest / MODE))

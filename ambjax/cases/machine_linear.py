@@ -10,7 +10,8 @@ import numpy as np
 
 from ambjax.cases.controller_file import contents_of
 from ambjax.cases.reader import Case
-from ambjax.cases.rotor_tables import MODES, RIGID, SPEED
+from ambjax.cases.rotor_tables import MODES, RIGID
+from ambjax.cases.speed_table import SPEED
 from ambjax.cases.table import Table, show
 from ambjax.control.current import AmplifierCurrent
 from ambjax.control.linear_controller import OUTPUTS, SAME_PERIOD

@@ -24,11 +24,12 @@ def notch_from(top: Table, scenario: Scenario) -> tuple[SynchronousNotch, float 
     table, rotor = controller.table("notch"), scenario.rotor
     table.only(["kind", "rate", "min_speed", "phase"])
     kind, phase = table.choice("kind", list(NULLED), next(iter(NULLED))), table.leaf("phase", PHASE)
-    if rotor is None or (rotor.speed == 0 and rotor.acceleration == 0):
+    varying = rotor is not None and (rotor.acceleration != 0 or bool(rotor.changes))
+    if rotor is None or (rotor.speed == 0 and not varying):
         raise ValueError("[controller.notch]: it follows the speed of the rotor. Give rotor.speed, in rpm.")
     given = Table({key: table.raw[key] for key in ("rate", "min_speed") if key in table.raw}, table.path)
     notch = given.record(SynchronousNotch)
-    return dataclasses.replace(notch, removes=kind, rotor=rotor, varying=rotor.acceleration != 0), phase
+    return dataclasses.replace(notch, removes=kind, rotor=rotor, varying=varying), phase
 
 
 def with_notch(top: Table, cascade: Cascade, scenario: Scenario, clock: Clock) -> Cascade:

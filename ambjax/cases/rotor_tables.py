@@ -26,6 +26,7 @@ from ambjax.cases.rotor_body import (
 )
 from ambjax.cases.rotor_file import body_of_file
 from ambjax.cases.scenario_tables import signal_from
+from ambjax.cases.speed_table import speed_of
 from ambjax.cases.table import Table, show
 from ambjax.numerics.records import leaf
 from ambjax.world.rotation import GRAM_MM, UnbalanceGrade
@@ -42,7 +43,6 @@ LONGEST_ELEMENT = 1 / 70
 ANGLE = leaf(default=0.0, unit="degrees", at_least=-360.0, at_most=360.0, doc="angle of the first axis from x")
 AMOUNT, PHASE = (field for field in dataclasses.fields(RotorUnbalance) if field.name in ("amount", "phase"))
 GRADE = {field.name: field for field in dataclasses.fields(UnbalanceGrade)}
-SPEED, ACCELERATION = (field for field in dataclasses.fields(Rotor) if field.name in ("speed", "acceleration"))
 LENGTH = leaf(unit="m", at_least=1e-6, at_most=100.0, doc="length of a section")
 DIAMETER = leaf(unit="m", at_least=1e-6, at_most=100.0, doc="outer diameter of a section")
 INNER = leaf(default=0.0, unit="m", at_least=0.0, at_most=100.0, doc="inner diameter of a section")
@@ -248,7 +248,7 @@ def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pat
     real = np.stack([unit[0], unit[4], *unit[RIGID::2]])
     imaginary = np.stack([unit[1], -unit[3], *unit[RIGID + 1 :: 2]])
     G = real.T @ body.gyroscopic @ imaginary - imaginary.T @ body.gyroscopic @ real
-    gravity = np.zeros(n)
+    turning, gravity = speed_of(table), np.zeros(n)
     gravity[:3] = body.m * vector(table, "gravity", 3, (0.0, -9.81, 0.0))
     return Rotor(
         M=jnp.diag(mass),
@@ -258,8 +258,9 @@ def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pat
         at_magnets=jnp.stack([axis.magnet for axis in axes]),
         at_sensors=jnp.stack([axis.sensor for axis in axes]),
         gravity=jnp.asarray(gravity),
-        speed=table.leaf("speed", SPEED, 0.0),
-        acceleration=table.leaf("acceleration", ACCELERATION, 0.0),
+        speed=turning.speed,
+        acceleration=turning.acceleration,
+        changes=turning.changes,
         unbalances=tuple(_unbalance(one, body, graded) for one in unbalances),
         loads=tuple(_load(one, body, Recordings(folder, ())) for one in tables_of(top, "load")),
     )

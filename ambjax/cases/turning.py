@@ -3,12 +3,12 @@
 import dataclasses
 from typing import Any
 
+from ambjax.cases.speed_table import SPEED, table_of_speeds
 from ambjax.cases.table import Table
 from ambjax.numerics.records import leaf
 from ambjax.world.rotation import Rotation
 from ambjax.world.scenario import SLOTS, Scenario
 
-(SPEED,) = (field for field in dataclasses.fields(Rotation) if field.name == "speed")
 RUN_UP = leaf(default=1.0, unit="s", at_least=1e-9, at_most=1e9, doc="duration of the run-up")
 # Keys of a load or a runout with a speed of its own, in a case without [rotor].
 OWN_SPEED = ("speed", "speed_end", "duration")
@@ -16,6 +16,9 @@ OWN_SPEED = ("speed", "speed_end", "duration")
 
 def rotation_from(table: Table) -> Rotation:
     """Return the speed of [rotor]. Raises ValueError for an invalid one."""
+    if turning := table_of_speeds(table):
+        table.only(["speed"])
+        return turning
     rotation = table.record(Rotation)
     rotation.check(table.path)
     return rotation

@@ -76,7 +76,8 @@ def operating_range(case: MachineCase) -> tuple[float, float]:
     """
     speeds = [abs(speed) for speed in case.speeds if speed != 0]
     first, rotor = abs(float(case.machine.rotor.speed)), case.machine.rotor
-    if float(rotor.acceleration) != 0 and len(case.speeds) == 2 and len(speeds) == 2 and first == speeds[0]:
+    varying = float(rotor.acceleration) != 0 or bool(rotor.changes)
+    if varying and len(case.speeds) == 2 and len(speeds) == 2 and first == speeds[0]:
         speeds = speeds[1:]
     return (min(speeds), max(speeds)) if speeds else (0.0, 0.0)
 

@@ -13,10 +13,10 @@ NEAR = 0.1
 
 
 def running_speeds(rotor: Rotation | None, duration: float) -> tuple[float, ...]:
-    """Return the speeds (Hz) at the start and at the end of a run, without 0; one if they are equal."""
+    """Return the speeds (Hz) at the start, the corners and the end of a run, without 0, each once."""
     if rotor is None:
         return ()
-    speeds = {abs(PER_MINUTE * float(rotor.rpm(t))) for t in (0.0, duration)}
+    speeds = {abs(PER_MINUTE * float(rotor.rpm(t))) for t in rotor.corners(duration)}
     return tuple(sorted(speeds - {0.0}))
 
 

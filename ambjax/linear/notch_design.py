@@ -23,10 +23,11 @@ SPEEDS = 33
 
 def notch_speeds(rotor: Rotation, notch: SynchronousNotch, duration: float) -> tuple[float, ...]:
     """Return the speeds (rpm) at which a notch needs its gain: those of a run from `min_speed` on, at most SPEEDS."""
-    first, last = sorted(abs(float(rotor.rpm(t))) for t in (0.0, duration))
+    signed = [float(rotor.rpm(t)) for t in rotor.corners(duration)]
+    first, *_, last = sorted(abs(rpm) for rpm in signed)
     if not notch.varying:
         return (first,)
-    if rotor.rpm(0.0) * rotor.rpm(duration) < 0:
+    if min(signed) < 0 < max(signed):
         first = 0.0
     low = max(first, float(notch.min_speed), last / (4 * SPEEDS))
     return tuple(np.linspace(low, last, SPEEDS).tolist()) if low < last else (last,)

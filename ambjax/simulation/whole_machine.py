@@ -141,7 +141,7 @@ class Machine:
         n = self.rotor.M.shape[-1]
         key = jax.tree.map(lambda x: x[0], self.loops()[0].scenario).key()
         inverse = solve(jnp.asarray(self.rotor.M)[None], jnp.eye(n, dtype=jnp.result_type(float))[None])[0]
-        realised = functools.partial(_realised, Rotation(self.rotor.speed, self.rotor.acceleration))
+        realised = functools.partial(_realised, self.rotor.rotation)
         axes = tuple(self.each(realised, self.split(jnp.arange(self.count))))
         return dataclasses.replace(self, rotor=self.rotor.realised(key), axes=axes, inverse=inverse)
 

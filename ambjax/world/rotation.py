@@ -24,6 +24,14 @@ def _phase() -> Any:
 
 
 @record
+class SpeedChange:
+    """A change of the rate of a rotor's speed at an instant: a corner of a table of speeds."""
+
+    at: Scalar = leaf(unit="s", at_least=0, at_most=1e9, doc="instant of the change")
+    by: Scalar = leaf(unit="rpm/s", at_least=-1e12, at_most=1e12, doc="rate after it minus rate before it")
+
+
+@record
 class Rotation:
     """Speed of a rotor over time. Its angle is the integral of the speed, and 0 at t = 0.
 
@@ -37,6 +45,7 @@ class Rotation:
     speed_end: Scalar | None = _rpm(
         -1e7, "speed at which the run-up or run-down ends; none: it never ends", default=None, optional=True
     )
+    changes: tuple[SpeedChange, ...] = part(default=(), doc="later changes of the rate, of a table of speeds")
 
     def check(self, path: str) -> None:
         """Raise ValueError if the speed never reaches speed_end. `path`: dotted path, for the message."""
@@ -47,20 +56,25 @@ class Rotation:
                 "speed_end out."
             )
 
-    def edges(self) -> tuple[Scalar, ...]:
+    def _end(self) -> tuple[Array, ...]:
         """Return the end of the run-up, s; empty if it never ends."""
         if self.speed_end is None:
             return ()
         return (jnp.maximum((self.speed_end - self.speed) / self.acceleration, 0.0),)
 
+    def edges(self) -> tuple[Scalar, ...]:
+        """Return the instants (s) at which the rate of the speed jumps."""
+        return (*self._end(), *(change.at for change in self.changes))
+
     def _sweep(self, t: Array) -> Array:
         """Return the time for which the speed has changed, s."""
-        return jnp.minimum(t, *edges) if (edges := self.edges()) else t
+        return jnp.minimum(t, *end) if (end := self._end()) else t
 
     def rpm(self, t: Scalar) -> Array:
         """Return the speed at time t (s), rpm."""
         t = jnp.asarray(t, jnp.result_type(float))
-        return self.speed + self.acceleration * self._sweep(t)
+        rpm = self.speed + self.acceleration * self._sweep(t)
+        return rpm + sum(change.by * jnp.maximum(t - change.at, 0.0) for change in self.changes)
 
     def omega(self, t: Scalar) -> Array:
         """Return the speed at time t (s), rad/s."""
@@ -70,11 +84,17 @@ class Rotation:
         """Return the angle at time t (s), in turns: the integral of the speed from 0 to t, in closed form."""
         t = jnp.asarray(t, jnp.result_type(float))
         sweep = self._sweep(t)
-        return PER_MINUTE * (self.speed * t + self.acceleration * sweep * (t - sweep / 2))
+        turns = self.speed * t + self.acceleration * sweep * (t - sweep / 2)
+        turns += sum(change.by * jnp.maximum(t - change.at, 0.0) ** 2 / 2 for change in self.changes)
+        return PER_MINUTE * turns
 
     def fastest(self, end: Scalar) -> float:
         """Return the largest |speed| between 0 and `end` (s), rad/s."""
-        return max(float(np.max(np.abs(self.omega(t)))) for t in (0.0, end))
+        return max(float(np.max(np.abs(self.omega(t)))) for t in self.corners(end))
+
+    def corners(self, end: Scalar) -> tuple[Scalar, ...]:
+        """Return 0, the changes before `end`, and `end`, s: |speed| is largest at one of them."""
+        return (0.0, *(jnp.minimum(change.at, end) for change in self.changes), end)
 
 
 def _rotation() -> Any:

@@ -9,7 +9,7 @@ from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, part, record
 from ambjax.numerics.smooth import TWO_PI, sine
-from ambjax.world.rotation import GRAM_MM, PER_MINUTE
+from ambjax.world.rotation import GRAM_MM, PER_MINUTE, Rotation, SpeedChange
 from ambjax.world.scenario import SIGNAL_STREAM, SLOTS
 from ambjax.world.waveforms import Signal, edges_of, realised
 
@@ -63,17 +63,24 @@ class Rotor:
     gravity: Array = _matrix("n", "", "weight, as forces on the coordinates")
     speed: Scalar = leaf(default=0.0, unit="rpm", at_least=-1e7, at_most=1e7, doc="speed at t = 0")
     acceleration: Scalar = leaf(default=0.0, unit="rpm/s", at_least=-1e9, at_most=1e9, doc="rate of the speed")
+    changes: tuple[SpeedChange, ...] = part(default=(), doc="later changes of the rate, of a table of speeds")
     unbalances: tuple[RotorUnbalance, ...] = part(default=(), doc="unbalances")
     loads: tuple[RotorLoad, ...] = part(default=(), doc="loads")
 
+    @property
+    def rotation(self) -> Rotation:
+        """Speed and angle over time."""
+        return Rotation(self.speed, self.acceleration, changes=self.changes)
+
     def speed_at(self, t: Scalar) -> Array:
         """Return the speed W at time t (s), rad/s."""
-        return jnp.asarray(TWO_PI * PER_MINUTE * (self.speed + self.acceleration * t))
+        return self.rotation.omega(t)
 
     def forces(self, t: Scalar) -> Array:
         """Return the weight, the unbalance forces and the loads at time t (s), on the coordinates [n]."""
-        turns = jnp.asarray(PER_MINUTE * (self.speed * t + self.acceleration * t * t / 2))
-        W, W_dot = self.speed_at(t), jnp.asarray(TWO_PI * PER_MINUTE * self.acceleration)
+        turns, W = self.rotation.turns(t), self.speed_at(t)
+        rate = self.acceleration + sum(jnp.where(t >= one.at, one.by, 0.0) for one in self.changes)
+        W_dot = jnp.asarray(TWO_PI * PER_MINUTE * rate)
         total = jnp.asarray(self.gravity)
         for one in self.unbalances:
             total = total + one.force(turns, W, W_dot)
@@ -86,8 +93,8 @@ class Rotor:
         return dataclasses.replace(self, unbalances=(), loads=())
 
     def edges(self) -> tuple[Scalar, ...]:
-        """Return the instants (s) at which a load jumps."""
-        return tuple(edge for load in self.loads for edge in edges_of(load.signal))
+        """Return the instants (s) at which a load or the rate of the speed jumps."""
+        return (*self.rotation.edges(), *(edge for load in self.loads for edge in edges_of(load.signal)))
 
     def realised(self, key: Array) -> "Rotor":
         """Return the rotor with its random loads drawn. `key`: random key of the member."""

@@ -1,0 +1,65 @@
+"""A table of speeds over time, of one axis and of a machine."""
+
+import numpy as np
+import pytest
+import scipy.integrate
+from machine_cases import MACHINES
+
+from ambjax.cases.machine_case import machine_from
+from ambjax.cases.reader import case_from
+from ambjax.results.machine_run import simulate_machine
+
+TIMES, RPM = [0.01, 0.5, 1.5], [600.0, 6000.0, -3000.0]
+UNBALANCE = [{"at": 0.05, "amount": 50.0, "phase": 20.0}]
+
+
+def machine(**rotor):
+    raw = MACHINES["rigid"]
+    return machine_from(raw | {"rotor": raw["rotor"] | rotor, "unbalance": UNBALANCE}, "machine")
+
+
+def test_the_angle_is_the_integral_of_the_speed():
+    rotor = case_from({"rotor": {"speed": {"times": TIMES, "rpm": RPM}}}, "case").scenario.rotor
+    for t in (0.005, 0.3, 1.0, 2.5):
+        corners = [x for x in TIMES if x < t]
+        turns = scipy.integrate.quad(lambda x: np.interp(x, TIMES, RPM) / 60, 0.0, t, points=corners or None)[0]
+        np.testing.assert_allclose(rotor.turns(t), turns, rtol=1e-9)
+        np.testing.assert_allclose(rotor.rpm(t), np.interp(t, TIMES, RPM), rtol=1e-9)
+    assert sorted(map(float, rotor.edges())) == TIMES
+    assert rotor.fastest(2.5) == pytest.approx(2 * np.pi * 100)
+
+
+def test_the_unbalance_force_is_the_second_derivative_of_the_turning_mass():
+    rotor, h = machine(speed={"times": TIMES, "rpm": RPM}).machine.rotor, 1e-5
+    assert [float(t) for t in rotor.edges()] == TIMES
+
+    def place(t):
+        angle = 2 * np.pi * float(rotor.rotation.turns(t)) + np.radians(20.0)
+        return 50e-6 * np.array([np.cos(angle), np.sin(angle)])
+
+    for t in (0.005, 0.3, 1.0, 2.5):
+        force = -(place(t + h) - 2 * place(t) + place(t - h)) / h**2
+        np.testing.assert_allclose((rotor.forces(t) - rotor.gravity)[:2], force, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_table_of_two_points_is_a_run_up():
+    table, ramp = (
+        machine(speed={"times": [0.0, 1.0], "rpm": [3000.0, 63000.0]}),
+        machine(speed=3000.0, acceleration=6e4),
+    )
+    assert table.speeds == ramp.speeds
+    ours, theirs = (simulate_machine(one).signals for one in (table, ramp))
+    for name in ("z", "i"):
+        np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-9, atol=1e-13)
+
+
+def test_the_speeds_of_the_sensitivity_are_first_last_and_largest():
+    speed = {"times": [0.0, 0.01, 0.02], "rpm": [0.0, 6000.0, 3000.0]}
+    assert machine(speed=speed).speeds == pytest.approx((0.0, 3000.0, 6000.0))
+
+
+@pytest.mark.parametrize("times", [[0.0], [0.0, 0.0], [1.0, 0.5], [0.0, 1.0, 2.0]])
+def test_times_must_ascend_with_one_rpm_each(times):
+    with pytest.raises(ValueError, match="ascending"):
+        case_from({"rotor": {"speed": {"times": times, "rpm": [0.0, 1.0]}}}, "case")
