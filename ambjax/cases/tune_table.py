@@ -177,9 +177,9 @@ def _limits() -> Iterator[Line]:
             "m; largest distance of z beyond its initial value and the range of r so far (left out: none)",
         ),
         ("clearance_used = 0.8", "largest |z| of any member as a share of the clearance (left out: none)"),
-        ("z_1x_m = 1e-6", "m; amplitude of z at the speed of [rotor], of any member (left out: none)"),
-        ("i_1x_A = 0.1", "A; amplitude of the current at the speed of [rotor], of any member (left out: none)"),
-        ("sensitivity_1x = 1.5", "|S| at the speed of [rotor], of any member, at r = 0 (left out: none)"),
+        ("z_1x_m = inf", "m; amplitude of z at the speed of [rotor], which it needs, of any member (left out: none)"),
+        ("i_1x_A = inf", "A; amplitude of the current at this speed, of any member (left out: none)"),
+        ("sensitivity_1x = inf", "|S| at this speed, of any member, at r = 0 (left out: none)"),
         (
             "sensitivity = 3.0",
             "peak of |S| of any member, at r = 0; inf: no limit (left out: sensitivity.zone_a)",
