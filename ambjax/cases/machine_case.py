@@ -58,6 +58,7 @@ class MachineCase:
     rotor's coordinates. `cases`: the case of each axis, with the mass and the weight that it carries. `settle`: time
     from which "settled" metrics count, s. `zones`, `speeds`: range, limits and speeds (rpm) of the sensitivity.
     `spread`: the numbers that vary between the members of an ensemble. `text`: the file as read.
+    `folder`: that of the file.
     """
 
     name: str
@@ -71,6 +72,7 @@ class MachineCase:
     speeds: tuple[float, ...]
     spread: Spread = Spread()
     text: str = ""
+    folder: pathlib.Path = pathlib.Path()
 
 
 def read_machine(path: str | pathlib.Path) -> MachineCase:
@@ -147,6 +149,7 @@ def machine_from(
         speeds=_speeds(top.table("sensitivity"), rotor, float(clock.duration)),
         spread=spread,
         text=text,
+        folder=folder,
     )
 
 

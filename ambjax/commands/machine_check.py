@@ -6,6 +6,7 @@ import tomllib
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, machine_from
+from ambjax.cases.rotor_body import MODES
 from ambjax.commands.machine_commands import analysed, once_per_revolution, worst_of_speeds
 from ambjax.host.heartbeat import say
 from ambjax.linear import MachineSensitivity, poles_in_s
@@ -75,11 +76,14 @@ def _spill_over(case: MachineCase) -> dict[str, float]:
     raw = tomllib.loads(case.text) if case.text else {}
     if raw.get("rotor", {}).get("kind") != "shaft" or isinstance(raw["rotor"].get("damping"), list):
         return {}
-    known = (len(case.coordinates) - 5) // 2
-    raw["rotor"]["modes"] = known + MORE
+    known, most = (len(case.coordinates) - 5) // 2, MODES.metadata["at_most"]
+    if known == most:
+        return {}
+    raw["rotor"]["modes"] = min(known + MORE, most)
+    raw.pop("initial", None)  # it has the coordinates of the rotor with fewer modes
     if raw.get("controller", {}).get("kind") == "lqg":  # the same controller
         raw["controller"]["lqg"] = {"modes": known} | raw["controller"].get("lqg", {})
-    more = machine_from(raw, case.name)
+    more = machine_from(raw, case.name, folder=case.folder)
     points = turning_machines(more.machine, case.clock.sample_period, case.speeds)
     growth = [float(np.max(np.real(poles_in_s(point.system.without_idle())))) for point in points]
     return {f"{speed:g}": rate for speed, rate in zip(case.speeds, growth, strict=True)}
@@ -88,7 +92,7 @@ def _spill_over(case: MachineCase) -> dict[str, float]:
 def _more(spilled: dict[str, float]) -> str:
     if not spilled:
         return ""
-    return f"; with {MORE} more bending modes the largest growth rate is {max(spilled.values()):.3g} 1/s"
+    return f"; with up to {MORE} more bending modes the largest growth rate is {max(spilled.values()):.3g} 1/s"
 
 
 def _axis(case: MachineCase, k: int, metrics: dict[str, float], points: list[MachineSensitivity]) -> dict[str, object]:
