@@ -130,6 +130,11 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
         ambjax.survival_map(case, ("plant.m", 1, 2), "plant.R=1:2")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match=r'it must be a list. Write \["controller.position.c"\]'):
         ambjax.gains_of(case.cascade, "controller.position.c")
+    for function in (ambjax.Metrics.for_case, ambjax.simulate_machine):
+        with pytest.raises(ValueError, match="case = Cascade: it must be a "):
+            function(case.cascade)
+    with pytest.raises(ValueError, match="template = 'rigg': it must be one of tracking"):
+        ambjax.template("rigg")
     for function in (
         ambjax.simulate,
         ambjax.sensitivity,
@@ -142,6 +147,17 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
             function(wrong)
     with pytest.raises(ValueError, match="cascade = Scenario: it must be a Cascade"):
         ambjax.rollout(case.scenario, case.cascade, case.clock)  # pyright: ignore[reportArgumentType]
+    for given in (("case.toml",), (case.cascade,), ((case.cascade, case.scenario, case.clock),), (case, case.scenario)):
+        with pytest.raises(ValueError, match="give a case, .* or a Cascade, a Scenario and a Clock"):
+            ambjax.rollout(*given)
+    two, plain = jnp.array([17.0, 18.0]), dataclasses.replace(case.scenario, reference=0.0)
+    with pytest.raises(ValueError, match=r"controller.position.c has the shape \[2\]: rollout simulates one member"):
+        ambjax.rollout(ambjax.with_gains(case, {"controller.position.c": two}))
+    with pytest.raises(ValueError, match=r"scenario.reference = 0.0: it must be a record, such as Constant\(\)"):
+        ambjax.rollout(case.cascade, plain, case.clock)
+    for named, said in (({"fold": ambjax.Metrics}, "fold = .* a fold"), ({"record_every": -1}, "record_every = -1")):
+        with pytest.raises(ValueError, match=said):
+            ambjax.rollout(case, **named)
     late = dataclasses.replace(case.scenario, q_z=ambjax.signals.Pulse(1.0, 2.0, 1.0))
     with pytest.raises(ValueError, match=r"q_z.stop = 1.0: it must not be less than start = 2.0"):
         ambjax.rollout(case.cascade, late, case.clock)

@@ -24,6 +24,7 @@ from ambjax.numerics.shapes import varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
 from ambjax.simulation.rollout import Result, System, prepare, run
+from ambjax.simulation.system import check_recording
 from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 
@@ -69,6 +70,7 @@ def run_ensemble(
 
     Raises ValueError as `rollout` does, if the lengths of two leaves differ, and if no leaf is an array.
     """
+    check_recording(fold, record_every)
     tree = canonical((*prepare(cascade, scenario, clock), fold))
     return map_members(_rollout(record_every), tree, threads=threads, call=call)
 

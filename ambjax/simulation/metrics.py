@@ -108,7 +108,12 @@ class Metrics:
 
     @classmethod
     def for_case(cls, case: SettledCase) -> "Metrics":
-        """Return the metrics for a case of `read_case`: `Metrics.of` with its settling time and its scenario."""
+        """Return the metrics for a case of `read_case`: `Metrics.of` with its settling time and its scenario.
+
+        Raises ValueError for anything else.
+        """
+        if not (hasattr(case, "settle") and hasattr(case, "scenario")):
+            raise ValueError(f"case = {type(case).__name__}: it must be a Case, as ambjax.read_case(PATH) returns it.")
         return Metrics.of(case.settle, case.scenario)
 
     def _folds(self) -> Named:
