@@ -19,6 +19,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from ambjax.compiler.fast_path import block_length, one_kernel
 from ambjax.compiler.short_compilation import compiled_quickly
 from ambjax.control.cascade import Cascade
+from ambjax.numerics.declared import require_number
 from ambjax.numerics.records import canonical
 from ambjax.numerics.shapes import varying
 from ambjax.simulation.clock import Clock
@@ -124,6 +125,8 @@ def map_members(
     Raises ValueError if the lengths of two leaves differ, or if no leaf is an array.
     """
     compiled = one_kernel if not plain else compiled_quickly if quick else jax.jit
+    for name, value in (("threads", threads), ("call", call), ("block", block)):
+        require_number(name, value, 1, whole=True, optional=True)
     return _Engine(function, tree, threads, call, block, compiled, vectorised).results()
 
 

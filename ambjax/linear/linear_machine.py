@@ -14,7 +14,7 @@ from ambjax.control.cascade_state import CascadeState, Sample
 from ambjax.control.machine_law import MachineInputs
 from ambjax.linear.analysis import Zones
 from ambjax.linear.equilibrium import TOLERANCE, at_rest, ideal, newton_of, reading, sizes_of, start_of
-from ambjax.linear.margins import Margins, ResponsePeak, peak, poles_in_s, reading_margins, whole_end
+from ambjax.linear.margins import NO_PEAK, Margins, ResponsePeak, peak, poles_in_s, reading_margins, whole_end
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar, canonical
 from ambjax.numerics.small_matrices import exponential, times
@@ -49,7 +49,7 @@ class AxisSensitivity(NamedTuple):
 class MachineSensitivity(NamedTuple):
     """Sensitivity of a machine at one speed, with all loops closed.
 
-    - `speed`: rpm. `stable`: whether no mode grows. If one does, the peaks have no physical meaning, and zones are D.
+    - `speed`: rpm. `stable`: whether no mode grows. If one does, the peaks are infinite, and the zones D.
     - `axes`: the peaks of each axis. `sigma`: peak of the largest singular value of the matrix S.
     - `poles`: poles of the machine, 1/s, in the order of decreasing real part.
     - `system`: the linear system, with inputs e_k at the sensors, and outputs as of `linearise_machine`.
@@ -426,6 +426,8 @@ def sensitivity_of(point: TurningMachine, names: tuple[str, ...], speed: float, 
         return responses[key]
 
     def largest(magnitude: Callable) -> ResponsePeak:
+        if not stable:
+            return NO_PEAK
         return peak(system, lambda f: magnitude(response(f)), low, high, end)
 
     axes = []
@@ -435,7 +437,7 @@ def sensitivity_of(point: TurningMachine, names: tuple[str, ...], speed: float, 
         KS = largest(lambda H, k=k: np.abs(H[:, c + k, k]))
         own = system._replace(B=system.B[:, [k]], C=system.C[[k]], D=system.D[[k]][:, [k]])
         margins = reading_margins(own) if stable else None
-        axes.append(AxisSensitivity(name, S, T, KS, zones.zone(S.height) if stable else "D", margins))
+        axes.append(AxisSensitivity(name, S, T, KS, zones.zone(S.height), margins))
     sigma = largest(lambda H: np.linalg.norm(H[:, :c], 2, axis=(1, 2)))
     poles = poles_in_s(system)
     return MachineSensitivity(speed, stable, tuple(axes), sigma, poles[np.argsort(-np.real(poles))], system)

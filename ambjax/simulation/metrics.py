@@ -95,6 +95,8 @@ class Metrics:
         `settle`: start of the evaluation of the settled metrics, s. The ratios of the bands are those of the plant of
         Table 1: 4e-4 of the size of sigma, 4e-5 of the size of v, and 4e-3 of i_0.
         """
+        if not isinstance(scenario, Scenario):
+            raise ValueError(f"scenario = {scenario!r}: it must be a Scenario, such as `case.scenario`.")
         plant, usual, paper = scenario.plant, Metrics(), Plant()
         return Metrics(
             settle,

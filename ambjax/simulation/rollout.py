@@ -106,7 +106,7 @@ def rollout(
     """
     loop, clock = prepare(cascade, scenario, clock)
     check_recording(fold, record_every)
-    require_one_member({"controller": cascade, "scenario": scenario})
+    require_one_member({"controller": cascade, "scenario": scenario, "clock": clock})
     loop, clock, fold = canonical((loop, clock, fold))
     return roll(loop, clock, fold, record_every=record_every)
 

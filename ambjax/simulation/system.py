@@ -1,7 +1,6 @@
 """The closed loop of a case, in continuous time or on a processor."""
 
 import dataclasses
-import numbers
 from typing import Any
 
 import jax
@@ -11,6 +10,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState
 from ambjax.control.guard import simulated
 from ambjax.control.stages import STAGES
+from ambjax.numerics.declared import require_number
 from ambjax.numerics.records import Scalar, is_traced, validate
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop
@@ -39,8 +39,7 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
     check_parts(cascade, scenario, clock.sample_period)
     validate(scenario, "scenario")
     validate(clock, "clock")
-    if not isinstance(clock.samples, numbers.Integral) or clock.samples < 1:
-        raise ValueError(f"clock.samples = {clock.samples}: it must be a whole number of at least 1.")
+    require_number("clock.samples", clock.samples, 1, whole=True)
 
 
 def require_records(name: str, node: Any) -> None:
@@ -56,8 +55,7 @@ def check_recording(fold: object, record_every: object) -> None:
     """Raise ValueError for arguments of `rollout` that are not a fold, or not a number of samples."""
     if fold is not None and (isinstance(fold, type) or not hasattr(fold, "init")):
         raise ValueError(f"fold = {fold!r}: it must be a fold, such as ambjax.Metrics.for_case(case), or None.")
-    if not isinstance(record_every, numbers.Integral) or record_every < 0:
-        raise ValueError(f"record_every = {record_every!r}: it must be a whole number of at least 0.")
+    require_number("record_every", record_every, 0, whole=True)
 
 
 def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> None:

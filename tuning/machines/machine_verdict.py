@@ -69,7 +69,7 @@ def report_text(facts: dict[str, Any]) -> str:
             axis["name"],
             _peak(a, old),
             _peak(b, axis),
-            f"{axis['frequency_hz']:.4g}",
+            f"{axis['frequency_hz']:.4g}" if b["stable"] else "-",
             axis["zone"],
         )
         for a, b in speeds
