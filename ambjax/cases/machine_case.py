@@ -1,4 +1,4 @@
-"""Reader of the case file of a whole machine: [rotor], [[bearing]], [[unbalance]], [[load]], and the common tables."""
+"""Reader of the case file of a whole machine: rotor, bearings, unbalances, loads, base, and the common tables."""
 
 import copy
 import dataclasses
@@ -40,7 +40,7 @@ from ambjax.text.words import one_line
 from ambjax.world.rotation import known
 from ambjax.world.rotor import Rotor
 
-MACHINE_TABLES = ("rotor", "bearing", "unbalance", "load")
+MACHINE_TABLES = ("rotor", "bearing", "unbalance", "load", "base")
 # Product of step and angular frequency of a mode (or of nutation) at which the relative error of RK4 in one period is
 # below 1e-6.
 MODE = 0.1
@@ -105,7 +105,7 @@ def machine_from(
     top = Table(raw)
     top.only([*TABLES, *MACHINE_TABLES[1:], "tune"])
     if "disturbance" in raw:
-        raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] instead.")
+        raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] or [[base]] instead.")
     body, bearings = body_from(top, folder), tables_of(top, "bearing")
     if not bearings:
         raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
@@ -231,7 +231,8 @@ def _shares(rotor: Rotor) -> tuple[list[float], list[float]]:
     B, M, gravity = (np.asarray(x, np.float64) for x in (rotor.at_magnets, rotor.M, rotor.gravity))
     B = B[:, :RIGID]
     masses = 1 / np.sum(B * np.linalg.solve(M[:RIGID, :RIGID], B.T).T, 1)
-    return masses.tolist(), (np.linalg.pinv(B.T) @ -gravity[:RIGID]).tolist()
+    forces = np.linalg.pinv(B.T) @ -gravity[:RIGID]
+    return masses.tolist(), np.where(np.abs(forces) > 1e-12 * np.abs(forces).max(), forces, 0.0).tolist()
 
 
 def _check_force(case: Case, axis: BearingAxis, force: float) -> None:
