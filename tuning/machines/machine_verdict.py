@@ -30,7 +30,7 @@ def judged(case: MachineCase, found: MachineCase, limits: dict[str, float], seed
     values["sensitivity"] = after["peak"] if after["stable"] else math.inf
     rows: list[dict[str, Any]] = [
         {"name": name, "meaning": LIMITS[name][0], "value": values[name], "threshold": most}
-        | {"holds": bool(values[name] <= most)}
+        | {"holds": bool(values[name] <= most and (name == "sensitivity" or held.all()))}
         for name, most in limits.items()
     ]
     broken = [row["name"] for row in rows if not row["holds"]]
@@ -38,9 +38,10 @@ def judged(case: MachineCase, found: MachineCase, limits: dict[str, float], seed
     words = [
         f"peak of |S| {after['peak']:.4g} ({at}), zone {after['zone']}" if after["stable"] else "NOT STABLE",
         f"{int(held.sum())} of {members} members held",
-        "all limits met" if not broken else f"beyond the limits: {', '.join(broken)}",
     ]
     good = bool(after["stable"] and held.all() and not broken)
+    if good or broken:
+        words.append("all limits met" if good else f"beyond the limits: {', '.join(broken)}")
     return {
         "verdict": f"{'; '.join(words)}.",
         "case": case.name,
