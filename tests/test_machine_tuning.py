@@ -14,9 +14,10 @@ from ambjax.cases.template_text import template
 from ambjax.commands.machine_commands import analysed
 from ambjax.linear.linear_machine import machine_sensitivity
 from tuning.__main__ import main
+from tuning.machines.lqg_weights import lqg_space
 from tuning.machines.machine_gains import MachineSpace, machine_space
 from tuning.machines.machine_peaks import Peaks
-from tuning.machines.machine_tuning import Settings, searched
+from tuning.machines.machine_search import Settings, searched
 from tuning.machines.machine_verdict import judged
 from tuning.machines.nonsmooth import Value, minimise
 from tuning.problem.space import Gain, Space
@@ -95,6 +96,38 @@ def test_bfgs_finds_the_minimum_of_a_function_that_is_not_smooth():
 
     found = minimise(function, function(np.array([-0.7, 0.6])), 500, lambda value: False)
     assert found.f < 1e-3
+
+
+def lqg_case(**tune):
+    raw = tomllib.loads(template("machine"))
+    raw |= {"controller": {"kind": "lqg"}, "tune": tune, "bearing": raw["bearing"][:2]}
+    case = machine_from(raw)
+    return case, lqg_space(Table(raw).table("tune"), case, raw)
+
+
+def test_the_weights_of_an_lqg_begin_at_those_of_the_case():
+    case, space = lqg_case(bounds={"controller": {"lqg": {"error": [1e-9, 1e-3]}}})
+    x = space.space.encode(space.values(case))
+    assert len(x) == 5  # bending included, although the rotor is rigid
+    law = space.decode(x, case.machine).law
+    for name in ("A", "B", "C", "D", "start"):
+        np.testing.assert_allclose(getattr(law, name), getattr(case.machine.law, name), rtol=1e-6, atol=1e-9)
+
+
+def test_refused_weights():
+    with pytest.raises(ValueError, match="k_p"):
+        lqg_case(gains=["controller.lqg.k_p"])
+
+
+@pytest.mark.slow
+def test_peak_and_derivatives_of_an_lqg():
+    case, space = lqg_case(gains=[f"controller.lqg.{name}" for name in ("error", "noise")])
+    found, x = Peaks(case, space), space.space.encode(space.values(case)) + np.array([0.5, 0.3])
+    machine, h = space.decode(x, case.machine), 1e-4
+    points = [machine_sensitivity(machine, case.axes, case.clock.sample_period, v, case.zones) for v in case.speeds]
+    assert np.exp(found.peak(x).f) == pytest.approx(max(point.worst.S.height for point in points), rel=1e-3)
+    steps = [(found.peak(x + h * e).f - found.peak(x - h * e).f) / (2 * h) for e in np.eye(2)]
+    np.testing.assert_allclose(found.peak(x).gradient, steps, rtol=0.02, atol=0.02 * np.abs(steps).max())
 
 
 class Parabola:
