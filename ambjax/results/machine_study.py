@@ -10,6 +10,7 @@ import numpy as np
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.machine_controller import inner
 from ambjax.cases.machine_spread import axis_values, machine_places, varied_rotors
+from ambjax.compiler.members_last import members_last
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
 from ambjax.ensemble.paths import kinds, places, with_values
@@ -23,7 +24,7 @@ from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
 from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import Result, prepare, run
-from ambjax.simulation.whole_machine import ContinuousMachine, Machine, PerAxis, SampledMachine, machine_of, stack_axes
+from ambjax.simulation.whole_machine import Machine, PerAxis, machine_of, stack_axes
 from ambjax.world.rotor import Rotor
 from ambjax.world.scenario import Scenario
 
@@ -121,9 +122,7 @@ class MachineStudy(AnyStudy):
             far = np.array(machine.start_q)
             far[:2] = FAR * max(float(np.max(np.asarray(one.scenario.limit))) for one in self.case.cases)
             machine = dataclasses.replace(machine, start_q=far)
-        tree = canonical((machine, self.clock, fold))
-        # plain: within one kernel, arrays of axes take minutes to compile
-        outcome = map_members(_simulated, tree, threads=threads, call=call, plain=True, quick=False)
+        outcome = simulate_members(machine, self.clock, fold, threads=threads, call=call)
         values = {SPREAD + path: x for path, x in self.drawn(members).items()}
         return {"index": members, "lost_at": outcome.trajectory.lost_at, **worst_of(outcome.metrics), **values}
 
@@ -148,5 +147,13 @@ class MachineStudy(AnyStudy):
         return facts | {"rotor": digest.hexdigest()}
 
 
-def _simulated(tree: tuple[SampledMachine | ContinuousMachine, Clock, Fold]) -> Result:
-    return run(*tree, 0)
+def simulate_members(
+    machine: Machine, clock: Clock, fold: Fold, *, threads: int | None = None, call: int | None = None
+) -> Result:
+    """Simulate every member of an ensemble of machines, with a leading axis [N] of what varies; no rows are recorded."""
+    tree = canonical((machine, clock, fold))
+    return map_members(_simulated, tree, threads=threads, call=call, vectorised=True)
+
+
+def _simulated(tree: tuple[Machine, Clock, Fold], axes: object) -> Result:
+    return members_last(lambda one: run(*one, 0), axes)(tree)
