@@ -65,6 +65,46 @@ def test_every_number_reads_back_from_the_case_file(case):
         assert document == values[k], one.path
 
 
+LISTS = """
+plant = { m = 5.0, s_0 = 8e-4 }
+[[disturbance.q_z]]
+kind = "constant"
+unit = "N"
+value = 1.0
+[[disturbance.q_z]]
+kind = "sine"
+amplitude = 0.5
+frequency = 50.0
+[[disturbance.q_z]]
+kind = "sine"
+unit = "N"
+amplitude = 2.0
+frequency = 20.0
+[reference]
+kind = "sum"
+terms = [{ kind = "constant", value = 1e-5 }, { kind = "sine", amplitude = 1e-5, frequency = 10.0, phase = 0.5 }]
+[controller.position]
+k = { over = "error", at = [0.0, 1e-5], values = [100.0, 200.0] }
+[processor]
+[clock]
+duration = 0.01
+"""
+
+
+def test_loads_in_a_list_schedules_omitted_gains_and_the_initial_state_have_sliders_that_set_them_in_the_file():
+    case = rig(LISTS)
+    given, (lines,) = html_page._written(case, [])
+    written = {"disturbance.q_f.terms.1.amplitude", "disturbance.q_z.phase", "reference.terms.1.phase"}
+    assert {one.path for one in given} >= written | {
+        "controller.position.k.1", "controller.position.c", "controller.current.k_i", "initial.z", "plant.m"
+    }  # fmt: skip
+    values, expected = [one.value for one in given], parameter_values(case)
+    for k, one in enumerate(given):
+        if one.path.startswith(("disturbance.", "reference.", "controller.", "initial.")):
+            values[k] = expected[one.parameter] = moved(one)
+    np.testing.assert_array_equal(parameter_values(rig(filled(lines, given, values))), expected)
+
+
 def test_a_changed_plant_does_not_change_the_controller_s_model(case):
     (mass,) = (one for one in sliders(case, []) if one.path == "plant.m")
     lines, _ = editable_lines(case.text, [mass])
