@@ -179,12 +179,17 @@ def tuned():
 
 
 @pytest.fixture(scope="module")
-def tab(case, tuned, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("page")
-    (folder / "page.html").write_text(page(case, [tuned], f"{HOSTILE}.toml"), encoding="utf-8")
-    with browser.browser(folder) as tab:
+def written(case, tuned, tmp_path_factory):
+    path = tmp_path_factory.mktemp("page") / "page.html"
+    path.write_text(page(case, [tuned], f"{HOSTILE}.toml"), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def tab(written, tmp_path_factory):
+    with browser.browser(tmp_path_factory.mktemp("profile")) as tab:
         tab.size(1280)
-        tab.open(folder / "page.html")
+        tab.open(written)
         settled(tab)
         yield tab
 
@@ -344,6 +349,27 @@ def test_the_drawing_of_the_machine_shows_the_selected_time(fresh):
     assert fresh.run(drawing) != begin
     z = 1e6 * signal(fresh, "z")[-1]
     assert f"Rotor at {z:.2f} micrometres" in fresh.run(drawing)
+
+
+@in_browser
+def test_no_curve_is_visible_before_the_first_run(written, tmp_path):
+    with browser.browser(tmp_path) as tab:
+        tab.call("Page.addScriptToEvaluateOnNewDocument", source="window.Worker = class { postMessage() {} }")
+        tab.open(written)
+        tab.wait("window.ambjax && ambjax.state.sent > 0")
+        assert tab.run("document.getElementById('status').textContent").startswith("Computing")
+        visible = "one => one.checkVisibility({ visibilityProperty: true })"
+        assert not tab.run(f"[...document.querySelectorAll('.plot > div')].some({visible})")
+
+
+@in_browser
+def test_curves_are_visible_after_a_run_and_the_page_ends_with_its_content(fresh):
+    shown = (
+        "[...document.querySelectorAll('.plot > div')].every(one => one.checkVisibility({visibilityProperty: true}))"
+    )
+    assert fresh.run(shown)
+    end = "document.querySelector('main').getBoundingClientRect().bottom + scrollY"
+    assert fresh.run(f"document.documentElement.scrollHeight - ({end})") < 20
 
 
 @in_browser
