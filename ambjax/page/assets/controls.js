@@ -73,7 +73,8 @@ function addSlider(slider, k, changed) {
     if (reason === "") { values[k] = slider.grid ? onGrid(x) : x; show(k); changed(); }
   });
   box.show = (x) => {
-    typed.value = text(x);
+    typed.value = slider.whole || text(x).length < 10 ? text(x) : text(x, 6);
+    typed.title = text(x);
     typed.setAttribute("aria-invalid", "false");
     why.textContent = "";
     range.value = toPosition(slider, x);
