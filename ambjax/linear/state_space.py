@@ -51,6 +51,10 @@ class CommandPath(NamedTuple):
 NEUTRAL = 1e-12
 
 
+# Number of states from which NumPy computes a response at many frequencies from one Schur decomposition.
+LARGE = 40
+
+
 class StateSpace(NamedTuple):
     """The linear system x' = A x + B w, y = C x + D w, or x_{n+1} = A x_n + B w_n on a processor.
 
@@ -102,6 +106,8 @@ class StateSpace(NamedTuple):
         np_: Any = np if isinstance(self.A, np.ndarray) else jnp
         A, B, C, D, *_ = self.scaled()
         at = self.point(frequency)[:, None, None]
+        if np_ is np and LARGE <= len(A) < len(at):
+            return C @ _solved_large(A, B, at[:, 0]) + D
         solved = np.linalg.solve if np_ is np else solve
         x = solved(at * np.eye(len(A)) - A, np_.broadcast_to(B + 0j, (at.shape[0], *B.shape)))
         return C @ x + D
@@ -185,6 +191,17 @@ class StateSpace(NamedTuple):
         matrices = [np.asarray(x) for x in (self.A, self.B, self.C, self.D)]
         step = 0 if self.period is None else float(self.period)
         return control.StateSpace(*matrices, step, inputs=list(INPUTS), outputs=list(OUTPUTS))
+
+
+def _solved_large(A: np.ndarray, B: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return (s - A)^-1 B [F, N, m] for the points s in `at` [F, 1], by back substitution in a triangular matrix."""
+    from scipy.linalg import schur
+
+    T, U = schur(A, "complex")
+    right, x = U.conj().T @ B, np.empty((len(A), len(at), B.shape[1]), complex)
+    for k in reversed(range(len(A))):
+        x[k] = (right[k] + np.tensordot(T[k, k + 1 :], x[k + 1 :], 1)) / (at - T[k, k])
+    return np.moveaxis(np.tensordot(U, x, 1), 0, 1)
 
 
 def _exponential(M: np.ndarray) -> np.ndarray:
