@@ -44,7 +44,7 @@ def magnets(cases: Sequence[Case], voltage: bool) -> dict[str, Any]:
 def linear(top: Table, cases: list[Case], folder: pathlib.Path) -> StateSpaceLaw:
     """Return the controller of a file."""
     table, c = top.table("controller"), len(cases)
-    table.only(["kind", "file", "output", "model", "current"])
+    table.only(["kind", "file", "output", "model", "current", "notch"])
     output = table.choice("output", list(OUTPUTS), OUTPUTS[0])
     convert = lambda A, B, C, D, dt=0.0: several((A, B, C, D), dt, c)  # noqa: E731
     matrices, steady, dt = contents_of(table, folder, convert)[2]
@@ -85,7 +85,7 @@ def bilinear(matrices: tuple[np.ndarray, ...], period: float) -> tuple[np.ndarra
 def lqg(top: Table, cases: list[Case], rotor: Rotor) -> StateSpaceLaw:
     """Return the LQG of a rotor."""
     table = top.table("controller")
-    table.only(["kind", "model", "lqg"])
+    table.only(["kind", "model", "lqg", "notch"])
     own, processor = table.table("lqg"), cases[0].cascade.processor
     if processor is None:
         raise ValueError(f'{table.at("kind")} = "lqg": it is designed for a processor. Add [processor].')
