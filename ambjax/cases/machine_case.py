@@ -4,7 +4,8 @@ import copy
 import dataclasses
 import math
 import pathlib
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +27,7 @@ from ambjax.cases.rotor_tables import (
 )
 from ambjax.cases.speed_table import SPEED
 from ambjax.cases.table import Table, load, show
+from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.synchronous_notch import SynchronousNotch
 from ambjax.ensemble.spread import Spread
@@ -39,6 +41,7 @@ from ambjax.simulation.rollout import prepare
 from ambjax.simulation.whole_machine import Machine, machine_of
 from ambjax.text.words import one_line
 from ambjax.world.rotor import Rotor
+from ambjax.world.scenario import Scenario
 
 MACHINE_TABLES = ("rotor", "bearing", "unbalance", "load", "base")
 # Product of step and angular frequency of a mode (or of nutation) at which the relative error of RK4 in one period is
@@ -75,6 +78,14 @@ class MachineCase:
     folder: pathlib.Path = pathlib.Path()
 
 
+AnyCase: TypeAlias = Case | MachineCase
+
+
+def first_axis(case: AnyCase) -> Case:
+    """Return a case of one axis, or that of the first axis of a machine: it has the tables that all axes share."""
+    return case if isinstance(case, Case) else case.cases[0]
+
+
 def read_machine(path: str | pathlib.Path) -> MachineCase:
     """Read and check the case file of a machine. Raises ValueError, one line, for an invalid file."""
     case = read_any(path)
@@ -87,7 +98,7 @@ def read_machine(path: str | pathlib.Path) -> MachineCase:
     return case
 
 
-def read_any(path: str | pathlib.Path) -> Case | MachineCase:
+def read_any(path: str | pathlib.Path) -> AnyCase:
     """Read and check a case file: of one axis, or of a whole machine. Raises ValueError, one line, as `read_case`."""
     require_file("path", path)
     path = pathlib.Path(path)
@@ -130,7 +141,7 @@ def machine_from(
         _check_force(case, axis, force)
         cases.append(case)
     law, parts = law_from(top, rotor, bearings, cases, read, folder)
-    spread = machine_spread(top, rotor, axes, names, cases)
+    spread = machine_spread(top, rotor, q, axes, names, cases)
     if law is not None:
         refuse_unused(spread)
     fixed = not isinstance(raw.get("clock", {}).get("dt", "auto"), str)
@@ -138,13 +149,13 @@ def machine_from(
     controllers = [merged(top.table("controller").raw, own.table("controller").raw) for own in bearings]
     notches = [notch_of_axis(controllers[axis.bearing], case) for axis, case in zip(axes, cases, strict=True)]
     if any(notches):
-        found = with_machine_gains(_machine(rotor, cases, clock, q, law), notches, clock)
+        found = with_machine_gains(machine_of_axes(rotor, parts_of(cases), clock, q, law), notches, clock)
         laws = [dataclasses.replace(case.cascade, notch=notch) for case, notch in zip(cases, found, strict=True)]
         cases = [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
     coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
     return MachineCase(
         name=safe_name(name),
-        machine=_machine(rotor, cases, clock, q, law),
+        machine=machine_of_axes(rotor, parts_of(cases), clock, q, law),
         clock=clock,
         axes=tuple(axis.name for axis in axes),
         coordinates=coordinates,
@@ -158,8 +169,16 @@ def machine_from(
     )
 
 
-def _machine(rotor: Rotor, cases: list[Case], clock: Clock, q: np.ndarray, law: MachineLaw | None) -> Machine:
-    systems = [prepare(case.cascade, case.scenario, clock)[0] for case in cases]
+def parts_of(cases: Sequence[Case]) -> list[tuple[Cascade, Scenario]]:
+    """Return the laws and the scenario of each axis."""
+    return [(case.cascade, case.scenario) for case in cases]
+
+
+def machine_of_axes(
+    rotor: Rotor, parts: Sequence[tuple[Cascade, Scenario]], clock: Clock, q: Any, law: MachineLaw | None
+) -> Machine:
+    """Return the machine of a rotor and its axes. `q`: coordinates at t = 0. `law`: of the whole machine."""
+    systems = [prepare(*part, clock)[0] for part in parts]
     systems = [canonical(system if law is None else inner(system, law)) for system in systems]
     return machine_of(rotor, systems, jnp.asarray(q), law)
 
@@ -182,7 +201,10 @@ def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:
         return (*ends, most) if abs(most) > max(abs(first), abs(last)) else ends
     if not isinstance(value, list) or not 0 < len(value) <= MOST_SPEEDS:
         raise ValueError(f"{table.at('speeds')} = {show(value)}: it must be a list of 1 to {MOST_SPEEDS} speeds, rpm.")
-    return tuple(Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(value))
+    speeds = [Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(value)]
+    if twice := next((x for x in speeds if speeds.count(x) > 1), None):
+        raise ValueError(f"{table.at('speeds')} = {show(value)}: {twice:g} rpm is given more than once. Give it once.")
+    return tuple(speeds)
 
 
 def _start(table: Table, rotor: Rotor, count: int) -> tuple[np.ndarray, list[float]]:

@@ -162,7 +162,11 @@ def _check_one(path: str, kind: Distribution, place: Place) -> None:
     def refuse(text: str) -> ValueError:
         return SpreadError(path, kind, text)
 
-    if fault := kind.fault():
+    try:
+        fault = kind.fault()
+    except TypeError:  # a text or None
+        raise ValueError(f"spread.{path} = {kind!r}: its values must be numbers.") from None
+    if fault:
         raise refuse(f"{fault}.")
     if np.size(place.value) != 1:
         raise refuse(f"{path} is an array of {np.size(place.value)} already. Spread a single number.")
