@@ -138,7 +138,7 @@ def problem_of(kind: Kind, case: MachineCase) -> ctypes.Structure:
     rotor, clock, sensor = case.machine.rotor, case.clock, case.cases[0].scenario.sensor
     (unbalance,), (load,), (M, D, K) = rotor.unbalances, rotor.loads, map(np.asarray, (rotor.M, rotor.D, rotor.K))
     assert all(np.array_equal(x, np.diag(np.diag(x))) for x in (M, D, K)), "machines.c takes diagonal matrices"
-    assert unbalance.phase == 0 and rotor.acceleration == 0
+    assert unbalance.phase == rotor.acceleration == 0
     W, found = float(rotor.speed_at(0.0)), problem_type(kind)()
     amount = 1e-6 * float(unbalance.amount)
     numbers: dict[str, Any] = {

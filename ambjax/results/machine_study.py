@@ -150,7 +150,7 @@ class MachineStudy(AnyStudy):
 def simulate_members(
     machine: Machine, clock: Clock, fold: Fold, *, threads: int | None = None, call: int | None = None
 ) -> Result:
-    """Simulate every member of an ensemble of machines, with a leading axis [N] of what varies; no rows are recorded."""
+    """Simulate every member of an ensemble of machines. What varies has a leading axis [N]. No rows are recorded."""
     tree = canonical((machine, clock, fold))
     return map_members(_simulated, tree, threads=threads, call=call, vectorised=True)
 
