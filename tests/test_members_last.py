@@ -30,12 +30,15 @@ def every_rule(tree: dict[str, jax.Array]) -> dict[str, jax.Array]:
         "moving": moving,
         "rows": rows,
         "sorted": jnp.sort(x) @ A,
-        "at": lax.dynamic_index_in_dim(x, n, 0, False) + lax.dynamic_index_in_dim(x, 1, 0, False),
-        "set": x.at[1].set(y) + lax.dynamic_update_index_in_dim(x, y, n, 0),
+        "at": lax.dynamic_index_in_dim(x, n, 0, False) + lax.dynamic_index_in_dim(x, np.int32(1), 0, False),
+        "set": x.at[1].set(y)
+        + lax.dynamic_update_index_in_dim(x, y, n, 0)
+        + lax.dynamic_update_index_in_dim(x, y, np.uint32(2), 0),
         "chosen": lax.cond(n > 1, lambda: x, lambda: -x),
         "relaxed": jax.jit(relax)(x, 0.1, 5.0),
         "any": jnp.any(x > 0.5) & jnp.all(x < 2),
         "common": jnp.sum(A),
+        "outer": jax.vmap(jax.vmap(jnp.multiply, (None, 0)), (0, None))(x, A[0]),
     }
 
 

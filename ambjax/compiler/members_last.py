@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
 
@@ -108,7 +109,7 @@ class _Members:
         return jnp.broadcast_to(x if moves or not x.ndim else x[..., None], (*shape, self.size))
 
     def together(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> list:
-        shape = max((x.aval.shape for x in eqn.invars), key=len)
+        shape = np.broadcast_shapes(*(x.aval.shape for x in eqn.invars))  # equal up to lengths of 1, or ()
         return [self.wide(x, m, shape) for x, m in zip(values, moves, strict=True)]
 
     def jit(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged:
@@ -144,13 +145,15 @@ class _Members:
     def dynamic_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         if any(moves[1:]):
             return None
-        return [(lax.dynamic_slice(values[0], (*values[1:], 0), (*eqn.params["slice_sizes"], self.size)), True)]
+        return [
+            (lax.dynamic_slice(values[0], (*values[1:], _first(eqn)), (*eqn.params["slice_sizes"], self.size)), True)
+        ]
 
     def dynamic_update_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         if any(moves[2:]):
             return None
         whole, part = (self.wide(x, m, v.aval.shape) for x, m, v in zip(values, moves, eqn.invars[:2], strict=False))
-        return [(lax.dynamic_update_slice(whole, part, (*values[2:], 0)), True)]
+        return [(lax.dynamic_update_slice(whole, part, (*values[2:], _first(eqn))), True)]
 
     def reduced(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         """Reduce one short axis term by term."""
@@ -220,6 +223,11 @@ class _Members:
             if all(c or not a for a, c in zip(after, carried, strict=True)):
                 return begin, turn, carried
             carried[:] = [a or c for a, c in zip(after, carried, strict=True)]
+
+
+def _first(eqn: JaxprEqn) -> Array:
+    """Return index 0, with the type of the equation's last operand, an index."""
+    return jnp.zeros((), eqn.invars[-1].aval.dtype)
 
 
 def _flagged(eqn: JaxprEqn, results: Any, moves: bool) -> Flagged:

@@ -122,7 +122,7 @@ class MachineStudy(AnyStudy):
             far = np.array(machine.start_q)
             far[:2] = FAR * max(float(np.max(np.asarray(one.scenario.limit))) for one in self.case.cases)
             machine = dataclasses.replace(machine, start_q=far)
-        outcome = simulate_members(machine, self.clock, fold, threads=threads, call=call)
+        outcome = run_machines(machine, self.clock, fold, threads=threads, call=call)
         values = {SPREAD + path: x for path, x in self.drawn(members).items()}
         return {"index": members, "lost_at": outcome.trajectory.lost_at, **worst_of(outcome.metrics), **values}
 
@@ -147,7 +147,7 @@ class MachineStudy(AnyStudy):
         return facts | {"rotor": digest.hexdigest()}
 
 
-def simulate_members(
+def run_machines(
     machine: Machine, clock: Clock, fold: Fold, *, threads: int | None = None, call: int | None = None
 ) -> Result:
     """Simulate every member of an ensemble of machines. What varies has a leading axis [N]. No rows are recorded."""
