@@ -4,12 +4,12 @@ import argparse
 import dataclasses
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
-from ambjax.cases.reader import Case
+from ambjax.cases.reader import Case, require_case
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
 from ambjax.commands.comparison_report import Compared, comparison_markdown, comparison_summary, comparison_table
@@ -18,7 +18,7 @@ from ambjax.commands.reading import read_with_warnings
 from ambjax.commands.study_report import findings_of
 from ambjax.ensemble.study import Study
 from ambjax.ensemble.worker import CALL, chunk
-from ambjax.host.heartbeat import FIRST_RUN, doing, say
+from ambjax.host.heartbeat import FIRST_RUN, doing, is_quiet, quiet, say
 from ambjax.linear.state_space import StateSpace
 from ambjax.page.html_page import check_processor, pages
 from ambjax.results.case_export import guarded_for
@@ -57,8 +57,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
         cases = tuned_cases(cases, out, args)
         studies = [study_of(case, _seed(args, cases), args.members) for case in cases]
     html_pages = pages(cases, args.cases) if args.page else {}
-    compared = [_compared(case, study) for case, study in zip(cases, studies, strict=True)]
-    summary = comparison_summary(compared, studies[0], notes)
+    summary, compared = _comparison(cases, studies, notes)
     with files(out) as part:
         write_json(part / "compare.json", summary)
         described("compare.png", lambda: _draw(cases, compared, part / "compare.png"))
@@ -76,6 +75,48 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     return int(not good), plain(summary | {"out": str(out)})
 
 
+class Comparison(NamedTuple):
+    """The result of `compare`.
+
+    - `summary`: the content of compare.json: members, seed, and the numbers of each case.
+    - `compared`: each case with the columns of its members, its nominal loop and its peaks.
+    """
+
+    summary: dict[str, Any]
+    compared: list[Compared]
+
+    def table(self) -> str:
+        """Return the table that `ambjax compare` prints."""
+        return comparison_table(self.summary)
+
+
+def compare(cases: Sequence[Case], members: int = 1, *, seed: int | None = None) -> Comparison:
+    """Compare cases of one axis on the same members of their spread, as `ambjax compare` does.
+
+    - `cases`: two to eight cases with the same spread. What differs in more than the controller is in
+      `summary["differences"]`.
+    - `members`, `seed`: as for `simulate_members`; the seed of all cases is by default that of the first one.
+
+    Raises ValueError for anything but cases, for another number of them, if their spreads differ, and as
+    `simulate_members` does.
+    """
+    cases = list(cases)
+    for case in cases:
+        require_case(case)
+    _check_count(len(cases), "case")
+    cases = _named(cases)
+    seed = study_of(cases[0], seed, members).seed
+    studies = [study_of(case, seed, members) for case in cases]
+    with quiet():
+        return _comparison(cases, studies, _differences([case.name for case in cases], cases, studies))
+
+
+def _comparison(cases: Sequence[Case], studies: Sequence[Study], notes: Sequence[str]) -> Comparison:
+    """Simulate and analyse the cases. `notes`: of `_differences`."""
+    compared = [_compared(case, study) for case, study in zip(cases, studies, strict=True)]
+    return Comparison(comparison_summary(compared, studies[0], notes), compared)
+
+
 def _write_html(summary: Mapping[str, Any], part: pathlib.Path) -> None:
     """Write compare.html into the folder `part`, with the picture in it."""
     picture = part / "compare.png"
@@ -90,17 +131,25 @@ def _seed(args: argparse.Namespace, cases: Sequence[Case]) -> int:
 
 
 def _read(paths: Sequence[str]) -> list[Case]:
-    """Read the cases. Append a number to a name that occurs more than once.
+    """Read the cases.
 
     Raises ValueError for fewer than 2 or too many files, a repeated file, or a file that `read_case` refuses.
     """
-    if not 2 <= len(paths) <= MOST_CASES:
-        raise ValueError(f"{len(paths)} case file{'s' * (len(paths) > 1)}: give 2 to {MOST_CASES} case files.")
+    _check_count(len(paths), "case file")
     for path in paths:
         same = [other for other in paths if pathlib.Path(other).resolve() == pathlib.Path(path).resolve()]
         if len(same) > 1:
             raise ValueError(f"{path}: this file is given {len(same)} times. Give each once.")
-    cases = [read_with_warnings(path) for path in paths]
+    return _named([read_with_warnings(path) for path in paths])
+
+
+def _check_count(count: int, what: str) -> None:
+    if not 2 <= count <= MOST_CASES:
+        raise ValueError(f"{count} {what}{'s' * (count > 1)}: give 2 to {MOST_CASES} {what}s.")
+
+
+def _named(cases: Sequence[Case]) -> list[Case]:
+    """Append a number to a name that occurs more than once."""
     names = [case.name for case in cases]
     return [
         case if names.count(case.name) == 1 else dataclasses.replace(case, name=f"{case.name} ({n})")
@@ -143,7 +192,8 @@ def _compared(case: Case, study: Study) -> Compared:
 def _columns(case: Case, study: Study) -> dict[str, np.ndarray]:
     """Simulate the members, with a progress bar, and return their columns [N] by name."""
     size, parts = min(CHUNK, study.members), []
-    with tqdm(total=study.members, unit="member", unit_scale=True, delay=2, leave=False, desc=case.name) as bar:
+    shown = {"unit": "member", "unit_scale": True, "delay": 2, "leave": False, "desc": case.name}
+    with tqdm(total=study.members, disable=is_quiet(), **shown) as bar:
         for start in range(0, study.members, size):
             stop = min(start + size, study.members)
             parts.append(chunk(study, start, stop, size))
