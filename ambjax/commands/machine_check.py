@@ -119,10 +119,10 @@ def _axis(case: MachineCase, k: int, metrics: dict[str, float], points: list[Mac
     }  # fmt: skip
 
 
-def _cells(own: dict[str, object]) -> list[str]:
+def _cells(own: dict[str, Any]) -> list[str]:
     """Return the cells of an axis; no peak and no zone if the machine is unstable at one of its speeds."""
-    *rest, peak, zone = own.values()
-    return [*map(_short, rest), *(map(_short, (peak, zone)) if np.isfinite(peak) else "--")]
+    shown = own if np.isfinite(own["peak"]) else own | {"peak": "-", "zone": "-"}
+    return [*map(_short, shown.values())]
 
 
 def _short(value: object) -> str:
