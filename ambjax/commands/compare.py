@@ -180,8 +180,9 @@ def _linear(case: AnyCase, study: Study | MachineStudy) -> ComparedLoop:
     except ValueError as error:
         say(f"{case.name}: {error}")
         return no_loop(None)
-    drawn = isinstance(study, Study) and case.spread.entries
-    return loop_of_axis(point, spread_peaks(case, study, MEMBERS) if drawn else None)
+    if isinstance(study, Study) and case.spread.entries:
+        return loop_of_axis(point, spread_peaks(case, study, MEMBERS))
+    return loop_of_axis(point, None)
 
 
 def _flops(case: Case) -> int | None:
