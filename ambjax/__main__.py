@@ -59,7 +59,9 @@ def parser() -> Parser:
     simulate.add_argument("--from", dest="begin", type=float, metavar="T", help="plot the run from time T (s)")
     simulate.add_argument("--to", dest="end", type=float, metavar="T", help="plot the run up to time T (s)")
     _page_option(simulate)
-    ensemble = command("ensemble", "simulate many members: members.npz, summary.json, fan.png", case=True, out=True)
+    ensemble = command(
+        "ensemble", "simulate many members: members.npz, summary.json, histograms.png", case=True, out=True
+    )
     ensemble.add_argument("--members", type=int, metavar="N", required=True, help="number of members")
     _seed_option(ensemble)
     ensemble.add_argument(

@@ -1,6 +1,7 @@
 """Ensembles of whole machines: each member is a machine of its own."""
 
 import copy
+import dataclasses
 import json
 import tomllib
 
@@ -62,17 +63,23 @@ def test_members_are_machines():
 def test_numbers_of_the_rotor():
     raw = copy.deepcopy(MACHINE)
     raw["rotor"] |= {"kind": "modal", "modes": [{"frequency": 80.0, "damping": 0.01}, {"frequency": 300.0}]}
+    raw["base"] = [{"direction": [2.0, 0.0, 0.0], "kind": "constant", "value": 1.0}]
     for bearing in raw["bearing"][:2]:
         bearing |= {"modes": [0.5, 0.4], "sensor_modes": [0.4, 0.2]}
     rotor = machine_from(raw).machine.rotor
     values = {"rotor.m": 3.0, "rotor.I_t": 0.07, "rotor.I_p": 1e-3, "rotor.modes.1.frequency": 250.0}
     values |= {"rotor.modes.0.damping": 0.02, "unbalance.0.amount": 7.0, "load.0.start": 0.2, "rotor.speed": 10.0}
+    values |= {"base.0.value": 5.0}
     other = varied_rotor(rotor, values)
     nominal, found = rotor_places(rotor), rotor_places(other)
     for path, place in found.items():
         assert float(np.asarray(place.value)) == pytest.approx(values.get(path, float(np.asarray(nominal[path].value))))
     # the weight follows the mass; a free bending mode has the given frequency and damping
     assert np.asarray(other.gravity)[1] == pytest.approx(-9.81 * 3.0)
+    still = dataclasses.replace(other, speed=0.0)  # no unbalance
+    np.testing.assert_allclose(still.forces(0.0)[:3], [-5.0 * 3.0, -9.81 * 3.0, 0.0], rtol=1e-12)
+    thin = varied_rotor(varied_rotor(rotor, {"rotor.I_p": 0.0}), {"rotor.I_p": 2e-3})
+    assert (thin.G[3, 4], thin.G[4, 3]) == (2e-3, -2e-3)
     k = other.K[7, 7] / other.M[7, 7]
     assert np.sqrt(k) == pytest.approx(2 * np.pi * 250)
     assert other.D[5, 5] == pytest.approx(2 * 0.02 * 2 * np.pi * 80)

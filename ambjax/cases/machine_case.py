@@ -1,4 +1,4 @@
-"""Reader of the case file of a whole machine: [rotor], [[bearing]], [[unbalance]], [[load]], and the common tables."""
+"""Reader of the case file of a whole machine: rotor, bearings, unbalances, loads, base, and the common tables."""
 
 import copy
 import dataclasses
@@ -43,7 +43,7 @@ from ambjax.world.rotation import known
 from ambjax.world.rotor import Rotor
 from ambjax.world.scenario import Scenario
 
-MACHINE_TABLES = ("rotor", "bearing", "unbalance", "load")
+MACHINE_TABLES = ("rotor", "bearing", "unbalance", "load", "base")
 # Product of step and angular frequency of a mode (or of nutation) at which the relative error of RK4 in one period is
 # below 1e-6.
 MODE = 0.1
@@ -116,7 +116,7 @@ def machine_from(
     top = Table(raw)
     top.only([*TABLES, *MACHINE_TABLES[1:], "tune"])
     if "disturbance" in raw:
-        raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] instead.")
+        raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] or [[base]] instead.")
     body, bearings = body_from(top, folder), tables_of(top, "bearing")
     if not bearings:
         raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
@@ -208,7 +208,10 @@ def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:
         return (*ends, most) if abs(most) > max(abs(first), abs(last)) else ends
     if not isinstance(value, list) or not 0 < len(value) <= MOST_SPEEDS:
         raise ValueError(f"{table.at('speeds')} = {show(value)}: it must be a list of 1 to {MOST_SPEEDS} speeds, rpm.")
-    return tuple(Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(value))
+    speeds = [Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(value)]
+    if twice := next((x for x in speeds if speeds.count(x) > 1), None):
+        raise ValueError(f"{table.at('speeds')} = {show(value)}: {twice:g} rpm is given more than once. Give it once.")
+    return tuple(speeds)
 
 
 def _start(table: Table, rotor: Rotor, count: int) -> tuple[np.ndarray, list[float]]:
@@ -247,7 +250,8 @@ def _shares(rotor: Rotor) -> tuple[list[float], list[float]]:
     B, M, gravity = (np.asarray(x, np.float64) for x in (rotor.at_magnets, rotor.M, rotor.gravity))
     B = B[:, :RIGID]
     masses = 1 / np.sum(B * np.linalg.solve(M[:RIGID, :RIGID], B.T).T, 1)
-    return masses.tolist(), (np.linalg.pinv(B.T) @ -gravity[:RIGID]).tolist()
+    forces = np.linalg.pinv(B.T) @ -gravity[:RIGID]
+    return masses.tolist(), np.where(np.abs(forces) > 1e-12 * np.abs(forces).max(), forces, 0.0).tolist()
 
 
 def _check_force(case: Case, axis: BearingAxis, force: float) -> None:

@@ -17,7 +17,7 @@ from ambjax.numerics.records import leaf
 from ambjax.world.rotor import Rotor
 
 # First words of the paths of the rotor, of its start, and of those of one bearing or one axis.
-OF_ROTOR, OF_START, OF_BEARING = ("rotor", "unbalance", "load"), "initial", "bearing"
+OF_ROTOR, OF_START, OF_BEARING = ("rotor", "unbalance", "load", "base"), "initial", "bearing"
 START = "initial.q."
 # Numbers of an axis that follow from those of the rotor, and a table that a machine does not have.
 FROM_ROTOR, ABSENT = ("m", "k_z", "g"), "disturbance"
@@ -160,16 +160,15 @@ def rotor_places(rotor: Rotor) -> dict[str, Place]:
         "rotor.I_p": Place((), I_P, G[3, 4]),
     }
     numbers = numbers_in(rotor, "rotor")
-    table |= {path: numbers[path] for path in ("rotor.speed", "rotor.acceleration")}
+    # a table of speeds has no rate of its own
+    table |= {path: numbers[path] for path in ("rotor.speed", "rotor.acceleration")[: 1 if rotor.changes else 2]}
     w = np.sqrt(np.diag(K)[RIGID::2] / np.diag(M)[RIGID::2])
     for j, (own, d) in enumerate(zip(w, np.diag(D)[RIGID::2], strict=True)):
         table[f"rotor.modes.{j}.frequency"] = Place((), FREQUENCY, own / (2 * np.pi))
         table[f"rotor.modes.{j}.damping"] = Place((), DAMPING, d / (2 * own * M[RIGID + 2 * j, RIGID + 2 * j]))
-    for stem in ("rotor.unbalances.", "rotor.loads."):
+    for stem, name in (("rotor.unbalances.", "unbalance."), ("rotor.loads.", "load."), ("rotor.base.", "base.")):
         own = {path: place for path, place in numbers.items() if path.startswith(stem) and ".along" not in path}
-        table |= {
-            path.removeprefix("rotor.").replace("s.", ".", 1).replace(".signal.", ".", 1): x for path, x in own.items()
-        }
+        table |= {path.replace(stem, name).replace(".signal.", ".", 1): x for path, x in own.items()}
     return table
 
 
@@ -200,7 +199,8 @@ def varied_rotor(rotor: Rotor, values: Mapping[str, float]) -> Rotor:
         elif path == "rotor.I_t":
             M[(3, 4), (3, 4)] = x
         elif path == "rotor.I_p":
-            G *= x / G[3, 4]
+            G *= x / G[3, 4] if G[3, 4] else 1.0
+            G[3, 4], G[4, 3] = x, -x
         else:
             k = RIGID + 2 * int(path.split(".")[2])
             mass, at = M[k, k], (range(k, k + 2), range(k, k + 2))

@@ -26,7 +26,7 @@ def check(args: argparse.Namespace, case: MachineCase) -> tuple[int, dict[str, o
 
     The exit code is 1 if the rotor is lost, or if the machine is not stable at one of its speeds, also with more modes.
     """
-    say(f"simulating {case.clock.samples} samples; the first run compiles for some seconds")
+    say(f"simulating {case.clock.samples} samples")
     run = simulate_machine(case)
     say(f"linearising at {', '.join(f'{speed:g}' for speed in case.speeds)} rpm")
     points = analysed(case)
@@ -46,7 +46,7 @@ def check(args: argparse.Namespace, case: MachineCase) -> tuple[int, dict[str, o
         "stable": {f"{point.speed:g}": point.stable for point in points},
         "zone": worst.worst.zone,
         "peak": worst.worst.S.height,
-        "axis": worst.worst.name,
+        "axis": worst.worst.name if worst.stable else None,
         "speed_rpm": worst.speed,
         "running_speed": {
             axis: [fact for point in at_speeds for fact in point[k][0]] for k, axis in enumerate(case.axes)
@@ -59,11 +59,12 @@ def check(args: argparse.Namespace, case: MachineCase) -> tuple[int, dict[str, o
         held = "held" if summary["held"] else f"LOST ({run.lost_why})"
         at = f"{worst.worst.name} at {worst.speed:g} rpm"
         print(f"run: {held}; settled |z| reaches {share:.3g} of the clearance, zone {summary['clearance_zone']}")
-        print(f"sensitivity: peak {worst.worst.S.height:.4g} ({at}), zone {worst.worst.zone}")
+        peak = f"peak {worst.worst.S.height:.4g} ({at}), zone {worst.worst.zone}"
+        print(f"sensitivity: {peak if worst.stable else f'no peak and no zone: not stable at {worst.speed:g} rpm'}")
         print(
             f"stability: {'stable' if stable else 'NOT STABLE'} at {', '.join(summary['stable'])} rpm{_more(spilled)}"
         )
-        print(table(AXIS_COLUMNS, [(axis, *map(_short, own.values())) for axis, own in axes.items()]))
+        print(table(AXIS_COLUMNS, [(axis, *_cells(own)) for axis, own in axes.items()]))
         if lines := [line for point in at_speeds for _, own in point for line in own]:
             print("\n".join(lines))
         if light := _light(modes):
@@ -105,6 +106,12 @@ def _axis(case: MachineCase, k: int, metrics: dict[str, float], points: list[Mac
         "clearance_used": share, "clearance_zone": case.zones.clearance_zone(share), "force_carried": carried,
         "force_reserve": 1 - used, "peak": worst.S.height, "zone": worst.zone,
     }  # fmt: skip
+
+
+def _cells(own: dict[str, object]) -> list[str]:
+    """Return the cells of an axis; no peak and no zone if the machine is unstable at one of its speeds."""
+    *rest, peak, zone = own.values()
+    return [*map(_short, rest), *(map(_short, (peak, zone)) if np.isfinite(peak) else "--")]
 
 
 def _short(value: object) -> str:

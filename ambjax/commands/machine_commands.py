@@ -39,16 +39,16 @@ COLUMNS = {
 }
 
 
-def refuse(args: argparse.Namespace, names: tuple[str, ...]) -> None:
-    """Raise ValueError for an option that a machine does not take."""
-    for name in names:
-        if getattr(args, name, None):
+def refuse(**options: object) -> None:
+    """Raise ValueError for an option that a machine does not take. `options`: their values by name."""
+    for name, value in options.items():
+        if value not in (None, False):
             raise ValueError(f"--{name}: a machine with [rotor] does not take it yet. Leave it out.")
 
 
 def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]:
     """Simulate a machine and write its files. Exit code 1 if the rotor is lost."""
-    refuse(args, ("begin", "end", "page"))
+    refuse(**{"from": args.begin, "to": args.end, "page": args.page})
     out = directory(args.out, f"simulate-{case.name}", SIMULATED, args.force)
     say(f"method: {case.clock.method}; axes: {', '.join(case.axes)}")
     with tqdm(total=case.clock.samples, unit="sample", unit_scale=True, delay=2, leave=False, desc="simulate") as bar:
@@ -87,7 +87,7 @@ def analysed(case: MachineCase) -> list[MachineSensitivity]:
 
 def sensitivity(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]:
     """Analyse a machine at its speeds and write the files. Exit code 1 if it is not stable at one of them."""
-    refuse(args, ("members", "seed"))
+    refuse(members=args.members, seed=args.seed)
     points = analysed(case)
     measured = _injections(case, points, args.inject)
     out = directory(args.out, f"sensitivity-{case.name}", ANALYSED, args.force)
@@ -157,7 +157,7 @@ def sensitivity_summary(points: list[MachineSensitivity], measured: Measured) ->
     axis = worst.worst
     first: Summary = {
         "stable": all(point.stable for point in points), "peak": axis.S.height, "frequency_hz": axis.S.frequency,
-        "zone": axis.zone, "axis": axis.name, "speed_rpm": worst.speed,
+        "zone": axis.zone, "axis": axis.name if worst.stable else None, "speed_rpm": worst.speed,
     }  # fmt: skip
     own: dict[str, Any] = at[points.index(worst)]
     first |= {key: x for key, x in own["axes"][worst.axes.index(axis)].items() if key.startswith("injected")}
@@ -192,11 +192,13 @@ def sensitivity_text(points: list[MachineSensitivity], measured: Measured) -> st
              *(["", ""] if axis.margins is None else [f"{axis.margins.gain:.3g}", f"{axis.margins.phase_deg:.3g}"]))
             for axis in point.axes
         ]  # fmt: skip
+        slow = f"largest real part of a pole {np.max(np.real(point.poles)):.4g} 1/s"
+        if not point.stable:
+            parts.append(f"{point.speed:g} rpm: NOT STABLE, so there are no peaks, zones and margins; {slow}")
+            continue
+        parts.append(f"{point.speed:g} rpm: stable; {slow}")
         single = f"{point.sigma.height:.4g}", f"{point.sigma.frequency:.4g}"
         rows.append(("largest singular value", *single, "", "", "", ""))
-        slow = np.max(np.real(point.poles))
-        words = "stable" if point.stable else "NOT STABLE: the peaks have no physical meaning"
-        parts.append(f"{point.speed:g} rpm: {words}; largest real part of a pole {slow:.4g} 1/s")
         parts.append(
             table(("axis", "peak of |S|", "Hz", "zone", "peak of |T|", "gain margin", "phase margin, deg"), rows)
         )

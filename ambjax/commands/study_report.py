@@ -53,7 +53,8 @@ def write_report(
             if error is not None:
                 summary["sliding_step_error"] = error
             write_json(part / "summary.json", summary)
-        with doing(f"drawing the pictures: simulating members for the fan chart; {FIRST_RUN}"):
+        fan = f": simulating members for the fan chart; {FIRST_RUN}" if isinstance(case, Case) else ""
+        with doing(f"drawing the pictures{fan}"):
             _pictures(case, study, columns, summary, part)
         names = [name for name in WRITTEN if (part / name).exists()]
     if not args.json:

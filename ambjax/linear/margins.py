@@ -44,6 +44,10 @@ class ResponsePeak(NamedTuple):
     outside: "ResponsePeak | None" = None
 
 
+# Of an unstable loop: no response to a test signal is bounded.
+NO_PEAK = ResponsePeak(math.inf, math.nan)
+
+
 class Margins(NamedTuple):
     """Margins of the loop transfer L = 1/S - 1, with the loop broken at one place.
 

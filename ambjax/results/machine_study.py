@@ -12,6 +12,7 @@ import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, machine_from, machine_of_axes, parts_of
 from ambjax.cases.machine_spread import axis_values, machine_places, shared, varied_rotors, varied_start
+from ambjax.compiler.members_last import members_last
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
 from ambjax.ensemble.maps import PERIOD
@@ -27,7 +28,7 @@ from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
 from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import Result, run
-from ambjax.simulation.whole_machine import ContinuousMachine, Machine, PerAxis, SampledMachine, stack_axes
+from ambjax.simulation.whole_machine import Machine, PerAxis, stack_axes
 from ambjax.world.scenario import Scenario
 
 # Multiple of the clearance by which the rotor of a `lost` call is displaced along x and y.
@@ -133,11 +134,8 @@ class MachineStudy(AnyStudy):
         return machine_of_axes(rotor, parts, self.clock, start, machine.law), PerAxis(stack_axes(folds))
 
     def metrics(self, values: dict[str, np.ndarray], members: np.ndarray) -> dict[str, np.ndarray]:
-        return worst_of(self._simulated(*self.varied(values, members)).metrics)
-
-    def _simulated(self, machine: Machine, fold: PerAxis, **options: Any) -> Result:
-        # plain: within one kernel, arrays of axes take minutes to compile
-        return map_members(_member, canonical((machine, self.clock, fold)), plain=True, quick=False, **options)
+        machine, fold = self.varied(values, members)
+        return worst_of(simulate_members(machine, self.clock, fold).metrics)
 
     def _axis(self, values: dict[str, Any], k: int, member: Any) -> tuple[Cascade, Scenario]:
         one = self.case.cases[k]
@@ -170,7 +168,7 @@ class MachineStudy(AnyStudy):
             far = np.array(machine.start_q)
             far[..., :2] = FAR * max(float(np.max(np.asarray(one.scenario.limit))) for one in self.case.cases)
             machine = dataclasses.replace(machine, start_q=far)
-        outcome = self._simulated(machine, fold, threads=threads, call=call)
+        outcome = simulate_members(machine, self.clock, fold, threads=threads, call=call)
         values = {SPREAD + path: x for path, x in self.drawn(members).items()}
         for k, axis in enumerate(self.case.axes):
             values |= {f"{axis}.{name}": outcome.metrics[name][:, k] for name in self.by_axis}
@@ -206,8 +204,16 @@ class MachineStudy(AnyStudy):
         return facts
 
 
-def _member(tree: tuple[SampledMachine | ContinuousMachine, Clock, Fold]) -> Result:
-    return run(*tree, 0)
+def simulate_members(
+    machine: Machine, clock: Clock, fold: Fold, *, threads: int | None = None, call: int | None = None
+) -> Result:
+    """Simulate all members of an ensemble of machines. What varies has a leading axis [N]. No rows are recorded."""
+    tree = canonical((machine, clock, fold))
+    return map_members(_simulated, tree, threads=threads, call=call, vectorised=True)
+
+
+def _simulated(tree: tuple[Machine, Clock, Fold], axes: object) -> Result:
+    return members_last(lambda one: run(*one, 0), axes)(tree)
 
 
 def _reread(case: MachineCase, changes: Mapping[str, object]) -> MachineCase:

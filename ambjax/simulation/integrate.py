@@ -206,6 +206,11 @@ class FixedSteps:
     substeps: int = static(default=1, doc="steps per sample period")
     limit: ClassVar[float | None] = None
 
+    @property
+    def steps(self) -> str:
+        """The number of substeps in words."""
+        return f"{self.substeps} substep{'s' * (self.substeps != 1)}"
+
     def step_size(self, period: float) -> float | None:
         return period / self.substeps
 

@@ -189,4 +189,4 @@ class Slide(FixedSteps):
         return problem.slide(problem.inputs(at(0.0)), problem.inputs(at(1.0)), h, state, span)
 
     def __str__(self) -> str:
-        return f"sliding step, {self.substeps} substeps"
+        return f"sliding step, {self.steps}"
