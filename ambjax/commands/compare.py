@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     cases = _read(args.cases)
     of_axis = [case for case in cases if isinstance(case, Case)]
     if not of_axis:
-        refuse(args, ("tune", "page"))
+        refuse(tune=args.tune, page=args.page)
     studies = _studies(cases, args)
     notes = _differences(args.cases, cases, studies)
     for note in notes:
@@ -180,9 +180,8 @@ def _linear(case: AnyCase, study: Study | MachineStudy) -> ComparedLoop:
     except ValueError as error:
         say(f"{case.name}: {error}")
         return no_loop(None)
-    if isinstance(study, Study) and case.spread.entries:
-        return loop_of_axis(point, spread_peaks(case, study, MEMBERS))
-    return loop_of_axis(point, None)
+    drawn = spread_peaks(case, study, MEMBERS) if isinstance(study, Study) and case.spread.entries else None
+    return loop_of_axis(point, drawn)
 
 
 def _flops(case: Case) -> int | None:

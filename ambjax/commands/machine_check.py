@@ -110,8 +110,8 @@ def _axis(case: MachineCase, k: int, metrics: dict[str, float], points: list[Mac
 
 def _cells(own: dict[str, object]) -> list[str]:
     """Return the cells of an axis; no peak and no zone if the machine is unstable at one of its speeds."""
-    *rest, peak, zone = own.values()
-    return [*map(_short, rest), *(map(_short, (peak, zone)) if np.isfinite(peak) else "--")]
+    known = np.isfinite(float(str(own["peak"])))
+    return [_short(value) if known or key not in ("peak", "zone") else "-" for key, value in own.items()]
 
 
 def _short(value: object) -> str:
