@@ -260,6 +260,7 @@ def _draw(compared: Sequence[Compared], path: pathlib.Path) -> None:
             np.asarray(one.columns["settled_rms_u_V"]),
             one.loop.system,
             one.loop.channel,
+            one.loop.command,
             str(one.loop.numbers["worst_at"] or ""),
         )
         for one in compared

@@ -23,6 +23,11 @@ INPUTS = ("e_z", "e_z_dot", "q_z")
 OUTPUTS = ("z_read", "z_dot_read", "u", "z", "command", "i_read")
 
 
+def array_module(x: Array | np.ndarray) -> Any:
+    """Return the module that computes with an array: NumPy for its own, else jax.numpy."""
+    return np if isinstance(x, np.ndarray) else jnp
+
+
 class CommandPath(NamedTuple):
     """Path from the command to the plant, x' = A x + b u, where x [n] are the first n states of the loop.
 
@@ -40,8 +45,8 @@ class CommandPath(NamedTuple):
         `fraction` [...]: part of the sample after which a new command acts. The first result is the effect of the new
         command, per unit; the second is that of the command before it.
         """
-        tools: Any = (np, _exponential) if isinstance(self.A, np.ndarray) else (jnp, exponential)
-        np_, expm = tools
+        np_ = array_module(self.A)
+        expm = _exponential if np_ is np else exponential
         n, fraction = len(self.b), np_.asarray(fraction)[..., None, None]
         table = np_.concatenate([np_.concatenate([self.A, self.b[:, None]], 1), np_.zeros((1, n + 1))]) * period
         late, early = expm(table * (1 - fraction)), expm(table * fraction)
@@ -78,6 +83,13 @@ class StateSpace(NamedTuple):
             path = path._replace(A=path.A * own / own[:, None], b=path.b / own)
         return self._replace(A=self.A * s / s[:, None], B=self.B / s[:, None], C=self.C * s, sizes=s / s, path=path)
 
+    @property
+    def known_path(self) -> CommandPath:
+        """The path from the command to the plant. Raises ValueError without one."""
+        if self.path is None:
+            raise ValueError("path: the path from the command to the plant is not known.")
+        return self.path
+
     def idle(self) -> Array | np.ndarray:
         """Return which states [N] no input reaches, such as an integral whose gain is 0: their deviations stay 0."""
         linked, reached = self.A != 0, (self.B != 0).any(1)
@@ -87,7 +99,7 @@ class StateSpace(NamedTuple):
 
     def without_idle(self) -> "StateSpace":
         """Return the system with NumPy arrays, without the states of the laws that no input reaches."""
-        one: Any = jax.tree.map(np.asarray, self)
+        one = jax.tree.map(np.asarray, self)
         kept = ~np.asarray(one.idle())
         if one.path is not None:
             kept[: len(one.path.b)] = True  # the states of the plant
@@ -105,7 +117,7 @@ class StateSpace(NamedTuple):
 
     def point(self, frequency: Array | np.ndarray) -> Any:
         """Return s = 2 pi j f, or z = exp(s T) on a processor, at frequencies [F] in Hz."""
-        np_: Any = np if isinstance(self.A, np.ndarray) else jnp
+        np_ = array_module(self.A)
         s = 2j * np.pi * np_.asarray(frequency)
         return s if self.period is None else np_.exp(s * self.period)
 
@@ -116,8 +128,7 @@ class StateSpace(NamedTuple):
     def command_row(self, frequency: Array | np.ndarray) -> Any:
         """Return h [F, n]: response of the command to an input of each state of the plant, in the units of `scaled`."""
         A, _, C, *_ = self.scaled()
-        n = len(self.path.b)  # pyright: ignore[reportOptionalMemberAccess]
-        return _solved(A.T, self.point(frequency), C[4][:, None])[:, :n, 0]
+        return _solved(A.T, self.point(frequency), C[4][:, None])[:, : len(self.known_path.b), 0]
 
     def command_effect(self, frequency: Array | np.ndarray, late: Scalar = 0.0) -> Array:
         """Return the effect [F, n] of a unit command on the states of the plant, in the units of `scaled`.
@@ -125,8 +136,8 @@ class StateSpace(NamedTuple):
         `late`: additional delay of the command, s. On a processor, the effect is that of the hold, which begins after
         the delay and ends one sample later.
         """
-        path: Any = self.scaled().path
-        np_: Any = np if isinstance(self.A, np.ndarray) else jnp
+        path = self.scaled().known_path
+        np_ = array_module(self.A)
         s = 2j * np.pi * np_.asarray(frequency)[:, None]
         if self.period is None:
             return path.b * np_.exp(-s * late)
@@ -142,7 +153,7 @@ class StateSpace(NamedTuple):
         the laws remember their own commands. S = 1/(1 + L) is the response of the signal at this place to a signal that
         is added to it.
         """
-        np_: Any = np if isinstance(self.A, np.ndarray) else jnp
+        np_ = array_module(self.A)
         if place == "reading":
             return (1 / self.sensitivity(frequency) - 1) * np_.exp(-2j * np.pi * np_.asarray(frequency) * late)
         row, own = self.command_row(frequency), self.command_effect(frequency)
