@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     cases = _read(args.cases)
     of_axis = [case for case in cases if isinstance(case, Case)]
     if not of_axis:
-        refuse(tune=args.tune, page=args.page)
+        refuse(args, ("tune", "page"))
     studies = _studies(cases, args.seed, args.members)
     notes = _differences(args.cases, cases, studies)
     for note in notes:

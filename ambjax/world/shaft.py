@@ -28,7 +28,7 @@ class Section(NamedTuple):
     E: Scalar
     rho: Scalar
     nu: Scalar
-    stiff: bool = True
+    stiff: Scalar = 1
 
 
 class Disc(NamedTuple):
