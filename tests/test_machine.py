@@ -224,6 +224,10 @@ def test_the_published_controller_of_the_munich_rig(tmp_path):
                 (-8.91, 607.5)]  # fmt: skip
     # the amplifier of 1 MHz and the pole of the derivative move the damped pair by 3e-4
     np.testing.assert_allclose(ours, expected, rtol=2e-3, atol=0.02)
+    # each pair and two real poles, of the integrals, in both planes: 14 + 2 eigenvalues each
+    still = [pole for pole in found.poles if abs(pole.imag) < 1 and pole.real > -1e3]
+    np.testing.assert_allclose(still, [-0.5] * 4, atol=2e-3)
+    assert sum(pole.imag > 1 for pole in slow) == 2 * len(expected)
     peaks = [axis.S.height for axis in found.axes]
     np.testing.assert_allclose(peaks, [5.05, 5.05, 4.85, 4.85], rtol=3e-3)
     assert found.stable
