@@ -122,9 +122,11 @@ def machine_sensitivity_picture(
         )
         top = max(2 * limits[-1], 1.3 * point.sigma.height)
         bounds = [1e-2, *limits, top]
-        for low, high, colour, name in zip(bounds[:-1], bounds[1:], ("g", "y", "orange", "r"), "ABCD", strict=True):
+        zones = zip(bounds[:-1], bounds[1:], ("g", "y", "orange", "r"), "ABCD", (0.96, 0.985) * 2, strict=True)
+        for low, high, colour, name, x in zones:  # thin zones are neighbours, with names side by side
             ax.axhspan(low, high, color=colour, alpha=0.08)
-            ax.text(f[-1], np.sqrt(max(low, 0.5) * high), f" {name}", va="center", fontsize="small")
+            at = x, np.sqrt(max(low, 0.5) * high)
+            ax.text(*at, name, transform=ax.get_yaxis_transform(), ha="center", va="center", fontsize="small")
         ax.set_ylim(1e-2, top)
         ax.set_xlabel("frequency, Hz")
         ax.set_ylabel("|S|")
