@@ -81,7 +81,7 @@ class Cascade:
         t = 0; in continuous time, the initial state of the position law may depend on them (`PositionLaw.begin`). On a
         processor, `begun` gives the states of the first sample.
         """
-        observed: Any = extremes(self.observer)[0].init(self.model, measured)
+        observed = extremes(self.observer)[0].init(self.model, measured)
         observed = observed if self.notch is None else (observed, self.notch.init(measured))
         rest = [extremes(law)[0] for law in self.laws[1:]]
         if self.sampled:
