@@ -7,23 +7,37 @@
 import ast
 import importlib
 import pathlib
+import sys
 from typing import Any
 
+_FOLDER = pathlib.Path(__file__).parent
+_RENAMED = {"Outcome": "Result", "Standard": "Metrics"}  # former names
 
-def _modules() -> dict[str, str]:
-    """Return the module of each name that the stub imports."""
-    stub = ast.parse(pathlib.Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
-    lines = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
+
+def _imported(path: pathlib.Path) -> dict[str, str]:
+    """Return the module of each name that a file imports."""
+    lines = [node for node in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(node, ast.ImportFrom)]
     return {alias.name: str(node.module) for node in lines for alias in node.names}
 
 
-_MODULES = _modules()
+def _elsewhere(name: str) -> str:
+    """Return a sentence with the public name of what `ambjax.NAME` may mean, or ""."""
+    found = [f"ambjax.{_RENAMED[name]}"] if name in _RENAMED else []
+    for space in (space for space, home in _MODULES.items() if home == "ambjax"):
+        path = _FOLDER / space
+        if name in _imported(path / "__init__.py" if path.is_dir() else path.with_suffix(".py")):
+            found.append(f"ambjax.{space}.{name}")
+    return f". Use {' or '.join(found)}." if found else ""
+
+
+_MODULES = _imported(_FOLDER / "__init__.pyi")
 __all__ = sorted(name for name, module in _MODULES.items() if module != "ambjax")  # pyright: ignore
 
 
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
-        raise AttributeError(f"module 'ambjax' has no attribute '{name}'")
+        text = f"module 'ambjax' has no attribute '{name}'{_elsewhere(name)}"
+        raise AttributeError(text, name=name, obj=sys.modules[__name__])
     home = _MODULES[name]
     if home == "ambjax":  # the name is a module
         return importlib.import_module(f"{home}.{name}")

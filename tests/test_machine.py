@@ -73,8 +73,8 @@ def test_the_sensitivity_of_an_uncoupled_axis_is_that_of_one_axis(machine):
     f = np.geomspace(1, 9000, 50)
     ours = np.asarray(found.system.response(f))[:, 4, 4]
     np.testing.assert_allclose(ours, system.sensitivity(f), rtol=1e-7)  # conditioning of 65 states
-    # no coupling: the other entries of its row vanish
-    assert np.abs(np.asarray(found.system.response(f))[:, 4, :4]).max() < 1e-12
+    # no coupling: the other entries of its row vanish, up to the same conditioning
+    assert np.abs(np.asarray(found.system.response(f))[:, 4, :4]).max() < 1e-10
 
 
 def test_nutation_and_precession_of_a_fast_rotor():
@@ -327,8 +327,12 @@ def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monke
         ({"bearing": []}, r"\[\[bearing\]\] is missing"),
         ({"bearing": [{"kind": "radial"}]}, r"bearing\[0\]\.at is missing"),
         ({"bearing": [MACHINE["bearing"][0]] * 2}, r"bearing\[1\]\.name = .*needs a name of its own"),
+        ({"bearing": [MACHINE["bearing"][0] | {"name": "top.a"}]}, r"bearing\[0\]\.name = .top\.a.: .*without dots"),
+        ({"bearing": [*MACHINE["bearing"][:2], {"kind": "axial", "angle": 45.0}]}, r"bearing\[2\]\.angle.*along the"),
+        ({"base": [{"direction": [0, 0, 0], "kind": "constant", "value": 1.0}]}, r"base\[0\]\.direction.*not be zero"),
+        ({"load": [{"direction": [1, 0, 0], "kind": "unbalance", "unbalance": 1.0}]}, r"load\[0\].*as \[\[unbalance"),
         ({"plant": MACHINE["plant"] | {"n": 20.0}}, "must carry .* N, and its magnet gives at most"),
-        ({"disturbance": {"q_z": {"kind": "constant"}}}, r"\[disturbance\].*Use \[\[load\]\]"),
+        ({"disturbance": {"q_z": {"kind": "constant"}}}, r"\[disturbance\].*Use \[\[load\]\] or \[\[base"),
         ({"load": [{"direction": [0, 0, 0], "kind": "constant", "value": 1.0}]}, r"load\[0\]\.direction"),
         ({"unbalance": [{"at": 0.0}]}, r"unbalance\[0\]\.amount is missing"),
         ({"initial": {"q": [0.0, 0.0]}}, r"initial\.q = .*a list of 5 numbers"),

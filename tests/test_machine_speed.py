@@ -11,9 +11,11 @@ from ambjax.__main__ import main
 from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.template_text import template
 from ambjax.commands import campbell
+from ambjax.commands.machine_commands import once_per_revolution, sensitivity_text
 from ambjax.linear.linear_machine import machine_sensitivity, turning_machines
 from ambjax.linear.rotor_modes import modes_of, springs_critical
 from ambjax.linear.unbalance_response import UnbalanceResponse, critical_speeds, separation, unbalance_response
+from ambjax.pictures.machine_pictures import machine_sensitivity_picture
 from ambjax.pictures.run_up_picture import waterfall
 from ambjax.results.machine_run import simulate_machine
 
@@ -33,8 +35,11 @@ class Pid:
 @pytest.fixture(scope="module")
 def rigid(tmp_path_factory):
     """A rigid rotor on two equal bearings, in continuous time; its unbalance beside the centre of mass."""
-    folder = tmp_path_factory.mktemp("rigid")
-    save_controller(folder / "pid.npz", Pid)
+    return machine_of(tmp_path_factory.mktemp("rigid"), Pid)
+
+
+def machine_of(folder, controller):
+    save_controller(folder / "pid.npz", controller)
     raw = {
         "rotor": {"kind": "rigid", "m": MASS, "I_t": I_T, "I_p": I_P, "gravity": [0.0] * 3},
         "bearing": [{"name": n, "kind": "radial", "at": at} for n, at in (("left", -HALF), ("right", HALF))],
@@ -46,6 +51,29 @@ def rigid(tmp_path_factory):
         "clock": {"duration": 1e-3, "sample_period": 1e-6},
     }  # fmt: skip
     return machine_from(raw, "rigid", "", folder)
+
+
+def test_an_unstable_machine_has_no_peaks_no_zones_and_no_verdict_by_api(tmp_path):
+    """A stiffness of 1000 A/m times K_I is half of the negative one of the magnets."""
+
+    class Weak(Pid):
+        D = np.array([[1000.0 + 5.0 * Pid.w]])
+
+    weak = machine_of(tmp_path, Weak)
+    found = machine_sensitivity(weak.machine, weak.axes, weak.clock.sample_period, 6000.0, weak.zones)
+    assert not found.stable
+    peaks = [peak for axis in found.axes for peak in (axis.S, axis.T, axis.KS)]
+    assert {peak.height for peak in [*peaks, found.sigma]} == {np.inf}
+    assert once_per_revolution(found) == [([], [])] * len(weak.axes)
+    (line,) = sensitivity_text([found], {}).splitlines()
+    assert "NOT STABLE" in line
+    response = unbalance_response(weak.machine, weak.clock.sample_period, 100.0)
+    assert np.isnan(response.sensors).all()
+    text = campbell.unbalance_text(weak, response, critical_speeds(response, (50.0, 90.0)), (50.0, 90.0))
+    assert "not judged by A1" in text
+    assert "um" not in text
+    machine_sensitivity_picture([found], (3.0, 4.0, 5.0), tmp_path / "S.png", "x")
+    assert campbell.ranges(np.arange(5.0), np.array([True, False, True, True, True])) == "0, 2 to 4"
 
 
 def test_the_unbalance_response_of_a_rigid_rotor_is_the_closed_form(rigid):

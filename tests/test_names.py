@@ -1,6 +1,7 @@
 """Names that messages suggest, and warnings about numbers that are inconsistent."""
 
 import json
+import operator
 import pathlib
 import re
 import warnings
@@ -49,6 +50,16 @@ from ambjax.commands.reading import read_with_warnings
 def test_the_message_suggests_the_right_name(tables, said):
     with pytest.raises(ValueError, match=said):
         case_from(tables)
+
+
+@pytest.mark.parametrize(
+    ("former", "now"),
+    [("Plant", "plants.Plant"), ("current", "laws.current"), ("RK4", "solvers.RK4"), ("Standard", "Metrics")],
+)
+def test_a_former_name_says_where_it_is_now(former, now):
+    with pytest.raises(AttributeError, match=rf"'{former}'. Use ambjax.{now}.$"):
+        getattr(ambjax, former)
+    assert operator.attrgetter(now)(ambjax)
 
 
 # A plausible bearing: 146 N/A, 364 N at the bias, a weight of 15.7 N, a pole of 675 1/s.

@@ -13,6 +13,7 @@ import pytest
 from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template as case_template
+from ambjax.control.synchronous_notch import SynchronousNotch
 from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.study import Study
 from ambjax.linear.analysis import analyse, linearise
@@ -65,6 +66,46 @@ def test_every_number_reads_back_from_the_case_file(case):
         assert document == values[k], one.path
 
 
+LISTS = """
+plant = { m = 5.0, s_0 = 8e-4 }
+[[disturbance.q_z]]
+kind = "constant"
+unit = "N"
+value = 1.0
+[[disturbance.q_z]]
+kind = "sine"
+amplitude = 0.5
+frequency = 50.0
+[[disturbance.q_z]]
+kind = "sine"
+unit = "N"
+amplitude = 2.0
+frequency = 20.0
+[reference]
+kind = "sum"
+terms = [{ kind = "constant", value = 1e-5 }, { kind = "sine", amplitude = 1e-5, frequency = 10.0, phase = 0.5 }]
+[controller.position]
+k = { over = "error", at = [0.0, 1e-5], values = [100.0, 200.0] }
+[processor]
+[clock]
+duration = 0.01
+"""
+
+
+def test_loads_in_a_list_schedules_omitted_gains_and_the_initial_state_have_sliders_that_set_them_in_the_file():
+    case = rig(LISTS)
+    given, (lines,) = html_page._written(case, [])
+    written = {"disturbance.q_f.terms.1.amplitude", "disturbance.q_z.phase", "reference.terms.1.phase"}
+    assert {one.path for one in given} >= written | {
+        "controller.position.k.1", "controller.position.c", "controller.current.k_i", "initial.z", "plant.m"
+    }  # fmt: skip
+    values, expected = [one.value for one in given], parameter_values(case)
+    for k, one in enumerate(given):
+        if one.path.startswith(("disturbance.", "reference.", "controller.", "initial.")):
+            values[k] = expected[one.parameter] = moved(one)
+    np.testing.assert_array_equal(parameter_values(rig(filled(lines, given, values))), expected)
+
+
 def test_a_changed_plant_does_not_change_the_controller_s_model(case):
     (mass,) = (one for one in sliders(case, []) if one.path == "plant.m")
     lines, _ = editable_lines(case.text, [mass])
@@ -98,12 +139,10 @@ def test_a_signal_from_a_file_is_refused_in_one_line(tmp_path, capsys):
     assert 'disturbance.q_z: kind = "table": a page cannot contain a signal from a file.' in said
 
 
-def test_a_notch_is_refused_in_one_line(tmp_path, capsys):
-    notch = '[rotor]\nspeed = 6000.0\n[controller.notch]\nkind = "force-free"\n'
-    (tmp_path / "case.toml").write_text(f"{notch}[clock]\nduration = 0.01\n[processor]\n")
-    assert main(["page", str(tmp_path / "case.toml")]) == 2
-    (said,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ambjax")]
-    assert "[controller.notch]: a page cannot contain a notch" in said
+def test_a_notch_is_refused(case):
+    cascade = dataclasses.replace(case.cascade, notch=SynchronousNotch())  # the reader would linearise the loop first
+    with pytest.raises(ValueError, match="a page cannot contain a notch"):
+        page(dataclasses.replace(case, cascade=cascade))
 
 
 def test_a_case_with_another_structure_is_refused_as_a_preset(tmp_path, capsys):
@@ -139,12 +178,17 @@ def tuned():
 
 
 @pytest.fixture(scope="module")
-def tab(case, tuned, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("page")
-    (folder / "page.html").write_text(page(case, [tuned], f"{HOSTILE}.toml"), encoding="utf-8")
-    with browser.browser(folder) as tab:
+def written(case, tuned, tmp_path_factory):
+    path = tmp_path_factory.mktemp("page") / "page.html"
+    path.write_text(page(case, [tuned], f"{HOSTILE}.toml"), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def tab(written, tmp_path_factory):
+    with browser.browser(tmp_path_factory.mktemp("profile")) as tab:
         tab.size(1280)
-        tab.open(folder / "page.html")
+        tab.open(written)
         settled(tab)
         yield tab
 
@@ -304,6 +348,27 @@ def test_the_drawing_of_the_machine_shows_the_selected_time(fresh):
     assert fresh.run(drawing) != begin
     z = 1e6 * signal(fresh, "z")[-1]
     assert f"Rotor at {z:.2f} micrometres" in fresh.run(drawing)
+
+
+@in_browser
+def test_no_curve_is_visible_before_the_first_run(written, tmp_path):
+    with browser.browser(tmp_path) as tab:
+        tab.call("Page.addScriptToEvaluateOnNewDocument", source="window.Worker = class { postMessage() {} }")
+        tab.open(written)
+        tab.wait("window.ambjax && ambjax.state.sent > 0")
+        assert tab.run("document.getElementById('status').textContent").startswith("Computing")
+        visible = "one => one.checkVisibility({ visibilityProperty: true })"
+        assert not tab.run(f"[...document.querySelectorAll('.plot > div')].some({visible})")
+
+
+@in_browser
+def test_curves_are_visible_after_a_run_and_the_page_ends_with_its_content(fresh):
+    shown = (
+        "[...document.querySelectorAll('.plot > div')].every(one => one.checkVisibility({visibilityProperty: true}))"
+    )
+    assert fresh.run(shown)
+    end = "document.querySelector('main').getBoundingClientRect().bottom + scrollY"
+    assert fresh.run(f"document.documentElement.scrollHeight - ({end})") < 20
 
 
 @in_browser

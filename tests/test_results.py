@@ -70,6 +70,31 @@ def test_the_dataset_has_the_signals_with_units(run):
     assert {name: data[name].attrs["units"] for name in data} == run.to_pandas().attrs["units"]
 
 
+@pytest.mark.slow
+def test_a_comparison_equals_that_of_the_command_and_prints_nothing(path, tmp_path, capfd):
+    case = ambjax.read_case(path)
+    other = ambjax.with_gains(case, {"controller.position.c": 20.0})
+    found = ambjax.compare([case, other], 4)
+    assert capfd.readouterr() == ("", "")
+    assert [row["case"] for row in found.summary["cases"]] == ["case (1)", "case (2)"]
+    alone = ambjax.simulate_members(other, 4).columns["settled_rms_error_m"]
+    assert np.array_equal(found.compared[1].columns["settled_rms_error_m"], alone)
+    assert found.summary["cases"][1]["peak"] == ambjax.sensitivity(other).S.height
+    assert "case (2)" in found.table()
+    with pytest.raises(ValueError, match="1 case: give 2 to 8 cases"):
+        ambjax.compare([case])
+
+
+@pytest.mark.slow
+def test_a_check_returns_its_verdict_and_prints_nothing(path, capfd):
+    case = ambjax.read_case(path)
+    found = ambjax.check(case)
+    assert capfd.readouterr() == ("", "")
+    assert found.holds == found.summary["holds"]
+    assert found.text.startswith("The check passes." if found.holds else "The check FAILS")
+    assert found.summary["loop"]["peak"] == pytest.approx(ambjax.sensitivity(case).S.height)
+
+
 def test_the_pictures_show_the_results(run, members):
     axes = run.plot().axes
     assert any("position" in ax.get_ylabel() for ax in axes)
@@ -116,7 +141,7 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
     numbers: tuple[tuple[Any, Any, str], ...] = (
         (ambjax.read_case, 3, "path = 3: it must be the path of a file"),
         (ambjax.tune, 3, "case = 3: it must be the path of a file"),
-        (lambda r: ambjax.sensitivity(case, r), "a", "r = 'a': it must be a number"),
+        (lambda r: ambjax.sensitivity(case, r), "a", "r = 'a': it must be a finite number"),
         (lambda paths: ambjax.gains_of(case.cascade, paths), 3, "paths = 3: it must be a list"),
         (lambda gains: ambjax.with_gains(case.cascade, gains), 3, "gains = 3: it must be a dict"),
         (lambda loop: ambjax.gains_of(loop, []), 3, "loop = int: it must be a Case"),
@@ -130,8 +155,15 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
         ambjax.survival_map(case, ("plant.m", 1, 2), "plant.R=1:2")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match=r'it must be a list. Write \["controller.position.c"\]'):
         ambjax.gains_of(case.cascade, "controller.position.c")
+    for function in (ambjax.Metrics.for_case, ambjax.simulate_machine):
+        with pytest.raises(ValueError, match="case = Cascade: it must be a "):
+            function(case.cascade)
+    with pytest.raises(ValueError, match="template = 'rigg': it must be one of tracking"):
+        ambjax.template("rigg")
     for function in (
         ambjax.simulate,
+        ambjax.check,
+        lambda given: ambjax.compare([given, given]),
         ambjax.sensitivity,
         ambjax.vector_field,
         ambjax.export,
@@ -142,6 +174,35 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
             function(wrong)
     with pytest.raises(ValueError, match="cascade = Scenario: it must be a Cascade"):
         ambjax.rollout(case.scenario, case.cascade, case.clock)  # pyright: ignore[reportArgumentType]
+    for given in (("case.toml",), (case.cascade,), ((case.cascade, case.scenario, case.clock),), (case, case.scenario)):
+        with pytest.raises(ValueError, match=r"give a case, .* or a Cascade, a Scenario and a Clock"):
+            ambjax.rollout(*given)
+    two, plain = jnp.array([17.0, 18.0]), dataclasses.replace(case.scenario, reference=0.0)
+    with pytest.raises(ValueError, match=r"controller.position.c has the shape \[2\]: rollout simulates one member"):
+        ambjax.rollout(ambjax.with_gains(case, {"controller.position.c": two}))
+    with pytest.raises(ValueError, match=r"scenario.reference = 0.0: it must be a record, such as Constant\(\)"):
+        ambjax.rollout(case.cascade, plain, case.clock)
+    for named, said in (({"fold": ambjax.Metrics}, "fold = .* a fold"), ({"record_every": -1}, "record_every = -1")):
+        with pytest.raises(ValueError, match=said):
+            ambjax.rollout(case, **named)
+    two = dataclasses.replace(case.scenario, member=np.arange(2))
+    refused: tuple[tuple[Any, Any, str], ...] = (
+        (lambda x: ambjax.rollout(case, record_every=x), 2.5, "record_every = 2.5: it must be a whole number"),
+        (lambda x: ambjax.Scenario(seed=x), 2.5, "Scenario.seed = 2.5: it must be a whole number"),
+        (lambda x: ambjax.Metrics.of(0.0, x), 3, "scenario = 3: it must be a Scenario"),
+        (lambda x: ambjax.linear.linearise(case, x), [0.0], r"r = \[0.0\]: it must be a finite number"),
+        (lambda x: ambjax.linear.injected(case, [100.0], periods=x), 0, "periods = 0: it must be a whole number of"),
+        (lambda x: ambjax.linear.injected(case, [100.0], members=x), "a", "members = 'a': it must be a whole"),
+        (
+            lambda x: ambjax.ensemble.run_ensemble(case.cascade, two, case.clock, fold=None, threads=x),
+            -1,
+            "threads = -1",
+        ),
+        (lambda x: ambjax.ensemble.quantile(np.arange(3.0), x), -1, "q = -1: it must be from 0 to 1"),
+    )
+    for function, value, said in refused:
+        with pytest.raises(ValueError, match=said):
+            function(value)
     late = dataclasses.replace(case.scenario, q_z=ambjax.signals.Pulse(1.0, 2.0, 1.0))
     with pytest.raises(ValueError, match=r"q_z.stop = 1.0: it must not be less than start = 2.0"):
         ambjax.rollout(case.cascade, late, case.clock)

@@ -89,6 +89,26 @@ def test_a_reference_without_an_equilibrium_is_named_and_the_others_are_analysed
     assert [row["stable"] for row in points] == [True, None, None]
 
 
+def test_an_unstable_loop_has_no_peaks_and_no_zone(tmp_path, capsys):
+    """A stiffness of 1 N/m holds no rotor: the cause is said in place of figures, by `sensitivity` and `check`."""
+    text = '[controller]\nposition = { kind = "pid", k_p = 1.0, k_d = 1.0 }\n[rotor]\nspeed = 6000.0\n'
+    code, out, _, path = answered(tmp_path, capsys, text + "[processor]\n[clock]\nduration = 0.01\n")
+    assert code == 1
+    assert "The nominal loop is not stable" in out
+    row = next(line.split() for line in out.splitlines() if line.startswith("nominal"))
+    assert row == ["nominal", "unstable", "-", "-", "-", "-"]
+    assert not any(word in out for word in ("Zones", "Once per revolution", "stiffness", "|S| peaks"))
+    written = json.loads((tmp_path / "out" / "sensitivity.json").read_text())
+    numbers = ("peak", "frequency_hz", "t_peak", "ks_peak", "injected_peak", "static_stiffness_N_per_m", "noise_gain")
+    assert {written[name] for name in numbers} == {None}
+    assert written["running_speed"] == []
+    axes = frequency_figure("x", [], [3.0, 4.0, 5.0], (1.0, 500.0)).axes
+    assert not any(ax.patches for ax in axes)  # no zones
+    summary, lines, _ = acceptance.acceptance(read_case(path))
+    assert lines == ["Sensitivity: no zone and no margins: the linearised loop is not stable at r = 0."]
+    assert not {"peak", "running_speed", "delay_margin_s"} & set(summary)
+
+
 def test_the_picture_shows_the_response(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(CASE)

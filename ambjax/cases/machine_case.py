@@ -1,10 +1,11 @@
-"""Reader of the case file of a whole machine: [rotor], [[bearing]], [[unbalance]], [[load]], and the common tables."""
+"""Reader of the case file of a whole machine: rotor, bearings, unbalances, loads, base, and the common tables."""
 
 import copy
 import dataclasses
 import math
 import pathlib
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,10 +27,12 @@ from ambjax.cases.rotor_tables import (
 )
 from ambjax.cases.speed_table import SPEED
 from ambjax.cases.table import Table, load, show
+from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
+from ambjax.control.synchronous_notch import SynchronousNotch
 from ambjax.ensemble.spread import Spread
 from ambjax.linear.analysis import Zones
-from ambjax.linear.notch_design import machine_notch_gains, notch_speeds
+from ambjax.linear.notch_design import with_machine_gains
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
@@ -37,10 +40,10 @@ from ambjax.simulation.method import ACCURATE, slopes
 from ambjax.simulation.rollout import prepare
 from ambjax.simulation.whole_machine import Machine, machine_of
 from ambjax.text.words import one_line
-from ambjax.world.rotation import known
 from ambjax.world.rotor import Rotor
+from ambjax.world.scenario import Scenario
 
-MACHINE_TABLES = ("rotor", "bearing", "unbalance", "load")
+MACHINE_TABLES = ("rotor", "bearing", "unbalance", "load", "base")
 # Product of step and angular frequency of a mode (or of nutation) at which the relative error of RK4 in one period is
 # below 1e-6.
 MODE = 0.1
@@ -75,6 +78,14 @@ class MachineCase:
     folder: pathlib.Path = pathlib.Path()
 
 
+AnyCase: TypeAlias = Case | MachineCase
+
+
+def first_axis(case: AnyCase) -> Case:
+    """Return a case of one axis, or that of the first axis of a machine: it has the tables that all axes share."""
+    return case if isinstance(case, Case) else case.cases[0]
+
+
 def read_machine(path: str | pathlib.Path) -> MachineCase:
     """Read and check the case file of a machine. Raises ValueError, one line, for an invalid file."""
     case = read_any(path)
@@ -87,7 +98,7 @@ def read_machine(path: str | pathlib.Path) -> MachineCase:
     return case
 
 
-def read_any(path: str | pathlib.Path) -> Case | MachineCase:
+def read_any(path: str | pathlib.Path) -> AnyCase:
     """Read and check a case file: of one axis, or of a whole machine. Raises ValueError, one line, as `read_case`."""
     require_file("path", path)
     path = pathlib.Path(path)
@@ -105,7 +116,7 @@ def machine_from(
     top = Table(raw)
     top.only([*TABLES, *MACHINE_TABLES[1:], "tune"])
     if "disturbance" in raw:
-        raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] instead.")
+        raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] or [[base]] instead.")
     body, bearings = body_from(top, folder), tables_of(top, "bearing")
     if not bearings:
         raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
@@ -130,16 +141,21 @@ def machine_from(
         _check_force(case, axis, force)
         cases.append(case)
     law, parts = law_from(top, rotor, bearings, cases, read, folder)
-    spread = machine_spread(top, rotor, axes, names, cases)
+    spread = machine_spread(top, rotor, q, axes, names, cases)
     if law is not None:
         refuse_unused(spread)
     fixed = not isinstance(raw.get("clock", {}).get("dt", "auto"), str)
     clock = _clock([*cases, *parts], fastest_rotor(rotor, spread), fixed)
-    cases = _with_notches(top, rotor, cases, clock, q, law)
+    controllers = [merged(top.table("controller").raw, own.table("controller").raw) for own in bearings]
+    notches = [notch_of_axis(controllers[axis.bearing], case) for axis, case in zip(axes, cases, strict=True)]
+    if any(notches):
+        found = with_machine_gains(machine_of_axes(rotor, parts_of(cases), clock, q, law), notches, clock)
+        laws = [dataclasses.replace(case.cascade, notch=notch) for case, notch in zip(cases, found, strict=True)]
+        cases = [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
     coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
     return MachineCase(
         name=safe_name(name),
-        machine=_machine(rotor, cases, clock, q, law),
+        machine=machine_of_axes(rotor, parts_of(cases), clock, q, law),
         clock=clock,
         axes=tuple(axis.name for axis in axes),
         coordinates=coordinates,
@@ -153,30 +169,26 @@ def machine_from(
     )
 
 
-def _machine(rotor: Rotor, cases: list[Case], clock: Clock, q: np.ndarray, law: MachineLaw | None) -> Machine:
-    systems = [prepare(case.cascade, case.scenario, clock)[0] for case in cases]
+def parts_of(cases: Sequence[Case]) -> list[tuple[Cascade, Scenario]]:
+    """Return the laws and the scenario of each axis."""
+    return [(case.cascade, case.scenario) for case in cases]
+
+
+def machine_of_axes(
+    rotor: Rotor, parts: Sequence[tuple[Cascade, Scenario]], clock: Clock, q: Any, law: MachineLaw | None
+) -> Machine:
+    """Return the machine of a rotor and its axes. `q`: coordinates at t = 0. `law`: of the whole machine."""
+    systems = [prepare(*part, clock)[0] for part in parts]
     systems = [canonical(system if law is None else inner(system, law)) for system in systems]
     return machine_of(rotor, systems, jnp.asarray(q), law)
 
 
-def _with_notches(
-    top: Table, rotor: Rotor, cases: list[Case], clock: Clock, q: np.ndarray, law: MachineLaw | None
-) -> list[Case]:
-    """Return the cases of the axes with the notch of [controller.notch], whose gains are those of the machine."""
-    found = notch_from(top, cases[0].scenario)
-    if found is None:
-        return cases
-    if law is not None:
-        raise ValueError('[controller.notch] acts on axes. Leave it out, or use controller.coordinates = "axes".')
-    notch, phase = found
-    speeds = notch_speeds(known(notch.rotor), notch, float(clock.duration))
-    machine = _machine(rotor, cases, clock, q, None)
-    gains = machine_notch_gains(machine, notch, speeds, clock.sample_period, phase)
-    laws = [
-        dataclasses.replace(case.cascade, notch=dataclasses.replace(notch, gains=own))
-        for case, own in zip(cases, gains, strict=True)
-    ]
-    return [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
+def notch_of_axis(controller: dict[str, Any], case: Case) -> tuple[SynchronousNotch, float | None] | None:
+    """Return `notch_from` of an axis. `controller`: the common table with the keys of its bearing."""
+    try:
+        return notch_from(Table({"controller": controller}), case.scenario)
+    except ValueError as error:
+        raise ValueError(f"{case.name}: {error}") from None
 
 
 def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:
@@ -189,7 +201,10 @@ def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:
         return (*ends, most) if abs(most) > max(abs(first), abs(last)) else ends
     if not isinstance(value, list) or not 0 < len(value) <= MOST_SPEEDS:
         raise ValueError(f"{table.at('speeds')} = {show(value)}: it must be a list of 1 to {MOST_SPEEDS} speeds, rpm.")
-    return tuple(Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(value))
+    speeds = [Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(value)]
+    if twice := next((x for x in speeds if speeds.count(x) > 1), None):
+        raise ValueError(f"{table.at('speeds')} = {show(value)}: {twice:g} rpm is given more than once. Give it once.")
+    return tuple(speeds)
 
 
 def _start(table: Table, rotor: Rotor, count: int) -> tuple[np.ndarray, list[float]]:
@@ -228,7 +243,8 @@ def _shares(rotor: Rotor) -> tuple[list[float], list[float]]:
     B, M, gravity = (np.asarray(x, np.float64) for x in (rotor.at_magnets, rotor.M, rotor.gravity))
     B = B[:, :RIGID]
     masses = 1 / np.sum(B * np.linalg.solve(M[:RIGID, :RIGID], B.T).T, 1)
-    return masses.tolist(), (np.linalg.pinv(B.T) @ -gravity[:RIGID]).tolist()
+    forces = np.linalg.pinv(B.T) @ -gravity[:RIGID]
+    return masses.tolist(), np.where(np.abs(forces) > 1e-12 * np.abs(forces).max(), forces, 0.0).tolist()
 
 
 def _check_force(case: Case, axis: BearingAxis, force: float) -> None:

@@ -113,7 +113,8 @@ def require_file(name: str, path: object) -> None:
 def require_case(case: object) -> None:
     """Raise ValueError for anything but a `Case`, such as a path."""
     if not isinstance(case, Case):
-        raise ValueError(f"case = {cut(repr(case))}: it must be a Case, as ambjax.read_case(PATH) returns it.")
+        other = " For a whole machine, use ambjax.simulate_machine." if hasattr(case, "machine") else ""
+        raise ValueError(f"case = {cut(repr(case))}: it must be a Case, as ambjax.read_case(PATH) returns it.{other}")
 
 
 def safe_name(text: str) -> str:
@@ -138,7 +139,8 @@ def case_from(
     if is_machine(raw):
         raise ValueError(
             "[rotor], [[bearing]]: a whole machine, and this takes one axis. `ambjax simulate`, `check`, "
-            "`sensitivity`, `campbell`, `ensemble` and `tune` take machines; in Python, read_machine does."
+            "`sensitivity`, `campbell`, `ensemble`, `map`, `compare` and `tune` take machines; in Python, read_machine "
+            "does."
         )
     top.only([*TABLES, *OTHERS])
     plant = _plant(top.table("plant"))

@@ -181,7 +181,13 @@ def _number(value: float) -> str:
 
 
 def template(scenario: str) -> str:
-    """Return an annotated case file: the paper's "tracking" or "regulation" with repaired gains, or one of MACHINES."""
+    """Return an annotated case file: the paper's "tracking" or "regulation" with repaired gains, or one of MACHINES.
+
+    Raises ValueError for another name.
+    """
+    known = ["tracking", "regulation", *MACHINES]
+    if scenario not in known:
+        raise ValueError(f"template = {scenario!r}: it must be one of {', '.join(known)}.")
     if scenario in MACHINES:
         return MACHINES[scenario]
     tracking = scenario == "tracking"

@@ -55,7 +55,7 @@ def acceptance(case: Case) -> tuple[dict[str, object], list[str], str]:
 
 def _verdict(case: Case, loop: Analysis) -> str:
     if not loop.stable:
-        return "Sensitivity: the linearised loop is not stable at r = 0."
+        return "Sensitivity: no zone and no margins: the linearised loop is not stable at r = 0."
     signs = any(set_valued_signs(getattr(case.cascade, stage)) for stage in DEFAULT_LAWS)
     inside = " (linear loop, valid inside the bands of the set-valued signs)" if signs else ""
     word = "largest |S|" if loop.S.at_edge else "peak"

@@ -5,8 +5,10 @@ import pathlib
 
 import numpy as np
 
-from ambjax.cases.machine_case import MachineCase, read_machine
+from ambjax.cases.machine_case import MachineCase
+from ambjax.cases.reader import Case
 from ambjax.cases.rotor_drawing import drawing_of
+from ambjax.commands.reading import read_any_with_warnings
 from ambjax.host.heartbeat import say
 from ambjax.linear.linear_machine import turning_machines
 from ambjax.linear.margins import poles_in_s
@@ -34,19 +36,26 @@ LIGHT, DAMPED = 0.35, 0.95
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     """Analyse a machine at speeds from 0 on, and draw it. Exit code 1 if the machine is unstable at one of them."""
-    case = read_machine(args.case)
+    case = read_any_with_warnings(args.case)
+    if isinstance(case, Case):
+        raise ValueError(
+            f"{args.case}: it has no [rotor] with a kind, so it is a case of one axis, and campbell is for machines. "
+            "`ambjax template machine` prints one; `ambjax sensitivity` analyses one axis."
+        )
     fastest = max(abs(speed) for speed in case.speeds)
     end = args.to if args.to is not None else BEYOND * fastest or SLOWEST
     if not end > 0:
         raise ValueError(f"--to {end:g}: it must be above 0 rpm.")
     out = directory(args.out, f"campbell-{case.name}", WRITTEN, args.force)
-    say(f"linearising the machine at {SPEEDS} speeds or more; the first one compiles for some seconds")
+    say(f"linearising the machine at {SPEEDS} speeds or more")
     speeds = np.linspace(0.0, end, SPEEDS)
     points = list(turning_machines(case.machine, case.clock.sample_period, speeds))
-    poles = [poles_in_s(point.system.without_idle()) for point in points]
+    systems = [point.system.without_idle() for point in points]
+    poles = [poles_in_s(system) for system in systems]
     modes = [modes_of(point, case.machine.rotor) for point in points]
     growth = np.array([float(np.max(np.real(own))) for own in poles])
-    unstable = [float(speed) for speed, rate in zip(speeds, growth, strict=True) if rate > 0]
+    wrong = np.array([not system.stable for system in systems])
+    unstable = [float(speed) for speed in speeds[wrong]]
     operating = operating_range(case)
     found = unbalance_response(case.machine, case.clock.sample_period, end) if case.machine.rotor.unbalances else None
     criticals = [] if found is None else critical_speeds(found, operating)
@@ -61,12 +70,19 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
         _pictures(case, (speeds, modes, criticals), found, part)
         names = [name for name in WRITTEN if (part / name).exists()]
     if not args.json:
-        words = f"unstable at {', '.join(f'{speed:g}' for speed in unstable)} rpm" if unstable else "stable"
+        words = f"unstable at {ranges(speeds, wrong)} rpm" if unstable else "stable"
         print(f"0 to {end:g} rpm: {words}; largest real part of a pole {growth.max():.4g} 1/s")
         if found is not None:
-            print(_text(case, found, criticals, operating))
+            print(unbalance_text(case, found, criticals, operating))
         written(out, ", ".join(names))
     return int(bool(unstable)), plain(summary | {"out": str(out)})
+
+
+def ranges(speeds: np.ndarray, wrong: np.ndarray) -> str:
+    """Return the speeds (rpm) that are wrong as text: the first and the last one of each group of neighbours."""
+    edges = np.diff(np.concatenate([[0], wrong.astype(int), [0]]))
+    groups = zip(speeds[np.flatnonzero(edges > 0)], speeds[np.flatnonzero(edges < 0) - 1], strict=True)
+    return ", ".join(f"{low:g}" if low == high else f"{low:g} to {high:g}" for low, high in groups)
 
 
 def operating_range(case: MachineCase) -> tuple[float, float]:
@@ -108,11 +124,14 @@ def _unbalance(
 
 
 def _vibration(found: UnbalanceResponse, operating: tuple[float, float]) -> tuple[float, float]:
-    """Return A1 at the highest operating speed, and the largest displacement at a sensor at operating speeds, m."""
+    """Return A1 at the highest operating speed, and the largest displacement at a sensor at operating speeds, m.
+
+    The displacement is NaN if the machine is not stable at one of these speeds.
+    """
     size = 2 * np.abs(found.sensors).max(1)
     between = (found.speeds > operating[0]) & (found.speeds < operating[1])
     ends = np.interp(operating, found.speeds, size)
-    return float(a1_limit(operating[1])), float(max(*ends, *size[between]))
+    return float(a1_limit(operating[1])), float(np.max([*ends, *size[between]]))
 
 
 def _pictures(case: MachineCase, analysed: tuple, found: UnbalanceResponse | None, part: pathlib.Path) -> None:
@@ -135,12 +154,12 @@ def _pictures(case: MachineCase, analysed: tuple, found: UnbalanceResponse | Non
         picture.name,
         lambda: rotor_picture(case.name, drawing_of(case), light or drawn, map_of, operating[1], picture),
     )
-    if found is not None:
+    if found is not None and np.isfinite(found.sensors).any():  # stable at a speed
         path = part / "unbalance.png"
         described(path.name, lambda: unbalance_picture(case, found, criticals, operating, path))
 
 
-def _text(
+def unbalance_text(
     case: MachineCase, found: UnbalanceResponse, criticals: list[CriticalSpeed], operating: tuple[float, float]
 ) -> str:
     """Return the critical speeds and the vibration at operating speeds as text."""
@@ -158,4 +177,7 @@ def _text(
     speeds = f"{low:g} to {high:g} rpm" if low != high else f"{high:g} rpm"
     last = f"unbalance at {speeds}: {1e6 * largest:.3g} um peak to peak at the sensors; limit A1 {1e6 * limit:.3g} um"
     last += ", exceeded" if largest > limit else ""
-    return "\n".join([table(header, rows) if rows else "no critical speed with a peak", *([last] if high else [])])
+    if np.isnan(largest):
+        last = f"unbalance at {speeds}: not judged by A1, because the machine is unstable at one of these speeds"
+    none = "no critical speed with a peak" + " at the stable speeds" * bool(np.isnan(found.sensors).any())
+    return "\n".join([table(header, rows) if rows else none, *([last] if high else [])])

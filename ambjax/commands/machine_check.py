@@ -1,7 +1,7 @@
 """`check` of a whole machine."""
 
-import argparse
 import tomllib
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,12 +21,25 @@ MORE, LIGHT, MOST = 4, 0.3, 8
 AXIS_COLUMNS = ("axis", "|z|/clearance", "zone", "weight/force", "force reserve", "peak of |S|", "zone")
 
 
-def check(args: argparse.Namespace, case: MachineCase) -> tuple[int, dict[str, object]]:
+class CaseCheck(NamedTuple):
+    """The result of a check.
+
+    - `holds`: whether the check passes.
+    - `summary`: its numbers, as `ambjax check --json` prints them.
+    - `text`: the verdict in the first lines, then the tables that apply.
+    """
+
+    holds: bool
+    summary: dict[str, Any]
+    text: str
+
+
+def check(case: MachineCase) -> CaseCheck:
     """Check a machine: held in its run, clearance, force, stability and zones at its speeds, and spill-over.
 
-    The exit code is 1 if the rotor is lost, or if the machine is not stable at one of its speeds, also with more modes.
+    It fails if the rotor is lost, or if the machine is not stable at one of its speeds, also with more modes.
     """
-    say(f"simulating {case.clock.samples} samples; the first run compiles for some seconds")
+    say(f"simulating {case.clock.samples} samples")
     run = simulate_machine(case)
     say(f"linearising at {', '.join(f'{speed:g}' for speed in case.speeds)} rpm")
     points = analysed(case)
@@ -46,7 +59,7 @@ def check(args: argparse.Namespace, case: MachineCase) -> tuple[int, dict[str, o
         "stable": {f"{point.speed:g}": point.stable for point in points},
         "zone": worst.worst.zone,
         "peak": worst.worst.S.height,
-        "axis": worst.worst.name,
+        "axis": worst.worst.name if worst.stable else None,
         "speed_rpm": worst.speed,
         "running_speed": {
             axis: [fact for point in at_speeds for fact in point[k][0]] for k, axis in enumerate(case.axes)
@@ -55,20 +68,19 @@ def check(args: argparse.Namespace, case: MachineCase) -> tuple[int, dict[str, o
         "growth_with_more_modes_per_s": spilled,
     }
     stable = all(point.stable for point in points) and all(rate <= 0 for rate in spilled.values())
-    if not args.json:
-        held = "held" if summary["held"] else f"LOST ({run.lost_why})"
-        at = f"{worst.worst.name} at {worst.speed:g} rpm"
-        print(f"run: {held}; settled |z| reaches {share:.3g} of the clearance, zone {summary['clearance_zone']}")
-        print(f"sensitivity: peak {worst.worst.S.height:.4g} ({at}), zone {worst.worst.zone}")
-        print(
-            f"stability: {'stable' if stable else 'NOT STABLE'} at {', '.join(summary['stable'])} rpm{_more(spilled)}"
-        )
-        print(table(AXIS_COLUMNS, [(axis, *map(_short, own.values())) for axis, own in axes.items()]))
-        if lines := [line for point in at_speeds for _, own in point for line in own]:
-            print("\n".join(lines))
-        if light := _light(modes):
-            print(table(("lightly damped mode", "Hz", "damping ratio", "rpm"), light))
-    return int(run.lost or not stable), plain(summary)
+    held = "held" if summary["held"] else f"LOST ({run.lost_why})"
+    at = f"{worst.worst.name} at {worst.speed:g} rpm"
+    peak = f"peak {worst.worst.S.height:.4g} ({at}), zone {worst.worst.zone}"
+    lines = [
+        f"run: {held}; settled |z| reaches {share:.3g} of the clearance, zone {summary['clearance_zone']}",
+        f"sensitivity: {peak if worst.stable else f'no peak and no zone: not stable at {worst.speed:g} rpm'}",
+        f"stability: {'stable' if stable else 'NOT STABLE'} at {', '.join(summary['stable'])} rpm{_more(spilled)}",
+        table(AXIS_COLUMNS, [(axis, *_cells(own)) for axis, own in axes.items()]),
+        *(line for point in at_speeds for _, own in point for line in own),
+    ]
+    if light := _light(modes):
+        lines.append(table(("lightly damped mode", "Hz", "damping ratio", "rpm"), light))
+    return CaseCheck(not run.lost and stable, plain(summary), "\n".join(lines))
 
 
 def _spill_over(case: MachineCase) -> dict[str, float]:
@@ -105,6 +117,12 @@ def _axis(case: MachineCase, k: int, metrics: dict[str, float], points: list[Mac
         "clearance_used": share, "clearance_zone": case.zones.clearance_zone(share), "force_carried": carried,
         "force_reserve": 1 - used, "peak": worst.S.height, "zone": worst.zone,
     }  # fmt: skip
+
+
+def _cells(own: dict[str, Any]) -> list[str]:
+    """Return the cells of an axis; no peak and no zone if the machine is unstable at one of its speeds."""
+    shown = own if np.isfinite(own["peak"]) else own | {"peak": "-", "zone": "-"}
+    return [*map(_short, shown.values())]
 
 
 def _short(value: object) -> str:

@@ -42,8 +42,10 @@ COLUMNS = {
 def refuse(args: argparse.Namespace, names: tuple[str, ...]) -> None:
     """Raise ValueError for an option that a machine does not take."""
     for name in names:
-        if getattr(args, name, None):
-            raise ValueError(f"--{name}: a machine with [rotor] does not take it yet. Leave it out.")
+        value = getattr(args, name, None)
+        if value is not None and value is not False:
+            option = {"begin": "from", "end": "to"}.get(name, name)
+            raise ValueError(f"--{option}: a machine with [rotor] does not take it yet. Leave it out.")
 
 
 def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]:
@@ -157,7 +159,7 @@ def sensitivity_summary(points: list[MachineSensitivity], measured: Measured) ->
     axis = worst.worst
     first: Summary = {
         "stable": all(point.stable for point in points), "peak": axis.S.height, "frequency_hz": axis.S.frequency,
-        "zone": axis.zone, "axis": axis.name, "speed_rpm": worst.speed,
+        "zone": axis.zone, "axis": axis.name if worst.stable else None, "speed_rpm": worst.speed,
     }  # fmt: skip
     own: dict[str, Any] = at[points.index(worst)]
     first |= {key: x for key, x in own["axes"][worst.axes.index(axis)].items() if key.startswith("injected")}
@@ -192,11 +194,13 @@ def sensitivity_text(points: list[MachineSensitivity], measured: Measured) -> st
              *(["", ""] if axis.margins is None else [f"{axis.margins.gain:.3g}", f"{axis.margins.phase_deg:.3g}"]))
             for axis in point.axes
         ]  # fmt: skip
+        slow = f"largest real part of a pole {np.max(np.real(point.poles)):.4g} 1/s"
+        if not point.stable:
+            parts.append(f"{point.speed:g} rpm: NOT STABLE, so there are no peaks, zones and margins; {slow}")
+            continue
+        parts.append(f"{point.speed:g} rpm: stable; {slow}")
         single = f"{point.sigma.height:.4g}", f"{point.sigma.frequency:.4g}"
         rows.append(("largest singular value", *single, "", "", "", ""))
-        slow = np.max(np.real(point.poles))
-        words = "stable" if point.stable else "NOT STABLE: the peaks have no physical meaning"
-        parts.append(f"{point.speed:g} rpm: {words}; largest real part of a pole {slow:.4g} 1/s")
         parts.append(
             table(("axis", "peak of |S|", "Hz", "zone", "peak of |T|", "gain margin", "phase margin, deg"), rows)
         )

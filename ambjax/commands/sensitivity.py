@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
         points, missing = _points(case)
     spread = None if study is None else _spread(case, study, points[0])
     measured = None
-    if args.inject or case.cascade.sampled:
+    if points[0].analysis.stable and (args.inject or case.cascade.sampled):
         with doing(f"measuring the sensitivity by injection into the simulation; {FIRST_RUN}"):
             measured = _injections(case, points[0])
     out = directory(args.out, f"sensitivity-{case.name}", WRITTEN, args.force)
@@ -66,10 +66,10 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
 
 
 def _spread(case: Case, study: Study, point: OperatingPoint) -> SpreadPeaks:
-    """Return the peaks of the members; with set-valued signs, also the peaks measured by injection."""
+    """Return the peaks of the members; with set-valued signs and a stable `point`, also those of an injection."""
     with doing(f"linearising the loops of the members; {FIRST_RUN}"):
         spread = spread_peaks(case, study)
-    if not set_valued(case):
+    if not set_valued(case) or not point.analysis.stable:
         return spread
     with doing(f"measuring the sensitivity of the members by injection into the simulation; {FIRST_RUN}"):
         return spread._replace(measured=measured_peaks(case, study, point.analysis.S.frequency))

@@ -14,6 +14,8 @@ from ambjax.linear import PLACES, Injection, MemberPeaks, StateSpace, Zones
 from ambjax.results.operating import OperatingPoint, SpreadPeaks, analysis_summary
 from ambjax.results.outputs import table
 
+UNSTABLE = "The nominal loop is not stable, so it has no peaks, no zone and no margins, and nothing is injected."
+
 
 class Injections(NamedTuple):
     """The measured sensitivity at the position sensor, and at the velocity sensor (None without a velocity sensor)."""
@@ -163,15 +165,18 @@ def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None
         first = stable[0].analysis
         where = first.margins_at.place("delay")
         rows += [f"The delay margin is the smaller one, {_number(first.margins.delay)} s, at the {where}."]
-    stiffness = f"{_number(one.stiffness)} N/m" if np.isfinite(one.stiffness) else "infinite"
-    rows += [
-        f"Zones of the peak of |S|: A below {zones.zone_a:g}, B below {zones.zone_b:g}, C below {zones.zone_c:g}, D "
-        "above.",
-        f"Static stiffness: {stiffness}. Rms of z per rms of position noise: {_number(one.noise)}. "
-        f"Largest real part of the poles: {_number(one.poles[0].real)} 1/s.",
-    ]
-    if not one.stable:
-        rows += ["The nominal loop is not stable: the rotor does not stay at this equilibrium."]
+        rows += [
+            f"Zones of the peak of |S|: A below {zones.zone_a:g}, B below {zones.zone_b:g}, C below {zones.zone_c:g}, "
+            "D above."
+        ]
+    growth = f"Largest real part of the poles: {_number(one.poles[0].real)} 1/s."
+    if one.stable:
+        stiffness = f"{_number(one.stiffness)} N/m" if np.isfinite(one.stiffness) else "infinite"
+        rows += [
+            f"Static stiffness: {stiffness}. Rms of z per rms of position noise: {_number(one.noise)}. {growth}",
+        ]
+    else:
+        rows += [f"{UNSTABLE} {growth}"]
     if measured is not None:
         system, velocity = points[0].system, measured.velocity
         rows += [injection_text(system, measured.position)]
@@ -189,7 +194,7 @@ def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None
             f"{', '.join(signs)}: the signs are set-valued. The linear analysis applies while the signal of each law "
             "stays inside its band, that is, without chattering."
         ]
-    if one.S_velocity is not None:
+    if one.S_velocity is not None and one.stable:
         larger = "velocity" if one.S_velocity.height > one.S.height else "position"
         rows += [
             "The velocity has its own sensor. |S| at the position sensor does not include the errors of the velocity "
@@ -214,7 +219,7 @@ def _measured_text(peaks: MemberPeaks, zones: Zones) -> str:
 def _row(point: OperatingPoint) -> tuple[str, ...]:
     one = point.analysis
     if not one.stable:
-        return (point.name, "unstable", "-", "D", "-", "-")
+        return (point.name, "unstable", *["-"] * 4)
     S, T, KS = (_number(x.height) + (" (at edge)" if x.at_edge else "") for x in (one.S, one.T, one.KS))
     return (point.name, S, _number(one.S.frequency), one.zone, T, KS)
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.linear.margins import ResponsePeak
+from ambjax.linear.margins import NO_PEAK, ResponsePeak
 from ambjax.linear.state_space import StateSpace
 from ambjax.world.rotation import PER_MINUTE, Rotation
 
@@ -23,11 +23,11 @@ def running_speeds(rotor: Rotation | None, duration: float) -> tuple[float, ...]
 def running_facts(
     speeds: tuple[float, ...], system: StateSpace, peak: ResponsePeak, axis: int = 0, what: str = "|S|"
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return |S| at each speed (Hz) for the JSON summary, and as lines of text.
+    """Return |S| at each speed (Hz) for the JSON summary, and as lines of text; neither for an unstable loop.
 
     `peak`: of |S|. `axis`: number of the input and the output of S. `what`: |S| in words.
     """
-    if not speeds:
+    if not speeds or peak == NO_PEAK:
         return [], []
     found = np.abs(np.asarray(system.response(np.array(speeds)))[:, axis, axis]).tolist()
     low, high = (1 - NEAR) * speeds[0], (1 + NEAR) * speeds[-1]

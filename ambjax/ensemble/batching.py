@@ -19,11 +19,13 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from ambjax.compiler.fast_path import block_length, one_kernel
 from ambjax.compiler.short_compilation import compiled_quickly
 from ambjax.control.cascade import Cascade
+from ambjax.numerics.declared import require_number
 from ambjax.numerics.records import canonical
 from ambjax.numerics.shapes import varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
 from ambjax.simulation.rollout import Result, System, prepare, run
+from ambjax.simulation.system import check_recording
 from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 
@@ -69,6 +71,7 @@ def run_ensemble(
 
     Raises ValueError as `rollout` does, if the lengths of two leaves differ, and if no leaf is an array.
     """
+    check_recording(fold, record_every)
     tree = canonical((*prepare(cascade, scenario, clock), fold))
     return map_members(_rollout(record_every), tree, threads=threads, call=call)
 
@@ -122,6 +125,8 @@ def map_members(
     Raises ValueError if the lengths of two leaves differ, or if no leaf is an array.
     """
     compiled = one_kernel if not plain else compiled_quickly if quick else jax.jit
+    for name, value in (("threads", threads), ("call", call), ("block", block)):
+        require_number(name, value, 1, whole=True, optional=True)
     return _Engine(function, tree, threads, call, block, compiled, vectorised).results()
 
 

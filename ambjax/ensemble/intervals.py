@@ -64,14 +64,16 @@ def quantile(values: np.ndarray, q: npt.ArrayLike, confidence: float = 0.95) -> 
     The number of values below the true quantile is binomial with N trials of probability q. Its quantiles are
     the ranks of the two ends, the upper one plus 1. An end is -inf or +inf if N is too small. Values of +inf are
     allowed.
-    Raises ValueError as `column_of` does.
+    Raises ValueError for a q outside of 0 to 1, and as `column_of` does.
     """
     from scipy.stats import binom
 
-    x = np.sort(column_of(values))
+    x, q = np.sort(column_of(values)), np.asarray(q)
+    if q.dtype.kind not in "iuf" or not np.all((q >= 0) & (q <= 1)):
+        raise ValueError(f"q = {q}: it must be from 0 to 1.")
     n, tail = len(x), (1 - confidence) / 2
     # A product may round to just above an integer: 0.07 * 100 is 7.000000000000001.
-    rank = np.clip(np.ceil(np.asarray(q) * n - 1e-9 * n), 1, n).astype(int)
+    rank = np.clip(np.ceil(q * n - 1e-9 * n), 1, n).astype(int)
     padded = np.concatenate([[-np.inf], x, [np.inf]])
     low, high = binom.ppf(tail, n, q), binom.ppf(1 - tail, n, q) + 1
     return Estimate(padded[rank], padded[low.astype(int)], padded[high.astype(int)])

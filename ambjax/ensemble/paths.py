@@ -59,6 +59,8 @@ def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
     names |= {f"disturbance.{slot if len(acting) > 1 else 'q_z'}": slot for slot in acting}
     for path, name in names.items():
         table |= _below(getattr(scenario, name), path, (1, name))
+    if scenario.rotor is not None and scenario.rotor.changes:  # a table of speeds has no rate of its own
+        table = {path: x for path, x in table.items() if path == "rotor.speed" or not path.startswith("rotor.")}
     fields = {field.name: field for field in dataclasses.fields(scenario)}
     for path, name in (("actuator.u_max", "u_max"), ("run.clearance", "clearance")):
         table[path] = Place((1, name), fields[name], getattr(scenario, name))
@@ -85,8 +87,9 @@ def _below(node: object, path: str, route: tuple[int | str, ...]) -> Iterator[tu
             for knot, x in enumerate(value.values):
                 yield f"{at[0]}.{knot}", Place((*at[1], "values", knot), field, x)
         elif field.metadata.get("leaf") and (axes := axes_of(field)) and value is not None:
+            known = value if is_traced(value) else np.asarray(value)
             for index in np.ndindex(*np.shape(value)[-len(axes) :]):
-                entry = value[(..., *index)]
+                entry = known[(..., *index)]
                 yield ".".join(map(str, (at[0], *index))), Place((*at[1], *index), field, entry)
         elif field.metadata.get("leaf"):
             yield at[0], Place(at[1], field, value)

@@ -147,6 +147,8 @@ def no_such_number(path: str, known: Iterable[str], where: str = "in this case")
     hint = hint_of_path(path, known)
     if path.split(".")[0] == "sensor":
         hint = " This case has no sensor noise; add the table [sensor], with std = 0.0 for example."
+    if path == "rotor.acceleration" and "rotor.speed" in known:
+        hint = " The table rotor.speed gives it; a spread of rotor.speed shifts the whole table."
     stems = [path.rsplit(".", n)[0] for n in range(path.count(".") + 1)]
     near = next((some for stem in stems if (some := [p for p in known if p.startswith(stem + ".")])), known)
     if len(near) > 12:
@@ -160,7 +162,11 @@ def _check_one(path: str, kind: Distribution, place: Place) -> None:
     def refuse(text: str) -> ValueError:
         return SpreadError(path, kind, text)
 
-    if fault := kind.fault():
+    try:
+        fault = kind.fault()
+    except TypeError:  # a text or None
+        raise ValueError(f"spread.{path} = {kind!r}: its values must be numbers.") from None
+    if fault:
         raise refuse(f"{fault}.")
     if np.size(place.value) != 1:
         raise refuse(f"{path} is an array of {np.size(place.value)} already. Spread a single number.")

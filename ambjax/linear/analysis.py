@@ -11,6 +11,7 @@ from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
 from ambjax.linear.margins import (
+    NO_PEAK,
     STATIC,
     LoopMargins,
     Margins,
@@ -23,6 +24,7 @@ from ambjax.linear.margins import (
 )
 from ambjax.linear.matrices import loop_matrices, rest
 from ambjax.linear.state_space import StateSpace
+from ambjax.numerics.declared import require_number
 from ambjax.numerics.records import Scalar, canonical, leaf, record
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import prepare
@@ -135,7 +137,7 @@ def _zone(x: float, a: Scalar, b: Scalar, c: Scalar) -> str:
 class Analysis(NamedTuple):
     """Linear analysis of a loop at one equilibrium.
 
-    - `stable`: whether all poles are stable. If not, the peaks and the stiffness have no physical meaning.
+    - `stable`: whether all poles are stable. If not, the peaks are infinite (`margins.NO_PEAK`), and the stiffness NaN.
     - `S`, `T`, `KS`: peaks of |S|, |T| (1) and |KS| (V/m) in the band of the case. Each contains the largest value
       outside this band if it is larger.
     - `zone`: zone of the peak of |S|; D if the loop is unstable.
@@ -172,6 +174,7 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
     Returns the state space with NumPy arrays. States that no input reaches are left out. Raises ValueError as `rollout`
     does, if no equilibrium is found at r, and if a law has no derivative there.
     """
+    require_number("r", r)
     inputs = canonical((*linearisation_inputs(cascade, scenario, clock), r))
     system, found = _matrices(*inputs)
     return checked(system, found, r, "" if found else _rest(*inputs).moving())
@@ -244,19 +247,22 @@ def analyse(
     def largest(output: int, source: int, less: float = 0.0) -> ResponsePeak:
         return peak(system, lambda f: np.abs(system.response(f)[:, output, source] - less), low, high, end)
 
-    stable, S = system.stable, largest(0, 0)
-    poles, none = poles_in_s(system), Margins(*[0.0] * 6)
-    margins = margins_of(system) if stable else LoopMargins(none, none)
+    poles = poles_in_s(system)
+    poles = poles[np.argsort(-np.real(poles))]
+    if not system.stable:
+        none, no, at = Margins(*[0.0] * 6), NO_PEAK, NO_PEAK if velocity else None
+        return Analysis(False, no, no, no, "D", at, none, np.nan, np.inf, poles, LoopMargins(none, none))
+    S, margins = largest(0, 0), margins_of(system)
     return Analysis(
-        stable,
+        True,
         S,
         largest(0, 0, 1.0),
         largest(2, 0),
-        zones.zone(S.height) if stable else "D",
+        zones.zone(S.height),
         largest(1, 1) if velocity else None,
         margins.smaller,
         _stiffness(system, float(m), STATIC * low),
-        noise_gain(system, float(period)) if stable else np.inf,
-        poles[np.argsort(-np.real(poles))],
+        noise_gain(system, float(period)),
+        poles,
         margins,
     )

@@ -16,6 +16,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.linear.analysis import Zones
 from ambjax.linear.member_responses import Responses, member_responses
 from ambjax.linear.multisine import Reading
+from ambjax.numerics.declared import require_number
 from ambjax.numerics.records import Scalar
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.triple import takes_case
@@ -108,8 +109,8 @@ def injected(
             f"injection.reading = 'z_dot': the observer {type(cascade.observer).__name__} estimates the velocity and "
             "reads no velocity sensor. Inject at 'z'."
         )
-    if members < 1:
-        raise ValueError(f"injection: members = {members}: it must be at least 1.")
+    require_number("members", members, 1, whole=True)
+    require_number("confidence", confidence, 0, 1)
     scenario = dataclasses.replace(scenario, seed=seed, member=np.arange(members))
     one = member_responses(cascade, scenario, clock, frequencies, reading, amplitude, r, settle, periods)
     return injection_of(one, scenario.random, confidence)

@@ -13,8 +13,8 @@ from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Sample
 from ambjax.control.machine_law import MachineInputs
 from ambjax.linear.analysis import Zones
-from ambjax.linear.equilibrium import TOLERANCE, at_rest, ideal, newton_of, reading, sizes_of, start_of
-from ambjax.linear.margins import Margins, ResponsePeak, peak, poles_in_s, reading_margins, whole_end
+from ambjax.linear.equilibrium import TOLERANCE, at_rest, ideal, inverse, newton_of, reading, sizes_of, start_of
+from ambjax.linear.margins import NO_PEAK, Margins, ResponsePeak, peak, poles_in_s, reading_margins, whole_end
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar, canonical
 from ambjax.numerics.small_matrices import exponential, times
@@ -26,8 +26,6 @@ from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
 
 T = TypeVar("T")
-# Stands for a demand that no law of the machine makes.
-ABSENT: Any = None
 # Parts of a point or of its rates: one stacked pytree for each group.
 Groups = tuple
 
@@ -49,7 +47,7 @@ class AxisSensitivity(NamedTuple):
 class MachineSensitivity(NamedTuple):
     """Sensitivity of a machine at one speed, with all loops closed.
 
-    - `speed`: rpm. `stable`: whether no mode grows. If one does, the peaks have no physical meaning, and zones are D.
+    - `speed`: rpm. `stable`: whether no mode grows. If one does, the peaks are infinite, and the zones D.
     - `axes`: the peaks of each axis. `sigma`: peak of the largest singular value of the matrix S.
     - `poles`: poles of the machine, 1/s, in the order of decreasing real part.
     - `system`: the linear system, with inputs e_k at the sensors, and outputs as of `linearise_machine`.
@@ -157,30 +155,45 @@ class _Linear:
 
         `control`: states of the laws of the groups. `law`: state of the law of the machine.
         """
-        reference, unlimited = at_rest(0.0), jnp.asarray(jnp.inf)
-        demands: Groups = (None,) * len(self.cascade)
+        reference, unlimited, count = at_rest(0.0), jnp.asarray(jnp.inf), len(self.cascade)
+        demands: Groups = (None,) * count
+        notched: Groups = (None,) * count
+
+        def sample(past: tuple) -> Sample:
+            return Sample(reference, self.period, unlimited, past)
+
+        def notch(cascade: Cascade, _: object, read: Measurement, state: CascadeState, past: tuple) -> tuple:
+            return cascade.observed(read, state.observer, reference, sample(past) if self.sampled else None)
+
         whole = self.machine.law
         if whole is not None:
             act = whole.step if self.sampled else whole
-            demanded, law = act(self.machine.join(measured), law, self.inputs(past))
-            demands = forces(self.machine, demanded)
+            parts = self.each(notch, measured, control, past)
+            demanded, law = act(self.machine.join([one for one, _ in parts]), law, self.inputs(past))
+            demands, notched = forces(self.machine, demanded), tuple(after for _, after in parts)
 
         def one(
-            cascade: Cascade, _: object, measured: Measurement, control: CascadeState, past: tuple, demand: Any
+            cascade: Cascade,
+            _: object,
+            measured: Measurement,
+            control: CascadeState,
+            past: tuple,
+            demand: Any,
+            own: Any,
         ) -> tuple[Array, CascadeState]:
-            force, estimate = demand or 2 * (ABSENT,)
-            sample = Sample(reference, self.period, unlimited, past)
-            if not self.sampled and force is None:
-                command, after = cascade(measured, control, reference, unlimited)
-            elif not self.sampled:
-                command, after = cascade.command_rates(force, estimate, control, reference, unlimited)
-            elif force is None:
-                command, after, _ = cascade.step(measured, control, sample)
+            if demand is not None:
+                if self.sampled:
+                    command, after = cascade.commanded(*demand, control, sample(past))
+                else:
+                    command, after = cascade.command_rates(*demand, control, reference, unlimited)
+                after = after._replace(observer=own)
+            elif self.sampled:
+                command, after, _ = cascade.step(measured, control, sample(past))
             else:
-                command, after = cascade.commanded(force, estimate, control, sample)
+                command, after = cascade(measured, control, reference, unlimited)
             return command.u, after
 
-        found = self.each(one, measured, control, past, demands)
+        found = self.each(one, measured, control, past, demands, notched)
         return tuple(u for u, _ in found), tuple(after for _, after in found), law
 
     def past(self, u: Groups) -> Groups:
@@ -211,11 +224,18 @@ class _Linear:
         plant = tuple(jax.tree.map(lambda x, w=w: x / w, own.plant) for own, w in axes)
         return MachineRest(moved.q_dot / fastest**2, plant, change, jax.tree.map(jnp.subtract, u, point.u), law)
 
-    def rest(self) -> MachineRest:
-        """Return the equilibrium, or the point nearest to it that was found."""
-        start, sizes = self.start()
+    def rest(self, held: "_Linear") -> MachineRest:
+        """Return the equilibrium, or the point nearest to it that was found.
+
+        `held`: the same machine, without derivatives. Those of the equilibrium are those of the implicit function.
+        """
+        start, sizes = held.start()
         scale, (flat, restore) = ravel_pytree(sizes)[0], ravel_pytree(start)
-        return restore(newton_of(lambda y: self.deviation(restore(y * scale), scale), flat / scale).y * scale)
+        newton = newton_of(lambda y: held.deviation(restore(y * scale), scale), flat / scale)
+        found = newton.error <= TOLERANCE * jnp.finfo(flat.dtype).eps
+        # one more step with a constant Jacobian, as in `equilibrium`
+        step = inverse(newton.J) @ self.deviation(restore(newton.y * scale), scale)
+        return restore((newton.y - jnp.where(found, step, 0.0)) * scale)
 
     def deviation(self, point: MachineRest, scale: Array) -> Array:
         """Return the residual relative to the sizes of the states."""
@@ -333,7 +353,7 @@ def _held(A: Array, B: Array, period: Scalar, delay: Scalar, kept: int) -> tuple
 
 @jax.jit
 def _at_rest(machine: Machine, W: Scalar, period: Scalar) -> MachineRest:
-    return _Linear(machine, W, period).rest()
+    return _Linear(machine, W, period).rest(_Linear(jax.lax.stop_gradient(machine), W, period))
 
 
 @jax.jit
@@ -426,6 +446,8 @@ def sensitivity_of(point: TurningMachine, names: tuple[str, ...], speed: float, 
         return responses[key]
 
     def largest(magnitude: Callable) -> ResponsePeak:
+        if not stable:
+            return NO_PEAK
         return peak(system, lambda f: magnitude(response(f)), low, high, end)
 
     axes = []
@@ -435,7 +457,7 @@ def sensitivity_of(point: TurningMachine, names: tuple[str, ...], speed: float, 
         KS = largest(lambda H, k=k: np.abs(H[:, c + k, k]))
         own = system._replace(B=system.B[:, [k]], C=system.C[[k]], D=system.D[[k]][:, [k]])
         margins = reading_margins(own) if stable else None
-        axes.append(AxisSensitivity(name, S, T, KS, zones.zone(S.height) if stable else "D", margins))
+        axes.append(AxisSensitivity(name, S, T, KS, zones.zone(S.height), margins))
     sigma = largest(lambda H: np.linalg.norm(H[:, :c], 2, axis=(1, 2)))
     poles = poles_in_s(system)
     return MachineSensitivity(speed, stable, tuple(axes), sigma, poles[np.argsort(-np.real(poles))], system)

@@ -44,6 +44,10 @@ class ResponsePeak(NamedTuple):
     outside: "ResponsePeak | None" = None
 
 
+# Of an unstable loop: no response to a test signal is bounded.
+NO_PEAK = ResponsePeak(math.inf, math.nan)
+
+
 class Margins(NamedTuple):
     """Margins of the loop transfer L = 1/S - 1, with the loop broken at one place.
 
@@ -241,7 +245,8 @@ def _crossings(function: Magnitude, f: np.ndarray, values: np.ndarray) -> list[f
     def one(x: float) -> float:
         return float(function(np.array([x]))[0])
 
-    changes = np.flatnonzero(values[:-1] * values[1:] < 0)
+    # the sign of a rounding error at one end may be another one in the scan, which solves for all frequencies together
+    changes = [k for k in np.flatnonzero(values[:-1] * values[1:] < 0) if one(f[k]) * one(f[k + 1]) < 0]
     found = [float(brentq(one, f[k], f[k + 1], xtol=1e-300, rtol=1e-14)) for k in changes]  # pyright: ignore
     # at a pole of the function its sign changes, but its value does not cross 0
     return [x for x, k in zip(found, changes, strict=True) if abs(one(x)) <= 1e-3 * max(abs(values[k]), 1e-30)]

@@ -13,6 +13,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members, size
 from ambjax.linear.equilibrium import ideal, reading
 from ambjax.linear.multisine import MultiSine, Reading, Response, multisine
+from ambjax.numerics.declared import require_number
 from ambjax.numerics.records import Scalar, canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import prepare, run
@@ -65,13 +66,13 @@ def member_responses(
     numbers of the members. Raises ValueError as `injected` does.
     """
     gap, pole = (float(np.mean(np.asarray(x))) for x in (scenario.plant.s_0, scenario.plant.pole))
+    require_number("amplitude", amplitude, optional=True)
     amplitude = AMPLITUDE * gap * (pole if channel == "z_dot" else 1.0) if amplitude is None else float(amplitude)
     if not amplitude > 0:
-        raise ValueError(f"injection.amplitude = {amplitude:g}: it must be above 0.")
-    if settle < 0 or periods < 1:
-        raise ValueError(
-            f"injection: settle = {settle}, periods = {periods}: settle must be at least 0, periods at least 1."
-        )
+        raise ValueError(f"amplitude = {amplitude:g}: it must be above 0.")
+    require_number("settle", settle, 0, whole=True)
+    require_number("periods", periods, 1, whole=True)
+    require_number("r", r)
     wave = multisine(_harmonics(frequencies, clock), clock.samples, float(clock.sample_period), amplitude, channel)
     skip = settle * clock.samples
     method = None if isinstance(clock.method, Slide) else clock.method

@@ -24,6 +24,7 @@ CRITICALLY_DAMPED = 2.5
 class UnbalanceResponse(NamedTuple):
     """Complex amplitudes against speed: a signal is Re(a exp(j W t)), with the rotor angle W t.
 
+    They are NaN at speeds at which the machine is not stable, because no motion there is periodic.
     - `speeds` [S]: rpm. `magnets`, `sensors` [S, c]: displacements at the magnets and at the sensors, m.
     - `current` [S, c]: A. `command` [S, c]: commands of the laws, V, or A for commanded currents.
     """
@@ -99,8 +100,10 @@ def _near_crossings(speeds: np.ndarray, points: Sequence[TurningMachine]) -> np.
 
 
 def _amplitudes(point: TurningMachine, rotor: Rotor) -> np.ndarray:
-    """Return the complex amplitudes of the outputs at one speed."""
+    """Return the complex amplitudes of the outputs at one speed, NaN if the machine is not stable there."""
     system, W = point.system, point.W
+    if not system.without_idle().stable:
+        return np.full(len(system.C), np.nan, complex)
     force = sum(
         GRAM_MM * float(one.amount) * W**2 * np.exp(1j * np.radians(float(one.phase)))
         * (np.asarray(one.along_x) - 1j * np.asarray(one.along_y))

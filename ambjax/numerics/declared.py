@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from jax.core import Tracer
 
 
 def numbers(field: dataclasses.Field) -> str:
@@ -102,6 +103,30 @@ def check_number(field: dataclasses.Field, name: str, value: object) -> None:
     if not within(field.metadata, number):
         shown = f"{value:g}" if isinstance(value, (int, float)) else _shown(value, number)
         raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.")
+
+
+def require_number(
+    name: str,
+    value: Any,
+    low: float = -math.inf,
+    high: float = math.inf,
+    *,
+    whole: bool = False,
+    optional: bool = False,
+) -> None:
+    """Raise ValueError unless the argument `name` of a function is one real number from `low` to `high`.
+
+    `whole`: whether it must be a whole number. `optional`: whether None is allowed. A traced number may have any value,
+    but it is not whole.
+    """
+    if (isinstance(value, Tracer) and not whole) or (optional and value is None):
+        return
+    number = not isinstance(value, Tracer) and np.ndim(value) == 0 and np.asarray(value).dtype.kind in "biuf"
+    if not (number and low <= value <= high and math.isfinite(value) and not (whole and value % 1)):
+        ends = [f"of at least {low:g}"] if math.isfinite(low) else []
+        ends = [f"from {low:.10g} to {high:.10g}"] if math.isfinite(high) else ends
+        kind = "a whole number" if whole else "a finite number"
+        raise ValueError(f"{name} = {value!r}: it must be {' '.join([kind, *ends])}.")
 
 
 def _shown(value: object, number: npt.ArrayLike) -> str:

@@ -52,6 +52,18 @@ def varying(tree: object) -> tuple[bool, ...]:
     return tuple(np.ndim(x) > rank for x, rank in zip(leaves, _ranks(structure), strict=True))
 
 
+def require_one_member(parts: dict[str, object]) -> None:
+    """Raise ValueError if a number of the parts has one value per member of an ensemble."""
+    if any(varying(parts)):
+        leaves = zip(jax.tree_util.tree_leaves_with_path(parts), varying(parts), strict=True)
+        path, value = next(leaf for leaf, varies in leaves if varies)
+        name = jax.tree_util.keystr(path, simple=True, separator=".")
+        raise ValueError(
+            f"{name} has the shape {list(np.shape(value))}: rollout simulates one member. Give one value, or use "
+            "jax.vmap or ambjax.ensemble.run_ensemble for several members."
+        )
+
+
 def map_varying(function: Callable[[Any], Any], tree: T) -> T:
     """Return the pytree with `function` applied to each leaf that has an axis of members."""
     leaves, structure = jax.tree.flatten(tree)

@@ -65,7 +65,8 @@ def frequency_figure(
     """Return a picture: |S| with zones, |T|, |KS|, dynamic stiffness, Nyquist curve with the disk, Bode plot of L.
 
     `limits`: upper limits of the zones A, B and C. `span`: lowest and highest frequency, Hz. `measured`: points
-    measured on the nominal loop, which are drawn with the curves. Only the first len(LINES) loops are drawn.
+    measured on the nominal loop, which are drawn with the curves. Only the first len(LINES) loops are drawn. Without a
+    loop, because none is stable, there are no zones.
     """
     figure = Figure(figsize=(12, 11), layout="constrained")
     left = figure.add_gridspec(4, 2)
@@ -94,7 +95,10 @@ def frequency_figure(
         phase_axes.semilogx(
             measured.frequency, _near(np.degrees(np.angle(L)), measured.frequency, phase_axes), **points
         )
-    shade_zones(S_axes, limits)
+    if loops:
+        shade_zones(S_axes, limits)
+    else:
+        S_axes.text(0.5, 0.5, "the loop is not stable", transform=S_axes.transAxes, ha="center", va="center")
     _nyquist(nyquist_axes, loops)
     gain_axes.axhline(1.0, color=INK, linewidth=0.8)
     labels = {
@@ -111,7 +115,7 @@ def frequency_figure(
         ax.grid(True, which="major", color="#dddddd", linewidth=0.6)
     for ax in (stiffness_axes, phase_axes):
         ax.set_xlabel("frequency, Hz")
-    if S_axes.get_legend_handles_labels()[0]:  # there are none if no loop is stable
+    if loops:
         S_axes.legend(fontsize=8, loc="best")
     figure.suptitle(f"{title}: sensitivity at the position sensor", fontsize=12)
     return figure

@@ -101,6 +101,9 @@ def machine_sensitivity_picture(
     for ax in list(grid.flat)[len(shown) :]:
         ax.set_axis_off()
     for ax, point in zip(grid.flat, shown, strict=False):
+        ax.set_title(f"{point.speed:g} rpm{'' if point.stable else ': not stable'}")
+        if not point.stable:
+            continue
         end = 5e3 if point.system.period is None else 0.45 / float(point.system.period)
         f = np.geomspace(1.0, end, 800)
         c = len(point.axes)
@@ -120,8 +123,6 @@ def machine_sensitivity_picture(
             ax.axhspan(low, high, color=colour, alpha=0.08)
             ax.text(f[-1], np.sqrt(max(low, 0.5) * high), f" {name}", va="center", fontsize="small")
         ax.set_ylim(1e-2, top)
-        stable = "" if point.stable else ", unstable: no zones"
-        ax.set_title(f"{point.speed:g} rpm{stable}")
         ax.set_xlabel("frequency, Hz")
         ax.set_ylabel("|S|")
         ax.grid(True, alpha=0.3)

@@ -28,17 +28,18 @@ def unbalance_picture(
     highest operating speed, rpm.
     """
     speeds = found.speeds
-    radial = [k for k, axis in enumerate(case.axes) if np.abs(found.sensors[:, k]).max() > 0]
+    radial = [k for k, axis in enumerate(case.axes) if not axis.endswith(".z")]
     drive = case.cases[0].scenario.drive
     figure = Figure(figsize=(11.0, 9.0), layout="constrained")
     top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=[2, 1, 1])
     for k in radial:
         line = top.semilogy(speeds, 2e6 * np.abs(found.sensors[:, k]), label=f"{case.axes[k]}, sensor")[0]
-        if not np.allclose(found.sensors[:, k], found.magnets[:, k]):
+        if not np.allclose(found.sensors[:, k], found.magnets[:, k], equal_nan=True):
             top.semilogy(speeds, 2e6 * np.abs(found.magnets[:, k]), ":", color=line.get_color(), label="at its magnet")
         middle.plot(speeds, np.abs(found.current[:, k]), label=case.axes[k])
         bottom.plot(speeds, np.abs(found.command[:, k]))
-    largest = 2e6 * np.abs(found.sensors[1:, radial]).max()
+    sizes = 2e6 * np.abs(found.sensors[1:, radial])
+    largest = float(sizes.max(where=np.isfinite(sizes), initial=1e-3))
     top.set_ylim(largest * 1e-3, max(3 * largest, 40.0))
     top.semilogy(speeds[1:], 1e6 * a1_limit(speeds[1:]), "k--", linewidth=1.0, label="A1 of API 684")
     for one in criticals:

@@ -75,8 +75,6 @@ def sensitivity(case: Case, r: float = 0.0) -> Analysis:
     Raises ValueError as `linearise` does.
     """
     require_case(case)
-    if np.ndim(r) or np.asarray(r).dtype.kind not in "iuf":
-        raise ValueError(f"r = {r!r}: it must be a number, the reference in m.")
     return operating_point(case, "nominal", r).analysis
 
 

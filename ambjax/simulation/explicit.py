@@ -99,7 +99,7 @@ class Euler(_Explicit):
     ROWS = ((1.0,),)
 
     def __str__(self) -> str:
-        return f"explicit Euler, {self.substeps} substeps"
+        return f"explicit Euler, {self.steps}"
 
 
 @record
@@ -114,7 +114,7 @@ class RK4(_Explicit):
     ROWS = ((1 / 2,), (0.0, 1 / 2), (0.0, 0.0, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6))
 
     def __str__(self) -> str:
-        return f"RK4, {self.substeps} substeps"
+        return f"RK4, {self.steps}"
 
 
 @record
@@ -156,7 +156,7 @@ class DOP853(_Explicit):
     # fmt: on
 
     def __str__(self) -> str:
-        return f"DOP853, {self.substeps} substeps"
+        return f"DOP853, {self.steps}"
 
 
 @record

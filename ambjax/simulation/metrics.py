@@ -95,6 +95,8 @@ class Metrics:
         `settle`: start of the evaluation of the settled metrics, s. The ratios of the bands are those of the plant of
         Table 1: 4e-4 of the size of sigma, 4e-5 of the size of v, and 4e-3 of i_0.
         """
+        if not isinstance(scenario, Scenario):
+            raise ValueError(f"scenario = {scenario!r}: it must be a Scenario, such as `case.scenario`.")
         plant, usual, paper = scenario.plant, Metrics(), Plant()
         return Metrics(
             settle,
@@ -108,7 +110,12 @@ class Metrics:
 
     @classmethod
     def for_case(cls, case: SettledCase) -> "Metrics":
-        """Return the metrics for a case of `read_case`: `Metrics.of` with its settling time and its scenario."""
+        """Return the metrics for a case of `read_case`: `Metrics.of` with its settling time and its scenario.
+
+        Raises ValueError for anything else.
+        """
+        if not (hasattr(case, "settle") and hasattr(case, "scenario")):
+            raise ValueError(f"case = {type(case).__name__}: it must be a Case, as ambjax.read_case(PATH) returns it.")
         return Metrics.of(case.settle, case.scenario)
 
     def _folds(self) -> Named:

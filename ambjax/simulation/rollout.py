@@ -1,8 +1,6 @@
 """Rollout: the simulation of a cascade in a scenario. It returns a trajectory, the result of a fold, or both."""
 
-import dataclasses
 import functools
-import numbers
 from typing import Any, NamedTuple, Protocol, Self, TypeVar, cast
 
 import jax
@@ -11,8 +9,8 @@ from jax import Array, lax
 
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.control.cascade import Cascade
-from ambjax.control.stages import STAGES
-from ambjax.numerics.records import Scalar, canonical, validate
+from ambjax.numerics.records import Scalar, canonical
+from ambjax.numerics.shapes import require_one_member
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Ending, Fold
 from ambjax.simulation.integrate import Advanced, Integrator, choose
@@ -20,7 +18,7 @@ from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.method import with_method
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.span import Span
-from ambjax.simulation.system import check_parts, system_of
+from ambjax.simulation.system import check_inputs, check_recording, system_of
 from ambjax.simulation.trajectory import ALIVE, Row, Trajectory, first_time
 from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
@@ -106,7 +104,10 @@ def rollout(
 
     Raises ValueError for an invalid gain, parameter or clock, and as `with_method` does.
     """
-    loop, clock, fold = canonical((*prepare(cascade, scenario, clock), fold))
+    loop, clock = prepare(cascade, scenario, clock)
+    check_recording(fold, record_every)
+    require_one_member({"controller": cascade, "scenario": scenario, "clock": clock})
+    loop, clock, fold = canonical((loop, clock, fold))
     return roll(loop, clock, fold, record_every=record_every)
 
 
@@ -118,30 +119,6 @@ def prepare(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[ClosedL
     check_inputs(cascade, scenario, clock)
     clock = with_method(clock, cascade, scenario)
     return system_of(cascade, scenario, clock), clock
-
-
-def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
-    """Raise ValueError for an invalid value that is not traced. The message gives its path and a correction.
-
-    Traced values are not checked.
-    """
-    for name, value, kind in (("cascade", cascade, Cascade), ("scenario", scenario, Scenario), ("clock", clock, Clock)):
-        if not isinstance(value, kind):
-            raise ValueError(f"{name} = {type(value).__name__}: it must be a {kind.__name__}.")
-    for stage, base in STAGES.items():
-        law = getattr(cascade, stage)
-        if not isinstance(law, base):
-            raise ValueError(
-                f"controller.{stage} = {type(law).__name__}: it is not a law of this stage. Derive the class from "
-                f"ambjax.extend.{base.__name__}."
-            )
-    validate(dataclasses.replace(cascade, processor=None), "controller")
-    validate(cascade.processor, "processor")
-    check_parts(cascade, scenario, clock.sample_period)
-    validate(scenario, "scenario")
-    validate(clock, "clock")
-    if not isinstance(clock.samples, numbers.Integral) or clock.samples < 1:
-        raise ValueError(f"clock.samples = {clock.samples}: it must be a whole number of at least 1.")
 
 
 def run(system: System, clock: Clock, fold: Fold | None, record_every: int) -> Result:

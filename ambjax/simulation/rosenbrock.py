@@ -58,7 +58,7 @@ class Rodas3(FixedSteps):
         return new, span.with_instant(here, h / 2, h).with_instant(there, h / 2)
 
     def __str__(self) -> str:
-        return f"RODAS3 (L-stable Rosenbrock), {self.substeps} substeps"
+        return f"RODAS3 (L-stable Rosenbrock), {self.steps}"
 
 
 @record

@@ -1,15 +1,61 @@
 """The closed loop of a case, in continuous time or on a processor."""
 
+import dataclasses
+from typing import Any
+
+import jax
 import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState
 from ambjax.control.guard import simulated
-from ambjax.numerics.records import Scalar, is_traced
+from ambjax.control.stages import STAGES
+from ambjax.numerics.declared import require_number
+from ambjax.numerics.records import Scalar, is_traced, validate
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.sampled import Sampled
 from ambjax.world.scenario import Scenario
+
+
+def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
+    """Raise ValueError for an invalid value that is not traced. The message gives its path and a correction.
+
+    Traced values are not checked.
+    """
+    for name, value, kind in (("cascade", cascade, Cascade), ("scenario", scenario, Scenario), ("clock", clock, Clock)):
+        if not isinstance(value, kind):
+            raise ValueError(f"{name} = {type(value).__name__}: it must be a {kind.__name__}.")
+        require_records(name, value)
+    for stage, base in STAGES.items():
+        law = getattr(cascade, stage)
+        if not isinstance(law, base):
+            raise ValueError(
+                f"controller.{stage} = {type(law).__name__}: it is not a law of this stage. Derive the class from "
+                f"ambjax.extend.{base.__name__}."
+            )
+    validate(dataclasses.replace(cascade, processor=None), "controller")
+    validate(cascade.processor, "processor")
+    check_parts(cascade, scenario, clock.sample_period)
+    validate(scenario, "scenario")
+    validate(clock, "clock")
+    require_number("clock.samples", clock.samples, 1, whole=True)
+
+
+def require_records(name: str, node: Any) -> None:
+    """Raise ValueError if a part of the record `node` is a number, a text, a class or a function."""
+    for field in dataclasses.fields(node):
+        value, usual = getattr(node, field.name), field.default
+        if not (field.metadata.get("leaf") or field.metadata.get("static")) and jax.tree_util.all_leaves([value]):
+            like = f", such as {type(usual).__name__}()" if dataclasses.is_dataclass(usual) else ""
+            raise ValueError(f"{name}.{field.name} = {value!r}: it must be a record{like}.")
+
+
+def check_recording(fold: object, record_every: object) -> None:
+    """Raise ValueError for arguments of `rollout` that are not a fold, or not a number of samples."""
+    if fold is not None and (isinstance(fold, type) or not hasattr(fold, "init")):
+        raise ValueError(f"fold = {fold!r}: it must be a fold, such as ambjax.Metrics.for_case(case), or None.")
+    require_number("record_every", record_every, 0, whole=True)
 
 
 def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> None:
@@ -75,7 +121,10 @@ def _check_laws(cascade: Cascade, sample_period: Scalar) -> None:
 
 def system_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> ClosedLoop | Sampled:
     """Return the closed loop of the cascade, in continuous time or on its processor."""
-    if not cascade.sampled:
-        return ClosedLoop(cascade, scenario)
+    return sampled_of(cascade, scenario, clock) if cascade.sampled else ClosedLoop(cascade, scenario)
+
+
+def sampled_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> Sampled:
+    """Return the closed loop of a cascade on its processor."""
     period = clock.sample_period
     return Sampled(ClosedLoop(simulated(cascade.on_processor(), scenario, period), scenario), period, clock.cuts)

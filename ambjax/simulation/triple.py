@@ -10,6 +10,7 @@ from ambjax.world.scenario import Scenario
 
 P = ParamSpec("P")
 R = TypeVar("R", covariant=True)
+PARTS = ("cascade", "scenario", "clock")
 
 
 class Triple(Protocol):
@@ -39,9 +40,18 @@ def takes_case(function: Callable[Concatenate[Cascade, Scenario, Clock, P], R]) 
 
     @functools.wraps(function)
     def called(*args: Any, **named: Any) -> R:
-        if args and all(hasattr(args[0], name) for name in ("cascade", "scenario", "clock")):
-            case = args[0]
-            args = (case.cascade, case.scenario, case.clock, *args[1:])
+        kinds = [type(x).__name__ for x in args]
+        if args and all(hasattr(args[0], name) for name in PARTS):
+            case, *others = args
+            whole = not any(isinstance(x, (Scenario, Clock)) for x in others)
+            args = (case.cascade, case.scenario, case.clock, *others)
+        else:
+            whole = len(args) + sum(name in named for name in PARTS) >= len(PARTS)
+        if not whole:
+            raise ValueError(
+                f"{function.__name__}({', '.join(kinds)}): give a case, as ambjax.read_case(PATH) returns it, or a "
+                "Cascade, a Scenario and a Clock."
+            )
         return function(*args, **named)
 
     return cast(TakesCase[P, R], called)

@@ -387,8 +387,8 @@ class ContinuousMachine(WholeState, Machine):
     def demands(self, t: Scalar, state: MachineState, errors: Sequence[object]) -> Groups:
         if self.law is None:
             return super().demands(t, state, errors)
-        own, sensed = self.each(lambda axis: axis.inputs(t)), tuple(one.plant for one in self.at_sensors(state))
-        found = demanded_now(self, self.rotor.speed_at(t), own, sensed, state.law, errors)[0]
+        own = self.each(lambda axis: axis.inputs(t))
+        found = demanded_now(self, self.rotor.speed_at(t), own, self.at_sensors(state), state.law, errors)[0]
         return tuple((one,) for one in found)
 
     def problem(self, errors: Sequence[object]) -> InitialValueProblem:
@@ -399,10 +399,11 @@ class ContinuousMachine(WholeState, Machine):
 
         def observed(inputs: Any, state: MachineState) -> tuple[MachineState, Instant]:
             outside, own = inputs
-            sensed, law = tuple(one.plant for one in self.at_sensors(state)), ()
+            sensing, law = self.at_sensors(state), ()
             demands: Groups = (None,) * len(self.groups)
             if self.law is not None:
-                demands, law = demanded_now(self, outside[1], own, sensed, state.law, errors)
+                demands, law = demanded_now(self, outside[1], own, sensing, state.law, errors)
+            sensed = tuple(one.plant for one in sensing)
             observe = lambda axis, *now: axis.observed(*now)  # noqa: E731
             parts = self.each(observe, own, self.at_magnets(state), errors, sensed, demands)
             return self.coupled(outside, state, [rates for rates, _ in parts], law), self.join([x for _, x in parts])

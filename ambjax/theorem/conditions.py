@@ -20,7 +20,8 @@ from ambjax.control.stages import PositionLaw
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Lowest, Named, Peak
-from ambjax.simulation.rollout import check_inputs, prepare, roll
+from ambjax.simulation.rollout import prepare, roll
+from ambjax.simulation.system import check_inputs
 from ambjax.simulation.trajectory import STALLED, STATUSES
 from ambjax.simulation.triple import takes_case
 from ambjax.theorem.causes import Cause

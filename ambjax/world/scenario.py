@@ -86,8 +86,8 @@ class Scenario:
     stop: Stop | None = part(
         default=None, doc="the touchdown bearing at the clearance; None: a rotor that reaches the clearance is lost"
     )
-    seed: Scalar = leaf(default=0, at_least=0, at_most=2**32 - 1, doc="seed of the noise")
-    member: Scalar = leaf(default=0, at_least=0, at_most=2**32 - 1, doc="member of an ensemble")
+    seed: Scalar = leaf(default=0, at_least=0, at_most=2**32 - 1, whole=True, doc="seed of the noise")
+    member: Scalar = leaf(default=0, at_least=0, at_most=2**32 - 1, whole=True, doc="member of an ensemble")
 
     @property
     def touchdown(self) -> Scalar:
