@@ -121,11 +121,11 @@ def parser() -> Parser:
     export = command("export", summary, case=True, out=True)
     parts = ["controller", "plant", "loop"]
     export.add_argument("--what", choices=parts, default="controller", help="part to export (default: controller)")
-    export.add_argument("--format", choices=["c", "fmu"], default="c", help="a C package or an FMU (default: c)")
+    export.add_argument("--format", choices=["c", "fmu", "js"], default="c", help="C, FMU or JavaScript (default: c)")
     export.add_argument("--fmi", type=int, choices=[2, 3], help="version of FMI, with --format fmu (default: 3)")
     meaning = "compile the C and compare it with JAX; exit code 1 if they differ"
     export.add_argument("--verify", action="store_true", help=meaning)
-    meaning = "C type of all numbers of a C package (default: float); an FMU always has double"
+    meaning = "C type of all numbers of a C package (default: float); the other formats have double"
     export.add_argument("--precision", choices=["float", "double"], help=meaning)
     export.add_argument("--prefix", metavar="NAME", help="prefix of all names in the C code (default: the case's name)")
     page = command("page", "write one HTML file with sliders that runs the loop of a case in a browser", case=True)

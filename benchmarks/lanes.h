@@ -25,7 +25,9 @@
 #define BYTES 32
 #endif
 #define LANES ((int)(BYTES / sizeof(REAL)))
+#ifndef CHAINS
 #define CHAINS 2
+#endif
 #define GROUP (CHAINS * LANES)
 #define BLOCK 256 /* members per block: their state fits the first-level cache */
 #define INLINE static inline __attribute__((always_inline))

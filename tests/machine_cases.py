@@ -88,7 +88,8 @@ MACHINES = {
         "unbalance": [{"at": 0.1, "amount": 60.0, "phase": 30.0}, {"at": -0.2, "amount": 40.0, "phase": -100.0}],
         "clock": CLOCK,
     },
-    # two bending modes, sensors 15 mm outside the magnets; an unbalance and a pulse of force that act on the modes
+    # two bending modes, sensors 15 mm outside the magnets; an unbalance and a pulse of force that act on the modes;
+    # the base shakes, at a slant and with a pulse
     "bending": {
         "plant": RIG,
         "rotor": SHORT
@@ -109,6 +110,10 @@ MACHINES = {
                 "at": 0.0, "direction": [0.0, 1.0, 0.0], "modes": [0.62, 0.01],
                 "kind": "pulse", "amplitude": 20.0, "start": 0.002, "stop": 0.00303,
             }
+        ],
+        "base": [
+            {"direction": [3.0, -4.0, 0.0], "kind": "sine", "amplitude": 2.0, "frequency": 80.0},
+            {"direction": [0.0, 1.0, 0.5], "kind": "pulse", "amplitude": 3.0, "start": 0.00601, "stop": 0.009},
         ],
         "initial": {"q": [1e-5, 1e-5, 0.0, 2e-5, 2e-5]},
         "clock": CLOCK,

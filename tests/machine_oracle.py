@@ -9,6 +9,7 @@ rules are those of `sampled_oracle`; the rotor couples the axes. Readings of the
 - coordinates: x, y, z, beta_x, beta_y, then for each mode its x and its y; those that [initial] omits are 0.
 - initial.i is a number for all axes or one for each. q' = 0; u = 0 before the first voltage; r = 0.
 - a load's direction is made a unit vector. A step or pulse jumps at its edges, where a substep ends.
+- the base's acceleration, along such a direction, acts as -M times it on the coordinates, which are relative to it.
 - a row's u is within +-u_max; i_ref is that before the step, and that of a law without a start its first one.
 - an axis is lost at |z_k| >= clearance (0.9 s_0 of the axis), not at a radius; later rows are NaN.
 - there is no guard of the readings: the cases switch it off.
@@ -101,6 +102,9 @@ class World:
         for one in () if still else case.get("load", ()):
             way = np.array(one["direction"]) / np.linalg.norm(one["direction"])
             self.loads.append((one, row(way, one["at"], one.get("modes", []), modes)))
+        for one in () if still else case.get("base", ()):
+            way = np.array(one["direction"]) / np.linalg.norm(one["direction"])
+            self.loads.append((one, -parts.M * np.append(way, np.zeros(n - 3))))
         initial = case.get("initial", {})
         q = np.zeros(n)
         q[: len(initial.get("q", ()))] = initial.get("q", ())

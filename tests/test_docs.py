@@ -12,7 +12,7 @@ import re
 
 import numpy as np
 import pytest
-from reference import benchmarks, case_file, commands, metrics, site
+from reference import benchmarks, case_file, commands, metrics, page_outputs, site
 
 import ambjax
 from ambjax.__main__ import main
@@ -239,3 +239,16 @@ def test_the_committed_tables_are_current(name):
     path = site.FOLDER / name
     assert path.exists(), "run: python docs/reference/site.py"
     assert path.read_text(encoding="utf-8") == site.tables()[name], "run: python docs/reference/site.py"
+
+
+@pytest.mark.parametrize("name", [*page_outputs.PAGES, page_outputs.GALLERY])
+def test_the_committed_outputs_are_those_of_the_cells(name):
+    assert page_outputs.outdated(name) == [], "run: python docs/reference/page_outputs.py"
+    assert not re.search(r"/(tmp|work|root|home|Users)/", (ROOT / "docs" / f"{name}.md").read_text())
+
+
+def test_the_gallery_links_sections_and_its_pictures_are_small():
+    for page, anchor in re.findall(r"\(([\w-]+)\.md#([\w-]+)\)", (ROOT / "docs" / "gallery.md").read_text()):
+        titles = re.findall(r"^#+ (.+)$", (ROOT / "docs" / f"{page}.md").read_text(), flags=re.MULTILINE)
+        assert anchor in {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}, (page, anchor)
+    assert sum(path.stat().st_size for path in page_outputs.PICTURES.iterdir()) < 1e6  # bytes

@@ -11,6 +11,8 @@ from test_export_blocks import CASES
 from test_export_emitter import EDGES, LOOSE, listed
 
 from ambjax import rollout
+from ambjax.__main__ import main
+from ambjax.cases.template_text import template as case_template
 from ambjax.codegen.block import Block
 from ambjax.codegen.javascript.script import HELPERS, script, script_of
 from ambjax.codegen.of_case import blocks_of
@@ -95,6 +97,22 @@ def test_one_step_equals_jax(what, tmp_path):
     # the same operations in the same order: what differs are exp and its like, by units in the last place
     assert np.all(same | (off < 1e-14))
     np.testing.assert_array_equal(found[-1], should.bits)
+
+
+@pytest.mark.slow
+def test_the_command_writes_the_controller_and_refuses_what_javascript_has_not(tmp_path, capsys):
+    one, out = tmp_path / "new.toml", tmp_path / "js"
+    one.write_text(case_template("rig"))
+    for _ in range(2):  # its own file is replaced
+        assert main(["export", str(one), "--format", "js", "--out", str(out)]) == 0
+    text = (out / "amb_new.js").read_text()
+    run = "const y = new Float64Array(4), s = amb_new.start();\nconst run = x => {"
+    run += " amb_new.step(amb_new.values(), s, x, y); return y; };\n"
+    (found,) = run_rows(text + run, np.array([[1e-5, 0, 0, 0, 0, 0, 0]]), tmp_path)
+    assert found[0] < 0  # the rotor is above the reference: the voltage pulls it down
+    for option in (["--verify"], ["--precision", "float"]):
+        assert main(["export", str(one), "--format", "js", *option]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) >= 2
 
 
 LOOP = """

@@ -1,6 +1,7 @@
 """Ensembles of whole machines: each member is a machine of its own."""
 
 import copy
+import dataclasses
 import json
 import tomllib
 
@@ -8,9 +9,12 @@ import numpy as np
 import pytest
 
 from ambjax.__main__ import main
-from ambjax.cases.machine_case import machine_from
+from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.machine_spread import rotor_places, varied_rotor
 from ambjax.cases.template_text import template
+from ambjax.ensemble.worker import chunk
+from ambjax.linear import machine_sensitivity
+from ambjax.results.case_map import study_and_axes, survival_map
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.spread_runs import simulate_members, study_of
 
@@ -59,17 +63,23 @@ def test_members_are_machines():
 def test_numbers_of_the_rotor():
     raw = copy.deepcopy(MACHINE)
     raw["rotor"] |= {"kind": "modal", "modes": [{"frequency": 80.0, "damping": 0.01}, {"frequency": 300.0}]}
+    raw["base"] = [{"direction": [2.0, 0.0, 0.0], "kind": "constant", "value": 1.0}]
     for bearing in raw["bearing"][:2]:
         bearing |= {"modes": [0.5, 0.4], "sensor_modes": [0.4, 0.2]}
     rotor = machine_from(raw).machine.rotor
     values = {"rotor.m": 3.0, "rotor.I_t": 0.07, "rotor.I_p": 1e-3, "rotor.modes.1.frequency": 250.0}
     values |= {"rotor.modes.0.damping": 0.02, "unbalance.0.amount": 7.0, "load.0.start": 0.2, "rotor.speed": 10.0}
+    values |= {"base.0.value": 5.0}
     other = varied_rotor(rotor, values)
     nominal, found = rotor_places(rotor), rotor_places(other)
     for path, place in found.items():
         assert float(np.asarray(place.value)) == pytest.approx(values.get(path, float(np.asarray(nominal[path].value))))
     # the weight follows the mass; a free bending mode has the given frequency and damping
     assert np.asarray(other.gravity)[1] == pytest.approx(-9.81 * 3.0)
+    still = dataclasses.replace(other, speed=0.0)  # no unbalance
+    np.testing.assert_allclose(still.forces(0.0)[:3], [-5.0 * 3.0, -9.81 * 3.0, 0.0], rtol=1e-12)
+    thin = varied_rotor(varied_rotor(rotor, {"rotor.I_p": 0.0}), {"rotor.I_p": 2e-3})
+    assert (thin.G[3, 4], thin.G[4, 3]) == (2e-3, -2e-3)
     k = other.K[7, 7] / other.M[7, 7]
     assert np.sqrt(k) == pytest.approx(2 * np.pi * 250)
     assert other.D[5, 5] == pytest.approx(2 * 0.02 * 2 * np.pi * 80)
@@ -112,3 +122,83 @@ def test_command(tmp_path, capsys):
     assert alone["rms_error_m"] == pytest.approx(columns["rms_error_m"][2], rel=1e-6)
     speed = np.load(tmp_path / "s" / "trajectory.npz")["speed_rpm"][0]
     assert speed == pytest.approx(columns["spread.rotor.speed"][2])
+
+
+AREAS = "\n[spread]\nplant.A = { percent = 10 }\n"
+SHORT = [("duration = 0.2", "duration = 1e-3"), ("settle = 0.05", "settle = 0.0")]
+
+
+@pytest.fixture
+def files(tmp_path):
+    """Return a function that writes the template with replaced text to a file, and returns its path."""
+
+    def written(name, *changes, end=""):
+        text = template("machine")
+        for old, new in (*SHORT, *changes):
+            assert old in text
+            text = text.replace(old, new)
+        (tmp_path / name).write_text(text + end)
+        return str(tmp_path / name)
+
+    return written
+
+
+@pytest.mark.slow  # compiles the rollout of the ensemble, and the linear analysis
+def test_compare(files, tmp_path):
+    still = ("speeds = [0.0, 6000.0, 12000.0]", "speeds = [0.0]")
+    soft = ("[processor]", "c = 150.0\n\n[processor]")
+    paths = [files("one.toml", still, end=AREAS), files("two.toml", still, soft, end=AREAS)]
+    code = main(["compare", *paths, "--members", "3", "--out", str(tmp_path / "c")])
+    summary = json.loads((tmp_path / "c" / "compare.json").read_text())
+    for row, one in zip(summary["cases"], map(read_machine, paths), strict=True):
+        errors = chunk(study_of(one, 0, 3), 0, 3, 3)["settled_rms_error_m"]
+        point = machine_sensitivity(one.machine, one.axes, 5e-5, 0.0, one.zones)
+        assert row["rms_error_median_m"] == np.median(errors)
+        assert {name: own["peak"] for name, own in row["axes"].items()} == {a.name: a.S.height for a in point.axes}
+        assert row["worst_at"] == f"{point.worst.name} at 0 rpm"
+        for key in ("max_u_V", "max_i_A", "max_error_m"):
+            assert row[key] == max(own[key] for own in row["axes"].values())
+    assert summary["cases"][0]["peak"] != summary["cases"][1]["peak"]
+    assert summary["differences"] == []
+    assert code == 0
+    assert (tmp_path / "c" / "compare.png").exists()
+
+
+@pytest.mark.slow  # compiles the rollout of the cells
+def test_a_cell_of_a_map_is_a_machine(files):
+    x, y = "rotor.speed=6000:30000:2", "initial.q.1=-3e-5:6e-5:2"
+    found = survival_map(read_machine(files("m.toml")), x, y).map
+    other = files("o.toml", ("speed = 6000.0", "speed = 30000.0"), ("q = [2e-5, -3e-5,", "q = [2e-5, 6e-5,"))
+    for path, cell in ((files("m.toml"), (0, 0)), (other, (1, 1))):
+        alone = simulate_machine(read_machine(path)).metrics
+        assert found.error[cell] == pytest.approx(alone["settled_max_abs_error_m"], rel=1e-6)
+    assert found.survival.min() == 1
+    assert found.unstable.max() == 0
+
+
+def test_axes_of_a_map(files):
+    path = files("m.toml", end=AREAS)
+    study, x, y = study_and_axes(read_machine(path), "plant.A=-10%:10%:2", "rotor.speed=0:4e6:2", 2, None)
+    # one value for all axes, which replaces the spread; the steps resolve the fastest rotor
+    assert study.parts(x.path) == tuple(f"bearing.{axis}.plant.A" for axis in study.case.axes)
+    assert len(study.parts("bearing.left.plant.A")) == 2
+    assert study.parts(y.path) == ("rotor.speed",)
+    assert study.clock.method.substeps > study_of(read_machine(path), None, 2).clock.method.substeps
+    halved = study.at_period(2.5e-5)
+    assert halved.clock.samples == 2 * study.clock.samples
+    for bad, words in (("plant.m=1:2", "Spread rotor.m"), ("rotor.speed=-1e9:0", "rotor.speed must be")):
+        with pytest.raises(ValueError, match=words):
+            study_and_axes(read_machine(path), bad, "initial.q.0=0:1e-5", 1, None)
+
+
+def test_compare_refuses(files, tmp_path, capsys):
+    machine, axis = files("m.toml"), tmp_path / "axis.toml"
+    axis.write_text(template("rig"))
+    other = files("n.toml", end="\n[spread]\nplant.A = { percent = 1 }\n")
+    for argv, words in (
+        ([machine, str(axis)], "Compare cases of one kind"),
+        ([machine, other, "--tune"], "--tune: a machine"),
+        ([machine, other], "Give both cases the same [spread]"),
+    ):
+        assert main(["compare", *argv, "--out", str(tmp_path / "no")]) == 2
+        assert words in capsys.readouterr().err

@@ -12,6 +12,7 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.commands import map as commands
 from ambjax.ensemble import Normal, Spread, maps, wilson
+from ambjax.ensemble import study as studies
 from ambjax.ensemble.maps import Axis, grid
 from ambjax.ensemble.study import Study
 from ambjax.laws import inversion
@@ -127,7 +128,7 @@ X, Y = "initial.z=-1e-5:1e-5:3", "initial.z_dot=-1e-3:1e-3:3"
     ],
 )
 def test_bad_axes_are_refused_in_one_line(x, y, words, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(maps, "run_ensemble", None)  # before anything is computed
+    monkeypatch.setattr(studies, "run_ensemble", None)  # before anything is computed
     pulse = '[disturbance.q_z]\nkind = "pulse"\namplitude = 0.1\nstart = 0.1\nstop = 0.2\n'
     (tmp_path / "case.toml").write_text(CASE.replace("settle = 1e-3", "settle = 1.5e-3") + pulse)
     out = tmp_path / "out"
@@ -146,7 +147,7 @@ def test_bad_axes_are_refused_in_one_line(x, y, words, tmp_path, capsys, monkeyp
     ],
 )
 def test_the_axes_are_checked_for_every_case_before_any_run(x, y, words, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(maps, "run_ensemble", None)
+    monkeypatch.setattr(studies, "run_ensemble", None)
     rounded = CASE + "[processor]\n[sensor]\nbits = 12\n"
     sine = rounded + '[reference]\nkind = "sine"\namplitude = 1e-5\nfrequency = 2.0\n'
     for name, text in (("one", sine), ("two", rounded)):
@@ -219,7 +220,7 @@ def test_the_command_states_the_drawn_outlines_and_the_undecided_cells(tmp_path,
     said = capsys.readouterr()
     assert "one member does not draw the [spread]; --members 2" in said.err
     assert "case: nominal: no quantity is drawn" in said.out
-    run = maps.run_ensemble
+    run = studies.run_ensemble
 
     def stalling(*args, **options):
         outcome = run(*args, **options)
@@ -227,7 +228,7 @@ def test_the_command_states_the_drawn_outlines_and_the_undecided_cells(tmp_path,
         status = {"lost_at_s": np.where(first, 1e-3, np.inf), "stalled": first}
         return outcome._replace(metrics=outcome.metrics | status)
 
-    monkeypatch.setattr(maps, "run_ensemble", stalling)
+    monkeypatch.setattr(studies, "run_ensemble", stalling)
     assert main([*argv, "--members", "2"]) == 0
     text = capsys.readouterr().out
     assert "case: drawn for each member: plant.m" in text

@@ -65,6 +65,46 @@ def test_every_number_reads_back_from_the_case_file(case):
         assert document == values[k], one.path
 
 
+LISTS = """
+plant = { m = 5.0, s_0 = 8e-4 }
+[[disturbance.q_z]]
+kind = "constant"
+unit = "N"
+value = 1.0
+[[disturbance.q_z]]
+kind = "sine"
+amplitude = 0.5
+frequency = 50.0
+[[disturbance.q_z]]
+kind = "sine"
+unit = "N"
+amplitude = 2.0
+frequency = 20.0
+[reference]
+kind = "sum"
+terms = [{ kind = "constant", value = 1e-5 }, { kind = "sine", amplitude = 1e-5, frequency = 10.0, phase = 0.5 }]
+[controller.position]
+k = { over = "error", at = [0.0, 1e-5], values = [100.0, 200.0] }
+[processor]
+[clock]
+duration = 0.01
+"""
+
+
+def test_loads_in_a_list_schedules_omitted_gains_and_the_initial_state_have_sliders_that_set_them_in_the_file():
+    case = rig(LISTS)
+    given, (lines,) = html_page._written(case, [])
+    written = {"disturbance.q_f.terms.1.amplitude", "disturbance.q_z.phase", "reference.terms.1.phase"}
+    assert {one.path for one in given} >= written | {
+        "controller.position.k.1", "controller.position.c", "controller.current.k_i", "initial.z", "plant.m"
+    }  # fmt: skip
+    values, expected = [one.value for one in given], parameter_values(case)
+    for k, one in enumerate(given):
+        if one.path.startswith(("disturbance.", "reference.", "controller.", "initial.")):
+            values[k] = expected[one.parameter] = moved(one)
+    np.testing.assert_array_equal(parameter_values(rig(filled(lines, given, values))), expected)
+
+
 def test_a_changed_plant_does_not_change_the_controller_s_model(case):
     (mass,) = (one for one in sliders(case, []) if one.path == "plant.m")
     lines, _ = editable_lines(case.text, [mass])
@@ -139,12 +179,17 @@ def tuned():
 
 
 @pytest.fixture(scope="module")
-def tab(case, tuned, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("page")
-    (folder / "page.html").write_text(page(case, [tuned], f"{HOSTILE}.toml"), encoding="utf-8")
-    with browser.browser(folder) as tab:
+def written(case, tuned, tmp_path_factory):
+    path = tmp_path_factory.mktemp("page") / "page.html"
+    path.write_text(page(case, [tuned], f"{HOSTILE}.toml"), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def tab(written, tmp_path_factory):
+    with browser.browser(tmp_path_factory.mktemp("profile")) as tab:
         tab.size(1280)
-        tab.open(folder / "page.html")
+        tab.open(written)
         settled(tab)
         yield tab
 
@@ -304,6 +349,27 @@ def test_the_drawing_of_the_machine_shows_the_selected_time(fresh):
     assert fresh.run(drawing) != begin
     z = 1e6 * signal(fresh, "z")[-1]
     assert f"Rotor at {z:.2f} micrometres" in fresh.run(drawing)
+
+
+@in_browser
+def test_no_curve_is_visible_before_the_first_run(written, tmp_path):
+    with browser.browser(tmp_path) as tab:
+        tab.call("Page.addScriptToEvaluateOnNewDocument", source="window.Worker = class { postMessage() {} }")
+        tab.open(written)
+        tab.wait("window.ambjax && ambjax.state.sent > 0")
+        assert tab.run("document.getElementById('status').textContent").startswith("Computing")
+        visible = "one => one.checkVisibility({ visibilityProperty: true })"
+        assert not tab.run(f"[...document.querySelectorAll('.plot > div')].some({visible})")
+
+
+@in_browser
+def test_curves_are_visible_after_a_run_and_the_page_ends_with_its_content(fresh):
+    shown = (
+        "[...document.querySelectorAll('.plot > div')].every(one => one.checkVisibility({visibilityProperty: true}))"
+    )
+    assert fresh.run(shown)
+    end = "document.querySelector('main').getBoundingClientRect().bottom + scrollY"
+    assert fresh.run(f"document.documentElement.scrollHeight - ({end})") < 20
 
 
 @in_browser

@@ -59,6 +59,17 @@ def test_the_speeds_of_the_sensitivity_are_first_last_and_largest():
     assert machine(speed=speed).speeds == pytest.approx((0.0, 3000.0, 6000.0))
 
 
+@pytest.mark.parametrize("read", [machine_from, case_from])
+def test_a_table_has_no_rate_that_varies(read):
+    raw = MACHINES["rigid"] if read is machine_from else {"rotor": {}}
+    turning = raw["rotor"] | {"speed": {"times": TIMES, "rpm": RPM}}
+    spread = {"rotor": {"acceleration": {"uniform": [0.0, 1.0]}}}
+    with pytest.raises(ValueError, match=r"spread.rotor.acceleration.*The table rotor.speed gives it"):
+        read(raw | {"rotor": turning, "spread": spread})
+    shifted = read(raw | {"rotor": turning, "spread": {"rotor": {"speed": {"uniform": [0.0, 9.0]}}}})
+    assert shifted.spread.paths == ("rotor.speed",)
+
+
 @pytest.mark.parametrize("times", [[0.0], [0.0, 0.0], [1.0, 0.5], [0.0, 1.0, 2.0]])
 def test_times_must_ascend_with_one_rpm_each(times):
     with pytest.raises(ValueError, match="ascending"):

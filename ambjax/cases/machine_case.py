@@ -1,10 +1,11 @@
-"""Reader of the case file of a whole machine: [rotor], [[bearing]], [[unbalance]], [[load]], and the common tables."""
+"""Reader of the case file of a whole machine: rotor, bearings, unbalances, loads, base, and the common tables."""
 
 import copy
 import dataclasses
 import math
 import pathlib
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +27,7 @@ from ambjax.cases.rotor_tables import (
 )
 from ambjax.cases.speed_table import SPEED
 from ambjax.cases.table import Table, load, show
+from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
 from ambjax.ensemble.spread import Spread
 from ambjax.linear.analysis import Zones
@@ -39,8 +41,9 @@ from ambjax.simulation.whole_machine import Machine, machine_of
 from ambjax.text.words import one_line
 from ambjax.world.rotation import known
 from ambjax.world.rotor import Rotor
+from ambjax.world.scenario import Scenario
 
-MACHINE_TABLES = ("rotor", "bearing", "unbalance", "load")
+MACHINE_TABLES = ("rotor", "bearing", "unbalance", "load", "base")
 # Product of step and angular frequency of a mode (or of nutation) at which the relative error of RK4 in one period is
 # below 1e-6.
 MODE = 0.1
@@ -75,6 +78,14 @@ class MachineCase:
     folder: pathlib.Path = pathlib.Path()
 
 
+AnyCase: TypeAlias = Case | MachineCase
+
+
+def first_axis(case: AnyCase) -> Case:
+    """Return a case of one axis, or that of the first axis of a machine: it has the tables that all axes share."""
+    return case if isinstance(case, Case) else case.cases[0]
+
+
 def read_machine(path: str | pathlib.Path) -> MachineCase:
     """Read and check the case file of a machine. Raises ValueError, one line, for an invalid file."""
     case = read_any(path)
@@ -87,7 +98,7 @@ def read_machine(path: str | pathlib.Path) -> MachineCase:
     return case
 
 
-def read_any(path: str | pathlib.Path) -> Case | MachineCase:
+def read_any(path: str | pathlib.Path) -> AnyCase:
     """Read and check a case file: of one axis, or of a whole machine. Raises ValueError, one line, as `read_case`."""
     require_file("path", path)
     path = pathlib.Path(path)
@@ -105,7 +116,7 @@ def machine_from(
     top = Table(raw)
     top.only([*TABLES, *MACHINE_TABLES[1:], "tune"])
     if "disturbance" in raw:
-        raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] instead.")
+        raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] or [[base]] instead.")
     body, bearings = body_from(top, folder), tables_of(top, "bearing")
     if not bearings:
         raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
@@ -130,7 +141,7 @@ def machine_from(
         _check_force(case, axis, force)
         cases.append(case)
     law, parts = law_from(top, rotor, bearings, cases, read, folder)
-    spread = machine_spread(top, rotor, axes, names, cases)
+    spread = machine_spread(top, rotor, q, axes, names, cases)
     if law is not None:
         refuse_unused(spread)
     fixed = not isinstance(raw.get("clock", {}).get("dt", "auto"), str)
@@ -139,7 +150,7 @@ def machine_from(
     coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
     return MachineCase(
         name=safe_name(name),
-        machine=_machine(rotor, cases, clock, q, law),
+        machine=machine_of_axes(rotor, parts_of(cases), clock, q, law),
         clock=clock,
         axes=tuple(axis.name for axis in axes),
         coordinates=coordinates,
@@ -153,8 +164,16 @@ def machine_from(
     )
 
 
-def _machine(rotor: Rotor, cases: list[Case], clock: Clock, q: np.ndarray, law: MachineLaw | None) -> Machine:
-    systems = [prepare(case.cascade, case.scenario, clock)[0] for case in cases]
+def parts_of(cases: Sequence[Case]) -> list[tuple[Cascade, Scenario]]:
+    """Return the laws and the scenario of each axis."""
+    return [(case.cascade, case.scenario) for case in cases]
+
+
+def machine_of_axes(
+    rotor: Rotor, parts: Sequence[tuple[Cascade, Scenario]], clock: Clock, q: Any, law: MachineLaw | None
+) -> Machine:
+    """Return the machine of a rotor and its axes. `q`: coordinates at t = 0. `law`: of the whole machine."""
+    systems = [prepare(*part, clock)[0] for part in parts]
     systems = [canonical(system if law is None else inner(system, law)) for system in systems]
     return machine_of(rotor, systems, jnp.asarray(q), law)
 
@@ -170,7 +189,7 @@ def _with_notches(
         raise ValueError('[controller.notch] acts on axes. Leave it out, or use controller.coordinates = "axes".')
     notch, phase = found
     speeds = notch_speeds(known(notch.rotor), notch, float(clock.duration))
-    machine = _machine(rotor, cases, clock, q, None)
+    machine = machine_of_axes(rotor, parts_of(cases), clock, q, None)
     gains = machine_notch_gains(machine, notch, speeds, clock.sample_period, phase)
     laws = [
         dataclasses.replace(case.cascade, notch=dataclasses.replace(notch, gains=own))
@@ -231,7 +250,8 @@ def _shares(rotor: Rotor) -> tuple[list[float], list[float]]:
     B, M, gravity = (np.asarray(x, np.float64) for x in (rotor.at_magnets, rotor.M, rotor.gravity))
     B = B[:, :RIGID]
     masses = 1 / np.sum(B * np.linalg.solve(M[:RIGID, :RIGID], B.T).T, 1)
-    return masses.tolist(), (np.linalg.pinv(B.T) @ -gravity[:RIGID]).tolist()
+    forces = np.linalg.pinv(B.T) @ -gravity[:RIGID]
+    return masses.tolist(), np.where(np.abs(forces) > 1e-12 * np.abs(forces).max(), forces, 0.0).tolist()
 
 
 def _check_force(case: Case, axis: BearingAxis, force: float) -> None:

@@ -3,7 +3,7 @@
 import dataclasses
 import pathlib
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -82,8 +82,37 @@ def bilinear(matrices: tuple[np.ndarray, ...], period: float) -> tuple[np.ndarra
     return 2 * P - np.eye(len(A)), period * P @ B, C @ P, D + period / 2 * C @ P @ B
 
 
-def lqg(top: Table, cases: list[Case], rotor: Rotor) -> StateSpaceLaw:
-    """Return the LQG of a rotor."""
+class LqgProblem(NamedTuple):
+    """The design of an LQG.
+
+    - `weights`: the numbers of `LqgWeights`, none left out. `speeds`: those of the designs, rpm.
+    - `models`: of the rotor at these speeds. `coils`: linear magnets and coils. `pole`: of the magnets, 1/s.
+    - `period`: sample period, s. `delay`: samples. `magnets`, `output`: fields of `StateSpaceLaw`.
+    """
+
+    weights: dict[str, float]
+    speeds: list[float]
+    models: list[RotorModel]
+    coils: LinearCoils
+    pole: float
+    period: float
+    delay: float
+    magnets: dict[str, Any]
+    output: str
+
+    def law(self, weights: dict[str, float]) -> StateSpaceLaw:
+        """Return the law with these weights. Raises ValueError if a Riccati equation has no solution."""
+        found = [design(one, self.coils, weights, self.pole, self.period, self.delay) for one in self.models]
+        first, names = found[0], [name for name in DesignedController._fields if name not in ("steady", "start")]
+        return StateSpaceLaw(
+            **{name: jnp.asarray(np.stack([getattr(one, name) for one in found])) for name in names},
+            steady=jnp.asarray(first.steady), start=jnp.asarray(first.start), sizes=jnp.ones(len(first.a)),
+            speeds=jnp.asarray(self.speeds), **self.magnets, inputs=CURRENTS, output=self.output,
+        )  # fmt: skip
+
+
+def lqg_problem(top: Table, cases: Sequence[Case], rotor: Rotor) -> LqgProblem:
+    """Return the design of the LQG of a rotor."""
     table = top.table("controller")
     table.only(["kind", "model", "lqg"])
     own, processor = table.table("lqg"), cases[0].cascade.processor
@@ -100,21 +129,20 @@ def lqg(top: Table, cases: list[Case], rotor: Rotor) -> StateSpaceLaw:
     weights = {field.name: getattr(given, field.name) for field in dataclasses.fields(LqgWeights)}
     weights |= {name: x for name, x in zip(weights, usual, strict=False) if weights[name] is None}
     speeds = _speeds(own, float(rotor.speed))
-    period, delay = float(cases[0].clock.sample_period), float(processor.delay)
-    try:
-        found = [design(_model(rotor, cases, count, speed), coils, weights, w, period, delay) for speed in speeds]
-    except ValueError as error:
-        raise ValueError(f"{own.path}: {error}. Change the weights, or the rotor's modes.") from None
-    tables = {
-        name: jnp.stack([getattr(one, name) for one in found])
-        for name in DesignedController._fields
-        if name not in ("steady", "start")
-    }
-    steady, start, n = jnp.asarray(found[0].steady), jnp.asarray(found[0].start), len(found[0].a)
-    return StateSpaceLaw(
-        **tables, steady=steady, start=start, sizes=jnp.ones(n), speeds=jnp.asarray(speeds), **magnets(cases, voltage),
-        inputs=CURRENTS, output=OUTPUTS[1 if voltage else 0],
+    return LqgProblem(
+        {name: float(x) for name, x in weights.items()}, speeds, [_model(rotor, cases, count, one) for one in speeds],
+        coils, w, float(cases[0].clock.sample_period), float(processor.delay), magnets(cases, voltage),
+        OUTPUTS[1 if voltage else 0],
     )  # fmt: skip
+
+
+def lqg(top: Table, cases: list[Case], rotor: Rotor) -> StateSpaceLaw:
+    """Return the LQG of a rotor."""
+    problem = lqg_problem(top, cases, rotor)
+    try:
+        return problem.law(problem.weights)
+    except ValueError as error:
+        raise ValueError(f"controller.lqg: {error}. Change the weights, or the rotor's modes.") from None
 
 
 def _speeds(table: Table, default: float) -> list[float]:
@@ -128,7 +156,7 @@ def _speeds(table: Table, default: float) -> list[float]:
     return speeds
 
 
-def _coils(cases: list[Case], voltage: bool) -> LinearCoils:
+def _coils(cases: Sequence[Case], voltage: bool) -> LinearCoils:
     """Return the linear magnets and coils at the current that carries the weight."""
     m, a, R, L, s_0 = (numbers(cases, name) for name in ("m", "a", "R", "L", "s_0"))
     models = [case.cascade.model for case in cases]
@@ -144,7 +172,7 @@ def _coils(cases: list[Case], voltage: bool) -> LinearCoils:
     return LinearCoils(m * a * dv_dz, m * a * dv_di, np.ones(len(m)), np.array(lags), np.zeros(len(m)))
 
 
-def _model(rotor: Rotor, cases: list[Case], count: int, speed: float) -> RotorModel:
+def _model(rotor: Rotor, cases: Sequence[Case], count: int, speed: float) -> RotorModel:
     """Return the model of the rotor with `count` bending modes at a speed, rpm."""
     B, C, M, D, K, G, gravity = (
         np.asarray(x, float)

@@ -83,3 +83,9 @@ def dampings_of(table: Table, default: np.ndarray) -> np.ndarray:
     for x in vector(table, "damping", len(default)):
         Table({"damping": float(x)}, table.path).leaf("damping", DAMPING)
     return vector(table, "damping", len(default))
+
+
+def row(at: float, direction: Any, shapes: np.ndarray) -> np.ndarray:
+    """Return the displacement [n] along `direction` of the shaft at `at` (m) per unit of each coordinate."""
+    x, y, z = direction
+    return np.concatenate([[x, y, z, -at * y, at * x], np.outer(shapes, [x, y]).ravel()])

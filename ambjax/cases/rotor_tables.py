@@ -1,6 +1,5 @@
-"""Readers of the tables [rotor], [[bearing]], [[unbalance]] and [[load]] of a machine: the rotor and its axes."""
+"""Readers of [rotor], [[bearing]], [[unbalance]], [[load]] and [[base]] of a machine: the rotor and its axes."""
 
-import dataclasses
 import itertools
 import math
 import pathlib
@@ -21,16 +20,16 @@ from ambjax.cases.rotor_body import (
     RotorBody,
     dampings_of,
     needed,
+    row,
     tables_of,
     vector,
 )
 from ambjax.cases.rotor_file import body_of_file
-from ambjax.cases.scenario_tables import signal_from
+from ambjax.cases.rotor_loads import base_from, load_from, unbalance_from
 from ambjax.cases.speed_table import speed_of
 from ambjax.cases.table import Table, show
 from ambjax.numerics.records import leaf
-from ambjax.world.rotation import GRAM_MM, UnbalanceGrade
-from ambjax.world.rotor import Rotor, RotorLoad, RotorUnbalance
+from ambjax.world.rotor import Rotor
 from ambjax.world.shaft import Disc, Section, shaft_model
 
 KINDS = ["rigid", "modal", "shaft"]
@@ -41,8 +40,6 @@ OWN = ("plant", "controller", "sensor", "actuator", "reference")
 # Longest finite element, as a share of the shaft's length: bending frequencies are then correct to 1e-5.
 LONGEST_ELEMENT = 1 / 70
 ANGLE = leaf(default=0.0, unit="degrees", at_least=-360.0, at_most=360.0, doc="angle of the first axis from x")
-AMOUNT, PHASE = (field for field in dataclasses.fields(RotorUnbalance) if field.name in ("amount", "phase"))
-GRADE = {field.name: field for field in dataclasses.fields(UnbalanceGrade)}
 LENGTH = leaf(unit="m", at_least=1e-6, at_most=100.0, doc="length of a section")
 DIAMETER = leaf(unit="m", at_least=1e-6, at_most=100.0, doc="outer diameter of a section")
 INNER = leaf(default=0.0, unit="m", at_least=0.0, at_most=100.0, doc="inner diameter of a section")
@@ -193,12 +190,6 @@ def _distinct(x: Any, close: float) -> np.ndarray:
     return x[np.concatenate([[True], np.diff(x) > close])]
 
 
-def row(at: float, direction: Any, shapes: np.ndarray) -> np.ndarray:
-    """Return the displacement [n] along `direction` of the shaft at `at` (m) per unit of each coordinate."""
-    x, y, z = direction
-    return np.concatenate([[x, y, z, -at * y, at * x], np.outer(shapes, [x, y]).ravel()])
-
-
 def axes_from(bearings: list[Table], body: RotorBody) -> list[BearingAxis]:
     """Return the axes of all bearings: two of a radial one, at `angle` and 90 degrees further; one of an axial one."""
     axes, seen = [], set()
@@ -207,10 +198,14 @@ def axes_from(bearings: list[Table], body: RotorBody) -> list[BearingAxis]:
         table.only(["name", "kind", "at", "sensor_at", "angle", *own, *OWN])
         kind = table.choice("kind", ["radial", "axial"])
         name = table.raw.get("name", f"bearing{number + 1}")
-        if not isinstance(name, str) or not name or name in seen:
-            raise ValueError(f"{table.at('name')} = {show(name)}: each bearing needs a name of its own, as text.")
+        if not isinstance(name, str) or not name or "." in name or name in seen:
+            raise ValueError(
+                f"{table.at('name')} = {show(name)}: each bearing needs a name of its own, as text without dots, which "
+                "separate the words of paths."
+            )
         seen.add(name)
         if kind == "axial":
+            _check_axial(table)
             none = np.zeros(len(body.frequencies))
             z = row(0.0, (0.0, 0.0, 1.0), none)
             axes.append(BearingAxis(f"{name}.z", number, z, z))
@@ -229,13 +224,22 @@ def axes_from(bearings: list[Table], body: RotorBody) -> list[BearingAxis]:
     return axes
 
 
+def _check_axial(table: Table) -> None:
+    """Raise ValueError for a key that an axial bearing cannot use. Its places are checked, but have no effect."""
+    for key in ("angle", "modes", "sensor_modes"):
+        if key in table.raw:
+            raise ValueError(f"{table.at(key)}: an axial bearing acts along the shaft, without bending. Omit {key}.")
+    for key in ("at", "sensor_at"):
+        table.leaf(key, PLACE, 0.0)
+
+
 def _exact(x: float) -> float:
     """Return x, or the whole number within rounding of it, so that axes along x and y are uncoupled."""
     return float(round(x)) if abs(x - round(x)) < 1e-15 else x
 
 
 def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pathlib.Path) -> Rotor:
-    """Return the rotor of the tables [rotor], [[unbalance]] and [[load]]."""
+    """Return the rotor of the tables [rotor], [[unbalance]], [[load]] and [[base]]."""
     table, k = top.table("rotor"), len(body.frequencies)
     unbalances = tables_of(top, "unbalance")
     graded = sum("grade" in one.raw for one in unbalances)
@@ -261,32 +265,7 @@ def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pat
         speed=turning.speed,
         acceleration=turning.acceleration,
         changes=turning.changes,
-        unbalances=tuple(_unbalance(one, body, graded) for one in unbalances),
-        loads=tuple(_load(one, body, Recordings(folder, ())) for one in tables_of(top, "load")),
+        unbalances=tuple(unbalance_from(one, body, graded) for one in unbalances),
+        loads=tuple(load_from(one, body, Recordings(folder, ())) for one in tables_of(top, "load")),
+        base=tuple(base_from(one, n, Recordings(folder, ())) for one in tables_of(top, "base")),
     )
-
-
-def _unbalance(table: Table, body: RotorBody, graded: int) -> RotorUnbalance:
-    """Return an unbalance. `graded`: number of planes that share the unbalance of a grade equally."""
-    own = ["grade", "service_speed"] if "grade" in table.raw else ["amount"]
-    table.only(["at", *own, "phase", *(["modes"] if body.shapes is None else [])])
-    at, shapes = body.place(table)
-    x, y = (jnp.asarray(row(at, d, shapes)) for d in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
-    if "grade" in table.raw:
-        G, service_speed = (needed(table, key, GRADE[key]) for key in own)
-        grade = UnbalanceGrade(G, service_speed)
-        amount = float(body.m * grade.eccentricity / GRAM_MM / graded)
-    else:
-        amount = needed(table, "amount", AMOUNT)
-    return RotorUnbalance(amount, x, y, table.leaf("phase", PHASE, 0.0))
-
-
-def _load(table: Table, body: RotorBody, recordings: Recordings) -> RotorLoad:
-    places = ("at", "direction", *(["modes"] if body.shapes is None else []))
-    direction = vector(table, "direction", 3)
-    size = float(np.linalg.norm(direction))
-    if size == 0:
-        raise ValueError(f"{table.at('direction')} = {show(table.raw['direction'])}: it must not be zero.")
-    at, shapes = body.place(table)
-    rest = Table({key: value for key, value in table.raw.items() if key not in places}, table.path)
-    return RotorLoad(signal_from(rest, "N", recordings), jnp.asarray(row(at, direction / size, shapes)))

@@ -81,10 +81,15 @@ def _disturbances(table: Table, recordings: Recordings) -> dict[str, Any]:
     found: dict[str, list[Any]] = {}
     for name, slots in UNITS.items():
         for one in _each(table, name) if name in table.raw else ():
-            own = [unit for unit in slots if unit == FIXED_UNITS.get(str(one.raw.get("kind")))]
-            unit = one.choice("unit", list(slots), [*own, *slots][0])
+            unit = one.choice("unit", list(slots), usual_unit(name, one.raw))
             found.setdefault(slots[unit], []).append(signal_from(one, unit, recordings, extra=("unit",)))
     return {slot: made[0] if len(made) == 1 else waveforms.Sum(tuple(made)) for slot, made in found.items()}
+
+
+def usual_unit(name: str, raw: dict[str, Any]) -> str:
+    """Return the unit of a disturbance `name` whose table `raw` gives none."""
+    own = [unit for unit in UNITS[name] if unit == FIXED_UNITS.get(str(raw.get("kind")))]
+    return [*own, *UNITS[name]][0]
 
 
 def _each(table: Table, name: str) -> list[Table]:

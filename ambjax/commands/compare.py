@@ -3,26 +3,36 @@
 import argparse
 import dataclasses
 import pathlib
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
+from ambjax.cases.machine_case import AnyCase, MachineCase, first_axis
 from ambjax.cases.reader import Case, require_case
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
-from ambjax.commands.comparison_report import Compared, comparison_markdown, comparison_summary, comparison_table
+from ambjax.commands.comparison_loop import ComparedLoop, loop_of_axis, loop_of_machine, no_loop
+from ambjax.commands.comparison_report import (
+    BY_AXIS,
+    Compared,
+    comparison_markdown,
+    comparison_summary,
+    comparison_table,
+)
 from ambjax.commands.comparison_tuning import check_options, tuned_cases
-from ambjax.commands.reading import read_with_warnings
+from ambjax.commands.machine_commands import analysed, refuse
+from ambjax.commands.reading import read_any_with_warnings
 from ambjax.commands.study_report import findings_of
-from ambjax.ensemble.study import Study
+from ambjax.ensemble.study import AnyStudy, Study
 from ambjax.ensemble.worker import CALL, chunk
 from ambjax.host.heartbeat import FIRST_RUN, doing, is_quiet, quiet, say
-from ambjax.linear.state_space import StateSpace
 from ambjax.page.html_page import check_processor, pages
 from ambjax.results.case_export import guarded_for
-from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks, operating_point, shown_band, spread_peaks
+from ambjax.results.machine_study import MachineStudy
+from ambjax.results.operating import MEMBERS, operating_point, shown_band, spread_peaks
 from ambjax.results.outputs import described, directory, files, plain, write_json, written
 from ambjax.results.spread_runs import study_of
 from ambjax.text.web_page import render_page
@@ -32,35 +42,38 @@ WRITTEN = ("compare.html", "compare.json", "compare.png")
 MOST_CASES = 8
 # Members that are simulated between two updates of the progress bar: a whole number of calls of the compiled program.
 CHUNK = 16 * CALL
-# Beginnings of the names in a study's fingerprint whose values may differ: the controller, and the integration method.
-MAY_DIFFER = ("controller.", "clock.method")
+# Names in a study's fingerprint whose values may differ: the controller, that of an axis, and the integration method.
+MAY_DIFFER = re.compile(r"(bearing\..*\.)?controller\.|clock\.method")
 
 
 def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     """Compare cases.
 
     The exit code is 0 if each case holds all members, the members tested are stable, and its nominal loop is stable at
-    rest.
+    rest, for a machine at each of its speeds.
     """
     check_options(args)
     cases = _read(args.cases)
-    studies = [study_of(case, _seed(args, cases), args.members) for case in cases]
+    of_axis = [case for case in cases if isinstance(case, Case)]
+    if not of_axis:
+        refuse(tune=args.tune, page=args.page)
+    studies = _studies(cases, args.seed, args.members)
     notes = _differences(args.cases, cases, studies)
     for note in notes:
         say(note)
-    for path, case in zip(args.cases, cases, strict=True):
-        if args.page:
+    if args.page:
+        for path, case in zip(args.cases, of_axis, strict=True):
             check_processor(case, path)
     name = f"compare-{'-'.join(case.name for case in cases)}"[:80]
     out = directory(args.out, name, WRITTEN, args.force or args.resume)
     if args.tune:
-        cases = tuned_cases(cases, out, args)
-        studies = [study_of(case, _seed(args, cases), args.members) for case in cases]
-    html_pages = pages(cases, args.cases) if args.page else {}
+        cases = of_axis = tuned_cases(of_axis, out, args)
+        studies = _studies(cases, args.seed, args.members)
+    html_pages = pages(of_axis, args.cases) if args.page else {}
     summary, compared = _comparison(cases, studies, notes)
     with files(out) as part:
         write_json(part / "compare.json", summary)
-        described("compare.png", lambda: _draw(cases, compared, part / "compare.png"))
+        described("compare.png", lambda: _draw(compared, part / "compare.png"))
         described("compare.html", lambda: _write_html(summary, part))
         for name, html in html_pages.items():
             (part / name).write_text(html, encoding="utf-8")
@@ -68,10 +81,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     if not args.json:
         print(described("the table", lambda: comparison_table(summary)) or "")
         written(out, ", ".join([*names, *html_pages]))
-    good = all(
-        one.held.all() and one.findings.stable and one.point is not None and one.point.analysis.stable
-        for one in compared
-    )
+    good = all(one.held.all() and one.findings.stable and one.loop.stable for one in compared)
     return int(not good), plain(summary | {"out": str(out)})
 
 
@@ -79,7 +89,7 @@ class Comparison(NamedTuple):
     """The result of `compare`.
 
     - `summary`: the content of compare.json: members, seed, and the numbers of each case.
-    - `compared`: each case with the columns of its members, its nominal loop and its peaks.
+    - `compared`: each case with the columns of its members, and the numbers of its loop.
     """
 
     summary: dict[str, Any]
@@ -90,28 +100,28 @@ class Comparison(NamedTuple):
         return comparison_table(self.summary)
 
 
-def compare(cases: Sequence[Case], members: int = 1, *, seed: int | None = None) -> Comparison:
-    """Compare cases of one axis on the same members of their spread, as `ambjax compare` does.
+def compare(cases: Sequence[AnyCase], members: int = 1, *, seed: int | None = None) -> Comparison:
+    """Compare cases of one axis, or machines, on the same members of their spread, as `ambjax compare` does.
 
     - `cases`: two to eight cases with the same spread. What differs in more than the controller is in
       `summary["differences"]`.
     - `members`, `seed`: as for `simulate_members`; the seed of all cases is by default that of the first one.
 
-    Raises ValueError for anything but cases, for another number of them, if their spreads differ, and as
+    Raises ValueError for anything but cases, for another number of them, if their kinds or spreads differ, and as
     `simulate_members` does.
     """
     cases = list(cases)
-    for case in cases:
-        require_case(case)
     _check_count(len(cases), "case")
-    cases = _named(cases)
-    seed = study_of(cases[0], seed, members).seed
-    studies = [study_of(case, seed, members) for case in cases]
+    for case in cases:
+        if not isinstance(case, MachineCase):
+            require_case(case)
+    cases = _named([case.name for case in cases], cases)
+    studies = _studies(cases, seed, members)
     with quiet():
         return _comparison(cases, studies, _differences([case.name for case in cases], cases, studies))
 
 
-def _comparison(cases: Sequence[Case], studies: Sequence[Study], notes: Sequence[str]) -> Comparison:
+def _comparison(cases: Sequence[AnyCase], studies: Sequence[Study | MachineStudy], notes: Sequence[str]) -> Comparison:
     """Simulate and analyse the cases. `notes`: of `_differences`."""
     compared = [_compared(case, study) for case, study in zip(cases, studies, strict=True)]
     return Comparison(comparison_summary(compared, studies[0], notes), compared)
@@ -125,22 +135,27 @@ def _write_html(summary: Mapping[str, Any], part: pathlib.Path) -> None:
     (part / "compare.html").write_text(html, encoding="utf-8")
 
 
-def _seed(args: argparse.Namespace, cases: Sequence[Case]) -> int:
-    """Return the seed of all cases: --seed, or the first case's."""
-    return int(cases[0].scenario.seed) if args.seed is None else args.seed
+def _studies(cases: Sequence[AnyCase], seed: int | None, members: int) -> list[Study | MachineStudy]:
+    """Return the studies of the cases, with the same seed; None: the first case's."""
+    seed = study_of(cases[0], seed, members).seed
+    studies = [study_of(case, seed, members) for case in cases]
+    return [
+        dataclasses.replace(study, by_axis=BY_AXIS) if isinstance(study, MachineStudy) else study for study in studies
+    ]
 
 
-def _read(paths: Sequence[str]) -> list[Case]:
+def _read(paths: Sequence[str]) -> Sequence[AnyCase]:
     """Read the cases.
 
-    Raises ValueError for fewer than 2 or too many files, a repeated file, or a file that `read_case` refuses.
+    Raises ValueError for fewer than 2 or too many files, a repeated file, a file that `read_any` refuses, or machines
+    beside cases of one axis.
     """
     _check_count(len(paths), "case file")
     for path in paths:
         same = [other for other in paths if pathlib.Path(other).resolve() == pathlib.Path(path).resolve()]
         if len(same) > 1:
             raise ValueError(f"{path}: this file is given {len(same)} times. Give each once.")
-    return _named([read_with_warnings(path) for path in paths])
+    return _named(paths, [read_any_with_warnings(path) for path in paths])
 
 
 def _check_count(count: int, what: str) -> None:
@@ -148,8 +163,13 @@ def _check_count(count: int, what: str) -> None:
         raise ValueError(f"{count} {what}{'s' * (count > 1)}: give 2 to {MOST_CASES} {what}s.")
 
 
-def _named(cases: Sequence[Case]) -> list[Case]:
-    """Append a number to a name that occurs more than once."""
+def _named(paths: Sequence[str], cases: Sequence[AnyCase]) -> list[AnyCase]:
+    """Append a number to a name that occurs more than once. Raises ValueError for machines beside cases of one axis."""
+    for path, case in zip(paths, cases, strict=True):
+        if type(case) is not type(cases[0]):
+            raise ValueError(
+                f"{path}, {paths[0]}: one has one axis, the other is a machine with [rotor]. Compare cases of one kind."
+            )
     names = [case.name for case in cases]
     return [
         case if names.count(case.name) == 1 else dataclasses.replace(case, name=f"{case.name} ({n})")
@@ -157,7 +177,7 @@ def _named(cases: Sequence[Case]) -> list[Case]:
     ]
 
 
-def _differences(paths: Sequence[str], cases: Sequence[Case], studies: Sequence[Study]) -> list[str]:
+def _differences(paths: Sequence[str], cases: Sequence[AnyCase], studies: Sequence[AnyStudy]) -> list[str]:
     """Return a note for each case that differs from the first in more than the controller and the integration method.
 
     Raises ValueError if the spreads differ, because the members would then not be the same.
@@ -166,7 +186,7 @@ def _differences(paths: Sequence[str], cases: Sequence[Case], studies: Sequence[
     for path, case, study in zip(paths[1:], cases[1:], studies[1:], strict=True):
         other = study.fingerprint()
         differing = [name for name in {**first, **other} if first.get(name) != other.get(name)]
-        names = [name for name in differing if not name.startswith(MAY_DIFFER)]
+        names = [name for name in differing if not MAY_DIFFER.match(name)]
         spread = [name for name in names if name.startswith("spread.")]
         if spread:
             name = spread[0]
@@ -181,15 +201,15 @@ def _differences(paths: Sequence[str], cases: Sequence[Case], studies: Sequence[
     return notes
 
 
-def _compared(case: Case, study: Study) -> Compared:
+def _compared(case: AnyCase, study: Study | MachineStudy) -> Compared:
     """Simulate the members of a case, analyse its loop, and count the operations of a step."""
     with doing(f"{case.name}: linearising and simulating the loops of the members; {FIRST_RUN}"):
-        point, peaks = _linear(case, study)
-        columns = _columns(case, study)
-        return Compared(case, columns, point, peaks, _flops(case), findings_of(study, columns))
+        loop, columns = _linear(case, study), _columns(case, study)
+        flops = _flops(case) if isinstance(case, Case) else None
+        return Compared(case, columns, loop, flops, findings_of(study, columns))
 
 
-def _columns(case: Case, study: Study) -> dict[str, np.ndarray]:
+def _columns(case: AnyCase, study: AnyStudy) -> dict[str, np.ndarray]:
     """Simulate the members, with a progress bar, and return their columns [N] by name."""
     size, parts = min(CHUNK, study.members), []
     shown = {"unit": "member", "unit_scale": True, "delay": 2, "leave": False, "desc": case.name}
@@ -201,14 +221,17 @@ def _columns(case: Case, study: Study) -> dict[str, np.ndarray]:
     return {name: np.concatenate([np.asarray(part[name]) for part in parts]) for name in parts[0]}
 
 
-def _linear(case: Case, study: Study) -> tuple[OperatingPoint | None, SpreadPeaks | None]:
-    """Analyse the nominal loop (None: no equilibrium) and, if the case has a spread, its first members."""
+def _linear(case: AnyCase, study: Study | MachineStudy) -> ComparedLoop:
+    """Analyse the nominal loop and, if a case of one axis has a spread, its first members."""
     try:
+        if isinstance(case, MachineCase):
+            return loop_of_machine(analysed(case))
         point = operating_point(case, "nominal", 0.0)
     except ValueError as error:
         say(f"{case.name}: {error}")
-        return None, None
-    return point, spread_peaks(case, study, MEMBERS) if case.spread.entries else None
+        return no_loop(None)
+    drawn = spread_peaks(case, study, MEMBERS) if isinstance(study, Study) and case.spread.entries else None
+    return loop_of_axis(point, drawn)
 
 
 def _flops(case: Case) -> int | None:
@@ -226,26 +249,24 @@ def _flops(case: Case) -> int | None:
         return None
 
 
-def _draw(cases: Sequence[Case], compared: Sequence[Compared], path: pathlib.Path) -> None:
+def _draw(compared: Sequence[Compared], path: pathlib.Path) -> None:
     from ambjax.pictures import comparison
 
-    first = cases[0]
     shown = [
         comparison.Contender(
             one.case.name,
             one.held,
             np.asarray(one.columns["settled_rms_error_m"]),
             np.asarray(one.columns["settled_rms_u_V"]),
-            _stable(one.point),
+            one.loop.system,
+            one.loop.channel,
+            str(one.loop.numbers["worst_at"] or ""),
         )
         for one in compared
     ]
-    limits = [float(x) for x in (first.zones.zone_a, first.zones.zone_b, first.zones.zone_c)]
-    systems = [_stable(one.point) for one in compared]
-    spans = [shown_band(case, [one] if one else []) for case, one in zip(cases, systems, strict=True)]
+    zones = compared[0].case.zones
+    limits = [float(x) for x in (zones.zone_a, zones.zone_b, zones.zone_c)]
+    loops = [(first_axis(one.case), one.loop.system) for one in compared]
+    spans = [shown_band(case, [system] if system else []) for case, system in loops]
     span = min(low for low, _ in spans), max(high for _, high in spans)
     comparison.comparison(shown, limits, span, path)
-
-
-def _stable(point: OperatingPoint | None) -> StateSpace | None:
-    return point.system if point is not None and point.analysis.stable else None

@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ambjax.cases.machine_case import AnyCase
 from ambjax.cases.reader import Case
-from ambjax.ensemble.paths import kinds, places
-from ambjax.ensemble.study import Study
+from ambjax.commands.comparison_loop import ComparedLoop, laws_of
+from ambjax.ensemble.study import AnyStudy
 from ambjax.linear import Findings
 from ambjax.linear.stability import MOST_TESTED
-from ambjax.results.operating import MEMBERS, OperatingPoint, SpreadPeaks
+from ambjax.results.operating import MEMBERS
 from ambjax.results.outputs import table
 from ambjax.simulation import orders
 from ambjax.text import web_page
@@ -22,16 +23,14 @@ from ambjax.text import web_page
 class Compared:
     """A case and its results.
 
-    `columns`: metrics of the members by name, [N] each. `point`: the nominal loop; None without an equilibrium.
-    `peaks`: sensitivity peaks of the members; None without a spread or without an equilibrium. `flops`: operations of a
-    step of the controller; None without a processor, or if a law cannot be exported. `findings`: the stability of the
-    members with the largest settled errors.
+    `columns`: metrics of the members by name, [N] each. `loop`: the linearised loops. `flops`: operations of a step of
+    the controller; None without a processor, for a machine, or if a law cannot be exported. `findings`: the stability
+    of the members with the largest settled errors.
     """
 
-    case: Case
+    case: AnyCase
     columns: Mapping[str, np.ndarray]
-    point: OperatingPoint | None
-    peaks: SpreadPeaks | None
+    loop: ComparedLoop
     flops: int | None
     findings: Findings = Findings(0, 0)
 
@@ -47,12 +46,20 @@ class Compared:
 
 
 class Quantity(NamedTuple):
-    """A row of the table: its key in the summary, its words, its unit, and whether less is better (None: neither)."""
+    """A row of the table: its key in the summary, its words, its unit, and whether less is better (None: neither).
+
+    `axis`: name of an axis of a machine; "" for the whole case.
+    """
 
     key: str
     words: str
     unit: str
     less: bool | None = True
+    axis: str = ""
+
+    def value(self, case: Mapping[str, Any]) -> Any:
+        """Return the number of a case of the summary; None if it has none."""
+        return (case.get("axes", {}).get(self.axis, {}) if self.axis else case).get(self.key)
 
 
 QUANTITIES = (
@@ -75,6 +82,8 @@ QUANTITIES = (
     Quantity("peak", "peak of |S|", "1"),
     Quantity("frequency_hz", "its frequency", "Hz", None),
     Quantity("zone", "its zone (ISO 14839-3)", "", None),
+    Quantity("worst_at", "its axis and speed", "", None),
+    Quantity("sigma_max", "largest singular value of S", "1"),
     Quantity("outside_peak", "|S| outside the band of [sensitivity], if larger", "1"),
     Quantity("unstable", f"members not stable at rest, of the first {MEMBERS}", "1"),
     Quantity("worst_peak", "peak of |S|, worst member", "1"),
@@ -96,10 +105,19 @@ QUANTITIES = (
     ),
 )
 
+# Of each axis of a machine: key in the summary, metric of the members, and how it is reduced.
+AXIS_METRICS = {
+    "rms_error_median_m": ("settled_rms_error_m", np.median),
+    "max_error_m": ("settled_max_abs_error_m", np.max),
+    "max_i_A": ("max_abs_i_A", np.max),
+    "max_u_V": ("max_abs_u_V", np.max),
+}
+BY_AXIS = tuple(metric for metric, _ in AXIS_METRICS.values())
 
-def comparison_summary(compared: Sequence[Compared], study: Study, notes: Sequence[str]) -> dict[str, Any]:
+
+def comparison_summary(compared: Sequence[Compared], study: AnyStudy, notes: Sequence[str]) -> dict[str, Any]:
     """Return the content of compare.json: the members, the notes on the cases, and the numbers of each case."""
-    rows = [{"case": one.case.name, **_values(one, compared[0]), "laws": _laws(one.case)} for one in compared]
+    rows = [{**_values(one, compared[0]), "laws": laws_of(one.case)} for one in compared]
     return {"members": study.members, "seed": study.seed, "differences": list(notes), "cases": rows}
 
 
@@ -109,7 +127,9 @@ def _values(one: Compared, first: Compared) -> dict[str, object]:
     settled = max(float(case.clock.duration) - float(case.settle), float(case.clock.sample_period))
     chatter, used = one.of("chatter_V", np.mean), one.of("settled_clearance_used", np.max)
     zone = "D" if used is None or not one.held.all() else case.zones.clearance_zone(used)
+    axes = {} if isinstance(case, Case) else {"axes": {axis: _axis(one, axis) for axis in case.axes}}
     return {
+        "case": case.name,
         "lost": int(np.sum(~one.held & ~stalled)),
         "stalled": int(np.sum(stalled)),
         "not_stable": one.findings.unstable,
@@ -127,40 +147,22 @@ def _values(one: Compared, first: Compared) -> dict[str, object]:
         "clearance_used": used,
         "clearance_zone": zone,
         **{name: one.of(name, _mean_phase if unit == "deg" else np.median) for name, unit in orders.UNITS.items()},
-        **_loop(one),
+        **one.loop.numbers,
         "flops": one.flops,
+        **axes,
     }
+
+
+def _axis(one: Compared, axis: str) -> dict[str, object]:
+    """Return the numbers of an axis of a machine."""
+    numbers = {key: one.of(f"{axis}.{metric}", reduce) for key, (metric, reduce) in AXIS_METRICS.items()}
+    return {**numbers, **one.loop.axes.get(axis, {})}
 
 
 def _better(one: Compared, first: Compared) -> int:
     """Return the number of members that this case holds and the first case loses, or holds with a larger rms error."""
     ours, theirs = (np.where(x.held, x.columns["settled_rms_error_m"], math.inf) for x in (one, first))
     return int(np.sum(ours < theirs))
-
-
-def _loop(one: Compared) -> dict[str, object]:
-    """Return the numbers of the linearised loops of a case.
-
-    If the nominal loop is not stable, its zone is D and its other numbers are None. If it has no linearisation, its
-    zone is None too.
-    """
-    keys = ("peak", "frequency_hz", "t_peak", "ks_peak", "gain_margin_low", "gain_margin_high", "phase_margin_deg")
-    keys += ("delay_margin_s", "disk_margin", "stiffness_N_per_m", "outside_peak")
-    keys += ("delay_margin_reading_s", "delay_margin_command_s")
-    worst: dict[str, object] = {"unstable": None, "worst_peak": None}
-    if one.peaks is not None:
-        worst["unstable"] = one.peaks.members - one.peaks.stable
-        if not worst["unstable"] and one.peaks.point is not None:
-            worst["worst_peak"] = one.peaks.point.analysis.S.height
-    if one.point is None or not one.point.analysis.stable:
-        unstable = {"stable": None, "zone": None} if one.point is None else {"stable": False, "zone": "D"}
-        return {**unstable, **dict.fromkeys(keys), **worst}
-    loop = one.point.analysis
-    margins, at, outside = loop.margins, loop.margins_at, loop.S.outside
-    found = (loop.S.height, loop.S.frequency, loop.T.height, loop.KS.height, margins.gain_low, margins.gain_high)
-    found += (margins.phase_deg, margins.delay, margins.disk, loop.stiffness)
-    found += (None if outside is None else outside.height, at.reading.delay, at.command.delay)
-    return {"stable": True, "zone": loop.zone, **dict(zip(keys, found, strict=True)), **worst}
 
 
 def _rms(values: np.ndarray) -> float:
@@ -171,23 +173,10 @@ def _mean_phase(degrees: np.ndarray) -> float:
     return float(np.degrees(np.angle(np.mean(np.exp(1j * np.radians(degrees))))))
 
 
-def _laws(case: Case) -> dict[str, dict[str, object]]:
-    """Return the kind and the numbers of each law, by stage."""
-    laws: dict[str, dict[str, object]] = {}
-    for path, kind in kinds(case.cascade, "controller."):
-        if path.endswith(".kind") and path.count(".") == 2:
-            laws[path.split(".")[1]] = {"kind": kind}
-    for path, place in places(case.cascade, case.scenario).items():
-        _, stage, *rest = path.split(".") if path.startswith("controller.") else ("", "")
-        if rest and place.value is not None and stage != "model":
-            laws[stage][".".join(rest)] = float(place.value)
-    return {stage: laws[stage] for stage in laws if stage not in ("model", "processor")}
-
-
 def comparison_table(summary: Mapping[str, Any]) -> str:
     """Return the table that the command prints."""
     names = [case["case"] for case in summary["cases"]]
-    rows = [(q.words, *(_cell(case[q.key]) for case in summary["cases"]), q.unit) for q in _shown(summary)]
+    rows = [(q.words, *(_cell(q.value(case)) for case in summary["cases"]), q.unit) for q in _shown(summary)]
     return "\n".join([table(("", *names, "unit"), rows), "", _words(summary)])
 
 
@@ -212,20 +201,31 @@ def _words(summary: Mapping[str, Any]) -> str:
     poor = [case["case"] for case in summary["cases"] if case["peak"] is None or any(case[key] for key in bad)]
     why = f" Members not held or not stable, or a loop not stable at rest: {', '.join(poor)}." if poor else ""
     why += " See 'ambjax check'." if poor else ""
+    machines = "axes" in summary["cases"][0]
+    loop = "loops of a machine: its worst axis at its worst speed" if machines else "loop at rest"
+    worst = " A metric of a member is that of its worst axis, except by axis." * machines
     return (
         f"{summary['members']} members, seed {summary['seed']}, the same in all cases. Errors, voltages, currents and "
-        f"power losses are those of the members that are held. Sensitivity and margins are those of the linearised "
-        f"loop at rest.{why}"
+        f"power losses are those of the members that are held.{worst} Sensitivity and margins are those of the "
+        f"linearised {loop}.{why}"
     )
 
 
 def _shown(summary: Mapping[str, Any]) -> list[Quantity]:
     """Return the quantities that at least one case has. The row of stalled members is left out if there are none."""
+    cases = summary["cases"]
+    axes = dict.fromkeys(axis for case in cases for axis in case.get("axes", ()))
+    by_key = {q.key: q for q in QUANTITIES}
+    of_axes = [
+        by_key[key]._replace(words=f"{axis}: {by_key[key].words}", axis=axis)
+        for axis in axes
+        for key in (*AXIS_METRICS, "peak", "zone")
+    ]
     return [
         q
-        for q in QUANTITIES
-        if any(case[q.key] is not None for case in summary["cases"])
-        and (q.key != "stalled" or any(case[q.key] for case in summary["cases"]))
+        for q in (*QUANTITIES, *of_axes)
+        if any(q.value(case) is not None for case in cases)
+        and (q.key != "stalled" or any(case[q.key] for case in cases))
     ]
 
 
@@ -239,7 +239,7 @@ def _cell(value: object) -> str:
 
 def _marked(quantity: Quantity, summary: Mapping[str, Any]) -> list[str]:
     """Return the cells of a row, the best one bold if not all are equal."""
-    values = [case[quantity.key] for case in summary["cases"]]
+    values = [quantity.value(case) for case in summary["cases"]]
     known = [value for value in values if isinstance(value, (int, float))]
     if quantity.less is None or len(set(known)) < 2:
         return [_cell(value) for value in values]

@@ -3,13 +3,13 @@
 import argparse
 import itertools
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ambjax.cases.reader import Case
-from ambjax.commands.reading import read_with_warnings
+from ambjax.cases.machine_case import AnyCase
+from ambjax.commands.reading import read_any_with_warnings
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.maps import CERTAIN, GRIDS, Map, grid
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
@@ -21,7 +21,7 @@ WRITTEN = ("map.png", "map.json")
 
 def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     """Simulate the cells of a map for each case and write map.png and map.json."""
-    cases = [read_with_warnings(path) for path in [args.case, *(args.against or [])]]
+    cases = [read_any_with_warnings(path) for path in [args.case, *(args.against or [])]]
     ready = [study_and_axes(case, args.x, args.y, args.members, args.seed) for case in cases]
     out = directory(args.out, f"map-{cases[0].name}", WRITTEN, args.force)
     with files(out) as part:
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     return 0, plain(summary)
 
 
-def _text(cases: list[Case], maps: list[Map]) -> str:
+def _text(cases: Sequence[AnyCase], maps: list[Map]) -> str:
     first, sure = maps[0], any(one.decisive for one in maps)
     rows, lines = [], []
     for case, one in zip(cases, maps, strict=True):
@@ -92,13 +92,13 @@ def _spread_words(one: Map) -> str:
     return f"drawn for each member: {', '.join(one.drawn)}" if one.drawn else "nominal: no quantity is drawn"
 
 
-def _draw(cases: list[Case], maps: list[Map], path: pathlib.Path) -> None:
+def _draw(cases: Sequence[AnyCase], maps: list[Map], path: pathlib.Path) -> None:
     from ambjax.pictures import heatmaps
 
     panels = [panel(case, one) for case, one in zip(cases, maps, strict=True)]
     heatmaps.maps(panels, *labels(cases[0], maps[0]), path)
 
 
-def _summary(case: Case, one: Map) -> Mapping[str, object]:
+def _summary(case: AnyCase, one: Map) -> Mapping[str, object]:
     facts: dict[str, Any] = {"case": case.name, "x": one.x._asdict(), "y": one.y._asdict()}
     return facts | {key: getattr(one, key) for key in (*GRIDS, "members", "drawn", "decisive")} | {"reach": one.reach()}

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.cases.machine_case import MachineCase
+from ambjax.cases.machine_case import MachineCase, first_axis
 from ambjax.cases.reader import Case
 from ambjax.cases.warned import reversal
 from ambjax.ensemble import statistics
@@ -61,8 +61,7 @@ def write_report(
         tables = None if summary is None else described("the table", lambda: study_tables(summary, findings.words()))
         print(tables or "{survivors} of {members} members survive".format(**survivors))
         written(out, ", ".join(["members.npz", *names]))
-    one = case if isinstance(case, Case) else case.cases[0]
-    for warning in reversal(one, float(np.max(columns["max_abs_i_A"], initial=0.0, where=held))):
+    for warning in reversal(first_axis(case), float(np.max(columns["max_abs_i_A"], initial=0.0, where=held))):
         say(warning)
     good = held.all() and findings.stable
     return int(not good), plain(summary or survivors) | {"out": str(out)}

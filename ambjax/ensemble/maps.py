@@ -4,21 +4,13 @@ import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
-from ambjax.control.cascade import Cascade
-from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.distributions import Choice, Distribution, Uniform
 from ambjax.ensemble.intervals import wilson
-from ambjax.ensemble.paths import places
-from ambjax.ensemble.spread import STEP_PATHS, Spread, SpreadError, apply, check_spread, corners, ends, no_such_number
-from ambjax.ensemble.study import Study
-from ambjax.numerics.shapes import map_varying
-from ambjax.simulation.clock import Clock
+from ambjax.ensemble.spread import STEP_PATHS, Spread, SpreadError, check_spread, corners, drawn, ends, no_such_number
+from ambjax.ensemble.study import AnyStudy, Study
 from ambjax.simulation.method import choose_method
-from ambjax.simulation.metrics import Metrics
-from ambjax.world.scenario import Scenario
 
 PERIOD = "clock.sample_period"
 # Survival of a cell is certain if the lower end of its interval is at least this share.
@@ -85,27 +77,27 @@ class Map(NamedTuple):
         return float(self.x.values[begin[longest]]), float(self.x.values[end[longest]])
 
 
-# Returns whether each member of an ensemble is stable, [N].
-StabilityTest = Callable[[Cascade, Scenario, Clock], np.ndarray]
+# Returns whether each system of a study is stable, [N]. The other arguments are those of `AnyStudy.metrics`.
+StabilityTest = Callable[[AnyStudy, dict[str, np.ndarray], np.ndarray], np.ndarray]
 
 
-def grid(study: Study, x: Axis, y: Axis, stable: StabilityTest | None = None) -> Map:
+def grid(study: AnyStudy, x: Axis, y: Axis, stable: StabilityTest | None = None) -> Map:
     """Compute a map with `study.members` members in every cell.
 
-    An axis may be any number of the case, or clock.sample_period. All cells with the same sample period run in one
-    ensemble. Sample periods run one after the other, each for the duration of the case. Member k has the same noise in
-    each cell. With one member the case is nominal: no spread, and the noise of member 0. With more members, the case's
-    spread applies to all quantities that are not axes. `stable`: the test of member 0 of each
-    cell; None: `unstable` is 0.
+    An axis may be any number of `study.places()`, or clock.sample_period. All cells with the same sample period run in
+    one ensemble. Sample periods run one after the other, each for the duration of the case. Member k has the same noise
+    in each cell. With one member the case is nominal: no spread, and the noise of member 0. With more members, the
+    case's spread applies to all quantities that are not axes. `stable`: the test of member 0 of each cell; None:
+    `unstable` is 0.
 
-    Raises ValueError for a path that does not exist, for two equal paths, and for values of an axis that the case does
-    not allow.
+    Raises ValueError for a path that does not exist, for two equal paths, and for values of an axis that a case of one
+    axis does not allow.
     """
     if x.path == PERIOD:
         transpose = grid(study, y, x, stable)
         return transpose._replace(x=x, y=y, **{k: getattr(transpose, k).T for k in GRIDS})
     _check(study, x, y)
-    studies = [(study, y)] if y.path != PERIOD else [(_at_period(study, p), None) for p in y.values]
+    studies = [(study, y)] if y.path != PERIOD else [(study.at_period(float(p)), None) for p in y.values]
     rows = [_cells(one, x, axis, stable) for one, axis in studies]
     ended, stalled, error, unstable = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     survival = wilson(np.sum(~ended, axis=-1), study.members)
@@ -124,7 +116,7 @@ def grid(study: Study, x: Axis, y: Axis, stable: StabilityTest | None = None) ->
         *counts,
         unstable,
         study.members,
-        bool(paths) or study.scenario.random,
+        bool(paths) or study.random,
         paths,
     )
 
@@ -148,19 +140,22 @@ def with_method_for_axes(study: Study, x: Axis, y: Axis) -> Study:
     return dataclasses.replace(study, clock=dataclasses.replace(clock, method=method))
 
 
-def _entries(study: Study, axes: tuple[str, ...]) -> tuple[tuple[str, Distribution], ...]:
+def _entries(study: AnyStudy, axes: tuple[str, ...]) -> tuple[tuple[str, Distribution], ...]:
     """Return the entries of the study's spread that are not axes; none for one member."""
-    return tuple(entry for entry in study.spread.entries if entry[0] not in axes) if study.members > 1 else ()
+    parts = {part for path in axes for part in study.parts(path)}
+    return tuple(entry for entry in study.spread.entries if entry[0] not in parts) if study.members > 1 else ()
 
 
-def _check(study: Study, x: Axis, y: Axis) -> None:
+def _check(study: AnyStudy, x: Axis, y: Axis) -> None:
     """Raise ValueError for an axis whose path or values the case does not allow, and for two equal paths."""
-    known = [*places(study.cascade, study.scenario), PERIOD]
+    known = [*study.places(), PERIOD]
     for name, axis in (("x", x), ("y", y)):
         if axis.path not in known:
             raise ValueError(f"--{name} {axis.path}: {no_such_number(axis.path, known)}")
     if x.path == y.path:
         raise ValueError(f"--y {y.path}: --x has the same quantity. Choose another.")
+    if not isinstance(study, Study):
+        return
     axes = {axis.path: (name, Choice(tuple(axis.values))) for name, axis in (("x", x), ("y", y)) if axis.path != PERIOD}
     entries = (*((path, values) for path, (_, values) in axes.items()), *_entries(study, (x.path, y.path)))
     try:
@@ -173,12 +168,7 @@ def _check(study: Study, x: Axis, y: Axis) -> None:
         raise ValueError(f"--{name} {error.path}={low:g}:{high:g}: {error.reason}") from None
 
 
-def _at_period(study: Study, period: float) -> Study:
-    samples = max(round(float(study.clock.duration) / period), 1)
-    return dataclasses.replace(study, clock=dataclasses.replace(study.clock, samples=samples, sample_period=period))
-
-
-def _cells(study: Study, x: Axis, y: Axis | None, stable: StabilityTest | None) -> tuple[np.ndarray, ...]:
+def _cells(study: AnyStudy, x: Axis, y: Axis | None, stable: StabilityTest | None) -> tuple[np.ndarray, ...]:
     """Return, for each member, whether it is lost or stalled, whether it is stalled, and its settled error, m.
 
     The settled error is the largest settled |z - r|. Each array has shape [ny, nx, members]. The last array, [ny, nx],
@@ -189,18 +179,15 @@ def _cells(study: Study, x: Axis, y: Axis | None, stable: StabilityTest | None) 
     axes = {x.path: np.broadcast_to(x.values[None, :, None], shape).ravel()}
     if y is not None:
         axes[y.path] = np.broadcast_to(y.values[:, None, None], shape).ravel()
-    entries = _entries(study, tuple(axes))
-    values = dataclasses.replace(study, spread=Spread(entries, study.spread.design)).drawn(np.arange(study.members))
-    cascade, scenario = _batch(study.cascade, study.scenario, {k: v[member] for k, v in values.items()} | axes)
-    scenario = dataclasses.replace(scenario, seed=study.seed, member=member)
-    metrics = run_ensemble(cascade, scenario, study.clock, fold=Metrics.of(study.settle, scenario)).metrics
+    spread = Spread(_entries(study, tuple(axes)), study.spread.design)
+    values = drawn(spread, study.places(), study.seed, np.arange(study.members), study.members)
+    values = {k: v[member] for k, v in values.items()}
+    values |= {part: v for path, v in axes.items() for part in study.parts(path)}
+    metrics = study.metrics(values, member)
     ended, stalled, error = np.isfinite(metrics["lost_at_s"]), metrics["stalled"], metrics["settled_max_abs_error_m"]
-    one, world = map_varying(lambda x: x[:: study.members], (cascade, scenario))
-    unstable = np.zeros(shape[:2], bool).ravel() if stable is None else ~stable(one, world, study.clock)
+    unstable = np.zeros(shape[:2], bool).ravel()
+    if stable is not None:
+        unstable = ~stable(study, {k: v[:: study.members] for k, v in values.items()}, member[:: study.members])
     unstable = unstable & ~ended[:: study.members]
-    values = (np.reshape(part, shape) for part in (ended, stalled, error))
-    return *values, np.reshape(unstable, shape[:2]).astype(int)
-
-
-def _batch(cascade: Cascade, scenario: Scenario, values: dict[str, np.ndarray]) -> tuple[Cascade, Scenario]:
-    return jax.tree.map(np.asarray, apply(cascade, scenario, values))
+    grids = (np.reshape(part, shape) for part in (ended, stalled, error))
+    return *grids, np.reshape(unstable, shape[:2]).astype(int)

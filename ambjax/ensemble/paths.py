@@ -59,6 +59,8 @@ def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
     names |= {f"disturbance.{slot if len(acting) > 1 else 'q_z'}": slot for slot in acting}
     for path, name in names.items():
         table |= _below(getattr(scenario, name), path, (1, name))
+    if scenario.rotor is not None and scenario.rotor.changes:  # a table of speeds has no rate of its own
+        table = {path: x for path, x in table.items() if path == "rotor.speed" or not path.startswith("rotor.")}
     fields = {field.name: field for field in dataclasses.fields(scenario)}
     for path, name in (("actuator.u_max", "u_max"), ("run.clearance", "clearance")):
         table[path] = Place((1, name), fields[name], getattr(scenario, name))

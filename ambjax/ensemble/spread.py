@@ -147,6 +147,8 @@ def no_such_number(path: str, known: Iterable[str], where: str = "in this case")
     hint = hint_of_path(path, known)
     if path.split(".")[0] == "sensor":
         hint = " This case has no sensor noise; add the table [sensor], with std = 0.0 for example."
+    if path == "rotor.acceleration" and "rotor.speed" in known:
+        hint = " The table rotor.speed gives it; a spread of rotor.speed shifts the whole table."
     stems = [path.rsplit(".", n)[0] for n in range(path.count(".") + 1)]
     near = next((some for stem in stems if (some := [p for p in known if p.startswith(stem + ".")])), known)
     if len(near) > 12:

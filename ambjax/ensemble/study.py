@@ -5,14 +5,15 @@ import dataclasses
 import math
 import shlex
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
+import jax
 import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.blocks import Blocks
-from ambjax.ensemble.paths import kinds, places
+from ambjax.ensemble.paths import Place, kinds, places
 from ambjax.ensemble.spread import Spread, apply, draw
 from ambjax.host.sealed import provenance
 from ambjax.simulation.clock import Clock
@@ -69,6 +70,25 @@ class AnyStudy(abc.ABC):
     @abc.abstractmethod
     def drawn(self, members: np.ndarray) -> dict[str, np.ndarray]:
         """Draw the spread quantities of these members (integers [n]); arrays [n] by dotted path."""
+
+    @abc.abstractmethod
+    def places(self) -> dict[str, Place]:
+        """Return the numbers that an axis of a map may vary, by dotted path."""
+
+    def parts(self, path: str) -> tuple[str, ...]:
+        """Return the paths of the numbers that a path of `places` stands for: itself, or those of several axes."""
+        return (path,)
+
+    @abc.abstractmethod
+    def at_period(self, period: float) -> Self:
+        """Return the study with another sample period, s, and runs of the same duration."""
+
+    @abc.abstractmethod
+    def metrics(self, values: dict[str, np.ndarray], members: np.ndarray) -> dict[str, np.ndarray]:
+        """Simulate systems with these values [n] by dotted path, and return their metrics [n].
+
+        `members` [n]: numbers of the members whose random signals they have.
+        """
 
     @abc.abstractmethod
     def columns(
@@ -130,8 +150,23 @@ class Study(AnyStudy):
 
     def batch(self, members: np.ndarray) -> tuple[Cascade, Scenario]:
         """Return the cascade and scenario of these members (integers [n]); leaves that vary are arrays [n]."""
-        cascade, scenario = apply(self.cascade, self.scenario, self.drawn(members))
+        return self.varied(self.drawn(members), members)
+
+    def varied(self, values: dict[str, np.ndarray], members: np.ndarray) -> tuple[Cascade, Scenario]:
+        """Return the cascade and scenario with these values [n], and with the random signals of these members [n]."""
+        cascade, scenario = apply(self.cascade, self.scenario, values)
         return cascade, dataclasses.replace(scenario, seed=self.seed, member=members)
+
+    def places(self) -> dict[str, Place]:
+        return places(self.cascade, self.scenario)
+
+    def at_period(self, period: float) -> Self:
+        samples = max(round(float(self.clock.duration) / period), 1)
+        return dataclasses.replace(self, clock=dataclasses.replace(self.clock, samples=samples, sample_period=period))
+
+    def metrics(self, values: dict[str, np.ndarray], members: np.ndarray) -> dict[str, np.ndarray]:
+        cascade, scenario = jax.tree.map(np.asarray, self.varied(values, members))
+        return run_ensemble(cascade, scenario, self.clock, fold=Metrics.of(self.settle, scenario)).metrics
 
     def member(self, index: int) -> tuple[Cascade, Scenario]:
         """Return the cascade and scenario of one member; all leaves are numbers."""

@@ -106,7 +106,7 @@ def equilibrium(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar)
     newton = newton_of(lambda y: residual(y, *held), lax.stop_gradient(flat / sizes))
     found = newton.error <= TOLERANCE * jnp.finfo(flat.dtype).eps
     # one more Newton step with a constant Jacobian: its derivative is that of the implicit function
-    y = newton.y - jnp.where(found, _inverse(newton.J) @ residual(newton.y, cascade, scenario), 0.0)
+    y = newton.y - jnp.where(found, inverse(newton.J) @ residual(newton.y, cascade, scenario), 0.0)
     return Equilibrium(restore(y * sizes), found, restore(residual(lax.stop_gradient(y), *held)))
 
 
@@ -138,7 +138,7 @@ def newton_of(residual: Callable[[Array], Array], y: Array) -> Newton:
     def evaluate(newton: Newton) -> Newton:
         J, G = jax.jacfwd(both, has_aux=True)(newton.trial)
         better = _size(G) < newton.error
-        direction = jnp.where(better, _inverse(J) @ G, newton.direction)
+        direction = jnp.where(better, inverse(J) @ G, newton.direction)
         fraction = jnp.where(better, 1.0, 0.5 * newton.fraction)
         y, J = jnp.where(better, newton.trial, newton.y), jnp.where(better, J, newton.J)
         error = jnp.where(better, _size(G), newton.error)
@@ -157,7 +157,7 @@ def _size(G: Array) -> Array:
     return jnp.where(jnp.all(jnp.isfinite(G)), jnp.max(jnp.abs(G)), jnp.inf)
 
 
-def _inverse(J: Array) -> Array:
+def inverse(J: Array) -> Array:
     """Return the pseudo-inverse of a Jacobian, in which a state that never changes is held.
 
     The row of a state that never changes is 0: the equation dx = 0 replaces it. The other rows are divided by their

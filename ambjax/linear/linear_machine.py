@@ -13,7 +13,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Sample
 from ambjax.control.machine_law import MachineInputs
 from ambjax.linear.analysis import Zones
-from ambjax.linear.equilibrium import TOLERANCE, at_rest, ideal, newton_of, reading, sizes_of, start_of
+from ambjax.linear.equilibrium import TOLERANCE, at_rest, ideal, inverse, newton_of, reading, sizes_of, start_of
 from ambjax.linear.margins import NO_PEAK, Margins, ResponsePeak, peak, poles_in_s, reading_margins, whole_end
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar, canonical
@@ -211,11 +211,18 @@ class _Linear:
         plant = tuple(jax.tree.map(lambda x, w=w: x / w, own.plant) for own, w in axes)
         return MachineRest(moved.q_dot / fastest**2, plant, change, jax.tree.map(jnp.subtract, u, point.u), law)
 
-    def rest(self) -> MachineRest:
-        """Return the equilibrium, or the point nearest to it that was found."""
-        start, sizes = self.start()
+    def rest(self, held: "_Linear") -> MachineRest:
+        """Return the equilibrium, or the point nearest to it that was found.
+
+        `held`: the same machine, without derivatives. Those of the equilibrium are those of the implicit function.
+        """
+        start, sizes = held.start()
         scale, (flat, restore) = ravel_pytree(sizes)[0], ravel_pytree(start)
-        return restore(newton_of(lambda y: self.deviation(restore(y * scale), scale), flat / scale).y * scale)
+        newton = newton_of(lambda y: held.deviation(restore(y * scale), scale), flat / scale)
+        found = newton.error <= TOLERANCE * jnp.finfo(flat.dtype).eps
+        # one more step with a constant Jacobian, as in `equilibrium`
+        step = inverse(newton.J) @ self.deviation(restore(newton.y * scale), scale)
+        return restore((newton.y - jnp.where(found, step, 0.0)) * scale)
 
     def deviation(self, point: MachineRest, scale: Array) -> Array:
         """Return the residual relative to the sizes of the states."""
@@ -333,7 +340,7 @@ def _held(A: Array, B: Array, period: Scalar, delay: Scalar, kept: int) -> tuple
 
 @jax.jit
 def _at_rest(machine: Machine, W: Scalar, period: Scalar) -> MachineRest:
-    return _Linear(machine, W, period).rest()
+    return _Linear(machine, W, period).rest(_Linear(jax.lax.stop_gradient(machine), W, period))
 
 
 @jax.jit

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import tomlkit
-from tomlkit.items import Table
 
+from ambjax.cases.scenario_tables import UNITS, usual_unit
 from ambjax.page.sliders import Slider
 
 # Numbers that mark the places of the sliders while the file is split into lines. No case contains them.
@@ -30,6 +30,33 @@ class TemplateLine(NamedTuple):
     only: list[int]
 
 
+class Spot(NamedTuple):
+    """The place of a number in a case file.
+
+    - `holder`: the table or list that contains it; None if the file has no such table.
+    - `key`: its key in the table, or its index in the list.
+    - `table`: dotted name of the table.
+    - `element`: number of the table in a list of tables of this name; None for a table outside a list.
+    """
+
+    holder: Any
+    key: str | int
+    table: str
+    element: int | None
+
+    @property
+    def header(self) -> str:
+        """The header of the table."""
+        return f"[{self.table}]" if self.element is None else f"[[{self.table}]]"
+
+    @property
+    def written(self) -> bool:
+        """Whether the file contains the number."""
+        if isinstance(self.holder, list):
+            return int(self.key) < len(self.holder)
+        return self.holder is not None and self.key in self.holder
+
+
 def editable_lines(text: str, given: Sequence[Slider]) -> tuple[list[TemplateLine], list[int]]:
     """Return the lines of a case file, and the indices of the sliders that have a place in it.
 
@@ -41,60 +68,87 @@ def editable_lines(text: str, given: Sequence[Slider]) -> tuple[list[TemplateLin
     the old value there for the controller.
     """
     document, written = tomlkit.parse(text), {}
-    added: dict[str, dict[str, int]] = {}
-    placed = []
-    for k, slider in enumerate(given):
-        tables, name = _route(slider.path)
-        found = _find(document, tables)
-        if found is not None and name in found:
-            written[k] = found[name].as_string()
-            found[name] = tomlkit.value(MARK.format(k))
-            placed.append(k)
-        elif found is None or isinstance(found, Table):
-            added.setdefault(".".join(tables), {})[name] = k
-            placed.append(k)
+    spots = {k: spot for k, slider in enumerate(given) if (spot := _spot(document, slider.path)) is not None}
+    for k, spot in spots.items():
+        if spot.written:
+            written[k] = spot.holder[spot.key].as_string()
+            spot.holder[spot.key] = tomlkit.value(MARK.format(k))
     lines = [_line(line, written) for line in tomlkit.dumps(document).split("\n")]
-    kept = _find(document, ["controller", "model"])
-    names = {given[k].path.rpartition(".")[2]: k for k in placed if given[k].path.startswith("plant.")}
-    keep = {name: k for name, k in names.items() if kept is None or name not in kept}
-    if kept is None or isinstance(kept, Table):
-        rows = [([f"{name} = {given[k].value!r}"], [k]) for name, k in keep.items()]
-        _insert(lines, "controller.model", kept is not None, rows)
+    for k in [k for k in spots if k not in written and not _addable(lines, spots[k])]:
+        del spots[k]
+    model = _spot(document, "controller.model.m")
+    names = {given[k].path.rpartition(".")[2]: k for k in spots if given[k].path.startswith("plant.")}
+    keep = {name: k for name, k in names.items() if model is None or not model._replace(key=name).written}
+    if model is not None and _addable(lines, model):
+        _insert(lines, model, [([f"{name} = {given[k].value!r}"], [k]) for name, k in keep.items()])
     else:
-        placed = [k for k in placed if k not in keep.values()]
-    for table, names in added.items():
-        rows = [([f"{name} = ", (k, ""), ""], [k]) for name, k in names.items()]
-        if _find(document, table.split(".")) is None and table.startswith(SIGNALS):
-            rows = [(['kind = "constant"'], sorted(names.values())), *rows]
-        _insert(lines, table, _find(document, table.split(".")) is not None, rows)
-    return lines, placed
+        spots = {k: spot for k, spot in spots.items() if k not in keep.values()}
+    added: dict[tuple[str, int | None], list[int]] = {}
+    for k, spot in spots.items():
+        if k not in written:
+            added.setdefault((spot.table, spot.element), []).append(k)
+    for same in added.values():
+        rows: list[Any] = [([f"{spots[k].key} = ", (k, ""), ""], [k]) for k in same]
+        if spots[same[0]].holder is None and spots[same[0]].table.startswith(SIGNALS):
+            rows = [(['kind = "constant"'], same), *rows]
+        _insert(lines, spots[same[0]], rows)
+    return lines, list(spots)
 
 
-def _insert(lines: list[TemplateLine], table: str, there: bool, rows: Sequence[tuple[Any, list[int]]]) -> None:
-    """Insert optional lines below the header of a table. `there`: whether the file has it; else add it at the end."""
-    new = [TemplateLine(*row) for row in rows]
-    if there:
-        at = next(
-            k for k, line in enumerate(lines) if line.parts and str(line.parts[0]).strip().startswith(f"[{table}]")
-        )
+def _addable(lines: Sequence[TemplateLine], spot: Spot) -> bool:
+    """Return whether a line for a number can be added: below the header of its table, or in a new table."""
+    return _header(lines, spot) is not None or (spot.holder is None and spot.element is None)
+
+
+def _header(lines: Sequence[TemplateLine], spot: Spot) -> int | None:
+    """Return the index of the line with the header of a table; None if there is none."""
+    found = [k for k, line in enumerate(lines) if line.parts and str(line.parts[0]).strip().startswith(spot.header)]
+    return next(iter(found[spot.element or 0 :]), None)
+
+
+def _insert(lines: list[TemplateLine], spot: Spot, rows: Sequence[tuple[Any, list[int]]]) -> None:
+    """Insert optional lines below the header of a table. If there is no header, add the table at the end."""
+    new, at = [TemplateLine(*row) for row in rows], _header(lines, spot)
+    if at is not None:
         lines[at + 1 : at + 1] = new
     elif new:
         every = sorted({k for line in new for k in line.only})
-        lines += [TemplateLine([""], every), TemplateLine([f"[{table}]"], every), *new]
+        lines += [TemplateLine([""], every), TemplateLine([spot.header], every), *new]
 
 
-def _route(path: str) -> tuple[list[str], str]:
-    """Return the names of the tables in a dotted path, and the key."""
-    *tables, name = path.split(".")
-    return tables, name
+def _spot(document: Any, path: str) -> Spot | None:
+    """Return the place of the number at this dotted path; None if it has none."""
+    *words, key = _words(document, path)
+    holder, numbers = document, [word for word in words if isinstance(word, int)]
+    for word in words:
+        holder = _entry(holder, word)
+    if isinstance(key, int) and isinstance(holder, dict):
+        holder = holder.get("values")  # of a schedule
+    if len(numbers) > 1 and not Spot(holder, key, "", None).written:
+        return None
+    if holder is None and numbers:
+        return None
+    return Spot(holder, key, ".".join(str(word) for word in words if word not in numbers), next(iter(numbers), None))
 
 
-def _find(document: Any, tables: list[str]) -> Any:
-    """Return the table at this path, or None."""
-    for word in tables:
-        if not hasattr(document, "get") or (document := document.get(word)) is None:
-            return None
-    return document if hasattr(document, "get") else None
+def _entry(holder: Any, word: str | int) -> Any:
+    """Return an entry of a table or of a list; None if there is none."""
+    if isinstance(word, int):
+        return holder[word] if isinstance(holder, list) and word < len(holder) else None
+    return holder.get(word) if isinstance(holder, dict) else None
+
+
+def _words(document: Any, path: str) -> list[str | int]:
+    """Return the keys and indices of a dotted path in the file, where all forces are in the list `disturbance.q_z`."""
+    words = [int(word) if word.isdigit() else word for word in path.split(".")]
+    loads, slots = _entry(_entry(document, "disturbance"), "q_z"), UNITS["q_z"]
+    if words[0] != "disturbance" or words[1] not in slots.values() or not isinstance(loads, list):
+        return words
+    # A path has the name of a unit, such as q_f, only if the loads have several units.
+    named = [slots[load.get("unit", usual_unit("q_z", load))] for load in loads]
+    own = [n for n, name in enumerate(named) if name == words[1]] or list(range(len(loads)))
+    n, rest = (words[3], words[4:]) if len(own) > 1 else (0, words[2:])
+    return ["disturbance", "q_z", own[int(n)], *rest]
 
 
 def _line(text: str, written: dict[int, str]) -> TemplateLine:

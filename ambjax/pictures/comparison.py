@@ -24,6 +24,7 @@ class Contender(NamedTuple):
     - `held`: whether each member keeps its rotor [N].
     - `error`, `voltage`: settled rms error (m) and settled rms voltage (V) of each member [N].
     - `system`: the linearised loop; None: not stable, or no equilibrium. Then |S| and |KS| are not drawn.
+    - `channel`: number of the sensor of the drawn responses. `where`: axis and speed of a machine in the legend.
     """
 
     name: str
@@ -31,6 +32,8 @@ class Contender(NamedTuple):
     error: np.ndarray
     voltage: np.ndarray
     system: StateSpace | None
+    channel: int = 0
+    where: str = ""
 
 
 @own_style
@@ -60,9 +63,9 @@ def comparison_figure(cases: Sequence[Contender], limits: Sequence[float], span:
         if case.system is not None:
             period = case.system.period
             f = grid if period is None else grid[grid <= 0.5 / float(period)]
-            H = np.asarray(case.system.response(f))
-            S_axes.loglog(f, np.abs(H[:, 0, 0]), **look)
-            KS_axes.loglog(f, np.abs(H[:, 2, 0]), **look)
+            H, k = np.asarray(case.system.response(f)), case.channel
+            S_axes.loglog(f, np.abs(H[:, k, k]), **look | {"label": f"{case.name}: {case.where}"})
+            KS_axes.loglog(f, np.abs(H[:, H.shape[-1] + k, k]), **look)
         errors, lost = factor * np.sort(case.error[case.held]), int(np.sum(~case.held))
         label = f"{case.name} ({lost} lost)" if lost else case.name
         error_axes.step(errors, np.arange(1, errors.size + 1) / case.held.size, where="post", **look | {"label": label})
@@ -75,6 +78,8 @@ def comparison_figure(cases: Sequence[Contender], limits: Sequence[float], span:
     _label(effort_axes, "settled rms voltage, V", f"settled rms error, {unit}", "one point per member")
     error_axes.set_ylim(0, 1.02)
     error_axes.legend(fontsize=8, loc="lower right")
+    if any(case.system is not None and case.where for case in cases):
+        S_axes.legend(fontsize=8, loc="lower right")
     for ax in (S_axes, KS_axes):
         ax.set_xlim(span)
     return figure

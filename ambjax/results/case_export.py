@@ -20,6 +20,7 @@ from ambjax.codegen.c99 import machine, package, texts
 from ambjax.codegen.c99.source import Origin
 from ambjax.codegen.c99.statements import RESERVED
 from ambjax.codegen.fmi import archive, cross_check
+from ambjax.codegen.javascript.script import script_of
 from ambjax.codegen.of_case import WHAT, block_of
 from ambjax.codegen.program import PRECISIONS
 from ambjax.codegen.trace import trace
@@ -30,6 +31,7 @@ from ambjax.ensemble.spread import ends
 from ambjax.host.arguments import names_arguments
 from ambjax.results.outputs import described, directory, files, plain, spare
 
+FORMATS = ("c", "fmu", "js")
 # Files of the verification.
 VERIFIED = ("verify.md", "verify.json")
 # Largest length of a prefix.
@@ -42,6 +44,12 @@ HEADER_NAMES = {
     *("signal", "stdarg", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath", "time", "wchar"),
     "wctype",
 }
+# Keywords of C and of JavaScript that RESERVED does not contain.
+KEYWORDS = {
+    *("arguments", "await", "break", "class", "continue", "debugger", "else", "eval", "extends", "finally", "for"),
+    *("function", "if", "implements", "import", "in", "instanceof", "interface", "let", "null", "package", "return"),
+    *("super", "try", "typeof", "var", "while", "with", "yield"),
+}
 
 
 class Plan(NamedTuple):
@@ -49,7 +57,8 @@ class Plan(NamedTuple):
 
     - `case`: the case.
     - `block`: what is exported.
-    - `fmi`: version of FMI, 2 or 3; 0 for a C package.
+    - `format`: one of FORMATS.
+    - `fmi`: version of FMI of an FMU, 2 or 3.
     - `precision`: C type of a C package, "float" or "double".
     - `prefix`: prefix of all C names.
     - `verified`: whether the C is compared with JAX.
@@ -57,6 +66,7 @@ class Plan(NamedTuple):
 
     case: Case
     block: Block
+    format: str
     fmi: int
     precision: str
     prefix: str
@@ -131,14 +141,15 @@ def export(
     prefix: str | None = None,
     verify: bool = False,
 ) -> ExportedCase:
-    """Return the controller, the plant or the loop of a case as C or as an FMU, as `ambjax export` writes it.
+    """Return the controller, the plant or the loop of a case as C, FMU or JavaScript, as `ambjax export` writes it.
 
     - `case`: from `read_case`, with the table [processor].
     - `what`: part to export, "controller", "plant" or "loop".
-    - `format`: "c" for a C package, "fmu" for an FMU.
+    - `format`: "c" for a C package, "fmu" for an FMU, "js" for JavaScript.
     - `fmi`: version of FMI of an FMU, 2 or 3; None: 3.
-    - `precision`: C type of all numbers of a C package, "float" or "double"; None: "float". An FMU has double.
-    - `prefix`: prefix of all names in the C code, a C identifier; None: the case's name, made a C identifier.
+    - `precision`: C type of all numbers of a C package, "float" or "double"; None: "float". Other formats have double.
+    - `prefix`: prefix of all names in the C code, or name of the JavaScript object, a C identifier; None: the case's
+      name, made a C identifier.
     - `verify`: compile the C in both precisions and compare it with JAX. Takes about a minute; needs a C compiler.
 
     Writes no files: see `ExportedCase.write`. Returns an `ExportedCase`; a failed check is a result, see its `ok`.
@@ -153,18 +164,20 @@ def planned(
 ) -> Plan:
     """Check the options of `export` and build the block. Raises ValueError as `export` does."""
     _choice("what", what, WHAT)
-    _choice("format", format, ("c", "fmu"))
+    _choice("format", format, FORMATS)
     _choice("fmi", fmi, (None, 2, 3))
     _choice("precision", precision, (None, *PRECISIONS))
     name = _prefix(prefix, case.name)
     block = block_of(what, guarded_for(case), case.scenario, case.clock)
     if fmi is not None and format != "fmu":
         raise ValueError(f"--fmi {fmi}: it is the version of an FMU. Omit --fmi, or set --format to fmu.")
-    if precision == "float" and format == "fmu":
-        raise ValueError("--precision float: an FMU computes in double. Omit --precision, or set --format to c.")
+    if precision == "float" and format != "c":
+        raise ValueError(f"--precision float: --format {format} has double. Omit --precision, or set --format to c.")
+    if verified and format == "js":
+        raise ValueError("--verify: it compares C with JAX. Omit it, or set --format to c.")
     if verified:
         machine.check_compiler()
-    return Plan(case, block, (fmi or 3) if format == "fmu" else 0, precision or "float", name, verified)
+    return Plan(case, block, format, fmi or 3, precision or "float", name, verified)
 
 
 def _choice(name: str, value: object, allowed: tuple[object, ...]) -> None:
@@ -183,7 +196,7 @@ def generated(plan: Plan) -> ExportedCase:
     checks = described("the verification", lambda: verify.verify(drafts, loop))
     if checks is None:  # the files are written, but they are not verified
         checks = [verify.Check("verification", plan.precision, "it ended with an error", "it is complete", False)]
-    built = _built(plan) if plan.fmi else {**drafts[plan.precision].files}
+    built = _built(plan) if plan.format == "fmu" else {**drafts[plan.precision].files}
     record = {"from": plan.mark, "ok": verify.holds(checks), "checks": [check._asdict() for check in checks]}
     page = verify.checks_page(checks, case.name, plan.mark, plan.block.noun)
     text = json.dumps(plain(record), indent=2) + "\n"
@@ -192,7 +205,9 @@ def generated(plan: Plan) -> ExportedCase:
 
 def _built(plan: Plan) -> dict[str, str | bytes]:
     """Return the content of each file by name, without verification."""
-    if not plan.fmi:
+    if plan.format == "js":
+        return {f"{plan.prefix}.js": f"// {plan.mark}\n{script_of(plan.block, plan.prefix)}"}
+    if plan.format == "c":
         return {**package.package_files(plan.block, plan.precision, plan.prefix, plan.origin)}
     case, traced = plan.case, trace(plan.block, "double")
     fmu = {f"{plan.prefix}.fmu": archive.packed(traced, plan.prefix, plan.origin, plan.fmi)}
@@ -210,7 +225,9 @@ def destination(out: str | None, name: str, plan: Plan) -> Iterator[tuple[pathli
     with the same prefix.
     """
     path = directory(out, name)
-    names = FMU_NAMES[: 1 if _holds_fmu(path, plan) else None] if plan.fmi else package.NAMES
+    names = {"fmu": FMU_NAMES[: 1 if _holds_fmu(path, plan) else None], "js": ("{p}.js",), "c": package.NAMES}[
+        plan.format
+    ]
     spare(path, [*(name.format(p=plan.prefix) for name in names), *VERIFIED], plan.mark)
     with files(path) as part:
         yield path, part
@@ -240,13 +257,13 @@ def _prefix(option: str | None, name: str) -> str:
     if not isinstance(option, str) or not _is_name(option):
         raise ValueError(
             f"--prefix {option}: it must be a C identifier (a letter, then at most {MOST_LETTERS - 1} letters, "
-            "digits or '_'), and neither a C keyword nor the name of a C header. For example: controller."
+            "digits or '_'), no keyword of C or JavaScript, and not the name of a C header. For example: controller."
         )
     return option
 
 
 def _is_name(text: str) -> bool:
     """Return whether a text can be the prefix: a C identifier that is neither a keyword nor the name of a C header."""
-    words = RESERVED | HEADER_NAMES | {"break", "continue", "else", "for", "if", "return", "while"}
+    words = RESERVED | HEADER_NAMES | KEYWORDS
     valid = re.fullmatch(r"[A-Za-z]\w*", text, flags=re.ASCII) is not None and len(text) <= MOST_LETTERS
     return valid and text not in words

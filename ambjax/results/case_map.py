@@ -7,20 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.cases.reader import Case, require_case
+from ambjax.cases.machine_case import AnyCase, MachineCase
+from ambjax.cases.reader import require_case
 from ambjax.cases.timing import FEWEST_SAMPLES, MOST_SAMPLES, SAMPLE_PERIOD
-from ambjax.control.cascade import Cascade
 from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, with_method_for_axes
-from ambjax.ensemble.paths import Place, places
+from ambjax.ensemble.paths import Place
 from ambjax.ensemble.spread import no_such_number
-from ambjax.ensemble.study import Study
+from ambjax.ensemble.study import AnyStudy, Study
 from ambjax.host.arguments import names_arguments
 from ambjax.host.optional import extra
 from ambjax.linear import stability_of
 from ambjax.numerics.declared import numbers, within
+from ambjax.results.machine_study import MachineStudy
 from ambjax.results.spread_runs import study_of
-from ambjax.simulation.clock import Clock
-from ambjax.world.scenario import Scenario
 
 COUNT = 21
 MOST_CELLS = 1_000_000
@@ -46,7 +45,7 @@ class CaseMap:
     A notebook shows the smallest and largest values of each array.
     """
 
-    case: Case
+    case: AnyCase
     map: Map
 
     def to_xarray(self) -> Any:
@@ -82,10 +81,10 @@ class CaseMap:
 
 
 @names_arguments()
-def survival_map(case: Case, x: str, y: str, *, members: int = 1, seed: int | None = None) -> CaseMap:
+def survival_map(case: AnyCase, x: str, y: str, *, members: int = 1, seed: int | None = None) -> CaseMap:
     """Return survival and error over a grid of two quantities of a case, as `ambjax map` computes them.
 
-    - `case`: from `read_case`.
+    - `case`: from `read_case` or `read_machine`.
     - `x`, `y`: quantity and range of each axis, in the form of the command's options: "PATH=LOW:HIGH[:COUNT][:log]".
       LOW and HIGH are in SI units, or changes of the value in the case in per cent: -20% is 0.8 times this value.
       COUNT is 21 by default.
@@ -94,7 +93,8 @@ def survival_map(case: Case, x: str, y: str, *, members: int = 1, seed: int | No
 
     Raises ValueError for an unknown quantity, a range that the case does not allow, and too many runs.
     """
-    require_case(case)
+    if not isinstance(case, MachineCase):
+        require_case(case)
     for name, axis in (("x", x), ("y", y)):
         if not isinstance(axis, str):
             raise ValueError(f"{name} = {axis!r}: it must be text. Write {FORM}.")
@@ -102,12 +102,17 @@ def survival_map(case: Case, x: str, y: str, *, members: int = 1, seed: int | No
     return CaseMap(case, grid(study, first, second, is_stable))
 
 
-def is_stable(cascade: Cascade, scenario: Scenario, clock: Clock) -> np.ndarray:
-    """Return whether each member of an ensemble [N] is stable, for `grid`."""
-    return stability_of(cascade, scenario, clock).stable
+def is_stable(study: AnyStudy, values: dict[str, np.ndarray], members: np.ndarray) -> np.ndarray:
+    """Return whether each system is stable [N], for `grid`. Of a machine, the linear loops are tested."""
+    if isinstance(study, MachineStudy):
+        return study.growth(values, members) <= 0
+    assert isinstance(study, Study)
+    return stability_of(*study.varied(values, members), study.clock).stable
 
 
-def study_and_axes(case: Case, x: str, y: str, members: int, seed: int | None) -> tuple[Study, Axis, Axis]:
+def study_and_axes(
+    case: AnyCase, x: str, y: str, members: int, seed: int | None
+) -> tuple[Study | MachineStudy, Axis, Axis]:
     """Return the study and the axes of a map. Raises ValueError as `survival_map` does."""
     study = study_of(case, seed, members)
     first, second = _axis("--x", x, case), _axis("--y", y, case)
@@ -115,16 +120,23 @@ def study_and_axes(case: Case, x: str, y: str, members: int, seed: int | None) -
     if cells * members > MOST_CELLS:
         raise ValueError(f"--members {members}: with {cells} cells, more than {MOST_CELLS:,} runs. Reduce either.")
     _check_samples(case, first, second, members)
+    if isinstance(study, MachineStudy):
+        return study.with_steps_for({axis.path: axis.values for axis in (first, second)}), first, second
     return with_method_for_axes(study, first, second), first, second
 
 
-def unit_of(case: Case, axis: Axis) -> str:
+def _places(case: AnyCase) -> dict[str, Place]:
+    """Return the numbers that an axis may vary, by dotted path."""
+    return study_of(case, 0, 1).places()
+
+
+def unit_of(case: AnyCase, axis: Axis) -> str:
     """Return the unit of the quantity on an axis."""
-    place = places(case.cascade, case.scenario).get(axis.path)
+    place = _places(case).get(axis.path)
     return "s" if place is None else place.field.metadata["unit"]
 
 
-def panel(case: Case, one: Map) -> Any:
+def panel(case: AnyCase, one: Map) -> Any:
     """Return the panel of a map, a `heatmaps.MapPanel`."""
     from ambjax.pictures.heatmaps import MapPanel
 
@@ -148,7 +160,7 @@ def _subtitle(one: Map) -> str:
     return words + f"; {int(one.stalled.sum())} runs not decided" * bool(one.stalled.any())
 
 
-def labels(case: Case, one: Map) -> tuple[str, str, bool, bool]:
+def labels(case: AnyCase, one: Map) -> tuple[str, str, bool, bool]:
     """Return the labels of x and y with their units, and whether each axis is logarithmic."""
 
     def label(axis: Axis) -> str:
@@ -158,7 +170,7 @@ def labels(case: Case, one: Map) -> tuple[str, str, bool, bool]:
     return label(one.x), label(one.y), one.x.log, one.y.log
 
 
-def _axis(flag: str, text: str, case: Case) -> Axis:
+def _axis(flag: str, text: str, case: AnyCase) -> Axis:
     """Parse the value of --x or --y. Raises ValueError with the option, its text and the valid form."""
 
     def refuse(why: str) -> ValueError:
@@ -170,7 +182,7 @@ def _axis(flag: str, text: str, case: Case) -> Axis:
     parts = parts[:-1] if log else parts
     if len(parts) not in (2, 3):
         raise refuse("it must be a path, '=' and a range")
-    known = places(case.cascade, case.scenario)
+    known = _places(case)
     if path != PERIOD and path not in known:
         raise ValueError(f"{flag} {path}: {no_such_number(path, [*known, PERIOD])}")
     nominal = float(case.clock.sample_period) if path == PERIOD else _nominal(known[path])
@@ -191,7 +203,7 @@ def _axis(flag: str, text: str, case: Case) -> Axis:
     return Axis(path, np.geomspace(low, high, count) if log else np.linspace(low, high, count), log)
 
 
-def _check_samples(case: Case, x: Axis, y: Axis, members: int) -> None:
+def _check_samples(case: AnyCase, x: Axis, y: Axis, members: int) -> None:
     """Raise ValueError if a sample period is too long for the run, or if a run or the map has too many samples."""
     for flag, axis, other in (("--x", x, y), ("--y", y, x)):
         if axis.path != PERIOD:

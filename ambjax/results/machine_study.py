@@ -1,30 +1,34 @@
 """An ensemble of a machine: its study, whose metrics are those of the worst axis."""
 
+import contextlib
 import dataclasses
 import hashlib
-from typing import Any
+import tomllib
+from collections.abc import Mapping
+from typing import Any, Self
 
 import jax
 import numpy as np
 
-from ambjax.cases.machine_case import MachineCase
-from ambjax.cases.machine_controller import inner
-from ambjax.cases.machine_spread import axis_values, machine_places, varied_rotors
+from ambjax.cases.machine_case import MachineCase, machine_from, machine_of_axes, parts_of
+from ambjax.cases.machine_spread import axis_values, machine_places, shared, varied_rotors, varied_start
+from ambjax.compiler.members_last import members_last
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
-from ambjax.ensemble.paths import kinds, places, with_values
+from ambjax.ensemble.maps import PERIOD
+from ambjax.ensemble.paths import Place, kinds, places, with_values
 from ambjax.ensemble.spread import Spread, drawn
 from ambjax.ensemble.study import SPREAD, AnyStudy
 from ambjax.linear import linearise_machine, poles_in_s
 from ambjax.linear.stability import Findings
 from ambjax.numerics.records import canonical
+from ambjax.numerics.shapes import map_varying
 from ambjax.results.machine_run import worst_of
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
 from ambjax.simulation.metrics import Metrics
-from ambjax.simulation.rollout import Result, prepare, run
-from ambjax.simulation.whole_machine import ContinuousMachine, Machine, PerAxis, SampledMachine, machine_of, stack_axes
-from ambjax.world.rotor import Rotor
+from ambjax.simulation.rollout import Result, run
+from ambjax.simulation.whole_machine import Machine, PerAxis, stack_axes
 from ambjax.world.scenario import Scenario
 
 # Multiple of the clearance by which the rotor of a `lost` call is displaced along x and y.
@@ -49,11 +53,13 @@ class MachineStudy(AnyStudy):
     - `case`: the machine, with its spread.
     - `seed`: seed of the spread and of the noise.
     - `members`: number of members.
+    - `by_axis`: metrics of each axis among the columns, as AXIS.METRIC.
     """
 
     case: MachineCase
     seed: int
     members: int
+    by_axis: tuple[str, ...] = ()
 
     @property
     def clock(self) -> Clock:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -72,24 +78,64 @@ class MachineStudy(AnyStudy):
         return any(one.scenario.random for one in self.case.cases)
 
     def drawn(self, members: np.ndarray) -> dict[str, np.ndarray]:
-        known = machine_places(self.case.machine.rotor, self.case.axes, self.case.cases)
-        return drawn(self.spread, known, self.seed, members, self.members)
+        return drawn(self.spread, self._numbers(), self.seed, members, self.members)
+
+    def _numbers(self) -> dict[str, Place]:
+        """Return every number of the rotor and of each axis by dotted path."""
+        machine = self.case.machine
+        return machine_places(machine.rotor, machine.start_q, self.case.axes, self.case.cases)
+
+    def places(self) -> dict[str, Place]:
+        table = self._numbers()
+        for path, parts in shared(table, self.case.axes).items():
+            first = table[parts[0]]
+            same = all(np.array_equal(table[part].value, first.value) for part in parts)
+            table[path] = first if same else first._replace(value=None)
+        return table
+
+    def parts(self, path: str) -> tuple[str, ...]:
+        return shared(self._numbers(), self.case.axes).get(path, (path,))
+
+    def at_period(self, period: float) -> Self:
+        case = _reread(self.case, {PERIOD: period})
+        return self._with_clock(case, dataclasses.replace(case.clock, method=self.clock.method))
+
+    def _with_clock(self, case: MachineCase, clock: Clock) -> Self:
+        return dataclasses.replace(self, case=dataclasses.replace(case, clock=clock))
+
+    def with_steps_for(self, axes: dict[str, np.ndarray]) -> Self:
+        """Return the study with integration steps for all values of these numbers, by dotted path of `places`.
+
+        Raises ValueError for values that the machine does not allow.
+        """
+        wide: dict[str, object] = {}
+        for path, x in axes.items():
+            low, high = float(x.min()), float(x.max())
+            wide |= {PERIOD: high} if path == PERIOD else {f"spread.{path}": {"uniform": [low, high]}}
+        try:
+            found = _reread(self.case, wide)
+        except ValueError as error:
+            raise ValueError(f"--x, --y: {error}") from None
+        return self._with_clock(self.case, dataclasses.replace(self.clock, method=found.clock.method))
 
     def batch(self, members: np.ndarray) -> tuple[Machine, PerAxis]:
         """Return the machine of these members (integers [n]), and the metrics of its axes; what varies has an axis [n].
 
         The nominal plants of the controllers do not vary.
         """
-        values = self.drawn(members)
-        parts = [self._axis(values, k, members) for k in range(len(self.case.axes))]
-        machine = self._machine(varied_rotors(self.case.machine.rotor, values), parts)
-        return machine, PerAxis(stack_axes([canonical(Metrics.of(self.settle, scenario)) for _, scenario in parts]))
+        return self.varied(self.drawn(members), members)
 
-    def _machine(self, rotor: Rotor, parts: list[tuple[Cascade, Scenario]]) -> Machine:
-        law = self.case.machine.law
-        systems = [prepare(*part, self.clock)[0] for part in parts]
-        systems = [canonical(system if law is None else inner(system, law)) for system in systems]
-        return machine_of(rotor, systems, self.case.machine.start_q, law)
+    def varied(self, values: dict[str, np.ndarray], members: np.ndarray) -> tuple[Machine, PerAxis]:
+        """Return the machine with these values [n] and the random signals of these members [n], as `batch` does."""
+        machine = self.case.machine
+        parts = [self._axis(values, k, members) for k in range(len(self.case.axes))]
+        rotor, start = varied_rotors(machine.rotor, values), varied_start(machine.start_q, values)
+        folds = [canonical(Metrics.of(self.settle, scenario)) for _, scenario in parts]
+        return machine_of_axes(rotor, parts, self.clock, start, machine.law), PerAxis(stack_axes(folds))
+
+    def metrics(self, values: dict[str, np.ndarray], members: np.ndarray) -> dict[str, np.ndarray]:
+        machine, fold = self.varied(values, members)
+        return worst_of(simulate_members(machine, self.clock, fold).metrics)
 
     def _axis(self, values: dict[str, Any], k: int, member: Any) -> tuple[Cascade, Scenario]:
         one = self.case.cases[k]
@@ -104,11 +150,12 @@ class MachineStudy(AnyStudy):
         for k, one in enumerate(self.case.cases):
             cascade, scenario = self._axis(numbers, k, index)
             cases.append(dataclasses.replace(one, cascade=cascade, scenario=scenario))
-        rotor = self.case.machine.rotor
-        rotors = varied_rotors(rotor, values)
-        if rotors is not rotor:
-            rotor = jax.tree.map(lambda x: x[0], rotors)
-        machine = self._machine(rotor, [(one.cascade, one.scenario) for one in cases])
+        machine = self.case.machine
+        rotor, start = varied_rotors(machine.rotor, values), varied_start(machine.start_q, values)
+        if rotor is not machine.rotor:
+            rotor = jax.tree.map(lambda x: x[0], rotor)
+        start = start.reshape(-1, start.shape[-1])[0]
+        machine = machine_of_axes(rotor, parts_of(cases), self.clock, start, machine.law)
         name = f"{self.case.name}-{index}"
         return dataclasses.replace(self.case, name=name, machine=machine, cases=tuple(cases))
 
@@ -119,34 +166,65 @@ class MachineStudy(AnyStudy):
         machine, fold = self.batch(members)
         if lost:
             far = np.array(machine.start_q)
-            far[:2] = FAR * max(float(np.max(np.asarray(one.scenario.limit))) for one in self.case.cases)
+            far[..., :2] = FAR * max(float(np.max(np.asarray(one.scenario.limit))) for one in self.case.cases)
             machine = dataclasses.replace(machine, start_q=far)
-        tree = canonical((machine, self.clock, fold))
-        # plain: within one kernel, arrays of axes take minutes to compile
-        outcome = map_members(_simulated, tree, threads=threads, call=call, plain=True, quick=False)
+        outcome = simulate_members(machine, self.clock, fold, threads=threads, call=call)
         values = {SPREAD + path: x for path, x in self.drawn(members).items()}
+        for k, axis in enumerate(self.case.axes):
+            values |= {f"{axis}.{name}": outcome.metrics[name][:, k] for name in self.by_axis}
         return {"index": members, "lost_at": outcome.trajectory.lost_at, **worst_of(outcome.metrics), **values}
 
     def findings(self, index: np.ndarray) -> Findings:
         """Test whether the linear loops of the first MOST_TESTED of these members are stable at their first speed."""
-        growth = []
-        for k in index[:MOST_TESTED]:
-            one = self.member(int(k))
-            speed = float(np.asarray(one.machine.rotor.speed))
-            growth.append(np.max(np.real(poles_in_s(linearise_machine(one.machine, self.clock.sample_period, speed)))))
-        return LinearFindings(len(growth), int(np.sum(np.array(growth) > 0)))
+        tested = index[:MOST_TESTED]
+        return LinearFindings(len(tested), int(np.sum(self.growth(self.drawn(tested), tested) > 0)))
+
+    def growth(self, values: dict[str, np.ndarray], members: np.ndarray) -> np.ndarray:
+        """Return the largest real part of a pole (1/s) of each system of `varied` [n]; inf without an equilibrium."""
+        machine, _ = self.varied(values, members)
+        rates = np.full(len(members), np.inf)
+        for k in range(len(members)):
+            one = map_varying(lambda x, k=k: x[k], machine)
+            with contextlib.suppress(ValueError):
+                system = linearise_machine(one, self.clock.sample_period, float(np.asarray(one.rotor.speed)))
+                rates[k] = np.max(np.real(poles_in_s(system)))
+        return rates
 
     def fingerprint(self) -> dict[str, object]:
-        facts, digest = self.facts(), hashlib.sha256()
+        machine, facts = self.case.machine, self.facts()
         for k, one in enumerate(self.case.cases):
             at = f"bearing.{self.case.axes[k]}."
             facts |= {**dict(kinds(one.cascade, f"{at}controller.")), **dict(kinds(one.scenario, at))}
-        known = machine_places(self.case.machine.rotor, self.case.axes, self.case.cases)
-        facts |= {path: str(place.value) for path, place in known.items()}
-        for x in jax.tree.leaves((self.case.machine.rotor, self.case.machine.start_q)):
-            digest.update(np.asarray(x).tobytes())
-        return facts | {"rotor": digest.hexdigest()}
+        facts |= {path: str(place.value) for path, place in self._numbers().items()}
+        for name, part in (("rotor", machine.rotor), ("initial.q", machine.start_q), ("controller.law", machine.law)):
+            digest = hashlib.sha256(repr(jax.tree.structure(part)).encode())
+            for x in jax.tree.leaves(part):
+                digest.update(np.asarray(x).tobytes())
+            facts[name] = digest.hexdigest()[:12]
+        return facts
 
 
-def _simulated(tree: tuple[SampledMachine | ContinuousMachine, Clock, Fold]) -> Result:
-    return run(*tree, 0)
+def simulate_members(
+    machine: Machine, clock: Clock, fold: Fold, *, threads: int | None = None, call: int | None = None
+) -> Result:
+    """Simulate all members of an ensemble of machines. What varies has a leading axis [N]. No rows are recorded."""
+    tree = canonical((machine, clock, fold))
+    return map_members(_simulated, tree, threads=threads, call=call, vectorised=True)
+
+
+def _simulated(tree: tuple[Machine, Clock, Fold], axes: object) -> Result:
+    return members_last(lambda one: run(*one, 0), axes)(tree)
+
+
+def _reread(case: MachineCase, changes: Mapping[str, object]) -> MachineCase:
+    """Return a machine with other values at dotted paths of its file. Raises ValueError as `machine_from` does."""
+    if not case.text:
+        raise ValueError(f"{case.name}: it has no file. Read it with read_machine.")
+    raw = tomllib.loads(case.text)
+    for path, value in changes.items():
+        *stems, key = path.split(".")
+        node = raw
+        for stem in stems:
+            node = node.setdefault(stem, {})
+        node[key] = value
+    return machine_from(raw, case.name, case.text, case.folder)

@@ -6,7 +6,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from ambjax.cases.machine_case import MachineCase
+from ambjax.cases.machine_case import MachineCase, first_axis
 from ambjax.cases.reader import Case, require_case
 from ambjax.ensemble import statistics
 from ambjax.ensemble.design import MOST_MEMBERS
@@ -100,8 +100,7 @@ def study_of(case: Case | MachineCase, seed: int | None, members: int) -> Study 
     """Return the study of a case. Raises ValueError for a member count or seed out of range."""
     if not isinstance(members, numbers.Integral) or not 1 <= members <= MOST_MEMBERS:
         raise ValueError(f"--members {members!r}: it must be a whole number from 1 to {MOST_MEMBERS:,}.")
-    one = case if isinstance(case, Case) else case.cases[0]
-    seed = int(one.scenario.seed) if seed is None else seed
+    seed = int(first_axis(case).scenario.seed) if seed is None else seed
     if not isinstance(seed, numbers.Integral) or not 0 <= seed < 2**32:
         raise ValueError(f"--seed {seed!r}: it must be a whole number from 0 to 4294967295.")
     if isinstance(case, MachineCase):

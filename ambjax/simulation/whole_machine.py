@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.compiler.barrier import materialised
 from ambjax.control.machine_law import MachineLaw
 from ambjax.numerics.records import Scalar, leaf, part, record, static
 from ambjax.numerics.shapes import varying
@@ -187,10 +188,10 @@ class Machine:
         """
         (others, W), rotor = outside, self.rotor
         accelerations = self.join([own.plant.z_dot for own in rates])
-        magnets = self.plants("m") * (accelerations + self.plants("g"))
+        magnets = materialised(self.plants("m") * (accelerations + self.plants("g")))
         forces = jnp.sum(rotor.at_magnets * magnets[:, None], 0) + others
         forces = forces - times(rotor.D + W * rotor.G, state.q_dot) - times(rotor.K, state.q)
-        return MachineState(state.q_dot, times(self.inverse, forces), still(rates), law)
+        return MachineState(state.q_dot, times(self.inverse, materialised(forces)), still(rates), law)
 
     def outside(self, t: Scalar) -> tuple[Array, Array]:
         """Return the forces on the coordinates other than the magnets' [n], and the speed (rad/s), at t (s)."""

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, part, record
+from ambjax.numerics.small_matrices import times
 from ambjax.numerics.smooth import TWO_PI, sine
 from ambjax.world.rotation import GRAM_MM, PER_MINUTE, Rotation, SpeedChange
 from ambjax.world.scenario import SIGNAL_STREAM, SLOTS
@@ -46,6 +47,14 @@ class RotorLoad:
 
 
 @record
+class BaseMotion:
+    """A motion of the stator along a direction. q is relative to the stator, so that -M `along` times it acts on q."""
+
+    signal: Signal = part(doc="the acceleration of the stator over time, m/s^2")
+    along: Array = _matrix("n", "1", "unit vector of the direction as x, y, z; 0 for the other coordinates")
+
+
+@record
 class Rotor:
     """A rotor with n coordinates q and c bearing axes: M q'' + (D + W G) q' + K q = sum of b_k F_k + other forces.
 
@@ -66,6 +75,7 @@ class Rotor:
     changes: tuple[SpeedChange, ...] = part(default=(), doc="later changes of the rate, of a table of speeds")
     unbalances: tuple[RotorUnbalance, ...] = part(default=(), doc="unbalances")
     loads: tuple[RotorLoad, ...] = part(default=(), doc="loads")
+    base: tuple[BaseMotion, ...] = part(default=(), doc="motions of the stator")
 
     @property
     def rotation(self) -> Rotation:
@@ -77,7 +87,7 @@ class Rotor:
         return self.rotation.omega(t)
 
     def forces(self, t: Scalar) -> Array:
-        """Return the weight, the unbalance forces and the loads at time t (s), on the coordinates [n]."""
+        """Return weight, unbalance forces, loads and inertia of the base motion at t (s), on the coordinates [n]."""
         turns, W = self.rotation.turns(t), self.speed_at(t)
         rate = self.acceleration + sum(jnp.where(t >= one.at, one.by, 0.0) for one in self.changes)
         W_dot = jnp.asarray(TWO_PI * PER_MINUTE * rate)
@@ -86,21 +96,25 @@ class Rotor:
             total = total + one.force(turns, W, W_dot)
         for load in self.loads:
             total = total + load.along * load.signal(t)
+        for motion in self.base:
+            total = total - times(self.M, motion.along) * motion.signal(t)
         return total
 
     def without_forces(self) -> "Rotor":
-        """Return the rotor with its weight, without unbalances and loads."""
-        return dataclasses.replace(self, unbalances=(), loads=())
+        """Return the rotor with its weight, without unbalances, loads and base motion."""
+        return dataclasses.replace(self, unbalances=(), loads=(), base=())
 
     def edges(self) -> tuple[Scalar, ...]:
-        """Return the instants (s) at which a load or the rate of the speed jumps."""
-        return (*self.rotation.edges(), *(edge for load in self.loads for edge in edges_of(load.signal)))
+        """Return the instants (s) at which a load, the base motion or the rate of the speed jumps."""
+        signals = [one.signal for one in (*self.loads, *self.base)]
+        return (*self.rotation.edges(), *(edge for signal in signals for edge in edges_of(signal)))
 
     def realised(self, key: Array) -> "Rotor":
-        """Return the rotor with its random loads drawn. `key`: random key of the member."""
+        """Return the rotor with its random loads and base motions drawn. `key`: random key of the member."""
         key = jax.random.fold_in(key, SIGNAL_STREAM)
         drawn = [
             dataclasses.replace(load, signal=realised(load.signal, jax.random.fold_in(key, len(SLOTS) + n)))
-            for n, load in enumerate(self.loads)
+            for n, load in enumerate((*self.loads, *self.base))
         ]
-        return dataclasses.replace(self, loads=tuple(drawn))
+        loads = len(self.loads)
+        return dataclasses.replace(self, loads=tuple(drawn[:loads]), base=tuple(drawn[loads:]))

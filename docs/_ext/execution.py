@@ -19,7 +19,9 @@ from typing import Any
 from jupyter_cache import get_cache
 from jupyter_cache.base import CacheBundleIn
 from jupyter_cache.executors.utils import ExecutionResult, single_nb_execution
+from myst_nb.core.config import NbParserConfig
 from myst_nb.core.read import create_nb_reader
+from myst_parser.config.main import MdParserConfig
 from quick import take_core
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
@@ -49,23 +51,33 @@ def execute(app: Sphinx, env: Any, docnames: list[str]) -> None:
     folder = pathlib.Path(app.config.nb_execution_cache_path)
     for old in set(folder.parent.glob("*")) - {folder}:
         shutil.rmtree(old)
-    cache = get_cache(str(folder))
-    logging.getLogger("traitlets").setLevel(logging.WARNING)  # one line per page otherwise
     paths = [pathlib.Path(env.doc2path(name)) for name in docnames]
+    notebooks(paths, str(folder), app.config.nb_execution_timeout)
+
+
+def notebooks(paths: list[pathlib.Path], folder: str, timeout: int) -> dict[pathlib.Path, Any]:
+    """Return the executed notebook of each page with cells, and keep it in a cache. Raises ExtensionError if one fails.
+
+    - `folder`: folder of the cache.
+    - `timeout`: longest time that one cell may take, s.
+    """
+    cache = get_cache(folder)
+    logging.getLogger("traitlets").setLevel(logging.WARNING)  # one line per page otherwise
     # Searches take longest. The pages that contain them start first, so that no core is idle at the end.
-    paths.sort(key=lambda path: -path.read_text(encoding="utf-8").count("\nambjax tune "))
-    places = itertools.count()
+    paths = sorted(paths, key=lambda path: -path.read_text(encoding="utf-8").count("\nambjax tune "))
+    places, found = itertools.count(), {}
     with concurrent.futures.ThreadPoolExecutor(AT_ONCE, initializer=lambda: take_core(next(places))) as pool:
         running = {}
         for path in paths:
-            reader = create_nb_reader(str(path), env.myst_config, env.mystnb_config, path.read_text(encoding="utf-8"))
+            text = path.read_text(encoding="utf-8")
+            reader = create_nb_reader(str(path), MdParserConfig(), NbParserConfig(), text)
             if reader is None or path.suffix != ".md" or not reader.read_fmt:
                 continue
-            notebook = reader.read(path.read_text(encoding="utf-8"))
+            found[path] = notebook = reader.read(text)
             with contextlib.suppress(KeyError):
-                cache.match_cache_notebook(notebook)
+                found[path] = cache.merge_match_into_notebook(notebook)[1]
                 continue
-            running[pool.submit(_run, notebook, app.config.nb_execution_timeout)] = path
+            running[pool.submit(_run, notebook, timeout)] = path
         for done in concurrent.futures.as_completed(running):
             result, path = done.result(), running[done]
             if result.err is not None:
@@ -73,6 +85,8 @@ def execute(app: Sphinx, env: Any, docnames: list[str]) -> None:
             logger.info("executed %s in %.1f s", path.name, result.time)
             bundle = CacheBundleIn(result.nb, str(path), data={"execution_seconds": result.time})
             cache.cache_notebook_bundle(bundle, check_validity=False, overwrite=True)
+            found[path] = result.nb
+    return found
 
 
 def _run(notebook: Any, timeout: int) -> ExecutionResult:

@@ -1,5 +1,6 @@
 """The largest peak of |S_kk| of a machine over its axes and speeds, and its derivatives in the gains."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -9,15 +10,20 @@ from jax import Array
 
 from ambjax.cases.machine_case import MachineCase
 from ambjax.extend import canonical
-from ambjax.linear.linear_machine import machine_loop, machine_rest
-from ambjax.linear.state_space import StateSpace
+from ambjax.linear.linear_machine import MachineRest, machine_loop, machine_rest
+from ambjax.linear.margins import STATIC
+from ambjax.linear.state_space import NEUTRAL, StateSpace
+from ambjax.simulation.whole_machine import Machine
 from ambjax.world.rotation import PER_MINUTE
+from tuning.machines.lqg_weights import LqgSpace
 from tuning.machines.machine_gains import MachineSpace
 from tuning.machines.nonsmooth import Value
 
 # Numbers of frequencies on a logarithmic axis; offsets of further ones from each pole, in units of its damping; largest
-# damping ratio of these poles; share of the Nyquist frequency up to which peaks are sought.
-POINTS, BESIDE, LIGHT, HIGHEST = 250, (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0), 0.3, 0.98
+# damping ratio of these poles.
+POINTS, BESIDE, LIGHT = 250, (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0), 0.3
+# Change of a coordinate in a difference quotient.
+STEP = 1e-6
 
 
 class Loop(NamedTuple):
@@ -34,31 +40,39 @@ class Peaks:
     """Evaluation of the nominal machine of a case at its speeds.
 
     `stability` and `peak` are functions of coordinates [m]. Both give a `Value`: the largest growth rate of a pole
-    (1/s); the logarithm of the largest peak of |S_kk|, inf if a pole grows. The equilibrium is that of the case.
+    (1/s); the logarithm of the largest peak of |S_kk|, inf if a pole grows.
     """
 
-    def __init__(self, case: MachineCase, space: MachineSpace) -> None:
-        self.count, self.period, self.low = len(case.axes), float(case.clock.sample_period), float(case.zones.f_low)
+    def __init__(self, case: MachineCase, space: MachineSpace | LqgSpace) -> None:
+        self.count, self.period, self.zones = len(case.axes), float(case.clock.sample_period), case.zones
         machine, self.sampled = canonical(case.machine), case.cases[0].cascade.sampled
-        speeds = 2 * np.pi * PER_MINUTE * np.array(case.speeds)
-        rest = machine_rest(machine, self.period)
+        speeds = jnp.asarray(2 * np.pi * PER_MINUTE * np.array(case.speeds))
 
-        def system(x: Array, W: Array, known: Any) -> StateSpace:
-            found = machine_loop(space.decode(x, known[0]), W, self.period, known[1]).scaled()
-            return found._replace(C=found.C[: self.count], D=found.D[: self.count], period=None)
+        def systems(machine: Machine, rest: MachineRest) -> StateSpace:
+            def one(W: Array) -> StateSpace:
+                found = machine_loop(machine, W, self.period, rest).scaled()
+                return found._replace(C=found.C[: self.count], D=found.D[: self.count], period=None)
 
-        def both(x: Array, known: Any) -> tuple[StateSpace, StateSpace]:
-            one = lambda W: (system(x, W, known), jax.jacfwd(system)(x, W, known))  # noqa: E731
-            return jax.lax.map(one, jnp.asarray(speeds))
+            return jax.lax.map(one, speeds)
 
-        self._both: Any = jax.jit(both)
-        self._known = machine, rest  # arguments, because constants are not arrays of JAX
+        def at(x: Array, machine: Machine) -> tuple[StateSpace, StateSpace]:
+            own = space.decode(x, machine)
+            found = systems(own, machine_rest(own, self.period))
+            return found, found
+
+        self._both: Callable[[np.ndarray], tuple[StateSpace, StateSpace]]
+        if isinstance(space, LqgSpace):  # the weights do not move the rotor
+            rest, compiled = machine_rest(machine, self.period), jax.jit(systems)
+            self._both = lambda x: _differences(lambda x: compiled(space.decode(x, machine), rest), x)
+        else:  # the machine is an argument, because constants are not arrays of JAX
+            both = jax.jit(jax.jacfwd(at, has_aux=True))
+            self._both = lambda x: both(jnp.asarray(x), machine)[::-1]
         self._last: tuple[np.ndarray, list[Loop]] | None = None
 
     def loops(self, x: np.ndarray) -> list[Loop]:
         """Return the loops at coordinates x [m], one for each speed."""
         if self._last is None or not np.array_equal(self._last[0], x):
-            found = jax.tree.map(np.asarray, self._both(jnp.asarray(x), self._known))
+            found = jax.tree.map(np.asarray, self._both(x))
             each = [jax.tree.map(lambda a, k=k: a[k], found) for k in range(len(found[0].A))]
             self._last = x.copy(), [self._loop(*one) for one in each]
         return self._last[1]
@@ -86,9 +100,14 @@ class Peaks:
         slope = slope / (loop.values[k] * self.period) if self.sampled else slope
         return Value(x, float(rates[n][k].real), slope.real)
 
+    def stable(self, value: Value) -> bool:
+        """Return whether no pole grows, with the tolerance of `StateSpace.stable`. `value`: a `stability`."""
+        fastest = 1 / self.period if self.sampled else max(np.abs(loop.values).max() for loop in self.loops(value.x))
+        return value.f <= NEUTRAL * fastest
+
     def peak(self, x: np.ndarray) -> Value:
         """Return the logarithm of the largest peak of |S_kk| of any axis at any speed."""
-        if not self.stability(x).f <= 0:
+        if not self.stable(self.stability(x)):
             return Value(x, np.inf, np.zeros(len(x)))
         best: tuple[Any, ...] = (0.0,)
         for loop in self.loops(x):
@@ -100,14 +119,15 @@ class Peaks:
         return Value(x, float(np.log(height)), np.real(np.conj(S) * self._slope(loop, at, axis)) / height**2)
 
     def _points(self, rates: np.ndarray) -> np.ndarray:
-        """Return the points s or z at which S is evaluated: on a logarithmic axis, and beside lightly damped poles."""
-        highest = HIGHEST / (2 * self.period) if self.sampled else max(1e4, np.abs(rates).max() / 2)
+        """Return the points s or z at which S is evaluated: of the range of the sensitivity, and beside light poles."""
         size = np.maximum(np.abs(rates), 1e-12)
+        end = max(1e4, size.max() / 2, 2 * float(self.zones.f_low))
+        low, high = self.zones.range(self.period if self.sampled else None, end)
         damping = -np.real(rates) / size
         light = (np.imag(rates) > 0) & (damping < LIGHT)
         beside = np.outer(size[light] / (2 * np.pi), np.ones(len(BESIDE))) * (1 + np.outer(damping[light], BESIDE))
-        f = np.concatenate([np.geomspace(self.low, highest, POINTS), beside.ravel()])
-        s = 2j * np.pi * np.unique(f[(f >= self.low) & (f <= highest)])
+        f = np.concatenate([np.geomspace(low, high, POINTS), beside.ravel()])
+        s = 2j * np.pi * np.unique([STATIC * low, *f[(f >= low) & (f <= high)]])
         return np.exp(s * self.period) if self.sampled else s
 
     def _response(self, loop: Loop, at: np.ndarray) -> np.ndarray:
@@ -127,3 +147,10 @@ class Peaks:
             + left @ moves.B[kept, axis]
             + np.einsum("i,ijm,j->m", left, moves.A[kept][:, kept], right)
         )
+
+
+def _differences(systems: Callable[[np.ndarray], StateSpace], x: np.ndarray) -> tuple[StateSpace, StateSpace]:
+    """Return the systems at x [m] and their derivatives [.., m] by forward differences."""
+    now = systems(x)
+    each = [jax.tree.map(lambda a, b: (b - a) / STEP, now, systems(x + STEP * one)) for one in np.eye(len(x))]
+    return now, jax.tree.map(lambda *own: np.stack(own, -1), *each)

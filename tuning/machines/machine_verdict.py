@@ -9,7 +9,7 @@ from ambjax.cases.machine_case import MachineCase
 from ambjax.commands.machine_commands import analysed, sensitivity_summary
 from ambjax.results.machine_study import MachineStudy
 
-# Limits of [tune.limits], each with its meaning and the metric whose largest value counts; "": the sensitivity.
+# Limits of [tune.limits], each with its meaning and the metric whose largest value counts; "": a sensitivity.
 LIMITS = {
     "sensitivity": ("peak of \\|S\\| of the worst axis at any speed", ""),
     "rms_u_V": ("rms voltage after run.settle, V", "settled_rms_u_V"),
@@ -18,19 +18,23 @@ LIMITS = {
     "rms_error_m": ("rms error after run.settle, m", "settled_rms_error_m"),
     "largest_error_m": ("largest error after run.settle, m", "settled_max_abs_error_m"),
     "clearance_used": ("largest share of the clearance", "clearance_used"),
+    "z_1x_m": ("largest amplitude of z at the speed, m", "z_1x_m"),
+    "i_1x_A": ("largest amplitude of a current at the speed, A", "i_1x_A"),
+    "sensitivity_1x": ("largest \\|S\\| of an axis at a speed, where the rotor turns with it", ""),
 }
 
 
 def judged(case: MachineCase, found: MachineCase, limits: dict[str, float], seed: int, members: int) -> dict[str, Any]:
     """Return the content of report.json but the gains. `case`, `found`: before and after; `members`: to simulate."""
     before, after = (sensitivity_summary(analysed(one), {}) for one in (case, found))
-    columns = MachineStudy(found, seed, members).columns(0, members)
-    held = np.isposinf(columns["lost_at"])
-    values: dict[str, Any] = {name: _worst(columns[metric], held) for name, (_, metric) in LIMITS.items() if metric}
-    values["sensitivity"] = after["peak"] if after["stable"] else math.inf
+    held, simulated = simulate(found, seed, members)
+    values: dict[str, Any] = {name: _worst(x, held) for name, x in simulated.items()}
+    turning = [fact["S"] for at in after["speeds"] for axis in at["axes"] for fact in axis["running_speed"]]
+    linear = {"sensitivity": after["peak"], "sensitivity_1x": max(turning, default=0.0)}
+    values |= linear if after["stable"] else dict.fromkeys(linear, math.inf)
     rows: list[dict[str, Any]] = [
         {"name": name, "meaning": LIMITS[name][0], "value": values[name], "threshold": most}
-        | {"holds": bool(values[name] <= most)}
+        | {"holds": bool(values[name] <= most and (name in linear or held.all()))}
         for name, most in limits.items()
     ]
     broken = [row["name"] for row in rows if not row["holds"]]
@@ -38,9 +42,10 @@ def judged(case: MachineCase, found: MachineCase, limits: dict[str, float], seed
     words = [
         f"peak of |S| {after['peak']:.4g} ({at}), zone {after['zone']}" if after["stable"] else "NOT STABLE",
         f"{int(held.sum())} of {members} members held",
-        "all limits met" if not broken else f"beyond the limits: {', '.join(broken)}",
     ]
     good = bool(after["stable"] and held.all() and not broken)
+    if good or broken:
+        words.append("all limits met" if good else f"beyond the limits: {', '.join(broken)}")
     return {
         "verdict": f"{'; '.join(words)}.",
         "case": case.name,
@@ -54,6 +59,20 @@ def judged(case: MachineCase, found: MachineCase, limits: dict[str, float], seed
 
 def _worst(values: np.ndarray, held: np.ndarray) -> float:
     return float(np.max(values[held])) if held.any() else math.inf
+
+
+def simulate(case: MachineCase, seed: int, members: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return which members [n] are held, and the limited metrics [n] of the worst axis of each."""
+    columns = MachineStudy(case, seed, members).columns(0, members)
+    found = {name: columns.get(metric, np.zeros(members)) for name, (_, metric) in LIMITS.items() if metric}
+    return np.isposinf(columns["lost_at"]), found  # at rest there are no amplitudes at the speed
+
+
+def refused(case: MachineCase, limits: dict[str, float], seed: int, members: int) -> int:
+    """Return how many members are lost or beyond the limits of a simulation."""
+    held, found = simulate(case, seed, members)
+    within = [found[name] <= most for name, most in limits.items() if name in found]
+    return int(np.sum(~np.all([held, *within], axis=0)))
 
 
 def report_text(facts: dict[str, Any]) -> str:

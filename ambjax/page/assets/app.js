@@ -28,10 +28,18 @@ const cells = data.metrics.map((name) => {
   return cell;
 });
 
+// Shown until the newest run has been computed. The first run has no older results behind it.
+function showComputing() {
+  byId("status").textContent = `Computing ${data.samples} samples ...`;
+  byId("status").classList.remove("lost");
+  byId("results").classList.add("stale");
+}
+
 function showStatus({ lost, lost_at_s: at, max_abs_u_V: u }, code) {
   const words = lost ? `The rotor is lost at ${at.toPrecision(4)} s: ${data.statuses[code]}.` : `The rotor is held. Largest voltage: ${u.toPrecision(4)} V.`;
   byId("status").textContent = words;
   byId("status").classList.toggle("lost", Boolean(lost));
+  byId("results").classList.remove("waiting", "stale");
 }
 
 function showMachine(draw) {
@@ -50,8 +58,10 @@ async function begin() {
   const plots = await buildPlots(byId("plots")), draw = machine(byId("drawing"));
   const request = () => {
     state.sent += 1;
-    state.began.set(state.sent, performance.now());
-    worker.postMessage({ id: state.sent, P: parameters() });
+    const id = state.sent;
+    state.began.set(id, performance.now());
+    setTimeout(() => { if (state.shown < id) showComputing(); }, 400);
+    worker.postMessage({ id, P: parameters() });
   };
   worker.onerror = (event) => { byId("status").textContent = `The worker failed: ${event.message}`; };
   worker.onmessage = ({ data: answer }) => {

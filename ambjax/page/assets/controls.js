@@ -61,7 +61,7 @@ function addSlider(slider, k, changed) {
   const unit = slider.unit ? ` in ${slider.unit}` : "";
   const range = element("input", { type: "range", min: 0, max: STEPS, step: 1, id: `range-${k}`, "data-path": slider.path });
   const typed = element("input", { type: "text", inputmode: "decimal", id: `number-${k}`, autocomplete: "off", "aria-describedby": `fault-${k}` });
-  const label = element("label", { for: `number-${k}`, title: slider.doc }, slider.path, element("small", {}, unit));
+  const label = element("label", { for: `number-${k}`, title: slider.doc }, ...slider.path.split(/(?<=\.)/).flatMap((word) => [word, element("wbr", {})]), element("small", {}, unit));
   const why = element("span", { class: "fault", id: `fault-${k}` });
   range.setAttribute("aria-label", `${slider.path}${unit}`);
   const box = element("div", { class: "number" }, label, typed, range, why);
@@ -73,7 +73,8 @@ function addSlider(slider, k, changed) {
     if (reason === "") { values[k] = slider.grid ? onGrid(x) : x; show(k); changed(); }
   });
   box.show = (x) => {
-    typed.value = text(x);
+    typed.value = slider.whole || text(x).length < 10 ? text(x) : text(x, 6);
+    typed.title = text(x);
     typed.setAttribute("aria-invalid", "false");
     why.textContent = "";
     range.value = toPosition(slider, x);
@@ -90,7 +91,7 @@ function buildControls(changed) {
   data.groups.forEach(([prefix, title], number) => {
     const members = data.sliders.map((slider, k) => [slider, k]).filter(([slider]) => slider.path.startsWith(prefix));
     if (!members.length) return;
-    const group = element("details", number < 2 ? { open: "" } : {}, element("summary", {}, title));
+    const group = element("details", number < 1 ? { open: "" } : {}, element("summary", {}, `${title} (${members.length})`));
     for (const [slider, k] of members) group.append((boxes[k] = addSlider(slider, k, changed)));
     byId("groups").append(group);
   });

@@ -37,13 +37,16 @@ function addPlot({ id, title, y, unit, lines, x = "time in s", range = null, hei
   figure.toolbar.logo = null;
   if (more) more(figure);
   lines.forEach(([name, , hidden], k) => {
-    const line = figure.line({ field: "x" }, { field: "y" }, { source: sources[k], color: COLORS[k], line_width: 1.4, legend_label: name });
+    const line = figure.line({ field: "x" }, { field: "y" }, { source: sources[k], color: COLORS[k], line_width: 1.4 });
     line.visible = !hidden;
     drawn.push(line);
     const tip = log ? `${name}: @y{0.000e} ${unit} at @x{0.00} Hz` : `${name}: @y{0.0000} ${unit} at @x{0.00000} s`;
     figure.add_tools(new Bokeh.HoverTool({ renderers: [line], tooltips: [["", tip]], mode: "mouse", line_policy: "nearest" }));
   });
-  Object.assign(figure.legend, { click_policy: "hide", background_fill_alpha: 0.85, label_text_font_size: "11px", padding: 4, margin: 4 });
+  if (lines.length > 1) {
+    const items = lines.map(([name], k) => new Bokeh.LegendItem({ label: name, renderers: [drawn[k]] }));
+    figure.add_layout(new Bokeh.Legend({ items, orientation: "horizontal", click_policy: "hide", border_line_color: null, label_text_font_size: "11px", padding: 0, margin: 0 }), "above");
+  }
   return { id, title, figure, sources, lines, drawn };
 }
 
@@ -98,6 +101,7 @@ async function buildPlots(parent) {
   const sensitivityPlot = addPlot({ id: "sensitivity", title: "Sensitivity |S|", y: "|S|", unit: "", lines: [["|S|", null]], heights: new Bokeh.Range1d({ start: 0.01, end: 10 }), more: zones, ...hertz });
   await showPlots(parent, [...timed, members, spectrumPlot, sensitivityPlot]);
   parent.append(byId("machine"));
+  byId("plot-members").classList.add("pending");
   watchWindow([...timed, members, spectrumPlot, sensitivityPlot]);
   let shown = null;
   const drawTimes = () => {
@@ -118,6 +122,8 @@ async function buildPlots(parent) {
       const columns = timed.map(({ lines }) => lines.map(([, of]) => of(run)));
       shown = { t: Array.from(run.error, (_, n) => n * data.period), columns, zoomed };
       drawTimes();
+      retitle(members, "Envelope of the members: computing ...");
+      byId("plot-members").classList.add("stale");
       refresh(spectrumPlot, () => { spectrumPlot.sources[0].data = { x: spectrum.f, y: finite(spectrum.amplitude.map(micro)) }; });
       refresh(sensitivityPlot, () => {
         sensitivityPlot.sources[0].data = S === null ? { x: [1, 10], y: [NaN, NaN] } : { x: S.f, y: finite(S.size) };
@@ -136,7 +142,8 @@ async function buildPlots(parent) {
         members.sources[1].data = { x, y: lows };
         band.data = { x, low: lows, high: highs };
       });
-      retitle(members, `Envelope of ${count} members: the rotor is held in ${kept}`);
+      retitle(members, `Envelope: ${kept} of ${count} members are held`);
+      byId("plot-members").classList.remove("stale", "pending");
     },
     onZoom() {
       let waiting = false;

@@ -1,0 +1,105 @@
+"""The search for the gains of a machine: descents of the largest peak of |S| from several starts."""
+
+import math
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from tuning.events import Tell
+from tuning.machines.lqg_weights import LqgSpace
+from tuning.machines.machine_gains import MachineSpace
+from tuning.machines.machine_peaks import Peaks
+from tuning.machines.nonsmooth import Value, minimise
+
+# Standard deviations of the logarithms of the gains of random starts: around the case, and around the best point.
+FAR, NEAR = 0.7, 0.3
+# Default of `minutes`.
+MINUTES = 5.0
+
+Lost = Callable[[np.ndarray], int]
+Over = Callable[[Value], bool]
+
+
+class Settings(NamedTuple):
+    """The table [tune] of a machine."""
+
+    space: MachineSpace | LqgSpace
+    limits: dict[str, float]
+    minutes: float
+    seed: int
+    starts: int
+    iterations: int
+    held_out: int
+
+
+def searched(peaks: Peaks, settings: Settings, start: np.ndarray, lost: Lost, tell: Tell) -> Value:
+    """Return the lowest peak with the fewest lost members, or the least growth rate if no start can be made stable.
+
+    From each start, BFGS reduces the largest growth rate until the machine is stable, then the peak. `lost`: number of
+    members that are lost, or beyond a limit of their simulation, at coordinates [m].
+    """
+    rng, space, first = np.random.default_rng(settings.seed), settings.space.space, settings.space.space.encode(start)
+    end = time.monotonic() + 60 * (settings.minutes if math.isfinite(settings.minutes) else MINUTES)
+    slowest = Value(first, math.inf, np.zeros(len(first)))
+    best, fewest = slowest, math.inf
+    over: Over = lambda _: time.monotonic() > end  # noqa: E731
+    for number in range(settings.starts):
+        near = number % 2 == 1 and math.isfinite(best.f)
+        centre, size = (best.x, NEAR) if near else (first, FAR if number else 0.0)
+        held = _stabilised(peaks, space.drawn_back(centre + size * rng.normal(size=len(first))), settings, over)
+        slowest = min(slowest, held, key=lambda v: v.f)
+        if peaks.stable(held):
+            path = _descent(peaks, held.x, settings, over)
+            if fewest or path[-1].f < best.f:
+                low, count = _kept(peaks, path, settings, lost, over)
+                best, fewest = (low, count) if (count, low.f) < (fewest, best.f) else (best, fewest)
+        found = f"best peak {math.exp(best.f):.4g}" if math.isfinite(best.f) else f"growth rate {slowest.f:.3g} 1/s"
+        found += f", {fewest} members lost or beyond the limits" if 0 < fewest < math.inf else ""
+        tell(f"start {number + 1} of {settings.starts}: {found}")
+        if over(best):
+            break
+    return best if math.isfinite(best.f) else slowest
+
+
+def _stabilised(peaks: Peaks, x: np.ndarray, settings: Settings, over: Over) -> Value:
+    """Return the first point of a descent of the growth rate that is stable, or its last one."""
+    held = peaks.stability(x)
+    if peaks.stable(held):
+        return held
+    return minimise(peaks.stability, held, settings.iterations, lambda value: peaks.stable(value) or over(value))
+
+
+def _descent(peaks: Peaks, x: np.ndarray, settings: Settings, over: Over) -> list[Value]:
+    """Return the points of a descent of the peak."""
+    path = [peaks.peak(x)]
+
+    def followed(value: Value) -> bool:
+        path.append(value)
+        return over(value)
+
+    minimise(peaks.peak, path[0], settings.iterations, followed)
+    return path
+
+
+def _kept(peaks: Peaks, path: list[Value], settings: Settings, lost: Lost, over: Over) -> tuple[Value, int]:
+    """Return the lowest peak found at which no member is lost, or the lowest of all, and the number of lost members.
+
+    Simulations take longer than peaks, so that a descent comes without. If it loses members, another one, which rejects
+    such points, begins at the last point of the first that loses none.
+    """
+    count = lost(path[-1].x)
+    if not count or lost(path[0].x):
+        return path[-1], count
+    first, last = 0, len(path) - 1
+    while last - first > 1:
+        middle = (first + last) // 2
+        first, last = (first, middle) if lost(path[middle].x) else (middle, last)
+
+    def guarded(x: np.ndarray) -> Value:
+        value = peaks.peak(x)
+        good = value.f < path[first].f and not over(value) and not lost(x)
+        return value if good else Value(x, math.inf, np.zeros(len(x)))
+
+    return minimise(guarded, path[first], settings.iterations, over), 0
