@@ -15,8 +15,7 @@ def law_from(table: Table, kind: type[Law], base: Law | None) -> Any:
 
     Raises ValueError with the dotted path, the value, what is allowed and the fix.
     """
-    declared: Any = kind
-    names = {field.name: field for field in dataclasses.fields(declared) if field.metadata.get("leaf")}
+    names = {field.name: field for field in dataclasses.fields(kind) if field.metadata.get("leaf")}
     given = {name: table.raw[name] for name in names if isinstance(table.raw.get(name), dict)}
     numbers = Table({key: value for key, value in table.raw.items() if key not in given}, table.path)
     law = numbers.record(kind, extra=("kind",), base=base)

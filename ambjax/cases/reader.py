@@ -139,7 +139,8 @@ def case_from(
     if is_machine(raw):
         raise ValueError(
             "[rotor], [[bearing]]: a whole machine, and this takes one axis. `ambjax simulate`, `check`, "
-            "`sensitivity`, `campbell`, `ensemble` and `tune` take machines; in Python, read_machine does."
+            "`sensitivity`, `campbell`, `ensemble`, `map`, `compare` and `tune` take machines; in Python, read_machine "
+            "does."
         )
     top.only([*TABLES, *OTHERS])
     plant = _plant(top.table("plant"))

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from ambjax.control.base import Law
-from ambjax.control.stages import CurrentDemand, CurrentInputs, ForceDemand
+from ambjax.control.stages import CurrentDemand, CurrentInputs, ForceDemand, PositionLaw
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
 from ambjax.world.waveforms import Reference
@@ -27,7 +27,6 @@ def try_law(law: Law, stage: str, model: Plant) -> None:
     TypeError if an output, a rate, a scale, a slope or a state has a wrong structure or shape. Exceptions that the
     methods raise are passed on.
     """
-    one: Any = law
     motion, reference = Measurement(*_zeros(3)), Reference(*_zeros(3))
     demand, force = CurrentDemand(*_zeros(2)), ForceDemand(_zero(), _zero(), _zero(), _zero())
     inputs, wanted = {
@@ -39,14 +38,14 @@ def try_law(law: Law, stage: str, model: Plant) -> None:
     first = (model, motion) if stage == "observer" else (model,)
 
     def everything(inputs: Any) -> tuple[Any, ...]:
-        state = one.init(*first)
-        kept = state if stage == "observer" else one.init_sampled(model)
-        owns = any(one.has_own_step(implicit) for implicit in (True, False))
-        after = one.step(model, inputs, kept, 1e-4) if owns else one(model, inputs, kept)
+        state = law.init(*first)
+        kept = state if stage == "observer" else law.init_sampled(model)
+        owns = any(law.has_own_step(implicit) for implicit in (True, False))
+        after = law.step(model, inputs, kept, 1e-4) if owns else law(model, inputs, kept)
         starts = state, kept
-        if stage == "position":
-            starts = one.begin(model, inputs), one.begin_sampled(model, inputs, 1e-4)
-        return state, one(model, inputs, state), one.scale(model), kept, after, one.slope(model), starts
+        if isinstance(law, PositionLaw):
+            starts = law.begin(model, inputs), law.begin_sampled(model, inputs, 1e-4)
+        return state, law(model, inputs, state), law.scale(model), kept, after, law.slope(model), starts
 
     state, (output, rate), scale, kept, after, slope, (begun, sampled) = jax.eval_shape(everything, inputs)
     _same(output, wanted, f"{type(law).__name__} must return {OUTPUTS[stage]} and the rate of its state; the output is")

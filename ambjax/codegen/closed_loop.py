@@ -1,6 +1,6 @@
 """Software in the loop: JAX's plant with the compiled controller, compared with JAX's own closed loop."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.rollout import begin, segment
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
-from ambjax.simulation.system import system_of
+from ambjax.simulation.system import sampled_of
 from ambjax.world.sensor import Measurement
 from ambjax.world.waveforms import Reference
 
@@ -69,7 +69,7 @@ class CompiledLoop(Sampled):
         return super().start()._replace(control=ControllerState(jnp.zeros(self.machines.room), zero, zero))
 
     def with_command(self, measured: Measurement, reference: Reference, state: SampledState) -> SampledState:
-        memory: Any = state.control
+        memory = state.control
         inputs = jnp.stack([*measured, *reference])
         shapes = jax.ShapeDtypeStruct((self.machines.room,), float), jax.ShapeDtypeStruct((2 + len(OUTPUTS),), float)
         numbers, rest = jax.pure_callback(
@@ -78,7 +78,7 @@ class CompiledLoop(Sampled):
         answer = dict(zip(OUTPUTS, rest[2:], strict=True))
         command = Command(**answer, i_ref_dot=jnp.zeros(()))
         faulty = rest[1].astype(int) & sum(FAULTS) != 0
-        after: Any = ControllerState(numbers, rest[0], memory.faults + faulty)
+        after = ControllerState(numbers, rest[0], memory.faults + faulty)
         past, finite = self.processor.remembered(state.command.u, *state.past), jnp.where(faulty, 0.0, state.finite)
         watch, guard = state.watch, self.processor.guard
         if watch and guard:  # from `left`, `Sampled.row` finds whether a reading was refused
@@ -107,7 +107,7 @@ begin_jit, segment_jit = jax.jit(begin), jax.jit(segment, static_argnames=("coun
 
 def compare_loops(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, LoopComparison]:
     """Compare the loop of each compiled controller to JAX's loop. Returns one comparison for each precision."""
-    given: Any = system_of(case.cascade, case.scenario, case.clock)
+    given = sampled_of(case.cascade, case.scenario, case.clock)
     host, found = Machines(*machines.values()), {}
     for which, (precision, horizon) in enumerate(horizons(case, list(machines)).items()):
         loop = ClosedLoop(given.loop.cascade, case.scenario)

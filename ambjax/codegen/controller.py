@@ -206,8 +206,8 @@ class Controller(Block):
         if self.commands == "voltage":
             weight *= float(model.R)
         u = float(limits.u_max) if math.isfinite(limits.u_max) else 10 * weight + 1.0
-        guard: Any = cascade.timing.guard
-        watch = [z, z_dot, i, float(guard.samples)] if guard else []
+        guard = cascade.timing.guard
+        watch = [z, z_dot, i, float(guard.samples)] if guard and guard.samples is not None else []
         # commands are in the order of their pytree
         states = [*scales(cascade.scale()), v, v, i, i * pole, u, *[u] * len(self.start().before), *watch]
         return states, [z, z_dot, i, z, z * pole, z * pole**2, z * pole**3]

@@ -94,7 +94,7 @@ class LoopStep(Block):
         before = choose(memory.plant.started, memory.control, self.start().control)
         given = PlantInputs._make([before.last.u, *inputs[: len(DISTURBANCES)]])
         plant, motion, lost = self.plant.step(parameters.machine, memory.plant, given, period, read)
-        readings: Any = StepInputs._make([*motion[:3], *inputs[len(DISTURBANCES) :]])
+        readings = StepInputs._make([*motion[:3], *inputs[len(DISTURBANCES) :]])
         control, command, status = self.controller.step(parameters.controller, before, readings, period, read)
         alive, off = plant.lost == ALIVE, jnp.zeros(())
         frozen = before._replace(last=before.last._replace(u=off), before=(off,) * len(before.before))

@@ -164,8 +164,7 @@ class PlantStep(Block):
             u_a=memory.u_a,
         )
         code = jnp.where(memory.lost == TOUCHED, TOUCHED, jnp.where(memory.lost == ALIVE, ALIVE, DIVERGED))
-        method: Any = self.method
-        after = system.advance(method, Errors(zero, zero, zero), 0.0, system.period, state, (), code)
+        after = system.advance(self.method, Errors(zero, zero, zero), 0.0, system.period, state, (), code)
         lost_now = (code == ALIVE) & (after.code != ALIVE)
         new = choose(lost_now, system.rest(after.state, after.code), after.state)
         before, lost = past[:-1], _real(after.code)

@@ -154,7 +154,7 @@ def _borders(trace: Trace, x: np.ndarray) -> np.ndarray:
 def evaluated(trace: Trace, x: np.ndarray, started: np.ndarray) -> list[np.ndarray]:
     """Return the value of every node at these parameters, states and inputs, computed with NumPy."""
     count, program, dtype = x.shape[1], trace.program, PRECISIONS[trace.precision]
-    rows: Any = iter(x)
+    rows = iter(x)
     values: list[Any] = [next(rows) for _ in trace.parameters]
     memory = [np.zeros(count, dtype)] * (len(trace.refs) - len(trace.parameters) - len(trace.inputs) - 2)
     for k in trace.keep:

@@ -33,7 +33,7 @@ def results(trace: Trace, at: Points) -> Results:
     """Return the results of the step at these points, computed with JAX operation by operation."""
     count = at.started.size
     with precision(trace.precision):
-        given: Any = arguments(trace.block)
+        given = arguments(trace.block)
         step: Any = trace.block.step
         closed = jax.make_jaxpr(lambda *x: step(*x, trace.read))(*given)
         rows: list[Any] = [np.zeros(count, at.state.dtype)] * (len(jax.tree.leaves(given[1])) - 1) + [at.started]

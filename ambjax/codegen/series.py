@@ -1,7 +1,5 @@
 """The inputs of an exported block at every sample of a case: disturbances, random numbers of sensors, reference."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +11,7 @@ from ambjax.numerics.gaussian import normals
 from ambjax.numerics.records import Scalar, canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.system import system_of
+from ambjax.simulation.system import sampled_of
 from ambjax.world.scenario import Scenario
 
 
@@ -27,7 +25,7 @@ def series(cascade: Cascade, scenario: Scenario, clock: Clock, samples: int) -> 
 
     The disturbances for sample n are those of the sample before, because these act until sample n.
     """
-    given: Any = system_of(cascade, scenario, clock)
+    given = sampled_of(cascade, scenario, clock)
     found = _series(canonical(given), jnp.arange(samples))
     return {name: np.asarray(x) for name, x in found._asdict().items()}
 

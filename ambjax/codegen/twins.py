@@ -7,7 +7,7 @@ While the twins stay close to JAX's loop, a correct program does too.
 """
 
 import dataclasses
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ from ambjax.simulation.integrate import Advanced, Integrator
 from ambjax.simulation.rollout import run
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
-from ambjax.simulation.system import system_of
+from ambjax.simulation.system import sampled_of
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors
 from ambjax.world.waveforms import Constant
@@ -148,7 +148,7 @@ def horizons(case: LoopCase, precisions: list[str], *, held: bool = False) -> di
 
     `held`: hold the disturbances over each sample, as an exported plant does.
     """
-    given: Any = system_of(case.cascade, case.scenario, case.clock)
+    given = sampled_of(case.cascade, case.scenario, case.clock)
     twin, clock = canonical((Twin(given.loop, given.period, given.cuts, held=held), case.clock))
     units = [0.0] + [float(np.finfo(PRECISIONS[x]).eps) for x in precisions for _ in range(TWINS)]
     signals, r, lost_at = _together(twin, clock, jnp.asarray(units), jnp.arange(len(units)))
@@ -182,7 +182,7 @@ def _together(twin: Twin, clock: Clock, units: Array, seeds: Array) -> tuple[tup
     """Return z and u of one loop for each unit and seed, [loops, samples]; r, same shape; time of each loss, s."""
 
     def one(unit: Array, seed: Array) -> tuple[tuple[Array, ...], Array, Scalar]:
-        system: Any = dataclasses.replace(twin, unit=unit, seed=seed)
+        system = dataclasses.replace(twin, unit=unit, seed=seed)
         made = run(system, clock, None, record_every=1).trajectory
         return tuple(getattr(made.rows, name) for name in SIGNALS), made.rows.r, made.lost_at
 

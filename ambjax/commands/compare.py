@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     cases = _read(args.cases)
     of_axis = [case for case in cases if isinstance(case, Case)]
     if not of_axis:
-        refuse(tune=args.tune, page=args.page)
+        refuse(args, ("tune", "page"))
     studies = _studies(cases, args.seed, args.members)
     notes = _differences(args.cases, cases, studies)
     for note in notes:
@@ -89,7 +89,7 @@ class Comparison(NamedTuple):
     """The result of `compare`.
 
     - `summary`: the content of compare.json: members, seed, and the numbers of each case.
-    - `compared`: each case with the columns of its members, and the numbers of its loop.
+    - `compared`: each case with the columns of its members, its nominal loop and its peaks.
     """
 
     summary: dict[str, Any]
@@ -101,21 +101,21 @@ class Comparison(NamedTuple):
 
 
 def compare(cases: Sequence[AnyCase], members: int = 1, *, seed: int | None = None) -> Comparison:
-    """Compare cases of one axis, or machines, on the same members of their spread, as `ambjax compare` does.
+    """Compare cases, or machines, on the same members of their spread, as `ambjax compare` does.
 
     - `cases`: two to eight cases with the same spread. What differs in more than the controller is in
       `summary["differences"]`.
     - `members`, `seed`: as for `simulate_members`; the seed of all cases is by default that of the first one.
 
-    Raises ValueError for anything but cases, for another number of them, if their kinds or spreads differ, and as
+    Raises ValueError for anything but cases, for another number of them, if their spreads differ, and as
     `simulate_members` does.
     """
     cases = list(cases)
-    _check_count(len(cases), "case")
     for case in cases:
         if not isinstance(case, MachineCase):
             require_case(case)
-    cases = _named([case.name for case in cases], cases)
+    _check_count(len(cases), "case")
+    cases = _named(cases, [case.name for case in cases])
     studies = _studies(cases, seed, members)
     with quiet():
         return _comparison(cases, studies, _differences([case.name for case in cases], cases, studies))
@@ -136,7 +136,7 @@ def _write_html(summary: Mapping[str, Any], part: pathlib.Path) -> None:
 
 
 def _studies(cases: Sequence[AnyCase], seed: int | None, members: int) -> list[Study | MachineStudy]:
-    """Return the studies of the cases, with the same seed; None: the first case's."""
+    """Return the studies of the cases, with the same seed: by default the first case's."""
     seed = study_of(cases[0], seed, members).seed
     studies = [study_of(case, seed, members) for case in cases]
     return [
@@ -144,7 +144,7 @@ def _studies(cases: Sequence[AnyCase], seed: int | None, members: int) -> list[S
     ]
 
 
-def _read(paths: Sequence[str]) -> Sequence[AnyCase]:
+def _read(paths: Sequence[str]) -> list[AnyCase]:
     """Read the cases.
 
     Raises ValueError for fewer than 2 or too many files, a repeated file, a file that `read_any` refuses, or machines
@@ -155,7 +155,7 @@ def _read(paths: Sequence[str]) -> Sequence[AnyCase]:
         same = [other for other in paths if pathlib.Path(other).resolve() == pathlib.Path(path).resolve()]
         if len(same) > 1:
             raise ValueError(f"{path}: this file is given {len(same)} times. Give each once.")
-    return _named(paths, [read_any_with_warnings(path) for path in paths])
+    return _named([read_any_with_warnings(path) for path in paths], paths)
 
 
 def _check_count(count: int, what: str) -> None:
@@ -163,7 +163,7 @@ def _check_count(count: int, what: str) -> None:
         raise ValueError(f"{count} {what}{'s' * (count > 1)}: give 2 to {MOST_CASES} {what}s.")
 
 
-def _named(paths: Sequence[str], cases: Sequence[AnyCase]) -> list[AnyCase]:
+def _named(cases: Sequence[AnyCase], paths: Sequence[str]) -> list[AnyCase]:
     """Append a number to a name that occurs more than once. Raises ValueError for machines beside cases of one axis."""
     for path, case in zip(paths, cases, strict=True):
         if type(case) is not type(cases[0]):
@@ -260,6 +260,7 @@ def _draw(compared: Sequence[Compared], path: pathlib.Path) -> None:
             np.asarray(one.columns["settled_rms_u_V"]),
             one.loop.system,
             one.loop.channel,
+            one.loop.command,
             str(one.loop.numbers["worst_at"] or ""),
         )
         for one in compared

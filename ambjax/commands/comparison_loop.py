@@ -19,13 +19,15 @@ class ComparedLoop(NamedTuple):
 
     - `numbers`: of the nominal loop, or of the worst axis and speed of a machine, by the keys of the summary.
     - `axes`: peak of |S| and zone of each axis of a machine by its name, at the worst speed; {} for one axis.
-    - `system`: the loop that the picture shows; None: not stable, or no equilibrium. `channel`: number of its sensor.
+    - `system`: the loop that the picture shows; None: not stable, or no equilibrium. `channel`, `command`:
+      numbers of the reading and the voltage that the picture shows, among its outputs.
     """
 
     numbers: Mapping[str, object]
     axes: Mapping[str, Mapping[str, object]] = {}
     system: StateSpace | None = None
     channel: int = 0
+    command: int = 2
 
     @property
     def stable(self) -> bool:
@@ -83,7 +85,8 @@ def loop_of_machine(points: Sequence[MachineSensitivity]) -> ComparedLoop:
     for axis in at.axes:
         own = max((other for other, _ in rows if other.name == axis.name), key=lambda other: other.S.height)
         axes[axis.name] = {"peak": own.S.height, "frequency_hz": own.S.frequency, "zone": own.zone}
-    return ComparedLoop({**no_loop(True).numbers, **numbers}, axes, at.system, at.axes.index(worst))
+    k = at.axes.index(worst)
+    return ComparedLoop({**no_loop(True).numbers, **numbers}, axes, at.system, k, len(at.axes) + k)
 
 
 def laws_of(case: AnyCase) -> dict[str, dict[str, object]]:

@@ -12,7 +12,6 @@ from ambjax.cases.reader import Case
 from ambjax.commands.comparison_loop import ComparedLoop, laws_of
 from ambjax.ensemble.study import AnyStudy
 from ambjax.linear import Findings
-from ambjax.linear.stability import MOST_TESTED
 from ambjax.results.operating import MEMBERS
 from ambjax.results.outputs import table
 from ambjax.simulation import orders
@@ -65,7 +64,7 @@ class Quantity(NamedTuple):
 QUANTITIES = (
     Quantity("lost", "members lost", "1"),
     Quantity("stalled", "members not decided (the integrator stalled)", "1"),
-    Quantity("not_stable", f"members held, but not stable, of at most {MOST_TESTED} tested", "1"),
+    Quantity("not_stable", "members held, but not stable, of those tested", "1"),
     Quantity("cycle_m", "the largest amplitude of their own oscillation", "m"),
     Quantity("rms_error_median_m", "settled rms error, median", "m"),
     Quantity("rms_error_worst_m", "settled rms error, worst member", "m"),

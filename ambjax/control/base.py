@@ -3,9 +3,10 @@
 The classes of `control.stages` add the inputs and outputs of each stage.
 """
 
+import abc
 import dataclasses
 from collections.abc import Collection
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +28,7 @@ class Requirement(NamedTuple):
     over: str
 
 
-class Law:
+class Law(abc.ABC):
     """Base class of a law; it has no fields. A subclass is a frozen record whose leaves are the gains.
 
     Class attributes:
@@ -50,6 +51,11 @@ class Law:
       (`laws.Relaxation`); True for a class that defines it.
     """
 
+    if TYPE_CHECKING:  # every law is a record; an observer's `init` has one argument more
+        __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
+
+        def init(self, *args: Any, **kwargs: Any) -> Any: ...
+
     requirement: ClassVar[Requirement | None] = None
     estimates_velocity: ClassVar[bool] = False
     memory: ClassVar[tuple[tuple[str, str, str], ...] | None] = None
@@ -69,6 +75,15 @@ class Law:
             cls.analytic = False  # the property of an overridden law says nothing about this one
         cls.stiff, cls.slides = cls.stiff or "layer" in written, cls.slides or "slide" in written
 
+    @abc.abstractmethod
+    def scale(self, model: Plant) -> object: ...
+
+    @abc.abstractmethod
+    def slope(self, model: Plant) -> Scalar: ...
+
+    @abc.abstractmethod
+    def __call__(self, model: Plant, inputs: Any, state: Any, /) -> tuple[Any, Any]: ...
+
     def size(self, model: Plant) -> Scalar | None:
         """Return the characteristic size of the argument of the law's smoothed sign; None if the law has no such sign.
 
@@ -81,8 +96,7 @@ class Law:
 
         The value is inf for a state that no sign moves; this is the default for all states.
         """
-        scale: Any = self
-        return jax.tree.map(lambda _: jnp.inf, scale.scale(model))
+        return jax.tree.map(lambda _: jnp.inf, self.scale(model))
 
     def robust(self, error: Array, /) -> Array:
         """Return the term that the sign adds to the rate of the stage's error: -k sgn(sigma) in Eq. (12), for example.
@@ -110,21 +124,18 @@ class Law:
         Euler, state + period * rate. Define it to compute the law differently, for example with the sign at the end of
         the sample; `own_steps` says for which processors.
         """
-        law: Any = self
-        output, rate = law(model, inputs, state)
+        output, rate = self(model, inputs, state)
         return output, jax.tree.map(lambda x, d: x + period * d, state, rate)
 
     def init_sampled(self, model: Plant) -> object:
         """Return the state at t = 0 on a processor. For an observer, `init` is called instead."""
-        law: Any = self
-        return law.init(model)
+        return self.init(model)
 
     def scale_sampled(self, model: Plant) -> object:
         """Return the characteristic size of each component of the state on a processor."""
-        law: Any = self
-        return law.scale(model)
+        return self.scale(model)
 
-    def designed(self, model: Plant, sampling: Sampling | None) -> "Law":
+    def designed(self: L, model: Plant, sampling: Sampling | None) -> L:
         """Return the law with default gains designed for `model`.
 
         The default implementation scales the steepnesses (`scaled_steepness`). `sampling`: None in continuous time; on
@@ -172,10 +183,10 @@ def default_law(
     """
     if printed and kind.printed and is_table_1(model):
         return kind()
-    law: Any = kind().designed(model, sampling)
+    law = kind().designed(model, sampling)
     if set(kind.switching).isdisjoint(given):
         return law
-    scaled: Any = scaled_steepness(kind(), model)
+    scaled = scaled_steepness(kind(), model)
     return dataclasses.replace(law, **{name: getattr(scaled, name) for name in _steepnesses(law)})
 
 
@@ -194,17 +205,14 @@ def scaled_steepness(law: L, model: Plant) -> L:
     same share of this size for every plant. The size of v for Table 1, for example, is 2500 A^2/m^2; with
     p = 25 m^2/A^2 the boundary layer of v_tilde is 1.6e-5 of it.
     """
-    given: Any = law
-    size = law.size(model)
-    if size is None:
+    size, usual = law.size(model), law.size(Plant())
+    if size is None or usual is None:
         return law
-    ratio = given.size(Plant()) / size
-    return dataclasses.replace(given, **{name: getattr(law, name) * ratio for name in _steepnesses(law)})
+    return dataclasses.replace(law, **{name: getattr(law, name) * (usual / size) for name in _steepnesses(law)})
 
 
 def _steepnesses(law: Law) -> list[str]:
-    fields: Any = law
-    return [field.name for field in dataclasses.fields(fields) if field.metadata.get("steepness")]
+    return [field.name for field in dataclasses.fields(law) if field.metadata.get("steepness")]
 
 
 def memory_of(law: Law, state: object) -> list[tuple[str, str, str]]:
@@ -241,14 +249,12 @@ def set_valued_signs(law: Law) -> list[str]:
 
 def with_set_valued_signs(law: L) -> L:
     """Return the law with None for every steepness that is inf. Raises ValueError as `set_valued_signs` does."""
-    given: Any = law
-    return dataclasses.replace(given, **dict.fromkeys(set_valued_signs(law)))
+    return dataclasses.replace(law, **dict.fromkeys(set_valued_signs(law)))
 
 
 def with_default_steepness(law: L, model: Plant) -> L:
     """Return the law with the default steepness for the model in place of every inf or None."""
-    given: Any = law
     if not set_valued_signs(law):
         return law
     usual = scaled_steepness(type(law)(), model)
-    return dataclasses.replace(given, **{name: getattr(usual, name) for name in set_valued_signs(law)})
+    return dataclasses.replace(law, **{name: getattr(usual, name) for name in set_valued_signs(law)})

@@ -10,7 +10,7 @@ from ambjax.control.base import Requirement, scaled_steepness
 from ambjax.control.defaults import current_rate
 from ambjax.control.sampling import Relay, Sampling, non_oscillating
 from ambjax.control.search import Interval, SearchContext, authority, rate, steepness, switch
-from ambjax.control.stages import CurrentInputs, CurrentLaw, unwinding
+from ambjax.control.stages import CurrentInputs, CurrentLaw, Stateless, unwinding
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, limited, smooth_sign
@@ -18,7 +18,7 @@ from ambjax.world.plant import Plant, State
 
 
 @record
-class SlidingMode(CurrentLaw[tuple[()]]):
+class SlidingMode(Stateless, CurrentLaw[tuple[()]]):
     """u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - k_i sgn(i - i_ref)) + R i. Eq. (11), sgn smoothed.
 
     The default k_i is that of Table 2 for the plant of Table 1. For other plants it gives the sign the slope
@@ -43,12 +43,6 @@ class SlidingMode(CurrentLaw[tuple[()]]):
     def designed(self, model: Plant, sampling: Sampling | None) -> "SlidingMode":
         scaled = scaled_steepness(self, model)
         return dataclasses.replace(scaled, k_i=current_rate(model, sampling) / (TWO_OVER_PI * scaled.p))
-
-    def init(self, model: Plant) -> tuple[()]:
-        return ()
-
-    def scale(self, model: Plant) -> tuple[()]:
-        return ()
 
     def slope(self, model: Plant) -> Scalar:
         return TWO_OVER_PI * self.k_i * self.p
@@ -134,7 +128,7 @@ class ProportionalIntegral(CurrentLaw[Array]):
 
 
 @record
-class DeadBeat(CurrentLaw[tuple[()]]):
+class DeadBeat(Stateless, CurrentLaw[tuple[()]]):
     """Law that inverts Eq. (2) for i' = i_ref' - w (i - i_ref). Each implicit step multiplies i - i_ref by 1 - share.
 
     In continuous time u = kappa/(2(s_0+z)) (-2 z_dot i/(s_0+z) + i_ref' - w (i - i_ref)) + R i. On a processor with
@@ -161,12 +155,6 @@ class DeadBeat(CurrentLaw[tuple[()]]):
     def designed(self, model: Plant, sampling: Sampling | None) -> "DeadBeat":
         share = 1.0 if sampling is None else non_oscillating(sampling.late)
         return DeadBeat(current_rate(model, sampling), share)
-
-    def init(self, model: Plant) -> tuple[()]:
-        return ()
-
-    def scale(self, model: Plant) -> tuple[()]:
-        return ()
 
     def slope(self, model: Plant) -> Scalar:
         return self.w
@@ -202,7 +190,7 @@ class DeadBeat(CurrentLaw[tuple[()]]):
 
 
 @record
-class OpenLoop(CurrentLaw[tuple[()]]):
+class OpenLoop(Stateless, CurrentLaw[tuple[()]]):
     """u = R i_ref: the voltage that holds the reference current. The current is not fed back.
 
     Use it with a position law that demands a voltage, such as position.LinearController. With inversion.Linearised, u
@@ -214,12 +202,6 @@ class OpenLoop(CurrentLaw[tuple[()]]):
 
     analytic = True
     accepts: ClassVar = ("voltage",)
-
-    def init(self, model: Plant) -> tuple[()]:
-        return ()
-
-    def scale(self, model: Plant) -> tuple[()]:
-        return ()
 
     def slope(self, model: Plant) -> Scalar:
         return 0.0
@@ -235,7 +217,7 @@ class OpenLoop(CurrentLaw[tuple[()]]):
 
 
 @record
-class AmplifierCurrent(CurrentLaw[tuple[()]]):
+class AmplifierCurrent(Stateless, CurrentLaw[tuple[()]]):
     """u = i_ref in A, for an amplifier that controls the current (`actuator.mode = "current"`).
 
     On a processor u is the i_ref that the inversion has computed at this sample. The prediction over the delay and the
@@ -249,12 +231,6 @@ class AmplifierCurrent(CurrentLaw[tuple[()]]):
     )
     commands = "current"
     own_steps = ("implicit", "explicit")
-
-    def init(self, model: Plant) -> tuple[()]:
-        return ()
-
-    def scale(self, model: Plant) -> tuple[()]:
-        return ()
 
     def slope(self, model: Plant) -> Scalar:
         return 0.0

@@ -13,7 +13,7 @@ from ambjax.control.base import Requirement, scaled_steepness
 from ambjax.control.defaults import adaptation_gain
 from ambjax.control.sampling import Relay, Sampling
 from ambjax.control.search import Interval, SearchContext, steepness
-from ambjax.control.stages import CurrentDemand, ForceDemand, InversionLaw, Relaxation
+from ambjax.control.stages import CurrentDemand, ForceDemand, InversionLaw, Relaxation, Stateless
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.numerics.relax import relax, relaxation
 from ambjax.numerics.smooth import TWO_OVER_PI, away_from_zero, smooth_sign
@@ -173,7 +173,7 @@ class StaticInversionState(NamedTuple):
     begun: Array
 
 
-class StaticInversion(InversionLaw[tuple[()]]):
+class StaticInversion(Stateless, InversionLaw[tuple[()]]):
     """Base class of a law whose i_ref is a function of z and v_star.
 
     In continuous time the law has no state, and i_ref' is exact.
@@ -191,14 +191,8 @@ class StaticInversion(InversionLaw[tuple[()]]):
     def inverse(self, model: Plant, z: Array, v_star: Array) -> Array:
         """Return the current (A) for a position and a demanded force."""
 
-    def init(self, model: Plant) -> tuple[()]:
-        return ()
-
     def init_sampled(self, model: Plant) -> StaticInversionState:
         return StaticInversionState(jnp.zeros(()), jnp.zeros(()))
-
-    def scale(self, model: Plant) -> tuple[()]:
-        return ()
 
     def scale_sampled(self, model: Plant) -> StaticInversionState:
         return StaticInversionState(jnp.asarray(model.i_0 / 25), jnp.ones(()))

@@ -15,7 +15,7 @@ from ambjax.control.defaults import switching_gain, switching_steepness
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, position_switch, rate, steepness
-from ambjax.control.stages import PositionLaw
+from ambjax.control.stages import PositionLaw, Stateless
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, safe_sqrt, smooth_root, smooth_sign
@@ -108,7 +108,7 @@ class UtkinSlidingMode(PositionLaw[Array]):
 
 
 @record
-class TerminalSlidingMode(PositionLaw[tuple[()]]):
+class TerminalSlidingMode(Stateless, PositionLaw[tuple[()]]):
     """v_star = (-2 k_z z/m + r_ddot + g - 2/3 c^2 l |y|^(1/2) sgn(y) - k sgn(sigma))/a, y = e_dot/(c l).
 
     Non-singular terminal sliding mode (Y. Feng, X. Yu and Z. Man, Automatica 38 (2002) 2159-2167) with the exponent
@@ -129,12 +129,6 @@ class TerminalSlidingMode(PositionLaw[tuple[()]]):
         default=25.0, unit="s/m", doc="steepness of the smoothed sign of sigma; left out: scaled to the nominal plant",
         steepness=True,
     )  # fmt: skip
-
-    def init(self, model: Plant) -> tuple[()]:
-        return ()
-
-    def scale(self, model: Plant) -> tuple[()]:
-        return ()
 
     def designed(self, model: Plant, sampling: Sampling | None) -> "TerminalSlidingMode":
         scaled = scaled_steepness(self, model)

@@ -9,26 +9,20 @@ from jax import Array
 from ambjax.control.exact import DERIVATIVES, ExactDifferentiator
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
-from ambjax.control.stages import Observer
+from ambjax.control.stages import Observer, Stateless
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
 
 
 @record
-class Direct(Observer[tuple[()]]):
+class Direct(Stateless, Observer[tuple[()]]):
     """No observer: the estimate is the measurement, as in the paper.
 
     Use it where position and velocity are measured with little noise: `Cascade(observer=observer.Direct())`.
     """
 
     analytic = True
-
-    def init(self, model: Plant, measured: Measurement) -> tuple[()]:
-        return ()
-
-    def scale(self, model: Plant) -> tuple[()]:
-        return ()
 
     def slope(self, model: Plant) -> Scalar:
         return 0.0

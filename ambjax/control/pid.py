@@ -8,7 +8,7 @@ from jax import Array
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
-from ambjax.control.stages import PositionLaw, unwinding
+from ambjax.control.stages import PositionLaw, Stateless, unwinding
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
@@ -113,7 +113,7 @@ class PID(PositionLaw[PIDState]):
 
 
 @record
-class FeedbackLinearisation(PositionLaw[tuple[()]]):
+class FeedbackLinearisation(Stateless, PositionLaw[tuple[()]]):
     """v_star = (-2 k_z z/m + r_ddot + g - k_p e - k_d e_dot)/a, e = z - r: feedback linearisation with a PD controller.
 
     The demanded force cancels stiffness and weight. With inversion.ClosedForm, which cancels the nonlinear magnet, the
@@ -128,12 +128,6 @@ class FeedbackLinearisation(PositionLaw[tuple[()]]):
     analytic = True
     k_p: Scalar = gain(default=2.82e5, unit="1/s^2", doc="proportional gain; left out: w^2")
     k_d: Scalar = gain(default=1062.0, unit="1/s", doc="derivative gain; left out: 2 w")
-
-    def init(self, model: Plant) -> tuple[()]:
-        return ()
-
-    def scale(self, model: Plant) -> tuple[()]:
-        return ()
 
     def designed(self, model: Plant, sampling: Sampling | None) -> "FeedbackLinearisation":
         return FeedbackLinearisation(model.pole**2, 2 * model.pole)

@@ -17,7 +17,7 @@ from ambjax.control.pid import PID as PID
 from ambjax.control.pid import FeedbackLinearisation as FeedbackLinearisation
 from ambjax.control.sampling import Relay, Sampling
 from ambjax.control.search import Interval, SearchContext, authority, manifold, position_switch, rate, steepness
-from ambjax.control.stages import PositionLaw
+from ambjax.control.stages import PositionLaw, Stateless
 from ambjax.control.state_feedback import StateFeedback as StateFeedback
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share, twist
@@ -28,7 +28,7 @@ from ambjax.world.waveforms import Reference
 
 
 @record
-class SlidingMode(PositionLaw[tuple[()]]):
+class SlidingMode(Stateless, PositionLaw[tuple[()]]):
     """v_star = (-2 k_z z/m - c (z_dot - r_dot) + r_ddot + g - k sgn(sigma)) / a. Eq. (5), sgn smoothed.
 
     The default gains are those of Table 2 for the plant of Table 1. For other plants the error has a double pole at -w,
@@ -56,12 +56,6 @@ class SlidingMode(PositionLaw[tuple[()]]):
 
     def designed(self, model: Plant, sampling: Sampling | None) -> "SlidingMode":
         return SlidingMode(model.pole, switching_gain(model), switching_steepness(model))
-
-    def init(self, model: Plant) -> tuple[()]:
-        return ()
-
-    def scale(self, model: Plant) -> tuple[()]:
-        return ()
 
     def slope(self, model: Plant) -> Scalar:
         return jnp.maximum(TWO_OVER_PI * self.k * self.p, self.c)

@@ -88,6 +88,16 @@ class Relaxation(NamedTuple):
     v_tilde: tuple[Array, Array, Array]
 
 
+class Stateless(Law):
+    """A law without a state: a second base class, before that of the stage."""
+
+    def init(self, model: Plant, measured: Measurement | None = None) -> tuple[()]:
+        return ()
+
+    def scale(self, model: Plant) -> tuple[()]:
+        return ()
+
+
 def unwinding(k_aw: Scalar, k_int: Scalar) -> Array:
     """Return the anti-windup rate k_aw (1/s) of an integral with the gain k_int, or 0 without an integral.
 
@@ -96,7 +106,7 @@ def unwinding(k_aw: Scalar, k_int: Scalar) -> Array:
     return jnp.where(jnp.asarray(k_int) > 0, k_aw, 0.0)
 
 
-class Observer(Law, Generic[State], abc.ABC):
+class Observer(Law, Generic[State]):
     """Base class of an observer: its input is the measurement, its output the estimated motion and current."""
 
     @abc.abstractmethod
@@ -107,16 +117,10 @@ class Observer(Law, Generic[State], abc.ABC):
         return self
 
     @abc.abstractmethod
-    def scale(self, model: Plant) -> object: ...
-
-    @abc.abstractmethod
-    def slope(self, model: Plant) -> Scalar: ...
-
-    @abc.abstractmethod
     def __call__(self, model: Plant, inputs: Measurement, state: State, /) -> tuple[Measurement, State]: ...
 
 
-class PositionLaw(Law, Generic[State], abc.ABC):
+class PositionLaw(Law, Generic[State]):
     """Base class of a position law: its input is (estimate, reference), its output the scaled force v_star, A^2/m^2."""
 
     @property
@@ -147,19 +151,13 @@ class PositionLaw(Law, Generic[State], abc.ABC):
         return self.init_sampled(model) if has_sampled_state(self) else self.begin(model, inputs)
 
     @abc.abstractmethod
-    def scale(self, model: Plant) -> object: ...
-
-    @abc.abstractmethod
-    def slope(self, model: Plant) -> Scalar: ...
-
-    @abc.abstractmethod
     def sigma(self, motion: Measurement, reference: Reference) -> Array: ...
 
     @abc.abstractmethod
     def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: State, /) -> tuple[Array, State]: ...
 
 
-class InversionLaw(Law, Generic[State], abc.ABC):
+class InversionLaw(Law, Generic[State]):
     """Base class of an inversion law: its input is the demanded force, its output the demanded current.
 
     `accepts`: the demands of a position law (`PositionLaw.demand`) with which the law can be combined.
@@ -175,16 +173,10 @@ class InversionLaw(Law, Generic[State], abc.ABC):
         return self
 
     @abc.abstractmethod
-    def scale(self, model: Plant) -> object: ...
-
-    @abc.abstractmethod
-    def slope(self, model: Plant) -> Scalar: ...
-
-    @abc.abstractmethod
     def __call__(self, model: Plant, inputs: ForceDemand, state: State, /) -> tuple[CurrentDemand, State]: ...
 
 
-class CurrentLaw(Law, Generic[State], abc.ABC):
+class CurrentLaw(Law, Generic[State]):
     """Base class of a current law: its input is the demanded current, its output the command u.
 
     `accepts`: the demands of a position law (`PositionLaw.demand`) with which the law can be combined. `commands`: what
@@ -196,12 +188,6 @@ class CurrentLaw(Law, Generic[State], abc.ABC):
 
     @abc.abstractmethod
     def init(self, model: Plant) -> State: ...
-
-    @abc.abstractmethod
-    def scale(self, model: Plant) -> object: ...
-
-    @abc.abstractmethod
-    def slope(self, model: Plant) -> Scalar: ...
 
     @abc.abstractmethod
     def __call__(self, model: Plant, inputs: CurrentInputs, state: State, /) -> tuple[Array, State]: ...

@@ -1,7 +1,6 @@
 """A sampled loop that is broken at the command, which is held for a sample and may be delayed by a part of a sample."""
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -21,9 +20,9 @@ class HeldCommand:
     """
 
     def __init__(self, system: StateSpace):
-        path: Any = system.path
-        self.system, self.period, self.own = system, float(np.asarray(system.period)), float(np.asarray(path.delay))
-        self.path: Any = system.scaled().path
+        own = system.known_path.delay
+        self.system, self.period, self.own = system, float(np.asarray(system.period)), float(np.asarray(own))
+        self.path = system.scaled().known_path
         self._held = self.path.held(self.own - math.floor(self.own), self.period)
 
     def transfer(self, f: np.ndarray, delay: float | None = None) -> np.ndarray:

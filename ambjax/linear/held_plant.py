@@ -3,7 +3,7 @@
 At an equilibrium the linearised equations have constant coefficients, and the matrix exponential solves them exactly.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -103,6 +103,6 @@ def _at(lag: Array, number: int) -> Array:
 def _integrated(A: Array, b: Array, h: Scalar) -> tuple[Array, Array]:
     """Return exp(A h), and the integral of exp(A t) b over t from 0 to h (s)."""
     n = len(b)
-    table: Any = jnp.zeros((n + 1, n + 1), A.dtype).at[:n].set(jnp.concatenate([A, b[:, None]], 1) * h)
+    table = jnp.zeros((n + 1, n + 1), A.dtype).at[:n].set(jnp.concatenate([A, b[:, None]], 1) * h)
     whole = exponential(table)
     return whole[:n, :n], whole[:n, n]

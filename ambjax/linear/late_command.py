@@ -50,11 +50,11 @@ class _Command:
     """The loop transfer L broken at the command; late is an additional delay in samples, or s in continuous time."""
 
     def __init__(self, system: StateSpace):
-        path: Any = system.path
+        path = system.known_path
         self.system, self.n, self.b = system, len(path.b), path.b
         self.sampled = system.period is not None
-        self.unit: Any = system.period if self.sampled else 1.0
-        self.own: Any = path.delay if self.sampled else 0.0
+        self.unit = jnp.asarray(1.0 if system.period is None else system.period)
+        self.own = jnp.asarray(path.delay if self.sampled else 0.0)
         if self.sampled:
             table = jnp.zeros((self.n + 1, self.n + 1), path.A.dtype)
             self.rates = table.at[: self.n].set(jnp.concatenate([path.A, path.b[:, None]], 1)) * self.unit / GRID

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.linear.resolvent import resolvent
 from ambjax.numerics.records import Scalar
 from ambjax.numerics.small_matrices import exponential, solve
 
@@ -20,6 +21,11 @@ INPUTS = ("e_z", "e_z_dot", "q_z")
 # Outputs: the readings of z (m) and z_dot (m/s), test signals included, the voltage u (V), the true position z (m), and
 # the command of the laws (V, or A for a commanded current), and the reading of i (A).
 OUTPUTS = ("z_read", "z_dot_read", "u", "z", "command", "i_read")
+
+
+def array_module(x: Array | np.ndarray) -> Any:
+    """Return the module that computes with an array: NumPy for its own, else jax.numpy."""
+    return np if isinstance(x, np.ndarray) else jnp
 
 
 class CommandPath(NamedTuple):
@@ -39,8 +45,8 @@ class CommandPath(NamedTuple):
         `fraction` [...]: part of the sample after which a new command acts. The first result is the effect of the new
         command, per unit; the second is that of the command before it.
         """
-        tools: Any = (np, _exponential) if isinstance(self.A, np.ndarray) else (jnp, exponential)
-        np_, expm = tools
+        np_ = array_module(self.A)
+        expm = _exponential if np_ is np else exponential
         n, fraction = len(self.b), np_.asarray(fraction)[..., None, None]
         table = np_.concatenate([np_.concatenate([self.A, self.b[:, None]], 1), np_.zeros((1, n + 1))]) * period
         late, early = expm(table * (1 - fraction)), expm(table * fraction)
@@ -77,6 +83,13 @@ class StateSpace(NamedTuple):
             path = path._replace(A=path.A * own / own[:, None], b=path.b / own)
         return self._replace(A=self.A * s / s[:, None], B=self.B / s[:, None], C=self.C * s, sizes=s / s, path=path)
 
+    @property
+    def known_path(self) -> CommandPath:
+        """The path from the command to the plant. Raises ValueError without one."""
+        if self.path is None:
+            raise ValueError("path: the path from the command to the plant is not known.")
+        return self.path
+
     def idle(self) -> Array | np.ndarray:
         """Return which states [N] no input reaches, such as an integral whose gain is 0: their deviations stay 0."""
         linked, reached = self.A != 0, (self.B != 0).any(1)
@@ -86,7 +99,7 @@ class StateSpace(NamedTuple):
 
     def without_idle(self) -> "StateSpace":
         """Return the system with NumPy arrays, without the states of the laws that no input reaches."""
-        one: Any = jax.tree.map(np.asarray, self)
+        one = jax.tree.map(np.asarray, self)
         kept = ~np.asarray(one.idle())
         if one.path is not None:
             kept[: len(one.path.b)] = True  # the states of the plant
@@ -99,16 +112,12 @@ class StateSpace(NamedTuple):
         If the matrices are NumPy arrays, NumPy computes the response, without compilation. If they are JAX arrays, it
         is differentiable.
         """
-        np_: Any = np if isinstance(self.A, np.ndarray) else jnp
         A, B, C, D, *_ = self.scaled()
-        at = self.point(frequency)[:, None, None]
-        solved = np.linalg.solve if np_ is np else solve
-        x = solved(at * np.eye(len(A)) - A, np_.broadcast_to(B + 0j, (at.shape[0], *B.shape)))
-        return C @ x + D
+        return C @ _solved(A, self.point(frequency), B) + D
 
     def point(self, frequency: Array | np.ndarray) -> Any:
         """Return s = 2 pi j f, or z = exp(s T) on a processor, at frequencies [F] in Hz."""
-        np_: Any = np if isinstance(self.A, np.ndarray) else jnp
+        np_ = array_module(self.A)
         s = 2j * np.pi * np_.asarray(frequency)
         return s if self.period is None else np_.exp(s * self.period)
 
@@ -118,12 +127,8 @@ class StateSpace(NamedTuple):
 
     def command_row(self, frequency: Array | np.ndarray) -> Any:
         """Return h [F, n]: response of the command to an input of each state of the plant, in the units of `scaled`."""
-        np_: Any = np if isinstance(self.A, np.ndarray) else jnp
         A, _, C, *_ = self.scaled()
-        at, n = self.point(frequency)[:, None, None], len(self.path.b)  # pyright: ignore[reportOptionalMemberAccess]
-        row = np_.broadcast_to(C[4][:, None] + 0j, (at.shape[0], len(A), 1))
-        solved = np.linalg.solve if np_ is np else solve
-        return solved(at * np.eye(len(A)) - A.T, row)[:, :n, 0]
+        return _solved(A.T, self.point(frequency), C[4][:, None])[:, : len(self.known_path.b), 0]
 
     def command_effect(self, frequency: Array | np.ndarray, late: Scalar = 0.0) -> Array:
         """Return the effect [F, n] of a unit command on the states of the plant, in the units of `scaled`.
@@ -131,8 +136,8 @@ class StateSpace(NamedTuple):
         `late`: additional delay of the command, s. On a processor, the effect is that of the hold, which begins after
         the delay and ends one sample later.
         """
-        path: Any = self.scaled().path
-        np_: Any = np if isinstance(self.A, np.ndarray) else jnp
+        path = self.scaled().known_path
+        np_ = array_module(self.A)
         s = 2j * np.pi * np_.asarray(frequency)[:, None]
         if self.period is None:
             return path.b * np_.exp(-s * late)
@@ -148,7 +153,7 @@ class StateSpace(NamedTuple):
         the laws remember their own commands. S = 1/(1 + L) is the response of the signal at this place to a signal that
         is added to it.
         """
-        np_: Any = np if isinstance(self.A, np.ndarray) else jnp
+        np_ = array_module(self.A)
         if place == "reading":
             return (1 / self.sensitivity(frequency) - 1) * np_.exp(-2j * np.pi * np_.asarray(frequency) * late)
         row, own = self.command_row(frequency), self.command_effect(frequency)
@@ -185,6 +190,13 @@ class StateSpace(NamedTuple):
         matrices = [np.asarray(x) for x in (self.A, self.B, self.C, self.D)]
         step = 0 if self.period is None else float(self.period)
         return control.StateSpace(*matrices, step, inputs=list(INPUTS), outputs=list(OUTPUTS))
+
+
+def _solved(A: Any, z: Any, B: Any) -> Any:
+    """Return (z I - A)^-1 B as `resolvent` does, by NumPy or JAX."""
+    if isinstance(A, np.ndarray):
+        return resolvent(A, z, B)
+    return solve(z[:, None, None] * np.eye(len(A)) - A, jnp.broadcast_to(B + 0j, (*z.shape, *B.shape)))
 
 
 def _exponential(M: np.ndarray) -> np.ndarray:

@@ -95,18 +95,18 @@ def _columns(numbers: Numbers, x: LoopPoint) -> tuple[PointValues, list[PointVal
 
 def _values(numbers: Numbers, x: LoopPoint) -> PointValues:
     """Return the values at a point. `numbers`: those of `_ideal`."""
-    scenario: Any = numbers.scenario
-    lagged: Any = x.lagged
+    scenario = numbers.scenario
+    lagged = x.lagged
     motion = scenario.plant.measurement(lagged.plant)
     sensor, amplifier, lags = scenario.sensors, scenario.actuator, LagState((), (), ())
-    u: Any = x.acting
+    u = jnp.asarray(x.acting)
     read = motion
     if sensor.bandwidth is not None:
-        lags = lags._replace(z_filtered=2 * jnp.pi * sensor.bandwidth * (motion.z - lagged.z_filtered))
+        lags = lags._replace(z_filtered=2 * jnp.pi * sensor.bandwidth * (motion.z - jnp.asarray(lagged.z_filtered)))
         read = motion._replace(z=jnp.asarray(lagged.z_filtered))
     if amplifier.slow:
-        lags = lags._replace(u_a=amplifier.slope() * (u - lagged.u_a))
-        u = lagged.u_a
+        lags = lags._replace(u_a=amplifier.slope() * (u - jnp.asarray(lagged.u_a)))
+        u = jnp.asarray(lagged.u_a)
     measured = reading(scenario, read, (x.e, 0.0))
     sample = Sample(at_rest(0.0), jnp.asarray(numbers.period), jnp.asarray(jnp.inf), x.past)
     command, control, _ = numbers.cascade.step(measured, x.control, sample)

@@ -14,7 +14,7 @@ from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import RolloutState, begin, one_sample
 from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.system import system_of
+from ambjax.simulation.system import sampled_of
 from ambjax.simulation.trajectory import Row
 from ambjax.world.scenario import Scenario
 
@@ -43,7 +43,7 @@ class LoopFunctions:
 
     def _system(self, numbers: Numbers, normals: Any) -> tuple[Sampled, Clock, Metrics]:
         clock = dataclasses.replace(self.clock, sample_period=numbers.period)
-        built: Any = system_of(numbers.cascade, numbers.scenario, clock)
+        built = sampled_of(numbers.cascade, numbers.scenario, clock)
         word = jnp.zeros((), jnp.uint32)
         cascade = built.loop.cascade.turning(numbers.scenario.rotor)
         loop = ClosedLoop(cascade, numbers.scenario.turning(), (word, word), normals)

@@ -24,7 +24,8 @@ class Contender(NamedTuple):
     - `held`: whether each member keeps its rotor [N].
     - `error`, `voltage`: settled rms error (m) and settled rms voltage (V) of each member [N].
     - `system`: the linearised loop; None: not stable, or no equilibrium. Then |S| and |KS| are not drawn.
-    - `channel`: number of the sensor of the drawn responses. `where`: axis and speed of a machine in the legend.
+    - `channel`, `command`: numbers of the drawn reading and voltage among the outputs of `system`; the reading has the
+      number of its test signal. `where`: axis and speed of a machine in the legend.
     """
 
     name: str
@@ -33,6 +34,7 @@ class Contender(NamedTuple):
     voltage: np.ndarray
     system: StateSpace | None
     channel: int = 0
+    command: int = 2
     where: str = ""
 
 
@@ -65,7 +67,7 @@ def comparison_figure(cases: Sequence[Contender], limits: Sequence[float], span:
             f = grid if period is None else grid[grid <= 0.5 / float(period)]
             H, k = np.asarray(case.system.response(f)), case.channel
             S_axes.loglog(f, np.abs(H[:, k, k]), **look | {"label": f"{case.name}: {case.where}"})
-            KS_axes.loglog(f, np.abs(H[:, H.shape[-1] + k, k]), **look)
+            KS_axes.loglog(f, np.abs(H[:, case.command, k]), **look)
         errors, lost = factor * np.sort(case.error[case.held]), int(np.sum(~case.held))
         label = f"{case.name} ({lost} lost)" if lost else case.name
         error_axes.step(errors, np.arange(1, errors.size + 1) / case.held.size, where="post", **look | {"label": label})

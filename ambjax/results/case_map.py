@@ -105,7 +105,7 @@ def survival_map(case: AnyCase, x: str, y: str, *, members: int = 1, seed: int |
 def is_stable(study: AnyStudy, values: dict[str, np.ndarray], members: np.ndarray) -> np.ndarray:
     """Return whether each system is stable [N], for `grid`. Of a machine, the linear loops are tested."""
     if isinstance(study, MachineStudy):
-        return study.growth(values, members) <= 0
+        return study.stable(values, members)
     assert isinstance(study, Study)
     return stability_of(*study.varied(values, members), study.clock).stable
 

@@ -19,7 +19,7 @@ from ambjax.ensemble.maps import PERIOD
 from ambjax.ensemble.paths import Place, kinds, places, with_values
 from ambjax.ensemble.spread import Spread, drawn
 from ambjax.ensemble.study import SPREAD, AnyStudy
-from ambjax.linear import linearise_machine, poles_in_s
+from ambjax.linear import linearise_machine
 from ambjax.linear.stability import Findings
 from ambjax.numerics.records import canonical
 from ambjax.numerics.shapes import map_varying
@@ -135,7 +135,7 @@ class MachineStudy(AnyStudy):
 
     def metrics(self, values: dict[str, np.ndarray], members: np.ndarray) -> dict[str, np.ndarray]:
         machine, fold = self.varied(values, members)
-        return worst_of(simulate_members(machine, self.clock, fold).metrics)
+        return worst_of(run_machines(machine, self.clock, fold).metrics)
 
     def _axis(self, values: dict[str, Any], k: int, member: Any) -> tuple[Cascade, Scenario]:
         one = self.case.cases[k]
@@ -168,7 +168,7 @@ class MachineStudy(AnyStudy):
             far = np.array(machine.start_q)
             far[..., :2] = FAR * max(float(np.max(np.asarray(one.scenario.limit))) for one in self.case.cases)
             machine = dataclasses.replace(machine, start_q=far)
-        outcome = simulate_members(machine, self.clock, fold, threads=threads, call=call)
+        outcome = run_machines(machine, self.clock, fold, threads=threads, call=call)
         values = {SPREAD + path: x for path, x in self.drawn(members).items()}
         for k, axis in enumerate(self.case.axes):
             values |= {f"{axis}.{name}": outcome.metrics[name][:, k] for name in self.by_axis}
@@ -177,18 +177,18 @@ class MachineStudy(AnyStudy):
     def findings(self, index: np.ndarray) -> Findings:
         """Test whether the linear loops of the first MOST_TESTED of these members are stable at their first speed."""
         tested = index[:MOST_TESTED]
-        return LinearFindings(len(tested), int(np.sum(self.growth(self.drawn(tested), tested) > 0)))
+        return LinearFindings(len(tested), int(np.sum(~self.stable(self.drawn(tested), tested))))
 
-    def growth(self, values: dict[str, np.ndarray], members: np.ndarray) -> np.ndarray:
-        """Return the largest real part of a pole (1/s) of each system of `varied` [n]; inf without an equilibrium."""
+    def stable(self, values: dict[str, np.ndarray], members: np.ndarray) -> np.ndarray:
+        """Return whether the linear loops of each system of `varied` are stable [n]; not without an equilibrium."""
         machine, _ = self.varied(values, members)
-        rates = np.full(len(members), np.inf)
+        found = np.zeros(len(members), bool)
         for k in range(len(members)):
             one = map_varying(lambda x, k=k: x[k], machine)
             with contextlib.suppress(ValueError):
-                system = linearise_machine(one, self.clock.sample_period, float(np.asarray(one.rotor.speed)))
-                rates[k] = np.max(np.real(poles_in_s(system)))
-        return rates
+                speed = float(np.asarray(one.rotor.speed))
+                found[k] = linearise_machine(one, self.clock.sample_period, speed).stable
+        return found
 
     def fingerprint(self) -> dict[str, object]:
         machine, facts = self.case.machine, self.facts()
@@ -204,10 +204,10 @@ class MachineStudy(AnyStudy):
         return facts
 
 
-def simulate_members(
+def run_machines(
     machine: Machine, clock: Clock, fold: Fold, *, threads: int | None = None, call: int | None = None
 ) -> Result:
-    """Simulate all members of an ensemble of machines. What varies has a leading axis [N]. No rows are recorded."""
+    """Simulate every member of an ensemble of machines. What varies has a leading axis [N]. No rows are recorded."""
     tree = canonical((machine, clock, fold))
     return map_members(_simulated, tree, threads=threads, call=call, vectorised=True)
 

@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import itertools
 import operator
-from typing import Any, Self
+from typing import Self
 
 import jax
 import jax.numpy as jnp
@@ -235,9 +235,9 @@ class Sampled:
         `t`: time of the sample, s. `reached`: the states of the plant at the end of each part of the sample. `times`:
         the lengths of the parts, s.
         """
-        z_filtered: Any = state.z_filtered
+        z_filtered = state.z_filtered
         sensor = self.loop.scenario.sensors
-        if not lags(self.loop):
+        if not lags(self.loop) or isinstance(z_filtered, tuple):
             return z_filtered
         instants = itertools.accumulate(times, initial=t)
         states = (state.plant, *reached)

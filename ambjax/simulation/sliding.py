@@ -55,7 +55,7 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     ahead, control_1, force_0 = materialised((ahead, control_1, force_0))
     force_1, estimate_1, rates_1 = cascade.demand(loop.received(end, ahead, errors), control_1, end.reference)
 
-    inversion: Any = with_gains_at(cascade.inversion, estimate_0.z, begin.reference)
+    inversion = with_gains_at(cascade.inversion, estimate_0.z, begin.reference)
     sliding, slaved, tau, (w, w_1, w_2) = inversion.slide(model, force_0, force_1, i_ref, h)
     sliding, slaved, tau, force_1 = materialised((sliding, slaved, tau, force_1))
 

@@ -121,7 +121,10 @@ def _check_laws(cascade: Cascade, sample_period: Scalar) -> None:
 
 def system_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> ClosedLoop | Sampled:
     """Return the closed loop of the cascade, in continuous time or on its processor."""
-    if not cascade.sampled:
-        return ClosedLoop(cascade, scenario)
+    return sampled_of(cascade, scenario, clock) if cascade.sampled else ClosedLoop(cascade, scenario)
+
+
+def sampled_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> Sampled:
+    """Return the closed loop of a cascade on its processor."""
     period = clock.sample_period
     return Sampled(ClosedLoop(simulated(cascade.on_processor(), scenario, period), scenario), period, clock.cuts)

@@ -23,7 +23,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState
 from ambjax.control.sampling import Sampling
 from ambjax.control.schedule import extremes
-from ambjax.control.stages import CurrentDemand, CurrentInputs, ForceDemand, step_law
+from ambjax.control.stages import CurrentDemand, CurrentInputs, ForceDemand, PositionLaw, step_law
 from ambjax.simulation.clock import Clock
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
@@ -75,9 +75,8 @@ def law_poles(cascade: Cascade, clock: Clock) -> list[LawPoles]:
     """
     sampling, cascade, lines = sampling_of(cascade, clock), cascade.on_processor(), []
     for stage, law in zip(CascadeState._fields, cascade.laws, strict=True):
-        given: Any = law
-        gains = any("steepness" in field.metadata for field in dataclasses.fields(given))
-        if not gains or (stage == "position" and given.demand == "voltage"):
+        gains = any("steepness" in field.metadata for field in dataclasses.fields(law))
+        if not gains or (isinstance(law, PositionLaw) and law.demand == "voltage"):
             continue
         implicit = law.has_own_step(sampling.implicit)
         if set_valued_signs(law) and not implicit:

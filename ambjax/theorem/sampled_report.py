@@ -226,7 +226,7 @@ def _smallest_distance(run: Trajectory, plant: Bearing) -> tuple[float, float]:
 
     It is computed after the run, because XLA does not compile it within the loop as one kernel.
     """
-    rows: Any = run.rows
+    rows = run.rows
     t, distance = np.asarray(rows.t), np.asarray(_distances(*canonical((plant, rows.z, rows.i_ref))))
     worst = int(np.argmin(np.where(t <= float(run.lost_at), distance, np.inf)))
     return float(distance[worst]), float(t[worst])

@@ -1,6 +1,6 @@
 """Texts about a block for the header and the README: order of operations, what the export fixes, what a step checks."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,7 +58,7 @@ def notes_of(trace: Trace) -> list[str]:
 
 def _of_plant(trace: Trace) -> list[str]:
     """Return the lines of `notes_of` for a plant or a loop."""
-    block: Any = trace.block
+    block = trace.block
     lines = [
         f"Step n ends at t = n T, T = {block.period:g} s. It advances the plant by T under the voltages that act, with",
         "the simulator's own steps, and reads the sensors. Step 0 only reads them, in the initial state.",

@@ -58,7 +58,7 @@ def reference(block: Block, cascade: Cascade, scenario: Scenario, clock: Clock) 
     given = series(cascade, scenario, clock, count + 1)
     if block.noun == "controller":
         short = dataclasses.replace(clock, samples=count)
-        read: Any = rollout(cascade, scenario, short).trajectory.rows
+        read = rollout(cascade, scenario, short).trajectory.rows
         signals = {**given, "z": read.z_measured, "z_dot": read.z_dot, "i": read.i}
         rows = np.array([signals[name][:count] for name in block.inputs]).T
         found = np.concatenate([np.zeros((1, len(block.outputs))), run_block(block, rows)[0]])
