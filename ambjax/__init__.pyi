@@ -18,6 +18,8 @@ from ambjax.cases.machine_case import read_machine as read_machine
 from ambjax.cases.reader import Case as Case
 from ambjax.cases.template_text import template as template
 from ambjax.cases.warned import read_case as read_case
+from ambjax.commands.check import check as check
+from ambjax.commands.compare import compare as compare
 from ambjax.control.cascade import Cascade as Cascade
 from ambjax.control.guard import Guard as Guard
 from ambjax.control.processor import Processor as Processor

@@ -26,7 +26,7 @@ import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, machine_from
 from ambjax.cases.template_text import template
-from ambjax.results.machine_study import MachineStudy, simulate_members
+from ambjax.results.machine_study import MachineStudy, run_machines
 from ambjax.simulation.folds import Peak
 from ambjax.simulation.whole_machine import PerAxis
 
@@ -138,7 +138,7 @@ def problem_of(kind: Kind, case: MachineCase) -> ctypes.Structure:
     rotor, clock, sensor = case.machine.rotor, case.clock, case.cases[0].scenario.sensor
     (unbalance,), (load,), (M, D, K) = rotor.unbalances, rotor.loads, map(np.asarray, (rotor.M, rotor.D, rotor.K))
     assert all(np.array_equal(x, np.diag(np.diag(x))) for x in (M, D, K)), "machines.c takes diagonal matrices"
-    assert unbalance.phase == 0 and rotor.acceleration == 0
+    assert unbalance.phase == rotor.acceleration == 0
     W, found = float(rotor.speed_at(0.0)), problem_type(kind)()
     amount = 1e-6 * float(unbalance.amount)
     numbers: dict[str, Any] = {
@@ -201,7 +201,7 @@ def by_c(kind: Kind, problem: ctypes.Structure, members: int, errors: np.ndarray
 
 
 def ensemble(kind: Kind, members: int, samples: int, every: bool = False) -> tuple[MachineCase, Any]:
-    """Return the case and its arguments of `simulate_members`. `every`: all metrics, not only the largest |z|."""
+    """Return the case and its arguments of `run_machines`. `every`: all metrics, not only the largest |z|."""
     case = case_of(kind, samples)
     machine, fold = MachineStudy(case, 0, members).batch(np.arange(members))
     return case, (machine, case.clock, fold if every else PerAxis(Peak("z", np.zeros(kind.axes))))
@@ -222,7 +222,7 @@ def errors_of(kind: Kind, members: int, samples: int) -> np.ndarray:
 def agreement(kind: Kind, members: int = 9, samples: int = 200) -> float:
     """Return the relative error of machines.c in the largest |z|; AssertionError beyond 1e-10."""
     case, arguments = ensemble(kind, members, samples)
-    expected = simulate_members(*arguments, threads=1).metrics
+    expected = run_machines(*arguments, threads=1).metrics
     found = by_c(kind, problem_of(kind, case), members, errors_of(kind, members, samples))
     error = float(np.max(np.abs(found / expected - 1)))
     assert error <= 1e-10, f"machines.c is off by {error:.1e}: {kind}"
@@ -233,7 +233,7 @@ def measure(kind: Kind, compare: bool = True) -> dict[str, Any]:
     """Return one row: a machine, with the comparison with machines.c."""
     case, arguments = ensemble(kind, MEMBERS, SAMPLES)
     problem = problem_of(kind, case)
-    runs: dict[str, Any] = {"ambjax": lambda: simulate_members(*arguments, threads=1).metrics}
+    runs: dict[str, Any] = {"ambjax": lambda: run_machines(*arguments, threads=1).metrics}
     runs |= {"C": lambda: by_c(kind, problem, MEMBERS)}
     found = _measure.alternating(runs, REPEATS, clock=_measure.own_seconds)
     row: dict[str, Any] = {**kind._asdict(), "axes": kind.axes, "members": MEMBERS, "samples": SAMPLES}

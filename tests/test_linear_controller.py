@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.io
+import scipy.signal
 
 from ambjax import Cascade, Clock, Processor, Scenario, save_controller
 from ambjax.__main__ import main
@@ -222,9 +223,23 @@ def test_a_missing_file_or_period_is_refused_in_one_line(folder):
     with pytest.raises(ValueError, match=r"discrete, dt = 0\.0001 s, and the sample period is 5e-05 s"):
         read(CASE + "[processor]\n[clock]\nsample_period = 5e-5\n")
     assert read(CASE + "[processor]\n").cascade.position.realisation.dt == PERIOD
-    with pytest.raises(ValueError, match="convert it to a state space"):
-        position.LinearController.of(PID)
-    with pytest.raises(ValueError, match=r"must end in \.npz"):
-        save_controller("k.mat", K)
-    with pytest.raises(ValueError, match="system = ndarray has no A, B, C, D: it must be a state space"):
-        save_controller("k.npz", np.eye(2))
+    improper = scipy.signal.TransferFunction([1.0, 0.0], [1.0])
+    for wrong in (np.eye(2), improper, control.tf([[[1.0], [1.0]]], [[[1.0, 1.0], [2.0, 1.0]]])):
+        for take in (position.LinearController.of, lambda system: save_controller("k.npz", system)):
+            with pytest.raises(ValueError, match=r"system = .*: it must be a state space .* one input and one output"):
+                take(wrong)
+    with pytest.raises(ValueError, match=r"must end in \.npz or \.mat"):
+        save_controller("k.csv", K)
+
+
+@pytest.mark.parametrize("kind", [control.tf, scipy.signal.TransferFunction])
+@pytest.mark.parametrize("ending", ["npz", "mat"])
+def test_a_transfer_function_is_a_controller(kind, ending, tmp_path, monkeypatch):
+    """K(s) = (3 s + 5)/(s^2 + 2 s + 7), also after it was saved."""
+    monkeypatch.chdir(tmp_path)
+    K = kind([3.0, 5.0], [1.0, 2.0, 7.0])
+    save_controller(f"k.{ending}", K)
+    saved = read(CASE.replace("npz", ending)).cascade.position
+    for law in (position.LinearController.of(K), saved):
+        wanted = (3j * W + 5) / ((1j * W) ** 2 + 2j * W + 7)
+        np.testing.assert_allclose(law.realisation.response(W)[:, 0], wanted, rtol=1e-9)

@@ -93,6 +93,16 @@ def test_a_pole_on_the_border_is_stable_only_up_to_rounding_errors():
         assert StateSpace(np.diag([0.1, 1 + growth]), *parts, period=np.asarray(1.0)).stable is stable
 
 
+def test_the_response_of_many_states_is_that_of_the_definition():
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(50, 50)) / 10
+    A[:5] = 0.0  # as commands kept by a processor
+    B, C, D = rng.normal(size=(50, 2)), rng.normal(size=(3, 50)), rng.normal(size=(3, 2))
+    system, f = StateSpace(A, B, C, D, np.geomspace(0.1, 10, 50), np.asarray(1e-4)), np.geomspace(1.0, 4500.0, 60)
+    each = [C @ np.linalg.solve(np.exp(2e-4j * np.pi * one) * np.eye(50) - A, B) + D for one in f]
+    np.testing.assert_allclose(system.response(f), each, rtol=1e-10, atol=1e-12)
+
+
 @with_node
 @pytest.mark.slow
 def test_the_page_linearises_a_loop_with_a_state_that_never_changes(tmp_path):

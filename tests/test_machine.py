@@ -73,8 +73,8 @@ def test_the_sensitivity_of_an_uncoupled_axis_is_that_of_one_axis(machine):
     f = np.geomspace(1, 9000, 50)
     ours = np.asarray(found.system.response(f))[:, 4, 4]
     np.testing.assert_allclose(ours, system.sensitivity(f), rtol=1e-7)  # conditioning of 65 states
-    # no coupling: the other entries of its row vanish
-    assert np.abs(np.asarray(found.system.response(f))[:, 4, :4]).max() < 1e-12
+    # no coupling: the other entries of its row vanish, up to the same conditioning
+    assert np.abs(np.asarray(found.system.response(f))[:, 4, :4]).max() < 1e-10
 
 
 def test_nutation_and_precession_of_a_fast_rotor():

@@ -17,15 +17,16 @@ from ambjax.results.machine_run import simulate_machine
 MACHINE = tomllib.loads(template("machine"))
 # With l^2 = I_t/m at both ends, a force at one end does not move the other. All motions then have the same plant.
 UNCOUPLED = {
-    "rotor": {"kind": "rigid", "m": 3.0, "I_t": 0.12, "I_p": 0.0, "gravity": [3.0, -9.0, 2.0]},
+    "rotor": {"kind": "rigid", "m": 3.0, "I_t": 0.12, "I_p": 0.0, "gravity": [3.0, -9.0, 2.0], "speed": 6000.0},
+    "unbalance": [{"at": 0.2, "amount": 20.0}],
     "bearing": [
         {"name": "left", "kind": "radial", "at": -0.2},
-        {"name": "right", "kind": "radial", "at": 0.2},
+        {"name": "right", "kind": "radial", "at": 0.2, "controller": {"notch": {"min_speed": 7000.0}}},
         {"name": "thrust", "kind": "axial"},
     ],
     "plant": {"mu_0": 1.2566e-6, "n": 208.0, "A": 2.68e-4, "s_0": 5e-4, "i_0": 2.5, "R": 1.0},
     "controller": {"observer": {"kind": "kalman"}, "position": {"kind": "pid"}, "inversion": {"kind": "closed-form"},
-                   "current": {"kind": "pi"}},
+                   "current": {"kind": "pi"}, "notch": {"kind": "force-free", "rate": 100.0}},
     "sensor": {"velocity": False},
     "processor": {"delay": 1.0},
     "actuator": {"u_max": 20.0},
@@ -65,7 +66,8 @@ def test_rigid_body_coordinates_in_continuous_time_equal_the_axes():
     raw["clock"] = {"duration": 0.004, "sample_period": 1e-5}
     axes, rigid = signals(raw), signals(changed(raw, coordinates="rigid-body"))
     for name in ("z", "i", "u"):
-        np.testing.assert_allclose(rigid[name], axes[name], rtol=0, atol=1e-9 * np.abs(axes[name]).max())
+        # the unbalance is unknown to the Kalman filters, and the magnets are not quite linear: 2e-7
+        np.testing.assert_allclose(rigid[name], axes[name], rtol=0, atol=1e-6 * np.abs(axes[name]).max())
 
 
 def munich(left, right, modes, **tables):

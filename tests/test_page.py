@@ -13,6 +13,7 @@ import pytest
 from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template as case_template
+from ambjax.control.synchronous_notch import SynchronousNotch
 from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.study import Study
 from ambjax.linear.analysis import analyse, linearise
@@ -138,12 +139,10 @@ def test_a_signal_from_a_file_is_refused_in_one_line(tmp_path, capsys):
     assert 'disturbance.q_z: kind = "table": a page cannot contain a signal from a file.' in said
 
 
-def test_a_notch_is_refused_in_one_line(tmp_path, capsys):
-    notch = '[rotor]\nspeed = 6000.0\n[controller.notch]\nkind = "force-free"\n'
-    (tmp_path / "case.toml").write_text(f"{notch}[clock]\nduration = 0.01\n[processor]\n")
-    assert main(["page", str(tmp_path / "case.toml")]) == 2
-    (said,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ambjax")]
-    assert "[controller.notch]: a page cannot contain a notch" in said
+def test_a_notch_is_refused(case):
+    cascade = dataclasses.replace(case.cascade, notch=SynchronousNotch())  # the reader would linearise the loop first
+    with pytest.raises(ValueError, match="a page cannot contain a notch"):
+        page(dataclasses.replace(case, cascade=cascade))
 
 
 def test_a_case_with_another_structure_is_refused_as_a_preset(tmp_path, capsys):

@@ -13,6 +13,7 @@ from ambjax.codegen.c99.source import Origin
 from ambjax.codegen.of_case import block_of
 from ambjax.codegen.verify import draft, holds, verify
 from ambjax.linear import linearise
+from ambjax.linear.linear_machine import linearise_machine
 from ambjax.linear.margins import poles_in_s
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.runs import simulate
@@ -110,18 +111,36 @@ def test_the_exported_notch_equals_the_simulated_one(tmp_path, rotor):
     assert holds(verify({"double": made}, None))
 
 
-@pytest.mark.slow
-def test_every_axis_of_a_machine_is_freed_of_force():
+def of_machine(bearings=(), **controller):
+    """The template of a machine at RPM under an unbalance; `bearings`: the notch of each of the first ones."""
     raw = tomllib.loads(template("machine"))
     raw["rotor"] |= {"speed": RPM}
-    raw |= {"clock": raw["clock"] | {"duration": 0.5}, "run": {"settle": 0.45}, "load": [],
-            "sensor": {"velocity": False}, "unbalance": [{"at": 0.05, "amount": 0.1}]}  # fmt: skip
-    alone = simulate_machine(machine_from(raw)).metrics["axes"]
-    freed = simulate_machine(machine_from(with_notch(raw, "force-free"))).metrics["axes"]
-    radial = [axis for axis in alone if not axis.endswith(".z")]
-    assert len(radial) == 4
-    for axis in radial:
-        assert freed[axis]["i_1x_A"] < 1e-2 * alone[axis]["i_1x_A"]
+    raw["controller"] = (raw["controller"] if "kind" not in controller else {}) | controller
+    for one, notch in zip(raw["bearing"], bearings, strict=False):
+        one["controller"] = {"notch": notch}
+    return raw | {"clock": raw["clock"] | {"duration": 0.3}, "run": {"settle": 0.25}, "load": [], "initial": {},
+                  "sensor": {"velocity": False}, "unbalance": [{"at": 0.05, "amount": 0.1}]}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("controller", [{"coordinates": "rigid-body"}, {"kind": "lqg"}])
+def test_each_bearing_of_a_machine_has_its_own_notch(controller):
+    """One law of all axes: no current at the speed on the left, no displacement on the right, no notch along z."""
+    notches = {"rate": 40.0}, {"kind": "displacement-free", "rate": 40.0}, {"kind": "none"}
+    case = machine_from(of_machine(notches, **controller))
+    axes = simulate_machine(case).metrics["axes"]
+    # exp(-40 * 0.25) = 5e-5 of what the start contains
+    for axis in ("x", "y"):
+        left, right = axes[f"left.{axis}"], axes[f"right.{axis}"]
+        assert left["i_1x_A"] < 1e-2 * right["i_1x_A"]
+        assert right["z_1x_m"] < 1e-2 * left["z_1x_m"]
+    system = linearise_machine(case.machine, case.clock.sample_period, RPM)
+    H = np.abs(np.asarray(system.response(np.array([RPM / 60])))[0])
+    assert np.max(H[10:12, :5]) < 1e-9 * np.max(H[12:14, :5])  # currents
+    assert np.max(H[2:4, :5]) < 1e-9 * np.max(H[:2, :5])  # readings
+    assert H[14, 4] > 1e-3 * np.max(H[12:14, :5])
+    poles = poles_in_s(system) - 2j * np.pi * RPM / 60
+    assert np.sort(np.abs(poles + 40.0))[3] < 20.0  # four notches converge with about their rate
 
 
 @pytest.mark.parametrize(
@@ -137,10 +156,6 @@ def test_a_wrong_notch_is_refused(raw, said):
         case_from(raw)
 
 
-def test_a_notch_of_one_bearing_is_refused():
-    raw = tomllib.loads(template("machine"))
-    raw["rotor"] |= {"speed": RPM}
-    bearings = [dict(one) for one in raw["bearing"]]
-    bearings[1] = with_notch(bearings[1], "force-free")
-    with pytest.raises(ValueError, match=r"bearing.*controller.notch: no bearing has its own notch"):
-        machine_from(raw | {"bearing": bearings})
+def test_a_wrong_notch_of_a_bearing_is_refused():
+    with pytest.raises(ValueError, match=r"axis right.x: controller.notch.kind = .*one of 'force-free'"):
+        machine_from(of_machine(({"kind": "none"}, {"kind": "free"})))

@@ -4,13 +4,14 @@ import contextlib
 import pathlib
 import zipfile
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from ambjax.cases.own_laws import path_from
 from ambjax.cases.table import Table, show
-from ambjax.control.realisation import Matrices, Realisation, realisation
+from ambjax.control.linear_controller import state_space_of
+from ambjax.control.realisation import Realisation, realisation
 
 NAMES, OPTIONAL = ("A", "B", "C", "D"), "dt"
 ENDINGS = (".npz", ".mat")
@@ -103,20 +104,23 @@ def _of_mat(path: pathlib.Path) -> dict[str, np.ndarray]:
     return arrays
 
 
-def save_controller(path: str | pathlib.Path, system: Matrices) -> None:
-    """Write a state space of python-control or SciPy into an .npz file that a case file may name.
+def save_controller(path: str | pathlib.Path, system: Any) -> None:
+    """Write a system of python-control or SciPy into an .npz or .mat file that a case file may name.
 
-    `system`: an object with the matrices A, B, C, D and the period dt (s); dt absent, None or 0: continuous. Raises
-    ValueError if a matrix is absent, if the path does not end in .npz, or as `realisation` does.
+    `system`: a transfer function, or an object with the matrices A, B, C, D; with the period dt (s). Without it, or if
+    it is None or 0, the system is continuous. Raises ValueError for another ending of the path, and as `state_space_of`
+    and `realisation` do.
     """
-    if lacking := [name for name in NAMES if not hasattr(system, name)]:
-        raise ValueError(
-            f"save_controller: system = {type(system).__name__} has no {', '.join(lacking)}: it must be a state space "
-            "with the matrices A, B, C, D, such as control.ss(A, B, C, D, dt) or scipy.signal.StateSpace(A, B, C, D)."
-        )
+    system = state_space_of(system)
     dt = getattr(system, OPTIONAL, None)
     arrays = {name: np.asarray(getattr(system, name)) for name in NAMES}
     realisation(**arrays, dt=dt)
-    if pathlib.Path(path).suffix != ENDINGS[0]:
-        raise ValueError(f"{path}: the file must end in .npz.")
-    np.savez(path, **arrays, dt=np.asarray(0.0 if dt is None else dt))  # pyright: ignore[reportArgumentType]
+    arrays[OPTIONAL] = np.asarray(0.0 if dt is None else dt)
+    if not str(path).endswith(ENDINGS):
+        raise ValueError(f"{path}: the file must end in .npz or .mat.")
+    if pathlib.Path(path).suffix == ENDINGS[0]:
+        np.savez(path, **arrays)  # pyright: ignore[reportArgumentType]
+    else:
+        import scipy.io
+
+        scipy.io.savemat(path, arrays)

@@ -29,9 +29,10 @@ from ambjax.cases.speed_table import SPEED
 from ambjax.cases.table import Table, load, show
 from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
+from ambjax.control.synchronous_notch import SynchronousNotch
 from ambjax.ensemble.spread import Spread
 from ambjax.linear.analysis import Zones
-from ambjax.linear.notch_design import machine_notch_gains, notch_speeds
+from ambjax.linear.notch_design import with_machine_gains
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
@@ -39,7 +40,6 @@ from ambjax.simulation.method import ACCURATE, slopes
 from ambjax.simulation.rollout import prepare
 from ambjax.simulation.whole_machine import Machine, machine_of
 from ambjax.text.words import one_line
-from ambjax.world.rotation import known
 from ambjax.world.rotor import Rotor
 from ambjax.world.scenario import Scenario
 
@@ -146,7 +146,12 @@ def machine_from(
         refuse_unused(spread)
     fixed = not isinstance(raw.get("clock", {}).get("dt", "auto"), str)
     clock = _clock([*cases, *parts], fastest_rotor(rotor, spread), fixed)
-    cases = _with_notches(top, rotor, cases, clock, q, law)
+    controllers = [merged(top.table("controller").raw, own.table("controller").raw) for own in bearings]
+    notches = [notch_of_axis(controllers[axis.bearing], case) for axis, case in zip(axes, cases, strict=True)]
+    if any(notches):
+        found = with_machine_gains(machine_of_axes(rotor, parts_of(cases), clock, q, law), notches, clock)
+        laws = [dataclasses.replace(case.cascade, notch=notch) for case, notch in zip(cases, found, strict=True)]
+        cases = [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
     coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
     return MachineCase(
         name=safe_name(name),
@@ -178,24 +183,12 @@ def machine_of_axes(
     return machine_of(rotor, systems, jnp.asarray(q), law)
 
 
-def _with_notches(
-    top: Table, rotor: Rotor, cases: list[Case], clock: Clock, q: np.ndarray, law: MachineLaw | None
-) -> list[Case]:
-    """Return the cases of the axes with the notch of [controller.notch], whose gains are those of the machine."""
-    found = notch_from(top, cases[0].scenario)
-    if found is None:
-        return cases
-    if law is not None:
-        raise ValueError('[controller.notch] acts on axes. Leave it out, or use controller.coordinates = "axes".')
-    notch, phase = found
-    speeds = notch_speeds(known(notch.rotor), notch, float(clock.duration))
-    machine = machine_of_axes(rotor, parts_of(cases), clock, q, None)
-    gains = machine_notch_gains(machine, notch, speeds, clock.sample_period, phase)
-    laws = [
-        dataclasses.replace(case.cascade, notch=dataclasses.replace(notch, gains=own))
-        for case, own in zip(cases, gains, strict=True)
-    ]
-    return [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
+def notch_of_axis(controller: dict[str, Any], case: Case) -> tuple[SynchronousNotch, float | None] | None:
+    """Return `notch_from` of an axis. `controller`: the common table with the keys of its bearing."""
+    try:
+        return notch_from(Table({"controller": controller}), case.scenario)
+    except ValueError as error:
+        raise ValueError(f"{case.name}: {error}") from None
 
 
 def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:

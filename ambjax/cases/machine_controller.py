@@ -86,13 +86,10 @@ def law_from(
 
     `cases`: of the axes. `read`: reads a raw case with a name.
     """
-    for bearing in bearings:
-        if "notch" in (own := bearing.table("controller")).raw:
-            raise ValueError(f"{own.at('notch')}: no bearing has its own notch. Use [controller.notch], for all axes.")
     table = top.table("controller")
     if (kind := kind_of(top.raw)) != LAWS[0]:
         for bearing in bearings:
-            bearing.table("controller").only(["model", *(["current"] if kind == "linear" else [])])
+            bearing.table("controller").only(["model", "notch", *(["current"] if kind == "linear" else [])])
         return (linear(top, cases, folder) if kind == "linear" else lqg(top, cases, rotor)), []
     for key in ("file", "output", "lqg"):
         if key in table.raw:

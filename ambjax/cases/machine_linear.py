@@ -44,7 +44,7 @@ def magnets(cases: Sequence[Case], voltage: bool) -> dict[str, Any]:
 def linear(top: Table, cases: list[Case], folder: pathlib.Path) -> StateSpaceLaw:
     """Return the controller of a file."""
     table, c = top.table("controller"), len(cases)
-    table.only(["kind", "file", "output", "model", "current"])
+    table.only(["kind", "file", "output", "model", "current", "notch"])
     output = table.choice("output", list(OUTPUTS), OUTPUTS[0])
     convert = lambda A, B, C, D, dt=0.0: several((A, B, C, D), dt, c)  # noqa: E731
     matrices, steady, dt = contents_of(table, folder, convert)[2]
@@ -114,7 +114,7 @@ class LqgProblem(NamedTuple):
 def lqg_problem(top: Table, cases: Sequence[Case], rotor: Rotor) -> LqgProblem:
     """Return the design of the LQG of a rotor."""
     table = top.table("controller")
-    table.only(["kind", "model", "lqg"])
+    table.only(["kind", "model", "lqg", "notch"])
     own, processor = table.table("lqg"), cases[0].cascade.processor
     if processor is None:
         raise ValueError(f'{table.at("kind")} = "lqg": it is designed for a processor. Add [processor].')

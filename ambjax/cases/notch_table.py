@@ -10,6 +10,8 @@ from ambjax.numerics.records import leaf
 from ambjax.simulation.clock import Clock
 from ambjax.world.scenario import Scenario
 
+# The kind that switches off the notch, for example on one bearing.
+OFF = "none"
 PHASE = leaf(
     default=None, unit="degrees", at_least=-360.0, at_most=360.0, optional=True,
     doc="phase of the response that the notch inverts; none: that of the linear loop at each speed",
@@ -17,13 +19,15 @@ PHASE = leaf(
 
 
 def notch_from(top: Table, scenario: Scenario) -> tuple[SynchronousNotch, float | None] | None:
-    """Return the notch of [controller.notch] without its gains, and the key `phase`; None without the table."""
+    """Return the notch of [controller.notch] without its gains, and the key `phase`; None if there is no notch."""
     controller = top.table("controller")
     if "notch" not in controller.raw:
         return None
     table, rotor = controller.table("notch"), scenario.rotor
     table.only(["kind", "rate", "min_speed", "phase"])
-    kind, phase = table.choice("kind", list(NULLED), next(iter(NULLED))), table.leaf("phase", PHASE)
+    kind, phase = table.choice("kind", [*NULLED, OFF], next(iter(NULLED))), table.leaf("phase", PHASE)
+    if kind == OFF:
+        return None
     varying = rotor is not None and (rotor.acceleration != 0 or bool(rotor.changes))
     if rotor is None or (rotor.speed == 0 and not varying):
         raise ValueError("[controller.notch]: it follows the speed of the rotor. Give rotor.speed, in rpm.")

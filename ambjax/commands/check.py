@@ -11,19 +11,21 @@ import numpy as np
 
 from ambjax.cases.forces import forces
 from ambjax.cases.machine_case import MachineCase
-from ambjax.cases.reader import Case
+from ambjax.cases.reader import Case, require_case
 from ambjax.commands import machine_check
 from ambjax.commands.acceptance import acceptance
 from ambjax.commands.check_text import OnProcessor
+from ambjax.commands.machine_check import CaseCheck
 from ambjax.commands.reading import read_any_with_warnings
 from ambjax.control.cascade import Cascade
-from ambjax.host.heartbeat import FIRST_RUN, doing, say
+from ambjax.host.heartbeat import FIRST_RUN, doing, quiet, say
 from ambjax.linear.stability import Findings, stability_of
 from ambjax.results.outputs import plain
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import rollout
 from ambjax.theorem.causes import Cause, find_cause
-from ambjax.theorem.conditions import Condition, Report, check
+from ambjax.theorem.conditions import Condition, Report
+from ambjax.theorem.conditions import check as check_theorem
 from ambjax.theorem.sampled_report import Delays, SampledReport
 from ambjax.world.scenario import Scenario
 
@@ -33,16 +35,36 @@ Summary = dict[str, object]
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """Check a case. Print the verdict, then the tables that apply; with `--full` all tables.
 
-    Returns the exit code and the summary. The exit code is 1 if a condition fails, if the rotor is lost, if the
-    integrator stalls, if the rotor is held but the loop is not stable, if the magnets cannot carry the rotor, or if the
-    loop cannot be linearised. On a processor, the conditions of Theorem 1 do not count. The zones and the margins of
-    the linearised loop never count.
+    Returns the exit code, 1 if the check fails, and the summary.
     """
+    case = read_any_with_warnings(args.case)
+    found = machine_check.check(case) if isinstance(case, MachineCase) else _checked(case, args.case, args.full)
+    if not args.json:
+        print(found.text)
+    return int(not found.holds), found.summary
+
+
+def check(case: Case | MachineCase, *, full: bool = False) -> CaseCheck:
+    """Check a case of one axis or of a machine, as `ambjax check` does.
+
+    The check of an axis fails if a condition fails, if the rotor is lost, if the integrator stalls, if the rotor is
+    held but the loop is not stable, if the magnets cannot carry the rotor, or if the loop cannot be linearised. On a
+    processor, the conditions of Theorem 1 do not count. The zones and the margins of the linearised loop never count.
+    The check of a machine fails if the rotor is lost, or if the machine is not stable at one of its speeds.
+
+    `full`: whether the text contains also what does not affect the verdict. Raises ValueError for anything but a case.
+    """
+    with quiet():
+        if isinstance(case, MachineCase):
+            return machine_check.check(case)
+        require_case(case)
+        return _checked(case, f"{case.name}.toml", full)
+
+
+def _checked(case: Case, path: str, full: bool) -> CaseCheck:
+    """Check a case of one axis. `path`: of its file, for the text."""
     from ambjax.commands import check_text
 
-    case = read_any_with_warnings(args.case)
-    if isinstance(case, MachineCase):
-        return machine_check.check(args, case)
     with doing(f"simulating and analysing the loop; {FIRST_RUN}"):
         report, (loop, sensitivity, machine), on_processor = _results(case)
     lost = report.lost_at if on_processor is None else on_processor.sampled.lost_at
@@ -69,11 +91,10 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     summary |= _clearance(case, used)
     steady = findings is None or findings.stable
     summary["holds"] = bool(summary["holds"]) and largest >= weight and steady
-    if not args.json:
-        shown = check_text.Checked(case, args.case, report, findings, on_processor, differs, loop["stable"] is not None)
-        print("\n".join(check_text.verdict(shown, sensitivity[0], used)))
-        print("\n" + "\n\n".join(["\n".join([*sensitivity[1:], machine]), *check_text.details(shown, args.full)]))
-    return int(not summary["holds"] or loop["stable"] is None), plain(summary)
+    shown = check_text.Checked(case, path, report, findings, on_processor, differs, loop["stable"] is not None)
+    verdict = "\n".join(check_text.verdict(shown, sensitivity[0], used))
+    text = "\n\n".join([verdict, "\n".join([*sensitivity[1:], machine]), *check_text.details(shown, full)])
+    return CaseCheck(summary["holds"] and loop["stable"] is not None, plain(summary), text)
 
 
 def _results(case: Case) -> tuple[Report, tuple[Summary, list[str], str], OnProcessor | None]:
@@ -83,7 +104,7 @@ def _results(case: Case) -> tuple[Report, tuple[Summary, list[str], str], OnProc
     """
     with ThreadPoolExecutor(1) as pool:
         say(f"checking Theorem 1: simulating {float(case.clock.duration):g} s in continuous time")
-        theorem = pool.submit(check, case.cascade, case.scenario, case.clock, case.settle)
+        theorem = pool.submit(check_theorem, case.cascade, case.scenario, case.clock, case.settle)
         say("linearising the loop")
         loop, on_processor = acceptance(case), None
         if case.cascade.sampled:

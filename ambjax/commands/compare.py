@@ -5,13 +5,13 @@ import dataclasses
 import pathlib
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
 from ambjax.cases.machine_case import AnyCase, MachineCase, first_axis
-from ambjax.cases.reader import Case
+from ambjax.cases.reader import Case, require_case
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
 from ambjax.commands.comparison_loop import ComparedLoop, loop_of_axis, loop_of_machine, no_loop
@@ -28,7 +28,7 @@ from ambjax.commands.reading import read_any_with_warnings
 from ambjax.commands.study_report import findings_of
 from ambjax.ensemble.study import AnyStudy, Study
 from ambjax.ensemble.worker import CALL, chunk
-from ambjax.host.heartbeat import FIRST_RUN, doing, say
+from ambjax.host.heartbeat import FIRST_RUN, doing, is_quiet, quiet, say
 from ambjax.page.html_page import check_processor, pages
 from ambjax.results.case_export import guarded_for
 from ambjax.results.machine_study import MachineStudy
@@ -56,8 +56,8 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     cases = _read(args.cases)
     of_axis = [case for case in cases if isinstance(case, Case)]
     if not of_axis:
-        refuse(tune=args.tune, page=args.page)
-    studies = _studies(cases, args)
+        refuse(args, ("tune", "page"))
+    studies = _studies(cases, args.seed, args.members)
     notes = _differences(args.cases, cases, studies)
     for note in notes:
         say(note)
@@ -68,10 +68,9 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     out = directory(args.out, name, WRITTEN, args.force or args.resume)
     if args.tune:
         cases = of_axis = tuned_cases(of_axis, out, args)
-        studies = _studies(cases, args)
+        studies = _studies(cases, args.seed, args.members)
     html_pages = pages(of_axis, args.cases) if args.page else {}
-    compared = [_compared(case, study) for case, study in zip(cases, studies, strict=True)]
-    summary = comparison_summary(compared, studies[0], notes)
+    summary, compared = _comparison(cases, studies, notes)
     with files(out) as part:
         write_json(part / "compare.json", summary)
         described("compare.png", lambda: _draw(compared, part / "compare.png"))
@@ -86,6 +85,48 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     return int(not good), plain(summary | {"out": str(out)})
 
 
+class Comparison(NamedTuple):
+    """The result of `compare`.
+
+    - `summary`: the content of compare.json: members, seed, and the numbers of each case.
+    - `compared`: each case with the columns of its members, its nominal loop and its peaks.
+    """
+
+    summary: dict[str, Any]
+    compared: list[Compared]
+
+    def table(self) -> str:
+        """Return the table that `ambjax compare` prints."""
+        return comparison_table(self.summary)
+
+
+def compare(cases: Sequence[AnyCase], members: int = 1, *, seed: int | None = None) -> Comparison:
+    """Compare cases, or machines, on the same members of their spread, as `ambjax compare` does.
+
+    - `cases`: two to eight cases with the same spread. What differs in more than the controller is in
+      `summary["differences"]`.
+    - `members`, `seed`: as for `simulate_members`; the seed of all cases is by default that of the first one.
+
+    Raises ValueError for anything but cases, for another number of them, if their spreads differ, and as
+    `simulate_members` does.
+    """
+    cases = list(cases)
+    for case in cases:
+        if not isinstance(case, MachineCase):
+            require_case(case)
+    _check_count(len(cases), "case")
+    cases = _named(cases, [case.name for case in cases])
+    studies = _studies(cases, seed, members)
+    with quiet():
+        return _comparison(cases, studies, _differences([case.name for case in cases], cases, studies))
+
+
+def _comparison(cases: Sequence[AnyCase], studies: Sequence[Study | MachineStudy], notes: Sequence[str]) -> Comparison:
+    """Simulate and analyse the cases. `notes`: of `_differences`."""
+    compared = [_compared(case, study) for case, study in zip(cases, studies, strict=True)]
+    return Comparison(comparison_summary(compared, studies[0], notes), compared)
+
+
 def _write_html(summary: Mapping[str, Any], part: pathlib.Path) -> None:
     """Write compare.html into the folder `part`, with the picture in it."""
     picture = part / "compare.png"
@@ -94,28 +135,36 @@ def _write_html(summary: Mapping[str, Any], part: pathlib.Path) -> None:
     (part / "compare.html").write_text(html, encoding="utf-8")
 
 
-def _studies(cases: Sequence[AnyCase], args: argparse.Namespace) -> list[Study | MachineStudy]:
-    """Return the studies of the cases, with the same seed: --seed, or the first case's."""
-    seed = study_of(cases[0], args.seed, args.members).seed
-    studies = [study_of(case, seed, args.members) for case in cases]
+def _studies(cases: Sequence[AnyCase], seed: int | None, members: int) -> list[Study | MachineStudy]:
+    """Return the studies of the cases, with the same seed: by default the first case's."""
+    seed = study_of(cases[0], seed, members).seed
+    studies = [study_of(case, seed, members) for case in cases]
     return [
         dataclasses.replace(study, by_axis=BY_AXIS) if isinstance(study, MachineStudy) else study for study in studies
     ]
 
 
-def _read(paths: Sequence[str]) -> Sequence[AnyCase]:
-    """Read the cases. Append a number to a name that occurs more than once.
+def _read(paths: Sequence[str]) -> list[AnyCase]:
+    """Read the cases.
 
     Raises ValueError for fewer than 2 or too many files, a repeated file, a file that `read_any` refuses, or machines
     beside cases of one axis.
     """
-    if not 2 <= len(paths) <= MOST_CASES:
-        raise ValueError(f"{len(paths)} case file{'s' * (len(paths) > 1)}: give 2 to {MOST_CASES} case files.")
+    _check_count(len(paths), "case file")
     for path in paths:
         same = [other for other in paths if pathlib.Path(other).resolve() == pathlib.Path(path).resolve()]
         if len(same) > 1:
             raise ValueError(f"{path}: this file is given {len(same)} times. Give each once.")
-    cases = [read_any_with_warnings(path) for path in paths]
+    return _named([read_any_with_warnings(path) for path in paths], paths)
+
+
+def _check_count(count: int, what: str) -> None:
+    if not 2 <= count <= MOST_CASES:
+        raise ValueError(f"{count} {what}{'s' * (count > 1)}: give 2 to {MOST_CASES} {what}s.")
+
+
+def _named(cases: Sequence[AnyCase], paths: Sequence[str]) -> list[AnyCase]:
+    """Append a number to a name that occurs more than once. Raises ValueError for machines beside cases of one axis."""
     for path, case in zip(paths, cases, strict=True):
         if type(case) is not type(cases[0]):
             raise ValueError(
@@ -163,7 +212,8 @@ def _compared(case: AnyCase, study: Study | MachineStudy) -> Compared:
 def _columns(case: AnyCase, study: AnyStudy) -> dict[str, np.ndarray]:
     """Simulate the members, with a progress bar, and return their columns [N] by name."""
     size, parts = min(CHUNK, study.members), []
-    with tqdm(total=study.members, unit="member", unit_scale=True, delay=2, leave=False, desc=case.name) as bar:
+    shown = {"unit": "member", "unit_scale": True, "delay": 2, "leave": False, "desc": case.name}
+    with tqdm(total=study.members, disable=is_quiet(), **shown) as bar:
         for start in range(0, study.members, size):
             stop = min(start + size, study.members)
             parts.append(chunk(study, start, stop, size))

@@ -1,7 +1,7 @@
 """`check` of a whole machine."""
 
-import argparse
 import tomllib
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,10 +21,23 @@ MORE, LIGHT, MOST = 4, 0.3, 8
 AXIS_COLUMNS = ("axis", "|z|/clearance", "zone", "weight/force", "force reserve", "peak of |S|", "zone")
 
 
-def check(args: argparse.Namespace, case: MachineCase) -> tuple[int, dict[str, object]]:
+class CaseCheck(NamedTuple):
+    """The result of a check.
+
+    - `holds`: whether the check passes.
+    - `summary`: its numbers, as `ambjax check --json` prints them.
+    - `text`: the verdict in the first lines, then the tables that apply.
+    """
+
+    holds: bool
+    summary: dict[str, Any]
+    text: str
+
+
+def check(case: MachineCase) -> CaseCheck:
     """Check a machine: held in its run, clearance, force, stability and zones at its speeds, and spill-over.
 
-    The exit code is 1 if the rotor is lost, or if the machine is not stable at one of its speeds, also with more modes.
+    It fails if the rotor is lost, or if the machine is not stable at one of its speeds, also with more modes.
     """
     say(f"simulating {case.clock.samples} samples")
     run = simulate_machine(case)
@@ -55,21 +68,19 @@ def check(args: argparse.Namespace, case: MachineCase) -> tuple[int, dict[str, o
         "growth_with_more_modes_per_s": spilled,
     }
     stable = all(point.stable for point in points) and all(rate <= 0 for rate in spilled.values())
-    if not args.json:
-        held = "held" if summary["held"] else f"LOST ({run.lost_why})"
-        at = f"{worst.worst.name} at {worst.speed:g} rpm"
-        print(f"run: {held}; settled |z| reaches {share:.3g} of the clearance, zone {summary['clearance_zone']}")
-        peak = f"peak {worst.worst.S.height:.4g} ({at}), zone {worst.worst.zone}"
-        print(f"sensitivity: {peak if worst.stable else f'no peak and no zone: not stable at {worst.speed:g} rpm'}")
-        print(
-            f"stability: {'stable' if stable else 'NOT STABLE'} at {', '.join(summary['stable'])} rpm{_more(spilled)}"
-        )
-        print(table(AXIS_COLUMNS, [(axis, *_cells(own)) for axis, own in axes.items()]))
-        if lines := [line for point in at_speeds for _, own in point for line in own]:
-            print("\n".join(lines))
-        if light := _light(modes):
-            print(table(("lightly damped mode", "Hz", "damping ratio", "rpm"), light))
-    return int(run.lost or not stable), plain(summary)
+    held = "held" if summary["held"] else f"LOST ({run.lost_why})"
+    at = f"{worst.worst.name} at {worst.speed:g} rpm"
+    peak = f"peak {worst.worst.S.height:.4g} ({at}), zone {worst.worst.zone}"
+    lines = [
+        f"run: {held}; settled |z| reaches {share:.3g} of the clearance, zone {summary['clearance_zone']}",
+        f"sensitivity: {peak if worst.stable else f'no peak and no zone: not stable at {worst.speed:g} rpm'}",
+        f"stability: {'stable' if stable else 'NOT STABLE'} at {', '.join(summary['stable'])} rpm{_more(spilled)}",
+        table(AXIS_COLUMNS, [(axis, *_cells(own)) for axis, own in axes.items()]),
+        *(line for point in at_speeds for _, own in point for line in own),
+    ]
+    if light := _light(modes):
+        lines.append(table(("lightly damped mode", "Hz", "damping ratio", "rpm"), light))
+    return CaseCheck(not run.lost and stable, plain(summary), "\n".join(lines))
 
 
 def _spill_over(case: MachineCase) -> dict[str, float]:
@@ -108,10 +119,10 @@ def _axis(case: MachineCase, k: int, metrics: dict[str, float], points: list[Mac
     }  # fmt: skip
 
 
-def _cells(own: dict[str, object]) -> list[str]:
+def _cells(own: dict[str, Any]) -> list[str]:
     """Return the cells of an axis; no peak and no zone if the machine is unstable at one of its speeds."""
-    known = np.isfinite(float(str(own["peak"])))
-    return [_short(value) if known or key not in ("peak", "zone") else "-" for key, value in own.items()]
+    shown = own if np.isfinite(own["peak"]) else own | {"peak": "-", "zone": "-"}
+    return [*map(_short, shown.values())]
 
 
 def _short(value: object) -> str:

@@ -39,16 +39,18 @@ COLUMNS = {
 }
 
 
-def refuse(**options: object) -> None:
-    """Raise ValueError for an option that a machine does not take. `options`: their values by name."""
-    for name, value in options.items():
-        if value not in (None, False):
-            raise ValueError(f"--{name}: a machine with [rotor] does not take it yet. Leave it out.")
+def refuse(args: argparse.Namespace, names: tuple[str, ...]) -> None:
+    """Raise ValueError for an option that a machine does not take."""
+    for name in names:
+        value = getattr(args, name, None)
+        if value is not None and value is not False:
+            option = {"begin": "from", "end": "to"}.get(name, name)
+            raise ValueError(f"--{option}: a machine with [rotor] does not take it yet. Leave it out.")
 
 
 def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]:
     """Simulate a machine and write its files. Exit code 1 if the rotor is lost."""
-    refuse(**{"from": args.begin, "to": args.end, "page": args.page})
+    refuse(args, ("begin", "end", "page"))
     out = directory(args.out, f"simulate-{case.name}", SIMULATED, args.force)
     say(f"method: {case.clock.method}; axes: {', '.join(case.axes)}")
     with tqdm(total=case.clock.samples, unit="sample", unit_scale=True, delay=2, leave=False, desc="simulate") as bar:
@@ -87,7 +89,7 @@ def analysed(case: MachineCase) -> list[MachineSensitivity]:
 
 def sensitivity(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]:
     """Analyse a machine at its speeds and write the files. Exit code 1 if it is not stable at one of them."""
-    refuse(members=args.members, seed=args.seed)
+    refuse(args, ("members", "seed"))
     points = analysed(case)
     measured = _injections(case, points, args.inject)
     out = directory(args.out, f"sensitivity-{case.name}", ANALYSED, args.force)

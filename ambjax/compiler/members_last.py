@@ -1,123 +1,49 @@
 """Vectorisation over members whose axis is the last of every array.
 
-`jax.vmap` puts the axis of members first. The last axis of an array with a number for each axis of a machine is then
+`jax.vmap` puts the axis of members first. The last axis of an array with one number per axis of a machine is then
 short, and XLA's CPU backend, which vectorises over the last axis, compiles such a program slowly into slow code.
 """
 
 import functools
-import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
 
 # Primitives whose operands have one shape, or no axes.
-ELEMENTWISE = frozenset(
-    [
-        "abs",
-        "acos",
-        "add",
-        "add_any",
-        "and",
-        "asin",
-        "atan",
-        "atan2",
-        "bitcast_convert_type",
-        "cbrt",
-        "ceil",
-        "complex",
-        "clamp",
-        "convert_element_type",
-        "copy",
-        "copy_p",
-        "cos",
-        "cosh",
-        "div",
-        "eq",
-        "erf",
-        "erf_inv",
-        "exp",
-        "exp2",
-        "expm1",
-        "floor",
-        "ge",
-        "gt",
-        "imag",
-        "integer_pow",
-        "is_finite",
-        "le",
-        "log",
-        "log1p",
-        "logistic",
-        "lt",
-        "max",
-        "min",
-        "mul",
-        "ne",
-        "neg",
-        "nextafter",
-        "not",
-        "optimization_barrier",
-        "or",
-        "pow",
-        "real",
-        "reduce_precision",
-        "rem",
-        "round",
-        "rsqrt",
-        "select_n",
-        "shift_left",
-        "shift_right_arithmetic",
-        "shift_right_logical",
-        "sign",
-        "sin",
-        "sinh",
-        "sqrt",
-        "square",
-        "sub",
-        "tan",
-        "tanh",
-        "threefry2x32",
-        "xla_metadata_value",
-        "xor",
-    ]
+NAMES = (
+    "abs acos add add_any and asin atan atan2 bitcast_convert_type cbrt ceil clamp complex convert_element_type copy "
+    "copy_p cos cosh div eq erf erf_inv exp exp2 expm1 floor ge gt imag integer_pow is_finite le log log1p logistic lt "
+    "max min mul ne neg nextafter not or pow real reduce_precision rem round rsqrt select_n shift_left "
+    "shift_right_arithmetic shift_right_logical sign sin sinh sqrt square stop_gradient sub tan tanh threefry2x32 "
+    "xla_metadata_value xor"
 )
-# Primitives whose parameters name axes, which a further last axis does not change.
-SAME = frozenset(
-    [
-        "argmax",
-        "argmin",
-        "concatenate",
-        "cumsum",
-        "cumprod",
-        "cummax",
-        "cummin",
-        "reduce_and",
-        "reduce_max",
-        "reduce_min",
-        "reduce_or",
-        "reduce_prod",
-        "reduce_sum",
-        "reduce_xor",
-        "rev",
-        "split",
-        "squeeze",
-    ]
-)
-# Largest number of terms that are added one by one.
+ELEMENTWISE = frozenset(NAMES.split())
+# Primitives of one operand whose parameters name axes: a further last axis does not change them.
+SAME_AXES = frozenset(("argmax", "argmin", "cumsum", "reduce_prod", "rev", "split", "squeeze"))
+# Reductions, as functions of two terms. XLA compiles a reduction into a loop that is not vectorised.
+REDUCTIONS = {
+    "reduce_and": lax.bitwise_and,
+    "reduce_max": lax.max,
+    "reduce_min": lax.min,
+    "reduce_or": lax.bitwise_or,
+    "reduce_sum": lax.add,
+}
+# Largest number of terms that are combined one by one.
 SHORT = 32
-# Primitives that call one jaxpr, by the name of their parameter.
-CALLS = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat2": "jaxpr"}
+# Primitives that call a jaxpr, by the name of its parameter.
+CALLS = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat2": "jaxpr", "checkpoint": "jaxpr"}
 
 
 def members_last(function: Callable[..., Any], axes: object) -> Callable[..., Any]:
-    """Return `function` for all members of a block: as jax.vmap(function, (axes,)), with the members last inside.
+    """Return `jax.vmap(function, (axes,))`, which computes with the members in the last axis.
 
-    `axes`: 0 for a leaf of the argument with a leading axis of members, None for one that all members share. The
-    derivatives of custom rules are lost.
+    `axes`: 0 for each leaf of the argument that has a leading axis of members, None for a leaf that all members share.
+    Derivatives of custom rules are lost. Primitives without a rule here use that of `jax.vmap`.
     """
 
     def mapped(tree: object) -> Any:
@@ -125,196 +51,201 @@ def members_last(function: Callable[..., Any], axes: object) -> Callable[..., An
         moves = [axis is not None for axis in structure.flatten_up_to(axes)]
         size = next(x.shape[0] for x, moving in zip(leaves, moves, strict=True) if moving)
         one = [jax.typeof(x).update(shape=x.shape[1:]) if m else x for x, m in zip(leaves, moves, strict=True)]
-        closed, shape = jax.make_jaxpr(lambda *x: function(jax.tree.unflatten(structure, x)), return_shape=True)(*one)
+        closed, shape = jax.make_jaxpr(lambda *x: function(structure.unflatten(x)), return_shape=True)(*one)
         last = [jnp.moveaxis(x, 0, -1) if moving else x for x, moving in zip(leaves, moves, strict=True)]
-        found, moved = _Members(size).closed(closed, last, moves)
-        found = [
-            x if m else jnp.broadcast_to(x[..., None], (*x.shape, size)) for x, m in zip(found, moved, strict=True)
-        ]
+        members = _Members(size)
+        found = [members.wide(x, m, jnp.shape(x)[: jnp.ndim(x) - m]) for x, m in members.evaluated(closed, last, moves)]
         return jax.tree.unflatten(jax.tree.structure(shape), [jnp.moveaxis(x, -1, 0) for x in found])
 
     return mapped
 
 
+# Results with their flags: whether the value has the last axis of members.
+Flagged = list[tuple[Any, bool]]
+
+
 class _Members:
-    """Evaluation of a jaxpr of one member for `size` members. Values and flags: whether they have the last axis."""
+    """Evaluation of a jaxpr of one member for `size` members."""
 
     def __init__(self, size: int) -> None:
         self.size = size
 
-    def closed(self, closed: ClosedJaxpr, values: Sequence[Any], moves: Sequence[bool]) -> tuple[list, list[bool]]:
-        return self.evaluated(closed.jaxpr, closed.consts, values, moves)
-
-    def evaluated(
-        self, jaxpr: Jaxpr, consts: Sequence[Any], values: Sequence[Any], moves: Sequence[bool]
-    ) -> tuple[list, list[bool]]:
-        known: dict[Any, tuple[Any, bool]] = dict(zip(jaxpr.constvars, [(x, False) for x in consts], strict=True))
+    def evaluated(self, closed: ClosedJaxpr, values: Sequence[Any], moves: Sequence[bool]) -> Flagged:
+        """Return the results of a jaxpr. `moves`: the flags of `values`."""
+        jaxpr = closed.jaxpr
+        known: dict[Any, tuple[Any, bool]] = dict(
+            zip(jaxpr.constvars, [(x, False) for x in closed.consts], strict=True)
+        )
         known |= dict(zip(jaxpr.invars, zip(values, moves, strict=True), strict=True))
         read = lambda x: (x.val, False) if isinstance(x, Literal) else known[x]  # noqa: E731
         for eqn in jaxpr.eqns:
             own = [read(x) for x in eqn.invars]
             results = self.one(eqn, [x for x, _ in own], [m for _, m in own])
             known |= dict(zip(eqn.outvars, results, strict=True))
-        results = [read(x) for x in jaxpr.outvars]
-        return [x for x, _ in results], [m for _, m in results]
+        return [read(x) for x in jaxpr.outvars]
 
-    def one(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> list[tuple[Any, bool]]:
+    def one(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged:
         """Return the results of one equation."""
         name, params = eqn.primitive.name, eqn.params
-        if not any(moves) and name not in CALLS:
-            return self.flagged(eqn, eqn.primitive.bind(*values, **params), False)
-        if name in ELEMENTWISE:
-            return self.flagged(eqn, eqn.primitive.bind(*self.together(eqn, values, moves), **params), True)
-        if name in ("pjit", "jit"):
-            return self.jitted(params, values, moves)
         if name in CALLS:
             inner = params[CALLS[name]]
-            closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
-            return list(zip(*self.closed(closed, values, moves), strict=True))
-        if (special := getattr(self, name.removesuffix("_loop"), None)) is not None or name == "while":
-            special = special or self.while_
-            found = special(eqn, values, moves)
-            if found is not None:
-                return found
-        if name in SAME and all(moves):
-            return self.flagged(eqn, eqn.primitive.bind(*values, **params), True)
+            return self.evaluated(inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ()), values, moves)
+        if not any(moves):
+            return _flagged(eqn, eqn.primitive.bind(*values, **params), False)
+        if name in ELEMENTWISE:
+            return _flagged(eqn, eqn.primitive.bind(*self.together(eqn, values, moves), **params), True)
+        if name in SAME_AXES:
+            return _flagged(eqn, eqn.primitive.bind(*values, **params), True)
+        rule = RULES.get(name)
+        if rule is not None and (found := rule(self, eqn, values, moves)) is not None:
+            return found
         axes = [-1 if moving else None for moving in moves]
         mapped = jax.vmap(lambda *x: eqn.primitive.bind(*x, **params), axes, -1, axis_size=self.size)
-        return self.flagged(eqn, mapped(*values), True)
-
-    def flagged(self, eqn: JaxprEqn, results: Any, moves: bool) -> list[tuple[Any, bool]]:
-        return [(x, moves) for x in (results if eqn.primitive.multiple_results else [results])]
+        return _flagged(eqn, mapped(*values), True)
 
     def wide(self, x: Any, moves: bool, shape: tuple[int, ...]) -> Array:
-        """Return a value of one member's `shape` with the last axis of members."""
+        """Return a value with the last axis of members. `shape`: that of one member."""
         x = jnp.asarray(x)
         return jnp.broadcast_to(x if moves or not x.ndim else x[..., None], (*shape, self.size))
 
     def together(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> list:
-        shape = max((x.aval.shape for x in eqn.invars), key=len)
+        shape = np.broadcast_shapes(*(x.aval.shape for x in eqn.invars))  # equal up to lengths of 1, or ()
         return [self.wide(x, m, shape) for x, m in zip(values, moves, strict=True)]
 
-    def jitted(self, params: dict[str, Any], values: list, moves: list[bool]) -> list[tuple[Any, bool]]:
+    def jit(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged:
         flags: list[bool] = []
 
         def inner(*values: Any) -> list:
-            found, moved = self.closed(params["jaxpr"], values, moves)
-            flags[:] = moved
-            return found
+            found = self.evaluated(eqn.params["jaxpr"], values, moves)
+            flags[:] = [m for _, m in found]
+            return [x for x, _ in found]
 
-        if params["inline"]:
-            return list(zip(inner(*values), flags, strict=True))
-        inner.__name__ = params["name"]
-        return list(zip(jax.jit(inner)(*values), flags, strict=True))
+        inner.__name__ = eqn.params["name"]
+        return list(zip((inner if eqn.params["inline"] else jax.jit(inner))(*values), flags, strict=True))
 
-    def broadcast_in_dim(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> list | None:
+    def broadcast_in_dim(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         shape, dims = eqn.params["shape"], eqn.params["broadcast_dimensions"]
-        if len(values) > 1:
-            return None
         return [(lax.broadcast_in_dim(values[0], (*shape, self.size), (*dims, len(shape))), True)]
 
-    def reshape(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> list | None:
+    def reshape(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         return [(lax.reshape(values[0], (*eqn.params["new_sizes"], self.size)), True)]
 
-    def transpose(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> list | None:
+    def transpose(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         order = eqn.params["permutation"]
         return [(lax.transpose(values[0], (*order, len(order))), True)]
 
-    def slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> list | None:
+    def slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         begin, end, strides = (eqn.params[x] for x in ("start_indices", "limit_indices", "strides"))
         return [(lax.slice(values[0], (*begin, 0), (*end, self.size), strides and (*strides, 1)), True)]
 
-    def concatenate(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> list | None:
+    def concatenate(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         parts = [self.wide(x, m, v.aval.shape) for x, m, v in zip(values, moves, eqn.invars, strict=True)]
         return [(lax.concatenate(parts, eqn.params["dimension"]), True)]
 
-    def reduce_sum(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> list | None:
-        x, axes = values[0], eqn.params["axes"]
-        if len(axes) > 1 or x.shape[axes[0]] > SHORT:
-            return None
-        parts = [lax.index_in_dim(x, n, axes[0], False) for n in range(x.shape[axes[0]])]
-        return [(functools.reduce(operator.add, parts), True)]
-
-    def dynamic_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> list | None:
+    def dynamic_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         if any(moves[1:]):
             return None
-        return [(lax.dynamic_slice(values[0], (*values[1:], 0), (*eqn.params["slice_sizes"], self.size)), True)]
+        return [
+            (lax.dynamic_slice(values[0], (*values[1:], _first(eqn)), (*eqn.params["slice_sizes"], self.size)), True)
+        ]
 
-    def dynamic_update_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> list | None:
+    def dynamic_update_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         if any(moves[2:]):
             return None
-        whole, part = (self.wide(x, m, v.aval.shape) for x, m, v in zip(values[:2], moves, eqn.invars, strict=False))
-        return [(lax.dynamic_update_slice(whole, part, (*values[2:], 0)), True)]
+        whole, part = (self.wide(x, m, v.aval.shape) for x, m, v in zip(values, moves, eqn.invars[:2], strict=False))
+        return [(lax.dynamic_update_slice(whole, part, (*values[2:], _first(eqn))), True)]
 
-    def steady(
-        self, jaxpr: ClosedJaxpr, before: list, consts: list, carry: list, carried: list[bool], after: list
-    ) -> list[bool]:
-        """Return which values carried by a loop have the last axis: those that differ between members at any turn.
-
-        `consts`, `after`: pairs of a value and a flag of the loop's other inputs.
-        """
-        while True:
-
-            def turn(*values: Any) -> list:
-                found, moved = self.closed(jaxpr, values, [m for _, m in consts] + carried + [m for _, m in after])
-                result[:] = moved[: len(carry)]
-                return found
-
-            result: list[bool] = []
-            wide = [
-                self.wide(x, False, v.aval.shape) if m and not b else x
-                for x, m, b, v in zip(carry, carried, before, jaxpr.jaxpr.invars[len(consts) :], strict=False)
-            ]
-            jax.eval_shape(turn, *[x for x, _ in consts], *wide, *[x for x, _ in after])
-            joined = [a or b for a, b in zip(carried, result, strict=True)]
-            if joined == carried:
-                return carried
-            carried = joined
-
-    def while_(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> list | None:
-        p = eqn.params
-        a, b = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
-        consts = list(zip(values[a:b], moves[a:b], strict=True))
-        carry, before = values[b:], moves[b:]
-        carried = self.steady(p["body_jaxpr"], before, consts, carry, list(before), [])
-        shapes = [v.aval.shape for v in p["body_jaxpr"].in_avals and p["body_jaxpr"].jaxpr.invars[b - a :]]
-        flags: list[bool] = []
-
-        def goes(x: list) -> Any:
-            found, moved = self.closed(p["cond_jaxpr"], [*values[:a], *x], [*moves[:a], *carried])
-            flags[:] = moved
-            return found[0]
-
-        begin = [
-            self.wide(x, m, s) if c and not m else x for x, m, c, s in zip(carry, before, carried, shapes, strict=True)
-        ]
-        jax.eval_shape(goes, begin)
-        if flags[0]:
+    def reduced(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
+        """Reduce one short axis term by term."""
+        (x,), (axis, *others) = values, eqn.params["axes"]
+        if others or x.shape[axis] > SHORT:
             return None
+        parts = [lax.index_in_dim(x, n, axis, False) for n in range(x.shape[axis])]
+        return [(functools.reduce(REDUCTIONS[eqn.primitive.name], parts), True)]
 
-        def turn(x: list) -> list:
-            found, moved = self.closed(p["body_jaxpr"], [*values[a:b], *x], [*moves[a:b], *carried])
-            return [self.wide(x, m, s) if c else x for x, m, c, s in zip(found, moved, carried, shapes, strict=True)]
+    def while_loop(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
+        goes, body, first = eqn.params["cond_jaxpr"], eqn.params["body_jaxpr"], eqn.params["cond_nconsts"]
+        start = first + eqn.params["body_nconsts"]
+        begin, turn, carried = self.carry(body, list(zip(values, moves, strict=True))[first:], start - first, ())
 
-        return list(zip(lax.while_loop(goes, turn, begin), carried, strict=True))
+        def going(x: list) -> tuple[Any, bool]:
+            return self.evaluated(goes, [*values[:first], *x], [*moves[:first], *carried])[0]
 
-    def scan(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> list | None:
-        p, (a, b) = eqn.params, (eqn.params["num_consts"], eqn.params["num_consts"] + eqn.params["num_carry"])
-        consts, after = list(zip(values[:a], moves[:a], strict=True)), list(zip(values[b:], moves[b:], strict=True))
-        one = [(x[0], m) for x, m in after]
-        carry, before = values[a:b], moves[a:b]
-        carried = self.steady(p["jaxpr"], before, consts, carry, list(before), one)
-        shapes = [v.aval.shape for v in p["jaxpr"].jaxpr.invars[a:b]]
+        flags: list[bool] = []
+        jax.eval_shape(lambda x: flags.append((found := going(x))[1]) or found[0], begin)
+        if flags[0]:  # members that end at different turns
+            return None
+        end = lax.while_loop(lambda x: going(x)[0], lambda x: turn(x, ())[0], begin)
+        return list(zip(end, carried, strict=True))
+
+    def scan(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
+        p = eqn.params
+        consts, both = p["num_consts"], p["num_consts"] + p["num_carry"]
+        pairs, each = list(zip(values[:both], moves, strict=False)), values[both:]
+        begin, turn, carried = self.carry(
+            p["jaxpr"], pairs, consts, [(x[0], m) for x, m in zip(each, moves[both:], strict=True)]
+        )
         flags: list[bool] = []
 
-        def turn(x: list, each: list) -> tuple[list, list]:
-            found, moved = self.closed(p["jaxpr"], [*values[:a], *x, *each], [*moves[:a], *carried, *moves[b:]])
-            flags[:] = moved[b - a :]
-            head = [self.wide(x, m, s) if c else x for x, m, c, s in zip(found, moved, carried, shapes, strict=False)]
-            return head, found[b - a :]
+        def body(x: list, own: list) -> tuple[list, list]:
+            head, rest = turn(x, own)
+            flags[:] = [m for _, m in rest]
+            return head, [y for y, _ in rest]
 
-        begin = [
-            self.wide(x, m, s) if c and not m else x for x, m, c, s in zip(carry, before, carried, shapes, strict=True)
-        ]
-        end, stacked = lax.scan(turn, begin, values[b:], p["length"], p["reverse"], p["unroll"])
+        end, stacked = lax.scan(body, begin, each, p["length"], p["reverse"], p["unroll"])
         return list(zip([*end, *stacked], [*carried, *flags], strict=True))
+
+    def carry(
+        self, body: ClosedJaxpr, values: Flagged, consts: int, each: Sequence[tuple[Any, bool]]
+    ) -> tuple[list, Callable[[Sequence, Sequence], tuple[list, Flagged]], list[bool]]:
+        """Return the initial values of a loop, one turn of it, and the flags of the values that it carries.
+
+        A carried value has the last axis if it has it after any turn. `values`: the constants, of which there are
+        `consts`, and the initial values. `each`: inputs of the first turn. A turn returns the values, and its outputs.
+        """
+        fixed, initial = values[:consts], values[consts:]
+        shapes = [x.aval.shape for x in body.jaxpr.invars[consts : len(values)]]
+        carried = [m for _, m in initial]
+
+        def turn(x: Sequence, own: Sequence, result: list | None = None) -> tuple[list, Flagged]:
+            flags = [*(m for _, m in fixed), *carried, *(m for _, m in each)]
+            found = self.evaluated(body, [*(y for y, _ in fixed), *x, *own], flags)
+            after = [m for _, m in found[: len(carried)]]
+            if result is not None:
+                result[:] = after
+            wide = zip(found, shapes, carried, strict=False)
+            return [self.wide(*y, shape) if c else y[0] for y, shape, c in wide], found[len(carried) :]
+
+        while True:
+            begin = [self.wide(*y, s) if c else y[0] for y, s, c in zip(initial, shapes, carried, strict=True)]
+            after: list[bool] = []
+            jax.eval_shape(lambda x, own, after=after: turn(x, own, after)[0], begin, [y for y, _ in each])
+            if all(c or not a for a, c in zip(after, carried, strict=True)):
+                return begin, turn, carried
+            carried[:] = [a or c for a, c in zip(after, carried, strict=True)]
+
+
+def _first(eqn: JaxprEqn) -> Array:
+    """Return index 0, with the type of the equation's last operand, an index."""
+    return jnp.zeros((), eqn.invars[-1].aval.dtype)
+
+
+def _flagged(eqn: JaxprEqn, results: Any, moves: bool) -> Flagged:
+    return [(x, moves) for x in (results if eqn.primitive.multiple_results else [results])]
+
+
+# Rules of primitives by name; None as a result: the rule does not apply.
+RULES: dict[str, Callable[[_Members, JaxprEqn, list, list[bool]], Flagged | None]] = {
+    "broadcast_in_dim": _Members.broadcast_in_dim,
+    "concatenate": _Members.concatenate,
+    "dynamic_slice": _Members.dynamic_slice,
+    "dynamic_update_slice": _Members.dynamic_update_slice,
+    "jit": _Members.jit,
+    "pjit": _Members.jit,
+    "reshape": _Members.reshape,
+    "scan": _Members.scan,
+    "slice": _Members.slice,
+    "transpose": _Members.transpose,
+    "while": _Members.while_loop,
+    **dict.fromkeys(REDUCTIONS, _Members.reduced),
+}

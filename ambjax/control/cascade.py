@@ -88,7 +88,7 @@ class Cascade:
             return CascadeState(observed, *(law.init_sampled(self.model) for law in rest))
         states = [law.init(self.model) for law in rest]
         if reference is not None:
-            estimate, _ = self._observed(measured, observed, reference)
+            estimate, _ = self.observed(measured, observed, reference)
             position = with_gains_at(self.position, estimate.z, reference)
             states[0] = position.begin(self.model, (estimate, reference))
         return CascadeState(observed, *states)
@@ -181,7 +181,7 @@ class Cascade:
         def demanded(
             reference: Reference, z: Array, z_dot: Array, observed: object, positioned: object
         ) -> tuple[tuple[Array, Array], tuple[Measurement, object, object]]:
-            estimate, observed_rate = self._observed(Measurement(z, z_dot, measured.i), observed, reference)
+            estimate, observed_rate = self.observed(Measurement(z, z_dot, measured.i), observed, reference)
             if self.observer.estimates_velocity:
                 # XLA aborts when it compiles a one-kernel rollout (`compiler.fast_path`) in which z_dot is unused
                 estimate = estimate._replace(z_dot=estimate.z_dot + 0.0 * z_dot)
@@ -201,7 +201,7 @@ class Cascade:
         rates = CascadeState(observed_rate, positioned_rate, (), ())
         return ForceDemand(z, z_rate, v_star, v_star_rate, gaps), estimate, rates
 
-    def _observed(
+    def observed(
         self, measured: Measurement, state: Any, reference: Reference, sample: Sample | None = None
     ) -> tuple[Measurement, Any]:
         """Pass the readings through the notch and the observer.
@@ -297,16 +297,12 @@ class Cascade:
         Returns the estimate for the other laws (with prediction: at the end of the delay), the next state of the
         observer, and the estimate at the sample itself.
         """
-        now, state = self.observed(measured, state, sample)
+        now, state = self.observed(measured, state, sample.reference, sample)
         estimate = now
         if self.timing.predicts:
             steps = self.timing.prediction_steps(sample.period)
             estimate = predicted_over_delay(self.model, self.driven, now, sample.past, steps)
         return estimate, state, now
-
-    def observed(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State]:
-        """Step the observer on a processor. Return the estimate at the sample, and the next state of the observer."""
-        return self._observed(measured, state, sample.reference, sample)
 
     def positioned(
         self, sample: Sample, estimate: Measurement, reference: Reference, state: State

@@ -1,6 +1,8 @@
 """A linear controller designed elsewhere, such as by H-infinity synthesis, as a position law."""
 
 import dataclasses
+import types
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +25,27 @@ OUTPUTS, SAME_PERIOD = ("current", "voltage"), 1e-6
 LEAD = realisation(-10600.0, 1.0, -0.219 * 10600.0**2, 135 + 0.219 * 10600.0)
 
 
+def state_space_of(system: Any) -> Matrices:
+    """Return a system as a state space with the matrices A, B, C, D; its period `dt` (s) is absent if continuous.
+
+    `system`: such an object, or a transfer function of python-control or SciPy with one input and one output. Raises
+    ValueError for anything else.
+    """
+    if all(hasattr(system, name) for name in "ABCD"):
+        return system
+    from scipy.signal import tf2ss
+
+    try:
+        num, den = (np.squeeze(np.asarray(x, float)) for x in (system.num, system.den))
+        A, B, C, D = tf2ss(np.atleast_1d(num), np.atleast_1d(den))
+    except (AttributeError, TypeError, ValueError):
+        raise ValueError(
+            f"system = {type(system).__name__}: it must be a state space with the matrices A, B, C, D, such as "
+            "control.ss(A, B, C, D, dt), or a proper transfer function with one input and one output."
+        ) from None
+    return cast(Matrices, types.SimpleNamespace(A=A, B=B, C=C, D=D, dt=getattr(system, "dt", None)))
+
+
 @record
 class LinearController(PositionLaw[tuple[Array, ...]]):
     """v_star = dv/dz z + dv/di i_star, i_star = g/b + gain K(s) (r - z): a linear controller in state space.
@@ -33,7 +56,7 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
 
     A continuous K is discretised by the bilinear (Tustin) transform at the period of a processor. A discrete K requires
     a processor with its own period. There is no anti-windup: the states of K do not depend on the supply's limit. The
-    reported sigma is the rate of the error, m/s. `of` constructs the law from a state space of python-control or SciPy.
+    reported sigma is the rate of the error, m/s. `of` constructs the law from a system of python-control or SciPy.
 
     Use it for a controller designed elsewhere:
     `position.LinearController.of(control.ss(A, B, C, D), output="current")`.
@@ -46,17 +69,13 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
     own_steps = ("implicit", "explicit")
 
     @classmethod
-    def of(cls, system: Matrices, output: str = OUTPUTS[0], gain: Scalar = 1.0) -> "LinearController":
-        """Return the law of a state space `system`: an object with matrices A, B, C, D and the period dt (s).
+    def of(cls, system: Any, output: str = OUTPUTS[0], gain: Scalar = 1.0) -> "LinearController":
+        """Return the law of a state space or a transfer function of python-control or SciPy, with the period dt (s).
 
-        `output`: "current" or "voltage". `gain`: factor of the output. Raises ValueError if `system` lacks these
-        matrices, if `output` is not allowed, or as `realisation` does.
+        `output`: "current" or "voltage". `gain`: factor of the output. Raises ValueError if `output` is not allowed, or
+        as `state_space_of` and `realisation` do.
         """
-        if not all(hasattr(system, name) for name in "ABCD"):
-            kind = type(system).__name__
-            raise ValueError(
-                f"{kind} has no matrices A, B, C, D: convert it to a state space, for example with control.ss."
-            )
+        system = state_space_of(system)
         if output not in OUTPUTS:
             raise ValueError(f"output = {output!r}: it must be one of {', '.join(map(repr, OUTPUTS))}.")
         dt = getattr(system, "dt", None)

@@ -74,7 +74,7 @@ class RigidBody(MachineLaw):
             states = jax.vmap(lambda law, m, r: law.init(m, r))(self.laws, now, reference)
             return RigidState(states.observer, states.position)
         implicit, sample = self.laws.timing.implicit, self._sample(inputs)
-        estimate = jax.vmap(lambda law, m, own, r: law.observed(m, own, sample(r))[0])(
+        estimate = jax.vmap(lambda law, m, own, r: law.observed(m, own, r, sample(r))[0])(
             self.laws, now, observed, reference
         )
         estimate, _ = self._predicted(estimate, measured.i, inputs)
@@ -87,7 +87,7 @@ class RigidBody(MachineLaw):
 
     def step(self, measured: Measurement, state: RigidState, inputs: MachineInputs) -> tuple[Demanded, RigidState]:
         now, reference, sample = self._read(measured, inputs), self._reference(inputs), self._sample(inputs)
-        observe = jax.vmap(lambda law, m, own, r: law.observed(m, own, sample(r)))
+        observe = jax.vmap(lambda law, m, own, r: law.observed(m, own, r, sample(r)))
         now, observed = observe(self.laws, now, state.observer, reference)
         estimate, i = self._predicted(now, measured.i, inputs)
 

@@ -87,8 +87,9 @@ def _below(node: object, path: str, route: tuple[int | str, ...]) -> Iterator[tu
             for knot, x in enumerate(value.values):
                 yield f"{at[0]}.{knot}", Place((*at[1], "values", knot), field, x)
         elif field.metadata.get("leaf") and (axes := axes_of(field)) and value is not None:
+            known = value if is_traced(value) else np.asarray(value)
             for index in np.ndindex(*np.shape(value)[-len(axes) :]):
-                entry = value[(..., *index)]
+                entry = known[(..., *index)]
                 yield ".".join(map(str, (at[0], *index))), Place((*at[1], *index), field, entry)
         elif field.metadata.get("leaf"):
             yield at[0], Place(at[1], field, value)

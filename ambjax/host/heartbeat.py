@@ -17,6 +17,8 @@ SILENCE = 4.5
 FIRST_RUN = "the first run compiles a program, which can take a minute"
 # The heartbeats that run, the last one entered at the end.
 _running: list["Heartbeat"] = []
+# One entry for each open `quiet`.
+_quiet: list[bool] = []
 
 
 class Heartbeat:
@@ -73,8 +75,25 @@ class Heartbeat:
             print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
 
 
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Print no remarks in the block: for functions of Python that the commands share. A running heartbeat goes on."""
+    _quiet.append(True)
+    try:
+        yield
+    finally:
+        _quiet.pop()
+
+
+def is_quiet() -> bool:
+    """Return whether remarks are not printed."""
+    return bool(_quiet)
+
+
 def say(text: str) -> None:
     """Print a remark on one line of stderr; stdout carries the results only. A failure of stderr is ignored."""
+    if is_quiet():
+        return
     for heartbeat in _running:
         heartbeat.close()
         if heartbeat.text:

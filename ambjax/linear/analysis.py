@@ -250,9 +250,8 @@ def analyse(
     poles = poles_in_s(system)
     poles = poles[np.argsort(-np.real(poles))]
     if not system.stable:
-        none, at = Margins(*[0.0] * 6), NO_PEAK if velocity else None
-        peaks = (NO_PEAK, NO_PEAK, NO_PEAK)
-        return Analysis(False, *peaks, "D", at, none, np.nan, np.inf, poles, LoopMargins(none, none))
+        none, no, at = Margins(*[0.0] * 6), NO_PEAK, NO_PEAK if velocity else None
+        return Analysis(False, no, no, no, "D", at, none, np.nan, np.inf, poles, LoopMargins(none, none))
     S, margins = largest(0, 0), margins_of(system)
     return Analysis(
         True,

@@ -26,8 +26,6 @@ from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
 
 T = TypeVar("T")
-# Stands for a demand that no law of the machine makes.
-ABSENT: Any = None
 # Parts of a point or of its rates: one stacked pytree for each group.
 Groups = tuple
 
@@ -157,30 +155,45 @@ class _Linear:
 
         `control`: states of the laws of the groups. `law`: state of the law of the machine.
         """
-        reference, unlimited = at_rest(0.0), jnp.asarray(jnp.inf)
-        demands: Groups = (None,) * len(self.cascade)
+        reference, unlimited, count = at_rest(0.0), jnp.asarray(jnp.inf), len(self.cascade)
+        demands: Groups = (None,) * count
+        notched: Groups = (None,) * count
+
+        def sample(past: tuple) -> Sample:
+            return Sample(reference, self.period, unlimited, past)
+
+        def notch(cascade: Cascade, _: object, read: Measurement, state: CascadeState, past: tuple) -> tuple:
+            return cascade.observed(read, state.observer, reference, sample(past) if self.sampled else None)
+
         whole = self.machine.law
         if whole is not None:
             act = whole.step if self.sampled else whole
-            demanded, law = act(self.machine.join(measured), law, self.inputs(past))
-            demands = forces(self.machine, demanded)
+            parts = self.each(notch, measured, control, past)
+            demanded, law = act(self.machine.join([one for one, _ in parts]), law, self.inputs(past))
+            demands, notched = forces(self.machine, demanded), tuple(after for _, after in parts)
 
         def one(
-            cascade: Cascade, _: object, measured: Measurement, control: CascadeState, past: tuple, demand: Any
+            cascade: Cascade,
+            _: object,
+            measured: Measurement,
+            control: CascadeState,
+            past: tuple,
+            demand: Any,
+            own: Any,
         ) -> tuple[Array, CascadeState]:
-            force, estimate = demand or 2 * (ABSENT,)
-            sample = Sample(reference, self.period, unlimited, past)
-            if not self.sampled and force is None:
-                command, after = cascade(measured, control, reference, unlimited)
-            elif not self.sampled:
-                command, after = cascade.command_rates(force, estimate, control, reference, unlimited)
-            elif force is None:
-                command, after, _ = cascade.step(measured, control, sample)
+            if demand is not None:
+                if self.sampled:
+                    command, after = cascade.commanded(*demand, control, sample(past))
+                else:
+                    command, after = cascade.command_rates(*demand, control, reference, unlimited)
+                after = after._replace(observer=own)
+            elif self.sampled:
+                command, after, _ = cascade.step(measured, control, sample(past))
             else:
-                command, after = cascade.commanded(force, estimate, control, sample)
+                command, after = cascade(measured, control, reference, unlimited)
             return command.u, after
 
-        found = self.each(one, measured, control, past, demands)
+        found = self.each(one, measured, control, past, demands, notched)
         return tuple(u for u, _ in found), tuple(after for _, after in found), law
 
     def past(self, u: Groups) -> Groups:

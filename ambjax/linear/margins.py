@@ -245,7 +245,8 @@ def _crossings(function: Magnitude, f: np.ndarray, values: np.ndarray) -> list[f
     def one(x: float) -> float:
         return float(function(np.array([x]))[0])
 
-    changes = np.flatnonzero(values[:-1] * values[1:] < 0)
+    # the sign of a rounding error at one end may be another one in the scan, which solves for all frequencies together
+    changes = [k for k in np.flatnonzero(values[:-1] * values[1:] < 0) if one(f[k]) * one(f[k + 1]) < 0]
     found = [float(brentq(one, f[k], f[k + 1], xtol=1e-300, rtol=1e-14)) for k in changes]  # pyright: ignore
     # at a pole of the function its sign changes, but its value does not cross 0
     return [x for x, k in zip(found, changes, strict=True) if abs(one(x)) <= 1e-3 * max(abs(values[k]), 1e-30)]

@@ -11,10 +11,9 @@ from ambjax.control.cascade import Cascade
 from ambjax.control.synchronous_notch import NULLED, NotchGain, SynchronousNotch
 from ambjax.linear.analysis import linearise
 from ambjax.linear.linear_machine import linearise_machine
-from ambjax.numerics.records import Scalar
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.whole_machine import Machine
-from ambjax.world.rotation import PER_MINUTE, Rotation
+from ambjax.world.rotation import PER_MINUTE, Rotation, known
 from ambjax.world.scenario import Scenario
 
 # Number of speeds at which the gain of a notch is computed for a run-up.
@@ -59,12 +58,23 @@ def notch_gains(speeds: Sequence[float], response: np.ndarray, phase: float | No
     return tuple(found)
 
 
-def machine_notch_gains(
-    machine: Machine, notch: SynchronousNotch, speeds: Sequence[float], period: Scalar, phase: float | None
-) -> list[tuple[NotchGain, ...]]:
-    """Return the gains of the notch of each axis of a machine without notches, all loops closed. See `notch_gains`."""
-    c, responses = machine.count, []
-    for speed in speeds:
-        H = linearise_machine(machine, period, speed).response(np.array([PER_MINUTE * speed]))[0]
-        responses.append(np.diag(H[2 * c : 3 * c]) if NULLED[notch.removes] == "i" else np.diag(H[:c]) - 1)
-    return [notch_gains(speeds, np.array([one[k] for one in responses]), phase) for k in range(c)]
+def with_machine_gains(
+    machine: Machine, notches: Sequence[tuple[SynchronousNotch, float | None] | None], clock: Clock
+) -> list[SynchronousNotch | None]:
+    """Return the notches of the axes with the gains for a machine without notches, all loops closed.
+
+    `notches`: notch and phase (`notch_gains`) of each axis; None: no notch.
+    """
+    c, found, responses = machine.count, list[SynchronousNotch | None](), dict[float, np.ndarray]()
+    for k, given in enumerate(notches):
+        if given is None:
+            found.append(None)
+            continue
+        notch, phase = given
+        speeds = notch_speeds(known(notch.rotor), notch, float(clock.duration))
+        for speed in (x for x in speeds if x not in responses):
+            system = linearise_machine(machine, clock.sample_period, speed)
+            responses[speed] = np.asarray(system.response(np.array([PER_MINUTE * speed])))[0]
+        nulled = [H[2 * c + k, k] if NULLED[notch.removes] == "i" else H[k, k] - 1 for H in map(responses.get, speeds)]
+        found.append(dataclasses.replace(notch, gains=notch_gains(speeds, np.array(nulled), phase)))
+    return found

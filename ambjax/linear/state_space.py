@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.linear.resolvent import resolvent
 from ambjax.numerics.records import Scalar
 from ambjax.numerics.small_matrices import exponential, solve
 
@@ -111,12 +112,8 @@ class StateSpace(NamedTuple):
         If the matrices are NumPy arrays, NumPy computes the response, without compilation. If they are JAX arrays, it
         is differentiable.
         """
-        np_ = array_module(self.A)
         A, B, C, D, *_ = self.scaled()
-        at = self.point(frequency)[:, None, None]
-        solved = np.linalg.solve if np_ is np else solve
-        x = solved(at * np.eye(len(A)) - A, np_.broadcast_to(B + 0j, (at.shape[0], *B.shape)))
-        return C @ x + D
+        return C @ _solved(A, self.point(frequency), B) + D
 
     def point(self, frequency: Array | np.ndarray) -> Any:
         """Return s = 2 pi j f, or z = exp(s T) on a processor, at frequencies [F] in Hz."""
@@ -130,12 +127,8 @@ class StateSpace(NamedTuple):
 
     def command_row(self, frequency: Array | np.ndarray) -> Any:
         """Return h [F, n]: response of the command to an input of each state of the plant, in the units of `scaled`."""
-        np_ = array_module(self.A)
         A, _, C, *_ = self.scaled()
-        at, n = self.point(frequency)[:, None, None], len(self.known_path.b)
-        row = np_.broadcast_to(C[4][:, None] + 0j, (at.shape[0], len(A), 1))
-        solved = np.linalg.solve if np_ is np else solve
-        return solved(at * np.eye(len(A)) - A.T, row)[:, :n, 0]
+        return _solved(A.T, self.point(frequency), C[4][:, None])[:, : len(self.known_path.b), 0]
 
     def command_effect(self, frequency: Array | np.ndarray, late: Scalar = 0.0) -> Array:
         """Return the effect [F, n] of a unit command on the states of the plant, in the units of `scaled`.
@@ -197,6 +190,13 @@ class StateSpace(NamedTuple):
         matrices = [np.asarray(x) for x in (self.A, self.B, self.C, self.D)]
         step = 0 if self.period is None else float(self.period)
         return control.StateSpace(*matrices, step, inputs=list(INPUTS), outputs=list(OUTPUTS))
+
+
+def _solved(A: Any, z: Any, B: Any) -> Any:
+    """Return (z I - A)^-1 B as `resolvent` does, by NumPy or JAX."""
+    if isinstance(A, np.ndarray):
+        return resolvent(A, z, B)
+    return solve(z[:, None, None] * np.eye(len(A)) - A, jnp.broadcast_to(B + 0j, (*z.shape, *B.shape)))
 
 
 def _exponential(M: np.ndarray) -> np.ndarray:

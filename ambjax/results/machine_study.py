@@ -135,7 +135,7 @@ class MachineStudy(AnyStudy):
 
     def metrics(self, values: dict[str, np.ndarray], members: np.ndarray) -> dict[str, np.ndarray]:
         machine, fold = self.varied(values, members)
-        return worst_of(simulate_members(machine, self.clock, fold).metrics)
+        return worst_of(run_machines(machine, self.clock, fold).metrics)
 
     def _axis(self, values: dict[str, Any], k: int, member: Any) -> tuple[Cascade, Scenario]:
         one = self.case.cases[k]
@@ -168,7 +168,7 @@ class MachineStudy(AnyStudy):
             far = np.array(machine.start_q)
             far[..., :2] = FAR * max(float(np.max(np.asarray(one.scenario.limit))) for one in self.case.cases)
             machine = dataclasses.replace(machine, start_q=far)
-        outcome = simulate_members(machine, self.clock, fold, threads=threads, call=call)
+        outcome = run_machines(machine, self.clock, fold, threads=threads, call=call)
         values = {SPREAD + path: x for path, x in self.drawn(members).items()}
         for k, axis in enumerate(self.case.axes):
             values |= {f"{axis}.{name}": outcome.metrics[name][:, k] for name in self.by_axis}
@@ -204,10 +204,10 @@ class MachineStudy(AnyStudy):
         return facts
 
 
-def simulate_members(
+def run_machines(
     machine: Machine, clock: Clock, fold: Fold, *, threads: int | None = None, call: int | None = None
 ) -> Result:
-    """Simulate all members of an ensemble of machines. What varies has a leading axis [N]. No rows are recorded."""
+    """Simulate every member of an ensemble of machines. What varies has a leading axis [N]. No rows are recorded."""
     tree = canonical((machine, clock, fold))
     return map_members(_simulated, tree, threads=threads, call=call, vectorised=True)
 

@@ -102,7 +102,11 @@ def most_inside(scenario: Scenario, period: Scalar, reference: bool = False) -> 
     between members counts as inside a sample. Two edges count as inside the same sample if their distance can be
     shorter than the longest period. The distance can have every value between its extremes over the members.
     """
-    edges, knots = scenario.edges(reference), scenario.knots(reference)
+    return most_of(scenario.edges(reference), period, scenario.knots(reference))
+
+
+def most_of(edges: tuple[Scalar, ...], period: Scalar, knots: tuple[Knots, ...] = ()) -> int | None:
+    """Return the largest number of `edges` and `knots` strictly inside one sample, as `most_inside`."""
     if any(map(is_traced, (*edges, *(one.start for one in knots), period))):
         return None
     periods = np.asarray(period, float)

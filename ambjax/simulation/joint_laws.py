@@ -1,4 +1,6 @@
-"""Laws of a machine in its loop: they demand the forces of all axes, each of which keeps its guard and its inner laws.
+"""Laws of a machine in its loop: they demand the forces of all axes.
+
+Each axis keeps its guard, its notch and its inner laws; it has no observer.
 
 The functions take the machine: `simulation.whole_machine.Machine`.
 """
@@ -14,7 +16,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import Demanded, MachineInputs, MachineLaw
 from ambjax.control.stages import ForceDemand
 from ambjax.numerics.records import Scalar
-from ambjax.simulation.loop import ClosedLoop
+from ambjax.simulation.loop import ClosedLoop, LoopState
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.world.plant import State
@@ -72,7 +74,9 @@ def jumped(
     def read(axis: Sampled, own: SampledState, error: Any) -> tuple:
         own, measured = axis.read(own, error)
         measured = axis.injected(measured, t)
-        return own, *axis.received(measured, axis.reference(t), own)
+        sample, checked, measured, laws = axis.received(measured, axis.reference(t), own)
+        measured, notched = axis.loop.cascade.observed(measured, laws.observer, sample.reference, sample)
+        return own, sample, checked, measured, laws._replace(observer=notched)
 
     parts = machine.each(read, axes, errors)
     samples, measured = (machine.join([part[k] for part in parts]) for k in (1, 3))
@@ -98,14 +102,19 @@ def jumped(
 
 
 def demanded_now(
-    machine: Grouped, W: Scalar, own: Sequence[Any], sensed: Sequence[object], law: Any, errors: Sequence[object]
+    machine: Grouped, W: Scalar, own: Sequence[Any], sensed: Sequence[Any], law: Any, errors: Sequence[object]
 ) -> tuple[tuple[tuple[ForceDemand, Measurement], ...], Any]:
     """Return the demands of the groups in continuous time, and the rates of the state of the law.
 
-    `own`: external inputs of the groups. `sensed`: states of their plants at the places of the sensors. `law`: state of
-    the law of the machine.
+    `own`: external inputs of the groups. `sensed`: states of the groups, with the motion at the sensors. `law`: state
+    of the law of the machine.
     """
-    measured = machine.join(machine.each(ClosedLoop.received, own, sensed, errors))
+
+    def read(loop: ClosedLoop, own: Any, state: LoopState, error: Any) -> Measurement:
+        measured = loop.received(own, state.plant, error)
+        return loop.cascade.observed(measured, state.control.observer, own.reference)[0]
+
+    measured = machine.join(machine.each(read, own, sensed, errors))
     limits = machine.join([jnp.asarray(loop.scenario.command_limit) for loop in machine.loops()])
     references = machine.join([one.reference for one in own])
     assert machine.law is not None

@@ -167,11 +167,13 @@ class ClosedLoop(WholeState):
         and the estimate, if another law computes them; None: observer and position law of the cascade do.
         """
         u_max = jnp.asarray(self.scenario.command_limit)
+        measured = self.received(inputs, state.plant if sensed is None else sensed, errors)
         if demanded is None:
-            measured = self.received(inputs, state.plant if sensed is None else sensed, errors)
             command, rates = self.cascade(measured, state.control, inputs.reference, u_max)
         else:
             command, rates = self.cascade.command_rates(*demanded, state.control, inputs.reference, u_max)
+            _, notched = self.cascade.observed(measured, state.control.observer, inputs.reference)
+            rates = rates._replace(observer=notched)
         return command, rates, self.scenario.coil_voltage(limited(command.u, u_max), state.plant, inputs.q_i)
 
     def rates(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> LoopState:

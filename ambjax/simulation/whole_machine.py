@@ -22,7 +22,7 @@ from ambjax.numerics.records import Scalar, leaf, part, record, static
 from ambjax.numerics.shapes import varying
 from ambjax.numerics.small_matrices import solve, times
 from ambjax.simulation.between import acting, lags, plant_status, under
-from ambjax.simulation.edges import NO_EDGES, Edges
+from ambjax.simulation.edges import NO_EDGES, Edges, most_of
 from ambjax.simulation.folds import Ending
 from ambjax.simulation.integrate import Advanced, InitialValueProblem, Integrator, WholeState, in_turn
 from ambjax.simulation.joint_laws import begun, demanded_now, jumped
@@ -102,6 +102,10 @@ class Machine:
     groups: tuple[tuple[int, ...], ...] = static(doc="numbers of the axes of each group")
     inverse: Array | None = leaf(
         default=None, shape="n n", at_least=-1e30, at_most=1e30, optional=True, doc="inverse of the mass matrix"
+    )
+    cuts: int | None = static(
+        default=None,
+        doc="largest number of jumps of the rotor's loads inside one sample; None: the number of all jumps",
     )
     law: Any = part(default=None, doc="law that demands the forces of all axes; none: each axis has its own laws")
 
@@ -197,6 +201,11 @@ class Machine:
         """Return the forces on the coordinates other than the magnets' [n], and the speed (rad/s), at t (s)."""
         return self.rotor.forces(t), self.rotor.speed_at(t)
 
+    def edges(self) -> Edges:
+        """Return the instants at which the forces on the rotor jump."""
+        at = self.rotor.edges()
+        return Edges(at, len(at) if self.cuts is None else self.cuts)
+
     def status(self, state: MachineState) -> Array:
         """Return the status code of the rotor: the largest of its axes; DIVERGED if a coordinate is not finite."""
         finite = 0.0 * (jnp.sum(state.q) + jnp.sum(state.q_dot)) == 0
@@ -248,7 +257,7 @@ class Machine:
 
     def problem_of(self, inputs: Callable, observed: Callable, scale: Sequence) -> InitialValueProblem:
         """Return the initial value problem with these inputs, rates with signals, and sizes of the groups' states."""
-        edges = Edges(self.rotor.edges(), len(self.rotor.edges()))
+        edges = self.edges()
         limit = self.join([jnp.asarray(loop.scenario.limit) for loop in self.loops()])
         return InitialValueProblem(
             inputs,
@@ -311,7 +320,7 @@ class SampledMachine(Machine):
         delay, whole = jnp.asarray(processor.delay)[0], bool(processor.whole)
         commands = [acting((own.command.u, *own.past), delay, period, whole) for own in axes]
         low_passed = any(map(lags, self.loops()))
-        edges, u_a, pieces = Edges(self.rotor.edges(), len(self.rotor.edges())), [own.u_a for own in axes], []
+        edges, u_a, pieces = self.edges(), [own.u_a for own in axes], []
         for interval in zip(*commands, strict=True):
             time = interval[0][1]
             voltages = []
@@ -378,8 +387,8 @@ class ContinuousMachine(WholeState, Machine):
     def demands(self, t: Scalar, state: MachineState, errors: Sequence[object]) -> Groups:
         if self.law is None:
             return super().demands(t, state, errors)
-        own, sensed = self.each(lambda axis: axis.inputs(t)), tuple(one.plant for one in self.at_sensors(state))
-        found = demanded_now(self, self.rotor.speed_at(t), own, sensed, state.law, errors)[0]
+        own = self.each(lambda axis: axis.inputs(t))
+        found = demanded_now(self, self.rotor.speed_at(t), own, self.at_sensors(state), state.law, errors)[0]
         return tuple((one,) for one in found)
 
     def problem(self, errors: Sequence[object]) -> InitialValueProblem:
@@ -390,10 +399,11 @@ class ContinuousMachine(WholeState, Machine):
 
         def observed(inputs: Any, state: MachineState) -> tuple[MachineState, Instant]:
             outside, own = inputs
-            sensed, law = tuple(one.plant for one in self.at_sensors(state)), ()
+            sensing, law = self.at_sensors(state), ()
             demands: Groups = (None,) * len(self.groups)
             if self.law is not None:
-                demands, law = demanded_now(self, outside[1], own, sensed, state.law, errors)
+                demands, law = demanded_now(self, outside[1], own, sensing, state.law, errors)
+            sensed = tuple(one.plant for one in sensing)
             observe = lambda axis, *now: axis.observed(*now)  # noqa: E731
             parts = self.each(observe, own, self.at_magnets(state), errors, sensed, demands)
             return self.coupled(outside, state, [rates for rates, _ in parts], law), self.join([x for _, x in parts])
@@ -450,5 +460,8 @@ def machine_of(
     for k, axis in enumerate(axes):
         numbers.setdefault(jax.tree.structure(axis), []).append(k)
     stacked = [stack_axes([axes[k] for k in group]) for group in numbers.values()]
-    kind = SampledMachine if isinstance(axes[0], Sampled) else ContinuousMachine
-    return kind(rotor, tuple(stacked), start_q, tuple(map(tuple, numbers.values())), law=law)
+    groups, first = tuple(map(tuple, numbers.values())), axes[0]
+    if not isinstance(first, Sampled):
+        return ContinuousMachine(rotor, tuple(stacked), start_q, groups, law=law)
+    cuts = most_of(rotor.edges(), first.period)
+    return SampledMachine(rotor, tuple(stacked), start_q, groups, law=law, cuts=cuts)

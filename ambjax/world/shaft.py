@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ambjax.numerics.records import Scalar
@@ -27,7 +28,7 @@ class Section(NamedTuple):
     E: Scalar
     rho: Scalar
     nu: Scalar
-    stiff: bool = True
+    stiff: Scalar = 1
 
 
 class Disc(NamedTuple):
@@ -68,15 +69,14 @@ def shaft_model(
     `places`: numbers of the nodes at which the shapes are returned. `modes`: number of bending modes.
     """
     count = len(nodes)
-    M, G, K = (jnp.zeros((2 * count, 2 * count)) for _ in range(3))
-    for layer in range(len(sizes) // (count - 1)):
-        for k in range(count - 1):
-            number = sizes[layer * (count - 1) + k]
-            if number < 0:
-                continue
-            mass, spin, stiffness = element(sections[number], nodes[k + 1] - nodes[k])
-            at = slice(2 * k, 2 * k + 4)
-            M, G, K = M.at[at, at].add(mass), G.at[at, at].add(spin), K.at[at, at].add(stiffness)
+    numbers = np.asarray(sizes, int).reshape(-1, count - 1)
+    layers, at = np.nonzero(numbers >= 0)
+    table = Section(*(jnp.asarray(field)[numbers[layers, at]] for field in zip(*sections, strict=True)))
+    rows = 2 * at + np.arange(4)[:, None]
+    M, G, K = (
+        jnp.zeros((2 * count, 2 * count)).at[rows[:, None], rows[None]].add(x)
+        for x in element(table, jnp.diff(nodes)[at])
+    )
     for disc in discs:
         node = int(jnp.argmin(jnp.abs(nodes - disc.at)))
         M = M.at[2 * node, 2 * node].add(disc.m).at[2 * node + 1, 2 * node + 1].add(disc.I_t)
@@ -110,7 +110,10 @@ def reduced(M: Array, G: Array, K: Array, nodes: Array, rows: Sequence[int], mod
 
 
 def element(section: Section, length: Scalar) -> tuple[Array, Array, Array]:
-    """Return mass, gyroscopic and stiffness matrix [4, 4] of an element, for (displacement, slope) at both ends."""
+    """Return mass, gyroscopic and stiffness matrix [4, 4] of an element, for (displacement, slope) at both ends.
+
+    The numbers may be arrays [elements], and so are then the entries.
+    """
     ratio, nu = section.inner / section.outer, section.nu
     area = jnp.pi / 4 * (section.outer**2 - section.inner**2)
     I = jnp.pi / 64 * (section.outer**4 - section.inner**4)
@@ -121,7 +124,8 @@ def element(section: Section, length: Scalar) -> tuple[Array, Array, Array]:
 
     def matrix(a: Scalar, b: Scalar, c: Scalar, d: Scalar, e: Scalar, f: Scalar) -> Array:
         b, d, e, f = b * length, d * length, e * length**2, f * length**2
-        return jnp.array([[a, b, c, -d], [b, e, d, -f], [c, d, a, -b], [-d, -f, -b, e]])
+        entries = jnp.broadcast_arrays(a, b, c, -d, b, e, d, -f, c, d, a, -b, -d, -f, -b, e)
+        return jnp.stack(entries).reshape(4, 4, *entries[0].shape)
 
     translation = matrix(
         13 / 35 + 7 * phi / 10 + phi**2 / 3,
