@@ -178,7 +178,7 @@ LAWS = [
 
 
 # Laws that take long; the benchmark of the default gains contains every structure.
-LONG = ("super-twisting", "terminal-sliding-mode", "utkin-sliding-mode", "feedback-linearisation")
+LONG = ("sliding-mode", "super-twisting", "terminal-sliding-mode", "utkin-sliding-mode", "feedback-linearisation")
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,7 @@ for words in json.load(sys.stdin):
 """
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", ["paper", pytest.param("bearing", marks=pytest.mark.slow)])
 def test_every_command_writes_all_of_its_files(case, tmp_path):
     (tmp_path / "case.toml").write_text(CASES[case])
     commands = COMMANDS | (SAMPLED if case == "bearing" else CONTINUOUS)

@@ -2,13 +2,11 @@
 
 import dataclasses
 import functools
-import itertools
 import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from oracle import World, solve
 from structures import METHODS
@@ -340,23 +338,6 @@ def test_the_default_clock_works_under_jit_and_in_both_modes_of_differentiation(
     forward = jax.jacfwd(jax.jit(peak))(gamma)
     # the same steps in both modes, so that only rounding differs
     np.testing.assert_allclose(jax.grad(jax.jit(peak))(gamma), forward, rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_optax_reduces_an_error_over_the_gains_of_a_law_with_the_default_clock():
-    def error(logarithms):
-        cascade = dataclasses.replace(REPAIRED, position=jax.tree.map(jnp.exp, logarithms))
-        return 1e6 * amb.rollout(cascade, TRACKING, amb.Clock(50)).trajectory.rows.e_z[-1] ** 2
-
-    gains, optimiser = jax.tree.map(jnp.log, REPAIRED.position), optax.adam(1e-2)
-    state, slope = optimiser.init(gains), jax.jit(jax.value_and_grad(error))
-    errors = []
-    for _ in range(4):
-        value, gradient = slope(gains)
-        updates, state = optimiser.update(gradient, state)
-        gains = optax.apply_updates(gains, updates)
-        errors.append(float(value))
-    assert all(after < before for before, after in itertools.pairwise(errors))
 
 
 def test_a_fixed_number_of_steps_is_not_chosen_from_traced_values():

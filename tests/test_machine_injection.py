@@ -17,7 +17,8 @@ SPEED = 9000.0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["five", "coordinates"])  # laws of the axes, in two groups; a law of the machine
+# laws of the axes, in two groups; a law of the machine
+@pytest.mark.parametrize("name", [pytest.param("five", marks=pytest.mark.thorough), "coordinates"])
 def test_the_injected_sensitivity_of_every_axis_is_the_linear_one(name):
     """At all lines, within 1 % of the largest |S|: one period of 50 ms does not settle the integrals further.
 

@@ -84,6 +84,8 @@ LOOPS = {
     "state feedback, dead-beat": lambda: on({"kind": "state-feedback"}),
     "state feedback, 3.4 samples late": lambda: slow(3.4),
 }  # fmt: skip
+# Loops whose parts the others have.
+REPEATED = ("cascade, explicit", "cascade, continuous", "PID, dead-beat", "state feedback, dead-beat")
 
 
 def agrees(parts, margin, changed, most):
@@ -95,8 +97,9 @@ def agrees(parts, margin, changed, most):
     return below and (margin > most or not parts.stable(changed((1 + ERROR) * margin)))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.thorough if x in REPEATED else pytest.mark.slow) for x in LOOPS]
+)
 def test_the_margins_agree_with_the_poles_of_the_changed_loop(name):
     case = LOOPS[name]()
     system = linearise(case.cascade, case.scenario, case.clock)

@@ -43,7 +43,7 @@ def project(tmp_path):
     return tmp_path
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_killed_and_surviving_mutants_are_distinguished(project):
     assert verdict(BREAK, project) == KILLED
     assert verdict(BREAK._replace(test="tests/test_it.py::test_zero"), project) == SURVIVED
@@ -55,7 +55,7 @@ def test_killed_and_surviving_mutants_are_distinguished(project):
     assert "mend them first" in said[-1]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_no_mutation_of_a_sample_survives(capsys):
     """`python tests/mutate.py` tests all mutations."""
     assert main(["--share", str(examples(26, 3))]) == 0, capsys.readouterr().out

@@ -46,8 +46,10 @@ def without():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "nulled"), [("force-free", "i_1x_A"), ("displacement-free", "z_1x_m")])
-@pytest.mark.parametrize(("which", "raw"), [("c", TURNING), ("p", ON_PROCESSOR)])
+@pytest.mark.parametrize(
+    ("which", "raw", "kind", "nulled"),
+    [("c", TURNING, "force-free", "i_1x_A"), ("p", ON_PROCESSOR, "displacement-free", "z_1x_m")],
+)
 def test_the_notch_removes_the_speed_from_one_signal(without, which, raw, kind, nulled):
     run = simulate(case_from(with_notch(raw, kind)))
     # exp(-20 * 0.65) = 2e-6 of what the start contains
