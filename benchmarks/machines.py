@@ -31,8 +31,8 @@ from ambjax.simulation.folds import Peak
 from ambjax.simulation.whole_machine import PerAxis
 
 MEMBERS, SAMPLES, REPEATS = 1024, 500, 9
-# Groups of members that machines.c interleaves.
-CHAINS = int(os.environ.get("CHAINS", "1"))
+# Vectors that machines.c interleaves, of which two are faster with smooth signs and one with set-valued signs.
+CHAINS = {False: 2, True: 1}
 SOURCE = pathlib.Path(__file__).with_name("machines.c")
 # Places (m) of the radial bearings, in the order in which they are added.
 PLACES = {"left": -0.139, "right": 0.241, "third": -0.06, "fourth": 0.12}
@@ -178,9 +178,10 @@ def problem_of(kind: Kind, case: MachineCase) -> ctypes.Structure:
 
 
 @functools.cache
-def library(radial: int, thrust: int, modes: int) -> Any:
-    """Return machines.c, compiled for these numbers of bearings and modes; of two numbers of chains, the faster one."""
-    sizes = [f"-DRADIAL={radial}", f"-DTHRUST={thrust}", f"-DMODES={modes}", f"-DCHAINS={CHAINS}"]
+def library(kind: Kind) -> Any:
+    """Return machines.c, compiled for a machine."""
+    sizes = [f"-DRADIAL={kind.radial}", f"-DTHRUST={kind.thrust}", f"-DMODES={kind.modes}"]
+    sizes.append(f"-DCHAINS={CHAINS[kind.hard]}")
     with tempfile.TemporaryDirectory() as folder:
         path = str(pathlib.Path(folder, "machines.so"))
         command = ["gcc", *limit.FLAGS.split(), *limit.PRECISION["float64"].split(), *sizes, str(SOURCE), "-o", path]
@@ -193,8 +194,7 @@ def by_c(kind: Kind, problem: ctypes.Structure, members: int, errors: np.ndarray
     peak, lost = np.zeros((members, kind.axes)), np.zeros(members)
     given = None if errors is None else ctypes.c_void_p(errors.ctypes.data)
     pointers = [ctypes.c_void_p(x.ctypes.data) for x in (peak, lost)]
-    program = library(kind.radial, kind.thrust, kind.modes)
-    if program.run(ctypes.byref(problem), ctypes.c_long(members), *pointers, given):
+    if library(kind).run(ctypes.byref(problem), ctypes.c_long(members), *pointers, given):
         raise ValueError("machines.c: too many substeps")
     assert not lost.any(), f"{kind}: the rotor is lost"
     return peak

@@ -348,6 +348,7 @@ def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monke
         ({"unbalance": [{"at": 0.0}]}, r"unbalance\[0\]\.amount is missing"),
         ({"initial": {"q": [0.0, 0.0]}}, r"initial\.q = .*a list of 5 numbers"),
         ({"sensitivity": {"speeds": []}}, r"sensitivity\.speeds"),
+        ({"sensitivity": {"speeds": [0.0, 9e3, 0]}}, r"sensitivity\.speeds = .*: 0 rpm is given more than once"),
         ({"controller": {"position": {"kind": "pdi"}}}, "axis left.x: controller.position.kind"),
     ],
 )
@@ -357,7 +358,7 @@ def test_bad_input_is_refused_in_one_line(change, said):
     assert "\n" not in str(refused.value)
 
 
-def test_one_axis_and_a_machine_are_not_confused(tmp_path):
+def test_one_axis_and_a_machine_are_not_confused(tmp_path, capsys):
     whole, alone = tmp_path / "whole.toml", tmp_path / "alone.toml"
     whole.write_text(template("machine"))
     alone.write_text(template("bearing"))
@@ -365,5 +366,12 @@ def test_one_axis_and_a_machine_are_not_confused(tmp_path):
         read_case(whole)
     with pytest.raises(ValueError, match="so it is a case of one axis"):
         read_machine(alone)
+    for words, said in (
+        (["campbell", str(alone)], "ambjax sensitivity"),
+        (["simulate", str(whole), "--from", "0"], "ambjax: --from: a machine"),
+        (["simulate", str(whole), "--to", "0.1"], "ambjax: --to: a machine"),
+    ):
+        assert main(words) == 2
+        assert said in capsys.readouterr().err
     assert case_from(tomllib.loads(alone.read_text())).scenario.plant.m == 2.4
     assert pathlib.Path(whole).exists()

@@ -202,7 +202,7 @@ def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:
     if not isinstance(value, list) or not 0 < len(value) <= MOST_SPEEDS:
         raise ValueError(f"{table.at('speeds')} = {show(value)}: it must be a list of 1 to {MOST_SPEEDS} speeds, rpm.")
     speeds = [Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(value)]
-    if twice := next((x for x in speeds if speeds.count(x) > 1), None):
+    if (twice := next((x for x in speeds if speeds.count(x) > 1), None)) is not None:
         raise ValueError(f"{table.at('speeds')} = {show(value)}: {twice:g} rpm is given more than once. Give it once.")
     return tuple(speeds)
 
