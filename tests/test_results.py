@@ -172,6 +172,10 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
     ):
         with pytest.raises(ValueError, match=r"case = 'case.toml': it must be a Case, as ambjax.read_case"):
             function(wrong)
+    with pytest.raises(ValueError, match="cases = Case: it must be a list of 2 to 8 cases"):
+        ambjax.compare(case)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r"make one with ambjax\.Case\(NAME, cascade, scenario, clock, SETTLE\)"):
+        ambjax.sensitivity(case.cascade)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="cascade = Scenario: it must be a Cascade"):
         ambjax.rollout(case.scenario, case.cascade, case.clock)  # pyright: ignore[reportArgumentType]
     for given in (("case.toml",), (case.cascade,), ((case.cascade, case.scenario, case.clock),), (case, case.scenario)):

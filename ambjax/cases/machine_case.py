@@ -143,7 +143,7 @@ def machine_from(
     law, parts = law_from(top, rotor, bearings, cases, read, folder)
     spread = machine_spread(top, rotor, q, axes, names, cases)
     if law is not None:
-        refuse_unused(spread)
+        refuse_unused(spread, law.output)
     fixed = not isinstance(raw.get("clock", {}).get("dt", "auto"), str)
     clock = _clock([*cases, *parts], fastest_rotor(rotor, spread), fixed)
     controllers = [merged(top.table("controller").raw, own.table("controller").raw) for own in bearings]
@@ -202,7 +202,7 @@ def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:
     if not isinstance(value, list) or not 0 < len(value) <= MOST_SPEEDS:
         raise ValueError(f"{table.at('speeds')} = {show(value)}: it must be a list of 1 to {MOST_SPEEDS} speeds, rpm.")
     speeds = [Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(value)]
-    if twice := next((x for x in speeds if speeds.count(x) > 1), None):
+    if (twice := next((x for x in speeds if speeds.count(x) > 1), None)) is not None:
         raise ValueError(f"{table.at('speeds')} = {show(value)}: {twice:g} rpm is given more than once. Give it once.")
     return tuple(speeds)
 

@@ -114,6 +114,8 @@ def require_case(case: object) -> None:
     """Raise ValueError for anything but a `Case`, such as a path."""
     if not isinstance(case, Case):
         other = " For a whole machine, use ambjax.simulate_machine." if hasattr(case, "machine") else ""
+        if isinstance(case, Cascade):
+            other = " Of a cascade, make one with ambjax.Case(NAME, cascade, scenario, clock, SETTLE)."
         raise ValueError(f"case = {cut(repr(case))}: it must be a Case, as ambjax.read_case(PATH) returns it.{other}")
 
 

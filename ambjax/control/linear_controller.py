@@ -33,17 +33,21 @@ def state_space_of(system: Any) -> Matrices:
     """
     if all(hasattr(system, name) for name in "ABCD"):
         return system
-    from scipy.signal import tf2ss
-
     try:
-        num, den = (np.squeeze(np.asarray(x, float)) for x in (system.num, system.den))
-        A, B, C, D = tf2ss(np.atleast_1d(num), np.atleast_1d(den))
-    except (AttributeError, TypeError, ValueError):
+        num, den = (
+            np.trim_zeros(np.atleast_1d(np.squeeze(np.asarray(x, float))), "f") for x in (system.num, system.den)
+        )
+        n = len(den) - 1
+        num = np.pad(num, ((n + 1 - len(num), 0),)) / den[0]  # the width is negative for an improper one
+        A, B, C = np.eye(n, k=-1), np.eye(n, 1), (num[1:] - num[0] * den[1:] / den[0])[None]
+        A[:1] = -den[1:] / den[0]
+    except (AttributeError, TypeError, ValueError, IndexError):
         raise ValueError(
             f"system = {type(system).__name__}: it must be a state space with the matrices A, B, C, D, such as "
             "control.ss(A, B, C, D, dt), or a proper transfer function with one input and one output."
         ) from None
-    return cast(Matrices, types.SimpleNamespace(A=A, B=B, C=C, D=D, dt=getattr(system, "dt", None)))
+    matrices = types.SimpleNamespace(A=A, B=B, C=C, D=num[:1, None], dt=getattr(system, "dt", None))
+    return cast(Matrices, matrices)
 
 
 @record

@@ -81,7 +81,9 @@ class CaseRun:
         """Return a matplotlib Figure with the main signals: the whole run, its start and its end."""
         from ambjax.pictures.overview import overview_figure
 
-        return overview_figure(self.trajectory, f"{self.case.name}: {self.case.clock.method}", settle=self.case.settle)
+        method = self.case.clock.method
+        title = self.case.name if method is None else f"{self.case.name}: {method}"
+        return overview_figure(self.trajectory, title, settle=self.case.settle)
 
     def plot_phase(self) -> Any:
         """Return a matplotlib Figure of the velocity against the displacement, in the whole run and when settled."""
