@@ -1,4 +1,4 @@
-"""Sections of the benchmark page: machines that nobody tuned the tuner for, and its mechanisms switched off."""
+"""Sections of the benchmark page: drawn bearings, the tuner without its mechanisms, and whole machines."""
 
 import statistics
 from typing import Any
@@ -84,3 +84,28 @@ def _against(rows: dict[tuple[str, ...], dict[str, Any]], off: str, task: str) -
 
 def _number(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
+
+
+def machines() -> list[str]:
+    data = load("machines")
+    lines = ["## Whole machines (`machines.py`)", "", facts(data["machine"])]
+    first = data["limits"][0]
+    lines += [
+        f"{first['members']:,} members, float64, one core, held noise, 20 kHz, one sample of delay with prediction,",
+        f"{first['substeps']} substeps: the rigid rotor of `ambjax template machine` with the paper's cascade on every",
+        "axis. Times are in ns of processor time per member and sample. C: the program `machines.c`, which knows the",
+        "structure of the matrices. Error: largest relative difference between C and ambjax under the same noise.",
+        "Signs: smooth, with the default steepnesses, or set-valued. Compilation: processor time of the first run.",
+        "",
+    ]
+    titles = "axes | modes a plane | signs | ambjax | C | ratio | error | compilation (s)"
+    for name in ("limits", "axes", "modes"):
+        if name != "limits":
+            lines += ["", f"Cost against the number of {name}:", ""]
+        rows = []
+        for r in data[name]:
+            cells = [str(r["axes"]), str(r["modes"]), "set-valued" if r["hard"] else "smooth"]
+            cells += [f"{r['ambjax']:.0f}", f"{r['C']:.0f}", f"{r['ratio']:.2f}"]
+            rows.append([*cells, f"{r['error']:.0e}" if "error" in r else "", f"{r['compile_s']:.1f}"])
+        lines += table(titles, rows)
+    return lines

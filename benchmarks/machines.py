@@ -31,8 +31,8 @@ from ambjax.simulation.folds import Peak
 from ambjax.simulation.whole_machine import PerAxis
 
 MEMBERS, SAMPLES, REPEATS = 1024, 500, 9
-# Groups of members that machines.c interleaves.
-CHAINS = int(os.environ.get("CHAINS", "1"))
+# Vectors that machines.c interleaves, of which two are faster with smooth signs and one with set-valued signs.
+CHAINS = {False: 2, True: 1}
 SOURCE = pathlib.Path(__file__).with_name("machines.c")
 # Places (m) of the radial bearings, in the order in which they are added.
 PLACES = {"left": -0.139, "right": 0.241, "third": -0.06, "fourth": 0.12}
@@ -67,7 +67,7 @@ class Kind(NamedTuple):
         return 5 + 2 * self.modes
 
 
-# The machines of the issue, and then those that show the cost of axes and modes.
+# The machines with stated limits of the ratio, and then those that show the cost of axes and modes.
 LIMITS = (Kind(), Kind(hard=True), Kind(modes=4), Kind(modes=4, hard=True))
 AXES = tuple(Kind(radial, thrust) for radial, thrust in ((2, 0), (2, 1), (3, 1), (4, 1)))
 BENDING = tuple(Kind(modes=modes) for modes in (0, 1, 2, 4))
@@ -178,9 +178,10 @@ def problem_of(kind: Kind, case: MachineCase) -> ctypes.Structure:
 
 
 @functools.cache
-def library(radial: int, thrust: int, modes: int) -> Any:
-    """Return machines.c, compiled for these numbers of bearings and modes; of two numbers of chains, the faster one."""
-    sizes = [f"-DRADIAL={radial}", f"-DTHRUST={thrust}", f"-DMODES={modes}", f"-DCHAINS={CHAINS}"]
+def library(kind: Kind) -> Any:
+    """Return machines.c, compiled for a machine."""
+    sizes = [f"-DRADIAL={kind.radial}", f"-DTHRUST={kind.thrust}", f"-DMODES={kind.modes}"]
+    sizes.append(f"-DCHAINS={CHAINS[kind.hard]}")
     with tempfile.TemporaryDirectory() as folder:
         path = str(pathlib.Path(folder, "machines.so"))
         command = ["gcc", *limit.FLAGS.split(), *limit.PRECISION["float64"].split(), *sizes, str(SOURCE), "-o", path]
@@ -193,8 +194,7 @@ def by_c(kind: Kind, problem: ctypes.Structure, members: int, errors: np.ndarray
     peak, lost = np.zeros((members, kind.axes)), np.zeros(members)
     given = None if errors is None else ctypes.c_void_p(errors.ctypes.data)
     pointers = [ctypes.c_void_p(x.ctypes.data) for x in (peak, lost)]
-    program = library(kind.radial, kind.thrust, kind.modes)
-    if program.run(ctypes.byref(problem), ctypes.c_long(members), *pointers, given):
+    if library(kind).run(ctypes.byref(problem), ctypes.c_long(members), *pointers, given):
         raise ValueError("machines.c: too many substeps")
     assert not lost.any(), f"{kind}: the rotor is lost"
     return peak
@@ -216,7 +216,7 @@ def errors_of(kind: Kind, members: int, samples: int) -> np.ndarray:
         drawn = jax.vmap(lambda n: machine.join(machine.sensor_errors(n))[:3])(jnp.arange(samples))
         return np.stack([np.asarray(x) for x in drawn], 2)
 
-    return np.ascontiguousarray(np.stack([one(n) for n in range(members)], 3))
+    return np.ascontiguousarray(np.stack([one(n) for n in range(members)], 3), np.float64)
 
 
 def agreement(kind: Kind, members: int = 9, samples: int = 200) -> float:
@@ -229,8 +229,9 @@ def agreement(kind: Kind, members: int = 9, samples: int = 200) -> float:
     return error
 
 
-def measure(kind: Kind, compare: bool = True) -> dict[str, Any]:
-    """Return one row: a machine, with the comparison with machines.c."""
+@functools.cache
+def measure(kind: Kind) -> dict[str, Any]:
+    """Return one row: a machine, with the agreement with machines.c if it is one of LIMITS."""
     case, arguments = ensemble(kind, MEMBERS, SAMPLES)
     problem = problem_of(kind, case)
     runs: dict[str, Any] = {"ambjax": lambda: run_machines(*arguments, threads=1).metrics}
@@ -239,7 +240,7 @@ def measure(kind: Kind, compare: bool = True) -> dict[str, Any]:
     row: dict[str, Any] = {**kind._asdict(), "axes": kind.axes, "members": MEMBERS, "samples": SAMPLES}
     row |= {name: 1e9 * each.seconds / MEMBERS / SAMPLES for name, each in found.items()}
     row |= {"ratio": found["ambjax"].over(found["C"]), "compile_s": found["ambjax"].compile_s}
-    if compare:
+    if kind in LIMITS:
         row["error"] = agreement(kind)
     print(
         f"{kind}: ambjax {row['ambjax']:.0f} ns a sample, C {row['C']:.0f}, ratio {row['ratio']:.2f}; compiled in "
@@ -251,8 +252,8 @@ def measure(kind: Kind, compare: bool = True) -> dict[str, Any]:
 
 def main() -> None:
     _measure.one_core()
-    rows = {"limits": [measure(kind) for kind in LIMITS], "axes": [measure(kind, False) for kind in AXES]}
-    rows["modes"] = [measure(kind, False) for kind in BENDING]
+    groups = {"limits": LIMITS, "axes": AXES, "modes": BENDING}
+    rows = {name: [measure(kind) for kind in kinds] for name, kinds in groups.items()}
     _measure.write("machines", rows)
 
 

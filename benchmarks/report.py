@@ -25,6 +25,7 @@ Smooth gains are gamma = 1e9 and p = 25e-6 in the inversion; repaired gains are 
     .venv/bin/python benchmarks/limit.py             # the C program alone, compared with ambjax
     .venv/bin/python benchmarks/throughput.py        # ensembles against the C program
     .venv/bin/python benchmarks/sampled.py           # the cascade on a processor against C
+    .venv/bin/python benchmarks/machines.py          # whole machines against C
     .venv/bin/python benchmarks/peers.py             # ensembles against other libraries
     .venv/bin/python benchmarks/scaling.py --full    # cost and memory against members and horizon
     .venv/bin/python benchmarks/gpu.py               # ensembles on a GPU
@@ -52,6 +53,7 @@ SECTIONS = {
     "work_precision": simulated.work_precision,
     "throughput": simulated.throughput,
     "sampled": simulated.sampled,
+    "machines": fleet.machines,
     "peers": simulated.peers,
     "scaling": simulated.scaling,
     "gpu": simulated.gpu,

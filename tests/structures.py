@@ -11,8 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from ambjax import solvers
 from ambjax.simulation.loop import ClosedLoop
 
+# One method of each kind.
+METHODS = [
+    solvers.Euler(3), solvers.RK4(3), solvers.DOP853(3), solvers.Rodas3(3), solvers.AdaptiveRodas3(),
+    solvers.AdaptiveCashKarp(),
+]  # fmt: skip
 RIG = {"m": 1.64, "k_z": 0.0, "mu_0": 1.2566e-6, "n": 208.0, "A": 2.68e-4, "s_0": 5e-4, "i_0": 2.5, "R": 1.0}
 OBSERVERS = ["direct", "complementary", "difference", "kalman", "ired-1", "ired-2"]
 POSITIONS = [

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from structures import METHODS
 
 import ambjax as amb
 from ambjax.control.processor import Processor
@@ -61,18 +62,7 @@ AREA = {  # from 1 to 2
 }
 
 
-@pytest.mark.parametrize(
-    "method",
-    [
-        amb.solvers.Euler(3),
-        amb.solvers.RK4(3),
-        amb.solvers.DOP853(3),
-        amb.solvers.Rodas3(3),
-        amb.solvers.AdaptiveRodas3(),
-        amb.solvers.AdaptiveCashKarp(),
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("method", METHODS, ids=str)
 @pytest.mark.parametrize("name", ["pulse", "held", "linear"])
 def test_an_integral_is_exact_wherever_the_rate_jumps_or_has_a_kink(method, name):
     signal = {"pulse": amb.signals.Pulse(2.0, 1.137, 1.642), "held": HELD, "linear": LINEAR}[name]

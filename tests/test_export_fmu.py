@@ -272,7 +272,7 @@ def test_a_command_writes_the_fmu_and_its_reference(elsewhere, tmp_path, capsys,
     assert main(["export", str(case), "--out", str(out), "--fmi", "2"]) == 2
     assert "--fmi 2: it is the version of an FMU" in capsys.readouterr().err
     assert main(["export", str(case), "--out", str(out), "--format", "fmu", "--precision", "float"]) == 2
-    assert "--precision float: an FMU computes in double" in capsys.readouterr().err
+    assert "--precision float: --format fmu computes in double" in capsys.readouterr().err
     monkeypatch.setenv("CC", "no-such-compiler")
     assert main(["export", str(case), "--out", str(out), "--format", "fmu"]) == 2
     assert (

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracle import World, solve
+from structures import METHODS
 
 import ambjax as amb
 from ambjax.numerics import linear
@@ -51,18 +52,7 @@ def slope(x, y):
 
 
 every_fixed = pytest.mark.parametrize(("method", "order"), FIXED.values(), ids=FIXED)
-every_method = pytest.mark.parametrize(
-    "method",
-    [
-        amb.solvers.Euler(3),
-        amb.solvers.RK4(3),
-        amb.solvers.DOP853(3),
-        amb.solvers.Rodas3(3),
-        amb.solvers.AdaptiveRodas3(),
-        amb.solvers.AdaptiveCashKarp(),
-    ],
-    ids=str,
-)
+every_method = pytest.mark.parametrize("method", METHODS, ids=str)
 
 
 @every_fixed

@@ -20,6 +20,7 @@ from ambjax.commands import machine_commands
 from ambjax.linear import linearise
 from ambjax.linear.linear_machine import linearise_machine, machine_sensitivity
 from ambjax.numerics.records import canonical
+from ambjax.pictures.machine_pictures import machine_figure
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.runs import simulate
 from ambjax.simulation.folds import Rms
@@ -64,6 +65,12 @@ def test_an_uncoupled_axis_equals_the_case_of_one_axis(machine, held):
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-11 * np.abs(theirs).max())
     for name in ("max_abs_u_V", "rms_error_m", "copper_loss_W"):
         assert held.metrics["axes"]["thrust.z"][name] == pytest.approx(alone.metrics[name], rel=1e-9)
+
+
+def test_the_orbits_of_a_rotor_that_is_lost_before_it_settles_end_at_the_loss(machine, held):
+    lost = held.signals | {"lost_at": np.asarray(0.004), "lost_why": np.asarray("touched down")}
+    (orbit,) = machine_figure(dataclasses.replace(machine, settle=0.005), lost, "m").axes[-1].lines
+    np.testing.assert_allclose(orbit.get_xdata(), 1e6 * held.signals["z"][:81, 2])  # 5e-5 s a sample
 
 
 def test_the_sensitivity_of_an_uncoupled_axis_is_that_of_one_axis(machine):
@@ -224,6 +231,10 @@ def test_the_published_controller_of_the_munich_rig(tmp_path):
                 (-8.91, 607.5)]  # fmt: skip
     # the amplifier of 1 MHz and the pole of the derivative move the damped pair by 3e-4
     np.testing.assert_allclose(ours, expected, rtol=2e-3, atol=0.02)
+    # each pair and two real poles, of the integrals, in both planes: 14 + 2 eigenvalues each
+    still = [pole for pole in found.poles if abs(pole.imag) < 1 and pole.real > -1e3]
+    np.testing.assert_allclose(still, [-0.5] * 4, atol=2e-3)
+    assert sum(pole.imag > 1 for pole in slow) == 2 * len(expected)
     peaks = [axis.S.height for axis in found.axes]
     np.testing.assert_allclose(peaks, [5.05, 5.05, 4.85, 4.85], rtol=3e-3)
     assert found.stable

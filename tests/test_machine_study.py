@@ -95,11 +95,13 @@ def test_numbers_of_the_rotor():
         ({"rotor": {"kind": {"percent": 1}}}, "spread.rotor.kind"),
         ({"rotor": {"m": {"uniform": [-1.0, 2.0]}}}, "rotor.m"),
         ({"plant": {"B": {"percent": 1}}}, "plant.B"),
+        ({"controller": {"current": {"k_p": {"percent": 1}}}}, "current.k_p: one law commands all axes"),
     ],
 )
 def test_refused(spread, words):
+    lqg = {"controller": {"kind": "lqg"}} if "controller" in spread else {}
     with pytest.raises(ValueError, match=words):
-        case(spread)
+        case(spread, **lqg)
 
 
 def test_steps_resolve_the_fastest_member():

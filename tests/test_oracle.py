@@ -11,19 +11,8 @@ import pytest
 from oracle import REST, TABLE_1, World, solve
 
 import ambjax as amb
-
-KINDS = {
-    "observer": {"direct": amb.laws.observer.Direct, "complementary": amb.laws.observer.Complementary},
-    "position": {"sliding-mode": amb.laws.position.SlidingMode, "super-twisting": amb.laws.position.SuperTwisting},
-    "inversion": {"adaptive": amb.laws.inversion.Adaptive, "closed-form": amb.laws.inversion.ClosedForm},
-    "current": {"sliding-mode": amb.laws.current.SlidingMode, "pi": amb.laws.current.ProportionalIntegral},
-}
-SIGNALS = {
-    "constant": amb.signals.Constant,
-    "sine": amb.signals.Sine,
-    "smoothstep": amb.signals.SmoothStep,
-    "pulse": amb.signals.Pulse,
-}
+from ambjax.cases.controller_tables import KINDS
+from ambjax.cases.scenario_tables import SIGNALS
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,8 @@ from sampled_oracle import World, simulate
 from test_oracle import adaptive, current, pulse, sine, smc, smoothstep, twisting
 
 import ambjax as amb
+from ambjax.cases.controller_tables import KINDS
+from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
 from ambjax.simulation.system import system_of
@@ -19,25 +21,6 @@ from ambjax.simulation.trajectory import DIVERGED
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.coils import TwoCoil
 
-KINDS = {
-    "observer": {
-        "direct": amb.laws.observer.Direct,
-        "complementary": amb.laws.observer.Complementary,
-        "difference": amb.laws.observer.Difference,
-        "kalman": amb.laws.observer.Kalman,
-        "ired-1": amb.laws.observer.IRED1,
-        "ired-2": amb.laws.observer.IRED2,
-    },
-    "position": {"sliding-mode": amb.laws.position.SlidingMode, "super-twisting": amb.laws.position.SuperTwisting},
-    "inversion": {"adaptive": amb.laws.inversion.Adaptive, "closed-form": amb.laws.inversion.ClosedForm},
-    "current": {"sliding-mode": amb.laws.current.SlidingMode, "pi": amb.laws.current.ProportionalIntegral},
-}
-SIGNALS = {
-    "constant": amb.signals.Constant,
-    "sine": amb.signals.Sine,
-    "smoothstep": amb.signals.SmoothStep,
-    "pulse": amb.signals.Pulse,
-}
 INF = math.inf
 
 

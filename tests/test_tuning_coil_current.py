@@ -5,7 +5,7 @@ import tomllib
 
 import numpy as np
 import pytest
-from texts import case_and_tune, problem_from
+from texts import SMALL_SEARCH, case_and_tune, problem_from
 
 from ambjax import rollout
 from ambjax.simulation.folds import Named
@@ -47,21 +47,14 @@ duration = 0.02
 sample_period = 5e-5
 [run]
 settle = 0.001
-[tune]
-objective = "least_error"
+"""
+CASE += SMALL_SEARCH
+CASE += """
 gains = ["controller.position.c"]
 bounds.controller.position.c = [100.0, 10000.0]
-weights = { effort = 0.0, chatter = 0.0, conditions = 0.0 }
 members = 4
-stressed = 0
 validation = 8
 held_out = 8
-screen = 0
-starts = 1
-iterations = 10
-[tune.limits]
-sensitivity = inf
-rms_u_V = inf
 """
 
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from texts import case_and_tune, problem_from
+from texts import SMALL_SEARCH, case_and_tune, problem_from
 
 from tuning.judge.evaluate import judge
 from tuning.problem.config import seeds
@@ -27,20 +27,14 @@ duration = 0.04
 sample_period = 1e-4
 [run]
 settle = 0.02
-[tune]
-objective = "least_error"
+"""
+CASE += SMALL_SEARCH
+CASE += """
 gains = ["controller.position.k_d"]
 bounds.controller.position.k_d = [100.0, 1500.0]
-weights = { effort = 0.0, chatter = 0.0, conditions = 0.0 }
 members = 2
-stressed = 0
 validation = 2
 held_out = 2
-screen = 0
-starts = 1
-iterations = 10
-[tune.limits]
-sensitivity = inf
 """
 
 

@@ -9,6 +9,18 @@ from ambjax.cases.table import Table
 from tuning.problem.config import tune_from
 from tuning.problem.tuning_problem import problem_of
 
+# The end of a case: a search of a few iterations without weights and limits, for keys of [tune] that follow.
+SMALL_SEARCH = """
+[tune]
+objective = "least_error"
+weights = { effort = 0.0, chatter = 0.0, conditions = 0.0 }
+limits = { sensitivity = inf, rms_u_V = inf }
+stressed = 0
+screen = 0
+starts = 1
+iterations = 10
+"""
+
 
 def write(text, name="case.toml"):
     """Write the text to a file in the folder where the test runs. Return its name."""

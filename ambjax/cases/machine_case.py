@@ -143,7 +143,7 @@ def machine_from(
     law, parts = law_from(top, rotor, bearings, cases, read, folder)
     spread = machine_spread(top, rotor, q, axes, names, cases)
     if law is not None:
-        refuse_unused(spread)
+        refuse_unused(spread, law.output)
     fixed = not isinstance(raw.get("clock", {}).get("dt", "auto"), str)
     clock = _clock([*cases, *parts], fastest_rotor(rotor, spread), fixed)
     controllers = [merged(top.table("controller").raw, own.table("controller").raw) for own in bearings]

@@ -48,7 +48,7 @@ def linear(top: Table, cases: list[Case], folder: pathlib.Path) -> StateSpaceLaw
     output = table.choice("output", list(OUTPUTS), OUTPUTS[0])
     convert = lambda A, B, C, D, dt=0.0: several((A, B, C, D), dt, c)  # noqa: E731
     matrices, steady, dt = contents_of(table, folder, convert)[2]
-    period = float(cases[0].clock.sample_period) if cases[0].cascade.processor is not None else None
+    period = float(cases[0].clock.sample_period) if cases[0].cascade.sampled else None
     if dt and (period is None or not abs(period / dt - 1) < SAME_PERIOD):
         has = "in continuous time" if period is None else f"with a sample period of {period:g} s"
         raise ValueError(
@@ -115,8 +115,8 @@ def lqg_problem(top: Table, cases: Sequence[Case], rotor: Rotor) -> LqgProblem:
     """Return the design of the LQG of a rotor."""
     table = top.table("controller")
     table.only(["kind", "model", "lqg", "notch"])
-    own, processor = table.table("lqg"), cases[0].cascade.processor
-    if processor is None:
+    own, cascade = table.table("lqg"), cases[0].cascade
+    if not cascade.sampled:
         raise ValueError(f'{table.at("kind")} = "lqg": it is designed for a processor. Add [processor].')
     voltage = cases[0].scenario.drive == "voltage"
     given = own.record(LqgWeights, extra=("speeds", "modes"))
@@ -131,7 +131,7 @@ def lqg_problem(top: Table, cases: Sequence[Case], rotor: Rotor) -> LqgProblem:
     speeds = _speeds(own, float(rotor.speed))
     return LqgProblem(
         {name: float(x) for name, x in weights.items()}, speeds, [_model(rotor, cases, count, one) for one in speeds],
-        coils, w, float(cases[0].clock.sample_period), float(processor.delay), magnets(cases, voltage),
+        coils, w, float(cases[0].clock.sample_period), float(cascade.timing.delay), magnets(cases, voltage),
         OUTPUTS[1 if voltage else 0],
     )  # fmt: skip
 

@@ -55,10 +55,11 @@ def axis_table(raw: dict[str, Any], axis: BearingAxis, name: str) -> dict[str, A
     return {"spread": merged} if merged else {}
 
 
-def refuse_unused(spread: Spread) -> None:
-    """Raise ValueError for a number of the laws of an axis, for a machine whose law demands the forces of all axes."""
+def refuse_unused(spread: Spread, output: str) -> None:
+    """Raise ValueError for a number of laws that an axis lacks because one law commands all. `output`: of that law."""
+    unused = ("observer", "position", "model", *(["current"] if output == "voltage" else []))
     for path, _ in spread.entries:
-        if any(f".controller.{part}." in path for part in ("observer", "position", "model")):
+        if any(f".controller.{part}." in path for part in unused):
             raise ValueError(f"spread.{path}: one law commands all axes, so an axis has none. Leave it out.")
 
 

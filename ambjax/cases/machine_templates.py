@@ -82,7 +82,33 @@ settle = 0.05                 # s
 speeds = [0.0, 6000.0, 12000.0]  # rpm
 """
 
-FLEXIBLE = """\
+# The end of both flexible rotors, before the speeds of the sensitivity.
+FLEXIBLE_END = """\
+[processor]
+delay = 1.0                   # samples
+
+[sensor]
+velocity = false
+std = 2e-7                    # m; assumed
+
+[actuator]
+u_max = 48.0                  # V; assumed
+
+[initial]
+q = [1e-5, 0.0, 0.0, 0.0, 0.0]  # x, y, z (m) of the centre of mass, beta_x, beta_y (rad); at rest
+
+[clock]
+duration = 0.4                # s
+sample_period = 5e-5          # s
+
+[run]
+settle = 0.2                  # s
+
+[sensitivity]
+"""
+
+FLEXIBLE = (
+    """\
 # A case for ambjax: a flexible rotor on two radial magnetic bearings, from its geometry, on a 20 kHz processor.
 # Units are SI unless a comment says otherwise. Run it with 'ambjax simulate', analyse it with 'ambjax sensitivity'.
 # Source: AMrotor, Technical University of Munich, the magnetic-bearing test rig: shaft, discs, magnets with
@@ -140,26 +166,7 @@ kind = "kalman"
 [controller.position]
 kind = "sliding-mode"
 
-[processor]
-delay = 1.0                   # samples
-
-[sensor]
-velocity = false
-std = 2e-7                    # m; assumed
-
-[actuator]
-u_max = 48.0                  # V; assumed
-
-[initial]
-q = [1e-5, 0.0, 0.0, 0.0, 0.0]  # x, y, z (m) of the centre of mass, beta_x, beta_y (rad); at rest
-
-[clock]
-duration = 0.4                # s
-sample_period = 5e-5          # s
-
-[run]
-settle = 0.2                  # s
-
-[sensitivity]
-speeds = [0.0, 3000.0, 6000.0]  # rpm
 """
+    + FLEXIBLE_END
+    + "speeds = [0.0, 3000.0, 6000.0]  # rpm\n"
+)

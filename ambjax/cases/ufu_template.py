@@ -1,6 +1,9 @@
 """Annotated case file of a whole machine: a flexible rotor whose magnets are at 45 degrees."""
 
-UFU = """\
+from ambjax.cases.machine_templates import FLEXIBLE_END
+
+UFU = (
+    """\
 # A case for ambjax: a flexible rotor on two radial magnetic bearings at 45 degrees, from its geometry, on a 20 kHz
 # processor. Units are SI unless a comment says otherwise. Run it with 'ambjax simulate', analyse it with
 # 'ambjax sensitivity'. Source: amb_models.py of ROSS (Apache-2.0), the test rig of the Federal University of Uberlandia
@@ -83,26 +86,7 @@ k_int = 4e5                   # 1/s^3
 k_d = 300.0                   # 1/s
 w_f = 1.5e4                   # 1/s
 
-[processor]
-delay = 1.0                   # samples
-
-[sensor]
-velocity = false
-std = 2e-7                    # m; assumed
-
-[actuator]
-u_max = 48.0                  # V; assumed
-
-[initial]
-q = [1e-5, 0.0, 0.0, 0.0, 0.0]  # x, y, z (m) of the centre of mass, beta_x, beta_y (rad); at rest
-
-[clock]
-duration = 0.4                # s
-sample_period = 5e-5          # s
-
-[run]
-settle = 0.2                  # s
-
-[sensitivity]
-speeds = [0.0, 3000.0, 6000.0, 10000.0]  # rpm
 """
+    + FLEXIBLE_END
+    + "speeds = [0.0, 3000.0, 6000.0, 10000.0]  # rpm\n"
+)

@@ -160,11 +160,11 @@ def _stability(case: Case) -> Findings:
     return stability_of(case.cascade, as_member(case.scenario), case.clock).findings()
 
 
-def _delays_differ(case: Case, results: OnProcessor, loop: Summary) -> str:
+def _delays_differ(case: Case, results: OnProcessor, loop: Mapping[str, Any]) -> str:
     """Return why the simulated loop is stable beyond the delay margin of the linearised `loop`; '' if it is not."""
     from ambjax.theorem import advice
 
-    places: Any = loop.get("margins") or {}
+    places = loop.get("margins") or {}
     linear = places.get("command", {}).get("delay_margin_s")
     sizes = float(case.cascade.timing.delay), float(case.clock.sample_period)
     return advice.delay_difference(linear, results.unknown or results.margin, *sizes)

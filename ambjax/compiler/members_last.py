@@ -14,6 +14,8 @@ import numpy as np
 from jax import Array, lax
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
 
+from ambjax.compiler.member_flags import CALLS, called, carried_flags, moved, while_parts
+
 # Primitives whose operands have one shape, or no axes.
 NAMES = (
     "abs acos add add_any and asin atan atan2 bitcast_convert_type cbrt ceil clamp complex convert_element_type copy "
@@ -35,8 +37,6 @@ REDUCTIONS = {
 }
 # Largest number of terms that are combined one by one.
 SHORT = 32
-# Primitives that call a jaxpr, by the name of its parameter.
-CALLS = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat2": "jaxpr", "checkpoint": "jaxpr"}
 
 
 def members_last(function: Callable[..., Any], axes: object) -> Callable[..., Any]:
@@ -87,9 +87,8 @@ class _Members:
     def one(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged:
         """Return the results of one equation."""
         name, params = eqn.primitive.name, eqn.params
-        if name in CALLS:
-            inner = params[CALLS[name]]
-            return self.evaluated(inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ()), values, moves)
+        if name in CALLS and name not in RULES:
+            return self.evaluated(called(eqn), values, moves)
         if not any(moves):
             return _flagged(eqn, eqn.primitive.bind(*values, **params), False)
         if name in ELEMENTWISE:
@@ -113,15 +112,12 @@ class _Members:
         return [self.wide(x, m, shape) for x, m in zip(values, moves, strict=True)]
 
     def jit(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged:
-        flags: list[bool] = []
-
         def inner(*values: Any) -> list:
-            found = self.evaluated(eqn.params["jaxpr"], values, moves)
-            flags[:] = [m for _, m in found]
-            return [x for x, _ in found]
+            return [x for x, _ in self.evaluated(called(eqn), values, moves)]
 
         inner.__name__ = eqn.params["name"]
-        return list(zip((inner if eqn.params["inline"] else jax.jit(inner))(*values), flags, strict=True))
+        found = (inner if eqn.params["inline"] else jax.jit(inner))(*values)
+        return list(zip(found, moved(called(eqn), moves), strict=True))
 
     def broadcast_in_dim(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         shape, dims = eqn.params["shape"], eqn.params["broadcast_dimensions"]
@@ -164,65 +160,44 @@ class _Members:
         return [(functools.reduce(REDUCTIONS[eqn.primitive.name], parts), True)]
 
     def while_loop(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
-        goes, body, first = eqn.params["cond_jaxpr"], eqn.params["body_jaxpr"], eqn.params["cond_nconsts"]
-        start = first + eqn.params["body_nconsts"]
-        begin, turn, carried = self.carry(body, list(zip(values, moves, strict=True))[first:], start - first, ())
-
-        def going(x: list) -> tuple[Any, bool]:
-            return self.evaluated(goes, [*values[:first], *x], [*moves[:first], *carried])[0]
-
-        flags: list[bool] = []
-        jax.eval_shape(lambda x: flags.append((found := going(x))[1]) or found[0], begin)
-        if flags[0]:  # members that end at different turns
+        goes, body, consts, fixed = while_parts(eqn)
+        carried = carried_flags(body, moves[consts:], fixed, ())
+        if moved(goes, [*moves[:consts], *carried])[0]:  # members that end at different turns
             return None
-        end = lax.while_loop(lambda x: going(x)[0], lambda x: turn(x, ())[0], begin)
-        return list(zip(end, carried, strict=True))
+        begin, turn = self.loop(body, values[consts:], moves[consts:], carried)
+
+        def going(x: list) -> Any:
+            return self.evaluated(goes, [*values[:consts], *x], [*moves[:consts], *carried])[0][0]
+
+        return list(zip(lax.while_loop(going, lambda x: turn(x)[0], begin), carried, strict=True))
 
     def scan(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         p = eqn.params
-        consts, both = p["num_consts"], p["num_consts"] + p["num_carry"]
-        pairs, each = list(zip(values[:both], moves, strict=False)), values[both:]
-        begin, turn, carried = self.carry(
-            p["jaxpr"], pairs, consts, [(x[0], m) for x, m in zip(each, moves[both:], strict=True)]
-        )
-        flags: list[bool] = []
+        fixed, both = p["num_consts"], p["num_consts"] + p["num_carry"]
+        carried = carried_flags(p["jaxpr"], moves[:both], fixed, moves[both:])
+        begin, turn = self.loop(p["jaxpr"], values[:both], moves[:both], carried, moves[both:])
+        end, stacked = lax.scan(turn, begin, values[both:], p["length"], p["reverse"], p["unroll"])
+        flags = moved(p["jaxpr"], [*moves[:fixed], *carried, *moves[both:]])
+        return list(zip([*end, *stacked], flags, strict=True))
 
-        def body(x: list, own: list) -> tuple[list, list]:
-            head, rest = turn(x, own)
-            flags[:] = [m for _, m in rest]
-            return head, [y for y, _ in rest]
+    def loop(
+        self, body: ClosedJaxpr, values: list, moves: list[bool], carried: list[bool], each: Sequence[bool] = ()
+    ) -> tuple[list, Callable[..., tuple[list, list]]]:
+        """Return the initial values of a loop, and one turn of it: turn(carried values, own inputs) -> both results.
 
-        end, stacked = lax.scan(body, begin, each, p["length"], p["reverse"], p["unroll"])
-        return list(zip([*end, *stacked], [*carried, *flags], strict=True))
-
-    def carry(
-        self, body: ClosedJaxpr, values: Flagged, consts: int, each: Sequence[tuple[Any, bool]]
-    ) -> tuple[list, Callable[[Sequence, Sequence], tuple[list, Flagged]], list[bool]]:
-        """Return the initial values of a loop, one turn of it, and the flags of the values that it carries.
-
-        A carried value has the last axis if it has it after any turn. `values`: the constants, of which there are
-        `consts`, and the initial values. `each`: inputs of the first turn. A turn returns the values, and its outputs.
+        `values`: the constants of the loop and the initial values. `each`: flags of the own inputs of a turn.
         """
-        fixed, initial = values[:consts], values[consts:]
-        shapes = [x.aval.shape for x in body.jaxpr.invars[consts : len(values)]]
-        carried = [m for _, m in initial]
+        fixed = len(values) - len(carried)
+        shapes = [x.aval.shape for x in body.jaxpr.invars[fixed : len(values)]]
 
-        def turn(x: Sequence, own: Sequence, result: list | None = None) -> tuple[list, Flagged]:
-            flags = [*(m for _, m in fixed), *carried, *(m for _, m in each)]
-            found = self.evaluated(body, [*(y for y, _ in fixed), *x, *own], flags)
-            after = [m for _, m in found[: len(carried)]]
-            if result is not None:
-                result[:] = after
-            wide = zip(found, shapes, carried, strict=False)
-            return [self.wide(*y, shape) if c else y[0] for y, shape, c in wide], found[len(carried) :]
+        def widened(found: Flagged) -> list:
+            return [self.wide(*x, shape) if c else x[0] for x, shape, c in zip(found, shapes, carried, strict=True)]
 
-        while True:
-            begin = [self.wide(*y, s) if c else y[0] for y, s, c in zip(initial, shapes, carried, strict=True)]
-            after: list[bool] = []
-            jax.eval_shape(lambda x, own, after=after: turn(x, own, after)[0], begin, [y for y, _ in each])
-            if all(c or not a for a, c in zip(after, carried, strict=True)):
-                return begin, turn, carried
-            carried[:] = [a or c for a, c in zip(after, carried, strict=True)]
+        def turn(x: list, own: Sequence = ()) -> tuple[list, list]:
+            found = self.evaluated(body, [*values[:fixed], *x, *own], [*moves[:fixed], *carried, *each])
+            return widened(found[: len(carried)]), [y for y, _ in found[len(carried) :]]
+
+        return widened(list(zip(values, moves, strict=True))[fixed:]), turn
 
 
 def _first(eqn: JaxprEqn) -> Array:

@@ -154,7 +154,7 @@ class Cascade:
     @property
     def timing(self) -> Processor:
         """The field `processor`; in continuous time, a processor without delay, prediction and guard."""
-        return _CONTINUOUS if self.processor is None else self.processor
+        return self.processor or _CONTINUOUS
 
     def with_processor(self, **fields: object) -> "Cascade":
         """Return the cascade with other fields of its processor. In continuous time, it does not change."""

@@ -95,7 +95,6 @@ def map_members(
     call: int | None = None,
     block: int | None = None,
     plain: bool = False,
-    quick: bool = True,
     vectorised: bool = False,
 ) -> Mapped:
     """Return function(member) for every member of an ensemble.
@@ -115,8 +114,6 @@ def map_members(
     - `block`: members that run together in vector instructions (None: as many as fit the first-level cache,
       fewer in a small ensemble).
     - `plain`: compile without the fast path, which does not support the functions of LAPACK, such as eigenvalues.
-    - `quick`: whether a plain program is compiled with `short_compilation.QUICK`, which the large program of a machine
-      must not be: that takes many minutes.
     - `vectorised`: whether the function is vectorised already. It then receives the tree of a block of members, and the
       tree `in_axes` of `jax.vmap` (0 or None for each leaf). Each leaf of its result has a leading axis of the block.
 
@@ -124,7 +121,7 @@ def map_members(
 
     Raises ValueError if the lengths of two leaves differ, or if no leaf is an array.
     """
-    compiled = one_kernel if not plain else compiled_quickly if quick else jax.jit
+    compiled = compiled_quickly if plain else one_kernel
     for name, value in (("threads", threads), ("call", call), ("block", block)):
         require_number(name, value, 1, whole=True, optional=True)
     return _Engine(function, tree, threads, call, block, compiled, vectorised).results()

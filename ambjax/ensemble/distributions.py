@@ -92,12 +92,18 @@ class Percent:
 
 
 @record
-class Uniform:
-    """Uniform distribution from low to high. It does not depend on the nominal value."""
-
+class _Range:
     low: float = part(doc="smallest value")
     high: float = part(doc="largest value")
     relative = False
+
+    def support(self, nominal: float) -> tuple[float, float]:
+        return self.low, self.high
+
+
+@record
+class Uniform(_Range):
+    """Uniform distribution from low to high. It does not depend on the nominal value."""
 
     def __str__(self) -> str:
         return f"{{ uniform = [{self.low:g}, {self.high:g}] }}"
@@ -105,29 +111,19 @@ class Uniform:
     def fault(self) -> str | None:
         return None if -math.inf < self.low < self.high < math.inf else "uniform must be [low, high] with low < high"
 
-    def support(self, nominal: float) -> tuple[float, float]:
-        return self.low, self.high
-
     def quantile(self, u: np.ndarray, nominal: float) -> np.ndarray:
         return self.low + (self.high - self.low) * np.asarray(u)
 
 
 @record
-class LogUniform:
+class LogUniform(_Range):
     """Log-uniform distribution: the logarithm of the number is uniform from log(low) to log(high)."""
-
-    low: float = part(doc="smallest value")
-    high: float = part(doc="largest value")
-    relative = False
 
     def __str__(self) -> str:
         return f"{{ log-uniform = [{self.low:g}, {self.high:g}] }}"
 
     def fault(self) -> str | None:
         return None if 0 < self.low < self.high < math.inf else "log-uniform must be [low, high] with 0 < low < high"
-
-    def support(self, nominal: float) -> tuple[float, float]:
-        return self.low, self.high
 
     def quantile(self, u: np.ndarray, nominal: float) -> np.ndarray:
         low, high = math.log(self.low), math.log(self.high)  # logarithms, because high/low may overflow

@@ -156,7 +156,7 @@ class _Linear:
         `control`: states of the laws of the groups. `law`: state of the law of the machine.
         """
         reference, unlimited, count = at_rest(0.0), jnp.asarray(jnp.inf), len(self.cascade)
-        demands: Groups = (None,) * count
+        demands: Groups = ((None, None),) * count
         notched: Groups = (None,) * count
 
         def sample(past: tuple) -> Sample:
@@ -173,19 +173,14 @@ class _Linear:
             demands, notched = forces(self.machine, demanded), tuple(after for _, after in parts)
 
         def one(
-            cascade: Cascade,
-            _: object,
-            measured: Measurement,
-            control: CascadeState,
-            past: tuple,
-            demand: Any,
-            own: Any,
+            cascade: Cascade, _: object, measured: Measurement, control: CascadeState, past: tuple, *demand: Any
         ) -> tuple[Array, CascadeState]:
-            if demand is not None:
+            (force, estimate), own = demand
+            if force is not None:
                 if self.sampled:
-                    command, after = cascade.commanded(*demand, control, sample(past))
+                    command, after = cascade.commanded(force, estimate, control, sample(past))
                 else:
-                    command, after = cascade.command_rates(*demand, control, reference, unlimited)
+                    command, after = cascade.command_rates(force, estimate, control, reference, unlimited)
                 after = after._replace(observer=own)
             elif self.sampled:
                 command, after, _ = cascade.step(measured, control, sample(past))

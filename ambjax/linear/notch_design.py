@@ -75,6 +75,7 @@ def with_machine_gains(
         for speed in (x for x in speeds if x not in responses):
             system = linearise_machine(machine, clock.sample_period, speed)
             responses[speed] = np.asarray(system.response(np.array([PER_MINUTE * speed])))[0]
-        nulled = [H[2 * c + k, k] if NULLED[notch.removes] == "i" else H[k, k] - 1 for H in map(responses.get, speeds)]
-        found.append(dataclasses.replace(notch, gains=notch_gains(speeds, np.array(nulled), phase)))
+        own = np.array([responses[speed] for speed in speeds])
+        nulled = own[:, 2 * c + k, k] if NULLED[notch.removes] == "i" else own[:, k, k] - 1
+        found.append(dataclasses.replace(notch, gains=notch_gains(speeds, nulled, phase)))
     return found

@@ -23,14 +23,18 @@ LIGHT = 0.3
 def machine_figure(case: Any, signals: dict[str, np.ndarray], title: str) -> Figure:
     """Return one page: displacement, current and voltage of every axis over time, and the orbit of each radial bearing.
 
-    `signals`: those of a `MachineRun`. The orbits show the time from run.settle on, at the magnets.
+    `signals`: those of a `MachineRun`. The orbits show the time from run.settle on, at the magnets, or the whole
+    run of a rotor that is lost before. What follows the loss is drawn in the first column alone.
     """
     axes, t = [str(name) for name in signals["axes"]], signals["t"]
     step = max(len(t) // MOST_POINTS, 1)
     pairs = orbits_of(axes)
     figure = Figure(figsize=(13.0, 8.2), layout="constrained")
     grid = figure.add_gridspec(3, 2 + bool(pairs), width_ratios=[2, 2, 1.3][: 2 + bool(pairs)])
-    early = t <= min(t[-1], max(0.02, 0.1 * t[-1]))
+    end = min(t[-1], float(signals["lost_at"]))
+    early = t <= min(end, max(0.02, 0.1 * t[-1]))
+    begin = case.settle if case.settle < end else 0.0
+    settled = (t >= begin) & (t <= end)
     rows = (("z", 1e6, "displacement at the magnet, µm"), ("i", 1.0, "current, A"), ("u", 1.0, "voltage, V"))
     for row, (name, scale, words) in enumerate(rows):
         for column, shown in enumerate((slice(None, None, step), early)):
@@ -45,12 +49,11 @@ def machine_figure(case: Any, signals: dict[str, np.ndarray], title: str) -> Fig
             ax.grid(True, alpha=0.3)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, ncols=len(axes), fontsize="small", loc="outside lower center")
-    settled = t >= case.settle
     for row, (name, x, y) in enumerate(pairs[:3]):
         ax = figure.add_subplot(grid[row, 2])
         ax.plot(1e6 * signals["z"][settled, x], 1e6 * signals["z"][settled, y], linewidth=0.7)
         ax.set_aspect("equal", adjustable="datalim")
-        ax.set_title(f"orbit of {name}, from {case.settle:g} s on")
+        ax.set_title(f"orbit of {name}, from {begin:g} s on")
         ax.set_xlabel("x axis, µm")
         ax.set_ylabel("y axis, µm")
         ax.grid(True, alpha=0.3)
@@ -119,9 +122,11 @@ def machine_sensitivity_picture(
         )
         top = max(2 * limits[-1], 1.3 * point.sigma.height)
         bounds = [1e-2, *limits, top]
-        for low, high, colour, name in zip(bounds[:-1], bounds[1:], ("g", "y", "orange", "r"), "ABCD", strict=True):
+        zones = zip(bounds[:-1], bounds[1:], ("g", "y", "orange", "r"), "ABCD", (0.96, 0.985) * 2, strict=True)
+        for low, high, colour, name, x in zones:  # thin zones are neighbours, with names side by side
             ax.axhspan(low, high, color=colour, alpha=0.08)
-            ax.text(f[-1], np.sqrt(max(low, 0.5) * high), f" {name}", va="center", fontsize="small")
+            at = x, np.sqrt(max(low, 0.5) * high)
+            ax.text(*at, name, transform=ax.get_yaxis_transform(), ha="center", va="center", fontsize="small")
         ax.set_ylim(1e-2, top)
         ax.set_xlabel("frequency, Hz")
         ax.set_ylabel("|S|")

@@ -213,7 +213,7 @@ def run_machines(
 
 
 def _simulated(tree: tuple[Machine, Clock, Fold], axes: object) -> Result:
-    return members_last(lambda one: run(*one, 0), axes)(tree)
+    return members_last(lambda one: run(one[0], one[1], one[2], 0), axes)(tree)
 
 
 def _reread(case: MachineCase, changes: Mapping[str, object]) -> MachineCase:

@@ -13,7 +13,7 @@ order there.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -204,7 +204,7 @@ class FixedSteps:
     """Equal substeps, divided at edges. The loop has a fixed length, so JAX can differentiate it in both modes."""
 
     substeps: int = static(default=1, doc="steps per sample period")
-    limit: ClassVar[float | None] = None
+    limit = None
 
     @property
     def steps(self) -> str:

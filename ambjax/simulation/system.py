@@ -26,7 +26,6 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
     for name, value, kind in (("cascade", cascade, Cascade), ("scenario", scenario, Scenario), ("clock", clock, Clock)):
         if not isinstance(value, kind):
             raise ValueError(f"{name} = {type(value).__name__}: it must be a {kind.__name__}.")
-        require_records(name, value)
     for stage, base in STAGES.items():
         law = getattr(cascade, stage)
         if not isinstance(law, base):
@@ -34,6 +33,8 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
                 f"controller.{stage} = {type(law).__name__}: it is not a law of this stage. Derive the class from "
                 f"ambjax.extend.{base.__name__}."
             )
+    for name, value in (("cascade", cascade), ("scenario", scenario), ("clock", clock)):
+        require_records(name, value)
     validate(dataclasses.replace(cascade, processor=None), "controller")
     validate(cascade.processor, "processor")
     check_parts(cascade, scenario, clock.sample_period)

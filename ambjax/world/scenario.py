@@ -102,12 +102,12 @@ class Scenario:
     @property
     def sensors(self) -> Sensor:
         """The field `sensor`, or ideal sensors."""
-        return _IDEAL_SENSOR if self.sensor is None else self.sensor
+        return self.sensor or _IDEAL_SENSOR
 
     @property
     def actuator(self) -> Amplifier | CurrentAmplifier:
         """The field `amplifier`, or an ideal amplifier."""
-        return _IDEAL_AMPLIFIER if self.amplifier is None else self.amplifier
+        return self.amplifier or _IDEAL_AMPLIFIER
 
     @property
     def drive(self) -> str:

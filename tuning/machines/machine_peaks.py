@@ -55,16 +55,17 @@ class Peaks:
 
             return jax.lax.map(one, speeds)
 
-        def at(x: Array, machine: Machine) -> tuple[StateSpace, StateSpace]:
-            own = space.decode(x, machine)
-            found = systems(own, machine_rest(own, self.period))
-            return found, found
-
         self._both: Callable[[np.ndarray], tuple[StateSpace, StateSpace]]
         if isinstance(space, LqgSpace):  # the weights do not move the rotor
             rest, compiled = machine_rest(machine, self.period), jax.jit(systems)
             self._both = lambda x: _differences(lambda x: compiled(space.decode(x, machine), rest), x)
         else:  # the machine is an argument, because constants are not arrays of JAX
+
+            def at(x: Array, machine: Machine) -> tuple[StateSpace, StateSpace]:
+                own = space.decode(x, machine)
+                found = systems(own, machine_rest(own, self.period))
+                return found, found
+
             both = jax.jit(jax.jacfwd(at, has_aux=True))
             self._both = lambda x: both(jnp.asarray(x), machine)[::-1]
         self._last: tuple[np.ndarray, list[Loop]] | None = None

@@ -26,7 +26,8 @@ LIMITS = {
 
 def judged(case: MachineCase, found: MachineCase, limits: dict[str, float], seed: int, members: int) -> dict[str, Any]:
     """Return the content of report.json but the gains. `case`, `found`: before and after; `members`: to simulate."""
-    before, after = (sensitivity_summary(analysed(one), {}) for one in (case, found))
+    each: list[dict[str, Any]] = [sensitivity_summary(analysed(one), {}) for one in (case, found)]
+    before, after = each
     held, simulated = simulate(found, seed, members)
     values: dict[str, Any] = {name: _worst(x, held) for name, x in simulated.items()}
     turning = [fact["S"] for at in after["speeds"] for axis in at["axes"] for fact in axis["running_speed"]]

@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -155,7 +154,7 @@ class Compiled:
         self.state = np.zeros((), self.memory)
         self.inputs, self.outputs = np.zeros(len(trace.inputs), real), np.zeros(len(trace.outputs), real)
         self._at = [x.ctypes.data_as(ctypes.c_void_p) for x in (self.parameters, self.state, self.inputs, self.outputs)]
-        self._library: Any = loaded
+        self._library = loaded
 
     def step(self) -> int:
         """Compute one sample from `inputs`, update `state` and `outputs`, and return the status bits."""

@@ -155,13 +155,7 @@ static int differs({p}_real is, {p}_real should)
 }}
 """
 
-FAULT_TEST = """/* return whether a step treats a NaN in one input wrongly: a NaN in a reading must be {effect};
- * with a NaN in the reference, the step must be invalid and hold u */
-static int refused({p}_state *state, int which)
-{{
-    {p}_input input;
-    {p}_output output;
-    const {p}_real u = state->last.u;
+STEP_WITH_NAN = """\
 {zeros}
     switch (which) {{
 {fields}
@@ -169,13 +163,26 @@ static int refused({p}_state *state, int which)
         break;
     }}
     const uint32_t status = {p}_step(&{p}_default, state, &input, &output);
-    if (which < {readings}) {{
+"""
+
+FAULT_TEST = (
+    """/* return whether a step treats a NaN in one input wrongly: a NaN in a reading must be {effect};
+ * with a NaN in the reference, the step must be invalid and hold u */
+static int refused({p}_state *state, int which)
+{{
+    {p}_input input;
+    {p}_output output;
+    const {p}_real u = state->last.u;
+"""
+    + STEP_WITH_NAN
+    + """    if (which < {readings}) {{
         return {unseen};
     }}
     return (status & {p}_INVALID) == 0u || differs(output.u, u) || differs(state->last.u, u);
 }}
 
 """
+)
 
 START_TEST = """    {p}_init(&state);
     faults += state.started != 0u || differs(state.last.u, 0);
@@ -188,23 +195,20 @@ START_TEST = """    {p}_init(&state);
 """
 
 # For the plant and the loop.
-BLOCK_FAULT_TEST = """\
+BLOCK_FAULT_TEST = (
+    """\
 /* return whether a step treats a NaN in one input wrongly: it must be invalid and its outputs finite */
 static int refused({p}_state *state, int which)
 {{
     {p}_input input;
     {p}_output output;
-{zeros}
-    switch (which) {{
-{fields}
-    default:
-        break;
-    }}
-    const uint32_t status = {p}_step(&{p}_default, state, &input, &output);
-    return (status & {p}_INVALID) == 0u{finite};
+"""
+    + STEP_WITH_NAN
+    + """    return (status & {p}_INVALID) == 0u{finite};
 }}
 
 """
+)
 
 BLOCK_START_TEST = """    {p}_init(&state);
     faults += state.started != 0u;

@@ -1,0 +1,65 @@
+"""Flags of the values of a jaxpr: whether a value differs between members, so that it has an axis of members."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
+
+# Primitives that call a jaxpr, by the name of its parameter.
+CALLS = {
+    "checkpoint": "jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+    "remat2": "jaxpr",
+}
+
+
+def moved(closed: ClosedJaxpr, moves: Sequence[bool]) -> list[bool]:
+    """Return the flags of the results of a jaxpr."""
+    jaxpr = closed.jaxpr
+    known: dict[Any, bool] = dict(zip(jaxpr.invars, moves, strict=True))
+    read = lambda x: not isinstance(x, Literal) and known.get(x, False)  # noqa: E731
+    for eqn in jaxpr.eqns:
+        own, name = [read(x) for x in eqn.invars], eqn.primitive.name
+        flags = [any(own)] * len(eqn.outvars)
+        if any(own) and name in CALLS:
+            flags = moved(called(eqn), own)
+        elif any(own) and name == "scan":
+            fixed, both = eqn.params["num_consts"], eqn.params["num_consts"] + eqn.params["num_carry"]
+            body = eqn.params["jaxpr"]
+            flags = moved(body, [*own[:fixed], *carried_flags(body, own[:both], fixed, own[both:]), *own[both:]])
+        elif any(own) and name == "while":
+            goes, body, consts, fixed = while_parts(eqn)
+            carried = carried_flags(body, own[consts:], fixed, ())
+            flags = [True] * len(carried) if moved(goes, [*own[:consts], *carried])[0] else carried
+        known |= dict(zip(eqn.outvars, flags, strict=True))
+    return [read(x) for x in jaxpr.outvars]
+
+
+def carried_flags(body: ClosedJaxpr, moves: Sequence[bool], fixed: int, each: Sequence[bool]) -> list[bool]:
+    """Return which values that a loop carries differ between members after any turn.
+
+    `moves`: flags of the constants, of which there are `fixed`, and of the initial values. `each`: flags of the own
+    inputs of a turn.
+    """
+    carried = list(moves[fixed:])
+    while True:
+        after = moved(body, [*moves[:fixed], *carried, *each])
+        joined = [a or b for a, b in zip(carried, after, strict=False)]
+        if joined == carried:
+            return carried
+        carried = joined
+
+
+def while_parts(eqn: JaxprEqn) -> tuple[ClosedJaxpr, ClosedJaxpr, int, int]:
+    """Return condition and body of a loop, and the numbers of their constants."""
+    p = eqn.params
+    return p["cond_jaxpr"], p["body_jaxpr"], p["cond_nconsts"], p["body_nconsts"]
+
+
+def called(eqn: JaxprEqn) -> ClosedJaxpr:
+    """Return the jaxpr that an equation of CALLS calls."""
+    inner = eqn.params[CALLS[eqn.primitive.name]]
+    return inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
