@@ -8,6 +8,7 @@ such as `Peak` or `Rms` of a signal, or several `Named` folds.
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.control.base import Law, Requirement
 from ambjax.control.force import force_for, linear_mechanics, sliding_variable
+from ambjax.control.machine_law import Demanded, MachineInputs, MachineLaw, demand_of
 from ambjax.control.sampling import Relay
 from ambjax.control.search import Interval, SearchContext, manifold, rate
 from ambjax.control.stages import (
@@ -27,6 +28,7 @@ from ambjax.simulation.folds import Fold, Lowest, Named, Peak, Rms
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import Row, Trajectory
 from ambjax.world.bearing import Bearing, Signals
+from ambjax.world.rotor import Rotor
 from ambjax.world.waveforms import Reference, Signal, reference_at
 
 __all__ = [
@@ -36,12 +38,15 @@ __all__ = [
     "CurrentDemand",
     "CurrentInputs",
     "CurrentLaw",
+    "Demanded",
     "Fold",
     "ForceDemand",
     "Interval",
     "InversionLaw",
     "Law",
     "Lowest",
+    "MachineInputs",
+    "MachineLaw",
     "Named",
     "Observer",
     "Peak",
@@ -51,6 +56,7 @@ __all__ = [
     "Relay",
     "Requirement",
     "Rms",
+    "Rotor",
     "Row",
     "Scalar",
     "SearchContext",
@@ -59,6 +65,7 @@ __all__ = [
     "Span",
     "Trajectory",
     "canonical",
+    "demand_of",
     "force_for",
     "gain",
     "leaf",

@@ -1,6 +1,7 @@
 """Tuning of whole machines: derivatives, gains of one bearing, and the command."""
 
 import json
+import re
 import tomllib
 
 import jax.numpy as jnp
@@ -175,24 +176,29 @@ def test_refused_options(tmp_path, capsys, options):
 
 
 @pytest.mark.slow
-def test_command(tmp_path):
+def test_command(tmp_path, capsys):
     text = template("machine").replace("duration = 0.2", "duration = 2e-3").replace("settle = 0.05", "settle = 0.0")
-    text = text.replace('kind = "integral-sliding-mode"', 'kind = "pid"')
     parts = '[controller.inversion]\nkind = "linearised"\n[controller.current]\nkind = "pi"\n'
-    tune = f"[tune]\ngains = {json.dumps(GAINS)}\nstarts = 1\niterations = 1\nheld_out = 2\nlimits.sensitivity = 2.5\n"
+    tune = (
+        f"[tune]\ngains = {json.dumps(SLIDING)}\nstarts = 1\niterations = 1\nheld_out = 2\nlimits.sensitivity = 2.5\n"
+    )
     path = tmp_path / "m.toml"
     path.write_text(f"{text}\n{parts}\n{tune}")
     found = tuning.tune(path, tmp_path / "t")
     before, after = found.report["before"], found.report["sensitivity"]
     assert after["peak"] < before["peak"]
+    # although the default of a gain depends on whether k is given
+    said = float(re.findall(r"best peak ([\d.]+)", capsys.readouterr().err)[-1])
+    assert said == pytest.approx(after["peak"], rel=1e-3)
     # the file is the answer, with the gains of each bearing in its table
     again = read_machine(tmp_path / "t" / "tuned.toml")
     assert max(point.worst.S.height for point in analysed(again)) == pytest.approx(after["peak"], rel=1e-6)
     raw = tomllib.loads((tmp_path / "t" / "tuned.toml").read_text())
-    assert raw["bearing"][0]["controller"]["position"]["k_p"] == pytest.approx(found.report["gains"][1]["after"])
+    assert raw["bearing"][0]["controller"]["position"]["k"] == pytest.approx(found.report["gains"][1]["after"])
     assert found.good == (after["peak"] <= 2.5)
-    # beyond the stop all members are lost, so that no limit of theirs is met
-    far = machine_from(raw | {"initial": {"q": [5e-4, 0.0, 0.0, 0.0, 0.0]}})
-    facts = judged(far, far, {"max_u_V": 1e6}, 0, 2)
+    # 5 kN: all members are lost, so that no limit of theirs is met
+    load = raw["load"][0] | {"amplitude": 5e3, "start": 0.0}
+    pushed = machine_from(raw | {"load": [load]})
+    facts = judged(pushed, pushed, {"max_u_V": 1e6}, 0, 2)
     assert (facts["outcome"]["held"], facts["limits"][0]["holds"]) == (0, False)
     assert "all limits met" not in facts["verdict"]

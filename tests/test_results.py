@@ -186,6 +186,20 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
         ambjax.rollout(ambjax.with_gains(case, {"controller.position.c": two}))
     with pytest.raises(ValueError, match=r"scenario.reference = 0.0: it must be a record, such as Constant\(\)"):
         ambjax.rollout(case.cascade, plain, case.clock)
+    whole: tuple[Any, ...] = (
+        ambjax.simulate,
+        ambjax.sensitivity,
+        ambjax.check,
+        lambda given: ambjax.compare([given, case]),
+        lambda given: ambjax.simulate_members(given, 2),
+        ambjax.linear.linearise,
+        ambjax.theorem.check,
+    )
+    for function in whole:
+        with pytest.raises(ValueError, match=r"a number is traced, .* Use ambjax\.rollout"):
+            jax.grad(lambda c, f=function: f(ambjax.with_gains(case, {"controller.position.c": c})))(17.0)
+    with pytest.raises(ValueError, match=r"clock\.method\.substeps = 0: it must be a whole number of at least 1"):
+        ambjax.rollout(case.cascade, case.scenario, case.clock.with_method(ambjax.solvers.RK4(0)))
     for named, said in (({"fold": ambjax.Metrics}, "fold = .* a fold"), ({"record_every": -1}, "record_every = -1")):
         with pytest.raises(ValueError, match=said):
             ambjax.rollout(case, **named)

@@ -10,9 +10,10 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.cases.machine_controller import axis_controller, inner, law_from, merged
+from ambjax.cases.machine_controller import axis_controller, inner, kind_of, law_from, merged
 from ambjax.cases.machine_spread import axis_table, fastest_rotor, machine_spread, refuse_unused
 from ambjax.cases.notch_table import notch_from
+from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
 from ambjax.cases.rotor_tables import (
     COORDINATES,
@@ -27,6 +28,7 @@ from ambjax.cases.rotor_tables import (
 )
 from ambjax.cases.speed_table import SPEED
 from ambjax.cases.table import Table, load, show
+from ambjax.cases.trial import try_machine
 from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.synchronous_notch import SynchronousNotch
@@ -61,7 +63,7 @@ class MachineCase:
     rotor's coordinates. `cases`: the case of each axis, with the mass and the weight that it carries. `settle`: time
     from which "settled" metrics count, s. `zones`, `speeds`: range, limits and speeds (rpm) of the sensitivity.
     `spread`: the numbers that vary between the members of an ensemble. `text`: the file as read.
-    `folder`: that of the file.
+    `folder`: that of the file. `own_laws`: the custom laws of the file.
     """
 
     name: str
@@ -76,6 +78,7 @@ class MachineCase:
     spread: Spread = Spread()
     text: str = ""
     folder: pathlib.Path = pathlib.Path()
+    own_laws: tuple[OwnLaw, ...] = ()
 
 
 AnyCase: TypeAlias = Case | MachineCase
@@ -140,7 +143,8 @@ def machine_from(
         case = read(own, f"axis {axis.name}")
         _check_force(case, axis, force)
         cases.append(case)
-    law, parts = law_from(top, rotor, bearings, cases, read, folder)
+    own_law = own_machine_law(kind, folder) if is_own(kind := kind_of(raw)) else None
+    law, parts = law_from(top, rotor, bearings, cases, read, folder, own_law)
     spread = machine_spread(top, rotor, q, axes, names, cases)
     if law is not None:
         refuse_unused(spread, law.output)
@@ -153,9 +157,13 @@ def machine_from(
         laws = [dataclasses.replace(case.cascade, notch=notch) for case, notch in zip(cases, found, strict=True)]
         cases = [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
     coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
+    found_laws = [(own_law,) if own_law else (), *(one.own_laws for one in cases)]
+    machine = machine_of_axes(rotor, parts_of(cases), clock, q, law)
+    if own_law is not None:
+        tried(own_law, lambda: try_machine(machine))
     return MachineCase(
         name=safe_name(name),
-        machine=machine_of_axes(rotor, parts_of(cases), clock, q, law),
+        machine=machine,
         clock=clock,
         axes=tuple(axis.name for axis in axes),
         coordinates=coordinates,
@@ -166,6 +174,7 @@ def machine_from(
         spread=spread,
         text=text,
         folder=folder,
+        own_laws=tuple(dict.fromkeys(law for laws in found_laws for law in laws)),
     )
 
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.machine_linear import linear, lqg
+from ambjax.cases.own_laws import FORM, OwnLaw, is_own, tried
 from ambjax.cases.reader import Case
 from ambjax.cases.rotor_tables import COORDINATES, RIGID
 from ambjax.cases.table import Table
@@ -28,6 +29,7 @@ from ambjax.world.rotor import Rotor
 # Keys of [controller] for a machine. The tables replace keys of the common ones for the tilts and for the axial motion.
 TABLES = {"tilt": ("beta_x", "beta_y"), "axial": ("z",)}
 KEYS = ("kind", "coordinates", "compensate_gyroscopics", *TABLES, "file", "output", "lqg")
+INNER = ("model", "inversion", "current")  # tables beside a custom law
 WAYS, LAWS = ["axes", "rigid-body"], ["cascade", "linear", "lqg"]
 
 
@@ -51,7 +53,9 @@ def merged(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 
 def kind_of(raw: dict[str, Any]) -> str:
     """Return controller.kind of a machine."""
-    return Table(raw).table("controller").choice("kind", LAWS, LAWS[0])
+    table = Table(raw).table("controller")
+    kind = table.raw.get("kind")
+    return str(kind) if is_own(kind) else table.choice("kind", LAWS, LAWS[0], FORM)
 
 
 def axis_controller(raw: dict[str, Any]) -> None:
@@ -69,7 +73,10 @@ def axis_controller(raw: dict[str, Any]) -> None:
     inner = {"inversion": {"kind": "linearised"}}
     if "current" not in controller and raw.get("actuator", {}).get("mode", "voltage") == "voltage":
         inner["current"] = {"kind": "pi"}
-    raw["controller"] = controller | outer | inner
+    if is_own(kind):
+        raw["controller"] = inner | {key: controller[key] for key in INNER if key in controller} | outer
+    else:
+        raw["controller"] = controller | outer | inner
     if isinstance(raw.get("processor"), dict):
         raw["processor"]["predict"] = False
 
@@ -81,12 +88,18 @@ def law_from(
     cases: list[Case],
     read: Callable[[dict, str], Case],
     folder: pathlib.Path,
+    own_law: OwnLaw | None,
 ) -> tuple[MachineLaw | None, list[Case]]:
     """Return the law of all axes, None if each axis has its own, and the cases of its parts.
 
-    `cases`: of the axes. `read`: reads a raw case with a name.
+    `cases`: of the axes. `read`: reads a raw case with a name. `own_law`: the custom law of the machine, if it has one.
     """
     table = top.table("controller")
+    if own_law is not None:
+        for bearing in bearings:
+            bearing.table("controller").only([*INNER, "notch"])
+        given = table.record(own_law.law, extra=("kind", *INNER, "notch"))
+        return tried(own_law, lambda: given.designed(rotor)), []
     if (kind := kind_of(top.raw)) != LAWS[0]:
         for bearing in bearings:
             bearing.table("controller").only(["model", "notch", *(["current"] if kind == "linear" else [])])

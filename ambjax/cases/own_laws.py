@@ -6,17 +6,19 @@ import os
 import pathlib
 import types
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 
 from ambjax.cases.table import quoted, show
 from ambjax.cases.trial import try_law
 from ambjax.control.base import Law
+from ambjax.control.machine_law import MachineLaw
 from ambjax.control.stages import STAGES
 from ambjax.host.imports import digest_of, line_of, module_of_file, module_of_name, pickle_with_source
 from ambjax.world.plant import Plant
 
+T = TypeVar("T")
 FORM = '"FILE.py:CLASS" or "MODULE:CLASS", a custom law'
 
 # Function that returns the error of a law for a given reason.
@@ -26,18 +28,20 @@ Refuse = Callable[[str], ValueError]
 class OwnLaw(NamedTuple):
     """A custom law that a case names: its stage, `kind` as written, its class, and the file or module.
 
+    `stage`: "" for a law of a whole machine.
+
     `file`: absolute path of the file; None for an installed module. `digest`: SHA-256 of the source.
     """
 
     stage: str
     kind: str
-    law: type[Law]
+    law: type[Law] | type[MachineLaw]
     file: pathlib.Path | None
     digest: str
 
     def __str__(self) -> str:
         source = self.kind.rpartition(":")[0] if self.file is None else self.file
-        return f"controller.{self.stage}.kind: imported {self.law.__name__} from {source}"
+        return f"{_key(self.stage)}: imported {self.law.__name__} from {source}"
 
 
 def is_own(kind: object) -> bool:
@@ -51,20 +55,43 @@ def own_law(stage: str, kind: str, folder: pathlib.Path, model: Plant) -> OwnLaw
     Raises ValueError, with the dotted path, the value and the reason, if there is no such class, if the import fails,
     if the class is not a law of this stage, or if it cannot be called with `model`.
     """
+    found = _imported(stage, kind, folder, STAGES[stage])
+    law = found.law()
+    assert isinstance(law, Law)
+    tried(found, lambda: try_law(law, stage, model))
+    return found
+
+
+def own_machine_law(kind: str, folder: pathlib.Path) -> OwnLaw:
+    """Import the law of a whole machine that `kind` names, as `own_law`; its methods are not called."""
+    return _imported("", kind, folder, MachineLaw)
+
+
+def tried(law: OwnLaw, trial: Callable[[], T]) -> T:
+    """Return the result of a trial of a law. Raises ValueError with the reason if it fails."""
+    try:
+        return trial()
+    except Exception as error:
+        why = f"{law.law.__name__} {_said(error, law.file)}."
+        raise ValueError(f"{_key(law.stage)} = {show(law.kind)}: {why}") from error
+
+
+def _key(stage: str) -> str:
+    return f"controller.{stage}.kind" if stage else "controller.kind"
+
+
+def _imported(stage: str, kind: str, folder: pathlib.Path, base: type[Law] | type[MachineLaw]) -> OwnLaw:
+    """Import a subclass of `base` that is a record."""
     source, _, name = kind.rpartition(":")
     file = (folder / source).resolve() if source.endswith(".py") else None
 
     def refuse(why: str) -> ValueError:
-        return ValueError(f"controller.{stage}.kind = {show(kind)}: {why}")
+        return ValueError(f"{_key(stage)} = {show(kind)}: {why}")
 
     if not source or not name.isidentifier():
         raise refuse(f"write {FORM}.")
-    found = _class(_module(source, file, refuse), name, source, STAGES[stage], refuse)
+    found = _class(_module(source, file, refuse), name, source, base, refuse)
     _check_record(found, name, stage, refuse)
-    try:
-        try_law(found(), stage, model)
-    except Exception as error:
-        raise refuse(f"{name} {_said(error, file)}.") from error
     if file is not None:
         pickle_with_source(found)
     return OwnLaw(stage, kind, found, file, digest_of(found))
@@ -80,7 +107,7 @@ def relocated(laws: Iterable[OwnLaw], out: pathlib.Path) -> dict[str, str]:
         kind, file = law.kind, law.file
         if file is not None:
             kind = f"{path_from(kind.rpartition(':')[0], file, out)}:{law.law.__name__}"
-        kinds[f"controller.{law.stage}.kind"] = kind
+        kinds[_key(law.stage)] = kind
     return kinds
 
 
@@ -120,7 +147,7 @@ def _said(error: BaseException, file: pathlib.Path | None) -> str:
     return f"raised {type(error).__name__}: {words.rstrip('.')}{'' if line is None else f' (line {line})'}{fix}"
 
 
-def _class(module: types.ModuleType, name: str, source: str, base: type[Law], refuse: Refuse) -> type[Law]:
+def _class(module: types.ModuleType, name: str, source: str, base: type, refuse: Refuse) -> type:
     """Return the class of this name. Raises ValueError unless it is a law of the stage."""
     laws = [
         one
@@ -138,11 +165,11 @@ def _class(module: types.ModuleType, name: str, source: str, base: type[Law], re
     return found
 
 
-def _named(base: type[Law]) -> str:
+def _named(base: type) -> str:
     return f"ambjax.extend.{base.__name__}"
 
 
-def _check_record(found: type[Law], name: str, stage: str, refuse: Refuse) -> None:
+def _check_record(found: type, name: str, stage: str, refuse: Refuse) -> None:
     """Raise ValueError unless the class is a record that defines every method.
 
     Each field must have a default, be declared by gain, leaf or static, and have another name than `kind`.
@@ -162,4 +189,4 @@ def _check_record(found: type[Law], name: str, stage: str, refuse: Refuse) -> No
         if not (field.metadata.get("leaf") or field.metadata.get("static")):
             raise refuse(f"{name}.{field.name}: declare it by gain(...), leaf(...) or static(...) of ambjax.extend.")
         if field.name == "kind":
-            raise refuse(f"{name}.kind: the key kind of [controller.{stage}] selects the law. Choose another name.")
+            raise refuse(f"{name}.kind: the key kind of [{_key(stage)[:-5]}] selects the law. Choose another name.")

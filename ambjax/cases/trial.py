@@ -7,6 +7,8 @@ import jax.numpy as jnp
 
 from ambjax.control.base import Law
 from ambjax.control.stages import CurrentDemand, CurrentInputs, ForceDemand, PositionLaw
+from ambjax.numerics.records import canonical
+from ambjax.simulation.whole_machine import Machine, SampledMachine
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
 from ambjax.world.waveforms import Reference
@@ -55,6 +57,21 @@ def try_law(law: Law, stage: str, model: Plant) -> None:
     _same(begun, state, "begin(model, inputs) must be like init(model); it is")
     _same(sampled, kept, "begin_sampled(model, inputs, period) must be like init_sampled(model); it is")
     _same(slope, _zero(), "slope(model) must be a number; it is")
+
+
+def try_machine(machine: Machine) -> None:
+    """Trace the law of a whole machine in its loop: `begin`, `scale`, and `step` or the call. Raises as `try_law`."""
+
+    def everything(machine: Machine) -> tuple[Any, Any, Any]:
+        assert machine.law is not None
+        errors = machine.sensor_errors(0)
+        state = machine.start()
+        if isinstance(machine, SampledMachine):
+            return state.law, machine.law.scale(), machine.jump(0.0, state, errors).law
+        return state.law, machine.law.scale(), machine.demands(0.0, state, errors)
+
+    begun, scale, _ = jax.eval_shape(everything, canonical(machine))
+    _same(scale, begun, "scale() must be like the state that begin returns; it is")
 
 
 def _zero() -> jax.Array:

@@ -2,7 +2,7 @@
 
 import pathlib
 
-from ambjax.cases.machine_case import MachineCase, read_any
+from ambjax.cases.machine_case import AnyCase, read_any
 from ambjax.cases.reader import Case, read_case
 from ambjax.cases.warned import warnings_of_file
 from ambjax.host.heartbeat import say
@@ -16,17 +16,24 @@ def read_with_warnings(path: str | pathlib.Path) -> Case:
     return case
 
 
-def read_any_with_warnings(path: str | pathlib.Path) -> Case | MachineCase:
+def read_any_with_warnings(path: str | pathlib.Path) -> AnyCase:
     """Read the case file of one axis, as `read_with_warnings` does, or of a whole machine."""
     case = read_any(path)
     if isinstance(case, Case):
         print_warnings(case, path)
+    else:
+        print_laws(case, path)
     return case
+
+
+def print_laws(case: AnyCase, path: str | pathlib.Path) -> None:
+    """Print the custom laws of a case on stderr, one line each."""
+    for law in case.own_laws:
+        say(one_line(f"{path}: {law}"))
 
 
 def print_warnings(case: Case, path: str | pathlib.Path) -> None:
     """Print the custom laws and the warnings of a case on stderr, one line each."""
-    for law in case.own_laws:
-        say(one_line(f"{path}: {law}"))
+    print_laws(case, path)
     for warning in warnings_of_file(case, path):
         say(warning)

@@ -108,7 +108,7 @@ class _Members:
         return jnp.broadcast_to(x if moves or not x.ndim else x[..., None], (*shape, self.size))
 
     def together(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> list:
-        shape = np.broadcast_shapes(*(x.aval.shape for x in eqn.invars))  # equal up to lengths of 1, or ()
+        shape = np.broadcast_shapes(*map(_shape, eqn.invars))  # equal up to lengths of 1, or ()
         return [self.wide(x, m, shape) for x, m in zip(values, moves, strict=True)]
 
     def jit(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged:
@@ -135,7 +135,7 @@ class _Members:
         return [(lax.slice(values[0], (*begin, 0), (*end, self.size), strides and (*strides, 1)), True)]
 
     def concatenate(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
-        parts = [self.wide(x, m, v.aval.shape) for x, m, v in zip(values, moves, eqn.invars, strict=True)]
+        parts = [self.wide(x, m, _shape(v)) for x, m, v in zip(values, moves, eqn.invars, strict=True)]
         return [(lax.concatenate(parts, eqn.params["dimension"]), True)]
 
     def dynamic_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
@@ -148,7 +148,7 @@ class _Members:
     def dynamic_update_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         if any(moves[2:]):
             return None
-        whole, part = (self.wide(x, m, v.aval.shape) for x, m, v in zip(values, moves, eqn.invars[:2], strict=False))
+        whole, part = (self.wide(x, m, _shape(v)) for x, m, v in zip(values, moves, eqn.invars[:2], strict=False))
         return [(lax.dynamic_update_slice(whole, part, (*values[2:], _first(eqn))), True)]
 
     def reduced(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
@@ -159,17 +159,25 @@ class _Members:
         parts = [lax.index_in_dim(x, n, axis, False) for n in range(x.shape[axis])]
         return [(functools.reduce(REDUCTIONS[eqn.primitive.name], parts), True)]
 
-    def while_loop(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
+    def while_loop(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged:
         goes, body, consts, fixed = while_parts(eqn)
         carried = carried_flags(body, moves[consts:], fixed, ())
-        if moved(goes, [*moves[:consts], *carried])[0]:  # members that end at different turns
-            return None
+        own_end = moved(goes, [*moves[:consts], *carried])[0]  # members end at different turns
+        carried = [own_end or moving for moving in carried]
         begin, turn = self.loop(body, values[consts:], moves[consts:], carried)
 
         def going(x: list) -> Any:
             return self.evaluated(goes, [*values[:consts], *x], [*moves[:consts], *carried])[0][0]
 
-        return list(zip(lax.while_loop(going, lambda x: turn(x)[0], begin), carried, strict=True))
+        def turn_of_some(x: list) -> list:
+            goes_on = going(x)
+            return [jnp.where(goes_on, after, before) for after, before in zip(turn(x)[0], x, strict=True)]
+
+        if own_end:
+            end = lax.while_loop(lambda x: jnp.any(going(x)), turn_of_some, begin)
+        else:
+            end = lax.while_loop(going, lambda x: turn(x)[0], begin)
+        return list(zip(end, carried, strict=True))
 
     def scan(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         p = eqn.params
@@ -188,7 +196,7 @@ class _Members:
         `values`: the constants of the loop and the initial values. `each`: flags of the own inputs of a turn.
         """
         fixed = len(values) - len(carried)
-        shapes = [x.aval.shape for x in body.jaxpr.invars[fixed : len(values)]]
+        shapes = list(map(_shape, body.jaxpr.invars[fixed : len(values)]))
 
         def widened(found: Flagged) -> list:
             return [self.wide(*x, shape) if c else x[0] for x, shape, c in zip(found, shapes, carried, strict=True)]
@@ -202,7 +210,13 @@ class _Members:
 
 def _first(eqn: JaxprEqn) -> Array:
     """Return index 0, with the type of the equation's last operand, an index."""
-    return jnp.zeros((), eqn.invars[-1].aval.dtype)
+    index: Any = eqn.invars[-1].aval
+    return jnp.zeros((), index.dtype)
+
+
+def _shape(x: Any) -> tuple[int, ...]:
+    """Return the shape of a variable of one member."""
+    return x.aval.shape
 
 
 def _flagged(eqn: JaxprEqn, results: Any, moves: bool) -> Flagged:

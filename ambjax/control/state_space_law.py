@@ -6,8 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.control.machine_law import Demanded, MachineInputs, MachineLaw
-from ambjax.control.stages import ForceDemand
+from ambjax.control.machine_law import Demanded, MachineInputs, MachineLaw, demand_of
 from ambjax.numerics.records import leaf, record, static
 from ambjax.numerics.small_matrices import times
 from ambjax.numerics.smooth import limited
@@ -84,6 +83,5 @@ class StateSpaceLaw(MachineLaw):
         i = self.resting + (times(C, state) + times(D, w) + b) / self.resistance
         u = self.resistance * i
         v_star = self.dv_dz * measured.z + self.dv_di * i
-        force = ForceDemand(measured.z, measured.z_dot, v_star, 0.0 * v_star)
         after = times(A, state) + times(B, w) + a
-        return Demanded(force, measured, measured), after, limited(u, inputs.u_max) - u
+        return demand_of(v_star, measured), after, limited(u, inputs.u_max) - u

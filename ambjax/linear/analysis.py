@@ -25,7 +25,7 @@ from ambjax.linear.margins import (
 from ambjax.linear.matrices import loop_matrices, rest
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.declared import require_number
-from ambjax.numerics.records import Scalar, canonical, leaf, record
+from ambjax.numerics.records import Scalar, canonical, leaf, record, require_concrete
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import prepare
 from ambjax.simulation.triple import takes_case
@@ -175,6 +175,7 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
     does, if no equilibrium is found at r, and if a law has no derivative there.
     """
     require_number("r", r)
+    require_concrete("linearise", (cascade, scenario, clock, r))
     inputs = canonical((*linearisation_inputs(cascade, scenario, clock), r))
     system, found = _matrices(*inputs)
     return checked(system, found, r, "" if found else _rest(*inputs).moving())

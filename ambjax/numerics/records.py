@@ -200,6 +200,15 @@ def is_traced(x: object) -> bool:
     return isinstance(x, Tracer)
 
 
+def require_concrete(name: str, node: object) -> None:
+    """Raise ValueError if a number of the pytree is traced. `name`: what it is, for the message."""
+    if any(is_traced(x) for x in jax.tree.leaves(node)):
+        raise ValueError(
+            f"{name}: a number is traced, and this function does not work inside jit, vmap or grad. Use ambjax.rollout "
+            "there, or ambjax.linear.loop_matrices for the linearised loop."
+        )
+
+
 def validate(node: object, path: str = "") -> None:
     """Check every leaf of the records in `node` against the bounds and the shape of its field.
 

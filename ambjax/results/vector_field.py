@@ -32,7 +32,7 @@ def vector_field(case: Case) -> VectorField:
     Sensor noise is left out, because it is held over samples. A solver does not stop where the rotor touches down.
     Raises ValueError for a controller on a processor, because its loop is not a differential equation.
     """
-    require_case(case)
+    require_case(case, traced=True)
     if case.cascade.sampled:
         raise ValueError(
             "vector_field: this controller runs on a processor, so its loop is not a differential equation. Remove "

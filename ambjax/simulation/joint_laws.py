@@ -43,16 +43,20 @@ def inputs_of(
     """Return the inputs of the law of a machine. All arguments but W and `period` have one number for each axis [c]."""
     cascades = [loop.cascade for loop in machine.loops()]
 
-    def joined(function: Callable[..., State], *parts: object) -> State:
+    def joined(function: Callable[..., T], *parts: object) -> T:
         groups = zip(cascades, *map(machine.split, parts), strict=True)
         return machine.join([jax.vmap(function)(*own) for own in groups])
 
     def start(measured: Measurement) -> State:
         return joined(lambda cascade, m: cascade.model.start(m), measured)
 
-    return MachineInputs(
-        references, jnp.asarray(W), u_max, start, lambda u, x: joined(Cascade.driven, u, x), past, period
-    )
+    def driven(u: Array, states: State) -> State:
+        return joined(Cascade.driven, u, states)
+
+    def scaled(force: Array) -> Array:
+        return joined(lambda cascade, f: (f / cascade.model.m + cascade.model.g) / cascade.model.a, force)
+
+    return MachineInputs(references, jnp.asarray(W), u_max, start, driven, scaled, past, period)
 
 
 def forces(machine: Grouped, demanded: Demanded) -> tuple[tuple[ForceDemand, Measurement], ...]:

@@ -41,13 +41,16 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
     validate(scenario, "scenario")
     validate(clock, "clock")
     require_number("clock.samples", clock.samples, 1, whole=True)
+    require_number("clock.method.substeps", getattr(clock.method, "substeps", 1), 1, whole=True)
 
 
 def require_records(name: str, node: Any) -> None:
     """Raise ValueError if a part of the record `node` is a number, a text, a class or a function."""
     for field in dataclasses.fields(node):
         value, usual = getattr(node, field.name), field.default
-        if not (field.metadata.get("leaf") or field.metadata.get("static")) and jax.tree_util.all_leaves([value]):
+        if not (field.metadata.get("leaf") or field.metadata.get("static")) and (
+            isinstance(value, (list, dict)) or jax.tree_util.all_leaves([value])
+        ):
             like = f", such as {type(usual).__name__}()" if dataclasses.is_dataclass(usual) else ""
             raise ValueError(f"{name}.{field.name} = {value!r}: it must be a record{like}.")
 

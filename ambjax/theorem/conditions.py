@@ -17,7 +17,7 @@ from jax import Array
 from ambjax.control.cascade import DEFAULT_LAWS, Cascade
 from ambjax.control.schedule import extremes, schedules
 from ambjax.control.stages import PositionLaw
-from ambjax.numerics.records import canonical
+from ambjax.numerics.records import canonical, require_concrete
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Lowest, Named, Peak
 from ambjax.simulation.rollout import prepare, roll
@@ -139,6 +139,7 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float = 0.
     signs then get the default steepness. `settle`: start of the evaluation of |z|, s. Raises ValueError as `rollout`
     does.
     """
+    require_concrete("check", (cascade, scenario, clock))
     check_inputs(cascade, scenario, clock)
     if cascade.sampled:
         cascade, clock = cascade.in_continuous_time(), dataclasses.replace(clock, method=None)

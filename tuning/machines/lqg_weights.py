@@ -48,15 +48,13 @@ class LqgSpace(NamedTuple):
 
     def decode(self, x: np.ndarray, machine: Machine) -> Machine:
         """Return the machine with the weights at coordinates x [m]. Its law is not finite if there is no design."""
-        found = dict(zip((path.removeprefix(ROOT) for path in self.space.paths), self._at(x), strict=True))
+        values = np.asarray(self.space.gains_at(jnp.asarray(x))).tolist()
+        found = dict(zip((path.removeprefix(ROOT) for path in self.space.paths), values, strict=True))
         try:
             law = self.problem.law(self.problem.weights | found)
         except ValueError:
             law = jax.tree.map(lambda leaf: jnp.full_like(leaf, math.inf), machine.law)
         return dataclasses.replace(machine, law=canonical(law))
-
-    def _at(self, x: np.ndarray) -> list[float]:
-        return np.asarray(self.space.gains_at(jnp.asarray(x))).tolist()
 
 
 def lqg_space(table: Table, case: MachineCase, raw: dict[str, Any]) -> LqgSpace:

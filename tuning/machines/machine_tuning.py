@@ -17,8 +17,8 @@ from ambjax.extend import leaf
 from ambjax.results.outputs import directory, files, plain, write_json
 from ambjax.text.web_page import render_page
 from tuning.events import Tell
-from tuning.machines.lqg_weights import lqg_space
-from tuning.machines.machine_gains import machine_space
+from tuning.machines.lqg_weights import LqgSpace, lqg_space
+from tuning.machines.machine_gains import MachineSpace, machine_space
 from tuning.machines.machine_peaks import Peaks
 from tuning.machines.machine_search import Settings, searched
 from tuning.machines.machine_verdict import LIMITS, judged, refused, report_text
@@ -76,12 +76,8 @@ def tune_machine(
     case, settings, start, peaks = _checked(path, minutes, loaded)
     place, own = directory(out, f"tune-{case.name}", WRITTEN, force), settings.space
 
-    def gains_at(x: np.ndarray) -> dict[str, float]:
-        return {gain.where: float(g) for gain, g in zip(own.gains, own.space.gains_at(jnp.asarray(x)), strict=True)}
-
     def case_at(x: np.ndarray, verdict: str = NOT_JUDGED) -> MachineCase:
-        text = tuned(loaded[1], gains_at(x), case.name, verdict)
-        return machine_from(tomllib.loads(text), case.name, text, case.folder)
+        return _written(case, loaded[1], own, _gains(own, x), verdict)
 
     def refused_at(x: np.ndarray) -> int:  # other members than those of the judgement
         return refused(case_at(x), settings.limits, settings.seed + 1, min(settings.held_out, SEARCHED))
@@ -96,9 +92,9 @@ def tune_machine(
     facts = judged(case, found, settings.limits, settings.seed, settings.held_out)
     facts["gains"] = [
         {"path": one.path, "before": a, "after": b, "at_bound": one.at_bound(b)}
-        for one, a, b in zip(own.space.gains, start.tolist(), gains_at(best.x).values(), strict=True)
+        for one, a, b in zip(own.space.gains, start.tolist(), _gains(own, best.x), strict=True)
     ]
-    found = dataclasses.replace(found, text=tuned(loaded[1], gains_at(best.x), case.name, facts["verdict"]))
+    found = case_at(best.x, facts["verdict"])
     _put(place, found.text, facts)
     return MachineTuning(found, facts["outcome"]["good"], plain(facts), place)
 
@@ -116,9 +112,23 @@ def _checked(
             settings = settings._replace(minutes=minutes)
         start = settings.space.values(case)
         settings.space.space.encode(start)
-        return case, settings, start, Peaks(case, settings.space)
+        # the default of a gain may depend on whether another one is given
+        return case, settings, start, Peaks(_written(case, text, settings.space, start.tolist()), settings.space)
     except ValueError as why:
         raise ValueError(one_line(f"{path}: {why}")) from None
+
+
+def _gains(space: MachineSpace | LqgSpace, x: np.ndarray) -> list[float]:
+    return np.asarray(space.space.gains_at(jnp.asarray(x))).tolist()
+
+
+def _written(
+    case: MachineCase, text: str, space: MachineSpace | LqgSpace, gains: list[float], verdict: str = NOT_JUDGED
+) -> MachineCase:
+    """Return the case with these gains [m] in its text."""
+    where = [gain.where for gain in space.gains]
+    text = tuned(text, dict(zip(where, gains, strict=True)), case.name, verdict)
+    return machine_from(tomllib.loads(text), case.name, text, case.folder)
 
 
 def _put(place: pathlib.Path, text: str, facts: dict[str, Any]) -> None:
