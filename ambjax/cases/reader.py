@@ -92,7 +92,7 @@ class Case:
         return case_table(self.name, parts_of(self.cascade, self.scenario, self.clock), self.spread.paths)
 
 
-class _Facts(tuple[object, ...]):
+class _Facts(tuple[Any, ...]):
     """The other fields of a case. Two are equal if each field is the same object: arrays have no hash."""
 
     def __eq__(self, other: object) -> bool:
