@@ -156,6 +156,8 @@ def test_the_commands_say_that_a_larger_peak_lies_outside_the_band_of_the_case(t
         assert (one["zone"], one["at_band_edge"], one["outside_zone"]) == ("A", True, "D")
         assert one["outside_peak"] == pytest.approx(full["peak"], rel=1e-6)
         assert one["outside_frequency_hz"] == pytest.approx(full["frequency_hz"], rel=1e-3)
+    assert loop["delay_margin_samples"] == pytest.approx(50e3 * loop["delay_margin_s"])
+    assert f"({loop['delay_margin_samples']:.4g} samples)" in text
     said = f"|S| is larger: {full['peak']:.4g} at {full['frequency_hz']:.4g} Hz (zone D)."
     assert said in text
     assert any(said in line for line in verdict)

@@ -50,6 +50,12 @@ def test_default_ranges_of_converters_follow_from_the_plant():
     assert (float(seen.z), float(seen.i)) == (-1e-3, -0.1)
 
 
+def test_the_current_may_have_a_converter_of_its_own():
+    for bits, z in ((16.0, 5e-3 * (1 - 2**-15)), (None, 1.0)):
+        seen = Sensor(bits=bits, bits_i=4.0).converted(motion(z=1.0, i=1.0), 5e-3, 0.25)
+        assert (float(seen.z), float(seen.i)) == (z, 0.5 * 7 / 8)
+
+
 def test_a_reading_is_scaled_offset_and_noisy_and_a_velocity_not_measured_is_zero():
     errors = Errors(*map(jnp.asarray, (1e-6, 2e-6, 3e-6)))
     seen = Sensor(gain=1.1, offset=1e-5).reading(motion(), errors)
@@ -205,7 +211,8 @@ def test_a_wrong_key_is_refused_with_its_path(table, key, value, words):
 
 
 @pytest.mark.parametrize(
-    ("table", "key", "value"), [("sensor", "bits", 12), ("sensor", "bandwidth", 1e4), ("actuator", "slew", 1e6)]
+    ("table", "key", "value"),
+    [("sensor", "bits", 12), ("sensor", "bits_i", 12), ("sensor", "bandwidth", 1e4), ("actuator", "slew", 1e6)],
 )
 def test_keys_that_need_a_processor_are_refused_without_one(table, key, value):
     with pytest.raises(ValueError, match=rf"^{table}\.{key} is for a controller on a processor"):

@@ -292,6 +292,10 @@ def test_a_case_stands_for_its_cascade_scenario_and_clock():
     one, other = ambjax.rollout(faster), ambjax.rollout(faster.cascade, case.scenario, case.clock)
     np.testing.assert_array_equal(one.trajectory.rows.z, other.trajectory.rows.z)
     assert ambjax.rollout(case, record_every=0).trajectory.rows is None
+    both = jax.tree.map(lambda *x: jnp.stack(x), case, faster)  # a case is a pytree, also of arrays
+    shapes = jax.eval_shape(jax.vmap(ambjax.rollout), both).trajectory.rows
+    assert (both.cascade.position.c[1], shapes.z.shape) == (50.0, (2, case.clock.samples))
+    assert jax.jit(lambda case: case)(faster) == faster
     loop = ambjax.linear.linearise(case, r=1e-5)
     np.testing.assert_array_equal(loop.A, ambjax.linear.linearise(case.cascade, case.scenario, case.clock, 1e-5).A)
 

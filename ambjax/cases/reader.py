@@ -7,7 +7,10 @@ ValueError with one line: the dotted path, the value, what is allowed and the fi
 import dataclasses
 import pathlib
 import re
+from collections.abc import Hashable
 from typing import Any
+
+import jax
 
 from ambjax.cases.case_table import case_table, parts_of
 from ambjax.cases.controller_file import ControllerFile
@@ -28,6 +31,7 @@ from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method
 from ambjax.simulation.sliding import Slide, slides
 from ambjax.simulation.system import check_parts
+from ambjax.simulation.triple import PARTS
 from ambjax.text.words import one_line
 from ambjax.world.bearing import Bearing
 from ambjax.world.coils import TwoCoil
@@ -66,6 +70,8 @@ class Case:
     file omits while it gives others; they keep the paper's values. Empty if the file gives all or none. `own_laws`: the
     custom laws that the file names. `controller_file`: the linear controller that the file names, or None. `zones`:
     range and limits of the sensitivity. `recorded`: the files of recorded signals.
+
+    A case is a pytree of its cascade, scenario and clock, so it is an argument of functions under jit and vmap.
     """
 
     name: str
@@ -84,6 +90,26 @@ class Case:
     def _repr_html_(self) -> str:
         """Return the table of the parts of the case and their numbers, for notebooks."""
         return case_table(self.name, parts_of(self.cascade, self.scenario, self.clock), self.spread.paths)
+
+
+class _Facts(tuple[Any, ...]):
+    """The other fields of a case. Two are equal if each field is the same object: arrays have no hash."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Facts) and all(a is b for a, b in zip(self, other, strict=True))
+
+    def __hash__(self) -> int:
+        return hash(tuple(map(id, self)))
+
+
+def _flatten(case: Case) -> tuple[tuple[tuple[Hashable, object], ...], _Facts]:
+    """Return the parts of a case as a pytree, and its other fields."""
+    fields = [field.name for field in dataclasses.fields(Case)]
+    parts = tuple((jax.tree_util.GetAttrKey(name), getattr(case, name)) for name in PARTS)
+    return parts, _Facts(getattr(case, name) for name in fields if name not in PARTS)
+
+
+jax.tree_util.register_pytree_with_keys(Case, _flatten, lambda facts, parts: Case(facts[0], *parts, *facts[1:]))
 
 
 def read_case(path: str | pathlib.Path) -> Case:

@@ -41,7 +41,8 @@ def acceptance(case: Case) -> tuple[dict[str, object], list[str], str]:
         summary = {"stable": None, "zone": None, "why": str(error), **{fact.key: fact.value for fact in facts}}
         return summary, [f"Sensitivity: no zone and no margins: {error}"], _facts_table(facts)
     loop = analyse(system, case.scenario.plant.m, case.clock.sample_period, case.zones)
-    facts = [*_loop_facts(loop), *machine(case)]
+    rate = 1 / float(case.clock.sample_period) if case.cascade.sampled else None
+    facts = [*_loop_facts(loop, rate), *machine(case)]
     summary = {"stable": loop.stable, "zone": loop.zone, **{fact.key: fact.value for fact in facts if fact.key}}
     lines = [_verdict(case, loop)]
     if loop.stable:
@@ -62,8 +63,11 @@ def _verdict(case: Case, loop: Analysis) -> str:
     return f"Sensitivity: zone {loop.zone}, {word} {loop.S.height:.4g} at {loop.S.frequency:.4g} Hz{inside}."
 
 
-def _loop_facts(loop: Analysis) -> list[Fact]:
-    """Return the peak of a stable loop, and its margins: the smaller one of each kind, and that at the other place."""
+def _loop_facts(loop: Analysis, rate: float | None) -> list[Fact]:
+    """Return the peak of a stable loop, and its margins: the smaller one of each kind, and that at the other place.
+
+    `rate`: sampling rate of the processor, Hz; None: continuous time.
+    """
     if not loop.stable:
         return []
     kinds = {
@@ -78,6 +82,8 @@ def _loop_facts(loop: Analysis) -> list[Fact]:
         other = next(one for one in PLACES if one != place)
         facts.append(Fact(key, f"{words}, at the {place}", getattr(loop.margins, kind), unit))
         facts.append(Fact("", f"{words}, at the {other}", getattr(getattr(loop.margins_at, other), kind), unit))
+        if kind == "delay" and rate:
+            facts.append(Fact("delay_margin_samples", f"{words}, at the {place}", loop.margins.delay * rate, "samples"))
     return facts
 
 

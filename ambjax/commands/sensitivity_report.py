@@ -164,7 +164,7 @@ def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None
         rows += ["", table(margins, [row for point in stable for row in _margin_rows(point)]), ""]
         first = stable[0].analysis
         where = first.margins_at.place("delay")
-        rows += [f"The delay margin is the smaller one, {_number(first.margins.delay)} s, at the {where}."]
+        rows += [f"The delay margin is the smaller one, {_delay(case, first.margins.delay)}, at the {where}."]
         rows += [
             f"Zones of the peak of |S|: A below {zones.zone_a:g}, B below {zones.zone_b:g}, C below {zones.zone_c:g}, "
             "D above."
@@ -232,6 +232,12 @@ def _margin_rows(point: OperatingPoint) -> list[tuple[str, ...]]:
         gains = f"{_number(one.gain_low)} to {_number(one.gain_high)}"
         rows.append((point.name, place, gains, *map(_number, (one.phase_deg, one.delay, one.disk))))
     return rows
+
+
+def _delay(case: Case, delay: float) -> str:
+    """Return a delay in s, and on a processor in samples too."""
+    samples = f" ({_number(delay / float(case.clock.sample_period))} samples)" if case.cascade.sampled else ""
+    return f"{_number(delay)} s{samples}"
 
 
 def _number(x: float) -> str:

@@ -109,7 +109,9 @@ class Guard:
         values = {
             "z": sensor.largest_reading(limit, scenario.plant.s_0),
             "z_dot": GAPS * model.s_0 / period,
-            "i": CURRENTS * model.i_0 if sensor.bits is None else BEYOND * sensor.current_end(scenario.plant.i_0),
+            "i": CURRENTS * model.i_0
+            if sensor.current_bits is None
+            else BEYOND * sensor.current_end(scenario.plant.i_0),
             "noise": 2 * sensor.largest_error(scenario.plant.s_0),
             "speed": LARGEST_NORMAL * sensor.std_z_dot + velocity_error * fall,
             "samples": jnp.maximum(1 / (model.pole * period) // 1, 1.0),

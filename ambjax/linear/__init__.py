@@ -16,7 +16,7 @@ to the sensor's own reading, and KS that from e to u.
 from ambjax.linear.analysis import Analysis, Zones, analyse, checked, linearisation_inputs, linearise, linearise_members
 from ambjax.linear.differentiable import LoopQuantities, loop_quantities
 from ambjax.linear.injection import Injection, MemberPeaks, frequency_lines, injected, injected_members
-from ambjax.linear.linear_machine import MachineSensitivity, linearise_machine, machine_sensitivity
+from ambjax.linear.linear_machine import MachineSensitivity, linearise_machine, machine_rest, machine_sensitivity
 from ambjax.linear.machine_injection import machine_injected
 from ambjax.linear.margins import (
     LoopMargins,
@@ -61,6 +61,7 @@ __all__ = [
     "loop_matrices",
     "loop_quantities",
     "machine_injected",
+    "machine_rest",
     "machine_sensitivity",
     "margins_of",
     "noise_gain",

@@ -249,8 +249,8 @@ def _quiet_run(cascade: Cascade, scenario: Scenario, clock: Clock) -> _QuietRun:
 def quiet(scenario: Scenario) -> Scenario:
     """Return the scenario of the quiet run. The start is displaced by KICK of the clearance, towards z = 0."""
     calm = scenario.undisturbed()
-    bits = None if calm.sensors.bits is None else FINE_BITS
-    calm = calm.louder(0.0).with_sensor(bits=bits, outliers=None, dropouts=None)
+    bits = None if calm.sensors.current_bits is None else FINE_BITS
+    calm = calm.louder(0.0).with_sensor(bits=bits, bits_i=None, outliers=None, dropouts=None)
     initial, z = scenario.initial, np.asarray(scenario.initial.z, float)
     z = z + np.where(z > 0, -1.0, 1.0) * KICK * np.asarray(scenario.touchdown)
     return dataclasses.replace(

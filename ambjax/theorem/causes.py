@@ -100,9 +100,10 @@ def _sensors(scenario: Scenario) -> Iterator[tuple[str, str, Scenario]]:
 
     if (quiet := scenario.louder(0.0)).sensor != scenario.sensor:
         yield "the noise of the sensors", "Lower it, or choose an observer that attenuates it more.", quiet
-    if sensor.bits is not None:
-        name = f"the converter (sensor.bits = {float(np.max(sensor.bits)):g})"
-        yield name, "Give more bits, or a smaller range_z or range_i.", scenario.with_sensor(bits=FINE_BITS)
+    for name in ("bits", "bits_i"):
+        if (bits := getattr(sensor, name)) is not None:
+            words = f"the converter (sensor.{name} = {float(np.max(bits)):g})"
+            yield words, "Give more bits, or a smaller range_z or range_i.", scenario.with_sensor(**{name: FINE_BITS})
     if sensor.faulty:
         yield "the faults of the position sensor", "", scenario.with_sensor(outliers=None, dropouts=None)
     if sensor.bandwidth is not None:

@@ -77,6 +77,14 @@ class Sensor:
         optional=True,
         doc="resolution of the converter of z and i; none: not rounded",
     )
+    bits_i: Scalar | None = leaf(
+        default=None,
+        at_least=2,
+        at_most=32,
+        whole=True,
+        optional=True,
+        doc="resolution of the converter of i, if it is another one; none: that of z",
+    )
     range_z: Scalar | None = leaf(
         default=None,
         unit="m",
@@ -102,7 +110,7 @@ class Sensor:
         default=None, doc="runout of the surface that the position sensor reads; None: no runout"
     )
 
-    sampled: ClassVar[tuple[str, ...]] = ("bits", "bandwidth", "outliers", "dropouts")
+    sampled: ClassVar[tuple[str, ...]] = ("bits", "bits_i", "bandwidth", "outliers", "dropouts")
     """Fields that require a processor."""
 
     @property
@@ -171,7 +179,12 @@ class Sensor:
 
     def linear(self) -> "Sensor":
         """Return the sensor without the effects that a linear system cannot contain."""
-        return dataclasses.replace(self.louder(0.0), bits=None, outliers=None, dropouts=None)
+        return dataclasses.replace(self.louder(0.0), bits=None, bits_i=None, outliers=None, dropouts=None)
+
+    @property
+    def current_bits(self) -> Scalar | None:
+        """The resolution of the converter of i, bits; None: no converter."""
+        return self.bits if self.bits_i is None else self.bits_i
 
     def current_end(self, i_0: Scalar) -> Scalar:
         """Return the end of the converter's range of i (A) for a plant with the bias current i_0 (A)."""
@@ -202,12 +215,11 @@ class Sensor:
 
     def converted(self, reading: Measurement, s_0: Scalar, i_0: Scalar) -> Measurement:
         """Return the converted readings; s_0 (m) and i_0 (A) of the plant give the ranges that are left out."""
-        if self.bits is None:
-            return reading
-        return reading._replace(
-            z=converted(reading.z, self.bits, self.ends(s_0)),
-            i=converted(reading.i, self.bits, self.current_end(i_0)),
-        )
+        if self.bits is not None:
+            reading = reading._replace(z=converted(reading.z, self.bits, self.ends(s_0)))
+        if (bits := self.current_bits) is not None:
+            reading = reading._replace(i=converted(reading.i, bits, self.current_end(i_0)))
+        return reading
 
     def lagged(self, y: Array, before: Measurement, after: Measurement, h: Scalar) -> Array:
         """Return the output of the low-pass after h (s), from y (m): y' = w (z - y), w = 2 pi bandwidth.

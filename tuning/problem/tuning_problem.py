@@ -146,9 +146,9 @@ class TuningProblem:
         error of the integration steps.
         """
         scenario = self.objective.scenario
-        if scenario.sensors.bits is None:
+        if scenario.sensors.current_bits is None:
             return self.engine, self.reference
-        objective = dataclasses.replace(self.objective, scenario=scenario.with_sensor(bits=None))
+        objective = dataclasses.replace(self.objective, scenario=scenario.with_sensor(bits=None, bits_i=None))
         exact = dataclasses.replace(self, objective=objective)
         return exact._stepping(objective.clock.integrator, lanes=REFERENCE_MEMBERS), exact.reference
 
