@@ -101,7 +101,7 @@ def machines() -> list[str]:
     titles = "axes | modes a plane | signs | ambjax | C | ratio | error | compilation (s)"
     for name in ("limits", "axes", "modes"):
         if name != "limits":
-            lines += ["", f"Cost against the number of {name}:", ""]
+            lines += [f"Cost against the number of {name}:", ""]
         rows = []
         for r in data[name]:
             cells = [str(r["axes"]), str(r["modes"]), "set-valued" if r["hard"] else "smooth"]

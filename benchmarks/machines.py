@@ -135,7 +135,7 @@ def axis_numbers(case: Any, period: float) -> dict[str, float]:
 
 def problem_of(kind: Kind, case: MachineCase) -> ctypes.Structure:
     """Return the numbers of a case for machines.c."""
-    rotor, clock, sensor = case.machine.rotor, case.clock, case.cases[0].scenario.sensor
+    rotor, clock, sensor = case.machine.rotor, case.clock, case.cases[0].scenario.sensors
     (unbalance,), (load,), (M, D, K) = rotor.unbalances, rotor.loads, map(np.asarray, (rotor.M, rotor.D, rotor.K))
     assert all(np.array_equal(x, np.diag(np.diag(x))) for x in (M, D, K)), "machines.c takes diagonal matrices"
     assert unbalance.phase == rotor.acceleration == 0
@@ -149,7 +149,7 @@ def problem_of(kind: Kind, case: MachineCase) -> ctypes.Structure:
         "std_z": sensor.std,
         "std_z_dot": sensor.std_z_dot,
         "std_i": sensor.std_i,
-        "substeps": clock.method.substeps,
+        "substeps": vars(clock.method)["substeps"],
         "samples": clock.samples,
         "load_from": round(vars(load.signal)["start"] / clock.sample_period),
         "gyroscopic": W * np.asarray(rotor.G)[3, 4],
@@ -204,7 +204,7 @@ def ensemble(kind: Kind, members: int, samples: int, every: bool = False) -> tup
     """Return the case and its arguments of `run_machines`. `every`: all metrics, not only the largest |z|."""
     case = case_of(kind, samples)
     machine, fold = MachineStudy(case, 0, members).batch(np.arange(members))
-    return case, (machine, case.clock, fold if every else PerAxis(Peak("z", np.zeros(kind.axes))))
+    return case, (machine, case.clock, fold if every else PerAxis(Peak("z", jnp.zeros(kind.axes))))
 
 
 def errors_of(kind: Kind, members: int, samples: int) -> np.ndarray:

@@ -13,8 +13,8 @@ HEAD = """# Benchmarks
 Both times of a ratio come from the same run of a script. Absolute times depend on the machine and its load.
 
 The comparison with other libraries and the scaling were measured before metrics included substeps; ensembles with
-all metrics are slower now. Other programs ran while the times of `ambjax tune`, of the search and of the page were
-measured. All other times were measured on an idle machine.
+all metrics are slower now. Other programs ran while the times of `ambjax tune`, of the search, of whole machines and
+of the page were measured. All other times were measured on an idle machine.
 
 The scenario is the paper's tracking scenario with the disturbance as a scaled force, unless a section names another.
 Smooth gains are gamma = 1e9 and p = 25e-6 in the inversion; repaired gains are gamma = 7.5e4 and p = 25.
