@@ -360,6 +360,10 @@ def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monke
         ({"initial": {"q": [0.0, 0.0]}}, r"initial\.q = .*a list of 5 numbers"),
         ({"sensitivity": {"speeds": []}}, r"sensitivity\.speeds"),
         ({"sensitivity": {"speeds": [0.0, 9e3, 0]}}, r"sensitivity\.speeds = .*: 0 rpm is given more than once"),
+        ({"rotor": FLEXIBLE["rotor"] | {"m": 3.0}}, r"rotor\.m = 3\.0: it follows from the geometry"),
+        ({"rotor": MACHINE["rotor"] | {"kind": "modal"}}, r"rotor\.modes is missing: give \[\[rotor\.modes"),
+        ({"unbalance": [{"amount": 1.0, "grade": 2.5}]}, r"unbalance\[0\]\.grade: give amount, or grade .*not both"),
+        ({"controller": {"kind": "pid"}}, r"controller\.kind = .pid.: it is a law of each axis.*position\.kind"),
         ({"controller": {"position": {"kind": "pdi"}}}, "axis left.x: controller.position.kind"),
     ],
 )
