@@ -94,7 +94,10 @@ def test_the_flux_follows_a_held_current_exponentially(kind):
     assert float(plant.flux_slope()) == pytest.approx(1 / tau)
 
 
-@pytest.mark.parametrize(("eddy", "most"), [(2e-4, 2), (5e-5, 2), pytest.param(1e-5, 10, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize(
+    ("eddy", "most"),
+    [pytest.param(2e-4, 2, marks=pytest.mark.slow), (5e-5, 2), pytest.param(1e-5, 10, marks=pytest.mark.thorough)],
+)
 def test_the_chosen_step_resolves_the_lag_of_the_flux(eddy, most):
     """Against 25 times as many steps: z in the first 30 samples, as the rotor leaves the centre and the voltage limits.
 

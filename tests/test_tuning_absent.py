@@ -156,6 +156,7 @@ def judged_again(facts):
     return dataclasses.replace(facts, outcome=outcome.facts(), verdict=outcome_text(facts, outcome))
 
 
+@pytest.mark.slow
 def test_the_report_is_complete_for_every_combination_of_ensembles_and_peaks(facts, all_lost, unjudged):
     """Held or lost, before and after; not judged; a limit not met; not verified; no front; each kind of peak of |S|."""
     ends = {"held": facts, "lost": all_lost, "none": unjudged}
