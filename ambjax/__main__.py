@@ -93,8 +93,8 @@ def parser() -> Parser:
     meaning = "also print what does not affect the verdict (a case of one axis)"
     checks.add_argument("--full", action="store_true", help=meaning)
     summary = (
-        "modes, critical speeds and unbalance response of a machine against its speed: campbell.json, campbell.png, "
-        "rotor.png, unbalance.png"
+        "modes, critical speeds and unbalance response of a machine against its speed: campbell.html, campbell.json, "
+        "campbell.png, rotor.png, unbalance.png"
     )
     campbell = command("campbell", summary, case=True, out=True)
     campbell.add_argument("--to", type=float, metavar="RPM", help="largest speed (default: 1.3 times that of the case)")

@@ -20,6 +20,7 @@ from ambjax.commands import machine_commands
 from ambjax.linear import linearise
 from ambjax.linear.linear_machine import linearise_machine, machine_sensitivity
 from ambjax.numerics.records import canonical
+from ambjax.page.rotor_motion import motion_of
 from ambjax.pictures.machine_pictures import machine_figure
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.runs import simulate
@@ -71,6 +72,16 @@ def test_the_orbits_of_a_rotor_that_is_lost_before_it_settles_end_at_the_loss(ma
     lost = held.signals | {"lost_at": np.asarray(0.004), "lost_why": np.asarray("touched down")}
     (orbit,) = machine_figure(dataclasses.replace(machine, settle=0.005), lost, "m").axes[-1].lines
     np.testing.assert_allclose(orbit.get_xdata(), 1e6 * held.signals["z"][:81, 2])  # 5e-5 s a sample
+
+
+def test_the_page_of_the_motion_shows_the_displacements_of_the_axes(machine, held):
+    shown = motion_of(machine, held.signals)
+    kept = np.searchsorted(held.signals["t"], np.array(shown["t"]) - 1e-9)
+    for at, axis in ((-0.139, 0), (0.241, 2)):
+        row = shown["along"][int(np.argmin(np.abs(np.array(shown["at"]) - at)))]
+        for k, motion in enumerate((shown["x"], shown["y"])):
+            z = held.signals["z"][kept, axis + k]
+            np.testing.assert_allclose(np.array(motion) @ row, z, rtol=0, atol=1e-4 * np.abs(z).max())
 
 
 def test_the_sensitivity_of_an_uncoupled_axis_is_that_of_one_axis(machine):
@@ -348,6 +359,10 @@ def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monke
         ({"initial": {"q": [0.0, 0.0]}}, r"initial\.q = .*a list of 5 numbers"),
         ({"sensitivity": {"speeds": []}}, r"sensitivity\.speeds"),
         ({"sensitivity": {"speeds": [0.0, 9e3, 0]}}, r"sensitivity\.speeds = .*: 0 rpm is given more than once"),
+        ({"rotor": FLEXIBLE["rotor"] | {"m": 3.0}}, r"rotor\.m = 3\.0: it follows from the geometry"),
+        ({"rotor": MACHINE["rotor"] | {"kind": "modal"}}, r"rotor\.modes is missing: give \[\[rotor\.modes"),
+        ({"unbalance": [{"amount": 1.0, "grade": 2.5}]}, r"unbalance\[0\]\.grade: give amount, or grade .*not both"),
+        ({"controller": {"kind": "pid"}}, r"controller\.kind = .pid.: it is a law of each axis.*position\.kind"),
         ({"controller": {"position": {"kind": "pdi"}}}, "axis left.x: controller.position.kind"),
     ],
 )

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ambjax.cases.controller_tables import KINDS
 from ambjax.cases.machine_linear import linear, lqg
 from ambjax.cases.own_laws import FORM, OwnLaw, is_own, tried
 from ambjax.cases.reader import Case
@@ -55,6 +56,8 @@ def kind_of(raw: dict[str, Any]) -> str:
     """Return controller.kind of a machine."""
     table = Table(raw).table("controller")
     kind = table.raw.get("kind")
+    if kind in list(KINDS["position"]) and kind not in LAWS:
+        raise ValueError(f'{table.at("kind")} = "{kind}": it is a law of each axis. Set controller.position.kind.')
     return str(kind) if is_own(kind) else table.choice("kind", LAWS, LAWS[0], FORM)
 
 

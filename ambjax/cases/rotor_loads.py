@@ -20,6 +20,8 @@ GRADE = {field.name: field for field in dataclasses.fields(UnbalanceGrade)}
 
 def unbalance_from(table: Table, body: RotorBody, graded: int) -> RotorUnbalance:
     """Return an unbalance. `graded`: number of planes that share the unbalance of a grade equally."""
+    if "amount" in table.raw and "grade" in table.raw:
+        raise ValueError(f"{table.at('grade')}: give amount, or grade and service_speed, not both.")
     own = ["grade", "service_speed"] if "grade" in table.raw else ["amount"]
     table.only(["at", *own, "phase", *(["modes"] if body.shapes is None else [])])
     at, shapes = body.place(table)

@@ -64,6 +64,10 @@ def body_from(top: Table, folder: pathlib.Path = pathlib.Path()) -> RotorBody:
     table = top.table("rotor")
     kind = table.choice("kind", KINDS)
     common = ["kind", "gravity", "speed", "acceleration"]
+    known = next((key for key in ("m", "I_t", "I_p") if key in table.raw), None)
+    if known and (kind == "shaft" or "file" in table.raw):
+        source = "geometry" if kind == "shaft" else "file"
+        raise ValueError(f"{table.at(known)} = {show(table.raw[known])}: it follows from the {source}. Leave it out.")
     if kind == "shaft":
         table.only([*common, "elements", "discs", "sleeves", "modes", "damping", *MATERIAL])
         return _shaft(table, _places(top))
@@ -76,6 +80,11 @@ def body_from(top: Table, folder: pathlib.Path = pathlib.Path()) -> RotorBody:
         raise ValueError(f"{table.at('I_p')} = {I_p:g}: it must be at most 2 I_t = {2 * I_t:g} kg m^2, as of a disc.")
     if I_t == 0:
         raise ValueError(f"{table.at('I_t')} = 0: it must be above 0 kg m^2.")
+    if kind == "modal" and "modes" not in table.raw:
+        raise ValueError(
+            f"{table.at('modes')} is missing: give [[rotor.modes]] with the frequency of each bending mode, or "
+            'a file; kind = "rigid" has no modes.'
+        )
     modes = tables_of(table, "modes")
     for one in modes:
         one.only(["frequency", "damping"])

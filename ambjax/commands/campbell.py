@@ -12,7 +12,7 @@ from ambjax.commands.reading import read_any_with_warnings
 from ambjax.host.heartbeat import say
 from ambjax.linear.linear_machine import turning_machines
 from ambjax.linear.margins import poles_in_s
-from ambjax.linear.rotor_modes import modes_of, springs_critical
+from ambjax.linear.rotor_modes import Mode, modes_of, springs_critical
 from ambjax.linear.unbalance_response import (
     CriticalSpeed,
     UnbalanceResponse,
@@ -21,8 +21,10 @@ from ambjax.linear.unbalance_response import (
     unbalance_response,
 )
 from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
+from ambjax.text.web_page import escape_markdown, markdown_table, render_page
 
-WRITTEN = ("campbell.json", "campbell.png", "rotor.png", "unbalance.png")
+PICTURES = ("campbell.png", "rotor.png", "unbalance.png")
+WRITTEN = ("campbell.json", *PICTURES, "campbell.html")
 # Number of speeds, and the end of their range as a multiple of the largest speed of the case: a critical speed up to
 # 26 % above it needs a separation margin.
 SPEEDS, BEYOND = 31, 1.3
@@ -65,17 +67,30 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
         "modes": [[mode.numbers() for mode in own] for own in modes],
         "unbalance": None if found is None else _unbalance(case, found, criticals, operating),
     }  # fmt: skip
+    words = f"unstable at {ranges(speeds, wrong)} rpm" if unstable else "stable"
+    text = f"0 to {end:g} rpm: {words}; largest real part of a pole {growth.max():.4g} 1/s"
+    text += "" if found is None else "\n" + unbalance_text(case, found, criticals, operating)
     with files(out) as part:
         write_json(part / "campbell.json", summary)
         _pictures(case, (speeds, modes, criticals), found, part)
+        (part / "campbell.html").write_text(_report(case, text, speeds, modes, part), encoding="utf-8")
         names = [name for name in WRITTEN if (part / name).exists()]
     if not args.json:
-        words = f"unstable at {ranges(speeds, wrong)} rpm" if unstable else "stable"
-        print(f"0 to {end:g} rpm: {words}; largest real part of a pole {growth.max():.4g} 1/s")
-        if found is not None:
-            print(unbalance_text(case, found, criticals, operating))
+        print(text)
         written(out, ", ".join(names))
     return int(bool(unstable)), plain(summary | {"out": str(out)})
+
+
+def _report(case: MachineCase, text: str, speeds: np.ndarray, modes: list[list[Mode]], part: pathlib.Path) -> str:
+    """Return a page with the printed text, the pictures, and the modes at the lowest and the highest speed."""
+    pictures = {name: (part / name).read_bytes() for name in PICTURES if (part / name).exists()}
+    lines = [f"# Modes and unbalance of {escape_markdown(case.name)}", "", "```text", text, "```"]
+    lines += [line for name in pictures for line in ("", f"![{name}]({name})")]
+    for k in (0, -1):
+        rows = [(f"{mode.frequency:.4g}", f"{mode.damping:.3g}", mode.label) for mode in modes[k]]
+        lines += ["", f"## Modes of the closed loops at {speeds[k]:g} rpm", ""]
+        lines += markdown_table(("frequency, Hz", "damping ratio", "mode"), rows)
+    return render_page("\n".join(lines), pictures, f"Modes of {case.name}")
 
 
 def ranges(speeds: np.ndarray, wrong: np.ndarray) -> str:

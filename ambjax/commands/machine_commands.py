@@ -13,6 +13,7 @@ from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.linear import Injection, machine_injected
 from ambjax.linear.linear_machine import MachineSensitivity, sensitivity_of, turning_machines
 from ambjax.linear.margins import Margins
+from ambjax.page.rotor_motion import motion_page
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.operating import one_period
 from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
@@ -23,7 +24,7 @@ Summary = dict[str, object]
 # The measured sensitivity of each axis by speed, rpm.
 Measured = dict[float, tuple[Injection, ...]]
 # runup.png: only if the speed changes.
-SIMULATED = ("trajectory.npz", "metrics.json", "overview.png", "runup.png")
+SIMULATED = ("trajectory.npz", "metrics.json", "overview.png", "runup.png", "motion.html")
 ANALYSED = ("sensitivity.json", "sensitivity.png")
 # Metrics of the printed table, with their headings.
 COLUMNS = {
@@ -68,6 +69,9 @@ def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]
         described("overview.png", lambda: machine_picture(case, run.signals, title, part / "overview.png"))
         if np.ptp(run.signals["speed_rpm"]) > 0:
             described("runup.png", lambda: run_up_picture(case, run.signals, part / "runup.png"))
+        page = described("motion.html", lambda: motion_page(case, run.signals))
+        if page is not None:
+            (part / "motion.html").write_text(page, encoding="utf-8")
         names = [name for name in SIMULATED if (part / name).exists()]
     if not args.json:
         shown = {name: words for name, words in COLUMNS.items() if name in run.metrics}
