@@ -345,6 +345,8 @@ def test_a_fixed_number_of_steps_is_not_chosen_from_traced_values():
         cascade = amb.Cascade(inversion=amb.laws.inversion.Adaptive(gamma=gamma, p=25e-6))
         return amb.solvers.with_method(amb.Clock(10), cascade, TRACKING, reverse=True).sample_period
 
+    with pytest.raises(ValueError, match="clock = Cascade: it must be a Clock"):
+        amb.solvers.with_method(REPAIRED, TRACKING, amb.Clock(10))
     with pytest.raises(ValueError, match=r"with_method\(clock, cascade, scenario, reverse=True\)"):
         jax.jit(chosen)(1e9)
 

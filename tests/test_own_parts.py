@@ -201,3 +201,39 @@ def test_a_law_without_the_base_class_is_refused():
     cascade = dataclasses.replace(CASCADE, current=wrong)
     with pytest.raises(ValueError, match=r"controller\.current = Bare: .* ambjax\.extend\.CurrentLaw"):
         rollout(cascade, SCENARIO, CLOCK)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (
+            lambda model, inputs: (inputs[0].z if inputs[0].z > 0 else 0.0, ()),
+            r"TracerBoolConversionError.* jnp\.where",
+        ),
+        (lambda model, inputs: inputs[0].z, "its call must return the number v_star and the rate of its state"),
+        (lambda model, inputs: (jnp.ones(2) * inputs[0].z, ()), r"Law must return the number v_star .*\(2,\)"),
+    ],
+)
+def test_a_law_that_cannot_be_called_is_refused_in_one_line(call, said):
+    @record
+    class Law(PositionLaw):
+        def __call__(self, model, inputs, state):
+            return call(model, inputs)
+
+        def init(self, model):
+            return ()
+
+        def scale(self, model):
+            return ()
+
+        def sigma(self, model, inputs, state):
+            return 0.0
+
+        def slope(self, model):
+            return 1.0
+
+    cascade = dataclasses.replace(CASCADE, position=Law())
+    for run in (rollout, jax.jit(rollout)):
+        with pytest.raises(ValueError, match=rf"controller\.position = Law: it raised .*{said}") as refused:
+            run(cascade, SCENARIO, CLOCK)
+        assert "\n" not in str(refused.value)

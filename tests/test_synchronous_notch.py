@@ -125,7 +125,9 @@ def of_machine(bearings=(), **controller):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("controller", [{"coordinates": "rigid-body"}, {"kind": "lqg"}])
+@pytest.mark.parametrize(
+    "controller", [pytest.param({"coordinates": "rigid-body"}, marks=pytest.mark.thorough), {"kind": "lqg"}]
+)
 def test_each_bearing_of_a_machine_has_its_own_notch(controller):
     """One law of all axes: no current at the speed on the left, no displacement on the right, no notch along z."""
     notches = {"rate": 40.0}, {"kind": "displacement-free", "rate": 40.0}, {"kind": "none"}

@@ -12,6 +12,7 @@ import numpy as np
 
 from ambjax.cases.machine_controller import axis_controller, inner, kind_of, law_from, merged
 from ambjax.cases.machine_spread import axis_table, fastest_rotor, machine_spread, refuse_unused
+from ambjax.cases.machine_trial import try_machine
 from ambjax.cases.notch_table import notch_from
 from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
@@ -28,7 +29,6 @@ from ambjax.cases.rotor_tables import (
 )
 from ambjax.cases.speed_table import SPEED
 from ambjax.cases.table import Table, load, show
-from ambjax.cases.trial import try_machine
 from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.synchronous_notch import SynchronousNotch

@@ -11,11 +11,11 @@ from typing import NamedTuple, TypeVar
 import jax
 
 from ambjax.cases.table import quoted, show
-from ambjax.cases.trial import try_law
 from ambjax.control.base import Law
+from ambjax.control.law_trial import reason, try_law
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.stages import STAGES
-from ambjax.host.imports import digest_of, line_of, module_of_file, module_of_name, pickle_with_source
+from ambjax.host.imports import digest_of, module_of_file, module_of_name, pickle_with_source
 from ambjax.world.plant import Plant
 
 T = TypeVar("T")
@@ -72,7 +72,7 @@ def tried(law: OwnLaw, trial: Callable[[], T]) -> T:
     try:
         return trial()
     except Exception as error:
-        why = f"{law.law.__name__} {_said(error, law.file)}."
+        why = f"{law.law.__name__} {reason(error, law.file)}."
         raise ValueError(f"{_key(law.stage)} = {show(law.kind)}: {why}") from error
 
 
@@ -127,24 +127,13 @@ def _module(source: str, file: pathlib.Path | None, refuse: Refuse) -> types.Mod
         return module_of_name(source) if file is None else module_of_file(file)
     except OSError as error:
         if file is None or error.filename != str(file):
-            raise refuse(f"importing it {_said(error, file)}.") from error
+            raise refuse(f"importing it {reason(error, file)}.") from error
         why = f"{file} cannot be read ({error.strerror}). A path is relative to the folder of the case file"
         raise refuse(f"{why}.") from None
     except (Exception, SystemExit) as error:
         missing = isinstance(error, ModuleNotFoundError) and file is None and error.name == source.partition(".")[0]
         hint = ". Install it, set PYTHONPATH, or name a file" if missing else ""
-        raise refuse(f"importing it {_said(error, file)}{hint}.") from error
-
-
-def _said(error: BaseException, file: pathlib.Path | None) -> str:
-    line = None if file is None else line_of(error, file)
-    words = str(error).strip().partition("\n")[0] or "no message"
-    if isinstance(error, SyntaxError) and line is not None:
-        words = error.msg  # str(error) contains the line too
-    fix = ""
-    if isinstance(error, (jax.errors.TracerBoolConversionError, jax.errors.TracerArrayConversionError)):
-        fix = ". Compute with jax.numpy, and use jnp.where in place of `if`, `and` and `or`"
-    return f"raised {type(error).__name__}: {words.rstrip('.')}{'' if line is None else f' (line {line})'}{fix}"
+        raise refuse(f"importing it {reason(error, file)}{hint}.") from error
 
 
 def _class(module: types.ModuleType, name: str, source: str, base: type, refuse: Refuse) -> type:

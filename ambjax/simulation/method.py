@@ -168,6 +168,10 @@ def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: 
     ValueError also for adaptive steps if an amplifier controls the current in continuous time, and UnknownSlopeError if
     fixed steps are required and the values are hidden.
     """
+    if not isinstance(clock, Clock):
+        raise ValueError(
+            f"clock = {type(clock).__name__}: it must be a Clock. The order is with_method(clock, cascade, scenario)."
+        )
     if clock.method is None:
         period = lax.stop_gradient(clock.sample_period)
         try:

@@ -9,6 +9,7 @@ import numpy as np
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState
 from ambjax.control.guard import simulated
+from ambjax.control.law_trial import check_own_law
 from ambjax.control.stages import STAGES
 from ambjax.numerics.declared import require_number
 from ambjax.numerics.records import Scalar, is_traced, validate
@@ -35,6 +36,8 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
             )
     for name, value in (("cascade", cascade), ("scenario", scenario), ("clock", clock)):
         require_records(name, value)
+    for stage in STAGES:
+        check_own_law(getattr(cascade, stage), stage, cascade.model)
     validate(dataclasses.replace(cascade, processor=None), "controller")
     validate(cascade.processor, "processor")
     check_parts(cascade, scenario, clock.sample_period)
