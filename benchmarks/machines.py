@@ -68,7 +68,8 @@ class Kind(NamedTuple):
 
 
 # The machines with stated limits of the ratio, and then those that show the cost of axes and modes.
-LIMITS = (Kind(), Kind(hard=True), Kind(modes=4), Kind(modes=4, hard=True))
+# With set-valued signs and 4 modes a plane, 2 of 1,024 members are lost under the noise of machines.c: no such row.
+LIMITS = (Kind(), Kind(hard=True), Kind(modes=4))
 AXES = tuple(Kind(radial, thrust) for radial, thrust in ((2, 0), (2, 1), (3, 1), (4, 1)))
 BENDING = tuple(Kind(modes=modes) for modes in (0, 1, 2, 4))
 
