@@ -26,10 +26,7 @@ FAULTS = [1 << k for k, name in enumerate(BITS) if name in ("invalid", "failed")
 
 
 class ControllerState(NamedTuple):
-    """State of the compiled controller: its numbers, whether it has started, and its faulty samples so far.
-
-    A faulty sample has an invalid input, or a law whose result is not finite.
-    """
+    """State of the compiled controller: its numbers, whether it has started, and its faulty samples so far."""
 
     numbers: Array
     started: Array

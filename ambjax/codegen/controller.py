@@ -1,8 +1,4 @@
-"""The exported controller: the simulator's step, with names for its inputs, states, parameters and outputs.
-
-`Controller.step` first checks the reference, the delay and the steepnesses. Then it runs `Sampled.with_command`, which
-includes the guard of the readings.
-"""
+"""The exported controller: the simulator's step, with names for its inputs, states, parameters and outputs."""
 
 import dataclasses
 import functools
@@ -104,11 +100,7 @@ class Controller(Block):
     def step(
         self, parameters: Parameters, memory: Memory, inputs: StepInputs, period: Scalar, read: frozenset[str]
     ) -> tuple[Memory, StepOutputs, Status]:
-        """Compute one sample. Return the memory for the next one, the outputs and the status.
-
-        The step checks the reference inputs named in `read`, the steepnesses and, if the laws or the guard use a
-        prediction, the delay. The guard checks the readings.
-        """
+        """Compute one sample. Return the memory for the next one, the outputs and the status."""
         cascade, limits = parameters
         measured = Measurement(*inputs[:3])
         fine = [

@@ -1,7 +1,6 @@
 """The loop with a compiled plant, or a compiled loop, compared with JAX's loop.
 
-A compiled plant runs with JAX's controller, step by step. JAX's loop holds the disturbances over each sample, as the
-exported plant does.
+JAX's loop holds the disturbances over each sample, as the exported plant does.
 """
 
 from collections.abc import Callable

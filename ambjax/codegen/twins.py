@@ -118,10 +118,10 @@ class Twin(Sampled):
         return jax.tree.unflatten(tree, [x + self.unit * s * h for x, s, h in zip(leaves, signs, steps, strict=True)])
 
     def _sizes(self, state: SampledState) -> SampledState:
-        """Return the scale of each state. A number below its scale changes by the unit in the last place of the scale.
+        """Return the scale of each state.
 
         The scale of a voltage includes the voltage that changes the current by i_ref within one sample, because the
-        laws divide the difference of two references by the period. The scale of a commanded current is that of i_ref.
+        laws divide the difference of two references by the period.
         """
         cascade, plant = self.loop.cascade, self.loop.scenario.plant
         model = cascade.model
@@ -144,10 +144,7 @@ class Twin(Sampled):
 
 
 def horizons(case: LoopCase, precisions: list[str], *, held: bool = False) -> dict[str, Horizon]:
-    """Simulate JAX's loop and its twins. Return the horizon of each precision.
-
-    `held`: hold the disturbances over each sample, as an exported plant does.
-    """
+    """Simulate JAX's loop and its twins. Return the horizon of each precision."""
     given = sampled_of(case.cascade, case.scenario, case.clock)
     twin, clock = canonical((Twin(given.loop, given.period, given.cuts, held=held), case.clock))
     units = [0.0] + [float(np.finfo(PRECISIONS[x]).eps) for x in precisions for _ in range(TWINS)]

@@ -88,20 +88,13 @@ class Guard:
 
     @property
     def derived(self) -> bool:
-        """Whether every number is left out.
-
-        Derived limits accept every reading of a sensor without faults, if the error of the model's force is below the
-        full pull of one magnet.
-        """
+        """Whether every number is left out."""
         return all(getattr(self, field.name) is None for field in dataclasses.fields(type(self)))
 
     def with_limits(self, model: Plant, scenario: Scenario, period: Scalar, estimated: bool) -> "Guard":
         """Return the guard with every number set; those that are None are derived (docs/processor.md).
 
         `period`: sample period, s. `estimated`: whether an observer estimates the velocity.
-
-        The derivation uses the gap, the pole and the bias current of `model`. Of `scenario`, it uses the sensor, the
-        gap and the |z| at which the rotor is lost.
         """
         sensor = scenario.sensors
         limit, clearance = scenario.limit, scenario.limit / scenario.plant.s_0 * model.s_0
@@ -125,11 +118,7 @@ class Guard:
         return Watch(Measurement(zero, zero, zero), zero)
 
     def check(self, model: Plant, measured: Measurement, watch: Watch, period: Scalar, estimated: bool) -> GuardResult:
-        """Accept or replace the readings of a sample.
-
-        `measured`: the readings. `watch`: state of the guard at this sample. `period`: sample period, s. `estimated`:
-        whether an observer estimates the velocity, so that z_dot is not checked.
-        """
+        """Accept or replace the readings of a sample. `estimated`: an observer estimates z_dot: no check of it."""
         guard: Any = self  # its numbers are set (`with_limits`)
         (z, _, i), time = watch.expected, (guard.samples - watch.left + 1) * period
         # bound of the model's error in acceleration, m/s^2: the full pull of one magnet at the expected z and i
@@ -153,11 +142,7 @@ class Guard:
 
 
 def expected(driven: Callable[[Array, State], State], at: State, u: Array, period: Scalar) -> Measurement:
-    """Return the predicted readings of the next sample.
-
-    `driven`: `Cascade.driven`. `at`: state of the nominal model at this sample. `u`: mean command over the sample, V or
-    A. `period`: sample period, s.
-    """
+    """Return the predicted readings of the next sample. `at`: nominal state. `u`: mean command over it, V or A."""
     rates = driven(u, at)
     z, z_dot, i = (x + period * rate for x, rate in zip(at[:3], rates[:3], strict=True))
     return Measurement(z + period * period / 2 * rates.z_dot, z_dot, i)

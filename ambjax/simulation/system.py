@@ -20,10 +20,7 @@ from ambjax.world.scenario import Scenario
 
 
 def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
-    """Raise ValueError for an invalid value that is not traced. The message gives its path and a correction.
-
-    Traced values are not checked.
-    """
+    """Raise ValueError for an invalid value that is not traced. The message gives its path and a correction."""
     for name, value, kind in (("cascade", cascade, Cascade), ("scenario", scenario, Scenario), ("clock", clock, Clock)):
         if not isinstance(value, kind):
             raise ValueError(f"{name} = {type(value).__name__}: it must be a {kind.__name__}.")

@@ -110,10 +110,7 @@ SIDES = {
 
 
 class Required(NamedTuple):
-    """The requirement on one law: name, dotted path and unit of the gain, symbol of the right side, value of the gain.
-
-    If the law has no requirement, the value is None and the other fields are those of the paper's law.
-    """
+    """Requirement on one law: name, dotted path and unit of the gain, symbol of the right side, value of the gain."""
 
     gain: str
     path: str

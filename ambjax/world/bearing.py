@@ -117,10 +117,7 @@ class Bearing(Generic[S]):
         return self.i_0 + i, self.i_0 - i
 
     def flux_currents(self, state: S) -> tuple[Array, Array]:
-        """Return the currents (A) that determine the fluxes of the two coils.
-
-        They are the delayed currents if the flux has a lag.
-        """
+        """Return the currents (A) that determine the fluxes of the two coils."""
         return self.currents(state)
 
     def pull(self, flux_currents: tuple[Array, Array], z: Scalar, gaps: Gaps | None = None) -> Array:
