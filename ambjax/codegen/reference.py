@@ -33,8 +33,7 @@ def results(trace: Trace, at: Points) -> Results:
     count = at.started.size
     with precision(trace.precision):
         given = arguments(trace.block)
-        step: Any = trace.block.step
-        closed = jax.make_jaxpr(lambda *x: step(*x, trace.read))(*given)
+        closed = jax.make_jaxpr(lambda p, m, x, t: trace.block.step(p, m, x, t, trace.read))(*given)
         rows: list[Any] = [np.zeros(count, at.state.dtype)] * (len(jax.tree.leaves(given[1])) - 1) + [at.started]
         for row, k in zip(at.state, trace.keep, strict=True):
             rows[k] = row

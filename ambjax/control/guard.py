@@ -5,7 +5,7 @@ docs/processor.md defines the rules.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -15,9 +15,6 @@ from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.world.plant import Plant, State
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
-
-# Type of a cascade. Its class cannot be imported here, because its module imports this one.
-C = TypeVar("C")
 
 # Default limits of velocity (gaps per sample) and current: bias currents, or with a converter a share of its range.
 GAPS, CURRENTS, BEYOND = 2.0, 100.0, 1.1
@@ -146,25 +143,3 @@ def expected(driven: Callable[[Array, State], State], at: State, u: Array, perio
     rates = driven(u, at)
     z, z_dot, i = (x + period * rate for x, rate in zip(at[:3], rates[:3], strict=True))
     return Measurement(z + period * period / 2 * rates.z_dot, z_dot, i)
-
-
-def guarded(cascade: C, scenario: Scenario, period: Scalar) -> C:
-    """Return the cascade with the numbers of its guard set for a scenario; unchanged if it has no guard."""
-    one: Any = cascade
-    if one.timing.guard is None:
-        return cascade
-    guard = one.timing.guard.with_limits(one.model, scenario, period, one.observer.estimates_velocity)
-    return one.with_processor(guard=guard)
-
-
-def simulated(cascade: C, scenario: Scenario, period: Scalar) -> C:
-    """Return the cascade for a simulation.
-
-    If all limits of its guard are derived and the sensor has no faults, the guard would refuse no reading, and it is
-    removed. Otherwise the numbers of the guard are set (`guarded`).
-    """
-    one: Any = cascade
-    idle = one.timing.guard is not None and one.timing.guard.derived
-    if idle and not scenario.sensors.faulty:
-        return one.with_processor(guard=None)
-    return guarded(cascade, scenario, period)

@@ -26,10 +26,10 @@ from ambjax.codegen.program import PRECISIONS
 from ambjax.codegen.trace import trace
 from ambjax.codegen.twins import LoopCase
 from ambjax.control.cascade import Cascade
-from ambjax.control.guard import guarded
 from ambjax.ensemble.spread import ends
 from ambjax.host.arguments import names_arguments
 from ambjax.results.outputs import described, directory, files, plain, spare
+from ambjax.simulation.system import guarded
 
 FORMATS = ("c", "fmu", "js")
 # Files of the verification.
