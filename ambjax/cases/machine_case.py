@@ -307,4 +307,4 @@ def _clock(cases: list[Case], rotor: Rotor, fixed: bool) -> Clock:
             f"clock: this machine needs {substeps} steps in a sample of {period:g} s; at most {MOST_SUBSTEPS} are "
             "allowed. Use a processor or smooth gains, leave out the fastest modes, or shorten clock.sample_period."
         )
-    return dataclasses.replace(clock, method=dataclasses.replace(most, substeps=substeps))
+    return clock.with_method(dataclasses.replace(most, substeps=substeps))

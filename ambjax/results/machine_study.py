@@ -98,7 +98,7 @@ class MachineStudy(AnyStudy):
 
     def at_period(self, period: float) -> Self:
         case = _reread(self.case, {PERIOD: period})
-        return self._with_clock(case, dataclasses.replace(case.clock, method=self.clock.method))
+        return self._with_clock(case, case.clock.with_method(self.clock.method))
 
     def _with_clock(self, case: MachineCase, clock: Clock) -> Self:
         return dataclasses.replace(self, case=dataclasses.replace(case, clock=clock))
@@ -116,7 +116,7 @@ class MachineStudy(AnyStudy):
             found = _reread(self.case, wide)
         except ValueError as error:
             raise ValueError(f"--x, --y: {error}") from None
-        return self._with_clock(self.case, dataclasses.replace(self.clock, method=found.clock.method))
+        return self._with_clock(self.case, self.clock.with_method(found.clock.method))
 
     def batch(self, members: np.ndarray) -> tuple[Machine, PerAxis]:
         """Return the machine of these members (integers [n]), and the metrics of its axes; what varies has an axis [n].

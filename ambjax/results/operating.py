@@ -1,7 +1,6 @@
 """Operating points: linearised loops of a case at its equilibria, and of the members of its spread."""
 
 import contextlib
-import dataclasses
 import math
 from typing import NamedTuple, overload
 
@@ -28,6 +27,7 @@ from ambjax.linear import (
     linearise_members,
 )
 from ambjax.linear.linear_machine import MachineSensitivity, sensitivity_of, turning_machines
+from ambjax.numerics.records import replaced
 from ambjax.simulation.clock import Clock
 from ambjax.world.scenario import Scenario
 
@@ -144,7 +144,7 @@ def measured_peaks(case: Case, study: Study, peak: float) -> MemberPeaks:
 def one_period(case: Case | MachineCase) -> Clock:
     """Return the clock of one period of the multi-sine of an injection: the period of its lowest frequency."""
     period = float(case.clock.sample_period)
-    return dataclasses.replace(case.clock, samples=math.ceil(1 / (float(case.zones.f_low) * period)))
+    return replaced(case.clock, samples=math.ceil(1 / (float(case.zones.f_low) * period)))
 
 
 def shown_band(case: Case, systems: list[StateSpace]) -> tuple[float, float]:
