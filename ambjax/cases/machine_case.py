@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.machine_controller import axis_controller, inner, kind_of, law_from, merged
-from ambjax.cases.machine_spread import axis_table, fastest_rotor, machine_spread, refuse_unused
+from ambjax.cases.machine_spread import axis_table, machine_spread, refuse_unused
 from ambjax.cases.machine_trial import try_machine
 from ambjax.cases.notch_table import notch_from
 from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
+from ambjax.cases.rotor_numbers import fastest_rotor
 from ambjax.cases.rotor_tables import (
     COORDINATES,
     OWN,
