@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.machine_controller import axis_controller, inner, kind_of, law_from, merged
-from ambjax.cases.machine_spread import axis_table, fastest_rotor, machine_spread, refuse_unused
+from ambjax.cases.machine_spread import axis_table, machine_spread, refuse_unused
 from ambjax.cases.machine_trial import try_machine
 from ambjax.cases.notch_table import notch_from
 from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
+from ambjax.cases.rotor_numbers import fastest_rotor
 from ambjax.cases.rotor_tables import (
     COORDINATES,
     OWN,
@@ -27,7 +28,7 @@ from ambjax.cases.rotor_tables import (
     tables_of,
     vector,
 )
-from ambjax.cases.speed_table import SPEED
+from ambjax.cases.speed_table import MOST_SPEEDS, listed_speeds
 from ambjax.cases.table import Table, load, show
 from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
@@ -49,8 +50,6 @@ MACHINE_TABLES = ("rotor", "bearing", "unbalance", "load", "base")
 # Product of step and angular frequency of a mode (or of nutation) at which the relative error of RK4 in one period is
 # below 1e-6.
 MODE = 0.1
-# Largest number of speeds of the sensitivity.
-MOST_SPEEDS = 100
 # Largest number of substeps that the reader chooses.
 MOST_SUBSTEPS = 512
 
@@ -202,18 +201,12 @@ def notch_of_axis(controller: dict[str, Any], case: Case) -> tuple[SynchronousNo
 
 def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:
     """Return sensitivity.speeds, rpm; by default the first, the last and the largest of the run."""
-    value = table.raw.get("speeds")
-    if value is None:
-        first, *between, last = (float(rotor.rotation.rpm(t)) for t in rotor.rotation.corners(duration))
-        ends = (first,) if first == last else (first, last)
-        most = max(between, key=abs, default=0.0)
-        return (*ends, most) if abs(most) > max(abs(first), abs(last)) else ends
-    if not isinstance(value, list) or not 0 < len(value) <= MOST_SPEEDS:
-        raise ValueError(f"{table.at('speeds')} = {show(value)}: it must be a list of 1 to {MOST_SPEEDS} speeds, rpm.")
-    speeds = [Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(value)]
-    if (twice := next((x for x in speeds if speeds.count(x) > 1), None)) is not None:
-        raise ValueError(f"{table.at('speeds')} = {show(value)}: {twice:g} rpm is given more than once. Give it once.")
-    return tuple(speeds)
+    if "speeds" in table.raw:
+        return tuple(listed_speeds(table, MOST_SPEEDS))
+    first, *between, last = (float(rotor.rotation.rpm(t)) for t in rotor.rotation.corners(duration))
+    ends = (first,) if first == last else (first, last)
+    most = max(between, key=abs, default=0.0)
+    return (*ends, most) if abs(most) > max(abs(first), abs(last)) else ends
 
 
 def _start(table: Table, rotor: Rotor, count: int) -> tuple[np.ndarray, list[float]]:
