@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from ambjax.cases.axis_case import FROM_ROTOR
 from ambjax.cases.reader import Case
 from ambjax.cases.rotor_tables import COORDINATES, DAMPING, FREQUENCY, I_P, I_T, MASS, RIGID, BearingAxis
 from ambjax.cases.table import Table
@@ -19,8 +20,8 @@ from ambjax.world.rotor import Rotor
 # First words of the paths of the rotor, of its start, and of those of one bearing or one axis.
 OF_ROTOR, OF_START, OF_BEARING = ("rotor", "unbalance", "load", "base"), "initial", "bearing"
 START = "initial.q."
-# Numbers of an axis that follow from those of the rotor, and a table that a machine does not have.
-FROM_ROTOR, ABSENT = ("m", "k_z", "g"), "disturbance"
+# A table that a machine does not have.
+ABSENT = "disturbance"
 # Coordinates of the rigid rotor at t = 0.
 OFFSET = leaf(unit="m", at_least=-10.0, at_most=10.0, doc="displacement of the centre of mass at t = 0")
 TILT = leaf(unit="rad", at_least=-10.0, at_most=10.0, doc="tilt at t = 0")
