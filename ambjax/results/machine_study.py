@@ -131,7 +131,7 @@ class MachineStudy(AnyStudy):
         machine = self.case.machine
         parts = [self._axis(values, k, members) for k in range(len(self.case.axes))]
         rotor, start = varied_rotors(machine.rotor, values, self.case.axes), varied_start(machine.start_q, values)
-        folds = [canonical(Metrics.of(self.settle, scenario)) for _, scenario in parts]
+        folds = [canonical(Metrics.of(self.settle, scenario, machine.near)) for _, scenario in parts]
         return machine_of_axes(rotor, parts, self.clock, start, machine.law), PerAxis(stack_axes(folds))
 
     def metrics(self, values: dict[str, np.ndarray], members: np.ndarray) -> dict[str, np.ndarray]:
