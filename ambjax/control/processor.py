@@ -3,10 +3,11 @@
 import functools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from ambjax.control.guard import Guard
 from ambjax.control.sampling import Sampling
@@ -127,7 +128,17 @@ def predicted_over_delay(
 
     `driven`: `Cascade.driven`. `past`: the commands u_{n-1}, u_{n-2}, ... `lengths`: durations for which they act, s.
     """
-    x = model.start(estimate)
-    for u, h in reversed(list(zip(past[: len(lengths)], lengths, strict=True))):
-        x = rk4_step(functools.partial(driven, u), x, h)
-    return model.measurement(x)
+    count, start = len(lengths), model.start(estimate)
+
+    def moved(loop: tuple[State, tuple[Array, ...], tuple[Array, ...]], _: None) -> tuple[Any, None]:
+        x, past, lengths = loop
+        x = rk4_step(functools.partial(driven, past[-1]), x, lengths[-1])
+        return (x, (past[-1], *past[:-1]), (lengths[-1], *lengths[:-1])), None
+
+    loop = (start, past[:count], lengths)
+    if count <= USUAL_DELAY:
+        for _ in range(count):
+            loop, _ = moved(loop, None)
+    else:  # a loop, so that the program does not grow with the delay
+        loop, _ = lax.scan(moved, loop, None, count)
+    return model.measurement(loop[0])
