@@ -249,10 +249,7 @@ def _shares(rotor: Rotor) -> tuple[list[float], list[float]]:
 
 
 def _clock(cases: list[Case], rotor: Rotor, fixed: bool) -> Clock:
-    """Return the clock with a method whose fixed steps resolve every axis, the bending modes and nutation.
-
-    `fixed`: whether the case gives the step.
-    """
+    """Return the clock with a method whose fixed steps resolve every axis, the bending modes and nutation."""
     clock, period = cases[0].clock, float(cases[0].clock.sample_period)
     methods = [case.clock.method for case in cases]
     fixed_steps = [method for method in methods if isinstance(method, (RK4, DOP853, Euler))]

@@ -1,8 +1,4 @@
-"""Reader of case files: from TOML to a cascade, a scenario and a clock.
-
-The reader is strict. An unknown key, a wrong type, a number out of bounds or two contradictory settings raise a
-ValueError with one line: the dotted path, the value, what is allowed and the fix.
-"""
+"""Reader of case files: from TOML to a cascade, a scenario and a clock."""
 
 import dataclasses
 import pathlib

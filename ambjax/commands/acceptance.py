@@ -30,10 +30,7 @@ class Fact(NamedTuple):
 
 
 def acceptance(case: Case) -> tuple[dict[str, object], list[str], str]:
-    """Return the JSON summary, the lines on the zone of the loop linearised at r = 0, and the table of its numbers.
-
-    If the loop cannot be linearised, `zone` and `stable` are None, and `why` is the cause.
-    """
+    """Return the JSON summary, the lines on the zone of the loop linearised at r = 0, and the table of its numbers."""
     try:
         system = linearise(case.cascade, case.scenario, case.clock)
     except ValueError as error:
@@ -117,10 +114,7 @@ def machine(case: Case) -> list[Fact]:
 
 
 def _voltages(case: Case) -> tuple[float | None, float | None]:
-    """Return the largest u, and the largest voltage of a coil in excess of R i_0, V; None: no limit.
-
-    The largest u is half the difference of the voltages of the coils, each within its limit, for a command of u_max.
-    """
+    """Return the largest u, and the largest voltage of a coil in excess of R i_0, V; None: no limit."""
     scenario, bias = case.scenario, case.scenario.plant.R * case.scenario.plant.i_0
     coil = scenario.actuator.coil
     u_max, reserve = float(scenario.u_max), math.inf

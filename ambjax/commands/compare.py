@@ -146,11 +146,7 @@ def _studies(cases: Sequence[AnyCase], seed: int | None, members: int) -> list[S
 
 
 def _read(paths: Sequence[str]) -> list[AnyCase]:
-    """Read the cases.
-
-    Raises ValueError for fewer than 2 or too many files, a repeated file, a file that `read_any` refuses, or machines
-    beside cases of one axis.
-    """
+    """Read the cases."""
     _check_count(len(paths), "case file")
     for path in paths:
         same = [other for other in paths if pathlib.Path(other).resolve() == pathlib.Path(path).resolve()]
@@ -236,10 +232,7 @@ def _linear(case: AnyCase, study: Study | MachineStudy) -> ComparedLoop:
 
 
 def _flops(case: Case) -> int | None:
-    """Return the number of floating-point operations of a step of the exported controller in single precision.
-
-    None in continuous time, or if a law cannot be exported.
-    """
+    """Return the floating-point operations of a step of the exported controller; None if it cannot be exported."""
     if not case.cascade.sampled:
         return None
     try:

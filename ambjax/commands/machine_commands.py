@@ -113,8 +113,7 @@ def worst_of_speeds(points: list[MachineSensitivity]) -> MachineSensitivity:
 def _injections(case: MachineCase, points: list[MachineSensitivity], everywhere: bool) -> Measured:
     """Measure the sensitivity of each axis by injection into the simulation.
 
-    On a processor at the speed with the largest peak; `everywhere`: at all speeds, also in continuous time. An
-    unstable machine is not measured.
+    On a processor at the speed with the largest peak; `everywhere`: at all speeds, also in continuous time.
     """
     sampled = isinstance(case.machine, SampledMachine)
     at = points if everywhere else [worst_of_speeds(points)] if sampled else []

@@ -293,7 +293,6 @@ class Cascade:
     def estimate(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State, Measurement]:
         """Step the observer on a processor.
 
-        `measured`: the readings. `state`: state of the observer. `sample`: reference, period and past commands.
         Returns the estimate for the other laws (with prediction: at the end of the delay), the next state of the
         observer, and the estimate at the sample itself.
         """
@@ -350,10 +349,7 @@ class Cascade:
     def commanded(
         self, force: ForceDemand, estimate: Measurement, state: CascadeState, sample: Sample
     ) -> tuple[Command, CascadeState]:
-        """Step inversion and current law on a processor, for a demanded force.
-
-        `estimate`: estimated motion and current. The states of observer and position law do not change.
-        """
+        """Step inversion and current law on a processor for a demanded force; the other states do not change."""
         advance = self._advance(sample)
         inversion = with_gains_at(self.inversion, force.z, sample.reference)
         current = with_gains_at(self.current, force.z, sample.reference)
@@ -378,10 +374,7 @@ class Cascade:
     def command_rates(
         self, force: ForceDemand, estimate: Measurement, state: CascadeState, reference: Reference, u_max: Scalar
     ) -> tuple[Command, CascadeState]:
-        """Return the command in continuous time for a demanded force, and the rates of inversion and current law.
-
-        The rates of observer and position law are ().
-        """
+        """Return the command in continuous time for a demanded force, and the rates; those of the others are ()."""
         inversion = with_gains_at(self.inversion, force.z, reference)
         current = with_gains_at(self.current, force.z, reference)
         demand, inversion_rate = inversion(self.model, force, state.inversion)

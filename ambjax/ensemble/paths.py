@@ -102,8 +102,7 @@ def _below(node: object, path: str, route: tuple[int | str, ...]) -> Iterator[tu
 def kinds(node: object, path: str = "") -> Iterator[tuple[str, str]]:
     """Yield what is not a number in a record and its nested records: the type and the static fields, by dotted path.
 
-    For a custom law, the digest of its source is yielded too. `path`: prefix of the dotted paths, which ends with a dot
-    or is empty.
+    For a custom law, the digest of its source is yielded too.
     """
     if isinstance(node, tuple):
         for index, item in enumerate(node):

@@ -189,10 +189,7 @@ class Study(AnyStudy):
         return {"index": members, "lost_at": outcome.trajectory.lost_at, **outcome.metrics, **values}
 
     def bands(self, members: int, times: int, until: float = math.inf) -> Bands:
-        """Compute the data of a fan chart of the first `members` members, up to time `until` (s) or the end of the run.
-
-        The instants are equally spaced, at most `times` of them, and the last sample is added.
-        """
+        """Compute the data of a fan chart of the first `members` members, up to time `until` (s) or the end."""
         period = float(self.clock.sample_period)
         samples = int(min(self.clock.samples, math.ceil(until / period) + 1 if math.isfinite(until) else math.inf))
         every = -(-samples // times)
@@ -230,10 +227,7 @@ def _beside(blocks: np.ndarray, combine: Callable[[np.ndarray, np.ndarray], np.n
 
 
 def _rate(increments: np.ndarray, t: np.ndarray, width: int) -> np.ndarray:
-    """Return the mean rate of growth over the `width` blocks before each instant t [T]; NaN before all have passed.
-
-    `increments` [members, count]: growth from each instant to the next.
-    """
+    """Return the mean rate of growth over the `width` blocks before each instant t [T]; NaN before all have passed."""
     total = np.concatenate([np.zeros((len(increments), 1)), np.cumsum(increments, axis=1)], axis=1)[:, : len(t)]
     rate = np.full(total.shape, np.nan)
     rate[:, width:] = (total[:, width:] - total[:, :-width]) / (t[width:] - t[:-width])

@@ -80,10 +80,7 @@ class Zones:
     )
 
     def check(self, period: Scalar | None) -> None:
-        """Raise ValueError if the limits are not in ascending order, or as `range` does.
-
-        `period`: see `range`.
-        """
+        """Raise ValueError if the limits are not in ascending order, or as `range` does."""
         self.range(period)
         for names in (("zone_a", "zone_b", "zone_c"), ("clearance_a", "clearance_b", "clearance_c")):
             limits = [float(getattr(self, name)) for name in names]

@@ -178,10 +178,7 @@ def poles_in_s(system: StateSpace) -> np.ndarray:
 
 
 def margins_of(system: StateSpace) -> LoopMargins:
-    """Return the margins of a stable loop, broken at the reading and at the command.
-
-    The scan ends at half the sampling rate or, in continuous time, far above all poles.
-    """
+    """Return the margins of a stable loop, broken at the reading and at the command."""
     f = _scanned(system)
     return LoopMargins(_margins(system, "reading", f), _margins(system, "command", f))
 

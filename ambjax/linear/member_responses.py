@@ -63,7 +63,7 @@ def member_responses(
     """Inject the same multi-sine into each member of an ensemble, whose varying leaves are arrays [N].
 
     The arguments are those of `injected`; `channel` is its argument `reading`. `scenario.member` [N] contains the
-    numbers of the members. Raises ValueError as `injected` does.
+    numbers of the members.
     """
     gap, pole = (float(np.mean(np.asarray(x))) for x in (scenario.plant.s_0, scenario.plant.pole))
     require_number("amplitude", amplitude, optional=True)
@@ -95,10 +95,7 @@ def _member(tree: Any) -> tuple[Any, Any]:
 
 
 def padded(wave: MultiSine, lines: int) -> MultiSine:
-    """Return the wave with this number of lines.
-
-    The new lines have the frequency 0 and the phase pi/2, whose cosine is 0.
-    """
+    """Return the wave with this number of lines."""
     padding = (0, lines - len(wave.harmonics))
     phases = np.pad(wave.phases, padding, constant_values=0.5 * np.pi)
     return dataclasses.replace(wave, harmonics=np.pad(wave.harmonics, padding), phases=phases)

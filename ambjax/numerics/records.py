@@ -168,10 +168,7 @@ def record(cls: type[T]) -> type[T]:
 
 
 def _check_at_construction(cls: type) -> None:
-    """Add a `__post_init__` that checks the plain numbers. Call this before the class becomes a dataclass.
-
-    A `__post_init__` in the body of the class runs first.
-    """
+    """Add a `__post_init__` that checks the plain numbers. Call this before the class becomes a dataclass."""
     own = cls.__dict__.get("__post_init__")
 
     def check(self: object) -> None:
@@ -195,10 +192,7 @@ def _check_at_construction(cls: type) -> None:
 
 
 def _getter(names: list[str]) -> Callable[[object], tuple[object, ...]]:
-    """Return a fast function from an object to the tuple of its attributes `names`.
-
-    Speed matters because a rollout flattens about twenty records three times.
-    """
+    """Return a fast function from an object to the tuple of its attributes `names`."""
     if len(names) > 1:
         return operator.attrgetter(*names)
     return lambda node: tuple(getattr(node, name) for name in names)
@@ -253,11 +247,7 @@ def validate(node: object, path: str = "") -> None:
 
 
 def check_leaf(field: dataclasses.Field, name: str, value: object) -> None:
-    """Raise the ValueError of `check_number` if the leaf `field` does not allow `value`. Traced values are allowed.
-
-    `name`: dotted name, for messages. `value` may be a `GainFunction`, which checks itself. None is
-    allowed for an optional field and for a steepness.
-    """
+    """Raise the ValueError of `check_number` if the leaf `field` does not allow `value`; traced values are allowed."""
     if isinstance(value, GainFunction):
         value.check(field, name)
     elif not (is_traced(value) or (value is None and (field.metadata["optional"] or field.metadata.get("steepness")))):

@@ -72,10 +72,7 @@ class LoopFunctions:
 
 
 def loop_parameters(case: Case, any_delay: bool = False) -> Numbers:
-    """Return the numbers of a case on a processor.
-
-    `any_delay`: the program admits any delay up to `longest_delay`, not only that of the case.
-    """
+    """Return the numbers of a case on a processor."""
     cascade = case.cascade.on_processor()
     if any_delay:
         cascade = cascade.on_processor(0.0, longest_delay(case), between=True)

@@ -27,10 +27,10 @@ from ambjax.codegen.program import PRECISIONS
 from ambjax.codegen.trace import trace
 from ambjax.codegen.twins import LoopCase
 from ambjax.control.cascade import Cascade
-from ambjax.control.guard import guarded
 from ambjax.ensemble.spread import ends
 from ambjax.host.arguments import names_arguments
 from ambjax.results.outputs import described, directory, files, plain, spare
+from ambjax.simulation.system import guarded
 
 FORMATS = ("c", "fmu", "js")
 # Files of the verification.
@@ -223,9 +223,7 @@ def _built(plan: Plan) -> dict[str, str | bytes]:
 def destination(out: str | None, name: str, plan: Plan) -> Iterator[tuple[pathlib.Path, pathlib.Path]]:
     """Yield the output directory, and a folder whose files move into it at the end of the `with` block, as in `files`.
 
-    `out` and `name` are those of `directory`. Without verification, the verification of an earlier export is removed,
-    because it does not apply to the new files. Raises ValueError if it would replace a file that is not from an export
-    with the same prefix.
+    Without verification, the verification of an earlier export is removed, because it does not apply to the new files.
     """
     path = directory(out, name)
     names = {"fmu": FMU_NAMES[: 1 if _holds_fmu(path, plan) else None], "js": ("{p}.js",), "c": package.NAMES}[

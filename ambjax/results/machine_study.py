@@ -105,10 +105,7 @@ class MachineStudy(AnyStudy):
         return dataclasses.replace(self, case=dataclasses.replace(case, clock=clock))
 
     def with_steps_for(self, axes: dict[str, np.ndarray]) -> Self:
-        """Return the study with integration steps for all values of these numbers, by dotted path of `places`.
-
-        Raises ValueError for values that the machine does not allow.
-        """
+        """Return the study with integration steps for all values of these numbers, by dotted path of `places`."""
         wide: dict[str, object] = {}
         for path, x in axes.items():
             low, high = float(x.min()), float(x.max())
@@ -120,10 +117,7 @@ class MachineStudy(AnyStudy):
         return self._with_clock(self.case, self.clock.with_method(found.clock.method))
 
     def batch(self, members: np.ndarray) -> tuple[Machine, PerAxis]:
-        """Return the machine of these members (integers [n]), and the metrics of its axes; what varies has an axis [n].
-
-        The nominal plants of the controllers do not vary.
-        """
+        """Return the machine of these members [n], and the metrics of its axes; what varies has an axis [n]."""
         return self.varied(self.drawn(members), members)
 
     def varied(self, values: dict[str, np.ndarray], members: np.ndarray) -> tuple[Machine, PerAxis]:

@@ -103,10 +103,7 @@ def _analysis(case: Case, system: StateSpace, m: float, velocity: bool) -> Analy
 
 
 def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPeaks:
-    """Analyse the members of the study at r = 0, and return the counts and the member with the largest peak.
-
-    `most`: number of members to analyse, the first of the study (None: all).
-    """
+    """Analyse the members of the study at r = 0, and return the counts and the member with the largest peak."""
     members = study.members if most is None else min(study.members, most)
     cascade, scenario = study.batch(np.arange(members))
     systems, found = linearise_members(cascade, scenario, study.clock)
@@ -131,10 +128,7 @@ def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPea
 
 
 def measured_peaks(case: Case, study: Study, peak: float) -> MemberPeaks:
-    """Measure the peak of |S| of each member of the study by injection of a multi-sine.
-
-    The frequencies of the multi-sine are denser near `peak` (Hz).
-    """
+    """Measure the peak of |S| of each member of the study by injection of a multi-sine."""
     cascade, scenario = study.batch(np.arange(study.members))
     clock = one_period(case)
     lines = frequency_lines(case.zones, clock, peak)

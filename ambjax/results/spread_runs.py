@@ -38,9 +38,9 @@ class MembersRun:
         return statistics.summary(self.columns, self.study.spread.paths, self.study.seed)
 
     def to_pandas(self) -> Any:
-        """Return the columns as a pandas DataFrame, one row per member. Raises ValueError if pandas is not installed.
+        """Return the columns as a pandas DataFrame, one row per member.
 
-        `attrs["units"]` has the unit of each metric. `DataFrame.to_parquet` writes the table to a file.
+        `attrs["units"]` has the unit of each metric.
         """
         columns = {name: x for name, x in self.columns.items() if name != "index"}
         index = extra("pandas").Index(self.columns["index"], name="member")
@@ -62,7 +62,7 @@ class MembersRun:
         return f"<table><caption>{head}</caption>{titles}{rows}</table>"
 
     def plot(self, *metrics: str) -> Any:
-        """Return a matplotlib Figure with histograms of these metrics over the members. Default: the main ones.
+        """Return a matplotlib Figure with histograms of these metrics over the members.
 
         Raises ValueError if none of these names is a column.
         """

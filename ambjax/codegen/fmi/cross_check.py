@@ -25,10 +25,7 @@ GROWTH = 1e4
 
 
 def run_block(block: Block, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Run a block in JAX. Return its outputs [samples, outputs] and status [samples], the bits as an integer.
-
-    `rows`: inputs [samples, inputs]. Units and order are those of `block.inputs` and `block.outputs`.
-    """
+    """Run a block in JAX. Return its outputs [samples, outputs] and status [samples], the bits as an integer."""
     parameters, memory, _, period = arguments(block)
     read = frozenset(block.inputs)
 
@@ -43,9 +40,6 @@ def run_block(block: Block, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def reference(block: Block, cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[np.ndarray, np.ndarray]:
     """Return inputs and outputs of a block's FMU in the loop of the case.
-
-    The readings of a controller are the reading of z and the true velocity and current of the simulated case. They do
-    not depend on whether the plant can be exported.
 
     Each is an array [instants, 1 + numbers] with the time (s) in the first column; the outputs have one instant more.
     The inputs of a row act in the communication step that begins at its time. For a plant and a loop, the first row is
