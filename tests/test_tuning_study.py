@@ -8,6 +8,7 @@ import math
 import os
 import tomllib
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -24,7 +25,6 @@ from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.cases.tune_table import Budget
 from tuning.judge.evaluate import RESOLVED, describe, judge, step_error, summarise
-from tuning.optimisers import bfgs
 from tuning.problem.config import seeds
 from tuning.problem.goal import Goal
 from tuning.problem.loss import TERMS
@@ -33,7 +33,7 @@ from tuning.problem.risk import Mean
 from tuning.problem.shortfalls import Bound
 from tuning.problem.space import Gain, Space
 from tuning.report import slices as explore
-from tuning.solve.descent import Descent
+from tuning.solve.descent import Descent, begin, step
 from tuning.solve.refine import RACE, best_of, search
 from tuning.solve.screen import initial_points
 
@@ -198,9 +198,8 @@ def test_the_penalty_of_the_conditions_acts_where_the_loss_is_constant():
     space = Space(tuple(Gain(path) for path in PATHS))
     conditions = (Bound("controller.position.k", 50.0, "Q_z", "m/s^2"),)
     goal = Goal(space, (1.0,) * 6, Mean(), conditions, 2.0, 0.1)
-    descent = Descent(goal, "bfgs", 0.1)
     x = jnp.asarray(np.log([[30.0, 20.0]]))
-    flat = descent.step(3, descent.begin(x), jnp.ones((1, 3, 1)), jnp.zeros((1, 3, 1, 2)), jnp.ones(1, bool))
+    flat = Descent(goal)(3, begin(x), jnp.ones((1, 3, 1)), jnp.zeros((1, 3, 1, 2)), jnp.ones(1, bool))
     # log of the mean loss, 1, and the weighed square of log(1.1 * 50 / 20)
     assert float(flat.value[0]) == pytest.approx(2 * math.log(2.75) ** 2)
     assert float(flat.trial[0, 0]) == pytest.approx(float(x[0, 0]))
@@ -224,13 +223,10 @@ def test_the_path_of_bfgs_does_not_depend_on_the_unit_of_the_loss():
     hessian, centre = jnp.diag(jnp.asarray([4.0, 60.0, 900.0])), jnp.asarray([0.5, -0.3, 0.2])
 
     def way(unit):
-        x, method, found = jnp.zeros(3), bfgs(), []
-        state = method.init(x)
-        for n in range(6):
-            gradient = unit * hessian @ (x - centre)
-            step, state = method.update(gradient, state, x, value=jnp.asarray(-0.1 * n))  # always better
-            x = x + step
-            found.append(np.asarray(x))
+        start, found = jax.tree.map(lambda a: a[0], begin(jnp.zeros((1, 3)))), []
+        for n in range(6):  # every value is better than the last
+            start = step(start, jnp.asarray(-0.1 * n), unit * hessian @ (start.trial - centre))
+            found.append(np.asarray(start.trial))
         return np.array(found)
 
     # the first step is as long as allowed in either unit; the same numbers but for rounding

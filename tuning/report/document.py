@@ -189,7 +189,7 @@ def _course(facts: TuningFacts) -> list[str]:
     """Return the section on the search: its settings, its cost, and the error of its steps."""
     how = facts.search
     lines = [
-        f"- risk: {how['risk']} over {how['members']} members (seed {how['seed']}), optimiser {how['optimiser']}",
+        f"- risk: {how['risk']} over {how['members']} members (seed {how['seed']})",
         f"- {how['iterations']} iterations, {how['rollouts']} simulated rollouts "
         f"(a gradient of m gains counts m + 1), {how['seconds']:.0f} s",
     ]
