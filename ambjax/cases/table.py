@@ -20,6 +20,8 @@ from ambjax.text.words import one_line
 LONGEST = 60
 # Largest depth of nested tables and lists. A sum of sums needs less. The readers are recursive and rely on this limit.
 DEEPEST = 32
+# Tables of which a case may have several.
+SEVERAL = r"disturbance\.\w+|bearing|unbalance|load|base|rotor\.(?:modes|elements|discs|sleeves)"
 # Largest size of a case file.
 MOST_BYTES = 10_000_000
 
@@ -65,7 +67,9 @@ def _place(text: str, error: str) -> str:
     if re.match(r"[^#\[\"']*=\s*[-+]?\d+,\d", line):
         return f"{shown} Write a decimal number with a point."
     if "twice" in error or ("overwrite" in error and line.lstrip().startswith("[")):
-        return f"{shown} Write each table once. For several loads, put [[disturbance.q_z]] above each, also the first."
+        several = re.match(rf"\s*\[+({SEVERAL})\]", line)
+        advice = f" For several, put [[{several[1]}]] above each, also the first." if several else ""
+        return f"{shown} Write each table once.{advice}"
     if "overwrite" in error:
         return f"{shown} Write each key once."
     return f"{shown} See 'ambjax template' for a file to start from."

@@ -68,10 +68,10 @@ def _loop_facts(loop: Analysis, rate: float | None) -> list[Fact]:
     if not loop.stable:
         return []
     kinds = {
-        "gain": ("gain_margin", "gain margin (the one nearer to 1)", "1"),
-        "phase_deg": ("phase_margin_deg", "phase margin", "degrees"),
+        "gm": ("gain_margin", "gain margin (the one nearer to 1)", "1"),
+        "pm": ("phase_margin_deg", "phase margin", "degrees"),
         "delay": ("delay_margin_s", "delay margin", "s"),
-        "disk": ("disk_margin", "disk margin", "1"),
+        "dm": ("disk_margin", "disk margin", "1"),
     }
     facts = [Fact("peak", "peak of |S|", loop.S.height, "1")]
     for kind, (key, words, unit) in kinds.items():

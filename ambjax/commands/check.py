@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.forces import forces
+from ambjax.cases.given import of_case
 from ambjax.cases.machine_case import MachineCase
-from ambjax.cases.reader import Case, require_case
+from ambjax.cases.reader import Case
 from ambjax.commands import machine_check
 from ambjax.commands.acceptance import acceptance
 from ambjax.commands.check_text import OnProcessor
@@ -41,6 +42,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     return int(not found.holds), found.summary
 
 
+@of_case(machines=True)
 def check(case: Case | MachineCase, *, full: bool = False) -> CaseCheck:
     """Check a case of one axis or of a machine, as `ambjax check` does.
 
@@ -54,7 +56,6 @@ def check(case: Case | MachineCase, *, full: bool = False) -> CaseCheck:
     with quiet():
         if isinstance(case, MachineCase):
             return machine_check.check(case)
-        require_case(case)
         return _checked(case, f"{case.name}.toml", full)
 
 

@@ -90,7 +90,7 @@ def sliding_error(study: Study) -> dict[str, Any]:
     The comparison uses the first COMPARISON members, without those that are lost or stalled with either kind of steps.
     """
     tolerance = max(TOLERANCE, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps))
-    accurate = dataclasses.replace(study, clock=dataclasses.replace(study.clock, method=AdaptiveRodas3(tolerance)))
+    accurate = dataclasses.replace(study, clock=study.clock.with_method(AdaptiveRodas3(tolerance)))
     count = min(COMPARISON, study.members)
     ours, theirs = (chunk(one, 0, count, count) for one in (study, accurate))
     ends = [~np.isfinite(columns["lost_at"]) for columns in (ours, theirs)]

@@ -217,10 +217,10 @@ def _row(point: OperatingPoint) -> tuple[str, ...]:
 def _margin_rows(point: OperatingPoint) -> list[tuple[str, ...]]:
     """Return the margins of a stable loop at each place, the place with the smaller disk margin first."""
     at, rows = point.analysis.margins_at, []
-    for place in sorted(PLACES, key=lambda place: place != at.place("disk")):
+    for place in sorted(PLACES, key=lambda place: place != at.place("dm")):
         one = getattr(at, place)
-        gains = f"{_number(one.gain_low)} to {_number(one.gain_high)}"
-        rows.append((point.name, place, gains, *map(_number, (one.phase_deg, one.delay, one.disk))))
+        gains = f"{_number(one.gm_low)} to {_number(one.gm_high)}"
+        rows.append((point.name, place, gains, *map(_number, (one.pm, one.delay, one.dm))))
     return rows
 
 

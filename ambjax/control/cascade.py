@@ -31,7 +31,7 @@ from ambjax.control.stages import (
     step_law,
 )
 from ambjax.control.synchronous_notch import SynchronousNotch
-from ambjax.numerics.records import Scalar, is_traced, part, record
+from ambjax.numerics.records import Scalar, is_traced, part, record, replaced
 from ambjax.world.plant import Plant
 from ambjax.world.plant import State as NominalState
 from ambjax.world.rotation import Rotation
@@ -158,7 +158,7 @@ class Cascade:
 
     def with_processor(self, **fields: object) -> "Cascade":
         """Return the cascade with other fields of its processor. In continuous time, it does not change."""
-        return dataclasses.replace(self, processor=self.processor and dataclasses.replace(self.processor, **fields))
+        return dataclasses.replace(self, processor=self.processor and replaced(self.processor, **fields))
 
     def driven(self, u: Array, state: NominalState) -> NominalState:
         """Return the rates of the nominal plant under the command u, V or A."""

@@ -9,7 +9,7 @@ import numpy as np
 from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import Schedule
 from ambjax.host.imports import digest_of
-from ambjax.numerics.records import is_traced, leaf
+from ambjax.numerics.records import is_traced, leaf, replaced
 from ambjax.numerics.shapes import axes_of, with_entry
 from ambjax.world.scenario import Scenario
 from ambjax.world.waveforms import Constant
@@ -159,7 +159,7 @@ def _set(node: Any, route: tuple[int | str, ...], value: Any) -> Any:
         if isinstance(node, tuple):
             return (*node[:step], _set(node[step], tuple(rest), value), *node[step + 1 :])
         return with_entry(node, route, value)
-    return dataclasses.replace(node, **{step: _set(getattr(node, step), tuple(rest), value)})
+    return replaced(node, **{step: _set(getattr(node, step), tuple(rest), value)})
 
 
 def numbers_in(node: object, path: str) -> dict[str, Place]:

@@ -16,6 +16,7 @@ from ambjax.ensemble.blocks import Blocks
 from ambjax.ensemble.paths import Place, kinds, places
 from ambjax.ensemble.spread import Spread, apply, draw
 from ambjax.host.sealed import provenance
+from ambjax.numerics.records import replaced
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.trajectory import Trajectory
@@ -162,7 +163,7 @@ class Study(AnyStudy):
 
     def at_period(self, period: float) -> Self:
         samples = max(round(float(self.clock.duration) / period), 1)
-        return dataclasses.replace(self, clock=dataclasses.replace(self.clock, samples=samples, sample_period=period))
+        return dataclasses.replace(self, clock=replaced(self.clock, samples=samples, sample_period=period))
 
     def metrics(self, values: dict[str, np.ndarray], members: np.ndarray) -> dict[str, np.ndarray]:
         cascade, scenario = jax.tree.map(np.asarray, self.varied(values, members))
@@ -195,7 +196,7 @@ class Study(AnyStudy):
         count = -(-samples // every)
         cascade, scenario = self.batch(np.arange(min(members, self.members)))
         fold = Blocks(tuple(FAN_SIGNALS.values()), every, count, period)
-        clock = dataclasses.replace(self.clock, samples=samples)
+        clock = replaced(self.clock, samples=samples)
         outcome = run_ensemble(cascade, scenario, clock, fold=fold, record_every=every)
         rows, folded = outcome.trajectory.rows, outcome.metrics
         # Add the last sample, unless the last block begins there.

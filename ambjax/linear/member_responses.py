@@ -14,7 +14,7 @@ from ambjax.ensemble.batching import map_members, size
 from ambjax.linear.equilibrium import ideal, reading
 from ambjax.linear.multisine import MultiSine, Reading, Response, multisine
 from ambjax.numerics.declared import require_number
-from ambjax.numerics.records import Scalar, canonical
+from ambjax.numerics.records import Scalar, canonical, replaced
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import prepare, run
 from ambjax.simulation.sliding import Slide
@@ -76,7 +76,7 @@ def member_responses(
     wave = multisine(_harmonics(frequencies, clock), clock.samples, float(clock.sample_period), amplitude, channel)
     skip = settle * clock.samples
     method = None if isinstance(clock.method, Slide) else clock.method
-    longer = dataclasses.replace(clock, samples=skip + periods * clock.samples, method=method)
+    longer = replaced(clock, samples=skip + periods * clock.samples, method=method)
     system, longer = prepare(*_at_rest(cascade, scenario, r), longer)
     response = Response(padded(wave, PADDED * math.ceil(len(wave.harmonics) / PADDED)), scenario.voltage_limit, skip)
     tree = canonical((system, longer, response))

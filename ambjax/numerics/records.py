@@ -10,7 +10,7 @@ import inspect
 import math
 import operator
 from collections.abc import Callable, Hashable, Iterable
-from typing import Any, TypeAlias, TypeVar, dataclass_transform
+from typing import Any, Literal, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
@@ -100,6 +100,23 @@ def static(default: object = dataclasses.MISSING, *, doc: str = "") -> Any:
     return dataclasses.field(default=default, metadata={"static": True, "doc": doc})
 
 
+def derived(*, init: Literal[False] = False) -> Any:
+    """Declare a static field that a function computes, None until then. The constructor does not take it.
+
+    `dataclasses.replace` resets it; `replaced` keeps it. `init`: for type checkers.
+    """
+    return dataclasses.field(default=None, init=init, repr=False, metadata={"static": True})
+
+
+def replaced(node: T, **fields: object) -> T:
+    """Return the record with other values of these fields, of which some may be declared by `derived`."""
+    kinds = dataclasses.fields(node)  # pyright: ignore[reportArgumentType]
+    computed = {kind.name: fields.pop(kind.name, getattr(node, kind.name)) for kind in kinds if not kind.init}
+    other = dataclasses.replace(node, **fields)  # pyright: ignore[reportArgumentType]
+    other.__dict__.update(computed)
+    return other
+
+
 def part(*, default: object = dataclasses.MISSING, doc: str, channels: bool = False) -> Any:
     """Declare a field that is itself a record, or another pytree of numbers. `doc`: its meaning.
 
@@ -108,7 +125,7 @@ def part(*, default: object = dataclasses.MISSING, doc: str, channels: bool = Fa
     return dataclasses.field(default=default, metadata={"doc": doc, "channels": channels})
 
 
-@dataclass_transform(frozen_default=True, field_specifiers=(leaf, gain, static, part, dataclasses.field))
+@dataclass_transform(frozen_default=True, field_specifiers=(leaf, gain, static, derived, part, dataclasses.field))
 def record(cls: type[T]) -> type[T]:
     """Make `cls` a frozen dataclass and register it as a pytree.
 

@@ -214,7 +214,7 @@ def _finest(case: Case, others: list[Case]) -> Case:
     period = float(case.clock.sample_period)
     steps = [one.clock for one in (case, *others) if one.clock.integrator.step_size(period) is not None]
     clock = min(steps, key=lambda clock: clock.integrator.step_size(period) or 0.0, default=case.clock)
-    return dataclasses.replace(case, clock=dataclasses.replace(case.clock, method=clock.method))
+    return dataclasses.replace(case, clock=case.clock.with_method(clock.method))
 
 
 def _members(case: Case) -> dict[str, Any]:

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from ambjax.cases.reader import Case, require_case
+from ambjax.cases.given import of_case
+from ambjax.cases.reader import Case
 from ambjax.codegen import verify
 from ambjax.codegen.block import Block
 from ambjax.codegen.c99 import machine, package, texts
@@ -130,6 +131,7 @@ class ExportedCase:
         return f"<table><caption>{names}</caption>{titles if rows else ''}{rows}</table>"
 
 
+@of_case()
 @names_arguments()
 def export(
     case: Case,
@@ -155,7 +157,6 @@ def export(
     Writes no files: see `ExportedCase.write`. Returns an `ExportedCase`; a failed check is a result, see its `ok`.
     Raises ValueError for an option that is not allowed, a case that cannot be exported, and a missing compiler.
     """
-    require_case(case)
     return generated(planned(case, what, format, fmi, precision, prefix, verify))
 
 

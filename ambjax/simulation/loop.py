@@ -52,6 +52,7 @@ class Sizes(NamedTuple):
     i: Array
     e: Array
     v_tilde: Array
+    z_stop: Array | tuple[()] = ()
 
 
 class Densities(NamedTuple):

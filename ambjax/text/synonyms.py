@@ -119,7 +119,8 @@ def meant(word: str, allowed: Iterable[str], elsewhere: Iterable[str] = ()) -> s
     for name in names:
         if _plain(name) == plain or plain in other_words(name):
             return name
-    paths = [path for path in elsewhere if _plain(path.rpartition(".")[2]) == plain]
+    lasts = {path: path.rpartition(".")[2] for path in elsewhere}
+    paths = [path for path, last in lasts.items() if plain in (_plain(last), *other_words(last))]
     paths += [name for name, words in OTHER_WORDS.items() if "." in name and plain in words.split()]
     path = next(iter(paths or difflib.get_close_matches(word, names, n=1)), None)
     last = path.rpartition(".")[2] if path else ""

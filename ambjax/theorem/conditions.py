@@ -140,7 +140,7 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float = 0.
     require_concrete("check", (cascade, scenario, clock))
     check_inputs(cascade, scenario, clock)
     if cascade.sampled:
-        cascade, clock = cascade.in_continuous_time(), dataclasses.replace(clock, method=None)
+        cascade, clock = cascade.in_continuous_time(), clock.with_method(None)
         scenario = scenario.in_continuous_time()
     loop, clock = prepare(cascade, scenario, clock)
     assert isinstance(loop, ClosedLoop)

@@ -1,6 +1,5 @@
 """Reference data of an FMU in the format of FMI's cross-check: the signals of a case, and the outputs of JAX."""
 
-import dataclasses
 import math
 from typing import Any
 
@@ -14,6 +13,7 @@ from ambjax.codegen.of_case import block_of
 from ambjax.codegen.series import series
 from ambjax.codegen.trace import arguments, precision
 from ambjax.control.cascade import Cascade
+from ambjax.numerics.records import replaced
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import rollout
 from ambjax.world.scenario import Scenario
@@ -51,7 +51,7 @@ def reference(block: Block, cascade: Cascade, scenario: Scenario, clock: Clock) 
         count = max(min(count, int(math.log(GROWTH) / pole)), 1)
     given = series(cascade, scenario, clock, count + 1)
     if block.noun == "controller":
-        short = dataclasses.replace(clock, samples=count)
+        short = replaced(clock, samples=count)
         read = rollout(cascade, scenario, short).trajectory.rows
         signals = {**given, "z": read.z_measured, "z_dot": read.z_dot, "i": read.i}
         rows = np.array([signals[name][:count] for name in block.inputs]).T
