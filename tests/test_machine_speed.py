@@ -194,4 +194,4 @@ def test_the_margins_of_an_axis_follow_from_its_sensitivity(rigid):
         L = 1 / np.asarray(found.system.response(f))[:, k, k] - 1
         crossing = np.flatnonzero(np.diff(np.sign(np.abs(L) - 1)))
         phases = np.abs(np.abs(np.angle(L[crossing], deg=True)) - 180)
-        assert axis.margins.phase_deg == pytest.approx(phases.min(), abs=0.05)  # a step of f is 0.05 %
+        assert axis.margins.pm == pytest.approx(phases.min(), abs=0.05)  # a step of f is 0.05 %

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ambjax.cases.axis_case import FROM_ROTOR
 from ambjax.cases.reader import Case
 from ambjax.cases.rotor_numbers import OF_BEARING, SHAPES, rotor_places
 from ambjax.cases.rotor_tables import COORDINATES, BearingAxis
@@ -18,8 +19,8 @@ from ambjax.world.rotor import Rotor
 # First words of the paths of the rotor, and of its start.
 OF_ROTOR, OF_START = ("rotor", "unbalance", "load", "base"), "initial"
 START = "initial.q."
-# Numbers of an axis that follow from those of the rotor, and a table that a machine does not have.
-FROM_ROTOR, ABSENT = ("m", "k_z", "g"), "disturbance"
+# A table that a machine does not have.
+ABSENT = "disturbance"
 # Coordinates of the rigid rotor at t = 0.
 OFFSET = leaf(unit="m", at_least=-10.0, at_most=10.0, doc="displacement of the centre of mass at t = 0")
 TILT = leaf(unit="rad", at_least=-10.0, at_most=10.0, doc="tilt at t = 0")
