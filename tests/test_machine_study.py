@@ -4,6 +4,7 @@ import argparse
 import copy
 import dataclasses
 import json
+import pickle
 import tomllib
 
 import jax
@@ -76,6 +77,26 @@ def test_draws():
     assert "bearing.left.y.plant.R" not in drawn
     # the processor is common to all axes
     assert [path for path in drawn if path.endswith("delay")] == ["processor.delay"]
+    # worker processes receive the study
+    assert pickle.loads(pickle.dumps(study)).fingerprint() == study.fingerprint()
+
+
+@pytest.mark.slow  # compiles the linear loop
+def test_numbers_of_the_notches():
+    notch = {"kind": "displacement-free", "rate": 20.0}
+    laws = MACHINE["controller"] | {"notch": notch}
+    rate = {"controller": {"notch": {"rate": {"percent": 10}, "max_speed": {"uniform": [6e3, 9e3]}}}}
+    left = {"bearing": {"left": {"controller": {"notch": {"rate": {"uniform": [40.0, 50.0]}}}}}}
+    study = study_of(case(rate | left, controller=laws), 0, 50)
+    rates = {name: study.drawn(np.arange(50))[f"bearing.{name}.controller.notch.rate"] for name in study.case.axes}
+    assert {name: (15 < x.min() < x.max() < 25) for name, x in rates.items() if not name.startswith("left")} == {
+        "right.x": True, "right.y": True, "thrust.z": True
+    }  # fmt: skip
+    assert min(rates["left.x"].min(), rates["left.y"].min()) > 40
+    member = study.member(7)
+    assert float(member.cases[3].cascade.notch.rate) == rates["right.y"][7]
+    with pytest.raises(ValueError, match=r"spread.controller.notch.rate.*no such number"):
+        case(rate)
 
 
 @pytest.mark.slow  # compiles the rollout of the ensemble and that of one machine
