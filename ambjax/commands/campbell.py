@@ -7,7 +7,7 @@ import numpy as np
 
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
-from ambjax.cases.rotor_drawing import drawing_of
+from ambjax.cases.rotor_drawing import drawing_of, radial_axes
 from ambjax.commands.reading import read_any_with_warnings
 from ambjax.host.heartbeat import say
 from ambjax.linear.linear_machine import turning_machines
@@ -59,7 +59,8 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     wrong = np.array([not system.stable for system in systems])
     unstable = [float(speed) for speed in speeds[wrong]]
     operating = operating_range(case)
-    found = unbalance_response(case.machine, case.clock.sample_period, end) if case.machine.rotor.unbalances else None
+    turned = case.machine.rotor.unbalances and radial_axes(case)
+    found = unbalance_response(case.machine, case.clock.sample_period, end) if turned else None
     criticals = [] if found is None else critical_speeds(found, operating)
     summary = {
         "speeds_rpm": speeds, "stable": not unstable, "unstable_at_rpm": unstable, "growth_per_s": growth,
@@ -157,11 +158,12 @@ def _pictures(case: MachineCase, analysed: tuple, found: UnbalanceResponse | Non
     speeds, modes, criticals = analysed
     described("campbell.png", lambda: campbell_picture(case.name, speeds, modes, part / "campbell.png"))
     operating = operating_range(case)
+    if not (radial := radial_axes(case)):
+        return
     point = next(turning_machines(case.machine, case.clock.sample_period, operating[1:]))
     drawn = [mode for mode in modes_of(point, case.machine.rotor) if mode.name != "axial" and mode.damping < DAMPED]
     light = [mode for mode in drawn if mode.damping < LIGHT]
-    radial = [own for name, own in zip(case.axes, case.cases, strict=True) if not name.endswith(".z")]
-    k_s = abs(float(radial[0].scenario.plant.k_s))
+    k_s = abs(float(case.cases[radial[0]].scenario.plant.k_s))
     stiffness = k_s * np.geomspace(SOFTEST, STIFFEST, STIFFNESSES)
     map_of = (stiffness, springs_critical(case.machine.rotor, stiffness), k_s)
     picture = part / "rotor.png"
