@@ -426,6 +426,16 @@ def test_bad_input_is_refused_in_one_line(change, said):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize(("name", "advice"), [("load", "put [[load]] above each"), ("run", "table once.")])
+def test_a_table_given_twice_is_refused_in_one_line(name, advice, tmp_path):
+    path = tmp_path / "twice.toml"
+    path.write_text(f"{template('machine')}\n[{name}]\n[{name}]\n".replace("[[load]]", "[load]"))
+    with pytest.raises(ValueError, match="not valid TOML") as refused:
+        read_machine(path)
+    assert advice in str(refused.value)
+    assert "disturbance" not in str(refused.value)
+
+
 def test_one_axis_and_a_machine_are_not_confused(tmp_path, capsys):
     whole, alone = tmp_path / "whole.toml", tmp_path / "alone.toml"
     whole.write_text(template("machine"))
