@@ -187,18 +187,17 @@ def _tune(plan: TuningPlan, path: str, listen: Listener) -> TunedCase:
     answer = _searched(plan, listen)
     with files(plan.out) as part:
         case = put_answer(part, plan.out, answer, NOT_JUDGED)
-    found = described("the judgement of the tuned gains", lambda: examined(answer, options.pareto, tell))
-    if found is None:
+    facts = described("the judgement of the tuned gains", lambda: examined(answer, options.pareto, tell))
+    if facts is None:
         tell(f"the tuned gains are in {plan.out / TUNED}. To judge them, repeat the command with --resume.")
         return TunedCase(case, False, {"verdict": NOT_JUDGED, "outcome": {"good": False}}, plan.out)
-    facts, slices = found
     with files(plan.out) as part:
         case = put_answer(part, plan.out, answer, facts.verdict)
         table = facts.table
         if answer.complete:
             table |= {KEY: record(plan.record, part)}
         write_json(part / REPORT, table)
-        put_report(part, case.cascade, answer, facts, slices)
+        put_report(part, case.cascade, answer, facts)
         if options.pareto:
             described("the case files of the front", lambda: put_front(part, plan.out, answer, facts))
         if options.page:

@@ -11,11 +11,12 @@ import numpy as np
 
 from ambjax.cases.axis_case import MACHINE_TABLES, as_written, axis_tables, check_axis, stop_slope
 from ambjax.cases.machine_controller import inner, kind_of, law_from, merged
-from ambjax.cases.machine_spread import axis_table, fastest_rotor, machine_spread, refuse_unused
+from ambjax.cases.machine_spread import axis_table, machine_spread, refuse_unused
 from ambjax.cases.machine_trial import try_machine
 from ambjax.cases.notch_table import notch_from
 from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
+from ambjax.cases.rotor_numbers import fastest_rotor
 from ambjax.cases.rotor_tables import (
     COORDINATES,
     RIGID,
@@ -26,8 +27,8 @@ from ambjax.cases.rotor_tables import (
     tables_of,
     vector,
 )
-from ambjax.cases.speed_table import SPEED
-from ambjax.cases.table import Table, load, show
+from ambjax.cases.speed_table import MOST_SPEEDS, listed_speeds
+from ambjax.cases.table import Table, load
 from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.synchronous_notch import SynchronousNotch
@@ -47,8 +48,6 @@ from ambjax.world.scenario import Scenario
 # Product of step and angular frequency of a mode (or of nutation) at which the relative error of RK4 in one period is
 # below 1e-6.
 MODE = 0.1
-# Largest number of speeds of the sensitivity.
-MOST_SPEEDS = 100
 # Largest number of substeps that the reader chooses.
 MOST_SUBSTEPS = 512
 
@@ -201,18 +200,12 @@ def notch_of_axis(controller: dict[str, Any], case: Case) -> tuple[SynchronousNo
 
 def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:
     """Return sensitivity.speeds, rpm; by default the first, the last and the largest of the run."""
-    value = table.raw.get("speeds")
-    if value is None:
-        first, *between, last = (float(rotor.rotation.rpm(t)) for t in rotor.rotation.corners(duration))
-        ends = (first,) if first == last else (first, last)
-        most = max(between, key=abs, default=0.0)
-        return (*ends, most) if abs(most) > max(abs(first), abs(last)) else ends
-    if not isinstance(value, list) or not 0 < len(value) <= MOST_SPEEDS:
-        raise ValueError(f"{table.at('speeds')} = {show(value)}: it must be a list of 1 to {MOST_SPEEDS} speeds, rpm.")
-    speeds = [Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(value)]
-    if (twice := next((x for x in speeds if speeds.count(x) > 1), None)) is not None:
-        raise ValueError(f"{table.at('speeds')} = {show(value)}: {twice:g} rpm is given more than once. Give it once.")
-    return tuple(speeds)
+    if "speeds" in table.raw:
+        return tuple(listed_speeds(table, MOST_SPEEDS))
+    first, *between, last = (float(rotor.rotation.rpm(t)) for t in rotor.rotation.corners(duration))
+    ends = (first,) if first == last else (first, last)
+    most = max(between, key=abs, default=0.0)
+    return (*ends, most) if abs(most) > max(abs(first), abs(last)) else ends
 
 
 def _start(table: Table, rotor: Rotor, count: int) -> tuple[np.ndarray, list[float]]:
@@ -262,10 +255,7 @@ def _shares(rotor: Rotor) -> tuple[list[float], list[float]]:
 
 
 def _clock(cases: list[Case], rotor: Rotor, fixed: bool) -> Clock:
-    """Return the clock with a method whose fixed steps resolve every axis, the bending modes and nutation.
-
-    `fixed`: whether the case gives the step.
-    """
+    """Return the clock with a method whose fixed steps resolve every axis, the bending modes and nutation."""
     clock, period = cases[0].clock, float(cases[0].clock.sample_period)
     methods = [case.clock.method for case in cases]
     fixed_steps = [method for method in methods if isinstance(method, (RK4, DOP853, Euler))]
@@ -284,4 +274,4 @@ def _clock(cases: list[Case], rotor: Rotor, fixed: bool) -> Clock:
             f"clock: this machine needs {substeps} steps in a sample of {period:g} s; at most {MOST_SUBSTEPS} are "
             "allowed. Use a processor or smooth gains, leave out the fastest modes, or shorten clock.sample_period."
         )
-    return dataclasses.replace(clock, method=dataclasses.replace(most, substeps=substeps))
+    return clock.with_method(dataclasses.replace(most, substeps=substeps))

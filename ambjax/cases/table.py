@@ -29,8 +29,7 @@ MOST_BYTES = 10_000_000
 def load(path: str | pathlib.Path) -> tuple[dict[str, Any], str]:
     """Return a case file as parsed TOML, not yet checked, and its text.
 
-    The file is read only once, because it may be a pipe. Raises ValueError, one line, if it cannot be read, is larger
-    than MOST_BYTES, or is not TOML.
+    Raises ValueError, one line, if it cannot be read, is larger than MOST_BYTES, or is not TOML.
     """
     path = pathlib.Path(path)
 
@@ -99,10 +98,7 @@ class Table:
         return f"{self.path}.{cut(key)}" if self.path else cut(key)
 
     def only(self, allowed: list[str], elsewhere: Iterable[str] = ()) -> None:
-        """Raise ValueError for a key that is not in `allowed`, and suggest the one that is meant.
-
-        `elsewhere`: paths of keys of other tables, which may be meant too.
-        """
+        """Raise ValueError for a key that is not in `allowed`, and suggest the one that is meant."""
         for key in self.raw:
             if key not in allowed:
                 names, other = ", ".join(allowed) if allowed else "none", hint(key[:LONGEST], allowed, elsewhere)
@@ -115,10 +111,7 @@ class Table:
         return Table(self.raw.get(key, {}), self.at(key))
 
     def number(self, key: str, default: object, allowed: str = "a number") -> Any:
-        """Return a number, or the default if left out. Raises ValueError for anything else.
-
-        `allowed`: description of the valid values, for the message.
-        """
+        """Return a number, or the default if left out. Raises ValueError for anything else."""
         value = self.raw.get(key, default)
         if value is default:
             return default
@@ -168,10 +161,7 @@ class Table:
         return value
 
     def choice(self, key: str, allowed: list[str], default: str | None = None, other: str = "") -> str:
-        """Return one of the `allowed` words, or the default if left out. Raises ValueError for any other.
-
-        `other`: description of the other values that the caller accepts, for the message.
-        """
+        """Return one of the `allowed` words, or the default if left out. Raises ValueError for any other."""
         value = self.raw.get(key, default)
         words = quoted(allowed) + (f"; or {other}" if other else "")
         if value is None:

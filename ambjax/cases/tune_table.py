@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from ambjax.numerics.records import leaf
 
-# Default optimiser, risk, and alpha of the risk "cvar".
-OPTIMISER, RISK, ALPHA = "bfgs", "mean", 0.9
+# Default risk, and alpha of the risk "cvar".
+RISK, ALPHA = "mean", 0.9
 # Objectives, the default first: least voltage with at most 1.25 times the least error, or the least error itself.
 OBJECTIVES = ("knee", "least_error")
 # Default limit of the rms voltage, as a share of actuator.u_max.
@@ -32,7 +32,6 @@ NUMBERS: dict[str, dataclasses.Field] = {
     "gain_margin": leaf(
         1.25, above=0, at_most=1e6, doc="each gain of a stressed member is multiplied or divided by this factor"
     ),
-    "learning_rate": leaf(0.1, above=0, at_most=1e3, doc="step size of Adam"),
     "minutes": leaf(
         math.inf,
         above=0,
@@ -133,8 +132,7 @@ def template_lines() -> Iterator[Line]:
     yield from _defaults("", {name: BUDGET[name] for name in ("members", "stressed")})
     yield from _defaults("", {name: NUMBERS[name] for name in ("stress", "gain_margin")})
     yield from _defaults("", {name: field for name, field in BUDGET.items() if name not in ("members", "stressed")})
-    yield Line(f'optimiser = "{OPTIMISER}"', 'or "adam"')
-    yield from _defaults("", {name: NUMBERS[name] for name in ("learning_rate", "minutes")})
+    yield from _defaults("", {"minutes": NUMBERS["minutes"]})
 
 
 def _defaults(prefix: str, fields: dict[str, dataclasses.Field]) -> Iterator[Line]:
@@ -143,11 +141,7 @@ def _defaults(prefix: str, fields: dict[str, dataclasses.Field]) -> Iterator[Lin
 
 
 def _limits() -> Iterator[Line]:
-    """Yield the lines of [tune.limits].
-
-    The limits of the rms voltage, the sensitivity and the survival have defaults; the other limits have none. The keys
-    settling_band_m and margin have defaults too.
-    """
+    """Yield the lines of [tune.limits]."""
     shares = (100 * VOLTAGE_SHARE, MEAN_MARGIN, WORST_MARGIN, LOOP_MARGIN)
     voltage, means, worst, loops = (f"{x:g}" for x in shares)
     examples = [

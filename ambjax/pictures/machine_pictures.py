@@ -23,9 +23,8 @@ LIGHT = 0.3
 def machine_figure(case: Any, signals: dict[str, np.ndarray], title: str) -> Figure:
     """Return one page: displacement, current and voltage of every axis over time, and the orbit of each radial bearing.
 
-    `signals`: those of a `MachineRun`. The orbits show the time from run.settle on, at the magnets, or the whole
-    run of a rotor that is lost before. What follows the loss is drawn in the first column alone. If the stops have
-    places of their own, displacements and orbits are those at the stops.
+    The orbits show the time from run.settle on, at the magnets, or the whole run of a rotor that is lost before. If the
+    stops have places of their own, displacements and orbits are those at the stops.
     """
     axes, t = [str(name) for name in signals["axes"]], signals["t"]
     place = "stop" if "z_stop" in signals else "magnet"
@@ -106,11 +105,7 @@ def machine_sensitivity_picture(
     title: str,
     measured: Mapping[float, Sequence[Any]] = MappingProxyType({}),
 ) -> None:
-    """Write |S_kk| of every axis and the largest singular value over frequency, a panel for each speed.
-
-    `points`: results of `machine_sensitivity`. `limits`: upper limits of the zones A, B and C. `measured`: the
-    `Injection` of each axis by speed (rpm), drawn as points.
-    """
+    """Write |S_kk| of every axis and the largest singular value over frequency, a panel for each speed."""
     shown = list(points)[:4]
     figure = Figure(figsize=(13.0, 4.6 if len(shown) < 3 else 8.2), layout="constrained")
     grid = figure.subplots(1 + (len(shown) > 2), min(len(shown), 2), squeeze=False, sharex=True, sharey=True)
@@ -153,8 +148,7 @@ def machine_sensitivity_picture(
 def campbell_picture(title: str, speeds: np.ndarray, modes: Sequence[Sequence[Any]], path: pathlib.Path) -> None:
     """Write the frequencies of the modes against speed, coloured by their damping ratio, with the line of the speed.
 
-    `speeds`: rpm. `modes`: the modes at each speed. Triangles up are forward modes, triangles down backward ones;
-    unstable modes are red crosses. The lightly damped modes are named at the last speed.
+    Triangles up are forward modes, triangles down backward ones; unstable modes are red crosses.
     """
     figure = Figure(figsize=(11.0, 6.8), layout="constrained")
     ax = figure.add_subplot()

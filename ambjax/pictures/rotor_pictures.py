@@ -27,11 +27,7 @@ SHAPES = 6
 def unbalance_picture(
     case: Any, found: Any, criticals: Sequence[Any], operating: tuple[float, float], path: pathlib.Path
 ) -> None:
-    """Write displacement, current and command of every radial axis against speed.
-
-    `case`: the machine. `found`: an `UnbalanceResponse`. `criticals`: its critical speeds. `operating`: lowest and
-    highest operating speed, rpm.
-    """
+    """Write displacement, current and command of every radial axis against speed."""
     speeds = found.speeds
     radial = [k for k, axis in enumerate(case.axes) if not axis.endswith(".z")]
     drive = case.cases[0].scenario.drive

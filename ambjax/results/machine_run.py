@@ -57,13 +57,7 @@ _segment = functools.partial(jax.jit, static_argnames=("count",))(recorded_segme
 
 
 def simulate_machine(case: MachineCase, progress: Callable[[int], object] = lambda samples: None) -> MachineRun:
-    """Simulate a machine and record every sample.
-
-    `progress`: called with the number of new samples after each part of the run. A lost rotor is no error: see
-    `MachineRun.lost`. Raises ValueError unless `case` is a MachineCase.
-    """
-    if not isinstance(case, MachineCase):
-        raise ValueError(f"case = {type(case).__name__}: it must be a MachineCase, as ambjax.read_machine returns it.")
+    """Simulate a machine, as `simulate` does."""
     fold = PerAxis(
         stack_axes([canonical(Metrics.of(case.settle, one.scenario, case.machine.near)) for one in case.cases])
     )

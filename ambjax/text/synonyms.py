@@ -114,10 +114,7 @@ DERIVED = {
 
 
 def meant(word: str, allowed: Iterable[str], elsewhere: Iterable[str] = ()) -> str | None:
-    """Return the name that `word` probably means: one of `allowed`, or a name of another table; None if unknown.
-
-    `elsewhere`: paths of names of other tables; those of OTHER_WORDS are added.
-    """
+    """Return the name that `word` probably means: one of `allowed`, or a name of another table; None if unknown."""
     names, plain = list(allowed), _plain(word)
     for name in names:
         if _plain(name) == plain or plain in other_words(name):
@@ -136,10 +133,7 @@ def other_words(name: str) -> list[str]:
 
 
 def hint(word: str, allowed: Iterable[str], elsewhere: Iterable[str] = ()) -> str:
-    """Return " Did you mean 'name'?" for the name that `word` probably means (`meant`); "" if unknown.
-
-    For a quantity that follows from other numbers of the plant, the text names these instead.
-    """
+    """Return " Did you mean 'name'?" for the name that `word` probably means (`meant`); "" if unknown."""
     allowed = list(allowed)
     if _plain(word) in DERIVED and "mu_0" in allowed:
         return f" It follows from {DERIVED[_plain(word)]}."

@@ -14,7 +14,6 @@ from ambjax.cases.tune_table import (
     BUDGET,
     NUMBERS,
     OBJECTIVES,
-    OPTIMISER,
     RISK,
     SETTLING_BAND,
     SURVIVAL,
@@ -25,7 +24,6 @@ from ambjax.cases.tune_table import (
 )
 from ambjax.extend import leaf
 from ambjax.host.extensions import NothingToTuneError
-from tuning.optimisers import NAMES
 from tuning.problem.gains_table import space_from
 from tuning.problem.limits import LEAST_MARGIN, Limit
 from tuning.problem.loss import TERMS
@@ -35,7 +33,7 @@ from tuning.problem.space import Space
 from tuning.problem.unbreakable import bounds_of
 
 # Keys of [tune] that are neither in NUMBERS nor in BUDGET.
-OTHER_KEYS = ["objective", "gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
+OTHER_KEYS = ["objective", "gains", "bounds", "weights", "limits", "risk", "alpha"]
 # Keys of [tune] that depend on the laws of the case.
 KEYS_OF_LAWS = ("gains", "bounds")
 # Allowed range of each limit: OTHER_RANGES by name, LIMIT_RANGE for all others. BAND_RANGE: that of settling_band_m.
@@ -78,7 +76,6 @@ class Tune:
     - `early`: weight of errors before run.settle. Errors after it have the weight 1.
     - `stress`: factor on the sensor noise of the stressed members (`Budget.stressed`).
     - `gain_margin`: each gain of a stressed member is multiplied or divided by this factor.
-    - `learning_rate`: step size of an optimiser of optax.
     - `minutes`: time for the whole tuning.
     """
 
@@ -93,8 +90,6 @@ class Tune:
     stress: float
     gain_margin: float
     risk: Risk
-    optimiser: str
-    learning_rate: float
     minutes: float
     budget: Budget
 
@@ -135,7 +130,6 @@ def tune_from(table: Table, case: Case) -> Tune:
     table.only([*OTHER_KEYS, *NUMBERS, *BUDGET], [table.at(f"limits.{name}") for name in KINDS])
     budget = Budget(**{name: table.whole(name, field) for name, field in BUDGET.items()})
     weights, conditions = _weights(table.table("weights"))
-    optimiser = table.choice("optimiser", list(NAMES), OPTIMISER)
     numbers = {name: table.leaf(name, field, field.default) for name, field in NUMBERS.items()}
     return Tune(
         objective=table.choice("objective", list(OBJECTIVES), OBJECTIVES[0]),
@@ -145,7 +139,6 @@ def tune_from(table: Table, case: Case) -> Tune:
         conditions=conditions,
         margin=numbers.pop("conditions_margin"),
         risk=_risk(table),
-        optimiser=optimiser,
         budget=budget,
         **numbers,
     )
@@ -245,9 +238,7 @@ def settings(tune: Tune) -> dict[str, Any]:
         "settling_band_m": tune.limits.band,
         "risk": str(tune.risk),
     }
-    rest = {
-        name: getattr(tune, name) for name in ("margin", "early", "stress", "gain_margin", "optimiser", "learning_rate")
-    }
+    rest = {name: getattr(tune, name) for name in ("margin", "early", "stress", "gain_margin")}
     return facts | rest | dataclasses.asdict(tune.budget)
 
 

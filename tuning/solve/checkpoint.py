@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.host.sealed import DamagedError, difference, flat, provenance, seal, unseal, write_whole
-from tuning.solve.descent import Descent, Starts
+from tuning.solve.descent import Starts
 from tuning.solve.evolution import CmaState, idle_state
 
 NAME = re.compile(r"round-[0-9]+\.npz")
@@ -88,8 +88,8 @@ class CheckpointFile:
         facts = {"fingerprint": self.fingerprint, "seconds": progress.seconds}
         seal(self.path, {**leaves, **past, ACTIVE: progress.active}, facts)
 
-    def load(self, descent: Descent, starts: int, m: int) -> SearchState | None:
-        """Return the saved search of `starts` starts in m coordinates, or None if there is none.
+    def load(self) -> SearchState | None:
+        """Return the saved search, or None if there is none.
 
         If the checkpoint is damaged, tells the reason and returns None. Raises ValueError if it belongs to another
         problem.
@@ -104,7 +104,7 @@ class CheckpointFile:
                     f"--resume: {self.path} belongs to another search: {differs}. "
                     "Use another --out, or leave out --resume to start a new search."
                 )
-            tree = jax.tree.structure((jax.eval_shape(descent.begin, jnp.zeros((starts, m))), idle_state(m)))
+            tree = jax.tree.structure((Starts(*Starts._fields), CmaState(*CmaState._fields)))
             state, drawn = jax.tree.unflatten(tree, [arrays[f"{LEAF}{n}"] for n in range(tree.num_leaves)])
             past = {name.removeprefix(PAST): list(rows) for name, rows in arrays.items() if name.startswith(PAST)}
             state, active = jax.tree.map(jnp.asarray, state), arrays[ACTIVE]

@@ -98,8 +98,7 @@ class Course:
             self.tell(f"search {number}: from the best point, on {members}")
         progress = search(
             self.problem.engine, self.problem.goal, self.members, points, keep=tune.budget.starts,
-            iterations=tune.budget.iterations, name=tune.optimiser, rate=tune.learning_rate,
-            seed=self.seed + len(self.past),
+            iterations=tune.budget.iterations, seed=self.seed + len(self.past),
             checkpoint_file=CheckpointFile(path, self.facts, number, self.tell), resume=self.resume,
             on_iteration=self._standing(number), until=self.began + 60 * self.minutes,
         )  # fmt: skip

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tuning.optimisers import FIRST_RADIUS
+from tuning.solve.descent import FIRST_RADIUS
 
 # A search has converged if PATIENCE populations in a row do not lower `CmaState.level`, a logarithm, by STALL.
 STALL, PATIENCE = 0.01, 6
