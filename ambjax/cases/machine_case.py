@@ -226,13 +226,19 @@ def _start(table: Table, rotor: Rotor, count: int) -> tuple[np.ndarray, list[flo
 
 
 def _check_rank(rotor: Rotor, axes: list[BearingAxis]) -> None:
-    """Raise ValueError if magnets or sensors leave a coordinate free that any of them acts on, or a weight."""
+    """Raise ValueError if magnets or sensors leave a coordinate free that any of them acts on, or a weight.
+
+    An axial bearing alone leaves the coordinates across the shaft out; radial bearings must hold all four.
+    """
+    gravity, across = np.asarray(rotor.gravity), [k for k in range(RIGID) if k != 2]
     for rows, what in ((rotor.at_magnets, "magnets"), (rotor.at_sensors, "sensors")):
         rigid = np.asarray(rows)[:, :RIGID]
         used = [k for k in range(RIGID) if np.any(rigid[:, k])]
-        free = [COORDINATES[k] for k in range(RIGID) if k not in used and (k != 2 or rotor.gravity[2] != 0)]
-        if free:
-            raise ValueError(f"bearing: no axis holds {', '.join(free)}. Add a bearing whose {what} act on it.")
+        needed = [k for k in range(RIGID) if gravity[k] != 0 or (k in across and set(used) & set(across))]
+        if free := [k for k in needed if k not in used]:
+            other = ", or a rotor.gravity that does not" if np.any(gravity[free]) else ""
+            names = ", ".join(COORDINATES[k] for k in free)
+            raise ValueError(f"bearing: no axis holds {names}. Give a bearing whose {what} act on it{other}.")
         scale = np.abs(rigid[:, used]).max(0)
         rank = int(np.linalg.matrix_rank(rigid[:, used] / scale, tol=1e-9))
         if rank < len(used):

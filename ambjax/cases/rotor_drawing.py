@@ -62,6 +62,11 @@ def _planes(rotor: Rotor) -> list[tuple[tuple[str, float], np.ndarray]]:
     return list(found.items())
 
 
+def radial_axes(case: MachineCase) -> list[int]:
+    """Return the numbers of the axes across the shaft, two of each radial bearing."""
+    return [k for k, name in enumerate(case.axes) if not name.endswith(".z")]
+
+
 def place_of(row: np.ndarray) -> float:
     """Return the place of the row [n] of a displacement across the shaft, m from the centre of mass."""
     d = row[:2]
