@@ -69,7 +69,7 @@ MUTATIONS = [
     M(
         "the score of the search omits the multipliers of the limits",
         "tuning/problem/goal.py",
-        "    return goal(outcomes, x, ordinary)",
+        "    return goal(outcomes, ordinary)",
         "    return goal.ordinary_risk(outcomes[:ordinary])",
         "tests/test_tuning_search.py",
     ),

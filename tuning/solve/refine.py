@@ -138,7 +138,7 @@ def _evolved(
     """Draw one population and update the distribution. Return the best of its points [m], its goal and terms [N]."""
     points = evolution.ask()
     terms = engine.terms(points, members)
-    values = goal.score(points, terms, members)
+    values = goal.score(terms, members)
     evolution.tell(points, values)
     first = int(np.argmin(values))
     return points[first], float(values[first]), {name: one[first] for name, one in terms.items()}
