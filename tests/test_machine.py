@@ -44,6 +44,11 @@ def short(raw, samples=200, **tables):
     return changed(raw, **({"clock": raw["clock"] | {"duration": samples * period}, "run": {"settle": 0.0}} | tables))
 
 
+def first(**keys):
+    """The tables of the bearings, of which the first one has other keys."""
+    return {"bearing": [MACHINE["bearing"][0] | keys, *MACHINE["bearing"][1:]]}
+
+
 @pytest.fixture(scope="module")
 def machine():
     # without noise: each axis of a machine has a random key of its own
@@ -343,6 +348,15 @@ def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monke
         ({"rotor": MACHINE["rotor"] | {"kind": "elastic"}}, r"rotor\.kind = .*must be one of 'rigid'"),
         ({"plant": MACHINE["plant"] | {"m": 2.0}}, r"plant\.m = 2\.0: the rotor gives it"),
         ({"plant": MACHINE["plant"] | {"g": 9.81}}, r"plant\.g = 9\.81: the rotor gives it"),
+        ({"plant": MACHINE["plant"] | {"mass": 2.0}}, r"plant\.mass = 2\.0: unknown key\. Did you mean 'rotor\.m'"),
+        (first(plant={"m": 2.0}), r"^bearing\[0\]\.plant\.m = 2\.0: the rotor gives it"),
+        (first(plant={"A": -1.0}), r"left\.x: bearing\[0\]\.plant\.A = -1: it must be"),
+        (first(stop=0.1), r"bearing\[0\]\.stop = 0\.1: unknown key\. Did you mean 'stop_at'"),
+        (first(stop_at=1e9), r"bearing\[0\]\.stop_at = 1e\+09: it must be a finite number from -100 to 100"),
+        (first(stop_modes=[1.0]), r"bearing\[0\]\.stop_modes"),
+        (first(clearance=4e-4), r"left\.x: bearing\[0\]\.clearance = 0\.0004 m: it must be less than the gap"),
+        (first(stop_at=-5.0), r"left\.y: initial\.q: at this axis z = .* touch its stop at the start"),
+        ({"loads": []}, r"loads = \[\]: unknown key\. Did you mean 'load'"),
         ({"bearing": MACHINE["bearing"][:1]}, "determine .* of the .* rigid motions"),
         ({"bearing": MACHINE["bearing"][2:]}, "no axis holds x, y"),
         ({"bearing": []}, r"\[\[bearing\]\] is missing"),

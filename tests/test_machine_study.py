@@ -5,12 +5,13 @@ import dataclasses
 import json
 import tomllib
 
+import jax
 import numpy as np
 import pytest
 
 from ambjax.__main__ import main
 from ambjax.cases.machine_case import machine_from, read_machine
-from ambjax.cases.machine_spread import rotor_places, varied_rotor
+from ambjax.cases.rotor_numbers import rotor_places, varied_rotor
 from ambjax.cases.template_text import template
 from ambjax.ensemble.worker import chunk
 from ambjax.linear import machine_sensitivity
@@ -19,6 +20,15 @@ from ambjax.results.machine_run import simulate_machine
 from ambjax.results.spread_runs import simulate_members, study_of
 
 MACHINE = tomllib.loads(template("machine"))
+# Spread of the shapes of a flexible rotor.
+FACTOR = "rotor.modes.0.scale"
+SHAPES = {
+    "rotor": {"modes": {"0": {"scale": {"percent": 20}}}},
+    "bearing": {
+        "left": {"modes": {"0": {"percent": 10}}},
+        "right": {"sensor_modes": {"1": {"uniform": [-0.1, 0.3]}}},
+    },
+}
 SPREAD = {
     "plant": {"A": {"percent": 10}},
     "bearing": {"left": {"plant": {"A": {"percent": 1}}, "x": {"plant": {"R": {"uniform": [0.9, 1.1]}}}}},
@@ -32,6 +42,22 @@ def case(spread, **tables):
     clock = {"duration": 1e-3, "sample_period": 5e-5}
     raw = copy.deepcopy(MACHINE) | {"spread": spread, "clock": clock, "run": {"settle": 0.0}} | tables
     return machine_from(raw, "machine")
+
+
+@pytest.fixture
+def flexible():
+    """Return a function: the case of the template with two bending modes, whose bearings have these shapes."""
+
+    def made(spread, shapes=(([0.5, 0.4], [0.4, 0.2]),) * 2, load=0.7):
+        raw = copy.deepcopy(MACHINE)
+        rotor = raw["rotor"] | {"kind": "modal", "modes": [{"frequency": 80.0, "damping": 0.01}, {"frequency": 300.0}]}
+        for bearing, (magnet, sensor) in zip(raw["bearing"], shapes, strict=False):
+            bearing |= {"modes": magnet, "sensor_modes": sensor, "angle": 20.0}
+        for one in (*raw["unbalance"], *raw["load"]):
+            one["modes"] = [load, 0.1]
+        return case(spread, rotor=rotor, **{key: raw[key] for key in ("bearing", "unbalance", "load")})
+
+    return made
 
 
 def test_draws():
@@ -69,9 +95,10 @@ def test_numbers_of_the_rotor():
     rotor = machine_from(raw).machine.rotor
     values = {"rotor.m": 3.0, "rotor.I_t": 0.07, "rotor.I_p": 1e-3, "rotor.modes.1.frequency": 250.0}
     values |= {"rotor.modes.0.damping": 0.02, "unbalance.0.amount": 7.0, "load.0.start": 0.2, "rotor.speed": 10.0}
-    values |= {"base.0.value": 5.0}
-    other = varied_rotor(rotor, values)
-    nominal, found = rotor_places(rotor), rotor_places(other)
+    values |= {"base.0.value": 5.0, "bearing.left.modes.0": 0.6, "bearing.right.sensor_modes.1": -0.3}
+    axes = ("left.x", "left.y", "right.x", "right.y", "thrust.z")
+    other = varied_rotor(rotor, values, axes)
+    nominal, found = rotor_places(rotor, axes), rotor_places(other, axes)
     for path, place in found.items():
         assert float(np.asarray(place.value)) == pytest.approx(values.get(path, float(np.asarray(nominal[path].value))))
     # the weight follows the mass; a free bending mode has the given frequency and damping
@@ -83,6 +110,21 @@ def test_numbers_of_the_rotor():
     k = other.K[7, 7] / other.M[7, 7]
     assert np.sqrt(k) == pytest.approx(2 * np.pi * 250)
     assert other.D[5, 5] == pytest.approx(2 * 0.02 * 2 * np.pi * 80)
+
+
+def test_shapes_of_modes(flexible):
+    """A member is the machine whose bearings, unbalances and loads are given with its shapes."""
+    study = study_of(flexible(SHAPES), 3, 4)
+    drawn = {path: x[1] for path, x in study.drawn(np.arange(4)).items()}
+    assert len(drawn) == 3
+    left, sensor, factor = (drawn[path] for path in ("bearing.left.modes.0", "bearing.right.sensor_modes.1", FACTOR))
+    shapes = ([left * factor, 0.4], [0.4 * factor, 0.2]), ([0.5 * factor, 0.4], [0.4 * factor, sensor])
+    expected = flexible({}, shapes, 0.7 * factor).machine.rotor
+    found = study.member(1).machine.rotor
+    for one in jax.tree.leaves(jax.tree.map(lambda a, b: np.max(np.abs(a - b)), found, expected)):
+        assert one < 1e-12
+    assert abs(left - 0.5) < 0.05
+    assert left != 0.5
 
 
 @pytest.mark.parametrize(

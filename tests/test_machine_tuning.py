@@ -12,8 +12,8 @@ import tuning
 from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.table import Table
 from ambjax.cases.template_text import template
-from ambjax.commands.machine_commands import analysed
 from ambjax.linear.linear_machine import machine_sensitivity
+from ambjax.results.operating import sensitivity
 from tuning.__main__ import main
 from tuning.machines.lqg_weights import lqg_space
 from tuning.machines.machine_gains import MachineSpace, machine_space
@@ -192,7 +192,7 @@ def test_command(tmp_path, capsys):
     assert said == pytest.approx(after["peak"], rel=1e-3)
     # the file is the answer, with the gains of each bearing in its table
     again = read_machine(tmp_path / "t" / "tuned.toml")
-    assert max(point.worst.S.height for point in analysed(again)) == pytest.approx(after["peak"], rel=1e-6)
+    assert max(point.worst.S.height for point in sensitivity(again)) == pytest.approx(after["peak"], rel=1e-6)
     raw = tomllib.loads((tmp_path / "t" / "tuned.toml").read_text())
     assert raw["bearing"][0]["controller"]["position"]["k"] == pytest.approx(found.report["gains"][1]["after"])
     assert found.good == (after["peak"] <= 2.5)

@@ -108,7 +108,7 @@ def test_a_lane_has_the_delay_of_its_member(delays):
     delays = members.values["processor.delay"]
     assert np.all(delays != np.round(delays))
     for lane, delay in zip(tracking, delays, strict=True):
-        processor = dataclasses.replace(case.cascade.processor, delay=float(delay), whole=None, most=None)
+        processor = dataclasses.replace(case.cascade.processor, delay=float(delay))
         cascade = dataclasses.replace(case.cascade, processor=processor)
         alone = rollout(
             cascade, case.scenario, problem.objective.clock, fold=problem.objective.loss, record_every=0

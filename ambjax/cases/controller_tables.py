@@ -162,10 +162,7 @@ def _linear(table: Table, files: Files) -> tuple[Law, ControllerFile]:
 
 
 def _defaults(table: Table, kind: type[Law], model: Plant, sampling: Sampling | None, printed: bool) -> Law | None:
-    """Return the law of this kind with its default gains; None if the table gives every gain.
-
-    `printed`: whether the paper's gains are the default for its plant.
-    """
+    """Return the law of this kind with its default gains; None if the table gives every gain."""
     names = _gains(kind)
     if names <= set(table.raw):
         return None

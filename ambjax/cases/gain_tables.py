@@ -11,10 +11,7 @@ EXAMPLE = '{ over = "error", at = [0.0, 1e-5], values = [100.0, 200.0] }'
 
 
 def law_from(table: Table, kind: type[Law], base: Law | None) -> Any:
-    """Return a law of this kind with the gains of this table. `base`: law with the defaults; None: those of `kind`.
-
-    Raises ValueError with the dotted path, the value, what is allowed and the fix.
-    """
+    """Return a law of this kind with the gains of this table. `base`: law with the defaults; None: those of `kind`."""
     names = {field.name: field for field in dataclasses.fields(kind) if field.metadata.get("leaf")}
     given = {name: table.raw[name] for name in names if isinstance(table.raw.get(name), dict)}
     numbers = Table({key: value for key, value in table.raw.items() if key not in given}, table.path)

@@ -1,6 +1,7 @@
 """The speed of [rotor]: a number with a rate, or a table of speeds over time."""
 
 import dataclasses
+import math
 
 import numpy as np
 
@@ -9,6 +10,8 @@ from ambjax.world.rotation import Rotation, SpeedChange
 
 SPEED, ACCELERATION = (field for field in dataclasses.fields(Rotation) if field.name in ("speed", "acceleration"))
 (AT,) = (field for field in dataclasses.fields(SpeedChange) if field.name == "at")
+# Largest number of speeds in a list.
+MOST_SPEEDS = 100
 
 
 def table_of_speeds(table: Table) -> Rotation | None:
@@ -30,6 +33,35 @@ def table_of_speeds(table: Table) -> Rotation | None:
     if times[0] > 0:
         return Rotation(rpm[0], changes=tuple(changes))
     return Rotation(rpm[0], rates[1], changes=tuple(changes[1:]))
+
+
+def listed_speeds(table: Table, most: int) -> list[float]:
+    """Return the key `speeds`, rpm: a list, or a range of equal steps, as in `ambjax map`. `most`: of them."""
+    value = table.raw["speeds"]
+
+    def refuse(why: str) -> ValueError:
+        return ValueError(f"{table.at('speeds')} = {show(value)}: {why}.")
+
+    values = _range(value) if isinstance(value, str) else value
+    if not isinstance(values, list) or not 0 < len(values) <= most:
+        raise refuse(
+            f'it must be a list of 1 to {most} speeds (rpm), or a range "LOW:HIGH:COUNT" of 2 to {most}, as "0:6000:7"'
+        )
+    speeds = [Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(values)]
+    if (twice := next((x for x in speeds if speeds.count(x) > 1), None)) is not None:
+        raise refuse(f"{twice:g} rpm is given more than once. Give it once")
+    return speeds
+
+
+def _range(text: str) -> list[float] | None:
+    """Return the speeds of a range, or None if it is not one."""
+    try:
+        first, last, number = text.split(":")
+        low, high, count = float(first), float(last), int(number)
+    except ValueError:
+        return None
+    good = -math.inf < low < high < math.inf and 2 <= count <= MOST_SPEEDS
+    return np.linspace(low, high, count).tolist() if good else None
 
 
 def speed_of(table: Table) -> Rotation:

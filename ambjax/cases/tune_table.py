@@ -137,11 +137,7 @@ def _defaults(prefix: str, fields: dict[str, dataclasses.Field]) -> Iterator[Lin
 
 
 def _limits() -> Iterator[Line]:
-    """Yield the lines of [tune.limits].
-
-    The limits of the rms voltage, the sensitivity and the survival have defaults; the other limits have none. The keys
-    settling_band_m and margin have defaults too.
-    """
+    """Yield the lines of [tune.limits]."""
     shares = (100 * VOLTAGE_SHARE, MEAN_MARGIN, WORST_MARGIN, LOOP_MARGIN)
     voltage, means, worst, loops = (f"{x:g}" for x in shares)
     examples = [

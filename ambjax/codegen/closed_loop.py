@@ -1,6 +1,6 @@
 """Software in the loop: JAX's plant with the compiled controller, compared with JAX's own closed loop."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,27 +9,22 @@ from jax import Array
 
 from ambjax.codegen.c99.machine import Compiled
 from ambjax.codegen.interface import BITS, OUTPUTS
-from ambjax.codegen.twins import Horizon, LoopCase, farthest, horizons
+from ambjax.codegen.twins import AroundLoop, Horizon, LoopCase, farthest, horizons
 from ambjax.control.cascade_state import Command
 from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.loop import ClosedLoop
+from ambjax.simulation.integrate import Advanced
 from ambjax.simulation.rollout import begin, segment
-from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.system import sampled_of
-from ambjax.world.sensor import Measurement
-from ambjax.world.waveforms import Reference
+from ambjax.world.sensor import Errors
 
 FAULTS = [1 << k for k, name in enumerate(BITS) if name in ("invalid", "failed")]
 (REFUSED,) = (1 << k for k, name in enumerate(BITS) if name == "refused")
 
 
 class ControllerState(NamedTuple):
-    """State of the compiled controller: its numbers, whether it has started, and its faulty samples so far.
-
-    A faulty sample has an invalid input, or a law whose result is not finite.
-    """
+    """State of the compiled controller: its numbers, whether it has started, and its faulty samples so far."""
 
     numbers: Array
     started: Array
@@ -58,7 +53,7 @@ class Machines:
 
 
 @record
-class CompiledLoop(Sampled):
+class CompiledLoop(AroundLoop):
     """The sampled loop whose laws are the compiled controller `which` of `machines`."""
 
     which: Scalar = 0.0
@@ -66,11 +61,12 @@ class CompiledLoop(Sampled):
 
     def start(self) -> SampledState:
         zero = jnp.zeros(())
-        return super().start()._replace(control=ControllerState(jnp.zeros(self.machines.room), zero, zero))
+        return self.loop.start()._replace(control=ControllerState(jnp.zeros(self.machines.room), zero, zero))
 
-    def with_command(self, measured: Measurement, reference: Reference, state: SampledState) -> SampledState:
-        memory = state.control
-        inputs = jnp.stack([*measured, *reference])
+    def jump(self, t: Scalar, state: SampledState, errors: Errors) -> SampledState:
+        state, measured = self.loop.read(state, errors)
+        memory, processor = state.control, self.loop.processor
+        inputs = jnp.stack([*measured, *self.loop.reference(t)])
         shapes = jax.ShapeDtypeStruct((self.machines.room,), float), jax.ShapeDtypeStruct((2 + len(OUTPUTS),), float)
         numbers, rest = jax.pure_callback(
             self.machines.step, shapes, self.which, memory.numbers, memory.started, inputs, vmap_method="sequential"
@@ -79,11 +75,14 @@ class CompiledLoop(Sampled):
         command = Command(**answer, i_ref_dot=jnp.zeros(()))
         faulty = rest[1].astype(int) & sum(FAULTS) != 0
         after = ControllerState(numbers, rest[0], memory.faults + faulty)
-        past, finite = self.processor.remembered(state.command.u, *state.past), jnp.where(faulty, 0.0, state.finite)
-        watch, guard = state.watch, self.processor.guard
+        past, finite = processor.remembered(state.command.u, *state.past), jnp.where(faulty, 0.0, state.finite)
+        watch, guard = state.watch, processor.guard
         if watch and guard:  # from `left`, `Sampled.row` finds whether a reading was refused
             watch = watch._replace(left=jnp.where(rest[1].astype(int) & REFUSED, 0.0, jnp.asarray(guard.samples)))
         return state._replace(control=after, command=command, past=past, finite=finite, watch=watch)
+
+    def advance(self, *now: Any) -> Advanced:
+        return self.loop.advance(*now)
 
 
 class LoopComparison(NamedTuple):
@@ -110,8 +109,7 @@ def compare_loops(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, Lo
     given = sampled_of(case.cascade, case.scenario, case.clock)
     host, found = Machines(*machines.values()), {}
     for which, (precision, horizon) in enumerate(horizons(case, list(machines)).items()):
-        loop = ClosedLoop(given.loop.cascade, case.scenario)
-        looped = CompiledLoop(loop, given.period, given.cuts, which=which, machines=host)
+        looped = CompiledLoop(given, which=which, machines=host)
         found[precision] = LoopComparison(
             horizon, times_of(_displacement(looped, case.clock, horizon.samples), horizon)
         )

@@ -1,7 +1,6 @@
 """The loop with a compiled plant, or a compiled loop, compared with JAX's loop.
 
-A compiled plant runs with JAX's controller, step by step. JAX's loop holds the disturbances over each sample, as the
-exported plant does.
+JAX's loop holds the disturbances over each sample, as the exported plant does.
 """
 
 from collections.abc import Callable
@@ -14,6 +13,8 @@ import numpy as np
 from ambjax.codegen.c99.machine import Compiled
 from ambjax.codegen.closed_loop import LoopComparison, times_of
 from ambjax.codegen.controller import Controller, controller_of
+from ambjax.codegen.loop_step import LoopStep
+from ambjax.codegen.plant_step import PlantStep
 from ambjax.codegen.series import series
 from ambjax.codegen.trace import arguments
 from ambjax.codegen.twins import LoopCase, horizons
@@ -24,8 +25,9 @@ Law = Callable[[np.ndarray], float]
 
 def compare_blocks(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, LoopComparison]:
     """Compare the loop of each compiled plant, or each compiled loop, to JAX's loop. Keys: the precisions."""
-    block: Any = next(iter(machines.values())).trace.block
-    plant = block if block.noun == "plant" else block.plant
+    block = next(iter(machines.values())).trace.block
+    plant = block.plant if isinstance(block, LoopStep) else block
+    assert isinstance(plant, PlantStep)
     case = case._replace(clock=case.clock.with_method(plant.method))
     controller = controller_of(case.cascade, case.scenario.u_max, plant.period, case.scenario)
     found = {}

@@ -12,10 +12,7 @@ RESPONSES = {
 
 
 def band_lines(name: str, analysis: Analysis, zones: Zones) -> list[str]:
-    """Return one sentence for each maximum of a stable loop that is not a peak, or not the largest value.
-
-    `name`: of the loop.
-    """
+    """Return one sentence for each maximum of a stable loop that is not a peak, or not the largest value."""
     lines = []
     for field, (words, unit, _, zoned) in RESPONSES.items():
         one: ResponsePeak | None = getattr(analysis, field)

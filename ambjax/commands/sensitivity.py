@@ -136,8 +136,7 @@ def _draw(
     if spread is not None and spread.point is not None and spread.point.analysis.stable:
         shown.append(spread.point)
     loops = [
-        frequency.NamedLoop(point.name, point.system, point.m, point.analysis.margins_at.reading.disk)
-        for point in shown
+        frequency.NamedLoop(point.name, point.system, point.m, point.analysis.margins_at.reading.dm) for point in shown
     ]
     limits = [float(x) for x in (case.zones.zone_a, case.zones.zone_b, case.zones.zone_c)]
     injected_points = None

@@ -23,10 +23,7 @@ def running_speeds(rotor: Rotation | None, duration: float) -> tuple[float, ...]
 def running_facts(
     speeds: tuple[float, ...], system: StateSpace, peak: ResponsePeak, axis: int = 0, what: str = "|S|"
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return |S| at each speed (Hz) for the JSON summary, and as lines of text; neither for an unstable loop.
-
-    `peak`: of |S|. `axis`: number of the input and the output of S. `what`: |S| in words.
-    """
+    """Return |S| at each speed (Hz) for the JSON summary, and as lines of text; neither for an unstable loop."""
     if not speeds or peak == NO_PEAK:
         return [], []
     found = np.abs(np.asarray(system.response(np.array(speeds)))[:, axis, axis]).tolist()

@@ -1,17 +1,17 @@
 """The processor of a cascade: all laws make one step per sample, and their voltage acts after a delay."""
 
-import dataclasses
 import functools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from ambjax.control.guard import Guard
 from ambjax.control.sampling import Sampling
-from ambjax.numerics.records import Scalar, is_traced, leaf, part, record, static
+from ambjax.numerics.records import Scalar, derived, is_traced, leaf, part, record, replaced, static
 from ambjax.numerics.runge_kutta import rk4_step
 from ambjax.world.plant import Plant, State
 from ambjax.world.sensor import Measurement
@@ -54,15 +54,11 @@ class Processor:
         doc="delay that the prediction assumes; none: the true delay",
     )
     guard: Guard | None = part(default=Guard(), doc="guard of the readings; None: every reading is accepted")
-    whole: bool | None = static(
-        default=None, doc="whether every delay is a whole number of samples; None: not determined yet"
-    )
-    most: int | None = static(
-        default=None, doc="number of samples over which the longest prediction extends; None: not determined yet"
-    )
-    kept: int | None = static(
-        default=None, doc="number of past commands that the program keeps; None: not determined yet"
-    )
+    # Of `resolved`: whether every delay is a whole number of samples, the samples over which the longest prediction
+    # extends, and the number of past commands that the program keeps.
+    whole: bool | None = derived()
+    most: int | None = derived()
+    kept: int | None = derived()
 
     def __str__(self) -> str:
         ahead = "with" if self.predicts else "without"
@@ -104,7 +100,7 @@ class Processor:
         ahead = longest if self.assumed is None else math.ceil(np.max(np.asarray(self.assumed)))
         most = max(self.most or 0, ahead)
         kept = max(self.kept or 0, most, longest, math.ceil(USUAL_DELAY))
-        return dataclasses.replace(self, whole=whole, most=most, kept=kept)
+        return replaced(self, whole=whole, most=most, kept=kept)
 
     def remembered(self, u: Array, *past: Array) -> tuple[Array, ...]:
         """Return the past commands of the next sample. `u`, `past`: the command of this sample and those before it."""
@@ -132,7 +128,17 @@ def predicted_over_delay(
 
     `driven`: `Cascade.driven`. `past`: the commands u_{n-1}, u_{n-2}, ... `lengths`: durations for which they act, s.
     """
-    x = model.start(estimate)
-    for u, h in reversed(list(zip(past[: len(lengths)], lengths, strict=True))):
-        x = rk4_step(functools.partial(driven, u), x, h)
-    return model.measurement(x)
+    count, start = len(lengths), model.start(estimate)
+
+    def moved(loop: tuple[State, tuple[Array, ...], tuple[Array, ...]], _: None) -> tuple[Any, None]:
+        x, past, lengths = loop
+        x = rk4_step(functools.partial(driven, past[-1]), x, lengths[-1])
+        return (x, (past[-1], *past[:-1]), (lengths[-1], *lengths[:-1])), None
+
+    loop = (start, past[:count], lengths)
+    if count <= USUAL_DELAY:
+        for _ in range(count):
+            loop, _ = moved(loop, None)
+    else:  # a loop, so that the program does not grow with the delay
+        loop, _ = lax.scan(moved, loop, None, count)
+    return model.measurement(loop[0])

@@ -16,7 +16,7 @@ from ambjax.world.scenario import Scenario
 # only in a narrow interval of delays; from there to MOST_DELAY they are at most 1/32 sample. An interval that lies
 # between two neighbouring delays is not found. The last ensemble divides one step by 256.
 DELAYS = 257
-# The ranges of delays end at these numbers of samples. All delays up to an end share one compiled program.
+# The ranges of delays end at these numbers of samples. All delays share one compiled program.
 ENDS = (USUAL_DELAY, MOST_DELAY)
 
 
@@ -61,8 +61,7 @@ def delay_margin(cascade: Cascade, scenario: Scenario, clock: Clock, *, known: b
 
 def at_delays(cascade: Cascade, delays: np.ndarray, *, known: bool) -> Cascade:
     """Return the cascade with these delays [N] (samples) of its processor. `known`: as in `delay_margin`."""
-    end = next(end for end in ENDS if np.max(delays) <= end)
-    cascade = cascade.on_processor(0.0, end)
+    cascade = cascade.on_processor(0.0, MOST_DELAY, between=True)
     # an array in both cases, so that both use the same compiled program
     assumed = delays if known else np.full(len(delays), float(cascade.timing.ahead))
     return cascade.with_processor(predict=cascade.timing.predict is not False, delay=delays, assumed=assumed)

@@ -1,7 +1,4 @@
-"""The linearised plant with the lags of sensor and amplifier, integrated exactly over one sample.
-
-At an equilibrium the linearised equations have constant coefficients, and the matrix exponential solves them exactly.
-"""
+"""The linearised plant with the lags of sensor and amplifier, integrated exactly over one sample."""
 
 from typing import NamedTuple
 
@@ -33,10 +30,7 @@ class HeldPlant(NamedTuple):
 
 
 class Lagged:
-    """The plant of a scenario with the lags of sensor and amplifier; its state is one vector [N].
-
-    `point`: the equilibrium, at which `held` linearises the plant.
-    """
+    """The plant of a scenario with the lags of sensor and amplifier; its state is one vector [N]."""
 
     def __init__(self, scenario: Scenario, point: Point):
         self.scenario = scenario
@@ -81,8 +75,7 @@ class Lagged:
     def held(self, point: Point, period: Scalar, delay: Scalar, kept: int) -> HeldPlant:
         """Return the linear map of one sample at the equilibrium `point`.
 
-        `period`: sample period, s. `delay`: samples after which the voltage of a sample begins to act.
-        `kept`: number of past commands, at least `delay`.
+        `delay`: samples after which the voltage of a sample begins to act.
         """
         A, B = jax.jacfwd(lambda x, w: self.rates(x, w[0], w[1]), (0, 1))(
             self.start, jnp.stack([point.u, 0.0 * point.u])

@@ -20,7 +20,7 @@ import numpy as np
 
 from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import DEFAULT_LAWS, Cascade
-from ambjax.ensemble.batching import run_ensemble
+from ambjax.ensemble.batching import run_ensemble, size
 from ambjax.ensemble.blocks import Blocks
 from ambjax.linear.analysis import linearise_members
 from ambjax.simulation.clock import Clock
@@ -162,10 +162,7 @@ def stability_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> Stabilit
 
 
 def suspects(error: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Return the indices of the held members with the largest settled errors, ascending, at most MOST_TESTED.
-
-    `error` [N]: settled errors, m. `held` [N]: whether a member is held.
-    """
+    """Return the indices of the held members with the largest settled errors, ascending, at most MOST_TESTED."""
     alive = np.flatnonzero(held)
     return np.sort(alive[np.argsort(-np.asarray(error)[alive], kind="stable")[:MOST_TESTED]])
 
@@ -200,9 +197,9 @@ def with_stability(margin: "Delays", cascade: Cascade, scenario: Scenario, clock
 
 def _growth(cascade: Cascade, scenario: Scenario, clock: Clock) -> np.ndarray:
     """Return the largest growth rate of the linear loop of each member [N], 1/s; NaN where there is no verdict."""
-    system, found = linearise_members(cascade, scenario, clock)
     if any(set_valued_signs(getattr(cascade, stage)) for stage in DEFAULT_LAWS):
-        return np.full(np.shape(found), np.nan)
+        return np.full(size((cascade, scenario)), np.nan)
+    system, found = linearise_members(cascade, scenario, clock)
     A, sizes = np.asarray(system.A), np.asarray(system.sizes)
     known = np.asarray(found, bool) & np.isfinite(A).all((1, 2)) & np.isfinite(sizes).all(1)
     scaled = np.zeros_like(A)

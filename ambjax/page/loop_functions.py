@@ -8,7 +8,7 @@ from jax import Array
 
 from ambjax.cases.reader import Case
 from ambjax.control.cascade import Cascade
-from ambjax.numerics.records import Scalar
+from ambjax.numerics.records import Scalar, replaced
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.metrics import Metrics
@@ -42,7 +42,7 @@ class LoopFunctions:
     clock: Clock
 
     def _system(self, numbers: Numbers, normals: Any) -> tuple[Sampled, Clock, Metrics]:
-        clock = dataclasses.replace(self.clock, sample_period=numbers.period)
+        clock = replaced(self.clock, sample_period=numbers.period)
         built = sampled_of(numbers.cascade, numbers.scenario, clock)
         word = jnp.zeros((), jnp.uint32)
         cascade = built.loop.cascade.turning(numbers.scenario.rotor)
@@ -72,10 +72,7 @@ class LoopFunctions:
 
 
 def loop_parameters(case: Case, any_delay: bool = False) -> Numbers:
-    """Return the numbers of a case on a processor.
-
-    `any_delay`: the program admits any delay up to `longest_delay`, not only that of the case.
-    """
+    """Return the numbers of a case on a processor."""
     cascade = case.cascade.on_processor()
     if any_delay:
         cascade = cascade.on_processor(0.0, longest_delay(case), between=True)

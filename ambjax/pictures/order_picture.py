@@ -17,7 +17,7 @@ SHOWN = {"z": ("position", "µm", 1e6), "i": ("current", "mA", 1e3)}
 def once_per_turn(x: np.ndarray, turns: np.ndarray) -> np.ndarray:
     """Return the amplitude [N] of a signal `x` at the speed, in each of its N whole turns.
 
-    `turns`: angle of the rotor at each sample, in turns. A straight line is removed, because the mean of `x` may drift.
+    `turns`: angle of the rotor at each sample, in turns.
     """
     number = np.floor(np.abs(turns - turns[0]) + 1e-9).astype(int)
     found = []

@@ -44,10 +44,7 @@ def waterfall(x: np.ndarray, speed: np.ndarray, period: float) -> Waterfall:
 
 @own_style
 def run_up_picture(case: Any, signals: dict[str, np.ndarray], path: pathlib.Path) -> None:
-    """Write the waterfall and the orbits of each radial bearing, and the largest currents and voltages against speed.
-
-    `case`: the machine. `signals`: those of a `MachineRun`.
-    """
+    """Write the waterfall and the orbits of each radial bearing, and largest currents and voltages against speed."""
     alive = signals["t"] < float(signals["lost_at"])
     t, speed = signals["t"][alive], signals["speed_rpm"][alive]
     pairs, period = orbits_of([str(name) for name in signals["axes"]])[:3], float(t[1] - t[0])

@@ -134,7 +134,7 @@ class TuningProblem:
         return dataclasses.replace(self.goal, weights=self.tune.weights, minimised="", limits=())
 
     def _stepping(self, method: Integrator, **more: Any) -> Engine:
-        objective = dataclasses.replace(self.objective, clock=dataclasses.replace(self.objective.clock, method=method))
+        objective = dataclasses.replace(self.objective, clock=self.objective.clock.with_method(method))
         return Engine(objective, settle=self.case.settle, **more)
 
     @functools.cached_property

@@ -1,6 +1,5 @@
 """The files of a tuning: the case with the tuned gains, the report with its pictures, the front and the page."""
 
-import dataclasses
 import functools
 import pathlib
 import tomllib
@@ -107,7 +106,7 @@ def nominal(problem: TuningProblem, cascade: Cascade) -> Trajectory:
     case = problem.case
     if problem.replays:
         return record_member(cascade, case.scenario, case.clock).trajectory
-    clock = dataclasses.replace(case.clock, method=problem.reference.objective.clock.method)
+    clock = case.clock.with_method(problem.reference.objective.clock.method)
     return rollout(cascade, case.scenario, clock).trajectory
 
 

@@ -107,7 +107,7 @@ def _stability(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[s
     tell(f"testing whether the loops of {index.size} held-out members are stable")
     members = problem.objective.chosen(seed, index, len(columns["lost_at_s"]))
     # in continuous time, the step of the case may be too coarse for these gains
-    clock = problem.case.clock if problem.sampled else dataclasses.replace(problem.case.clock, method=None)
+    clock = problem.case.clock if problem.sampled else problem.case.clock.with_method(None)
     return stability_of(*problem.objective.fixed(x, members), clock).findings()._asdict()
 
 
@@ -140,7 +140,7 @@ def _conditions(problem: TuningProblem, x: np.ndarray) -> Row:
     """Return the fields on the theorem's conditions at x [m]."""
     case = problem.case
     cascade = problem.objective.space.decode(jnp.asarray(x), case.cascade)
-    line: Check = check(cascade, case.scenario, dataclasses.replace(case.clock, method=None))
+    line: Check = check(cascade, case.scenario, case.clock.with_method(None))
     rows = [dataclasses.asdict(one) | {"margin": one.margin} for one in line.conditions]
     return {"conditions": rows, "advice_on_conditions": on_conditions(line)}
 

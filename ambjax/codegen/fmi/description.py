@@ -36,10 +36,7 @@ class Variable(NamedTuple):
 
 
 def variables(traced: Trace) -> list[Variable]:
-    """Return the variables of an exported block, except inputs and parameters that it does not read.
-
-    Their value references are those of fmu_core.h: time, inputs, outputs, parameters, states, status.
-    """
+    """Return the variables of an exported block, except inputs and parameters that it does not read."""
     outputs, states = ([x for x, _ in group] for group in (traced.outputs, traced.state))
     groups: tuple[tuple[Sequence[Number], str, str], ...] = (
         (traced.inputs, "input", "discrete"),
@@ -110,12 +107,7 @@ FORMS = {
 
 
 def description(traced: Trace, identifier: str, case: str, guid: str, sources: list[str], version: int) -> str:
-    """Return the text of modelDescription.xml.
-
-    - `case`: name of the case.
-    - `sources`: names of the C files.
-    - `version`: of FMI, 2 or 3.
-    """
+    """Return the text of modelDescription.xml. `case`: name of the case. `sources`: names of the C files."""
     form, period = FORMS[version], traced.block.period
     words = f"{traced.block.noun} of case {case}: one sample per communication step"
     head = f"modelName={quoteattr(f'{identifier} ({traced.block.noun})')} description={quoteattr(words)}"
@@ -166,10 +158,7 @@ def _units(found: list[Variable]) -> list[str]:
 
 
 def build_description(identifier: str, sources: list[str]) -> str:
-    """Return the text of buildDescription.xml of FMI 3.0, which tells a tool how to compile the sources.
-
-    `sources`: names of the C files.
-    """
+    """Return the text of buildDescription.xml of FMI 3.0, which tells a tool how to compile the sources."""
     files = "".join(f'\n      <SourceFile name="{name}"/>' for name in sources)
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n<fmiBuildDescription fmiVersion="3.0">\n'
