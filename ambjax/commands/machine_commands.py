@@ -70,8 +70,8 @@ def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]
         described("overview.png", lambda: machine_picture(case, run.signals, title, part / "overview.png"))
         if np.ptp(run.signals["speed_rpm"]) > 0:
             described("runup.png", lambda: run_up_picture(case, run.signals, part / "runup.png"))
-        page = radial_axes(case) and described("motion.html", lambda: motion_page(case, run.signals))
-        if page:
+        page = described("motion.html", lambda: motion_page(case, run.signals)) if radial_axes(case) else None
+        if page is not None:
             (part / "motion.html").write_text(page, encoding="utf-8")
         names = [name for name in SIMULATED if (part / name).exists()]
     if not args.json:
