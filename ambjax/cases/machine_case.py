@@ -11,7 +11,7 @@ import numpy as np
 
 from ambjax.cases.axis_case import MACHINE_TABLES, as_written, axis_tables, check_axis, stop_slope
 from ambjax.cases.machine_controller import inner, kind_of, law_from, merged
-from ambjax.cases.machine_spread import axis_table, machine_spread, refuse_unused
+from ambjax.cases.machine_spread import axis_table, machine_spread, refuse_unused, with_notches
 from ambjax.cases.machine_trial import try_machine
 from ambjax.cases.notch_table import notch_from
 from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
@@ -133,11 +133,13 @@ def machine_from(
             raise ValueError(f"{name}: {as_written(str(error), bearing)}") from None
 
     names = [table.raw.get("name", f"bearing{k + 1}") for k, table in enumerate(bearings)]
-    cases = []
+    cases, of_notches = [], []
     for axis, m, force, i in zip(axes, masses, forces, currents, strict=True):
         bearing = bearings[axis.bearing]
         own = axis_tables(raw, bearing, axis, m, force, (q, i))
-        own |= axis_table(raw, axis, names[axis.bearing])
+        table, turning = axis_table(raw, axis, names[axis.bearing])
+        own |= table
+        of_notches.append(turning)
         case = read(own, f"axis {axis.name}", bearing)
         check_axis(case, axis, force, q)
         cases.append(case)
@@ -154,6 +156,7 @@ def machine_from(
         found = with_machine_gains(machine_of_axes(rotor, parts_of(cases), clock, q, law), notches, clock)
         laws = [dataclasses.replace(case.cascade, notch=notch) for case, notch in zip(cases, found, strict=True)]
         cases = [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
+    spread = with_notches(spread, of_notches, axes, cases)
     coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
     found_laws = [(own_law,) if own_law else (), *(one.own_laws for one in cases)]
     machine = machine_of_axes(rotor, parts_of(cases), clock, q, law)

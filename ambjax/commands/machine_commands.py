@@ -8,8 +8,8 @@ from tqdm import tqdm
 
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.rotor_drawing import radial_axes
+from ambjax.commands.band_text import running_facts
 from ambjax.commands.sensitivity_report import injected_numbers, injection_text
-from ambjax.commands.speed_text import running_facts
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.linear import Injection, machine_injected
 from ambjax.linear.linear_machine import MachineSensitivity

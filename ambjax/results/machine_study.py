@@ -13,7 +13,7 @@ import numpy as np
 from ambjax.cases.machine_case import MachineCase, machine_from, machine_of_axes, parts_of
 from ambjax.cases.machine_spread import axis_values, machine_places, shared, varied_start
 from ambjax.cases.rotor_numbers import varied_rotors
-from ambjax.compiler.members_last import members_last
+from ambjax.compiler.members_last import SHORT, members_last
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
 from ambjax.ensemble.maps import PERIOD
@@ -204,7 +204,13 @@ def run_machines(
 ) -> Result:
     """Simulate every member of an ensemble of machines. What varies has a leading axis [N]. No rows are recorded."""
     tree = canonical((machine, clock, fold))
-    return map_members(_simulated, tree, threads=threads, call=call, vectorised=True)
+    return map_members(_simulated, tree, threads=threads, call=call, plain=_has_long_sums(machine), vectorised=True)
+
+
+def _has_long_sums(machine: Machine) -> bool:
+    """Return whether a product of a matrix has a sum of more than SHORT terms, which XLA refuses in one kernel."""
+    matrices = [x for x in jax.tree.leaves(machine.law) if np.ndim(x) > 1]
+    return max(np.shape(x)[-1] for x in (machine.rotor.gravity, *matrices)) > SHORT
 
 
 def _simulated(tree: tuple[Machine, Clock, Fold], axes: object) -> Result:
