@@ -394,6 +394,10 @@ def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monke
         (first(stop_modes=[1.0]), r"bearing\[0\]\.stop_modes"),
         (first(clearance=4e-4), r"left\.x: bearing\[0\]\.clearance = 0\.0004 m: it must be less than the gap"),
         (first(stop_at=-5.0), r"left\.y: initial\.q: at this axis z = .* touch its stop at the start"),
+        (
+            {"spread": {"bearing": {"left": {"clearance": {"uniform": [0.0, 1.0]}}}}},
+            r"spread\.bearing\.left\.clearance =",
+        ),
         ({"loads": []}, r"loads = \[\]: unknown key\. Did you mean 'load'"),
         ({"bearing": MACHINE["bearing"][:1]}, "determine .* of the .* rigid motions"),
         ({"bearing": MACHINE["bearing"][2:]}, r"no axis holds y\. .*or a rotor\.gravity that does not"),

@@ -1,9 +1,10 @@
 """Reader of the case file of a whole machine: rotor, bearings, unbalances, loads, base, and the common tables."""
 
 import dataclasses
+import functools
 import math
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import jax.numpy as jnp
@@ -126,11 +127,11 @@ def machine_from(
     _check_rank(rotor, axes)
     masses, forces = _shares(rotor)
 
-    def read(raw: dict[str, Any], name: str, bearing: Table | None = None) -> Case:
+    def read(raw: dict[str, Any], name: str, written: Callable[[str], str] = str) -> Case:
         try:
             return case_from(raw, name, "", folder)
         except ValueError as error:
-            raise ValueError(f"{name}: {as_written(str(error), bearing)}") from None
+            raise ValueError(f"{name}: {written(str(error))}") from None
 
     names = [table.raw.get("name", f"bearing{k + 1}") for k, table in enumerate(bearings)]
     cases, of_notches = [], []
@@ -140,7 +141,8 @@ def machine_from(
         table, turning = axis_table(raw, axis, names[axis.bearing])
         own |= table
         of_notches.append(turning)
-        case = read(own, f"axis {axis.name}", bearing)
+        written = functools.partial(as_written, raw=raw, bearing=bearing, axis=axis)
+        case = read(own, f"axis {axis.name}", written)
         check_axis(case, axis, force, q)
         cases.append(case)
     own_law = own_machine_law(kind, folder) if is_own(kind := kind_of(raw)) else None

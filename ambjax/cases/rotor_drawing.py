@@ -50,9 +50,11 @@ def drawing_of(case: MachineCase) -> RotorDrawing:
 
 def _planes(rotor: Rotor) -> list[tuple[tuple[str, float], np.ndarray]]:
     """Return kind, place and mode shapes of each plane of the rotor, without repetition."""
-    rows = [("magnet", row) for row in np.asarray(rotor.at_magnets)]
+    magnets = np.asarray(rotor.at_magnets)
+    stops = magnets if rotor.at_stops is None else np.asarray(rotor.at_stops)
+    rows = [("magnet", row) for row in magnets]
     rows += [("sensor", row) for row in np.asarray(rotor.at_sensors)]
-    rows += [("stop", row) for row in ([] if rotor.at_stops is None else np.asarray(rotor.at_stops))]
+    rows += [("stop", row) for row in stops[np.any(stops != magnets, 1)]]
     rows += [("unbalance", np.asarray(one.along_x)) for one in rotor.unbalances]
     found: dict[tuple[str, float], np.ndarray] = {}
     for kind, row in rows:

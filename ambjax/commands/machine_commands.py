@@ -71,7 +71,7 @@ def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]
         if np.ptp(run.signals["speed_rpm"]) > 0:
             described("runup.png", lambda: run_up_picture(case, run.signals, part / "runup.png"))
         page = described("motion.html", lambda: motion_page(case, run.signals)) if radial_axes(case) else None
-        if page:
+        if page is not None:
             (part / "motion.html").write_text(page, encoding="utf-8")
         names = [name for name in SIMULATED if (part / name).exists()]
     if not args.json:
