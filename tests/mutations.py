@@ -43,7 +43,7 @@ MUTATIONS = [
       "return -sliding_variable(self.k_d, *inputs)", "return 0 * sliding_variable(self.k_d, *inputs)",
       "tests/test_manifolds.py::test_an_integral_sliding_mode_begins_on_its_manifold"),
     M("the score of the search omits the multipliers of the limits", "tuning/problem/goal.py",
-      "    return goal(outcomes, x, ordinary)", "    return goal.ordinary_risk(outcomes[:ordinary])",
+      "    return goal(outcomes, ordinary)", "    return goal.ordinary_risk(outcomes[:ordinary])",
       "tests/test_tuning_search.py"),
     M("the position law compensates one passive bearing instead of two", "ambjax/control/force.py",
       "wanted = -2 * model.k_z", "wanted = -model.k_z", "tests/test_laws.py::test_equation_5_sets_the_rate_of_sigma"),
