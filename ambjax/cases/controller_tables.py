@@ -79,11 +79,7 @@ def processor_from(table: Table) -> Processor:
 
 
 def cascade_from(
-    top: Table,
-    plant: Bearing,
-    processor: Processor | None,
-    period: Scalar | None,
-    files: Files,
+    top: Table, plant: Bearing, processor: Processor | None, period: Scalar | None, files: Files
 ) -> tuple[Cascade, tuple[OwnLaw, ...], ControllerFile | None]:
     """Return the cascade of the [controller] tables, its custom laws, and the file of its linear controller or None.
 

@@ -6,15 +6,7 @@ from typing import Any
 from ambjax.cases.table import Table, quoted, show
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.design import DESIGNS
-from ambjax.ensemble.distributions import (
-    SHAPES,
-    Choice,
-    Distribution,
-    LogUniform,
-    Normal,
-    Percent,
-    Uniform,
-)
+from ambjax.ensemble.distributions import SHAPES, Choice, Distribution, LogUniform, Normal, Percent, Uniform
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import Spread, check_spread, require_path
 from ambjax.world.scenario import Scenario

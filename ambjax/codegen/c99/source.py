@@ -141,9 +141,7 @@ class Writer:
             ),
             params=self.struct("params", t.parameters),
             state=self.struct(
-                "state",
-                [x for x, _ in t.state],
-                [f"uint32_t started; /* {ABOUT[t.block.noun].started} */"],
+                "state", [x for x, _ in t.state], [f"uint32_t started; /* {ABOUT[t.block.noun].started} */"]
             ),
             input=self.struct("input", inputs),
             output=self.struct("output", [x for x, _ in t.outputs]),
