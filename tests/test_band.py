@@ -22,40 +22,15 @@ PERIOD = 2e-5
 # |S| of a resonance at 5150 Hz with 6 % damping: its largest value at most 2 kHz is at 2 kHz.
 W, DAMPING = 2 * np.pi * 5150.0, 0.06
 BEARING = """
-[plant]
-m = 0.03
-k_z = 0.0
-mu_0 = 1.25663706e-6
-n = 100.0
-A = 4e-5
-s_0 = 2e-4
-i_0 = 1.0
-R = 1.0
-[controller.observer]
-kind = "difference"
-w = 5e4
-[controller.position]
-kind = "chain"
-k_p = 363248.0
-k_d = 69.375
-k_int = 1e5
-w_f = 3e5
-w_lp = 1e9
-[controller.inversion]
-kind = "linearised"
-[actuator]
-mode = "current"
-bandwidth = 2e4
-[processor]
-predict = false
-[sensor]
-velocity = false
-[sensitivity]
-f_high = 2e3
-f_low = 100.0
-[clock]
-duration = 0.001
-sample_period = 2e-5
+plant = { m = 0.03, k_z = 0.0, mu_0 = 1.25663706e-6, n = 100.0, A = 4e-5, s_0 = 2e-4, i_0 = 1.0, R = 1.0 }
+controller.observer = { kind = "difference", w = 5e4 }
+controller.position = { kind = "chain", k_p = 363248.0, k_d = 69.375, k_int = 1e5, w_f = 3e5, w_lp = 1e9 }
+controller.inversion = { kind = "linearised" }
+actuator = { mode = "current", bandwidth = 2e4 }
+processor = { predict = false }
+sensor = { velocity = false }
+sensitivity = { f_high = 2e3, f_low = 100.0 }
+clock = { duration = 0.001, sample_period = 2e-5 }
 """
 
 
@@ -146,7 +121,7 @@ def test_the_commands_say_that_a_larger_peak_lies_outside_the_band_of_the_case(t
     summary = json.loads((tmp_path / "out" / "sensitivity.json").read_text())
     loop, verdict, _ = acceptance(read_case(path))  # the first part of `ambjax check`
     whole = pathlib.Path(tmp_path / "whole.toml")
-    whole.write_text(BEARING.replace("f_high = 2e3", ""))
+    whole.write_text(BEARING.replace("f_high = 2e3, ", ""))
     main(["sensitivity", str(whole), *out, "--json"])
     full = json.loads(capsys.readouterr().out)
     assert full["zone"] == "D"

@@ -14,19 +14,14 @@ from ambjax.theorem.causes import NO_PART, Cause, cause_words, find_cause, parts
 from ambjax.theorem.sampled_report import Delays
 
 EVERYTHING = """
-[plant]
-kind = "two-coil"
-[controller.model]
-m = 0.7
-[controller.observer]
-kind = "kalman"
-[disturbance.q_z]
-kind = "step"
-amplitude = 1.0
-start = 0.1
-[processor]
-delay = 1.0
-discretisation = "explicit"
+plant = { kind = "two-coil" }
+controller.model = { m = 0.7 }
+controller.observer = { kind = "kalman" }
+disturbance.q_z = { kind = "step", amplitude = 1.0, start = 0.1 }
+processor = { delay = 1.0, discretisation = "explicit" }
+actuator = { u_max = 100.0, bandwidth = 5e3 }
+initial = { z = 1e-4 }
+clock = { sample_period = 1e-4, duration = 0.2 }
 [sensor]
 std = 1e-7
 bits = 12
@@ -35,14 +30,6 @@ velocity = false
 [sensor.outliers]
 rate = 1.0
 size = 1e-5
-[actuator]
-u_max = 100.0
-bandwidth = 5e3
-[initial]
-z = 1e-4
-[clock]
-sample_period = 1e-4
-duration = 0.2
 """
 # Part, and whether a case still has it.
 PARTS = {
@@ -144,16 +131,10 @@ def test_the_cause_of_a_loss_is_the_part_without_which_the_rotor_is_held(name):
 
 # The paper's plant on a processor with explicit steps, whose signs then chatter.
 CHATTERING = """
-[controller.inversion]
-gamma = 7.5e4
-[processor]
-delay = 1.0
-discretisation = "explicit"
-[actuator]
-u_max = 200.0
-[clock]
-duration = 0.2
-sample_period = 1e-4
+controller.inversion = { gamma = 7.5e4 }
+processor = { delay = 1.0, discretisation = "explicit" }
+actuator = { u_max = 200.0 }
+clock = { duration = 0.2, sample_period = 1e-4 }
 """
 ALTERNATING = {
     # 44.7 % and 0.5 % with and without the converter

@@ -12,69 +12,30 @@ from ambjax.cases.reader import read_case
 
 # The paper's tracking scenario in continuous time, from the printed gains, with small noise.
 PAPER = """
+reference = { kind = "sine", amplitude = 0.0025, frequency = 2.0 }
+disturbance.q_z = { kind = "pulse", amplitude = 1.0, start = 0.01, stop = 0.015, unit = "A^2/m^2" }
+sensor = { std = 1e-6, std_z_dot = 1e-4, std_i = 1e-4 }
+actuator = { u_max = 200.0 }
+clock = { duration = 0.03 }
+run = { settle = 0.02 }
+spread = { plant.m = { percent = 10 } }
 [controller.inversion]
 gamma = 1000.0  # the printed gain, which loses every member
-[reference]
-kind = "sine"
-amplitude = 0.0025
-frequency = 2.0
-[disturbance.q_z]
-kind = "pulse"
-amplitude = 1.0
-start = 0.01
-stop = 0.015
-unit = "A^2/m^2"
-[sensor]
-std = 1e-6
-std_z_dot = 1e-4
-std_i = 1e-4
-[actuator]
-u_max = 200.0
-[clock]
-duration = 0.03
-[run]
-settle = 0.02
-[spread]
-plant.m = { percent = 10 }
 """
 # A bearing from a data sheet on a processor, without a velocity sensor.
 BEARING = """
-[plant]
-m = 2.4
-k_z = 0.0
-mu_0 = 1.2566e-6
-n = 300.0
-A = 2.0e-4
-s_0 = 5e-4
-i_0 = 2.0
-R = 1.0
-[controller.observer]
-kind = "kalman"
-[controller.position]
-kind = "pid"
-k_p = 2e5
-[controller.inversion]
-kind = "linearised"
-[controller.current]
-kind = "pi"
-[processor]
-delay = 1.0
-[sensor]
-std = 3e-7
-std_i = 2e-3
-velocity = false
-bits = 14
-[actuator]
-u_max = 72.0
-[initial]
-z = 2e-5
-[clock]
-duration = 0.03
-sample_period = 6.25e-5
-[run]
-settle = 0.015
-[spread]
-plant.m = { percent = 10 }
+plant = { m = 2.4, k_z = 0.0, mu_0 = 1.2566e-6, n = 300.0, A = 2.0e-4, s_0 = 5e-4, i_0 = 2.0, R = 1.0 }
+controller.observer = { kind = "kalman" }
+controller.position = { kind = "pid", k_p = 2e5 }
+controller.inversion = { kind = "linearised" }
+controller.current = { kind = "pi" }
+processor = { delay = 1.0 }
+sensor = { std = 3e-7, std_i = 2e-3, velocity = false, bits = 14 }
+actuator = { u_max = 72.0 }
+initial = { z = 2e-5 }
+clock = { duration = 0.03, sample_period = 6.25e-5 }
+run = { settle = 0.015 }
+spread = { plant.m = { percent = 10 } }
 """
 # The smallest search, of one gain.
 SMALLEST = """

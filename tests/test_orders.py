@@ -67,16 +67,9 @@ def test_without_a_whole_revolution_nothing_is_known():
 
 
 TURNING = """
-[rotor]
-speed = 6000.0
-
-[disturbance.q_z]
-kind = "unbalance"
-unbalance = 5.0
-
-[clock]
-duration = 0.1
-sample_period = 1e-4
+rotor = { speed = 6000.0 }
+disturbance.q_z = { kind = "unbalance", unbalance = 5.0 }
+clock = { duration = 0.1, sample_period = 1e-4 }
 """
 
 

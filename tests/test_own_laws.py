@@ -50,28 +50,16 @@ class PD(PositionLaw):
         return force_for(0.0, model, motion, reference, wanted), 10 * self.stiff * (motion.z - reference.r)
 '''
 CASE = """
-[processor]
-delay = 1.0
+processor = { delay = 1.0 }
+controller.inversion = { gamma = 7.97e5, p = inf }
+controller.current = { k_i = 870.6, p = inf }
+sensor = { std = 1e-6, std_z_dot = 1e-4 }
+actuator = { u_max = 200.0 }
+clock = { duration = 0.01 }
+tune = { objective = "least_error", limits.sensitivity = inf, gains = ["controller.position.damp"] }
 [controller.position]
 kind = "mine.py:PD"  # ours
 damp = 300.0
-[controller.inversion]
-gamma = 7.97e5
-p = inf
-[controller.current]
-k_i = 870.6
-p = inf
-[sensor]
-std = 1e-6
-std_z_dot = 1e-4
-[actuator]
-u_max = 200.0
-[clock]
-duration = 0.01
-[tune]
-objective = "least_error"
-limits.sensitivity = inf
-gains = ["controller.position.damp"]
 """
 IMPORTED = "case.toml: controller.position.kind: imported PD from "
 

@@ -19,16 +19,10 @@ from tuning.__main__ import main as tune_main
 from tuning.command import TunedCase
 
 CASE = """
-[reference]
-kind = "sine"
-amplitude = 1e-4
-frequency = 5.0
-[clock]
-duration = 0.02
-[run]
-settle = 0.01
-[spread]
-plant.m = { percent = 5 }
+reference = { kind = "sine", amplitude = 1e-4, frequency = 5.0 }
+clock = { duration = 0.02 }
+run = { settle = 0.01 }
+spread = { plant.m = { percent = 5 } }
 """
 
 

@@ -196,16 +196,9 @@ def test_check_begins_with_the_numbers_of_the_machine(tmp_path, capsys):
 
 
 PROCESSOR = """
-[controller.position]
-c = 200.0
-k = 63.0
-p = 5.0
-[controller.inversion]
-gamma = 2e6
-p = 1e-3
-[controller.current]
-k_i = 600.0
-p = 20.0
+controller.position = { c = 200.0, k = 63.0, p = 5.0 }
+controller.inversion = { gamma = 2e6, p = 1e-3 }
+controller.current = { k_i = 600.0, p = 20.0 }
 [processor]
 [sensitivity]
 f_low = 20.0

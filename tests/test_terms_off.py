@@ -20,6 +20,12 @@ from ambjax.linear.equilibrium import equilibrium, ideal
 T = 5e-5
 # A bearing with a current amplifier: chain without observer, PD unless k_int is given.
 BEARING = tomllib.loads("""
+controller.position = { kind = "chain", k_p = 1.2e4, k_int = 0.0, k_d = 25.0, w_f = 20000.0 }
+controller.inversion = { kind = "linearised" }
+actuator = { mode = "current", bandwidth = 1500.0, u_max = 100.0, i_max = 2.5 }
+processor = { delay = 1.0, predict = false }
+sensor = { velocity = false }
+clock = { duration = 0.1, sample_period = 1e-4 }
 [plant]
 kind = "two-coil"
 m = 3.274
@@ -30,27 +36,6 @@ A = 2.6792506e-4
 s_0 = 7.8e-4
 i_0 = 2.5
 R = 1.0
-[controller.position]
-kind = "chain"
-k_p = 1.2e4
-k_int = 0.0
-k_d = 25.0
-w_f = 20000.0
-[controller.inversion]
-kind = "linearised"
-[actuator]
-mode = "current"
-bandwidth = 1500.0
-u_max = 100.0
-i_max = 2.5
-[processor]
-delay = 1.0
-predict = false
-[sensor]
-velocity = false
-[clock]
-duration = 0.1
-sample_period = 1e-4
 """)
 
 

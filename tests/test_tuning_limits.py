@@ -117,25 +117,17 @@ def test_limits_that_are_not_a_table_are_refused():
 # --- how they are measured ---
 
 SAMPLED = """
+reference = { kind = "sine", amplitude = 1e-3, frequency = 5.0 }
+sensor = { std = 1e-6, std_z_dot = 1e-4, std_i = 1e-4 }
+actuator = { u_max = 200.0 }
+clock = { duration = 0.02 }
+run = { settle = 0.01 }
+rotor = { speed = 12000.0 }
 [controller]
 position = { c = 1300.0, k = 11.0, p = inf }
 inversion = { gamma = 6e6, p = inf }
 current = { k_i = 900.0, p = inf }
 [processor]
-[reference]
-kind = "sine"
-amplitude = 1e-3
-frequency = 5.0
-[sensor]
-std = 1e-6
-std_z_dot = 1e-4
-std_i = 1e-4
-[actuator]
-u_max = 200.0
-[clock]
-duration = 0.02
-[run]
-settle = 0.01
 [tune]
 objective = "least_error"
 members = 4
@@ -157,8 +149,6 @@ overshoot_m = 1e-5
 clearance_used = 0.6
 z_1x_m = 1e-6
 i_1x_A = 0.1
-[rotor]
-speed = 12000.0
 """
 
 

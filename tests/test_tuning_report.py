@@ -22,24 +22,13 @@ from tuning.report import document as report
 from tuning.report import folder, pictures
 
 CASE = """
-[reference]
-kind = "sine"
-amplitude = 1e-3
-frequency = 5.0
-[controller.inversion]
-gamma = 3e5
-[sensor]
-std = 1e-6
-std_z_dot = 1e-4
-std_i = 1e-4
-[actuator]
-u_max = 200.0
-[clock]
-duration = 0.02
-[run]
-settle = 0.01
-[spread]
-plant.m = { percent = 5 }
+reference = { kind = "sine", amplitude = 1e-3, frequency = 5.0 }
+controller.inversion = { gamma = 3e5 }
+sensor = { std = 1e-6, std_z_dot = 1e-4, std_i = 1e-4 }
+actuator = { u_max = 200.0 }
+clock = { duration = 0.02 }
+run = { settle = 0.01 }
+spread = { plant.m = { percent = 5 } }
 [tune]
 objective = "least_error"
 limits.sensitivity = inf

@@ -395,20 +395,12 @@ def test_a_gain_that_is_both_spread_and_tuned_is_refused():
 
 # Steps that are fine enough for accurate steps to confirm the answer of a search this short.
 CASE = """
-[controller.inversion]
-gamma = 1000.0
-[reference]
-kind = "sine"
-amplitude = 1e-3
-frequency = 2.0
-[sensor]
-std = 1e-6
-[actuator]
-u_max = 400.0
-[clock]
-duration = 0.03
-[run]
-settle = 0.01
+controller.inversion = { gamma = 1000.0 }
+reference = { kind = "sine", amplitude = 1e-3, frequency = 2.0 }
+sensor = { std = 1e-6 }
+actuator = { u_max = 400.0 }
+clock = { duration = 0.03 }
+run = { settle = 0.01 }
 [tune]
 objective = "least_error"
 limits.sensitivity = inf

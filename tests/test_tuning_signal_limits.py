@@ -17,6 +17,12 @@ from tuning.rounds import rounds
 
 # A rotor of 1.64 kg between coils with a bias of 1 A is moved by 0.1 mm. Then a load acts on it.
 MOVED = """
+disturbance.q_z = { kind = "step", amplitude = -20.0, start = 0.005 }
+sensor = { std = 1e-7 }
+actuator = { u_max = 48.0 }
+initial = { z = 1e-4 }
+clock = { duration = 0.02, sample_period = 5e-5 }
+run = { settle = 0.001 }
 [plant]
 kind = "two-coil"
 m = 1.64
@@ -31,22 +37,7 @@ R = 1.0
 position = { c = 2500.0, k = 9.0, p = 500.0 }
 inversion = { gamma = 7e11, p = 1e-8 }
 current = { k_i = 1100.0, p = 50.0 }
-[disturbance.q_z]
-kind = "step"
-amplitude = -20.0
-start = 0.005
 [processor]
-[sensor]
-std = 1e-7
-[actuator]
-u_max = 48.0
-[initial]
-z = 1e-4
-[clock]
-duration = 0.02
-sample_period = 5e-5
-[run]
-settle = 0.001
 """
 MOVED += SMALL_SEARCH
 MOVED += """
@@ -60,21 +51,15 @@ held_out = 8
 
 # Unbalance at 300 Hz, far above the bandwidth: more damping means less motion and more current.
 TURNING = """
-[rotor]
-speed = 18000.0
+rotor = { speed = 18000.0 }
+disturbance.q_z = { kind = "unbalance", unbalance = 0.1 }
+clock = { duration = 0.04, sample_period = 1e-4 }
+run = { settle = 0.02 }
 [controller]
 position = { kind = "pid", k_p = 1e5, k_d = 800.0 }
 inversion = { kind = "closed-form" }
 current = { kind = "pi" }
-[disturbance.q_z]
-kind = "unbalance"
-unbalance = 0.1
 [processor]
-[clock]
-duration = 0.04
-sample_period = 1e-4
-[run]
-settle = 0.02
 """
 TURNING += SMALL_SEARCH
 TURNING += """
