@@ -62,7 +62,6 @@ MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "descent: CMA-ES only": by_values,
     "jumps known to the BFGS": constant(descent, JUMP=math.inf),
     "stressed members": setting(stressed=0),
-    "conditions of Theorem 1 in the goal": lambda raw: raw["tune"].setdefault("weights", {}).update(conditions=0.0),
     "validation": setting(validation=0),
     "members of large errors join": constant(validate, LARGER=math.inf),
     "updates of the multipliers": constant(multipliers, MOST_UPDATES=0),

@@ -372,7 +372,7 @@ def test_a_loaded_checkpoint_equals_the_saved_search(checkpoint):
 
 
 def no_state(arrays, facts):
-    del arrays["leaf_0"]
+    del arrays["start_best"]
 
 
 def no_seconds(arrays, facts):

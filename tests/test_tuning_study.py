@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bowl import FLOOR, PATHS, S_0, World, document, study
+from bowl import FLOOR, S_0, World, document, study
 from scipy import stats
 from texts import piped
 from tomlkit import dumps
@@ -26,14 +26,10 @@ from ambjax.cases.template_text import template
 from ambjax.cases.tune_table import Budget
 from tuning.judge.evaluate import RESOLVED, describe, judge, step_error, summarise
 from tuning.problem.config import seeds
-from tuning.problem.goal import Goal
 from tuning.problem.loss import TERMS
-from tuning.problem.ranges import END_FACTOR
-from tuning.problem.risk import Mean
-from tuning.problem.shortfalls import Bound
-from tuning.problem.space import Gain, Space
+from tuning.problem.ranges import END_FACTOR, theorem_bounds
 from tuning.report.judging import changed_gains
-from tuning.solve.descent import Descent, begin, step
+from tuning.solve.descent import begin, step
 from tuning.solve.refine import RACE, best_of, search
 from tuning.solve.screen import initial_points
 
@@ -53,7 +49,7 @@ def begins(monkeypatch, count, tables=None, **tune):
     paths = [f"controller.{path}" for path in GAINS]
     made = study(monkeypatch, World(), tables, **{"gains": paths, "bounds": {}} | tune)
     start = made.tune.space.values(made.case.cascade)
-    points = initial_points(made.objective, made.goal.conditions, start, count, 1)
+    points = initial_points(made.objective.space, made.ranges, start, count, 1)
     gains = np.array([made.objective.space.gains_at(jnp.asarray(x)) for x in points])
     np.testing.assert_allclose(gains[0], start, rtol=1e-9)
     assert np.all(np.isfinite(gains))
@@ -74,7 +70,7 @@ def test_starts_cover_the_ranges_derived_from_the_plant(monkeypatch):
     assert 0.8 * 2000 < found["position.c"].max() <= 2000
     slow, _ = begins(monkeypatch, 64, {"clock": {"duration": 0.02, "sample_period": 1e-3}}, **given)
     assert 0.8 * 200 < slow["position.c"].max() <= 200
-    delta_1 = next(bound.value for bound in made.goal.conditions if bound.symbol == "Delta_1")
+    delta_1 = theorem_bounds(made.objective)["Delta_1"]
     assert found["inversion.gamma"].min() >= delta_1 > 0
     assert 2.0 < found["position.p"].min() < 2.5 < 80.0 < found["position.p"].max() < 90.0  # bounds that are given hold
 
@@ -183,18 +179,6 @@ def test_the_effect_of_a_change_of_each_gain(monkeypatch):
 
 
 # --- descent ---
-
-
-def test_the_penalty_of_the_conditions_acts_where_the_loss_is_constant():
-    space = Space(tuple(Gain(path) for path in PATHS))
-    conditions = (Bound("controller.position.k", 50.0, "Q_z", "m/s^2"),)
-    goal = Goal(space, (1.0,) * 6, Mean(), conditions, 2.0, 0.1)
-    x = jnp.asarray(np.log([[30.0, 20.0]]))
-    flat = Descent(goal)(3, begin(x), jnp.ones((1, 3, 1)), jnp.zeros((1, 3, 1, 2)), jnp.ones(1, bool))
-    # log of the mean loss, 1, and the weighed square of log(1.1 * 50 / 20)
-    assert float(flat.value[0]) == pytest.approx(2 * math.log(2.75) ** 2)
-    assert float(flat.trial[0, 0]) == pytest.approx(float(x[0, 0]))
-    assert float(flat.trial[0, 1]) > float(x[0, 1])
 
 
 def test_after_some_iterations_only_the_best_start_continues(monkeypatch):

@@ -1,9 +1,10 @@
 """Reader of the case file of a whole machine: rotor, bearings, unbalances, loads, base, and the common tables."""
 
 import dataclasses
+import functools
 import math
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import jax.numpy as jnp
@@ -126,11 +127,11 @@ def machine_from(
     _check_rank(rotor, axes)
     masses, forces = _shares(rotor)
 
-    def read(raw: dict[str, Any], name: str, bearing: Table | None = None) -> Case:
+    def read(raw: dict[str, Any], name: str, written: Callable[[str], str] = str) -> Case:
         try:
             return case_from(raw, name, "", folder)
         except ValueError as error:
-            raise ValueError(f"{name}: {as_written(str(error), bearing)}") from None
+            raise ValueError(f"{name}: {written(str(error))}") from None
 
     names = [table.raw.get("name", f"bearing{k + 1}") for k, table in enumerate(bearings)]
     cases, of_notches = [], []
@@ -140,7 +141,8 @@ def machine_from(
         table, turning = axis_table(raw, axis, names[axis.bearing])
         own |= table
         of_notches.append(turning)
-        case = read(own, f"axis {axis.name}", bearing)
+        written = functools.partial(as_written, raw=raw, bearing=bearing, axis=axis)
+        case = read(own, f"axis {axis.name}", written)
         check_axis(case, axis, force, q)
         cases.append(case)
     own_law = own_machine_law(kind, folder) if is_own(kind := kind_of(raw)) else None
@@ -226,13 +228,19 @@ def _start(table: Table, rotor: Rotor, count: int) -> tuple[np.ndarray, list[flo
 
 
 def _check_rank(rotor: Rotor, axes: list[BearingAxis]) -> None:
-    """Raise ValueError if magnets or sensors leave a coordinate free that any of them acts on, or a weight."""
+    """Raise ValueError if magnets or sensors leave a coordinate free that any of them acts on, or a weight.
+
+    An axial bearing alone leaves the coordinates across the shaft out; radial bearings must hold all four.
+    """
+    gravity, across = np.asarray(rotor.gravity), [k for k in range(RIGID) if k != 2]
     for rows, what in ((rotor.at_magnets, "magnets"), (rotor.at_sensors, "sensors")):
         rigid = np.asarray(rows)[:, :RIGID]
         used = [k for k in range(RIGID) if np.any(rigid[:, k])]
-        free = [COORDINATES[k] for k in range(RIGID) if k not in used and (k != 2 or rotor.gravity[2] != 0)]
-        if free:
-            raise ValueError(f"bearing: no axis holds {', '.join(free)}. Add a bearing whose {what} act on it.")
+        needed = [k for k in range(RIGID) if gravity[k] != 0 or (k in across and set(used) & set(across))]
+        if free := [k for k in needed if k not in used]:
+            other = ", or a rotor.gravity that does not" if np.any(gravity[free]) else ""
+            names = ", ".join(COORDINATES[k] for k in free)
+            raise ValueError(f"bearing: no axis holds {names}. Give a bearing whose {what} act on it{other}.")
         scale = np.abs(rigid[:, used]).max(0)
         rank = int(np.linalg.matrix_rank(rigid[:, used] / scale, tol=1e-9))
         if rank < len(used):

@@ -24,9 +24,6 @@ MEAN_MARGIN, WORST_MARGIN, LOOP_MARGIN = 0.005, 0.03, 0.05
 
 # The numbers of [tune]. The bounds are decades wider than useful values.
 NUMBERS: dict[str, dataclasses.Field] = {
-    "conditions_margin": leaf(
-        0.1, at_least=0, at_most=1e3, doc="share by which each gain should exceed its lower bound in Theorem 1"
-    ),
     "early": leaf(0.0, at_least=0, at_most=1e6, doc="weight of errors before run.settle; after it, the weight is 1"),
     "stress": leaf(1.2, above=0, at_most=1e6, doc="factor on the noise of the stressed members"),
     "gain_margin": leaf(
@@ -47,7 +44,7 @@ def _weight(default: float, doc: str) -> dataclasses.Field:
     return leaf(default, at_least=0, at_most=1e9, doc=doc)
 
 
-# The weights of the terms of the loss, in the order of the template, and of the conditions.
+# The weights of the terms of the loss, in the order of the template.
 WEIGHTS: dict[str, dataclasses.Field] = {
     "tracking": _weight(1.0, "mean square error after run.settle; all terms are dimensionless"),
     "peak": _weight(0.0, "largest error after run.settle"),
@@ -55,7 +52,6 @@ WEIGHTS: dict[str, dataclasses.Field] = {
     "chatter": _weight(0.1, "mean square step of the voltage"),
     "clearance": _weight(1e-3, "closeness to the stop"),
     "survival": _weight(1.0, "loss of the rotor; it counts more if it is earlier"),
-    "conditions": _weight(1.0, "conditions of Theorem 1 that fail, or hold by less than the margin"),
 }
 SURVIVAL: dataclasses.Field = leaf(SURVIVING, above=0, at_most=1, doc="share of the held-out members that must survive")
 # Largest whole numbers. MOST_MEMBERS, for members and starting points, is smaller, because all of them are in memory
@@ -124,7 +120,7 @@ def template_lines() -> Iterator[Line]:
     yield Line("", "is at most a fifth of the sampling rate, others 3 times the end of their range or start")
     yield from _defaults("weights.", WEIGHTS)
     yield from _limits()
-    yield from _defaults("", {name: NUMBERS[name] for name in ("conditions_margin", "early")})
+    yield from _defaults("", {name: NUMBERS[name] for name in ("early",)})
     yield Line(
         'risk = "cvar"', f'how the members\' losses are combined: "cvar", "soft-worst" or "mean"; left out: "{RISK}"'
     )

@@ -32,7 +32,7 @@ from ambjax.simulation.rollout import Result, run
 from ambjax.simulation.whole_machine import Machine, PerAxis, stack_axes
 from ambjax.world.scenario import Scenario
 
-# Multiple of the clearance by which the rotor of a `lost` call is displaced along x and y.
+# Multiple of the clearance by which the rotor of a `lost` call is displaced along x, y and z.
 FAR = 4.0
 # Largest number of members whose linearised loops are tested.
 MOST_TESTED = 16
@@ -161,7 +161,7 @@ class MachineStudy(AnyStudy):
         machine, fold = self.batch(members)
         if lost:
             far = np.array(machine.start_q)
-            far[..., :2] = FAR * max(float(np.max(np.asarray(one.scenario.limit))) for one in self.case.cases)
+            far[..., :3] = FAR * max(float(np.max(np.asarray(one.scenario.limit))) for one in self.case.cases)
             machine = dataclasses.replace(machine, start_q=far)
         outcome = run_machines(machine, self.clock, fold, threads=threads, call=call)
         values = {SPREAD + path: x for path, x in self.drawn(members).items()}

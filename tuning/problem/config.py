@@ -70,9 +70,7 @@ class Tune:
     """The table [tune].
 
     - `space`: the gains to tune, with their bounds.
-    - `weights`: weights of the terms of the loss, in the order of TERMS. `conditions`: weight of the conditions of
-      Theorem 1.
-    - `margin`: share by which each gain should exceed its lower bound in Theorem 1.
+    - `weights`: weights of the terms of the loss, in the order of TERMS.
     - `early`: weight of errors before run.settle. Errors after it have the weight 1.
     - `stress`: factor on the sensor noise of the stressed members (`Budget.stressed`).
     - `gain_margin`: each gain of a stressed member is multiplied or divided by this factor.
@@ -84,8 +82,6 @@ class Tune:
     space: Space
     weights: tuple[float, ...]
     limits: LimitSettings
-    conditions: float
-    margin: float
     early: float
     stress: float
     gain_margin: float
@@ -129,22 +125,19 @@ def tune_from(table: Table, case: Case) -> Tune:
     """Return [tune] of a case. A missing key has its default. Raises ValueError for an invalid table."""
     table.only([*OTHER_KEYS, *NUMBERS, *BUDGET], [table.at(f"limits.{name}") for name in KINDS])
     budget = Budget(**{name: table.whole(name, field) for name, field in BUDGET.items()})
-    weights, conditions = _weights(table.table("weights"))
     numbers = {name: table.leaf(name, field, field.default) for name, field in NUMBERS.items()}
     return Tune(
         objective=table.choice("objective", list(OBJECTIVES), OBJECTIVES[0]),
         space=space_from(table, case),
-        weights=weights,
+        weights=_weights(table.table("weights")),
         limits=_limits(table.table("limits"), case),
-        conditions=conditions,
-        margin=numbers.pop("conditions_margin"),
         risk=_risk(table),
         budget=budget,
         **numbers,
     )
 
 
-def _weights(table: Table) -> tuple[tuple[float, ...], float]:
+def _weights(table: Table) -> tuple[float, ...]:
     table.only(list(WEIGHTS))
     given = {name: table.leaf(name, field, field.default) for name, field in WEIGHTS.items()}
     if not any(given[name] > 0 for name in ("tracking", "peak")):
@@ -154,7 +147,7 @@ def _weights(table: Table) -> tuple[tuple[float, ...], float]:
         )
     if given["survival"] == 0:
         raise ValueError(f"{table.path}.survival = 0: losing the rotor would cost nothing. Give it a weight above 0.")
-    return tuple(given[name] for name in TERMS), given["conditions"]
+    return tuple(given[name] for name in TERMS)
 
 
 def _check_speed(keys: list[str], case: Case) -> None:
@@ -232,13 +225,13 @@ def settings(tune: Tune) -> dict[str, Any]:
         "objective": tune.objective,
         "gains": tune.space.paths,
         "bounds": {gain.path: [gain.low, gain.high] for gain in tune.space.gains},
-        "weights": dict(zip(TERMS, tune.weights, strict=True)) | {"conditions": tune.conditions},
+        "weights": dict(zip(TERMS, tune.weights, strict=True)),
         "limits": {limit.name: {"threshold": limit.threshold, "margin": limit.margin} for limit in tune.limits.each},
         "survival": tune.limits.survival,
         "settling_band_m": tune.limits.band,
         "risk": str(tune.risk),
     }
-    rest = {name: getattr(tune, name) for name in ("margin", "early", "stress", "gain_margin")}
+    rest = {name: getattr(tune, name) for name in ("early", "stress", "gain_margin")}
     return facts | rest | dataclasses.asdict(tune.budget)
 
 

@@ -50,7 +50,7 @@ def _gains(facts: TuningFacts) -> list[str]:
     words = (
         "Last column: increase of the risk if this gain alone is larger or smaller by a factor of e^0.25 = 1.28. The "
         "larger of the two increases is shown. Here the risk is that of the search of least error: it includes the "
-        "stressed members and the penalty of the theorem's conditions, but not the limits. A gain with a large "
+        "stressed members, but not the limits. A gain with a large "
         "increase must be set accurately. If this change loses more members of the training ensemble than the "
         "answer does, the column shows how many more. "
         "`tune.bounds` sets other bounds."

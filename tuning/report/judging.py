@@ -154,7 +154,7 @@ def changed_gains(problem: TuningProblem, x: np.ndarray, members: Members) -> tu
     steps = STEP * np.eye(len(x))
     at = x + np.concatenate([np.zeros((1, len(x))), steps, -steps])
     terms = problem.engine.terms(at, members)
-    risk, lost = problem.error_goal.score(at, terms, members), (terms["survival"] > 0).sum(axis=1)
+    risk, lost = problem.error_goal.score(terms, members), (terms["survival"] > 0).sum(axis=1)
     beside = [np.max(one[1:].reshape(2, -1), axis=0) - one[0] for one in (risk, lost)]
     return 100 * np.expm1(beside[0]), np.maximum(beside[1], 0)
 

@@ -169,7 +169,7 @@ def first_search(course: Course, start: np.ndarray) -> np.ndarray:
     Raises ValueError as `check_loops` does.
     """
     problem, budget = course.problem, course.problem.tune.budget
-    points = initial_points(problem.objective, problem.goal.conditions, start, budget.screen, course.seed)
+    points = initial_points(problem.objective.space, problem.ranges, start, budget.screen, course.seed)
     check_loops(problem.objective, points, course.members.searched)
     return course.search(points)
 

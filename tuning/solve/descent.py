@@ -101,8 +101,8 @@ class Descent:
         """
 
         def one(start: Starts, outcomes: Array, slopes: Array, on: Array) -> Starts:
-            value, (weights, slope) = jax.value_and_grad(self.goal, (0, 1))(outcomes, start.trial, ordinary)
-            after = step(start, value, jnp.tensordot(weights, slopes, 2) + slope)
+            value, weights = jax.value_and_grad(self.goal)(outcomes, ordinary)
+            after = step(start, value, jnp.tensordot(weights, slopes, 2))
             return jax.tree.map(lambda p, q: jnp.where(on, p, q), after, start)
 
         return jax.vmap(one)(starts, outcomes, slopes, on)

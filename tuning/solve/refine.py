@@ -20,7 +20,7 @@ from tuning.problem.members import Members
 from tuning.problem.quantities import KINDS
 from tuning.solve.checkpoint import CheckpointFile, SearchState
 from tuning.solve.descent import Descent, begin
-from tuning.solve.evolution import initial_state, next_population, updated
+from tuning.solve.evolution import Evolution
 from tuning.solve.screen import screen
 
 # Number of iterations after which only the best start continues.
@@ -77,8 +77,8 @@ def search(
             with deferred(INTERRUPT_MESSAGE if progress.history else ""):
                 raise_if_interrupted()
                 before = progress.seconds
-                iterate(engine, goal, members, progress, descent, seed)
-                _advance(progress)
+                iterate(engine, goal, members, progress, descent)
+                _advance(progress, seed)
                 progress.seconds = progress.earlier + time.perf_counter() - began
                 checkpoint_file.save(progress)
                 on_iteration(progress, progress.seconds - before)
@@ -89,12 +89,10 @@ def search(
     return progress
 
 
-def iterate(
-    engine: Engine, goal: Goal, members: Members, progress: SearchState, descent: Descent, seed: int = 0
-) -> None:
+def iterate(engine: Engine, goal: Goal, members: Members, progress: SearchState, descent: Descent) -> None:
     """Make one step of each active start, or draw one population of CMA-ES, and add the best point to the history."""
-    if progress.evolving:
-        x, value, terms = _evolved(engine, goal, members, progress, seed)
+    if progress.evolution is not None:
+        x, value, terms = _evolved(engine, goal, members, progress.evolution)
     else:
         x, value, terms = _descended(engine, goal, members, progress, descent)
     past, n = progress.history, members.ordinary
@@ -135,18 +133,18 @@ def _descended(
 
 
 def _evolved(
-    engine: Engine, goal: Goal, members: Members, progress: SearchState, seed: int
+    engine: Engine, goal: Goal, members: Members, evolution: Evolution
 ) -> tuple[np.ndarray, float, dict[str, Any]]:
     """Draw one population and update the distribution. Return the best of its points [m], its goal and terms [N]."""
-    points = next_population(progress.cma, seed)
+    points = evolution.ask()
     terms = engine.terms(points, members)
-    values = goal.score(points, terms, members)
-    progress.cma = updated(progress.cma, points, values)
+    values = goal.score(terms, members)
+    evolution.tell(points, values)
     first = int(np.argmin(values))
     return points[first], float(values[first]), {name: one[first] for name, one in terms.items()}
 
 
-def _advance(progress: SearchState) -> None:
+def _advance(progress: SearchState, seed: int) -> None:
     """Select the starts that continue, let the last one switch to CMA-ES, or end it.
 
     A descent ends if its step is at most SHORTEST, or if the goal stalls. It switches if the gradient is then
@@ -154,8 +152,8 @@ def _advance(progress: SearchState) -> None:
     derivatives grow with time and do not describe the goal; and a descent stops early at a jump of the goal, beyond
     which members are lost.
     """
-    if progress.evolving:
-        progress.active &= not (progress.cma.reach <= SHORTEST or progress.cma.converged)
+    if progress.evolution is not None:
+        progress.active &= not (progress.evolution.reach <= SHORTEST or progress.evolution.converged)
         return
     best = int(np.argmin(np.asarray(progress.starts.value)))
     if progress.iteration >= RACE:
@@ -167,7 +165,7 @@ def _advance(progress: SearchState) -> None:
     stalled = len(values) > PATIENCE and values[-1] > values[-1 - PATIENCE] - STALL
     ended = stalled or float(jnp.linalg.norm(starts.trial[best] - starts.best[best])) <= SHORTEST
     if not norm < STEEP or (ended and norm >= CONVERGED):
-        progress.cma = initial_state(progress.history["x"][-1])
+        progress.evolution = Evolution(progress.history["x"][-1], seed)
     elif ended:
         progress.active = np.zeros_like(progress.active)
 
