@@ -27,7 +27,6 @@ from ambjax.results.case_export import export as export
 from ambjax.results.case_map import survival_map as survival_map
 from ambjax.results.gains import gains_of as gains_of
 from ambjax.results.gains import with_gains as with_gains
-from ambjax.results.machine_run import simulate_machine as simulate_machine
 from ambjax.results.operating import sensitivity as sensitivity
 from ambjax.results.runs import simulate as simulate
 from ambjax.results.spread_runs import simulate_members as simulate_members

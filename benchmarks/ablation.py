@@ -21,9 +21,9 @@ import tasks
 import tomlkit
 
 from ambjax.cases.template_text import template
-from tuning import optimisers, validate
+from tuning import validate
 from tuning.__main__ import main as tune
-from tuning.solve import multipliers, refine
+from tuning.solve import descent, multipliers, refine
 
 NEVER = 10**9
 FIRST_KINDS = {
@@ -60,10 +60,8 @@ MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "several starts: only the best of the screen": setting(starts=1),
     "CMA-ES": constant(refine, STEEP=math.inf, CONVERGED=math.inf),
     "descent: CMA-ES only": by_values,
-    "BFGS: Adam instead": setting(optimiser="adam"),
-    "jumps known to the BFGS": constant(optimisers, JUMP=math.inf),
+    "jumps known to the BFGS": constant(descent, JUMP=math.inf),
     "stressed members": setting(stressed=0),
-    "conditions of Theorem 1 in the goal": lambda raw: raw["tune"].setdefault("weights", {}).update(conditions=0.0),
     "validation": setting(validation=0),
     "members of large errors join": constant(validate, LARGER=math.inf),
     "updates of the multipliers": constant(multipliers, MOST_UPDATES=0),

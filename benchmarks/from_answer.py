@@ -43,7 +43,7 @@ def members(problem: TuningProblem, x: np.ndarray) -> Members:
 def goals(problem: TuningProblem, x: np.ndarray, ensemble: Members) -> np.ndarray:
     """Return the objective [S] at x [S, m], with limits as penalties on the values of ordinary members."""
     terms, free = problem.engine.terms(x, ensemble), dataclasses.replace(problem.goal, limits=())
-    values = free.score(x, {name: rows for name, rows in terms.items() if not name.startswith(PREFIX)}, ensemble)
+    values = free.score({name: rows for name, rows in terms.items() if not name.startswith(PREFIX)}, ensemble)
     for limit in problem.limits:
         rows = terms[PREFIX + limit.name][:, : ensemble.ordinary]
         excess = [max(limit.log_excess(float(limit.kind.judged(one))), 0.0) for one in rows]

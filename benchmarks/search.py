@@ -34,7 +34,6 @@ import numpy as np
 from ambjax.ensemble.worker import processes
 from tuning.events import Event
 from tuning.problem.config import read_tune
-from tuning.problem.ranges import ranges
 from tuning.problem.tuning_problem import TuningProblem, problem_of
 from tuning.solve.course import Course, first_search, training
 
@@ -54,8 +53,7 @@ class CountedGoal:
 
     def __init__(self, problem: TuningProblem, members: Any, most: int):
         self.problem, self.members, self.most = problem, members, most
-        start = problem.tune.space.values(problem.case.cascade)
-        space, box = problem.objective.space, ranges(problem.objective, problem.goal.conditions, start)
+        space, box = problem.objective.space, problem.ranges
         ends = ([r.low for r in box], [r.high for r in box])
         self.low, self.high = (space.encode(space.clip(np.array(gains))) for gains in ends)
         self.trace: list[tuple[int, float, float]] = []
@@ -65,7 +63,7 @@ class CountedGoal:
         if self.spent >= self.most:
             raise SpentError
         x = self.low + units * (self.high - self.low)
-        values = self.problem.goal.score(x, self.problem.engine.terms(x, self.members), self.members)
+        values = self.problem.goal.score(self.problem.engine.terms(x, self.members), self.members)
         values = np.where(np.isfinite(values), values, WORST)
         self.spent += len(x) * len(self.members.member)
         row = (self.spent, time.process_time() - self.started, min(self.best, float(values.min())))

@@ -88,7 +88,7 @@ def test_the_numbers_are_those_of_the_study_and_of_the_analysis(two, cases, k):
     assert row["clearance_zone"] == "A"
     loop = analyse(linearise(case.cascade, case.scenario, case.clock), 0.588, 1e-4)
     assert row["peak"] == loop.S.height
-    assert row["disk_margin"] == loop.margins.disk
+    assert row["disk_margin"] == loop.margins.dm
     assert row["zone"] == loop.zone
     assert row["unstable"] == 0
     assert row["worst_peak"] > loop.S.height

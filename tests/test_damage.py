@@ -12,7 +12,7 @@ from ambjax.ensemble.store import Store
 from ambjax.host import sealed
 from ambjax.host.sealed import DamagedError, difference, flat, seal, unseal, write_whole
 from tuning.solve.checkpoint import CheckpointFile, SearchState, remove_all
-from tuning.solve.descent import Descent
+from tuning.solve.descent import begin
 
 FACTS = {"seed": 3, "plant.m": "0.588"}
 MEMBERS, CHUNK = 50, 20
@@ -343,29 +343,24 @@ SEARCH_FACTS = {"case": {"plant": {"m": 0.5}}, "tune": {"members": 4}}
 STARTS, GAINS, ITERATIONS = 3, 4, 2
 
 
-@pytest.fixture(scope="module")
-def descent():
-    return Descent(None, "bfgs", 0.1)
-
-
-def search_of(descent, starts=STARTS, gains=GAINS):
+def search_of(starts=STARTS, gains=GAINS):
     row = {"value": (), "x": (gains,), "gains": (gains,), "lost": (), "members": ()}
     row |= {"terms": (6,), "quantities": (1,), "rollouts": ()}
     dice = np.random.default_rng(1)
     past = {name: [dice.random(shape) for _ in range(ITERATIONS)] for name, shape in row.items()}
     x = jnp.asarray(dice.random((starts, gains)))
-    return SearchState(descent.begin(x), np.arange(starts) > 0, past, seconds=2.5)
+    return SearchState(begin(x), np.arange(starts) > 0, past, seconds=2.5)
 
 
 @pytest.fixture
-def checkpoint(tmp_path, descent):
+def checkpoint(tmp_path):
     checkpoint_file = CheckpointFile(tmp_path / "checkpoints" / "round-2.npz", SEARCH_FACTS, 2, print)
-    checkpoint_file.save(search_of(descent))
+    checkpoint_file.save(search_of())
     return checkpoint_file
 
 
-def test_a_loaded_checkpoint_equals_the_saved_search(checkpoint, descent):
-    before, after = search_of(descent), checkpoint.load(descent, STARTS, GAINS)
+def test_a_loaded_checkpoint_equals_the_saved_search(checkpoint):
+    before, after = search_of(), checkpoint.load()
     for a, b in zip(jax.tree.leaves(before.starts), jax.tree.leaves(after.starts), strict=True):
         np.testing.assert_array_equal(a, b)
         assert a.dtype == b.dtype
@@ -377,7 +372,7 @@ def test_a_loaded_checkpoint_equals_the_saved_search(checkpoint, descent):
 
 
 def no_state(arrays, facts):
-    del arrays["leaf_0"]
+    del arrays["start_best"]
 
 
 def no_seconds(arrays, facts):
@@ -392,15 +387,15 @@ CHECKPOINT_STRANGE = {
 
 
 @pytest.mark.parametrize("kind", [*DAMAGE, *(f"sealed: {k}" for k in CHECKPOINT_STRANGE)])
-def test_a_search_with_a_damaged_checkpoint_starts_again_with_one_line(kind, checkpoint, descent, capsys):
+def test_a_search_with_a_damaged_checkpoint_starts_again_with_one_line(kind, checkpoint, capsys):
     (DAMAGE | {f"sealed: {k}": damage for k, damage in CHECKPOINT_STRANGE.items()})[kind](checkpoint.path)
-    assert checkpoint.load(descent, STARTS, GAINS) is None
+    assert checkpoint.load() is None
     said = capsys.readouterr().out
     assert said.startswith(f"{checkpoint.path}: ")
     assert said.endswith("; search 2 begins again\n")
     assert said.count("\n") == 1
-    checkpoint.save(search_of(descent))
-    assert checkpoint.load(descent, STARTS, GAINS) is not None
+    checkpoint.save(search_of())
+    assert checkpoint.load() is not None
 
 
 @pytest.mark.parametrize(
@@ -416,9 +411,9 @@ def test_a_search_with_a_damaged_checkpoint_starts_again_with_one_line(kind, che
         (SEARCH_FACTS | {"precision": "float32"}, "precision is float64 in the file and float32 in this run"),
     ],
 )
-def test_a_checkpoint_of_another_search_is_refused_with_the_difference(other, words, checkpoint, descent):
+def test_a_checkpoint_of_another_search_is_refused_with_the_difference(other, words, checkpoint):
     with pytest.raises(ValueError, match=r"round-2.npz belongs to another search") as raised:
-        CheckpointFile(checkpoint.path, other, 2).load(descent, STARTS, GAINS)
+        CheckpointFile(checkpoint.path, other, 2).load()
     assert words in str(raised.value)
     assert checkpoint.path.exists()
 

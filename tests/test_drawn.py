@@ -23,7 +23,6 @@ from ambjax.pictures.thinning import BINS, thin
 from ambjax.pictures.tornado import Bar, tornado
 from ambjax.results import case_map
 from ambjax.simulation.trajectory import ALIVE, TOUCHED, Row, Trajectory
-from tuning.report.slices import Slices
 
 ROOT = pathlib.Path(__file__).parents[1]
 sys.path.append(str(ROOT / "benchmarks"))
@@ -398,24 +397,6 @@ def test_the_picture_of_the_convergence_shows_the_history_of_the_search(kept):
     ]
 
 
-def test_the_picture_of_the_slices_shows_the_computed_values(kept):
-    gains = np.stack([np.geomspace(1, 9, 13), np.geomspace(100, 900, 13)])
-    goals = np.stack([np.linspace(-1, 6, 13) ** 2 / 9, np.linspace(2, -1, 13)])
-    goals[0, 12] = np.inf
-    lost = np.zeros((2, 13), int)
-    lost[1, :3] = 2
-    axes = tuned.landscape(Slices(gains, goals, lost, goals), ["controller.a", "controller.b"]).axes
-    for j, ax in enumerate(axes):
-        line, held, *others = ax.lines
-        relative = np.exp(goals[j] - goals[j, 6])
-        np.testing.assert_allclose(line.get_data(), (gains[j], np.minimum(relative, tuned.HIGHEST)), rtol=ROUNDING)
-        np.testing.assert_array_equal(held.get_xdata(), gains[j, lost[j] == 0])
-        crosses, middle = others if j else (None, *others)
-        assert middle.get_xdata()[0] == gains[j, 6]
-        if crosses is not None:
-            np.testing.assert_array_equal(crosses.get_xdata(), gains[j, lost[j] > 0])
-
-
 def test_points_of_the_front_that_lose_members_are_marked(kept):
     rows = [
         {"settled_rms_error_m": e, "settled_rms_u_V": u, "lost": lost, "stalled": 0, "taken": e == 2e-7}
@@ -429,6 +410,3 @@ def test_points_of_the_front_that_lose_members_are_marked(kept):
     assert ax.get_ylabel() == "settled rms error (nm)"
     assert len([at for at in ax.get_yticks() if 200 / 1.2 <= at <= 3600]) >= 3
     assert len(tuned.front(rows[:1]).axes[0].lines) == 1
-
-
-# ---------------------------------------------------------------- benchmarks

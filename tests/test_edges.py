@@ -11,6 +11,7 @@ from structures import METHODS
 
 import ambjax as amb
 from ambjax.control.processor import Processor
+from ambjax.numerics.records import replaced
 from ambjax.simulation.edges import Edges, most_inside
 from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.world.waveforms import edges_of, knots_of
@@ -115,7 +116,7 @@ def spread(**values):
 def test_the_number_of_edges_inside_a_sample(scenario, most):
     assert most_inside(scenario, T) == most
     assert amb.solvers.with_method(amb.Clock(10, T), SOFT, scenario).cuts == most
-    clock = amb.Clock(10, T, cuts=1)  # counted for the whole of which this is a part
+    clock = replaced(amb.Clock(10, T), cuts=1)  # counted for the whole of which this is a part
     assert amb.solvers.with_method(clock, SOFT, scenario).cuts == max(most, 1)
 
 

@@ -92,7 +92,7 @@ limits.sensitivity = 8.0
 """
 CASES = {"paper": PAPER + SMALLEST, "bearing": BEARING}
 MAP = ["--x", "plant.m=-10%:10%:2", "--y", "initial.z=1e-5:2e-5:2"]
-PICTURES = ("before.png", "after.png", "spectrum.png", "convergence.png", "slices.png")
+PICTURES = ("before.png", "after.png", "spectrum.png", "convergence.png")
 REPORT = ("report.json", "report.md", "report.html", *PICTURES)
 # For each command: its arguments, and the files that it writes.
 COMMANDS = {

@@ -12,12 +12,12 @@ from test_sampled import DIFFERENCE, KALMAN, NOISE, TRACKING, World, hard, loop_
 
 import ambjax as amb
 from ambjax.cases.reader import case_from
-from ambjax.control.guard import Guard, guarded
+from ambjax.control.guard import Guard
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
 from ambjax.simulation.folds import Count, Named, Rms
 from ambjax.simulation.metrics import Metrics
-from ambjax.simulation.system import system_of
+from ambjax.simulation.system import guarded, system_of
 from ambjax.world.faults import VALUES, Dropouts, Outliers
 from ambjax.world.sensor import Errors, Measurement, Sensor
 from ambjax.world.waveforms import reference_at

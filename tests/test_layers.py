@@ -17,7 +17,7 @@ LAYERS = {
     "ambjax": "_version text compiler numerics host world control simulation "
     "extend laws signals plants sensors actuators solvers codegen theorem ensemble linear "
     "paper pictures cases results page commands __init__ __main__",
-    "tuning": "events optimisers problem judge solve validate front rounds report machines command __init__ __main__",
+    "tuning": "events problem judge solve validate front rounds report machines command __init__ __main__",
 }
 # Folders and modules that may import matplotlib: those that draw.
 DRAWING = ("ambjax.pictures.", "tuning.report.pictures")

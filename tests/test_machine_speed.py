@@ -168,6 +168,9 @@ def test_the_commands_write_what_an_engineer_looks_at(tmp_path, capsys):
     found = json.loads((tmp_path / "c" / "campbell.json").read_text())
     # by the closed form of the command's own definition: A1 at the highest speed of the case
     assert found["unbalance"]["a1_limit_m"] == pytest.approx(25.4e-6)
+    springs, rotor = found["undamped_critical_speeds"], read_machine(path).machine.rotor
+    for own, expected in zip(springs["speeds_rpm"], springs_critical(rotor, springs["stiffness_N_per_m"]), strict=True):
+        np.testing.assert_allclose(own, expected)
     capsys.readouterr()
     assert main(["check", str(path), "--json"]) == 0
     checked = json.loads(capsys.readouterr().out)
@@ -191,4 +194,4 @@ def test_the_margins_of_an_axis_follow_from_its_sensitivity(rigid):
         L = 1 / np.asarray(found.system.response(f))[:, k, k] - 1
         crossing = np.flatnonzero(np.diff(np.sign(np.abs(L) - 1)))
         phases = np.abs(np.abs(np.angle(L[crossing], deg=True)) - 180)
-        assert axis.margins.phase_deg == pytest.approx(phases.min(), abs=0.05)  # a step of f is 0.05 %
+        assert axis.margins.pm == pytest.approx(phases.min(), abs=0.05)  # a step of f is 0.05 %

@@ -1,24 +1,38 @@
 """Ensembles of whole machines: each member is a machine of its own."""
 
+import argparse
 import copy
 import dataclasses
 import json
+import pickle
 import tomllib
 
+import jax
 import numpy as np
 import pytest
 
 from ambjax.__main__ import main
 from ambjax.cases.machine_case import machine_from, read_machine
-from ambjax.cases.machine_spread import rotor_places, varied_rotor
+from ambjax.cases.rotor_numbers import rotor_places, varied_rotor
 from ambjax.cases.template_text import template
+from ambjax.commands import comparison_tuning
 from ambjax.ensemble.worker import chunk
+from ambjax.host.extensions import NothingToTuneError
 from ambjax.linear import machine_sensitivity
 from ambjax.results.case_map import study_and_axes, survival_map
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.spread_runs import simulate_members, study_of
 
 MACHINE = tomllib.loads(template("machine"))
+# Spread of the shapes of a flexible rotor.
+FACTOR = "rotor.modes.0.scale"
+SHAPES = {
+    "rotor": {"modes": {"0": {"scale": {"percent": 20}}}},
+    "bearing": {
+        "left": {"modes": {"0": {"percent": 10}}},
+        "right": {"sensor_modes": {"1": {"uniform": [-0.1, 0.3]}}},
+    },
+}
 SPREAD = {
     "plant": {"A": {"percent": 10}},
     "bearing": {"left": {"plant": {"A": {"percent": 1}}, "x": {"plant": {"R": {"uniform": [0.9, 1.1]}}}}},
@@ -34,6 +48,22 @@ def case(spread, **tables):
     return machine_from(raw, "machine")
 
 
+@pytest.fixture
+def flexible():
+    """Return a function: the case of the template with two bending modes, whose bearings have these shapes."""
+
+    def made(spread, shapes=(([0.5, 0.4], [0.4, 0.2]),) * 2, load=0.7):
+        raw = copy.deepcopy(MACHINE)
+        rotor = raw["rotor"] | {"kind": "modal", "modes": [{"frequency": 80.0, "damping": 0.01}, {"frequency": 300.0}]}
+        for bearing, (magnet, sensor) in zip(raw["bearing"], shapes, strict=False):
+            bearing |= {"modes": magnet, "sensor_modes": sensor, "angle": 20.0}
+        for one in (*raw["unbalance"], *raw["load"]):
+            one["modes"] = [load, 0.1]
+        return case(spread, rotor=rotor, **{key: raw[key] for key in ("bearing", "unbalance", "load")})
+
+    return made
+
+
 def test_draws():
     study = study_of(case(SPREAD), 3, 1000)
     drawn = study.drawn(np.arange(1000))
@@ -47,6 +77,26 @@ def test_draws():
     assert "bearing.left.y.plant.R" not in drawn
     # the processor is common to all axes
     assert [path for path in drawn if path.endswith("delay")] == ["processor.delay"]
+    # worker processes receive the study
+    assert pickle.loads(pickle.dumps(study)).fingerprint() == study.fingerprint()
+
+
+@pytest.mark.slow  # compiles the linear loop
+def test_numbers_of_the_notches():
+    notch = {"kind": "displacement-free", "rate": 20.0}
+    laws = MACHINE["controller"] | {"notch": notch}
+    rate = {"controller": {"notch": {"rate": {"percent": 10}, "max_speed": {"uniform": [6e3, 9e3]}}}}
+    left = {"bearing": {"left": {"controller": {"notch": {"rate": {"uniform": [40.0, 50.0]}}}}}}
+    study = study_of(case(rate | left, controller=laws), 0, 50)
+    rates = {name: study.drawn(np.arange(50))[f"bearing.{name}.controller.notch.rate"] for name in study.case.axes}
+    assert {name: (15 < x.min() < x.max() < 25) for name, x in rates.items() if not name.startswith("left")} == {
+        "right.x": True, "right.y": True, "thrust.z": True
+    }  # fmt: skip
+    assert min(rates["left.x"].min(), rates["left.y"].min()) > 40
+    member = study.member(7)
+    assert float(member.cases[3].cascade.notch.rate) == rates["right.y"][7]
+    with pytest.raises(ValueError, match=r"spread.controller.notch.rate.*no such number"):
+        case(rate)
 
 
 @pytest.mark.slow  # compiles the rollout of the ensemble and that of one machine
@@ -69,9 +119,10 @@ def test_numbers_of_the_rotor():
     rotor = machine_from(raw).machine.rotor
     values = {"rotor.m": 3.0, "rotor.I_t": 0.07, "rotor.I_p": 1e-3, "rotor.modes.1.frequency": 250.0}
     values |= {"rotor.modes.0.damping": 0.02, "unbalance.0.amount": 7.0, "load.0.start": 0.2, "rotor.speed": 10.0}
-    values |= {"base.0.value": 5.0}
-    other = varied_rotor(rotor, values)
-    nominal, found = rotor_places(rotor), rotor_places(other)
+    values |= {"base.0.value": 5.0, "bearing.left.modes.0": 0.6, "bearing.right.sensor_modes.1": -0.3}
+    axes = ("left.x", "left.y", "right.x", "right.y", "thrust.z")
+    other = varied_rotor(rotor, values, axes)
+    nominal, found = rotor_places(rotor, axes), rotor_places(other, axes)
     for path, place in found.items():
         assert float(np.asarray(place.value)) == pytest.approx(values.get(path, float(np.asarray(nominal[path].value))))
     # the weight follows the mass; a free bending mode has the given frequency and damping
@@ -83,6 +134,21 @@ def test_numbers_of_the_rotor():
     k = other.K[7, 7] / other.M[7, 7]
     assert np.sqrt(k) == pytest.approx(2 * np.pi * 250)
     assert other.D[5, 5] == pytest.approx(2 * 0.02 * 2 * np.pi * 80)
+
+
+def test_shapes_of_modes(flexible):
+    """A member is the machine whose bearings, unbalances and loads are given with its shapes."""
+    study = study_of(flexible(SHAPES), 3, 4)
+    drawn = {path: x[1] for path, x in study.drawn(np.arange(4)).items()}
+    assert len(drawn) == 3
+    left, sensor, factor = (drawn[path] for path in ("bearing.left.modes.0", "bearing.right.sensor_modes.1", FACTOR))
+    shapes = ([left * factor, 0.4], [0.4 * factor, 0.2]), ([0.5 * factor, 0.4], [0.4 * factor, sensor])
+    expected = flexible({}, shapes, 0.7 * factor).machine.rotor
+    found = study.member(1).machine.rotor
+    for one in jax.tree.leaves(jax.tree.map(lambda a, b: np.max(np.abs(a - b)), found, expected)):
+        assert one < 1e-12
+    assert abs(left - 0.5) < 0.05
+    assert left != 0.5
 
 
 @pytest.mark.parametrize(
@@ -193,13 +259,33 @@ def test_axes_of_a_map(files):
             study_and_axes(read_machine(path), bad, "initial.q.0=0:1e-5", 1, None)
 
 
+def test_tuned_machines_are_compared(files, tmp_path, monkeypatch):
+    """The tuner is replaced: it writes its answer, or finds nothing to tune."""
+    paths = [files("one.toml"), files("two.toml")]
+
+    def tune(words, program, nested):
+        if "two" in words[0]:
+            raise NothingToTuneError
+        (folder := tmp_path / "tuned-one").mkdir()
+        files("tuned-one/tuned.toml", ("[processor]", "c = 321.0\n\n[processor]"))
+        assert words == [paths[0], "--settings-of", paths[0], "--out", str(folder)]
+
+    monkeypatch.setattr(comparison_tuning, "extension", lambda name: {"tune": tune}[name])
+    cases = [read_machine(path) for path in paths]
+    options = argparse.Namespace(cases=paths, out=str(tmp_path), resume=False, force=False)
+    one, two = comparison_tuning.tuned_cases(cases, tmp_path, options)
+    assert (one.name, one.folder) == ("one", tmp_path)
+    assert float(one.cases[0].cascade.position.c) == 321.0
+    assert two is cases[1]
+
+
 def test_compare_refuses(files, tmp_path, capsys):
     machine, axis = files("m.toml"), tmp_path / "axis.toml"
     axis.write_text(template("rig"))
     other = files("n.toml", end="\n[spread]\nplant.A = { percent = 1 }\n")
     for argv, words in (
         ([machine, str(axis)], "Compare cases of one kind"),
-        ([machine, other, "--tune"], "--tune: a machine"),
+        ([machine, other, "--page"], "--page: a machine"),
         ([machine, other], "Give both cases the same [spread]"),
     ):
         assert main(["compare", *argv, "--out", str(tmp_path / "no")]) == 2

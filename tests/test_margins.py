@@ -108,12 +108,12 @@ def test_the_margins_agree_with_the_poles_of_the_changed_loop(name):
     assert parts.stable(Change())
     for place in PLACES:
         one = getattr(found, place)
-        assert 0 <= one.gain_low < 1 < one.gain_high
-        for gain, sign in ((one.gain_low, -1), (one.gain_high, 1)):
+        assert 0 <= one.gm_low < 1 < one.gm_high
+        for gain, sign in ((one.gm_low, -1), (one.gm_high, 1)):
             size = abs(math.log(gain)) if gain else math.inf
             assert agrees(parts, size, lambda x, at=place, sign=sign: Change(**{at: math.exp(sign * x)}), 6.0)
         turns = [lambda x, at=place, sign=sign: Change(**{at: np.exp(sign * 1j * x)}) for sign in (1, -1)]
-        assert any(agrees(parts, math.radians(one.phase_deg), turn, math.pi) for turn in turns)
+        assert any(agrees(parts, math.radians(one.pm), turn, math.pi) for turn in turns)
         assert agrees(parts, one.delay, lambda x, at=place: Change(**{f"late_{at}": x}), 0.02)
 
 
@@ -167,7 +167,7 @@ def test_the_smaller_margin_of_each_kind_is_that_of_the_loop():
     other = Margins(1.6, 0.2, 1.6, 50.0, 1e-5, 0.5)
     both = LoopMargins(one, other)
     assert both.smaller == Margins(1.6, 0.5, 1.6, 40.0, 1e-5, 0.5)
-    assert [both.place(kind) for kind in ("gain", "phase_deg", "delay", "disk")] == [
+    assert [both.place(kind) for kind in ("gm", "pm", "delay", "dm")] == [
         "command", "reading", "command", "command",
     ]  # fmt: skip
     assert LoopMargins(one, one).place("delay") == "reading"

@@ -126,6 +126,15 @@ def test_the_sensitivity_equals_the_linear_analysis(path):
     assert at.S.height == pytest.approx(abs(system.sensitivity(np.array([at.S.frequency]))[0]))
 
 
+def test_the_parts_of_a_case_stand_for_it(path, run):
+    case = ambjax.read_case(path)
+    parts = case.cascade, case.scenario, case.clock
+    again = ambjax.simulate(*parts)
+    np.testing.assert_array_equal(again.trajectory.rows.z, run.trajectory.rows.z)
+    assert again.metrics["max_abs_i_A"] == run.metrics["max_abs_i_A"]
+    assert ambjax.sensitivity(*parts).S == ambjax.sensitivity(case).S
+
+
 def test_bad_input_is_refused_by_name(path, run, monkeypatch):
     case = ambjax.read_case(path)
     wrong: Any = "case.toml"
@@ -155,9 +164,8 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
         ambjax.survival_map(case, ("plant.m", 1, 2), "plant.R=1:2")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match=r'it must be a list. Write \["controller.position.c"\]'):
         ambjax.gains_of(case.cascade, "controller.position.c")
-    for function in (ambjax.Metrics.for_case, ambjax.simulate_machine):
-        with pytest.raises(ValueError, match="case = Cascade: it must be a "):
-            function(case.cascade)
+    with pytest.raises(ValueError, match="case = Cascade: it must be a "):
+        ambjax.Metrics.for_case(case.cascade)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="template = 'rigg': it must be one of tracking"):
         ambjax.template("rigg")
     for function in (
@@ -174,8 +182,9 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
             function(wrong)
     with pytest.raises(ValueError, match="cases = Case: it must be a list of 2 to 8 cases"):
         ambjax.compare(case)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match=r"make one with ambjax\.Case\(NAME, cascade, scenario, clock, SETTLE\)"):
-        ambjax.sensitivity(case.cascade)  # pyright: ignore[reportArgumentType]
+    for function in (ambjax.simulate, ambjax.sensitivity, ambjax.check, ambjax.vector_field, ambjax.export):
+        with pytest.raises(ValueError, match=r"\(Cascade, .*\): give a case, .* a Cascade, a Scenario and a Clock"):
+            function(case.cascade, case.clock, case.scenario)
     with pytest.raises(ValueError, match="cascade = Scenario: it must be a Cascade"):
         ambjax.rollout(case.scenario, case.cascade, case.clock)  # pyright: ignore[reportArgumentType]
     for given in (("case.toml",), (case.cascade,), ((case.cascade, case.scenario, case.clock),), (case, case.scenario)):

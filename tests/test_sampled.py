@@ -224,7 +224,7 @@ def test_a_part_of_an_ensemble_uses_the_program_of_the_whole():
     """
     spread = cascade_of(delay=0.0).on_processor(0.5, 2.0)
     for delay in (0.0, 1.0, np.array([0.0, 0.7])):
-        part = dataclasses.replace(spread, processor=dataclasses.replace(spread.processor, delay=delay))
+        part = spread.with_processor(delay=delay)
         processor = part.on_processor().processor
         assert (processor.whole, processor.most, processor.predicts) == (False, 2, True)
     alone = cascade_of(delay=0.0).on_processor().processor

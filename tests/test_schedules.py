@@ -20,7 +20,6 @@ from ambjax.world.sensor import Measurement
 from ambjax.world.waveforms import Reference
 from tuning.problem.config import tune_from
 from tuning.problem.ranges import from_unit_cube
-from tuning.problem.shortfalls import Bound, shortfall
 from tuning.problem.space import tunable
 from tuning.problem.tuning_problem import problem_of
 from tuning.report.tuned import tuned
@@ -213,10 +212,6 @@ def test_knots_are_searched_in_the_range_of_their_gain():
     )
     assert np.all(points[:, :3] == points[:, :1])
     assert np.any(points[:, 3] != points[:, 2])
-    # the condition k > Q_z applies to each knot
-    bound = (Bound("controller.position.k", 10.0, "Q_z", "m/s^2"),)
-    gains = {"controller.position.k.0": jnp.asarray(20.0), "controller.position.k.1": jnp.asarray(5.0)}
-    assert shortfall(gains, bound, 0.0) == pytest.approx(np.log(2.0) ** 2)
 
 
 @pytest.mark.parametrize("spelled", ["inline", "table"])

@@ -46,7 +46,7 @@ def test_the_summary_agrees_with_the_analysis(tmp_path, capsys):
     case = read_case(path)
     for r, row in zip((0.0, 1e-3, -1e-3), summary["points"], strict=True):
         one = analyse(linearise(case.cascade, case.scenario, case.clock, r), 0.588, 1e-4, case.zones)
-        found = [one.S.height, one.S.frequency, one.T.height, one.margins.phase_deg, one.margins.disk]
+        found = [one.S.height, one.S.frequency, one.T.height, one.margins.pm, one.margins.dm]
         assert [row[k] for k in ("peak", "frequency_hz", "t_peak", "phase_margin_deg", "disk_margin")] == found
         assert row["reference_m"] == pytest.approx(r, rel=1e-3)
         assert row["zone"] == "D"

@@ -59,6 +59,22 @@ def test_the_speeds_of_the_sensitivity_are_first_last_and_largest():
     assert machine(speed=speed).speeds == pytest.approx((0.0, 3000.0, 6000.0))
 
 
+def listed(speeds):
+    return machine_from(MACHINES["rigid"] | {"sensitivity": {"speeds": speeds}}, "machine").speeds
+
+
+def test_a_range_of_speeds_is_a_list_of_them():
+    assert listed("-3000:6000:4") == listed([-3000.0, 0.0, 3000.0, 6000.0])
+
+
+@pytest.mark.parametrize("speeds", ["", "0:6000", "6000:0:3", "0:6000:1", "0:6000:2.5", "0:inf:3", "0:1:101", 6000.0])
+def test_a_wrong_range_of_speeds_is_refused(speeds):
+    with pytest.raises(ValueError, match=r"sensitivity\.speeds = .*LOW:HIGH:COUNT"):
+        listed(speeds)
+    with pytest.raises(ValueError, match=r"sensitivity\.speeds\[0\] = -1e\+09"):
+        listed("-1e9:0:3")
+
+
 @pytest.mark.parametrize("read", [machine_from, case_from])
 def test_a_table_has_no_rate_that_varies(read):
     raw = MACHINES["rigid"] if read is machine_from else {"rotor": {}}

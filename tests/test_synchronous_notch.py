@@ -3,6 +3,8 @@
 import dataclasses
 import tomllib
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -12,11 +14,14 @@ from ambjax.cases.template_text import template
 from ambjax.codegen.c99.source import Origin
 from ambjax.codegen.of_case import block_of
 from ambjax.codegen.verify import draft, holds, verify
+from ambjax.control.synchronous_notch import NotchGain, NotchState, SynchronousNotch
 from ambjax.linear import linearise
 from ambjax.linear.linear_machine import linearise_machine
 from ambjax.linear.margins import poles_in_s
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.runs import simulate
+from ambjax.world.rotation import Rotation
+from ambjax.world.sensor import Measurement
 
 RATE, RPM = 20.0, 6000.0
 LAWS = {
@@ -100,6 +105,46 @@ def test_a_run_up_switches_the_notch_on_without_a_kick():
     np.testing.assert_allclose(i[below], i_alone[below], rtol=0, atol=1e-12)
     assert np.ptp(i[on]) < 1.2 * np.ptp(i_alone[on])
     assert run.metrics["i_1x_A"] < 1e-4 * alone.metrics["i_1x_A"]
+
+
+def band(rotation):
+    gains = NotchGain(2000.0, 0.5, 0.2), NotchGain(4000.0, 0.7, -0.1)
+    return SynchronousNotch("displacement-free", RATE, 2000.0, 4000.0, gains, rotation, True)
+
+
+def reading(z):
+    return Measurement(z, 0.0, 0.0)
+
+
+def test_a_notch_is_on_in_a_band_of_speeds_and_vanishes_as_exp():
+    """The amplitude |c| of a run-up through the band: 0 below it, no jump anywhere, exp(-rate t) above it."""
+    T, count = 1e-3, 1200
+    rotation = Rotation(1000.0, 5000.0)  # 2000 rpm at 0.2 s, 4000 rpm at 0.6 s
+    notch, z = band(rotation), np.cos(2 * np.pi * np.asarray(rotation.turns(T * np.arange(count))))
+
+    def step(state, z):
+        added, after = notch.step(reading(z), state, T)
+        return after, (added - z, jnp.hypot(state.real, state.imaginary))
+
+    start = notch.init(reading(jnp.asarray(0.0)))
+    _, (added, size) = jax.jit(lambda z: jax.lax.scan(step, start, z))(z)
+    added, size, t = np.asarray(added), np.asarray(size), T * np.arange(count)
+    assert np.all(size[t < 0.2] == 0)
+    assert np.all(np.abs(added) <= size + 1e-12)
+    assert np.ptp(added[(t > 0.5) & (t < 0.6)]) > 1.0
+    assert np.all(np.abs(np.diff(size)) <= RATE * T * (2 * 0.75 + size[:-1]))
+    after = t > 0.602
+    np.testing.assert_allclose(np.diff(np.log(size[after])), np.log(1 - RATE * T), rtol=1e-6)
+
+
+@pytest.mark.parametrize("rpm", [1500.0, 3000.0, 5000.0])
+def test_short_steps_of_a_notch_equal_its_rate(rpm):
+    notch, h = band(Rotation(rpm)), 1e-7
+    state = NotchState(*map(jnp.asarray, (0.3, -0.2, 0.05, 0.0)))
+    added, rate = notch(reading(0.4), state)
+    same, after = notch.step(reading(0.4), state, h)
+    assert added == same == pytest.approx(0.7)
+    np.testing.assert_allclose((np.array(after) - np.array(state)) / h, rate, rtol=1e-4, atol=1e-3)
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ def parsed(tune):
     return case_and_tune({"sensor": {"std": 1e-6}, "rotor": {"speed": 6000.0}, "tune": tune})[1]
 
 
-ENDS = NUMBERS | {f"weights.{name}": WEIGHTS[name] for name in [*TERMS, "conditions"]}
+ENDS = NUMBERS | {f"weights.{name}": WEIGHTS[name] for name in TERMS}
 ENDS |= {f"limits.{name}": OTHER_RANGES.get(name, LIMIT_RANGE) for name in [*KINDS, "survival"]}
 
 

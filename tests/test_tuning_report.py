@@ -20,7 +20,6 @@ from tuning.__main__ import main
 from tuning.problem.goal import shown
 from tuning.report import document as report
 from tuning.report import folder, pictures
-from tuning.report.slices import REACH, Slices
 
 CASE = """
 [reference]
@@ -80,7 +79,7 @@ def written(tmp_path_factory):
     return folder / "out"
 
 
-DRAWN = ("before", "after", "spectrum", "convergence", "slices", "front")
+DRAWN = ("before", "after", "spectrum", "convergence", "front")
 
 
 def cells(text, heading):
@@ -88,30 +87,6 @@ def cells(text, heading):
     below = text.partition(f"## {heading}")[2].lstrip("\n")
     lines = [line for line in below.partition("\n## ")[0].splitlines() if line.startswith("|")]
     return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines if "---" not in line]
-
-
-# --- slices ---
-
-
-def test_the_lowest_point_of_the_slices_loses_no_more_members():
-    middle = len(REACH) // 2
-    goals = np.zeros((2, len(REACH)))
-    goals[0, 3], goals[1, 9], goals[1, 2] = -0.5, -0.2, np.nan
-    lost = np.zeros((2, len(REACH)), int)
-    gains = np.arange(2 * len(REACH), dtype=float).reshape(2, -1)
-    assert Slices(gains, goals, lost, goals).lowest() == (0, 3, 0.5)
-    lost[0, 3] = 1
-    assert Slices(gains, goals, lost, goals).lowest() == (1, 9, 0.2)
-    lost[0, middle] = 1  # the answer loses one too
-    assert Slices(gains, goals, lost, goals).lowest() == (0, 3, 0.5)
-    assert Slices(gains, np.abs(goals), lost, goals).lowest()[2] == 0
-
-
-def test_a_lower_point_on_a_slice_is_reported():
-    beside = {"path": "controller.position.c", "gain": 12.5, "lower": 0.2}
-    assert "20 % lower, at controller.position.c = 12.5" in report._lower_point(beside)
-    beside["lower"] = 0.0
-    assert "No point of these slices has a lower objective" in report._lower_point(beside)
 
 
 # --- pages ---------------------------------------------------------------------------------------------------------
@@ -155,7 +130,7 @@ def test_wide_content_scrolls_in_its_own_box(written):
     assert '<meta name="viewport" content="width=device-width,initial-scale=1">' in shown
     assert re.search(r"\.wide\{[^}]*overflow-x:auto", shown)
     assert shown.count("<table>") == shown.count('<div class="wide"><table>') > 4
-    assert shown.count("<img ") == shown.count('<span class="wide"><img ') == 6
+    assert shown.count("<img ") == shown.count('<span class="wide"><img ') == 5
     assert 'src="data:image/png;base64,' in shown
     # the page needs no other file; the data of a picture may contain these letters by chance
     assert "http" not in re.sub(r"base64,[^\"]*", "", shown)

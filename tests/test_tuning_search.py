@@ -10,7 +10,6 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from texts import case_and_tune
 
@@ -22,17 +21,16 @@ from ambjax.sensors import Sensor
 from ambjax.signals import Sine
 from ambjax.solvers import Slide
 from tuning.__main__ import main
-from tuning.optimisers import BACKTRACK, JUMP, NAMES, bfgs, optimiser
 from tuning.problem.goal import Goal
 from tuning.problem.lanes import Engine
 from tuning.problem.loss import TERMS, loss_for, weigh
 from tuning.problem.members import Objective
+from tuning.problem.ranges import ranges
 from tuning.problem.risk import CVaR, Mean
-from tuning.problem.shortfalls import bounds
 from tuning.problem.space import Gain, Space
 from tuning.problem.tuning_problem import problem_of
 from tuning.solve.checkpoint import CheckpointFile
-from tuning.solve.descent import Descent
+from tuning.solve.descent import JUMP, Descent, begin, step
 from tuning.solve.refine import RACE, best_of, search
 from tuning.solve.screen import initial_points, screen
 
@@ -110,7 +108,7 @@ def test_a_lane_has_the_delay_of_its_member(delays):
     delays = members.values["processor.delay"]
     assert np.all(delays != np.round(delays))
     for lane, delay in zip(tracking, delays, strict=True):
-        processor = dataclasses.replace(case.cascade.processor, delay=float(delay), whole=None, most=None)
+        processor = dataclasses.replace(case.cascade.processor, delay=float(delay))
         cascade = dataclasses.replace(case.cascade, processor=processor)
         alone = rollout(
             cascade, case.scenario, problem.objective.clock, fold=problem.objective.loss, record_every=0
@@ -152,61 +150,35 @@ def test_stressed_members_have_more_noise_and_only_their_survival_counts():
 # --- optimisers ---
 
 
-def minimise(steps, method):
-    """Return the loss after this number of steps of an optimiser, and before."""
+def test_bfgs_solves_a_quadratic_in_few_steps():
+    # superlinear: measured 2e-10 of the start after 15 steps in three dimensions, without a line search
     centre, scales = jnp.asarray([0.7, -0.4, 0.2]), jnp.asarray([1.0, 9.0, 0.3])
 
     def loss(x):
         return jnp.sum(scales * (x - centre) ** 2)
 
-    def one(carry, _):
-        x, state = carry
-        value, gradient = jax.value_and_grad(loss)(x)
-        step, state = method.update(gradient, state, x, value=value)
-        return (optax.apply_updates(x, step), state), None
+    def one(start, _):
+        return step(start, *jax.value_and_grad(loss)(start.trial)), None
 
-    start = jnp.zeros(3)
-    (_, state), _ = jax.lax.scan(one, (start, method.init(start)), length=steps)
-    assert float(state.value) == pytest.approx(float(loss(state.best)), rel=1e-12)
-    return float(state.value), float(loss(start))
-
-
-def test_bfgs_solves_a_quadratic_in_few_steps():
-    # superlinear: measured 2e-10 of the start after 15 steps in three dimensions, without a line search
-    last, first = minimise(20, bfgs())
-    assert last < 1e-8 * first
+    last, _ = jax.lax.scan(one, jax.tree.map(lambda a: a[0], begin(jnp.zeros((1, 3)))), length=20)
+    assert float(last.value) == pytest.approx(float(loss(last.best)), rel=1e-12)
+    assert float(last.value) < 1e-8 * float(loss(jnp.zeros(3)))
 
 
 def test_a_refused_trial_of_bfgs_updates_the_curvature():
     """On the parabola 50 x^2 the first step, 0.3, overshoots; from its gradient the next trial is the minimum."""
-    method, start = bfgs(), jnp.asarray([0.1])
 
-    def tried(state, x, value):
-        step, state = method.update(100 * x, state, x, value=jnp.asarray(value))
-        return optax.apply_updates(x, step), state
+    def tried(start, value):
+        return step(start, jnp.asarray(value), 100 * start.trial)
 
-    trial, state = tried(method.init(start), start, 0.5)
-    np.testing.assert_allclose(trial, -0.2)
-    again, after = tried(state, trial, 0.5 + 0.9 * JUMP)
-    np.testing.assert_allclose(again, 0.0, atol=1e-12)
+    first = tried(jax.tree.map(lambda a: a[0], begin(jnp.asarray([[0.1]]))), 0.5)
+    np.testing.assert_allclose(first.trial, -0.2)
+    after = tried(first, 0.5 + 0.9 * JUMP)
+    np.testing.assert_allclose(after.trial, 0.0, atol=1e-12)
     assert (float(after.best[0]), float(after.value)) == (0.1, 0.5)
     # a trial beyond a jump, or with a loss that is not finite, only shortens the step, to a quarter
     for value in (0.5 + 1.1 * JUMP, np.nan):
-        np.testing.assert_allclose(tried(state, trial, value)[0], 0.1 - 0.3 / 4)
-
-
-@pytest.mark.parametrize("name", [n for n in NAMES if n != "bfgs"])
-def test_every_optimiser_descends_and_backtracks_after_a_refused_trial(name):
-    method = optimiser(name, 0.02)
-    last, first = minimise(60, method)
-    assert last < 0.9 * first
-    # after a step of the right size: the best point, and a refused trial, whose gradient has no effect
-    best, trial = jnp.asarray([1.0, 2.0]), jnp.asarray([1.4, 2.4])
-    _, state = method.update(jnp.ones(2), method.init(best), best, value=jnp.asarray(0.3))
-    for gradient, value in ((jnp.ones(2), np.inf), (jnp.asarray([1.0, np.nan]), 0.1)):
-        step, after = method.update(gradient, state, trial, value=jnp.asarray(value))
-        np.testing.assert_allclose(trial + step, best + 0.4 * BACKTRACK)
-        assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), after, state))
+        np.testing.assert_allclose(tried(first, value).trial, 0.1 - 0.3 / 4)
 
 
 # --- the search ---
@@ -217,13 +189,13 @@ def small(engines):
     """A search of the problem whose programs are compiled already."""
     problem = engines[0].objective
     engine = Engine(problem, settle=0.002, threads=2)
-    goal = Goal(SPACE, (1.0, 0.0, 0.0, 0.0, 1e-3, 1.0), Mean(), bounds(CASCADE, SCENARIO, problem.clock), 1.0, 0.1)
+    goal = Goal((1.0, 0.0, 0.0, 0.0, 1e-3, 1.0), Mean())
     return engine, goal, problem.training(3, 4, 1, 1.2, 1.25), SPACE.values(CASCADE)
 
 
 def run(small, **more):
     engine, goal, members, start = small
-    points = initial_points(engine.objective, goal.conditions, start, 8, seed=1)
+    points = initial_points(SPACE, ranges(engine.objective, start), start, 8, seed=1)
     return search(engine, goal, members, points, keep=2, **{"iterations": 9, **more})
 
 
@@ -236,20 +208,20 @@ def test_the_search_descends_and_keeps_the_best(small):
     assert np.all(np.diff(value) <= 0)
     assert value[-1] < value[0] - 1e-3
     x, best = best_of(found)
-    again = goal.score(x[None], engine.terms(x[None], members), members)[0]
+    again = goal.score(engine.terms(x[None], members), members)[0]
     assert again == pytest.approx(best, rel=1e-9)
 
 
 def test_the_screen_orders_the_points_by_their_goal(small):
     """With this few members, a part of them is all."""
     engine, goal, members, start = small
-    points = initial_points(engine.objective, goal.conditions, start, 8, seed=1)
+    points = initial_points(SPACE, ranges(engine.objective, start), start, 8, seed=1)
     assert points.shape == (10, 4)
     np.testing.assert_allclose(points[0], SPACE.encode(start))
     ordered = screen(engine, members, points, goal)
-    values = goal.score(ordered, engine.terms(ordered, members), members)
+    values = goal.score(engine.terms(ordered, members), members)
     assert np.all(np.diff(values) >= 0)
-    np.testing.assert_allclose(np.sort(values), np.sort(goal.score(points, engine.terms(points, members), members)))
+    np.testing.assert_allclose(np.sort(values), np.sort(goal.score(engine.terms(points, members), members)))
 
 
 def test_lost_members_join_as_stressed_members():
@@ -317,23 +289,6 @@ def test_a_resumed_search_is_the_uninterrupted_one(small, tmp_path):
         run(small, checkpoint_file=CheckpointFile(tmp_path / "kept.npz", {"case": 2}), resume=True)
 
 
-@pytest.mark.slow
-def test_a_search_whose_checkpoint_was_damaged_is_the_uninterrupted_one(small, tmp_path, capsys):
-    whole = run(small)
-    checkpoint_file = CheckpointFile(tmp_path / "kept.npz", {"case": 1}, 3, print)
-    run(small, checkpoint_file=checkpoint_file, iterations=2)
-    content = bytearray(checkpoint_file.path.read_bytes())
-    content[len(content) // 2] ^= 1
-    checkpoint_file.path.write_bytes(content)
-    again = run(small, checkpoint_file=checkpoint_file, resume=True)
-    said = capsys.readouterr().out
-    assert said.startswith(f"{checkpoint_file.path}: ")
-    assert said.endswith("; search 3 begins again\n")
-    for a, b in zip(jax.tree.leaves(whole.starts), jax.tree.leaves(again.starts), strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert run(small, checkpoint_file=checkpoint_file, resume=True).ended
-
-
 @pytest.mark.parametrize("first", [0, RACE])
 @pytest.mark.slow
 def test_a_search_continues_by_values_if_derivatives_are_not_finite(small, first):
@@ -371,14 +326,13 @@ def test_ctrl_c_keeps_the_best_gains(small):
 
 def test_steps_that_are_not_finite_are_skipped(small):
     _, goal, *_ = small
-    descent = Descent(goal, "adam", 0.1)
-    starts = descent.begin(jnp.zeros((1, 4)))
-    good = descent.step(4, starts, jnp.ones((1, 4, 1)), jnp.ones((1, 4, 1, 4)), jnp.ones(1, bool))
-    bad = descent.step(4, good, jnp.full((1, 4, 1), jnp.nan), jnp.ones((1, 4, 1, 4)), jnp.ones(1, bool))
-    np.testing.assert_array_equal(bad.best, good.best)
-    assert np.all(np.isfinite(bad.trial))
-    for a, b in zip(jax.tree.leaves(bad.state), jax.tree.leaves(good.state), strict=True):
-        np.testing.assert_array_equal(a, b)
+    descent, slopes, on = Descent(goal), jnp.ones((1, 4, 1, 4)), jnp.ones(1, bool)
+    good = descent(4, begin(jnp.zeros((1, 4))), jnp.ones((1, 4, 1)), slopes, on)
+    bad = descent(4, good, jnp.full((1, 4, 1), jnp.nan), slopes, on)
+    for name in ("best", "value", "gradient", "inverse"):
+        np.testing.assert_array_equal(getattr(bad, name), getattr(good, name))
+    # a quarter of the rejected step
+    np.testing.assert_allclose(bad.trial - bad.best, (good.trial - good.best) / 4)
 
 
 # --- [tune] and the command ---
@@ -392,7 +346,6 @@ def parsed(tune, **tables):
 def test_everything_in_tune_has_a_default():
     tune = parsed({})
     assert tune.space.paths == [f"controller.{path}" for path in PATHS]
-    assert tune.optimiser == "bfgs"
     cvar = parsed({"risk": "cvar", "alpha": 0.8, "bounds": {"controller": {"position": {"c": [1, 100]}}}})
     assert cvar.risk == CVaR(0.8)
     assert (cvar.space.gains[0].low, cvar.space.gains[0].high) == (1.0, 100.0)
@@ -412,7 +365,7 @@ def test_everything_in_tune_has_a_default():
             "tune.bounds: 'controller.position.cc': there is no such number to tune in this case. Did you mean 'c",
         ),
         ({"gains": "c"}, "give a list of paths"),
-        ({"optimiser": "adamm"}, "Did you mean 'adam'"),
+        ({"objective": "knees"}, "Did you mean 'knee'"),
         ({"weights": {"tracking": 0.0}}, "no term of the loss depends on the error"),
         ({"weights": {"survival": 0.0}}, "losing the rotor would cost nothing"),
         ({"weights": {"tracking": -1.0}}, "tune.weights.tracking = -1"),
@@ -425,7 +378,7 @@ def test_everything_in_tune_has_a_default():
         ({"risk": "cvar", "alpha": 1.0}, "below 1"),
         ({"members": 0}, "tune.members = 0"),
         ({"memebrs": 3}, "Did you mean 'members'"),
-        ({"learning_rate": 0}, "tune.learning_rate = 0"),
+        ({"minutes": 0}, "tune.minutes = 0"),
     ],
 )
 def test_bad_settings_are_refused_with_a_message(tune, says):
@@ -526,7 +479,7 @@ def test_a_killed_search_is_resumed_and_damage_is_detected(tmp_path):
 
 def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, capsys):
     path, out = tmp_path / "case.toml", tmp_path / "out"
-    path.write_text(CASE + 'optimiser = "best"\n')
+    path.write_text(CASE + 'risk = "best"\n')
     assert main([str(path), "--out", str(out)]) == 2
     said = capsys.readouterr().err
     assert len(said.splitlines()) == 1

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import types
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +24,8 @@ from ambjax.theorem.conditions import delta_1_on_reference
 from tuning.problem.config import read_tune
 from tuning.problem.gains_table import off
 from tuning.problem.loss import TERMS, Loss, loss_for
+from tuning.problem.ranges import theorem_bounds
 from tuning.problem.risk import CVaR, Mean, SoftWorst
-from tuning.problem.shortfalls import bounds, shortfall
 from tuning.problem.space import CLOSEST, MARGIN, Gain, Space, tunable
 
 GAINS = [Gain("controller.position.c"), Gain("controller.position.c", 3.0), Gain("controller.position.c", 2.0, 5e3)]
@@ -236,14 +237,7 @@ def test_the_derivative_of_the_survival_points_to_longer_survival():
 
 
 def test_the_bounds_are_those_of_the_theorem():
-    found = {b.symbol: b.value for b in bounds(SMOOTH, TRACKING, CLOCK)}
+    found = theorem_bounds(types.SimpleNamespace(cascade=SMOOTH, scenario=TRACKING, clock=CLOCK))
     assert found["Q_z"] == pytest.approx(float(TRACKING.plant.a))
     assert found["Q_i"] == 0.0
     assert found["Delta_1"] == delta_1_on_reference(SMOOTH, TRACKING, CLOCK)[0]
-
-
-def test_shortfall_is_zero_with_margin_and_grows_below():
-    conditions = bounds(SMOOTH, TRACKING, CLOCK)
-    q_z = next(b.value for b in conditions if b.symbol == "Q_z")
-    assert float(shortfall({K: jnp.asarray(1.11 * q_z)}, conditions, 0.1)) == 0.0
-    assert float(shortfall({K: jnp.asarray(1.1 * q_z / math.e)}, conditions, 0.1)) == pytest.approx(1.0)

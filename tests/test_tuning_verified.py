@@ -16,12 +16,11 @@ import tuning.validate
 from ambjax.cases.reader import case_from
 from tuning.__main__ import main
 from tuning.judge.evaluate import StepError, comparison_members, describe, step_error, worst_of
-from tuning.optimisers import FirstOrderState
 from tuning.problem.tuning_problem import REFERENCE_MEMBERS, REFERENCE_TOLERANCE
 from tuning.rounds import MOST_HALVINGS, finer, rounds
 from tuning.solve.checkpoint import SearchState
 from tuning.solve.course import Course, training
-from tuning.solve.descent import Starts
+from tuning.solve.descent import begin
 from tuning.validate import Validation, joining
 
 ROTOR = (pathlib.Path(__file__).parent / "cases" / "rotor.toml").read_text()
@@ -157,7 +156,7 @@ class Verdicts:
 def searched(engine, goal, members, points, **rest):
     """A replacement of a search: the first point is the answer."""
     x, value = np.array(points[:1]), np.zeros(1)
-    starts = Starts(x, FirstOrderState(x, value, None), value, value)
+    starts = begin(x)
     rows = {"x": [x[0]], "value": [value[0]], "lost": [np.array(0)], "members": [np.array(len(members.member))]}
     return SearchState(starts, np.zeros(1, bool), rows)
 

@@ -13,7 +13,7 @@ from tuning.problem.tuning_problem import problem_of
 SMALL_SEARCH = """
 [tune]
 objective = "least_error"
-weights = { effort = 0.0, chatter = 0.0, conditions = 0.0 }
+weights = { effort = 0.0, chatter = 0.0 }
 limits = { sensitivity = inf, rms_u_V = inf }
 stressed = 0
 screen = 0

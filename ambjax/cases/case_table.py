@@ -49,10 +49,7 @@ def _described(part: object) -> str:
 
 
 def _numbers_of(part: object) -> str:
-    """Return the numbers of a record with their units, separated by commas; nested records are in parentheses.
-
-    A schedule is shown as "scheduled", a leaf of an ensemble as the number of its members.
-    """
+    """Return the numbers of a record with their units, separated by commas; nested records are in parentheses."""
     words = []
     for field in dataclasses.fields(part) if dataclasses.is_dataclass(part) else ():
         value, unit = getattr(part, field.name), field.metadata.get("unit", "")

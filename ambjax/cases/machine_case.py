@@ -1,24 +1,25 @@
 """Reader of the case file of a whole machine: rotor, bearings, unbalances, loads, base, and the common tables."""
 
-import copy
 import dataclasses
+import functools
 import math
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.cases.machine_controller import axis_controller, inner, kind_of, law_from, merged
-from ambjax.cases.machine_spread import axis_table, fastest_rotor, machine_spread, refuse_unused
+from ambjax.cases.axis_case import MACHINE_TABLES, as_written, axis_tables, check_axis, stop_slope
+from ambjax.cases.machine_controller import inner, kind_of, law_from, merged
+from ambjax.cases.machine_spread import axis_table, machine_spread, refuse_unused, with_notches
 from ambjax.cases.machine_trial import try_machine
 from ambjax.cases.notch_table import notch_from
 from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
+from ambjax.cases.rotor_numbers import fastest_rotor
 from ambjax.cases.rotor_tables import (
     COORDINATES,
-    OWN,
     RIGID,
     BearingAxis,
     axes_from,
@@ -27,8 +28,8 @@ from ambjax.cases.rotor_tables import (
     tables_of,
     vector,
 )
-from ambjax.cases.speed_table import SPEED
-from ambjax.cases.table import Table, load, show
+from ambjax.cases.speed_table import MOST_SPEEDS, listed_speeds
+from ambjax.cases.table import Table, load
 from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.synchronous_notch import SynchronousNotch
@@ -38,19 +39,16 @@ from ambjax.linear.notch_design import with_machine_gains
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
-from ambjax.simulation.method import ACCURATE, slopes
+from ambjax.simulation.method import ACCURATE, TOUCHED, slopes
 from ambjax.simulation.rollout import prepare
 from ambjax.simulation.whole_machine import Machine, machine_of
 from ambjax.text.words import one_line
 from ambjax.world.rotor import Rotor
 from ambjax.world.scenario import Scenario
 
-MACHINE_TABLES = ("rotor", "bearing", "unbalance", "load", "base")
 # Product of step and angular frequency of a mode (or of nutation) at which the relative error of RK4 in one period is
 # below 1e-6.
 MODE = 0.1
-# Largest number of speeds of the sensitivity.
-MOST_SPEEDS = 100
 # Largest number of substeps that the reader chooses.
 MOST_SUBSTEPS = 512
 
@@ -117,9 +115,9 @@ def machine_from(
 ) -> MachineCase:
     """Return the machine of a parsed TOML document. Raises ValueError, one line, for an invalid one."""
     top = Table(raw)
-    top.only([*TABLES, *MACHINE_TABLES[1:], "tune"])
     if "disturbance" in raw:
         raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] or [[base]] instead.")
+    top.only([*(name for name in TABLES if name != "disturbance"), *MACHINE_TABLES[1:], "tune"], ("rotor.m",))
     body, bearings = body_from(top, folder), tables_of(top, "bearing")
     if not bearings:
         raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
@@ -129,19 +127,23 @@ def machine_from(
     _check_rank(rotor, axes)
     masses, forces = _shares(rotor)
 
-    def read(raw: dict[str, Any], name: str) -> Case:
+    def read(raw: dict[str, Any], name: str, written: Callable[[str], str] = str) -> Case:
         try:
             return case_from(raw, name, "", folder)
         except ValueError as error:
-            raise ValueError(f"{name}: {error}") from None
+            raise ValueError(f"{name}: {written(str(error))}") from None
 
     names = [table.raw.get("name", f"bearing{k + 1}") for k, table in enumerate(bearings)]
-    cases = []
+    cases, of_notches = [], []
     for axis, m, force, i in zip(axes, masses, forces, currents, strict=True):
-        own = _axis_raw(raw, bearings[axis.bearing], m, force, {"z": float(axis.magnet @ q), "i": i})
-        own |= axis_table(raw, axis, names[axis.bearing])
-        case = read(own, f"axis {axis.name}")
-        _check_force(case, axis, force)
+        bearing = bearings[axis.bearing]
+        own = axis_tables(raw, bearing, axis, m, force, (q, i))
+        table, turning = axis_table(raw, axis, names[axis.bearing])
+        own |= table
+        of_notches.append(turning)
+        written = functools.partial(as_written, raw=raw, bearing=bearing, axis=axis)
+        case = read(own, f"axis {axis.name}", written)
+        check_axis(case, axis, force, q)
         cases.append(case)
     own_law = own_machine_law(kind, folder) if is_own(kind := kind_of(raw)) else None
     law, parts = law_from(top, rotor, bearings, cases, read, folder, own_law)
@@ -156,6 +158,7 @@ def machine_from(
         found = with_machine_gains(machine_of_axes(rotor, parts_of(cases), clock, q, law), notches, clock)
         laws = [dataclasses.replace(case.cascade, notch=notch) for case, notch in zip(cases, found, strict=True)]
         cases = [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
+    spread = with_notches(spread, of_notches, axes, cases)
     coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
     found_laws = [(own_law,) if own_law else (), *(one.own_laws for one in cases)]
     machine = machine_of_axes(rotor, parts_of(cases), clock, q, law)
@@ -202,18 +205,12 @@ def notch_of_axis(controller: dict[str, Any], case: Case) -> tuple[SynchronousNo
 
 def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:
     """Return sensitivity.speeds, rpm; by default the first, the last and the largest of the run."""
-    value = table.raw.get("speeds")
-    if value is None:
-        first, *between, last = (float(rotor.rotation.rpm(t)) for t in rotor.rotation.corners(duration))
-        ends = (first,) if first == last else (first, last)
-        most = max(between, key=abs, default=0.0)
-        return (*ends, most) if abs(most) > max(abs(first), abs(last)) else ends
-    if not isinstance(value, list) or not 0 < len(value) <= MOST_SPEEDS:
-        raise ValueError(f"{table.at('speeds')} = {show(value)}: it must be a list of 1 to {MOST_SPEEDS} speeds, rpm.")
-    speeds = [Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(value)]
-    if (twice := next((x for x in speeds if speeds.count(x) > 1), None)) is not None:
-        raise ValueError(f"{table.at('speeds')} = {show(value)}: {twice:g} rpm is given more than once. Give it once.")
-    return tuple(speeds)
+    if "speeds" in table.raw:
+        return tuple(listed_speeds(table, MOST_SPEEDS))
+    first, *between, last = (float(rotor.rotation.rpm(t)) for t in rotor.rotation.corners(duration))
+    ends = (first,) if first == last else (first, last)
+    most = max(between, key=abs, default=0.0)
+    return (*ends, most) if abs(most) > max(abs(first), abs(last)) else ends
 
 
 def _start(table: Table, rotor: Rotor, count: int) -> tuple[np.ndarray, list[float]]:
@@ -231,13 +228,19 @@ def _start(table: Table, rotor: Rotor, count: int) -> tuple[np.ndarray, list[flo
 
 
 def _check_rank(rotor: Rotor, axes: list[BearingAxis]) -> None:
-    """Raise ValueError if magnets or sensors leave a coordinate free that any of them acts on, or a weight."""
+    """Raise ValueError if magnets or sensors leave a coordinate free that any of them acts on, or a weight.
+
+    An axial bearing alone leaves the coordinates across the shaft out; radial bearings must hold all four.
+    """
+    gravity, across = np.asarray(rotor.gravity), [k for k in range(RIGID) if k != 2]
     for rows, what in ((rotor.at_magnets, "magnets"), (rotor.at_sensors, "sensors")):
         rigid = np.asarray(rows)[:, :RIGID]
         used = [k for k in range(RIGID) if np.any(rigid[:, k])]
-        free = [COORDINATES[k] for k in range(RIGID) if k not in used and (k != 2 or rotor.gravity[2] != 0)]
-        if free:
-            raise ValueError(f"bearing: no axis holds {', '.join(free)}. Add a bearing whose {what} act on it.")
+        needed = [k for k in range(RIGID) if gravity[k] != 0 or (k in across and set(used) & set(across))]
+        if free := [k for k in needed if k not in used]:
+            other = ", or a rotor.gravity that does not" if np.any(gravity[free]) else ""
+            names = ", ".join(COORDINATES[k] for k in free)
+            raise ValueError(f"bearing: no axis holds {names}. Give a bearing whose {what} act on it{other}.")
         scale = np.abs(rigid[:, used]).max(0)
         rank = int(np.linalg.matrix_rank(rigid[:, used] / scale, tol=1e-9))
         if rank < len(used):
@@ -256,40 +259,8 @@ def _shares(rotor: Rotor) -> tuple[list[float], list[float]]:
     return masses.tolist(), np.where(np.abs(forces) > 1e-12 * np.abs(forces).max(), forces, 0.0).tolist()
 
 
-def _check_force(case: Case, axis: BearingAxis, force: float) -> None:
-    most = float(case.scenario.largest_force)
-    if abs(force) > most:
-        raise ValueError(
-            f"axis {axis.name}: it must carry {abs(force):.4g} N, and its magnet gives at most {most:.4g} N at the "
-            "centre. Increase plant.n, plant.A or plant.i_0, or reduce plant.s_0."
-        )
-
-
-def _axis_raw(raw: dict[str, Any], bearing: Table, m: float, force: float, initial: dict[str, float]) -> dict[str, Any]:
-    """Return the case of one axis: the common tables, what the bearing changes, and the rotor's share."""
-    apart = (*MACHINE_TABLES, "initial", "tune", "spread")
-    own = copy.deepcopy({key: value for key, value in raw.items() if key not in apart})
-    if turning := {key: raw["rotor"][key] for key in ("speed", "acceleration") if key in raw["rotor"]}:
-        own["rotor"] = {"speed": 0.0, **turning}
-    for table in OWN:
-        if table in bearing.raw:
-            own[table] = merged(own.get(table, {}), bearing.table(table).raw)
-    plant = own.setdefault("plant", {})
-    for name in ("m", "k_z", "g"):
-        if isinstance(plant, dict) and name in plant:
-            raise ValueError(f"plant.{name} = {show(plant[name])}: the rotor gives it. Leave it out beside [rotor].")
-    own["plant"] = plant | {"m": m, "k_z": 0.0, "g": force / m}
-    axis_controller(own)
-    if isinstance(own.get("sensitivity"), dict):
-        own["sensitivity"].pop("speeds", None)
-    return own | {"initial": initial}
-
-
 def _clock(cases: list[Case], rotor: Rotor, fixed: bool) -> Clock:
-    """Return the clock with a method whose fixed steps resolve every axis, the bending modes and nutation.
-
-    `fixed`: whether the case gives the step.
-    """
+    """Return the clock with a method whose fixed steps resolve every axis, the bending modes and nutation."""
     clock, period = cases[0].clock, float(cases[0].clock.sample_period)
     methods = [case.clock.method for case in cases]
     fixed_steps = [method for method in methods if isinstance(method, (RK4, DOP853, Euler))]
@@ -301,10 +272,11 @@ def _clock(cases: list[Case], rotor: Rotor, fixed: bool) -> Clock:
     W = rotor.rotation.fastest(float(clock.duration))
     M, K, G = (np.asarray(x) for x in (rotor.M, rotor.K, rotor.G))
     fastest = max(math.sqrt(float(np.max(np.diag(K) / np.diag(M)))), float(W * np.max(np.abs(G) / np.diag(M)[:, None])))
-    substeps = most.substeps if fixed else max(most.substeps, math.ceil(period * fastest / MODE))
+    needed = period * max(fastest / MODE, stop_slope(rotor, cases) / TOUCHED)
+    substeps = most.substeps if fixed else max(most.substeps, math.ceil(needed))
     if substeps > MOST_SUBSTEPS:
         raise ValueError(
             f"clock: this machine needs {substeps} steps in a sample of {period:g} s; at most {MOST_SUBSTEPS} are "
             "allowed. Use a processor or smooth gains, leave out the fastest modes, or shorten clock.sample_period."
         )
-    return dataclasses.replace(clock, method=dataclasses.replace(most, substeps=substeps))
+    return clock.with_method(dataclasses.replace(most, substeps=substeps))

@@ -197,10 +197,7 @@ def inner_cascade(system: Sampled | ClosedLoop) -> Any:
 
 
 def inner(system: Any, law: MachineLaw) -> Any:
-    """Return the loop of an axis whose observer and position law never act, because of a law of the machine.
-
-    Their states are left out. A demanded voltage goes to the coils as it is.
-    """
+    """Return the loop of an axis whose observer and position law never act, because of a law of the machine."""
     loop = system.loop if isinstance(system, Sampled) else system
     cascade = loop.cascade
     position = FeedbackLinearisation().designed(cascade.model, None)

@@ -11,7 +11,7 @@ import numpy as np
 from ambjax.cases.controller_file import contents_of
 from ambjax.cases.reader import Case
 from ambjax.cases.rotor_tables import MODES, RIGID
-from ambjax.cases.speed_table import SPEED
+from ambjax.cases.speed_table import listed_speeds
 from ambjax.cases.table import Table, show
 from ambjax.control.current import AmplifierCurrent
 from ambjax.control.linear_controller import OUTPUTS, SAME_PERIOD
@@ -147,12 +147,9 @@ def lqg(top: Table, cases: list[Case], rotor: Rotor) -> StateSpaceLaw:
 
 def _speeds(table: Table, default: float) -> list[float]:
     """Return the speeds of the designs, rpm."""
-    value = table.raw.get("speeds", [default])
-    if not isinstance(value, list) or not 0 < len(value) <= MOST_DESIGNS:
-        raise ValueError(f"{table.at('speeds')} = {show(value)}: it must be a list of 1 to {MOST_DESIGNS} speeds, rpm.")
-    speeds = [Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(value)]
-    if sorted(set(speeds)) != speeds:
-        raise ValueError(f"{table.at('speeds')} = {show(value)}: the speeds must be in ascending order.")
+    speeds = listed_speeds(table, MOST_DESIGNS) if "speeds" in table.raw else [default]
+    if sorted(speeds) != speeds:
+        raise ValueError(f"{table.at('speeds')} = {show(speeds)}: the speeds must be in ascending order.")
     return speeds
 
 

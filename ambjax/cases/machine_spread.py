@@ -4,23 +4,24 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
+from ambjax.cases.axis_case import FROM_ROTOR
 from ambjax.cases.reader import Case
-from ambjax.cases.rotor_tables import COORDINATES, DAMPING, FREQUENCY, I_P, I_T, MASS, RIGID, BearingAxis
+from ambjax.cases.rotor_numbers import OF_BEARING, SHAPES, rotor_places
+from ambjax.cases.rotor_tables import COORDINATES, BearingAxis
 from ambjax.cases.table import Table
 from ambjax.cases.variation import entries_of, is_distribution
-from ambjax.ensemble.paths import Place, numbers_in, places, with_number
+from ambjax.ensemble.paths import Place, places
 from ambjax.ensemble.spread import Spread, check_entries
 from ambjax.numerics.records import leaf
 from ambjax.world.rotor import Rotor
 
-# First words of the paths of the rotor, of its start, and of those of one bearing or one axis.
-OF_ROTOR, OF_START, OF_BEARING = ("rotor", "unbalance", "load", "base"), "initial", "bearing"
+# First words of the paths of the rotor, and of its start.
+OF_ROTOR, OF_START = ("rotor", "unbalance", "load", "base"), "initial"
 START = "initial.q."
-# Numbers of an axis that follow from those of the rotor, and a table that a machine does not have.
-FROM_ROTOR, ABSENT = ("m", "k_z", "g"), "disturbance"
+# A table that a machine does not have.
+ABSENT = "disturbance"
 # Coordinates of the rigid rotor at t = 0.
 OFFSET = leaf(unit="m", at_least=-10.0, at_most=10.0, doc="displacement of the centre of mass at t = 0")
 TILT = leaf(unit="rad", at_least=-10.0, at_most=10.0, doc="tilt at t = 0")
@@ -28,15 +29,17 @@ TILT = leaf(unit="rad", at_least=-10.0, at_most=10.0, doc="tilt at t = 0")
 COMMON, NOT_OF_AXIS = "processor.", ("rotor.", "initial.", "disturbance.")
 
 
-def axis_table(raw: dict[str, Any], axis: BearingAxis, name: str) -> dict[str, Any]:
+def axis_table(raw: dict[str, Any], axis: BearingAxis, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the table [spread] of the case of one axis: the common paths, then those of its bearing and of the axis.
 
-    `name`: of the bearing. Raises ValueError, one line, for a number that an axis does not have of its own.
+    The second table is that of the notch, which the case of an axis does not have. `name`: of the bearing. Raises
+    ValueError, one line, for a number that an axis does not have of its own.
     """
     table = raw.get("spread", {})
     if not isinstance(table, dict):
-        return {"spread": table}
+        return {"spread": table}, {}
     own = table.get(OF_BEARING, {}).get(name, {}) if isinstance(table.get(OF_BEARING, {}), dict) else {}
+    own = {key: value for key, value in own.items() if key not in SHAPES} if isinstance(own, dict) else own
     label = axis.name.removeprefix(f"{name}.")
     parts = [table, own, own.get(label, {})] if isinstance(own, dict) else [table]
     for key in (*OF_ROTOR, OF_START):
@@ -52,7 +55,24 @@ def axis_table(raw: dict[str, Any], axis: BearingAxis, name: str) -> dict[str, A
     for key in FROM_ROTOR:
         if isinstance(merged.get("plant"), dict) and key in merged["plant"]:
             raise ValueError(f"spread.plant.{key}: the rotor gives it. Spread rotor.m instead.")
-    return {"spread": merged} if merged else {}
+    notch, laws = {}, merged.get("controller")
+    if isinstance(laws, dict) and "notch" in laws:
+        notch, laws = {"notch": laws["notch"]}, {key: value for key, value in laws.items() if key != "notch"}
+        merged = {key: laws if key == "controller" else x for key, x in merged.items() if key != "controller" or laws}
+    return {"spread": merged} if merged else {}, notch
+
+
+def with_notches(
+    spread: Spread, tables: Sequence[dict[str, Any]], axes: Sequence[BearingAxis], cases: Sequence[Case]
+) -> Spread:
+    """Return the spread with the numbers of the notches. `tables`: of each axis, as `axis_table` returns them."""
+    entries = list(spread.entries)
+    for table, axis, case in zip(tables, axes, cases, strict=True):
+        known = places(case.cascade, case.scenario)
+        own = entries_of(table, "controller.", list(known))
+        check_entries(Spread(tuple(own)), known)
+        entries += [(f"{OF_BEARING}.{axis.name}.{path}", kind) for path, kind in own]
+    return dataclasses.replace(spread, entries=tuple(entries))
 
 
 def refuse_unused(spread: Spread, output: str) -> None:
@@ -81,14 +101,19 @@ def machine_spread(
     ValueError for an invalid entry of the rotor or its start, or for an unknown bearing.
     """
     raw = top.table("spread").raw
-    for name, own in Table(raw, "spread").table(OF_BEARING).raw.items():
+    bearings, shapes = Table(raw, "spread").table(OF_BEARING), {}
+    for name in bearings.raw:
+        own = bearings.table(name).raw
+        shapes[name] = {key: own[key] for key in SHAPES if key in own}
         labels = [axis.name.removeprefix(f"{name}.") for axis in axes if axis.name.startswith(f"{name}.")]
         if name not in names:
             raise ValueError(f"spread.{OF_BEARING}.{name}: there is no such bearing. There are: {', '.join(names)}.")
         if wrong := [key for key in own if key in ("x", "y", "z") and key not in labels]:
             raise ValueError(f"spread.{OF_BEARING}.{name}.{wrong[0]}: its axes are {', '.join(labels)}.")
-    known = rotor_places(rotor) | start_places(q)
-    entries = entries_of({key: value for key, value in raw.items() if key in (*OF_ROTOR, OF_START)}, "", list(known))
+    known = rotor_places(rotor, [axis.name for axis in axes]) | start_places(q)
+    given = {key: value for key, value in raw.items() if key in (*OF_ROTOR, OF_START)}
+    entries = entries_of(given, "", list(known))
+    entries += entries_of({name: own for name, own in shapes.items() if own}, f"{OF_BEARING}.", list(known))
     check_entries(Spread(tuple(entries)), known)
     for k, (axis, case) in enumerate(zip(axes, cases, strict=True)):
         for path, kind in case.spread.entries:
@@ -101,7 +126,7 @@ def machine_spread(
 
 def machine_places(rotor: Rotor, q: Any, names: Sequence[str], cases: Sequence[Case]) -> dict[str, Place]:
     """Return every number of a machine that may vary, by dotted path. `q`: start. `names`: of the axes."""
-    table = rotor_places(rotor) | start_places(q)
+    table = rotor_places(rotor, names) | start_places(q)
     for name, case in zip(names, cases, strict=True):
         own = {path: x for path, x in places(case.cascade, case.scenario).items() if not path.startswith(NOT_OF_AXIS)}
         table |= {path if path.startswith(COMMON) else f"{OF_BEARING}.{name}.{path}": x for path, x in own.items()}
@@ -147,79 +172,3 @@ def axis_values(values: Mapping[str, object], name: str, known: Iterable[str]) -
     own = f"{OF_BEARING}.{name}."
     common = {path: x for path, x in values.items() if path in known}
     return common | {path.removeprefix(own): x for path, x in values.items() if path.startswith(own)}
-
-
-def rotor_places(rotor: Rotor) -> dict[str, Place]:
-    """Return the numbers of a rotor, its unbalances and its loads by dotted path.
-
-    The frequencies and dampings of the bending modes are those of a rotor with diagonal stiffness and damping.
-    """
-    M, K, D, G = (np.asarray(x) for x in (rotor.M, rotor.K, rotor.D, rotor.G))
-    table = {
-        "rotor.m": Place((), MASS, M[0, 0]),
-        "rotor.I_t": Place((), I_T, M[3, 3]),
-        "rotor.I_p": Place((), I_P, G[3, 4]),
-    }
-    numbers = numbers_in(rotor, "rotor")
-    # a table of speeds has no rate of its own
-    table |= {path: numbers[path] for path in ("rotor.speed", "rotor.acceleration")[: 1 if rotor.changes else 2]}
-    w = np.sqrt(np.diag(K)[RIGID::2] / np.diag(M)[RIGID::2])
-    for j, (own, d) in enumerate(zip(w, np.diag(D)[RIGID::2], strict=True)):
-        table[f"rotor.modes.{j}.frequency"] = Place((), FREQUENCY, own / (2 * np.pi))
-        table[f"rotor.modes.{j}.damping"] = Place((), DAMPING, d / (2 * own * M[RIGID + 2 * j, RIGID + 2 * j]))
-    for stem, name in (("rotor.unbalances.", "unbalance."), ("rotor.loads.", "load."), ("rotor.base.", "base.")):
-        own = {path: place for path, place in numbers.items() if path.startswith(stem) and ".along" not in path}
-        table |= {path.replace(stem, name).replace(".signal.", ".", 1): x for path, x in own.items()}
-    return table
-
-
-def varied_rotors(rotor: Rotor, values: Mapping[str, Any]) -> Rotor:
-    """Return the rotors of members: the values of `rotor_places` are arrays [N], and so is each leaf, [N, ...].
-
-    Without values it is the rotor itself.
-    """
-    own = {path: np.asarray(x, float) for path, x in values.items() if path.startswith(OF_ROTOR)}
-    if not own:
-        return rotor
-    members = [varied_rotor(rotor, dict(zip(own, row, strict=True))) for row in zip(*own.values(), strict=True)]
-    return jax.tree.map(lambda *x: np.stack(x), *members)
-
-
-def varied_rotor(rotor: Rotor, values: Mapping[str, float]) -> Rotor:
-    """Return the rotor with these numbers of `rotor_places`.
-
-    The weight follows the mass. The polar inertia scales the gyroscopic terms of the bending modes too.
-    """
-    known = rotor_places(rotor)
-    M, D, G, K, gravity = (np.array(x, float) for x in (rotor.M, rotor.D, rotor.G, rotor.K, rotor.gravity))
-    for path, x in values.items():
-        if known[path].route:
-            rotor = with_number(rotor, known[path].route, x)
-        elif path == "rotor.m":
-            M[range(3), range(3)], gravity = x, gravity * (x / M[0, 0])
-        elif path == "rotor.I_t":
-            M[(3, 4), (3, 4)] = x
-        elif path == "rotor.I_p":
-            G *= x / G[3, 4] if G[3, 4] else 1.0
-            G[3, 4], G[4, 3] = x, -x
-        else:
-            k = RIGID + 2 * int(path.split(".")[2])
-            mass, at = M[k, k], (range(k, k + 2), range(k, k + 2))
-            w = np.sqrt(K[k, k] / mass)
-            ratio = D[k, k] / (2 * w * mass)
-            if path.endswith("frequency"):
-                w = 2 * np.pi * x
-            else:
-                ratio = x
-            K[at], D[at] = mass * w**2, 2 * ratio * w * mass
-    return dataclasses.replace(rotor, M=M, D=D, G=G, K=K, gravity=gravity)
-
-
-def fastest_rotor(rotor: Rotor, spread: Spread) -> Rotor:
-    """Return the rotor of the spread with the highest frequencies, for the choice of the integration step."""
-    known, chosen = rotor_places(rotor), {}
-    for path, kind in spread.entries:
-        if path in known:
-            ends = kind.support(float(np.asarray(known[path].value)))
-            chosen[path] = ends[0] if path in ("rotor.m", "rotor.I_t") else max(ends, key=abs)
-    return varied_rotor(rotor, chosen)

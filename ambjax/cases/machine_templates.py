@@ -20,6 +20,8 @@ name = "left"
 kind = "radial"
 at = -0.139                   # m; place of the magnet, from the centre of mass
 sensor_at = -0.119            # m; place of the sensor (left out: that of the magnet)
+# stop_at = -0.17             # m; place of the touchdown bearing (left out: that of the magnet)
+# clearance = 1.9e-4          # m; its clearance (left out: run.clearance, or else 0.9 of s_0)
 # angle = 45.0                # degrees; direction of the first axis, from x (left out: 0)
 
 [[bearing]]

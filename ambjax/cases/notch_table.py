@@ -12,6 +12,7 @@ from ambjax.world.scenario import Scenario
 
 # The kind that switches off the notch, for example on one bearing.
 OFF = "none"
+NUMBERS = ("rate", "min_speed", "max_speed")
 PHASE = leaf(
     default=None, unit="degrees", at_least=-360.0, at_most=360.0, optional=True,
     doc="phase of the response that the notch inverts; none: that of the linear loop at each speed",
@@ -24,14 +25,14 @@ def notch_from(top: Table, scenario: Scenario) -> tuple[SynchronousNotch, float 
     if "notch" not in controller.raw:
         return None
     table, rotor = controller.table("notch"), scenario.rotor
-    table.only(["kind", "rate", "min_speed", "phase"])
+    table.only(["kind", *NUMBERS, "phase"])
     kind, phase = table.choice("kind", [*NULLED, OFF], next(iter(NULLED))), table.leaf("phase", PHASE)
     if kind == OFF:
         return None
     varying = rotor is not None and (rotor.acceleration != 0 or bool(rotor.changes))
     if rotor is None or (rotor.speed == 0 and not varying):
         raise ValueError("[controller.notch]: it follows the speed of the rotor. Give rotor.speed, in rpm.")
-    given = Table({key: table.raw[key] for key in ("rate", "min_speed") if key in table.raw}, table.path)
+    given = Table({key: table.raw[key] for key in NUMBERS if key in table.raw}, table.path)
     notch = given.record(SynchronousNotch)
     return dataclasses.replace(notch, removes=kind, rotor=rotor, varying=varying), phase
 

@@ -98,10 +98,7 @@ def _imported(stage: str, kind: str, folder: pathlib.Path, base: type[Law] | typ
 
 
 def relocated(laws: Iterable[OwnLaw], out: pathlib.Path) -> dict[str, str]:
-    """Return the value of the key `kind` of each law for a case file in the folder `out`, by dotted path.
-
-    A module, and a path that leads to the same file from `out`, are kept as written.
-    """
+    """Return the value of the key `kind` of each law for a case file in the folder `out`, by dotted path."""
     kinds = {}
     for law in laws:
         kind, file = law.kind, law.file
@@ -159,10 +156,7 @@ def _named(base: type) -> str:
 
 
 def _check_record(found: type, name: str, stage: str, refuse: Refuse) -> None:
-    """Raise ValueError unless the class is a record that defines every method.
-
-    Each field must have a default, be declared by gain, leaf or static, and have another name than `kind`.
-    """
+    """Raise ValueError unless the class is a record that defines every method."""
     try:
         law = found()
     except TypeError as error:  # abstract methods, or fields without a default

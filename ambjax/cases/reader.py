@@ -1,8 +1,4 @@
-"""Reader of case files: from TOML to a cascade, a scenario and a clock.
-
-The reader is strict. An unknown key, a wrong type, a number out of bounds or two contradictory settings raise a
-ValueError with one line: the dotted path, the value, what is allowed and the fix.
-"""
+"""Reader of case files: from TOML to a cascade, a scenario and a clock."""
 
 import dataclasses
 import pathlib
@@ -26,7 +22,6 @@ from ambjax.cases.variation import spread_from
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import Spread, corners, ends
 from ambjax.linear.analysis import Zones
-from ambjax.numerics.records import require_concrete
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method
 from ambjax.simulation.sliding import Slide, slides
@@ -135,17 +130,6 @@ def require_file(name: str, path: object) -> None:
     """Raise ValueError unless the argument `name` is the path of a file: text or a pathlib.Path."""
     if not isinstance(path, str | pathlib.PurePath):
         raise ValueError(f"{name} = {cut(repr(path))}: it must be the path of a file, as text or a pathlib.Path.")
-
-
-def require_case(case: object, *, traced: bool = False) -> None:
-    """Raise ValueError for anything but a `Case`, such as a path. `traced`: whether its numbers may be traced."""
-    if not isinstance(case, Case):
-        other = " For a whole machine, use ambjax.simulate_machine." if hasattr(case, "machine") else ""
-        if isinstance(case, Cascade):
-            other = " Of a cascade, make one with ambjax.Case(NAME, cascade, scenario, clock, SETTLE)."
-        raise ValueError(f"case = {cut(repr(case))}: it must be a Case, as ambjax.read_case(PATH) returns it.{other}")
-    if not traced:
-        require_concrete("case", (case.cascade, case.scenario, case.clock))
 
 
 def safe_name(text: str) -> str:

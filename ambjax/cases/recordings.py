@@ -42,10 +42,7 @@ class Recordings:
         self.read: list[RecordedFile] = []
 
     def signal(self, table: Table, extra: tuple[str, ...] = ()) -> Recorded:
-        """Return the signal of a table with `kind = "table"`. `extra`: further keys that the table may have.
-
-        Raises ValueError, with the path, the value and the fix, if a key or the file is invalid.
-        """
+        """Return the signal of a table with `kind = "table"`. `extra`: further keys that the table may have."""
         table.only(["kind", *KEYS, *extra])
         held = table.choice("interpolation", INTERPOLATIONS, INTERPOLATIONS[0]) == "held"
         scale, start = (table.leaf(name, FIELDS[name], FIELDS[name].default) for name in ("scale", "start"))
@@ -81,10 +78,7 @@ class Recordings:
 
 
 def relocated_files(files: Iterable[RecordedFile], out: pathlib.Path) -> dict[str, str]:
-    """Return the paths, by dotted key, by which a case file in the folder `out` must name these files.
-
-    A path is kept as written if it leads to the same file from `out`.
-    """
+    """Return the paths, by dotted key, by which a case file in the folder `out` must name these files."""
     return {one.key: path_from(one.written, one.file, out) for one in files}
 
 
@@ -113,11 +107,7 @@ def _chosen(found: dict[str, np.ndarray], columns: tuple[str, str] | None) -> tu
 
 
 def _checked(times: np.ndarray, values: np.ndarray) -> Samples:
-    """Return the samples.
-
-    Raises ValueError for a wrong shape or number of rows, a value that is not a finite real number, or times that do
-    not increase.
-    """
+    """Return the samples. Raises ValueError for a wrong shape, a number that is not finite, or times not in order."""
     shapes = np.shape(times), np.shape(values)
     if any(len(shape) != 1 for shape in shapes) or shapes[0] != shapes[1]:
         raise ValueError(
@@ -177,10 +167,7 @@ def _csv(file: pathlib.Path) -> dict[str, np.ndarray]:
 
 
 def _float(cell: str, comma: bool) -> float | None:
-    """Return the number in a cell; NaN if the cell is empty, None if its text is not a number.
-
-    `comma`: whether a number may have a decimal comma.
-    """
+    """Return the number in a cell; NaN if the cell is empty, None if its text is not a number."""
     try:
         return float(cell.replace(",", ".") if comma else cell) if cell.strip() else math.nan
     except ValueError:

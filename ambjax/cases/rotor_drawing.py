@@ -17,7 +17,7 @@ PLACES = 71
 class RotorDrawing(NamedTuple):
     """A rotor from the side. Places are measured from the centre of mass, m.
 
-    - `planes`: kind ("magnet", "sensor" or "unbalance") and place.
+    - `planes`: kind ("magnet", "sensor", "stop" apart from its magnet, or "unbalance") and place.
     - `at` [P], `shapes` [P, k]: places, ascending, and shapes of the bending modes there.
     - `sections`: begin, end and diameter (m) of each section of a shaft. `discs`: places of its discs.
     """
@@ -50,13 +50,26 @@ def drawing_of(case: MachineCase) -> RotorDrawing:
 
 def _planes(rotor: Rotor) -> list[tuple[tuple[str, float], np.ndarray]]:
     """Return kind, place and mode shapes of each plane of the rotor, without repetition."""
-    rows = [("magnet", row) for row in np.asarray(rotor.at_magnets)]
+    magnets = np.asarray(rotor.at_magnets)
+    stops = magnets if rotor.at_stops is None else np.asarray(rotor.at_stops)
+    rows = [("magnet", row) for row in magnets]
     rows += [("sensor", row) for row in np.asarray(rotor.at_sensors)]
+    rows += [("stop", row) for row in stops[np.any(stops != magnets, 1)]]
     rows += [("unbalance", np.asarray(one.along_x)) for one in rotor.unbalances]
     found: dict[tuple[str, float], np.ndarray] = {}
     for kind, row in rows:
         d, own = row[:2], row[RIGID:].reshape(-1, 2)
         if np.any(d):  # radial: the row of a displacement along d at l
-            place = round(float((row[4] * d[0] - row[3] * d[1]) / (d @ d)), 12)
-            found.setdefault((kind, place), own @ d / (d @ d))
+            found.setdefault((kind, place_of(row)), own @ d / (d @ d))
     return list(found.items())
+
+
+def radial_axes(case: MachineCase) -> list[int]:
+    """Return the numbers of the axes across the shaft, two of each radial bearing."""
+    return [k for k, name in enumerate(case.axes) if not name.endswith(".z")]
+
+
+def place_of(row: np.ndarray) -> float:
+    """Return the place of the row [n] of a displacement across the shaft, m from the centre of mass."""
+    d = row[:2]
+    return round(float((row[4] * d[0] - row[3] * d[1]) / (d @ d)), 12)

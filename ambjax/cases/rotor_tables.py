@@ -38,6 +38,8 @@ COORDINATES = ("x", "y", "z", "beta_x", "beta_y")
 RIGID = len(COORDINATES)
 # Tables that describe one axis, which each bearing may change.
 OWN = ("plant", "controller", "sensor", "actuator", "reference")
+# Keys of a bearing: the places of its magnet, sensor and stop, and the shapes of the modes there.
+PLACE_KEYS, SHAPE_KEYS = ("at", "sensor_at", "stop_at"), ("modes", "sensor_modes", "stop_modes")
 # Longest finite element, as a share of the shaft's length: bending frequencies are then correct to 1e-5.
 LONGEST_ELEMENT = 1 / 70
 ANGLE = leaf(default=0.0, unit="degrees", at_least=-360.0, at_most=360.0, doc="angle of the first axis from x")
@@ -54,12 +56,13 @@ _shaft_model = compiled_quickly(shaft_model, static_argnames=("sizes", "places",
 
 
 class BearingAxis(NamedTuple):
-    """One axis of a bearing: its name, the bearing's number, and the rows of its magnet and its sensor, each [n]."""
+    """One axis of a bearing: its name, the bearing's number, and the rows of its magnet, sensor and stop, each [n]."""
 
     name: str
     bearing: int
     magnet: np.ndarray
     sensor: np.ndarray
+    stop: np.ndarray
 
 
 def body_from(top: Table, folder: pathlib.Path = pathlib.Path()) -> RotorBody:
@@ -133,7 +136,7 @@ def _places(top: Table) -> list[float]:
         one.leaf(key, PLACE)
         for name in ("bearing", "unbalance", "load")
         for one in tables_of(top, name)
-        for key in ("at", "sensor_at")
+        for key in PLACE_KEYS
         if key in one.raw
     ]
     return [*found, 0.0]
@@ -207,8 +210,8 @@ def axes_from(bearings: list[Table], body: RotorBody) -> list[BearingAxis]:
     """Return the axes of all bearings: two of a radial one, at `angle` and 90 degrees further; one of an axial one."""
     axes, seen = [], set()
     for number, table in enumerate(bearings):
-        own = [] if body.shapes is not None else ["modes", "sensor_modes"]
-        table.only(["name", "kind", "at", "sensor_at", "angle", *own, *OWN])
+        own = [] if body.shapes is not None else SHAPE_KEYS
+        table.only(["name", "kind", *PLACE_KEYS, "angle", "clearance", *own, *OWN])
         kind = table.choice("kind", ["radial", "axial"])
         name = table.raw.get("name", f"bearing{number + 1}")
         if not isinstance(name, str) or not name or "." in name or name in seen:
@@ -221,28 +224,30 @@ def axes_from(bearings: list[Table], body: RotorBody) -> list[BearingAxis]:
             _check_axial(table)
             none = np.zeros(len(body.frequencies))
             z = row(0.0, (0.0, 0.0, 1.0), none)
-            axes.append(BearingAxis(f"{name}.z", number, z, z))
+            axes.append(BearingAxis(f"{name}.z", number, z, z, z))
             continue
         at = needed(table, "at", PLACE)
         if body.shapes is None and len(body.frequencies):
             vector(table, "modes", len(body.frequencies))  # a radial bearing gives the shapes at its magnet
         magnet = body.place(table)
-        sensor = body.place(table, "sensor_at", "sensor_modes", (at, magnet[1]))
+        places = (
+            magnet,
+            *(body.place(table, *keys, (at, magnet[1])) for keys in zip(PLACE_KEYS[1:], SHAPE_KEYS[1:], strict=True)),
+        )
         angle = math.radians(table.leaf("angle", ANGLE, 0.0))
         cos, sin = _exact(math.cos(angle)), _exact(math.sin(angle))
         for label, d in (("x", (cos, sin, 0.0)), ("y", (-sin, cos, 0.0))):
-            axes.append(
-                BearingAxis(f"{name}.{label}", number, row(magnet[0], d, magnet[1]), row(sensor[0], d, sensor[1]))
-            )
+            rows = [row(place, d, shapes) for place, shapes in places]
+            axes.append(BearingAxis(f"{name}.{label}", number, *rows))
     return axes
 
 
 def _check_axial(table: Table) -> None:
     """Raise ValueError for a key that an axial bearing cannot use. Its places are checked, but have no effect."""
-    for key in ("angle", "modes", "sensor_modes"):
+    for key in ("angle", *SHAPE_KEYS):
         if key in table.raw:
             raise ValueError(f"{table.at(key)}: an axial bearing acts along the shaft, without bending. Omit {key}.")
-    for key in ("at", "sensor_at"):
+    for key in PLACE_KEYS:
         table.leaf(key, PLACE, 0.0)
 
 
@@ -267,6 +272,7 @@ def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pat
     G = real.T @ body.gyroscopic @ imaginary - imaginary.T @ body.gyroscopic @ real
     turning, gravity = speed_of(table), np.zeros(n)
     gravity[:3] = body.m * vector(table, "gravity", 3, (0.0, -9.81, 0.0))
+    apart = any(np.any(axis.stop != axis.magnet) for axis in axes)
     return Rotor(
         M=jnp.diag(mass),
         D=jnp.diag(D),
@@ -274,6 +280,7 @@ def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pat
         K=jnp.diag(K),
         at_magnets=jnp.stack([axis.magnet for axis in axes]),
         at_sensors=jnp.stack([axis.sensor for axis in axes]),
+        at_stops=jnp.stack([axis.stop for axis in axes]) if apart else None,
         gravity=jnp.asarray(gravity),
         speed=turning.speed,
         acceleration=turning.acceleration,

@@ -20,6 +20,8 @@ from ambjax.text.words import one_line
 LONGEST = 60
 # Largest depth of nested tables and lists. A sum of sums needs less. The readers are recursive and rely on this limit.
 DEEPEST = 32
+# Tables of which a case may have several.
+SEVERAL = r"disturbance\.\w+|bearing|unbalance|load|base|rotor\.(?:modes|elements|discs|sleeves)"
 # Largest size of a case file.
 MOST_BYTES = 10_000_000
 
@@ -27,8 +29,7 @@ MOST_BYTES = 10_000_000
 def load(path: str | pathlib.Path) -> tuple[dict[str, Any], str]:
     """Return a case file as parsed TOML, not yet checked, and its text.
 
-    The file is read only once, because it may be a pipe. Raises ValueError, one line, if it cannot be read, is larger
-    than MOST_BYTES, or is not TOML.
+    Raises ValueError, one line, if it cannot be read, is larger than MOST_BYTES, or is not TOML.
     """
     path = pathlib.Path(path)
 
@@ -66,7 +67,9 @@ def _place(text: str, error: str) -> str:
     if re.match(r"[^#\[\"']*=\s*[-+]?\d+,\d", line):
         return f"{shown} Write a decimal number with a point."
     if "twice" in error or ("overwrite" in error and line.lstrip().startswith("[")):
-        return f"{shown} Write each table once. For several loads, put [[disturbance.q_z]] above each, also the first."
+        several = re.match(rf"\s*\[+({SEVERAL})\]", line)
+        advice = f" For several, put [[{several[1]}]] above each, also the first." if several else ""
+        return f"{shown} Write each table once.{advice}"
     if "overwrite" in error:
         return f"{shown} Write each key once."
     return f"{shown} See 'ambjax template' for a file to start from."
@@ -95,10 +98,7 @@ class Table:
         return f"{self.path}.{cut(key)}" if self.path else cut(key)
 
     def only(self, allowed: list[str], elsewhere: Iterable[str] = ()) -> None:
-        """Raise ValueError for a key that is not in `allowed`, and suggest the one that is meant.
-
-        `elsewhere`: paths of keys of other tables, which may be meant too.
-        """
+        """Raise ValueError for a key that is not in `allowed`, and suggest the one that is meant."""
         for key in self.raw:
             if key not in allowed:
                 names, other = ", ".join(allowed) if allowed else "none", hint(key[:LONGEST], allowed, elsewhere)
@@ -111,10 +111,7 @@ class Table:
         return Table(self.raw.get(key, {}), self.at(key))
 
     def number(self, key: str, default: object, allowed: str = "a number") -> Any:
-        """Return a number, or the default if left out. Raises ValueError for anything else.
-
-        `allowed`: description of the valid values, for the message.
-        """
+        """Return a number, or the default if left out. Raises ValueError for anything else."""
         value = self.raw.get(key, default)
         if value is default:
             return default
@@ -164,10 +161,7 @@ class Table:
         return value
 
     def choice(self, key: str, allowed: list[str], default: str | None = None, other: str = "") -> str:
-        """Return one of the `allowed` words, or the default if left out. Raises ValueError for any other.
-
-        `other`: description of the other values that the caller accepts, for the message.
-        """
+        """Return one of the `allowed` words, or the default if left out. Raises ValueError for any other."""
         value = self.raw.get(key, default)
         words = quoted(allowed) + (f"; or {other}" if other else "")
         if value is None:

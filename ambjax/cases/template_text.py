@@ -5,10 +5,9 @@ import math
 
 from ambjax.cases import tune_table
 from ambjax.cases.controller_tables import KINDS
-from ambjax.cases.data_sheet import BEARING
+from ambjax.cases.data_sheet import BEARING, RIG
 from ambjax.cases.machine_templates import FLEXIBLE, MACHINE
 from ambjax.cases.reader import PLANTS
-from ambjax.cases.rig import RIG
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.ufu_template import UFU
 from ambjax.ensemble.design import DESIGNS
@@ -76,6 +75,7 @@ settle = 0.5                  # s; time from which "settled" metrics count (left
 # kind = "force-free"         # removes this speed from the current, or, with "displacement-free", from z
 # rate = 10.0                 # 1/s; rate at which the notch converges
 # min_speed = 3000.0          # rpm; speed from which the notch is on (left out: 0)
+# max_speed = 9000.0          # rpm; speed above which the notch is off again (left out: no limit)
 # phase = 30.0                # degrees; phase of the response that it inverts (left out: that of the linear loop)
 
 # [sensor.runout]             # runout of the surface that the position sensor reads, with [rotor] (left out: none)

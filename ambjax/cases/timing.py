@@ -28,10 +28,7 @@ DT = leaf(default=1e-6, unit="s", at_least=1e-15, at_most=1e6, doc="integration 
 
 
 def clock_from(table: Table) -> tuple[Clock, float]:
-    """Return the clock and clock.duration in s. The clock's method is None if the reader must choose it later.
-
-    Raises ValueError as `read_case` does.
-    """
+    """Return the clock and clock.duration in s. The clock's method is None if the reader must choose it later."""
     table.only(["duration", "sample_period", "dt", "method"])
     duration = table.leaf("duration", DURATION, DURATION.default)
     period = table.leaf("sample_period", SAMPLE_PERIOD, SAMPLE_PERIOD.default)

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from ambjax.numerics.records import leaf
 
-# Default optimiser, risk, and alpha of the risk "cvar".
-OPTIMISER, RISK, ALPHA = "bfgs", "mean", 0.9
+# Default risk, and alpha of the risk "cvar".
+RISK, ALPHA = "mean", 0.9
 # Objectives, the default first: least voltage with at most 1.25 times the least error, or the least error itself.
 OBJECTIVES = ("knee", "least_error")
 # Default limit of the rms voltage, as a share of actuator.u_max.
@@ -24,15 +24,11 @@ MEAN_MARGIN, WORST_MARGIN, LOOP_MARGIN = 0.005, 0.03, 0.05
 
 # The numbers of [tune]. The bounds are decades wider than useful values.
 NUMBERS: dict[str, dataclasses.Field] = {
-    "conditions_margin": leaf(
-        0.1, at_least=0, at_most=1e3, doc="share by which each gain should exceed its lower bound in Theorem 1"
-    ),
     "early": leaf(0.0, at_least=0, at_most=1e6, doc="weight of errors before run.settle; after it, the weight is 1"),
     "stress": leaf(1.2, above=0, at_most=1e6, doc="factor on the noise of the stressed members"),
     "gain_margin": leaf(
         1.25, above=0, at_most=1e6, doc="each gain of a stressed member is multiplied or divided by this factor"
     ),
-    "learning_rate": leaf(0.1, above=0, at_most=1e3, doc="step size of Adam"),
     "minutes": leaf(
         math.inf,
         above=0,
@@ -48,7 +44,7 @@ def _weight(default: float, doc: str) -> dataclasses.Field:
     return leaf(default, at_least=0, at_most=1e9, doc=doc)
 
 
-# The weights of the terms of the loss, in the order of the template, and of the conditions.
+# The weights of the terms of the loss, in the order of the template.
 WEIGHTS: dict[str, dataclasses.Field] = {
     "tracking": _weight(1.0, "mean square error after run.settle; all terms are dimensionless"),
     "peak": _weight(0.0, "largest error after run.settle"),
@@ -56,7 +52,6 @@ WEIGHTS: dict[str, dataclasses.Field] = {
     "chatter": _weight(0.1, "mean square step of the voltage"),
     "clearance": _weight(1e-3, "closeness to the stop"),
     "survival": _weight(1.0, "loss of the rotor; it counts more if it is earlier"),
-    "conditions": _weight(1.0, "conditions of Theorem 1 that fail, or hold by less than the margin"),
 }
 SURVIVAL: dataclasses.Field = leaf(SURVIVING, above=0, at_most=1, doc="share of the held-out members that must survive")
 # Largest whole numbers. MOST_MEMBERS, for members and starting points, is smaller, because all of them are in memory
@@ -125,7 +120,7 @@ def template_lines() -> Iterator[Line]:
     yield Line("", "is at most a fifth of the sampling rate, others 3 times the end of their range or start")
     yield from _defaults("weights.", WEIGHTS)
     yield from _limits()
-    yield from _defaults("", {name: NUMBERS[name] for name in ("conditions_margin", "early")})
+    yield from _defaults("", {name: NUMBERS[name] for name in ("early",)})
     yield Line(
         'risk = "cvar"', f'how the members\' losses are combined: "cvar", "soft-worst" or "mean"; left out: "{RISK}"'
     )
@@ -133,8 +128,7 @@ def template_lines() -> Iterator[Line]:
     yield from _defaults("", {name: BUDGET[name] for name in ("members", "stressed")})
     yield from _defaults("", {name: NUMBERS[name] for name in ("stress", "gain_margin")})
     yield from _defaults("", {name: field for name, field in BUDGET.items() if name not in ("members", "stressed")})
-    yield Line(f'optimiser = "{OPTIMISER}"', 'or "adam"')
-    yield from _defaults("", {name: NUMBERS[name] for name in ("learning_rate", "minutes")})
+    yield from _defaults("", {"minutes": NUMBERS["minutes"]})
 
 
 def _defaults(prefix: str, fields: dict[str, dataclasses.Field]) -> Iterator[Line]:
@@ -143,11 +137,7 @@ def _defaults(prefix: str, fields: dict[str, dataclasses.Field]) -> Iterator[Lin
 
 
 def _limits() -> Iterator[Line]:
-    """Yield the lines of [tune.limits].
-
-    The limits of the rms voltage, the sensitivity and the survival have defaults; the other limits have none. The keys
-    settling_band_m and margin have defaults too.
-    """
+    """Yield the lines of [tune.limits]."""
     shares = (100 * VOLTAGE_SHARE, MEAN_MARGIN, WORST_MARGIN, LOOP_MARGIN)
     voltage, means, worst, loops = (f"{x:g}" for x in shares)
     examples = [

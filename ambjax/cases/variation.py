@@ -51,10 +51,7 @@ DISTRIBUTIONS: dict[str, Callable[[Table], Distribution]] = {
 
 
 def spread_from(top: Table, cascade: Cascade, scenario: Scenario) -> Spread:
-    """Return the spread of a case with this cascade and scenario; empty if the table [spread] is left out.
-
-    Raises ValueError for an invalid table. The message names the dotted path, the value, what is allowed and the fix.
-    """
+    """Return the spread of a case with this cascade and scenario; empty if the table [spread] is left out."""
     table = top.table("spread")
     design = table.choice("design", list(DESIGNS), Spread.design)
     known = list(places(cascade, scenario))

@@ -134,11 +134,7 @@ def _currents(case: Case) -> Iterator[str]:
 
 
 def _coil_voltage(scenario: Scenario, least: float) -> Iterator[str]:
-    """Yield warnings about the voltage limit of the coils.
-
-    There are two: the limit minus the bias voltage is below the voltage that holds the rotor, `least` (V); the command
-    may exceed the voltage at which both coils are at the limit.
-    """
+    """Yield warnings about the voltage limit of the coils."""
     coil = scenario.actuator.coil
     if coil is None or coil.u_max is None:
         return

@@ -1,6 +1,7 @@
-"""Software in the loop: JAX's plant with the compiled controller, compared with JAX's own closed loop."""
+"""Loops with compiled parts (the controller, the plant or both) compared with JAX's own closed loop."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,28 +9,28 @@ import numpy as np
 from jax import Array
 
 from ambjax.codegen.c99.machine import Compiled
+from ambjax.codegen.controller import Controller, controller_of
 from ambjax.codegen.interface import BITS, OUTPUTS
-from ambjax.codegen.twins import Horizon, LoopCase, farthest, horizons
+from ambjax.codegen.loop_step import LoopStep
+from ambjax.codegen.plant_step import PlantStep
+from ambjax.codegen.series import series
+from ambjax.codegen.trace import arguments
+from ambjax.codegen.twins import AroundLoop, Horizon, LoopCase, farthest, horizons
 from ambjax.control.cascade_state import Command
 from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.loop import ClosedLoop
+from ambjax.simulation.integrate import Advanced
 from ambjax.simulation.rollout import begin, segment
-from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.system import sampled_of
-from ambjax.world.sensor import Measurement
-from ambjax.world.waveforms import Reference
+from ambjax.world.sensor import Errors
 
 FAULTS = [1 << k for k, name in enumerate(BITS) if name in ("invalid", "failed")]
 (REFUSED,) = (1 << k for k, name in enumerate(BITS) if name == "refused")
 
 
 class ControllerState(NamedTuple):
-    """State of the compiled controller: its numbers, whether it has started, and its faulty samples so far.
-
-    A faulty sample has an invalid input, or a law whose result is not finite.
-    """
+    """State of the compiled controller: its numbers, whether it has started, and its faulty samples so far."""
 
     numbers: Array
     started: Array
@@ -58,7 +59,7 @@ class Machines:
 
 
 @record
-class CompiledLoop(Sampled):
+class CompiledLoop(AroundLoop):
     """The sampled loop whose laws are the compiled controller `which` of `machines`."""
 
     which: Scalar = 0.0
@@ -66,11 +67,12 @@ class CompiledLoop(Sampled):
 
     def start(self) -> SampledState:
         zero = jnp.zeros(())
-        return super().start()._replace(control=ControllerState(jnp.zeros(self.machines.room), zero, zero))
+        return self.loop.start()._replace(control=ControllerState(jnp.zeros(self.machines.room), zero, zero))
 
-    def with_command(self, measured: Measurement, reference: Reference, state: SampledState) -> SampledState:
-        memory = state.control
-        inputs = jnp.stack([*measured, *reference])
+    def jump(self, t: Scalar, state: SampledState, errors: Errors) -> SampledState:
+        state, measured = self.loop.read(state, errors)
+        memory, processor = state.control, self.loop.processor
+        inputs = jnp.stack([*measured, *self.loop.reference(t)])
         shapes = jax.ShapeDtypeStruct((self.machines.room,), float), jax.ShapeDtypeStruct((2 + len(OUTPUTS),), float)
         numbers, rest = jax.pure_callback(
             self.machines.step, shapes, self.which, memory.numbers, memory.started, inputs, vmap_method="sequential"
@@ -79,11 +81,14 @@ class CompiledLoop(Sampled):
         command = Command(**answer, i_ref_dot=jnp.zeros(()))
         faulty = rest[1].astype(int) & sum(FAULTS) != 0
         after = ControllerState(numbers, rest[0], memory.faults + faulty)
-        past, finite = self.processor.remembered(state.command.u, *state.past), jnp.where(faulty, 0.0, state.finite)
-        watch, guard = state.watch, self.processor.guard
+        past, finite = processor.remembered(state.command.u, *state.past), jnp.where(faulty, 0.0, state.finite)
+        watch, guard = state.watch, processor.guard
         if watch and guard:  # from `left`, `Sampled.row` finds whether a reading was refused
             watch = watch._replace(left=jnp.where(rest[1].astype(int) & REFUSED, 0.0, jnp.asarray(guard.samples)))
         return state._replace(control=after, command=command, past=past, finite=finite, watch=watch)
+
+    def advance(self, *now: Any) -> Advanced:
+        return self.loop.advance(*now)
 
 
 class LoopComparison(NamedTuple):
@@ -110,8 +115,7 @@ def compare_loops(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, Lo
     given = sampled_of(case.cascade, case.scenario, case.clock)
     host, found = Machines(*machines.values()), {}
     for which, (precision, horizon) in enumerate(horizons(case, list(machines)).items()):
-        loop = ClosedLoop(given.loop.cascade, case.scenario)
-        looped = CompiledLoop(loop, given.period, given.cuts, which=which, machines=host)
+        looped = CompiledLoop(given, which=which, machines=host)
         found[precision] = LoopComparison(
             horizon, times_of(_displacement(looped, case.clock, horizon.samples), horizon)
         )
@@ -137,3 +141,61 @@ def _displacement(system: CompiledLoop, clock: Clock, count: int) -> np.ndarray:
         progress, row = segment_jit(system, clock, None, progress, first, count=block, record_every=1)
         rows.append(np.asarray(row.z))
     return np.concatenate(rows)
+
+
+# Function that returns the controller's voltage (V) for readings and reference, [7], and stores the controller's state.
+Law = Callable[[np.ndarray], float]
+
+
+def compare_blocks(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, LoopComparison]:
+    """Compare the loop of each compiled plant, or each compiled loop, to JAX's loop. Keys: the precisions."""
+    block = next(iter(machines.values())).trace.block
+    plant = block.plant if isinstance(block, LoopStep) else block
+    assert isinstance(plant, PlantStep)
+    case = case._replace(clock=case.clock.with_method(plant.method))
+    controller = controller_of(case.cascade, case.scenario.u_max, plant.period, case.scenario)
+    found = {}
+    for precision, horizon in horizons(case, list(machines), held=True).items():
+        inputs = series(case.cascade, case.scenario, case.clock, max(horizon.samples, 1))
+        machine = machines[precision]
+        z = looped(machine, inputs, None if block.noun == "loop" else law_of(controller))
+        found[precision] = LoopComparison(horizon, times_of(z, horizon))
+    return found
+
+
+def looped(machine: Compiled, inputs: dict[str, np.ndarray], law: Law | None) -> np.ndarray:
+    """Return the true z (m) of a loop at every sample of `inputs`. `law`: the controller of a compiled plant."""
+    names, u = [x.name for x in machine.trace.inputs], 0.0
+    count = len(inputs["r"])
+    rows = np.array([inputs.get(name, np.zeros(count)) for name in names]).T
+    references = np.array([inputs[name] for name in ("r", "r_dot", "r_ddot", "r_dddot")]).T
+    at = [x.name for x, _ in machine.trace.outputs].index("z_true")
+    machine.state[()] = np.zeros((), machine.memory)
+    z = np.empty(count)
+    for n in range(count):
+        machine.inputs[:] = rows[n]
+        if law is not None:
+            machine.inputs[names.index("u")] = u
+        machine.step()
+        z[n] = machine.outputs[at]
+        if law is not None:
+            u = law(np.concatenate([machine.outputs[:3], references[n]]))
+    return z
+
+
+def law_of(controller: Controller) -> Law:
+    """Return JAX's step of a controller as a function with a state."""
+    parameters, memory, _, period = arguments(controller)
+    read = frozenset(controller.inputs)
+
+    @jax.jit
+    def step(memory: Any, x: jax.Array) -> tuple[Any, jax.Array]:
+        memory, outputs, _ = controller.step(parameters, memory, controller.ports(*x), period, read)
+        return memory, outputs.u
+
+    def law(x: np.ndarray) -> float:
+        nonlocal memory
+        memory, u = step(memory, jnp.asarray(x, float))
+        return float(u)
+
+    return law

@@ -1,8 +1,4 @@
-"""The exported controller: the simulator's step, with names for its inputs, states, parameters and outputs.
-
-`Controller.step` first checks the reference, the delay and the steepnesses. Then it runs `Sampled.with_command`, which
-includes the guard of the readings.
-"""
+"""The exported controller: the simulator's step, with names for its inputs, states, parameters and outputs."""
 
 import dataclasses
 import functools
@@ -19,12 +15,13 @@ from ambjax.codegen.numbering import Number, earlier, numbers_of
 from ambjax.control.base import memory_of
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
-from ambjax.control.guard import GAPS, Watch, guarded
+from ambjax.control.guard import GAPS, Watch
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.simulation.integrate import choose
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
+from ambjax.simulation.system import guarded
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
 from ambjax.world.waveforms import Reference
@@ -104,11 +101,7 @@ class Controller(Block):
     def step(
         self, parameters: Parameters, memory: Memory, inputs: StepInputs, period: Scalar, read: frozenset[str]
     ) -> tuple[Memory, StepOutputs, Status]:
-        """Compute one sample. Return the memory for the next one, the outputs and the status.
-
-        The step checks the reference inputs named in `read`, the steepnesses and, if the laws or the guard use a
-        prediction, the delay. The guard checks the readings.
-        """
+        """Compute one sample. Return the memory for the next one, the outputs and the status."""
         cascade, limits = parameters
         measured = Measurement(*inputs[:3])
         fine = [

@@ -1,7 +1,6 @@
 """Translate a JAX trace to straight-line scalar code: inline calls, unroll loops, turn branches into selections.
 
-The order of operations stays that of the trace. Exported code (C without contraction) therefore rounds as JAX does when
-it executes one operation at a time.
+The order of operations stays that of the trace.
 """
 
 import re
@@ -24,11 +23,7 @@ CODES = ("select_n", "eq", "ne", "lt", "le", "gt", "ge")
 def traced(
     program: Program, function: Callable[..., object], arguments: Iterable[object], operands: Sequence[Operand]
 ) -> list[Operand]:
-    """Trace `function(*arguments)` into `program` and return the operands of the leaves of its result.
-
-    `operands`: those of the leaves of the arguments. Raises ValueError, with the primitive and the law that uses it,
-    for a primitive that is not scalar arithmetic.
-    """
+    """Trace `function(*arguments)` into `program` and return the operands of the leaves of its result."""
     closed = jax.make_jaxpr(function)(*arguments)
     return _Reader(program).closed(closed, list(operands), "")
 

@@ -87,10 +87,7 @@ class LoopStep(Block):
     def step(
         self, parameters: LoopParameters, memory: LoopMemory, inputs: LoopInputs, period: Scalar, read: frozenset[str]
     ) -> tuple[LoopMemory, LoopOutputs, LoopStatus]:
-        """Advance the plant under the commanded voltages, read its sensors, and step the controller.
-
-        Once the rotor is lost, u is 0 and the controller keeps its state.
-        """
+        """Advance the plant under the commanded voltages, read its sensors, and step the controller."""
         before = choose(memory.plant.started, memory.control, self.start().control)
         given = PlantInputs._make([before.last.u, *inputs[: len(DISTURBANCES)]])
         plant, motion, lost = self.plant.step(parameters.machine, memory.plant, given, period, read)

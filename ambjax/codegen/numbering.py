@@ -93,11 +93,7 @@ def _bounds(meta: Mapping[str, Any]) -> tuple[float, float]:
 
 
 def _ends(meta: Mapping[str, Any], value: float) -> tuple[float, ...]:
-    """Return the further values of a parameter for the comparison: 1/SPAN and SPAN times `value`, within its bounds.
-
-    For a parameter that is 0 they are -1 and 1 in its unit; for one that is inf, 1 and SPAN. Then follow inf, if it is
-    allowed, and NaN.
-    """
+    """Return the further values of a parameter for the comparison: 1/SPAN and SPAN times `value`, within its bounds."""
     low, high = sorted((value / SPAN, value * SPAN)) if value else (-1.0, 1.0)
     if math.isinf(value):
         low, high = 1.0, SPAN

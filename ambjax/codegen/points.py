@@ -89,10 +89,7 @@ def _split(trace: Trace, x: np.ndarray, started: np.ndarray) -> Points:
 
 
 def _seen(trace: Trace, x: np.ndarray, started: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether a bit of `Block.crowded` is set, and whether no intermediate number is subnormal.
-
-    On CPUs, JAX replaces a subnormal number by 0, and exported code does not.
-    """
+    """Return whether a bit of `Block.crowded` is set, and whether no intermediate number is subnormal."""
     values, normal = evaluated(trace, x, started), np.ones(x.shape[1], bool)
     for value in values:
         if value.dtype.kind == "f":

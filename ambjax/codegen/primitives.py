@@ -115,8 +115,7 @@ def is_reciprocal(eqn: JaxprEqn) -> bool:
 def split_scan(params: dict[str, Any], args: list[Argument]) -> tuple[list[Argument], list[Argument]]:
     """Return the constants and the carry of a scan over scalars, from all its arguments.
 
-    Such a scan has no inputs or results per step. Its results are therefore the carry, which comes last in `args`. The
-    parameter with the number of constants is not used, because newer versions of JAX rename it.
+    Such a scan has no inputs or results per step. Its results are therefore the carry, which comes last in `args`.
     """
     first = len(args) - len(params["jaxpr"].out_avals)
     return args[:first], args[first:]

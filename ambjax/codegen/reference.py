@@ -1,9 +1,8 @@
 """Results of a step computed with JAX operation by operation: the reference of the exported code.
 
 If XLA compiles a whole step, it may round a product and a sum only once. If it compiles one operation at a time, it
-rounds each result, so two programs with the same operations in the same order agree to the last bits. `closed_loop`
-compares the C with the compiled simulator. Functions of <math.h> come from the C library, because XLA's own functions
-differ: its log1p is off by 1e2 units in the last place.
+rounds each result, so two programs with the same operations in the same order agree to the last bits. Functions of
+<math.h> come from the C library, because XLA's own functions differ: its log1p is off by 1e2 units in the last place.
 """
 
 import ctypes
@@ -34,8 +33,7 @@ def results(trace: Trace, at: Points) -> Results:
     count = at.started.size
     with precision(trace.precision):
         given = arguments(trace.block)
-        step: Any = trace.block.step
-        closed = jax.make_jaxpr(lambda *x: step(*x, trace.read))(*given)
+        closed = jax.make_jaxpr(lambda p, m, x, t: trace.block.step(p, m, x, t, trace.read))(*given)
         rows: list[Any] = [np.zeros(count, at.state.dtype)] * (len(jax.tree.leaves(given[1])) - 1) + [at.started]
         for row, k in zip(at.state, trace.keep, strict=True):
             rows[k] = row
@@ -47,10 +45,7 @@ def results(trace: Trace, at: Points) -> Results:
 
 
 def one_by_one(closed: ClosedJaxpr, args: list[ArrayLike], count: int) -> list[ArrayLike]:
-    """Evaluate a trace for scalars or rows of `count`, one primitive at a time.
-
-    Scalars are broadcast to rows, because XLA multiplies by the reciprocal if it divides a row by a scalar.
-    """
+    """Evaluate a trace for scalars or rows of `count`, one primitive at a time."""
     jaxpr = closed.jaxpr
     known: dict[Any, ArrayLike] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *args], strict=True))
 

@@ -68,10 +68,7 @@ class Trace:
         return sorted(n for n in self.program.needed(self.roots()) if self.program.nodes[n].op != "input")
 
     def counts(self) -> Counter:
-        """Return the number of operations of each kind in a step.
-
-        Operations on the period and constants alone are not counted, because a compiler computes them in advance.
-        """
+        """Return the number of operations of each kind in a step."""
         nodes = self.program.nodes
         fixed = {n for n, node in enumerate(nodes) if node.location == PERIOD}
         found: Counter = Counter()
@@ -150,10 +147,7 @@ def _traced(block: Block, to: str, read: frozenset[str]) -> Trace:
 
 
 def _used(program: Program, before: list[Ref], after: list[Operand], roots: list[Operand]) -> list[int]:
-    """Return the indices of the states on which `roots` depend, in this step or in a later one.
-
-    `before`, `after`: operand of each state, and of its next value.
-    """
+    """Return the indices of the states on which `roots` depend, in this step or in a later one."""
     keep: set[int] = set()
     while True:
         seen = program.needed([*roots, *(after[k] for k in keep)])

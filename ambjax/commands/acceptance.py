@@ -7,8 +7,7 @@ import jax.numpy as jnp
 
 from ambjax.cases.forces import bias_flux, forces
 from ambjax.cases.reader import Case
-from ambjax.commands.band_text import band_lines, band_numbers
-from ambjax.commands.speed_text import running_facts, running_speeds
+from ambjax.commands.band_text import band_lines, band_numbers, running_facts, running_speeds
 from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import DEFAULT_LAWS
 from ambjax.linear import PLACES, Analysis, analyse, linearise
@@ -30,10 +29,7 @@ class Fact(NamedTuple):
 
 
 def acceptance(case: Case) -> tuple[dict[str, object], list[str], str]:
-    """Return the JSON summary, the lines on the zone of the loop linearised at r = 0, and the table of its numbers.
-
-    If the loop cannot be linearised, `zone` and `stable` are None, and `why` is the cause.
-    """
+    """Return the JSON summary, the lines on the zone of the loop linearised at r = 0, and the table of its numbers."""
     try:
         system = linearise(case.cascade, case.scenario, case.clock)
     except ValueError as error:
@@ -71,10 +67,10 @@ def _loop_facts(loop: Analysis, rate: float | None) -> list[Fact]:
     if not loop.stable:
         return []
     kinds = {
-        "gain": ("gain_margin", "gain margin (the one nearer to 1)", "1"),
-        "phase_deg": ("phase_margin_deg", "phase margin", "degrees"),
+        "gm": ("gain_margin", "gain margin (the one nearer to 1)", "1"),
+        "pm": ("phase_margin_deg", "phase margin", "degrees"),
         "delay": ("delay_margin_s", "delay margin", "s"),
-        "disk": ("disk_margin", "disk margin", "1"),
+        "dm": ("disk_margin", "disk margin", "1"),
     }
     facts = [Fact("peak", "peak of |S|", loop.S.height, "1")]
     for kind, (key, words, unit) in kinds.items():
@@ -117,10 +113,7 @@ def machine(case: Case) -> list[Fact]:
 
 
 def _voltages(case: Case) -> tuple[float | None, float | None]:
-    """Return the largest u, and the largest voltage of a coil in excess of R i_0, V; None: no limit.
-
-    The largest u is half the difference of the voltages of the coils, each within its limit, for a command of u_max.
-    """
+    """Return the largest u, and the largest voltage of a coil in excess of R i_0, V; None: no limit."""
     scenario, bias = case.scenario, case.scenario.plant.R * case.scenario.plant.i_0
     coil = scenario.actuator.coil
     u_max, reserve = float(scenario.u_max), math.inf

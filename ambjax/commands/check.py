@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.forces import forces
+from ambjax.cases.given import of_case
 from ambjax.cases.machine_case import MachineCase
-from ambjax.cases.reader import Case, require_case
+from ambjax.cases.reader import Case
 from ambjax.commands import machine_check
 from ambjax.commands.acceptance import acceptance
 from ambjax.commands.check_text import OnProcessor
@@ -33,10 +34,7 @@ Summary = dict[str, object]
 
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
-    """Check a case. Print the verdict, then the tables that apply; with `--full` all tables.
-
-    Returns the exit code, 1 if the check fails, and the summary.
-    """
+    """Check a case. Print the verdict, then the tables that apply; with `--full` all tables."""
     case = read_any_with_warnings(args.case)
     found = machine_check.check(case) if isinstance(case, MachineCase) else _checked(case, args.case, args.full)
     if not args.json:
@@ -44,6 +42,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     return int(not found.holds), found.summary
 
 
+@of_case(machines=True)
 def check(case: Case | MachineCase, *, full: bool = False) -> CaseCheck:
     """Check a case of one axis or of a machine, as `ambjax check` does.
 
@@ -57,7 +56,6 @@ def check(case: Case | MachineCase, *, full: bool = False) -> CaseCheck:
     with quiet():
         if isinstance(case, MachineCase):
             return machine_check.check(case)
-        require_case(case)
         return _checked(case, f"{case.name}.toml", full)
 
 
@@ -98,11 +96,9 @@ def _checked(case: Case, path: str, full: bool) -> CaseCheck:
 
 
 def _results(case: Case) -> tuple[Report, tuple[Summary, list[str], str], OnProcessor | None, Findings | None]:
-    """Return the report of Theorem 1, the summary and text of the linearised loop, and the results on the processor.
+    """Return the report of Theorem 1, the linear loop, the results on the processor, and the stability of the loop.
 
-    The last result is the stability of the loop if the search of the delay margin has computed it.
-
-    Theorem 1 is checked in a second thread. Compilation and simulation release the GIL, so both threads run at once.
+    The stability is None unless the search of the delay margin has computed it.
     """
     with ThreadPoolExecutor(1) as pool:
         say(f"checking Theorem 1: simulating {float(case.clock.duration):g} s in continuous time")
@@ -136,8 +132,7 @@ def _sampled(case: Case) -> SampledReport:
 def _margins(case: Case) -> tuple[tuple[Delays, Delays | None], Findings | None]:
     """Return two delay margins: with prediction over the delay of each run, and over the delay of the case.
 
-    If the processor does not predict, the first is the margin without prediction, and the second is None. Also returns
-    the stability of the loop; None if an ensemble of delays does not contain the case.
+    Also returns the stability of the loop; None if an ensemble of delays does not contain the case.
     """
     from ambjax.ensemble.delays import DELAYS, delay_margin
     from ambjax.linear.stability import with_stability

@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
+from ambjax.cases.given import require_case
 from ambjax.cases.machine_case import AnyCase, MachineCase, first_axis
-from ambjax.cases.reader import Case, require_case
+from ambjax.cases.reader import Case
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
 from ambjax.commands.comparison_loop import ComparedLoop, loop_of_axis, loop_of_machine, no_loop
@@ -23,7 +24,7 @@ from ambjax.commands.comparison_report import (
     comparison_table,
 )
 from ambjax.commands.comparison_tuning import check_options, tuned_cases
-from ambjax.commands.machine_commands import analysed, refuse
+from ambjax.commands.machine_commands import refuse
 from ambjax.commands.reading import read_any_with_warnings
 from ambjax.commands.study_report import findings_of
 from ambjax.ensemble.study import AnyStudy, Study
@@ -32,7 +33,7 @@ from ambjax.host.heartbeat import FIRST_RUN, doing, is_quiet, quiet, say
 from ambjax.page.html_page import check_processor, pages
 from ambjax.results.case_export import guarded_for
 from ambjax.results.machine_study import MachineStudy
-from ambjax.results.operating import MEMBERS, operating_point, shown_band, spread_peaks
+from ambjax.results.operating import MEMBERS, operating_point, sensitivity, shown_band, spread_peaks
 from ambjax.results.outputs import described, directory, files, plain, write_json, written
 from ambjax.results.spread_runs import study_of
 from ambjax.text.web_page import render_page
@@ -56,7 +57,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     cases = _read(args.cases)
     of_axis = [case for case in cases if isinstance(case, Case)]
     if not of_axis:
-        refuse(args, ("tune", "page"))
+        refuse(args, ("page",))
     studies = _studies(cases, args.seed, args.members)
     notes = _differences(args.cases, cases, studies)
     for note in notes:
@@ -67,7 +68,8 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     name = f"compare-{'-'.join(case.name for case in cases)}"[:80]
     out = directory(args.out, name, WRITTEN, args.force or args.resume)
     if args.tune:
-        cases = of_axis = tuned_cases(of_axis, out, args)
+        cases = tuned_cases(cases, out, args)
+        of_axis = [case for case in cases if isinstance(case, Case)]
         studies = _studies(cases, args.seed, args.members)
     html_pages = pages(of_axis, args.cases) if args.page else {}
     summary, compared = _comparison(cases, studies, notes)
@@ -113,8 +115,7 @@ def compare(cases: Sequence[AnyCase], members: int = 1, *, seed: int | None = No
     if not isinstance(cases, Sequence) or isinstance(cases, str):
         raise ValueError(f"cases = {type(cases).__name__}: it must be a list of 2 to {MOST_CASES} cases.")
     for case in cases:
-        if not isinstance(case, MachineCase):
-            require_case(case)
+        require_case(case, machines=True)
     _check_count(len(cases), "case")
     cases = _named(cases, [case.name for case in cases])
     studies = _studies(cases, seed, members)
@@ -146,11 +147,7 @@ def _studies(cases: Sequence[AnyCase], seed: int | None, members: int) -> list[S
 
 
 def _read(paths: Sequence[str]) -> list[AnyCase]:
-    """Read the cases.
-
-    Raises ValueError for fewer than 2 or too many files, a repeated file, a file that `read_any` refuses, or machines
-    beside cases of one axis.
-    """
+    """Read the cases."""
     _check_count(len(paths), "case file")
     for path in paths:
         same = [other for other in paths if pathlib.Path(other).resolve() == pathlib.Path(path).resolve()]
@@ -226,7 +223,7 @@ def _linear(case: AnyCase, study: Study | MachineStudy) -> ComparedLoop:
     """Analyse the nominal loop and, if a case of one axis has a spread, its first members."""
     try:
         if isinstance(case, MachineCase):
-            return loop_of_machine(analysed(case))
+            return loop_of_machine(sensitivity(case))
         point = operating_point(case, "nominal", 0.0)
     except ValueError as error:
         say(f"{case.name}: {error}")
@@ -236,10 +233,7 @@ def _linear(case: AnyCase, study: Study | MachineStudy) -> ComparedLoop:
 
 
 def _flops(case: Case) -> int | None:
-    """Return the number of floating-point operations of a step of the exported controller in single precision.
-
-    None in continuous time, or if a law cannot be exported.
-    """
+    """Return the floating-point operations of a step of the exported controller; None if it cannot be exported."""
     if not case.cascade.sampled:
         return None
     try:

@@ -52,8 +52,8 @@ def loop_of_axis(point: OperatingPoint, peaks: SpreadPeaks | None) -> ComparedLo
     if not loop.stable:
         return ComparedLoop({**no_loop(False).numbers, **worst})
     margins, at, outside = loop.margins, loop.margins_at, loop.S.outside
-    found = (loop.S.height, loop.S.frequency, loop.T.height, loop.KS.height, margins.gain_low, margins.gain_high)
-    found += (margins.phase_deg, margins.delay, margins.disk, loop.stiffness)
+    found = (loop.S.height, loop.S.frequency, loop.T.height, loop.KS.height, margins.gm_low, margins.gm_high)
+    found += (margins.pm, margins.delay, margins.dm, loop.stiffness)
     found += (None if outside is None else outside.height, at.reading.delay, at.command.delay)
     numbers = {**no_loop(True).numbers, **dict(zip(KEYS, found, strict=False)), **worst, "zone": loop.zone}
     return ComparedLoop(numbers, system=point.system)
@@ -74,11 +74,11 @@ def loop_of_machine(points: Sequence[MachineSensitivity]) -> ComparedLoop:
         "sigma_max": max(point.sigma.height for point in points),
         "t_peak": max(axis.T.height for axis, _ in rows),
         "ks_peak": max(axis.KS.height for axis, _ in rows),
-        "gain_margin_low": max(one.gain_low for one in margins),
-        "gain_margin_high": min(one.gain_high for one in margins),
-        "phase_margin_deg": min(one.phase_deg for one in margins),
+        "gain_margin_low": max(one.gm_low for one in margins),
+        "gain_margin_high": min(one.gm_high for one in margins),
+        "phase_margin_deg": min(one.pm for one in margins),
         "delay_margin_reading_s": min(one.delay for one in margins),
-        "disk_margin": min(one.disk for one in margins),
+        "disk_margin": min(one.dm for one in margins),
         "outside_peak": max((axis.S.outside.height for axis, _ in rows if axis.S.outside is not None), default=None),
     }
     axes = {}

@@ -27,10 +27,7 @@ MOST_PROCESSES = 1024
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
-    """Run or resume a study and report it. Return the exit code and the summary.
-
-    The exit code is 1 if a member is lost, stalled or not stable.
-    """
+    """Run or resume a study and report it. The exit code is 1 if a member is lost, stalled or not stable."""
     case = read_any_with_warnings(args.case)
     study, store = _study_and_store(case, args)
     out = store.directory
@@ -79,10 +76,7 @@ def _check(study: AnyStudy, store: Store, args: argparse.Namespace) -> None:
 
 
 def _pilot(study: AnyStudy, store: Store, executor: tuple[Executor, int] | None) -> None:
-    """Time the simulation of the first members, and write the chunks that they fill.
-
-    Prints the expected duration of a long study, and chooses the chunk size if none is set.
-    """
+    """Time the simulation of the first members, and write the chunks that they fill."""
     with doing(f"simulating the first members; {FIRST_RUN}"):
         columns, seconds = pilot(study)
     first = len(columns["index"])

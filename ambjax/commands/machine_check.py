@@ -7,12 +7,13 @@ import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, machine_from
 from ambjax.cases.rotor_body import MODES
-from ambjax.commands.machine_commands import analysed, once_per_revolution, worst_of_speeds
+from ambjax.commands.machine_commands import once_per_revolution, worst_of_speeds
 from ambjax.host.heartbeat import say
 from ambjax.linear import MachineSensitivity, poles_in_s
 from ambjax.linear.linear_machine import turning_machines
 from ambjax.linear.rotor_modes import Mode, modes_of
 from ambjax.results.machine_run import simulate_machine
+from ambjax.results.operating import sensitivity
 from ambjax.results.outputs import plain, table
 
 # Modes that the second analysis adds to those of a shaft. Modes whose damping ratio is below LIGHT are listed, at most
@@ -42,7 +43,7 @@ def check(case: MachineCase) -> CaseCheck:
     say(f"simulating {case.clock.samples} samples")
     run = simulate_machine(case)
     say(f"linearising at {', '.join(f'{speed:g}' for speed in case.speeds)} rpm")
-    points = analysed(case)
+    points = sensitivity(case)
     share = float(run.metrics["settled_clearance_used"])
     axes = {axis: _axis(case, k, run.metrics["axes"][axis], points) for k, axis in enumerate(case.axes)}
     turning = turning_machines(case.machine, case.clock.sample_period, case.speeds)

@@ -7,15 +7,16 @@ import numpy as np
 from tqdm import tqdm
 
 from ambjax.cases.machine_case import MachineCase
+from ambjax.cases.rotor_drawing import radial_axes
+from ambjax.commands.band_text import running_facts
 from ambjax.commands.sensitivity_report import injected_numbers, injection_text
-from ambjax.commands.speed_text import running_facts
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.linear import Injection, machine_injected
-from ambjax.linear.linear_machine import MachineSensitivity, sensitivity_of, turning_machines
+from ambjax.linear.linear_machine import MachineSensitivity
 from ambjax.linear.margins import Margins
 from ambjax.page.rotor_motion import motion_page
+from ambjax.results import operating
 from ambjax.results.machine_run import simulate_machine
-from ambjax.results.operating import one_period
 from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
 from ambjax.simulation.whole_machine import SampledMachine
 from ambjax.world.rotation import PER_MINUTE
@@ -69,7 +70,7 @@ def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]
         described("overview.png", lambda: machine_picture(case, run.signals, title, part / "overview.png"))
         if np.ptp(run.signals["speed_rpm"]) > 0:
             described("runup.png", lambda: run_up_picture(case, run.signals, part / "runup.png"))
-        page = described("motion.html", lambda: motion_page(case, run.signals))
+        page = described("motion.html", lambda: motion_page(case, run.signals)) if radial_axes(case) else None
         if page is not None:
             (part / "motion.html").write_text(page, encoding="utf-8")
         names = [name for name in SIMULATED if (part / name).exists()]
@@ -84,17 +85,10 @@ def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]
     return int(run.lost or run.metrics["stalled"]), metrics | {"out": str(out)}
 
 
-def analysed(case: MachineCase) -> list[MachineSensitivity]:
-    """Return the sensitivities of a machine at its speeds."""
-    points = turning_machines(case.machine, case.clock.sample_period, case.speeds)
-    both = zip(points, case.speeds, strict=True)
-    return [sensitivity_of(point, case.axes, speed, case.zones) for point, speed in both]
-
-
 def sensitivity(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]:
     """Analyse a machine at its speeds and write the files. Exit code 1 if it is not stable at one of them."""
     refuse(args, ("members", "seed"))
-    points = analysed(case)
+    points = operating.sensitivity(case)
     measured = _injections(case, points, args.inject)
     out = directory(args.out, f"sensitivity-{case.name}", ANALYSED, args.force)
     summary = sensitivity_summary(points, measured)
@@ -120,8 +114,7 @@ def worst_of_speeds(points: list[MachineSensitivity]) -> MachineSensitivity:
 def _injections(case: MachineCase, points: list[MachineSensitivity], everywhere: bool) -> Measured:
     """Measure the sensitivity of each axis by injection into the simulation.
 
-    On a processor at the speed with the largest peak; `everywhere`: at all speeds, also in continuous time. An
-    unstable machine is not measured.
+    On a processor at the speed with the largest peak; `everywhere`: at all speeds, also in continuous time.
     """
     sampled = isinstance(case.machine, SampledMachine)
     at = points if everywhere else [worst_of_speeds(points)] if sampled else []
@@ -131,7 +124,7 @@ def _injections(case: MachineCase, points: list[MachineSensitivity], everywhere:
     with doing(f"measuring the sensitivity by injection into the simulation; {FIRST_RUN}"):
         peaks = [[axis.S.frequency for axis in point.axes] for point in at]
         speeds = [point.speed for point in at]
-        found = machine_injected(case.machine, one_period(case), case.zones, speeds, peaks)
+        found = machine_injected(case.machine, operating.one_period(case), case.zones, speeds, peaks)
     return dict(zip(speeds, found, strict=True))
 
 
@@ -184,8 +177,8 @@ def once_per_revolution(point: MachineSensitivity) -> list[tuple[list[Summary], 
 def _margins(margins: Margins) -> dict[str, float]:
     """Return the margins as plain data."""
     return {
-        "gain_low": margins.gain_low, "gain_high": margins.gain_high, "phase_deg": margins.phase_deg,
-        "delay_s": margins.delay, "disk": margins.disk,
+        "gain_low": margins.gm_low, "gain_high": margins.gm_high, "phase_deg": margins.pm,
+        "delay_s": margins.delay, "disk": margins.dm,
     }  # fmt: skip
 
 
@@ -195,7 +188,7 @@ def sensitivity_text(points: list[MachineSensitivity], measured: Measured) -> st
     for point in points:
         rows = [
             (axis.name, f"{axis.S.height:.4g}", f"{axis.S.frequency:.4g}", axis.zone, f"{axis.T.height:.4g}",
-             *(["", ""] if axis.margins is None else [f"{axis.margins.gain:.3g}", f"{axis.margins.phase_deg:.3g}"]))
+             *(["", ""] if axis.margins is None else [f"{axis.margins.gm:.3g}", f"{axis.margins.pm:.3g}"]))
             for axis in point.axes
         ]  # fmt: skip
         slow = f"largest real part of a pole {np.max(np.real(point.poles)):.4g} 1/s"

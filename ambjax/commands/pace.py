@@ -53,11 +53,7 @@ class Pace(NamedTuple):
 
 
 def pilot(study: AnyStudy) -> tuple[dict[str, np.ndarray], float]:
-    """Simulate the first members: one call of CALL members on each core. Return their columns and the duration in s.
-
-    A first run, in which all rotors are lost at the start, compiles the program at little cost. A message is printed
-    before the timed run, because one call of slow members may take a minute.
-    """
+    """Simulate the first members: one call of CALL members on each core. Return their columns and the duration in s."""
     first = min(CALL * cores() if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK, study.members)
     chunk(study, 0, first, first, lost=True)
     if first < study.members:
@@ -92,11 +88,9 @@ def sliding_error(study: Study) -> dict[str, Any]:
     """Compute the largest relative difference of each metric in COMPARED between this study's steps and adaptive steps.
 
     The comparison uses the first COMPARISON members, without those that are lost or stalled with either kind of steps.
-    The differences are None if no member remains. `lost_by_one` counts members that survive with only one kind of
-    steps.
     """
     tolerance = max(TOLERANCE, 1e3 * float(jnp.finfo(jnp.result_type(float)).eps))
-    accurate = dataclasses.replace(study, clock=dataclasses.replace(study.clock, method=AdaptiveRodas3(tolerance)))
+    accurate = dataclasses.replace(study, clock=study.clock.with_method(AdaptiveRodas3(tolerance)))
     count = min(COMPARISON, study.members)
     ours, theirs = (chunk(one, 0, count, count) for one in (study, accurate))
     ends = [~np.isfinite(columns["lost_at"]) for columns in (ours, theirs)]

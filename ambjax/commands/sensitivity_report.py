@@ -25,10 +25,7 @@ class Injections(NamedTuple):
 
 
 def set_valued(case: Case) -> list[str]:
-    """Return the names of the case-file tables of the laws with set-valued signs; none without a processor.
-
-    The linear loop describes these laws only inside their bands.
-    """
+    """Return the names of the case-file tables of the laws with set-valued signs; none without a processor."""
     if not case.cascade.sampled:
         return []
     return [f"controller.{stage}" for stage in DEFAULT_LAWS if set_valued_signs(getattr(case.cascade, stage))]
@@ -41,10 +38,7 @@ def sensitivity_summary(
     zones: Zones,
     missing: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, object]:
-    """Return the numbers of sensitivity.json: of the equilibria `points`, the spread, and the injection.
-
-    `missing`: the cause by name for each reference without a linearised loop.
-    """
+    """Return the numbers of sensitivity.json: of the equilibria `points`, the spread, and the injection."""
 
     def numbers(point: OperatingPoint) -> dict[str, object]:
         return analysis_summary(point.analysis) | band_numbers(point.analysis, zones)
@@ -94,8 +88,7 @@ def _position_numbers(point: OperatingPoint, measured: Injections | None) -> dic
 def injected_numbers(system: StateSpace, one: Injection | None, channel: int = 0) -> dict[str, object]:
     """Return the numbers of the measured sensitivity at one sensor.
 
-    `system`, `channel`: as in `_linear_there`. Without a measurement, only the peak and the ends of its interval are
-    returned, each as None.
+    Without a measurement, only the peak and the ends of its interval are returned, each as None.
     """
     if one is None:
         return {"injected_peak": None, "injected_low": None, "injected_high": None}
@@ -126,10 +119,7 @@ def _at_edge(measured: Injection) -> bool | None:
 
 
 def injection_text(system: StateSpace, measured: Injection, channel: int = 0, at: str = "", unit: str = "m") -> str:
-    """Describe the measured sensitivity at one sensor in one line.
-
-    `system`, `channel`: as in `_linear_there`. `at`: words that name the sensor. `unit`: that of its reading.
-    """
+    """Describe the measured sensitivity at one sensor in one line."""
     how = f"Injected{at} into the simulation (multi-sine of {measured.amplitude:.3g} {unit}"
     how += f", {measured.members} members)" if measured.members > 1 else ")"
     if measured.peak is None:
@@ -227,10 +217,10 @@ def _row(point: OperatingPoint) -> tuple[str, ...]:
 def _margin_rows(point: OperatingPoint) -> list[tuple[str, ...]]:
     """Return the margins of a stable loop at each place, the place with the smaller disk margin first."""
     at, rows = point.analysis.margins_at, []
-    for place in sorted(PLACES, key=lambda place: place != at.place("disk")):
+    for place in sorted(PLACES, key=lambda place: place != at.place("dm")):
         one = getattr(at, place)
-        gains = f"{_number(one.gain_low)} to {_number(one.gain_high)}"
-        rows.append((point.name, place, gains, *map(_number, (one.phase_deg, one.delay, one.disk))))
+        gains = f"{_number(one.gm_low)} to {_number(one.gm_high)}"
+        rows.append((point.name, place, gains, *map(_number, (one.pm, one.delay, one.dm))))
     return rows
 
 

@@ -39,11 +39,7 @@ def moved(closed: ClosedJaxpr, moves: Sequence[bool]) -> list[bool]:
 
 
 def carried_flags(body: ClosedJaxpr, moves: Sequence[bool], fixed: int, each: Sequence[bool]) -> list[bool]:
-    """Return which values that a loop carries differ between members after any turn.
-
-    `moves`: flags of the constants, of which there are `fixed`, and of the initial values. `each`: flags of the own
-    inputs of a turn.
-    """
+    """Return which values that a loop carries differ between members after any turn."""
     carried = list(moves[fixed:])
     while True:
         after = moved(body, [*moves[:fixed], *carried, *each])

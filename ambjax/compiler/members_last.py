@@ -191,10 +191,7 @@ class _Members:
     def loop(
         self, body: ClosedJaxpr, values: list, moves: list[bool], carried: list[bool], each: Sequence[bool] = ()
     ) -> tuple[list, Callable[..., tuple[list, list]]]:
-        """Return the initial values of a loop, and one turn of it: turn(carried values, own inputs) -> both results.
-
-        `values`: the constants of the loop and the initial values. `each`: flags of the own inputs of a turn.
-        """
+        """Return the initial values of a loop, and one turn of it: turn(carried values, own inputs) -> both results."""
         fixed = len(values) - len(carried)
         shapes = list(map(_shape, body.jaxpr.invars[fixed : len(values)]))
 

@@ -85,17 +85,11 @@ class Law(abc.ABC):
     def __call__(self, model: Plant, inputs: Any, state: Any, /) -> tuple[Any, Any]: ...
 
     def size(self, model: Plant) -> Scalar | None:
-        """Return the characteristic size of the argument of the law's smoothed sign; None if the law has no such sign.
-
-        Default steepnesses are proportional to 1/size (`scaled_steepness`).
-        """
+        """Return the characteristic size of the argument of the law's smoothed sign; None without a sign."""
         return None
 
     def layer(self, model: Plant) -> object:
-        """Return, for each state, the largest integration error that keeps it in the boundary layer of its sign.
-
-        The value is inf for a state that no sign moves; this is the default for all states.
-        """
+        """Return, for each state, the largest integration error that keeps it in the layer of its sign, or inf."""
         return jax.tree.map(lambda _: jnp.inf, self.scale(model))
 
     def robust(self, error: Array, /) -> Array:
@@ -107,10 +101,7 @@ class Law(abc.ABC):
         return 0.0 * error
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        """Return the range of the initial values of each gain in the tuner's search, by the name of the gain.
-
-        A gain that is not in the dict is searched around its value.
-        """
+        """Return the range of the initial values of each gain in the tuner's search, by the name of the gain."""
         return {}
 
     def relay(self) -> Relay | None:
@@ -226,8 +217,6 @@ def memory_of(law: Law, state: object) -> list[tuple[str, str, str]]:
 
 def set_valued_signs(law: Law) -> list[str]:
     """Return the names of the steepnesses that are inf or None, which make a sign set-valued.
-
-    Steepnesses that are traced or have a schedule are left out.
 
     Raises ValueError if a steepness is inf for some members only.
     """

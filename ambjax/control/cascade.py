@@ -31,7 +31,7 @@ from ambjax.control.stages import (
     step_law,
 )
 from ambjax.control.synchronous_notch import SynchronousNotch
-from ambjax.numerics.records import Scalar, is_traced, part, record
+from ambjax.numerics.records import Scalar, is_traced, part, record, replaced
 from ambjax.world.plant import Plant
 from ambjax.world.plant import State as NominalState
 from ambjax.world.rotation import Rotation
@@ -158,7 +158,7 @@ class Cascade:
 
     def with_processor(self, **fields: object) -> "Cascade":
         """Return the cascade with other fields of its processor. In continuous time, it does not change."""
-        return dataclasses.replace(self, processor=self.processor and dataclasses.replace(self.processor, **fields))
+        return dataclasses.replace(self, processor=self.processor and replaced(self.processor, **fields))
 
     def driven(self, u: Array, state: NominalState) -> NominalState:
         """Return the rates of the nominal plant under the command u, V or A."""
@@ -293,7 +293,6 @@ class Cascade:
     def estimate(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State, Measurement]:
         """Step the observer on a processor.
 
-        `measured`: the readings. `state`: state of the observer. `sample`: reference, period and past commands.
         Returns the estimate for the other laws (with prediction: at the end of the delay), the next state of the
         observer, and the estimate at the sample itself.
         """
@@ -350,10 +349,7 @@ class Cascade:
     def commanded(
         self, force: ForceDemand, estimate: Measurement, state: CascadeState, sample: Sample
     ) -> tuple[Command, CascadeState]:
-        """Step inversion and current law on a processor, for a demanded force.
-
-        `estimate`: estimated motion and current. The states of observer and position law do not change.
-        """
+        """Step inversion and current law on a processor for a demanded force; the other states do not change."""
         advance = self._advance(sample)
         inversion = with_gains_at(self.inversion, force.z, sample.reference)
         current = with_gains_at(self.current, force.z, sample.reference)
@@ -378,10 +374,7 @@ class Cascade:
     def command_rates(
         self, force: ForceDemand, estimate: Measurement, state: CascadeState, reference: Reference, u_max: Scalar
     ) -> tuple[Command, CascadeState]:
-        """Return the command in continuous time for a demanded force, and the rates of inversion and current law.
-
-        The rates of observer and position law are ().
-        """
+        """Return the command in continuous time for a demanded force, and the rates; those of the others are ()."""
         inversion = with_gains_at(self.inversion, force.z, reference)
         current = with_gains_at(self.current, force.z, reference)
         demand, inversion_rate = inversion(self.model, force, state.inversion)

@@ -22,10 +22,7 @@ from ambjax.world.waveforms import Reference
 
 
 class ChainState(NamedTuple):
-    """State of `FilterChain`, in A: derivative filter, integral, and the two states of each biquad.
-
-    `low_pass` is () if the law has no low-pass.
-    """
+    """State of `FilterChain`, in A: derivative filter, integral, and the two states of each biquad."""
 
     derivative: Array
     integral: Array
@@ -105,10 +102,7 @@ class FilterChain(PositionLaw[ChainState]):
         return self._begun(derivative, self.k_p * e + self.k_int * period / 2 * e, parts)
 
     def _begun(self, derivative: Array, y: Array, parts: Sequence[Callable[..., Any]]) -> ChainState:
-        """Return the state for an output y (A) of the PID. `parts`: functions that return output and state of a filter.
-
-        `derivative`: state of the derivative filter, A.
-        """
+        """Return the state for an output y (A) of the PID."""
         states: list[Any] = []
         for steady in parts:
             y, state = steady(y)
@@ -121,10 +115,7 @@ class FilterChain(PositionLaw[ChainState]):
         return ChainState(size, size, pair, pair, pair, () if self.w_lp is None else pair)
 
     def designed(self, model: Plant, sampling: Sampling | None) -> "FilterChain":
-        """Return the law with the gains of `optimal_gains` in continuous time, and k_aw and the corners from the pole.
-
-        It has no low-pass. Raises ValueError as `optimal_gains` does.
-        """
+        """Return the law with the gains of `optimal_gains` in continuous time, and k_aw and corners from the pole."""
         (k_int, k_p, k_d), w = map(float, optimal_gains(model)), float(model.pole)
         return dataclasses.replace(
             self, k_p=k_p, k_d=k_d, k_int=k_int, k_aw=w / 50, w_f=20 * w, w_z=5 * w, w_p=5 * w, w_1=10 * w, w_2=20 * w

@@ -86,8 +86,7 @@ class ProportionalIntegral(CurrentLaw[Array]):
     back-calculation changes the integral x so that u returns to clip(u) at the rate k_aw (Astrom and Murray, Feedback
     Systems, 2008, 10.4). The default gains for a model give the current loop the bandwidth w_c = 10 w, where w is the
     unstable pole of the magnets. On a processor with sample period T, w_c is at most 1/(4 T). The phase margin is then
-    above 50 degrees with one sample of delay. In the paper's tracking scenario, the default gains hold the rotor, and
-    much lower gains lose it.
+    above 50 degrees with one sample of delay.
 
     Use it where the drive has a PI controller, or the resistance is not known:
     `Cascade(current=current.ProportionalIntegral())`.
@@ -246,10 +245,7 @@ class AmplifierCurrent(Stateless, CurrentLaw[tuple[()]]):
 
 
 def _mean_decay(x: Array) -> Array:
-    """Return (1 - exp(-x))/x with |x| limited to 30.
-
-    Near 0, where the formula is 0/0 and its derivative loses digits, a series replaces it.
-    """
+    """Return (1 - exp(-x))/x with |x| limited to 30."""
     x = limited(x, 30.0)
     near = jnp.abs(x) < 1e-3
     far = jnp.where(near, 1.0, x)

@@ -43,8 +43,7 @@ def resting_current(model: Plant, reference: Reference) -> Array:
 def force_of_current(model: Plant, z: Array, i: Array) -> Array:
     """Return the scaled force dv/dz z + dv/di i (A^2/m^2) of the magnets linearised at the origin.
 
-    For this demand `inversion.Linearised` returns the current i itself. With an exact inversion the mechanics are
-    linear in z and i.
+    For this demand `inversion.Linearised` returns the current i itself.
     """
     s, b = linear_mechanics(model)
     return (s - 2 * model.k_z / model.m) / model.a * z + b / model.a * i

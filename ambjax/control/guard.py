@@ -5,7 +5,7 @@ docs/processor.md defines the rules.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -15,9 +15,6 @@ from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.world.plant import Plant, State
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
-
-# Type of a cascade. Its class cannot be imported here, because its module imports this one.
-C = TypeVar("C")
 
 # Default limits of velocity (gaps per sample) and current: bias currents, or with a converter a share of its range.
 GAPS, CURRENTS, BEYOND = 2.0, 100.0, 1.1
@@ -88,20 +85,13 @@ class Guard:
 
     @property
     def derived(self) -> bool:
-        """Whether every number is left out.
-
-        Derived limits accept every reading of a sensor without faults, if the error of the model's force is below the
-        full pull of one magnet.
-        """
+        """Whether every number is left out."""
         return all(getattr(self, field.name) is None for field in dataclasses.fields(type(self)))
 
     def with_limits(self, model: Plant, scenario: Scenario, period: Scalar, estimated: bool) -> "Guard":
         """Return the guard with every number set; those that are None are derived (docs/processor.md).
 
         `period`: sample period, s. `estimated`: whether an observer estimates the velocity.
-
-        The derivation uses the gap, the pole and the bias current of `model`. Of `scenario`, it uses the sensor, the
-        gap and the |z| at which the rotor is lost.
         """
         sensor = scenario.sensors
         limit, clearance = scenario.limit, scenario.limit / scenario.plant.s_0 * model.s_0
@@ -125,11 +115,7 @@ class Guard:
         return Watch(Measurement(zero, zero, zero), zero)
 
     def check(self, model: Plant, measured: Measurement, watch: Watch, period: Scalar, estimated: bool) -> GuardResult:
-        """Accept or replace the readings of a sample.
-
-        `measured`: the readings. `watch`: state of the guard at this sample. `period`: sample period, s. `estimated`:
-        whether an observer estimates the velocity, so that z_dot is not checked.
-        """
+        """Accept or replace the readings of a sample. `estimated`: an observer estimates z_dot: no check of it."""
         guard: Any = self  # its numbers are set (`with_limits`)
         (z, _, i), time = watch.expected, (guard.samples - watch.left + 1) * period
         # bound of the model's error in acceleration, m/s^2: the full pull of one magnet at the expected z and i
@@ -153,33 +139,7 @@ class Guard:
 
 
 def expected(driven: Callable[[Array, State], State], at: State, u: Array, period: Scalar) -> Measurement:
-    """Return the predicted readings of the next sample.
-
-    `driven`: `Cascade.driven`. `at`: state of the nominal model at this sample. `u`: mean command over the sample, V or
-    A. `period`: sample period, s.
-    """
+    """Return the predicted readings of the next sample. `at`: nominal state. `u`: mean command over it, V or A."""
     rates = driven(u, at)
     z, z_dot, i = (x + period * rate for x, rate in zip(at[:3], rates[:3], strict=True))
     return Measurement(z + period * period / 2 * rates.z_dot, z_dot, i)
-
-
-def guarded(cascade: C, scenario: Scenario, period: Scalar) -> C:
-    """Return the cascade with the numbers of its guard set for a scenario; unchanged if it has no guard."""
-    one: Any = cascade
-    if one.timing.guard is None:
-        return cascade
-    guard = one.timing.guard.with_limits(one.model, scenario, period, one.observer.estimates_velocity)
-    return one.with_processor(guard=guard)
-
-
-def simulated(cascade: C, scenario: Scenario, period: Scalar) -> C:
-    """Return the cascade for a simulation.
-
-    If all limits of its guard are derived and the sensor has no faults, the guard would refuse no reading, and it is
-    removed. Otherwise the numbers of the guard are set (`guarded`).
-    """
-    one: Any = cascade
-    idle = one.timing.guard is not None and one.timing.guard.derived
-    if idle and not scenario.sensors.faulty:
-        return one.with_processor(guard=None)
-    return guarded(cascade, scenario, period)

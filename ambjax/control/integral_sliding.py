@@ -25,13 +25,8 @@ class IntegralSlidingMode(PositionLaw[Array]):
     Eq. (5) with the integral of the error in the sliding variable (Slotine and Li, Applied Nonlinear Control, 1991,
     7.1): s' = -k sgn(s) + q_z as in Eq. (12), and e_ddot + c e_dot + c_int e = 0 on the manifold. The smoothed sign of
     Eq. (5) leaves an offset under a constant force, because s is then not zero. Here e = 0 at rest for any constant s.
-    There is no anti-windup: the law continues to integrate while the supply limits u.
-
-    The integral starts at 0, and s reaches 0 later. In `manifolds.UtkinSlidingMode`, s is 0 from the start. There, a PD
-    controller determines the motion, and the sign only cancels the disturbance. That law, too, has no offset under a
-    constant disturbance |q_z| < k.
-
-    The default gains are those of SlidingMode; c_int = c^2/4 gives two equal poles on the manifold.
+    There is no anti-windup: the law continues to integrate while the supply limits u. The default gains are those of
+    SlidingMode; c_int = c^2/4 gives two equal poles on the manifold.
 
     Use it instead of `SlidingMode` under a constant force: `Cascade(position=position.IntegralSlidingMode())`.
     """

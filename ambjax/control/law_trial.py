@@ -28,9 +28,7 @@ OUTPUTS = {
 def try_law(law: Law, stage: str, model: Plant) -> None:
     """Trace the call, `init`, `scale` and `slope` of a law, and `step` if the law has it.
 
-    Of a position law, `begin` and `begin_sampled` are traced too; of every law but an observer, `init_sampled`. Raises
-    TypeError if an output, a rate, a scale, a slope or a state has a wrong structure or shape. Exceptions that the
-    methods raise are passed on.
+    Raises TypeError if an output, a rate, a scale, a slope or a state has a wrong structure or shape.
     """
     motion, reference = Measurement(*_zeros(3)), Reference(*_zeros(3))
     demand, force = CurrentDemand(*_zeros(2)), ForceDemand(_zero(), _zero(), _zero(), _zero())
@@ -72,10 +70,7 @@ _PASSED: weakref.WeakSet[type] = weakref.WeakSet()
 
 
 def check_own_law(law: Law, stage: str, model: Plant) -> None:
-    """Raise ValueError, with the reason, if a custom law cannot be called. A class is tried once.
-
-    A law with scheduled gains is not tried. `law` and `model` may have an axis of members.
-    """
+    """Raise ValueError, with the reason, if a custom law cannot be called. A class is tried once."""
     kind = type(law)
     if kind.__module__.partition(".")[0] == "ambjax" or kind in _PASSED:
         return

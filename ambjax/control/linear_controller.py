@@ -96,11 +96,7 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
         return tuple((f"x_{k + 1}", "m", "state of the controller") for k in range(len(self.realisation.A)))
 
     def check_use(self, model: Plant, period: float | None) -> None:
-        """Raise ValueError if the law cannot run with this nominal model, or at this sample period.
-
-        A discrete controller requires a processor with its own period. An output that is a voltage requires R > 0.
-        `period`: sample period of the processor, s; None in continuous time.
-        """
+        """Raise ValueError if the law cannot run with this nominal model, or at this sample period."""
         dt = self.realisation.dt
         if dt and period is None:
             raise ValueError(
@@ -132,8 +128,7 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
     def slope(self, model: Plant) -> Scalar:
         """Return the larger of the fastest pole of the controller and the crossover frequency of the loop, 1/s.
 
-        The crossover is the largest frequency w at which the loop gain is 1 or more. With the inertia of the linearised
-        mechanics alone, the loop gain is b gain |K|/w^2; for a voltage, it is b gain |K|/(L w^3).
+        The crossover is the largest frequency w at which the loop gain is 1 or more.
         """
         size = self.gain * linear_mechanics(model).b * np.abs(self.realisation.response(FREQUENCIES)[:, -1])
         loop = size / FREQUENCIES**2 if self.demand == "force" else size / (model.L * FREQUENCIES**3)

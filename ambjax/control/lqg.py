@@ -157,10 +157,7 @@ def sampled_model(rotor: RotorModel, coils: LinearCoils, period: float, delay: f
 def design(
     rotor: RotorModel, coils: LinearCoils, weights: dict[str, float], w: float, period: float, delay: float
 ) -> DesignedController:
-    """Return the controller of a model. `weights`: the numbers of `LqgWeights`. `w`: pole of the magnets, 1/s.
-
-    Raises ValueError if a Riccati equation has no solution.
-    """
+    """Return the controller of a model; `w`: pole of the magnets, 1/s. Raises ValueError without a Riccati solution."""
     model, n, c = sampled_model(rotor, coils, period, delay), len(rotor.M), len(coils.R)
     N, error, current, force = len(model.F), weights["error"], weights["current"], weights["force"]
     # in units of the characteristic sizes, all numbers are of order one

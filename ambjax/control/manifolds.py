@@ -1,7 +1,4 @@
-"""Position laws with other sliding manifolds than the paper's.
-
-They are Utkin's integral sliding mode, which starts on its manifold, and a non-singular terminal sliding mode.
-"""
+"""Position laws with other sliding manifolds than the paper's: Utkin's integral one, and a terminal one."""
 
 import dataclasses
 import functools

@@ -1,6 +1,5 @@
 """The processor of a cascade: all laws make one step per sample, and their voltage acts after a delay."""
 
-import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -12,7 +11,7 @@ from jax import Array, lax
 
 from ambjax.control.guard import Guard
 from ambjax.control.sampling import Sampling
-from ambjax.numerics.records import Scalar, is_traced, leaf, part, record, static
+from ambjax.numerics.records import Scalar, derived, is_traced, leaf, part, record, replaced, static
 from ambjax.numerics.runge_kutta import rk4_step
 from ambjax.world.plant import Plant, State
 from ambjax.world.sensor import Measurement
@@ -55,15 +54,11 @@ class Processor:
         doc="delay that the prediction assumes; none: the true delay",
     )
     guard: Guard | None = part(default=Guard(), doc="guard of the readings; None: every reading is accepted")
-    whole: bool | None = static(
-        default=None, doc="whether every delay is a whole number of samples; None: not determined yet"
-    )
-    most: int | None = static(
-        default=None, doc="number of samples over which the longest prediction extends; None: not determined yet"
-    )
-    kept: int | None = static(
-        default=None, doc="number of past commands that the program keeps; None: not determined yet"
-    )
+    # Of `resolved`: whether every delay is a whole number of samples, the samples over which the longest prediction
+    # extends, and the number of past commands that the program keeps.
+    whole: bool | None = derived()
+    most: int | None = derived()
+    kept: int | None = derived()
 
     def __str__(self) -> str:
         ahead = "with" if self.predicts else "without"
@@ -105,7 +100,7 @@ class Processor:
         ahead = longest if self.assumed is None else math.ceil(np.max(np.asarray(self.assumed)))
         most = max(self.most or 0, ahead)
         kept = max(self.kept or 0, most, longest, math.ceil(USUAL_DELAY))
-        return dataclasses.replace(self, whole=whole, most=most, kept=kept)
+        return replaced(self, whole=whole, most=most, kept=kept)
 
     def remembered(self, u: Array, *past: Array) -> tuple[Array, ...]:
         """Return the past commands of the next sample. `u`, `past`: the command of this sample and those before it."""

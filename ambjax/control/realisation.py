@@ -90,9 +90,8 @@ class Realisation:
     def step(self, x: Sequence[Array], w: Sequence[Array], period: Scalar) -> tuple[Array, tuple[Array, ...]]:
         """Return y and the next state of the bilinear (Tustin) transform of the controller.
 
-        `x`: n states. `w`: inputs, in metres. `period`: T, s. With h = T/2 and the solution p of (I - h A) p = x + h B
-        w: y = C p + D w, x+ = 2 p - x. Back substitution solves for p, in blocks of one row, or two rows for a pair of
-        complex poles.
+        With h = T/2 and the solution p of (I - h A) p = x + h B w: y = C p + D w, x+ = 2 p - x. Back substitution
+        solves for p, in blocks of one row, or two rows for a pair of complex poles.
         """
         h = jnp.asarray(period) / 2
         p: list[Array] = [jnp.zeros(())] * len(self.A)
@@ -257,10 +256,7 @@ def _continued(
 
 
 def _balanced(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the state space with states scaled by powers of 2, so that rows and columns of A have similar norms.
-
-    The entries of a companion matrix, such as that of a transfer function, may span thirty decades.
-    """
+    """Return the state space with states scaled by powers of 2, so that rows and columns of A have similar norms."""
     if len(A) < 2:
         return A, B, C
     import scipy.linalg

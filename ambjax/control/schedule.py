@@ -43,11 +43,7 @@ class Schedule(GainFunction):
     over: str = static(default="error", doc="signal of the schedule")
 
     def value(self, z: Scalar, reference: Reference) -> Array:
-        """Return the gain at a position z (m) and a reference.
-
-        At a knot, the derivative with respect to the signal is the mean of those on both sides. Where the signal is 0,
-        the derivative with respect to z, r or r_dot is 0.
-        """
+        """Return the gain at a position z (m) and a reference."""
         signal = {"error": z - reference.r, "reference": reference.r, "reference-speed": reference.r_dot}[self.over]
         x, total = _magnitude(jnp.asarray(signal), ROUNDED * self.at[-1]), jnp.asarray(self.values[0])
         for (low, high), (first, last) in zip(*map(itertools.pairwise, (self.at, self.values)), strict=True):

@@ -99,10 +99,7 @@ class Stateless(Law):
 
 
 def unwinding(k_aw: Scalar, k_int: Scalar) -> Array:
-    """Return the anti-windup rate k_aw (1/s) of an integral with the gain k_int, or 0 without an integral.
-
-    Without an integral there is nothing to unwind, and the error would never remove what the anti-windup adds.
-    """
+    """Return the anti-windup rate k_aw (1/s) of an integral with the gain k_int, or 0 without an integral."""
     return jnp.where(jnp.asarray(k_int) > 0, k_aw, 0.0)
 
 
@@ -143,11 +140,7 @@ class PositionLaw(Law, Generic[State]):
         return self.init(model)
 
     def begin_sampled(self, model: Plant, inputs: tuple[Measurement, Reference], period: Scalar) -> object:
-        """Return the state before the first call of `step`, from the estimate and the reference of this sample.
-
-        `period`: sample period, s. The default is `begin`, or `init_sampled` for a law whose state on a processor
-        differs from that in continuous time.
-        """
+        """Return the state before the first call of `step`, from the estimate and the reference of this sample."""
         return self.init_sampled(model) if has_sampled_state(self) else self.begin(model, inputs)
 
     @abc.abstractmethod
@@ -214,10 +207,7 @@ def has_sampled_state(law: Law) -> bool:
 def begin_law(
     law: PositionLaw, inputs: tuple[Measurement, Reference], *, model: Plant, period: Scalar, implicit: bool
 ) -> Any:
-    """Return the state of a position law before its first step on a processor (`step_law`).
-
-    Without an own step the law makes explicit Euler steps, so the state is that in continuous time.
-    """
+    """Return the state of a position law before its first step on a processor (`step_law`)."""
     if law.has_own_step(implicit) or has_sampled_state(law):
         return law.begin_sampled(model, inputs, period)
     return law.begin(model, inputs)
@@ -226,11 +216,7 @@ def begin_law(
 def step_law(
     law: Law, inputs: object, state: State, *, model: Plant, period: Scalar, implicit: bool
 ) -> tuple[Any, State]:
-    """Step a law on a processor, by its method `step` or else by explicit Euler.
-
-    `inputs`, `state`: as the law's `__call__` takes them. `period`: sample period, s. `implicit`: whether the processor
-    uses implicit steps. Returns the output of the law at the sample, and its next state.
-    """
+    """Return the output of a law at a sample, by `step` or else by explicit Euler, and its next state."""
     with jax.named_scope(f"law:{type(law).__module__.rpartition('.')[2]}.{type(law).__qualname__}"):
         if law.has_own_step(implicit):
             return law.step(model, inputs, state, period)

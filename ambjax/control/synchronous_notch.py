@@ -6,7 +6,7 @@ feedback of magnetic bearings, IEEE Trans. Control Systems Technology 4 (1996).
 
 import dataclasses
 import itertools
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -51,7 +51,8 @@ class SynchronousNotch:
     mean, m' = rate (y - m), is subtracted, so that the notch does not respond to a constant y. g is the inverse of the
     response G of y to a signal added to the reading of z, in the closed loop at the speed W. What y contains at the
     speed then decays as exp(-rate t), if rate is small against the bandwidth of the loop. An error of the phase of g
-    must be below 90 degrees. Below `min_speed` the notch is off, and adds nothing.
+    must be below 90 degrees. Below `min_speed` and above `max_speed` the notch is off: c' = (j W - rate) c, so that the
+    signal appears and vanishes gradually.
 
     On a processor, c_{n+1} = exp(j W T) (c_n - 2 rate T g (y_n - m_n)). For a constant speed, the notch is linear and
     time-invariant. `linear.with_notch_gains` computes the gains.
@@ -60,6 +61,10 @@ class SynchronousNotch:
     removes: str = static(default="force-free", doc='"force-free" or "displacement-free"')
     rate: Scalar = leaf(default=10.0, unit="1/s", at_least=1e-6, at_most=1e6, doc="rate at which the notch converges")
     min_speed: Scalar = leaf(default=0.0, unit="rpm", at_least=0, at_most=1e7, doc="speed from which the notch is on")
+    max_speed: Scalar = leaf(
+        default=1e7, unit="rpm", at_least=0, at_most=1e7, doc="speed above which the notch is off again"
+    )
+    ordered: ClassVar = ("min_speed", "max_speed")
     gains: tuple[NotchGain, ...] = part(default=(), doc="gain at each speed, in between linear")
     rotor: Rotation | None = part(default=None, doc="speed of the rotor; that of a scenario replaces it")
     varying: bool = static(default=False, doc="whether the speed changes during a run")
@@ -99,30 +104,31 @@ class SynchronousNotch:
             imaginary = imaginary + share * (high.imaginary - low.imaginary)
         # a rotor that turns backwards: the response at -W is the conjugate of that at W
         # a number, because XLA aborts when it compiles a loop with a choice between constants
-        return rpm, real, jnp.where(rpm < 0, -imaginary, imaginary), jnp.where(size >= self.min_speed, 1.0, 0.0)
+        on = jnp.where(size >= self.min_speed, 1.0, 0.0) * jnp.where(size <= self.max_speed, 1.0, 0.0)
+        return rpm, real, jnp.where(rpm < 0, -imaginary, imaginary), on
 
     def __call__(self, measured: Measurement, state: NotchState) -> tuple[Array, NotchState]:
         """Return z with the signal of the notch, m, and the rate of the state."""
         rpm, real, imaginary, on = self._now(state)
         W = TWO_PI * PER_MINUTE * rpm
         moving = self._nulled(measured) - state.mean
-        drive = -2 * self.rate * moving
-        moved = -W * state.imaginary + real * drive, W * state.real + imaginary * drive
-        a, b = (on * new - (1 - on) * self.rate * old for new, old in zip(moved, state[:2], strict=True))
+        drive, decay = -2 * self.rate * on * moving, (1 - on) * self.rate
+        a = -W * state.imaginary + real * drive - decay * state.real
+        b = W * state.real + imaginary * drive - decay * state.imaginary
         t = () if isinstance(state.t, tuple) else jnp.ones_like(state.t)
-        return measured.z + on * state.real, NotchState(a, b, self.rate * moving, t)
+        return measured.z + state.real, NotchState(a, b, self.rate * moving, t)
 
     def step(self, measured: Measurement, state: NotchState, period: Scalar) -> tuple[Array, NotchState]:
         """Return z with the signal of the notch, m, and the state at the next sample. `period`: sample period, s."""
         rpm, real, imaginary, on = self._now(state)
         later = state.t
         moving = self._nulled(measured) - state.mean
-        drive = -2 * self.rate * period * moving
-        a, b = state.real + real * drive, state.imaginary + imaginary * drive
+        drive, kept = -2 * self.rate * period * on * moving, jnp.maximum(1 - (1 - on) * self.rate * period, 0.0)
+        a, b = kept * state.real + real * drive, kept * state.imaginary + imaginary * drive
         turn = PER_MINUTE * period * rpm
         if not isinstance(later, tuple):
             later = later + period
             turn = known(self.rotor).turns(later) - known(self.rotor).turns(later - period)
         c, s = jnp.cos(TWO_PI * turn), jnp.sin(TWO_PI * turn)
-        a, b = on * (a * c - b * s), on * (a * s + b * c)
-        return measured.z + on * state.real, NotchState(a, b, state.mean + self.rate * period * moving, later)
+        a, b = a * c - b * s, a * s + b * c
+        return measured.z + state.real, NotchState(a, b, state.mean + self.rate * period * moving, later)

@@ -128,10 +128,7 @@ def map_members(
 
 
 def size(tree: object) -> int:
-    """Return the number of members: the common length of the leaves' axis of members.
-
-    Raises ValueError if no leaf has this axis, or if the lengths differ.
-    """
+    """Return the number of members: the common length of the leaves' axis of members."""
     lengths = {np.shape(x)[0] for x, varies in zip(jax.tree.leaves(tree), varying(tree), strict=True) if varies}
     if len(lengths) != 1:
         listing = " and ".join(str(n) for n in sorted(lengths)) or "none"

@@ -1,8 +1,4 @@
-"""The fold behind the fan chart: extremes of signals and the variation of the voltage, block by block.
-
-A fan chart records a long run at a few instants only. This fold reduces a block, the samples between two instants,
-to the smallest and largest value of each signal and the total variation of the voltage.
-"""
+"""The fold behind the fan chart: extremes of signals and the variation of the voltage, block by block."""
 
 from collections.abc import Callable
 from typing import NamedTuple

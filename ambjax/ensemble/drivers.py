@@ -165,10 +165,7 @@ def _explanation(waves: np.ndarray, Y: np.ndarray, terms: Sequence[int], confide
 
 
 def _terms(columns: Sequence[np.ndarray], most: int = TERMS) -> list[int]:
-    """Return the number of cosines to fit to each column.
-
-    It follows from the number of members that differ from the most frequent value of the column.
-    """
+    """Return the number of cosines for each column, from its members beside the most frequent value."""
     differing = [len(column) - int(np.unique(column, return_counts=True)[1].max()) for column in columns]
     return [min(most, count // PER_TERM) for count in differing]
 

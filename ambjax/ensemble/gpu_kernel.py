@@ -106,10 +106,7 @@ def _in_one_kernel(
 
 
 def _traced(leaves: Sequence[Array], tree: Any, axes: Sequence[int | None], block: int) -> tuple[ClosedJaxpr, Any]:
-    """Trace the rollouts of `block` members. Return the trace, and the shapes of the Result.
-
-    Raises ValueError for a recorded signal: a kernel cannot contain its samples.
-    """
+    """Trace the rollouts of `block` members, and return the shapes too. Raises ValueError for a recorded signal."""
     member = jax.vmap(lambda *leaves: run(*jax.tree.unflatten(tree, leaves), record_every=0), in_axes=axes)
     shapes = [
         jax.ShapeDtypeStruct(x.shape if axis is None else (block, *x.shape[1:]), x.dtype)

@@ -1,17 +1,16 @@
 """Estimates from an ensemble, with confidence intervals.
 
 - Probability: Wilson's interval (J. Am. Stat. Assoc. 22, 1927).
-- Quantile: the interval between two order statistics, whose ranks follow from the binomial distribution. Its
-  coverage is at least the confidence for every distribution of the values. An end is infinite if the ensemble is too
-  small (David and Nagaraja, Order Statistics, section 7.1).
+- Quantile: the interval between two order statistics, whose ranks follow from the binomial distribution. Its coverage
+  is at least the confidence for every distribution of the values. An end is infinite if the ensemble is too small
+  (David and Nagaraja, Order Statistics, section 7.1).
 - Mean, standard deviation, CVaR: the studentised bootstrap (Efron and Tibshirani, An Introduction to the Bootstrap,
   section 12.5), which divides the deviation of each resample by the standard error of that resample. The simpler
   percentile intervals omit this division, and end too low if the values have a heavy upper tail.
 
-The cost of a resample grows only with log N. The sorted values are divided into groups. The width of a group is
-about 1/512 of its rank, counted from the nearer end: each value is a group of its own up to N = 2,048, and there are
-about 1,024 (2 + log(N/2,048)) groups for larger N. The numbers of values of a resample in the groups are multinomial.
-The same draw is used for all columns, and sums over a resample are matrix products.
+The cost of a resample grows only with log N. The sorted values are divided into groups. The width of a group is about
+1/512 of its rank, counted from the nearer end: each value is a group of its own up to N = 2,048, and there are about
+1,024 (2 + log(N/2,048)) groups for larger N.
 """
 
 import math
@@ -61,10 +60,8 @@ def wilson(successes: ArrayLike, n: ArrayLike, confidence: float = 0.95) -> Esti
 def quantile(values: np.ndarray, q: npt.ArrayLike, confidence: float = 0.95) -> Estimate:
     """Compute the q-quantile of values [N], the value of rank ceil(q N), with its interval. q: a number or an array.
 
-    The number of values below the true quantile is binomial with N trials of probability q. Its quantiles are
-    the ranks of the two ends, the upper one plus 1. An end is -inf or +inf if N is too small. Values of +inf are
-    allowed.
-    Raises ValueError for a q outside of 0 to 1, and as `column_of` does.
+    An end is -inf or +inf if N is too small. Values of +inf are allowed. Raises ValueError for a q outside of 0 to 1,
+    and as `column_of` does.
     """
     from scipy.stats import binom
 
@@ -208,10 +205,7 @@ def _resamples(n: int, sizes: np.ndarray, seed: int) -> Iterator[np.ndarray]:
 
 
 def _tail_counts(counts: np.ndarray, tail: float) -> np.ndarray:
-    """Return the part of each count that belongs to the largest `tail` values.
-
-    `counts` [replicates, groups]: numbers of values in groups of ascending value.
-    """
+    """Return the part of each count that belongs to the largest `tail` values."""
     above = np.cumsum(counts[:, ::-1], axis=1)[:, ::-1] - counts
     return np.clip(tail - above, 0.0, counts)
 

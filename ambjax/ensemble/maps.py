@@ -137,7 +137,7 @@ def with_method_for_axes(study: Study, x: Axis, y: Axis) -> Study:
     others = [entry for entry in study.spread.entries if entry[0] not in axes]
     wide = Spread((*others, *((path, Uniform(*reach)) for path, reach in axes.items())))
     method = choose_method(*ends(wide, cascade, scenario, STEP_PATHS), float(period))
-    return dataclasses.replace(study, clock=dataclasses.replace(clock, method=method))
+    return dataclasses.replace(study, clock=clock.with_method(method))
 
 
 def _entries(study: AnyStudy, axes: tuple[str, ...]) -> tuple[tuple[str, Distribution], ...]:

@@ -9,7 +9,7 @@ import numpy as np
 from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import Schedule
 from ambjax.host.imports import digest_of
-from ambjax.numerics.records import is_traced, leaf
+from ambjax.numerics.records import is_traced, leaf, replaced
 from ambjax.numerics.shapes import axes_of, with_entry
 from ambjax.world.scenario import Scenario
 from ambjax.world.waveforms import Constant
@@ -102,8 +102,7 @@ def _below(node: object, path: str, route: tuple[int | str, ...]) -> Iterator[tu
 def kinds(node: object, path: str = "") -> Iterator[tuple[str, str]]:
     """Yield what is not a number in a record and its nested records: the type and the static fields, by dotted path.
 
-    For a custom law, the digest of its source is yielded too. `path`: prefix of the dotted paths, which ends with a dot
-    or is empty.
+    For a custom law, the digest of its source is yielded too.
     """
     if isinstance(node, tuple):
         for index, item in enumerate(node):
@@ -160,7 +159,7 @@ def _set(node: Any, route: tuple[int | str, ...], value: Any) -> Any:
         if isinstance(node, tuple):
             return (*node[:step], _set(node[step], tuple(rest), value), *node[step + 1 :])
         return with_entry(node, route, value)
-    return dataclasses.replace(node, **{step: _set(getattr(node, step), tuple(rest), value)})
+    return replaced(node, **{step: _set(getattr(node, step), tuple(rest), value)})
 
 
 def numbers_in(node: object, path: str) -> dict[str, Place]:

@@ -76,18 +76,14 @@ def apply(cascade: Cascade, scenario: Scenario, values: Mapping[str, object]) ->
 def corners(spread: Spread, cascade: Cascade, scenario: Scenario) -> tuple[Cascade, Scenario]:
     """Return the cascade and scenario at every combination of the ends of the spreads that affect the step.
 
-    Each such number gets an array axis of length 2. An integration method chosen for the largest slope (rate, 1/s) of
-    this ensemble is then valid for every member. Raises ValueError as `check_spread` does.
+    Each such number gets an array axis of length 2. Raises ValueError as `check_spread` does.
     """
     check_spread(spread, cascade, scenario)
     return ends(spread, cascade, scenario, STEP_PATHS)
 
 
 def ends(spread: Spread, cascade: Cascade, scenario: Scenario, under: tuple[str, ...]) -> tuple[Cascade, Scenario]:
-    """Return the cascade and scenario with the two ends of each spread number whose path begins with one of `under`.
-
-    Each such number is an array with its own axis of length 2, so that together they give all combinations.
-    """
+    """Return the cascade and scenario with the two ends of each spread number whose path begins with one of `under`."""
     known = places(cascade, scenario)
     supports = [(p, d.support(_nominal(known[p]))) for p, d in spread.entries if p.startswith(under)]
     shape = [1] * len(supports)
@@ -108,11 +104,7 @@ class SpreadError(ValueError):
 
 
 def check_spread(spread: Spread, cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
-    """Check a spread, and return all numbers of this cascade and scenario by dotted path.
-
-    Raises ValueError if the spread is not valid for them. The message is one line with the path, the value, the allowed
-    range and the fix.
-    """
+    """Check a spread; return all numbers of this cascade and scenario by path. Raises ValueError if it is not valid."""
     known = places(cascade, scenario)
     check_entries(spread, known)
     _check_together(dict(spread.entries), known, cascade, scenario)
@@ -131,10 +123,7 @@ def check_entries(spread: Spread, known: Mapping[str, Place]) -> None:
 
 
 def require_path(path: str, known: Iterable[str], value: str = "") -> None:
-    """Raise ValueError for a path that is not in `known`; the message lists similar paths.
-
-    `value` is the value that the user gave, for the message.
-    """
+    """Raise ValueError for a path that is not in `known`; the message lists similar paths."""
     known = list(known)
     if path not in known:
         what = f"spread.{path} = {value}" if value else f"spread.{path}"
@@ -190,8 +179,7 @@ def _check_together(
 ) -> None:
     """Check the conditions that involve more than one number.
 
-    They are: start before stop, the clearance below the gap, the rotor inside its clearance, and `_check_coils`. Raises
-    SpreadError with the path of the number that is spread.
+    They are: start before stop, the clearance below the gap, the rotor inside its clearance, and `_check_coils`.
     """
 
     def reach(path: str) -> tuple[float, float]:
@@ -225,10 +213,7 @@ def _check_together(
 
 
 def _check_coils(reach: Callable[[str], tuple[float, float]], refuse: Callable[[tuple[str, ...], str], None]) -> None:
-    """Check that the limits of each coil exceed its bias: i_max > i_0 and u_max > R i_0.
-
-    `reach`: ends of the number at a path; NaN: no limit.
-    """
+    """Check that the limits of each coil exceed its bias: i_max > i_0 and u_max > R i_0."""
     i_max, u_max, i_0, R = "actuator.coil.i_max", "actuator.coil.u_max", "plant.i_0", "plant.R"
     least, most = reach(i_max)[0], reach(i_0)[1]
     if least <= most:

@@ -16,6 +16,7 @@ from ambjax.ensemble.blocks import Blocks
 from ambjax.ensemble.paths import Place, kinds, places
 from ambjax.ensemble.spread import Spread, apply, draw
 from ambjax.host.sealed import provenance
+from ambjax.numerics.records import replaced
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.trajectory import Trajectory
@@ -162,7 +163,7 @@ class Study(AnyStudy):
 
     def at_period(self, period: float) -> Self:
         samples = max(round(float(self.clock.duration) / period), 1)
-        return dataclasses.replace(self, clock=dataclasses.replace(self.clock, samples=samples, sample_period=period))
+        return dataclasses.replace(self, clock=replaced(self.clock, samples=samples, sample_period=period))
 
     def metrics(self, values: dict[str, np.ndarray], members: np.ndarray) -> dict[str, np.ndarray]:
         cascade, scenario = jax.tree.map(np.asarray, self.varied(values, members))
@@ -188,17 +189,14 @@ class Study(AnyStudy):
         return {"index": members, "lost_at": outcome.trajectory.lost_at, **outcome.metrics, **values}
 
     def bands(self, members: int, times: int, until: float = math.inf) -> Bands:
-        """Compute the data of a fan chart of the first `members` members, up to time `until` (s) or the end of the run.
-
-        The instants are equally spaced, at most `times` of them, and the last sample is added.
-        """
+        """Compute the data of a fan chart of the first `members` members, up to time `until` (s) or the end."""
         period = float(self.clock.sample_period)
         samples = int(min(self.clock.samples, math.ceil(until / period) + 1 if math.isfinite(until) else math.inf))
         every = -(-samples // times)
         count = -(-samples // every)
         cascade, scenario = self.batch(np.arange(min(members, self.members)))
         fold = Blocks(tuple(FAN_SIGNALS.values()), every, count, period)
-        clock = dataclasses.replace(self.clock, samples=samples)
+        clock = replaced(self.clock, samples=samples)
         outcome = run_ensemble(cascade, scenario, clock, fold=fold, record_every=every)
         rows, folded = outcome.trajectory.rows, outcome.metrics
         # Add the last sample, unless the last block begins there.
@@ -229,10 +227,7 @@ def _beside(blocks: np.ndarray, combine: Callable[[np.ndarray, np.ndarray], np.n
 
 
 def _rate(increments: np.ndarray, t: np.ndarray, width: int) -> np.ndarray:
-    """Return the mean rate of growth over the `width` blocks before each instant t [T]; NaN before all have passed.
-
-    `increments` [members, count]: growth from each instant to the next.
-    """
+    """Return the mean rate of growth over the `width` blocks before each instant t [T]; NaN before all have passed."""
     total = np.concatenate([np.zeros((len(increments), 1)), np.cumsum(increments, axis=1)], axis=1)[:, : len(t)]
     rate = np.full(total.shape, np.nan)
     rate[:, width:] = (total[:, width:] - total[:, :-width]) / (t[width:] - t[:-width])

@@ -73,10 +73,7 @@ def work(study: AnyStudy, start: int, stop: int, size: int) -> dict[str, np.ndar
 
 @contextlib.contextmanager
 def processes(count: int) -> Iterator[Executor]:
-    """Provide worker processes with JAX configured.
-
-    If the block raises, the workers are terminated at once. They also end when this process ends for any reason.
-    """
+    """Provide worker processes with JAX configured. If the block raises, the workers are terminated at once."""
     others = set(multiprocessing.active_children())
     with ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_begin) as pool:
         try:
@@ -89,10 +86,7 @@ def processes(count: int) -> Iterator[Executor]:
 
 @contextlib.contextmanager
 def ignore_sigint() -> Iterator[None]:
-    """Block SIGINT in this thread within the block, and permanently in the processes that it starts there.
-
-    Only their parent then handles Ctrl-C. On Windows, there is no effect.
-    """
+    """Block SIGINT in this thread within the block, and permanently in the processes that it starts there."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return

@@ -97,10 +97,7 @@ def run_command(parser: argparse.ArgumentParser, words: list[str] | None, run: R
 
 
 def _code(run: Callable[[], tuple[int, object]], as_json: bool, program: str) -> int:
-    """Call `run` and return its exit code.
-
-    If a user can correct an error, print it as one line and return 2. After a KeyboardInterrupt return 130.
-    """
+    """Call `run` and return its exit code."""
     try:
         code, summary = run()
         if as_json:

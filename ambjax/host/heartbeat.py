@@ -108,10 +108,7 @@ def _print(text: str) -> None:
 
 @contextlib.contextmanager
 def doing(text: str) -> Iterator[None]:
-    """Let the heartbeat of the command, if it has one, say `text` while the block takes long.
-
-    A remark in the block (`say`) replaces the text.
-    """
+    """Let the heartbeat of the command, if it has one, say `text` while the block takes long."""
     if not _running:
         yield
         return

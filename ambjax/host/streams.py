@@ -52,10 +52,7 @@ def open_streams() -> None:
 
 @contextlib.contextmanager
 def lenient() -> Iterator[Lenient]:
-    """Wrap stdout and stderr in `Lenient` for this block, and yield the wrapper of stdout.
-
-    A stream that failed stays wrapped: else its buffer would fail again at exit and change the exit code.
-    """
+    """Wrap stdout and stderr in `Lenient` for this block, and yield the wrapper of stdout."""
     before = {name: getattr(sys, name) for name in ("stdout", "stderr")}
     now = {name: Lenient(stream) for name, stream in before.items()}
     for name, stream in now.items():

@@ -4,7 +4,7 @@
 
     system = linearise(case)  # or linearise(cascade, scenario, clock)
     system.sensitivity(np.array([100.0]))  # S at 100 Hz, complex
-    analyse(system, case.scenario.plant.m, case.clock.sample_period).margins.phase_deg
+    analyse(system, case.scenario.plant.m, case.clock.sample_period).margins.pm
 
 A test signal e is added to the reading of the position sensor, after low-pass and converter: e_n at sample n, or e(t)
 in continuous time. S is the transfer function from e to the reading that the controller receives, T = S - 1 that from e

@@ -80,10 +80,7 @@ class Zones:
     )
 
     def check(self, period: Scalar | None) -> None:
-        """Raise ValueError if the limits are not in ascending order, or as `range` does.
-
-        `period`: see `range`.
-        """
+        """Raise ValueError if the limits are not in ascending order, or as `range` does."""
         self.range(period)
         for names in (("zone_a", "zone_b", "zone_c"), ("clearance_a", "clearance_b", "clearance_c")):
             limits = [float(getattr(self, name)) for name in names]
@@ -223,7 +220,7 @@ def linearisation_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> 
     If the cascade has a processor, the returned cascade is that of `Cascade.on_processor`. The integration method of
     `clock` has no effect: it may be too coarse for this cascade. Raises ValueError as `rollout` does otherwise.
     """
-    system, clock = prepare(cascade, scenario, dataclasses.replace(clock, method=None))
+    system, clock = prepare(cascade, scenario, clock.with_method(None))
     if cascade.sampled:
         cascade = system.loop.cascade  # pyright: ignore[reportAttributeAccessIssue]
     return dataclasses.replace(cascade), scenario, clock.sample_period

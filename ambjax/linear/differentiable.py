@@ -216,10 +216,7 @@ def _frequencies(loop: _Loop, low: Scalar, high: Scalar) -> Array:
 
 
 def _refined(loop: _Loop, f: Array, size: Array, low: Scalar, high: Scalar, which: int) -> Array:
-    """Return the frequency (Hz) of the peak near the largest `size` [F] at the frequencies `f` [F].
-
-    `which`: 0 for S, 1 for T, 2 for KS.
-    """
+    """Return the frequency (Hz) of the peak near the largest `size` [F] at the frequencies `f` [F]."""
     best, reach = f[jnp.argmax(size)], jnp.log(high / low) / (POINTS - 1)
     for _ in range(ROUNDS):
         near = best * jnp.exp(reach * jnp.linspace(-1, 1, LOCAL))

@@ -150,10 +150,7 @@ def injected_members(
 
 
 def injection_of(one: Responses, random: bool, confidence: float = 0.95) -> Injection:
-    """Return the means over the members that did not lose the rotor.
-
-    `random`: whether the members differ in the noise. `confidence`: as in `injected`.
-    """
+    """Return the means over the members that did not lose the rotor."""
     members = len(one.held)
     frequency, amplitude = one.frequency, one.amplitude
     S, KS, saturated = (x[one.held] for x in (one.S, one.KS, one.saturated))

@@ -151,10 +151,7 @@ class _Linear:
     def laws(
         self, measured: Sequence[Measurement], control: Groups, law: object, past: Sequence[Any]
     ) -> tuple[Groups, Groups, object]:
-        """Return the commands of the groups, and the next states of the laws, or their rates in continuous time.
-
-        `control`: states of the laws of the groups. `law`: state of the law of the machine.
-        """
+        """Return the commands of the groups, and the next states of the laws, or their rates in continuous time."""
         reference, unlimited, count = at_rest(0.0), jnp.asarray(jnp.inf), len(self.cascade)
         demands: Groups = ((None, None),) * count
         notched: Groups = (None,) * count
@@ -222,7 +219,7 @@ class _Linear:
     def rest(self, held: "_Linear") -> MachineRest:
         """Return the equilibrium, or the point nearest to it that was found.
 
-        `held`: the same machine, without derivatives. Those of the equilibrium are those of the implicit function.
+        `held`: the same machine, without derivatives.
         """
         start, sizes = held.start()
         scale, (flat, restore) = ravel_pytree(sizes)[0], ravel_pytree(start)
@@ -333,7 +330,7 @@ def _parts(points: Sequence) -> tuple[Groups, Groups, Groups]:
 def _held(A: Array, B: Array, period: Scalar, delay: Scalar, kept: int) -> tuple[Array, list[Array]]:
     """Return the map of one sample [N, N], and the effects [N, c] of the command of each sample, the newest first.
 
-    The command of a sample acts from `delay` samples after it until one sample later. `kept`: number of past commands.
+    The command of a sample acts from `delay` samples after it until one sample later.
     """
     n, c = B.shape
     table = jnp.zeros((n + c, n + c), A.dtype).at[:n].set(jnp.concatenate([A, B], 1) * period)

@@ -18,7 +18,7 @@ from ambjax.linear.injection import Injection, frequency_lines, injection_of
 from ambjax.linear.linear_machine import machine_rest
 from ambjax.linear.member_responses import AMPLITUDE, Responses, padded
 from ambjax.linear.multisine import FourierSums, MultiSine, Response, multisine
-from ambjax.numerics.records import Scalar, canonical, leaf, part, record
+from ambjax.numerics.records import Scalar, canonical, leaf, part, record, replaced
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Ending
 from ambjax.simulation.loop import ClosedLoop
@@ -118,7 +118,7 @@ def _responses(machine: Machine, clock: Clock, tests: _Test) -> tuple[FourierSum
     rest = machine.moving(machine.rotor.at_magnets, point.q, zero, tuple(map(PlantOnly, point.plant)))
     limits = machine.join([jnp.asarray(loop.scenario.voltage_limit) for loop in machine.loops()])
     skip = clock.samples
-    longer = dataclasses.replace(clock, samples=2 * skip)
+    longer = replaced(clock, samples=2 * skip)
 
     def one(test: _Test) -> tuple[FourierSums, Array]:
         def calm(axis: Sampled | ClosedLoop, own: PlantOnly, size: Array) -> Sampled | ClosedLoop:

@@ -49,22 +49,23 @@ NO_PEAK = ResponsePeak(math.inf, math.nan)
 
 
 class Margins(NamedTuple):
-    """Margins of the loop transfer L = 1/S - 1, with the loop broken at one place.
+    """Margins of the loop transfer L = 1/S - 1, with the loop broken at one place; named as in python-control.
 
-    - `gain_low`, `gain_high`: the loop stays stable for every factor on L between these two (0, inf: no such limit).
-    - `gain`: `gain_low` or `gain_high`, whichever is nearer to 1 on a logarithmic scale (inf: no limit).
-    - `phase_deg`: smallest phase change, lag or lead, that makes the loop unstable, degrees (inf: |L| is never 1).
+    - `gm_low`, `gm_high`: the loop stays stable for every factor on L between these two (0, inf: no such limit).
+    - `gm`: gain margin, `gm_low` or `gm_high`, whichever is nearer to 1 on a logarithmic scale (inf: no limit).
+    - `pm`: phase margin, degrees: the smallest phase change, lag or lead, that makes the loop unstable (inf: |L| is
+      never 1).
     - `delay`: smallest additional delay at this place that makes the loop unstable, s (inf: none).
-    - `disk`: disk margin 1/max|S - 1/2| (P. Seiler, A. Packard and P. Gahinet, IEEE Control Systems 40:5 (2020)). The
-      loop stays stable for every factor on L between (2 - disk)/(2 + disk) and its inverse.
+    - `dm`: disk margin 1/max|S - 1/2| (P. Seiler, A. Packard and P. Gahinet, IEEE Control Systems 40:5 (2020)). The
+      loop stays stable for every factor on L between (2 - dm)/(2 + dm) and its inverse.
     """
 
-    gain: float
-    gain_low: float
-    gain_high: float
-    phase_deg: float
+    gm: float
+    gm_low: float
+    gm_high: float
+    pm: float
     delay: float
-    disk: float
+    dm: float
 
 
 class LoopMargins(NamedTuple):
@@ -82,8 +83,8 @@ class LoopMargins(NamedTuple):
         """The smaller margin of each kind."""
         one, other = self
         return Margins(
-            min(one.gain, other.gain, key=lambda x: abs(math.log(x)) if x else 0.0),
-            max(one.gain_low, other.gain_low),
+            min(one.gm, other.gm, key=lambda x: abs(math.log(x)) if x else 0.0),
+            max(one.gm_low, other.gm_low),
             *(min(a, b) for a, b in zip(one[2:], other[2:], strict=True)),
         )
 
@@ -177,10 +178,7 @@ def poles_in_s(system: StateSpace) -> np.ndarray:
 
 
 def margins_of(system: StateSpace) -> LoopMargins:
-    """Return the margins of a stable loop, broken at the reading and at the command.
-
-    The scan ends at half the sampling rate or, in continuous time, far above all poles.
-    """
+    """Return the margins of a stable loop, broken at the reading and at the command."""
     f = _scanned(system)
     return LoopMargins(_margins(system, "reading", f), _margins(system, "command", f))
 

@@ -14,7 +14,7 @@ from ambjax.ensemble.batching import map_members, size
 from ambjax.linear.equilibrium import ideal, reading
 from ambjax.linear.multisine import MultiSine, Reading, Response, multisine
 from ambjax.numerics.declared import require_number
-from ambjax.numerics.records import Scalar, canonical
+from ambjax.numerics.records import Scalar, canonical, replaced
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import prepare, run
 from ambjax.simulation.sliding import Slide
@@ -63,7 +63,7 @@ def member_responses(
     """Inject the same multi-sine into each member of an ensemble, whose varying leaves are arrays [N].
 
     The arguments are those of `injected`; `channel` is its argument `reading`. `scenario.member` [N] contains the
-    numbers of the members. Raises ValueError as `injected` does.
+    numbers of the members.
     """
     gap, pole = (float(np.mean(np.asarray(x))) for x in (scenario.plant.s_0, scenario.plant.pole))
     require_number("amplitude", amplitude, optional=True)
@@ -76,7 +76,7 @@ def member_responses(
     wave = multisine(_harmonics(frequencies, clock), clock.samples, float(clock.sample_period), amplitude, channel)
     skip = settle * clock.samples
     method = None if isinstance(clock.method, Slide) else clock.method
-    longer = dataclasses.replace(clock, samples=skip + periods * clock.samples, method=method)
+    longer = replaced(clock, samples=skip + periods * clock.samples, method=method)
     system, longer = prepare(*_at_rest(cascade, scenario, r), longer)
     response = Response(padded(wave, PADDED * math.ceil(len(wave.harmonics) / PADDED)), scenario.voltage_limit, skip)
     tree = canonical((system, longer, response))
@@ -95,10 +95,7 @@ def _member(tree: Any) -> tuple[Any, Any]:
 
 
 def padded(wave: MultiSine, lines: int) -> MultiSine:
-    """Return the wave with this number of lines.
-
-    The new lines have the frequency 0 and the phase pi/2, whose cosine is 0.
-    """
+    """Return the wave with this number of lines."""
     padding = (0, lines - len(wave.harmonics))
     phases = np.pad(wave.phases, padding, constant_values=0.5 * np.pi)
     return dataclasses.replace(wave, harmonics=np.pad(wave.harmonics, padding), phases=phases)

@@ -21,13 +21,14 @@ SPEEDS = 33
 
 
 def notch_speeds(rotor: Rotation, notch: SynchronousNotch, duration: float) -> tuple[float, ...]:
-    """Return the speeds (rpm) at which a notch needs its gain: those of a run from `min_speed` on, at most SPEEDS."""
+    """Return the speeds (rpm) at which a notch needs its gain: those of a run while it is on, at most SPEEDS."""
     signed = [float(rotor.rpm(t)) for t in rotor.corners(duration)]
     first, *_, last = sorted(abs(rpm) for rpm in signed)
     if not notch.varying:
         return (first,)
     if min(signed) < 0 < max(signed):
         first = 0.0
+    last = min(last, max(first, float(notch.max_speed)))
     low = max(first, float(notch.min_speed), last / (4 * SPEEDS))
     return tuple(np.linspace(low, last, SPEEDS).tolist()) if low < last else (last,)
 

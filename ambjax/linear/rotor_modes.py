@@ -90,10 +90,7 @@ def _described(shape: np.ndarray, masses: np.ndarray) -> tuple[str, str]:
 
 
 def springs_critical(rotor: Rotor, stiffness: np.ndarray) -> list[np.ndarray]:
-    """Return the undamped critical speeds (rpm, ascending) of the rotor on springs at its radial magnets.
-
-    `stiffness`: of each spring, N/m. The motion is a forward whirl at the speed of the rotor.
-    """
+    """Return the undamped critical speeds (rpm, ascending) of the rotor on springs at its radial magnets."""
     n = len(np.asarray(rotor.gravity))
     unit = np.eye(n, dtype=complex)
     # x = 1, y = -j; tilt: beta_y = 1, beta_x = j

@@ -167,10 +167,7 @@ def stability_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> Stabilit
 
 
 def suspects(error: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Return the indices of the held members with the largest settled errors, ascending, at most MOST_TESTED.
-
-    `error` [N]: settled errors, m. `held` [N]: whether a member is held.
-    """
+    """Return the indices of the held members with the largest settled errors, ascending, at most MOST_TESTED."""
     alive = np.flatnonzero(held)
     return np.sort(alive[np.argsort(-np.asarray(error)[alive], kind="stable")[:MOST_TESTED]])
 

@@ -27,10 +27,7 @@ class Biquad(NamedTuple):
     centre: Scalar | None = None
 
     def output(self, u: Array, x: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
-        """Return the output for an input u and a state x, and the rate of the state, in observer canonical form.
-
-        The state has the unit of u.
-        """
+        """Return the output for an input u and a state x, and the rate of the state, in observer canonical form."""
         w = jnp.sqrt(jnp.asarray(self.a_0))
         return self.d * u + x[0], (self.c_1 * u - self.a_1 * x[0] + w * x[1], self.c_0 / w * u - w * x[0])
 

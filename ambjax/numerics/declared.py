@@ -21,10 +21,7 @@ def numbers(field: dataclasses.Field) -> str:
 
 
 def allowed(field: dataclasses.Field, infinity: str = "or inf") -> str:
-    """Return the range of a numeric field in words, without its unit; '' for a field of another kind.
-
-    `infinity`: words that follow the range if inf is allowed too.
-    """
+    """Return the range of a numeric field in words, without its unit; '' for a field of another kind."""
     meta = field.metadata
     if not meta.get("leaf"):
         return ""
@@ -90,11 +87,7 @@ def within(meta: Mapping[str, Any], value: npt.ArrayLike) -> bool:
 
 
 def check_number(field: dataclasses.Field, name: str, value: object) -> None:
-    """Raise ValueError if `field` does not allow `value`, a number or an array.
-
-    The message contains the dotted name, the value and the allowed range. It proposes no value: a default is the number
-    of one machine.
-    """
+    """Raise ValueError if `field` does not allow `value`, a number or an array."""
     try:
         number = value if isinstance(value, (int, float)) else np.asarray(value, dtype=float)
     except (TypeError, ValueError):

@@ -40,10 +40,7 @@ def slope(m: int, L: Scalar, width: Scalar) -> Scalar:
 
 
 def implicit_step(x: tuple[Array, ...], f: Array, L: Scalar, T: Scalar) -> tuple[Array, ...]:
-    """Return x at this sample from x at the previous one, by backward Euler with period T (s).
-
-    The sign is that of f - x_0 after the step.
-    """
+    """Return x at this sample from x at the previous one, by backward Euler with period T (s)."""
     m = len(x) - 1
     lam, b = LAM[m], f - sum(T**k * one for k, one in enumerate(x))
     ratio = b / (L * T ** (m + 1))

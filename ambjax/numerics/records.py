@@ -10,7 +10,7 @@ import inspect
 import math
 import operator
 from collections.abc import Callable, Hashable, Iterable
-from typing import Any, TypeAlias, TypeVar, dataclass_transform
+from typing import Any, Literal, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
@@ -100,6 +100,23 @@ def static(default: object = dataclasses.MISSING, *, doc: str = "") -> Any:
     return dataclasses.field(default=default, metadata={"static": True, "doc": doc})
 
 
+def derived(*, init: Literal[False] = False) -> Any:
+    """Declare a static field that a function computes, None until then. The constructor does not take it.
+
+    `dataclasses.replace` resets it; `replaced` keeps it. `init`: for type checkers.
+    """
+    return dataclasses.field(default=None, init=init, repr=False, metadata={"static": True})
+
+
+def replaced(node: T, **fields: object) -> T:
+    """Return the record with other values of these fields, of which some may be declared by `derived`."""
+    kinds = dataclasses.fields(node)  # pyright: ignore[reportArgumentType]
+    computed = {kind.name: fields.pop(kind.name, getattr(node, kind.name)) for kind in kinds if not kind.init}
+    other = dataclasses.replace(node, **fields)  # pyright: ignore[reportArgumentType]
+    other.__dict__.update(computed)
+    return other
+
+
 def part(*, default: object = dataclasses.MISSING, doc: str, channels: bool = False) -> Any:
     """Declare a field that is itself a record, or another pytree of numbers. `doc`: its meaning.
 
@@ -108,7 +125,7 @@ def part(*, default: object = dataclasses.MISSING, doc: str, channels: bool = Fa
     return dataclasses.field(default=default, metadata={"doc": doc, "channels": channels})
 
 
-@dataclass_transform(frozen_default=True, field_specifiers=(leaf, gain, static, part, dataclasses.field))
+@dataclass_transform(frozen_default=True, field_specifiers=(leaf, gain, static, derived, part, dataclasses.field))
 def record(cls: type[T]) -> type[T]:
     """Make `cls` a frozen dataclass and register it as a pytree.
 
@@ -151,10 +168,7 @@ def record(cls: type[T]) -> type[T]:
 
 
 def _check_at_construction(cls: type) -> None:
-    """Add a `__post_init__` that checks the plain numbers. Call this before the class becomes a dataclass.
-
-    A `__post_init__` in the body of the class runs first.
-    """
+    """Add a `__post_init__` that checks the plain numbers. Call this before the class becomes a dataclass."""
     own = cls.__dict__.get("__post_init__")
 
     def check(self: object) -> None:
@@ -178,10 +192,7 @@ def _check_at_construction(cls: type) -> None:
 
 
 def _getter(names: list[str]) -> Callable[[object], tuple[object, ...]]:
-    """Return a fast function from an object to the tuple of its attributes `names`.
-
-    Speed matters because a rollout flattens about twenty records three times.
-    """
+    """Return a fast function from an object to the tuple of its attributes `names`."""
     if len(names) > 1:
         return operator.attrgetter(*names)
     return lambda node: tuple(getattr(node, name) for name in names)
@@ -236,11 +247,7 @@ def validate(node: object, path: str = "") -> None:
 
 
 def check_leaf(field: dataclasses.Field, name: str, value: object) -> None:
-    """Raise the ValueError of `check_number` if the leaf `field` does not allow `value`. Traced values are allowed.
-
-    `name`: dotted name, for messages. `value` may be a `GainFunction`, which checks itself. None is
-    allowed for an optional field and for a steepness.
-    """
+    """Raise the ValueError of `check_number` if the leaf `field` does not allow `value`; traced values are allowed."""
     if isinstance(value, GainFunction):
         value.check(field, name)
     elif not (is_traced(value) or (value is None and (field.metadata["optional"] or field.metadata.get("steepness")))):

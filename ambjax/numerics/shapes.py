@@ -21,11 +21,7 @@ def axes_of(field: dataclasses.Field) -> list[str]:
 
 
 def check_shapes(fields: Sequence[dataclasses.Field], values: Mapping[str, Any], path: str = "") -> None:
-    """Raise ValueError if the shape of a leaf of a record is neither the declared one nor that of an ensemble.
-
-    `fields`: the leaves. `values`: their values by name; None and records are skipped. `path`: dotted path of the
-    record, for the message.
-    """
+    """Raise ValueError if the shape of a leaf of a record is neither the declared one nor that of an ensemble."""
     lengths: dict[str, tuple[int, str]] = {}
     for field in fields:
         value, axes = values[field.name], axes_of(field)

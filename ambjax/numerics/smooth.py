@@ -186,10 +186,7 @@ def _quarter(y: Array) -> Array:
 @jax.custom_jvp
 @compiled_alone
 def sine(x: Array) -> Array:
-    """Return sin(2 pi x), x in turns.
-
-    The reduction of x is exact. The function vectorises, whereas XLA's sine is a library call on CPUs.
-    """
+    """Return sin(2 pi x), x in turns. The function vectorises, whereas XLA's sine is a library call on CPUs."""
     y = _reduced_angle(x)
     return _quarter(jnp.maximum(jnp.minimum(y, 0.5 - y), -0.5 - y))
 

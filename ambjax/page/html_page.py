@@ -14,12 +14,11 @@ import numpy as np
 
 from ambjax.cases.reader import Case
 from ambjax.ensemble.study import Study
-from ambjax.host.optional import extra
+from ambjax.host.extensions import extra
 from ambjax.page.case_text import TemplateLine, checked, editable_lines
 from ambjax.page.functions import PRELUDE
 from ambjax.page.linear_script import linear_script
-from ambjax.page.loop_functions import loop_parameters
-from ambjax.page.loop_script import COILS, SIGNALS, loop_script
+from ambjax.page.loop_functions import COILS, SIGNALS, loop_parameters, loop_script
 from ambjax.page.sliders import GROUPS, SEED, Slider, changed, parameter_values, parameters, sliders
 from ambjax.simulation.metrics import UNITS
 from ambjax.simulation.trajectory import STATUSES
@@ -103,10 +102,7 @@ def _library() -> list[str]:
 
 
 def _check_contents(case: Case, path: str) -> None:
-    """Raise ValueError for what a page cannot contain: a signal from a file, and a notch.
-
-    The gain of a notch follows from the linear loop at the speed, so it would have to change with each slider.
-    """
+    """Raise ValueError for what a page cannot contain: a signal from a file, and a notch."""
     if case.cascade.notch is not None:
         raise ValueError(
             f"{path}: [controller.notch]: a page cannot contain a notch, whose gain depends on all numbers of the "
@@ -217,15 +213,11 @@ def _finest(case: Case, others: list[Case]) -> Case:
     period = float(case.clock.sample_period)
     steps = [one.clock for one in (case, *others) if one.clock.integrator.step_size(period) is not None]
     clock = min(steps, key=lambda clock: clock.integrator.step_size(period) or 0.0, default=case.clock)
-    return dataclasses.replace(case, clock=dataclasses.replace(case.clock, method=clock.method))
+    return dataclasses.replace(case, clock=case.clock.with_method(clock.method))
 
 
 def _members(case: Case) -> dict[str, Any]:
-    """Return the members of the ensemble for JSON: their number, and rows for the parameters that vary.
-
-    Each spread number has one row for each parameter that it changes.
-    A row is the index of the parameter, whether its values are factors of the page's value, and its values [members].
-    """
+    """Return the members of the ensemble for JSON: their number, and rows for the parameters that vary."""
     study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, MEMBERS)
     study = dataclasses.replace(study, seed=int(case.scenario.seed))
     own, drawn = parameter_values(case), study.drawn(np.arange(MEMBERS))

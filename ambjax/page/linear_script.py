@@ -1,8 +1,4 @@
-"""The linearised loop as JavaScript: the step of the laws and the rates of the plant, with their derivatives.
-
-From these, sensitivity.js computes the equilibrium by Newton's method, and the map of one sample as `ambjax.linear`
-does.
-"""
+"""The linearised loop as JavaScript: the step of the laws and the rates of the plant, with their derivatives."""
 
 from typing import Any, NamedTuple, TypeAlias
 

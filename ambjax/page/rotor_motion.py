@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase
-from ambjax.cases.rotor_drawing import drawing_of
+from ambjax.cases.rotor_drawing import drawing_of, place_of, radial_axes
 from ambjax.cases.rotor_tables import RIGID
 
 # Largest number of instants, and their least number in a revolution. A longer run is shown from its end backwards.
@@ -29,7 +29,7 @@ def motion_of(case: MachineCase, signals: dict[str, Any]) -> dict[str, Any]:
 
     `at`: places of the shaft, m. `along`: rows from the coordinates (translation, tilt, modes) of one plane to the
     displacement at each place. `x`, `y`: these coordinates at each time `t` (s). `planes`: kind and place. `rpm`:
-    speed. `gap`: smallest clearance of a radial axis, m.
+    speed. `stops`: place and clearance (m) of the stop of each radial bearing.
     """
     drawing = drawing_of(case)
     t, speed, period = signals["t"], np.abs(signals["speed_rpm"]), float(case.clock.sample_period)
@@ -40,10 +40,12 @@ def motion_of(case: MachineCase, signals: dict[str, Any]) -> dict[str, Any]:
     modes = q[:, RIGID:].reshape(len(q), -1, 2)
     x = np.column_stack([q[:, 0], q[:, 4], modes[:, :, 0]])
     y = np.column_stack([q[:, 1], -q[:, 3], modes[:, :, 1]])
-    radial = [own.scenario for name, own in zip(case.axes, case.cases, strict=True) if not name.endswith(".z")]
+    rotor = case.machine.rotor
+    rows = np.asarray(rotor.at_magnets if rotor.at_stops is None else rotor.at_stops)
+    stops = [[round(place_of(rows[k]), 6), float(case.cases[k].scenario.touchdown)] for k in radial_axes(case)[::2]]
     return {
         "t": _rounded(t[kept]), "rpm": _rounded(speed[kept]), "x": _rounded(x), "y": _rounded(y),
-        "at": _rounded(drawing.at), "gap": min(float(one.limit) for one in radial),
+        "at": _rounded(drawing.at), "stops": stops,
         "along": _rounded(np.column_stack([np.ones_like(drawing.at), drawing.at, drawing.shapes])),
         "planes": [[kind, round(place, 6)] for kind, place in drawing.planes],
     }  # fmt: skip

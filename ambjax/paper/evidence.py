@@ -61,10 +61,7 @@ class Survival(NamedTuple):
 
 
 def survival_of(tried: np.ndarray, lost: np.ndarray, stalled: np.ndarray) -> Survival:
-    """Return the survival of a scan over the ascending values `tried` [N].
-
-    `lost`, `stalled`: bool [N], whether a member at this value is lost or stalled.
-    """
+    """Return the survival of a scan over the ascending values `tried` [N]."""
     ended = np.flatnonzero(lost | stalled)
     first = int(ended[0]) if ended.size else len(tried)
     unknown = bool(ended.size) and not lost[first]
@@ -72,7 +69,7 @@ def survival_of(tried: np.ndarray, lost: np.ndarray, stalled: np.ndarray) -> Sur
 
 
 class Noise(NamedTuple):
-    """The noise scan at one sample period (s). `horizon`: simulated duration of each run, s.
+    """The noise scan at one sample period (s).
 
     Arrays with one entry for each of NOISE_STDS: whether a member is lost, whether a member is stalled, and the mean
     over the seeds of the largest settled |sigma|, m/s.
@@ -205,10 +202,7 @@ def _uncertain(cascade: Cascade, reading: str) -> Uncertain:
 
 @one_kernel
 def _scan(cascade: Cascade, scenarios: Scenario, clock: Clock) -> dict[str, np.ndarray]:
-    """Return the metrics of each member.
-
-    Members run one by one, because every member of a batch would take as many steps as the stiffest one.
-    """
+    """Return the metrics of each member."""
     fold = Metrics(0.4 * clock.duration)
     return jax.lax.map(lambda s: rollout(cascade, s, clock, fold=fold, record_every=0).metrics, scenarios)
 

@@ -31,10 +31,7 @@ def finding(ours: str, value: float, condition: bool, cause: str) -> Finding:
 
 
 def finding_if_lost(run: Run, evidence: Evidence) -> Finding | None:
-    """Return the finding on a claim about a run that is lost or stalled; None if the run reached its end.
-
-    The cause of a loss is Eq. (7), if it is violated in the tracking scenario; otherwise it is the status of the run.
-    """
+    """Return the finding on a claim about a run that is lost or stalled; None if the run reached its end."""
     if math.isinf(run.metrics["lost_at_s"]):
         return None
     if run.metrics["stalled"]:

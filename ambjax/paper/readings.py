@@ -103,8 +103,7 @@ def on_processor(reading: str) -> Cascade:
 def scenario(name: str, reading: str, *, pulse: bool = True) -> Scenario:
     """Return the "regulation" or "tracking" scenario in a reading; `pulse` False: without the disturbance.
 
-    Only the readings in NOISY have noise and a supply limit. Both scenarios have the same structure (regulation has
-    amplitude 0), so they share one compilation.
+    Only the readings in NOISY have noise and a supply limit.
     """
     reference = dataclasses.replace(REFERENCE, amplitude=REFERENCE.amplitude if name == "tracking" else 0.0)
     none = dataclasses.replace(PULSE, amplitude=0.0)

@@ -42,7 +42,6 @@ def fan(
     `bands[quantity][percent]`: the quantile [T] at the times t [T] (s) over the members not yet lost; NaN if all are
     lost. `limits[quantity]` (> 0): drawn at plus and minus its value if the data come near it. `lost_at` [N] (s, +inf:
     never): adds a panel with the share of survivors. `stalled` [N] (bool): members at which the integrator stalled.
-    Raises ValueError for an unknown quantity.
     """
     t = np.asarray(t, float)
     end = t[-1]
@@ -103,11 +102,7 @@ def _tint(k: int, pairs: int) -> tuple[float, ...]:
 
 
 def _reach(curves: Sequence[np.ndarray]) -> tuple[float, float, float]:
-    """Return the lowest and highest value to show, and the largest |value| if it lies far beyond them (else 0).
-
-    The inner bands are all but the outermost. If extremes exceed them by far, the range covers the inner bands for at
-    least 90 % of the time.
-    """
+    """Return the lowest and highest value to show, and the largest |value| if it lies far beyond them (else 0)."""
     values, inner = np.concatenate(curves), curves[1:-1] or curves
     lower, upper = inner[0][np.isfinite(inner[0])], inner[-1][np.isfinite(inner[-1])]
     values = values[np.isfinite(values)]

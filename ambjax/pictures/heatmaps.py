@@ -162,10 +162,7 @@ def _cells(ax: Axes, panel: MapPanel, values: np.ndarray, norm: Normalize, colou
 
 
 def _outline(ax: Axes, x_edges: np.ndarray, y_edges: np.ndarray, inside: np.ndarray, width: float) -> None:
-    """Draw the edges between the cells inside and outside.
-
-    A contour interpolated between the centres would cut through cells where survival falls from all to none.
-    """
+    """Draw the edges between the cells inside and outside."""
     row, column = np.nonzero(inside[:, 1:] != inside[:, :-1])
     at = x_edges[column + 1]
     upright = np.stack([np.stack([at, y_edges[row]], 1), np.stack([at, y_edges[row + 1]], 1)], 1)

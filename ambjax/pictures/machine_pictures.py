@@ -23,10 +23,12 @@ LIGHT = 0.3
 def machine_figure(case: Any, signals: dict[str, np.ndarray], title: str) -> Figure:
     """Return one page: displacement, current and voltage of every axis over time, and the orbit of each radial bearing.
 
-    `signals`: those of a `MachineRun`. The orbits show the time from run.settle on, at the magnets, or the whole
-    run of a rotor that is lost before. What follows the loss is drawn in the first column alone.
+    The orbits show the time from run.settle on, at the magnets, or the whole run of a rotor that is lost before. If the
+    stops have places of their own, displacements and orbits are those at the stops.
     """
     axes, t = [str(name) for name in signals["axes"]], signals["t"]
+    place = "stop" if "z_stop" in signals else "magnet"
+    signals = signals | {"z": signals.get("z_stop", signals["z"])}
     step = max(len(t) // MOST_POINTS, 1)
     pairs = orbits_of(axes)
     figure = Figure(figsize=(13.0, 8.2), layout="constrained")
@@ -35,7 +37,7 @@ def machine_figure(case: Any, signals: dict[str, np.ndarray], title: str) -> Fig
     early = t <= min(end, max(0.02, 0.1 * t[-1]))
     begin = case.settle if case.settle < end else 0.0
     settled = (t >= begin) & (t <= end)
-    rows = (("z", 1e6, "displacement at the magnet, µm"), ("i", 1.0, "current, A"), ("u", 1.0, "voltage, V"))
+    rows = (("z", 1e6, f"displacement at the {place}, µm"), ("i", 1.0, "current, A"), ("u", 1.0, "voltage, V"))
     for row, (name, scale, words) in enumerate(rows):
         for column, shown in enumerate((slice(None, None, step), early)):
             ax = figure.add_subplot(grid[row, column])
@@ -51,7 +53,9 @@ def machine_figure(case: Any, signals: dict[str, np.ndarray], title: str) -> Fig
     figure.legend(handles, labels, ncols=len(axes), fontsize="small", loc="outside lower center")
     for row, (name, x, y) in enumerate(pairs[:3]):
         ax = figure.add_subplot(grid[row, 2])
-        ax.plot(1e6 * signals["z"][settled, x], 1e6 * signals["z"][settled, y], linewidth=0.7)
+        orbit = 1e6 * signals["z"][settled][:, [x, y]]
+        ax.plot(*orbit.T, linewidth=0.7)
+        _stop_circle(ax, 1e6 * float(case.cases[x].scenario.touchdown), float(np.max(np.abs(orbit))))
         ax.set_aspect("equal", adjustable="datalim")
         ax.set_title(f"orbit of {name}, from {begin:g} s on")
         ax.set_xlabel("x axis, µm")
@@ -63,14 +67,22 @@ def machine_figure(case: Any, signals: dict[str, np.ndarray], title: str) -> Fig
 
 
 def _limit_lines(ax: Any, case: Any, name: str, scale: float) -> None:
-    """Draw the limits of a signal if they are near what is shown: the stop, the bias current, and the supply."""
-    scenario = case.cases[0].scenario
-    limits = {"z": scenario.limit, "i": scenario.plant.i_0, "u": scenario.voltage_limit}
-    limit, words = scale * float(limits[name]), {"z": "stop", "i": "bias", "u": "limit"}[name]
-    for edge, bound in zip(ax.get_ylim(), (-limit, limit), strict=True):
-        if NEAR * abs(bound) <= abs(edge):
-            ax.axhline(bound, color="r", linewidth=0.8, linestyle="--")
-            ax.annotate(words, (0.01, bound), xycoords=("axes fraction", "data"), color="r", fontsize="x-small")
+    """Draw the limits of a signal if they are near what is shown: the stops, the bias current, and the supply."""
+    scenario, stops = case.cases[0].scenario, {float(one.scenario.touchdown) for one in case.cases}
+    limits = {"z": sorted(stops), "i": [scenario.plant.i_0], "u": [scenario.voltage_limit]}
+    words, edges = {"z": "stop", "i": "bias", "u": "limit"}[name], ax.get_ylim()
+    for limit in limits[name]:
+        for edge, bound in zip(edges, (-scale * float(limit), scale * float(limit)), strict=True):
+            if NEAR * abs(bound) <= abs(edge):
+                ax.axhline(bound, color="r", linewidth=0.8, linestyle="--")
+                ax.annotate(words, (0.01, bound), xycoords=("axes fraction", "data"), color="r", fontsize="x-small")
+
+
+def _stop_circle(ax: Any, radius: float, reached: float) -> None:
+    """Draw the stop around an orbit if a displacement of it is near, `reached`."""
+    if reached >= NEAR * radius:
+        angle = np.linspace(0, 2 * np.pi, 181)
+        ax.plot(radius * np.cos(angle), radius * np.sin(angle), "r--", linewidth=0.8)
 
 
 def orbits_of(axes: Sequence[str]) -> list[tuple[str, int, int]]:
@@ -93,11 +105,7 @@ def machine_sensitivity_picture(
     title: str,
     measured: Mapping[float, Sequence[Any]] = MappingProxyType({}),
 ) -> None:
-    """Write |S_kk| of every axis and the largest singular value over frequency, a panel for each speed.
-
-    `points`: results of `machine_sensitivity`. `limits`: upper limits of the zones A, B and C. `measured`: the
-    `Injection` of each axis by speed (rpm), drawn as points.
-    """
+    """Write |S_kk| of every axis and the largest singular value over frequency, a panel for each speed."""
     shown = list(points)[:4]
     figure = Figure(figsize=(13.0, 4.6 if len(shown) < 3 else 8.2), layout="constrained")
     grid = figure.subplots(1 + (len(shown) > 2), min(len(shown), 2), squeeze=False, sharex=True, sharey=True)
@@ -140,8 +148,7 @@ def machine_sensitivity_picture(
 def campbell_picture(title: str, speeds: np.ndarray, modes: Sequence[Sequence[Any]], path: pathlib.Path) -> None:
     """Write the frequencies of the modes against speed, coloured by their damping ratio, with the line of the speed.
 
-    `speeds`: rpm. `modes`: the modes at each speed. Triangles up are forward modes, triangles down backward ones;
-    unstable modes are red crosses. The lightly damped modes are named at the last speed.
+    Triangles up are forward modes, triangles down backward ones; unstable modes are red crosses.
     """
     figure = Figure(figsize=(11.0, 6.8), layout="constrained")
     ax = figure.add_subplot()

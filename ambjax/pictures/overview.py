@@ -174,10 +174,7 @@ def _last_moments(trajectory: Trajectory, end: float) -> float:
 
 
 def _transient(trajectory: Trajectory, end: float, loss: bool) -> float:
-    """Return the length of the enlarged start, s: three times the time in which the errors decay.
-
-    The length is at most a twentieth of the run, or a third of a run that ends in a loss.
-    """
+    """Return the length of the enlarged start, s: three times the time in which the errors decay."""
     t = np.asarray(trajectory.rows.t, float)
     alive = t <= max(end, t[min(1, len(t) - 1)])
     t, most = t[alive] - t[0], (end - t[0]) / (3 if loss else 20)

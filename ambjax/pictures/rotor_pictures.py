@@ -13,7 +13,12 @@ from ambjax.linear.unbalance_response import a1_limit
 from ambjax.pictures.style import own_style
 
 # Marks of the planes: letter, colour, and side of the rotor (1: above).
-PLANES = {"magnet": ("M", "tab:blue", 1), "sensor": ("S", "tab:green", -1), "unbalance": ("U", "tab:red", 1)}
+PLANES = {
+    "magnet": ("M", "tab:blue", 1),
+    "sensor": ("S", "tab:green", -1),
+    "unbalance": ("U", "tab:red", 1),
+    "stop": ("T", "tab:purple", -1),
+}
 # Largest number of mode shapes.
 SHAPES = 6
 
@@ -22,11 +27,7 @@ SHAPES = 6
 def unbalance_picture(
     case: Any, found: Any, criticals: Sequence[Any], operating: tuple[float, float], path: pathlib.Path
 ) -> None:
-    """Write displacement, current and command of every radial axis against speed.
-
-    `case`: the machine. `found`: an `UnbalanceResponse`. `criticals`: its critical speeds. `operating`: lowest and
-    highest operating speed, rpm.
-    """
+    """Write displacement, current and command of every radial axis against speed."""
     speeds = found.speeds
     radial = [k for k, axis in enumerate(case.axes) if not axis.endswith(".z")]
     drive = case.cases[0].scenario.drive
@@ -99,12 +100,17 @@ def _rotor(ax: Axes, drawing: Any) -> None:
         letter, colour, way = PLANES[kind]
         ax.plot([at, at], [0, way * reach], color=colour, linewidth=1.0, linestyle="--")
         ax.text(
-            at, way * reach * (1.25 if kind != "unbalance" else 1.6), letter, color=colour, ha="center", va="center"
+            at,
+            way * reach * (1.25 if kind in ("magnet", "sensor") else 1.6),
+            letter,
+            color=colour,
+            ha="center",
+            va="center",
         )
     ax.plot(0.0, 0.0, "k+", markersize=10)
     ax.set_ylim(-2 * reach, 2 * reach)
     ax.set_yticks([])
-    ax.set_title("M magnet, S sensor, U unbalance, + centre of mass, dark: disc", fontsize="medium")
+    ax.set_title("M magnet, S sensor, T stop, U unbalance, + centre of mass, dark: disc", fontsize="medium")
 
 
 def _shape(ax: Axes, drawing: Any, mode: Any) -> None:

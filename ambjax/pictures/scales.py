@@ -123,10 +123,7 @@ def digits(value: float) -> str:
 
 
 def edges(centres: np.ndarray, log: bool) -> np.ndarray:
-    """Return the n + 1 edges halfway between n ascending centres, on a logarithmic scale if `log`.
-
-    Raises ValueError if a log axis has a centre that is not positive.
-    """
+    """Return the n + 1 edges halfway between n ascending centres, on a logarithmic scale if `log`."""
     centres = np.asarray(centres, float)
     if log and not np.all(centres > 0):
         raise ValueError(f"a log axis cannot show {centres.min():g}: use positive values, or a linear axis")

@@ -7,11 +7,7 @@ BINS = 2000
 
 
 def thin(t: np.ndarray, y: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np.ndarray]:
-    """Return K of the T samples of the curve y(t), enough to draw it; up to 4 `bins` samples are returned unchanged.
-
-    Keep the first and the last sample, the minimum and maximum of each bin (the last partial bin included), and the
-    samples on both sides of every border between finite values and NaN, so that each gap keeps its place.
-    """
+    """Return K of the T samples of the curve y(t), enough to draw it; up to 4 `bins` samples are returned unchanged."""
     n = len(t)
     if n <= 4 * bins:
         return t, y
@@ -31,10 +27,7 @@ def _bin_starts(samples: int, bins: int) -> np.ndarray:
 
 
 def smoothed(t: np.ndarray, y: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean times and means of y over `bins` bins of samples, [bins + 2].
-
-    The first mean is repeated at the first sample, and the last mean at the last sample.
-    """
+    """Return the mean times and means of y over `bins` bins of samples, [bins + 2]."""
     starts = _bin_starts(len(t), bins)
     centres, means = (np.add.reduceat(values, starts) / np.diff(starts, append=len(t)) for values in (t, y))
     return np.concatenate([t[:1], centres, t[-1:]]), np.concatenate([means[:1], means, means[-1:]])
@@ -43,11 +36,7 @@ def smoothed(t: np.ndarray, y: np.ndarray, bins: int) -> tuple[np.ndarray, np.nd
 def envelope(
     t: np.ndarray, low: np.ndarray, high: np.ndarray, bins: int = BINS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return times, lower and upper border of a band; up to 4 `bins` samples are returned unchanged.
-
-    With more samples, each bin has the minimum of `low` and the maximum of `high`, from its first sample to the first
-    of the next bin; the last bin ends at the last sample. NaN is ignored; a bin that has only NaN is NaN.
-    """
+    """Return times, lower and upper border of a band; up to 4 `bins` samples are returned unchanged."""
     if len(t) <= 4 * bins:
         return t, low, high
     starts = _bin_starts(len(t), bins)
@@ -57,8 +46,5 @@ def envelope(
 
 
 def stretch_of(t: np.ndarray, low: float, high: float) -> slice:
-    """Return the samples from `low` to `high`, s, with the outer neighbour of a bound that lies between two samples.
-
-    The curve then reaches both ends of its axis, and a rounding error of a bound does not drop a sample.
-    """
+    """Return the samples from `low` to `high`, s, with the outer neighbour of a bound that lies between two samples."""
     return slice(max(int(np.searchsorted(t, low, "right")) - 1, 0), int(np.searchsorted(t, high, "left")) + 1)

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from ambjax.cases.reader import Case, require_case
+from ambjax.cases.given import of_case
+from ambjax.cases.reader import Case
 from ambjax.codegen import verify
 from ambjax.codegen.block import Block
 from ambjax.codegen.c99 import machine, package, texts
@@ -26,10 +27,10 @@ from ambjax.codegen.program import PRECISIONS
 from ambjax.codegen.trace import trace
 from ambjax.codegen.twins import LoopCase
 from ambjax.control.cascade import Cascade
-from ambjax.control.guard import guarded
 from ambjax.ensemble.spread import ends
 from ambjax.host.arguments import names_arguments
 from ambjax.results.outputs import described, directory, files, plain, spare
+from ambjax.simulation.system import guarded
 
 FORMATS = ("c", "fmu", "js")
 # Files of the verification.
@@ -130,6 +131,7 @@ class ExportedCase:
         return f"<table><caption>{names}</caption>{titles if rows else ''}{rows}</table>"
 
 
+@of_case()
 @names_arguments()
 def export(
     case: Case,
@@ -155,7 +157,6 @@ def export(
     Writes no files: see `ExportedCase.write`. Returns an `ExportedCase`; a failed check is a result, see its `ok`.
     Raises ValueError for an option that is not allowed, a case that cannot be exported, and a missing compiler.
     """
-    require_case(case)
     return generated(planned(case, what, format, fmi, precision, prefix, verify))
 
 
@@ -222,9 +223,7 @@ def _built(plan: Plan) -> dict[str, str | bytes]:
 def destination(out: str | None, name: str, plan: Plan) -> Iterator[tuple[pathlib.Path, pathlib.Path]]:
     """Yield the output directory, and a folder whose files move into it at the end of the `with` block, as in `files`.
 
-    `out` and `name` are those of `directory`. Without verification, the verification of an earlier export is removed,
-    because it does not apply to the new files. Raises ValueError if it would replace a file that is not from an export
-    with the same prefix.
+    Without verification, the verification of an earlier export is removed, because it does not apply to the new files.
     """
     path = directory(out, name)
     names = {"fmu": FMU_NAMES[: 1 if _holds_fmu(path, plan) else None], "js": ("{p}.js",), "c": package.NAMES}[

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.cases.machine_case import AnyCase, MachineCase
-from ambjax.cases.reader import require_case
+from ambjax.cases.given import of_case
+from ambjax.cases.machine_case import AnyCase
 from ambjax.cases.timing import FEWEST_SAMPLES, MOST_SAMPLES, SAMPLE_PERIOD
 from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, with_method_for_axes
 from ambjax.ensemble.paths import Place
 from ambjax.ensemble.spread import no_such_number
 from ambjax.ensemble.study import AnyStudy, Study
 from ambjax.host.arguments import names_arguments
-from ambjax.host.optional import extra
+from ambjax.host.extensions import extra
 from ambjax.linear import stability_of
 from ambjax.numerics.declared import numbers, within
 from ambjax.results.machine_study import MachineStudy
@@ -80,6 +80,7 @@ class CaseMap:
         return f"<table><caption>{html.escape(head)}</caption>{titles}{rows}</table>"
 
 
+@of_case(machines=True)
 @names_arguments()
 def survival_map(case: AnyCase, x: str, y: str, *, members: int = 1, seed: int | None = None) -> CaseMap:
     """Return survival and error over a grid of two quantities of a case, as `ambjax map` computes them.
@@ -93,8 +94,6 @@ def survival_map(case: AnyCase, x: str, y: str, *, members: int = 1, seed: int |
 
     Raises ValueError for an unknown quantity, a range that the case does not allow, and too many runs.
     """
-    if not isinstance(case, MachineCase):
-        require_case(case)
     for name, axis in (("x", x), ("y", y)):
         if not isinstance(axis, str):
             raise ValueError(f"{name} = {axis!r}: it must be text. Write {FORM}.")

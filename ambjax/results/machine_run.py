@@ -59,14 +59,10 @@ _finished = compiled_quickly(finish, options=QUICKEST)
 
 
 def simulate_machine(case: MachineCase, progress: Callable[[int], object] = lambda samples: None) -> MachineRun:
-    """Simulate a machine and record every sample.
-
-    `progress`: called with the number of new samples after each part of the run. A lost rotor is no error: see
-    `MachineRun.lost`. Raises ValueError unless `case` is a MachineCase.
-    """
-    if not isinstance(case, MachineCase):
-        raise ValueError(f"case = {type(case).__name__}: it must be a MachineCase, as ambjax.read_machine returns it.")
-    fold = PerAxis(stack_axes([canonical(Metrics.of(case.settle, one.scenario)) for one in case.cases]))
+    """Simulate a machine, as `simulate` does."""
+    fold = PerAxis(
+        stack_axes([canonical(Metrics.of(case.settle, one.scenario, case.machine.near)) for one in case.cases])
+    )
     machine, clock, fold = canonical((case.machine, case.clock, fold))
     state, parts, count = _begun(machine, clock, fold), [], min(SEGMENT, clock.samples)
     for first in range(0, clock.samples, count):
@@ -81,6 +77,8 @@ def simulate_machine(case: MachineCase, progress: Callable[[int], object] = lamb
     signals |= {name: np.asarray(getattr(rows.axes, name), np.float64) for name in SIGNAL_UNITS if name != "t"}
     status = outcome.trajectory
     why = STATUSES[int(status.lost_code)]
+    if case.machine.near == "z_stop":
+        signals["z_stop"] = np.asarray(rows.axes.z_stop, np.float64)
     signals |= {"lost_at": np.asarray(status.lost_at), "lost_why": np.asarray(why)}
     measured = {name: np.asarray(x) for name, x in outcome.metrics.items()}
     by_axis = {axis: {name: x[k].item() for name, x in measured.items()} for k, axis in enumerate(case.axes)}

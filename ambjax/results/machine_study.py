@@ -11,8 +11,9 @@ import jax
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, machine_from, machine_of_axes, parts_of
-from ambjax.cases.machine_spread import axis_values, machine_places, shared, varied_rotors, varied_start
-from ambjax.compiler.members_last import members_last
+from ambjax.cases.machine_spread import axis_values, machine_places, shared, varied_start
+from ambjax.cases.rotor_numbers import varied_rotors
+from ambjax.compiler.members_last import SHORT, members_last
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
 from ambjax.ensemble.maps import PERIOD
@@ -31,7 +32,7 @@ from ambjax.simulation.rollout import Result, run
 from ambjax.simulation.whole_machine import Machine, PerAxis, stack_axes
 from ambjax.world.scenario import Scenario
 
-# Multiple of the clearance by which the rotor of a `lost` call is displaced along x and y.
+# Multiple of the clearance by which the rotor of a `lost` call is displaced along x, y and z.
 FAR = 4.0
 # Largest number of members whose linearised loops are tested.
 MOST_TESTED = 16
@@ -98,16 +99,13 @@ class MachineStudy(AnyStudy):
 
     def at_period(self, period: float) -> Self:
         case = _reread(self.case, {PERIOD: period})
-        return self._with_clock(case, dataclasses.replace(case.clock, method=self.clock.method))
+        return self._with_clock(case, case.clock.with_method(self.clock.method))
 
     def _with_clock(self, case: MachineCase, clock: Clock) -> Self:
         return dataclasses.replace(self, case=dataclasses.replace(case, clock=clock))
 
     def with_steps_for(self, axes: dict[str, np.ndarray]) -> Self:
-        """Return the study with integration steps for all values of these numbers, by dotted path of `places`.
-
-        Raises ValueError for values that the machine does not allow.
-        """
+        """Return the study with integration steps for all values of these numbers, by dotted path of `places`."""
         wide: dict[str, object] = {}
         for path, x in axes.items():
             low, high = float(x.min()), float(x.max())
@@ -116,21 +114,18 @@ class MachineStudy(AnyStudy):
             found = _reread(self.case, wide)
         except ValueError as error:
             raise ValueError(f"--x, --y: {error}") from None
-        return self._with_clock(self.case, dataclasses.replace(self.clock, method=found.clock.method))
+        return self._with_clock(self.case, self.clock.with_method(found.clock.method))
 
     def batch(self, members: np.ndarray) -> tuple[Machine, PerAxis]:
-        """Return the machine of these members (integers [n]), and the metrics of its axes; what varies has an axis [n].
-
-        The nominal plants of the controllers do not vary.
-        """
+        """Return the machine of these members [n], and the metrics of its axes; what varies has an axis [n]."""
         return self.varied(self.drawn(members), members)
 
     def varied(self, values: dict[str, np.ndarray], members: np.ndarray) -> tuple[Machine, PerAxis]:
         """Return the machine with these values [n] and the random signals of these members [n], as `batch` does."""
         machine = self.case.machine
         parts = [self._axis(values, k, members) for k in range(len(self.case.axes))]
-        rotor, start = varied_rotors(machine.rotor, values), varied_start(machine.start_q, values)
-        folds = [canonical(Metrics.of(self.settle, scenario)) for _, scenario in parts]
+        rotor, start = varied_rotors(machine.rotor, values, self.case.axes), varied_start(machine.start_q, values)
+        folds = [canonical(Metrics.of(self.settle, scenario, machine.near)) for _, scenario in parts]
         return machine_of_axes(rotor, parts, self.clock, start, machine.law), PerAxis(stack_axes(folds))
 
     def metrics(self, values: dict[str, np.ndarray], members: np.ndarray) -> dict[str, np.ndarray]:
@@ -151,7 +146,7 @@ class MachineStudy(AnyStudy):
             cascade, scenario = self._axis(numbers, k, index)
             cases.append(dataclasses.replace(one, cascade=cascade, scenario=scenario))
         machine = self.case.machine
-        rotor, start = varied_rotors(machine.rotor, values), varied_start(machine.start_q, values)
+        rotor, start = varied_rotors(machine.rotor, values, self.case.axes), varied_start(machine.start_q, values)
         if rotor is not machine.rotor:
             rotor = jax.tree.map(lambda x: x[0], rotor)
         start = start.reshape(-1, start.shape[-1])[0]
@@ -166,7 +161,7 @@ class MachineStudy(AnyStudy):
         machine, fold = self.batch(members)
         if lost:
             far = np.array(machine.start_q)
-            far[..., :2] = FAR * max(float(np.max(np.asarray(one.scenario.limit))) for one in self.case.cases)
+            far[..., :3] = FAR * max(float(np.max(np.asarray(one.scenario.limit))) for one in self.case.cases)
             machine = dataclasses.replace(machine, start_q=far)
         outcome = run_machines(machine, self.clock, fold, threads=threads, call=call)
         values = {SPREAD + path: x for path, x in self.drawn(members).items()}
@@ -209,7 +204,13 @@ def run_machines(
 ) -> Result:
     """Simulate every member of an ensemble of machines. What varies has a leading axis [N]. No rows are recorded."""
     tree = canonical((machine, clock, fold))
-    return map_members(_simulated, tree, threads=threads, call=call, vectorised=True)
+    return map_members(_simulated, tree, threads=threads, call=call, plain=_has_long_sums(machine), vectorised=True)
+
+
+def _has_long_sums(machine: Machine) -> bool:
+    """Return whether a product of a matrix has a sum of more than SHORT terms, which XLA refuses in one kernel."""
+    matrices = [x for x in jax.tree.leaves(machine.law) if np.ndim(x) > 1]
+    return max(np.shape(x)[-1] for x in (machine.rotor.gravity, *matrices)) > SHORT
 
 
 def _simulated(tree: tuple[Machine, Clock, Fold], axes: object) -> Result:

@@ -1,15 +1,16 @@
 """Operating points: linearised loops of a case at its equilibria, and of the members of its spread."""
 
 import contextlib
-import dataclasses
 import math
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import jax
 import numpy as np
 
+from ambjax.cases.given import of_case
 from ambjax.cases.machine_case import MachineCase
-from ambjax.cases.reader import Case, require_case
+from ambjax.cases.reader import Case
+from ambjax.control.cascade import Cascade
 from ambjax.ensemble.study import Study
 from ambjax.linear import (
     PLACES,
@@ -25,7 +26,10 @@ from ambjax.linear import (
     linearise,
     linearise_members,
 )
+from ambjax.linear.linear_machine import MachineSensitivity, sensitivity_of, turning_machines
+from ambjax.numerics.records import replaced
 from ambjax.simulation.clock import Clock
+from ambjax.world.scenario import Scenario
 
 # Number of members of [spread] that `ambjax compare` analyses, and `ambjax sensitivity` without --members.
 MEMBERS = 100
@@ -67,14 +71,25 @@ def operating_point(case: Case, name: str, r: float) -> OperatingPoint:
     return OperatingPoint(name, r, m, system, _analysis(case, system, m, _velocity_sensor(case)))
 
 
-def sensitivity(case: Case, r: float = 0.0) -> Analysis:
-    """Return the `Analysis` of a case, linearised at a constant reference r (m).
+@overload
+def sensitivity(case: MachineCase) -> list[MachineSensitivity]: ...
+@overload
+def sensitivity(case: Case, r: float = 0.0) -> Analysis: ...
+@overload
+def sensitivity(case: Cascade, scenario: Scenario, clock: Clock, /, r: float = 0.0) -> Analysis: ...
+@of_case(machines=True)
+def sensitivity(case: Case | MachineCase, r: float = 0.0) -> Analysis | list[MachineSensitivity]:
+    """Return the `Analysis` of a case, linearised at a constant reference r (m); of a machine, one for each speed.
 
-    It contains the peaks of |S|, |T| and |KS|, the zone, the margins and the stiffness.
+    `case`: from `read_case` or `read_machine`; or a cascade, a scenario and a clock.
+    The analysis contains the peaks of |S|, |T| and |KS|, the zone, the margins and the stiffness.
     `ambjax.linear` contains functions for the single steps, and for the measurement of S by injection of a test signal.
     Raises ValueError as `linearise` does.
     """
-    require_case(case)
+    if isinstance(case, MachineCase):
+        points = turning_machines(case.machine, case.clock.sample_period, case.speeds)
+        both = zip(points, case.speeds, strict=True)
+        return [sensitivity_of(point, case.axes, speed, case.zones) for point, speed in both]
     return operating_point(case, "nominal", r).analysis
 
 
@@ -88,10 +103,7 @@ def _analysis(case: Case, system: StateSpace, m: float, velocity: bool) -> Analy
 
 
 def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPeaks:
-    """Analyse the members of the study at r = 0, and return the counts and the member with the largest peak.
-
-    `most`: number of members to analyse, the first of the study (None: all).
-    """
+    """Analyse the members of the study at r = 0, and return the counts and the member with the largest peak."""
     members = study.members if most is None else min(study.members, most)
     cascade, scenario = study.batch(np.arange(members))
     systems, found = linearise_members(cascade, scenario, study.clock)
@@ -116,10 +128,7 @@ def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPea
 
 
 def measured_peaks(case: Case, study: Study, peak: float) -> MemberPeaks:
-    """Measure the peak of |S| of each member of the study by injection of a multi-sine.
-
-    The frequencies of the multi-sine are denser near `peak` (Hz).
-    """
+    """Measure the peak of |S| of each member of the study by injection of a multi-sine."""
     cascade, scenario = study.batch(np.arange(study.members))
     clock = one_period(case)
     lines = frequency_lines(case.zones, clock, peak)
@@ -129,7 +138,7 @@ def measured_peaks(case: Case, study: Study, peak: float) -> MemberPeaks:
 def one_period(case: Case | MachineCase) -> Clock:
     """Return the clock of one period of the multi-sine of an injection: the period of its lowest frequency."""
     period = float(case.clock.sample_period)
-    return dataclasses.replace(case.clock, samples=math.ceil(1 / (float(case.zones.f_low) * period)))
+    return replaced(case.clock, samples=math.ceil(1 / (float(case.zones.f_low) * period)))
 
 
 def shown_band(case: Case, systems: list[StateSpace]) -> tuple[float, float]:
@@ -170,10 +179,10 @@ def margin_numbers(one: Analysis) -> dict[str, object]:
 
 def _margin_numbers(margins: Margins) -> dict[str, float]:
     return {
-        "gain_margin": margins.gain,
-        "gain_margin_low": margins.gain_low,
-        "gain_margin_high": margins.gain_high,
-        "phase_margin_deg": margins.phase_deg,
+        "gain_margin": margins.gm,
+        "gain_margin_low": margins.gm_low,
+        "gain_margin_high": margins.gm_high,
+        "phase_margin_deg": margins.pm,
         "delay_margin_s": margins.delay,
-        "disk_margin": margins.disk,
+        "disk_margin": margins.dm,
     }

@@ -29,8 +29,6 @@ STRICT = False
 def directory(out: str | None, name: str, names: Iterable[str] = (), force: bool = False) -> pathlib.Path:
     """Make the output directory `out`, or a new one under ./out called `name`, and return it.
 
-    `names`: files that the command writes. `force`: whether it may overwrite them.
-
     Raises ValueError in these cases: the directory cannot be made or written; it holds the study of an ensemble; it has
     one of `names`, without `force`; `check_places` refuses one of `names`.
     """
@@ -73,10 +71,7 @@ def check_places(out: pathlib.Path, names: Iterable[str | pathlib.PurePath]) -> 
 
 
 def spare(out: pathlib.Path, names: Iterable[str], mark: str) -> None:
-    """Raise ValueError if a file in `out` has one of these names but lacks `mark`: it is the user's own file.
-
-    `mark`: text that every file of an export with this prefix contains.
-    """
+    """Raise ValueError if a file in `out` has one of these names but lacks `mark`: it is the user's own file."""
     for name in names:
         if os.path.lexists(out / name) and not _holds(out / name, mark):
             raise ValueError(
@@ -128,10 +123,7 @@ def make(path: pathlib.Path) -> None:
 
 @contextlib.contextmanager
 def files(out: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Yield a temporary folder whose files move into `out` at the end of the block, or not at all if the block fails.
-
-    After a failure, an empty `out` is removed. Raises ValueError if the disk is full or `out` cannot be written.
-    """
+    """Yield a temporary folder whose files move into `out` at the end of the block, or not at all if it fails."""
     with _refusal(out):
         try:
             with tempfile.TemporaryDirectory(prefix=".ambjax-", dir=out, ignore_cleanup_errors=True) as folder:

@@ -4,15 +4,23 @@ import dataclasses
 import html
 import pathlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
-from ambjax.cases.reader import Case, require_case
+from ambjax.cases.given import of_case
+from ambjax.cases.machine_case import MachineCase
+from ambjax.cases.reader import Case
+from ambjax.control.cascade import Cascade
 from ambjax.ensemble.replay import record_member
-from ambjax.host.optional import extra
+from ambjax.host.extensions import extra
+from ambjax.results.machine_run import MachineRun, simulate_machine
+from ambjax.simulation.clock import Clock
 from ambjax.simulation.metrics import UNITS, Metrics
 from ambjax.simulation.trajectory import SIGNAL_UNITS, Trajectory
+from ambjax.world.scenario import Scenario
+
+Progress = Callable[[int], object]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +95,7 @@ class CaseRun:
 
     def plot_phase(self) -> Any:
         """Return a matplotlib Figure of the velocity against the displacement, in the whole run and when settled."""
-        from ambjax.pictures.phase_plane import phase_plane
+        from ambjax.pictures.figures import phase_plane
 
         return phase_plane(self.trajectory, self.case.name, self.case.settle)
 
@@ -107,18 +115,26 @@ class CaseRun:
         return f"<table><caption>{head}</caption><tr><th>metric</th><th>value</th><th>unit</th></tr>{rows}</table>"
 
 
-def simulate(case: Case, progress: Callable[[int], object] = lambda samples: None) -> CaseRun:
-    """Simulate a case, as `ambjax simulate` does, and record every sample.
+@overload
+def simulate(case: MachineCase, progress: Progress = ...) -> MachineRun: ...
+@overload
+def simulate(case: Case, progress: Progress = ...) -> CaseRun: ...
+@overload
+def simulate(case: Cascade, scenario: Scenario, clock: Clock, /, progress: Progress = ...) -> CaseRun: ...
+@of_case(machines=True)
+def simulate(case: Case | MachineCase, progress: Progress = lambda samples: None) -> CaseRun | MachineRun:
+    """Simulate a case or a machine, as `ambjax simulate` does, and record every sample.
 
-    - `case`: from `read_case`.
+    - `case`: from `read_case` or `read_machine`; or a cascade, a scenario and a clock.
     - `progress`: called with the number of new samples after each part of the run.
 
-    Returns a `CaseRun`. Raises ValueError for anything but a case, and as `rollout` does. A lost rotor is no error: see
-    `CaseRun.lost`. Nor is a stalled run: see the metric `stalled`.
+    Returns a `CaseRun`, or a `MachineRun` of a machine. Raises ValueError for anything but a case, and as `rollout`
+    does. A lost rotor is no error: see `CaseRun.lost`. Nor is a stalled run: see the metric `stalled`.
     """
-    require_case(case)
     if not callable(progress):
         raise ValueError(f"progress = {progress!r}: it must be a function of the number of new samples.")
+    if isinstance(case, MachineCase):
+        return simulate_machine(case, progress)
     fold = Metrics.of(case.settle, case.scenario)
     outcome = record_member(case.cascade, case.scenario, case.clock, fold=fold, tell=progress)
     metrics = {name: np.asarray(x).item() for name, x in outcome.metrics.items()}

@@ -6,13 +6,14 @@ from typing import Any, overload
 
 import numpy as np
 
+from ambjax.cases.given import of_case
 from ambjax.cases.machine_case import MachineCase, first_axis
-from ambjax.cases.reader import Case, require_case
+from ambjax.cases.reader import Case
 from ambjax.ensemble import statistics
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.study import AnyStudy, Study
 from ambjax.host.arguments import names_arguments
-from ambjax.host.optional import extra
+from ambjax.host.extensions import extra
 from ambjax.results.machine_study import MachineStudy
 from ambjax.simulation.metrics import UNITS
 
@@ -37,9 +38,9 @@ class MembersRun:
         return statistics.summary(self.columns, self.study.spread.paths, self.study.seed)
 
     def to_pandas(self) -> Any:
-        """Return the columns as a pandas DataFrame, one row per member. Raises ValueError if pandas is not installed.
+        """Return the columns as a pandas DataFrame, one row per member.
 
-        `attrs["units"]` has the unit of each metric. `DataFrame.to_parquet` writes the table to a file.
+        `attrs["units"]` has the unit of each metric.
         """
         columns = {name: x for name, x in self.columns.items() if name != "index"}
         index = extra("pandas").Index(self.columns["index"], name="member")
@@ -61,7 +62,7 @@ class MembersRun:
         return f"<table><caption>{head}</caption>{titles}{rows}</table>"
 
     def plot(self, *metrics: str) -> Any:
-        """Return a matplotlib Figure with histograms of these metrics over the members. Default: the main ones.
+        """Return a matplotlib Figure with histograms of these metrics over the members.
 
         Raises ValueError if none of these names is a column.
         """
@@ -70,6 +71,7 @@ class MembersRun:
         return histogram_figure(self.columns, metrics or CHIEF)
 
 
+@of_case(machines=True)
 @names_arguments()
 def simulate_members(
     case: Case | MachineCase, members: int, *, seed: int | None = None, threads: int | None = None
@@ -83,8 +85,6 @@ def simulate_members(
     The results stay in memory; `ambjax ensemble` writes them in parts and can be resumed. Raises ValueError for
     anything but a case, and for a number of members or a seed out of range.
     """
-    if not isinstance(case, MachineCase):
-        require_case(case)
     study = study_of(case, seed, members)
     columns = {name: np.asarray(x) for name, x in study.columns(0, members, threads=threads).items()}
     return MembersRun(study, columns)

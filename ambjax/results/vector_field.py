@@ -7,7 +7,8 @@ import jax
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from ambjax.cases.reader import Case, require_case
+from ambjax.cases.given import of_case
+from ambjax.cases.reader import Case
 from ambjax.numerics.records import canonical
 from ambjax.simulation.loop import ClosedLoop, LoopState
 
@@ -26,13 +27,13 @@ class VectorField(NamedTuple):
     named: Callable[[Array], LoopState]
 
 
+@of_case(traced=True)
 def vector_field(case: Case) -> VectorField:
     """Return the equations of the closed loop of a case, for scipy.integrate.solve_ivp or a diffrax.ODETerm.
 
     Sensor noise is left out, because it is held over samples. A solver does not stop where the rotor touches down.
     Raises ValueError for a controller on a processor, because its loop is not a differential equation.
     """
-    require_case(case, traced=True)
     if case.cascade.sampled:
         raise ValueError(
             "vector_field: this controller runs on a processor, so its loop is not a differential equation. Remove "

@@ -52,15 +52,12 @@ class AdaptiveSteps:
     """Base class of adaptive methods: the rms of error / allowed error over the state is at most 1 in each step.
 
     The allowed error of a component is `tolerance` (scale + |state|), but at most the boundary layer of its smoothed
-    sign. With a larger error, one step would move the state to the other side of the sign, and the next step would move
-    it back. The steps would then shrink until the run stalls. A kink of the rates, such as the limit of the supply,
-    increases the error estimate of a step that contains it. The steps therefore shrink before it. The trial step at the
-    end of a sample is the first trial step of the next.
+    sign. A kink of the rates, such as the limit of the supply, increases the error estimate of a step that contains it.
+    The steps therefore shrink before it. The trial step at the end of a sample is the first trial step of the next.
 
     - `ORDER`: the error estimate of a step h falls as h^ORDER.
 
-    Forward mode, reverse mode and vmap work. Reverse mode repeats the steps of each sample
-    (`numerics.reversible`).
+    Forward mode, reverse mode and vmap work. Reverse mode repeats the steps of each sample (`numerics.reversible`).
     """
 
     tolerance: Scalar = leaf(default=1e-6, unit="1", above=0, at_most=1.0, doc="relative error allowed per step")

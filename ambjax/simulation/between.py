@@ -1,7 +1,6 @@
 """The plant between two samples of a processor: the voltages that act, and the initial value problems under them."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -111,9 +110,8 @@ def under(loop: ClosedLoop, state: object, command: Command, voltage: Voltage, e
 
     def rates(inputs: tuple[ExternalInputs, Array], x: object) -> object:
         outside, u = inputs
-        applied: Any = loop.scenario.applied(u, x, outside.q_i)
         q_z = loop.scenario.pushed(outside.q_z, plant.measurement(x))
-        return plant.rates(x, applied, q_z, outside.q_i)
+        return plant.rates(x, loop.scenario.applied(u, x, outside.q_i), q_z, outside.q_i)
 
     def observed(inputs: tuple[ExternalInputs, Array], x: object) -> tuple[object, Instant]:
         (outside, u), motion, heat = inputs, plant.measurement(x), plant.signals(x).heat

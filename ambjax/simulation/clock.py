@@ -1,8 +1,6 @@
 """The clock: number of samples, sample period, and the integrator between samples."""
 
-import dataclasses
-
-from ambjax.numerics.records import Scalar, leaf, part, record, static
+from ambjax.numerics.records import Scalar, derived, leaf, part, record, replaced, static
 from ambjax.simulation.integrate import Integrator
 
 
@@ -19,11 +17,8 @@ class Clock:
         doc="sample period; each measurement error is held for this time",
     )
     method: Integrator | None = part(default=None, doc="the integrator; None: `ambjax.solvers.with_method` chooses it")
-    cuts: int | None = static(
-        default=None,
-        doc="largest number of edges of disturbances inside one sample, on a processor. `ambjax.solvers.with_method` "
-        "computes it; None: the number of all edges",
-    )
+    # Largest number of edges of disturbances inside one sample of a processor, from `with_method`; None: of all edges.
+    cuts: int | None = derived()
 
     @property
     def duration(self) -> Scalar:
@@ -39,6 +34,6 @@ class Clock:
             )
         return self.method
 
-    def with_method(self, method: Integrator) -> "Clock":
+    def with_method(self, method: Integrator | None) -> "Clock":
         """Return this clock with another integrator."""
-        return dataclasses.replace(self, method=method)
+        return replaced(self, method=method)

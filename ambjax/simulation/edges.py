@@ -32,10 +32,7 @@ class Edges(NamedTuple):
     knots: tuple[Knots, ...] = ()
 
     def until(self, now: Scalar, h: Scalar) -> Array:
-        """Return the time from `now` to the first edge within the next `h`, s; h if there is no edge.
-
-        An edge within rounding of either end is not inside: `inset` moves the stages to the correct side of it.
-        """
+        """Return the time from `now` to the first edge within the next `h`, s; h if there is no edge."""
         tolerance, step = inset(now, h), jnp.asarray(h)
         for edge in (*self.at, *(knots.after(now + 2 * tolerance) for knots in self.knots)):
             ahead = (edge > now + tolerance) & (edge < now + step - tolerance)
@@ -56,8 +53,7 @@ class Edges(NamedTuple):
         """Divide `count` equal steps of length h, from t on, at the edges inside them.
 
         Returns the position before the first step, and a function from the number of a step, 0 to `count` + `most` - 1,
-        and the position to its begin, end and length, s, and the next position. If there are fewer edges than `most`,
-        the last steps have length 0. If there are more, the last of them are not ends of steps.
+        and the position to its begin, end and length, s, and the next position.
         """
         if not self.most:
             return (), lambda number, place: (t + number * h, t + (number + 1) * h, jnp.asarray(h), place)
@@ -79,10 +75,7 @@ NO_EDGES = Edges()
 
 
 def inset(t: Scalar, h: Scalar) -> Scalar:
-    """Return the distance by which stages at the ends of a step are moved into it, s: a few units in the last place.
-
-    The step begins at t (s) and has length h (s).
-    """
+    """Return the distance by which stages at the ends of a step are moved into it, s: a few units in the last place."""
     return _rounding() * (abs(t) + h)
 
 

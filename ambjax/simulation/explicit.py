@@ -17,10 +17,7 @@ from ambjax.simulation.span import Instant, Span
 
 @functools.cache
 def _combination(weights: tuple[float, ...]) -> Callable[..., Array]:
-    """Return the function (x, h, rates) -> x + h sum(weight * rate), on CPUs compiled as a separate loop.
-
-    On CPUs its inputs and outputs are stored in memory, so that XLA's fusion cannot compute them again.
-    """
+    """Return the function (x, h, rates) -> x + h sum(weight * rate), on CPUs compiled as a separate loop."""
 
     def plain(x: Array, h: Array, rates: tuple[Array, ...]) -> Array:
         first, *others = ((w, k) for w, k in zip(weights, rates, strict=True) if w)
@@ -49,8 +46,7 @@ class _Tableau:
     - `ROWS`: Butcher tableau: row k has the weights of the first k rates in the state at stage k + 1; the last row
       gives the new state.
 
-    On CPUs, the rates and the state of each stage are excluded from XLA's fusion. With fusion, shared terms of the
-    right-hand side would be computed again for every component of every stage.
+    On CPUs, the rates and the state of each stage are excluded from XLA's fusion.
     """
 
     TIMES: ClassVar[tuple[float, ...]]

@@ -1,8 +1,6 @@
 """Laws of a machine in its loop: they demand the forces of all axes.
 
 Each axis keeps its guard, its notch and its inner laws; it has no observer.
-
-The functions take the machine: `simulation.whole_machine.Machine`.
 """
 
 from collections.abc import Callable, Sequence
@@ -108,11 +106,7 @@ def jumped(
 def demanded_now(
     machine: Grouped, W: Scalar, own: Sequence[Any], sensed: Sequence[Any], law: Any, errors: Sequence[object]
 ) -> tuple[tuple[tuple[ForceDemand, Measurement], ...], Any]:
-    """Return the demands of the groups in continuous time, and the rates of the state of the law.
-
-    `own`: external inputs of the groups. `sensed`: states of the groups, with the motion at the sensors. `law`: state
-    of the law of the machine.
-    """
+    """Return the demands of the groups in continuous time, and the rates of the state of the law."""
 
     def read(loop: ClosedLoop, own: Any, state: LoopState, error: Any) -> Measurement:
         measured = loop.received(own, state.plant, error)

@@ -52,6 +52,7 @@ class Sizes(NamedTuple):
     i: Array
     e: Array
     v_tilde: Array
+    z_stop: Array | tuple[()] = ()
 
 
 class Densities(NamedTuple):
@@ -130,10 +131,7 @@ class ClosedLoop(WholeState):
         return jax.tree.map(jnp.asarray, LoopState(self.scenario.plant.scale(), self.cascade.scale()))
 
     def layer(self) -> LoopState:
-        """Return, for each state, the largest integration error that keeps it in the boundary layer of its sign.
-
-        The value is inf for the states of the plant.
-        """
+        """Return, for each state, the largest error that keeps it in the boundary layer of its sign; inf: the plant."""
         plant = jax.tree.map(lambda _: jnp.inf, self.scenario.plant.scale())
         return jax.tree.map(jnp.asarray, LoopState(plant, self.cascade.layer()))
 
@@ -145,10 +143,7 @@ class ClosedLoop(WholeState):
         return ExternalInputs(reference_at(scenario.reference, t), scenario.acceleration(t), scenario.q_i(t), runout, e)
 
     def received(self, inputs: ExternalInputs, plant: object, errors: Errors) -> Measurement:
-        """Return the readings that the controller receives, with the runout and the test signal.
-
-        `inputs`: the external inputs at this instant (method `inputs`).
-        """
+        """Return the readings that the controller receives, with the runout and the test signal."""
         motion = self.scenario.plant.measurement(plant)
         measured = self.scenario.sensors.reading(motion, errors._replace(runout=inputs.runout))
         return with_signal(measured, self.wave, inputs.e)
@@ -195,21 +190,14 @@ class ClosedLoop(WholeState):
         return self.derivative(inputs, state, control, u), signals
 
     def instant(self, reference: Reference, plant: object, i_ref: Array, v_tilde: Array, u: Array) -> Instant:
-        """Return the signals to record at one instant.
-
-        `plant`: state of the plant. `i_ref` (A), `v_tilde` (A^2/m^2): the values in the command. `u`: applied voltage,
-        V.
-        """
+        """Return the signals to record at one instant. `u`: applied voltage, V."""
         motion, heat = self.scenario.plant.measurement(plant), self.scenario.plant.signals(plant).heat
         sigma = self.cascade.sigma(motion, reference)
         sizes = Sizes(motion.z, motion.z - reference.r, sigma, u, motion.i, motion.i - i_ref, v_tilde)
         return Instant(sizes, Densities(u, u * u, heat))
 
     def derivative(self, inputs: ExternalInputs, state: LoopState, control: CascadeState, u: Array) -> LoopState:
-        """Return the time derivative of the state.
-
-        `control`: rates of the states of the laws. `u`: applied voltage, V.
-        """
+        """Return the time derivative of the state. `u`: applied voltage, V."""
         plant = self.scenario.plant
         q_z = self.scenario.pushed(inputs.q_z, plant.measurement(state.plant))
         return LoopState(plant.rates(state.plant, u, q_z, inputs.q_i), control)
@@ -219,10 +207,7 @@ class ClosedLoop(WholeState):
         return self.status_of(state, self.scale(), state.plant)
 
     def status_of(self, state: object, scale: object, plant: object) -> Array:
-        """Return the status code for a state or a part of it.
-
-        `scale`: characteristic sizes, with the structure of `state`. `plant`: state of the plant.
-        """
+        """Return the status code for a state or a part of it."""
         in_range = [jnp.abs(x) <= DIVERGENCE * s for x, s in zip(*map(jax.tree.leaves, (state, scale)), strict=True)]
         touched = jnp.abs(self.scenario.plant.measurement(plant).z) >= self.scenario.limit
         return jnp.where(
@@ -234,10 +219,7 @@ class ClosedLoop(WholeState):
         return self.scenario.plant.measurement(plant)[:2]
 
     def rest(self, state: LoopState, code: Array) -> LoopState:
-        """Return the state in which a lost rotor is frozen: at rest, at the stop that it touched or else at its last z.
-
-        The currents and the state of the controller do not change.
-        """
+        """Return the state in which a lost rotor is frozen: at rest, at the stop that it touched or at its last z."""
         plant = self.scenario.plant
         z = plant.measurement(state.plant).z
         stop = jnp.where(z < 0, -1.0, 1.0) * self.scenario.limit
@@ -273,10 +255,7 @@ class ClosedLoop(WholeState):
         alive: Array,
         demanded: tuple[ForceDemand, Measurement] | None = None,
     ) -> Row:
-        """Return the signals at time t (s), with u_mean = u_peak = 0. The drive of a lost rotor is off: u = 0.
-
-        `demanded`: as in `command`.
-        """
+        """Return the signals at time t (s), with u_mean = u_peak = 0. The drive of a lost rotor is off: u = 0."""
         inputs = self.inputs(t)
         command, _, u = self.command(inputs, state, errors, None, demanded)
         measured = self.received(inputs, state.plant, errors)
@@ -285,11 +264,7 @@ class ClosedLoop(WholeState):
     def signals(
         self, t: Scalar, inputs: ExternalInputs, state: object, command: Command, measured: Measurement, alive: Array
     ) -> Row:
-        """Return all signals at time t (s).
-
-        `state`: state of the plant. `command`: command with u within the limit of the supply. `measured`: readings of
-        the sensors.
-        """
+        """Return all signals at time t (s)."""
         plant = self.scenario.plant
         motion, signals, (i_1, i_2) = plant.measurement(state), plant.signals(state), plant.currents(state)
         return Row(

@@ -1,6 +1,5 @@
 """Choice of the integrator and its number of substeps from the slopes of the loop."""
 
-import dataclasses
 import math
 
 import jax
@@ -9,7 +8,7 @@ import numpy as np
 from jax import lax
 
 from ambjax.control.cascade import Cascade
-from ambjax.numerics.records import is_traced
+from ambjax.numerics.records import is_traced, replaced
 from ambjax.simulation.adaptive import AdaptiveSteps
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.edges import most_inside
@@ -192,7 +191,7 @@ def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: 
         _check_limit(clock, clock.method.limit, cascade, scenario)
     if not cascade.sampled or (cuts := most_inside(scenario, clock.sample_period)) is None:
         return clock
-    return dataclasses.replace(clock, cuts=max(cuts, clock.cuts or 0))
+    return replaced(clock, cuts=max(cuts, clock.cuts or 0))
 
 
 def _check_limit(clock: Clock, limit: float, cascade: Cascade, scenario: Scenario) -> None:

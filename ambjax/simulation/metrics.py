@@ -10,7 +10,7 @@ from typing import Protocol
 
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, part, record
+from ambjax.numerics.records import Scalar, leaf, part, record, static
 from ambjax.simulation import orders
 from ambjax.simulation.folds import Count, Driven, Ending, Fold, Named, Peak, Reaching, Rms, Variation
 from ambjax.simulation.span import Span
@@ -87,9 +87,10 @@ class Metrics:
     rotor: Rotation | None = part(
         default=None, doc="speed of the rotor, for amplitude and phase once and twice per revolution; None: none"
     )
+    near: str = static(default="z", doc="signal that counts against the clearance: z, or z_stop of a machine")
 
     @classmethod
-    def of(cls, settle: Scalar, scenario: Scenario) -> "Metrics":
+    def of(cls, settle: Scalar, scenario: Scenario, near: str = "z") -> "Metrics":
         """Return the metrics for a scenario: its clearance and largest force, and bands by the sizes of its plant.
 
         `settle`: start of the evaluation of the settled metrics, s. The ratios of the bands are those of the plant of
@@ -106,6 +107,7 @@ class Metrics:
             usual.e_band * (plant.i_0 / paper.i_0),
             scenario.largest_force,
             scenario.rotor,
+            near,
         )
 
     @classmethod
@@ -146,8 +148,8 @@ class Metrics:
                 "copper_loss_W": Driven("heat"),
                 "max_flux_T": Peak("B"),
                 "max_abs_force_N": Peak("force"),
-                "clearance_used": Peak("z"),
-                "settled_clearance_used": Peak("z", late),
+                "clearance_used": Peak(self.near),
+                "settled_clearance_used": Peak(self.near, late),
                 "refused": Count("refused"),
             }
         )

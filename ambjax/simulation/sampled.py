@@ -86,10 +86,7 @@ class Sampled:
         )
 
     def measured(self, plant: object, z_filtered: Array | tuple[()], errors: Errors) -> Measurement:
-        """Return the readings of the sensors, before the faults of the position sensor are applied.
-
-        `z_filtered`: output of the low-pass of the position sensor, m.
-        """
+        """Return the readings of the sensors, before the faults of the position sensor are applied."""
         true, sensor = self.loop.scenario.plant, self.loop.scenario.sensors
         motion = true.measurement(plant)
         if lags(self.loop):
@@ -134,8 +131,7 @@ class Sampled:
     def with_command(self, measured: Measurement, reference: Reference, state: SampledState) -> SampledState:
         """Compute the command from the readings, and return the state with it. The plant does not change.
 
-        `measured`: the readings, before the guard. `reference`: see `Sample`. The exported C is traced from this
-        function.
+        The exported C is traced from this function.
         """
         sample, checked, measured, laws = self.received(measured, reference, state)
         return self.accepted(state, sample, checked, self.loop.cascade.step(measured, laws, sample))[0]
@@ -155,10 +151,7 @@ class Sampled:
         checked: GuardResult | None,
         stepped: tuple[Command, CascadeState, Measurement],
     ) -> tuple[SampledState, Array]:
-        """Return the state with the results of the laws, and whether they are kept.
-
-        `checked`: result of the guard. `stepped`: command, next states of the laws, and the estimate at the sample.
-        """
+        """Return the state with the results of the laws, and whether they are kept."""
         (command, control, estimate), past = stepped, sample.past
         command = command._replace(u=limited(command.u, sample.u_max))
         new = materialised((control, command, self._next_guard_state(checked, estimate, (command.u, *past))))
@@ -230,11 +223,7 @@ class Sampled:
         return after._replace(state=state._replace(plant=after.state, z_filtered=z_filtered, u_a=u_a))
 
     def _lagged(self, t: Scalar, state: SampledState, reached: list[object], times: list[Scalar]) -> Array | tuple[()]:
-        """Return the output of the position sensor's low-pass at the next sample, m.
-
-        `t`: time of the sample, s. `reached`: the states of the plant at the end of each part of the sample. `times`:
-        the lengths of the parts, s.
-        """
+        """Return the output of the position sensor's low-pass at the next sample, m."""
         z_filtered = state.z_filtered
         sensor = self.loop.scenario.sensors
         if not lags(self.loop) or isinstance(z_filtered, tuple):

@@ -37,10 +37,7 @@ S = TypeVar("S")
 
 
 def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
-    """Advance the state of a ClosedLoop by h (s). `slides` must be true for its cascade and its plant.
-
-    `begin`, `end`: external inputs at the start and at the end of the step. Returns the new state and span.
-    """
+    """Advance the state of a ClosedLoop by h (s). `slides` must be true for its cascade and its plant."""
     cascade, scenario = loop.cascade, loop.scenario
     model, (z, z_dot, i, _), control = cascade.model, state.plant, state.control
     i_ref = control.inversion
@@ -126,10 +123,7 @@ class _Voltage(NamedTuple):
 
 
 def _with_step(span: Span, instants: tuple[Instant, ...], u: Array, rest: _Voltage, tau: Array, left: Array) -> Span:
-    """Add a step to the span: voltage `u` for tau, then `rest` for `left`.
-
-    `instants`: signals at the start of the step, at the end of the slide, and at the end of the step.
-    """
+    """Add a step to the span: voltage `u` for tau, then `rest` for `left`."""
     before = span.densities
     for instant, weight in zip(instants, (tau / 2, (tau + left) / 2, left / 2), strict=True):
         span = span.with_instant(instant, weight)

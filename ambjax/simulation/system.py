@@ -8,7 +8,6 @@ import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState
-from ambjax.control.guard import simulated
 from ambjax.control.law_trial import check_own_law
 from ambjax.control.stages import STAGES
 from ambjax.numerics.declared import require_number
@@ -20,10 +19,7 @@ from ambjax.world.scenario import Scenario
 
 
 def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
-    """Raise ValueError for an invalid value that is not traced. The message gives its path and a correction.
-
-    Traced values are not checked.
-    """
+    """Raise ValueError for an invalid value that is not traced. The message gives its path and a correction."""
     for name, value, kind in (("cascade", cascade, Cascade), ("scenario", scenario, Scenario), ("clock", clock, Clock)):
         if not isinstance(value, kind):
             raise ValueError(f"{name} = {type(value).__name__}: it must be a {kind.__name__}.")
@@ -135,3 +131,24 @@ def sampled_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> Sampled:
     """Return the closed loop of a cascade on its processor."""
     period = clock.sample_period
     return Sampled(ClosedLoop(simulated(cascade.on_processor(), scenario, period), scenario), period, clock.cuts)
+
+
+def guarded(cascade: Cascade, scenario: Scenario, period: Scalar) -> Cascade:
+    """Return the cascade with the numbers of its guard set for a scenario; unchanged if it has no guard."""
+    guard = cascade.timing.guard
+    if guard is None:
+        return cascade
+    guard = guard.with_limits(cascade.model, scenario, period, cascade.observer.estimates_velocity)
+    return cascade.with_processor(guard=guard)
+
+
+def simulated(cascade: Cascade, scenario: Scenario, period: Scalar) -> Cascade:
+    """Return the cascade for a simulation.
+
+    If all limits of its guard are derived and the sensor has no faults, the guard would refuse no reading, and it is
+    removed. Otherwise the numbers of the guard are set (`guarded`).
+    """
+    guard = cascade.timing.guard
+    if guard is not None and guard.derived and not scenario.sensors.faulty:
+        return cascade.with_processor(guard=None)
+    return guarded(cascade, scenario, period)

@@ -72,6 +72,8 @@ class Row(NamedTuple):
     """whether the guard of the processor refused the reading, bool"""
     alive: Array
     """whether the rotor is held, bool"""
+    z_stop: Array | tuple[()] = ()
+    """displacement at the stop, m; (): the stop is at the magnet"""
 
     @property
     def e_z(self) -> Array:
@@ -84,7 +86,7 @@ class Row(NamedTuple):
         return self.i - self.i_ref
 
 
-NOT_SAVED = ("u_peak", "heat", "alive")
+NOT_SAVED = ("u_peak", "heat", "alive", "z_stop")
 # Unit of each saved signal.
 SIGNAL_UNITS = {
     **dict.fromkeys(("z", "r", "z_measured"), "m"),

@@ -35,12 +35,19 @@ class TakesCase(Protocol[P, R]):
     ) -> R: ...
 
 
+def no_case(function: str, *given: object) -> ValueError:
+    """Return the error of a function whose first arguments are neither a case nor its three parts."""
+    kinds = ", ".join(type(x).__name__ for x in given)
+    return ValueError(
+        f"{function}({kinds}): give a case, as ambjax.read_case(PATH) returns it, or a Cascade, a Scenario and a Clock."
+    )
+
+
 def takes_case(function: Callable[Concatenate[Cascade, Scenario, Clock, P], R]) -> TakesCase[P, R]:
     """Return the function, which then also accepts a case in place of its first three arguments."""
 
     @functools.wraps(function)
     def called(*args: Any, **named: Any) -> R:
-        kinds = [type(x).__name__ for x in args]
         if args and all(hasattr(args[0], name) for name in PARTS):
             case, *others = args
             whole = not any(isinstance(x, (Scenario, Clock)) for x in others)
@@ -48,10 +55,7 @@ def takes_case(function: Callable[Concatenate[Cascade, Scenario, Clock, P], R]) 
         else:
             whole = len(args) + sum(name in named for name in PARTS) >= len(PARTS)
         if not whole:
-            raise ValueError(
-                f"{function.__name__}({', '.join(kinds)}): give a case, as ambjax.read_case(PATH) returns it, or a "
-                "Cascade, a Scenario and a Clock."
-            )
+            raise no_case(function.__name__, *args)
         return function(*args, **named)
 
     return cast(TakesCase[P, R], called)

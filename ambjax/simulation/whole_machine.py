@@ -27,10 +27,11 @@ from ambjax.simulation.folds import Ending
 from ambjax.simulation.integrate import Advanced, InitialValueProblem, Integrator, WholeState, in_turn
 from ambjax.simulation.joint_laws import begun, demanded_now, jumped
 from ambjax.simulation.loop import INSTANT_TREE, ClosedLoop, ExternalInputs, LoopState
+from ambjax.simulation.machine_stops import between_stops, limited, stop_forces
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.span import Instant, Span
-from ambjax.simulation.trajectory import DIVERGED, Row
+from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED, Row
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.rotation import Rotation
 from ambjax.world.rotor import Rotor
@@ -182,6 +183,21 @@ class Machine:
         """Return the states of the groups with the motion at the sensors."""
         return self.moving(self.rotor.at_sensors, *state[:3])
 
+    @property
+    def near(self) -> str:
+        """The signal of each axis that counts against its clearance."""
+        return "z" if self.rotor.at_stops is None else "z_stop"
+
+    def with_stops(self, instant: Instant, q: Array) -> Instant:
+        """Return the signals of all axes at one instant, with the displacements at stops at places of their own."""
+        rows = self.rotor.at_stops
+        return instant if rows is None else instant._replace(sizes=instant.sizes._replace(z_stop=times(rows, q)))
+
+    def pushed(self, outside: tuple[Array, Scalar], state: MachineState) -> tuple[Array, Scalar]:
+        """Return `outside` of `coupled` with the forces of elastic stops at places of their own."""
+        forces = stop_forces(self, state.q, state.q_dot)
+        return outside if forces is None else (outside[0] + forces, outside[1])
+
     def coupled(
         self, outside: tuple[Array, Scalar], state: MachineState, rates: Sequence, law: object = ()
     ) -> MachineState:
@@ -209,13 +225,18 @@ class Machine:
     def status(self, state: MachineState) -> Array:
         """Return the status code of the rotor: the largest of its axes; DIVERGED if a coordinate is not finite."""
         finite = 0.0 * (jnp.sum(state.q) + jnp.sum(state.q_dot)) == 0
-        at = self.at_magnets(state)
+        rows, limits = limited(self)
+        at = self.moving(rows[: self.count], *state[:3])
         codes = self.join(self.each(lambda axis, own: plant_status(loop_of(axis), own.plant), at))
+        if len(rows) > self.count:
+            beyond = jnp.abs(times(rows, state.q)) >= limits
+            codes = jnp.append(codes, jnp.where(jnp.any(beyond), TOUCHED, ALIVE))
         return jnp.where(finite, jnp.max(codes), DIVERGED)
 
     def motion(self, state: MachineState) -> tuple[Array, Array]:
-        """Return displacements (m) and velocities (m/s) at the magnets [c]."""
-        return times(self.rotor.at_magnets, state.q), times(self.rotor.at_magnets, state.q_dot)
+        """Return displacements (m) and velocities (m/s) at the places of `limited` [k]."""
+        rows, _ = limited(self)
+        return times(rows, state.q), times(rows, state.q_dot)
 
     def rest(self, state: MachineState, code: Array) -> MachineState:
         axes = self.each(lambda axis, own: axis.rest(own, code), self.at_sensors(state))
@@ -234,6 +255,8 @@ class Machine:
 
         row, sensed = rows(self.at_magnets(state)), rows(self.at_sensors(state))
         row = row._replace(z_measured=sensed.z_measured, refused=sensed.refused)
+        if self.rotor.at_stops is not None:
+            row = row._replace(z_stop=times(self.rotor.at_stops, state.q))
         return MachineRow(jnp.asarray(t), alive, state.q, self.rotor.speed_at(t), row)
 
     def completed(self, row: MachineRow, span: Span) -> MachineRow:
@@ -258,7 +281,7 @@ class Machine:
     def problem_of(self, inputs: Callable, observed: Callable, scale: Sequence) -> InitialValueProblem:
         """Return the initial value problem with these inputs, rates with signals, and sizes of the groups' states."""
         edges = self.edges()
-        limit = self.join([jnp.asarray(loop.scenario.limit) for loop in self.loops()])
+        signals = jax.tree.map(lambda _: jnp.zeros(self.count), INSTANT_TREE)
         return InitialValueProblem(
             inputs,
             lambda inputs, state: observed(inputs, state)[0],
@@ -266,10 +289,10 @@ class Machine:
             self.status,
             None,
             observed,
-            jax.tree.map(lambda _: jnp.zeros(self.count), INSTANT_TREE),
+            self.with_stops(signals, jnp.asarray(self.start_q)),
             edges=edges if edges.most else NO_EDGES,
             motion=self.motion,
-            limit=limit,
+            limit=limited(self)[1],
         )
 
 
@@ -352,12 +375,13 @@ class SampledMachine(Machine):
             def one(
                 axis: Sampled, first: SampledState, own: ExternalInputs, u: Array, plant: object
             ) -> tuple[PlantOnly, Instant]:
-                problem = under(axis.loop, first.plant, first.command, lambda _: u, NO_EDGES)
+                problem = under(between_stops(self, axis.loop), first.plant, first.command, lambda _: u, NO_EDGES)
                 rates, instant = problem.rates_and_signals((own, u), plant)
                 return PlantOnly(rates), instant
 
             parts = self.each(one, sampled, own, u, at)
-            return self.coupled(outside, state, [rates for rates, _ in parts]), self.join([x for _, x in parts])
+            rates, signals = zip(*parts, strict=True)
+            return self.coupled(self.pushed(outside, state), state, rates), self.with_stops(self.join(signals), state.q)
 
         sizes = self.each(lambda axis: PlantOnly(jax.tree.map(jnp.asarray, axis.loop.scenario.plant.scale())))
         return self.problem_of(inputs, observed, sizes)
@@ -404,9 +428,11 @@ class ContinuousMachine(WholeState, Machine):
             if self.law is not None:
                 demands, law = demanded_now(self, outside[1], own, sensing, state.law, errors)
             sensed = tuple(one.plant for one in sensing)
-            observe = lambda axis, *now: axis.observed(*now)  # noqa: E731
+            observe = lambda axis, *now: between_stops(self, axis).observed(*now)  # noqa: E731
             parts = self.each(observe, own, self.at_magnets(state), errors, sensed, demands)
-            return self.coupled(outside, state, [rates for rates, _ in parts], law), self.join([x for _, x in parts])
+            rates, signals = zip(*parts, strict=True)
+            moved = self.coupled(self.pushed(outside, state), state, rates, law)
+            return moved, self.with_stops(self.join(signals), state.q)
 
         return self.problem_of(inputs, observed, self.each(lambda axis: axis.scale()))
 

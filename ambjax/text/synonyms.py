@@ -114,15 +114,13 @@ DERIVED = {
 
 
 def meant(word: str, allowed: Iterable[str], elsewhere: Iterable[str] = ()) -> str | None:
-    """Return the name that `word` probably means: one of `allowed`, or a name of another table; None if unknown.
-
-    `elsewhere`: paths of names of other tables; those of OTHER_WORDS are added.
-    """
+    """Return the name that `word` probably means: one of `allowed`, or a name of another table; None if unknown."""
     names, plain = list(allowed), _plain(word)
     for name in names:
         if _plain(name) == plain or plain in other_words(name):
             return name
-    paths = [path for path in elsewhere if _plain(path.rpartition(".")[2]) == plain]
+    lasts = {path: path.rpartition(".")[2] for path in elsewhere}
+    paths = [path for path, last in lasts.items() if plain in (_plain(last), *other_words(last))]
     paths += [name for name, words in OTHER_WORDS.items() if "." in name and plain in words.split()]
     path = next(iter(paths or difflib.get_close_matches(word, names, n=1)), None)
     last = path.rpartition(".")[2] if path else ""
@@ -135,10 +133,7 @@ def other_words(name: str) -> list[str]:
 
 
 def hint(word: str, allowed: Iterable[str], elsewhere: Iterable[str] = ()) -> str:
-    """Return " Did you mean 'name'?" for the name that `word` probably means (`meant`); "" if unknown.
-
-    For a quantity that follows from other numbers of the plant, the text names these instead.
-    """
+    """Return " Did you mean 'name'?" for the name that `word` probably means (`meant`); "" if unknown."""
     allowed = list(allowed)
     if _plain(word) in DERIVED and "mu_0" in allowed:
         return f" It follows from {DERIVED[_plain(word)]}."

@@ -38,8 +38,8 @@ class Part(NamedTuple):
 class Cause(NamedTuple):
     """Result of `find_cause`.
 
-    `part`: name of the part without which the symptom is gone; None if it remains without each part tried.
-    `remedy`: what to change. `tried`: names of the parts without which the symptom remains.
+    `part`: name of the part without which the symptom is gone; None if it remains without each part tried. `remedy`:
+    what to change.
     """
 
     part: str | None
@@ -54,10 +54,7 @@ Shows = Callable[[Cascade, Scenario, Clock], bool]
 def find_cause(
     shows: Shows, cascade: Cascade, scenario: Scenario, clock: Clock, tell: Callable[[str], object] = lambda _: None
 ) -> Cause:
-    """Return the first part of `parts` without which the case does not show the symptom.
-
-    `shows`: simulates a case. `tell`: is called with a line of text before each run.
-    """
+    """Return the first part of `parts` without which the case does not show the symptom."""
     tried: list[str] = []
     for part in parts(cascade, scenario, clock):
         tell(f"looking for the cause: simulating without {part.name}")

@@ -20,6 +20,7 @@ from ambjax.control.stages import PositionLaw
 from ambjax.numerics.records import canonical, require_concrete
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Lowest, Named, Peak
+from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.rollout import prepare, roll
 from ambjax.simulation.system import check_inputs
 from ambjax.simulation.trajectory import STALLED, STATUSES
@@ -110,10 +111,7 @@ SIDES = {
 
 
 class Required(NamedTuple):
-    """The requirement on one law: name, dotted path and unit of the gain, symbol of the right side, value of the gain.
-
-    If the law has no requirement, the value is None and the other fields are those of the paper's law.
-    """
+    """Requirement on one law: name, dotted path and unit of the gain, symbol of the right side, value of the gain."""
 
     gain: str
     path: str
@@ -142,10 +140,10 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float = 0.
     require_concrete("check", (cascade, scenario, clock))
     check_inputs(cascade, scenario, clock)
     if cascade.sampled:
-        cascade, clock = cascade.in_continuous_time(), dataclasses.replace(clock, method=None)
+        cascade, clock = cascade.in_continuous_time(), clock.with_method(None)
         scenario = scenario.in_continuous_time()
-    loop: Any
     loop, clock = prepare(cascade, scenario, clock)
+    assert isinstance(loop, ClosedLoop)
     method = str(clock.method)
     system, clock, fold = canonical((Monitored(loop), clock, _monitors(settle)))
     trajectory, extremes = roll(system, clock, fold, record_every=0)
@@ -239,10 +237,7 @@ def _conditions(
 
 def constant_sigma(law: PositionLaw) -> list[Condition]:
     """Return a condition for each scheduled gain on which sigma depends; the theorem holds for constant ones only."""
-    plain: Any
-    one: Any
-    zero: Any
-    rows, plain, one, zero = [], extremes(law)[0], np.ones(()), np.zeros(())
+    rows, plain, one, zero = [], extremes(law)[0], jnp.ones(()), jnp.zeros(())
     motion, reference = Measurement(one, one, zero), Reference(zero, zero, zero)
     for name, schedule in schedules(law).items():
         low, high = (dataclasses.replace(plain, **{name: x}) for x in (1.0, 2.0))

@@ -222,10 +222,7 @@ def _simulated(loop: System, clock: Clock, run: Callable[[System, Clock], Result
 
 
 def _smallest_distance(run: Trajectory, plant: Bearing) -> tuple[float, float]:
-    """Return the smallest signed distance to the singular curve C until the rotor is lost, and its time (s).
-
-    It is computed after the run, because XLA does not compile it within the loop as one kernel.
-    """
+    """Return the smallest signed distance to the singular curve C until the rotor is lost, and its time (s)."""
     rows = run.rows
     t, distance = np.asarray(rows.t), np.asarray(_distances(*canonical((plant, rows.z, rows.i_ref))))
     worst = int(np.argmin(np.where(t <= float(run.lost_at), distance, np.inf)))

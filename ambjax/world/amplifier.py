@@ -100,10 +100,7 @@ class Amplifier:
         return 0.0 if self.bandwidth is None else 1 / self.slope()
 
     def at_coil(self, u_a: Array, i: Array, u_max: Scalar, response: Callable[[], CoilResponse]) -> Array:
-        """Return the voltage (V) at the coils for the output u_a (V) and a current i (A), within u_max (V).
-
-        `response`: returns the response of the current at this instant; it is called only if there is a current limit.
-        """
+        """Return the voltage (V) at the coils for the output u_a (V) and a current i (A), within u_max (V)."""
         if self.dead_band is not None:
             size = jnp.maximum(jnp.abs(u_a) - self.dead_band, 0.0)
             u_a = jnp.where(u_a < 0, -size, size)
@@ -153,8 +150,5 @@ class CurrentAmplifier:
         return self.i_max
 
     def at_coil(self, command: Array, i: Array, u_max: Scalar, response: Callable[[], CoilResponse]) -> Array:
-        """Return the voltage (V) at the coils for a commanded current (A) and a current i (A), within u_max (V).
-
-        `response`: returns the response of the current at this instant.
-        """
+        """Return the voltage (V) at the coils for a commanded current (A) and a current i (A), within u_max (V)."""
         return limited(response().voltage(self.slope() * (command - i)), u_max)

@@ -1,6 +1,6 @@
 """The bearing: a vertical rotor between two electromagnets (Table 1, Eq. (3)), and the base class of the plants."""
 
-from typing import ClassVar, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 from jax import Array
@@ -75,7 +75,7 @@ class Bearing(Generic[S]):
         """Return the state with this motion and current."""
         raise NotImplementedError
 
-    def rates(self, state: S, u: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> S:
+    def rates(self, state: S, u: Any, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> S:
         """Return the time derivative of the state under a voltage u (V) and disturbances q_z (m/s^2), q_i (A/s)."""
         raise NotImplementedError
 
@@ -117,10 +117,7 @@ class Bearing(Generic[S]):
         return self.i_0 + i, self.i_0 - i
 
     def flux_currents(self, state: S) -> tuple[Array, Array]:
-        """Return the currents (A) that determine the fluxes of the two coils.
-
-        They are the delayed currents if the flux has a lag.
-        """
+        """Return the currents (A) that determine the fluxes of the two coils."""
         return self.currents(state)
 
     def pull(self, flux_currents: tuple[Array, Array], z: Scalar, gaps: Gaps | None = None) -> Array:

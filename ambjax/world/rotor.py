@@ -76,6 +76,14 @@ class Rotor:
     unbalances: tuple[RotorUnbalance, ...] = part(default=(), doc="unbalances")
     loads: tuple[RotorLoad, ...] = part(default=(), doc="loads")
     base: tuple[BaseMotion, ...] = part(default=(), doc="motions of the stator")
+    at_stops: Array | None = leaf(
+        default=None,
+        shape="c n",
+        at_least=-1e30,
+        at_most=1e30,
+        optional=True,
+        doc="rows of the displacement at the stop of axis k; None: the stops are at the magnets",
+    )
 
     @property
     def rotation(self) -> Rotation:

@@ -132,10 +132,7 @@ class Sensor:
         return Measurement(*(std * x for std, x in zip(self.noises, normals, strict=True)))
 
     def on_processor(self, errors: Errors, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Errors:
-        """Return the errors of a sample with the runout and the faults that begin at this sample.
-
-        `key`, `sample`: as in `noise`. `period`: sample period, s.
-        """
+        """Return the errors of a sample with the runout and the faults that begin at this sample."""
         if self.runout is not None and self.bandwidth is None:
             t = jnp.asarray(sample, jnp.result_type(float)) * period
             errors = errors._replace(runout=self.runout(t))
@@ -204,10 +201,7 @@ class Sensor:
         return motion._replace(z=motion.z + runout, z_dot=motion.z_dot + rate)
 
     def reading(self, motion: Measurement, errors: Errors) -> Measurement:
-        """Return the readings of a motion with these errors. `motion.z`: after the low-pass.
-
-        z_dot is 0 if it is not measured.
-        """
+        """Return the readings of a motion with these errors. `motion.z`: after the low-pass."""
         if not isinstance(errors.runout, tuple):
             motion = motion._replace(z=motion.z + errors.runout)
         z_dot = motion.z_dot + errors.z_dot if self.velocity else jnp.zeros_like(motion.z_dot)
@@ -274,8 +268,7 @@ def _moments(b: Array) -> tuple[Array, Array, Array, Array]:
 def converted(x: Array, bits: Scalar, limit: Scalar) -> Array:
     """Return the output of a converter of `bits` bits over -limit..limit for the input x: x rounded and saturated.
 
-    The step is 2 limit / 2^bits; the largest value is one step below limit. The derivative is that of the saturation
-    alone.
+    The derivative is that of the saturation alone.
     """
     half = jnp.round(jnp.exp2(jnp.asarray(bits) - 1))  # XLA's exp2 has a rounding error
     step = limit / half

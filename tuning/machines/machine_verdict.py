@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase
-from ambjax.commands.machine_commands import analysed, sensitivity_summary
+from ambjax.commands.machine_commands import sensitivity_summary
 from ambjax.results.machine_study import MachineStudy
+from ambjax.results.operating import sensitivity
 
 # Limits of [tune.limits], each with its meaning and the metric whose largest value counts; "": a sensitivity.
 LIMITS = {
@@ -26,7 +27,7 @@ LIMITS = {
 
 def judged(case: MachineCase, found: MachineCase, limits: dict[str, float], seed: int, members: int) -> dict[str, Any]:
     """Return the content of report.json but the gains. `case`, `found`: before and after; `members`: to simulate."""
-    each: list[dict[str, Any]] = [sensitivity_summary(analysed(one), {}) for one in (case, found)]
+    each: list[dict[str, Any]] = [sensitivity_summary(sensitivity(one), {}) for one in (case, found)]
     before, after = each
     held, simulated = simulate(found, seed, members)
     values: dict[str, Any] = {name: _worst(x, held) for name, x in simulated.items()}

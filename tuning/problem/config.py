@@ -14,7 +14,6 @@ from ambjax.cases.tune_table import (
     BUDGET,
     NUMBERS,
     OBJECTIVES,
-    OPTIMISER,
     RISK,
     SETTLING_BAND,
     SURVIVAL,
@@ -25,7 +24,6 @@ from ambjax.cases.tune_table import (
 )
 from ambjax.extend import leaf
 from ambjax.host.extensions import NothingToTuneError
-from tuning.optimisers import NAMES
 from tuning.problem.gains_table import space_from
 from tuning.problem.limits import LEAST_MARGIN, Limit
 from tuning.problem.loss import TERMS
@@ -35,7 +33,7 @@ from tuning.problem.space import Space
 from tuning.problem.unbreakable import bounds_of
 
 # Keys of [tune] that are neither in NUMBERS nor in BUDGET.
-OTHER_KEYS = ["objective", "gains", "bounds", "weights", "limits", "risk", "alpha", "optimiser"]
+OTHER_KEYS = ["objective", "gains", "bounds", "weights", "limits", "risk", "alpha"]
 # Keys of [tune] that depend on the laws of the case.
 KEYS_OF_LAWS = ("gains", "bounds")
 # Allowed range of each limit: OTHER_RANGES by name, LIMIT_RANGE for all others. BAND_RANGE: that of settling_band_m.
@@ -72,13 +70,10 @@ class Tune:
     """The table [tune].
 
     - `space`: the gains to tune, with their bounds.
-    - `weights`: weights of the terms of the loss, in the order of TERMS. `conditions`: weight of the conditions of
-      Theorem 1.
-    - `margin`: share by which each gain should exceed its lower bound in Theorem 1.
+    - `weights`: weights of the terms of the loss, in the order of TERMS.
     - `early`: weight of errors before run.settle. Errors after it have the weight 1.
     - `stress`: factor on the sensor noise of the stressed members (`Budget.stressed`).
     - `gain_margin`: each gain of a stressed member is multiplied or divided by this factor.
-    - `learning_rate`: step size of an optimiser of optax.
     - `minutes`: time for the whole tuning.
     """
 
@@ -87,14 +82,10 @@ class Tune:
     space: Space
     weights: tuple[float, ...]
     limits: LimitSettings
-    conditions: float
-    margin: float
     early: float
     stress: float
     gain_margin: float
     risk: Risk
-    optimiser: str
-    learning_rate: float
     minutes: float
     budget: Budget
 
@@ -112,8 +103,7 @@ def read_tune(
     """
     raw, text = loaded or load(path)
     name = pathlib.Path(path).stem
-    if settings_of is not None:
-        raw = {**raw, "tune": _merged(raw.get("tune", {}), load(settings_of)[0].get("tune", {}))}
+    raw = with_settings_of(raw, settings_of)
     try:
         case = case_from(raw, name, text, pathlib.Path(path).parent)
         return case, tune_from(Table(raw).table("tune"), case), raw
@@ -122,36 +112,32 @@ def read_tune(
         raise kind(one_line(f"{path}: {error}")) from None
 
 
-def _merged(own: Any, other: Any) -> Any:
-    """Return [tune] of `other` with the gains and bounds of `own`; `own` if either argument is not a table."""
-    if not (isinstance(own, dict) and isinstance(other, dict)):
-        return own
+def with_settings_of(raw: dict[str, Any], settings_of: str | pathlib.Path | None) -> dict[str, Any]:
+    """Return a document with [tune] of another case file, but its own gains and bounds. None: there is no other."""
+    own, other = raw.get("tune", {}), {} if settings_of is None else load(settings_of)[0].get("tune", {})
+    if settings_of is None or not (isinstance(own, dict) and isinstance(other, dict)):
+        return raw
     kept = {key: value for key, value in own.items() if key in KEYS_OF_LAWS}
-    return kept | {key: value for key, value in other.items() if key not in KEYS_OF_LAWS}
+    return {**raw, "tune": kept | {key: value for key, value in other.items() if key not in KEYS_OF_LAWS}}
 
 
 def tune_from(table: Table, case: Case) -> Tune:
     """Return [tune] of a case. A missing key has its default. Raises ValueError for an invalid table."""
     table.only([*OTHER_KEYS, *NUMBERS, *BUDGET], [table.at(f"limits.{name}") for name in KINDS])
     budget = Budget(**{name: table.whole(name, field) for name, field in BUDGET.items()})
-    weights, conditions = _weights(table.table("weights"))
-    optimiser = table.choice("optimiser", list(NAMES), OPTIMISER)
     numbers = {name: table.leaf(name, field, field.default) for name, field in NUMBERS.items()}
     return Tune(
         objective=table.choice("objective", list(OBJECTIVES), OBJECTIVES[0]),
         space=space_from(table, case),
-        weights=weights,
+        weights=_weights(table.table("weights")),
         limits=_limits(table.table("limits"), case),
-        conditions=conditions,
-        margin=numbers.pop("conditions_margin"),
         risk=_risk(table),
-        optimiser=optimiser,
         budget=budget,
         **numbers,
     )
 
 
-def _weights(table: Table) -> tuple[tuple[float, ...], float]:
+def _weights(table: Table) -> tuple[float, ...]:
     table.only(list(WEIGHTS))
     given = {name: table.leaf(name, field, field.default) for name, field in WEIGHTS.items()}
     if not any(given[name] > 0 for name in ("tracking", "peak")):
@@ -161,7 +147,7 @@ def _weights(table: Table) -> tuple[tuple[float, ...], float]:
         )
     if given["survival"] == 0:
         raise ValueError(f"{table.path}.survival = 0: losing the rotor would cost nothing. Give it a weight above 0.")
-    return tuple(given[name] for name in TERMS), given["conditions"]
+    return tuple(given[name] for name in TERMS)
 
 
 def _check_speed(keys: list[str], case: Case) -> None:
@@ -239,15 +225,13 @@ def settings(tune: Tune) -> dict[str, Any]:
         "objective": tune.objective,
         "gains": tune.space.paths,
         "bounds": {gain.path: [gain.low, gain.high] for gain in tune.space.gains},
-        "weights": dict(zip(TERMS, tune.weights, strict=True)) | {"conditions": tune.conditions},
+        "weights": dict(zip(TERMS, tune.weights, strict=True)),
         "limits": {limit.name: {"threshold": limit.threshold, "margin": limit.margin} for limit in tune.limits.each},
         "survival": tune.limits.survival,
         "settling_band_m": tune.limits.band,
         "risk": str(tune.risk),
     }
-    rest = {
-        name: getattr(tune, name) for name in ("margin", "early", "stress", "gain_margin", "optimiser", "learning_rate")
-    }
+    rest = {name: getattr(tune, name) for name in ("early", "stress", "gain_margin")}
     return facts | rest | dataclasses.asdict(tune.budget)
 
 

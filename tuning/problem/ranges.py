@@ -1,21 +1,27 @@
 """Initial search ranges of the gains, from the plant, the clock and the theorem's conditions."""
 
 import dataclasses
+from collections.abc import Callable
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import extremes
 from ambjax.control.search import Interval, LowerBound, SearchContext
 from ambjax.linear.stability import KICK
+from ambjax.theorem.conditions import delta_1_on_reference, required
 from tuning.problem.members import Objective
-from tuning.problem.shortfalls import Bound
 from tuning.problem.space import Gain, Space
 
 # Default upper bound of a gain: this factor times the larger of the upper end of its range and its value in the case.
 END_FACTOR = 3.0
 # Range of a gain for which the law defines none: its value divided and multiplied by this factor.
 DEFAULT_FACTOR = 30.0
+# A range keeps this factor from a bound.
+ASIDE = 1.05
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +38,7 @@ class Range:
     product: tuple[str, float, float] | None = None
 
 
-def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarray) -> list[Range]:
+def ranges(objective: Objective, start: np.ndarray) -> list[Range]:
     """Return a range for each gain of the space, from the gains `start` [m] of the case.
 
     The range is that of [tune.bounds] if both bounds are given. Otherwise it is the range of the law or, if the law
@@ -40,7 +46,7 @@ def ranges(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarra
     bound, the upper bound is END_FACTOR times the larger of the upper end of the range and the value. The factor is 1
     if the interval of the law is firm (`Interval.firm`).
     """
-    context, gains = _context(objective, conditions), objective.space.gains
+    context, gains = _context(objective), objective.space.gains
     interval = [_interval(context, objective.cascade, *one) for one in zip(gains, start, strict=True)]
     rows = list(zip(gains, start, interval, strict=True))
     found = {gain.path: _range(gain, value, one) for gain, value, one in rows if not one.times}
@@ -65,20 +71,39 @@ def from_unit_cube(space: Space, box: list[Range], cube: np.ndarray) -> np.ndarr
     return gains
 
 
-def bounded(objective: Objective, conditions: tuple[Bound, ...], start: np.ndarray) -> tuple[Space, list[Range]]:
+def bounded(objective: Objective, start: np.ndarray) -> tuple[Space, list[Range]]:
     """Return the space with an upper bound for every gain, and the ranges that the bounds come from.
 
     The loss hardly depends on some gains, gamma in particular. Without an upper bound, the search moves such a gain to
     values for which the integration step is too large.
     """
-    gains, box = objective.space.gains, ranges(objective, conditions, start)
+    gains, box = objective.space.gains, ranges(objective, start)
     return Space(tuple(dataclasses.replace(gain, high=at.most) for gain, at in zip(gains, box, strict=True))), box
 
 
-def _context(objective: Objective, conditions: tuple[Bound, ...]) -> SearchContext:
+def theorem_bounds(objective: Objective) -> dict[str, float]:
+    """Return the lower bounds Q_z, Q_i and Delta_1 (Eq. 7) of the laws' gains, those that apply, by name.
+
+    Delta_1 is evaluated on the ideal motion z = r. Q_z and Q_i are maxima over the samples of the clock.
+    """
+    cascade, scenario, clock = objective.cascade, objective.scenario, objective.clock
+    t = jnp.arange(clock.samples) * clock.sample_period
+
+    def largest(signal: Callable[[Array], Array]) -> float:
+        return float(np.max(np.abs(np.asarray(jax.vmap(signal)(t)))))
+
+    sides = {
+        "Q_z": lambda: largest(scenario.acceleration),
+        "Q_i": lambda: largest(scenario.q_i),
+        "Delta_1": lambda: delta_1_on_reference(cascade, scenario, clock)[0],
+    }
+    return {one.over: sides[one.over]() for one in required(cascade) if one.value is not None}
+
+
+def _context(objective: Objective) -> SearchContext:
     model, scenario = objective.cascade.model, objective.scenario
     w = float(scenario.plant.pole)
-    bounds = {bound.symbol: bound.value for bound in conditions}
+    bounds = theorem_bounds(objective)
     stiffness = 4 * float(model.i_0) ** 2 / float(model.s_0) ** 3
     growth = stiffness * w
     places = [
@@ -131,7 +156,7 @@ def _range(gain: Gain, value: float, interval: Interval) -> Range:
     low, high, source = interval[:3]
     if gain.low > 0 or np.isfinite(gain.high):
         source += "; within tune.bounds"
-    low, high = max(low, gain.low * 1.05), min(high, gain.high / 1.05)
+    low, high = max(low, gain.low * ASIDE), min(high, gain.high / ASIDE)
     if low >= high and gain.low > 0:
         high = low * DEFAULT_FACTOR**2
     elif low >= high:
@@ -139,4 +164,4 @@ def _range(gain: Gain, value: float, interval: Interval) -> Range:
     if np.isfinite(gain.high):
         return Range(low, high, gain.high, source)
     most = max(high, value) * (1 if interval.firm else END_FACTOR)
-    return Range(low, high, most, f"{source}; tuned gain at most {most:.3g}")
+    return Range(low, min(high, most / ASIDE), most, f"{source}; tuned gain at most {most:.3g}")

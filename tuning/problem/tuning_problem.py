@@ -19,7 +19,6 @@ from tuning.problem.loss import HELD, TERMS, loss_for
 from tuning.problem.members import LoopRange, Objective
 from tuning.problem.quantities import KINDS, LimitContext
 from tuning.problem.ranges import Range, bounded
-from tuning.problem.shortfalls import bounds
 
 # Ratio of the number of steps of the judge to that of the search, in continuous time. On a processor, it is the ratio
 # for the accurate steps, and the judge makes the steps of the case. On the tuned loops of tests/test_metrics_dense.py,
@@ -135,7 +134,7 @@ class TuningProblem:
         return dataclasses.replace(self.goal, weights=self.tune.weights, minimised="", limits=())
 
     def _stepping(self, method: Integrator, **more: Any) -> Engine:
-        objective = dataclasses.replace(self.objective, clock=dataclasses.replace(self.objective.clock, method=method))
+        objective = dataclasses.replace(self.objective, clock=self.objective.clock.with_method(method))
         return Engine(objective, settle=self.case.settle, **more)
 
     @functools.cached_property
@@ -184,10 +183,9 @@ def problem_of(
     objective = Objective(
         tune.space, case.cascade, case.scenario, clock, loss, case.spread, _loop_range(case, limits.each)
     )
-    conditions = bounds(case.cascade, case.scenario, clock)
-    space, box = bounded(objective, conditions, tune.space.values(case.cascade))
+    space, box = bounded(objective, tune.space.values(case.cascade))
     objective = dataclasses.replace(objective, space=space)
-    goal = Goal(space, tune.weights, tune.risk, conditions, tune.conditions, tune.margin, quantities=tuple(names))
+    goal = Goal(tune.weights, tune.risk, quantities=tuple(names))
     mode = cheaper_mode(len(tune.space), 1 + len(loss.measures))
     engine = Engine(objective, settle=case.settle, mode=mode, threads=threads)
     return TuningProblem(case, tune, objective, engine, goal, box, finer, front=front).limited(limits.each)

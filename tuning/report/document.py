@@ -8,7 +8,7 @@ from ambjax.results.outputs import described
 from ambjax.text.web_page import escape_markdown, markdown_table
 from tuning.report import front_table, held_out, limit_table, sensitivity_table
 from tuning.report.facts import Row, TuningFacts
-from tuning.report.limit_table import broken, prices
+from tuning.report.outcome import answer
 
 
 def report_markdown(facts: TuningFacts) -> str:
@@ -23,69 +23,16 @@ def report_markdown(facts: TuningFacts) -> str:
 
 
 def answer_lines(facts: TuningFacts) -> list[str]:
-    """Return five list items and an empty line: held or not, error and voltage, sensitivity, limits, next command."""
-    items = {"members": _held, "error": _sizes, "sensitivity": _peaks, "limits": _limiting, "next command": _next}
-    lines = [described(f"the line on the {name}", functools.partial(line, facts)) for name, line in items.items()]
-    return [*(f"- {line}" for line in lines if line), ""]
-
-
-def _held(facts: TuningFacts) -> str:
-    """Return the item on the rotors that are held, and on the requirements."""
-    outcome, after = facts.outcome, facts.after
-    word = "NOT held" if not outcome["rotors_held"] else "Not verified" if facts.refuted else "Held"
-    which = "held-out members" if after["members"] else "training members"
-    kept = outcome["members"] - outcome["lost"] - outcome["stalled"]
-    words = f"**{word}:** {kept} of {outcome['members']} {which} are held"
-    if facts.before["members"]:
-        words += f" (before tuning: {facts.before['held']})"
-    met = "All requirements are met." if outcome["good"] else f"Not met: {'; '.join(outcome['against'])}."
-    return f"{words}. {met}"
-
-
-def _sizes(facts: TuningFacts) -> str:
-    """Return the item on the error and the voltage after tuning, and before it."""
-    after, before = facts.after, facts.before
-    if not after["members"]:
-        return "**Error and voltage:** not measured on held-out members (tune.held_out = 0)."
-    if not after["held"]:
-        return "**Error and voltage:** no held-out member is held."
-
-    def change(name: str, unit: str) -> str:
-        was = f" (before: {before[name]:.3g})" if before["held"] else ""
-        return f"{after[name]:.3g} {unit}{was}"
-
-    most = after.get("max_abs_u_V.largest")
-    return (
-        f"**Error:** {change('settled_rms_error_m', 'm')} rms after settling, largest "
-        f"{after['settled_max_abs_error_m']:.3g} m. **Voltage:** {change('settled_rms_u_V.mean', 'V')} rms"
-        f"{'' if most is None else f', largest {most:.3g} V'}."
-    )
-
-
-def _peaks(facts: TuningFacts) -> str:
-    return sensitivity_table.line(facts.sensitivity)
-
-
-def _limiting(facts: TuningFacts) -> str:
-    """Return the item on the limits that are not held or active, and on the gains at a bound."""
-    words = [escape_markdown(line) for line in (*broken(facts.limits), *prices(facts.limits))]
-    if ends := [row["path"] for row in facts.gains if row["at_bound"]]:
-        words.append(f"gains at a bound of `[tune.bounds]`: {', '.join(ends)}")
-    if not words:
-        front = "the trade-off between error and voltage (table below); " if len(facts.front or ()) > 1 else ""
-        words = [f"{front}no limit of `[tune.limits]` is active, and no gain is at a bound"]
-    return f"**Limited by:** {'; '.join(words)}."
+    """Return whether the requirements are met, and five list items: the answer, and the next command."""
+    lines = [f"- **{label}:** {escape_markdown(text)}" for label, text in answer(facts).items()]
+    lines.append(described("the line on the next command", lambda: _next(facts)) or "")
+    return [escape_markdown(facts.outcome["text"]), "", *lines, ""]
 
 
 def _next(facts: TuningFacts) -> str:
     """Return the next command, or the advice if a requirement is not met."""
-    if facts.advice:
-        return f"**Next:** {escape_markdown(facts.advice)}"
-    return f"**Next:** in this folder, {facts.next}"
-
-
-def _verdict(facts: TuningFacts) -> list[str]:
-    return ["## Verdict in full", "", facts.verdict, ""]
+    words = escape_markdown(facts.advice) if facts.advice else f"in this folder, {facts.next}"
+    return f"- **Next:** {words}"
 
 
 def _gains(facts: TuningFacts) -> list[str]:
@@ -103,7 +50,7 @@ def _gains(facts: TuningFacts) -> list[str]:
     words = (
         "Last column: increase of the risk if this gain alone is larger or smaller by a factor of e^0.25 = 1.28. The "
         "larger of the two increases is shown. Here the risk is that of the search of least error: it includes the "
-        "stressed members and the penalty of the theorem's conditions, but not the limits. A gain with a large "
+        "stressed members, but not the limits. A gain with a large "
         "increase must be set accurately. If this change loses more members of the training ensemble than the "
         "answer does, the column shows how many more. "
         "`tune.bounds` sets other bounds."
@@ -137,33 +84,6 @@ def _sensitivity(row: Row, facts: TuningFacts) -> str:
     return "-" if row["sensitivity_percent"] is None else f"{row['sensitivity_percent']:.3g} %"
 
 
-def _objective(facts: TuningFacts) -> list[str]:
-    """Return the section on the objective around the answer."""
-    if facts.beside is None:
-        return []
-    return [
-        "## Objective along each gain",
-        "",
-        "The objective is that of the search: stressed members must be held, but their error does not count.",
-        "",
-        "![Objective along each gain, through the answer](slices.png)",
-        "",
-        _lower_point(facts.beside),
-        "",
-    ]
-
-
-def _lower_point(beside: Row) -> str:
-    """Return a sentence on the point of the slices with the lowest objective."""
-    if beside["lower"] == 0:
-        return "No point of these slices has a lower objective without losing more members than the answer."
-    return (
-        f"The lowest point of these slices is {100 * beside['lower']:.2g} % lower, at {beside['path']} = "
-        f"{beside['gain']:.4g}, and loses no more members. It was not verified. To continue from it, set the gain in "
-        "tuned.toml and tune that file."
-    )
-
-
 def _number(x: float | None, form: str = ".5g") -> str:
     """Return a number as text; '-' for None and NaN."""
     return "-" if x is None or math.isnan(x) else format(x, form)
@@ -189,7 +109,7 @@ def _course(facts: TuningFacts) -> list[str]:
     """Return the section on the search: its settings, its cost, and the error of its steps."""
     how = facts.search
     lines = [
-        f"- risk: {how['risk']} over {how['members']} members (seed {how['seed']}), optimiser {how['optimiser']}",
+        f"- risk: {how['risk']} over {how['members']} members (seed {how['seed']})",
         f"- {how['iterations']} iterations, {how['rollouts']} simulated rollouts "
         f"(a gradient of m gains counts m + 1), {how['seconds']:.0f} s",
     ]
@@ -205,12 +125,10 @@ def _course(facts: TuningFacts) -> list[str]:
 # The sections of the report, in order.
 SECTIONS: dict[str, Callable[[TuningFacts], list[str]]] = {
     "the front": lambda facts: front_table.section(facts.front, facts.front_written),
-    "the verdict": _verdict,
     "the limits": lambda facts: limit_table.section(facts.limits),
     "the sensitivity": lambda facts: sensitivity_table.section(facts.sensitivity),
     "the gains": _gains,
     "the held-out members": held_out.section,
-    "the objective": _objective,
     "the conditions of Theorem 1": _conditions,
     "the search": _course,
 }

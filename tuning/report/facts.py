@@ -29,8 +29,7 @@ class TuningFacts:
     `stability`: of the held-out members with the largest settled errors (`ambjax.linear.Findings`); None if
     no member was judged. `front`: of error against voltage; None if it was not traced. `front_written`: whether each of
     its points has a case file. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it.
-    `beside`: the lowest point of the slices through the answer; None without slices. `next`: the next command, in
-    words. `conditions` and `slices` are empty or None if they could not be computed.
+    `next`: the next command, in words. `conditions` is empty if they could not be computed.
     """
 
     case: str
@@ -55,8 +54,6 @@ class TuningFacts:
     search: Row
     gains: list[Row]
     front: list[Row] | None
-    beside: Row | None
-    slices: Row | None
     front_written: bool = False
     stability: Row | None = None
     outcome: Row = dataclasses.field(default_factory=dict)

@@ -1,6 +1,5 @@
 """The files of a tuning: the case with the tuned gains, the report with its pictures, the front and the page."""
 
-import dataclasses
 import functools
 import pathlib
 import tomllib
@@ -24,7 +23,6 @@ from tuning.report import document as report
 from tuning.report import front_table, pictures
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.record import TUNED
-from tuning.report.slices import Slices
 from tuning.report.tuned import tuned_case
 from tuning.solve.course import SearchResult
 
@@ -45,11 +43,9 @@ def put_answer(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, verd
     return tuned
 
 
-def put_report(
-    part: pathlib.Path, cascade: Cascade, answer: SearchResult, facts: TuningFacts, slices: Slices | None
-) -> None:
+def put_report(part: pathlib.Path, cascade: Cascade, answer: SearchResult, facts: TuningFacts) -> None:
     """Write the report and its pictures into the folder `part`. `cascade`: the controller with the tuned gains."""
-    drawn = _pictures(answer.problem, cascade, answer.history, slices, facts.front)
+    drawn = _pictures(answer.problem, cascade, answer.history, facts.front)
     for name, data in drawn.items():
         (part / name).write_bytes(data)
     words = report.report_markdown(facts)
@@ -79,9 +75,7 @@ def put_page(part: pathlib.Path, case: Case, path: str) -> None:
     (part / NAME).write_text(sliders_page(case, found, path), encoding="utf-8")
 
 
-def _pictures(
-    problem: TuningProblem, tuned: Cascade, history: Any, slices: Slices | None, front: list[Row] | None
-) -> dict[str, bytes]:
+def _pictures(problem: TuningProblem, tuned: Cascade, history: Any, front: list[Row] | None) -> dict[str, bytes]:
     """Return the pictures of the report as PNG data by file name. `tuned`: the controller with the tuned gains.
 
     A picture that cannot be drawn is left out.
@@ -98,8 +92,6 @@ def _pictures(
         draw[f"{name}.png"] = functools.partial(pictures.nominal, run, f"{name} tuning", settle)
     if shown:
         draw["spectrum.png"] = lambda: pictures.spectrum(shown, settle)
-    if slices is not None:
-        draw["slices.png"] = lambda: pictures.landscape(slices, paths)
     if front:
         draw["front.png"] = lambda: pictures.front(front)
     drawn = {name: described(name, one) for name, one in draw.items()}
@@ -114,7 +106,7 @@ def nominal(problem: TuningProblem, cascade: Cascade) -> Trajectory:
     case = problem.case
     if problem.replays:
         return record_member(cascade, case.scenario, case.clock).trajectory
-    clock = dataclasses.replace(case.clock, method=problem.reference.objective.clock.method)
+    clock = case.clock.with_method(problem.reference.objective.clock.method)
     return rollout(cascade, case.scenario, clock).trajectory
 
 

@@ -17,24 +17,23 @@ from tuning.judge.evaluate import describe, held, judge, step_error, summarise, 
 from tuning.judge.late import delay_test
 from tuning.judge.peaks import injections
 from tuning.problem.config import seeds, settings
+from tuning.problem.members import Members
 from tuning.problem.tuning_problem import REFERENCE_MEMBERS, TuningProblem
 from tuning.report import front_table, limit_table, outcome, sensitivity_table
 from tuning.report.facts import Row, TuningFacts
-from tuning.report.slices import Slices
-from tuning.report.slices import slices as slices_through
 from tuning.solve.course import SearchResult
 
+# Change of a coordinate for the sensitivity of a gain.
+STEP = 0.25
 # Fields on the conditions of Theorem 1 if they cannot be computed.
 NO_CONDITIONS: Row = {"conditions": [], "advice_on_conditions": []}
 
 
-def examined(answer: SearchResult, front_written: bool, tell: Tell) -> tuple[TuningFacts, Slices | None]:
-    """Return the facts of an answer, and the slices of the goal through it. Arrays [m] have one value per gain.
+def examined(answer: SearchResult, front_written: bool, tell: Tell) -> TuningFacts:
+    """Return the facts of an answer.
 
-    Facts that do not decide on the verdict are absent if they cannot be computed (`described`).
-
-    `front_written`: whether each point of the front has a
-    case file. `tell`: receives what is done.
+    Facts that do not decide on the verdict are absent if they cannot be computed (`described`). `front_written`:
+    whether each point of the front has a case file. `tell`: receives what is done.
     """
     problem, x, members = answer.problem, answer.x, answer.members
     held_out, rollouts = seeds(problem.tune.budget)[2], problem.engine.rollouts
@@ -53,14 +52,13 @@ def examined(answer: SearchResult, front_written: bool, tell: Tell) -> tuple[Tun
         "front_written": front_written,
         "front": described("the front", lambda: front_table.facts(answer)) or None,
     }
-    tell("the objective around the answer")
-    slices = described("the slices through the answer", lambda: slices_through(problem, x, members))
-    facts = TuningFacts(**found, **_neighbourhood(problem, x, slices))
+    around = described("the sensitivity of the gains", lambda: changed_gains(problem, x, members))
+    facts = TuningFacts(**found, gains=_gains(problem, x, around))
     what = outcome.outcome_of(facts, problem.tune.limits.may_lose(problem.tune.budget.held_out))
-    verdict = described("the verdict in words", lambda: outcome.outcome_text(facts, what)) or what.text
+    facts = dataclasses.replace(facts, outcome=what.facts())
+    verdict = described("the verdict in words", lambda: outcome.verdict(facts)) or what.text
     advice = described("the advice", lambda: outcome.remedies(problem, facts, what, x, members)) or ""
-    words = {"verdict": verdict, "advice": advice, "next": outcome.next_command(problem)}
-    return dataclasses.replace(facts, outcome=what.facts(), **words), slices
+    return dataclasses.replace(facts, verdict=verdict, advice=advice, next=outcome.next_command(problem))
 
 
 def _judged(problem: TuningProblem, x: np.ndarray, held_out: int, tell: Tell) -> dict[str, dict[str, np.ndarray]]:
@@ -109,7 +107,7 @@ def _stability(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[s
     tell(f"testing whether the loops of {index.size} held-out members are stable")
     members = problem.objective.chosen(seed, index, len(columns["lost_at_s"]))
     # in continuous time, the step of the case may be too coarse for these gains
-    clock = problem.case.clock if problem.sampled else dataclasses.replace(problem.case.clock, method=None)
+    clock = problem.case.clock if problem.sampled else problem.case.clock.with_method(None)
     return stability_of(*problem.objective.fixed(x, members), clock).findings()._asdict()
 
 
@@ -142,18 +140,31 @@ def _conditions(problem: TuningProblem, x: np.ndarray) -> Row:
     """Return the fields on the theorem's conditions at x [m]."""
     case = problem.case
     cascade = problem.objective.space.decode(jnp.asarray(x), case.cascade)
-    line: Check = check(cascade, case.scenario, dataclasses.replace(case.clock, method=None))
+    line: Check = check(cascade, case.scenario, case.clock.with_method(None))
     rows = [dataclasses.asdict(one) | {"margin": one.margin} for one in line.conditions]
     return {"conditions": rows, "advice_on_conditions": on_conditions(line)}
 
 
-def _neighbourhood(problem: TuningProblem, x: np.ndarray, slices: Slices | None) -> Row:
-    """Return the fields on the gains at x [m], and on the goal around them. Without slices, the latter are None."""
+def changed_gains(problem: TuningProblem, x: np.ndarray, members: Members) -> tuple[np.ndarray, np.ndarray]:
+    """Return the effect of a change of one gain, up or down by about e^STEP, whichever is worse, by gain [m].
+
+    The first array is the increase of the risk of least error in per cent, the second the number of members that are
+    also lost. The loss of a rotor costs about 1e6 times as much as an error, so the risk has no meaning then.
+    """
+    steps = STEP * np.eye(len(x))
+    at = x + np.concatenate([np.zeros((1, len(x))), steps, -steps])
+    terms = problem.engine.terms(at, members)
+    risk, lost = problem.error_goal.score(terms, members), (terms["survival"] > 0).sum(axis=1)
+    beside = [np.max(one[1:].reshape(2, -1), axis=0) - one[0] for one in (risk, lost)]
+    return 100 * np.expm1(beside[0]), np.maximum(beside[1], 0)
+
+
+def _gains(problem: TuningProblem, x: np.ndarray, around: tuple[np.ndarray, np.ndarray] | None) -> list[Row]:
+    """Return a row for each gain at x [m]. `around`: from `changed_gains`; None if it could not be computed."""
     space = problem.objective.space
     ends = zip(space.values(problem.case.cascade), np.asarray(space.gains_at(jnp.asarray(x))), strict=True)
-    unknown = [math.nan] * len(x), [0] * len(x)
-    around = unknown if slices is None else (slices.sensitivity(), slices.more_lost())
-    gains = [
+    around = around or (np.full(len(x), math.nan), np.zeros(len(x), int))
+    return [
         {
             "path": gain.path,
             "before": float(before),
@@ -167,11 +178,3 @@ def _neighbourhood(problem: TuningProblem, x: np.ndarray, slices: Slices | None)
         | dataclasses.asdict(where)
         for gain, (before, after), grows, lost, where in zip(space.gains, ends, *around, problem.ranges, strict=True)
     ]
-    if slices is None:
-        return {"gains": gains, "beside": None, "slices": None}
-    j, k, drop = slices.lowest()
-    return {
-        "gains": gains,
-        "beside": {"path": space.paths[j], "gain": slices.gains[j, k], "lower": -np.expm1(-drop)},
-        "slices": {"gains": slices.gains, "log_risk": slices.goals, "lost": slices.lost},
-    }

@@ -1,14 +1,16 @@
 """The outcome of tuning, which determines the exit code, the log and the reports; and the advice if it is not good."""
 
 import dataclasses
+import functools
 
 import numpy as np
 
 from ambjax.linear import Findings
+from ambjax.results.outputs import described
 from ambjax.theorem.advice import STALLED, STALLED_PLANT
 from tuning.problem.members import Members
 from tuning.problem.tuning_problem import TuningProblem
-from tuning.report import front_table
+from tuning.report import front_table, sensitivity_table
 from tuning.report.facts import Row, TuningFacts
 from tuning.report.limit_table import BROKEN, UNJUDGED, UNVERIFIED, broken, prices
 
@@ -74,7 +76,8 @@ class TuningOutcome:
 
     def facts(self) -> Row:
         """Return the outcome as a dict for report.json."""
-        return dataclasses.asdict(self) | {"good": self.good, "rotors_held": self.rotors_held, "against": self.against}
+        own = {name: getattr(self, name) for name in ("good", "rotors_held", "against", "text")}
+        return dataclasses.asdict(self) | own
 
 
 def outcome_of(facts: TuningFacts, may_lose: int) -> TuningOutcome:
@@ -90,47 +93,78 @@ def outcome_of(facts: TuningFacts, may_lose: int) -> TuningOutcome:
     return TuningOutcome(after["members"], after["lost"], after["stalled"], may_lose, limits, facts.refuted, *found)
 
 
-def outcome_text(facts: TuningFacts, outcome: TuningOutcome) -> str:
-    """Return the outcome as text: verdict, lost members, error, limits, sensitive gains and gains at a bound."""
-    unjudged = [name for name, found in outcome.limits.items() if found == UNJUDGED]
-    words = [outcome.text, _statuses(facts)]
-    if facts.stability is not None:
-        words.append(Findings(**facts.stability).words())
-    if taken := front_table.sentence(facts.front or []):
-        words.append(taken)
-    if outcome.refuted:
-        words.append(f"This result is {UNVERIFIED.upper()}: {outcome.refuted}.")
-    words += [f"{line}." for line in [*broken(facts.limits), *prices(facts.limits)]]
-    if unjudged:
-        words.append(f"Limits {UNJUDGED}: {', '.join(unjudged)}.")
+def verdict(facts: TuningFacts) -> str:
+    """Return the verdict as text: whether the requirements are met, and the answer."""
+    return " ".join([facts.outcome["text"], *(f"{label}: {text}" for label, text in answer(facts).items())])
+
+
+def answer(facts: TuningFacts) -> dict[str, str]:
+    """Return the answer by label: held or not, error and voltage, sensitivity, limits.
+
+    An entry that cannot be computed is absent.
+    """
+    entries = {"held": _held, "error": _sizes, "sensitivity": _peaks, "limits": _limiting}
+    found = [described(f"the line on the {name}", functools.partial(entry, facts)) for name, entry in entries.items()]
+    return dict(one for one in found if one)
+
+
+def _held(facts: TuningFacts) -> tuple[str, str]:
+    """Return the entry on the rotors that are held."""
+    outcome, after = facts.outcome, facts.after
+    which = "held-out members" if after["members"] else "training members"
+    kept = outcome["members"] - outcome["lost"] - outcome["stalled"]
+    words = f"{kept} of {outcome['members']} {which} are held"
+    if facts.before["members"]:
+        words += f" (before tuning: {facts.before['held']})"
+    if outcome["stalled"]:
+        words += f", {outcome['stalled']} not decided (their integration stalls)"
+    tested = "" if facts.stability is None else Findings(**facts.stability).words()
+    refuted = f"This result is {UNVERIFIED.upper()}: {facts.refuted}." if facts.refuted else ""
+    label = "NOT held" if not outcome["rotors_held"] else "Not verified" if facts.refuted else "Held"
+    return label, " ".join(filter(None, [f"{words}.", tested, refuted]))
+
+
+def _sizes(facts: TuningFacts) -> tuple[str, str]:
+    """Return the entry on the error and the voltage after tuning, and before it."""
+    label, after, before = "Error and voltage", facts.after, facts.before
+    if not after["members"]:
+        return label, "not measured on held-out members (tune.held_out = 0)."
+    if not after["held"]:
+        return label, "no held-out member is held."
+
+    def change(name: str, unit: str) -> str:
+        was = f" (before: {before[name]:.3g})" if before["held"] else ""
+        return f"{after[name]:.3g} {unit} rms after settling{was}"
+
+    most = after.get("max_abs_u_V.largest")
+    words = (
+        f"{change('settled_rms_error_m', 'm')}, largest {after['settled_max_abs_error_m']:.3g} m; "
+        f"{change('settled_rms_u_V.mean', 'V')}{'' if most is None else f', largest {most:.3g} V'}."
+    )
+    return label, " ".join(filter(None, [words, front_table.sentence(facts.front or [])]))
+
+
+def _peaks(facts: TuningFacts) -> tuple[str, str]:
+    return "Sensitivity", sensitivity_table.line(facts.sensitivity)
+
+
+def _limiting(facts: TuningFacts) -> tuple[str, str]:
+    """Return the entry on the limits that are not held or active, on gains at a bound, and on sensitive gains."""
+    words = [*broken(facts.limits), *prices(facts.limits)]
+    if ends := [f"{row['path']} = {row['after']:.4g} ({row['at_bound']})" for row in facts.gains if row["at_bound"]]:
+        words.append(f"gains at a bound of tune.bounds: {', '.join(ends)}")
+    if not words:
+        front = "the trade-off between error and voltage; " if len(facts.front or ()) > 1 else ""
+        words = [f"{front}no limit of tune.limits is active, and no gain is at a bound"]
+    if names := [row["name"] for row in facts.limits if row["verdict"] == UNJUDGED]:
+        words.append(f"limits {UNJUDGED}: {', '.join(names)}")
     words += [
-        f"If {row['path']} changes by a factor of 1.28, {row['sensitivity_lost']} of {facts.trained_on} training "
-        "members are also lost."
+        f"if {row['path']} changes by a factor of 1.28, {row['sensitivity_lost']} of {facts.trained_on} training "
+        "members are also lost"
         for row in facts.gains
         if row.get("sensitivity_lost")
     ]
-    ends = [f"{row['path']} = {row['after']:.4g} ({row['at_bound']})" for row in facts.gains if row["at_bound"]]
-    if ends:
-        words.append(f"Gains at a bound: {', '.join(ends)}.")
-    return " ".join(words)
-
-
-def _statuses(facts: TuningFacts) -> str:
-    """Return the sentence on the members lost and on the settled error of the others."""
-    before, after = facts.before, facts.after
-    if not after["members"]:
-        return f"{facts.lost_in_training} members of the training ensemble are lost under the tuned gains."
-    largest = f"; largest error {after['settled_max_abs_error_m']:.3g} m" if after["held"] else ""
-    undecided = f", {after['stalled']} not decided (their integration stalls)" if after["stalled"] else ""
-    return (
-        f"Of {after['members']} held-out members, {after['lost']} are lost under the tuned gains (before: "
-        f"{before['lost']}){undecided}; settled rms error of the surviving members: {_error(after)} (before: "
-        f"{_error(before)}){largest}."
-    )
-
-
-def _error(summary: Row) -> str:
-    return f"{summary['settled_rms_error_m']:.3g} m" if summary["held"] else "none is held"
+    return "Limited by", f"{'; '.join(words)}."
 
 
 def remedies(

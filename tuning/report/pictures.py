@@ -1,7 +1,6 @@
 """Pictures of a search and its answer, as PNG."""
 
 import io
-import math
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from ambjax.pictures.style import own_style
 from ambjax.simulation.trajectory import ALIVE, STALLED, Trajectory
 from tuning.problem.goal import shown
 from tuning.report.front_table import letter
-from tuning.report.slices import Slices
 
 # Largest plotted goal, relative to the least. A lost member raises the goal by about 1e6, and violated limits by up to
 # 1e300, which would hide the other values.
@@ -82,39 +80,6 @@ def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
         for at in np.flatnonzero(np.diff(history["members"])):
             ax.axvline(at + 1.5, color="0.5", ls=":", lw=1)
         ax.grid(alpha=0.3)
-    return _png(figure)
-
-
-@own_style
-def landscape(slices: Slices, paths: list[str]) -> bytes:
-    """Draw the goal as a function of each gain as PNG. The other gains have their values in the answer."""
-    m = len(paths)
-    columns = math.ceil(math.sqrt(2 * m))
-    lines = -(-m // columns)
-    figure = Figure(figsize=(2.4 * columns + 1, 2.6 * lines + 0.6), layout="constrained")
-    grid = figure.subplots(lines, columns, sharey=True, squeeze=False)
-    axes = grid.flat[:m]
-    for ax in grid.flat[m:]:
-        ax.remove()
-    middle = slices.goals.shape[1] // 2
-    for ax, gains, goals, lost, path in zip(axes, slices.gains, slices.goals, slices.lost, paths, strict=True):
-        risk = np.exp(np.minimum(goals - goals[middle], np.log(HIGHEST)))
-        ax.loglog(gains, risk, "C0-", lw=1.2)
-        held = lost == 0
-        ax.plot(gains[held], risk[held], "C0o", ms=3.5, label="all members held")
-        if not held.all():
-            ax.plot(gains[~held], risk[~held], "C3x", ms=5, label="members lost")
-        ax.axvline(gains[middle], color="0.5", lw=0.8, ls=":")
-        ax.set_xlabel(path.removeprefix("controller."))
-        ax.set_xticks([], minor=True)
-        span = np.log(gains[-1] / gains[0])
-        ends = [end for end in (gains[0], gains[-1]) if abs(np.log(end / gains[middle])) > span / 4]
-        ax.set_xticks([*ends, gains[middle]], [digits(tick) for tick in (*ends, gains[middle])], fontsize=8)
-        ax.grid(alpha=0.3)
-    for ax in grid[:, 0]:
-        ax.set_ylabel(f"objective / that of the answer\n(cut at {HIGHEST:g})", fontsize=9)
-    handles = {label: h for ax in axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2, fontsize=8, frameon=False)
     return _png(figure)
 
 

@@ -32,14 +32,14 @@ def facts(problem: TuningProblem, injected: Sensitivity) -> Facts:
 def line(found: Facts | None) -> str:
     """Return the largest peak of |S| of the held-out members and its zone."""
     if not found or not found["members"]:
-        return "**Sensitivity:** not computed here; `ambjax sensitivity tuned.toml` computes |S| and the zone."
+        return "not computed here; `ambjax sensitivity tuned.toml` computes |S| and the zone."
     unknown = next((row for row in found["members"] if _unknown(row, found)), None)
     if unknown is not None:
         zone = unknown["injected_zone"] if unknown["lost"] else unknown["zone"]
-        words = escape_markdown(_unknown(unknown, found)).rstrip(".") + (f": zone {zone}" if zone else "")
-        return f"**Sensitivity:** no peak of |S| for member {unknown['member']}: {words}."
+        words = _unknown(unknown, found).rstrip(".") + (f": zone {zone}" if zone else "")
+        return f"no peak of |S| for member {unknown['member']}: {words}."
     peak, at, zone = max(_peak(row, found) for row in found["members"])
-    return f"**Sensitivity:** |S| is at most {peak:.3g} (at {at:.3g} Hz) over the worst members: zone {zone}."
+    return f"|S| is at most {peak:.3g} (at {at:.3g} Hz) over the worst members: zone {zone}."
 
 
 def _unknown(row: Facts, found: Facts) -> str:

@@ -7,18 +7,18 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ambjax.host.sealed import DamagedError, difference, flat, provenance, seal, unseal, write_whole
-from tuning.solve.descent import Descent, Starts
-from tuning.solve.evolution import CmaState, idle_state
+from tuning.solve.descent import Starts
+from tuning.solve.evolution import Evolution
 
 NAME = re.compile(r"round-[0-9]+\.npz")
 # Subfolder of the output directory, and the file in it that marks a search before its first checkpoint.
 FOLDER, MARK = "checkpoints", "search.json"
-LEAF, PAST, ACTIVE = "leaf_", "history_", "active"
+# Names of the arrays of a checkpoint, or their beginnings.
+LEAF, PAST, ACTIVE, ORIGIN, SEED, TOLD = "start_", "history_", "active", "cma_origin", "cma_seed", "cma_told"
 
 
 @dataclasses.dataclass
@@ -35,22 +35,13 @@ class SearchState:
     seconds: float = 0.0
     earlier: float = 0.0
     interrupted: bool = False
-    cma: CmaState = None  # pyright: ignore[reportAssignmentType]
-    """distribution of CMA-ES, which continues from the best point of the descents"""
-
-    def __post_init__(self) -> None:
-        if self.cma is None:
-            self.cma = idle_state(self.starts.best.shape[1])
+    evolution: Evolution | None = None
+    """CMA-ES, which continues from the best point of the descents; None: the search does not use it"""
 
     @property
     def iteration(self) -> int:
         """Number of iterations so far."""
         return len(self.history.get("value", ()))
-
-    @property
-    def evolving(self) -> bool:
-        """Whether the search uses CMA-ES."""
-        return bool(self.cma.drawn >= 0)
 
     @property
     def ended(self) -> bool:
@@ -81,15 +72,15 @@ class CheckpointFile:
         if self.path is None:
             return
         _make(self.path.parent)
-        leaves = {
-            f"{LEAF}{n}": np.asarray(leaf) for n, leaf in enumerate(jax.tree.leaves((progress.starts, progress.cma)))
-        }
+        leaves = {f"{LEAF}{name}": np.asarray(leaf) for name, leaf in progress.starts._asdict().items()}
+        if (cma := progress.evolution) is not None:
+            leaves |= {ORIGIN: cma.origin, SEED: np.array(cma.seed), TOLD: np.array(cma.told)}
         past = {f"{PAST}{name}": np.asarray(rows) for name, rows in progress.history.items()}
         facts = {"fingerprint": self.fingerprint, "seconds": progress.seconds}
         seal(self.path, {**leaves, **past, ACTIVE: progress.active}, facts)
 
-    def load(self, descent: Descent, starts: int, m: int) -> SearchState | None:
-        """Return the saved search of `starts` starts in m coordinates, or None if there is none.
+    def load(self) -> SearchState | None:
+        """Return the saved search, or None if there is none.
 
         If the checkpoint is damaged, tells the reason and returns None. Raises ValueError if it belongs to another
         problem.
@@ -104,12 +95,11 @@ class CheckpointFile:
                     f"--resume: {self.path} belongs to another search: {differs}. "
                     "Use another --out, or leave out --resume to start a new search."
                 )
-            tree = jax.tree.structure((jax.eval_shape(descent.begin, jnp.zeros((starts, m))), idle_state(m)))
-            state, drawn = jax.tree.unflatten(tree, [arrays[f"{LEAF}{n}"] for n in range(tree.num_leaves)])
+            starts = Starts(*(jnp.asarray(arrays[f"{LEAF}{name}"]) for name in Starts._fields))
+            evolution = Evolution(arrays[ORIGIN], int(arrays[SEED]), arrays[TOLD]) if ORIGIN in arrays else None
             past = {name.removeprefix(PAST): list(rows) for name, rows in arrays.items() if name.startswith(PAST)}
-            state, active = jax.tree.map(jnp.asarray, state), arrays[ACTIVE]
             spent = float(facts["seconds"])
-            return SearchState(state, active, past, spent, spent, cma=drawn)
+            return SearchState(starts, arrays[ACTIVE], past, spent, spent, evolution=evolution)
         except DamagedError as error:
             why = str(error)
         except KeyError:

@@ -98,8 +98,7 @@ class Course:
             self.tell(f"search {number}: from the best point, on {members}")
         progress = search(
             self.problem.engine, self.problem.goal, self.members, points, keep=tune.budget.starts,
-            iterations=tune.budget.iterations, name=tune.optimiser, rate=tune.learning_rate,
-            seed=self.seed + len(self.past),
+            iterations=tune.budget.iterations, seed=self.seed + len(self.past),
             checkpoint_file=CheckpointFile(path, self.facts, number, self.tell), resume=self.resume,
             on_iteration=self._standing(number), until=self.began + 60 * self.minutes,
         )  # fmt: skip
@@ -170,7 +169,7 @@ def first_search(course: Course, start: np.ndarray) -> np.ndarray:
     Raises ValueError as `check_loops` does.
     """
     problem, budget = course.problem, course.problem.tune.budget
-    points = initial_points(problem.objective, problem.goal.conditions, start, budget.screen, course.seed)
+    points = initial_points(problem.objective.space, problem.ranges, start, budget.screen, course.seed)
     check_loops(problem.objective, points, course.members.searched)
     return course.search(points)
 

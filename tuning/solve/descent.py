@@ -1,82 +1,108 @@
-"""Descent: the next trial of each start, computed from the members' losses and derivatives at the last trial.
+"""Descent: a dense BFGS with a trust region, for several starts at once.
 
-A start is a point that the search refines, with the state of its optimiser.
+It follows Nocedal and Wright, Numerical Optimization, 2006, 6.1, without a line search. The goal is a logarithm.
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 from jax import Array
 
-from ambjax.extend import record, static
-from tuning.optimisers import BFGSState, FirstOrderState, optimiser
+from ambjax.extend import record
 from tuning.problem.goal import Goal
+
+# Trust radius: its largest value (1: a factor e of one gain), and its value for the first step, which has no estimate
+# of the curvature.
+LARGEST_RADIUS, FIRST_RADIUS = 1.0, 0.3
+# After a rejected trial, the trust radius is the length of its step times CONTRACTION, or times its square if the trial
+# lies beyond a jump of the function.
+CONTRACTION = 0.5
+# A trial lies beyond a jump if its value, a logarithm, exceeds the best value by this or more, or if its value or
+# gradient is not finite.
+JUMP = 1.0
 
 
 class Starts(NamedTuple):
-    """State of all starts.
+    """State of starts, points that the search refines: the next trials, and the best points so far.
 
-    `trial` [S, m]: next points. `state`: of the optimiser. `length` [S]: distance from the best point to the trial.
-    `gradient_norm` [S]: norm of the goal's gradient at the best point.
+    `trial`, `best` [S, m]. `value` [S], `gradient` [S, m]: of the goal at the best points; +inf and 0 before the first
+    trial. `inverse` [S, m, m]: inverse Hessian. `radius` [S]: trust radius. `trials` [S]: number of trials so far.
     """
 
     trial: Array
-    state: BFGSState | FirstOrderState
-    length: Array
-    gradient_norm: Array
+    best: Array
+    value: Array
+    gradient: Array
+    inverse: Array
+    radius: Array
+    trials: Array
 
-    @property
-    def best(self) -> Array:
-        """The best points so far [S, m]."""
-        return self.state.best
 
-    @property
-    def value(self) -> Array:
-        """The goal at the best points [S]; +inf before the first trial."""
-        return self.state.value
+def begin(x: Array) -> Starts:
+    """Return the initial state of starts at coordinates x [S, m]."""
+    count, m = x.shape
+    full = functools.partial(jnp.full, count, dtype=x.dtype)
+    inverse = jnp.broadcast_to(jnp.eye(m, dtype=x.dtype), (count, m, m))
+    return Starts(x, x, full(jnp.inf), jnp.zeros_like(x), inverse, full(FIRST_RADIUS), jnp.zeros(count, int))
+
+
+def step(start: Starts, value: Array, gradient: Array) -> Starts:
+    """Return one start after its trial. `value`, `gradient` [m]: of the goal at the trial.
+
+    A trial is rejected if its value is not below the best value, or if its value or gradient is not finite. A rejected
+    trial still updates the inverse Hessian, unless it lies beyond a jump of the function (JUMP).
+    """
+    finite = jnp.isfinite(value) & jnp.isfinite(gradient).all()
+    gradient = jnp.where(finite, gradient, 0.0)
+    accept, smooth = finite & (value < start.value), finite & (value < start.value + JUMP)
+    s = start.trial - start.best
+    inverse = _updated_inverse(start, s, gradient - start.gradient, smooth)
+    tried = jnp.sqrt(s @ s)
+    wider = jnp.minimum(jnp.maximum(start.radius, 2 * tried), LARGEST_RADIUS)
+    narrower = jnp.where(smooth, CONTRACTION, CONTRACTION**2) * tried
+    radius = jnp.where(start.trials == 0, start.radius, jnp.where(accept, wider, narrower))
+    best, slope = jnp.where(accept, start.trial, start.best), jnp.where(accept, gradient, start.gradient)
+    move = -inverse @ slope
+    move = jnp.where(slope @ move < 0, move, -slope)
+    length = jnp.sqrt(move @ move)
+    move = move * jnp.minimum(1.0, radius / jnp.where(length > 0, length, 1.0))
+    value = jnp.where(accept, value, start.value)
+    return Starts(best + move, best, value, slope, inverse, radius, start.trials + 1)
+
+
+def _updated_inverse(start: Starts, s: Array, y: Array, smooth: Array) -> Array:
+    """Return the inverse Hessian [m, m] after an update with the step s [m] and the gradient's change y [m]."""
+    curvature = s @ y
+    usable = (start.trials > 0) & smooth & (curvature > 1e-10 * jnp.sqrt((s @ s) * (y @ y)))
+    rho = 1 / jnp.where(usable, curvature, 1.0)
+    # The first pair (s, y) of a search sets the scale of the inverse Hessian.
+    scale = jnp.where(start.trials == 1, curvature / jnp.where(usable, y @ y, 1.0), 1.0)
+    left = jnp.eye(len(s), dtype=s.dtype) - rho * jnp.outer(s, y)
+    return jnp.where(usable, scale * left @ start.inverse @ left.T + rho * jnp.outer(s, s), start.inverse)
 
 
 @record
 class Descent:
-    """Independent descents of several starts by the optimiser `name` with the learning rate `rate`.
+    """Steps of several starts towards the least goal.
 
-    The numbers of the limits are leaves, so its functions are compiled once for all goals of the same structure.
+    The numbers of the limits are leaves, so it is compiled once for all goals of the same structure.
     """
 
     goal: Goal
-    name: str = static()
-    rate: float = static()
-
-    @property
-    def method(self) -> optax.GradientTransformationExtraArgs:
-        """The optimiser."""
-        return optimiser(self.name, self.rate)
-
-    @jax.jit
-    def begin(self, x: Array) -> Starts:
-        """Return the initial state at coordinates x [S, m]."""
-        state: Any = jax.vmap(self.method.init)(x)
-        infinite = jnp.full(len(x), jnp.inf, x.dtype)
-        return Starts(x, state, infinite, infinite)
 
     @functools.partial(jax.jit, static_argnums=1)
-    def step(self, ordinary: int, starts: Starts, outcomes: Array, slopes: Array, on: Array) -> Starts:
+    def __call__(self, ordinary: int, starts: Starts, outcomes: Array, slopes: Array, on: Array) -> Starts:
         """Return the starts after one step. `on` [S]: whether each start makes the step.
 
         `outcomes` [S, N, 1 + L]: the weighted loss and the limited quantities of each member at the trials. `slopes`
         [S, N, 1 + L, m]: their derivatives. The first `ordinary` members are not stressed.
         """
-        return jax.vmap(functools.partial(self._one, ordinary))(starts, outcomes, slopes, on)
 
-    def _one(self, ordinary: int, start: Starts, outcomes: Array, slopes: Array, on: Array) -> Starts:
-        value, (weights, slope) = jax.value_and_grad(self.goal, (0, 1))(outcomes, start.trial, ordinary)
-        gradient: Any = jnp.tensordot(weights, slopes, 2) + slope
-        state: Any
-        step, state = self.method.update(gradient, start.state, start.trial, value=value)
-        trial: Any = optax.apply_updates(start.trial, step)
-        gradient_norm = jnp.where(state.value < start.value, jnp.linalg.norm(gradient), start.gradient_norm)
-        fresh = Starts(trial, state, jnp.linalg.norm(trial - state.best), gradient_norm)
-        return jax.tree.map(lambda p, q: jnp.where(on, p, q), fresh, start)
+        def one(start: Starts, outcomes: Array, slopes: Array, on: Array) -> Starts:
+            value, weights = jax.value_and_grad(self.goal)(outcomes, ordinary)
+            after = step(start, value, jnp.tensordot(weights, slopes, 2))
+            return jax.tree.map(lambda p, q: jnp.where(on, p, q), after, start)
+
+        return jax.vmap(one)(starts, outcomes, slopes, on)

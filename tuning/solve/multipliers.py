@@ -168,7 +168,7 @@ def _least(course: Course, points: Sequence[np.ndarray]) -> np.ndarray:
     course.tell("the multipliers of the limits do not converge; the best answer within the limits is taken")
     both = np.array(points)
     goal = dataclasses.replace(course.problem.goal, limits=())
-    return points[int(np.argmin(goal.score(both, course.problem.engine.terms(both, course.members), course.members)))]
+    return points[int(np.argmin(goal.score(course.problem.engine.terms(both, course.members), course.members)))]
 
 
 def met(limit: Limit, judged: float) -> bool:

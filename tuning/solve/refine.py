@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.host.interrupts import deferred, raise_if_interrupted
-from tuning.optimisers import BFGS
 from tuning.problem.goal import Goal
 from tuning.problem.lanes import Engine
 from tuning.problem.limits import PREFIX
@@ -20,8 +19,8 @@ from tuning.problem.loss import TERMS
 from tuning.problem.members import Members
 from tuning.problem.quantities import KINDS
 from tuning.solve.checkpoint import CheckpointFile, SearchState
-from tuning.solve.descent import Descent
-from tuning.solve.evolution import initial_state, next_population, updated
+from tuning.solve.descent import Descent, begin
+from tuning.solve.evolution import Evolution
 from tuning.solve.screen import screen
 
 # Number of iterations after which only the best start continues.
@@ -48,8 +47,6 @@ def search(
     *,
     keep: int = 1,
     iterations: int,
-    name: str = BFGS,
-    rate: float = 0.1,
     seed: int = 0,
     checkpoint_file: CheckpointFile | None = None,
     resume: bool = False,
@@ -58,30 +55,30 @@ def search(
 ) -> SearchState:
     """Refine the best `keep` of these points, coordinates [K, m], which a screen selects. Ctrl-C ends the search early.
 
-    The starts descend by the optimiser `name` with the learning rate `rate`. After RACE iterations, only the best one
-    continues. If its gradient does not lead to a minimum, it continues with CMA-ES. The search ends after `iterations`.
+    The starts descend (`Descent`). After RACE iterations, only the best one continues. If its gradient does not lead to
+    a minimum, it continues with CMA-ES. The search ends after `iterations`.
 
     `seed`: seed of the populations of CMA-ES. `on_iteration`: called after each iteration with the search and the
     duration of the iteration in s. `until`: time of `time.perf_counter` after which the search ends at its next
     iteration.
     """
-    descent, began = Descent(goal, name, rate), time.perf_counter()
+    descent, began = Descent(goal), time.perf_counter()
     checkpoint_file = checkpoint_file or CheckpointFile(None, {})
-    progress = checkpoint_file.load(descent, min(keep, len(points)), points.shape[1]) if resume else None
+    progress = checkpoint_file.load() if resume else None
     if progress is not None:
         engine.rollouts = int(progress.history["rollouts"][-1])
     else:
         if len(points) > keep:
             points = screen(engine, members, points, goal)[:keep]
-        progress = SearchState(descent.begin(jnp.asarray(points)), np.ones(len(points), bool))
+        progress = SearchState(begin(jnp.asarray(points)), np.ones(len(points), bool))
     try:
         while progress.active.any() and progress.iteration < iterations:
             # Before the first iteration, the search has no result to judge, so Ctrl-C ends the process.
             with deferred(INTERRUPT_MESSAGE if progress.history else ""):
                 raise_if_interrupted()
                 before = progress.seconds
-                iterate(engine, goal, members, progress, descent, seed)
-                _advance(progress)
+                iterate(engine, goal, members, progress, descent)
+                _advance(progress, seed)
                 progress.seconds = progress.earlier + time.perf_counter() - began
                 checkpoint_file.save(progress)
                 on_iteration(progress, progress.seconds - before)
@@ -92,12 +89,10 @@ def search(
     return progress
 
 
-def iterate(
-    engine: Engine, goal: Goal, members: Members, progress: SearchState, descent: Descent, seed: int = 0
-) -> None:
+def iterate(engine: Engine, goal: Goal, members: Members, progress: SearchState, descent: Descent) -> None:
     """Make one step of each active start, or draw one population of CMA-ES, and add the best point to the history."""
-    if progress.evolving:
-        x, value, terms = _evolved(engine, goal, members, progress, seed)
+    if progress.evolution is not None:
+        x, value, terms = _evolved(engine, goal, members, progress.evolution)
     else:
         x, value, terms = _descended(engine, goal, members, progress, descent)
     past, n = progress.history, members.ordinary
@@ -130,7 +125,7 @@ def _descended(
     full = [np.full((len(progress.active), *one.shape[1:]), np.nan) for one in (losses, slopes)]
     for whole, part in zip(full, (losses, slopes), strict=True):
         whole[active] = part
-    progress.starts = descent.step(members.ordinary, starts, *full, progress.active)
+    progress.starts = descent(members.ordinary, starts, *full, progress.active)
     best = active[int(np.argmin(np.asarray(progress.starts.value)[active]))]
     row = int(np.flatnonzero(active == best)[0])
     found = np.asarray(progress.starts.best)[best], float(progress.starts.value[best])
@@ -138,18 +133,18 @@ def _descended(
 
 
 def _evolved(
-    engine: Engine, goal: Goal, members: Members, progress: SearchState, seed: int
+    engine: Engine, goal: Goal, members: Members, evolution: Evolution
 ) -> tuple[np.ndarray, float, dict[str, Any]]:
     """Draw one population and update the distribution. Return the best of its points [m], its goal and terms [N]."""
-    points = next_population(progress.cma, seed)
+    points = evolution.ask()
     terms = engine.terms(points, members)
-    values = goal.score(points, terms, members)
-    progress.cma = updated(progress.cma, points, values)
+    values = goal.score(terms, members)
+    evolution.tell(points, values)
     first = int(np.argmin(values))
     return points[first], float(values[first]), {name: one[first] for name, one in terms.items()}
 
 
-def _advance(progress: SearchState) -> None:
+def _advance(progress: SearchState, seed: int) -> None:
     """Select the starts that continue, let the last one switch to CMA-ES, or end it.
 
     A descent ends if its step is at most SHORTEST, or if the goal stalls. It switches if the gradient is then
@@ -157,19 +152,20 @@ def _advance(progress: SearchState) -> None:
     derivatives grow with time and do not describe the goal; and a descent stops early at a jump of the goal, beyond
     which members are lost.
     """
-    if progress.evolving:
-        progress.active &= not (progress.cma.reach <= SHORTEST or progress.cma.converged)
+    if progress.evolution is not None:
+        progress.active &= not (progress.evolution.reach <= SHORTEST or progress.evolution.converged)
         return
     best = int(np.argmin(np.asarray(progress.starts.value)))
     if progress.iteration >= RACE:
         progress.active = np.arange(len(progress.active)) == best
     if progress.active.sum() > 1:
         return
-    norm, values = float(progress.starts.gradient_norm[best]), progress.history["value"]
+    starts, values = progress.starts, progress.history["value"]
+    norm = float(jnp.linalg.norm(starts.gradient[best])) if np.isfinite(starts.value[best]) else math.inf
     stalled = len(values) > PATIENCE and values[-1] > values[-1 - PATIENCE] - STALL
-    ended = stalled or float(progress.starts.length[best]) <= SHORTEST
+    ended = stalled or float(jnp.linalg.norm(starts.trial[best] - starts.best[best])) <= SHORTEST
     if not norm < STEEP or (ended and norm >= CONVERGED):
-        progress.cma = initial_state(progress.history["x"][-1])
+        progress.evolution = Evolution(progress.history["x"][-1], seed)
     elif ended:
         progress.active = np.zeros_like(progress.active)
 

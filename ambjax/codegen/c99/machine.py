@@ -37,10 +37,7 @@ def compiler(option: str = "--verify", fix: str = "Install one, set CC, or omit 
 
 
 def build(sources: list[pathlib.Path], target: pathlib.Path, *flags: str) -> str:
-    """Compile `sources` to `target` with STRICT, EXACT and `flags`.
-
-    Returns the compiler's error message, empty if there is none. Raises ValueError if the compiler cannot be run.
-    """
+    """Compile `sources` to `target` with STRICT, EXACT and `flags`."""
     command = [compiler(), *STRICT, EXACT, *flags, *map(str, sources), "-o", str(target), "-lm"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
@@ -53,10 +50,7 @@ def build(sources: list[pathlib.Path], target: pathlib.Path, *flags: str) -> str
 
 
 def execute(program: pathlib.Path) -> tuple[int, str]:
-    """Run a compiled program, and return its exit code and its output.
-
-    Raises ValueError if the program cannot be run, or does not end within TIME_LIMIT.
-    """
+    """Run a compiled program, and return its exit code and its output."""
     try:
         done = subprocess.run(
             [program], capture_output=True, text=True, errors="replace", check=False, timeout=TIME_LIMIT
@@ -101,10 +95,7 @@ def scratch() -> Iterator[pathlib.Path]:
 
 
 def check_compiler() -> None:
-    """Check that this machine can compile and run programs, plain and sanitized, and compile and load libraries.
-
-    Raises ValueError if it cannot: a failure of the machine must not count as a failure of the C.
-    """
+    """Check that this machine can compile and run programs, plain and sanitized, and compile and load libraries."""
     with scratch() as folder:
         source = folder / "empty.c"
         source.write_text("int main(void)\n{\n    return 0;\n}\n", encoding="utf-8")

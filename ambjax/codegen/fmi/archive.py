@@ -97,10 +97,7 @@ def binary_name(identifier: str, version: int) -> str:
 
 
 def compiled(files: dict[str, str], identifier: str) -> bytes:
-    """Return the library that the C compiler of this machine makes of an FMU's sources. `files`: their texts by name.
-
-    Raises ValueError if there is no compiler, or if it reports an error.
-    """
+    """Return the library that the C compiler of this machine makes of an FMU's sources."""
     machine.compiler("--format fmu", "Install one, set CC, or use --format c")
     with machine.scratch() as folder:
         for name, text in files.items():
@@ -113,12 +110,7 @@ def compiled(files: dict[str, str], identifier: str) -> bytes:
 
 
 def packed(traced: Trace, identifier: str, origin: Origin, version: int) -> bytes:
-    """Return the bytes of an FMU. A later export recognises it by MARK, the comment of the archive.
-
-    The arguments are those of `sources`.
-
-    Raises ValueError if there is no compiler, or if it cannot compile the sources.
-    """
+    """Return the bytes of an FMU. A later export recognises it by MARK, the comment of the archive."""
     files, guid = sources(traced, identifier, origin, version)
     units = [name for name in files if name.endswith(".c")]
     members: dict[str, str | bytes] = {f"sources/{name}": text for name, text in files.items()}

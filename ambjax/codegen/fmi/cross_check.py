@@ -1,6 +1,5 @@
 """Reference data of an FMU in the format of FMI's cross-check: the signals of a case, and the outputs of JAX."""
 
-import dataclasses
 import math
 from typing import Any
 
@@ -14,6 +13,7 @@ from ambjax.codegen.of_case import block_of
 from ambjax.codegen.series import series
 from ambjax.codegen.trace import arguments, precision
 from ambjax.control.cascade import Cascade
+from ambjax.numerics.records import replaced
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import rollout
 from ambjax.world.scenario import Scenario
@@ -25,10 +25,7 @@ GROWTH = 1e4
 
 
 def run_block(block: Block, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Run a block in JAX. Return its outputs [samples, outputs] and status [samples], the bits as an integer.
-
-    `rows`: inputs [samples, inputs]. Units and order are those of `block.inputs` and `block.outputs`.
-    """
+    """Run a block in JAX. Return its outputs [samples, outputs] and status [samples], the bits as an integer."""
     parameters, memory, _, period = arguments(block)
     read = frozenset(block.inputs)
 
@@ -44,9 +41,6 @@ def run_block(block: Block, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def reference(block: Block, cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[np.ndarray, np.ndarray]:
     """Return inputs and outputs of a block's FMU in the loop of the case.
 
-    The readings of a controller are the reading of z and the true velocity and current of the simulated case. They do
-    not depend on whether the plant can be exported.
-
     Each is an array [instants, 1 + numbers] with the time (s) in the first column; the outputs have one instant more.
     The inputs of a row act in the communication step that begins at its time. For a plant and a loop, the first row is
     also the input of the step that reads the sensors at the start.
@@ -57,7 +51,7 @@ def reference(block: Block, cascade: Cascade, scenario: Scenario, clock: Clock) 
         count = max(min(count, int(math.log(GROWTH) / pole)), 1)
     given = series(cascade, scenario, clock, count + 1)
     if block.noun == "controller":
-        short = dataclasses.replace(clock, samples=count)
+        short = replaced(clock, samples=count)
         read = rollout(cascade, scenario, short).trajectory.rows
         signals = {**given, "z": read.z_measured, "z_dot": read.z_dot, "i": read.i}
         rows = np.array([signals[name][:count] for name in block.inputs]).T

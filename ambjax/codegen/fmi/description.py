@@ -2,12 +2,13 @@
 
 import hashlib
 import math
+import re
+from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 from ambjax._version import __version__
-from ambjax.codegen.fmi.si_units import exponents
 from ambjax.codegen.numbering import UNREAD, Number
 from ambjax.codegen.trace import Trace
 
@@ -36,10 +37,7 @@ class Variable(NamedTuple):
 
 
 def variables(traced: Trace) -> list[Variable]:
-    """Return the variables of an exported block, except inputs and parameters that it does not read.
-
-    Their value references are those of fmu_core.h: time, inputs, outputs, parameters, states, status.
-    """
+    """Return the variables of an exported block, except inputs and parameters that it does not read."""
     outputs, states = ([x for x, _ in group] for group in (traced.outputs, traced.state))
     groups: tuple[tuple[Sequence[Number], str, str], ...] = (
         (traced.inputs, "input", "discrete"),
@@ -110,12 +108,7 @@ FORMS = {
 
 
 def description(traced: Trace, identifier: str, case: str, guid: str, sources: list[str], version: int) -> str:
-    """Return the text of modelDescription.xml.
-
-    - `case`: name of the case.
-    - `sources`: names of the C files.
-    - `version`: of FMI, 2 or 3.
-    """
+    """Return the text of modelDescription.xml. `case`: name of the case. `sources`: names of the C files."""
     form, period = FORMS[version], traced.block.period
     words = f"{traced.block.noun} of case {case}: one sample per communication step"
     head = f"modelName={quoteattr(f'{identifier} ({traced.block.noun})')} description={quoteattr(words)}"
@@ -166,13 +159,45 @@ def _units(found: list[Variable]) -> list[str]:
 
 
 def build_description(identifier: str, sources: list[str]) -> str:
-    """Return the text of buildDescription.xml of FMI 3.0, which tells a tool how to compile the sources.
-
-    `sources`: names of the C files.
-    """
+    """Return the text of buildDescription.xml of FMI 3.0, which tells a tool how to compile the sources."""
     files = "".join(f'\n      <SourceFile name="{name}"/>' for name in sources)
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n<fmiBuildDescription fmiVersion="3.0">\n'
         f'  <BuildConfiguration modelIdentifier="{identifier}">\n    <SourceFileSet language="C99">{files}\n'
         "    </SourceFileSet>\n  </BuildConfiguration>\n</fmiBuildDescription>\n"
     )
+
+
+# Exponents of the base units in each derived unit.
+DERIVED = {
+    "V": {"kg": 1, "m": 2, "s": -3, "A": -1},
+    "ohm": {"kg": 1, "m": 2, "s": -3, "A": -2},
+    "N": {"kg": 1, "m": 1, "s": -2},
+    "Hz": {"s": -1},
+    "W": {"kg": 1, "m": 2, "s": -3},
+    "rad": {"rad": 1},
+}
+BASE = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+# Units without a dimension.
+COUNTS = ("", "1", "samples", "turns")
+
+
+def exponents(unit: str) -> dict[str, int] | None:
+    """Return the exponents of the base units in a unit, or None for an unknown unit.
+
+    Example: {"m": -2, "A": 2} for "A^2/m^2". A factor after a "/" is in the denominator.
+    """
+    total: Counter[str] = Counter()
+    for k, part in enumerate(unit.split("/")):
+        for factor in part.split():
+            found = re.fullmatch(r"([A-Za-z]+|1)(?:\^(-?\d+))?", factor)
+            if found is None:
+                return None
+            name, power = found[1], int(found[2] or 1) * (-1 if k else 1)
+            if name in COUNTS:
+                continue
+            if name not in DERIVED and name not in BASE:
+                return None
+            for base, exponent in DERIVED.get(name, {name: 1}).items():
+                total[base] += power * exponent
+    return {base: total[base] for base in BASE if total[base]}

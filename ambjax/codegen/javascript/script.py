@@ -36,10 +36,7 @@ NEEDS = {"erf": ("erfc",), "erfc": ("erf",)}
 
 
 def script_of(block: Block, name: str) -> str:
-    """Return JavaScript that defines the constant `name`, an object with the step of a block in double precision.
-
-    `docs/export.md` describes the object. Raises ValueError as `trace` does.
-    """
+    """Return JavaScript that defines the constant `name`, an object with the step of a block in double precision."""
     return script(trace(block, "double"), name)
 
 

@@ -1,0 +1,84 @@
+"""The case that a function is given: a `Case`, a `MachineCase`, or a cascade, a scenario and a clock."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, cast, overload
+
+from ambjax.cases.machine_case import MachineCase
+from ambjax.cases.reader import Case
+from ambjax.cases.table import cut
+from ambjax.control.cascade import Cascade
+from ambjax.numerics.records import require_concrete
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.method import with_method
+from ambjax.simulation.system import check_parts
+from ambjax.simulation.triple import no_case
+from ambjax.world.scenario import Scenario
+
+P = ParamSpec("P")
+R = TypeVar("R", covariant=True)
+C = TypeVar("C", contravariant=True)
+
+
+class OfCase(Protocol[C, P, R]):
+    """A function of a case, or of a cascade, a scenario and a clock."""
+
+    @overload
+    def __call__(self, case: C, /, *args: P.args, **kwargs: P.kwargs) -> R: ...
+    @overload
+    def __call__(
+        self, cascade: Cascade, scenario: Scenario, clock: Clock, /, *args: P.args, **kwargs: P.kwargs
+    ) -> R: ...
+
+
+def of_case(
+    *, machines: bool = False, traced: bool = False
+) -> Callable[[Callable[Concatenate[C, P], R]], OfCase[C, P, R]]:
+    """Return a decorator for a function of a case, which then also accepts a cascade, a scenario and a clock.
+
+    The function raises ValueError for anything else, such as a path. `machines`: whether it takes a `MachineCase`.
+    `traced`: whether the numbers of a case may be traced.
+    """
+
+    def decorate(function: Callable[Concatenate[C, P], R]) -> OfCase[C, P, R]:
+        @functools.wraps(function)
+        def called(*args: Any, **named: Any) -> R:
+            if args and isinstance(args[0], Cascade):
+                args = (case_of(function.__name__, *args[:3]), *args[3:])
+            require_case(args[0] if args else named.get("case"), machines=machines, traced=traced)
+            return function(*args, **named)
+
+        return cast(OfCase[C, P, R], called)
+
+    return decorate
+
+
+def case_of(function: str, *parts: Any) -> Case:
+    """Return the case of a cascade, a scenario and a clock. Metrics are settled after a quarter of the run.
+
+    `function`: its name, for the message. Raises ValueError for other types, and as `with_method` does.
+    """
+    kinds = (Cascade, Scenario, Clock)
+    if len(parts) < len(kinds) or not all(isinstance(x, kind) for x, kind in zip(parts, kinds, strict=True)):
+        raise no_case(function, *parts)
+    cascade, scenario, clock = parts
+    require_concrete("case", parts)
+    check_parts(cascade, scenario, clock.sample_period)
+    clock = with_method(clock, cascade, scenario)
+    cascade = cascade.on_processor() if cascade.sampled else cascade
+    return Case("case", cascade, scenario, clock, float(clock.duration) / 4)
+
+
+def require_case(case: object, *, machines: bool = False, traced: bool = False) -> None:
+    """Raise ValueError for anything but a `Case`, or with `machines` a `MachineCase`.
+
+    `traced`: whether the numbers may be traced.
+    """
+    if isinstance(case, MachineCase):
+        if not machines:
+            raise ValueError("case = MachineCase: this function takes a case of one axis, from ambjax.read_case.")
+        return
+    if not isinstance(case, Case):
+        raise ValueError(f"case = {cut(repr(case))}: it must be a Case, as ambjax.read_case(PATH) returns it.")
+    if not traced:
+        require_concrete("case", (case.cascade, case.scenario, case.clock))
