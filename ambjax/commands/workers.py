@@ -61,7 +61,8 @@ def compute(study: AnyStudy, store: Store, executor: tuple[Executor, int] | None
         say(remark)
     before = study.members - sum(stop - start for start, stop in missing)
     with tqdm(total=study.members, initial=before, unit="member", unit_scale=True, delay=2, desc="ensemble") as bar:
-        results = _run_here(study, store, missing) if executor is None else _run_on(study, store, missing, *executor)
+        here: Results = ((span, chunk(study, *span, store.chunk)) for span in missing)
+        results = here if executor is None else _run_on(study, store, missing, *executor)
         for span, columns in results:
             with uninterrupted():
                 store.put(span, columns)
@@ -69,11 +70,6 @@ def compute(study: AnyStudy, store: Store, executor: tuple[Executor, int] | None
 
 
 Results = Iterator[tuple[tuple[int, int], dict[str, Any]]]
-
-
-def _run_here(study: AnyStudy, store: Store, missing: list[tuple[int, int]]) -> Results:
-    for span in missing:
-        yield span, chunk(study, *span, store.chunk)
 
 
 def _run_on(study: AnyStudy, store: Store, missing: list[tuple[int, int]], pool: Executor, ahead: int) -> Results:
