@@ -26,7 +26,7 @@ from tuning.problem.lanes import Engine
 from tuning.problem.loss import TERMS, loss_for, weigh
 from tuning.problem.members import Objective
 from tuning.problem.ranges import ranges
-from tuning.problem.risk import CVaR, Mean
+from tuning.problem.risk import CVaR
 from tuning.problem.space import Gain, Space
 from tuning.problem.tuning_problem import problem_of
 from tuning.solve.checkpoint import CheckpointFile
@@ -189,7 +189,7 @@ def small(engines):
     """A search of the problem whose programs are compiled already."""
     problem = engines[0].objective
     engine = Engine(problem, settle=0.002, threads=2)
-    goal = Goal((1.0, 0.0, 0.0, 0.0, 1e-3, 1.0), Mean())
+    goal = Goal((1.0, 0.0, 0.0, 0.0, 1e-3, 1.0), CVaR())
     return engine, goal, problem.training(3, 4, 1, 1.2, 1.25), SPACE.values(CASCADE)
 
 

@@ -13,7 +13,7 @@ from tuning.problem.limits import LimitTerm
 from tuning.problem.loss import outcomes
 from tuning.problem.members import Members
 from tuning.problem.quantities import KINDS
-from tuning.problem.risk import Risk
+from tuning.problem.risk import CVaR
 
 # Largest goal, a logarithm, whose exponential does not overflow.
 MOST = np.log(np.finfo(float).max)
@@ -36,7 +36,7 @@ class Goal:
     """
 
     weights: tuple[float, ...] = static()
-    risk: Risk = static()
+    risk: CVaR = static()
     limits: tuple[LimitTerm, ...] = ()
     quantities: tuple[str, ...] = static(default=())
     minimised: str = static(default="")
@@ -66,7 +66,7 @@ class Goal:
 
     def score(self, terms: dict[str, np.ndarray], members: Members) -> np.ndarray:
         """Return the goal [S] of S points from their terms [S, N] of members [N]; +inf where it is not finite."""
-        each = np.stack(outcomes(self.weights, terms, members.stressed), -1)
+        each = np.stack(outcomes(self.weights, terms, members.stressed, self.quantities), -1)
         values = np.array([_compiled(self, one, members.ordinary) for one in each])
         return np.where(np.isfinite(values), values, np.inf)
 
