@@ -104,21 +104,16 @@ def read_tune(
     raw, text = loaded or load(path)
     name = pathlib.Path(path).stem
     if settings_of is not None:
-        raw = {**raw, "tune": _merged(raw.get("tune", {}), load(settings_of)[0].get("tune", {}))}
+        own, other = raw.get("tune", {}), load(settings_of)[0].get("tune", {})
+        if isinstance(own, dict) and isinstance(other, dict):
+            kept = {key: value for key, value in own.items() if key in KEYS_OF_LAWS}
+            raw = {**raw, "tune": {key: other[key] for key in other if key not in KEYS_OF_LAWS} | kept}
     try:
         case = case_from(raw, name, text, pathlib.Path(path).parent)
         return case, tune_from(Table(raw).table("tune"), case), raw
     except ValueError as error:
         kind = NothingToTuneError if isinstance(error, NothingToTuneError) else ValueError
         raise kind(one_line(f"{path}: {error}")) from None
-
-
-def _merged(own: Any, other: Any) -> Any:
-    """Return [tune] of `other` with the gains and bounds of `own`; `own` if either argument is not a table."""
-    if not (isinstance(own, dict) and isinstance(other, dict)):
-        return own
-    kept = {key: value for key, value in own.items() if key in KEYS_OF_LAWS}
-    return kept | {key: value for key, value in other.items() if key not in KEYS_OF_LAWS}
 
 
 def tune_from(table: Table, case: Case) -> Tune:

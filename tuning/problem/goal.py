@@ -48,21 +48,12 @@ class Goal:
         `outcomes` [N, 1 + L]: the weighted loss and the `quantities` of each member. The first `ordinary`
         members are not stressed.
         """
-        stressed = outcomes[ordinary:, 0]
-        loss = self.ordinary_risk(outcomes[:ordinary]) + (jnp.mean(stressed) if stressed.size else 0.0)
-        return jnp.log(loss + TINY) + self.pull(outcomes[:ordinary, 1:])
-
-    def ordinary_risk(self, outcomes: Array) -> Array:
-        """Return the risk of the ordinary members' `outcomes` [N, 1 + L], plus the square of the minimised quantity."""
-        risk = self.risk(outcomes[:, 0])
-        if not self.minimised:
-            return risk
-        values = outcomes[:, 1 + self.quantities.index(self.minimised)]
-        return risk + (self.unit * KINDS[self.minimised].tuned(values)) ** 2
-
-    def pull(self, held: Array) -> Array | int:
-        """Return the sum of the limits' terms for the quantities `held` [N, L] of the ordinary members."""
-        return sum(term(held[:, self.quantities.index(term.name)]) for term in self.limits)
+        columns = {name: outcomes[:ordinary, 1 + k] for k, name in enumerate(self.quantities)}
+        stressed, loss = outcomes[ordinary:, 0], self.risk(outcomes[:ordinary, 0])
+        if self.minimised:
+            loss = loss + (self.unit * KINDS[self.minimised].tuned(columns[self.minimised])) ** 2
+        loss = loss + (jnp.mean(stressed) if stressed.size else 0.0)
+        return jnp.log(loss + TINY) + sum(term(columns[term.name]) for term in self.limits)
 
     def score(self, terms: dict[str, np.ndarray], members: Members) -> np.ndarray:
         """Return the goal [S] of S points from their terms [S, N] of members [N]; +inf where it is not finite."""

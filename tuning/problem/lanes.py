@@ -83,7 +83,13 @@ class LaneGradient:
     def __call__(self, lanes: Lane, axes: Lane) -> Any:
         """Evaluate a block of lanes. `axes`: axis of each leaf, 0 or None, as for `jax.vmap`."""
         if self.reverse:
-            return jax.vmap(self._pulled, (axes,))(lanes)
+
+            def pulled(lane: Lane) -> Any:
+                values, pull, terms = jax.vjp(lambda x: self._outcomes(x, lane), lane.x, has_aux=True)
+                (slopes,) = jax.vmap(pull)(jnp.eye(len(values), dtype=values.dtype))
+                return values, slopes, terms
+
+            return jax.vmap(pulled, (axes,))(lanes)
         each = jax.vmap(self._outcomes, (0, axes))
 
         # The outer map is over directions and the inner one over lanes, so the lanes are contiguous in memory.
@@ -92,12 +98,6 @@ class LaneGradient:
             return jax.jvp(lambda x: each(x, lanes), (lanes.x,), (every,), has_aux=True)
 
         return jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(len(self.space)))
-
-    def _pulled(self, lane: Lane) -> Any:
-        """Return outcomes, derivatives in reverse mode, and terms, of one lane."""
-        values, pull, terms = jax.vjp(lambda x: self._outcomes(x, lane), lane.x, has_aux=True)
-        (slopes,) = jax.vmap(pull)(jnp.eye(len(values), dtype=values.dtype))
-        return values, slopes, terms
 
     def _outcomes(self, x: Array, lane: Lane) -> tuple[Array, dict[str, Array]]:
         objective = Objective(self.space, *lane.world)

@@ -12,27 +12,16 @@ from tuning.report.outcome import answer
 
 
 def report_markdown(facts: TuningFacts) -> str:
-    """Return the text of report.md: the answer in five lines, the front, and all details.
+    """Return the text of report.md: the verdict, the answer and the next command in five lines, and all details.
 
     Its pictures are files in the same folder.
     """
-    lines = [f"# Tuning of {escape_markdown(facts.case)}", "", *answer_lines(facts)]
+    lines = [f"# Tuning of {escape_markdown(facts.case)}", "", escape_markdown(facts.outcome["text"]), ""]
+    lines += [f"- **{label}:** {escape_markdown(text)}" for label, text in answer(facts).items()]
+    lines += [f"- **Next:** {escape_markdown(facts.advice) or f'in this folder, {facts.next}'}", ""]
     for name, section in SECTIONS.items():
         lines += described(f"the section on {name} of the report", functools.partial(section, facts)) or []
     return "\n".join(lines) + "\n"
-
-
-def answer_lines(facts: TuningFacts) -> list[str]:
-    """Return whether the requirements are met, and five list items: the answer, and the next command."""
-    lines = [f"- **{label}:** {escape_markdown(text)}" for label, text in answer(facts).items()]
-    lines.append(described("the line on the next command", lambda: _next(facts)) or "")
-    return [escape_markdown(facts.outcome["text"]), "", *lines, ""]
-
-
-def _next(facts: TuningFacts) -> str:
-    """Return the next command, or the advice if a requirement is not met."""
-    words = escape_markdown(facts.advice) if facts.advice else f"in this folder, {facts.next}"
-    return f"- **Next:** {words}"
 
 
 def _gains(facts: TuningFacts) -> list[str]:

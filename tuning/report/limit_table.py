@@ -43,8 +43,13 @@ def facts(
     """
     members, held, settings = summary["members"], summary["held"], problem.tune.limits
     price_unit = "V" if problem.goal.minimised else "m"
-    rows = [_row(limit, columns, summary, refuted, injected, price_unit) for limit in _asked(problem)]
-    rows = [_tested(row, delayed, refuted, _not_simulated(problem, row["name"])) for row in rows]
+    rows = [
+        _tested(
+            _row(limit, columns, summary, refuted, injected, price_unit),
+            delayed, refuted, not_simulated(problem, limit) if limit.name == DELAY_MARGIN else "",
+        )
+        for limit in _asked(problem)
+    ]  # fmt: skip
     for limit, why in settings.unbreakable:
         source = f"{limit.source}; {UNBREAKABLE}: {why}"
         rows.append(_blank(limit.name, limit.threshold, price_unit, limit.kind, source=source, verdict=UNBREAKABLE))
@@ -109,11 +114,6 @@ def _row(
         "multiplier": limit.multiplier,
         "price": price if found["held"] else None,
     }
-
-
-def _not_simulated(problem: TuningProblem, name: str) -> str:
-    """Return why the delay of the limit on the delay margin is not simulated; '' if it is, and for other limits."""
-    return next((not_simulated(problem, one) for one in _asked(problem) if one.name == name == DELAY_MARGIN), "")
 
 
 def _tested(row: Row, delayed: DelayTest | None, refuted: str, reason: str = "") -> Row:
