@@ -343,9 +343,9 @@ def test_ctrl_c_keeps_the_best_gains(small):
 
 def test_steps_that_are_not_finite_are_skipped(small):
     _, goal, *_ = small
-    descent, slopes, on = Descent(goal), jnp.ones((1, 4, 1, 4)), jnp.ones(1, bool)
-    good = descent(4, begin(jnp.zeros((1, 4))), jnp.ones((1, 4, 1)), slopes, on)
-    bad = descent(4, good, jnp.full((1, 4, 1), jnp.nan), slopes, on)
+    descent, slopes = Descent(goal), jnp.ones((1, 4, 1, 4))
+    good = descent(4, begin(jnp.zeros((1, 4))), jnp.ones((1, 4, 1)), slopes)
+    bad = descent(4, good, jnp.full((1, 4, 1), jnp.nan), slopes)
     for name in ("best", "value", "gradient", "inverse"):
         np.testing.assert_array_equal(getattr(bad, name), getattr(good, name))
     # a quarter of the rejected step

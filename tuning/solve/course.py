@@ -198,7 +198,7 @@ def standing_of(problem: TuningProblem, progress: SearchState, number: int, spen
     volts = quantities.get("rms_u_V", float(np.asarray(loss.u_scale)) * math.sqrt(terms["effort"]))
     values = [(one, one.ratio * float(quantities[one.name])) for one in problem.limits]
     limits = tuple(Reached(one.name, value, one.threshold, one.holds(value)) for one, value in values)
-    members, starts = int(last["members"]), int(progress.active.sum())
+    members, starts = int(last["members"]), 0 if progress.converged else len(progress.starts.value)
     # the first iteration compiles
     left = (most - progress.iteration) * float(np.median(spent[1:])) if len(spent) > 1 else math.nan
     return Standing(
