@@ -1,13 +1,12 @@
-"""The cascade of one axis of `machine_oracle`, in plain NumPy: shares no code with ambjax.
+"""The cascade of one axis of `machine_oracle`, with implicit steps, in plain NumPy: shares no code with ambjax.
 
 Every function also takes complex numbers with a small imaginary part, which then carries a derivative.
 """
 
-import itertools
 import math
 
 import numpy as np
-from sampled_oracle import relax
+from sampled_oracle import relax, spans
 
 PAPER = {"mu_0": 1.25e-6, "n": 1480.0, "A": 0.121, "s_0": 5e-3, "i_0": 0.25, "R": 41.44}
 
@@ -24,9 +23,6 @@ class Magnet:
 
     def v(self, z, i):
         return ((self.i_0 + i) / (self.s_0 - z)) ** 2 - ((self.i_0 - i) / (self.s_0 + z)) ** 2
-
-    def slope(self, z, i):
-        return 2 * (self.i_0 + i) / (self.s_0 - z) ** 2 + 2 * (self.i_0 - i) / (self.s_0 + z) ** 2
 
     def current_for(self, z, v):
         """Return the root i of v(z, i) = v that stays finite at z = 0; beyond the largest force, its vertex."""
@@ -62,7 +58,7 @@ def defaults(magnet, T, given):
     p = 25 * speed if "k" in given else math.pi / (w * s_0)
     p_v, p_i = 25 * (paper.i_0 / paper.s_0 * s_0 / i_0) ** 2, 25 * paper.i_0 / i_0
     return {
-        "observer": {"direct": {}, "complementary": {"l": w / 50}, "difference": {"w": 10 * w}, "kalman": {"w": 3 * w}},
+        "observer": {"direct": {}, "kalman": {"w": 3 * w}},
         "position": {
             "sliding-mode": {"c": w, "k": w * w * s_0 / 2, "p": p},
             "pid": {"k_p": 1.25 * w * w, "k_int": w**3 / 4, "k_d": 2 * w, "w_f": 20 * w, "k_aw": w / 20},
@@ -83,7 +79,7 @@ def sgn(x, p):
     return np.sign(np.real(x)) if p == math.inf else 2 / math.pi * np.arctan(p * x)
 
 
-def implicit_share(w, h, p):
+def share(w, h, p):
     """Return (w - relax(w, h, p)) / h; of a complex w with a small imaginary part, its derivative too."""
     if h == 0:
         return sgn(w, p)
@@ -102,12 +98,6 @@ def rk4(rates, t, y, h):
     return y + h / 6 * (k_1 + 2 * k_2 + 2 * k_3 + rates(t + h, y + h * k_3))
 
 
-def spans(delay, end):
-    """Return the pieces (start, stop, lag), in samples after t_n, in which u_{n - lag} acts."""
-    edges = sorted({0.0, end} | {delay - k for k in range(math.ceil(delay)) if delay - k < end})
-    return [(a, b, math.ceil(delay - (a + b) / 2)) for a, b in itertools.pairwise(edges)]
-
-
 class Laws:
     """The cascade of one axis. Its state is a dictionary of numbers, empty at the start."""
 
@@ -115,7 +105,6 @@ class Laws:
         self.T, processor, controller = case["clock"]["sample_period"], case["processor"], tables["controller"]
         self.model = Magnet(tables["plant"] | controller.get("model", {}), m, g)
         self.velocity = case.get("sensor", {}).get("velocity", True)
-        self.implicit = processor.get("discretisation", "implicit") == "implicit"
         self.delay = processor.get("delay", 1.0)
         self.predict = processor.get("predict", self.delay > 0)
         known = defaults(self.model, self.T, controller.get("position", {}))
@@ -149,23 +138,8 @@ class Laws:
         (z, z_dot, i), T, kind, gains = reading, self.T, self.kind["observer"], self.gains["observer"]
         if kind == "direct":
             return z, z_dot, i
-        if kind == "complementary":
-            z_hat = state.get("z_hat", z)
-            state["z_hat"] = z_hat + T * (z_dot + gains["l"] * (z - z_hat))
-            return z_hat, z_dot, i
         z_hat, v, d, w = state.get("z_hat", z), state.get("v_hat", 0.0), state.get("d_hat", 0.0), gains["w"]
-        if kind == "difference":
-            q = math.exp(-w * T)
-            v = q * v + (1 - q) * (z - z_hat) / T if self.implicit else w * (z - z_hat)
-            state.update(z_hat=z if self.implicit else z_hat + T * v, v_hat=v)
-            return z, v, i
         f = self.model.a * self.model.v(z, i) - self.model.g
-        if not self.implicit:
-            e = z - z_hat
-            state.update(
-                z_hat=z_hat + T * (v + 3 * w * e), v_hat=v + T * (f + d + 3 * w**2 * e), d_hat=d + T * w**3 * e
-            )
-            return z_hat, v, i
         if "f" in state:
             z_hat = z_hat + T * v + T**2 * (state["f"] / 3 + f / 6 + d / 2)
             v = v + T * ((state["f"] + f) / 2 + d)
@@ -174,20 +148,16 @@ class Laws:
         state.update(z_hat=z_hat, v_hat=v, d_hat=d + (1 - q) ** 3 / T**2 * e, f=f)
         return z_hat, v, i
 
-    def share(self, w, h, p):
-        return implicit_share(w, h, p) if self.implicit else sgn(w, p)
-
     def position(self, state, z, z_dot, i):
         T, model, gains = self.T, self.model, self.gains["position"]
         if self.kind["position"] == "sliding-mode":
             c, k = gains["c"], gains["k"]
-            return (-c * z_dot + model.g - k * self.share(z_dot + c * z, T * k, gains["p"])) / model.a
+            return (-c * z_dot + model.g - k * share(z_dot + c * z, T * k, gains["p"])) / model.a
         d, x, w, k_aw = state.get("d", z_dot), state.get("x", 0.0), gains["w_f"], gains["k_aw"]
-        following = (d + T * w * z_dot) / (1 + T * w) if self.implicit else d + T * w * (z_dot - d)
-        used = following if self.implicit else d
-        demand = model.g - gains["k_p"] * z - gains["k_d"] * used - x
+        following = (d + T * w * z_dot) / (1 + T * w)
+        demand = model.g - gains["k_p"] * z - gains["k_d"] * following - x
         rate = gains["k_int"] * z + k_aw * (demand - model.a * model.v(z, i))
-        state.update(d=following, x=x + T * rate / (1 + T * k_aw if self.implicit else 1.0))
+        state.update(d=following, x=x + T * rate / (1 + T * k_aw))
         return demand / model.a
 
     def inversion(self, state, z, v_star):
@@ -199,9 +169,7 @@ class Laws:
             return model.current_for(z, v_star)
         i_ref = state.setdefault("i_ref", gains["i_ref"])
         w, h = v_star - model.v(z, i_ref), T * gains["gamma"]
-        if self.implicit:
-            return model.current_for(z, v_star - w + h * self.share(w, h, gains["p"]))
-        return i_ref + h * sgn(w, gains["p"]) / model.slope(z, i_ref)
+        return model.current_for(z, v_star - w + h * share(w, h, gains["p"]))
 
     def current(self, state, z, z_dot, i, i_ref, rate, u_max):
         T, model, gains, e = self.T, self.model, self.gains["current"], i - i_ref
@@ -212,7 +180,7 @@ class Laws:
             state["x_i"] = x + T * (-gains["k_int"] * e + gains["k_aw"] * (held - u))
             return held
         gap, k = model.s_0 + z, gains["k_i"]
-        robust = k * self.share(e, T * k, gains["p"])
+        robust = k * share(e, T * k, gains["p"])
         return limit(model.kappa / (2 * gap) * (-2 * z_dot * i / gap + rate - robust) + model.R * i, u_max)
 
 

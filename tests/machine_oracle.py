@@ -23,11 +23,10 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
-from axis_oracle import PAPER, Laws, Magnet, rk4, spans
-from machine_cases import MACHINES
+from axis_oracle import PAPER, Laws, Magnet, rk4
+from sampled_oracle import spans
 from scipy.optimize import minimize_scalar
 
-__all__ = ["MACHINES", "machine", "sensitivity", "simulate"]
 RPM = 2 * math.pi / 60
 
 
@@ -173,7 +172,7 @@ class Coordinate(Laws):
         part = {"beta_x": "tilt", "beta_y": "tilt", "z": "axial"}.get(name)
         tables = merge(tables, controller.get(part, {}))
         self.kind = {"observer": tables["observer"].get("kind", "direct"), "position": tables["position"]["kind"]}
-        self.gains, self.implicit = tables, case["processor"].get("discretisation", "implicit") == "implicit"
+        self.gains = tables
         self.model = SimpleNamespace(a=1.0, g=-weight, v=lambda z, acceleration: acceleration)
 
 
@@ -309,10 +308,10 @@ class Loop:
         raise ArithmeticError("no equilibrium found")
 
 
-def sensitivity(case, frequencies=None, substeps=8):
-    """Return S [F, axes, axes] (reading of a row per e of a column) at the frequencies, its peaks, and the poles.
+def sensitivity(case, substeps=8):
+    """Return the peaks of |S_kk| of every axis and of the largest singular value, and whether the loop is stable.
 
-    The peaks are those of |S_kk| of every axis and of the largest singular value, from 0 to 0.45/T, each refined.
+    S [axes, axes] is the reading of a row per e of a column. The peaks, from 0 to 0.45/T, are refined.
     """
     loop = Loop(case, substeps)
     x, T = loop.equilibrium(), loop.world.T
@@ -323,11 +322,8 @@ def sensitivity(case, frequencies=None, substeps=8):
     C[:, : len(loop.world.parts.M)] = loop.world.parts.c
     C, one, poles = C[:, kept], np.eye(len(A)), np.linalg.eigvals(A)
 
-    def S(f):
-        return np.eye(len(C)) + C @ np.linalg.solve(np.exp(2j * math.pi * f * T) * one - A, B)
-
     def figures(f):
-        matrix = S(f)
+        matrix = np.eye(len(C)) + C @ np.linalg.solve(np.exp(2j * math.pi * f * T) * one - A, B)
         return np.append(abs(matrix.diagonal()), np.linalg.norm(matrix, 2))
 
     near = abs(np.angle(poles)) / (2 * math.pi * T)
@@ -340,8 +336,4 @@ def sensitivity(case, frequencies=None, substeps=8):
             lambda f, k=k: -figures(f)[k], bounds=(low, high), method="bounded", options={"xatol": 1e-6 * high}
         )
         peaks.append((-found.fun, found.x) if -found.fun > values[best, k] else (values[best, k], grid[best]))
-    return SimpleNamespace(
-        f=frequencies, S=None if frequencies is None else np.array([S(f) for f in frequencies]),
-        axes=loop.world.parts.names, peaks=peaks[:-1], sigma_max=peaks[-1],
-        poles=poles, stable=abs(poles).max() < 1, q=x[: len(loop.world.parts.M)],
-    )  # fmt: skip
+    return SimpleNamespace(peaks=peaks[:-1], sigma_max=peaks[-1], stable=abs(poles).max() < 1)

@@ -32,7 +32,7 @@ from oracle import QUIET, REST, TABLE_1, Body, _edges, _pulse, _reference
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-SUBSTEP = 2.5e-5  # s, at most, of the fast way: z within 1e-12 m of DOP853 over 400 samples (test_sampled_oracle.py)
+SUBSTEP = 2.5e-5  # s, at most, of the fast way: z within 1e-12 m of DOP853 over 400 samples
 SLIVER = 1e-9  # of a period: a piece shorter than this is rounding, not a piece
 
 
@@ -125,7 +125,7 @@ def conversion(x, bits, limit):
     return min(max(code, -(2 ** (bits - 1))), 2 ** (bits - 1) - 1) * limit / 2 ** (bits - 1)
 
 
-def _spans(delay, end):
+def spans(delay, end):
     """Pieces (start, stop, lag) of the samples 0 to `end` after t_n, in which u_{n - lag} acts."""
     edges = sorted({0.0, end} | {delay - k for k in range(math.ceil(delay)) if delay - k < end})
     return [(a, b, math.ceil(delay - (a + b) / 2)) for a, b in itertools.pairwise(edges)]
@@ -135,7 +135,7 @@ def _sample(world, plant, controller, n, y, fast):
     """The plant at t_{n+1}, and seconds after t_n at which it touched down, or None."""
     T, signals = world.period, (world.q_z, world.q_v, world.q_i)
     inside = {edge - n * T for signal in signals for edge in _edges(signal)}
-    for start, stop, lag in _spans(world.delay, 1.0):
+    for start, stop, lag in spans(world.delay, 1.0):
         first, last = start * T, stop * T
         cuts = sorted({first, last} | {x for x in inside if first + SLIVER * T < x < last - SLIVER * T})
         for a, b in itertools.pairwise(cuts):
@@ -405,8 +405,8 @@ class Controller:
             return self.i_ref_shown, 0.0, math.nan, False, (math.nan,) * 3
         found = self.step(n, taken)
         self.i_ref_shown = found[0]
-        velocity, spans = self.velocity_now, _spans(self.world.delay, 1.0)
-        u = sum((b - a) * self.voltage(n - lag) for a, b, lag in spans)
+        velocity, pieces = self.velocity_now, spans(self.world.delay, 1.0)
+        u = sum((b - a) * self.voltage(n - lag) for a, b, lag in pieces)
         _, z_ddot, i_dot = self.model.rates((taken[0], velocity, taken[2]), u)
         self.expected = taken[0] + T * velocity + T * T / 2 * z_ddot, velocity + T * z_ddot, taken[2] + T * i_dot
         return found
@@ -446,7 +446,7 @@ class Controller:
 
     def _prediction(self, n, y):
         if self.world.predict and self.world.delay:
-            for a, b, lag in _spans(self.world.delay, self.world.delay):
+            for a, b, lag in spans(self.world.delay, self.world.delay):
                 y = rk4(functools.partial(self.model.rates, u=self.voltage(n - lag)), y, (b - a) * self.world.period)
         return y
 

@@ -275,9 +275,6 @@ def test_a_current_above_the_bias_causes_one_warning(capsys):
     assert not list(reversal(coils, 0.26))
 
 
-# --- spreads ---
-
-
 # --- names ---
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import ambjax as amb
+from ambjax.cases.data_sheet import RIG
 from ambjax.cases.reader import case_from
-from ambjax.cases.rig import RIG
 from ambjax.theorem import advice, sampled_report
 from ambjax.theorem.causes import NO_PART, Cause, cause_words, find_cause, parts
 from ambjax.theorem.sampled_report import Delays

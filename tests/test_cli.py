@@ -247,23 +247,8 @@ def test_simulate_writes_what_is_documented(capsys):
     path = write(SHORT)
     assert main(["simulate", path, "--out", "there"]) == 0
     with np.load("there/trajectory.npz") as data:
-        names = [
-            "t",
-            "z",
-            "z_dot",
-            "i",
-            "i_ref",
-            "u",
-            "v",
-            "v_star",
-            "v_tilde",
-            "sigma",
-            "r",
-            "q_z",
-            "q_i",
-            "z_measured",
-        ]
-        for name in names:
+        names = {"t", "z", "z_dot", "i", "i_ref", "u", "v", "v_star", "v_tilde", "sigma", "r", "q_z", "q_i"}
+        for name in names | {"z_measured"}:
             assert data[name].shape == (500,)
             assert data[name].dtype == np.float64
             assert np.isfinite(data[name]).all()

@@ -410,6 +410,3 @@ def test_points_of_the_front_that_lose_members_are_marked(kept):
     assert ax.get_ylabel() == "settled rms error (nm)"
     assert len([at for at in ax.get_yticks() if 200 / 1.2 <= at <= 3600]) >= 3
     assert len(tuned.front(rows[:1]).axes[0].lines) == 1
-
-
-# ---------------------------------------------------------------- benchmarks

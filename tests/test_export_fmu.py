@@ -16,8 +16,7 @@ from ambjax.cases.reader import read_case
 from ambjax.codegen.c99.source import Origin
 from ambjax.codegen.fmi.archive import packed, sources
 from ambjax.codegen.fmi.cross_check import files_of
-from ambjax.codegen.fmi.description import description, variables
-from ambjax.codegen.fmi.si_units import exponents
+from ambjax.codegen.fmi.description import description, exponents, variables
 from ambjax.codegen.of_case import block_of, blocks_of
 from ambjax.codegen.series import series
 from ambjax.codegen.trace import trace

@@ -164,7 +164,7 @@ def test_margins_agree_with_python_control(name):
     assert disk * (1 - 1e-3) < found.dm <= disk * (1 + 1e-9)
     if name == "continuous":  # of a sampled loop python-control finds roots of polynomials that it warns about
         gain, phase, *_ = control.stability_margins(L)
-        assert found.gain == pytest.approx(gain, rel=1e-9)
+        assert found.gm == pytest.approx(gain, rel=1e-9)
         assert found.pm == pytest.approx(abs(phase), rel=1e-9)
 
 

@@ -33,6 +33,9 @@ MACHINE = tomllib.loads(template("machine"))
 FLEXIBLE = tomllib.loads(template("machine-flexible"))
 
 
+VERTICAL = MACHINE["rotor"] | {"gravity": [0.0, 0.0, -9.81]}
+
+
 def changed(raw, **tables):
     """A copy of a raw case with other tables."""
     return copy.deepcopy(raw) | tables
@@ -71,6 +74,41 @@ def test_an_uncoupled_axis_equals_the_case_of_one_axis(machine, held):
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-11 * np.abs(theirs).max())
     for name in ("max_abs_u_V", "rms_error_m", "copper_loss_W"):
         assert held.metrics["axes"]["thrust.z"][name] == pytest.approx(alone.metrics[name], rel=1e-9)
+
+
+@pytest.mark.slow  # compiles the run and the linear machine
+def test_a_machine_with_an_axial_bearing_alone_is_the_case_of_one_axis():
+    tables = {key: MACHINE[key] for key in ("plant", "controller", "processor", "actuator", "clock")}
+    tables |= {
+        "sensor": {"velocity": False},
+        "clock": {"duration": 0.01, "sample_period": 5e-5},
+        "run": {"settle": 0.0},
+    }
+    load = {"kind": "step", "amplitude": 5.0, "start": 0.0022}
+    machine = machine_from(tables | {
+        "rotor": VERTICAL,
+        "bearing": MACHINE["bearing"][2:],
+        "load": [{"at": 0.0, "direction": [0.0, 0.0, 1.0]} | load],
+        "initial": {"q": [0.0, 0.0, 3e-5, 0.0, 0.0]},
+    })  # fmt: skip
+    one = case_from(tables | {
+        "plant": MACHINE["plant"] | {"m": 2.3, "g": 9.81, "k_z": 0.0},
+        "disturbance": {"q_z": {"unit": "N"} | load},
+        "initial": {"z": 3e-5},
+    })  # fmt: skip
+    ours, theirs = simulate_machine(machine), simulate(one)
+    for name in ("z", "i", "u", "i_ref", "z_measured"):
+        x = np.asarray(getattr(theirs.trajectory.rows, name))
+        np.testing.assert_allclose(ours.signals[name][:, 0], x, rtol=0, atol=1e-10 * np.abs(x).max())
+    for name in ("clearance_used", "max_abs_u_V", "force_used"):
+        assert ours.metrics[name] == pytest.approx(theirs.metrics[name], rel=1e-8)
+    # the coordinates across the shaft, which nothing holds, count neither as unstable nor in the peak
+    period = machine.clock.sample_period
+    found = machine_sensitivity(machine.machine, machine.axes, period, 6000.0, machine.zones)
+    f = np.geomspace(1, 9000, 50)
+    alone = linearise(one.cascade, one.scenario, one.clock).sensitivity(f)
+    assert found.stable
+    np.testing.assert_allclose(np.asarray(found.system.response(f))[:, 0, 0], alone, rtol=1e-7)
 
 
 def test_the_orbits_of_a_rotor_that_is_lost_before_it_settles_end_at_the_loss(machine, held):
@@ -356,9 +394,15 @@ def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monke
         (first(stop_modes=[1.0]), r"bearing\[0\]\.stop_modes"),
         (first(clearance=4e-4), r"left\.x: bearing\[0\]\.clearance = 0\.0004 m: it must be less than the gap"),
         (first(stop_at=-5.0), r"left\.y: initial\.q: at this axis z = .* touch its stop at the start"),
+        (
+            {"spread": {"bearing": {"left": {"clearance": {"uniform": [0.0, 1.0]}}}}},
+            r"spread\.bearing\.left\.clearance =",
+        ),
         ({"loads": []}, r"loads = \[\]: unknown key\. Did you mean 'load'"),
         ({"bearing": MACHINE["bearing"][:1]}, "determine .* of the .* rigid motions"),
-        ({"bearing": MACHINE["bearing"][2:]}, "no axis holds x, y"),
+        ({"bearing": MACHINE["bearing"][2:]}, r"no axis holds y\. .*or a rotor\.gravity that does not"),
+        ({"bearing": MACHINE["bearing"][:2], "rotor": VERTICAL}, "no axis holds z"),
+        ({"bearing": [{"kind": "radial", "at": 0.0}], "rotor": VERTICAL}, "no axis holds z, beta_x, beta_y"),
         ({"bearing": []}, r"\[\[bearing\]\] is missing"),
         ({"bearing": [{"kind": "radial"}]}, r"bearing\[0\]\.at is missing"),
         ({"bearing": [MACHINE["bearing"][0]] * 2}, r"bearing\[1\]\.name = .*needs a name of its own"),
@@ -384,6 +428,16 @@ def test_bad_input_is_refused_in_one_line(change, said):
     with pytest.raises(ValueError, match=said) as refused:
         machine_from(changed(MACHINE, **change))
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(("name", "advice"), [("load", "put [[load]] above each"), ("run", "table once.")])
+def test_a_table_given_twice_is_refused_in_one_line(name, advice, tmp_path):
+    path = tmp_path / "twice.toml"
+    path.write_text(f"{template('machine')}\n[{name}]\n[{name}]\n".replace("[[load]]", "[load]"))
+    with pytest.raises(ValueError, match="not valid TOML") as refused:
+        read_machine(path)
+    assert advice in str(refused.value)
+    assert "disturbance" not in str(refused.value)
 
 
 def test_one_axis_and_a_machine_are_not_confused(tmp_path, capsys):

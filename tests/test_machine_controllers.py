@@ -6,6 +6,7 @@ import tomllib
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
+from scipy.optimize import brentq
 
 from ambjax.cases.machine_case import machine_from
 from ambjax.cases.template_text import template
@@ -176,3 +177,24 @@ def test_the_loop_of_an_lqg_has_the_poles_of_its_feedback_and_of_its_filter(dela
     rest = np.linalg.solve(np.eye(len(loop)) - loop, load)
     assert np.abs(rotor.B @ rest[:3]).max() < 1e-12  # the magnets are centred, and the shaft is bent
     assert abs(rest[2]) > 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("controller", [{}, {"coordinates": "rigid-body"}])
+def test_a_start_at_rest_has_no_bump(controller):
+    """Off centre, where the currents hold the rotor at the reference: the first voltage stays, R i of each axis."""
+    r, raw = 2e-5, tomllib.loads(template("machine"))
+    raw |= {
+        "controller": {"observer": {"kind": "kalman"}, "position": {"kind": "pid"},
+                       "inversion": {"kind": "closed-form"}, "current": {"kind": "dead-beat"}} | controller,
+        "sensor": {"velocity": False, "bandwidth": 3000.0}, "processor": {"delay": 0.0},
+        "reference": {"kind": "constant", "value": r}, "load": [], "unbalance": [],
+        "initial": {"q": [r, r, r, 0.0, 0.0]}, "clock": {"duration": 0.005, "sample_period": 5e-5},
+        "run": {"settle": 0.0},
+    }  # fmt: skip
+    plants = [one.scenario.plant for one in machine_from(raw).cases]
+    held = [brentq(lambda i, p=p: float(p.a * p.v(r, i) - p.g), -1.4, 1.4, xtol=1e-15) for p in plants]
+    raw["initial"]["i"] = held
+    signals = simulate_machine(machine_from(raw)).signals
+    np.testing.assert_allclose(signals["u"], np.broadcast_to(held, signals["u"].shape), rtol=0, atol=1e-12)  # 1 ohm
+    np.testing.assert_allclose(signals["z"], r, rtol=0, atol=1e-16)

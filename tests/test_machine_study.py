@@ -1,8 +1,10 @@
 """Ensembles of whole machines: each member is a machine of its own."""
 
+import argparse
 import copy
 import dataclasses
 import json
+import pickle
 import tomllib
 
 import jax
@@ -13,7 +15,9 @@ from ambjax.__main__ import main
 from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.rotor_numbers import rotor_places, varied_rotor
 from ambjax.cases.template_text import template
+from ambjax.commands import comparison_tuning
 from ambjax.ensemble.worker import chunk
+from ambjax.host.extensions import NothingToTuneError
 from ambjax.linear import machine_sensitivity
 from ambjax.results.case_map import study_and_axes, survival_map
 from ambjax.results.machine_run import simulate_machine
@@ -73,6 +77,26 @@ def test_draws():
     assert "bearing.left.y.plant.R" not in drawn
     # the processor is common to all axes
     assert [path for path in drawn if path.endswith("delay")] == ["processor.delay"]
+    # worker processes receive the study
+    assert pickle.loads(pickle.dumps(study)).fingerprint() == study.fingerprint()
+
+
+@pytest.mark.slow  # compiles the linear loop
+def test_numbers_of_the_notches():
+    notch = {"kind": "displacement-free", "rate": 20.0}
+    laws = MACHINE["controller"] | {"notch": notch}
+    rate = {"controller": {"notch": {"rate": {"percent": 10}, "max_speed": {"uniform": [6e3, 9e3]}}}}
+    left = {"bearing": {"left": {"controller": {"notch": {"rate": {"uniform": [40.0, 50.0]}}}}}}
+    study = study_of(case(rate | left, controller=laws), 0, 50)
+    rates = {name: study.drawn(np.arange(50))[f"bearing.{name}.controller.notch.rate"] for name in study.case.axes}
+    assert {name: (15 < x.min() < x.max() < 25) for name, x in rates.items() if not name.startswith("left")} == {
+        "right.x": True, "right.y": True, "thrust.z": True
+    }  # fmt: skip
+    assert min(rates["left.x"].min(), rates["left.y"].min()) > 40
+    member = study.member(7)
+    assert float(member.cases[3].cascade.notch.rate) == rates["right.y"][7]
+    with pytest.raises(ValueError, match=r"spread.controller.notch.rate.*no such number"):
+        case(rate)
 
 
 @pytest.mark.slow  # compiles the rollout of the ensemble and that of one machine
@@ -235,13 +259,33 @@ def test_axes_of_a_map(files):
             study_and_axes(read_machine(path), bad, "initial.q.0=0:1e-5", 1, None)
 
 
+def test_tuned_machines_are_compared(files, tmp_path, monkeypatch):
+    """The tuner is replaced: it writes its answer, or finds nothing to tune."""
+    paths = [files("one.toml"), files("two.toml")]
+
+    def tune(words, program, nested):
+        if "two" in words[0]:
+            raise NothingToTuneError
+        (folder := tmp_path / "tuned-one").mkdir()
+        files("tuned-one/tuned.toml", ("[processor]", "c = 321.0\n\n[processor]"))
+        assert words == [paths[0], "--settings-of", paths[0], "--out", str(folder)]
+
+    monkeypatch.setattr(comparison_tuning, "extension", lambda name: {"tune": tune}[name])
+    cases = [read_machine(path) for path in paths]
+    options = argparse.Namespace(cases=paths, out=str(tmp_path), resume=False, force=False)
+    one, two = comparison_tuning.tuned_cases(cases, tmp_path, options)
+    assert (one.name, one.folder) == ("one", tmp_path)
+    assert float(one.cases[0].cascade.position.c) == 321.0
+    assert two is cases[1]
+
+
 def test_compare_refuses(files, tmp_path, capsys):
     machine, axis = files("m.toml"), tmp_path / "axis.toml"
     axis.write_text(template("rig"))
     other = files("n.toml", end="\n[spread]\nplant.A = { percent = 1 }\n")
     for argv, words in (
         ([machine, str(axis)], "Compare cases of one kind"),
-        ([machine, other, "--tune"], "--tune: a machine"),
+        ([machine, other, "--page"], "--page: a machine"),
         ([machine, other], "Give both cases the same [spread]"),
     ):
         assert main(["compare", *argv, "--out", str(tmp_path / "no")]) == 2

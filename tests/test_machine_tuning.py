@@ -12,12 +12,13 @@ import tuning
 from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.table import Table
 from ambjax.cases.template_text import template
-from ambjax.linear.linear_machine import machine_sensitivity
+from ambjax.linear.linear_machine import machine_sensitivity, turning_machines
 from ambjax.results.operating import sensitivity
 from tuning.__main__ import main
 from tuning.machines.lqg_weights import lqg_space
 from tuning.machines.machine_gains import MachineSpace, machine_space
 from tuning.machines.machine_peaks import Peaks
+from tuning.machines.machine_progress import save, saved
 from tuning.machines.machine_search import Settings, searched
 from tuning.machines.machine_verdict import judged
 from tuning.machines.nonsmooth import Value, minimise
@@ -148,9 +149,29 @@ class Parabola:
 def test_no_member_is_lost_for_a_lower_peak(lost_above, expected):
     settings = Settings(MachineSpace(Space((Gain("controller.position.k"),)), ()), {}, 1.0, 0, 3, 100, 2)
     lost = lambda x: 2 * int(x[0] > lost_above)  # noqa: E731
-    found = searched(Parabola(), settings, np.ones(1), lost, lambda words: None)
+    found = searched(Parabola(), settings, np.ones(1), lost, lambda words: None).answer
     assert found.x[0] == pytest.approx(expected, abs=0.01)
     assert found.x[0] <= max(lost_above, expected)
+
+
+def test_a_search_killed_after_any_start_ends_as_the_uninterrupted_one(tmp_path):
+    settings = Settings(MachineSpace(Space((Gain("controller.position.k"),)), ()), {}, 1.0, 0, 4, 2, 2)
+    after, path, facts = [], tmp_path / "round-1.npz", {"case": 1}
+
+    def search(before, save):
+        return searched(Parabola(), settings, np.ones(1), lambda x: int(x[0] > 1.5), print, before, save)[:4]
+
+    whole = search(None, after.append)
+    assert [now.number for now in after] == [1, 2, 3, 4]
+    assert len({now.best.f for now in after}) > 1  # later starts change the result
+    for now in after:
+        save(path, facts, now)
+        again = search(saved(path, facts, print), lambda now: None)
+        assert (again[1].x, again[1].f, again[2], again[3].f) == (whole[1].x, whole[1].f, whole[2], whole[3].f)
+    with pytest.raises(ValueError, match="belongs to another search: case is 1"):
+        saved(path, {"case": 2}, print)
+    path.write_bytes(path.read_bytes()[:-40])
+    assert saved(path, facts, print) is None  # damaged: the search begins again
 
 
 @pytest.mark.parametrize(
@@ -180,16 +201,27 @@ def test_command(tmp_path, capsys):
     text = template("machine").replace("duration = 0.2", "duration = 2e-3").replace("settle = 0.05", "settle = 0.0")
     parts = '[controller.inversion]\nkind = "linearised"\n[controller.current]\nkind = "pi"\n'
     tune = (
-        f"[tune]\ngains = {json.dumps(SLIDING)}\nstarts = 1\niterations = 1\nheld_out = 2\nlimits.sensitivity = 2.5\n"
+        f"[tune]\ngains = {json.dumps(SLIDING)}\nstarts = 2\niterations = 1\nheld_out = 2\nlimits.sensitivity = 2.5\n"
     )
     path = tmp_path / "m.toml"
     path.write_text(f"{text}\n{parts}\n{tune}")
-    found = tuning.tune(path, tmp_path / "t")
+
+    def killed(event):
+        if "start 1 of 2" in event.text:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        tuning.tune(path, tmp_path / "t", listen=killed)
+    with pytest.raises(ValueError, match="search that has not ended"):
+        tuning.tune(path, tmp_path / "t")
+    found = tuning.tune(path, tmp_path / "t", resume=True)
+    assert "start 1 of 2" not in (said := capsys.readouterr().err)
+    # an ended search is not repeated
+    assert tuning.tune(path, tmp_path / "t", resume=True).report["gains"] == found.report["gains"]
     before, after = found.report["before"], found.report["sensitivity"]
     assert after["peak"] < before["peak"]
     # although the default of a gain depends on whether k is given
-    said = float(re.findall(r"best peak ([\d.]+)", capsys.readouterr().err)[-1])
-    assert said == pytest.approx(after["peak"], rel=1e-3)
+    assert float(re.findall(r"best peak ([\d.]+)", said)[-1]) == pytest.approx(after["peak"], rel=1e-3)
     # the file is the answer, with the gains of each bearing in its table
     again = read_machine(tmp_path / "t" / "tuned.toml")
     assert max(point.worst.S.height for point in sensitivity(again)) == pytest.approx(after["peak"], rel=1e-6)
@@ -202,3 +234,14 @@ def test_command(tmp_path, capsys):
     facts = judged(pushed, pushed, {"max_u_V": 1e6}, 0, 2)
     assert (facts["outcome"]["held"], facts["limits"][0]["holds"]) == (0, False)
     assert "all limits met" not in facts["verdict"]
+    # two turns in the run: each limit at the speed holds or breaks by itself
+    turning = machine_from(raw | {"rotor": raw["rotor"] | {"speed": 60000.0}})
+    one = {"z_1x_m": 1.0, "i_1x_A": 9.0, "sensitivity_1x": 99.0}
+    values = judged(turning, turning, one, 0, 2)["metrics"]
+    points = zip(turning_machines(turning.machine, 5e-5, turning.speeds), turning.speeds, strict=True)
+    S = [np.diagonal(point.system.response([v / 60])[0, :5, :5]) for point, v in points if v]
+    assert values["sensitivity_1x"] == pytest.approx(np.max(np.abs(S)), rel=1e-9)
+    found = judged(turning, turning, {name: 0.999 * values[name] for name in one} | {"max_u_V": 1e6}, 0, 2)
+    assert [row["holds"] for row in found["limits"]] == [False, False, False, True]
+    assert min(row["value"] for row in found["limits"]) > 0
+    assert all(name in found["verdict"] for name in one)

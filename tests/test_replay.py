@@ -16,8 +16,8 @@ import pytest
 from texts import write
 
 from ambjax.__main__ import main, parser
+from ambjax.cases.data_sheet import RIG
 from ambjax.cases.reader import case_from, read_case
-from ambjax.cases.rig import RIG
 from ambjax.commands import simulate as simulating
 from ambjax.commands import study_report
 from ambjax.ensemble import replay as replaying

@@ -248,9 +248,6 @@ def test_a_finished_study_is_not_run_again(no_pictures, monkeypatch, capsys):
     assert not pathlib.Path("out", "chunks").exists()
 
 
-# --- damage ---
-
-
 # --- how long it takes ---
 
 

@@ -289,23 +289,6 @@ def test_a_resumed_search_is_the_uninterrupted_one(small, tmp_path):
         run(small, checkpoint_file=CheckpointFile(tmp_path / "kept.npz", {"case": 2}), resume=True)
 
 
-@pytest.mark.slow
-def test_a_search_whose_checkpoint_was_damaged_is_the_uninterrupted_one(small, tmp_path, capsys):
-    whole = run(small)
-    checkpoint_file = CheckpointFile(tmp_path / "kept.npz", {"case": 1}, 3, print)
-    run(small, checkpoint_file=checkpoint_file, iterations=2)
-    content = bytearray(checkpoint_file.path.read_bytes())
-    content[len(content) // 2] ^= 1
-    checkpoint_file.path.write_bytes(content)
-    again = run(small, checkpoint_file=checkpoint_file, resume=True)
-    said = capsys.readouterr().out
-    assert said.startswith(f"{checkpoint_file.path}: ")
-    assert said.endswith("; search 3 begins again\n")
-    for a, b in zip(jax.tree.leaves(whole.starts), jax.tree.leaves(again.starts), strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert run(small, checkpoint_file=checkpoint_file, resume=True).ended
-
-
 @pytest.mark.parametrize("first", [0, RACE])
 @pytest.mark.slow
 def test_a_search_continues_by_values_if_derivatives_are_not_finite(small, first):

@@ -19,7 +19,7 @@ from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
 from ambjax.results.outputs import check_new, described, directory, files, plain, write_json
 from tuning.events import Listener, Log, teller
-from tuning.machines.machine_tuning import tune_machine
+from tuning.machines.machine_tuning import MachinePlan, machine_plan, tune_machine
 from tuning.problem.config import allowed_minutes, read_tune
 from tuning.problem.gains_table import off
 from tuning.problem.tuning_problem import TuningProblem, problem_of
@@ -67,7 +67,7 @@ class TuningPlan(NamedTuple):
     """The checked input of a tuning.
 
     `facts`: what a checkpoint must match. `problem`: the tuning problem. `start`: initial gains [m], SI units. `out`:
-    output directory. `options`: of the command.
+    output directory. `options`: of the command. `names`: the files that the tuning writes.
     """
 
     facts: dict[str, Any]
@@ -75,11 +75,16 @@ class TuningPlan(NamedTuple):
     start: np.ndarray
     out: pathlib.Path
     options: Options
+    names: tuple[str, ...] = WRITTEN
 
     @property
     def record(self) -> dict[str, Any]:
         """The facts on which report.json depends: those of the search, and the options that add results."""
         return self.facts | {"options": [self.options.pareto, self.options.page]}
+
+    def kept(self) -> Case:
+        """Return the case of tuned.toml in `out`."""
+        return read_case(self.out / TUNED)
 
 
 @names_arguments(budget="minutes")
@@ -128,37 +133,42 @@ def run(path: str, options: Options, listen: Listener) -> TunedCase:
     Raises ValueError for bad input before anything is written, and in the search as `rounds` does.
     """
     loaded = load(path)  # once: a second read of a pipe would be empty
-    if is_machine(loaded[0]):
-        return _machine(path, options, listen, loaded)
-    plan = _plan(path, options, loaded)
+    plan = (_machine_plan if is_machine(loaded[0]) else _plan)(path, options, loaded)
     with locked(plan.out):
         if not options.resume:
             _clear(plan.out, options.force)
-        elif found := ended(plan.record, plan.out, WRITTEN):
+        elif found := ended(plan.record, plan.out, plan.names):
             teller(listen)(f"{plan.out}: this search has ended; its results are kept")
-            return TunedCase(read_case(plan.out / TUNED), found["outcome"]["good"], found, plan.out)
+            return TunedCase(plan.kept(), found["outcome"]["good"], found, plan.out)
         mark_directory(plan.out)
         with reporting(lambda: _kept(plan.out)):
-            return _tune(plan, path, listen)
+            if isinstance(plan, TuningPlan):
+                return _tune(plan, path, listen)
+            case, report = tune_machine(plan, options.resume, teller(listen))
+            return TunedCase(case, report["outcome"]["good"], report, plan.out)
 
 
-def _machine(path: str, options: Options, listen: Listener, loaded: tuple[dict[str, Any], str]) -> TunedCase:
-    """Tune a whole machine. Raises ValueError for an option that it does not take."""
-    for name, given in options._asdict().items():
-        if name in ("resume", "pareto", "page", "settings_of") and given:
-            raise ValueError(f"--{name.replace('_', '-')}: the tuning of a machine does not take it. Leave it out.")
+def _machine_plan(path: str, options: Options, loaded: tuple[dict[str, Any], str]) -> MachinePlan:
+    """Read a machine and make the output directory. Raises ValueError for an invalid case or option."""
+    for name in ("pareto", "page"):
+        if getattr(options, name):
+            raise ValueError(f"--{name}: the tuning of a machine does not take it. Leave it out.")
+    _check_resume(options)
     minutes = None if options.minutes is None else allowed_minutes(options.minutes)
-    found = tune_machine(path, options.out, options.force, minutes, teller(listen), loaded)
-    return TunedCase(found.case, found.good, found.report, found.directory)
+    return machine_plan(path, options.out, minutes, options.settings_of, loaded)
+
+
+def _check_resume(options: Options) -> None:
+    if options.resume and options.out is None:
+        raise ValueError("--resume: the directory of the search is missing. Give it as --out.")
+    if options.resume and not can_resume(pathlib.Path(str(options.out))):
+        raise ValueError(f"--resume: --out {options.out} contains no search. Check --out, or leave out --resume.")
 
 
 def _plan(path: str, options: Options, loaded: tuple[dict[str, Any], str]) -> TuningPlan:
     """Read the case and make the output directory. Raises ValueError for an invalid case or option."""
     case, tune, raw = read_tune(path, options.settings_of, loaded)
-    if options.resume and options.out is None:
-        raise ValueError("--resume: the directory of the search is missing. Give it as --out.")
-    if options.resume and not can_resume(pathlib.Path(str(options.out))):
-        raise ValueError(f"--resume: --out {options.out} contains no search. Check --out, or leave out --resume.")
+    _check_resume(options)
     if options.minutes is not None:
         tune = dataclasses.replace(tune, minutes=allowed_minutes(options.minutes))
     print_warnings(case, path)

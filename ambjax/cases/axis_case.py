@@ -62,19 +62,25 @@ def _check_plant(table: Table, kind: type) -> None:
     table.only(["kind", "iron", *(name for name in names if name != "iron")], ("rotor.m", "rotor.gravity"))
 
 
-def as_written(message: str, bearing: Table | None) -> str:
-    """Return a message about the case of an axis with the path that the machine's file has. `bearing`: of the axis."""
+def as_written(message: str, raw: dict[str, Any], bearing: Table, axis: BearingAxis) -> str:
+    """Return a message about the case of an axis with the path that the machine's file `raw` has."""
+    name, label = axis.name.rpartition(".")[::2]
     message = NOT_OF_MACHINE.sub("", message.replace("initial.z =", "initial.q: at this axis z =", 1))
-    if bearing is None or not (found := re.match(r"\w+(\.\w+)*", message)):
-        return message
-    keys, own = found[0].split("."), bearing.raw
-    if keys == ["run", "clearance"] and "clearance" in own:
-        return bearing.at("clearance") + message[found.end() :]
-    for key in keys:
-        if not isinstance(own, dict) or key not in own:
-            return message
-        own = own[key]
-    return f"{bearing.path}.{message}" if keys[0] in OWN else message
+    found = re.match(r"\w+(\.\w+)*", message)
+    first, *others = found[0].split(".") if found else [""]
+    if (first, *others) == ("run", "clearance") and "clearance" in bearing.raw:
+        return message.replace("run.clearance", bearing.at("clearance"), 1)
+    if first in OWN and _has(bearing.raw, [first, *others]):
+        return f"{bearing.path}.{message}"
+    for own in (["bearing", name, label], ["bearing", name]):
+        if first == "spread" and _has(raw, ["spread", *own, *others]):
+            return message.replace("spread", ".".join(["spread", *own]), 1)
+    return message
+
+
+def _has(raw: object, keys: list[str]) -> bool:
+    """Return whether a table has the value at a path of keys."""
+    return not keys or (isinstance(raw, dict) and keys[0] in raw and _has(raw[keys[0]], keys[1:]))
 
 
 def check_axis(case: Case, axis: BearingAxis, force: float, q: np.ndarray) -> None:

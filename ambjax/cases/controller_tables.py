@@ -5,7 +5,6 @@ import pathlib
 from typing import Any, NamedTuple
 
 from ambjax.cases.controller_file import ControllerFile, controller_file
-from ambjax.cases.gain_tables import law_from
 from ambjax.cases.own_laws import FORM, OwnLaw, is_own, own_law
 from ambjax.cases.scenario_tables import drive
 from ambjax.cases.table import Table, quoted, show
@@ -16,6 +15,7 @@ from ambjax.control.guard import Guard
 from ambjax.control.linear_controller import OUTPUTS
 from ambjax.control.processor import Processor
 from ambjax.control.sampling import Sampling
+from ambjax.control.schedule import OVER, Schedule
 from ambjax.numerics.records import Scalar
 from ambjax.world.bearing import Bearing
 from ambjax.world.plant import Plant
@@ -170,3 +170,34 @@ def _defaults(table: Table, kind: type[Law], model: Plant, sampling: Sampling | 
         return default_law(kind, model, sampling, table.raw, printed)
     except ValueError as error:
         raise ValueError(f"{table.path}: {error}. Give all of {', '.join(sorted(names))}.") from None
+
+
+EXAMPLE = '{ over = "error", at = [0.0, 1e-5], values = [100.0, 200.0] }'
+
+
+def law_from(table: Table, kind: type[Law], base: Law | None) -> Any:
+    """Return a law of this kind with the gains of this table. `base`: law with the defaults; None: those of `kind`."""
+    names = {field.name: field for field in dataclasses.fields(kind) if field.metadata.get("leaf")}
+    given = {name: table.raw[name] for name in names if isinstance(table.raw.get(name), dict)}
+    numbers = Table({key: value for key, value in table.raw.items() if key not in given}, table.path)
+    law = numbers.record(kind, extra=("kind",), base=base)
+    found = {name: _schedule(Table(raw, table.at(name))) for name, raw in given.items()}
+    for name, one in found.items():
+        one.check(names[name], table.at(name))
+    return dataclasses.replace(law, **found)
+
+
+def _schedule(table: Table) -> Schedule:
+    table.only(["over", "at", "values"])
+    over = table.choice("over", list(OVER))
+    return Schedule(_numbers(table, "values"), at=_numbers(table, "at"), over=over)
+
+
+def _numbers(table: Table, key: str) -> tuple[float, ...]:
+    if key not in table.raw:
+        raise ValueError(f"{table.at(key)} is missing: a schedule is a table such as {EXAMPLE}.")
+    values = table.raw[key]
+    if not isinstance(values, list):
+        raise ValueError(f"{table.at(key)} = {show(values)}: it must be a list of numbers, as in {EXAMPLE}.")
+    each = Table({str(n): x for n, x in enumerate(values)}, table.at(key))
+    return tuple(each.number(str(n), None) for n in range(len(values)))

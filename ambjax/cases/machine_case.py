@@ -1,9 +1,10 @@
 """Reader of the case file of a whole machine: rotor, bearings, unbalances, loads, base, and the common tables."""
 
 import dataclasses
+import functools
 import math
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import numpy as np
 
 from ambjax.cases.axis_case import MACHINE_TABLES, as_written, axis_tables, check_axis, stop_slope
 from ambjax.cases.machine_controller import inner, kind_of, law_from, merged
-from ambjax.cases.machine_spread import axis_table, machine_spread, refuse_unused
+from ambjax.cases.machine_spread import axis_table, machine_spread, refuse_unused, with_notches
 from ambjax.cases.machine_trial import try_machine
 from ambjax.cases.notch_table import notch_from
 from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
@@ -126,19 +127,22 @@ def machine_from(
     _check_rank(rotor, axes)
     masses, forces = _shares(rotor)
 
-    def read(raw: dict[str, Any], name: str, bearing: Table | None = None) -> Case:
+    def read(raw: dict[str, Any], name: str, written: Callable[[str], str] = str) -> Case:
         try:
             return case_from(raw, name, "", folder)
         except ValueError as error:
-            raise ValueError(f"{name}: {as_written(str(error), bearing)}") from None
+            raise ValueError(f"{name}: {written(str(error))}") from None
 
     names = [table.raw.get("name", f"bearing{k + 1}") for k, table in enumerate(bearings)]
-    cases = []
+    cases, of_notches = [], []
     for axis, m, force, i in zip(axes, masses, forces, currents, strict=True):
         bearing = bearings[axis.bearing]
         own = axis_tables(raw, bearing, axis, m, force, (q, i))
-        own |= axis_table(raw, axis, names[axis.bearing])
-        case = read(own, f"axis {axis.name}", bearing)
+        table, turning = axis_table(raw, axis, names[axis.bearing])
+        own |= table
+        of_notches.append(turning)
+        written = functools.partial(as_written, raw=raw, bearing=bearing, axis=axis)
+        case = read(own, f"axis {axis.name}", written)
         check_axis(case, axis, force, q)
         cases.append(case)
     own_law = own_machine_law(kind, folder) if is_own(kind := kind_of(raw)) else None
@@ -154,6 +158,7 @@ def machine_from(
         found = with_machine_gains(machine_of_axes(rotor, parts_of(cases), clock, q, law), notches, clock)
         laws = [dataclasses.replace(case.cascade, notch=notch) for case, notch in zip(cases, found, strict=True)]
         cases = [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
+    spread = with_notches(spread, of_notches, axes, cases)
     coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
     found_laws = [(own_law,) if own_law else (), *(one.own_laws for one in cases)]
     machine = machine_of_axes(rotor, parts_of(cases), clock, q, law)
@@ -223,13 +228,19 @@ def _start(table: Table, rotor: Rotor, count: int) -> tuple[np.ndarray, list[flo
 
 
 def _check_rank(rotor: Rotor, axes: list[BearingAxis]) -> None:
-    """Raise ValueError if magnets or sensors leave a coordinate free that any of them acts on, or a weight."""
+    """Raise ValueError if magnets or sensors leave a coordinate free that any of them acts on, or a weight.
+
+    An axial bearing alone leaves the coordinates across the shaft out; radial bearings must hold all four.
+    """
+    gravity, across = np.asarray(rotor.gravity), [k for k in range(RIGID) if k != 2]
     for rows, what in ((rotor.at_magnets, "magnets"), (rotor.at_sensors, "sensors")):
         rigid = np.asarray(rows)[:, :RIGID]
         used = [k for k in range(RIGID) if np.any(rigid[:, k])]
-        free = [COORDINATES[k] for k in range(RIGID) if k not in used and (k != 2 or rotor.gravity[2] != 0)]
-        if free:
-            raise ValueError(f"bearing: no axis holds {', '.join(free)}. Add a bearing whose {what} act on it.")
+        needed = [k for k in range(RIGID) if gravity[k] != 0 or (k in across and set(used) & set(across))]
+        if free := [k for k in needed if k not in used]:
+            other = ", or a rotor.gravity that does not" if np.any(gravity[free]) else ""
+            names = ", ".join(COORDINATES[k] for k in free)
+            raise ValueError(f"bearing: no axis holds {names}. Give a bearing whose {what} act on it{other}.")
         scale = np.abs(rigid[:, used]).max(0)
         rank = int(np.linalg.matrix_rank(rigid[:, used] / scale, tol=1e-9))
         if rank < len(used):

@@ -1,5 +1,6 @@
 """The table [spread] of a machine: distributions of numbers of the rotor, and of each axis."""
 
+import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -28,14 +29,15 @@ TILT = leaf(unit="rad", at_least=-10.0, at_most=10.0, doc="tilt at t = 0")
 COMMON, NOT_OF_AXIS = "processor.", ("rotor.", "initial.", "disturbance.")
 
 
-def axis_table(raw: dict[str, Any], axis: BearingAxis, name: str) -> dict[str, Any]:
+def axis_table(raw: dict[str, Any], axis: BearingAxis, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the table [spread] of the case of one axis: the common paths, then those of its bearing and of the axis.
 
-    `name`: of the bearing. Raises ValueError, one line, for a number that an axis does not have of its own.
+    The second table is that of the notch, which the case of an axis does not have. `name`: of the bearing. Raises
+    ValueError, one line, for a number that an axis does not have of its own.
     """
     table = raw.get("spread", {})
     if not isinstance(table, dict):
-        return {"spread": table}
+        return {"spread": table}, {}
     own = table.get(OF_BEARING, {}).get(name, {}) if isinstance(table.get(OF_BEARING, {}), dict) else {}
     own = {key: value for key, value in own.items() if key not in SHAPES} if isinstance(own, dict) else own
     label = axis.name.removeprefix(f"{name}.")
@@ -53,7 +55,24 @@ def axis_table(raw: dict[str, Any], axis: BearingAxis, name: str) -> dict[str, A
     for key in FROM_ROTOR:
         if isinstance(merged.get("plant"), dict) and key in merged["plant"]:
             raise ValueError(f"spread.plant.{key}: the rotor gives it. Spread rotor.m instead.")
-    return {"spread": merged} if merged else {}
+    notch, laws = {}, merged.get("controller")
+    if isinstance(laws, dict) and "notch" in laws:
+        notch, laws = {"notch": laws["notch"]}, {key: value for key, value in laws.items() if key != "notch"}
+        merged = {key: laws if key == "controller" else x for key, x in merged.items() if key != "controller" or laws}
+    return {"spread": merged} if merged else {}, notch
+
+
+def with_notches(
+    spread: Spread, tables: Sequence[dict[str, Any]], axes: Sequence[BearingAxis], cases: Sequence[Case]
+) -> Spread:
+    """Return the spread with the numbers of the notches. `tables`: of each axis, as `axis_table` returns them."""
+    entries = list(spread.entries)
+    for table, axis, case in zip(tables, axes, cases, strict=True):
+        known = places(case.cascade, case.scenario)
+        own = entries_of(table, "controller.", list(known))
+        check_entries(Spread(tuple(own)), known)
+        entries += [(f"{OF_BEARING}.{axis.name}.{path}", kind) for path, kind in own]
+    return dataclasses.replace(spread, entries=tuple(entries))
 
 
 def refuse_unused(spread: Spread, output: str) -> None:

@@ -50,9 +50,11 @@ def drawing_of(case: MachineCase) -> RotorDrawing:
 
 def _planes(rotor: Rotor) -> list[tuple[tuple[str, float], np.ndarray]]:
     """Return kind, place and mode shapes of each plane of the rotor, without repetition."""
-    rows = [("magnet", row) for row in np.asarray(rotor.at_magnets)]
+    magnets = np.asarray(rotor.at_magnets)
+    stops = magnets if rotor.at_stops is None else np.asarray(rotor.at_stops)
+    rows = [("magnet", row) for row in magnets]
     rows += [("sensor", row) for row in np.asarray(rotor.at_sensors)]
-    rows += [("stop", row) for row in ([] if rotor.at_stops is None else np.asarray(rotor.at_stops))]
+    rows += [("stop", row) for row in stops[np.any(stops != magnets, 1)]]
     rows += [("unbalance", np.asarray(one.along_x)) for one in rotor.unbalances]
     found: dict[tuple[str, float], np.ndarray] = {}
     for kind, row in rows:
@@ -60,6 +62,11 @@ def _planes(rotor: Rotor) -> list[tuple[tuple[str, float], np.ndarray]]:
         if np.any(d):  # radial: the row of a displacement along d at l
             found.setdefault((kind, place_of(row)), own @ d / (d @ d))
     return list(found.items())
+
+
+def radial_axes(case: MachineCase) -> list[int]:
+    """Return the numbers of the axes across the shaft, two of each radial bearing."""
+    return [k for k, name in enumerate(case.axes) if not name.endswith(".z")]
 
 
 def place_of(row: np.ndarray) -> float:

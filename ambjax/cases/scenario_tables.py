@@ -5,8 +5,8 @@ import math
 from typing import Any
 
 from ambjax.cases.recordings import Recordings
+from ambjax.cases.speed_table import OWN_SPEED, check_turning, rotation_from, turning_from
 from ambjax.cases.table import Table, show
-from ambjax.cases.turning import OWN_SPEED, check_turning, rotation_from, turning_from
 from ambjax.numerics.records import leaf
 from ambjax.simulation.clock import Clock
 from ambjax.world import waveforms

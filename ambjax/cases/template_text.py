@@ -5,10 +5,9 @@ import math
 
 from ambjax.cases import tune_table
 from ambjax.cases.controller_tables import KINDS
-from ambjax.cases.data_sheet import BEARING
+from ambjax.cases.data_sheet import BEARING, RIG
 from ambjax.cases.machine_templates import FLEXIBLE, MACHINE
 from ambjax.cases.reader import PLANTS
-from ambjax.cases.rig import RIG
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.ufu_template import UFU
 from ambjax.ensemble.design import DESIGNS

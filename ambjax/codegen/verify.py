@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ambjax.codegen import closed_loop, plant_loop
+from ambjax.codegen import closed_loop
 from ambjax.codegen.block import Block
 from ambjax.codegen.c99.machine import EXACT, SANITIZED, SHARED, STRICT, Compiled, build, execute, scratch, short
 from ambjax.codegen.c99.package import SHARE, ULPS, files_of_trace, tolerance
@@ -83,7 +83,7 @@ def verify(drafts: Mapping[str, Draft], case: LoopCase | None) -> list[Check]:
                     checks += _stepped(name, one, precision, machines[precision])
         if case is not None and len(machines) == len(drafts):
             whole = any(one.trace.block.noun != "controller" for one in drafts.values())
-            compare = plant_loop.compare_blocks if whole else closed_loop.compare_loops
+            compare = closed_loop.compare_blocks if whole else closed_loop.compare_loops
             checks += [_looped(precision, found) for precision, found in compare(case, machines).items()]
     return checks
 

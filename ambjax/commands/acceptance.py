@@ -7,8 +7,7 @@ import jax.numpy as jnp
 
 from ambjax.cases.forces import bias_flux, forces
 from ambjax.cases.reader import Case
-from ambjax.commands.band_text import band_lines, band_numbers
-from ambjax.commands.speed_text import running_facts, running_speeds
+from ambjax.commands.band_text import band_lines, band_numbers, running_facts, running_speeds
 from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import DEFAULT_LAWS
 from ambjax.linear import PLACES, Analysis, analyse, linearise

@@ -7,7 +7,7 @@ import numpy as np
 
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
-from ambjax.cases.rotor_drawing import drawing_of
+from ambjax.cases.rotor_drawing import drawing_of, radial_axes
 from ambjax.commands.reading import read_any_with_warnings
 from ambjax.host.heartbeat import say
 from ambjax.linear.linear_machine import turning_machines
@@ -59,15 +59,17 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     wrong = np.array([not system.stable for system in systems])
     unstable = [float(speed) for speed in speeds[wrong]]
     operating = operating_range(case)
-    found = unbalance_response(case.machine, case.clock.sample_period, end) if case.machine.rotor.unbalances else None
+    turned = case.machine.rotor.unbalances and radial_axes(case)
+    found = unbalance_response(case.machine, case.clock.sample_period, end) if turned else None
     criticals = [] if found is None else critical_speeds(found, operating)
-    stiffness, undamped, k_s = springs = _on_springs(case)
+    springs = _on_springs(case) if radial_axes(case) else None
     summary = {
         "speeds_rpm": speeds, "stable": not unstable, "unstable_at_rpm": unstable, "growth_per_s": growth,
         "poles_per_s": [[[float(p.real), float(p.imag)] for p in own[np.argsort(-np.real(own))]] for own in poles],
         "modes": [[mode.numbers() for mode in own] for own in modes],
         "unbalance": None if found is None else _unbalance(case, found, criticals, operating),
-        "undamped_critical_speeds": {"k_s": k_s, "stiffness_N_per_m": stiffness, "speeds_rpm": undamped},
+        "undamped_critical_speeds": springs
+        and dict(zip(("stiffness_N_per_m", "speeds_rpm", "k_s"), springs, strict=True)),
     }  # fmt: skip
     words = f"unstable at {ranges(speeds, wrong)} rpm" if unstable else "stable"
     text = f"0 to {end:g} rpm: {words}; largest real part of a pole {growth.max():.4g} 1/s"
@@ -153,8 +155,7 @@ def _vibration(found: UnbalanceResponse, operating: tuple[float, float]) -> tupl
 
 def _on_springs(case: MachineCase) -> tuple[np.ndarray, list[np.ndarray], float]:
     """Return stiffnesses (N/m), the undamped critical speeds (rpm) of the rotor on such springs, and |k_s| (N/m)."""
-    radial = [own for name, own in zip(case.axes, case.cases, strict=True) if not name.endswith(".z")]
-    k_s = abs(float(radial[0].scenario.plant.k_s))
+    k_s = abs(float(case.cases[radial_axes(case)[0]].scenario.plant.k_s))
     stiffness = k_s * np.geomspace(SOFTEST, STIFFEST, STIFFNESSES)
     return stiffness, springs_critical(case.machine.rotor, stiffness), k_s
 
@@ -162,7 +163,7 @@ def _on_springs(case: MachineCase) -> tuple[np.ndarray, list[np.ndarray], float]
 def _pictures(case: MachineCase, analysed: tuple, found: UnbalanceResponse | None, part: pathlib.Path) -> None:
     """Draw Campbell diagram, rotor and response to unbalance.
 
-    `analysed`: speeds, modes, critical speeds, and `_on_springs`.
+    `analysed`: speeds, modes, critical speeds, and `_on_springs`, None without radial bearings: then no rotor.
     """
     from ambjax.pictures.machine_pictures import campbell_picture
     from ambjax.pictures.rotor_pictures import rotor_picture, unbalance_picture
@@ -170,6 +171,8 @@ def _pictures(case: MachineCase, analysed: tuple, found: UnbalanceResponse | Non
     speeds, modes, criticals, springs = analysed
     described("campbell.png", lambda: campbell_picture(case.name, speeds, modes, part / "campbell.png"))
     operating = operating_range(case)
+    if springs is None:
+        return
     point = next(turning_machines(case.machine, case.clock.sample_period, operating[1:]))
     drawn = [mode for mode in modes_of(point, case.machine.rotor) if mode.name != "axial" and mode.damping < DAMPED]
     light = [mode for mode in drawn if mode.damping < LIGHT]

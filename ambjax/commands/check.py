@@ -64,10 +64,10 @@ def _checked(case: Case, path: str, full: bool) -> CaseCheck:
     from ambjax.commands import check_text
 
     with doing(f"simulating and analysing the loop; {FIRST_RUN}"):
-        report, (loop, sensitivity, machine), on_processor = _results(case)
+        report, (loop, sensitivity, machine), on_processor, findings = _results(case)
     lost = report.lost_at if on_processor is None else on_processor.sampled.lost_at
     with doing(f"testing the stability of the loop; {FIRST_RUN}"):
-        findings = _stability(case) if math.isinf(lost) else None
+        findings = (findings or _stability(case)) if math.isinf(lost) else None
     summary = {
         "holds": report.holds,
         "lost_at_s": report.lost_at,
@@ -95,20 +95,25 @@ def _checked(case: Case, path: str, full: bool) -> CaseCheck:
     return CaseCheck(summary["holds"] and loop["stable"] is not None, plain(summary), text)
 
 
-def _results(case: Case) -> tuple[Report, tuple[Summary, list[str], str], OnProcessor | None]:
-    """Return the report of Theorem 1, the summary and text of the linearised loop, and the results on the processor."""
+def _results(case: Case) -> tuple[Report, tuple[Summary, list[str], str], OnProcessor | None, Findings | None]:
+    """Return the report of Theorem 1, the linear loop, the results on the processor, and the stability of the loop.
+
+    The stability is None unless the search of the delay margin has computed it.
+    """
     with ThreadPoolExecutor(1) as pool:
         say(f"checking Theorem 1: simulating {float(case.clock.duration):g} s in continuous time")
         theorem = pool.submit(check_theorem, case.cascade, case.scenario, case.clock, case.settle)
         say("linearising the loop")
-        loop, on_processor = acceptance(case), None
+        loop, on_processor, findings = acceptance(case), None, None
         if case.cascade.sampled:
-            on_processor = OnProcessor(_sampled(case), *_margins(case))
+            sampled = _sampled(case)
+            margins, findings = _margins(case)
+            on_processor = OnProcessor(sampled, *margins)
         report = theorem.result()
     if report.lost and not case.cascade.sampled:
         cause = find_cause(_is_lost, case.cascade, case.scenario, case.clock, say)
         report = dataclasses.replace(report, cause=cause)
-    return report, loop, on_processor
+    return report, loop, on_processor, findings
 
 
 def _is_lost(cascade: Cascade, scenario: Scenario, clock: Clock) -> bool:
@@ -124,24 +129,28 @@ def _sampled(case: Case) -> SampledReport:
     return with_causes(check_sampled(*parts), *parts, say)
 
 
-def _margins(case: Case) -> tuple[Delays, Delays | None]:
-    """Return two delay margins: with prediction over the delay of each run, and over the delay of the case."""
+def _margins(case: Case) -> tuple[tuple[Delays, Delays | None], Findings | None]:
+    """Return two delay margins: with prediction over the delay of each run, and over the delay of the case.
+
+    Also returns the stability of the loop; None if an ensemble of delays does not contain the case.
+    """
     from ambjax.ensemble.delays import DELAYS, delay_margin
     from ambjax.linear.stability import with_stability
 
     loop = (case.cascade, case.scenario, case.clock)
 
-    def found(known: bool) -> Delays:
+    def found(known: bool) -> tuple[Delays, Findings | None]:
         margin = delay_margin(*loop, known=known)
         say("testing whether the loop is stable at these delays")
         return with_stability(margin, *loop, known=known)
 
     say(f"finding the delay margin: simulating ensembles of {DELAYS} delays, three at most")
-    margin = found(True)
+    margin, stability = found(True)
     if (processor := case.cascade.processor) is None or processor.predict is False:
-        return margin, None
+        return (margin, None), stability
     say("finding the delay margin again: the prediction uses the delay of the case")
-    return margin, found(False)
+    unknown, stability = found(False)
+    return (margin, unknown), stability
 
 
 def _stability(case: Case) -> Findings:

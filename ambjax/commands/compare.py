@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     cases = _read(args.cases)
     of_axis = [case for case in cases if isinstance(case, Case)]
     if not of_axis:
-        refuse(args, ("tune", "page"))
+        refuse(args, ("page",))
     studies = _studies(cases, args.seed, args.members)
     notes = _differences(args.cases, cases, studies)
     for note in notes:
@@ -68,7 +68,8 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     name = f"compare-{'-'.join(case.name for case in cases)}"[:80]
     out = directory(args.out, name, WRITTEN, args.force or args.resume)
     if args.tune:
-        cases = of_axis = tuned_cases(of_axis, out, args)
+        cases = tuned_cases(cases, out, args)
+        of_axis = [case for case in cases if isinstance(case, Case)]
         studies = _studies(cases, args.seed, args.members)
     html_pages = pages(of_axis, args.cases) if args.page else {}
     summary, compared = _comparison(cases, studies, notes)

@@ -8,7 +8,9 @@ import sys
 import time
 from collections.abc import Sequence
 
-from ambjax.cases.reader import Case, read_case
+from ambjax.cases.machine_case import AnyCase, MachineCase, machine_from
+from ambjax.cases.reader import read_case
+from ambjax.cases.table import load
 from ambjax.commands.pace import duration
 from ambjax.host.command_line import message
 from ambjax.host.extensions import NothingToTuneError, extension
@@ -33,7 +35,7 @@ def check_options(args: argparse.Namespace) -> None:
         raise ValueError(f"--resume: --out {args.out} does not exist. Check --out, or leave out --resume.")
 
 
-def tuned_cases(cases: Sequence[Case], out: pathlib.Path, args: argparse.Namespace) -> list[Case]:
+def tuned_cases(cases: Sequence[AnyCase], out: pathlib.Path, args: argparse.Namespace) -> list[AnyCase]:
     """Tune each case with the settings of the first, and return the tuned cases under the same names.
 
     A case without gains to tune is returned as it is. If one case cannot be tuned, the others still are. Raises
@@ -46,7 +48,7 @@ def tuned_cases(cases: Sequence[Case], out: pathlib.Path, args: argparse.Namespa
             f"--out {out}: it has tunings of an earlier run ({', '.join(old)}). Continue them with --resume, discard "
             "them with --force, or choose another directory."
         )
-    found, failed, times = list[Case](), list[str](), list[float]()
+    found, failed, times = list[AnyCase](), list[str](), list[float]()
     kept = f"the tunings so far are saved. To continue, repeat the command with --out {out} --resume"
     with reporting(lambda: kept):
         for n, (path, case) in enumerate(zip(args.cases, cases, strict=True)):
@@ -68,7 +70,7 @@ def tuned_cases(cases: Sequence[Case], out: pathlib.Path, args: argparse.Namespa
     return found
 
 
-def _folder(out: pathlib.Path, case: Case) -> pathlib.Path:
+def _folder(out: pathlib.Path, case: AnyCase) -> pathlib.Path:
     return out / f"tuned-{case.name}"
 
 
@@ -81,7 +83,7 @@ def _progress(name: str, n: int, count: int, times: Sequence[float]) -> str:
     return f"{words} ({len(times)} tuned in {duration(taken)}, about {duration(taken / len(times) * (count - n))} left)"
 
 
-def _tuned(path: str, case: Case, out: pathlib.Path, args: argparse.Namespace, times: list[float]) -> Case:
+def _tuned(path: str, case: AnyCase, out: pathlib.Path, args: argparse.Namespace, times: list[float]) -> AnyCase:
     """Return the tuned case. Append the duration of its tuning to `times`, unless it had ended in an earlier run."""
     folder, began = _folder(out, case), time.perf_counter()
     tuned, options = folder / TUNED, ["--force"] * args.force
@@ -98,6 +100,9 @@ def _tuned(path: str, case: Case, out: pathlib.Path, args: argparse.Namespace, t
             return case
     if _modified(tuned) != before:
         times.append(time.perf_counter() - began)
+    if isinstance(case, MachineCase):  # its files are beside the case
+        raw, text = load(tuned)
+        return machine_from(raw, case.name, text, case.folder)
     return dataclasses.replace(read_case(tuned), name=case.name)
 
 

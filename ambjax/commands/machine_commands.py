@@ -7,8 +7,9 @@ import numpy as np
 from tqdm import tqdm
 
 from ambjax.cases.machine_case import MachineCase
+from ambjax.cases.rotor_drawing import radial_axes
+from ambjax.commands.band_text import running_facts
 from ambjax.commands.sensitivity_report import injected_numbers, injection_text
-from ambjax.commands.speed_text import running_facts
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.linear import Injection, machine_injected
 from ambjax.linear.linear_machine import MachineSensitivity
@@ -69,7 +70,7 @@ def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]
         described("overview.png", lambda: machine_picture(case, run.signals, title, part / "overview.png"))
         if np.ptp(run.signals["speed_rpm"]) > 0:
             described("runup.png", lambda: run_up_picture(case, run.signals, part / "runup.png"))
-        page = described("motion.html", lambda: motion_page(case, run.signals))
+        page = described("motion.html", lambda: motion_page(case, run.signals)) if radial_axes(case) else None
         if page is not None:
             (part / "motion.html").write_text(page, encoding="utf-8")
         names = [name for name in SIMULATED if (part / name).exists()]

@@ -7,9 +7,9 @@ from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reach import largest
 from ambjax.cases.reader import Case
 from ambjax.commands import machine_commands
+from ambjax.commands.band_text import running_facts, running_speeds
 from ambjax.commands.reading import read_any_with_warnings
 from ambjax.commands.sensitivity_report import Injections, sensitivity_summary, set_valued, text_of
-from ambjax.commands.speed_text import running_facts, running_speeds
 from ambjax.ensemble.study import Study
 from ambjax.host.heartbeat import FIRST_RUN, doing
 from ambjax.linear import Injection, frequency_lines, injected

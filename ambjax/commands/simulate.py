@@ -66,8 +66,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     }
     if replayed is not None:
         metrics["trajectory_deviation"] = replayed.deviation
-    from ambjax.pictures.order_picture import order_picture
     from ambjax.pictures.overview import overview
+    from ambjax.pictures.run_up_picture import order_picture
 
     rotor = case.scenario.rotor
     with files(out) as part:

@@ -63,15 +63,20 @@ def doubled(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.nd
     E. K.-W. Chu, H.-Y. Fan, W.-W. Lin and C.-S. Wang, Int. J. Control 77 (2004) 767-788. Unlike SciPy's solver, it does
     not reorder eigenvalues, which fails for lightly damped modes. Raises ValueError if it does not converge.
     """
-    G, P, one = B @ np.linalg.solve(R, B.T), Q, np.eye(len(A))
+    G, P = B @ np.linalg.solve(R, B.T), Q
     for _ in range(MOST_DOUBLINGS):
-        W = np.linalg.solve(one + G @ P, np.hstack([A, G]))
-        change = A.T @ P @ W[:, : len(A)]
-        A, G, P = A @ W[:, : len(A)], G + A @ W[:, len(A) :] @ A.T, P + change
-        G, P = (G + G.T) / 2, (P + P.T) / 2
-        if np.linalg.norm(change) <= np.finfo(float).eps * np.linalg.norm(P):
+        before = P
+        A, G, P = _over_twice(A, G, P)
+        if np.linalg.norm(P - before) <= np.finfo(float).eps * np.linalg.norm(P):
             return P
     raise ValueError("no convergence")
+
+
+def _over_twice(A: np.ndarray, G: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the matrices of `doubled` for twice the horizon."""
+    W = np.linalg.solve(np.eye(len(A)) + G @ P, np.hstack([A, G]))
+    G, P, A = G + A @ W[:, len(A) :] @ A.T, P + A.T @ P @ W[:, : len(A)], A @ W[:, : len(A)]
+    return A, (G + G.T) / 2, (P + P.T) / 2
 
 
 def optimal_gains(model: Plant, period: float | None = None) -> np.ndarray:

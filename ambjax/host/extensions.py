@@ -1,10 +1,21 @@
-"""Commands that other packages declare, such as that of the tuner."""
+"""Optional packages, and commands that other packages declare, such as that of the tuner."""
 
+import importlib
 import importlib.metadata
 from collections.abc import Callable
+from typing import Any
 
 # Entry-point group in which a package that depends on ambjax declares its command.
 GROUP = "ambjax.commands"
+
+
+def extra(name: str, group: str = "tables") -> Any:
+    """Import an optional package by its dotted name. Raises ValueError, naming the extra `group`, if it is missing."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        package = name.partition(".")[0]
+        raise ValueError(f"{package} is not installed. Install it with: pip install 'ambjax[{group}]'.") from None
 
 
 class NothingToTuneError(ValueError):

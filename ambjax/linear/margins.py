@@ -270,6 +270,11 @@ def noise_gain(system: StateSpace, period: float) -> float:
     for _ in range(DOUBLINGS):
         if variance > 0 and variance - before <= SETTLED * variance:
             break
-        covariance, A = covariance + A @ covariance @ A.T, A @ A
+        covariance, A = _over_twice(covariance, A)
         before, variance = variance, float(c @ covariance @ c)
     return math.sqrt(variance)
+
+
+def _over_twice(covariance: np.ndarray, A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the covariance and the transition of twice the number of samples."""
+    return covariance + A @ covariance @ A.T, A @ A

@@ -1,5 +1,7 @@
 """Linearisation of the closed loop at an equilibrium: of the map of one sample period, or of the vector field."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -8,10 +10,97 @@ from jax.flatten_util import ravel_pytree
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import Sample
 from ambjax.linear.equilibrium import Equilibrium, Point, at_rest, equilibrium, ideal, reading, sizes_of
-from ambjax.linear.held_plant import Lagged
 from ambjax.linear.state_space import CommandPath, StateSpace
 from ambjax.numerics.records import Scalar
+from ambjax.numerics.small_matrices import exponential
 from ambjax.world.scenario import Scenario
+from ambjax.world.sensor import Measurement
+
+
+class HeldPlant(NamedTuple):
+    """Linear map of one sample, x_{n+1} = transition x_n + sum over k of driven[k] u_{n-k} + disturbed q_z.
+
+    x [N] is the state of the plant, of the sensor's low-pass (m) and of the amplifier (V). `transition` is [N, N],
+    `driven` [K + 1, N] for K past commands, and `disturbed` [N]. x and u are deviations from the equilibrium. q_z
+    (m/s^2) is constant during the sample. `path`: the rates of x under a command.
+    """
+
+    transition: Array
+    driven: Array
+    disturbed: Array
+    path: CommandPath
+
+
+class Lagged:
+    """The plant of a scenario with the lags of sensor and amplifier; its state is one vector [N]."""
+
+    def __init__(self, scenario: Scenario, point: Point):
+        self.scenario = scenario
+        self.low_passed = scenario.sensors.bandwidth is not None
+        self.lagged = scenario.actuator.slow
+        z = scenario.plant.measurement(point.plant).z
+        lags = [z] * self.low_passed + [point.u] * self.lagged
+        self.start, self.restore = ravel_pytree((point.plant, lags))
+
+    def motion(self, x: Array) -> Measurement:
+        """Return the true motion and current in a state."""
+        return self.scenario.plant.measurement(self.restore(x)[0])
+
+    def read(self, x: Array, injected: tuple[Scalar, Scalar]) -> Measurement:
+        """Return the readings in a state plus `injected`: test signals on z (m) and z_dot (m/s)."""
+        plant, lags = self.restore(x)
+        motion = self.scenario.plant.measurement(plant)
+        return reading(self.scenario, motion._replace(z=lags[0]) if self.low_passed else motion, injected)
+
+    def rates(self, x: Array, u: Scalar, q_z: Scalar) -> Array:
+        """Return the time derivative of the state under a command u (V or A) and a disturbance q_z (m/s^2)."""
+        (plant, lags), sensor, amplifier, lag_rates = self.restore(x), self.scenario.sensors, self.scenario.actuator, []
+        if sensor.bandwidth is not None:
+            z = self.scenario.plant.measurement(plant).z
+            lag_rates.append(2 * jnp.pi * sensor.bandwidth * (z - lags[0]))
+        if self.lagged:
+            lag_rates.append(amplifier.slope() * (u - lags[-1]))
+            u = lags[-1]
+        u = self.scenario.coil_voltage(jnp.asarray(u), plant)
+        return ravel_pytree((self.scenario.plant.rates(plant, u, q_z), lag_rates))[0]
+
+    def voltage(self, x: Array, u: Array) -> Array:
+        """Return the voltage (V) for a command: the command itself, or for a current command the coil voltage."""
+        return self.scenario.coil_voltage(u, self.restore(x)[0]) if self.scenario.drive == "current" else u
+
+    def sizes(self, sizes: Point) -> Array:
+        """Return the characteristic sizes [N] of the state. `sizes`: those of a `Point`."""
+        z = self.scenario.plant.measurement(sizes.plant).z
+        lags = [z] * self.low_passed + [sizes.u] * self.lagged
+        return ravel_pytree((sizes.plant, lags))[0]
+
+    def held(self, point: Point, period: Scalar, delay: Scalar, kept: int) -> HeldPlant:
+        """Return the linear map of one sample at the equilibrium `point`.
+
+        `delay`: samples after which the voltage of a sample begins to act.
+        """
+        A, B = jax.jacfwd(lambda x, w: self.rates(x, w[0], w[1]), (0, 1))(
+            self.start, jnp.stack([point.u, 0.0 * point.u])
+        )
+        path = CommandPath(A, B[:, 0], jnp.asarray(delay))
+        whole = jnp.floor(path.delay)
+        new, old = path.held(path.delay - whole, jnp.asarray(period))
+        driven = jnp.stack([_at(whole + 1, lag) * old + _at(whole, lag) * new for lag in range(kept + 1)])
+        transition, disturbed = _integrated(A, B[:, 1], period)
+        return HeldPlant(transition, driven, disturbed, path)
+
+
+def _at(lag: Array, number: int) -> Array:
+    """Return 1 if `lag`, a whole number, is `number`, else 0."""
+    return jnp.where(jnp.abs(lag - number) < 0.5, 1.0, 0.0)
+
+
+def _integrated(A: Array, b: Array, h: Scalar) -> tuple[Array, Array]:
+    """Return exp(A h), and the integral of exp(A t) b over t from 0 to h (s)."""
+    n = len(b)
+    table = jnp.zeros((n + 1, n + 1), A.dtype).at[:n].set(jnp.concatenate([A, b[:, None]], 1) * h)
+    whole = exponential(table)
+    return whole[:n, :n], whole[:n, n]
 
 
 def loop_matrices(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> tuple[StateSpace, Array]:

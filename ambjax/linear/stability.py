@@ -74,6 +74,11 @@ class Stability(NamedTuple):
     duration: float
     bias: float
 
+    @property
+    def first(self) -> "Stability":
+        """The stability of the first member."""
+        return self._replace(**{name: getattr(self, name)[:1] for name in self._fields[:-2]})
+
     def findings(self) -> "Findings":
         """Return the summary that all reports use."""
         bad = ~self.stable
@@ -167,16 +172,18 @@ def suspects(error: np.ndarray, held: np.ndarray) -> np.ndarray:
     return np.sort(alive[np.argsort(-np.asarray(error)[alive], kind="stable")[:MOST_TESTED]])
 
 
-def with_stability(margin: "Delays", cascade: Cascade, scenario: Scenario, clock: Clock, *, known: bool) -> "Delays":
+def with_stability(
+    margin: "Delays", cascade: Cascade, scenario: Scenario, clock: Clock, *, known: bool
+) -> tuple["Delays", Findings | None]:
     """Return a result of `delay_margin` with the delays, up to its `held`, up to which the loop is stable.
 
     `DELAYS` delays are tested; a second pass divides the step after the last one that is stable. `known`: as in
-    `delay_margin`.
+    `delay_margin`. Also returns the findings at the case's own delay; None if the rotor is not held there.
     """
     from ambjax.ensemble.delays import DELAYS, at_delays
 
     if margin.held is None:
-        return margin
+        return margin, None
     own = float(cascade.timing.delay)
     first = own if margin.held >= own else 0.0
 
@@ -185,14 +192,15 @@ def with_stability(margin: "Delays", cascade: Cascade, scenario: Scenario, clock
         return delays, stability_of(at_delays(cascade, delays, known=known), scenario, clock)
 
     delays, found = tried(first, margin.held)
+    at_own = found.first.findings() if first == own else None
     if found.stable.all():
-        return margin._replace(stable=margin.held, tested=DELAYS)
+        return margin._replace(stable=margin.held, tested=DELAYS), at_own
     facts, at = found.findings(), int(np.argmin(found.stable))
     stable = None
     if at:
         finer, again = tried(delays[at - 1], delays[at])
         stable = float(finer[max(int(np.argmin(again.stable)) - 1, 0)])
-    return margin._replace(stable=stable, swing_m=facts.swing_m, current_A=facts.current_A, tested=DELAYS)
+    return margin._replace(stable=stable, swing_m=facts.swing_m, current_A=facts.current_A, tested=DELAYS), at_own
 
 
 def _growth(cascade: Cascade, scenario: Scenario, clock: Clock) -> np.ndarray:

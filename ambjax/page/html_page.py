@@ -14,12 +14,11 @@ import numpy as np
 
 from ambjax.cases.reader import Case
 from ambjax.ensemble.study import Study
-from ambjax.host.optional import extra
+from ambjax.host.extensions import extra
 from ambjax.page.case_text import TemplateLine, checked, editable_lines
 from ambjax.page.functions import PRELUDE
 from ambjax.page.linear_script import linear_script
-from ambjax.page.loop_functions import loop_parameters
-from ambjax.page.loop_script import COILS, SIGNALS, loop_script
+from ambjax.page.loop_functions import COILS, SIGNALS, loop_parameters, loop_script
 from ambjax.page.sliders import GROUPS, SEED, Slider, changed, parameter_values, parameters, sliders
 from ambjax.simulation.metrics import UNITS
 from ambjax.simulation.trajectory import STATUSES

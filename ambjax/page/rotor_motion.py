@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase
-from ambjax.cases.rotor_drawing import drawing_of, place_of
+from ambjax.cases.rotor_drawing import drawing_of, place_of, radial_axes
 from ambjax.cases.rotor_tables import RIGID
 
 # Largest number of instants, and their least number in a revolution. A longer run is shown from its end backwards.
@@ -40,9 +40,9 @@ def motion_of(case: MachineCase, signals: dict[str, Any]) -> dict[str, Any]:
     modes = q[:, RIGID:].reshape(len(q), -1, 2)
     x = np.column_stack([q[:, 0], q[:, 4], modes[:, :, 0]])
     y = np.column_stack([q[:, 1], -q[:, 3], modes[:, :, 1]])
-    rotor, radial = case.machine.rotor, [k for k, name in enumerate(case.axes) if name.endswith(".x")]
+    rotor = case.machine.rotor
     rows = np.asarray(rotor.at_magnets if rotor.at_stops is None else rotor.at_stops)
-    stops = [[round(place_of(rows[k]), 6), float(case.cases[k].scenario.touchdown)] for k in radial]
+    stops = [[round(place_of(rows[k]), 6), float(case.cases[k].scenario.touchdown)] for k in radial_axes(case)[::2]]
     return {
         "t": _rounded(t[kept]), "rpm": _rounded(speed[kept]), "x": _rounded(x), "y": _rounded(y),
         "at": _rounded(drawing.at), "stops": stops,

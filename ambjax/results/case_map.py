@@ -15,7 +15,7 @@ from ambjax.ensemble.paths import Place
 from ambjax.ensemble.spread import no_such_number
 from ambjax.ensemble.study import AnyStudy, Study
 from ambjax.host.arguments import names_arguments
-from ambjax.host.optional import extra
+from ambjax.host.extensions import extra
 from ambjax.linear import stability_of
 from ambjax.numerics.declared import numbers, within
 from ambjax.results.machine_study import MachineStudy

@@ -13,7 +13,7 @@ import numpy as np
 from ambjax.cases.machine_case import MachineCase, machine_from, machine_of_axes, parts_of
 from ambjax.cases.machine_spread import axis_values, machine_places, shared, varied_start
 from ambjax.cases.rotor_numbers import varied_rotors
-from ambjax.compiler.members_last import members_last
+from ambjax.compiler.members_last import SHORT, members_last
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
 from ambjax.ensemble.maps import PERIOD
@@ -32,7 +32,7 @@ from ambjax.simulation.rollout import Result, run
 from ambjax.simulation.whole_machine import Machine, PerAxis, stack_axes
 from ambjax.world.scenario import Scenario
 
-# Multiple of the clearance by which the rotor of a `lost` call is displaced along x and y.
+# Multiple of the clearance by which the rotor of a `lost` call is displaced along x, y and z.
 FAR = 4.0
 # Largest number of members whose linearised loops are tested.
 MOST_TESTED = 16
@@ -161,7 +161,7 @@ class MachineStudy(AnyStudy):
         machine, fold = self.batch(members)
         if lost:
             far = np.array(machine.start_q)
-            far[..., :2] = FAR * max(float(np.max(np.asarray(one.scenario.limit))) for one in self.case.cases)
+            far[..., :3] = FAR * max(float(np.max(np.asarray(one.scenario.limit))) for one in self.case.cases)
             machine = dataclasses.replace(machine, start_q=far)
         outcome = run_machines(machine, self.clock, fold, threads=threads, call=call)
         values = {SPREAD + path: x for path, x in self.drawn(members).items()}
@@ -204,7 +204,13 @@ def run_machines(
 ) -> Result:
     """Simulate every member of an ensemble of machines. What varies has a leading axis [N]. No rows are recorded."""
     tree = canonical((machine, clock, fold))
-    return map_members(_simulated, tree, threads=threads, call=call, vectorised=True)
+    return map_members(_simulated, tree, threads=threads, call=call, plain=_has_long_sums(machine), vectorised=True)
+
+
+def _has_long_sums(machine: Machine) -> bool:
+    """Return whether a product of a matrix has a sum of more than SHORT terms, which XLA refuses in one kernel."""
+    matrices = [x for x in jax.tree.leaves(machine.law) if np.ndim(x) > 1]
+    return max(np.shape(x)[-1] for x in (machine.rotor.gravity, *matrices)) > SHORT
 
 
 def _simulated(tree: tuple[Machine, Clock, Fold], axes: object) -> Result:

@@ -13,7 +13,7 @@ from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.replay import record_member
-from ambjax.host.optional import extra
+from ambjax.host.extensions import extra
 from ambjax.results.machine_run import MachineRun, simulate_machine
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.metrics import UNITS, Metrics
@@ -95,7 +95,7 @@ class CaseRun:
 
     def plot_phase(self) -> Any:
         """Return a matplotlib Figure of the velocity against the displacement, in the whole run and when settled."""
-        from ambjax.pictures.phase_plane import phase_plane
+        from ambjax.pictures.figures import phase_plane
 
         return phase_plane(self.trajectory, self.case.name, self.case.settle)
 

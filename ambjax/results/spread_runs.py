@@ -13,7 +13,7 @@ from ambjax.ensemble import statistics
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.study import AnyStudy, Study
 from ambjax.host.arguments import names_arguments
-from ambjax.host.optional import extra
+from ambjax.host.extensions import extra
 from ambjax.results.machine_study import MachineStudy
 from ambjax.simulation.metrics import UNITS
 

@@ -1,11 +1,10 @@
 """The tuner as a function of `ambjax`. It is loaded through its entry point, so `ambjax` does not import it."""
 
 import importlib
-import importlib.metadata
 import pathlib
 from typing import Any
 
-from ambjax.host.extensions import GROUP
+from ambjax.host.extensions import extension
 
 
 def tune(case: str | pathlib.Path, out: str | pathlib.Path | None = None, **options: Any) -> Any:
@@ -17,8 +16,5 @@ def tune(case: str | pathlib.Path, out: str | pathlib.Path | None = None, **opti
 
     Raises ValueError for bad input, or if the tuner is not installed.
     """
-    found = tuple(importlib.metadata.entry_points(group=GROUP, name="tune"))
-    if not found:
-        raise ValueError("ambjax.tune: the tuner is not installed. Reinstall ambjax with pip.")
-    package = importlib.import_module(found[0].module.partition(".")[0])
+    package = importlib.import_module(extension("tune").__module__.partition(".")[0])
     return package.tune(case, out, **options)

@@ -11,6 +11,7 @@ from tuning.events import Tell
 from tuning.machines.lqg_weights import LqgSpace
 from tuning.machines.machine_gains import MachineSpace
 from tuning.machines.machine_peaks import Peaks
+from tuning.machines.machine_progress import Progress
 from tuning.machines.nonsmooth import Value, minimise
 
 # Standard deviations of the logarithms of the gains of random starts: around the case, and around the best point.
@@ -34,18 +35,31 @@ class Settings(NamedTuple):
     held_out: int
 
 
-def searched(peaks: Peaks, settings: Settings, start: np.ndarray, lost: Lost, tell: Tell) -> Value:
-    """Return the lowest peak with the fewest lost members, or the least growth rate if no start can be made stable.
+def searched(
+    peaks: Peaks,
+    settings: Settings,
+    start: np.ndarray,
+    lost: Lost,
+    tell: Tell,
+    before: Progress | None = None,
+    save: Callable[[Progress], None] = lambda now: None,
+) -> Progress:
+    """Return the result of the search.
 
     From each start, BFGS reduces the largest growth rate until the machine is stable, then the peak. `lost`: number of
-    members that are lost, or beyond a limit of their simulation, at coordinates [m].
+    members that are lost, or beyond a limit of their simulation, at coordinates [m]. `before`: the search so far, which
+    continues. `save`: receives it after each start.
     """
     rng, space, first = np.random.default_rng(settings.seed), settings.space.space, settings.space.space.encode(start)
-    end = time.monotonic() + 60 * (settings.minutes if math.isfinite(settings.minutes) else MINUTES)
-    slowest = Value(first, math.inf, np.zeros(len(first)))
-    best, fewest = slowest, math.inf
-    over: Over = lambda _: time.monotonic() > end  # noqa: E731
-    for number in range(settings.starts):
+    none = Value(first, math.inf, np.zeros(len(first)))
+    now = before or Progress(0, none, math.inf, none, 0.0)
+    began, minutes = time.monotonic() - now.seconds, settings.minutes if math.isfinite(settings.minutes) else MINUTES
+    over: Over = lambda _: time.monotonic() - began > 60 * minutes  # noqa: E731
+    rng.normal(size=(now.number, len(first)))  # the draws of the starts before
+    for number in range(now.number, settings.starts):
+        _, best, fewest, slowest, _ = now
+        if number and over(best):
+            break
         near = number % 2 == 1 and math.isfinite(best.f)
         centre, size = (best.x, NEAR) if near else (first, FAR if number else 0.0)
         held = _stabilised(peaks, space.drawn_back(centre + size * rng.normal(size=len(first))), settings, over)
@@ -55,12 +69,12 @@ def searched(peaks: Peaks, settings: Settings, start: np.ndarray, lost: Lost, te
             if fewest or path[-1].f < best.f:
                 low, count = _kept(peaks, path, settings, lost, over)
                 best, fewest = (low, count) if (count, low.f) < (fewest, best.f) else (best, fewest)
+        now = Progress(number + 1, best, fewest, slowest, time.monotonic() - began)
+        save(now)
         found = f"best peak {math.exp(best.f):.4g}" if math.isfinite(best.f) else f"growth rate {slowest.f:.3g} 1/s"
-        found += f", {fewest} members lost or beyond the limits" if 0 < fewest < math.inf else ""
+        found += f", {fewest:g} members lost or beyond the limits" if 0 < fewest < math.inf else ""
         tell(f"start {number + 1} of {settings.starts}: {found}")
-        if over(best):
-            break
-    return best if math.isfinite(best.f) else slowest
+    return now
 
 
 def _stabilised(peaks: Peaks, x: np.ndarray, settings: Settings, over: Over) -> Value:

@@ -11,20 +11,27 @@ import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, machine_from
 from ambjax.cases.machine_controller import kind_of
-from ambjax.cases.table import Table, one_line
+from ambjax.cases.table import Table, load, one_line
 from ambjax.cases.tune_table import BUDGET, NUMBERS
 from ambjax.extend import leaf
+from ambjax.host.extensions import NothingToTuneError
+from ambjax.host.sealed import flat, provenance
+from ambjax.results.machine_study import MachineStudy
 from ambjax.results.outputs import directory, files, plain, write_json
 from ambjax.text.web_page import render_page
 from tuning.events import Tell
 from tuning.machines.lqg_weights import LqgSpace, lqg_space
 from tuning.machines.machine_gains import MachineSpace, machine_space
 from tuning.machines.machine_peaks import Peaks
+from tuning.machines.machine_progress import save, saved
 from tuning.machines.machine_search import Settings, searched
 from tuning.machines.machine_verdict import LIMITS, judged, refused, report_text
+from tuning.problem.config import with_settings_of
+from tuning.report.record import KEY, REPORT, TUNED, record
 from tuning.report.tuned import tuned
+from tuning.solve.checkpoint import checkpoint
 
-WRITTEN = ("tuned.toml", "report.json", "report.md", "report.html")
+WRITTEN = (TUNED, REPORT, "report.md", "report.html")
 # Keys of [tune] and of [tune.limits] that a machine takes.
 KEYS, SIZES = ("gains", "bounds", "limits", "minutes"), ("seed", "starts", "iterations", "held_out")
 LIMIT: dataclasses.Field = leaf(above=0, at_most=1e12)
@@ -35,13 +42,26 @@ SEARCHED = 4
 NOT_JUDGED = "The tuned gains are not judged."
 
 
-class MachineTuning(NamedTuple):
-    """The result: the case with the tuned gains, whether all limits are met, report.json, and its directory."""
+class MachinePlan(NamedTuple):
+    """The checked input of the tuning of a machine.
+
+    `start`: initial gains [m]. `text`: of the case file. `record`: what a resumed search must match. `out`: directory.
+    `names`: the files that the tuning writes.
+    """
 
     case: MachineCase
-    good: bool
-    report: dict[str, Any]
-    directory: pathlib.Path
+    settings: Settings
+    start: np.ndarray
+    peaks: Peaks
+    text: str
+    record: dict[str, Any]
+    out: pathlib.Path
+    names: tuple[str, ...] = WRITTEN
+
+    def kept(self) -> MachineCase:
+        """Return the case of tuned.toml in `out`."""
+        raw, text = load(self.out / TUNED)
+        return machine_from(raw, self.case.name, text, self.case.folder)
 
 
 def settings_from(raw: dict[str, Any], case: MachineCase) -> Settings:
@@ -54,7 +74,9 @@ def settings_from(raw: dict[str, Any], case: MachineCase) -> Settings:
     sizes = {name: own.whole(name, BUDGET[name]) for name in SIZES}
     lqg = kind_of(raw) == "lqg"
     if case.machine.law is not None and not lqg:
-        raise ValueError("[tune]: one law commands all axes of this machine; only an LQG and laws of axes are tuned.")
+        raise NothingToTuneError(
+            "[tune]: one law commands all axes of this machine; only an LQG and laws of axes are tuned."
+        )
     return Settings(
         (lqg_space if lqg else machine_space)(own, case, raw),
         {"sensitivity": float(case.zones.zone_a)} | thresholds,
@@ -66,46 +88,17 @@ def settings_from(raw: dict[str, Any], case: MachineCase) -> Settings:
     )
 
 
-def tune_machine(
-    path: str, out: str | None, force: bool, minutes: float | None, tell: Tell, loaded: tuple[dict[str, Any], str]
-) -> MachineTuning:
-    """Tune the machine of a case file and write tuned.toml and the report. Raises ValueError for invalid input.
+def machine_plan(
+    path: str, out: str | None, minutes: float | None, settings_of: str | None, loaded: tuple[dict[str, Any], str]
+) -> MachinePlan:
+    """Return the checked input, and make the directory `out`. Raises ValueError for invalid input.
 
-    `loaded`: document and text of the file.
+    `settings_of`: a case file whose [tune] replaces that of the case, except for gains and bounds. `loaded`: document
+    and text of the file.
     """
-    case, settings, start, peaks = _checked(path, minutes, loaded)
-    place, own = directory(out, f"tune-{case.name}", WRITTEN, force), settings.space
-
-    def case_at(x: np.ndarray, verdict: str = NOT_JUDGED) -> MachineCase:
-        return _written(case, loaded[1], own, _gains(own, x), verdict)
-
-    def refused_at(x: np.ndarray) -> int:  # other members than those of the judgement
-        return refused(case_at(x), settings.limits, settings.seed + 1, min(settings.held_out, SEARCHED))
-
-    speeds = ", ".join(f"{speed:g}" for speed in case.speeds)
-    tell(f"tuning {', '.join(own.space.paths)} for the least peak of |S| at {speeds} rpm")
-    best = searched(peaks, settings, start, refused_at, tell)
-    found = case_at(best.x)
-    with files(place) as part:
-        (part / "tuned.toml").write_text(found.text, encoding="utf-8")
-    tell(f"simulating {settings.held_out} members with the tuned gains")
-    facts = judged(case, found, settings.limits, settings.seed, settings.held_out)
-    facts["gains"] = [
-        {"path": one.path, "before": a, "after": b, "at_bound": one.at_bound(b)}
-        for one, a, b in zip(own.space.gains, start.tolist(), _gains(own, best.x), strict=True)
-    ]
-    found = case_at(best.x, facts["verdict"])
-    _put(place, found.text, facts)
-    return MachineTuning(found, facts["outcome"]["good"], plain(facts), place)
-
-
-def _checked(
-    path: str, minutes: float | None, loaded: tuple[dict[str, Any], str]
-) -> tuple[MachineCase, Settings, np.ndarray, Peaks]:
-    """Return the case, its settings, its gains [m], and the peaks. Raises ValueError for invalid input."""
-    raw, text = loaded
-    file = pathlib.Path(path)
+    file, text = pathlib.Path(path), loaded[1]
     try:
+        raw = with_settings_of(loaded[0], settings_of)
         case = machine_from(raw, file.stem, text, file.parent)
         settings = settings_from(raw, case)
         if minutes is not None:
@@ -113,9 +106,42 @@ def _checked(
         start = settings.space.values(case)
         settings.space.space.encode(start)
         # the default of a gain may depend on whether another one is given
-        return case, settings, start, Peaks(_written(case, text, settings.space, start.tolist()), settings.space)
+        peaks = Peaks(_written(case, text, settings.space, start.tolist()), settings.space)
     except ValueError as why:
-        raise ValueError(one_line(f"{path}: {why}")) from None
+        kind = NothingToTuneError if isinstance(why, NothingToTuneError) else ValueError
+        raise kind(one_line(f"{path}: {why}")) from None
+    record = {"case": raw, "study": MachineStudy(case, 0, 1).fingerprint()}
+    place = directory(out, f"tune-{case.name}", WRITTEN, force=True)
+    return MachinePlan(case, settings, start, peaks, text, record, place)
+
+
+def tune_machine(plan: MachinePlan, resume: bool, tell: Tell) -> tuple[MachineCase, dict[str, Any]]:
+    """Tune a machine and write tuned.toml and the report. Return the tuned case and report.json."""
+    case, settings, own, path = plan.case, plan.settings, plan.settings.space, plan.out / checkpoint(1)
+
+    def case_at(x: np.ndarray, verdict: str = NOT_JUDGED) -> MachineCase:
+        return _written(case, plan.text, own, _gains(own, x), verdict)
+
+    def refused_at(x: np.ndarray) -> int:  # other members than those of the judgement
+        return refused(case_at(x), settings.limits, settings.seed + 1, min(settings.held_out, SEARCHED))
+
+    speeds = ", ".join(f"{speed:g}" for speed in case.speeds)
+    tell(f"tuning {', '.join(own.space.paths)} for the least peak of |S| at {speeds} rpm")
+    facts = flat({**provenance(), **plan.record})
+    before = saved(path, facts, tell) if resume else None
+    found = searched(plan.peaks, settings, plan.start, refused_at, tell, before, lambda now: save(path, facts, now))
+    x = found.answer.x
+    with files(plan.out) as part:
+        (part / TUNED).write_text(case_at(x).text, encoding="utf-8")
+    tell(f"simulating {settings.held_out} members with the tuned gains")
+    report = judged(case, case_at(x), settings.limits, settings.seed, settings.held_out)
+    report["gains"] = [
+        {"path": one.path, "before": a, "after": b, "at_bound": one.at_bound(b)}
+        for one, a, b in zip(own.space.gains, plan.start.tolist(), _gains(own, x), strict=True)
+    ]
+    tuned_case = case_at(x, report["verdict"])
+    _put(plan, tuned_case.text, report, complete=found.number == settings.starts)
+    return tuned_case, plain(report)
 
 
 def _gains(space: MachineSpace | LqgSpace, x: np.ndarray) -> list[float]:
@@ -131,11 +157,11 @@ def _written(
     return machine_from(tomllib.loads(text), case.name, text, case.folder)
 
 
-def _put(place: pathlib.Path, text: str, facts: dict[str, Any]) -> None:
-    """Write the case with the tuned gains and the report."""
-    words = report_text(facts)
-    with files(place) as part:
-        (part / "tuned.toml").write_text(text, encoding="utf-8")
-        write_json(part / "report.json", facts)
+def _put(plan: MachinePlan, text: str, report: dict[str, Any], complete: bool) -> None:
+    """Write the case with the tuned gains and the report. `complete`: whether no start is left."""
+    words = report_text(report)
+    with files(plan.out) as part:
+        (part / TUNED).write_text(text, encoding="utf-8")
+        write_json(part / REPORT, report | ({KEY: record(plan.record, part)} if complete else {}))
         (part / "report.md").write_text(words, encoding="utf-8")
-        (part / "report.html").write_text(render_page(words, {}, f"Tuning of {facts['case']}"), encoding="utf-8")
+        (part / "report.html").write_text(render_page(words, {}, f"Tuning of {report['case']}"), encoding="utf-8")

@@ -103,17 +103,22 @@ def read_tune(
     """
     raw, text = loaded or load(path)
     name = pathlib.Path(path).stem
-    if settings_of is not None:
-        own, other = raw.get("tune", {}), load(settings_of)[0].get("tune", {})
-        if isinstance(own, dict) and isinstance(other, dict):
-            kept = {key: value for key, value in own.items() if key in KEYS_OF_LAWS}
-            raw = {**raw, "tune": {key: other[key] for key in other if key not in KEYS_OF_LAWS} | kept}
+    raw = with_settings_of(raw, settings_of)
     try:
         case = case_from(raw, name, text, pathlib.Path(path).parent)
         return case, tune_from(Table(raw).table("tune"), case), raw
     except ValueError as error:
         kind = NothingToTuneError if isinstance(error, NothingToTuneError) else ValueError
         raise kind(one_line(f"{path}: {error}")) from None
+
+
+def with_settings_of(raw: dict[str, Any], settings_of: str | pathlib.Path | None) -> dict[str, Any]:
+    """Return a document with [tune] of another case file, but its own gains and bounds. None: there is no other."""
+    own, other = raw.get("tune", {}), {} if settings_of is None else load(settings_of)[0].get("tune", {})
+    if settings_of is None or not (isinstance(own, dict) and isinstance(other, dict)):
+        return raw
+    kept = {key: value for key, value in own.items() if key in KEYS_OF_LAWS}
+    return {**raw, "tune": kept | {key: value for key, value in other.items() if key not in KEYS_OF_LAWS}}
 
 
 def tune_from(table: Table, case: Case) -> Tune:
