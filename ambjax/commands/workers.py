@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import pickle
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from typing import Any
@@ -72,11 +73,11 @@ Results = Iterator[tuple[tuple[int, int], dict[str, Any]]]
 
 
 def _run_on(study: AnyStudy, store: Store, missing: list[tuple[int, int]], pool: Executor, ahead: int) -> Results:
-    queue, running = list(reversed(missing)), dict[Future, tuple[int, int]]()
+    queue, running, sent = list(reversed(missing)), dict[Future, tuple[int, int]](), pickle.dumps(study)
     while queue or running:
         while queue and len(running) < ahead:
             span = queue.pop()
             with ignore_sigint():
-                running[pool.submit(work, study, *span, store.chunk)] = span
+                running[pool.submit(work, sent, *span, store.chunk)] = span
         for future in wait(running, return_when=FIRST_COMPLETED).done:
             yield running.pop(future), future.result()
