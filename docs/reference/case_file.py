@@ -60,7 +60,7 @@ WORDS = {
     "controller.model": "Parameters of the controller's model that differ from the plant: any key of `[plant]`.",
     "rotor": "The speed of the rotor. Unbalance, runout and the notch of the controller share its angle. Default: the "
     "rotor does not turn. See [once per revolution](../loads.md#once-per-revolution). With `kind`, the table describes "
-    "the rotor of a [whole machine](../machine.md).",
+    "the rotor of a [whole machine](../machine-reference.md).",
     "controller.notch": "The synchronous notch: it removes the speed of `[rotor]` from the current or from z. Default: "
     "no notch. See [once per revolution](../loads.md#notch).",
     "processor": "The processor of the controller: all laws make one step per sample. Their voltage acts after "
