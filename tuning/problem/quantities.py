@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -34,14 +35,6 @@ class LimitContext:
     touchdown: float
     band: float
     rotor: Rotation | None = None
-
-
-def _once(name: str) -> Callable[[LimitContext, float], Fold]:
-    def fold(context: LimitContext, threshold: float) -> Fold:
-        assert context.rotor is not None
-        return OneOf(Orders(context.rotor, context.settle), name=name)
-
-    return fold
 
 
 def pooled(values: Array) -> Array:
@@ -80,11 +73,11 @@ class Kind:
 
     unit: str
     words: str
-    over: str
     fold: Callable[[LimitContext, float], Fold] | None
     exact: str | None
+    over: str
     tuned: Callable[[Any], Any]
-    judged: Callable[[np.ndarray], Any]
+    judged: Callable[[Any], Any]
     margin: float
     """default margin"""
     worst: bool = False
@@ -93,103 +86,67 @@ class Kind:
     """whether the limit is a lower one"""
 
 
-_POOLED = {"over": "root mean square over members", "tuned": pooled, "judged": pooled, "margin": MEAN_MARGIN}
-_MEAN = {"over": "mean over members", "tuned": jnp.mean, "judged": np.mean, "margin": MEAN_MARGIN}
-_WORST = {"over": "of the worst member", "tuned": largest, "judged": np.max, "margin": WORST_MARGIN, "worst": True}
-_LOOP = _WORST | {"tuned": worst_loop, "fold": None, "exact": None, "margin": LOOP_MARGIN}
+def _once(name: str) -> Callable[[LimitContext, float], Fold]:
+    def fold(case: LimitContext, threshold: float) -> Fold:
+        assert case.rotor is not None
+        return OneOf(Orders(case.rotor, case.settle), name=name)
+
+    return fold
+
+
+def _coils(case: LimitContext, threshold: float) -> Fold:
+    return LargestOf(Named({name: Rms(name, case.settle, driven=True) for name in ("i_1", "i_2")}))
+
+
+def _chatter(case: LimitContext, threshold: float) -> Fold:
+    return Scaled(Variation(case.settle), case.duration - case.settle)
+
+
+_mean = partial(Kind, over="mean over members", tuned=jnp.mean, judged=np.mean, margin=MEAN_MARGIN)
+_pooled = partial(Kind, over="root mean square over members", tuned=pooled, judged=pooled, margin=MEAN_MARGIN)
+_worst = partial(Kind, over="of the worst member", tuned=largest, judged=np.max, margin=WORST_MARGIN, worst=True)
+_loop = partial(_worst, fold=None, exact=None, tuned=worst_loop, margin=LOOP_MARGIN)
+_least = partial(_loop, tuned=smallest_loop, judged=np.min, at_least=True)
 
 KINDS: dict[str, Kind] = {
-    "rms_error_m": Kind(
-        "m",
-        "root mean square of z - r from run.settle on",
-        fold=lambda context, threshold: Rms("e_z", context.settle),
-        exact="settled_rms_error_m",
-        **_POOLED,
+    "rms_error_m": _pooled(
+        "m", "root mean square of z - r from run.settle on",
+        lambda case, _: Rms("e_z", case.settle), "settled_rms_error_m",
     ),
-    "rms_u_V": Kind(
-        "V",
-        "root mean square voltage from run.settle on",
-        fold=lambda context, threshold: Driven("u_squared", context.settle, root=True),
-        exact="settled_rms_u_V",
-        **_POOLED,
+    "rms_u_V": _pooled(
+        "V", "root mean square voltage from run.settle on",
+        lambda case, _: Driven("u_squared", case.settle, root=True), "settled_rms_u_V",
     ),
-    "max_u_V": Kind(
-        "V",
-        "largest voltage of the run",
-        fold=lambda context, threshold: Typical("u_peak", threshold),
-        exact="max_abs_u_V",
-        **_WORST,
+    "max_u_V": _worst("V", "largest voltage of the run", lambda case, most: Typical("u_peak", most), "max_abs_u_V"),
+    "max_abs_i_A": _worst("A", "largest current of the run", lambda case, _: Peak("i"), "max_abs_i_A"),
+    "rms_coil_A": _worst(
+        "A", "root mean square current from run.settle on, bias included, of the coil where it is larger", _coils, None
     ),
-    "max_abs_i_A": Kind(
-        "A", "largest current of the run", fold=lambda context, threshold: Peak("i"), exact="max_abs_i_A", **_WORST
+    "chatter_V_per_s": _mean(
+        "V/s", "variation of the voltage, averaged over each sample, per second from run.settle on", _chatter, None
     ),
-    "rms_coil_A": Kind(
-        "A",
-        "root mean square current from run.settle on, bias included, of the coil where it is larger",
-        fold=lambda context, threshold: LargestOf(
-            Named({name: Rms(name, context.settle, driven=True) for name in ("i_1", "i_2")})
-        ),
-        exact=None,
-        **_WORST,
+    "largest_error_m": _worst(
+        "m", "largest |z - r| from run.settle on", lambda case, _: Peak("e_z", case.settle), "settled_max_abs_error_m"
     ),
-    "chatter_V_per_s": Kind(
-        "V/s",
-        "variation of the voltage, averaged over each sample, per second from run.settle on",
-        fold=lambda context, threshold: Scaled(Variation(context.settle), context.duration - context.settle),
-        exact=None,
-        **_MEAN,
+    "settling_s": _worst(
+        "s", "time of the run from which |z - r|, at the samples, stays within settling_band_m",
+        lambda case, _: Settling(case.band), None,
     ),
-    "largest_error_m": Kind(
-        "m",
-        "largest |z - r| from run.settle on",
-        fold=lambda context, threshold: Peak("e_z", context.settle),
-        exact="settled_max_abs_error_m",
-        **_WORST,
+    "overshoot_m": _worst(
+        "m", "largest distance of z, at the samples, beyond its initial value and the range of r so far",
+        lambda case, _: Overshoot(), None,
     ),
-    "settling_s": Kind(
-        "s",
-        "time of the run from which |z - r|, at the samples, stays within settling_band_m",
-        fold=lambda context, threshold: Settling(context.band),
-        exact=None,
-        **_WORST,
+    "clearance_used": _worst(
+        "", "largest |z| as a share of the clearance",
+        lambda case, _: Scaled(Peak("z"), case.touchdown), "clearance_used",
     ),
-    "overshoot_m": Kind(
-        "m",
-        "largest distance of z, at the samples, beyond its initial value and the range of r so far",
-        fold=lambda context, threshold: Overshoot(),
-        exact=None,
-        **_WORST,
+    "z_1x_m": _worst("m", "amplitude of z at the speed of [rotor], from run.settle on", _once("z_1x_m"), "z_1x_m"),
+    "i_1x_A": _worst(
+        "A", "amplitude of the current at the speed of [rotor], from run.settle on", _once("i_1x_A"), "i_1x_A"
     ),
-    "clearance_used": Kind(
-        "",
-        "largest |z| as a share of the clearance",
-        fold=lambda context, threshold: Scaled(Peak("z"), context.touchdown),
-        exact="clearance_used",
-        **_WORST,
-    ),
-    "z_1x_m": Kind(
-        "m",
-        "amplitude of z at the speed of [rotor], from run.settle on",
-        fold=_once("z_1x_m"),
-        exact="z_1x_m",
-        **_WORST,
-    ),
-    "i_1x_A": Kind(
-        "A",
-        "amplitude of the current at the speed of [rotor], from run.settle on",
-        fold=_once("i_1x_A"),
-        exact="i_1x_A",
-        **_WORST,
-    ),
-    "sensitivity_1x": Kind(
-        "", "|S| at the speed of [rotor], at the start and end of the run, of the loop at r = 0", **_LOOP
-    ),
-    "sensitivity": Kind("", "peak of |S| of the loop linearised at r = 0", **_LOOP),
-    "complementary": Kind("", "peak of |T| of the loop linearised at r = 0", **_LOOP),
-    "control_sensitivity": Kind("V/m", "peak of |KS| of the loop linearised at r = 0", **_LOOP),
-    "delay_margin_s": Kind(
-        "s",
-        "smallest additional delay that makes the loop, linearised at r = 0, unstable",
-        **_LOOP | {"tuned": smallest_loop, "judged": np.min, "at_least": True},
-    ),
-}
+    "sensitivity_1x": _loop("", "|S| at the speed of [rotor], at the start and end of the run, of the loop at r = 0"),
+    "sensitivity": _loop("", "peak of |S| of the loop linearised at r = 0"),
+    "complementary": _loop("", "peak of |T| of the loop linearised at r = 0"),
+    "control_sensitivity": _loop("V/m", "peak of |KS| of the loop linearised at r = 0"),
+    "delay_margin_s": _least("s", "smallest additional delay that makes the loop, linearised at r = 0, unstable"),
+}  # fmt: skip

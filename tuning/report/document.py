@@ -37,12 +37,10 @@ def _gains(facts: TuningFacts) -> list[str]:
         rows.append([row["path"], *gains, *ends, *bounds, row["at_bound"] or "-", _sensitivity(row, facts)])
     lines = ["## Gains", "", *markdown_table(head, rows), ""]
     words = (
-        "Last column: increase of the risk if this gain alone is larger or smaller by a factor of e^0.25 = 1.28. The "
-        "larger of the two increases is shown. Here the risk is that of the search of least error: it includes the "
-        "stressed members, but not the limits. A gain with a large "
-        "increase must be set accurately. If this change loses more members of the training ensemble than the "
-        "answer does, the column shows how many more. "
-        "`tune.bounds` sets other bounds."
+        "Last column: increase of the risk of least error, which includes the stressed members but not the limits, if "
+        "this gain alone is larger or smaller by a factor of e^0.25 = 1.28, whichever is worse. A gain with a large "
+        "increase must be set accurately. If members of the training ensemble are then also lost, the column shows "
+        "their number. `tune.bounds` sets other bounds."
     )
     sources = [f"- {row['path']}: {escape_markdown(row['source'])}" for row in facts.gains if row.get("source")]
     return [
