@@ -120,7 +120,8 @@ class Bowl:
         self._note("gradient", x, members)
         self.rollouts += len(x) * len(members.member) * x.shape[1]
         each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS))).T[:, :, None]
-        found = [outcomes(each, self._terms(x, members, j), members.stressed) for j in range(x.shape[1])]
+        names = sorted(self.objective.loss.measures)
+        found = [outcomes(each, self._terms(x, members, j), members.stressed, names) for j in range(x.shape[1])]
         slopes = np.stack([np.stack(one, -1).imag for one in found], -1) / TINY
         chaos = self.world.chaos * np.sign(np.sin(1e6 * np.asarray(x)))[:, None, None, :]
         return np.stack(found[0], -1).real, slopes + chaos, self._terms(x, members)

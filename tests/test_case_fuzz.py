@@ -135,7 +135,7 @@ TUNE = st.fixed_dictionaries(
     optional={
         "bounds": BOUNDS.map(lambda ends: {"controller": {"position": {"c": ends}}}),
         "weights": st.dictionaries(st.sampled_from(TERMS), st.floats(1e-6, 1e3), max_size=2),
-        "risk": st.sampled_from(["mean", "cvar", "soft-worst"]),
+        "risk": st.sampled_from(["mean", "cvar"]),
     }
     | {name: st.one_of(*[st.floats(0.1, 2.0)] * 19, number(field)) for name, field in TUNED.items()}
     | {name: st.integers(1, 100) for name in ("members", "held_out", "seed", "starts", "substeps")},

@@ -99,7 +99,7 @@ COMMANDS = {
     "ensemble": (
         ["ensemble", "case.toml", "--members", "4"],
         ("members.npz", "summary.json", "fan.png", "histograms.png"),
-    ),
+    )
 }
 # Commands for one of the cases. docs/start.md tunes a case with a processor, tests/test_compare.py compares two.
 CONTINUOUS = {"tune": (["tune", "case.toml"], ("tuned.toml", "history.npz", *REPORT))}

@@ -547,10 +547,7 @@ LAST = 'while [ "$1" != -o ]; do shift; done; '
 # Compilers, as scripts, with the message about each.
 COMPILERS = {
     "it is no program": ("\0", "the C compiler {cc} cannot be run (Exec format error)"),
-    "it compiles nothing": (
-        "#!/bin/sh\necho error: sick >&2; exit 1",
-        "{cc} cannot make a program that works (sick)",
-    ),
+    "it compiles nothing": ("#!/bin/sh\necho error: sick >&2; exit 1", "{cc} cannot make a program that works (sick)"),
     "nothing that it makes may run": (
         f'#!/bin/sh\ncc "$@" || exit 1; {LAST} chmod a-x "$2"',
         "the output of {cc} cannot be run in ",

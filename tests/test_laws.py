@@ -163,11 +163,7 @@ def test_output_is_finite_for_extreme_states(stage, law):
 
 
 SITE = SearchContext(
-    MODEL,
-    500.0,
-    1e-4,
-    {"Q_z": 0.1, "Q_i": 2.0, "Delta_1": 6e4},
-    LowerBound(6e4, "Delta_1", "along the reference"),
+    MODEL, 500.0, 1e-4, {"Q_z": 0.1, "Q_i": 2.0, "Delta_1": 6e4}, LowerBound(6e4, "Delta_1", "along the reference")
 )
 
 
@@ -408,8 +404,7 @@ def test_the_rates_of_the_demand_are_derivatives_along_the_nominal_solution(watc
         """
         motion = Measurement(x[0], x[1], x[2])
         state = cascade.init(motion)._replace(
-            observer=() if not has_state(watch) else x[3],
-            position=() if not has_state(law) else x[7],
+            observer=() if not has_state(watch) else x[3], position=() if not has_state(law) else x[7]
         )
         t = 0.1 + 30 * jnp.abs(x[4])
         _, _, rates = cascade.demand(motion, state, reference_at(reference, t))

@@ -98,7 +98,7 @@ SCIPY += ("ambjax.control.realisation", "ambjax.control.lqg", "ambjax.cases.cont
 
 @pytest.mark.parametrize("module", [m for m in MODULES if m.startswith("ambjax")])
 def test_ambjax_does_not_import_tuning(module):
-    # optax belongs to tuning; diffrax to benchmarks; scipy is imported where it is used
+    # optax is for losses of users; diffrax belongs to benchmarks; scipy is imported where it is used
     roots = {name.split(".")[0] for name in imports(module)}
     at_once = {name.split(".")[0] for name in imports(module, top_level=True)}
     assert not roots & {"tuning", "optax", "diffrax", "ross", "equinox"}

@@ -12,16 +12,7 @@ from ambjax import Cascade, Clock, Scenario
 from ambjax.compiler.short_compilation import QUICKEST, supported
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.processor import Processor
-from ambjax.linear import (
-    StateSpace,
-    Zones,
-    analyse,
-    linearise,
-    loop_quantities,
-    margins_of,
-    noise_gain,
-    peak,
-)
+from ambjax.linear import StateSpace, Zones, analyse, linearise, loop_quantities, margins_of, noise_gain, peak
 from ambjax.linear.equilibrium import ideal
 from ambjax.plants import Plant
 from ambjax.sensors import Sensor

@@ -16,6 +16,7 @@ from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.rotor_numbers import rotor_places, varied_rotor
 from ambjax.cases.template_text import template
 from ambjax.commands import comparison_tuning
+from ambjax.ensemble import worker
 from ambjax.ensemble.worker import chunk
 from ambjax.host.extensions import NothingToTuneError
 from ambjax.linear import machine_sensitivity
@@ -77,8 +78,6 @@ def test_draws():
     assert "bearing.left.y.plant.R" not in drawn
     # the processor is common to all axes
     assert [path for path in drawn if path.endswith("delay")] == ["processor.delay"]
-    # worker processes receive the study
-    assert pickle.loads(pickle.dumps(study)).fingerprint() == study.fingerprint()
 
 
 @pytest.mark.slow  # compiles the linear loop
@@ -97,6 +96,22 @@ def test_numbers_of_the_notches():
     assert float(member.cases[3].cascade.notch.rate) == rates["right.y"][7]
     with pytest.raises(ValueError, match=r"spread.controller.notch.rate.*no such number"):
         case(rate)
+
+
+def test_a_worker_process_receives_a_machine_in_double_precision(monkeypatch):
+    study = study_of(case(SPREAD), 3, 8)
+    sent = pickle.dumps(study)
+    monkeypatch.delenv("JAX_ENABLE_X64", raising=False)
+    monkeypatch.setattr(worker, "chunk", lambda study, *_, **__: study)
+    jax.config.update("jax_enable_x64", False)
+    try:
+        found = worker.work(sent, 0, 8, 8)
+    finally:
+        jax.config.update("jax_enable_x64", True)
+    assert found.fingerprint() == study.fingerprint()
+    assert {path: list(x) for path, x in found.drawn(np.arange(8)).items()} == {
+        path: list(x) for path, x in study.drawn(np.arange(8)).items()
+    }
 
 
 @pytest.mark.slow  # compiles the rollout of the ensemble and that of one machine

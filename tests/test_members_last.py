@@ -44,12 +44,7 @@ def every_rule(tree: dict[str, jax.Array]) -> dict[str, jax.Array]:
 
 def test_members_last_equals_vmap_for_all_kinds_of_primitives():
     rng = np.random.default_rng(0)
-    tree = {
-        "x": rng.normal(size=(5, 3)),
-        "y": rng.normal(size=5),
-        "A": rng.normal(size=(3, 3)),
-        "n": np.arange(5) % 3,
-    }
+    tree = {"x": rng.normal(size=(5, 3)), "y": rng.normal(size=5), "A": rng.normal(size=(3, 3)), "n": np.arange(5) % 3}
     axes = {"x": 0, "y": 0, "A": None, "n": 0}
     expected = jax.vmap(every_rule, (axes,))(tree)
     found = jax.jit(members_last(every_rule, axes))(tree)

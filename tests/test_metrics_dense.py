@@ -99,10 +99,7 @@ SLOW = {"adaptive": [name for name in LOOPS if name not in SLIDING], "sliding": 
     ("name", "method"),
     [
         pytest.param(
-            name,
-            method,
-            id=f"{name}-{said}",
-            marks=pytest.mark.slow if name in SLOW[said] else pytest.mark.thorough,
+            name, method, id=f"{name}-{said}", marks=pytest.mark.slow if name in SLOW[said] else pytest.mark.thorough
         )
         for name in LOOPS
         for said, method in (("adaptive", AdaptiveRodas3()), ("sliding", Slide(3 * REFINEMENT)))

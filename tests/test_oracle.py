@@ -107,10 +107,7 @@ DROPS = [
     (-1.15e-3, 2.5e6, 1e-2, smc(17.0, 10.0, 50.0), current(152.0, 10.0), sine(2.5e-3, 4.0)),
     (6.5e-4, 8e8, 2.5e-3, twisting(17.0, 30.0, 50.0, 25.0), pi(), REST, 400.0),
 ]
-CASES += [
-    Case("drop 1", drop(*DROPS[0]), samples=1000),
-    SLOW(Case("drop 2", drop(*DROPS[1]), samples=1000)),
-]
+CASES += [Case("drop 1", drop(*DROPS[0]), samples=1000), SLOW(Case("drop 2", drop(*DROPS[1]), samples=1000))]
 
 
 def in_ambjax(case):

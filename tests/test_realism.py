@@ -275,10 +275,7 @@ def test_the_step_is_small_enough_for_the_ends_of_an_amplifier_s_spread():
     ).clock.method == amb.solvers.RK4(5)
 
 
-@pytest.mark.parametrize(
-    ("table", "loud"),
-    [({"std": 1e-6}, True), ({"std_z_dot": 1e-4}, False), (None, True)],
-)
+@pytest.mark.parametrize(("table", "loud"), [({"std": 1e-6}, True), ({"std_z_dot": 1e-4}, False), (None, True)])
 def test_a_velocity_measured_without_error_causes_a_warning(table, loud):
     raw = CASE | ({} if table is None else {"sensor": table})
     assert any("VELOCITY" in line for line in warnings_of(case_from(raw))) == loud

@@ -92,12 +92,7 @@ CASES = [
     Case("closed form, explicit", World(**EXPLICIT | CLOSED), 2000),
 ]
 # The fast tests; each law, part and delay stands in a case of the fast or slow tests.
-FAST = {
-    "explicit",
-    "a real position sensor",
-    "Kalman under noise",
-    "closed form, explicit",
-}
+FAST = {"explicit", "a real position sensor", "Kalman under noise", "closed form, explicit"}
 
 
 def record_of(kinds, given, *more):
@@ -144,10 +139,7 @@ def how_slow(name):
 
 
 # The plant's integration is what differs: DOP853 at 1e-12 against the package's RK4.
-@pytest.mark.parametrize(
-    "case",
-    [pytest.param(case, id=case.name, marks=how_slow(case.name)) for case in CASES],
-)
+@pytest.mark.parametrize("case", [pytest.param(case, id=case.name, marks=how_slow(case.name)) for case in CASES])
 def test_sampled_loops_agree_with_the_independent_simulator(case):
     cascade, scenario, clock = loop_of(case.world, case.samples, case.std)
     rows = amb.rollout(cascade, scenario, clock).trajectory.rows

@@ -25,7 +25,7 @@ from tuning.problem.config import LimitSettings, settings
 from tuning.problem.lanes import Engine
 from tuning.problem.limits import PENALTY, Limit, measures
 from tuning.problem.quantities import KINDS, LimitContext, largest
-from tuning.problem.risk import Mean
+from tuning.problem.risk import CVaR
 from tuning.problem.tuning_problem import REFINEMENT, problem_of
 from tuning.report import limit_table, sensitivity_table
 from tuning.report.limit_table import MORE
@@ -252,7 +252,7 @@ def test_the_penalty_of_a_limit_is_that_of_an_augmented_lagrangian():
 
 
 @dataclasses.dataclass(frozen=True)
-class Counting(Mean):
+class Counting(CVaR):
     """Return the mean, and count the traces of this function."""
 
     traces = 0

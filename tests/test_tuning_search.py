@@ -26,7 +26,7 @@ from tuning.problem.lanes import Engine
 from tuning.problem.loss import TERMS, loss_for, weigh
 from tuning.problem.members import Objective
 from tuning.problem.ranges import ranges
-from tuning.problem.risk import CVaR, Mean
+from tuning.problem.risk import CVaR
 from tuning.problem.space import Gain, Space
 from tuning.problem.tuning_problem import problem_of
 from tuning.solve.checkpoint import CheckpointFile
@@ -189,7 +189,7 @@ def small(engines):
     """A search of the problem whose programs are compiled already."""
     problem = engines[0].objective
     engine = Engine(problem, settle=0.002, threads=2)
-    goal = Goal((1.0, 0.0, 0.0, 0.0, 1e-3, 1.0), Mean())
+    goal = Goal((1.0, 0.0, 0.0, 0.0, 1e-3, 1.0), CVaR())
     return engine, goal, problem.training(3, 4, 1, 1.2, 1.25), SPACE.values(CASCADE)
 
 
@@ -326,9 +326,9 @@ def test_ctrl_c_keeps_the_best_gains(small):
 
 def test_steps_that_are_not_finite_are_skipped(small):
     _, goal, *_ = small
-    descent, slopes, on = Descent(goal), jnp.ones((1, 4, 1, 4)), jnp.ones(1, bool)
-    good = descent(4, begin(jnp.zeros((1, 4))), jnp.ones((1, 4, 1)), slopes, on)
-    bad = descent(4, good, jnp.full((1, 4, 1), jnp.nan), slopes, on)
+    descent, slopes = Descent(goal), jnp.ones((1, 4, 1, 4))
+    good = descent(4, begin(jnp.zeros((1, 4))), jnp.ones((1, 4, 1)), slopes)
+    bad = descent(4, good, jnp.full((1, 4, 1), jnp.nan), slopes)
     for name in ("best", "value", "gradient", "inverse"):
         np.testing.assert_array_equal(getattr(bad, name), getattr(good, name))
     # a quarter of the rejected step

@@ -158,7 +158,7 @@ def searched(engine, goal, members, points, **rest):
     x, value = np.array(points[:1]), np.zeros(1)
     starts = begin(x)
     rows = {"x": [x[0]], "value": [value[0]], "lost": [np.array(0)], "members": [np.array(len(members.member))]}
-    return SearchState(starts, np.zeros(1, bool), rows)
+    return SearchState(starts, rows, converged=True)
 
 
 def every_member_is_held(study, x, members):

@@ -29,7 +29,6 @@ from tuning.report.record import KEY, REPORT, TUNED, ended, record, search_facts
 from tuning.report.tuned import tuned_case
 from tuning.rounds import rounds
 from tuning.solve.checkpoint import can_resume, checkpoint, has_unfinished_search, mark_directory, remove_all
-from tuning.solve.course import SearchResult
 
 WRITTEN = (TUNED, "history.npz", "report.html", "report.md", "report.json")
 # Verdict in tuned.toml until the gains are judged.
@@ -194,7 +193,12 @@ def _tune(plan: TuningPlan, path: str, listen: Listener) -> TunedCase:
     The answer is written before it is judged. If it cannot be judged, it is not good, and there is no report.
     """
     options, tell = plan.options, teller(listen)
-    answer = _searched(plan, listen)
+    problem, tune = plan.problem, plan.problem.tune
+    method = problem.objective.clock.method
+    tell(f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {method}")
+    if zero := off(problem.case.cascade):
+        tell(f"not tuned, because they are 0 in the case, which switches their terms off: {', '.join(zero)}")
+    answer = rounds(problem, plan.start, plan.out, plan.facts, options.resume, listen)
     with files(plan.out) as part:
         case = put_answer(part, plan.out, answer, NOT_JUDGED)
     facts = described("the judgement of the tuned gains", lambda: examined(answer, options.pareto, tell))
@@ -213,17 +217,6 @@ def _tune(plan: TuningPlan, path: str, listen: Listener) -> TunedCase:
         if options.page:
             described(NAME, lambda: put_page(part, answer.problem.case, path))
     return TunedCase(case, facts.outcome["good"], plain(table), plan.out)
-
-
-def _searched(plan: TuningPlan, listen: Listener) -> SearchResult:
-    """Search and return the result."""
-    problem, tune, tell = plan.problem, plan.problem.tune, teller(listen)
-    tell(
-        f"tuning {', '.join(tune.space.paths)} on {tune.budget.members} members; step: {problem.objective.clock.method}"
-    )
-    if zero := off(problem.case.cascade):
-        tell(f"not tuned, because they are 0 in the case, which switches their terms off: {', '.join(zero)}")
-    return rounds(problem, plan.start, plan.out, plan.facts, plan.options.resume, listen)
 
 
 def _clear(out: pathlib.Path, force: bool) -> None:

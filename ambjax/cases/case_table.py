@@ -1,7 +1,8 @@
-"""The parts of a case and their numbers as rows of a table, for notebooks."""
+"""Tables for notebooks: that of the parts of a case and their numbers, and of results."""
 
 import dataclasses
 import html
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,12 @@ def _shown(value: Any) -> str:
 def case_table(name: str, parts: dict[str, str], spread: tuple[str, ...]) -> str:
     """Return an HTML table of the parts of a case called `name`. `spread`: paths of the quantities of its spread."""
     shown = parts | ({"spread": ", ".join(spread)} if spread else {})
-    rows = "".join(f"<tr><td>{part}</td><td>{html.escape(words)}</td></tr>" for part, words in shown.items())
-    titles = "<tr><th>part</th><th>numbers</th></tr>"
-    return f"<table><caption>{html.escape(name)}</caption>{titles}{rows}</table>"
+    return notebook_table(name, ("part", "numbers"), shown.items())
+
+
+def notebook_table(caption: str, titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return an HTML table of escaped texts. Without rows, it has its caption only."""
+    cells = lambda row, kind: "".join(f"<{kind}>{html.escape(x)}</{kind}>" for x in row)  # noqa: E731
+    lines = [cells(row, "td") for row in rows]
+    lines = [f"<tr>{line}</tr>" for line in ([cells(titles, "th"), *lines] if lines else [])]
+    return f"<table><caption>{html.escape(caption)}</caption>{''.join(lines)}</table>"

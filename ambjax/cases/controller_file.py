@@ -2,13 +2,13 @@
 
 import contextlib
 import pathlib
-import zipfile
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from ambjax.cases.own_laws import path_from
+from ambjax.cases.recordings import npz_arrays
 from ambjax.cases.table import Table, show
 from ambjax.control.linear_controller import state_space_of
 from ambjax.control.realisation import Realisation, realisation
@@ -70,7 +70,7 @@ def read_controller(path: pathlib.Path) -> dict[str, np.ndarray]:
 def arrays_of(path: pathlib.Path) -> dict[str, np.ndarray]:
     """Return the arrays of an .npz or .mat file. Raises ValueError if it cannot be read."""
     try:
-        return _of_npz(path) if path.suffix == ".npz" else _of_mat(path)
+        return npz_arrays(path) if path.suffix == ".npz" else _of_mat(path)
     except OSError as error:
         why = error.strerror or "is it a file?"
         raise ValueError(f"{path} cannot be read ({why}). A path is relative to the folder of the case file.") from None
@@ -78,14 +78,6 @@ def arrays_of(path: pathlib.Path) -> dict[str, np.ndarray]:
 
 def _needed() -> str:
     return "the arrays A, B, C, D and, for a discrete controller, dt in s"
-
-
-def _of_npz(path: pathlib.Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path) as file:
-            return {name: file[name] for name in file.files}
-    except (ValueError, TypeError, EOFError, AttributeError, zipfile.BadZipFile):  # no archive, or pickled objects
-        raise ValueError("not an .npz file of plain numbers. Write it with numpy.savez.") from None
 
 
 def _of_mat(path: pathlib.Path) -> dict[str, np.ndarray]:

@@ -79,11 +79,7 @@ def processor_from(table: Table) -> Processor:
 
 
 def cascade_from(
-    top: Table,
-    plant: Bearing,
-    processor: Processor | None,
-    period: Scalar | None,
-    files: Files,
+    top: Table, plant: Bearing, processor: Processor | None, period: Scalar | None, files: Files
 ) -> tuple[Cascade, tuple[OwnLaw, ...], ControllerFile | None]:
     """Return the cascade of the [controller] tables, its custom laws, and the file of its linear controller or None.
 
@@ -196,8 +192,4 @@ def _schedule(table: Table) -> Schedule:
 def _numbers(table: Table, key: str) -> tuple[float, ...]:
     if key not in table.raw:
         raise ValueError(f"{table.at(key)} is missing: a schedule is a table such as {EXAMPLE}.")
-    values = table.raw[key]
-    if not isinstance(values, list):
-        raise ValueError(f"{table.at(key)} = {show(values)}: it must be a list of numbers, as in {EXAMPLE}.")
-    each = Table({str(n): x for n, x in enumerate(values)}, table.at(key))
-    return tuple(each.number(str(n), None) for n in range(len(values)))
+    return tuple(table.column(key, f"a list of numbers, as in {EXAMPLE}"))

@@ -39,9 +39,10 @@ from ambjax.linear.notch_design import with_machine_gains
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
+from ambjax.simulation.machine_kinds import machine_of
 from ambjax.simulation.method import ACCURATE, TOUCHED, slopes
 from ambjax.simulation.rollout import prepare
-from ambjax.simulation.whole_machine import Machine, machine_of
+from ambjax.simulation.whole_machine import Machine
 from ambjax.text.words import one_line
 from ambjax.world.rotor import Rotor
 from ambjax.world.scenario import Scenario

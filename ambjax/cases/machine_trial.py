@@ -6,7 +6,8 @@ import jax
 
 from ambjax.control.law_trial import same_shapes
 from ambjax.numerics.records import canonical
-from ambjax.simulation.whole_machine import Machine, SampledMachine
+from ambjax.simulation.machine_kinds import SampledMachine
+from ambjax.simulation.whole_machine import Machine
 
 
 def try_machine(machine: Machine) -> None:

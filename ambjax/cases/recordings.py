@@ -174,12 +174,13 @@ def _float(cell: str, comma: bool) -> float | None:
         return None
 
 
-def _npz(file: pathlib.Path) -> dict[str, np.ndarray]:
+def npz_arrays(file: pathlib.Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an .npz file. Raises ValueError for another one, or for pickled objects."""
     try:
         with np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
-    except (ValueError, TypeError, zipfile.BadZipFile, EOFError):  # TypeError: an array of numpy.save
-        raise ValueError("it is not an npz file of numbers. Write it with numpy.savez.") from None
+    except (ValueError, TypeError, AttributeError, zipfile.BadZipFile, EOFError):  # TypeError: an array of numpy.save
+        raise ValueError("it is not an .npz file of plain numbers. Write it with numpy.savez.") from None
 
 
 def _parquet(file: pathlib.Path) -> dict[str, np.ndarray]:
@@ -194,4 +195,4 @@ def _parquet(file: pathlib.Path) -> dict[str, np.ndarray]:
     return {name: table[name].to_numpy() for name in table.column_names}
 
 
-READERS = {".csv": _csv, ".tsv": _csv, ".txt": _csv, ".npz": _npz, ".parquet": _parquet}
+READERS = {".csv": _csv, ".tsv": _csv, ".txt": _csv, ".npz": npz_arrays, ".parquet": _parquet}

@@ -3,12 +3,12 @@
 import pathlib
 from functools import partial
 
-import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.controller_file import ENDINGS, arrays_of
 from ambjax.cases.rotor_body import DAMPING, MODES, RotorBody, dampings_of
 from ambjax.cases.table import Table, show
+from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.world.shaft import reduced
 
 MATRICES, TABLE, SHAPES = ("M", "K", "G", "nodes"), ("f_hz", "m", "It", "Ip", "zc"), "phi_"
@@ -22,6 +22,8 @@ PLANES = {4: ((0, 3), (1, 2)), 6: ((0, 4), (1, 3))}
 CLOSE = 0.1
 # Largest distance between a place and the one at which a modal table has shapes, as a share of its length.
 SAME = 1e-3
+
+_reduced = compiled_quickly(reduced, static_argnames=("rows", "modes"), options=QUICKEST)
 
 
 def body_of_file(table: Table, folder: pathlib.Path) -> RotorBody:
@@ -97,8 +99,7 @@ def _of_matrices(arrays: dict[str, np.ndarray], table: Table) -> RotorBody:
     modes = table.whole("modes", MODES)
     if modes > 2 * count - 2:
         raise ValueError(f"{count} nodes have {2 * count - 2} bending modes, and {table.at('modes')} = {modes}.")
-    rows = list(range(2 * count))
-    model = reduced(jnp.asarray(own["M"]), jnp.asarray(own["G"]), jnp.asarray(K), jnp.asarray(nodes), rows, modes)
+    model = _reduced(own["M"], own["G"], K, nodes, rows=tuple(range(2 * count)), modes=modes)
     if float(model.I_p) < 0:
         raise ValueError("G has the opposite sign: G[tilt about x, tilt about y] must be the polar inertia.")
     shapes, frequencies = np.asarray(model.shapes), np.asarray(model.frequencies)

@@ -28,6 +28,7 @@ from ambjax.cases.rotor_file import body_of_file
 from ambjax.cases.rotor_loads import base_from, load_from, unbalance_from
 from ambjax.cases.speed_table import speed_of
 from ambjax.cases.table import Table, show
+from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.numerics.records import leaf
 from ambjax.world.rotor import Rotor
 from ambjax.world.shaft import Disc, Section, shaft_model
@@ -50,6 +51,8 @@ MATERIAL = {
     "rho": leaf(default=7850.0, unit="kg/m^3", at_least=1.0, at_most=1e5, doc="density"),
     "nu": leaf(default=0.3, unit="1", at_least=0.0, at_most=0.5, doc="Poisson's ratio"),
 }
+# One program: operation by operation, about 90 would be compiled.
+_shaft_model = compiled_quickly(shaft_model, static_argnames=("sizes", "places", "modes"), options=QUICKEST)
 
 
 class BearingAxis(NamedTuple):
@@ -184,7 +187,8 @@ def _shaft(table: Table, places: list[float]) -> RotorBody:
         for x in middles
     ]
     count = table.whole("modes", MODES)
-    model = shaft_model(sections, discs, jnp.asarray(nodes), sizes, list(range(len(nodes))), count)
+    places = tuple(range(len(nodes)))
+    model = _shaft_model(sections, discs, nodes, sizes=tuple(sizes), places=places, modes=count)
     shapes = np.asarray(model.shapes)
 
     def at(place: float) -> np.ndarray:

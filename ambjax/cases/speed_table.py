@@ -26,7 +26,7 @@ def table_of_speeds(table: Table) -> Rotation | None:
             raise ValueError(f"{table.at(key)}: rotor.speed is a table, which gives it. Leave {key} out.")
     own = table.table("speed")
     own.only(["times", "rpm"])
-    times, rpm = ([one.leaf(key, field) for key in one.raw] for one, field in _columns(own))
+    times, rpm = own.column("times", field=AT), own.column("rpm", field=SPEED)
     if len(times) < 2 or len(times) != len(rpm) or np.any(np.diff(times) <= 0):
         raise ValueError(
             f"{own.path} = {show(own.raw)}: it must have two or more times (s), ascending, and one rpm for each."
@@ -72,17 +72,6 @@ def speed_of(table: Table) -> Rotation:
     return table_of_speeds(table) or Rotation(
         table.leaf("speed", SPEED, 0.0), table.leaf("acceleration", ACCELERATION, 0.0)
     )
-
-
-def _columns(own: Table) -> list[tuple[Table, dataclasses.Field]]:
-    """Return the lists of times and speeds, each as a table with a key for each number, and their bounds."""
-    columns = []
-    for key, field in (("times", AT), ("rpm", SPEED)):
-        values = own.raw.get(key)
-        if not isinstance(values, list):
-            raise ValueError(f"{own.at(key)} = {show(values)}: it must be a list of numbers.")
-        columns.append((Table({f"{key}.{n}": x for n, x in enumerate(values)}, own.path), field))
-    return columns
 
 
 RUN_UP = leaf(default=1.0, unit="s", at_least=1e-9, at_most=1e9, doc="duration of the run-up")

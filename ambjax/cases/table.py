@@ -139,6 +139,16 @@ class Table:
         except ValueError:
             raise ValueError(f"{self.at(key)} = {show(value)}: its rows have different lengths.") from None
 
+    def column(
+        self, key: str, allowed: str = "a list of numbers", field: dataclasses.Field | None = None
+    ) -> list[float]:
+        """Return a list of numbers, within the bounds of `field` if given. Raises ValueError otherwise."""
+        values = self.raw.get(key)
+        if not isinstance(values, list):
+            raise ValueError(f"{self.at(key)} = {show(values)}: it must be {allowed}.")
+        each = Table({str(n): x for n, x in enumerate(values)}, self.at(key))
+        return [each.number(n, None) if field is None else each.leaf(n, field) for n in each.raw]
+
     def leaf(self, key: str, field: dataclasses.Field, default: object = None) -> Any:
         """Return a number within the bounds of `field`, or the default if left out. Raises ValueError otherwise."""
         value = self.number(key, default, numbers(field))

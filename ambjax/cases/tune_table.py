@@ -121,9 +121,7 @@ def template_lines() -> Iterator[Line]:
     yield from _defaults("weights.", WEIGHTS)
     yield from _limits()
     yield from _defaults("", {name: NUMBERS[name] for name in ("early",)})
-    yield Line(
-        'risk = "cvar"', f'how the members\' losses are combined: "cvar", "soft-worst" or "mean"; left out: "{RISK}"'
-    )
+    yield Line('risk = "cvar"', f'how the members\' losses are combined: "cvar" or "mean"; left out: "{RISK}"')
     yield Line(f"alpha = {ALPHA}", f'for "cvar": the mean of the worst 1 - alpha; left out: {ALPHA}')
     yield from _defaults("", {name: BUDGET[name] for name in ("members", "stressed")})
     yield from _defaults("", {name: NUMBERS[name] for name in ("stress", "gain_margin")})

@@ -6,15 +6,7 @@ from typing import Any
 from ambjax.cases.table import Table, quoted, show
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.design import DESIGNS
-from ambjax.ensemble.distributions import (
-    SHAPES,
-    Choice,
-    Distribution,
-    LogUniform,
-    Normal,
-    Percent,
-    Uniform,
-)
+from ambjax.ensemble.distributions import SHAPES, Choice, Distribution, LogUniform, Normal, Percent, Uniform
 from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import Spread, check_spread, require_path
 from ambjax.world.scenario import Scenario
@@ -28,11 +20,7 @@ def _pair(table: Table, key: str) -> list[float]:
 
 
 def _list(table: Table, key: str) -> list[float]:
-    values = table.raw[key]
-    if not isinstance(values, list):
-        raise ValueError(f"{table.at(key)} = {show(values)}: it must be a list of numbers, as in [1.0, 2.0].")
-    parts = Table({str(n): x for n, x in enumerate(values)}, table.at(key))
-    return [parts.number(str(n), None, "a number") for n in range(len(values))]
+    return table.column(key, "a list of numbers, as in [1.0, 2.0]")
 
 
 def _number(table: Table, key: str) -> float:

@@ -178,8 +178,7 @@ def _pictures(case: MachineCase, analysed: tuple, found: UnbalanceResponse | Non
     light = [mode for mode in drawn if mode.damping < LIGHT]
     picture = part / "rotor.png"
     described(
-        picture.name,
-        lambda: rotor_picture(case.name, drawing_of(case), light or drawn, springs, operating[1], picture),
+        picture.name, lambda: rotor_picture(case.name, drawing_of(case), light or drawn, springs, operating[1], picture)
     )
     if found is not None and np.isfinite(found.sensors).any():  # stable at a speed
         path = part / "unbalance.png"

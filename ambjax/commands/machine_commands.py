@@ -18,7 +18,7 @@ from ambjax.page.rotor_motion import motion_page
 from ambjax.results import operating
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
-from ambjax.simulation.whole_machine import SampledMachine
+from ambjax.simulation.machine_kinds import SampledMachine
 from ambjax.world.rotation import PER_MINUTE
 
 Summary = dict[str, object]

@@ -51,7 +51,8 @@ def _text(cases: Sequence[AnyCase], maps: list[Map]) -> str:
         cells = [f"{100 * share:.1f} %" for share in (one.survival.mean(), np.mean(one.survival == 1))]
         cells += [f"{100 * np.mean(one.low >= CERTAIN):.1f} %" if one.decisive else "-"] * sure
         rows.append((case.name, *cells, held))
-        lines += [f"{case.name}: {_spread_words(one)}"]
+        drawn = f"drawn for each member: {', '.join(one.drawn)}" if one.drawn else "nominal: no quantity is drawn"
+        lines += [f"{case.name}: {drawn}"]
         if one.unstable.any():
             many = f"{int(one.unstable.sum())} of {one.unstable.size} cells"
             lines += [f"{case.name}: in {many} the rotor is held, but the loop is NOT stable (hatched in map.png)"]
@@ -85,11 +86,6 @@ def _confidence_note(one: Map) -> str:
     enough = next(n for n in itertools.count(1) if wilson(n, n).low >= CERTAIN)
     runs = f"{one.members} run{'s' * (one.members > 1)} a cell"
     return f"{runs}: too few for a confidence statement about a cell; give --members {enough} or more"
-
-
-def _spread_words(one: Map) -> str:
-    """Return in words which quantities a map draws for each member."""
-    return f"drawn for each member: {', '.join(one.drawn)}" if one.drawn else "nominal: no quantity is drawn"
 
 
 def _draw(cases: Sequence[AnyCase], maps: list[Map], path: pathlib.Path) -> None:

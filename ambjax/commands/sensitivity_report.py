@@ -47,11 +47,7 @@ def sensitivity_summary(
         {"point": point.name, "reference_m": point.r, **numbers(point)} for point in points
     ]
     rows += [{"point": name, "stable": None, "zone": None, "why": why} for name, why in missing.items()]
-    summary: dict[str, object] = {
-        **numbers(points[0]),
-        **_position_numbers(points[0], measured),
-        "points": rows,
-    }
+    summary: dict[str, object] = {**numbers(points[0]), **_position_numbers(points[0], measured), "points": rows}
     if spread is not None:
         worst = {} if spread.point is None else numbers(spread.point)
         counts = {name: getattr(spread, name) for name in ("members", "stable", "zone_a", "failed")}
@@ -162,9 +158,7 @@ def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None
     growth = f"Largest real part of the poles: {_number(one.poles[0].real)} 1/s."
     if one.stable:
         stiffness = f"{_number(one.stiffness)} N/m" if np.isfinite(one.stiffness) else "infinite"
-        rows += [
-            f"Static stiffness: {stiffness}. Rms of z per rms of position noise: {_number(one.noise)}. {growth}",
-        ]
+        rows += [f"Static stiffness: {stiffness}. Rms of z per rms of position noise: {_number(one.noise)}. {growth}"]
     else:
         rows += [f"{UNSTABLE} {growth}"]
     if measured is not None:

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import pickle
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from typing import Any
@@ -60,7 +61,8 @@ def compute(study: AnyStudy, store: Store, executor: tuple[Executor, int] | None
         say(remark)
     before = study.members - sum(stop - start for start, stop in missing)
     with tqdm(total=study.members, initial=before, unit="member", unit_scale=True, delay=2, desc="ensemble") as bar:
-        results = _run_here(study, store, missing) if executor is None else _run_on(study, store, missing, *executor)
+        here: Results = ((span, chunk(study, *span, store.chunk)) for span in missing)
+        results = here if executor is None else _run_on(study, store, missing, *executor)
         for span, columns in results:
             with uninterrupted():
                 store.put(span, columns)
@@ -70,17 +72,12 @@ def compute(study: AnyStudy, store: Store, executor: tuple[Executor, int] | None
 Results = Iterator[tuple[tuple[int, int], dict[str, Any]]]
 
 
-def _run_here(study: AnyStudy, store: Store, missing: list[tuple[int, int]]) -> Results:
-    for span in missing:
-        yield span, chunk(study, *span, store.chunk)
-
-
 def _run_on(study: AnyStudy, store: Store, missing: list[tuple[int, int]], pool: Executor, ahead: int) -> Results:
-    queue, running = list(reversed(missing)), dict[Future, tuple[int, int]]()
+    queue, running, sent = list(reversed(missing)), dict[Future, tuple[int, int]](), pickle.dumps(study)
     while queue or running:
         while queue and len(running) < ahead:
             span = queue.pop()
             with ignore_sigint():
-                running[pool.submit(work, study, *span, store.chunk)] = span
+                running[pool.submit(work, sent, *span, store.chunk)] = span
         for future in wait(running, return_when=FIRST_COMPLETED).done:
             yield running.pop(future), future.result()

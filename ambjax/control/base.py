@@ -158,11 +158,7 @@ class Law(abc.ABC):
 
 
 def default_law(
-    kind: type[L],
-    model: Plant,
-    sampling: Sampling | None = None,
-    given: Collection[str] = (),
-    printed: bool = True,
+    kind: type[L], model: Plant, sampling: Sampling | None = None, given: Collection[str] = (), printed: bool = True
 ) -> L:
     """Return the law of type `kind` with its default gains for `model`.
 

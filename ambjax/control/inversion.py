@@ -141,9 +141,7 @@ class FeedForwardAdaptive(AdaptiveReference):
 
     analytic = True
     gamma: Scalar = gain(
-        default=7.5e4,
-        unit="A^2/m^2/s",
-        doc="adaptation gain; above the error of the rates; left out: 4 w (i_0/s_0)^2",
+        default=7.5e4, unit="A^2/m^2/s", doc="adaptation gain; above the error of the rates; left out: 4 w (i_0/s_0)^2"
     )
 
     def __call__(self, model: Plant, inputs: ForceDemand, state: Array) -> tuple[CurrentDemand, Array]:

@@ -195,13 +195,7 @@ def cores() -> int:
 
 
 def _blocks(
-    parts: Parts,
-    *,
-    function: Callable[..., Mapped],
-    moves: tuple[bool, ...],
-    tree: Any,
-    block: int,
-    vectorised: bool,
+    parts: Parts, *, function: Callable[..., Mapped], moves: tuple[bool, ...], tree: Any, block: int, vectorised: bool
 ) -> Mapped:
     """Run all members of a call: on a CPU, in a loop over blocks, vectorised over a block; elsewhere, all at once."""
     axes = jax.tree.unflatten(tree, [0 if varies else None for varies in moves])

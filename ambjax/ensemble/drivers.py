@@ -40,10 +40,6 @@ class Shares(NamedTuple):
     p: np.ndarray
 
 
-def _correlation(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return np.clip(x @ y.T / x.shape[1], -1.0, 1.0)
-
-
 def shares(x: Sequence[np.ndarray], y: Sequence[np.ndarray], confidence: float = 0.95) -> Shares:
     """Compute the share of the variation of each column of y [N] that each column of x [N] explains alone.
 
@@ -79,7 +75,8 @@ def drivers(
     if not spread:
         return {name: [] for name in metrics}, {name: _account(0.0, None, "the case has no spread") for name in metrics}
     x, ranks = list(spread.values()), list(_standard_ranks(list(metrics.values())))
-    parts, rho, paths = shares(x, ranks, confidence), _correlation(_standard_ranks(x), np.stack(ranks)), list(spread)
+    parts, paths = shares(x, ranks, confidence), list(spread)
+    rho = np.clip(_standard_ranks(x) @ np.stack(ranks).T / len(x[0]), -1.0, 1.0)
     pairs = _pairs(dict(spread), ranks, confidence)
     ranking, accounts = {}, {}
     for n, name in enumerate(metrics):

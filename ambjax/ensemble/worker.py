@@ -4,6 +4,7 @@ import contextlib
 import multiprocessing
 import os
 import pathlib
+import pickle
 import signal
 import threading
 import warnings
@@ -65,10 +66,13 @@ def chunk(
     return study.columns(start, stop, call=call, threads=threads, lost=lost)
 
 
-def work(study: AnyStudy, start: int, stop: int, size: int) -> dict[str, np.ndarray]:
-    """Simulate a chunk of a study in a worker process, on one core, and return its columns."""
+def work(study: bytes, start: int, stop: int, size: int) -> dict[str, np.ndarray]:
+    """Simulate a chunk of a study in a worker process, on one core, and return its columns.
+
+    `study`: pickled. Before JAX is configured, the arrays of JAX in it would be read as float32.
+    """
     configure_jax()
-    return chunk(study, start, stop, size, threads=1)
+    return chunk(pickle.loads(study), start, stop, size, threads=1)
 
 
 @contextlib.contextmanager

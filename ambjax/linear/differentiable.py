@@ -138,7 +138,8 @@ def loop_quantities(
     worse = MOST * jnp.where(fine, 1 + jnp.maximum(growth, 0.0) / pole, NO_EQUILIBRIUM)
 
     def bounded(x: Array) -> Array:
-        return jnp.where(stable, _capped(x), worse)
+        """Return x > 0 smoothly limited to MOST. At x = 3 the relative change is 2e-11."""
+        return jnp.where(stable, (jnp.maximum(x, 1e-12) ** -4 + MOST**-4) ** -0.25, worse)
 
     return LoopQuantities(
         bounded(heights[0]),
@@ -161,11 +162,6 @@ def _point(f: Array, period: Array | None) -> Array:
     """Return s = 2 pi j f, or z = exp(s T) on a processor."""
     s = 2j * jnp.pi * f
     return s if period is None else jnp.exp(s * period)
-
-
-def _capped(x: Array) -> Array:
-    """Return x > 0 smoothly limited to MOST. At x = 3 the relative change is 2e-11."""
-    return (jnp.maximum(x, 1e-12) ** -4 + MOST**-4) ** -0.25
 
 
 def _growth_and_loop(system: StateSpace, unit: Array) -> tuple[Array, _Loop]:

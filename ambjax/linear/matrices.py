@@ -83,16 +83,9 @@ class Lagged:
             self.start, jnp.stack([point.u, 0.0 * point.u])
         )
         path = CommandPath(A, B[:, 0], jnp.asarray(delay))
-        whole = jnp.floor(path.delay)
-        new, old = path.held(path.delay - whole, jnp.asarray(period))
-        driven = jnp.stack([_at(whole + 1, lag) * old + _at(whole, lag) * new for lag in range(kept + 1)])
+        driven = jnp.stack(path.effects(jnp.asarray(period), kept))
         transition, disturbed = _integrated(A, B[:, 1], period)
         return HeldPlant(transition, driven, disturbed, path)
-
-
-def _at(lag: Array, number: int) -> Array:
-    """Return 1 if `lag`, a whole number, is `number`, else 0."""
-    return jnp.where(jnp.abs(lag - number) < 0.5, 1.0, 0.0)
 
 
 def _integrated(A: Array, b: Array, h: Scalar) -> tuple[Array, Array]:

@@ -259,9 +259,7 @@ def quiet(scenario: Scenario) -> Scenario:
     initial, z = scenario.initial, np.asarray(scenario.initial.z, float)
     z = z + np.where(z > 0, -1.0, 1.0) * KICK * np.asarray(scenario.touchdown)
     return dataclasses.replace(
-        calm,
-        reference=Constant(_at_start(scenario.reference)),
-        initial=dataclasses.replace(initial, z=z),
+        calm, reference=Constant(_at_start(scenario.reference)), initial=dataclasses.replace(initial, z=z)
     )
 
 

@@ -29,9 +29,9 @@ def array_module(x: Array | np.ndarray) -> Any:
 
 
 class CommandPath(NamedTuple):
-    """Path from the command to the plant, x' = A x + b u, where x [n] are the first n states of the loop.
+    """Path from the command u (V or A) to the plant, x' = A x + b u, where x [n] are the first n states of the loop.
 
-    - `A` [n, n], `b` [n]: the linearised plant with the lags of sensor and amplifier; u is the command, V or A.
+    - `A` [n, n], `b` [n], or [n, c] for c commands: the linearised plant with the lags of sensor and amplifier.
     - `delay`: samples after which the command of a sample begins to act; 0 in continuous time.
     """
 
@@ -40,17 +40,26 @@ class CommandPath(NamedTuple):
     delay: Array
 
     def held(self, fraction: Any, period: Any) -> tuple[Any, Any]:
-        """Return the effects [..., n] on x at the next sample of a command that is held for a part of this sample.
+        """Return the effects [..., n(, c)] on x at the next sample of a command that is held for a part of this sample.
 
         `fraction` [...]: part of the sample after which a new command acts. The first result is the effect of the new
         command, per unit; the second is that of the command before it.
         """
         np_ = array_module(self.A)
         expm = _exponential if np_ is np else exponential
-        n, fraction = len(self.b), np_.asarray(fraction)[..., None, None]
-        table = np_.concatenate([np_.concatenate([self.A, self.b[:, None]], 1), np_.zeros((1, n + 1))]) * period
+        b, fraction = self.b.reshape(len(self.b), -1), np_.asarray(fraction)[..., None, None]
+        n, c = b.shape
+        table = np_.concatenate([np_.concatenate([self.A, b], 1), np_.zeros((c, n + c))]) * period
         late, early = expm(table * (1 - fraction)), expm(table * fraction)
-        return late[..., :n, n], (late[..., :n, :n] @ early[..., :n, n:])[..., 0]
+        new, old = late[..., :n, n:], late[..., :n, :n] @ early[..., :n, n:]
+        return (new, old) if self.b.ndim > 1 else (new[..., 0], old[..., 0])
+
+    def effects(self, period: Scalar, kept: int) -> list[Array]:
+        """Return the effects [n(, c)] on x at the next sample of the commands u_n, u_{n-1}, ..., u_{n-kept}."""
+        whole = jnp.floor(self.delay)
+        new, old = self.held(self.delay - whole, period)
+        at = lambda lag, number: jnp.where(jnp.abs(lag - number) < 0.5, 1.0, 0.0)  # noqa: E731
+        return [at(whole + 1, lag) * old + at(whole, lag) * new for lag in range(kept + 1)]
 
 
 # A mode whose growth rate is below this share of the fastest rate is at rest: the difference is a rounding error.

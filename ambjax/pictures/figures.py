@@ -58,12 +58,7 @@ MEASUREMENT = Panel("measured position", "mm", 1e3, (Curve("z_measured", "$z$ me
 MOTION = (POSITION, CURRENT, SLIDING, DISTURBANCE)
 FORCES = (FORCE, FORCE_ERROR, VOLTAGE)
 # The paper's Figures 3 to 6: scenario and panels, top to bottom.
-PAPER_FIGURES = {
-    3: ("regulation", MOTION),
-    4: ("regulation", FORCES),
-    5: ("tracking", MOTION),
-    6: ("tracking", FORCES),
-}
+PAPER_FIGURES = {3: ("regulation", MOTION), 4: ("regulation", FORCES), 5: ("tracking", MOTION), 6: ("tracking", FORCES)}
 
 
 @own_style
@@ -105,11 +100,7 @@ def readings(trajectories: dict[str, Trajectory], title: str, settle: float, pat
 
 
 def draw_panel(
-    ax: Axes,
-    panel: Panel,
-    trajectory: Trajectory,
-    first: bool = False,
-    stretch: tuple[float, float] | None = None,
+    ax: Axes, panel: Panel, trajectory: Trajectory, first: bool = False, stretch: tuple[float, float] | None = None
 ) -> None:
     """Draw a panel of the whole run, or of `stretch` (begin and end, s), up to the loss of the rotor.
 

@@ -90,9 +90,7 @@ def map_figure(
     figure.colorbar(ScalarMappable(norm, SURVIVAL), ax=list(axes[0]), label="survival (%)", pad=0.02)
     if rows == 2:
         _errors(figure, axes[1], panels, error_metric, labels)
-    keys: list[Any] = [
-        Line2D([], [], color=INK, linewidth=LINES["survival"], label=_contour_words(panels)),
-    ]
+    keys: list[Any] = [Line2D([], [], color=INK, linewidth=LINES["survival"], label=_contour_words(panels))]
     if any(panel.low is not None for panel in panels):
         words = "bounds of the confidence interval at 95 %"
         keys.append(Line2D([], [], color=INK, linewidth=LINES["low"], label=words))

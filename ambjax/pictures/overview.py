@@ -140,15 +140,12 @@ def _stretches(trajectory: Trajectory, settle: float) -> list[tuple[str, float, 
     start = max(_transient(trajectory, end, loss), least)
     last = max(_last_moments(trajectory, end), least)
     beyond = end + 0.15 * (end - begin) * loss
+    words = f"whole run (axis: values after {settle:g} s)" if _scales_late(trajectory, settle) else ""
     return [
-        (_status(trajectory) or _scale_words(trajectory, settle), begin, max(beyond, begin + least)),
+        (_status(trajectory) or words, begin, max(beyond, begin + least)),
         (f"the first {_short(start)}", begin, begin + start),
         (f"the last {_short(last)}", end - last, end + 0.15 * last * loss),
     ]
-
-
-def _scale_words(trajectory: Trajectory, settle: float) -> str:
-    return f"whole run (axis: values after {settle:g} s)" if _scales_late(trajectory, settle) else ""
 
 
 def _status(trajectory: Trajectory) -> str:

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import hashlib
-import html
 import json
 import pathlib
 import re
@@ -13,6 +12,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from ambjax.cases.case_table import notebook_table
 from ambjax.cases.given import of_case
 from ambjax.cases.reader import Case
 from ambjax.codegen import verify
@@ -122,13 +122,9 @@ class ExportedCase:
 
     def _repr_html_(self) -> str:
         """Return the names of the files, and the table of the checks."""
-        names = html.escape(f"{self.plan.block.noun} of {self.plan.case.name}: {', '.join(self.files)}")
-        rows = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(x)}</td>" for x in (*check[:4], check.verdict)) + "</tr>"
-            for check in self.checks
-        )
-        titles = "<tr><th>check</th><th>precision</th><th>found</th><th>allowed</th><th>verdict</th></tr>"
-        return f"<table><caption>{names}</caption>{titles if rows else ''}{rows}</table>"
+        names = f"{self.plan.block.noun} of {self.plan.case.name}: {', '.join(self.files)}"
+        rows = [(*check[:4], check.verdict) for check in self.checks]
+        return notebook_table(names, ("check", "precision", "found", "allowed", "verdict"), rows)
 
 
 @of_case()

@@ -1,12 +1,12 @@
 """`survival_map`: the map of the command `ambjax map` as a Python object."""
 
 import dataclasses
-import html
 import math
 from typing import Any
 
 import numpy as np
 
+from ambjax.cases.case_table import notebook_table
 from ambjax.cases.given import of_case
 from ambjax.cases.machine_case import AnyCase
 from ambjax.cases.timing import FEWEST_SAMPLES, MOST_SAMPLES, SAMPLE_PERIOD
@@ -70,14 +70,12 @@ class CaseMap:
         one = self.map
         head = f"{self.case.name}: {one.members} member(s) in each cell of {one.x.path} and {one.y.path}"
         grids = {name: getattr(one, name)[np.isfinite(getattr(one, name))] for name in GRIDS}
-        rows = "".join(
-            f"<tr><td>{MEANINGS[name][1]}</td><td>{x.min():.6g}</td><td>{x.max():.6g}</td>"
-            f"<td>{MEANINGS[name][0].strip('1')}</td></tr>"
+        rows = [
+            (MEANINGS[name][1], f"{x.min():.6g}", f"{x.max():.6g}", MEANINGS[name][0].strip("1"))
             for name, x in grids.items()
             if x.size
-        )
-        titles = "<tr><th>quantity</th><th>smallest</th><th>largest</th><th>unit</th></tr>"
-        return f"<table><caption>{html.escape(head)}</caption>{titles}{rows}</table>"
+        ]
+        return notebook_table(head, ("quantity", "smallest", "largest", "unit"), rows)
 
 
 @of_case(machines=True)

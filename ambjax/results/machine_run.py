@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase
+from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.ensemble.replay import SEGMENT
 from ambjax.numerics.records import canonical
 from ambjax.simulation.metrics import UNITS, Metrics
@@ -54,6 +55,7 @@ class MachineRun:
 # Compiled for one machine, without the one-kernel path: with arrays of axes it takes minutes to compile.
 _begun = jax.jit(begin)
 _segment = functools.partial(jax.jit, static_argnames=("count",))(recorded_segment)
+_finished = compiled_quickly(finish, options=QUICKEST)
 
 
 def simulate_machine(case: MachineCase, progress: Callable[[int], object] = lambda samples: None) -> MachineRun:
@@ -69,7 +71,7 @@ def simulate_machine(case: MachineCase, progress: Callable[[int], object] = lamb
         parts.append(jax.tree.map(lambda x, left=left: np.asarray(x)[:left], rows))
         progress(left)
     rows = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    outcome = finish(state, None, fold)
+    outcome = _finished(state, None, fold)
     signals = {"t": rows.t, "axes": np.array(case.axes), "coordinates": np.array(case.coordinates), "q": rows.q}
     signals |= {"speed_rpm": rows.speed * 30 / np.pi}
     signals |= {name: np.asarray(getattr(rows.axes, name), np.float64) for name in SIGNAL_UNITS if name != "t"}

@@ -1,13 +1,13 @@
 """Simulate a case, and return the result as tables and pictures."""
 
 import dataclasses
-import html
 import pathlib
 from collections.abc import Callable
 from typing import Any, overload
 
 import numpy as np
 
+from ambjax.cases.case_table import notebook_table
 from ambjax.cases.given import of_case
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
@@ -107,12 +107,8 @@ class CaseRun:
         """Return the table of the metrics, with the status of the rotor as its caption."""
         why = self.trajectory.lost_why
         ended = f"the rotor is lost: {why}" if self.lost else f"not decided, {why}" if why else "the rotor is held"
-        head = html.escape(f"{self.case.name}: {ended}")
-        rows = "".join(
-            f"<tr><td>{name}</td><td>{value:.6g}</td><td>{UNITS.get(name, '')}</td></tr>"
-            for name, value in self.metrics.items()
-        )
-        return f"<table><caption>{head}</caption><tr><th>metric</th><th>value</th><th>unit</th></tr>{rows}</table>"
+        rows = [(name, f"{value:.6g}", UNITS.get(name, "")) for name, value in self.metrics.items()]
+        return notebook_table(f"{self.case.name}: {ended}", ("metric", "value", "unit"), rows)
 
 
 @overload

@@ -6,6 +6,7 @@ from typing import Any, overload
 
 import numpy as np
 
+from ambjax.cases.case_table import notebook_table
 from ambjax.cases.given import of_case
 from ambjax.cases.machine_case import MachineCase, first_axis
 from ambjax.cases.reader import Case
@@ -52,14 +53,12 @@ class MembersRun:
         """Return the table of the metrics that have a unit and are finite for all held members, for notebooks."""
         held = np.isposinf(self.columns["lost_at"])
         head = f"{self.survivors} of {held.size} members are held (seed {self.study.seed})"
-        rows = "".join(
-            f"<tr><td>{name}</td><td>{np.median(x[held]):.6g}</td><td>{x[held].max():.6g}</td>"
-            f"<td>{UNITS.get(name, '')}</td></tr>"
+        rows = [
+            (name, f"{np.median(x[held]):.6g}", f"{x[held].max():.6g}", UNITS[name])
             for name, x in self.columns.items()
             if name in UNITS and held.any() and np.isfinite(x[held]).all()
-        )
-        titles = "<tr><th>metric</th><th>median</th><th>largest</th><th>unit</th></tr>"
-        return f"<table><caption>{head}</caption>{titles}{rows}</table>"
+        ]
+        return notebook_table(head, ("metric", "median", "largest", "unit"), rows)
 
     def plot(self, *metrics: str) -> Any:
         """Return a matplotlib Figure with histograms of these metrics over the members.

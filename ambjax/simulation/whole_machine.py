@@ -17,29 +17,25 @@ import numpy as np
 from jax import Array
 
 from ambjax.compiler.barrier import materialised
-from ambjax.control.machine_law import MachineLaw
 from ambjax.numerics.records import Scalar, leaf, part, record, static
 from ambjax.numerics.shapes import varying
 from ambjax.numerics.small_matrices import solve, times
-from ambjax.simulation.between import acting, lags, plant_status, under
-from ambjax.simulation.edges import NO_EDGES, Edges, most_of
+from ambjax.simulation.between import plant_status
+from ambjax.simulation.edges import NO_EDGES, Edges
 from ambjax.simulation.folds import Ending
-from ambjax.simulation.integrate import Advanced, InitialValueProblem, Integrator, WholeState, in_turn
-from ambjax.simulation.joint_laws import begun, demanded_now, jumped
-from ambjax.simulation.loop import INSTANT_TREE, ClosedLoop, ExternalInputs, LoopState
-from ambjax.simulation.machine_stops import between_stops, limited, stop_forces
+from ambjax.simulation.integrate import InitialValueProblem
+from ambjax.simulation.joint_laws import begun
+from ambjax.simulation.loop import INSTANT_TREE, ClosedLoop, LoopState
+from ambjax.simulation.machine_stops import limited, stop_forces
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.span import Instant, Span
 from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED, Row
-from ambjax.world.amplifier import Amplifier
 from ambjax.world.rotation import Rotation
 from ambjax.world.rotor import Rotor
-from ambjax.world.sensor import Errors, Measurement
+from ambjax.world.sensor import Errors
 
 T = TypeVar("T")
-# Voltages of the groups as functions of time, or outputs of their amplifiers.
-Voltages = list
 # States of the axes, or their rates: one stacked pytree for each group, of type SampledState, LoopState or PlantOnly.
 Groups = tuple
 
@@ -296,147 +292,6 @@ class Machine:
         )
 
 
-@record
-class SampledMachine(Machine):
-    """A machine whose cascades run on a processor, one step of all axes per sample."""
-
-    def jump(self, t: Scalar, state: MachineState, errors: Sequence[object]) -> MachineState:
-        """Step the laws of all axes at time t (s)."""
-        if self.law is not None:
-            W, at = self.rotor.speed_at(t), self.at_sensors(state)
-            axes, law = jumped(self, t, W, at, state.law, errors)
-            return state._replace(axes=still(axes), law=law)
-        axes = self.each(lambda axis, own, error: axis.jump(t, own, error), self.at_sensors(state), errors)
-        return state._replace(axes=still(axes))
-
-    def advance(
-        self,
-        method: Integrator,
-        errors: object,
-        t: Scalar,
-        period: Scalar,
-        state: MachineState,
-        memory: object,
-        code: Array,
-    ) -> Advanced:
-        """Integrate rotor and coils from the sample at t (s) to the next one."""
-        finite = jnp.min(self.join([own.finite for own in state.axes]))
-        code = jnp.where((code == 0) & (finite == 0), DIVERGED, code)
-        pieces, u_a = self._pieces(jnp.asarray(t), period, state.axes)
-        begin = MachineState(state.q, state.q_dot, tuple(PlantOnly(own.plant) for own in state.axes))
-        parts = [(self._problem(state, voltages), time) for voltages, time in pieces]
-        reached = in_turn(method, parts, t, begin, memory, code)
-        states, times_of = [begin, *(after.state for after in reached)], [time for _, time in pieces]
-        z_filtered = self._filtered(jnp.asarray(t), state.axes, states, times_of)
-        end = reached[-1].state
-        ended = zip(state.axes, end.axes, z_filtered, u_a, strict=True)
-        axes = tuple(own._replace(plant=at.plant, z_filtered=z, u_a=u) for own, at, z, u in ended)
-        return reached[-1]._replace(state=MachineState(end.q, end.q_dot, axes, state.law))
-
-    def _pieces(self, t: Array, period: Scalar, axes: Groups) -> tuple[list[tuple[Voltages, Scalar]], Voltages]:
-        """Divide a sample. Return the groups' voltages as functions of time, with the durations (s) of the pieces.
-
-        The second result contains the amplifiers' outputs at the end (V). With a low-pass of a sensor, pieces also end
-        at the jumps of loads.
-        """
-        processor = loop_of(self.axes[0]).cascade.timing
-        delay, whole = jnp.asarray(processor.delay)[0], bool(processor.whole)
-        commands = [acting((own.command.u, *own.past), delay, period, whole) for own in axes]
-        low_passed = any(map(lags, self.loops()))
-        edges, u_a, pieces = self.edges(), [own.u_a for own in axes], []
-        for interval in zip(*commands, strict=True):
-            time = interval[0][1]
-            voltages = []
-            for k, (u, _) in enumerate(interval):
-                amplifier = self.loops()[k].scenario.amplifier
-                if isinstance(amplifier, Amplifier) and amplifier.slow:
-                    voltages.append(lambda now, a=amplifier, u=u, u_a=u_a[k], t=t: a.followed(u_a, u, now - t))
-                    u_a[k] = amplifier.followed(u_a[k], u, jnp.asarray(time))
-                else:
-                    voltages.append(lambda now, u=u: u)
-            pieces += [(voltages, length) for length in (edges.pieces(t, time) if low_passed else [time])]
-            t = t + time
-        return pieces, u_a
-
-    def _problem(self, first: MachineState, voltages: Sequence[Callable]) -> InitialValueProblem:
-        """Return the initial value problem of rotor and coils under the voltages of the groups, functions of time (V).
-
-        `first`: state at the sample.
-        """
-        sampled = self.at_magnets(first)
-
-        def inputs(t: Scalar) -> tuple[object, ...]:
-            return self.outside(t), tuple(self.each(lambda axis: axis.loop.inputs(t))), tuple(u(t) for u in voltages)
-
-        def observed(inputs: Any, state: MachineState) -> tuple[MachineState, Instant]:
-            outside, own, u = inputs
-            at = tuple(one.plant for one in self.at_magnets(state))
-
-            def one(
-                axis: Sampled, first: SampledState, own: ExternalInputs, u: Array, plant: object
-            ) -> tuple[PlantOnly, Instant]:
-                problem = under(between_stops(self, axis.loop), first.plant, first.command, lambda _: u, NO_EDGES)
-                rates, instant = problem.rates_and_signals((own, u), plant)
-                return PlantOnly(rates), instant
-
-            parts = self.each(one, sampled, own, u, at)
-            rates, signals = zip(*parts, strict=True)
-            return self.coupled(self.pushed(outside, state), state, rates), self.with_stops(self.join(signals), state.q)
-
-        sizes = self.each(lambda axis: PlantOnly(jax.tree.map(jnp.asarray, axis.loop.scenario.plant.scale())))
-        return self.problem_of(inputs, observed, sizes)
-
-    def _filtered(self, t: Array, axes: Groups, states: list[MachineState], durations: list[Scalar]) -> list:
-        """Return the outputs of the sensors' low-passes of the groups at the next sample, m."""
-        found = []
-        sensed = [self.at_sensors(state) for state in states]
-        for k, loop in enumerate(self.loops()):
-            z, sensor, motions = axes[k].z_filtered, loop.scenario.sensors, list[Measurement]()
-            if not lags(loop):
-                found.append(z)
-                continue
-            for own, n in zip(sensed, range(len(durations) + 1), strict=True):
-                motion = Measurement(own[k].plant.z, own[k].plant.z_dot, z)
-                motions.append(sensor.over_surface(motion, jnp.broadcast_to(t + sum(durations[:n]), motion.z.shape)))
-            for before, after, time in zip(motions, motions[1:], durations, strict=False):
-                z = sensor.lagged(z, before, after, time)
-            found.append(z)
-        return found
-
-
-@record
-class ContinuousMachine(WholeState, Machine):
-    """A machine whose cascades run in continuous time."""
-
-    def demands(self, t: Scalar, state: MachineState, errors: Sequence[object]) -> Groups:
-        if self.law is None:
-            return super().demands(t, state, errors)
-        own = self.each(lambda axis: axis.inputs(t))
-        found = demanded_now(self, self.rotor.speed_at(t), own, self.at_sensors(state), state.law, errors)[0]
-        return tuple((one,) for one in found)
-
-    def problem(self, errors: Sequence[object]) -> InitialValueProblem:
-        """Return the initial value problem of one sample, with the measurement errors held."""
-
-        def inputs(t: Scalar) -> tuple[object, ...]:
-            return self.outside(t), tuple(self.each(lambda axis: axis.inputs(t)))
-
-        def observed(inputs: Any, state: MachineState) -> tuple[MachineState, Instant]:
-            outside, own = inputs
-            sensing, law = self.at_sensors(state), ()
-            demands: Groups = (None,) * len(self.groups)
-            if self.law is not None:
-                demands, law = demanded_now(self, outside[1], own, sensing, state.law, errors)
-            sensed = tuple(one.plant for one in sensing)
-            observe = lambda axis, *now: between_stops(self, axis).observed(*now)  # noqa: E731
-            parts = self.each(observe, own, self.at_magnets(state), errors, sensed, demands)
-            rates, signals = zip(*parts, strict=True)
-            moved = self.coupled(self.pushed(outside, state), state, rates, law)
-            return moved, self.with_stops(self.join(signals), state.q)
-
-        return self.problem_of(inputs, observed, self.each(lambda axis: axis.scale()))
-
-
 def still(axes: Sequence) -> Groups:
     """Return the states of the groups, or their rates, without displacement and velocity."""
     return tuple(own._replace(plant=own.plant._replace(z=(), z_dot=())) for own in axes)
@@ -472,22 +327,3 @@ def stack_axes(axes: Sequence[T]) -> T:
         most = max((x.shape for x in own), key=len)
         leaves.append(np.stack([np.broadcast_to(x, most) for x in own], 1) if varies else np.stack(own))
     return jax.tree.unflatten(jax.tree.structure(axes[0]), leaves)
-
-
-def machine_of(
-    rotor: Rotor, axes: Sequence[Sampled | ClosedLoop], start_q: Array, law: MachineLaw | None = None
-) -> Machine:
-    """Return the machine of a rotor and the loops of its axes. `start_q` [n]: coordinates at t = 0.
-
-    Axes with the same kinds of parts form a group. Leaves may have an axis of members. `law`: demands the forces of all
-    axes; None: each has its own laws.
-    """
-    numbers: dict[object, list[int]] = {}
-    for k, axis in enumerate(axes):
-        numbers.setdefault(jax.tree.structure(axis), []).append(k)
-    stacked = [stack_axes([axes[k] for k in group]) for group in numbers.values()]
-    groups, first = tuple(map(tuple, numbers.values())), axes[0]
-    if not isinstance(first, Sampled):
-        return ContinuousMachine(rotor, tuple(stacked), start_q, groups, law=law)
-    cuts = most_of(rotor.edges(), first.period)
-    return SampledMachine(rotor, tuple(stacked), start_q, groups, law=law, cuts=cuts)

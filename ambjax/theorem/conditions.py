@@ -103,10 +103,7 @@ class Side(NamedTuple):
 SIDES = {
     "Q_z": (Side("disturbance of z", "q_z"),),
     "Q_i": (Side("disturbance of i", "q_i"),),
-    "Delta_1": (
-        Side("inversion", "d", " along the run"),
-        Side("inversion, ideal", None, " along the reference"),
-    ),
+    "Delta_1": (Side("inversion", "d", " along the run"), Side("inversion, ideal", None, " along the reference")),
 }
 
 

@@ -146,11 +146,7 @@ def rolled(system: System, clock: Clock) -> Result:
 
 @takes_case
 def check_sampled(
-    cascade: Cascade,
-    scenario: Scenario,
-    clock: Clock,
-    settle: float,
-    run: Callable[[System, Clock], Result] = rolled,
+    cascade: Cascade, scenario: Scenario, clock: Clock, settle: float, run: Callable[[System, Clock], Result] = rolled
 ) -> SampledReport:
     """Return the report on a cascade with a processor. It is computed from a run without sensor noise and, if the case
     has noise, from a run with it.

@@ -84,7 +84,9 @@ class Amplifier:
         """Return the time (s) for which the slew rate limits the voltage on its way from u_a to u."""
         if self.slew is None:
             return jnp.zeros_like(u)
-        return jnp.maximum(jnp.abs(u - u_a) / self.slew - self._tail(), 0.0)
+        # the slew rate would cover the final first-order part in 1/w
+        tail = 0.0 if self.bandwidth is None else 1 / self.slope()
+        return jnp.maximum(jnp.abs(u - u_a) / self.slew - tail, 0.0)
 
     def followed(self, u_a: Array, u: Array, time: Scalar) -> Array:
         """Return the exact output voltage (V) after `time` (s), from u_a (V), under a constant command u (V)."""
@@ -94,10 +96,6 @@ class Amplifier:
         later = jnp.maximum(time - ramp, 0.0)
         decay = jnp.where(later > 0, 0.0, 1.0) if self.bandwidth is None else jnp.exp(-self.slope() * later)
         return u + jnp.where(u_a > u, left, -left) * decay
-
-    def _tail(self) -> Scalar:
-        """Return the time (s) in which the slew rate would cover the final first-order part: 1/w; 0 without a lag."""
-        return 0.0 if self.bandwidth is None else 1 / self.slope()
 
     def at_coil(self, u_a: Array, i: Array, u_max: Scalar, response: Callable[[], CoilResponse]) -> Array:
         """Return the voltage (V) at the coils for the output u_a (V) and a current i (A), within u_max (V)."""

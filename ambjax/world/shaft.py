@@ -78,7 +78,7 @@ def shaft_model(
         for x in element(table, jnp.diff(nodes)[at])
     )
     for disc in discs:
-        node = int(jnp.argmin(jnp.abs(nodes - disc.at)))
+        node = jnp.argmin(jnp.abs(nodes - disc.at))
         M = M.at[2 * node, 2 * node].add(disc.m).at[2 * node + 1, 2 * node + 1].add(disc.I_t)
         G = G.at[2 * node + 1, 2 * node + 1].add(disc.I_p)
     return reduced(M, G, K, nodes, [2 * place for place in places], modes)

@@ -10,7 +10,6 @@ import numpy as np
 from ambjax.ensemble import wilson
 from ambjax.ensemble.study import Study
 from tuning.problem.config import seeds
-from tuning.problem.lanes import Engine
 from tuning.problem.members import Members
 from tuning.problem.tuning_problem import REFERENCE_MEMBERS, REFERENCE_TOLERANCE, TuningProblem
 
@@ -129,19 +128,10 @@ def worst_of(values: np.ndarray) -> np.ndarray:
 def step_error(problem: TuningProblem, x: np.ndarray, members: Members | None = None) -> StepError:
     """Compare the search's steps with accurate ones at x [m], on `members` (default: `comparison_members`)."""
     members = comparison_members(problem) if members is None else members
-    ours, theirs = (metrics_of(engine, x, members) for engine in problem.steps)
-    return compare_metrics(problem, ours, theirs, members)
-
-
-def metrics_of(engine: Engine, x: np.ndarray, members: Members) -> dict[str, np.ndarray]:
-    """Return every metric [n] of the members at coordinates x [m]."""
-    return {name: values[0] for name, values in engine.metrics(x[None], members)["metrics"].items()}
-
-
-def compare_metrics(
-    problem: TuningProblem, ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], members: Members
-) -> StepError:
-    """Compare the members' metrics [n] by coarse steps (`ours`) with those by accurate steps (`theirs`)."""
+    ours, theirs = (
+        {name: values[0] for name, values in engine.metrics(x[None], members)["metrics"].items()}
+        for engine in problem.steps
+    )
     ended = [np.isfinite(metrics["lost_at_s"]) for metrics in (ours, theirs)]
     held, unconfirmed = ~(ended[0] | ended[1]), ended[1] & ~ended[0]
     stalled = unconfirmed & theirs["stalled"]

@@ -14,7 +14,7 @@ from ambjax.cases.table import Table
 from ambjax.control.lqg import LqgWeights
 from ambjax.extend import canonical
 from ambjax.simulation.whole_machine import Machine
-from tuning.machines.machine_gains import chosen
+from tuning.problem.gains_table import chosen
 from tuning.problem.space import Space
 
 ROOT = "controller.lqg."
@@ -65,4 +65,6 @@ def lqg_space(table: Table, case: MachineCase, raw: dict[str, Any]) -> LqgSpace:
     problem = lqg_problem(Table(raw), case.cases, case.machine.rotor)
     known = {ROOT + one.name: (0.0, float(one.metadata["at_most"])) for one in dataclasses.fields(LqgWeights)}
     off = [ROOT + name for name, weight in problem.weights.items() if not weight > 0]
-    return LqgSpace(chosen(table, known, [path for path in known if path not in (REFERENCE, *off)], off), problem)
+    return LqgSpace(
+        chosen(table, known, [path for path in known if path not in (REFERENCE, *off)], off, "machine"), problem
+    )

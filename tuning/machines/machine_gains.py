@@ -10,13 +10,11 @@ from jax import Array
 
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.rotor_tables import tables_of
-from ambjax.cases.table import Table, show
-from ambjax.ensemble.spread import no_such_number
-from ambjax.host.extensions import NothingToTuneError
+from ambjax.cases.table import Table
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.whole_machine import Machine, loop_of
-from tuning.problem.gains_table import bound_of, flattened
-from tuning.problem.space import Gain, Space, read, tunable, with_gain
+from tuning.problem.gains_table import chosen, flattened
+from tuning.problem.space import Space, read, tunable, with_gain
 
 BEARING = "bearing."
 
@@ -71,38 +69,13 @@ def machine_space(table: Table, case: MachineCase, raw: dict[str, Any]) -> Machi
     known = _known(case, raw)
     unusable = [path for path, gain in known.items() if not _usable(gain, case)]
     default = [path for path in known if path.startswith("controller.position.") and path not in unusable]
-    space = chosen(table, dict.fromkeys(known, (0.0, math.inf)), default, unusable)
+    space = chosen(table, dict.fromkeys(known, (0.0, math.inf)), default, unusable, "machine")
     gains = tuple(known[path] for path in space.paths)
     taken = [(gain.inner, k) for gain in gains for k in gain.axes]
     for gain in gains:
         if any(taken.count((gain.inner, k)) > 1 for k in gain.axes) and not gain.path.startswith(BEARING):
             raise ValueError(f"{table.at('gains')}: {gain.path} and a bearing's own are both named. Keep one of them.")
     return MachineSpace(space, gains)
-
-
-def chosen(table: Table, known: dict[str, tuple[float, float]], default: list[str], unusable: list[str]) -> Space:
-    """Return the search space of the table [tune]. `known`: bounds by path. `default`: the paths if it names none.
-
-    Raises ValueError for an unknown or unusable path, or an invalid bound.
-    """
-    paths = table.raw.get("gains", default)
-    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
-        raise ValueError(f'{table.at("gains")} = {show(paths)}: give a list of paths, as in ["controller.position.k"].')
-    if not paths:
-        example = next(iter(default), "controller.position.k_p")
-        raise NothingToTuneError(f'tune.gains is empty: name at least one, for example ["{example}"].')
-    bounds = flattened(table.table("bounds").raw)
-    for path in [*paths, *bounds]:
-        if path not in known:
-            key = "gains" if path in paths else "bounds"
-            raise ValueError(f"{table.at(key)}: '{path}': {no_such_number(path, known, 'to tune in this machine')}")
-    for path in paths:
-        if path in unusable:
-            raise ValueError(f"{table.at('gains')}: {path} is 0 or inf in this case. Give it a finite value above 0.")
-    if path := next((path for path in bounds if path not in paths), None):
-        raise ValueError(f"{table.at('bounds')}: {path} is not in tune.gains. Add it there or leave it out here.")
-    ends = {path: bound_of(bounds[path], path, table) if path in bounds else known[path] for path in paths}
-    return Space(tuple(Gain(path, *ends[path]) for path in paths))
 
 
 def _usable(gain: MachineGain, case: MachineCase) -> bool:

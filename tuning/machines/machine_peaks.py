@@ -10,7 +10,8 @@ from jax import Array
 
 from ambjax.cases.machine_case import MachineCase
 from ambjax.extend import canonical
-from ambjax.linear.linear_machine import MachineRest, machine_loop, machine_rest
+from ambjax.linear.linear_machine import machine_loop, machine_rest
+from ambjax.linear.machine_at_speed import MachineRest
 from ambjax.linear.margins import STATIC
 from ambjax.linear.state_space import NEUTRAL, StateSpace
 from ambjax.simulation.whole_machine import Machine

@@ -28,7 +28,7 @@ from tuning.problem.gains_table import space_from
 from tuning.problem.limits import LEAST_MARGIN, Limit
 from tuning.problem.loss import TERMS
 from tuning.problem.quantities import KINDS
-from tuning.problem.risk import CVaR, Mean, Risk, SoftWorst
+from tuning.problem.risk import CVaR
 from tuning.problem.space import Space
 from tuning.problem.unbreakable import bounds_of
 
@@ -85,7 +85,7 @@ class Tune:
     early: float
     stress: float
     gain_margin: float
-    risk: Risk
+    risk: CVaR
     minutes: float
     budget: Budget
 
@@ -200,12 +200,11 @@ def _limits(table: Table, case: Case) -> LimitSettings:
     )
 
 
-def _risk(table: Table) -> Risk:
-    name = table.choice("risk", ["mean", "cvar", "soft-worst"], RISK)
-    if name != "cvar":
+def _risk(table: Table) -> CVaR:
+    if table.choice("risk", ["mean", "cvar"], RISK) == "mean":
         if "alpha" in table.raw:
-            raise ValueError(f'{table.at("alpha")} applies to risk = "cvar" only; risk is "{name}". Remove alpha.')
-        return Mean() if name == "mean" else SoftWorst()
+            raise ValueError(f'{table.at("alpha")} applies to risk = "cvar" only; risk is "mean". Remove alpha.')
+        return CVaR()
     alpha = table.number("alpha", ALPHA, "a number from 0 to below 1")
     if not 0 <= alpha < 1:
         raise ValueError(f"{table.at('alpha')} = {alpha:g}: it must be at least 0 and below 1.")

@@ -13,7 +13,7 @@ from tuning.problem.limits import LimitTerm
 from tuning.problem.loss import outcomes
 from tuning.problem.members import Members
 from tuning.problem.quantities import KINDS
-from tuning.problem.risk import Risk
+from tuning.problem.risk import CVaR
 
 # Largest goal, a logarithm, whose exponential does not overflow.
 MOST = np.log(np.finfo(float).max)
@@ -36,7 +36,7 @@ class Goal:
     """
 
     weights: tuple[float, ...] = static()
-    risk: Risk = static()
+    risk: CVaR = static()
     limits: tuple[LimitTerm, ...] = ()
     quantities: tuple[str, ...] = static(default=())
     minimised: str = static(default="")
@@ -48,25 +48,16 @@ class Goal:
         `outcomes` [N, 1 + L]: the weighted loss and the `quantities` of each member. The first `ordinary`
         members are not stressed.
         """
-        stressed = outcomes[ordinary:, 0]
-        loss = self.ordinary_risk(outcomes[:ordinary]) + (jnp.mean(stressed) if stressed.size else 0.0)
-        return jnp.log(loss + TINY) + self.pull(outcomes[:ordinary, 1:])
-
-    def ordinary_risk(self, outcomes: Array) -> Array:
-        """Return the risk of the ordinary members' `outcomes` [N, 1 + L], plus the square of the minimised quantity."""
-        risk = self.risk(outcomes[:, 0])
-        if not self.minimised:
-            return risk
-        values = outcomes[:, 1 + self.quantities.index(self.minimised)]
-        return risk + (self.unit * KINDS[self.minimised].tuned(values)) ** 2
-
-    def pull(self, held: Array) -> Array | int:
-        """Return the sum of the limits' terms for the quantities `held` [N, L] of the ordinary members."""
-        return sum(term(held[:, self.quantities.index(term.name)]) for term in self.limits)
+        columns = {name: outcomes[:ordinary, 1 + k] for k, name in enumerate(self.quantities)}
+        stressed, loss = outcomes[ordinary:, 0], self.risk(outcomes[:ordinary, 0])
+        if self.minimised:
+            loss = loss + (self.unit * KINDS[self.minimised].tuned(columns[self.minimised])) ** 2
+        loss = loss + (jnp.mean(stressed) if stressed.size else 0.0)
+        return jnp.log(loss + TINY) + sum(term(columns[term.name]) for term in self.limits)
 
     def score(self, terms: dict[str, np.ndarray], members: Members) -> np.ndarray:
         """Return the goal [S] of S points from their terms [S, N] of members [N]; +inf where it is not finite."""
-        each = np.stack(outcomes(self.weights, terms, members.stressed), -1)
+        each = np.stack(outcomes(self.weights, terms, members.stressed, self.quantities), -1)
         values = np.array([_compiled(self, one, members.ordinary) for one in each])
         return np.where(np.isfinite(values), values, np.inf)
 

@@ -83,7 +83,13 @@ class LaneGradient:
     def __call__(self, lanes: Lane, axes: Lane) -> Any:
         """Evaluate a block of lanes. `axes`: axis of each leaf, 0 or None, as for `jax.vmap`."""
         if self.reverse:
-            return jax.vmap(self._pulled, (axes,))(lanes)
+
+            def pulled(lane: Lane) -> Any:
+                values, pull, terms = jax.vjp(lambda x: self._outcomes(x, lane), lane.x, has_aux=True)
+                (slopes,) = jax.vmap(pull)(jnp.eye(len(values), dtype=values.dtype))
+                return values, slopes, terms
+
+            return jax.vmap(pulled, (axes,))(lanes)
         each = jax.vmap(self._outcomes, (0, axes))
 
         # The outer map is over directions and the inner one over lanes, so the lanes are contiguous in memory.
@@ -93,16 +99,10 @@ class LaneGradient:
 
         return jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(len(self.space)))
 
-    def _pulled(self, lane: Lane) -> Any:
-        """Return outcomes, derivatives in reverse mode, and terms, of one lane."""
-        values, pull, terms = jax.vjp(lambda x: self._outcomes(x, lane), lane.x, has_aux=True)
-        (slopes,) = jax.vmap(pull)(jnp.eye(len(values), dtype=values.dtype))
-        return values, slopes, terms
-
     def _outcomes(self, x: Array, lane: Lane) -> tuple[Array, dict[str, Array]]:
         objective = Objective(self.space, *lane.world)
         terms = objective.run(x, lane.members, lane.world[-1], in_parts=self.reverse)
-        return jnp.stack(outcomes(lane.weights, terms, lane.members.stressed)), terms
+        return jnp.stack(outcomes(lane.weights, terms, lane.members.stressed, sorted(lane.world[-1].measures))), terms
 
 
 class Engine:
@@ -173,21 +173,16 @@ class Engine:
     def _with_loops(
         self, found: tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]], x: np.ndarray, members: Members
     ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        """Insert the quantities of the linearised loops into the results of `gradient`, in the order of the names.
+        """Append the quantities of the linearised loops to the results of `gradient`.
 
         For members not in `members.searched`, the quantities are 1 and their derivatives 0.
         """
         outcomes, slopes, terms = found
-        names = sorted(self.objective.loss.measures)
         values, moves = loops(self.objective, x, members.searched)
-        more = {name: _wide(one, len(members.member)) for name, one in values.items()}
-        columns = {name: outcomes[..., 1 + k] for k, name in enumerate(names)} | more
-        along = {name: slopes[..., 1 + k, :] for k, name in enumerate(names)}
-        along |= {name: _wide(one, len(members.member), 0.0) for name, one in moves.items()}
-        ordered = sorted(columns)
-        outcomes = np.stack([outcomes[..., 0], *(columns[name] for name in ordered)], -1)
-        slopes = np.stack([slopes[..., 0, :], *(along[name] for name in ordered)], -2)
-        return outcomes, slopes, terms | {PREFIX + name: one for name, one in more.items()}
+        values = {name: _wide(one, len(members.member)) for name, one in values.items()}
+        outcomes = np.concatenate([outcomes, np.stack(list(values.values()), -1)], -1)
+        moves = np.stack([_wide(one, len(members.member), 0.0) for one in moves.values()], -2)
+        return outcomes, np.concatenate([slopes, moves], -2), terms | {PREFIX + k: one for k, one in values.items()}
 
     def _lanes(
         self,

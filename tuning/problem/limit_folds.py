@@ -1,12 +1,13 @@
 """Folds that measure limited quantities in the search."""
 
 import functools
+from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
 
 from ambjax.extend import Scalar, leaf, record, static
-from ambjax.simulation.folds import Ending, Fold, Named
+from ambjax.simulation.folds import Ending, Fold
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import Row
 
@@ -47,46 +48,34 @@ class Scaled:
     """Fold: the result of another fold, divided by `by`."""
 
     fold: Fold
-    by: Scalar = leaf(above=0, at_most=1e30)
+    by: Scalar = leaf(default=1.0, above=0, at_most=1e30)
 
-    def init(self) -> object:
+    def init(self) -> Any:
         return self.fold.init()
 
-    def update(self, carry: object, row: Row, span: Span) -> object:
+    def update(self, carry: Any, row: Row, span: Span) -> Any:
         return self.fold.update(carry, row, span)
 
-    def result(self, carry: object, ending: Ending) -> Array:
-        return self.fold.result(carry, ending) / self.by
+    def result(self, carry: Any, ending: Ending) -> Array:
+        return self._of(self.fold.result(carry, ending)) / self.by
+
+    def _of(self, found: Any) -> Array:
+        return found
 
 
 @record
-class OneOf:
+class OneOf(Scaled):
     """Fold: the result `name` of a fold with several results."""
 
-    fold: Fold
-    name: str = static()
+    name: str = static(default="")
 
-    def init(self) -> object:
-        return self.fold.init()
-
-    def update(self, carry: object, row: Row, span: Span) -> object:
-        return self.fold.update(carry, row, span)
-
-    def result(self, carry: object, ending: Ending) -> Array:
-        return self.fold.result(carry, ending)[self.name]
+    def _of(self, found: dict[str, Array]) -> Array:
+        return found[self.name]
 
 
 @record
-class LargestOf:
-    """Fold: the largest of the results of other folds."""
+class LargestOf(Scaled):
+    """Fold: the largest of the results of a fold with several results."""
 
-    folds: Named
-
-    def init(self) -> dict[str, object]:
-        return self.folds.init()
-
-    def update(self, carry: dict[str, object], row: Row, span: Span) -> dict[str, object]:
-        return self.folds.update(carry, row, span)
-
-    def result(self, carry: dict[str, object], ending: Ending) -> Array:
-        return functools.reduce(lambda a, b: jnp.where(a >= b, a, b), self.folds.result(carry, ending).values())
+    def _of(self, found: dict[str, Array]) -> Array:
+        return functools.reduce(lambda a, b: jnp.where(a >= b, a, b), found.values())

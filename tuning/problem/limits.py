@@ -12,6 +12,7 @@ to the goal, which is a logarithm. At the optimum, a limit that is 1 % looser lo
 import dataclasses
 import math
 from collections.abc import Collection, Mapping
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -106,15 +107,10 @@ class Limit:
         """The limit's term in the goal."""
         return LimitTerm(self.name, math.log(self.allowed), self.multiplier, self.ratio)
 
-    def log_excess(self, reached: float) -> float:
-        """Return g = log(reached / allowed), or log(allowed / reached) for a lower limit."""
-        excess = math.log(max(reached, TINY) / self.allowed)
+    def log_excess(self, reached: Any) -> Any:
+        """Return g = log(reached / allowed), or log(allowed / reached) for a lower limit, of a number or an array."""
+        excess = np.log(np.maximum(reached, TINY) / self.allowed)
         return -excess if self.kind.at_least else excess
-
-    def log_excesses(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return g of each member [N] of an ensemble. `columns`: as for `reached`."""
-        ratios = np.log(np.maximum(self._values(columns), TINY) / self.allowed)
-        return -ratios if self.kind.at_least else ratios
 
     def active(self, reached: float | None) -> bool:
         """Return whether the limit is active: its multiplier is above 0, and `reached` (judged) is near the limit.
@@ -132,7 +128,7 @@ class Limit:
         loses the rotor; it is then replaced by LOST_FACTOR times the larger of `tuned` and the limit.
         """
         judged = judged if math.isfinite(judged) else LOST_FACTOR * max(tuned, self.threshold)
-        multiplier = max(self.multiplier + PENALTY * self.log_excess(self.ratio * tuned), 0.0)
+        multiplier = max(self.multiplier + PENALTY * float(self.log_excess(self.ratio * tuned)), 0.0)
         ratio = max(judged, TINY) / max(tuned, TINY)
         history = (*self.history, (max(judged, TINY), multiplier))
         return dataclasses.replace(self, multiplier=multiplier, ratio=ratio, history=history)
@@ -164,14 +160,14 @@ class Limit:
     def of_members(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the quantity of each member that is held, or of all members if none is held.
 
-        `columns`: as for `reached`. Lost rotors are excluded, because their voltage is 0 afterwards, which would lower
-        a mean. The limit `survival` counts them.
+        Lost rotors are excluded, because their voltage is 0 afterwards, which would lower a mean. The limit `survival`
+        counts them.
         """
-        alive = ~np.isfinite(columns["lost_at_s"])
-        values = self._values(columns)
+        alive, values = ~np.isfinite(columns["lost_at_s"]), self.values(columns)
         return values[alive] if alive.any() else values
 
-    def _values(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    def values(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return the quantity of every member [N] of an ensemble."""
         return np.asarray(columns[self.kind.exact or f"loss.{PREFIX}{self.name}"])
 
 

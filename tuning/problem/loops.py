@@ -41,17 +41,14 @@ class LaneLoop:
             cascade = self.space.decode(x, lane.cascade)
             names, *numbers = self.range
             matrices = loop_matrices(cascade, lane.scenario, lane.period, 0.0)
-            speeds = self._speeds(lane.scenario) if "sensitivity_1x" in names else None
+            speeds, rotor = None, lane.scenario.rotor
+            if "sensitivity_1x" in names and rotor is not None:  # at the start and the end of the run, Hz
+                speeds = jnp.abs(jnp.stack([rotor.rpm(t) for t in (0.0, self.duration)])) * PER_MINUTE
             found = loop_quantities(*matrices, *numbers, delay="delay_margin_s" in names, speeds=speeds)
             return found, found
 
         slopes, values = jax.jacfwd(quantities, has_aux=True)(lane.x)
         return values, slopes
-
-    def _speeds(self, scenario: Scenario) -> Array:
-        """Return the speeds of the rotor at the start and at the end of the run, Hz."""
-        assert scenario.rotor is not None
-        return jnp.abs(jnp.stack([scenario.rotor.rpm(t) for t in (0.0, self.duration)])) * PER_MINUTE
 
 
 def loops(

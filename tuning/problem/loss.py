@@ -151,6 +151,6 @@ def weigh(weights: Weights, terms: Mapping[str, Values], stressed: Values) -> Va
     return held + ordinary * sum(each.values()) * (1 + costs)
 
 
-def outcomes(weights: Weights, terms: dict[str, Values], stressed: Values) -> list[Values]:
-    """Return the loss (`weigh`), then the limited quantities among `terms` in the order of their names."""
-    return [weigh(weights, terms, stressed), *(terms[name] for name in sorted(terms.keys() - set(TERMS)))]
+def outcomes(weights: Weights, terms: dict[str, Values], stressed: Values, names: Sequence[str]) -> list[Values]:
+    """Return the loss (`weigh`), then the limited quantities `names` among `terms`."""
+    return [weigh(weights, terms, stressed), *(terms[PREFIX + name] for name in names)]

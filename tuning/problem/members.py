@@ -122,7 +122,7 @@ class Objective:
         cascade, scenario = (
             apply(self.cascade, scenario, members.values) if members.values else (self.cascade, scenario)
         )
-        return cascade, _with_noise(scenario, members.noise_factor)
+        return cascade, scenario.louder(members.noise_factor)
 
     def fixed(self, x: np.ndarray, members: Members) -> tuple[Cascade, Scenario]:
         """Return the cascade with the gains at x [m] and the scenario of members [n]. Varying leaves are arrays [n]."""
@@ -131,7 +131,7 @@ class Objective:
         cascade, scenario = apply(self.cascade, scenario, members.values)
         at = (x + members.shift).T if np.any(members.shift) else x  # [m] or [m, n]
         cascade = self.space.decode(jnp.asarray(at), cascade)
-        return cascade, _with_noise(scenario, members.noise_factor) if np.any(members.noise_factor != 1) else scenario
+        return cascade, scenario.louder(members.noise_factor) if np.any(members.noise_factor != 1) else scenario
 
     def run(self, x: Array, members: Members, fold: Any, *, in_parts: bool = False) -> Any:
         """Return the fold's result for the rollout of one member at coordinates x [m].
@@ -143,8 +143,3 @@ class Objective:
         if in_parts:
             return rolled_in_parts(*prepare(cascade, scenario, self.clock), fold).metrics
         return rollout(cascade, scenario, self.clock, fold=fold, record_every=0).metrics
-
-
-def _with_noise(scenario: Scenario, noise_factor: Any) -> Scenario:
-    """Return the scenario with `noise_factor` times the sensor noise."""
-    return scenario.louder(noise_factor)

@@ -39,7 +39,7 @@ class LimitContext:
 def _once(name: str) -> Callable[[LimitContext, float], Fold]:
     def fold(context: LimitContext, threshold: float) -> Fold:
         assert context.rotor is not None
-        return OneOf(Orders(context.rotor, context.settle), name)
+        return OneOf(Orders(context.rotor, context.settle), name=name)
 
     return fold
 

@@ -14,14 +14,12 @@ from ambjax.control.search import Interval, LowerBound, SearchContext
 from ambjax.linear.stability import KICK
 from ambjax.theorem.conditions import delta_1_on_reference, required
 from tuning.problem.members import Objective
-from tuning.problem.space import Gain, Space
+from tuning.problem.space import MARGIN, Gain, Space
 
 # Default upper bound of a gain: this factor times the larger of the upper end of its range and its value in the case.
 END_FACTOR = 3.0
 # Range of a gain for which the law defines none: its value divided and multiplied by this factor.
 DEFAULT_FACTOR = 30.0
-# A range keeps this factor from a bound.
-ASIDE = 1.05
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,7 +154,7 @@ def _range(gain: Gain, value: float, interval: Interval) -> Range:
     low, high, source = interval[:3]
     if gain.low > 0 or np.isfinite(gain.high):
         source += "; within tune.bounds"
-    low, high = max(low, gain.low * ASIDE), min(high, gain.high / ASIDE)
+    low, high = max(low, gain.low * (1 + MARGIN)), min(high, gain.high / (1 + MARGIN))
     if low >= high and gain.low > 0:
         high = low * DEFAULT_FACTOR**2
     elif low >= high:
@@ -164,4 +162,4 @@ def _range(gain: Gain, value: float, interval: Interval) -> Range:
     if np.isfinite(gain.high):
         return Range(low, high, gain.high, source)
     most = max(high, value) * (1 if interval.firm else END_FACTOR)
-    return Range(low, min(high, most / ASIDE), most, f"{source}; tuned gain at most {most:.3g}")
+    return Range(low, min(high, most / (1 + MARGIN)), most, f"{source}; tuned gain at most {most:.3g}")

@@ -1,33 +1,21 @@
-"""Risk measures: one number from the losses of an ensemble [N]."""
+"""Risk measure: one number from the losses of an ensemble [N]."""
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
 
 @dataclasses.dataclass(frozen=True)
-class Mean:
-    """Mean of the losses."""
-
-    def __call__(self, losses: Array) -> Array:
-        return jnp.mean(losses)
-
-    def __str__(self) -> str:
-        return "mean"
-
-
-@dataclasses.dataclass(frozen=True)
 class CVaR:
-    """Conditional value at risk: the mean of the worst share 1 - alpha of the losses.
+    """Conditional value at risk: the mean of the worst share 1 - alpha of the losses; with alpha = 0, their mean.
 
     Rockafellar and Uryasev, J. Risk 2 (2000) 21-41. It equals the minimum over q of
     q + mean(max(l - q, 0)) / (1 - alpha), which lies at the alpha quantile. If (1 - alpha) N is not whole, the last of
     the worst members counts in part.
     """
 
-    alpha: float
+    alpha: float = 0.0
 
     def __call__(self, losses: Array) -> Array:
         count = losses.shape[0]
@@ -36,21 +24,4 @@ class CVaR:
         return jnp.sum(weights * jnp.sort(losses)[::-1])
 
     def __str__(self) -> str:
-        return f"CVaR({self.alpha:g})"
-
-
-@dataclasses.dataclass(frozen=True)
-class SoftWorst:
-    """Smooth maximum: mean(l) / beta * log(mean(exp(beta l / mean(l)))), between the mean and the maximum."""
-
-    beta: float = 5.0
-
-    def __call__(self, losses: Array) -> Array:
-        scale = jax.lax.stop_gradient(jnp.mean(losses)) / self.beta
-        return scale * (jax.scipy.special.logsumexp(losses / scale) - jnp.log(losses.shape[0]))
-
-    def __str__(self) -> str:
-        return f"soft worst case ({self.beta:g})"
-
-
-Risk = Mean | CVaR | SoftWorst
+        return f"CVaR({self.alpha:g})" if self.alpha else "mean"

@@ -99,7 +99,7 @@ class Space:
 
     def __post_init__(self) -> None:
         if not self.gains:
-            raise NothingToTuneError('tune.gains is empty: name at least one, for example ["controller.position.c"].')
+            raise NothingToTuneError("tune.gains is empty: name at least one gain, or leave out tune.gains.")
         for gain in self.gains:
             if not 0 <= gain.low < gain.high:
                 raise ValueError(

@@ -175,14 +175,14 @@ def problem_of(
     clock = case.clock.with_method(method_for(case, tune.budget.substeps, finer))
     limits = tune.limits
     front = front or tune.objective == "knee"
+    loop = _loop_range(case, limits.each)
     names = sorted({limit.name for limit in limits.each} | set(TRACED if front else ()))
+    names = [*(name for name in names if KINDS[name].fold), *(loop.names if loop else ())]
     context = LimitContext(
         case.settle, float(clock.duration), float(case.scenario.touchdown), limits.band, case.scenario.rotor
     )
     loss = loss_for(case.scenario, case.settle, tune.early, measures(names, limits.each, context))
-    objective = Objective(
-        tune.space, case.cascade, case.scenario, clock, loss, case.spread, _loop_range(case, limits.each)
-    )
+    objective = Objective(tune.space, case.cascade, case.scenario, clock, loss, case.spread, loop)
     space, box = bounded(objective, tune.space.values(case.cascade))
     objective = dataclasses.replace(objective, space=space)
     goal = Goal(tune.weights, tune.risk, quantities=tuple(names))

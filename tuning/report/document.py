@@ -6,33 +6,22 @@ from collections.abc import Callable
 
 from ambjax.results.outputs import described
 from ambjax.text.web_page import escape_markdown, markdown_table
-from tuning.report import front_table, held_out, limit_table, sensitivity_table
-from tuning.report.facts import Row, TuningFacts
+from tuning.report import front_table, limit_table, sensitivity_table
+from tuning.report.facts import SUMMARY_METRICS, Row, TuningFacts, number
 from tuning.report.outcome import answer
 
 
 def report_markdown(facts: TuningFacts) -> str:
-    """Return the text of report.md: the answer in five lines, the front, and all details.
+    """Return the text of report.md: the verdict, the answer and the next command in five lines, and all details.
 
     Its pictures are files in the same folder.
     """
-    lines = [f"# Tuning of {escape_markdown(facts.case)}", "", *answer_lines(facts)]
+    lines = [f"# Tuning of {escape_markdown(facts.case)}", "", escape_markdown(facts.outcome["text"]), ""]
+    lines += [f"- **{label}:** {escape_markdown(text)}" for label, text in answer(facts).items()]
+    lines += [f"- **Next:** {escape_markdown(facts.advice) or f'in this folder, {facts.next}'}", ""]
     for name, section in SECTIONS.items():
         lines += described(f"the section on {name} of the report", functools.partial(section, facts)) or []
     return "\n".join(lines) + "\n"
-
-
-def answer_lines(facts: TuningFacts) -> list[str]:
-    """Return whether the requirements are met, and five list items: the answer, and the next command."""
-    lines = [f"- **{label}:** {escape_markdown(text)}" for label, text in answer(facts).items()]
-    lines.append(described("the line on the next command", lambda: _next(facts)) or "")
-    return [escape_markdown(facts.outcome["text"]), "", *lines, ""]
-
-
-def _next(facts: TuningFacts) -> str:
-    """Return the next command, or the advice if a requirement is not met."""
-    words = escape_markdown(facts.advice) if facts.advice else f"in this folder, {facts.next}"
-    return f"- **Next:** {words}"
 
 
 def _gains(facts: TuningFacts) -> list[str]:
@@ -42,8 +31,8 @@ def _gains(facts: TuningFacts) -> list[str]:
     head = ["gain", "before", "after", *looked, "allowed from", "to", "at a bound", "risk increase"]
     rows = []
     for row in facts.gains:
-        ends = [_number(row.get(end), ".3g") for end in ("low", "high")] if ranged else []
-        bounds = [_number(row.get(end), ".3g") for end in ("least", "most")]
+        ends = [number(row.get(end), ".3g") for end in ("low", "high")] if ranged else []
+        bounds = [number(row.get(end), ".3g") for end in ("least", "most")]
         gains = f"{row['before']:.6g}", f"{row['after']:.6g}"
         rows.append([row["path"], *gains, *ends, *bounds, row["at_bound"] or "-", _sensitivity(row, facts)])
     lines = ["## Gains", "", *markdown_table(head, rows), ""]
@@ -84,9 +73,39 @@ def _sensitivity(row: Row, facts: TuningFacts) -> str:
     return "-" if row["sensitivity_percent"] is None else f"{row['sensitivity_percent']:.3g} %"
 
 
-def _number(x: float | None, form: str = ".5g") -> str:
-    """Return a number as text; '-' for None and NaN."""
-    return "-" if x is None or math.isnan(x) else format(x, form)
+def _held_out(facts: TuningFacts) -> list[str]:
+    """Return the section on the held-out members."""
+    before, after = facts.before, facts.after
+    if not after["members"]:
+        return ["There is no held-out ensemble (tune.held_out = 0).", ""]
+    both = before, after
+    rows = [
+        [f"`{name}`", *(number(one.get(name)) for one in both)]
+        for name in SUMMARY_METRICS
+        if name in after or name in before
+    ]
+    rows += [[name, *(str(one[name]) for one in both)] for name in ("lost", "stalled")]
+    rows.append(["survival, 95 % interval", *map(_survival, both)])
+    title = f"## {after['members']} held-out members (seed {facts.held_out_seed})"
+    words = ["The metrics include only the members that are held.", *_worst(facts.worst_member), ""]
+    return [title, "", *markdown_table(["", "before", "after"], rows), "", *words]
+
+
+def _worst(worst: Row | None) -> list[str]:
+    """Describe the worst member, with the command that simulates it alone."""
+    if worst is None:
+        return []
+    status = f"largest settled error {worst['settled_max_abs_error_m']:.4g} m"
+    if math.isfinite(worst["lost_at_s"]):
+        status = f"it ends at {worst['lost_at_s']:.4g} s"
+    line = f"The worst is member {worst['member']}: {status}."
+    return ["", f"{line} In the folder of this report: `{worst['replay']}`" if worst["replay"] else line]
+
+
+def _survival(one: Row) -> str:
+    if isinstance(one["survival"], str):
+        return one["survival"]
+    return f"{one['survival']:.4f} ({one['survival_low']:.4f} to {one['survival_high']:.4f})"
 
 
 def _conditions(facts: TuningFacts) -> list[str]:
@@ -95,9 +114,9 @@ def _conditions(facts: TuningFacts) -> list[str]:
         return []
     rows = []
     for row in facts.conditions:
-        gain, margin = (_number(x) for x in (row["gain"], row["margin"]))
+        gain, margin = (number(x, ".5g") for x in (row["gain"], row["margin"]))
         verdict = {True: "holds", False: "FAILS", None: "-"}[row["holds"]]
-        rows.append([row["requires"], gain, _number(row["against"]), margin, row["unit"], verdict])
+        rows.append([row["requires"], gain, number(row["against"], ".5g"), margin, row["unit"], verdict])
     head = ["condition", "left", "right", "margin", "unit", "verdict"]
     lines = ["## Conditions of Theorem 1 along the nominal run", "", *markdown_table(head, rows), ""]
     if facts.advice_on_conditions:
@@ -128,7 +147,7 @@ SECTIONS: dict[str, Callable[[TuningFacts], list[str]]] = {
     "the limits": lambda facts: limit_table.section(facts.limits),
     "the sensitivity": lambda facts: sensitivity_table.section(facts.sensitivity),
     "the gains": _gains,
-    "the held-out members": held_out.section,
+    "the held-out members": _held_out,
     "the conditions of Theorem 1": _conditions,
     "the search": _course,
 }

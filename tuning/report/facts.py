@@ -1,6 +1,7 @@
 """The facts of a search: the record from which the verdict, the report and report.json derive."""
 
 import dataclasses
+import math
 from typing import Any
 
 # A row, or a nested table, of report.json.
@@ -18,6 +19,11 @@ SUMMARY_METRICS = (
 )
 # Fields that report.json leaves out if they are None.
 OPTIONAL = ("front", "sensitivity", "stability")
+
+
+def number(x: float | None, form: str = ".4g") -> str:
+    """Return a number as text; '-' for None and NaN."""
+    return "-" if x is None or math.isnan(x) else format(x, form)
 
 
 @dataclasses.dataclass(frozen=True)

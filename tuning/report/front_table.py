@@ -1,19 +1,17 @@
 """The front of error against voltage in the report: its points, the selected answer, and the case files."""
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 
 from ambjax.text.web_page import markdown_table
 from tuning.front import KNEE, FrontPoint
+from tuning.report.facts import Row
 from tuning.solve.course import SearchResult
 
-Facts = dict[str, Any]
 TITLE = "Error against voltage"
 
 
-def facts(answer: SearchResult) -> list[Facts]:
+def facts(answer: SearchResult) -> list[Row]:
     """Return a row for each point of the front, in order of its error limit; `taken`: whether it is the answer."""
     space = answer.problem.objective.space
     names = _names(answer.front)
@@ -43,7 +41,7 @@ def _names(points: tuple[FrontPoint, ...]) -> list[str]:
     return names
 
 
-def sentence(rows: list[Facts]) -> str:
+def sentence(rows: list[Row]) -> str:
     """Return which point is the answer, for the verdict; '' without a front."""
     taken = next((row for row in rows if row["taken"]), None)
     if taken is None or len(rows) < 2:
@@ -65,7 +63,7 @@ def letter(n: int) -> str:
     return chr(ord("A") + n)
 
 
-def section(rows: list[Facts] | None, written: bool) -> list[str]:
+def section(rows: list[Row] | None, written: bool) -> list[str]:
     """Return the section on the front. `written`: whether each point has a case file."""
     if not rows:
         return []

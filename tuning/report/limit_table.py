@@ -10,8 +10,8 @@ from tuning.judge.peaks import BY_INJECTION, Sensitivity, reached_of
 from tuning.problem.limits import FRONT, Limit
 from tuning.problem.quantities import Kind
 from tuning.problem.tuning_problem import TuningProblem
+from tuning.report.facts import Row
 
-Facts = dict[str, Any]
 # Share by which a limit is loosened to compute the effect.
 MORE = 0.1
 # Verdicts on a limit.
@@ -23,11 +23,11 @@ EMPHASISED = (BROKEN, UNVERIFIED)
 def facts(
     problem: TuningProblem,
     columns: dict[str, np.ndarray],
-    summary: Facts,
+    summary: Row,
     refuted: str = "",
     injected: Sensitivity | None = None,
     delayed: DelayTest | None = None,
-) -> list[Facts]:
+) -> list[Row]:
     """Return a row for each limit and one for survival, from the held-out members' columns [N] and their summary.
 
     A limit that cannot be broken has a row without a value reached.
@@ -43,8 +43,13 @@ def facts(
     """
     members, held, settings = summary["members"], summary["held"], problem.tune.limits
     price_unit = "V" if problem.goal.minimised else "m"
-    rows = [_row(limit, columns, summary, refuted, injected, price_unit) for limit in _asked(problem)]
-    rows = [_tested(row, delayed, refuted, _not_simulated(problem, row["name"])) for row in rows]
+    rows = [
+        _tested(
+            _row(limit, columns, summary, refuted, injected, price_unit),
+            delayed, refuted, not_simulated(problem, limit) if limit.name == DELAY_MARGIN else "",
+        )
+        for limit in _asked(problem)
+    ]  # fmt: skip
     for limit, why in settings.unbreakable:
         source = f"{limit.source}; {UNBREAKABLE}: {why}"
         rows.append(_blank(limit.name, limit.threshold, price_unit, limit.kind, source=source, verdict=UNBREAKABLE))
@@ -55,7 +60,7 @@ def facts(
     return [*rows, survival | _verdict(kept, refuted)]
 
 
-def _blank(name: str, threshold: float, price_unit: str, kind: Kind | None = None, **found: Any) -> Facts:
+def _blank(name: str, threshold: float, price_unit: str, kind: Kind | None = None, **found: Any) -> Row:
     """Return the row of a limit without a value reached, with the fields `found`. `kind`: None for survival."""
     return {
         "name": name,
@@ -71,7 +76,7 @@ def _blank(name: str, threshold: float, price_unit: str, kind: Kind | None = Non
     } | found
 
 
-def _verdict(kept: bool | None, refuted: str) -> Facts:
+def _verdict(kept: bool | None, refuted: str) -> Row:
     """Return whether a limit is held, and its verdict.
 
     `kept`: whether the judged value is within the limit; None if no member was judged.
@@ -86,11 +91,11 @@ def _verdict(kept: bool | None, refuted: str) -> Facts:
 def _row(
     limit: Limit,
     columns: dict[str, np.ndarray],
-    summary: Facts,
+    summary: Row,
     refuted: str,
     injected: Sensitivity | None,
     price_unit: str,
-) -> Facts:
+) -> Row:
     judged = summary["held"] > 0
     reached = reached_of(limit, columns, injected) if judged else None
     kept = limit.holds(reached) if reached is not None else False if summary["members"] else None
@@ -111,12 +116,7 @@ def _row(
     }
 
 
-def _not_simulated(problem: TuningProblem, name: str) -> str:
-    """Return why the delay of the limit on the delay margin is not simulated; '' if it is, and for other limits."""
-    return next((not_simulated(problem, one) for one in _asked(problem) if one.name == name == DELAY_MARGIN), "")
-
-
-def _tested(row: Facts, delayed: DelayTest | None, refuted: str, reason: str = "") -> Facts:
+def _tested(row: Row, delayed: DelayTest | None, refuted: str, reason: str = "") -> Row:
     """Return the row of the delay margin with the result of its test; any other row unchanged.
 
     `reason`: why there was no test (`not_simulated`).
@@ -153,7 +153,7 @@ def _saturated(limit: Limit, reached: float | None, injected: Sensitivity | None
     return next((one.saturated for one in peaks if one.largest.get(limit.name, np.nan) == reached), None)
 
 
-def _at_the_supply(row: Facts) -> str:
+def _at_the_supply(row: Row) -> str:
     """Return a warning if the supply limited u during the injection; '' if it did not."""
     share = row.get("saturated")
     if not share:
@@ -165,7 +165,7 @@ def _at_the_supply(row: Facts) -> str:
     )
 
 
-def broken(rows: list[Facts]) -> list[str]:
+def broken(rows: list[Row]) -> list[str]:
     """Return a sentence for each limit that is not held, including survival."""
     return [
         f"tune.limits.{row['name']} is {BROKEN}: "
@@ -176,7 +176,7 @@ def broken(rows: list[Facts]) -> list[str]:
     ]
 
 
-def prices(rows: list[Facts]) -> list[str]:
+def prices(rows: list[Row]) -> list[str]:
     """Return a sentence for each limit that is active and held."""
     return [
         f"{row['name']} = {_number(row['reached'], row)} is at its limit, {row['threshold']:g}: a limit "
@@ -187,7 +187,7 @@ def prices(rows: list[Facts]) -> list[str]:
     ]
 
 
-def section(rows: list[Facts]) -> list[str]:
+def section(rows: list[Row]) -> list[str]:
     """Return the section on limits."""
     if not rows:
         return []
@@ -212,9 +212,9 @@ def section(rows: list[Facts]) -> list[str]:
     return ["## Limits", "", *table, "", *sources, "", words, ""]
 
 
-def _side(row: Facts) -> str:
+def _side(row: Row) -> str:
     return "at least" if row["at_least"] else "at most"
 
 
-def _number(value: float | None, row: Facts) -> str:
+def _number(value: float | None, row: Row) -> str:
     return "-" if value is None else f"{value:.4g} {row['unit']}".rstrip()

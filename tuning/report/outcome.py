@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import numpy as np
 
@@ -103,7 +104,12 @@ def answer(facts: TuningFacts) -> dict[str, str]:
 
     An entry that cannot be computed is absent.
     """
-    entries = {"held": _held, "error": _sizes, "sensitivity": _peaks, "limits": _limiting}
+    entries: dict[str, Callable[[TuningFacts], tuple[str, str]]] = {
+        "held": _held,
+        "error": _sizes,
+        "sensitivity": lambda facts: ("Sensitivity", sensitivity_table.line(facts.sensitivity)),
+        "limits": _limiting,
+    }
     found = [described(f"the line on the {name}", functools.partial(entry, facts)) for name, entry in entries.items()]
     return dict(one for one in found if one)
 
@@ -142,10 +148,6 @@ def _sizes(facts: TuningFacts) -> tuple[str, str]:
         f"{change('settled_rms_u_V.mean', 'V')}{'' if most is None else f', largest {most:.3g} V'}."
     )
     return label, " ".join(filter(None, [words, front_table.sentence(facts.front or [])]))
-
-
-def _peaks(facts: TuningFacts) -> tuple[str, str]:
-    return "Sensitivity", sensitivity_table.line(facts.sensitivity)
 
 
 def _limiting(facts: TuningFacts) -> tuple[str, str]:

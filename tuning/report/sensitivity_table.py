@@ -1,19 +1,18 @@
 """The sensitivity in the report: linear and injected peaks of |S| of held-out members, and their zones."""
 
 import dataclasses
-from typing import Any
 
 from ambjax.linear.stability import MOST_TESTED
 from ambjax.text.web_page import escape_markdown, markdown_table
 from tuning.judge.peaks import Sensitivity, injects
 from tuning.problem.tuning_problem import TuningProblem
+from tuning.report.facts import Row, number
 
-Facts = dict[str, Any]
 # Text in place of the linear peak of a loop without one, by its zone.
 NO_PEAK = {"D": "unstable", None: "not computed"}
 
 
-def facts(problem: TuningProblem, injected: Sensitivity) -> Facts:
+def facts(problem: TuningProblem, injected: Sensitivity) -> Row:
     """Return plain data: a row for each member of `injected`, and the limits of the zones.
 
     `zone` of a row is that of the linear peak, `injected_zone` that of the injected one. `why`: why there is no linear
@@ -29,7 +28,7 @@ def facts(problem: TuningProblem, injected: Sensitivity) -> Facts:
     return {"members": rows, "injected": injects(problem), "decides": injected.decides, "zones": limits}
 
 
-def line(found: Facts | None) -> str:
+def line(found: Row | None) -> str:
     """Return the largest peak of |S| of the held-out members and its zone."""
     if not found or not found["members"]:
         return "not computed here; `ambjax sensitivity tuned.toml` computes |S| and the zone."
@@ -42,7 +41,7 @@ def line(found: Facts | None) -> str:
     return f"|S| is at most {peak:.3g} (at {at:.3g} Hz) over the worst members: zone {zone}."
 
 
-def _unknown(row: Facts, found: Facts) -> str:
+def _unknown(row: Row, found: Row) -> str:
     """Return why a member has no peak that counts; '' if it has one."""
     if row["lost"]:
         return "it is lost when a test signal is injected"
@@ -51,7 +50,7 @@ def _unknown(row: Facts, found: Facts) -> str:
     return "" if found["decides"] else row["why"]
 
 
-def _peak(row: Facts, found: Facts) -> tuple[float, float, str]:
+def _peak(row: Row, found: Row) -> tuple[float, float, str]:
     """Return the peak that counts, its frequency (Hz) and its zone.
 
     It is the injected peak if only injected peaks decide, otherwise the larger one.
@@ -63,14 +62,14 @@ def _peak(row: Facts, found: Facts) -> tuple[float, float, str]:
     return injected if found["decides"] else max(injected, linear)
 
 
-def section(found: Facts | None) -> list[str]:
+def section(found: Row | None) -> list[str]:
     """Return the section on the sensitivity."""
     if found is None:
         return []
     cells = [
         [
             str(row["member"]),
-            *([_number(row["linear"]), _number(row["frequency_hz"])] if row["linear"] else [NO_PEAK[row["zone"]], "-"]),
+            *([number(row["linear"]), number(row["frequency_hz"])] if row["linear"] else [NO_PEAK[row["zone"]], "-"]),
             row["zone"] or "-",
             *(_injected(row) if found["injected"] else []),
         ]
@@ -103,15 +102,11 @@ def section(found: Facts | None) -> list[str]:
     return ["## Sensitivity", "", *markdown_table(head, cells), "", *unknown, " ".join(words), ""]
 
 
-def _injected(row: Facts) -> list[str]:
+def _injected(row: Row) -> list[str]:
     if row["lost"]:
         return [f"lost: {row['lost']} of {row['repetitions']}", "-", "-", row["injected_zone"], "-"]
     if row["peak"] is None:
         return ["-"] * 5
     interval = "-" if row["low"] is None else f"{row['low']:.4g} to {row['high']:.4g}"
     saturated = f"{100 * row['saturated']:.2g} %"
-    return [_number(row["peak"]), interval, _number(row["at_hz"]), row["injected_zone"], saturated]
-
-
-def _number(x: float) -> str:
-    return f"{x:.4g}"
+    return [number(row["peak"]), interval, number(row["at_hz"]), row["injected_zone"], saturated]

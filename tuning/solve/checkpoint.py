@@ -18,23 +18,23 @@ NAME = re.compile(r"round-[0-9]+\.npz")
 # Subfolder of the output directory, and the file in it that marks a search before its first checkpoint.
 FOLDER, MARK = "checkpoints", "search.json"
 # Names of the arrays of a checkpoint, or their beginnings.
-LEAF, PAST, ACTIVE, ORIGIN, SEED, TOLD = "start_", "history_", "active", "cma_origin", "cma_seed", "cma_told"
+LEAF, PAST, CONVERGED, ORIGIN, SEED, TOLD = "start_", "history_", "converged", "cma_origin", "cma_seed", "cma_told"
 
 
 @dataclasses.dataclass
 class SearchState:
     """State of a search.
 
-    `active` [S]: whether each start continues. `history`: one row per iteration, of the best point so far. `seconds`:
-    duration so far, s; `earlier`: the part of it before the search was resumed.
+    `history`: one row per iteration, of the best point so far. `seconds`: duration so far, s; `earlier`: the part of it
+    before the search was resumed. `converged`: whether no further iteration is needed.
     """
 
     starts: Starts
-    active: np.ndarray
     history: dict[str, list[Any]] = dataclasses.field(default_factory=dict)
     seconds: float = 0.0
     earlier: float = 0.0
     interrupted: bool = False
+    converged: bool = False
     evolution: Evolution | None = None
     """CMA-ES, which continues from the best point of the descents; None: the search does not use it"""
 
@@ -77,7 +77,7 @@ class CheckpointFile:
             leaves |= {ORIGIN: cma.origin, SEED: np.array(cma.seed), TOLD: np.array(cma.told)}
         past = {f"{PAST}{name}": np.asarray(rows) for name, rows in progress.history.items()}
         facts = {"fingerprint": self.fingerprint, "seconds": progress.seconds}
-        seal(self.path, {**leaves, **past, ACTIVE: progress.active}, facts)
+        seal(self.path, {**leaves, **past, CONVERGED: np.array(progress.converged)}, facts)
 
     def load(self) -> SearchState | None:
         """Return the saved search, or None if there is none.
@@ -99,7 +99,8 @@ class CheckpointFile:
             evolution = Evolution(arrays[ORIGIN], int(arrays[SEED]), arrays[TOLD]) if ORIGIN in arrays else None
             past = {name.removeprefix(PAST): list(rows) for name, rows in arrays.items() if name.startswith(PAST)}
             spent = float(facts["seconds"])
-            return SearchState(starts, arrays[ACTIVE], past, spent, spent, evolution=evolution)
+            done = bool(arrays[CONVERGED])
+            return SearchState(starts, past, spent, spent, converged=done, evolution=evolution)
         except DamagedError as error:
             why = str(error)
         except KeyError:

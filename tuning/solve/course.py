@@ -109,7 +109,13 @@ class Course:
                 raise KeyboardInterrupt
             progress = dataclasses.replace(self.past.pop(), interrupted=True)
         self.past.append(progress)
-        return _best(progress)
+        x, value = best_of(progress)
+        if not np.isfinite(value):
+            raise ValueError(
+                "tune: at every starting point, the loss or its derivative is not finite. Check the case with 'ambjax "
+                "simulate' (for chattering of u), or change tune.screen and tune.bounds."
+            )
+        return x
 
     def again(self, x: np.ndarray) -> tuple[np.ndarray, bool]:
         """Search from x [m] on all members. Return the best point [m], and whether it is another one.
@@ -157,7 +163,8 @@ class Course:
     ) -> SearchResult:
         """Return the result at x [m]. `error`: step error at x, or None. The others are as in SearchResult."""
         seconds = time.perf_counter() - self.began + sum(progress.earlier for progress in self.past)
-        history = _joined(self.past)
+        names = self.past[0].history
+        history = {name: np.array([row for one in self.past for row in one.history.get(name, ())]) for name in names}
         return SearchResult(
             self.problem, self.members, x, error, history, lost, seconds, validation_error, complete=not self.over
         )
@@ -182,22 +189,6 @@ def training(problem: TuningProblem) -> Members:
     )
 
 
-def _best(progress: SearchState) -> np.ndarray:
-    """Return the best point [m]. Raises ValueError if the goal is not finite."""
-    x, value = best_of(progress)
-    if not np.isfinite(value):
-        raise ValueError(
-            "tune: at every starting point, the loss or its derivative is not finite. Check the case with 'ambjax "
-            "simulate' (for chattering of u), or change tune.screen and tune.bounds."
-        )
-    return x
-
-
-def _joined(past: list[SearchState]) -> dict[str, np.ndarray]:
-    """Concatenate the histories of all searches by name."""
-    return {name: np.array([row for one in past for row in one.history.get(name, ())]) for name in past[0].history}
-
-
 def standing_of(problem: TuningProblem, progress: SearchState, number: int, spent: Sequence[float]) -> Standing:
     """Return the standing of a search. `spent`: durations of its iterations so far, s."""
     last = {name: rows[-1] for name, rows in progress.history.items()}
@@ -207,7 +198,7 @@ def standing_of(problem: TuningProblem, progress: SearchState, number: int, spen
     volts = quantities.get("rms_u_V", float(np.asarray(loss.u_scale)) * math.sqrt(terms["effort"]))
     values = [(one, one.ratio * float(quantities[one.name])) for one in problem.limits]
     limits = tuple(Reached(one.name, value, one.threshold, one.holds(value)) for one, value in values)
-    members, starts = int(last["members"]), int(progress.active.sum())
+    members, starts = int(last["members"]), 0 if progress.converged else len(progress.starts.value)
     # the first iteration compiles
     left = (most - progress.iteration) * float(np.median(spent[1:])) if len(spent) > 1 else math.nan
     return Standing(

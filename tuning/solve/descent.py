@@ -93,16 +93,15 @@ class Descent:
     goal: Goal
 
     @functools.partial(jax.jit, static_argnums=1)
-    def __call__(self, ordinary: int, starts: Starts, outcomes: Array, slopes: Array, on: Array) -> Starts:
-        """Return the starts after one step. `on` [S]: whether each start makes the step.
+    def __call__(self, ordinary: int, starts: Starts, outcomes: Array, slopes: Array) -> Starts:
+        """Return the starts after one step.
 
         `outcomes` [S, N, 1 + L]: the weighted loss and the limited quantities of each member at the trials. `slopes`
         [S, N, 1 + L, m]: their derivatives. The first `ordinary` members are not stressed.
         """
 
-        def one(start: Starts, outcomes: Array, slopes: Array, on: Array) -> Starts:
+        def one(start: Starts, outcomes: Array, slopes: Array) -> Starts:
             value, weights = jax.value_and_grad(self.goal)(outcomes, ordinary)
-            after = step(start, value, jnp.tensordot(weights, slopes, 2))
-            return jax.tree.map(lambda p, q: jnp.where(on, p, q), after, start)
+            return step(start, value, jnp.tensordot(weights, slopes, 2))
 
-        return jax.vmap(one)(starts, outcomes, slopes, on)
+        return jax.vmap(one)(starts, outcomes, slopes)

@@ -59,32 +59,52 @@ def search_within_limits(course: Course, x: np.ndarray) -> tuple[np.ndarray, boo
     within = [one.x for one in seen if one.holds(limits)]
     if converged or not within:
         return seen[-1].x, bool(within) and within[-1] is seen[-1].x
-    return _least(course, within), True
+    course.tell("the multipliers of the limits do not converge; the best answer within the limits is taken")
+    goal = dataclasses.replace(course.problem.goal, limits=())
+    terms = course.problem.engine.terms(np.array(within), course.members)
+    return within[int(np.argmin(goal.score(terms, course.members)))], True
 
 
 def optima(course: Course, x: np.ndarray) -> tuple[list[Judged], bool]:
     """Judge the optimum x [m], let the members that break a limit join, or update the multipliers, and search again.
 
-    Returns the judged optima, the first at x, and whether the last one meets all limits. `course.problem` and
-    `course.members` are those of the last search.
-
-    There are at most MOST_UPDATES searches. The loop ends early if the course is over, and if a search ends where it
-    began and this point is within all limits.
+    Returns the judged optima, the first at x, and whether the last one meets all limits. There are at most MOST_UPDATES
+    searches. The loop ends early if the course is over, and if a search ends where it began and this point is within
+    all limits.
     """
     seen, moved = list[Judged](), True
     for update in range(MOST_UPDATES + 1):
-        before, one = course.problem.limits, judged_at(course, x)
+        one = judged_at(course, x)
         seen.append(one)
         last = update == MOST_UPDATES or course.over
-        if last or not join_breaking(course, one):
-            limits = tuple(limit.updated(*found) for limit, found in zip(before, one.numbers, strict=True))
-            course.problem = course.problem.limited(limits)
-            if _all_met(course, before, limits, one.numbers) or (not moved and one.holds(limits)):
-                return seen, True
+        if (last or not join_breaking(course, one)) and _updated(course, one, moved):
+            return seen, True
         if last:
             break
         x, moved = course.again(x)
     return seen, False
+
+
+def _updated(course: Course, one: Judged, moved: bool) -> bool:
+    """Update the multipliers at a judged optimum. Return whether all limits are met there.
+
+    A limit is met if the judge's value is close to the bound, or within it if its multiplier was and stays 0. If the
+    search has not `moved`, it suffices that no limit is broken. Tells each limit that is active or not met.
+    """
+    before = course.problem.limits
+    after = tuple(limit.updated(*found) for limit, found in zip(before, one.numbers, strict=True))
+    course.problem, done = course.problem.limited(after), []
+    for old, new, (_, judged) in zip(before, after, one.numbers, strict=True):
+        idle = old.multiplier == new.multiplier == 0
+        close = new.log_excess(judged) >= -TOLERANCE_BELOW and new.has_reserve(judged)
+        done.append(close or (idle and new.log_excess(judged) <= 0))
+        if not (idle and done[-1]):
+            _tell(course, new, judged)
+    return all(done) or (not moved and one.holds(after))
+
+
+def _tell(course: Course, limit: Limit, judged: float) -> None:
+    course.tell(f"limit {limit.name} = {limit.threshold:g} {limit.kind.unit}: judged {judged:.4g}")
 
 
 def join_breaking(course: Course, one: Judged) -> bool:
@@ -96,13 +116,9 @@ def join_breaking(course: Course, one: Judged) -> bool:
     if more is None:
         return False
     limits = course.problem.limits
-    broken = [
-        (limit, judged)
-        for limit, (_, judged) in zip(limits, one.numbers, strict=True)
-        if limit.kind.worst and not limit.has_reserve(judged)
-    ]
-    for limit, judged in broken:
-        course.tell(f"limit {limit.name} = {limit.threshold:g} {limit.kind.unit}: judged {judged:.4g}")
+    for limit, (_, judged) in zip(limits, one.numbers, strict=True):
+        if limit.kind.worst and not limit.has_reserve(judged):
+            _tell(course, limit, judged)
     course.tell(f"{len(more.member)} validation members that break a limit join the training ensemble")
     course.members = course.members.joined(more, stressed=False)
     reset = (dataclasses.replace(limit, ratio=1.0) if limit.kind.worst else limit for limit in limits)
@@ -138,45 +154,13 @@ def breaking(
         return None
     found = np.zeros(0, int)
     for limit, (tuned, judged) in zip(problem.limits, numbers, strict=True):
-        excess = np.where(held(columns), limit.log_excesses(columns), -math.inf)
+        excess = np.where(held(columns), limit.log_excess(limit.values(columns)), -math.inf)
         if limit.kind.worst and not limit.has_reserve(judged):
             found = np.append(found, largest_unseen(course, np.where(excess > 0, excess, -math.inf)))
         elif not limit.kind.worst and not limit.holds(judged) and judged > (1 + UNEXPECTED) * limit.ratio * tuned:
             found = np.append(found, largest_unseen(course, excess))
     total = len(columns["lost_at_s"])
     return problem.objective.chosen(seeds(budget)[1], np.unique(found), total) if found.size else None
-
-
-def _all_met(
-    course: Course, before: Sequence[Limit], after: Sequence[Limit], numbers: Sequence[tuple[float, float]]
-) -> bool:
-    """Return whether all limits are met, and tell each limit that is active or not met.
-
-    `before`, `after`: the limits before and after the update of their multipliers. `numbers`: as of `Judged`.
-    """
-    done = []
-    for old, new, (_, judged) in zip(before, after, numbers, strict=True):
-        idle = old.multiplier == new.multiplier == 0
-        done.append(met(new, judged) or (idle and new.log_excess(judged) <= 0))
-        if not (idle and done[-1]):
-            course.tell(f"limit {new.name} = {new.threshold:g} {new.kind.unit}: judged {judged:.4g}")
-    return all(done)
-
-
-def _least(course: Course, points: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the point [m] with the least goal on the training ensemble, without the terms of the limits."""
-    course.tell("the multipliers of the limits do not converge; the best answer within the limits is taken")
-    both = np.array(points)
-    goal = dataclasses.replace(course.problem.goal, limits=())
-    return points[int(np.argmin(goal.score(course.problem.engine.terms(both, course.members), course.members)))]
-
-
-def met(limit: Limit, judged: float) -> bool:
-    """Return whether the judge's value is close to the bound `Limit.allowed`, as it should be for an active limit.
-
-    g may lie between -TOLERANCE_BELOW and half of the margin.
-    """
-    return limit.log_excess(judged) >= -TOLERANCE_BELOW and limit.has_reserve(judged)
 
 
 def judged_at(course: Course, x: np.ndarray) -> Judged:

@@ -19,7 +19,7 @@ from tuning.problem.loss import TERMS
 from tuning.problem.members import Members
 from tuning.problem.quantities import KINDS
 from tuning.solve.checkpoint import CheckpointFile, SearchState
-from tuning.solve.descent import Descent, begin
+from tuning.solve.descent import Descent, Starts, begin
 from tuning.solve.evolution import Evolution
 from tuning.solve.screen import screen
 
@@ -70,9 +70,9 @@ def search(
     else:
         if len(points) > keep:
             points = screen(engine, members, points, goal)[:keep]
-        progress = SearchState(begin(jnp.asarray(points)), np.ones(len(points), bool))
+        progress = SearchState(begin(jnp.asarray(points)))
     try:
-        while progress.active.any() and progress.iteration < iterations:
+        while not progress.converged and progress.iteration < iterations:
             # Before the first iteration, the search has no result to judge, so Ctrl-C ends the process.
             with deferred(INTERRUPT_MESSAGE if progress.history else ""):
                 raise_if_interrupted()
@@ -90,7 +90,7 @@ def search(
 
 
 def iterate(engine: Engine, goal: Goal, members: Members, progress: SearchState, descent: Descent) -> None:
-    """Make one step of each active start, or draw one population of CMA-ES, and add the best point to the history."""
+    """Make one step of each start, or draw one population of CMA-ES, and add the best point to the history."""
     if progress.evolution is not None:
         x, value, terms = _evolved(engine, goal, members, progress.evolution)
     else:
@@ -116,20 +116,14 @@ def iterate(engine: Engine, goal: Goal, members: Members, progress: SearchState,
 def _descended(
     engine: Engine, goal: Goal, members: Members, progress: SearchState, descent: Descent
 ) -> tuple[np.ndarray, float, dict[str, Any]]:
-    """Make one step of each active start. Return the best point so far [m], its goal, and the terms [N] at its trial.
+    """Make one step of each start. Return the best point so far [m], its goal, and the terms [N] at its trial.
 
     If the best point is older than this step, the terms are those of the last trial of its start.
     """
-    starts, active = progress.starts, np.flatnonzero(progress.active)
-    losses, slopes, terms = engine.gradient(np.asarray(starts.trial)[active], members, goal.weights)
-    full = [np.full((len(progress.active), *one.shape[1:]), np.nan) for one in (losses, slopes)]
-    for whole, part in zip(full, (losses, slopes), strict=True):
-        whole[active] = part
-    progress.starts = descent(members.ordinary, starts, *full, progress.active)
-    best = active[int(np.argmin(np.asarray(progress.starts.value)[active]))]
-    row = int(np.flatnonzero(active == best)[0])
-    found = np.asarray(progress.starts.best)[best], float(progress.starts.value[best])
-    return *found, {name: one[row] for name, one in terms.items()}
+    losses, slopes, terms = engine.gradient(np.asarray(progress.starts.trial), members, goal.weights)
+    starts = progress.starts = descent(members.ordinary, progress.starts, losses, slopes)
+    best = int(np.argmin(starts.value))
+    return np.asarray(starts.best)[best], float(starts.value[best]), {name: one[best] for name, one in terms.items()}
 
 
 def _evolved(
@@ -153,21 +147,21 @@ def _advance(progress: SearchState, seed: int) -> None:
     which members are lost.
     """
     if progress.evolution is not None:
-        progress.active &= not (progress.evolution.reach <= SHORTEST or progress.evolution.converged)
+        progress.converged = progress.evolution.reach <= SHORTEST or progress.evolution.converged
         return
-    best = int(np.argmin(np.asarray(progress.starts.value)))
     if progress.iteration >= RACE:
-        progress.active = np.arange(len(progress.active)) == best
-    if progress.active.sum() > 1:
+        best = int(np.argmin(progress.starts.value))
+        progress.starts = Starts(*(leaf[best : best + 1] for leaf in progress.starts))
+    if len(progress.starts.value) > 1:
         return
     starts, values = progress.starts, progress.history["value"]
-    norm = float(jnp.linalg.norm(starts.gradient[best])) if np.isfinite(starts.value[best]) else math.inf
+    norm = float(jnp.linalg.norm(starts.gradient)) if np.isfinite(starts.value[0]) else math.inf
     stalled = len(values) > PATIENCE and values[-1] > values[-1 - PATIENCE] - STALL
-    ended = stalled or float(jnp.linalg.norm(starts.trial[best] - starts.best[best])) <= SHORTEST
+    ended = stalled or float(jnp.linalg.norm(starts.trial - starts.best)) <= SHORTEST
     if not norm < STEEP or (ended and norm >= CONVERGED):
         progress.evolution = Evolution(progress.history["x"][-1], seed)
     elif ended:
-        progress.active = np.zeros_like(progress.active)
+        progress.converged = True
 
 
 def best_of(progress: SearchState) -> tuple[np.ndarray, float]:

@@ -40,15 +40,12 @@ class Writer:
             outer, _, name = word(x.name).rpartition(".")
             lines += self._opened(open_, outer)
             open_ = outer
+            indent = "    " * (1 + (outer.count(".") + 1 if outer else 0))
             details = ", ".join(filter(None, (x.unit, x.allowed)))
             note = " ".join(filter(None, (f"[{details}]" if details else "", x.doc)))
-            lines.append(f"{self._indent(outer)}{self.prefix}_real {name};{f' /* {note} */' if note else ''}")
+            lines.append(f"{indent}{self.prefix}_real {name};{f' /* {note} */' if note else ''}")
         lines += [*self._opened(open_, ""), *(f"    {line}" for line in more), f"}} {self.prefix}_{kind};"]
         return "\n".join(lines)
-
-    @staticmethod
-    def _indent(outer: str) -> str:
-        return "    " * (1 + (outer.count(".") + 1 if outer else 0))
 
     def _opened(self, now: str, then: str) -> list[str]:
         """Return the lines that close the struct `now` and open `then`."""
@@ -144,9 +141,7 @@ class Writer:
             ),
             params=self.struct("params", t.parameters),
             state=self.struct(
-                "state",
-                [x for x, _ in t.state],
-                [f"uint32_t started; /* {ABOUT[t.block.noun].started} */"],
+                "state", [x for x, _ in t.state], [f"uint32_t started; /* {ABOUT[t.block.noun].started} */"]
             ),
             input=self.struct("input", inputs),
             output=self.struct("output", [x for x, _ in t.outputs]),

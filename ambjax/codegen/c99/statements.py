@@ -19,11 +19,7 @@ RESERVED = {
     *("noexcept", "nullptr", "reinterpret_cast", "requires", "static_assert", "static_cast", "thread_local", "true"),
     *("false", "typeid", "wchar_t", "asm", "compl", "bitand", "bitor", "and_eq", "or_eq", "xor_eq", "not_eq", "xor"),
 }
-HELPERS = {
-    "max": "a > b || a != a ? a : b",
-    "min": "a < b || a != a ? a : b",
-    "sign": "a > 0 ? 1 : a < 0 ? -1 : a",
-}
+HELPERS = {"max": "a > b || a != a ? a : b", "min": "a < b || a != a ? a : b", "sign": "a > 0 ? 1 : a < 0 ? -1 : a"}
 SAMPLE_PERIOD = "SAMPLE_PERIOD"
 
 
