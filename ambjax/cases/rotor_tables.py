@@ -187,8 +187,8 @@ def _shaft(table: Table, places: list[float]) -> RotorBody:
         for x in middles
     ]
     count = table.whole("modes", MODES)
-    places = tuple(range(len(nodes)))
-    model = _shaft_model(sections, discs, nodes, sizes=tuple(sizes), places=places, modes=count)
+    numbers = tuple(range(len(nodes)))
+    model = _shaft_model(sections, discs, nodes, sizes=tuple(sizes), places=numbers, modes=count)
     shapes = np.asarray(model.shapes)
 
     def at(place: float) -> np.ndarray:
