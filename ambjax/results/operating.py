@@ -19,10 +19,12 @@ from ambjax.linear import (
     MemberPeaks,
     StateSpace,
     analyse,
+    analysis,
     checked,
     decayed_end,
     frequency_lines,
     injected_members,
+    linear_machine,
     linearise,
     linearise_members,
 )
@@ -71,12 +73,13 @@ def operating_point(case: Case, name: str, r: float) -> OperatingPoint:
     return OperatingPoint(name, r, m, system, _analysis(case, system, m, _velocity_sensor(case)))
 
 
+# Modules in these types: the documentation would find two classes of each name, one of them in `ambjax.linear`.
 @overload
-def sensitivity(case: MachineCase) -> list[MachineSensitivity]: ...
+def sensitivity(case: MachineCase) -> list[linear_machine.MachineSensitivity]: ...
 @overload
-def sensitivity(case: Case, r: float = 0.0) -> Analysis: ...
+def sensitivity(case: Case, r: float = 0.0) -> analysis.Analysis: ...
 @overload
-def sensitivity(case: Cascade, scenario: Scenario, clock: Clock, /, r: float = 0.0) -> Analysis: ...
+def sensitivity(case: Cascade, scenario: Scenario, clock: Clock, /, r: float = 0.0) -> analysis.Analysis: ...
 @of_case(machines=True)
 def sensitivity(case: Case | MachineCase, r: float = 0.0) -> Analysis | list[MachineSensitivity]:
     """Return the `Analysis` of a case, linearised at a constant reference r (m); of a machine, one for each speed.
