@@ -116,7 +116,7 @@ def near(a, b, rtol, atol=0.0):
 def test_rows_are_samples_at_whole_multiples_of_the_period(short):
     rows = short.trajectory.rows
     assert isinstance(rows, Row)
-    assert all(np.shape(x) == (203,) for x in rows)
+    assert all(np.shape(x) == (203,) for x in jax.tree.leaves(rows))
     np.testing.assert_array_equal(rows.t, np.arange(203) * 1e-4)
     assert rows.alive.dtype == rows.refused.dtype == bool
     assert all(x.dtype == np.float64 for x in rows._replace(alive=rows.t, refused=rows.t))
