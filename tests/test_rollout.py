@@ -119,7 +119,7 @@ def test_rows_are_samples_at_whole_multiples_of_the_period(short):
     assert all(np.shape(x) == (203,) for x in jax.tree.leaves(rows))
     np.testing.assert_array_equal(rows.t, np.arange(203) * 1e-4)
     assert rows.alive.dtype == rows.refused.dtype == bool
-    assert all(x.dtype == np.float64 for x in rows._replace(alive=rows.t, refused=rows.t))
+    assert all(x.dtype == np.float64 for x in jax.tree.leaves(rows._replace(alive=rows.t, refused=rows.t)))
 
 
 def test_rows_are_consistent_with_the_plant_and_the_scenario(short):
