@@ -62,6 +62,8 @@ def test_the_peak_is_that_of_the_sensitivity(peaks, integral):
     assert np.exp(found.peak(x).f) == pytest.approx(worst, rel=1e-3)
     growth = max(np.max(np.real(point.poles)) for point in points)
     assert found.stability(x).f == pytest.approx(growth, rel=1e-3, abs=1e-6)
+    S = [np.diagonal(point.system.response([v / 60])[0]) for point, v in zip(points, case.speeds, strict=True) if v]
+    assert found.turning(x) == pytest.approx(np.max(np.abs(S)), rel=1e-9)
 
 
 @pytest.mark.slow

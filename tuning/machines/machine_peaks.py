@@ -47,7 +47,8 @@ class Peaks:
     def __init__(self, case: MachineCase, space: MachineSpace | LqgSpace) -> None:
         self.count, self.period, self.zones = len(case.axes), float(case.clock.sample_period), case.zones
         machine, self.sampled = canonical(case.machine), case.cases[0].cascade.sampled
-        speeds = jnp.asarray(2 * np.pi * PER_MINUTE * np.array(case.speeds))
+        self.speeds = 2 * np.pi * PER_MINUTE * np.array(case.speeds)
+        speeds = jnp.asarray(self.speeds)
 
         def systems(machine: Machine, rest: MachineRest) -> StateSpace:
             def one(W: Array) -> StateSpace:
@@ -119,6 +120,12 @@ class Peaks:
             best = max(best, (abs(S[k, axis]), at[k], int(axis), loop, S[k, axis]), key=lambda one: one[0])
         height, at, axis, loop, S = best
         return Value(x, float(np.log(height)), np.real(np.conj(S) * self._slope(loop, at, axis)) / height**2)
+
+    def turning(self, x: np.ndarray) -> float:
+        """Return the largest |S_kk| of any axis at the frequency of a speed; 0 if the rotor turns at none."""
+        loops = [(loop, 1j * abs(W)) for loop, W in zip(self.loops(x), self.speeds, strict=True) if W]
+        at = [(loop, np.array([np.exp(s * self.period) if self.sampled else s])) for loop, s in loops]
+        return max((float(np.abs(self._response(*one)).max()) for one in at), default=0.0)
 
     def _points(self, rates: np.ndarray) -> np.ndarray:
         """Return the points s or z at which S is evaluated: of the range of the sensitivity, and beside light poles."""

@@ -123,7 +123,8 @@ def tune_machine(plan: MachinePlan, resume: bool, tell: Tell) -> tuple[MachineCa
         return _written(case, plan.text, own, _gains(own, x), verdict)
 
     def refused_at(x: np.ndarray) -> int:  # other members than those of the judgement
-        return refused(case_at(x), settings.limits, settings.seed + 1, min(settings.held_out, SEARCHED))
+        count = refused(case_at(x), settings.limits, settings.seed + 1, min(settings.held_out, SEARCHED))
+        return count + (plan.peaks.turning(x) > settings.limits.get("sensitivity_1x", math.inf))
 
     speeds = ", ".join(f"{speed:g}" for speed in case.speeds)
     tell(f"tuning {', '.join(own.space.paths)} for the least peak of |S| at {speeds} rpm")
