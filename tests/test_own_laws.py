@@ -3,6 +3,7 @@
 import json
 import pathlib
 import pickle
+import pickle
 import subprocess
 import sys
 import tomllib
@@ -203,7 +204,7 @@ def test_workers_compute_what_this_process_computes(case):
     study = study_of(read_case(case), None, 3)
     here = study.columns(0, 3)
     with processes(1) as pool:
-        there = pool.submit(work, study, 0, 3, 3).result()
+        there = pool.submit(work, pickle.dumps(study), 0, 3, 3).result()
     assert here["rms_error_m"].tolist() == there["rms_error_m"].tolist()
 
 
