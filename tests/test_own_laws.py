@@ -3,7 +3,6 @@
 import json
 import pathlib
 import pickle
-import pickle
 import subprocess
 import sys
 import tomllib
