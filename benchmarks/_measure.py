@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from ambjax.compiler.fast_path import has_avx512
+
 RESULTS = pathlib.Path(__file__).parent / "results"
 
 
@@ -138,7 +140,7 @@ def machine() -> dict[str, Any]:
     return {
         "cpu": model or platform.processor(),
         "cores": os.cpu_count(),
-        "avx512": "avx512f" in text,
+        "avx512": has_avx512(),
         "python": platform.python_version(),
         "jax": jax.__version__,
         "numpy": np.__version__,

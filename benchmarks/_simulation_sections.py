@@ -1,5 +1,7 @@
 """Sections of the benchmark page: simulation, ensembles, gradients, commands, exported programs."""
 
+from typing import Any
+
 from _tables import facts, load, table
 
 
@@ -50,17 +52,26 @@ def work_precision() -> list[str]:
 
 
 def throughput() -> list[str]:
-    data = load("throughput")
+    data, older = load("throughput"), load("throughput_avx2")
     lines = ["## Ensembles against the machine's limit (`throughput.py`)", "", facts(data["machine"])]
-    width = 64 if data["machine"]["avx512"] else 32
     lines += [
         f"RK4 with steps of 10 us. A run has {data['samples']} samples of 10 steps, or {data['samples_of_few']:,}",
         "samples if there are fewer than 256 members. Times are in ns per member and step, without compilation. The",
-        f"limit is a C program (`limit.c`) with vectors of {width} bytes, two of them interleaved. The two programs",
-        "run alternately. A single member is a `rollout`. Speed-up: speed relative to one core; in brackets, that of",
-        "the limit. Held noise is constant over a sample.",
+        "limit is a C program (`limit.c`) with vectors of 64 bytes (AVX-512) or 32 bytes, two of them interleaved. The",
+        "two programs run alternately. A single member is a `rollout`. Speed-up: speed relative to one core; in",
+        "brackets, that of the limit. Held noise is constant over a sample.",
         "",
     ]
+    lines += _throughput_rows(data)
+    lines += [
+        "The same with the instructions of a processor without AVX-512",
+        "(`XLA_FLAGS=--xla_cpu_max_isa=AVX2`):",
+        "",
+    ]
+    return lines + _throughput_rows(older)
+
+
+def _throughput_rows(data: dict[str, Any]) -> list[str]:
     rows = []
     for row in data["rows"]:
         named = [row["dtype"], "held" if row["noise"] else "none", str(row["members"]), str(row["threads"])]
@@ -68,8 +79,7 @@ def throughput() -> list[str]:
         gain = f"{row['times_one_core']:.2f}" + (f" ({row['C_times_one_core']:.2f})" if "C" in row else "")
         rows.append([*named, f"{row['ambjax']:.2f}", *limit, gain, f"{1e9 / row['ambjax']:.2e}"])
     titles = "precision | noise | members | cores | ambjax (ns) | limit (ns) | ratio | speed-up | member-steps/s"
-    lines += table(titles, rows)
-    return lines
+    return table(titles, rows)
 
 
 def sampled() -> list[str]:

@@ -107,7 +107,8 @@ def gradient(p: float) -> float:
     """Return the cost of a gradient of the mean square of e_z, in forward runs."""
     work = sampled(TANGENTS_OF, SAMPLES // 2, p)
 
-    def loss(logs: Any, lanes: Any) -> Any:
+    def loss(logs: Any, lanes: Any, in_parts: bool) -> Any:
+        assert not in_parts  # only the forward mode is measured
         z, member = lanes
         alone = dataclasses.replace(work.scenario, initial=Initial(z=z), member=member)
         return (

@@ -4,6 +4,8 @@ The workload is that of workload.py (RK4, 10 us a step), without and with held n
 process per precision), on one core and on two. ambjax and limit.c are timed alternately in the same process. Ratios are
 medians over the rounds, without compilation. One member alone is a `rollout`.
 Run: python benchmarks/throughput.py
+With the instructions of a processor without AVX-512 (throughput_avx2.json):
+XLA_FLAGS=--xla_cpu_max_isa=AVX2 python benchmarks/throughput.py
 """
 
 import argparse
@@ -18,6 +20,8 @@ os.environ.setdefault("JAX_ENABLE_X64", "1")
 import _measure
 import limit
 import workload
+
+from ambjax.compiler.fast_path import has_avx512
 
 MEMBERS = (1, 16, 64, 256, 1024, 4096)
 THREADS = (1, 2)
@@ -72,7 +76,7 @@ def main() -> None:
             print(f"{named} {row['ambjax']:8.2f} {limits} {1e9 / row['ambjax']:9.2e}", flush=True)
     agreement = None if limit.missing() else limit.agreement()
     _measure.write(
-        "throughput",
+        "throughput" if has_avx512() else "throughput_avx2",
         {
             "samples": given.samples,
             "samples_of_few": given.samples * LONG // SAMPLES,

@@ -34,7 +34,7 @@ def without_mark() -> None:
     from ambjax.compiler import fast_path
 
     fast_path._mark = lambda tree: tree
-    fast_path.options = lambda: fast_path.WIDE if fast_path._has_avx512() else {}
+    fast_path.options = lambda: fast_path.WIDE if fast_path.has_avx512() else {}
 
 
 def without_width() -> None:

@@ -13,6 +13,7 @@ import functools
 import logging
 import os
 import pathlib
+import re
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -83,8 +84,10 @@ def _cpuinfo() -> str:
     return cpuinfo.read_text() if cpuinfo.exists() else ""
 
 
-def _has_avx512() -> bool:
-    return "avx512f" in _cpuinfo()
+def has_avx512() -> bool:
+    """Return whether the processor has AVX-512 and XLA_FLAGS do not select older instructions."""
+    selected = re.search(r"--xla_cpu_max_isa=(\w+)", os.environ.get("XLA_FLAGS", ""))
+    return "avx512f" in _cpuinfo() and (selected is None or selected[1].upper().startswith("AVX512"))
 
 
 def block_length(members: int) -> int:
@@ -97,7 +100,7 @@ def block_length(members: int) -> int:
     of 16 as in a block of 64. Blocks of 8 are hardly faster than blocks of 16.
     """
     number = jnp.result_type(float).itemsize
-    longest = (1024 if members >= 256 and _has_avx512() and "AuthenticAMD" in _cpuinfo() else 512) // number
+    longest = (1024 if members >= 256 and has_avx512() and "AuthenticAMD" in _cpuinfo() else 512) // number
     return min(max(SHORTEST, 1 << (members - 1).bit_length()), longest)
 
 
@@ -110,7 +113,7 @@ def options() -> dict[str, Any] | None:
         log.warning("one-kernel path is off: AMBJAX_PLAIN is set. Results are the same, runs are several times slower.")
         return None
     faults = []
-    for trial in [WIDE, {}] if _has_avx512() else [{}]:
+    for trial in [WIDE, {}] if has_avx512() else [{}]:
         fault = _probe(trial)
         if not fault:
             return trial
