@@ -8,13 +8,11 @@ import pytest
 from texts import write
 
 from ambjax.__main__ import main
-from ambjax.cases.reader import read_case
 from ambjax.cases.template_text import template
-from ambjax.commands import check as checking
 from ambjax.commands import simulate
 from ambjax.simulation.trajectory import STALLED, TOUCHED
 from ambjax.theorem import advice, sampled_report
-from ambjax.theorem.conditions import Condition, Report, check
+from ambjax.theorem.conditions import Condition, Report
 
 SHORT = "[reference]\nkind = 'sine'\namplitude = 2.5e-3\nfrequency = 2.0\n[clock]\nduration = 0.05\n"
 PUSHED = """[disturbance.q_i]
@@ -112,23 +110,6 @@ def test_a_value_that_is_not_finite_is_reported_without_advice(against):
     (words,) = advice.advice(Report([condition(1.0, against)], [], math.inf, "", ""))
     assert "not finite" in words
     assert not advised(words)
-
-
-@pytest.mark.slow
-def test_a_stalled_run_gives_no_verdict_on_the_rotor(capsys, monkeypatch):
-    case = read_case(write(SHORT))
-    report = check(case.cascade, case.scenario, case.clock)
-    assert not report.stalled
-    stalled = dataclasses.replace(report, lost_at=0.01, lost_why="stalled: ...", stalled=True)
-    assert not stalled.lost
-    assert not stalled.holds
-    monkeypatch.setattr(checking, "check_theorem", lambda *_: stalled)
-    assert main(["check", "case.toml"]) == 1
-    said = capsys.readouterr().out
-    assert "not decided" in said
-    assert "The rotor is lost" not in said
-    for word in ("steepness p", "dt = ", "rodas3"):
-        assert word in said
 
 
 # Of each status: when a run ended, whether for the integrator, and what each command must say and return.
