@@ -48,9 +48,7 @@ def test_default_ranges_of_converters_follow_from_the_plant():
     assert (float(seen.z), float(seen.i)) == (5e-3 * 127 / 128, 0.5 * 127 / 128)
     seen = Sensor(bits=8.0, range_z=1e-3, range_i=0.1).converted(motion(z=-1.0, i=-1.0), 5e-3, 0.25)
     assert (float(seen.z), float(seen.i)) == (-1e-3, -0.1)
-
-
-def test_the_current_may_have_a_converter_of_its_own():
+    # the current may have a converter of its own
     for bits, z in ((16.0, 5e-3 * (1 - 2**-15)), (None, 1.0)):
         seen = Sensor(bits=bits, bits_i=4.0).converted(motion(z=1.0, i=1.0), 5e-3, 0.25)
         assert (float(seen.z), float(seen.i)) == (z, 0.5 * 7 / 8)

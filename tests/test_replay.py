@@ -67,13 +67,6 @@ def commands(text):
     return [next(filter(None, one)) for one in found]
 
 
-def run(line):
-    """Exit code of a printed command, in this process."""
-    program, *argv = shlex.split(line)
-    assert program == "ambjax"
-    return main(argv)
-
-
 @pytest.fixture(scope="module")
 def printed(tmp_path_factory):
     """Folder, printed text, columns and summary of an ensemble of a case whose file name contains a space."""
@@ -124,7 +117,9 @@ def test_the_printed_command_replays_the_worst_member(printed, monkeypatch, caps
     monkeypatch.setattr(replaying, "SEGMENT", 300)  # four stretches, the last of which the run does not fill
     (line,) = commands(said)
     assert line == summary["worst"][0]["replay"]
-    assert run(f"{line} --json --out alone") == 0
+    program, *argv = shlex.split(line)
+    assert program == "ambjax"
+    assert main([*argv, "--json", "--out", "alone"]) == 0
     answer = capsys.readouterr()
     assert "trajectory.npz" not in answer.err  # no deviation to report
     metrics = json.loads(answer.out)

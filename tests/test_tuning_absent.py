@@ -51,10 +51,7 @@ SAID = {
     ("2", "1.5", True): "at most 1.5 (at 400 Hz)",
     ("unstable", "none", False): f"no peak of |S| for member 7: {UNSTABLE}: zone D",
     ("unknown", "none", False): f"no peak of |S| for member 7: {UNKNOWN}.",
-    ("unstable", "1.5", False): f"no peak of |S| for member 7: {UNSTABLE}: zone D",
-    ("unknown", "1.5", False): f"no peak of |S| for member 7: {UNKNOWN}.",
     ("unstable", "3.5", True): "at most 3.5 (at 400 Hz)",
-    ("unknown", "3.5", True): "at most 3.5 (at 400 Hz)",
 }
 
 

@@ -324,17 +324,14 @@ def test_a_resumed_search_with_limits_gives_the_same_result(monkeypatch, tmp_pat
 # --- the command ---
 
 
-def command(monkeypatch, tmp_path, world=None, **tune):
-    study(monkeypatch, world or World(), **tune)
-    path, out = case_file(tmp_path, **tune)
-    tuned = tuning.tune(path, out, force=True)
-    return int(not tuned.good), tuned.report, out
-
-
 @pytest.mark.slow
 def test_the_command_prints_the_price_of_a_limit(monkeypatch, tmp_path):
-    code, summary, out = command(monkeypatch, tmp_path, limits={"rms_u_V": 10.0})
-    assert code == 0
+    limits = {"rms_u_V": 10.0}
+    study(monkeypatch, World(), limits=limits)
+    path, out = case_file(tmp_path, limits=limits)
+    tuned = tuning.tune(path, out)
+    assert tuned.good
+    summary = tuned.report
     row, survival = summary["limits"]
     assert (row["name"], row["threshold"], row["held"], row["active"]) == ("rms_u_V", 10.0, True, True)
     assert row["reached"] == pytest.approx(summary["after"]["settled_rms_u_V.mean"])

@@ -75,16 +75,6 @@ def test_a_held_rotor_that_fails_a_condition_is_reported_as_held(capsys):
     assert answered((SHORT + PUSHED).replace("k_i = 152.0", "k_i = 220.1"), capsys)[0] == 0
 
 
-@pytest.mark.slow
-def test_the_advised_gain_is_set_by_the_pulse_that_breaks_the_loop(capsys):
-    # with the printed 7.5e4 the same pulse loses the rotor; Delta_1 of its fall is no reason to touch gamma
-    code, answer = answered((SHORT + PUSHED).replace("gamma = 1e6", "gamma = 7.5e4"), capsys)
-    assert code == 1
-    assert "2 of 5 do not" in answer
-    assert "The rotor is lost" in answer
-    assert advised(answer) == [("controller.current", "k_i", "220")]
-
-
 def condition(gain, against, path="controller.inversion.gamma", ideal=False, at=0.1):
     over = f"Delta_1 along the {'reference' if ideal else 'run'}"
     return Condition("x", f"gamma > {over}", gain, against, at, "u", gain > against, "", path, over, ideal)
