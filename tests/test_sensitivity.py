@@ -130,10 +130,13 @@ def test_bad_input_is_refused_in_one_line(tmp_path, capsys, text, flags, message
     assert not (tmp_path / "out").exists()
 
 
+CHECKED = "[controller]\n[clock]\nduration = 0.02\n[actuator]\nu_max = 200.0\n"
+
+
 def test_check_does_not_succeed_without_a_linearisation(tmp_path, capsys, monkeypatch):
     """All conditions hold, the rotor is held, and the verdict on the linear loop is missing."""
     path = tmp_path / "case.toml"
-    path.write_text("[controller]\n[clock]\nduration = 0.01\n")
+    path.write_text(CHECKED)
 
     def fails(*args):
         raise ValueError("the cause")
@@ -148,7 +151,7 @@ def test_check_does_not_succeed_without_a_linearisation(tmp_path, capsys, monkey
 def test_check_begins_with_the_numbers_of_the_machine(tmp_path, capsys):
     """By hand for the plant of Table 1: kappa = mu_0 n^2 A, k_s = kappa i_0^2/s_0^3, k_i = kappa i_0/s_0^2."""
     path = tmp_path / "case.toml"
-    path.write_text("[controller]\n[clock]\nduration = 0.02\n[actuator]\nu_max = 200.0\n")
+    path.write_text(CHECKED)
     main(["check", str(path), "--json"])
     loop = json.loads(capsys.readouterr().out)["loop"]
     kappa = 1.25e-6 * 1480**2 * 0.121

@@ -7,35 +7,13 @@ import re
 import browser
 import numpy as np
 import pytest
-from bowl import World, instead_of_engines
+from bowl import World, document, instead_of_engines
+from tomlkit import dumps
 
 from ambjax.cases.reader import safe_name
 from ambjax.text.web_page import escape_markdown, render_page
 from tuning.__main__ import main
 from tuning.problem.goal import shown
-
-CASE = """
-reference = { kind = "sine", amplitude = 1e-3, frequency = 5.0 }
-controller.inversion = { gamma = 3e5 }
-sensor = { std = 1e-6, std_z_dot = 1e-4, std_i = 1e-4 }
-actuator = { u_max = 200.0 }
-clock = { duration = 0.02 }
-run = { settle = 0.01 }
-spread = { plant.m = { percent = 5 } }
-[tune]
-objective = "least_error"
-limits.sensitivity = inf
-gains = ["controller.position.c", "controller.position.k"]
-screen = 4
-starts = 1
-iterations = 2
-members = 4
-stressed = 2
-validation = 4
-held_out = 12
-weights.peak = 0.5
-risk = "cvar"
-"""
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +21,7 @@ def written(tmp_path_factory):
     """Return the folder of a run of the command with a Bowl as its engine. The name of the case contains markup."""
     folder = tmp_path_factory.mktemp("written")
     path = folder / "<img src=x onerror=alert(1)> a|b *c* [d](e).toml"
-    path.write_text(CASE, encoding="utf-8")
+    path.write_text(dumps(document()), encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder.parent / "cache"))
         instead_of_engines(patch, World())
