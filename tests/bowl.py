@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from texts import case_and_tune
+from tomlkit import dumps
 
 from ambjax.solvers import AdaptiveRodas3
 from tuning.problem.limits import PREFIX
@@ -177,3 +178,20 @@ def study(monkeypatch, world, tables=None, **tune):
     instead_of_engines(monkeypatch, world)
     raw = document(tables, **tune)
     return tuning.problem.tuning_problem.problem_of(*case_and_tune(raw))
+
+
+def answer_of(monkeypatch, folder, world, listen=lambda event: None, **tune):
+    """The answer of the rounds of a study in a world, and its gains (c, k)."""
+    from tuning.rounds import rounds
+
+    folder.mkdir(exist_ok=True)
+    made = study(monkeypatch, world, **tune)
+    answer = rounds(made, made.tune.space.values(made.case.cascade), folder, {"of": str(tune)}, False, listen)
+    return answer, np.asarray(answer.problem.objective.space.gains_at(answer.x))
+
+
+def case_file(folder, **tune):
+    """Write the case file, and return its path and that of its output folder."""
+    path = folder / "case.toml"
+    path.write_text(dumps(document(**tune)))
+    return path, folder / "out"

@@ -1,6 +1,5 @@
 """A headless Chromium, driven over the DevTools protocol through a pipe. No package is needed."""
 
-import base64
 import contextlib
 import fcntl
 import itertools
@@ -105,11 +104,6 @@ class Tab:
         x, y = self.run(f"{middle}(document.querySelector({selector!r}).getBoundingClientRect())")
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-
-    def picture(self, path: pathlib.Path, whole: bool = True) -> None:
-        """Write a PNG of the page."""
-        data = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)["data"]
-        path.write_bytes(base64.b64decode(data))
 
 
 KEYS = {"ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40, "Tab": 9, "Enter": 13, "Home": 36, "End": 35}

@@ -1,5 +1,7 @@
 """Seven machines as case dictionaries, all held: what `machine_oracle` and another program are compared on."""
 
+import numpy as np
+
 RIG = {"mu_0": 1.2566e-6, "n": 208.0, "A": 2.68e-4, "s_0": 5e-4, "i_0": 2.5, "R": 1.0}
 PID = {"position": {"kind": "pid"}, "inversion": {"kind": "linearised"}, "current": {"kind": "pi"}}
 CLOCK = {"duration": 0.02, "sample_period": 5e-5}
@@ -146,3 +148,20 @@ MACHINES = {
         "clock": CLOCK,
     },
 }  # fmt: skip
+
+
+# Amplifiers without current: the magnets exert only what their bias gives.
+OFF = {
+    "controller": {"position": {"kind": "pid", "k_p": 1.0, "k_d": 1.0, "k_int": 1.0},
+                   "inversion": {"kind": "linearised"}, "current": {"kind": "amplifier", "bandwidth": 1e3}},
+    "actuator": {"mode": "current", "bandwidth": 1e3, "u_max": 1e-9},
+    "run": {"settle": 0.0},
+}  # fmt: skip
+
+
+class Pid:
+    """The published PID of the Munich rig: 5000 A/m, 1500 A/(m s), 5 A s/m; a pole of its derivative at 3e6 1/s."""
+
+    w = 3e6
+    A, B = np.array([[0.0, 0.0], [0.0, -w]]), np.array([[1.0], [1.0]])
+    C, D = np.array([[1500.0, -5.0 * w * w]]), np.array([[5000.0 + 5.0 * w]])

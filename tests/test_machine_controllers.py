@@ -110,22 +110,19 @@ def test_an_lqg_holds_the_munich_rig_in_a_run():
         ({"tilt": {"position": {"k_p": 1.0}}}, r'controller\.tilt is for coordinates = "rigid-body"'),
         ({"coordinates": "rigid-body", "tilt": {"current": {}}}, r"controller\.tilt\.current"),
         ({"coordinates": "rigid-body", "tilt": {"position": {"kind": "pid"}}}, "same kind in all coordinates"),
+        ({"coordinates": "rigid-body", "left": {"position": {"c": 300.0}}},
+         r"bearing\[0\]\.controller\.position: in rigid-body coordinates"),
     ],
-)
+)  # fmt: skip
 def test_bad_keys_are_refused_in_one_line(change, said):
-    raw = changed(MACHINE, **change)
+    """`left`: the controller of the first bearing."""
+    raw = changed(MACHINE, **{key: value for key, value in change.items() if key != "left"})
+    raw["bearing"][0] |= {"controller": change["left"]} if "left" in change else {}
     if "kind" in change:
         raw["controller"] = change
     with pytest.raises(ValueError, match=said) as refused:
         machine_from(raw)
     assert "\n" not in str(refused.value)
-
-
-def test_a_bearing_has_no_position_law_of_its_own_in_rigid_body_coordinates():
-    raw = changed(MACHINE, coordinates="rigid-body")
-    raw["bearing"][0]["controller"] = {"position": {"c": 300.0}}
-    with pytest.raises(ValueError, match=r"bearing\[0\]\.controller\.position: in rigid-body coordinates"):
-        machine_from(raw)
 
 
 @pytest.mark.slow

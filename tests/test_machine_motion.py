@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from machine_cases import OFF
 
 from ambjax.cases.machine_case import machine_from
 from ambjax.results.machine_run import simulate_machine
@@ -22,20 +23,16 @@ def moved(i_0=1e-6, shapes=SHAPES, W=W, gyroscopic=COUPLED, tilt=0.0, pulse=0, w
     own = [{"name": name, "kind": "radial", "at": at, "modes": [shape]}
            for name, at, shape in zip("abc", PLACES, shapes, strict=True)]  # fmt: skip
     between, alone = gyroscopic
-    raw = {
+    raw = OFF | {
         "plant": MAGNET | {"i_0": i_0},
         "rotor": {"kind": "modal", "m": M, "I_t": I_T, "I_p": I_P, "gravity": [0.0] * 3, "speed": W * 30 / np.pi,
                   "modes": [{"frequency": MODE / (2 * np.pi), "damping": 0.0}],
                   "Gm": [[0.0] * 3, [0.0, I_P / I_T, between], [0.0, between, alone]]},
         "bearing": own,
-        "controller": {"position": {"kind": "pid", "k_p": 1.0, "k_d": 1.0, "k_int": 1.0},
-                       "inversion": {"kind": "linearised"}, "current": {"kind": "amplifier", "bandwidth": 1e3}},
-        "actuator": {"mode": "current", "bandwidth": 1e3, "u_max": 1e-9},
         "load": [{"at": PLACES[pulse], "modes": [shapes[pulse]], "direction": [*way, 0.0], "kind": "pulse",
                   "amplitude": 0.0 if tilt else 10.0, "start": 1e-3, "stop": 2e-3}],
         "initial": {"q": [0.0, 0.0, 0.0, tilt, 0.0, 0.0, 0.0]},
         "clock": {"duration": 0.02, "sample_period": 5e-5, "dt": 5e-5},
-        "run": {"settle": 0.0},
     }  # fmt: skip
     return simulate_machine(machine_from(raw)).signals
 

@@ -4,43 +4,22 @@ import pathlib
 
 import numpy as np
 import pytest
+from test_own_laws import LAW
 
 from ambjax.cases.machine_case import machine_from
 from ambjax.linear.linear_machine import machine_sensitivity
 from ambjax.results.machine_run import simulate_machine
 
-LAWS = """
-import jax.numpy as jnp
-from ambjax.extend import MachineLaw, PositionLaw, Rotor, demand_of, force_for, gain, leaf, record
-
-
-@record
-class Axis(PositionLaw):
-    stiff: float = gain(default=3e4, unit="1/s^2", doc="proportional gain")
-    damp: float = gain(default=200.0, unit="1/s", doc="derivative gain")
-
-    def init(self, model):
-        return jnp.zeros(())
-
-    def scale(self, model):
-        return 1e-6
-
-    def slope(self, model):
-        return self.damp
-
-    def sigma(self, motion, reference):
-        return motion.z_dot
-
-    def __call__(self, model, inputs, state):
-        motion, reference = inputs
-        wanted = -self.stiff * (motion.z + 5 * state) - self.damp * motion.z_dot
-        return force_for(0.0, model, motion, reference, wanted), motion.z
-
+# The law of one axis is that of tests/test_own_laws.py.
+IMPORTS = "from ambjax.extend import MachineLaw, PositionLaw, demand_of, force_for, gain, leaf, record"
+LAWS = (
+    f"{IMPORTS}\n{LAW}"
+    + """
 
 @record
 class Whole(MachineLaw):
-    stiff: float = gain(default=3e4, unit="1/s^2", doc="proportional gain")
-    damp: float = gain(default=200.0, unit="1/s", doc="derivative gain")
+    stiff: float = gain(default=1e4, unit="1/s^2", doc="proportional gain")
+    damp: float = gain(default=400.0, unit="1/s", doc="derivative gain")
     mass: object = leaf(default=None, shape="c", unit="kg", at_least=0, at_most=1e6, optional=True, doc="of the axes")
 
     def designed(self, rotor):
@@ -48,15 +27,16 @@ class Whole(MachineLaw):
         return type(self)(self.stiff, self.damp, 1 / jnp.sum(B * jnp.linalg.solve(rotor.M, B.T).T, 1))
 
     def scale(self):
-        return jnp.full_like(self.mass, 1e-6)
+        return jnp.ones_like(self.mass)
 
     def begin(self, measured, inputs):
         return 0.0 * measured.z
 
     def __call__(self, measured, state, inputs):
-        wanted = -self.stiff * (measured.z + 5 * state) - self.damp * measured.z_dot
-        return demand_of(inputs.scaled(self.mass * wanted), measured), measured.z
+        wanted = -self.stiff * measured.z - self.damp * measured.z_dot - state
+        return demand_of(inputs.scaled(self.mass * wanted), measured), 10 * self.stiff * measured.z
 """
+)
 PLANT = {"mu_0": 1.2566e-6, "n": 200.0, "A": 7.6e-5, "s_0": 3.81e-4, "i_0": 1.444, "R": 1.0}
 INNER = {"inversion": {"kind": "closed-form"}, "current": {"kind": "pi"}}
 MACHINE = {
@@ -81,9 +61,9 @@ def read(tmp_path):
 
 @pytest.mark.slow
 def test_a_law_of_the_machine_that_treats_every_axis_alike_equals_that_law_on_each_axis(read):
-    each = read({"position": {"kind": "mine.py:Axis", "damp": 300.0}})
-    whole = read({"kind": "mine.py:Whole", "damp": 300.0})
-    assert [law.law.__name__ for case in (each, whole) for law in case.own_laws] == ["Axis", "Whole"]
+    each = read({"position": {"kind": "mine.py:PD", "stiff": 3e4, "damp": 300.0}})
+    whole = read({"kind": "mine.py:Whole", "stiff": 3e4, "damp": 300.0})
+    assert [law.law.__name__ for case in (each, whole) for law in case.own_laws] == ["PD", "Whole"]
     signals = [simulate_machine(case).signals for case in (each, whole)]
     assert np.ptp(signals[0]["z"][:, 0]) > 1e-5
     np.testing.assert_allclose(signals[1]["z"], signals[0]["z"], rtol=0, atol=1e-14)
@@ -95,7 +75,7 @@ def test_a_law_of_the_machine_that_treats_every_axis_alike_equals_that_law_on_ea
 @pytest.mark.parametrize(
     ("controller", "said"),
     [
-        ({"kind": "mine.py:Axis"}, r"controller\.kind = .*derive it from ambjax\.extend\.MachineLaw"),
+        ({"kind": "mine.py:PD"}, r"controller\.kind = .*derive it from ambjax\.extend\.MachineLaw"),
         ({"kind": "mine.py:Whole", "dmap": 1.0}, r"controller\.dmap = 1.*Did you mean 'damp'"),
         ({"kind": "mine.py:Whole", "mass": "x"}, r"controller\.mass"),
         ({"kind": "mine.py:Wrong"}, r"Wrong raised TypeError: .*scale\(\) must be like the state"),

@@ -5,6 +5,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from machine_cases import Pid
 
 from ambjax import save_controller
 from ambjax.__main__ import main
@@ -22,14 +23,6 @@ from ambjax.results.machine_run import simulate_machine
 MASS, I_T, I_P, HALF = 3.0, 0.1, 0.04, 0.25
 S_0, I_0, K_I, K_S = 0.78e-3, 1.56, 50.0, 1e5
 MAGNET = {"mu_0": 1.2566e-6, "n": 208.0, "A": K_I * S_0**2 / I_0 / 1.2566e-6 / 208.0**2, "s_0": S_0, "i_0": I_0}
-
-
-class Pid:
-    """A current of 5000 A/m, 1500 A/(m s) and 5 A s/m, with a pole of its derivative at 3e6 1/s."""
-
-    w = 3e6
-    A, B = np.array([[0.0, 0.0], [0.0, -w]]), np.array([[1.0], [1.0]])
-    C, D = np.array([[1500.0, -5.0 * w * w]]), np.array([[5000.0 + 5.0 * w]])
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from machine_cases import OFF
 
 from ambjax.cases.machine_case import machine_from
 from ambjax.results.machine_run import simulate_machine
@@ -21,17 +22,13 @@ BEARINGS = [{"name": name, "kind": "radial", "at": at} for name, at in (("a", -0
 def released(own=(), tilt=TILT, **tables):
     """The machine of a rotor that falls along y, from rest with a tilt beta_x. `own`: keys of the bearing a."""
     load = {"at": 0.0, "direction": [0.0, -1.0, 0.0], "kind": "constant", "value": M * G}
-    return machine_from({
+    return machine_from(OFF | {
         "plant": MAGNET,
         "rotor": {"kind": "rigid", "m": M, "I_t": I_T, "I_p": 0.0, "gravity": [0.0] * 3},
         "bearing": [BEARINGS[0] | dict(own), BEARINGS[1]],
-        "controller": {"position": {"kind": "pid", "k_p": 1.0, "k_d": 1.0, "k_int": 1.0},
-                       "inversion": {"kind": "linearised"}, "current": {"kind": "amplifier", "bandwidth": 1e3}},
-        "actuator": {"mode": "current", "bandwidth": 1e3, "u_max": 1e-9},
         "load": [load],
         "initial": {"q": [0.0, 0.0, 0.0, tilt, 0.0]},
         "clock": {"duration": 0.012, "sample_period": 5e-5, "dt": 5e-5},
-        "run": {"settle": 0.0},
     } | tables)  # fmt: skip
 
 

@@ -118,11 +118,6 @@ def test_the_weights_of_an_lqg_begin_at_those_of_the_case():
         np.testing.assert_allclose(getattr(law, name), getattr(case.machine.law, name), rtol=1e-6, atol=1e-9)
 
 
-def test_refused_weights():
-    with pytest.raises(ValueError, match="k_p"):
-        lqg_case(gains=["controller.lqg.k_p"])
-
-
 @pytest.mark.slow
 def test_peak_and_derivatives_of_an_lqg():
     case, space = lqg_case(gains=[f"controller.lqg.{name}" for name in ("error", "noise")])
@@ -188,6 +183,8 @@ def test_a_search_killed_after_any_start_ends_as_the_uninterrupted_one(tmp_path)
 def test_refused_gains(tune, words):
     with pytest.raises(ValueError, match=words):
         space_of(raw_case(**tune))
+    with pytest.raises(ValueError, match="k_p"):
+        lqg_case(gains=["controller.lqg.k_p"])
 
 
 @pytest.mark.parametrize("options", [["--resume"], ["--pareto"]])

@@ -12,7 +12,7 @@ from ambjax.control import inversion
 from ambjax.control.cascade_state import Sample
 from ambjax.control.exact import WIDTH
 from ambjax.control.inversion import StaticInversionState
-from ambjax.control.observer import IRED1, IRED2, Difference, Direct, Kalman, Predicted
+from ambjax.control.observer import IRED1, IRED2, Complementary, Difference, Direct, Kalman, Predicted
 from ambjax.control.processor import Processor
 from ambjax.numerics import differentiator
 from ambjax.plants import Plant
@@ -160,9 +160,6 @@ def test_errors_of_the_kalman_filter_have_three_equal_poles(w, z):
     np.testing.assert_allclose(np.poly(continuous), np.poly([-w * T] * 3), rtol=0, atol=1e-12 * (1 + w * T) ** 3)
 
 
-# --- the cubic ---
-
-
 # --- continuous time ---
 
 
@@ -277,3 +274,27 @@ def test_the_sliding_step_is_refused_with_a_differentiator(kind):
     with pytest.raises(ValueError, match=r"^clock.method = \"sliding\": .* an observer other than \"ired-1\""):
         case_from(case)
     case_from(case | {"controller": {"observer": {"kind": "kalman"}}})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", [inversion.Adaptive(), inversion.ClosedForm()], ids=lambda law: type(law).__name__)
+def test_the_laws_use_the_estimate_of_the_observer(law):
+    """The observer has its own estimate of the position.
+
+    The measured position then changes rates only, not the commands at the same instant.
+    """
+    cascade = Cascade(Complementary(l=7.0), inversion=law)
+    reference = reference_at(Sine(2.5e-3, 2.0), 0.013)
+    state = cascade.init(Measurement(jnp.asarray(2e-4), jnp.asarray(0.0), jnp.asarray(0.0)))
+
+    def outputs(z, estimate):
+        command, rates = cascade(Measurement(z, 3e-3, 0.02), state._replace(observer=estimate), reference, 200.0)
+        decided = [command.v_star, command.v_tilde, command.i_ref]
+        if isinstance(law, inversion.Adaptive):  # a static inversion passes the estimate's rate on to i_ref' and u
+            decided += [command.i_ref_dot, command.u]
+        return jnp.stack(decided), rates.observer
+
+    (by_z, by_estimate), rates = jax.jacfwd(outputs, (0, 1))(1e-4, 2e-4)
+    np.testing.assert_array_equal(by_z, 0.0 * by_z)
+    assert abs(by_estimate[0]) > 1.0
+    np.testing.assert_allclose(rates, (7.0, -7.0), rtol=1e-12)

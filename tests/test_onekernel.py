@@ -87,6 +87,7 @@ def test_the_kernel_compiles_for_a_gpu(laws, x64, changes, monkeypatch):
         ({"clock": Clock(0, 1e-4, RK4(1))}, "clock.samples = 0"),
         ({}, "run_on_gpu needs a GPU, and JAX runs on this backend: cpu. Use run_ensemble."),
         ({"scenario": dataclasses.replace(SCENARIO, reference=RECORDED), "interpret": True}, "a recorded signal"),
+        ({"cascade": Cascade(processor=Processor()), "interpret": True}, "cascades in continuous time only"),
     ],
 )
 def test_bad_input_is_refused(change, message):
@@ -101,9 +102,3 @@ def test_without_the_triton_back_end_the_ordinary_ensemble_runs(monkeypatch):
         found = run_on_gpu(CASCADE, SCENARIO, CLOCK, fold=Peak("e_z"), interpret=True)
     expected = run_ensemble(CASCADE, SCENARIO, CLOCK, fold=Peak("e_z"), threads=1)
     assert all(map(np.array_equal, jax.tree.leaves(found), jax.tree.leaves(expected)))
-
-
-def test_a_processor_is_refused():
-    cascade = Cascade(processor=Processor())
-    with pytest.raises(ValueError, match="run_on_gpu simulates cascades in continuous time only"):
-        run_on_gpu(cascade, Scenario(member=np.arange(2)), Clock(10, 1e-4, RK4(2)), fold=None, interpret=True)

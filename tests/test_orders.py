@@ -131,12 +131,3 @@ def test_the_amplitude_in_each_turn_of_a_run_up_is_that_of_the_signal():
     found = once_per_turn(3e-6 * np.cos(2 * np.pi * turns + 0.4) + 1e-5 * turns, turns)
     assert len(found) == int(turns[-1])
     np.testing.assert_allclose(found, 3e-6, rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_run_up_is_drawn_against_speed(tmp_path):
-    text = "[rotor]\nspeed = {}\n[clock]\nduration = 0.05\n[processor]\n"
-    for name, speed in (("up", "3000.0\nacceleration = 60000.0"), ("constant", "3000.0")):
-        (tmp_path / f"{name}.toml").write_text(text.format(speed))
-        assert main(["simulate", str(tmp_path / f"{name}.toml"), "--out", str(tmp_path / name)]) == 0
-        assert (tmp_path / name / "runup.png").exists() == (name == "up")

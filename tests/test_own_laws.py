@@ -13,8 +13,6 @@ from texts import write
 
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
-from ambjax.ensemble.worker import processes, work
-from ambjax.results.spread_runs import study_of
 from tuning.__main__ import main as tune_main
 from tuning.report.tuned import tuned_case
 
@@ -196,15 +194,6 @@ def test_a_law_is_unpickled_in_a_process_without_its_file(case):
     pathlib.Path("mine.py").unlink()
     done = subprocess.run([sys.executable, "-c", OTHER], input=sent, capture_output=True, check=True)
     assert done.stdout.decode() == "PD 300.0 True\n"
-
-
-@pytest.mark.slow
-def test_workers_compute_what_this_process_computes(case):
-    study = study_of(read_case(case), None, 3)
-    here = study.columns(0, 3)
-    with processes(1) as pool:
-        there = pool.submit(work, pickle.dumps(study), 0, 3, 3).result()
-    assert here["rms_error_m"].tolist() == there["rms_error_m"].tolist()
 
 
 @pytest.mark.parametrize(

@@ -216,21 +216,9 @@ def test_a_law_without_the_base_class_is_refused():
 )
 def test_a_law_that_cannot_be_called_is_refused_in_one_line(call, said):
     @record
-    class Law(PositionLaw):
+    class Law(BoundaryLayer):
         def __call__(self, model, inputs, state):
             return call(model, inputs)
-
-        def init(self, model):
-            return ()
-
-        def scale(self, model):
-            return ()
-
-        def sigma(self, model, inputs, state):
-            return 0.0
-
-        def slope(self, model):
-            return 1.0
 
     cascade = dataclasses.replace(CASCADE, position=Law())
     for run in (rollout, jax.jit(rollout)):

@@ -351,27 +351,6 @@ def test_the_drawing_of_the_machine_shows_the_selected_time(fresh):
 
 
 @in_browser
-def test_no_curve_is_visible_before_the_first_run(written, tmp_path):
-    with browser.browser(tmp_path) as tab:
-        tab.call("Page.addScriptToEvaluateOnNewDocument", source="window.Worker = class { postMessage() {} }")
-        tab.open(written)
-        tab.wait("window.ambjax && ambjax.state.sent > 0")
-        assert tab.run("document.getElementById('status').textContent").startswith("Computing")
-        visible = "one => one.checkVisibility({ visibilityProperty: true })"
-        assert not tab.run(f"[...document.querySelectorAll('.plot > div')].some({visible})")
-
-
-@in_browser
-def test_curves_are_visible_after_a_run_and_the_page_ends_with_its_content(fresh):
-    shown = (
-        "[...document.querySelectorAll('.plot > div')].every(one => one.checkVisibility({visibilityProperty: true}))"
-    )
-    assert fresh.run(shown)
-    end = "document.querySelector('main').getBoundingClientRect().bottom + scrollY"
-    assert fresh.run(f"document.documentElement.scrollHeight - ({end})") < 20
-
-
-@in_browser
 def test_every_input_has_a_label(fresh):
     unnamed = "[...document.querySelectorAll('input, select, textarea')].filter("
     unnamed += "e => !e.labels.length && !e.ariaLabel).length"

@@ -30,16 +30,6 @@ def noise(survived, radius_at_least=1e-8, stalled=False):
     return Noise(1e-4, 0.6, *statuses, NOISE_STDS / NOISE_STDS[0] * radius_at_least)
 
 
-def test_noise_scan_is_read_correctly():
-    scan = noise(4, radius_at_least=1e-6)
-    assert scan.survived == NOISE_STDS[3]
-    # sigma is proportional to std, so interpolation on logarithms is exact
-    assert scan.std_for(6e-6) == pytest.approx(6 * NOISE_STDS[0], rel=1e-12)
-    assert scan.std_for(1e-9) is None
-    assert noise(0).survived == 0.0
-    assert noise(0).std_for(6e-6) is None
-
-
 def test_verdicts_depend_on_the_evidence():
     """Each verdict changes when its number crosses the criterion."""
     judges = {c.says: c.judge for c in claims.CLAIMS}

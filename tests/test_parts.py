@@ -9,15 +9,10 @@ from ambjax.laws import current, inversion, position
 from ambjax.sensors import Sensor
 from ambjax.signals import Sine
 from ambjax.simulation.folds import Rms
-from ambjax.simulation.parts import part_length, rolled_in_parts
+from ambjax.simulation.parts import rolled_in_parts
 from ambjax.simulation.rollout import prepare
 from ambjax.solvers import RK4
 from tuning.problem.tuning_problem import cheaper_mode
-
-
-@pytest.mark.parametrize(("samples", "length"), [(100, 10), (20_000, 125), (240, 15), (17, 1), (1, 1)])
-def test_a_part_is_the_largest_divisor_up_to_the_square_root(samples, length):
-    assert part_length(samples) == length
 
 
 def gradient_in_parts(samples):

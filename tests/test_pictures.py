@@ -1,8 +1,10 @@
-"""Pictures of ensembles: numbers, units and edges against closed forms, and special cases.
+"""Pictures: units, enlarged parts and ranges of time against closed forms, and special cases.
 
 Warnings are errors here, so each picture is written without a warning.
 """
 
+import json
+import pathlib
 import re
 
 import numpy as np
@@ -10,29 +12,29 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from ambjax.pictures import fans, heatmaps, histograms
-from ambjax.pictures.scales import AXIS_UNITS, LABELS, axis_of, edges, label_of, prefix_of
+from ambjax.__main__ import main
+from ambjax.pictures import fans, figures, heatmaps, histograms
+from ambjax.pictures.overview import overview
+from ambjax.pictures.scales import AXIS_UNITS, LABELS, axis_of, label_of, prefix_of
 from ambjax.pictures.tornado import Bar, tornado
 from ambjax.simulation import orders
 from ambjax.simulation.metrics import UNITS, Metrics
+from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Row, Trajectory
 
 PERCENTS = (0, 5, 25, 50, 75, 95, 100)
 
 
 @pytest.fixture(autouse=True)
 def drawn(monkeypatch):
-    """The saved figures, which the tests can still inspect.
-
-    Each file is also written, with a low resolution to save time.
-    """
-    figures, save = [], Figure.savefig
+    """The saved figures, which the tests can still inspect. Each file has a low resolution to save time."""
+    kept, save = [], Figure.savefig
 
     def keep(self, path, **options):
-        figures.append(self)
+        kept.append(self)
         save(self, path, **options | {"dpi": 40})
 
     monkeypatch.setattr(Figure, "savefig", keep)
-    return figures
+    return kept
 
 
 def is_png(path):
@@ -96,72 +98,7 @@ def test_labels_keep_text_that_is_not_a_unit():
     assert label_of("plant.n (1)", 900.0) == (1.0, "plant.n")
 
 
-@pytest.mark.parametrize("log", [False, True])
-def test_the_bounds_of_cells_enclose_each_centre(log):
-    for centres in (np.geomspace(1e-6, 1e-2, 7), np.array([1.0, 2.0, 8.0]), np.array([3.0])):
-        bounds = edges(centres, log)
-        assert len(bounds) == len(centres) + 1
-        assert np.all((bounds[:-1] < centres) & (centres < bounds[1:]))
-    even = edges(np.geomspace(1e-6, 1e-2, 5), log=True)
-    np.testing.assert_allclose(even[1:] / even[:-1], 10.0, rtol=1e-12)  # rounding of logarithms
-
-
 # ---------------------------------------------------------------- fan
-
-
-def quantiles(members):
-    return {percent: np.percentile(members, percent, axis=0) for percent in PERCENTS}
-
-
-def members_of(n, t, seed=0):
-    noise = np.random.default_rng(seed).normal(size=(n, len(t)))
-    return 2e-5 * np.sin(4 * np.pi * t) + 1e-6 * noise
-
-
-def test_fan_shows_bands_units_limit_and_survivors(tmp_path, drawn):
-    t = np.linspace(0, 1, 201)
-    members = members_of(50, t)
-    lost_at = np.full(50, np.inf)
-    lost_at[:4] = [0.1, 0.2, 0.3, 0.4]
-    bands = {"z - r": quantiles(members), "u": quantiles(6e6 * members), "sigma": quantiles(members)}
-    limits, stalled = {"u": 150.0, "z - r": 4.5e-3}, np.arange(50) == 2
-    fans.fan(t, bands, limits, "a title", tmp_path / "fan.png", lost_at=lost_at, stalled=stalled)
-    assert is_png(tmp_path / "fan.png")
-    (figure,) = drawn
-    words = texts(figure)
-    assert "(µm)" in words
-    assert "(V)" in words
-    assert "(µm/s)" in words
-    assert "46 of 50 survive (92 %), 3 lost, 1 not decided" in words
-    assert "0 to 100 %" in words
-    assert "median" in words
-    error, voltage, _, survivors = figure.axes
-    # 150 V is near the data's 120 V; the clearance is nowhere near 20 µm
-    assert sorted(line.get_ydata()[0] for line in voltage.lines if line.get_linestyle() == "--") == [-150, 150]
-    assert not [line for line in error.lines if line.get_linestyle() == "--"]
-    step, rug = survivors.lines
-    assert step.get_ydata()[0] == 100
-    assert step.get_ydata()[-1] == pytest.approx(92.0)
-    np.testing.assert_array_equal(rug.get_xdata(), [0.1, 0.2, 0.3, 0.4])
-
-
-def test_fan_does_not_let_one_member_hide_the_rest(tmp_path, drawn):
-    t = np.linspace(0, 1, 101)
-    bands = quantiles(members_of(100, t))
-    bands[100] = np.full(len(t), 4.5e-3)
-    fans.fan(t, {"z - r": bands}, {}, "one went astray", tmp_path / "fan.png")
-    ax = drawn[0].axes[0]
-    assert ax.get_ylim()[1] < 60  # µm: the others reach 24
-    assert "band reaches 4500 µm, beyond this axis" in texts(drawn[0])
-
-
-def test_fan_does_not_let_a_brief_transient_hide_the_rest(tmp_path, drawn):
-    t = np.linspace(0, 1, 1001)
-    members = members_of(100, t) + 4e-3 * (t < 0.02)
-    fans.fan(t, {"z - r": quantiles(members)}, {"z - r": 4.5e-3}, "it came down", tmp_path / "fan.png")
-    ax = drawn[0].axes[0]
-    assert ax.get_ylim()[1] < 60  # µm: settled, they reach 24
-    assert "beyond this axis" in texts(drawn[0])
 
 
 @pytest.mark.parametrize("lost_at", [None, np.array([np.inf]), np.zeros(3)])
@@ -249,17 +186,106 @@ def test_maps_of_special_cases(tmp_path, survival, error):
     assert is_png(tmp_path / "m.png")
 
 
-def test_a_map_without_confidence_bounds_has_no_legend_for_them(tmp_path, drawn):
-    heatmaps.maps([a_panel(ALL)], "x", "y", False, False, tmp_path / "with.png")
-    heatmaps.maps([a_panel(ALL)._replace(low=None, high=None)], "x", "y", False, False, tmp_path / "without.png")
-    assert ["confidence interval" in texts(figure) for figure in drawn] == [True, False]
-    assert "all runs survive in" in texts(drawn[1])
-    assert ["95 %" in texts(figure) for figure in drawn] == [True, False]
-
-
 def test_maps_refuse_empty_panels_and_zeros_on_a_log_axis(tmp_path):
     with pytest.raises(ValueError, match="no panels"):
         heatmaps.maps([], "", "", False, False, tmp_path / "m.png")
     with pytest.raises(ValueError, match="log axis cannot show"):
         heatmaps.maps([a_panel(ALL, x=np.arange(4.0))], "x", "y", True, False, tmp_path / "m.png")
     assert not (tmp_path / "m.png").exists()
+
+
+# ---------------------------------------------------------------- runs
+
+
+def a_run(samples=20_000, period=1e-4, lost_at=np.inf, code=ALIVE, **signals):
+    """Return a run whose errors decay with 1 ms while all else is at rest; `signals` replace some."""
+    t = period * np.arange(samples)
+    rows = {name: np.zeros(samples) for name in Row._fields if name != "z_measured"}
+    rows |= {"t": t, "alive": t < lost_at, "z": 1e-4 * np.exp(-t / 1e-3), "v_tilde": np.exp(-t / 1e-3)} | signals
+    return Trajectory(Row(**({"z_measured": rows["z"]} | rows)), lost_at, code, np.inf)
+
+
+def columns(figure):
+    """Axes [panels, columns] in the order of the page."""
+    axes = np.array(figure.axes, dtype=object)
+    return axes.reshape(-1, 3)
+
+
+def test_a_short_transient_is_enlarged(tmp_path, drawn):
+    overview(a_run(), "a run", tmp_path / "o.png")
+    whole, start, end = columns(drawn[0])[1]
+    assert whole.get_xlim() == (0.0, pytest.approx(1.9999))
+    # down to 2 % of the peak after 3.9 ms, thrice of which is seen
+    assert start.get_xlim()[1] == pytest.approx(3 * 3.9e-3, rel=0.05)
+    assert np.diff(end.get_xlim())[0] == pytest.approx(0.02, rel=1e-9)
+    assert end.get_xlim()[1] == pytest.approx(1.9999)
+    titles = [ax.get_title(loc="left") for ax in columns(drawn[0])[0]]
+    assert titles == ["", "the first 12 ms", "the last 20 ms"]
+
+
+@pytest.mark.parametrize(
+    ("code", "words"), [(TOUCHED, "lost at 0.01 s: touched"), (STALLED, "not decided from 0.01 s")]
+)
+def test_a_loss_ends_the_picture_shortly_after(tmp_path, drawn, code, words):
+    overview(a_run(lost_at=0.01, code=code), "lost", tmp_path / "o.png")
+    whole, start, end = columns(drawn[0])[0]
+    assert whole.get_title(loc="left").startswith(words)
+    assert whole.get_xlim() == (0.0, pytest.approx(0.0115))
+    assert start.get_xlim()[1] <= 0.01 / 3
+    assert end.get_xlim() == (pytest.approx(0.008), pytest.approx(0.0103))
+
+
+@pytest.mark.parametrize(("code", "words"), [(TOUCHED, "lost at 0.01 s"), (STALLED, "not decided from 0.01 s")])
+def test_a_figure_of_the_paper_distinguishes_a_loss_from_a_stall(tmp_path, drawn, code, words):
+    figures.paper_figure(3, a_run(lost_at=0.01, code=code), "regulation", tmp_path / "f.png")
+    said = [text.get_text().split("\n")[0] for ax in drawn[0].axes for text in ax.texts]
+    assert said == [words]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("samples", "lost_at"), [(1, 0.0), (1, np.inf), (2, 1e-4), (3, 1.5e-4), (30, np.inf)])
+def test_runs_of_few_samples_are_drawn(tmp_path, samples, lost_at):
+    overview(a_run(samples=samples, lost_at=lost_at, code=TOUCHED), "tiny", tmp_path / "o.png")
+    assert (tmp_path / "o.png").stat().st_size > 1000
+
+
+def test_the_panels_of_the_whole_run_have_the_scale_of_the_settled_part(tmp_path, drawn):
+    t = 1e-4 * np.arange(20_000)
+    z = 1e-4 * np.exp(-t / 1e-3) + 2e-7 * np.sin(300 * t)
+    overview(a_run(z=z), "lift-off", tmp_path / "o.png", settle=0.1)
+    whole, start, _ = columns(drawn[0])[0]
+    assert whole.get_title(loc="left") == "whole run (axis: values after 0.1 s)"
+    assert whole.get_ylim() == (pytest.approx(-0.2 * 1.24, rel=1e-3), pytest.approx(0.2 * 1.24, rel=1e-3))  # um
+    assert start.get_ylim()[1] > 99.0
+    lost = a_run(z=z, lost_at=1.0, code=TOUCHED)
+    overview(lost, "lost", tmp_path / "o.png", settle=0.1)
+    assert columns(drawn[1])[0, 0].get_ylim()[1] > 99.0
+
+
+CASE = "[clock]\nduration = 0.05\n"
+
+
+@pytest.fixture
+def case(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pathlib.Path("case.toml").write_text(CASE)
+    return "case.toml"
+
+
+def test_the_command_draws_the_given_interval(case, drawn, capsys):
+    assert main(["simulate", case, "--from", "0.01", "--to", "0.05", "--out", "a", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["max_abs_error_m"] > 0
+    assert {ax.get_xlim() for ax in drawn[0].axes} == {(0.01, 0.05)}
+    with np.load("a/trajectory.npz") as whole:
+        assert len(whole["t"]) == 500
+
+
+@pytest.mark.parametrize(
+    "flags", [["--from", "0.05"], ["--to", "0.051"], ["--from", "-1"], ["--from", "nan"], ["--to", "0"]]
+)
+def test_an_interval_outside_the_run_is_refused(case, flags, capsys):
+    assert main(["simulate", case, *flags]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "both must lie within 0 to 0.05 s (clock.duration)" in error
+    assert not pathlib.Path("out").exists()

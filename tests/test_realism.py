@@ -48,9 +48,7 @@ def test_default_ranges_of_converters_follow_from_the_plant():
     assert (float(seen.z), float(seen.i)) == (5e-3 * 127 / 128, 0.5 * 127 / 128)
     seen = Sensor(bits=8.0, range_z=1e-3, range_i=0.1).converted(motion(z=-1.0, i=-1.0), 5e-3, 0.25)
     assert (float(seen.z), float(seen.i)) == (-1e-3, -0.1)
-
-
-def test_the_current_may_have_a_converter_of_its_own():
+    # the current may have a converter of its own
     for bits, z in ((16.0, 5e-3 * (1 - 2**-15)), (None, 1.0)):
         seen = Sensor(bits=bits, bits_i=4.0).converted(motion(z=1.0, i=1.0), 5e-3, 0.25)
         assert (float(seen.z), float(seen.i)) == (z, 0.5 * 7 / 8)
@@ -220,42 +218,24 @@ def test_keys_that_need_a_processor_are_refused_without_one(table, key, value):
     assert case_from(CASE | {table: {key: value}}).scenario.on_processor == f"{table}.{key}"
 
 
-def test_the_rig_holds_its_rotors_with_the_velocity_estimated():
-    case = case_from(tomllib.loads(template("rig")))
+# 0.25 um on average over 1,000 members of the rig. Of the bearing 1.5 um over the whole run: the transient of the step
+# of force is a third of what is averaged here.
+@pytest.mark.parametrize(("name", "most"), [("rig", 5e-7), ("bearing", 3e-6)])
+def test_the_machines_of_the_templates_are_plausible_and_hold_rotors_off_their_model(name, most):
+    case = case_from(tomllib.loads(template(name)))
+    plant = case.scenario.plant
     assert not case.scenario.sensor.velocity
     assert warnings_of(case) == []
-    spread = dataclasses.replace(
-        case.scenario, initial=amb.Initial(z=np.array([-1e-4, 0.0, 1e-4])), member=np.arange(3)
-    )
-    heavy = dataclasses.replace(spread.plant, m=spread.plant.m * np.array([0.9, 1.1, 1.1]))
-    clock, fold = dataclasses.replace(case.clock, samples=2000), amb.Metrics(0.05)
-    found = run_ensemble(case.cascade, dataclasses.replace(spread, plant=heavy), clock, fold=fold).metrics
-    assert np.isinf(found["lost_at_s"]).all()
-    assert np.max(found["settled_rms_error_m"]) < 5e-7  # 0.25 um on average over 1,000, of which none is lost
-
-
-def test_the_bearing_of_the_data_sheet_is_plausible_and_without_warnings():
-    """The numbers are those of the data sheet.
-
-    The bias flux density is below 1.2 T, and the force is more than twice the weight.
-    """
-    case = case_from(tomllib.loads(template("bearing")))
-    plant, scenario = case.scenario.plant, case.scenario
-    assert warnings_of(case) == []
-    assert (plant.m, plant.s_0, plant.i_0, scenario.u_max, scenario.sensor.bits) == (2.4, 5e-4, 2.0, 72.0, 14)
-    assert 1 / case.clock.sample_period == pytest.approx(16e3)
-    assert not scenario.sensor.velocity
-    assert [term.amplitude for term in scenario.q_f.terms] == [20.0, 8.0]  # N
     facts = {fact.key: fact.value for fact in machine(case)}
     assert facts["bias_flux_T"] < 1.2
     assert facts["force_reserve"] > 2
-    clock = dataclasses.replace(case.clock, samples=2000)
-    spread = dataclasses.replace(scenario, initial=amb.Initial(z=np.array([-1e-4, 1e-4])), member=np.arange(2))
-    heavy = dataclasses.replace(spread.plant, m=plant.m * np.array([0.9, 1.1]))
-    found = run_ensemble(case.cascade, dataclasses.replace(spread, plant=heavy), clock, fold=amb.Metrics(0.05)).metrics
+    start, heavy = np.array([-1e-4, 0.0, 1e-4]), plant.m * np.array([0.9, 1.1, 1.1])
+    spread = dataclasses.replace(case.scenario, initial=amb.Initial(z=start), member=np.arange(3))
+    spread = dataclasses.replace(spread, plant=dataclasses.replace(plant, m=heavy))
+    clock, fold = dataclasses.replace(case.clock, samples=2000), amb.Metrics(0.05)
+    found = run_ensemble(case.cascade, spread, clock, fold=fold).metrics
     assert np.isinf(found["lost_at_s"]).all()
-    # 1.5 um over the whole run; the transient of the step of force is a third of what is averaged here
-    assert np.max(found["settled_rms_error_m"]) < 3e-6
+    assert np.max(found["settled_rms_error_m"]) < most
 
 
 def test_the_step_is_small_enough_for_the_ends_of_an_amplifier_s_spread():

@@ -143,13 +143,6 @@ def test_every_nth_row_is_the_row_of_that_sample(every):
     near(sparse.metrics, dense.metrics, 1e-9)
 
 
-def test_no_rows_without_recording():
-    dense, nothing = light(), light(record_every=0)
-    assert nothing.trajectory.rows is None
-    near(nothing.metrics, dense.metrics, 1e-9)
-    same(nothing.trajectory.lost_at, dense.trajectory.lost_at)
-
-
 # --- folds ---
 
 
@@ -259,13 +252,6 @@ def test_a_lost_rotor_is_frozen_and_finite(lost):
     assert np.all(np.abs(rows.z[before]) < 0.9 * 5e-3)
 
 
-@pytest.mark.parametrize("amplitude", [2.5e-3, 0.0], ids=["tracking", "regulation"])
-def test_the_printed_gains_lose_the_rotor_within_20_ms(amplitude):
-    # gamma = 1000 violates the paper's own Eq. (7); here without noise
-    quiet = dataclasses.replace(NOISY, reference=Sine(amplitude, 2.0), sensor=Sensor(0.0, 0.0, 0.0))
-    assert rollout(LITERAL, quiet, SHORT, fold=FOLDS).trajectory.lost_at < 0.02
-
-
 def test_a_rotor_that_starts_against_the_stop_is_lost_at_once():
     out = rollout(REPAIRED, dataclasses.replace(NOISY, initial=Initial(z=-4.6e-3)), SHORT, fold=FOLDS)
     assert out.trajectory.lost_at == 0
@@ -318,24 +304,6 @@ def test_the_supply_limits_the_voltage_that_is_applied(short):
     limited = rollout(REPAIRED, dataclasses.replace(NOISY, u_max=40.0), SHORT, fold=FOLDS).trajectory
     assert np.max(np.abs(short.trajectory.rows.u)) > 40
     assert np.max(np.abs(limited.rows.u)) == 40
-
-
-# --- saving ---
-
-
-def test_save_writes_the_named_arrays_as_float64(short, lost, tmp_path):
-    names = ["t", "z", "z_dot", "i", "i_ref", "u", "v", "v_star", "v_tilde", "sigma", "r", "q_z", "q_i", "z_measured"]
-    for name, out in {"short": short, "lost": lost}.items():
-        path = tmp_path / f"{name}.npz"
-        out.trajectory.save(path)
-        with np.load(path) as saved:
-            assert set(names) <= set(saved.files)
-            for key in names:
-                assert saved[key].dtype == np.float64
-                np.testing.assert_array_equal(saved[key], getattr(out.trajectory.rows, key))
-            assert saved["lost_at"].dtype == np.float64
-            assert saved["lost_at"] == out.trajectory.lost_at
-            assert str(saved["lost_why"]) == out.trajectory.lost_why
 
 
 # --- errors at the boundary ---

@@ -8,7 +8,7 @@ import pytest
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
 from ambjax.commands import acceptance
-from ambjax.commands.sensitivity_report import _measured_numbers, _measured_text
+from ambjax.commands.sensitivity_report import _measured_numbers
 from ambjax.linear import MemberPeaks, Zones, analyse, linearise
 from ambjax.pictures.frequency import MeasuredPoints, NamedLoop, frequency_figure
 from ambjax.simulation.metrics import Metrics
@@ -109,24 +109,6 @@ def test_an_unstable_loop_has_no_peaks_and_no_zone(tmp_path, capsys):
     assert not {"peak", "running_speed", "delay_margin_s"} & set(summary)
 
 
-def test_the_picture_shows_the_response(tmp_path):
-    path = tmp_path / "case.toml"
-    path.write_text(CASE)
-    case = read_case(path)
-    system = linearise(case.cascade, case.scenario, case.clock)
-    axes = frequency_figure("x", [NamedLoop("nominal", system, 0.588, 0.02)], [3.0, 4.0, 5.0], (1.0, 500.0)).axes
-    curves = {ax.get_ylabel(): ax.get_lines()[0].get_xydata() for ax in axes}
-    f = curves["|S|"][:, 0]
-    assert f[[0, -1]] == pytest.approx([1.0, 500.0])
-    H = system.response(f)
-    assert curves["|S|"][:, 1] == pytest.approx(np.abs(H[:, 0, 0]))
-    assert curves["|T|"][:, 1] == pytest.approx(np.abs(H[:, 0, 0] - 1))
-    assert curves["|KS|, V/m"][:, 1] == pytest.approx(np.abs(H[:, 2, 0]))
-    assert curves["dynamic stiffness, N/m"][:, 1] == pytest.approx(0.588 / np.abs(H[:, 3, 2]))
-    L = curves["imaginary part of L"]
-    assert L[:, 0] + 1j * L[:, 1] == pytest.approx(1 / H[:, 0, 0] - 1)
-
-
 @pytest.mark.parametrize(
     ("text", "flags", "message"),
     [
@@ -148,10 +130,13 @@ def test_bad_input_is_refused_in_one_line(tmp_path, capsys, text, flags, message
     assert not (tmp_path / "out").exists()
 
 
+CHECKED = "[controller]\n[clock]\nduration = 0.02\n[actuator]\nu_max = 200.0\n"
+
+
 def test_check_does_not_succeed_without_a_linearisation(tmp_path, capsys, monkeypatch):
     """All conditions hold, the rotor is held, and the verdict on the linear loop is missing."""
     path = tmp_path / "case.toml"
-    path.write_text("[controller]\n[clock]\nduration = 0.01\n")
+    path.write_text(CHECKED)
 
     def fails(*args):
         raise ValueError("the cause")
@@ -166,7 +151,7 @@ def test_check_does_not_succeed_without_a_linearisation(tmp_path, capsys, monkey
 def test_check_begins_with_the_numbers_of_the_machine(tmp_path, capsys):
     """By hand for the plant of Table 1: kappa = mu_0 n^2 A, k_s = kappa i_0^2/s_0^3, k_i = kappa i_0/s_0^2."""
     path = tmp_path / "case.toml"
-    path.write_text("[controller]\n[clock]\nduration = 0.02\n[actuator]\nu_max = 200.0\n")
+    path.write_text(CHECKED)
     main(["check", str(path), "--json"])
     loop = json.loads(capsys.readouterr().out)["loop"]
     kappa = 1.25e-6 * 1480**2 * 0.121
@@ -182,17 +167,10 @@ def test_check_begins_with_the_numbers_of_the_machine(tmp_path, capsys):
     assert loop["zone"] == "D"
     assert loop["converter_step_m"] is None
     assert loop["delay_margin_s"] == min(loop["margins"][at]["delay_margin_s"] for at in ("reading", "command"))
-    main(["check", str(path)])
-    shown = capsys.readouterr().out
-    verdict = shown.partition("\n\n")[0].splitlines()
-    assert len(verdict) == 5
-    assert verdict[0] == "The check passes."
-    assert "Sensitivity: zone D, peak 41.27 at 0 Hz." in verdict
     main(["check", str(path), "--full"])
-    full = capsys.readouterr().out
-    assert {line for line in shown.splitlines() if not line.startswith(("--", "condition "))} < set(full.splitlines())
-    assert "Eq. (14a)" in full
-    assert "Eq. (14a)" not in shown
+    shown = capsys.readouterr().out
+    assert shown.startswith("The check passes.")
+    assert "Eq. (14a)" in shown
 
 
 PROCESSOR = """
@@ -217,10 +195,6 @@ def test_the_injected_and_the_linear_peak_are_both_reported(tmp_path, capsys):
     assert summary["injected_members"] == 1
     assert summary["injected_low"] == summary["injected_high"] == summary["injected_peak"]
     assert summary["injected_peak"] == pytest.approx(summary["injected_linear_there"], rel=0.02)
-    code, out, _, _ = answered(tmp_path, capsys, PROCESSOR)
-    assert "Injected into the simulation (multi-sine of 5e-05 m)" in out
-    assert "Injected at the velocity sensor into the simulation (multi-sine of 0.0265 m/s)" in out
-    assert "|S| peaks at 2.705 at 40 Hz; the linear value there is 2.694." in out
     assert summary["injected_velocity_frequency_hz"] == 40.0
     # half the amplitude, at both sensors: half the pole times the gap
     _, out, _, _ = answered(tmp_path, capsys, f"{PROCESSOR}amplitude = 2.5e-5\n")
@@ -238,15 +212,11 @@ def test_the_measured_members_are_counted_by_zone():
         "injected_worst_peak": 3.0,
         "injected_worst_frequency_hz": 40.0,
     }
-    text = "Injected into each of the 3 members: 2 are in zone A; the largest peak is 3 at 40 Hz, of member 1."
-    assert _measured_text(held, Zones()) == text
     lost = MemberPeaks(np.array([2.9, np.inf, 2.5]), np.full(3, 40.0), np.array([False, True, False]))
     assert _measured_numbers(lost, Zones())["injected_worst_peak"] is None
-    text = "Injected into each of the 3 members: 2 are in zone A; 1 lose the rotor, first member 1."
-    assert _measured_text(lost, Zones()) == text
 
 
-def test_the_picture_shows_the_injected_points(tmp_path):
+def test_the_picture_shows_the_response_and_the_injected_points(tmp_path):
     """A phase that differs by whole turns from that of the curve is drawn on the curve."""
     path = tmp_path / "case.toml"
     path.write_text(CASE)
@@ -257,6 +227,15 @@ def test_the_picture_shows_the_injected_points(tmp_path):
     measured = MeasuredPoints(f, H[:, 0, 0], H[:, 0, 0] - 1, H[:, 2, 0])
     loop = NamedLoop("nominal", system, 0.588, 0.02)
     axes = frequency_figure("x", [loop], [3.0, 4.0, 5.0], (1.0, 500.0), measured).axes
+    curves = {ax.get_ylabel(): ax.get_lines()[0].get_xydata() for ax in axes}
+    assert curves["|S|"][[0, -1], 0] == pytest.approx([1.0, 500.0])
+    H = system.response(curves["|S|"][:, 0])
+    assert curves["|S|"][:, 1] == pytest.approx(np.abs(H[:, 0, 0]))
+    assert curves["|T|"][:, 1] == pytest.approx(np.abs(H[:, 0, 0] - 1))
+    assert curves["|KS|, V/m"][:, 1] == pytest.approx(np.abs(H[:, 2, 0]))
+    assert curves["dynamic stiffness, N/m"][:, 1] == pytest.approx(0.588 / np.abs(H[:, 3, 2]))
+    L = curves["imaginary part of L"]
+    assert L[:, 0] + 1j * L[:, 1] == pytest.approx(1 / H[:, 0, 0] - 1)
     points = {
         ax.get_ylabel(): next((line for line in ax.get_lines() if line.get_label() == "injected"), None) for ax in axes
     }
@@ -266,9 +245,9 @@ def test_the_picture_shows_the_injected_points(tmp_path):
     assert shown["|KS|, V/m"][:, 1] == pytest.approx(np.abs(measured.KS))
     L = 1 / measured.S - 1
     assert shown["imaginary part of L"] == pytest.approx(np.stack([L.real, L.imag], axis=1))
-    curve = next(ax for ax in axes if ax.get_ylabel() == "phase of L, degrees").get_lines()[0].get_xydata()
     # the curve has 1200 points: between two of them its phase is linear to 0.01 degrees
-    assert shown["phase of L, degrees"][:, 1] == pytest.approx(np.interp(f, *curve.T), abs=0.01)
+    phase = np.interp(f, *curves["phase of L, degrees"].T)
+    assert shown["phase of L, degrees"][:, 1] == pytest.approx(phase, abs=0.01)
 
 
 @pytest.mark.slow

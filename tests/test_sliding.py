@@ -71,11 +71,6 @@ def test_the_slow_motion_is_of_second_order():
     assert order > 1.6, (order, errors)
 
 
-def test_another_inversion_law_is_refused():
-    with pytest.raises(ValueError, match="adaptive"):
-        rollout(Cascade(inversion=inversion.ClosedForm()), Scenario(), Clock(2, 1e-4, Slide(1)))
-
-
 @pytest.mark.slow
 def test_values_and_derivatives_are_finite_over_six_decades_of_gains():
     gains = np.array([17.0, 25.0, 7.5e4, 152.0]) * 10 ** np.random.default_rng(0).uniform(-3, 3, (200, 4))

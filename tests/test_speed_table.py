@@ -7,7 +7,6 @@ from machine_cases import MACHINES
 
 from ambjax.cases.machine_case import machine_from
 from ambjax.cases.reader import case_from
-from ambjax.results.machine_run import simulate_machine
 
 TIMES, RPM = [0.01, 0.5, 1.5], [600.0, 6000.0, -3000.0]
 UNBALANCE = [{"at": 0.05, "amount": 50.0, "phase": 20.0}]
@@ -40,18 +39,6 @@ def test_the_unbalance_force_is_the_second_derivative_of_the_turning_mass():
     for t in (0.005, 0.3, 1.0, 2.5):
         force = -(place(t + h) - 2 * place(t) + place(t - h)) / h**2
         np.testing.assert_allclose((rotor.forces(t) - rotor.gravity)[:2], force, rtol=1e-4, atol=1e-3)
-
-
-@pytest.mark.slow
-def test_a_table_of_two_points_is_a_run_up():
-    table, ramp = (
-        machine(speed={"times": [0.0, 1.0], "rpm": [3000.0, 63000.0]}),
-        machine(speed=3000.0, acceleration=6e4),
-    )
-    assert table.speeds == ramp.speeds
-    ours, theirs = (simulate_machine(one).signals for one in (table, ramp))
-    for name in ("z", "i"):
-        np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-9, atol=1e-13)
 
 
 def test_the_speeds_of_the_sensitivity_are_first_last_and_largest():

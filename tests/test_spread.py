@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ambjax import Cascade, Clock, Scenario, rollout
+from ambjax import Cascade, Scenario
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.ensemble import Choice, LogUniform, Normal, Percent, Spread, Uniform, apply, draw
@@ -17,7 +17,6 @@ from ambjax.ensemble.spread import corners
 from ambjax.laws import inversion, observer
 from ambjax.sensors import Sensor
 from ambjax.signals import Constant, Pulse, Sine, SmoothStep, Step, Sum
-from ambjax.simulation.explicit import Euler
 
 CASCADE = Cascade()
 SMOOTH = Cascade(inversion=inversion.Adaptive(gamma=1e9, p=25e-6))
@@ -162,21 +161,6 @@ def test_terms_of_a_sum_and_optional_numbers_have_paths():
     assert scenario.reference == Sum((Constant(1e-3), Sine(1e-3, 2.0, 1.0)))
     assert cascade.observer.z_hat == 1e-4
     assert scenario.touchdown == 4e-3
-
-
-def test_a_member_of_an_ensemble_equals_its_own_rollout():
-    spread = Spread((("plant.m", Percent(10.0)), ("initial.z", Normal(1e-5)), ("sensor.std", LogUniform(1e-8, 1e-6))))
-    clock = Clock(40, 5e-5, Euler(1))
-    values = draw(spread, SMOOTH, SCENARIO, 0, np.arange(4), 4)
-
-    def last(values, member):
-        cascade, scenario = apply(SMOOTH, dataclasses.replace(SCENARIO, member=member), values)
-        return rollout(cascade, scenario, clock).trajectory.rows.z[-1]
-
-    batch = jax.vmap(last)(values, np.arange(4))
-    for k in range(4):
-        # compiled for one member instead of four: last bits may differ
-        np.testing.assert_allclose(batch[k], last({p: x[k] for p, x in values.items()}, k), rtol=1e-12)
 
 
 def test_corners_hold_every_combination_of_ends():

@@ -248,18 +248,7 @@ def test_a_finished_study_is_not_run_again(no_pictures, monkeypatch, capsys):
     assert not pathlib.Path("out", "chunks").exists()
 
 
-# --- how long it takes ---
-
-
-def test_chunks_take_about_two_seconds_and_keep_every_worker_busy(monkeypatch):
-    monkeypatch.setattr(pace, "cores", lambda: 2)
-    assert pace.Pace(1000.0, None).chunk(10**6) == 2048  # 2 s of it, in whole calls of 64 on each of two cores
-    assert pace.Pace(2.6, None).chunk(2000) == 128  # no less than a call on each
-    assert pace.Pace(1e9, None).chunk(10**9) == pace.MOST_CHUNK
-    assert pace.Pace(1000.0, None).chunk(5) == 5
-    assert pace.Pace(1000.0, 4).chunk(10**6) == 1024  # as much as one core does
-    assert pace.Pace(1000.0, 4).chunk(1000) == 128  # so that there is one for each of them, and another
-    assert pace.Pace(1000.0, 4).whole == 2000
+# --- the first members ---
 
 
 def test_the_pilot_is_the_first_members(no_pictures):

@@ -92,21 +92,6 @@ def test_the_phase_must_be_right_within_a_quarter_of_a_turn():
         assert linearise(one.cascade, one.scenario, one.clock).stable == stable
 
 
-@pytest.mark.slow
-def test_a_run_up_switches_the_notch_on_without_a_kick():
-    rotor = {"speed": 600.0, "acceleration": 9000.0, "speed_end": RPM}
-    times = {"clock": {"duration": 1.2, "sample_period": 1e-4}, "run": {"settle": 1.1}}
-    plain = case_from(ON_PROCESSOR | times | {"rotor": rotor})
-    notched = case_from(with_notch(ON_PROCESSOR | times | {"rotor": rotor}, "force-free", min_speed=3000.0))
-    alone, run = simulate(plain), simulate(notched)
-    t = np.asarray(run.trajectory.rows.t)
-    below, on = t < 0.26, (t > 0.26) & (t < 0.5)  # 3000 rpm at 0.267 s
-    i, i_alone = (np.asarray(x.trajectory.rows.i) for x in (run, alone))
-    np.testing.assert_allclose(i[below], i_alone[below], rtol=0, atol=1e-12)
-    assert np.ptp(i[on]) < 1.2 * np.ptp(i_alone[on])
-    assert run.metrics["i_1x_A"] < 1e-4 * alone.metrics["i_1x_A"]
-
-
 def band(rotation):
     gains = NotchGain(2000.0, 0.5, 0.2), NotchGain(4000.0, 0.7, -0.1)
     return SynchronousNotch("displacement-free", RATE, 2000.0, 4000.0, gains, rotation, True)

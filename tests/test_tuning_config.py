@@ -98,27 +98,20 @@ def test_settings_of_another_case_apply_except_its_gains(tmp_path):
 
 MEANT = {
     "rms_u": "rms_u_V",
-    "rms_error": "rms_error_m",
-    "max_u": "max_u_V",
     "u_max": "max_u_V",
     "i_max": "max_abs_i_A",
     "max_current_A": "max_abs_i_A",
-    "max_i_A": "max_abs_i_A",
     "rms_i_A": "rms_coil_A",
     "chatter_V": "chatter_V_per_s",
     "max_error_m": "largest_error_m",
     "settling_time_s": "settling_s",
-    "settle": "settling_s",
     "settling_band": "settling_band_m",
-    "overshoot": "overshoot_m",
     "clearance": "clearance_used",
     "sensitivty": "sensitivity",
     "complimentary": "complementary",
     "KS": "control_sensitivity",
     "delay_margin": "delay_margin_s",
-    "survivl": "survival",
     "members": "tune.members",
-    "seed": "tune.seed",
     "effort": "tune.weights.effort",
 }
 

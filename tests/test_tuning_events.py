@@ -74,10 +74,3 @@ def test_standings_are_written_at_intervals_and_other_events_at_once(terminal, m
         log(Event("join"))
     assert stderr.text.count("search 1: iteration 3") == 1
     assert stderr.text.count("join") == 3
-
-
-def test_a_standing_names_the_limits_that_are_not_met():
-    assert "sensitivity 6 (beyond 3)" in STANDING.text
-    met = STANDING._replace(limits=(Reached("sensitivity", 2.0, 3.0, True),))
-    assert "sensitivity" not in met.text
-    assert "limits met" in met.text

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from bowl import World, study
+from bowl import World, answer_of, study
 
 from tuning.rounds import rounds
 from tuning.solve.evolution import PATIENCE, STALL, Evolution
@@ -43,17 +43,9 @@ def test_goals_that_are_not_finite_are_the_worst_ones():
 LIMITS = {"rms_u_V": 10.0, "chatter_V_per_s": 15.0, "settling_s": 30.0, "margin": 0.002}
 
 
-def found(monkeypatch, folder, world, **tune):
-    """The answer of the rounds, and its gains (c, k)."""
-    folder.mkdir(exist_ok=True)
-    made = study(monkeypatch, world, **tune)
-    answer = rounds(made, made.tune.space.values(made.case.cascade), folder, {"of": str(tune)}, False)
-    return answer, np.asarray(answer.problem.objective.space.gains_at(answer.x))
-
-
 @pytest.mark.parametrize("chaos", CHAOS)
 def test_a_minimum_is_found_in_spite_of_misleading_derivatives(monkeypatch, tmp_path, chaos):
-    answer, gains = found(monkeypatch, tmp_path, World(chaos=CHAOS[chaos]))
+    answer, gains = answer_of(monkeypatch, tmp_path, World(chaos=CHAOS[chaos]))
     # the loss is flat to 1 %, at which populations stall, within a factor of e^0.1
     np.testing.assert_allclose(gains, World().best, rtol=0.1)
     assert answer.lost == 0
@@ -61,7 +53,7 @@ def test_a_minimum_is_found_in_spite_of_misleading_derivatives(monkeypatch, tmp_
 
 @pytest.mark.slow
 def test_three_limits_hold_in_spite_of_misleading_derivatives(monkeypatch, tmp_path):
-    answer, (c, k) = found(monkeypatch, tmp_path, World(chaos=1e30), limits=LIMITS)
+    answer, (c, k) = answer_of(monkeypatch, tmp_path, World(chaos=1e30), limits=LIMITS)
     limits = {limit.name: limit for limit in answer.problem.limits}
     assert set(limits) == set(LIMITS) - {"margin"}
     assert 29.0 < k <= 30.0 * math.exp(0.001)  # at most half of the margin beyond, and 10 V is at 30
@@ -77,8 +69,8 @@ def populations(world):
 
 def test_cma_es_does_not_start_after_a_converged_descent(monkeypatch, tmp_path):
     smooth, rough = World(), World(chaos=1e30)
-    found(monkeypatch, tmp_path / "smooth", smooth)
-    found(monkeypatch, tmp_path / "rough", rough)
+    answer_of(monkeypatch, tmp_path / "smooth", smooth)
+    answer_of(monkeypatch, tmp_path / "rough", rough)
     assert populations(smooth) == 0
     assert populations(rough) > PATIENCE
 
@@ -104,9 +96,9 @@ def test_a_search_resumed_during_cma_es_gives_the_same_result(monkeypatch, tmp_p
                 raise KeyboardInterrupt
 
     world = World(chaos=1e30)
-    whole, _ = found(monkeypatch, tmp_path / "whole", world)
+    whole, _ = answer_of(monkeypatch, tmp_path / "whole", world)
     world.calls = Counting()
-    cut, _ = found(monkeypatch, tmp_path / "cut", world)
+    cut, _ = answer_of(monkeypatch, tmp_path / "cut", world)
     assert len(cut.history["value"]) < len(whole.history["value"])
     made = study(monkeypatch, World(chaos=1e30))
     again = rounds(made, made.tune.space.values(made.case.cascade), tmp_path / "cut", {"of": "{}"}, True)

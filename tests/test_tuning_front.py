@@ -6,9 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from bowl import FLOOR, RARE_FROM, S_0, World, document, study
+from bowl import FLOOR, RARE_FROM, S_0, World, case_file, document, study
 from texts import case_and_tune
-from tomlkit import dumps
 
 import tuning.command
 import tuning.report.folder
@@ -31,8 +30,7 @@ def ran(monkeypatch, tmp_path, capsys):
 
     def run(pareto=True, **tune):
         study(monkeypatch, World(), **tune)
-        path, out = tmp_path / "case.toml", tmp_path / "out"
-        path.write_text(dumps(document(**tune)))
+        path, out = case_file(tmp_path, **tune)
         code = main([str(path), "--out", str(out), *["--pareto"] * pareto])
         return code, json.loads((out / "report.json").read_text()), capsys.readouterr().out, out
 
@@ -95,19 +93,14 @@ def test_members_of_rare_large_errors_join_the_search(monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-def test_least_error_traces_no_front_without_pareto(ran):
-    code, facts, _, folder = ran(pareto=False)
+@pytest.mark.parametrize("pareto", [False, True])
+def test_least_error_is_the_answer_with_and_without_its_front(pareto, ran):
+    code, facts, out, folder = ran(pareto=pareto, front=1, bounds=BOUNDLESS)
     assert code == 0
-    assert "front" not in facts
-    assert not list(folder.glob("tuned_*"))
-
-
-@pytest.mark.slow
-def test_the_front_does_not_change_an_answer_of_least_error(ran):
-    _, facts, out, folder = ran(pareto=True, front=1, bounds=BOUNDLESS)
-    assert [(row["factor"], row["taken"]) for row in facts["front"]] == [(1, True), (1.25, False)]
-    assert "This answer has the least error: " in out
-    assert len(list(folder.glob("tuned_*V.toml"))) == 2
+    rows = facts.get("front", [])
+    assert [(row["factor"], row["taken"]) for row in rows] == ([(1, True), (1.25, False)] if pareto else [])
+    assert ("This answer has the least error: " in out) == pareto
+    assert len(list(folder.glob("tuned_*"))) == len(rows)
 
 
 @pytest.mark.slow
@@ -155,24 +148,3 @@ def test_the_knee_holds_as_many_members_and_limits_as_the_point_of_least_error()
     better = [point(2.0, 20.0), point(0.5, 15.0, lost=1), point(1.0, 15.0), point(1.2, 10.0), point(2.4, 5.0)]
     assert least_of(better) is better[2]
     assert chosen(better, 1.25) is better[3]
-
-
-@pytest.mark.parametrize(
-    ("taken", "volts", "words"),
-    [
-        (0, 3.0, "This answer has the least error: 1e-06 m at 5 V."),
-        (
-            1,
-            3.0,
-            "This answer has the least rms voltage of those with an error of at most 1.25 times the least error: ",
-        ),
-        (1, 9.0, "This answer: 1.2e-06 m at 9 V. Least error: 1e-06 m at 5 V."),
-    ],
-)
-def test_the_sentence_on_the_answer_claims_only_what_the_front_shows(taken, volts, words):
-    points = [(1e-6, 5.0), (1.2e-6, volts)]
-    rows = [
-        {"settled_rms_error_m": error, "settled_rms_u_V": volt, "taken": n == taken}
-        for n, (error, volt) in enumerate(points)
-    ]
-    assert front_table.sentence(rows).startswith(words)

@@ -16,7 +16,6 @@ from tuning.problem.limits import PREFIX
 from tuning.problem.loops import check_loops, loops
 from tuning.problem.quantities import KINDS, LOOPS
 from tuning.problem.tuning_problem import problem_of
-from tuning.rounds import finer
 
 NAMES = ["complementary", "control_sensitivity", "delay_margin_s", "sensitivity", "sensitivity_1x"]
 PATHS = ["controller.position.c", "controller.position.k", "controller.inversion.gamma", "controller.current.k_i"]
@@ -134,13 +133,6 @@ def test_an_unstable_loop_has_a_finite_value_whose_derivative_points_to_stabilit
     assert np.all(along[unstable] > 0)
     assert np.all(np.diff(S[unstable]) > 0)
     assert np.all(np.diff(values["delay_margin_s"][unstable, 0]) < 0)
-
-
-def test_finer_steps_use_as_many_cores():
-    problem = problem_of(*case_and_tune(DOCUMENT), threads=1)
-    fine = finer(problem)
-    assert fine.engine.threads == problem.engine.threads == 1
-    assert fine.finer == 2
 
 
 def test_a_lower_limit_holds_for_larger_values():

@@ -4,12 +4,10 @@ import collections
 import json
 import math
 import re
-import types
 
 import numpy as np
 import pytest
-from bowl import World, document, study
-from tomlkit import dumps
+from bowl import World, case_file, study
 
 import tuning.command
 import tuning.report.folder
@@ -17,15 +15,13 @@ import tuning.rounds
 from ambjax.cases.tune_table import Budget
 from ambjax.linear import Findings
 from ambjax.text.web_page import escape_markdown
-from ambjax.theorem.advice import STALLED, STALLED_PLANT
 from tuning.__main__ import main
 from tuning.judge.evaluate import summarise
 from tuning.problem.config import seeds
 from tuning.problem.limits import Limit
-from tuning.report import document as report
 from tuning.report import judging
 from tuning.report.limit_table import BROKEN, EMPHASISED, HELD, UNJUDGED, UNVERIFIED
-from tuning.report.outcome import ALL_MET, NO_HELD_OUT, NOT_MET, TuningOutcome, remedies
+from tuning.report.outcome import ALL_MET, NO_HELD_OUT, NOT_MET, TuningOutcome
 
 HELD_OUT = seeds(Budget())[2]
 
@@ -65,8 +61,7 @@ def ran(monkeypatch, tmp_path, capsys):
 
     def run(world, tune):
         study(monkeypatch, world, **tune)
-        path, out = tmp_path / "case.toml", tmp_path / "out"
-        path.write_text(dumps(document(**tune)))
+        path, out = case_file(tmp_path, **tune)
         code = main([str(path), "--out", str(out), "--force"])
         said = capsys.readouterr()
         return code, json.loads((out / "report.json").read_text()), said.out, said.err, out
@@ -165,22 +160,3 @@ def test_the_voltage_of_a_lost_member_is_excluded_from_the_limits():
     assert summary["lost_at_s.mean"] == 0.1
     no_held = summarise({name: x[1:] for name, x in columns.items()})
     assert (no_held["held"], "settled_rms_error_m" in no_held) == (0, False)
-
-
-def test_the_number_of_members_lost_by_a_changed_gain_is_reported():
-    row = {"path": "controller.position.c", "before": 1.0, "after": 2.0, "least": 0.0, "most": 9.0, "at_bound": ""}
-    rows = [row | {"sensitivity_percent": p, "sensitivity_lost": n} for p, n in ((None, 2), (3.0, 0))]
-    text = report._gains(types.SimpleNamespace(gains=rows, trained_on=40, nominal_steps="by accurate steps"))
-    assert [line.split("|")[-2].strip() for line in text if line.startswith("| controller")] == [
-        "**2 of 40 training members are also lost**", "3 %",
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize("sliding", [False, True])
-@pytest.mark.parametrize("sampled", [False, True])
-def test_remedies_name_keys_that_have_an_effect(sliding, sampled):
-    problem = types.SimpleNamespace(sliding=sliding, sampled=sampled)
-    outcome = TuningOutcome(10, 0, 1, 0, {}, "accurate steps lose a member")
-    advice = remedies(problem, None, outcome, None, None)
-    assert ("tune.substeps" in advice) == sliding
-    assert (STALLED_PLANT if sampled else STALLED) in advice

@@ -5,7 +5,7 @@ import math
 import bowl
 import numpy as np
 import pytest
-from bowl import S_0, World, study
+from bowl import S_0, World, answer_of, study
 
 import tuning.rounds
 from ambjax.solvers import Slide
@@ -15,14 +15,7 @@ from tuning.rounds import rounds
 
 TRAINING, VALIDATION, HELD_OUT = 0, 1, 2
 # Fingerprint of the study in a checkpoint.
-TOLD = {"case": "a bowl"}
-
-
-def tuned(monkeypatch, tmp_path, world, listen=lambda event: None, **tune):
-    """The answer of the rounds, and its gains (c, k)."""
-    made = study(monkeypatch, world, **tune)
-    found = rounds(made, made.tune.space.values(made.case.cascade), tmp_path, TOLD, False, listen)
-    return found, np.asarray(found.problem.objective.space.gains_at(found.x))
+TOLD = {"of": "{}"}
 
 
 def seed_of(which, seed=1):
@@ -42,7 +35,7 @@ def test_the_three_ensembles_have_different_seeds(seed):
 
 def test_the_best_gains_are_found_and_no_member_is_lost(monkeypatch, tmp_path):
     world = World()
-    found, gains = tuned(monkeypatch, tmp_path, world)
+    found, gains = answer_of(monkeypatch, tmp_path, world)
     # on a bowl: as near as the search's shortest step, 1e-3, and its stall, 1e-3 of the loss, allow: sqrt(1e-3)
     np.testing.assert_allclose(gains, world.best, rtol=0.05)
     assert found.lost == 0
@@ -54,7 +47,7 @@ def test_the_best_gains_are_found_and_no_member_is_lost(monkeypatch, tmp_path):
 
 def test_the_standing_after_an_iteration_is_that_of_the_best_point(monkeypatch, tmp_path):
     events = []
-    found, _ = tuned(monkeypatch, tmp_path, World(), listen=events.append)
+    found, _ = answer_of(monkeypatch, tmp_path, World(), listen=events.append)
     standings = [event.standing for event in events if event.standing]
     assert len(standings) == len(found.history["value"])
     errors = S_0 * np.sqrt(found.history["terms"][:, TERMS.index("tracking")])
@@ -67,7 +60,7 @@ def test_the_standing_after_an_iteration_is_that_of_the_best_point(monkeypatch, 
 @pytest.mark.parametrize("minutes", [1e-9, math.inf])
 def test_a_search_without_time_ends_with_a_validated_answer(minutes, monkeypatch, tmp_path):
     """With no time, the first search has one iteration, and no other search follows."""
-    found, _ = tuned(monkeypatch, tmp_path, World(), minutes=minutes)
+    found, _ = answer_of(monkeypatch, tmp_path, World(), minutes=minutes)
     assert found.error is not None
     assert math.isfinite(found.validation_error)
     assert (len(found.history["value"]) == 1) == math.isfinite(minutes)
@@ -80,7 +73,7 @@ def test_lost_validation_members_join_and_are_held(monkeypatch, tmp_path):
         return 40.0 if seed == seed_of(VALIDATION) and number in fragile else math.inf
 
     world = World(limit=limit)
-    found, (c, k) = tuned(monkeypatch, tmp_path, world)
+    found, (c, k) = answer_of(monkeypatch, tmp_path, world)
     assert ("terms", seed_of(VALIDATION), tuple(range(10)), 1) in world.calls
     assert found.lost == 0
     assert c < 40.0 < world.best[0]  # without them c = 100 is best
@@ -96,7 +89,7 @@ def test_validation_members_of_large_errors_join(monkeypatch, tmp_path):
     rare = {3, 7}
     world = World(best=(100.0, 10.0), rare=lambda seed, number: 30.0 * (seed == seed_of(VALIDATION) and number in rare))
     monkeypatch.setattr(bowl, "RARE_FROM", -math.log(2))
-    found, (_, k) = tuned(monkeypatch, tmp_path, world)
+    found, (_, k) = answer_of(monkeypatch, tmp_path, world)
     assert k > 15.0  # without them k = 10 is best
     assert found.validation_error < 1.5 * np.sqrt(found.history["terms"][-1][TERMS.index("tracking")])
     joined = found.members.seed == seed_of(VALIDATION)
@@ -117,7 +110,7 @@ def test_the_answer_is_not_worse_than_the_gains_of_the_case_if_these_meet_the_li
 
 def test_without_validation_there_are_no_validation_calls(monkeypatch, tmp_path):
     world = World(limit=lambda seed, number, *_: math.inf if seed == 1 else 40.0)
-    found, gains = tuned(monkeypatch, tmp_path, world, validation=0)
+    found, gains = answer_of(monkeypatch, tmp_path, world, validation=0)
     np.testing.assert_allclose(gains, world.best, rtol=0.05)
     assert seed_of(VALIDATION) not in world.seeds("terms") | world.seeds("metrics") | world.seeds("gradient")
     assert found.lost == 0
@@ -150,7 +143,7 @@ def test_the_answer_that_loses_the_fewest_members_is_returned(monkeypatch, tmp_p
 
     world = Moody()
     world.calls = Noticing()
-    found, _ = tuned(monkeypatch, tmp_path, world)
+    found, _ = answer_of(monkeypatch, tmp_path, world)
     assert found.lost == 1
     assert len(found.members.member) == 6 + 3  # the second round's: the three that the first lost have joined
     assert next(lost, None) is None
@@ -158,7 +151,7 @@ def test_the_answer_that_loses_the_fewest_members_is_returned(monkeypatch, tmp_p
 
 def test_steps_that_do_not_resolve_the_answer_are_halved(monkeypatch, tmp_path):
     world = World(bias=lambda substeps: {3: 0.5, 6: 0.2, 12: 0.05}.get(substeps, 0.0))
-    found, _ = tuned(monkeypatch, tmp_path, world)
+    found, _ = answer_of(monkeypatch, tmp_path, world)
     assert found.problem.objective.clock.method == Slide(12)
     assert found.error.relative == pytest.approx(0.05)
     assert found.error.resolved
@@ -168,7 +161,7 @@ def test_steps_that_do_not_resolve_the_answer_are_halved(monkeypatch, tmp_path):
 
 
 def test_steps_that_never_resolve_the_answer_are_reported(monkeypatch, tmp_path):
-    found, _ = tuned(monkeypatch, tmp_path, World(bias=lambda substeps: 0.5))
+    found, _ = answer_of(monkeypatch, tmp_path, World(bias=lambda substeps: 0.5))
     assert found.error.relative == pytest.approx(0.5)
     assert not found.error.resolved
 
@@ -179,7 +172,7 @@ def test_members_that_only_accurate_steps_lose_join_too(monkeypatch, tmp_path):
     def limit(seed, number, stressed, accurate):
         return 40.0 if (seed, number) == (1, 2) and (stressed or accurate) else math.inf
 
-    found, (c, _) = tuned(monkeypatch, tmp_path, World(limit=limit))
+    found, (c, _) = answer_of(monkeypatch, tmp_path, World(limit=limit))
     assert c < 40.0
     assert 2 in found.members.member[found.members.stressed]
     assert found.error.lost == 0
@@ -187,7 +180,7 @@ def test_members_that_only_accurate_steps_lose_join_too(monkeypatch, tmp_path):
 
 
 def test_a_search_that_loses_every_member_ends(monkeypatch, tmp_path):
-    found, _ = tuned(monkeypatch, tmp_path, World(limit=lambda seed, number, *_: 1e-3))
+    found, _ = answer_of(monkeypatch, tmp_path, World(limit=lambda seed, number, *_: 1e-3))
     assert found.lost == 10  # the whole validation ensemble
     assert found.error is None
 
@@ -204,12 +197,10 @@ def test_an_interrupted_search_is_resumed_where_it_ended(monkeypatch, tmp_path):
 
     world = World(limit=limit)
     out = [tmp_path / "whole", tmp_path / "cut"]
-    for folder in out:
-        folder.mkdir()
-    whole, (c, _) = tuned(monkeypatch, out[0], world)
+    whole, (c, _) = answer_of(monkeypatch, out[0], world)
     assert c < 40.0
     stop = True
-    _, (c, _) = tuned(monkeypatch, out[1], world)
+    _, (c, _) = answer_of(monkeypatch, out[1], world)
     assert c > 40.0  # what the first round found
     stop = False
     made = study(monkeypatch, world)

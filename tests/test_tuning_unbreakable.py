@@ -1,16 +1,13 @@
 """Limits that cannot be broken: which they are, that no run exceeds their bounds, and that the user is told."""
 
-import json
 import math
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bowl import World, document, instead_of_engines, study
+from bowl import World, study
 from texts import case_and_tune
-from tomlkit import dumps
 
-import tuning.command
 from ambjax import rollout
 from ambjax.extend import canonical
 from ambjax.simulation.folds import Named
@@ -124,21 +121,3 @@ def test_the_report_lists_a_limit_that_cannot_be_broken(monkeypatch):
     text = "\n".join(limit_table.section(rows))
     assert "| `max_u_V` | at most 250 V | - | - | cannot be broken |" in text
     assert "cannot be broken: |u| is at most 200 V (actuator.u_max)" in text
-
-
-@pytest.mark.slow
-def test_the_command_says_that_a_limit_cannot_be_broken(monkeypatch, tmp_path, capsys):
-    limits = {"max_u_V": 250.0, "rms_u_V": 150.0}
-    instead_of_engines(monkeypatch, World())
-    path, out = tmp_path / "case.toml", tmp_path / "out"
-    path.write_text(dumps(document(limits=limits)))
-    tuning.tune(path, out, force=True)
-    lines = [line for line in capsys.readouterr().err.splitlines() if "cannot be broken" in line]
-    assert len(lines) == 1
-    assert "tune.limits.max_u_V = 250" in lines[0]
-    assert "200 V (actuator.u_max)" in lines[0]
-    report = json.loads((out / "report.json").read_text())
-    rows = {row["name"]: row for row in report["limits"]}
-    assert set(rows) == {"max_u_V", "rms_u_V", "survival"}
-    assert rows["max_u_V"]["verdict"] == "cannot be broken"
-    assert list(report["search"]["limits"]) == ["rms_u_V"]
