@@ -22,10 +22,10 @@ from ambjax.simulation.metrics import Metrics
 from tuning.judge.peaks import MemberPeak, Sensitivity
 from tuning.problem import config
 from tuning.problem.config import LimitSettings, settings
+from tuning.problem.goal import CVaR
 from tuning.problem.lanes import Engine
 from tuning.problem.limits import PENALTY, Limit, measures
 from tuning.problem.quantities import KINDS, LimitContext, largest
-from tuning.problem.risk import CVaR
 from tuning.problem.tuning_problem import REFINEMENT, problem_of
 from tuning.report import limit_table, sensitivity_table
 from tuning.report.limit_table import MORE

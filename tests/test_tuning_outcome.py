@@ -169,6 +169,7 @@ def test_the_voltage_of_a_lost_member_is_excluded_from_the_limits():
 
 def test_the_number_of_members_lost_by_a_changed_gain_is_reported():
     row = {"path": "controller.position.c", "before": 1.0, "after": 2.0, "least": 0.0, "most": 9.0, "at_bound": ""}
+    row |= {"low": 0.5, "high": 3.0, "source": "bounds"}
     rows = [row | {"sensitivity_percent": p, "sensitivity_lost": n} for p, n in ((None, 2), (3.0, 0))]
     text = report._gains(types.SimpleNamespace(gains=rows, trained_on=40, nominal_steps="by accurate steps"))
     assert [line.split("|")[-2].strip() for line in text if line.startswith("| controller")] == [

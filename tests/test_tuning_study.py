@@ -27,11 +27,10 @@ from ambjax.cases.tune_table import Budget
 from tuning.judge.evaluate import RESOLVED, describe, judge, step_error, summarise
 from tuning.problem.config import seeds
 from tuning.problem.loss import TERMS
-from tuning.problem.ranges import END_FACTOR, theorem_bounds
+from tuning.problem.ranges import END_FACTOR, initial_points, theorem_bounds
 from tuning.report.judging import changed_gains
 from tuning.solve.descent import begin, step
 from tuning.solve.refine import RACE, best_of, search
-from tuning.solve.screen import initial_points
 
 
 def at(made, c, k):

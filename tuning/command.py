@@ -25,14 +25,12 @@ from tuning.problem.gains_table import off
 from tuning.problem.tuning_problem import TuningProblem, problem_of
 from tuning.report.folder import all_laws, put_answer, put_front, put_page, put_report
 from tuning.report.judging import examined
-from tuning.report.record import KEY, REPORT, TUNED, ended, record, search_facts
+from tuning.report.record import KEY, NOT_JUDGED, REPORT, TUNED, ended, record, search_facts
 from tuning.report.tuned import tuned_case
 from tuning.rounds import rounds
 from tuning.solve.checkpoint import can_resume, checkpoint, has_unfinished_search, mark_directory, remove_all
 
 WRITTEN = (TUNED, "history.npz", "report.html", "report.md", "report.json")
-# Verdict in tuned.toml until the gains are judged.
-NOT_JUDGED = "The tuned gains are not judged."
 
 
 @dataclasses.dataclass(frozen=True)

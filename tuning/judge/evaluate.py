@@ -10,11 +10,12 @@ import numpy as np
 from ambjax.ensemble import wilson
 from ambjax.ensemble.study import Study
 from tuning.problem.config import seeds
-from tuning.problem.members import Members
-from tuning.problem.tuning_problem import REFERENCE_MEMBERS, REFERENCE_TOLERANCE, TuningProblem
+from tuning.problem.members import FEW, Members
+from tuning.problem.tuning_problem import REFERENCE_TOLERANCE, TuningProblem
 
-# Largest relative difference of the settled rms errors with the search's steps and with accurate ones. Above it, the
-# steps are refined and the search continues.
+# Largest relative difference of two values that agree: settled rms errors with the search's steps and with accurate
+# ones (above it, the steps are refined), and judged and expected means of a limited quantity (above it, the training
+# ensemble lacks members with large values).
 RESOLVED = 0.1
 
 
@@ -115,14 +116,14 @@ def describe(error: StepError) -> str:
 
 
 def comparison_members(problem: TuningProblem) -> Members:
-    """Return the members used to compare steps: the first REFERENCE_MEMBERS of the training ensemble."""
+    """Return the members used to compare steps: the first FEW of the training ensemble."""
     count = problem.tune.budget.members
-    return problem.objective.chosen(seeds(problem.tune.budget)[0], np.arange(min(REFERENCE_MEMBERS, count)), count)
+    return problem.objective.chosen(seeds(problem.tune.budget)[0], np.arange(min(FEW, count)), count)
 
 
 def worst_of(values: np.ndarray) -> np.ndarray:
-    """Return the indices of the REFERENCE_MEMBERS largest values [n], largest first."""
-    return np.argsort(-values, kind="stable")[:REFERENCE_MEMBERS]
+    """Return the indices of the FEW largest values [n], largest first."""
+    return np.argsort(-values, kind="stable")[:FEW]
 
 
 def step_error(problem: TuningProblem, x: np.ndarray, members: Members | None = None) -> StepError:

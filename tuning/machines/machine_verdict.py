@@ -9,6 +9,7 @@ from ambjax.cases.machine_case import MachineCase
 from ambjax.commands.machine_commands import sensitivity_summary
 from ambjax.results.machine_study import MachineStudy
 from ambjax.results.operating import sensitivity
+from ambjax.text.web_page import markdown_table
 
 # Limits of [tune.limits], each with its meaning and the metric whose largest value counts; "": a sensitivity.
 LIMITS = {
@@ -79,10 +80,6 @@ def refused(case: MachineCase, limits: dict[str, float], seed: int, members: int
 
 def report_text(facts: dict[str, Any]) -> str:
     """Return the report in Markdown."""
-
-    def rows(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
-        return "\n".join("| " + " | ".join(row) + " |" for row in (head, ("---",) * len(head), *body))
-
     speeds = zip(facts["before"]["speeds"], facts["sensitivity"]["speeds"], strict=True)
     peaks = [
         (
@@ -101,13 +98,13 @@ def report_text(facts: dict[str, Any]) -> str:
         for row in facts["limits"]
     ]
     gains = [(row["path"], f"{row['before']:.6g}", f"{row['after']:.6g}", row["at_bound"]) for row in facts["gains"]]
-    parts = [
-        f"# Tuning of {facts['case']}", facts["verdict"],
-        "## Limits", rows(("limit", "meaning", "value", "at most", "met"), limits),
-        "## Peaks of |S|", rows(("rpm", "axis", "before", "after", "Hz", "zone"), peaks),
-        "## Gains", rows(("gain", "before", "after", "at a bound"), gains),
-    ]  # fmt: skip
-    return "\n\n".join(parts) + "\n"
+    tables = {
+        "Limits": (("limit", "meaning", "value", "at most", "met"), limits),
+        "Peaks of |S|": (("rpm", "axis", "before", "after", "Hz", "zone"), peaks),
+        "Gains": (("gain", "before", "after", "at a bound"), gains),
+    }
+    parts = [f"## {title}\n\n" + "\n".join(markdown_table(*table)) for title, table in tables.items()]
+    return "\n\n".join([f"# Tuning of {facts['case']}", facts["verdict"], *parts]) + "\n"
 
 
 def _peak(point: dict[str, Any], axis: dict[str, Any]) -> str:

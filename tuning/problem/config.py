@@ -25,10 +25,10 @@ from ambjax.cases.tune_table import (
 from ambjax.extend import leaf
 from ambjax.host.extensions import NothingToTuneError
 from tuning.problem.gains_table import space_from
+from tuning.problem.goal import CVaR
 from tuning.problem.limits import LEAST_MARGIN, Limit
 from tuning.problem.loss import TERMS
 from tuning.problem.quantities import KINDS
-from tuning.problem.risk import CVaR
 from tuning.problem.space import Space
 from tuning.problem.unbreakable import bounds_of
 

@@ -20,8 +20,7 @@ from jax import Array
 
 from ambjax.extend import Scalar, record, static
 from ambjax.simulation.folds import Fold
-from tuning.problem.limit_folds import TINY
-from tuning.problem.quantities import KINDS, Kind, LimitContext
+from tuning.problem.quantities import KINDS, TINY, Kind, LimitContext
 
 # Penalty; at a multiplier of 0, an excess of 10 % adds 0.14 to the goal.
 PENALTY = 30.0

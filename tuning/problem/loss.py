@@ -14,8 +14,8 @@ from ambjax.simulation.folds import Ending, Fold, Named
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import ALIVE, Row
 from ambjax.world.scenario import Scenario
-from tuning.problem.limit_folds import NORM
 from tuning.problem.limits import PREFIX
+from tuning.problem.quantities import NORM
 
 # Weights of the terms, in the order of TERMS; values of a term, for one member or for many [N].
 Weights = Sequence[float] | np.ndarray | Array

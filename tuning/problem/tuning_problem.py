@@ -16,7 +16,7 @@ from tuning.problem.goal import Goal
 from tuning.problem.lanes import Engine
 from tuning.problem.limits import FRONT, Limit, measures
 from tuning.problem.loss import HELD, TERMS, loss_for
-from tuning.problem.members import LoopRange, Objective
+from tuning.problem.members import FEW, LoopRange, Objective
 from tuning.problem.quantities import KINDS, LimitContext
 from tuning.problem.ranges import Range, bounded
 
@@ -24,16 +24,13 @@ from tuning.problem.ranges import Range, bounded
 # for the accurate steps, and the judge makes the steps of the case. On the tuned loops of tests/test_metrics_dense.py,
 # 24 steps a sample have an error of at most 0.8 % in the settled rms voltage, 12 steps 4.6 %, 3 steps 56 %.
 REFINEMENT = 8
-# Accurate reference: number of members, relative tolerance of the steps.
-REFERENCE_MEMBERS, REFERENCE_TOLERANCE = 4, 1e-6
+# Relative tolerance of the accurate steps.
+REFERENCE_TOLERANCE = 1e-6
 # Quantities that the front of error against voltage needs.
 TRACED = ("rms_error_m", "rms_u_V")
 # Initial multiplier of the limit on the error in the searches for the front, which minimise the voltage. It corresponds
 # to 1.5 % more voltage for 1 % less error.
 EXCHANGE = 3.0
-# Cost of a gradient, divided by that of a rollout: 1 + m in forward mode for m gains, RERUN + SWEEP q in reverse mode
-# for q differentiated quantities (benchmarks/schedules.py, gradients.py).
-SWEEP, RERUN = 4, 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +68,7 @@ class TuningProblem:
         Adaptive RODAS3 or, on a processor, REFINEMENT times as many steps as in the search.
         """
         accurate = AdaptiveRodas3(REFERENCE_TOLERANCE)
-        return self._stepping(self._fine if self.sampled else accurate, lanes=REFERENCE_MEMBERS)
+        return self._stepping(self._fine if self.sampled else accurate, lanes=FEW)
 
     @functools.cached_property
     def judging(self) -> Engine:
@@ -149,7 +146,7 @@ class TuningProblem:
             return self.engine, self.reference
         objective = dataclasses.replace(self.objective, scenario=scenario.with_sensor(bits=None, bits_i=None))
         exact = dataclasses.replace(self, objective=objective)
-        return exact._stepping(objective.clock.integrator, lanes=REFERENCE_MEMBERS), exact.reference
+        return exact._stepping(objective.clock.integrator, lanes=FEW), exact.reference
 
 
 def method_for(case: Case, substeps: int, finer: int) -> Integrator:
@@ -192,8 +189,12 @@ def problem_of(
 
 
 def cheaper_mode(gains: int, outcomes: int) -> str:
-    """Return "forward" or "reverse": the cheaper mode for the derivatives of `outcomes` quantities in `gains` gains."""
-    return "forward" if 1 + gains <= RERUN + SWEEP * outcomes else "reverse"
+    """Return "forward" or "reverse": the cheaper mode for the derivatives of `outcomes` quantities in `gains` gains.
+
+    A gradient costs 1 + m rollouts in forward mode for m gains, 5 + 4 q in reverse mode for q quantities
+    (benchmarks/schedules.py, gradients.py).
+    """
+    return "forward" if 1 + gains <= 5 + 4 * outcomes else "reverse"
 
 
 def _loop_range(case: Case, limits: tuple[Limit, ...]) -> LoopRange | None:

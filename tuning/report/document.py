@@ -7,8 +7,14 @@ from collections.abc import Callable
 from ambjax.results.outputs import described
 from ambjax.text.web_page import escape_markdown, markdown_table
 from tuning.report import front_table, limit_table, sensitivity_table
-from tuning.report.facts import SUMMARY_METRICS, Row, TuningFacts, number
+from tuning.report.facts import Column, Row, TuningFacts, number, table
 from tuning.report.outcome import answer
+
+# Metrics shown before and after; all others are in report.json.
+SUMMARY_METRICS = (
+    "settled_rms_error_m", "settled_rms_error_worst_member_m", "settled_max_abs_error_m", "settled_rms_u_V.mean",
+    "max_abs_u_V.largest", "max_abs_i_A.largest", "chatter_V.mean", "clearance_used.largest",
+)  # fmt: skip
 
 
 def report_markdown(facts: TuningFacts) -> str:
@@ -26,28 +32,25 @@ def report_markdown(facts: TuningFacts) -> str:
 
 def _gains(facts: TuningFacts) -> list[str]:
     """Return the sections on the gains and on the nominal run."""
-    ranged = any(row.get("source") for row in facts.gains)
-    looked = ["searched from", "to"] if ranged else []
-    head = ["gain", "before", "after", *looked, "allowed from", "to", "at a bound", "risk increase"]
-    rows = []
-    for row in facts.gains:
-        ends = [number(row.get(end), ".3g") for end in ("low", "high")] if ranged else []
-        bounds = [number(row.get(end), ".3g") for end in ("least", "most")]
-        gains = f"{row['before']:.6g}", f"{row['after']:.6g}"
-        rows.append([row["path"], *gains, *ends, *bounds, row["at_bound"] or "-", _sensitivity(row, facts)])
-    lines = ["## Gains", "", *markdown_table(head, rows), ""]
-    words = (
-        "Last column: increase of the risk of least error, which includes the stressed members but not the limits, if "
-        "this gain alone is larger or smaller by a factor of e^0.25 = 1.28, whichever is worse. A gain with a large "
-        "increase must be set accurately. If members of the training ensemble are then also lost, the column shows "
-        "their number. `tune.bounds` sets other bounds."
-    )
-    sources = [f"- {row['path']}: {escape_markdown(row['source'])}" for row in facts.gains if row.get("source")]
+    columns: dict[str, Column] = {
+        "gain": ("path", ""), "before": ("before", ".6g"), "after": ("after", ".6g"),
+        "searched from": ("low", ".3g"), "searched to": ("high", ".3g"),
+        "allowed from": ("least", ".3g"), "allowed to": ("most", ".3g"),
+        "at a bound": ("at_bound", ""), "risk increase": functools.partial(_sensitivity, trained_on=facts.trained_on),
+    }  # fmt: skip
     return [
-        *lines,
-        words,
+        "## Gains",
         "",
-        *(["Sources of the ranges:", "", *sources, ""] if sources else []),
+        *table(facts.gains, columns),
+        "",
+        "Last column: increase of the risk of least error, without the limits, if this gain alone is larger or smaller "
+        "by a factor of e^0.25 = 1.28, whichever is worse; or the number of training members that are then also lost. "
+        "`tune.bounds` sets other bounds.",
+        "",
+        "Sources of the ranges:",
+        "",
+        *(f"- {row['path']}: {escape_markdown(row['source'])}" for row in facts.gains),
+        "",
         "## One rotor before and after",
         "",
         f"The nominal run of the case, without `[spread]`, {facts.nominal_steps}. u is averaged over each sample.",
@@ -56,18 +59,17 @@ def _gains(facts: TuningFacts) -> list[str]:
         "",
         "![z - r and u after tuning](after.png)",
         "",
-        "Amplitude spectrum of the voltage from `run.settle` on (Hann window). A sine with an amplitude of 1 V has a "
-        "peak of 1 V.",
+        "Amplitude spectrum of the voltage from `run.settle` on (Hann window).",
         "",
         "![Amplitude spectrum of u before and after tuning](spectrum.png)",
         "",
     ]
 
 
-def _sensitivity(row: Row, facts: TuningFacts) -> str:
+def _sensitivity(row: Row, trained_on: int) -> str:
     """Return the increase of the risk, or the number of further members lost, if a gain changes by a factor of 1.28."""
-    if row.get("sensitivity_lost"):
-        return f"**{row['sensitivity_lost']} of {facts.trained_on} training members are also lost**"
+    if row["sensitivity_lost"]:
+        return f"**{row['sensitivity_lost']} of {trained_on} training members are also lost**"
     return "-" if row["sensitivity_percent"] is None else f"{row['sensitivity_percent']:.3g} %"
 
 
@@ -110,13 +112,15 @@ def _conditions(facts: TuningFacts) -> list[str]:
     """Return the section on the conditions of Theorem 1, left > right."""
     if not facts.conditions:
         return []
-    rows = []
-    for row in facts.conditions:
-        gain, margin = (number(x, ".5g") for x in (row["gain"], row["margin"]))
-        verdict = {True: "holds", False: "FAILS", None: "-"}[row["holds"]]
-        rows.append([row["requires"], gain, number(row["against"], ".5g"), margin, row["unit"], verdict])
-    head = ["condition", "left", "right", "margin", "unit", "verdict"]
-    lines = ["## Conditions of Theorem 1 along the nominal run", "", *markdown_table(head, rows), ""]
+    columns: dict[str, Column] = {
+        "condition": ("requires", ""),
+        "left": ("gain", ".5g"),
+        "right": ("against", ".5g"),
+        "margin": ("margin", ".5g"),
+        "unit": lambda row: row["unit"],
+        "verdict": lambda row: {True: "holds", False: "FAILS", None: "-"}[row["holds"]],
+    }
+    lines = ["## Conditions of Theorem 1 along the nominal run", "", *table(facts.conditions, columns), ""]
     if facts.advice_on_conditions:
         lines += [f"- {escape_markdown(line)}" for line in facts.advice_on_conditions] + [""]
     return lines

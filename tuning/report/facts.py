@@ -2,21 +2,15 @@
 
 import dataclasses
 import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
+
+from ambjax.text.web_page import markdown_table
 
 # A row, or a nested table, of report.json.
 Row = dict[str, Any]
-# Metrics shown before and after; all others are in report.json.
-SUMMARY_METRICS = (
-    "settled_rms_error_m",
-    "settled_rms_error_worst_member_m",
-    "settled_max_abs_error_m",
-    "settled_rms_u_V.mean",
-    "max_abs_u_V.largest",
-    "max_abs_i_A.largest",
-    "chatter_V.mean",
-    "clearance_used.largest",
-)
+# A column of a table: the key of a row and the format of its number, or a function of the row.
+Column = tuple[str, str] | Callable[[Row], str]
 # Fields that report.json leaves out if they are None.
 OPTIONAL = ("front", "sensitivity", "stability")
 
@@ -26,16 +20,26 @@ def number(x: float | None, form: str = ".4g") -> str:
     return "-" if x is None or math.isnan(x) else format(x, form)
 
 
+def table(rows: Sequence[Row], columns: Mapping[str, Column]) -> list[str]:
+    """Return a Markdown table of these rows. `columns`: by their heads."""
+
+    def cell(row: Row, column: Column) -> str:
+        if callable(column):
+            return column(row)
+        value = row[column[0]]
+        return (value or "-") if isinstance(value, str) else number(value, column[1])
+
+    return markdown_table(list(columns), [[cell(row, column) for column in columns.values()] for row in rows])
+
+
 @dataclasses.dataclass(frozen=True)
 class TuningFacts:
     """What a search found. Each field is a key of report.json.
 
     `before`, `after`: the held-out members under the case's gains and the tuned ones. `refuted`: why accurate steps
-    contradict the answer; '' if they confirm it.
-    `stability`: of the held-out members with the largest settled errors (`ambjax.linear.Findings`); None if
-    no member was judged. `front`: of error against voltage; None if it was not traced. `front_written`: whether each of
-    its points has a case file. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it.
-    `next`: the next command, in words. `conditions` is empty if they could not be computed.
+    contradict the answer; '' if they confirm it. `stability`: of the held-out members with the largest settled errors
+    (`ambjax.linear.Findings`). `front_written`: whether each point of the front has a case file. `next`: the next
+    command, in words. What was not computed is None or empty.
     """
 
     case: str

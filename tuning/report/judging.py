@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,15 +16,16 @@ from tuning.judge.evaluate import describe, held, judge, step_error, summarise, 
 from tuning.judge.late import delay_test
 from tuning.judge.peaks import injections
 from tuning.problem.config import seeds, settings
-from tuning.problem.members import Members
-from tuning.problem.tuning_problem import REFERENCE_MEMBERS, TuningProblem
+from tuning.problem.members import FEW, Members
+from tuning.problem.tuning_problem import TuningProblem
 from tuning.report import front_table, limit_table, outcome, sensitivity_table
 from tuning.report.facts import Row, TuningFacts
 from tuning.solve.course import SearchResult
 
 # Change of a coordinate for the sensitivity of a gain.
 STEP = 0.25
-# Fields on the conditions of Theorem 1 if they cannot be computed.
+# The summary of no members, and the fields on the conditions of Theorem 1 if they cannot be computed.
+NO_MEMBERS: Row = {"members": 0, "held": 0, "lost": 0, "stalled": 0}
 NO_CONDITIONS: Row = {"conditions": [], "advice_on_conditions": []}
 
 
@@ -37,14 +37,16 @@ def examined(answer: SearchResult, front_written: bool, tell: Tell) -> TuningFac
     """
     problem, x, members = answer.problem, answer.x, answer.members
     held_out, rollouts = seeds(problem.tune.budget)[2], problem.engine.rollouts
-    judged = _judged(problem, x, held_out, tell)
-    steps = _steps(answer, judged["after"], held_out, tell)
+    before, after = _judged(problem, x, held_out, tell)
+    steps = _steps(answer, after, held_out, tell)
     found = {
         "case": problem.case.name,
         "held_out_seed": held_out,
         "trained_on": len(members.member),
         "lost_in_validation": answer.lost,
-        **_ensembles(answer, judged, steps["refuted"], held_out, tell),
+        "before": summarise(before) if before else NO_MEMBERS,
+        **_held_out(problem, x, after, steps["refuted"], held_out, tell),
+        "lost_in_training": int((problem.engine.terms(x[None], members)["survival"] > 0).sum()),
         **steps,
         **(described("the conditions of Theorem 1", lambda: _conditions(problem, x)) or NO_CONDITIONS),
         "search": settings(problem.tune)
@@ -61,42 +63,38 @@ def examined(answer: SearchResult, front_written: bool, tell: Tell) -> TuningFac
     return dataclasses.replace(facts, verdict=verdict, advice=advice, next=outcome.next_command(problem))
 
 
-def _judged(problem: TuningProblem, x: np.ndarray, held_out: int, tell: Tell) -> dict[str, dict[str, np.ndarray]]:
-    """Return the metrics of the held-out members [N] with the gains of the case (`before`) and at x [m] (`after`).
+def _judged(problem: TuningProblem, x: np.ndarray, held_out: int, tell: Tell) -> list[dict[str, np.ndarray]]:
+    """Return the metrics of the held-out members [N] with the gains of the case and at x [m]; empty without members.
 
-    Gains of the case that are outside their bounds, or close to a bound, are clipped. Both results are empty if there
-    are no held-out members.
-    `held_out`: seed of these members.
+    Gains of the case that are outside their bounds, or close to a bound, are clipped. `held_out`: seed of the members.
     """
     space, count = problem.objective.space, problem.tune.budget.held_out
     tell(f"judging on {count} held-out members")
     start = space.encode(space.clip(space.values(problem.case.cascade)))
-    return {
-        name: judge(problem, at, held_out, count) if count else {} for name, at in (("before", start), ("after", x))
-    }
+    return [judge(problem, at, held_out, count) if count else {} for at in (start, x)]
 
 
-def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_out: int, tell: Tell) -> Row:
-    """Return the fields on the training members and on the held-out members.
+def _held_out(
+    problem: TuningProblem, x: np.ndarray, after: dict[str, np.ndarray], refuted: str, seed: int, tell: Tell
+) -> Row:
+    """Return the fields on the held-out members with this `seed` at x [m]. `after`: their metrics [N], or empty.
 
-    `judged`: from `_judged`. `refuted`: why accurate steps do not confirm the answer; '' if they do. `held_out`: seed
-    of the held-out members.
+    `refuted`: why accurate steps do not confirm the answer; '' if they do.
     """
-    problem = answer.problem
-    none = {"members": 0, "held": 0, "lost": 0, "stalled": 0}
-    found: Row = {name: summarise(one) if one else dict(none) for name, one in judged.items()}
-    after = judged["after"]
+    if not after:
+        none = dict.fromkeys(("worst_member", "stability", "sensitivity"))
+        return none | {"after": NO_MEMBERS, "limits": limit_table.facts(problem, after, NO_MEMBERS, refuted)}
     tell("the sensitivity of the held-out members")
-    injected = injections(problem, answer.x, held_out, after) if after else None
-    found["sensitivity"] = None if injected is None else sensitivity_table.facts(problem, injected)
-    late = delay_test(problem, answer.x, held_out, after) if after else None
-    found["limits"] = limit_table.facts(problem, after, found["after"], refuted, injected, late)
-    if refuted and after:
-        found["after"] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
-    found["worst_member"] = described("the worst member", lambda: worst(problem, after, held_out)) if after else None
-    found["stability"] = _stability(problem, answer.x, held_out, after, tell) if after else None
-    lost = problem.engine.terms(answer.x[None], answer.members)["survival"] > 0
-    return found | {"lost_in_training": int(lost.sum())}
+    injected, summary = injections(problem, x, seed, after), summarise(after)
+    late = delay_test(problem, x, seed, after)
+    unverified = dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
+    return {
+        "sensitivity": injected and sensitivity_table.facts(problem, injected),
+        "limits": limit_table.facts(problem, after, summary, refuted, injected, late),
+        "after": summary | (unverified if refuted else {}),
+        "worst_member": described("the worst member", lambda: worst(problem, after, seed)),
+        "stability": _stability(problem, x, seed, after, tell),
+    }
 
 
 def _stability(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray], tell: Tell) -> Row:
@@ -120,7 +118,7 @@ def _steps(answer: SearchResult, judged: dict[str, np.ndarray], held_out: int, t
     problem, error = answer.problem, None
     if judged and not problem.sampled and answer.confirmed and (alive := np.flatnonzero(held(judged))).size:
         worst = alive[worst_of(judged["settled_max_abs_error_m"][alive])]
-        those = np.union1d(worst, alive[:REFERENCE_MEMBERS])
+        those = np.union1d(worst, alive[:FEW])
         error = step_error(problem, answer.x, problem.objective.chosen(held_out, those, len(judged["lost_at_s"])))
         tell(f"accurate steps on the worst and the first of them: {describe(error)}")
     refuted = (error or answer.error).refuted if answer.error else "every member that it was tuned on is lost"

@@ -17,8 +17,8 @@ from tuning.report.front_table import letter
 # Largest plotted goal, relative to the least. A lost member raises the goal by about 1e6, and violated limits by up to
 # 1e300, which would hide the other values.
 HIGHEST = 30.0
-# FAINTEST: smallest plotted amplitude, as a share of the largest. FEWEST: smallest number of samples of a spectrum.
-FAINTEST, FEWEST = 1e-5, 16
+# Smallest number of samples of a spectrum.
+FEWEST = 16
 
 
 @own_style
@@ -40,7 +40,7 @@ def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
         ax.plot(frequency, amplitude, color=ORANGE if name == "before" else BLUE, lw=0.8, label=label)
         top = max(top, amplitude.max(initial=0.0))
     ax.set(xlabel="frequency (Hz)", ylabel="amplitude of u (V)", xscale="log", yscale="log")
-    ax.set_ylim(FAINTEST * (top or 1.0), 2 * (top or 1.0))
+    ax.set_ylim(1e-5 * (top or 1.0), 2 * (top or 1.0))
     ax.grid(alpha=0.3, which="both")
     ax.legend(fontsize=8)
     return _png(figure)

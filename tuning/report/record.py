@@ -19,6 +19,10 @@ KEY, TUNED = "record", "tuned.toml"
 REPORT = "report.json"
 
 
+# Verdict in tuned.toml until the gains are judged.
+NOT_JUDGED = "The tuned gains are not judged."
+
+
 def search_facts(raw: dict[str, Any], case: Case, tune: Tune) -> Row:
     """Return what a checkpoint must match: the case, [tune], and the contents of the other files of the case.
 

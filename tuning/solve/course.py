@@ -14,10 +14,10 @@ from tuning.judge.evaluate import StepError
 from tuning.problem.loops import check_loops
 from tuning.problem.loss import TERMS
 from tuning.problem.members import Members
+from tuning.problem.ranges import initial_points
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.checkpoint import CheckpointFile, SearchState, checkpoint
 from tuning.solve.refine import best_of, search
-from tuning.solve.screen import initial_points
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tuning.judge.evaluate import held, judge
+from tuning.judge.evaluate import RESOLVED, held, judge
 from tuning.judge.peaks import injections, injects, reached_of
 from tuning.problem.config import seeds
 from tuning.problem.limits import PREFIX, TOLERANCE_BELOW, Limit
@@ -24,9 +24,6 @@ MOST_UPDATES = 6
 AVERAGING_MEMBERS = 256
 # Largest number of members that join at once for each reason.
 MOST_JOINING = 8
-# If the judged mean of a limited quantity exceeds its expected value by more than this share, the training ensemble
-# lacks members with large values.
-UNEXPECTED = 0.1
 
 
 class Judged(NamedTuple):
@@ -145,7 +142,7 @@ def breaking(
 
     For a limit on the worst member, they are members that break it, if the judged value lacks
     reserve. For a limit on a mean, they are the members with the largest values, if the judged value breaks the limit
-    and exceeds its expected value, the search's value times `Limit.ratio`, by more than UNEXPECTED.
+    and exceeds its expected value, the search's value times `Limit.ratio`, by more than RESOLVED.
 
     `numbers`: the values of the search and of the judge for each limit. `columns` [N]: metrics of the judged members.
     """
@@ -157,7 +154,7 @@ def breaking(
         excess = np.where(held(columns), limit.log_excess(limit.values(columns)), -math.inf)
         if limit.kind.worst and not limit.has_reserve(judged):
             found = np.append(found, largest_unseen(course, np.where(excess > 0, excess, -math.inf)))
-        elif not limit.kind.worst and not limit.holds(judged) and judged > (1 + UNEXPECTED) * limit.ratio * tuned:
+        elif not limit.kind.worst and not limit.holds(judged) and judged > (1 + RESOLVED) * limit.ratio * tuned:
             found = np.append(found, largest_unseen(course, excess))
     total = len(columns["lost_at_s"])
     return problem.objective.chosen(seeds(budget)[1], np.unique(found), total) if found.size else None
