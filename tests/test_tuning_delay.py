@@ -7,6 +7,7 @@ import pytest
 from texts import case_and_tune
 
 from ambjax.linear import analyse, linearise, margins_of
+from tuning.judge.evaluate import JudgedMembers
 from tuning.judge.late import DELAY_MARGIN, DelayTest, delay_test, not_simulated
 from tuning.problem.limits import PREFIX
 from tuning.problem.tuning_problem import problem_of
@@ -44,12 +45,12 @@ def test_members_are_stable_below_the_margin_then_held_and_then_lost():
         f"loss.{PREFIX}{DELAY_MARGIN}": np.array([3.0, 1.0, 2.0]),
         "lost_at_s": np.array([math.inf, math.inf, 1.0]),
     }
-    found = {share: delay_test(problem(share * margin), x, 1, columns) for share in (0.8, 1.5, 2.0)}
+    found = {share: delay_test(JudgedMembers(problem(share * margin), x, 1, columns)) for share in (0.8, 1.5, 2.0)}
     # The model does not predict over the added delay, so the loop is stable up to 1.44 times this margin. From there to
     # 1.55 times, it ends in an oscillation that holds the rotor.
     assert found == {0.8: DelayTest(2, 0, 0), 1.5: DelayTest(2, 0, 2), 2.0: DelayTest(2, 2, 0)}
     lost = columns | {"lost_at_s": np.zeros(3)}
-    assert delay_test(problem(1e-4), x, 1, lost) is None
+    assert delay_test(JudgedMembers(problem(1e-4), x, 1, lost)) is None
 
 
 @pytest.mark.slow
@@ -65,7 +66,7 @@ def test_an_additional_delay_of_several_samples_is_simulated():
     for share in (0.9, 1.1):
         made = problem(share * margin, clock=clock)
         x = made.tune.space.encode(made.tune.space.values(case.cascade))
-        found.append(delay_test(made, x, 1, columns))
+        found.append(delay_test(JudgedMembers(made, x, 1, columns)))
     assert found == [DelayTest(2, 0, 0), DelayTest(2, 0, 2)]
 
 

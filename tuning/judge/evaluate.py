@@ -30,23 +30,42 @@ def judge(problem: TuningProblem, x: np.ndarray, seed: int, count: int) -> dict[
     return {name: values[0] for name, values in both.items()}
 
 
-def worst(problem: TuningProblem, judged: dict[str, np.ndarray], seed: int) -> dict[str, Any]:
-    """Return the worst member of the judged ensemble [N].
+class JudgedMembers(NamedTuple):
+    """The first N members of the ensemble with this `seed`, judged at coordinates x [m].
 
-    It is the member whose run ends first (lost or stalled), or else the one with the largest settled error. `replay` is
-    the command that simulates it and returns these values, for the directory of the report; None if the judge's steps
-    differ from those of `ambjax simulate`.
+    `columns` [N]: metrics and terms of the loss, from `judge`.
     """
-    error, lost_at = judged["settled_max_abs_error_m"], judged["lost_at_s"]
-    index = int(np.lexsort((-error, lost_at))[0])
-    case = problem.case
-    study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, seed, len(error))
-    return {
-        "member": index,
-        "settled_max_abs_error_m": float(error[index]),
-        "lost_at_s": float(lost_at[index]),
-        "replay": study.command("tuned.toml", index) if problem.replays else None,
-    }
+
+    problem: TuningProblem
+    x: np.ndarray
+    seed: int
+    columns: Mapping[str, np.ndarray]
+
+    @property
+    def held(self) -> np.ndarray:
+        """The numbers of the members that are held."""
+        return np.flatnonzero(held(self.columns))
+
+    def chosen(self, numbers: np.ndarray) -> Members:
+        """Return the members with these numbers."""
+        return self.problem.objective.chosen(self.seed, numbers, len(self.columns["lost_at_s"]))
+
+    def worst(self) -> dict[str, Any]:
+        """Return the worst member: its run ends first (lost or stalled), or else its settled error is the largest.
+
+        `replay` is the command that simulates it and returns these values, for the directory of the report; None if the
+        judge's steps differ from those of `ambjax simulate`.
+        """
+        error, lost_at = self.columns["settled_max_abs_error_m"], self.columns["lost_at_s"]
+        index = int(np.lexsort((-error, lost_at))[0])
+        case = self.problem.case
+        study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, self.seed, len(error))
+        return {
+            "member": index,
+            "settled_max_abs_error_m": float(error[index]),
+            "lost_at_s": float(lost_at[index]),
+            "replay": study.command("tuned.toml", index) if self.problem.replays else None,
+        }
 
 
 def rms(values: np.ndarray) -> float:
@@ -151,7 +170,7 @@ def held(metrics: Mapping[str, np.ndarray]) -> np.ndarray:
     return ~np.isfinite(metrics["lost_at_s"])
 
 
-def summarise(metrics: dict[str, np.ndarray]) -> dict[str, Any]:
+def summarise(metrics: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Return the statistics of an ensemble [N] for the report: statuses, survival, and metrics over members.
 
     The status of a member whose integration stalled is unknown: the member counts neither as lost nor as held, and not

@@ -1,6 +1,5 @@
 """Test of the limit on the delay margin: members are simulated with the limit as an additional delay."""
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -8,6 +7,7 @@ import numpy as np
 from ambjax.control.processor import MOST_DELAY
 from ambjax.ensemble import run_ensemble
 from ambjax.linear import stability_of
+from tuning.judge.evaluate import JudgedMembers
 from tuning.problem.limits import PREFIX, Limit
 from tuning.problem.quantities import LOOPS
 from tuning.problem.tuning_problem import TuningProblem
@@ -39,20 +39,19 @@ def not_simulated(problem: TuningProblem, limit: Limit) -> str:
     return ""
 
 
-def delay_test(problem: TuningProblem, x: np.ndarray, seed: int, columns: Mapping[str, np.ndarray]) -> DelayTest | None:
+def delay_test(of: JudgedMembers) -> DelayTest | None:
     """Simulate the LOOPS held members of least delay margin, with the limit on it as an additional delay.
 
-    The prediction of the controller assumes the delay of the case. `x`: coordinates of the m gains [m]. `columns` [N]:
-    result of `judge` for the ensemble with this `seed`. Returns None without such a limit, if `not_simulated` gives a
-    reason, or if no member is held.
+    The prediction of the controller assumes the delay of the case. Returns None without such a limit, if
+    `not_simulated` gives a reason, or if no member is held.
     """
+    problem, alive = of.problem, of.held
     limit = next((limit for limit in problem.limits if limit.name == DELAY_MARGIN), None)
-    alive = np.flatnonzero(~np.isfinite(columns["lost_at_s"]))
     if limit is None or not_simulated(problem, limit) or not alive.size:
         return None
-    order = np.argsort(columns[f"loss.{PREFIX}{DELAY_MARGIN}"][alive], kind="stable")
-    members = problem.objective.chosen(seed, alive[order[:LOOPS]], len(columns["lost_at_s"]))
-    cascade, scenario = problem.objective.fixed(x, members)
+    order = np.argsort(of.columns[f"loss.{PREFIX}{DELAY_MARGIN}"][alive], kind="stable")
+    members = of.chosen(alive[order[:LOOPS]])
+    cascade, scenario = problem.objective.fixed(of.x, members)
     processor = cascade.timing
     delay = np.asarray(processor.delay) + limit.threshold / float(problem.case.clock.sample_period)
     if np.max(delay) > MOST_DELAY:

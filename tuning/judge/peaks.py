@@ -16,6 +16,7 @@ from ambjax.linear.injection import injection_of
 from ambjax.linear.member_responses import Responses, member_responses
 from ambjax.linear.stability import MOST_TESTED
 from ambjax.results.operating import one_period
+from tuning.judge.evaluate import JudgedMembers
 from tuning.problem.limits import PREFIX, Limit
 from tuning.problem.tuning_problem import TuningProblem
 
@@ -76,38 +77,35 @@ def decides(problem: TuningProblem) -> bool:
     return injects(problem) and any(set_valued_signs(getattr(problem.case.cascade, stage)) for stage in DEFAULT_LAWS)
 
 
-def injections(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray]) -> Sensitivity | None:
-    """Analyse the INJECTED held members with the largest peaks at coordinates x [m]; on a processor, also inject.
+def injections(of: JudgedMembers) -> Sensitivity | None:
+    """Analyse the INJECTED held members with the largest peaks; on a processor, also inject.
 
-    `columns` [N]: result of `judge` for the ensemble with this `seed`. The members are those with the largest linear
-    peak of the first quantity of BY_INJECTION that has a limit. If only injections decide, they are those with the
-    largest injected peak, by one injection into each of the first MOST_TESTED held members. Returns None if no quantity
-    of BY_INJECTION has a limit, or if no member is held.
+    The members are those with the largest linear peak of the first quantity of BY_INJECTION that has a limit. If only
+    injections decide, they are those with the largest injected peak, by one injection into each of the first
+    MOST_TESTED held members. Returns None if no quantity of BY_INJECTION has a limit, or if no member is held.
     """
-    name = next((name for name in BY_INJECTION if f"loss.{PREFIX}{name}" in columns), None)
-    alive = np.flatnonzero(~np.isfinite(columns["lost_at_s"]))
+    name, alive = next((name for name in BY_INJECTION if f"loss.{PREFIX}{name}" in of.columns), None), of.held
     if name is None or not alive.size:
         return None
-    order = alive[np.argsort(-columns[f"loss.{PREFIX}{name}"][alive], kind="stable")]
-    of = _Ensemble(problem, x, seed, len(columns["lost_at_s"]))
-    if not injects(problem):
-        return Sensitivity(tuple(_summary(int(k), of.analysis(k), None) for k in order[:INJECTED]), False)
-    first = of.analysis(order[0])
+    order = alive[np.argsort(-of.columns[f"loss.{PREFIX}{name}"][alive], kind="stable")]
+    if not injects(of.problem):
+        return Sensitivity(tuple(_summary(int(k), _analysis(of, k), None) for k in order[:INJECTED]), False)
+    first = _analysis(of, order[0])
     peak = None if isinstance(first, str) else first.S.frequency
-    if decides(problem):
-        once = of.responses(alive[:MOST_TESTED], 1, peak)
+    if decides(of.problem):
+        once = _responses(of, alive[:MOST_TESTED], 1, peak)
         response = {"S": once.S, "T": once.S - 1, "KS": once.KS}[BY_INJECTION[name]]
         size = np.where(once.held, np.abs(response).max(axis=1), np.inf)
         order = alive[np.argsort(-size, kind="stable")]
-    random = problem.objective.scenario.random
+    random = of.problem.objective.scenario.random
     repetitions = REPETITIONS if random else 1
-    every = of.responses(order[:INJECTED], repetitions, peak)
+    every = _responses(of, order[:INJECTED], repetitions, peak)
     peaks = []
     for at, k in enumerate(order[:INJECTED]):
         own = slice(at * repetitions, (at + 1) * repetitions)
         parts = {name: getattr(every, name)[own] for name in ("S", "KS", "saturated", "held")}
-        peaks.append(_summary(int(k), of.analysis(k), injection_of(every._replace(**parts), random)))
-    return Sensitivity(tuple(peaks), decides(problem))
+        peaks.append(_summary(int(k), _analysis(of, k), injection_of(every._replace(**parts), random)))
+    return Sensitivity(tuple(peaks), decides(of.problem))
 
 
 def reached_of(limit: Limit, columns: Mapping[str, np.ndarray], injected: Sensitivity | None) -> float:
@@ -126,43 +124,34 @@ def reached_of(limit: Limit, columns: Mapping[str, np.ndarray], injected: Sensit
     return max(largest) if injected.decides else max(linear, *largest)
 
 
-class _Ensemble(NamedTuple):
-    """The members of a judged ensemble of `total` members with this `seed`, at coordinates x [m]."""
+def _analysis(of: JudgedMembers, number: int) -> Analysis | str:
+    """Analyse the linearised loop of one member. Return the cause as text if it cannot be linearised."""
+    objective, case = of.problem.objective, of.problem.case
+    cascade, scenario = objective.world(jax.tree.map(lambda a: a[0], of.chosen(np.array([number]))))
+    cascade = objective.space.decode(jnp.asarray(of.x), cascade)
+    scenario = dataclasses.replace(scenario, seed=case.scenario.seed, member=case.scenario.member)
+    try:
+        system = linearise(cascade, scenario, case.clock)
+    except ValueError as error:
+        return str(error)
+    return analyse(system, scenario.plant.m, float(case.clock.sample_period), case.zones.whole)
 
-    problem: TuningProblem
-    x: np.ndarray
-    seed: int
-    total: int
 
-    def analysis(self, number: int) -> Analysis | str:
-        """Analyse the linearised loop of one member. Return the cause as text if it cannot be linearised."""
-        objective, case = self.problem.objective, self.problem.case
-        member = jax.tree.map(lambda a: a[0], objective.chosen(self.seed, np.array([number]), self.total))
-        cascade, scenario = objective.world(member)
-        cascade = objective.space.decode(jnp.asarray(self.x), cascade)
-        scenario = dataclasses.replace(scenario, seed=case.scenario.seed, member=case.scenario.member)
-        try:
-            system = linearise(cascade, scenario, case.clock)
-        except ValueError as error:
-            return str(error)
-        return analyse(system, scenario.plant.m, float(case.clock.sample_period), case.zones.whole)
+def _responses(of: JudgedMembers, numbers: np.ndarray, repetitions: int, peak: float | None) -> Responses:
+    """Inject a test signal into the members `numbers` [n], each `repetitions` times with different noise.
 
-    def responses(self, numbers: np.ndarray, repetitions: int, peak: float | None) -> Responses:
-        """Inject a test signal into the members `numbers` [n], each `repetitions` times with different noise.
-
-        The lines are denser near `peak` (Hz). The results are in the order of the members.
-        """
-        objective, case = self.problem.objective, self.problem.case
-        members = objective.chosen(self.seed, np.repeat(numbers, repetitions), self.total)
-        cascade, scenario = objective.fixed(self.x, members)
-        scenario = dataclasses.replace(scenario, seed=0, member=np.arange(len(numbers) * repetitions))
-        clock = one_period(case)
-        lines = frequency_lines(case.zones.whole, clock, peak)
-        return member_responses(cascade, scenario, clock, lines, amplitude=case.zones.amplitude)
+    The lines are denser near `peak` (Hz). The results are in the order of the members.
+    """
+    case = of.problem.case
+    cascade, scenario = of.problem.objective.fixed(of.x, of.chosen(np.repeat(numbers, repetitions)))
+    scenario = dataclasses.replace(scenario, seed=0, member=np.arange(len(numbers) * repetitions))
+    clock = one_period(case)
+    lines = frequency_lines(case.zones.whole, clock, peak)
+    return member_responses(cascade, scenario, clock, lines, amplitude=case.zones.amplitude)
 
 
 def _summary(number: int, analysis: Analysis | str, one: Injection | None) -> MemberPeak:
-    """Return the peaks of a member. `analysis`: of `_Ensemble`. `one`: its injection; None if there was none."""
+    """Return the peaks of a member. `analysis`: of `_analysis`. `one`: its injection; None if there was none."""
     loop: tuple[float | None, float | None, str | None, str]
     if isinstance(analysis, str):
         loop = None, None, None, f"it cannot be linearised: {analysis}"

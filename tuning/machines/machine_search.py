@@ -15,9 +15,6 @@ from tuning.machines.machine_peaks import Peaks
 from tuning.machines.nonsmooth import Value, minimise
 from tuning.solve.checkpoint import restored
 
-# Standard deviations of the logarithms of the gains of random starts: around the case, and around the best point.
-FAR, NEAR = 0.7, 0.3
-
 Lost = Callable[[np.ndarray], int]
 Over = Callable[[Value], bool]
 
@@ -81,7 +78,9 @@ def searched(
 ) -> Progress:
     """Return the result of the search.
 
-    From each start, BFGS reduces the largest growth rate until the machine is stable, then the peak. `lost`: number of
+    From each start, BFGS reduces the largest growth rate until the machine is stable, then the peak. The first start is
+    the case. The logarithms of the gains of the others have a standard deviation of 0.3 around those of the best point
+    so far and of 0.7 around those of the case, in turn. `lost`: number of
     members that are lost, or beyond a limit of their simulation, at coordinates [m]. `before`: the search so far, which
     continues. `save`: receives it after each start.
     """
@@ -96,7 +95,7 @@ def searched(
         if number and over(best):
             break
         near = number % 2 == 1 and math.isfinite(best.f)
-        centre, size = (best.x, NEAR) if near else (first, FAR if number else 0.0)
+        centre, size = (best.x, 0.3) if near else (first, 0.7 if number else 0.0)
         held = _stabilised(peaks, space.drawn_back(centre + size * rng.normal(size=len(first))), settings, over)
         slowest = min(slowest, held, key=lambda v: v.f)
         if peaks.stable(held):

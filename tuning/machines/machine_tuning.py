@@ -34,8 +34,6 @@ WRITTEN = (TUNED, REPORT, "report.md", "report.html")
 # Keys of [tune] and of [tune.limits] that a machine takes.
 KEYS, SIZES = ("gains", "bounds", "limits", "minutes"), ("seed", "starts", "iterations", "held_out")
 LIMIT: dataclasses.Field = leaf(above=0, at_most=1e12)
-# Default of `held_out`: a machine takes longer to simulate than an axis.
-JUDGED = 16
 
 
 class MachinePlan(NamedTuple):
@@ -80,7 +78,7 @@ def settings_from(raw: dict[str, Any], case: MachineCase) -> Settings:
         sizes["seed"],
         sizes["starts"],
         10 * sizes["iterations"],
-        sizes["held_out"] if "held_out" in own.raw else JUDGED,
+        sizes["held_out"] if "held_out" in own.raw else 16,  # a machine takes longer to simulate than an axis
     )
 
 

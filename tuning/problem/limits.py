@@ -33,8 +33,6 @@ TOLERANCE_BELOW = 0.01
 LEAST_MARGIN = 0.002
 # Value of `Limit.source` for the limit on the rms error that traces the front of error against voltage.
 FRONT = "the front"
-# An infinite judged value is replaced by this factor times the larger of the limit and the search's value.
-LOST_FACTOR = 10.0
 
 
 @record
@@ -124,9 +122,9 @@ class Limit:
         """Return the limit after an update of its multiplier at an optimum of the goal.
 
         `tuned`, `judged`: values of the search and of the judge at the optimum. `judged` is infinite if an injection
-        loses the rotor; it is then replaced by LOST_FACTOR times the larger of `tuned` and the limit.
+        loses the rotor; it is then replaced by 10 times the larger of `tuned` and the limit.
         """
-        judged = judged if math.isfinite(judged) else LOST_FACTOR * max(tuned, self.threshold)
+        judged = judged if math.isfinite(judged) else 10 * max(tuned, self.threshold)
         multiplier = max(self.multiplier + PENALTY * float(self.log_excess(self.ratio * tuned)), 0.0)
         ratio = max(judged, TINY) / max(tuned, TINY)
         history = (*self.history, (max(judged, TINY), multiplier))

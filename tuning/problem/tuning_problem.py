@@ -28,9 +28,6 @@ REFINEMENT = 8
 REFERENCE_TOLERANCE = 1e-6
 # Quantities that the front of error against voltage needs.
 TRACED = ("rms_error_m", "rms_u_V")
-# Initial multiplier of the limit on the error in the searches for the front, which minimise the voltage. It corresponds
-# to 1.5 % more voltage for 1 % less error.
-EXCHANGE = 3.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +118,8 @@ class TuningProblem:
         others = (limit for limit in self.limits if limit.name != "rms_error_m")
         own = [dataclasses.replace(limit, multiplier=0.0, history=()) for limit in others]
         asked = min([factor * error_m, *(one.threshold for one in self.tune.limits.each if one.name == "rms_error_m")])
-        nearly = Limit("rms_error_m", asked, FRONT, KINDS["rms_error_m"].margin, multiplier=EXCHANGE)
+        # the first multiplier corresponds to 1.5 % more voltage for 1 % less error
+        nearly = Limit("rms_error_m", asked, FRONT, KINDS["rms_error_m"].margin, multiplier=3.0)
         limits = tuple(sorted([*own, nearly], key=lambda limit: limit.name))
         return dataclasses.replace(self, goal=goal).limited(limits)
 

@@ -1,5 +1,6 @@
 """Limits in the report: allowed and reached values, verdicts, and the effect of a limit that is 10 % looser."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ EMPHASISED = (BROKEN, UNVERIFIED)
 
 def facts(
     problem: TuningProblem,
-    columns: dict[str, np.ndarray],
+    columns: Mapping[str, np.ndarray],
     summary: Row,
     refuted: str = "",
     injected: Sensitivity | None = None,

@@ -25,7 +25,7 @@ class SearchResult:
     """Result of all searches and validations (`rounds`).
 
     `problem`, `members`: of the last search. `x` [m]: coordinates of the gains. `error`: step error at x; None if it
-    was not computed. `history`: arrays of all searches with a row for each iteration.
+    was not computed. `history`, `seconds`: as in `Course`.
     """
 
     problem: TuningProblem
@@ -36,7 +36,6 @@ class SearchResult:
     lost: int
     """number of lost validation members, plus the number of members that are lost or stall with accurate steps"""
     seconds: float
-    """duration of all searches and validations, s, including the searches before a checkpoint was resumed"""
     validation_error: float = math.inf
     """rms error of the validation members that are held, relative to s_0; inf if it was not computed"""
     within: bool = True
@@ -91,16 +90,14 @@ class Course:
         """
         tune, number = self.problem.tune, len(self.past) + 1
         path = self.out / checkpoint(number) if self.out else None
-        members = f"{len(self.members.member)} members"
-        if len(points) > tune.budget.starts:
-            self.tell(f"search {number}: the best {tune.budget.starts} of {len(points)} points, on {members}")
-        else:
-            self.tell(f"search {number}: from the best point, on {members}")
+        many = len(points) > tune.budget.starts
+        which = f"the best {tune.budget.starts} of {len(points)} points" if many else "from the best point"
+        self.tell(f"search {number}: {which}, on {len(self.members.member)} members")
         progress = search(
             self.problem.engine, self.problem.goal, self.members, points, keep=tune.budget.starts,
             iterations=tune.budget.iterations, seed=self.seed + len(self.past),
             checkpoint_file=CheckpointFile(path, self.facts, number, self.tell), resume=self.resume,
-            on_iteration=self._standing(number), until=self.began + 60 * self.minutes,
+            on_iteration=self._standing(number, []), until=self.began + 60 * self.minutes,
         )  # fmt: skip
         if progress.ended:
             self.tell(f"search {number} is complete; its result is read from {path}")
@@ -131,13 +128,12 @@ class Course:
         """Send an event to the listener."""
         self.listen(Event(text))
 
-    def _standing(self, number: int) -> Callable[[SearchState, float], None]:
-        """Return the function that sends the standing of a search after each iteration. `number`: of the search."""
-        problem, spent = self.problem, []
+    def _standing(self, number: int, spent: list[float]) -> Callable[[SearchState, float], None]:
+        """Return the function that sends the standing of search `number` after an iteration. `spent`: durations, s."""
 
         def send(progress: SearchState, seconds: float) -> None:
             spent.append(seconds)
-            standing = standing_of(problem, progress, number, spent)
+            standing = standing_of(self.problem, progress, number, spent)
             self.listen(Event(standing.text, standing))
 
         return send
@@ -158,16 +154,27 @@ class Course:
         past = self.past[-1].history
         return int(past["lost"][-1]) == past["members"][-1]
 
+    @property
+    def seconds(self) -> float:
+        """Duration of all searches and validations, s, including the searches before a checkpoint was resumed."""
+        return time.perf_counter() - self.began + sum(progress.earlier for progress in self.past)
+
+    @property
+    def history(self) -> dict[str, np.ndarray]:
+        """Arrays of all searches with a row for each iteration."""
+        return {
+            name: np.array([row for one in self.past for row in one.history.get(name, ())])
+            for name in self.past[0].history
+        }
+
     def answer(
         self, x: np.ndarray, error: StepError | None, lost: int, validation_error: float = math.inf
     ) -> SearchResult:
-        """Return the result at x [m]. `error`: step error at x, or None. The others are as in SearchResult."""
-        seconds = time.perf_counter() - self.began + sum(progress.earlier for progress in self.past)
-        names = self.past[0].history
-        history = {name: np.array([row for one in self.past for row in one.history.get(name, ())]) for name in names}
+        """Return the result at x [m]. The others are as in SearchResult."""
         return SearchResult(
-            self.problem, self.members, x, error, history, lost, seconds, validation_error, complete=not self.over
-        )
+            self.problem, self.members, x, error, self.history, lost, self.seconds, validation_error,
+            complete=not self.over,
+        )  # fmt: skip
 
 
 def first_search(course: Course, start: np.ndarray) -> np.ndarray:

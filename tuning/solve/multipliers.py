@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tuning.judge.evaluate import RESOLVED, held, judge
+from tuning.judge.evaluate import RESOLVED, JudgedMembers, held, judge
 from tuning.judge.peaks import injections, injects, reached_of
 from tuning.problem.config import seeds
 from tuning.problem.limits import PREFIX, TOLERANCE_BELOW, Limit
@@ -35,7 +35,7 @@ class Judged(NamedTuple):
 
     x: np.ndarray
     numbers: list[tuple[float, float]]
-    columns: dict[str, np.ndarray]
+    columns: Mapping[str, np.ndarray]
 
     def holds(self, limits: Sequence[Limit]) -> bool:
         """Return whether the judge's values are within all limits, without margins."""
@@ -170,9 +170,9 @@ def judged_at(course: Course, x: np.ndarray) -> Judged:
     if not any(limit.kind.worst for limit in problem.limits):
         count = min(count, AVERAGING_MEMBERS)
     course.tell(f"judging the limits on {count} members")
-    columns = judge(problem, x, seed, count)
+    of = JudgedMembers(problem, x, seed, judge(problem, x, seed, count))
     terms, n = problem.engine.terms(x[None], course.members), course.members.ordinary
     tuned = [float(limit.kind.tuned(terms[PREFIX + limit.name][0, :n])) for limit in problem.limits]
-    injected = injections(problem, x, seed, columns) if injects(problem) else None
-    judged = [reached_of(limit, columns, injected) for limit in problem.limits]
-    return Judged(x, list(zip(tuned, judged, strict=True)), columns)
+    injected = injections(of) if injects(problem) else None
+    judged = [reached_of(limit, of.columns, injected) for limit in problem.limits]
+    return Judged(x, list(zip(tuned, judged, strict=True)), of.columns)
