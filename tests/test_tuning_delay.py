@@ -8,7 +8,7 @@ from texts import case_and_tune
 
 from ambjax.linear import analyse, linearise, margins_of
 from tuning.judge.evaluate import JudgedMembers
-from tuning.judge.late import DELAY_MARGIN, DelayTest, delay_test, not_simulated
+from tuning.judge.peaks import DELAY_MARGIN, DelayTest, delay_test, not_simulated
 from tuning.problem.limits import PREFIX
 from tuning.problem.tuning_problem import problem_of
 from tuning.report import limit_table

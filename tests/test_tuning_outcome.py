@@ -172,7 +172,8 @@ def test_the_number_of_members_lost_by_a_changed_gain_is_reported():
     row |= {"low": 0.5, "high": 3.0, "source": "bounds"}
     rows = [row | {"sensitivity_percent": p, "sensitivity_lost": n} for p, n in ((None, 2), (3.0, 0))]
     text = report._gains(types.SimpleNamespace(gains=rows, trained_on=40, nominal_steps="by accurate steps"))
-    assert [line.split("|")[-2].strip() for line in text if line.startswith("| controller")] == [
+    lines = "\n".join(text).splitlines()
+    assert [line.split("|")[-2].strip() for line in lines if line.startswith("| controller")] == [
         "**2 of 40 training members are also lost**", "3 %",
     ]  # fmt: skip
 

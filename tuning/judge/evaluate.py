@@ -79,7 +79,8 @@ class StepError(NamedTuple):
     `search_m`, `reference_m` (m): settled rms errors with coarse and with accurate steps, over the `members` that are
     held with both. `relative`: relative difference of these errors; NaN without such members or for `reference_m` = 0.
     `tried`: number of members compared. `lost`, `stalled`: number of members that are held with coarse steps, but lost
-    or stalled with accurate ones. `unheld`: these members.
+    or stalled with accurate ones. `unheld`: these members. `negligible_m`: difference of the errors (m) within the
+    accuracy of the reference, below which the steps count as resolved.
     """
 
     search_m: float
@@ -91,7 +92,6 @@ class StepError(NamedTuple):
     stalled: int
     unheld: Members
     negligible_m: float
-    """difference of the errors (m) within the accuracy of the reference, below which the steps count as resolved"""
 
     @property
     def unconfirmed(self) -> int:

@@ -1,4 +1,4 @@
-"""The sensitivity of members of an ensemble: linear, and injected, by a test signal in the simulation."""
+"""Tests of judged members: linear and injected peaks of the sensitivity, and an additional delay."""
 
 import dataclasses
 import math
@@ -11,19 +11,23 @@ import numpy as np
 
 from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import DEFAULT_LAWS
-from ambjax.linear import Analysis, Injection, analyse, frequency_lines, linearise
+from ambjax.control.processor import MOST_DELAY
+from ambjax.ensemble import run_ensemble
+from ambjax.linear import Analysis, Injection, analyse, frequency_lines, linearise, stability_of
 from ambjax.linear.injection import injection_of
 from ambjax.linear.member_responses import Responses, member_responses
 from ambjax.linear.stability import MOST_TESTED
 from ambjax.results.operating import one_period
 from tuning.judge.evaluate import JudgedMembers
 from tuning.problem.limits import PREFIX, Limit
+from tuning.problem.quantities import LOOPS
 from tuning.problem.tuning_problem import TuningProblem
 
 # INJECTED: number of members, those with the largest peaks, with an injected signal. REPETITIONS: number of
 # injections into each of them, with different noise.
 INJECTED, REPETITIONS = 3, 8
 UNSTABLE = "its linearised loop is not stable"
+DELAY_MARGIN = "delay_margin_s"
 # Limited quantities that an injection measures.
 BY_INJECTION = {"sensitivity": "S", "complementary": "T", "control_sensitivity": "KS"}
 
@@ -169,3 +173,51 @@ def _summary(number: int, analysis: Analysis | str, one: Injection | None) -> Me
         number, *loop, one.peak, one.peak_low, one.peak_high, one.peak_frequency, one.saturated,
         one.lost, one.members, largest,
     )  # fmt: skip
+
+
+class DelayTest(NamedTuple):
+    """Number of members tested with the additional delay, and how many of them are lost, or held but not stable."""
+
+    members: int
+    lost: int
+    unstable: int
+
+    @property
+    def fails(self) -> bool:
+        """Whether the delay is not survived: a member is lost or not stable."""
+        return bool(self.lost or self.unstable)
+
+
+def not_simulated(problem: TuningProblem, limit: Limit) -> str:
+    """Return why the additional delay of the limit is not simulated; '' if it is."""
+    cascade, period = problem.case.cascade, float(problem.case.clock.sample_period)
+    if not cascade.sampled:
+        return "the controller runs in continuous time"
+    total = float(np.max(np.asarray(cascade.timing.delay))) + limit.threshold / period
+    if total > MOST_DELAY:
+        return f"the total delay of {total:.3g} samples exceeds the {MOST_DELAY:g} samples that can be simulated"
+    return ""
+
+
+def delay_test(of: JudgedMembers) -> DelayTest | None:
+    """Simulate the LOOPS held members of least delay margin, with the limit on it as an additional delay.
+
+    The prediction of the controller assumes the delay of the case. Returns None without such a limit, if
+    `not_simulated` gives a reason, or if no member is held.
+    """
+    problem, alive = of.problem, of.held
+    limit = next((limit for limit in problem.limits if limit.name == DELAY_MARGIN), None)
+    if limit is None or not_simulated(problem, limit) or not alive.size:
+        return None
+    order = np.argsort(of.columns[f"loss.{PREFIX}{DELAY_MARGIN}"][alive], kind="stable")
+    members = of.chosen(alive[order[:LOOPS]])
+    cascade, scenario = problem.objective.fixed(of.x, members)
+    processor = cascade.timing
+    delay = np.asarray(processor.delay) + limit.threshold / float(problem.case.clock.sample_period)
+    if np.max(delay) > MOST_DELAY:
+        return None
+    cascade = cascade.with_processor(delay=delay, assumed=processor.ahead, predict=processor.predicts)
+    ended = run_ensemble(cascade, scenario, problem.case.clock, fold=None, record_every=0)
+    lost = np.isfinite(ended.trajectory.lost_at)
+    unstable = ~lost & ~stability_of(cascade, scenario, problem.case.clock).stable
+    return DelayTest(len(members.member), int(lost.sum()), int(unstable.sum()))

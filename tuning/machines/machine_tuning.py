@@ -26,7 +26,7 @@ from tuning.machines.machine_search import Settings, save, saved, searched
 from tuning.machines.machine_verdict import LIMITS, judged, refused, report_text
 from tuning.problem.config import with_settings_of
 from tuning.problem.members import FEW
-from tuning.report.record import KEY, NOT_JUDGED, REPORT, TUNED, record
+from tuning.report.facts import KEY, NOT_JUDGED, REPORT, TUNED, record
 from tuning.report.tuned import tuned
 from tuning.solve.checkpoint import checkpoint
 

@@ -49,16 +49,17 @@ BAND_RANGE: dataclasses.Field = leaf(at_least=1e-12, at_most=1.0, unit="m")
 
 @dataclasses.dataclass(frozen=True)
 class LimitSettings:
-    """The table [tune.limits]."""
+    """The table [tune.limits].
+
+    `each`: the limits, in the order of their names. `survival`: share of the held-out members that must be held.
+    `band`: of the settling time, m. `unbreakable`: limits that are left out because they cannot be broken, with the
+    reason of each.
+    """
 
     each: tuple[Limit, ...] = ()
-    """the limits, in the order of their names"""
     survival: float = SURVIVING
-    """share of the held-out members that must be held"""
     band: float = 0.0
-    """band of the settling time, m"""
     unbreakable: tuple[tuple[Limit, str], ...] = ()
-    """limits that are left out because they cannot be broken, each with the reason"""
 
     def may_lose(self, members: int) -> int:
         """Return how many of `members` members may be lost."""
@@ -67,18 +68,13 @@ class LimitSettings:
 
 @dataclasses.dataclass(frozen=True)
 class Tune:
-    """The table [tune].
+    """The table [tune]; its numbers are described in `ambjax.cases.tune_table`.
 
-    - `space`: the gains to tune, with their bounds.
-    - `weights`: weights of the terms of the loss, in the order of TERMS.
-    - `early`: weight of errors before run.settle. Errors after it have the weight 1.
-    - `stress`: factor on the sensor noise of the stressed members (`Budget.stressed`).
-    - `gain_margin`: each gain of a stressed member is multiplied or divided by this factor.
-    - `minutes`: time for the whole tuning.
+    `objective`: "knee" or "least_error". `space`: the gains to tune, with their bounds. `weights`: of the terms of the
+    loss, in the order of TERMS.
     """
 
     objective: str
-    """one of OBJECTIVES: "knee" or "least_error" """
     space: Space
     weights: tuple[float, ...]
     limits: LimitSettings
@@ -209,13 +205,6 @@ def _risk(table: Table) -> CVaR:
     if not 0 <= alpha < 1:
         raise ValueError(f"{table.at('alpha')} = {alpha:g}: it must be at least 0 and below 1.")
     return CVaR(alpha)
-
-
-def allowed_minutes(minutes: float) -> float:
-    """Return the number of minutes of --budget. Raises ValueError unless it is above 0."""
-    if not minutes > 0:
-        raise ValueError(f"--budget {minutes:g}: it must be above 0, in minutes.")
-    return minutes
 
 
 def settings(tune: Tune) -> dict[str, Any]:

@@ -68,7 +68,8 @@ class Limit:
     """A limit, and the state of its augmented Lagrangian.
 
     `name`: key of the quantity in KINDS. `threshold`: the limit, in the unit of the quantity. `source`: origin of the
-    limit (case file, default or FRONT), for the report. `multiplier`: of the augmented Lagrangian. `ratio`: the judge's
+    limit (case file, default or FRONT), for the report. `margin`: relative distance that the search keeps from the
+    limit, on the allowed side. `multiplier`: of the augmented Lagrangian. `ratio`: the judge's
     value divided by the search's value. `history`: (judge's value, multiplier) of every update.
     """
 
@@ -76,7 +77,6 @@ class Limit:
     threshold: float
     source: str = "tune.limits"
     margin: float = 0.0
-    """relative distance that the search keeps from the limit, on the allowed side"""
     multiplier: float = 0.0
     ratio: float = 1.0
     history: tuple[tuple[float, float], ...] = ()

@@ -81,7 +81,10 @@ class Members(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Objective:
-    """The gains to tune, the simulated world and the loss: the part of a problem that is compiled."""
+    """The gains to tune, the simulated world and the loss: the part of a problem that is compiled.
+
+    `loop`: the analysis of the linearised loops; None: no limit needs it.
+    """
 
     space: Space
     cascade: Cascade
@@ -90,7 +93,6 @@ class Objective:
     loss: Loss
     spread: Spread = Spread()
     loop: LoopRange | None = None
-    """the analysis of the linearised loops; None: no limit needs it"""
 
     def members(self, seed: int, count: int) -> Members:
         """Return the first `count` members of the ensemble with this seed."""

@@ -122,7 +122,8 @@ class Kind:
     function of a LimitContext and the limit, which returns the fold that measures the quantity in the search; None: the
     quantity is a field of LoopQuantities, computed from the linearised loop. `exact`: the column of the judge's metrics
     with the exact value; None: the judge evaluates the same fold or loop quantity as the search, on its own members.
-    `tuned`, `judged`: the reduction over members in the search and by the judge.
+    `tuned`, `judged`: the reduction over members in the search and by the judge. `margin`: the default one. `worst`:
+    whether the quantity is that of the worst member. `at_least`: whether the limit is a lower one.
     """
 
     unit: str
@@ -133,11 +134,8 @@ class Kind:
     tuned: Callable[[Any], Any]
     judged: Callable[[Any], Any]
     margin: float
-    """default margin"""
     worst: bool = False
-    """whether the quantity is that of the worst member"""
     at_least: bool = False
-    """whether the limit is a lower one"""
 
 
 def _once(name: str) -> Callable[[LimitContext, float], Fold]:

@@ -32,7 +32,11 @@ TRACED = ("rms_error_m", "rms_u_V")
 
 @dataclasses.dataclass(frozen=True)
 class TuningProblem:
-    """A case, its settings, and the objective, engine and goal made from them."""
+    """A case, its settings, and the objective, engine and goal made from them.
+
+    `finer`: factor on the number of integration steps of the search (`method_for`). `limits`: the limits, and the state
+    of their augmented Lagrangian. `front`: whether the front of error against voltage is to be traced.
+    """
 
     case: Case
     tune: Tune
@@ -41,12 +45,8 @@ class TuningProblem:
     goal: Goal
     ranges: list[Range]
     finer: int = 1
-    """factor on the number of integration steps of the search (`method_for`)"""
     limits: tuple[Limit, ...] = ()
-    """the limits, and the state of their augmented Lagrangian"""
-
     front: bool = False
-    """whether the front of error against voltage is to be traced"""
 
     @property
     def sampled(self) -> bool:

@@ -22,12 +22,12 @@ def report_markdown(facts: TuningFacts) -> str:
 
     Its pictures are files in the same folder.
     """
-    lines = [f"# Tuning of {escape_markdown(facts.case)}", "", escape_markdown(facts.outcome["text"]), ""]
-    lines += [f"- **{label}:** {escape_markdown(text)}" for label, text in answer(facts).items()]
-    lines += [f"- **Next:** {escape_markdown(facts.advice) or f'in this folder, {facts.next}'}", ""]
+    said = [f"- **{label}:** {escape_markdown(text)}" for label, text in answer(facts).items()]
+    said.append(f"- **Next:** {escape_markdown(facts.advice) or f'in this folder, {facts.next}'}")
+    parts = [f"# Tuning of {escape_markdown(facts.case)}", escape_markdown(facts.outcome["text"]), "\n".join(said)]
     for name, section in SECTIONS.items():
-        lines += described(f"the section on {name} of the report", functools.partial(section, facts)) or []
-    return "\n".join(lines) + "\n"
+        parts += described(f"the section on {name} of the report", functools.partial(section, facts)) or []
+    return "\n\n".join(parts) + "\n"
 
 
 def _gains(facts: TuningFacts) -> list[str]:
@@ -40,29 +40,18 @@ def _gains(facts: TuningFacts) -> list[str]:
     }  # fmt: skip
     return [
         "## Gains",
-        "",
-        *table(facts.gains, columns),
-        "",
+        table(facts.gains, columns),
         "Last column: increase of the risk of least error, without the limits, if this gain alone is larger or smaller "
         "by a factor of e^0.25 = 1.28, whichever is worse; or the number of training members that are then also lost. "
         "`tune.bounds` sets other bounds.",
-        "",
         "Sources of the ranges:",
-        "",
-        *(f"- {row['path']}: {escape_markdown(row['source'])}" for row in facts.gains),
-        "",
+        "\n".join(f"- {row['path']}: {escape_markdown(row['source'])}" for row in facts.gains),
         "## One rotor before and after",
-        "",
         f"The nominal run of the case, without `[spread]`, {facts.nominal_steps}. u is averaged over each sample.",
-        "",
         "![z - r and u before tuning](before.png)",
-        "",
         "![z - r and u after tuning](after.png)",
-        "",
         "Amplitude spectrum of the voltage from `run.settle` on (Hann window).",
-        "",
         "![Amplitude spectrum of u before and after tuning](spectrum.png)",
-        "",
     ]
 
 
@@ -75,20 +64,19 @@ def _sensitivity(row: Row, trained_on: int) -> str:
 
 def _held_out(facts: TuningFacts) -> list[str]:
     """Return the section on the held-out members."""
-    before, after = facts.before, facts.after
-    if not after["members"]:
-        return ["There is no held-out ensemble (tune.held_out = 0).", ""]
-    both = before, after
-    rows = [
-        [f"`{name}`", *(number(one.get(name)) for one in both)]
-        for name in SUMMARY_METRICS
-        if name in after or name in before
-    ]
+    both = facts.before, facts.after
+    if not facts.after["members"]:
+        return ["There is no held-out ensemble (tune.held_out = 0)."]
+    names = [name for name in SUMMARY_METRICS if any(name in one for one in both)]
+    rows = [[f"`{name}`", *(number(one.get(name)) for one in both)] for name in names]
     rows += [[name, *(str(one[name]) for one in both)] for name in ("lost", "stalled")]
     rows.append(["survival, 95 % interval", *map(_survival, both)])
-    title = f"## {after['members']} held-out members (seed {facts.held_out_seed})"
-    words = ["The metrics include only the members that are held.", *_worst(facts.worst_member), ""]
-    return [title, "", *markdown_table(["", "before", "after"], rows), "", *words]
+    return [
+        f"## {facts.after['members']} held-out members (seed {facts.held_out_seed})",
+        "\n".join(markdown_table(["", "before", "after"], rows)),
+        "The metrics include only the members that are held.",
+        *_worst(facts.worst_member),
+    ]
 
 
 def _worst(worst: Row | None) -> list[str]:
@@ -98,8 +86,8 @@ def _worst(worst: Row | None) -> list[str]:
     status = f"largest settled error {worst['settled_max_abs_error_m']:.4g} m"
     if math.isfinite(worst["lost_at_s"]):
         status = f"it ends at {worst['lost_at_s']:.4g} s"
-    line = f"The worst is member {worst['member']}: {status}."
-    return ["", f"{line} In the folder of this report: `{worst['replay']}`" if worst["replay"] else line]
+    replay = f" In the folder of this report: `{worst['replay']}`" if worst["replay"] else ""
+    return [f"The worst is member {worst['member']}: {status}.{replay}"]
 
 
 def _survival(one: Row) -> str:
@@ -120,10 +108,9 @@ def _conditions(facts: TuningFacts) -> list[str]:
         "unit": lambda row: row["unit"],
         "verdict": lambda row: {True: "holds", False: "FAILS", None: "-"}[row["holds"]],
     }
-    lines = ["## Conditions of Theorem 1 along the nominal run", "", *table(facts.conditions, columns), ""]
-    if facts.advice_on_conditions:
-        lines += [f"- {escape_markdown(line)}" for line in facts.advice_on_conditions] + [""]
-    return lines
+    advice = "\n".join(f"- {escape_markdown(line)}" for line in facts.advice_on_conditions)
+    heading = "## Conditions of Theorem 1 along the nominal run"
+    return [heading, table(facts.conditions, columns), *([advice] if advice else [])]
 
 
 def _course(facts: TuningFacts) -> list[str]:
@@ -139,11 +126,10 @@ def _course(facts: TuningFacts) -> list[str]:
             f"- steps of the search compared with {facts.accurate_steps}, at the answer: {error['text']} "
             f"({error['search_m']:.4e} m against {error['reference_m']:.4e} m)"
         )
-    picture = "![Goal and gains by iteration](convergence.png)"
-    return ["## Course of the search", "", *lines, "", picture, ""]
+    return ["## Course of the search", "\n".join(lines), "![Goal and gains by iteration](convergence.png)"]
 
 
-# The sections of the report, in order.
+# The sections of the report, in order: functions that return the paragraphs.
 SECTIONS: dict[str, Callable[[TuningFacts], list[str]]] = {
     "the front": lambda facts: front_table.section(facts.front, facts.front_written),
     "the limits": lambda facts: limit_table.section(facts.limits),

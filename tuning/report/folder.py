@@ -20,8 +20,7 @@ from tuning.problem.space import Gain, Space, tunable
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.report import document as report
 from tuning.report import front_table, pictures
-from tuning.report.facts import Row, TuningFacts
-from tuning.report.record import TUNED
+from tuning.report.facts import TUNED, Row, TuningFacts
 from tuning.report.tuned import tuned_case
 from tuning.solve.course import SearchResult
 

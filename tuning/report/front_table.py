@@ -74,4 +74,4 @@ def section(rows: list[Row] | None, written: bool) -> list[str]:
         "validation ensemble. Only the selected answer is judged on the held-out members."
     )
     picture = "![Error against voltage; the selected answer is the filled point](front.png)"
-    return [f"## {TITLE}", "", *table(rows, columns | files), "", words, "", picture, ""]
+    return [f"## {TITLE}", table(rows, columns | files), words, picture]

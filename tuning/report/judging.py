@@ -13,8 +13,7 @@ from ambjax.theorem.conditions import Report as Check
 from ambjax.theorem.conditions import check
 from tuning.events import Tell
 from tuning.judge.evaluate import JudgedMembers, describe, held, judge, step_error, summarise, worst_of
-from tuning.judge.late import delay_test
-from tuning.judge.peaks import injections
+from tuning.judge.peaks import delay_test, injections
 from tuning.problem.config import seeds, settings
 from tuning.problem.members import FEW, Members
 from tuning.problem.tuning_problem import TuningProblem

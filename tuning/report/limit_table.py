@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from tuning.judge.late import DELAY_MARGIN, DelayTest, not_simulated
-from tuning.judge.peaks import BY_INJECTION, Sensitivity, reached_of
+from tuning.judge.peaks import BY_INJECTION, DELAY_MARGIN, DelayTest, Sensitivity, not_simulated, reached_of
 from tuning.problem.limits import FRONT, Limit
 from tuning.problem.quantities import Kind
 from tuning.problem.tuning_problem import TuningProblem
@@ -184,12 +183,12 @@ def section(rows: list[Row]) -> list[str]:
             "-" if row["price"] is None else f"{row['price']:.2g} {row['price_unit']}"
         ),
     }
-    sources = [f"- {row['name']}: {row['what']}. Source: {row['source']}." for row in rows]
+    sources = "\n".join(f"- {row['name']}: {row['what']}. Source: {row['source']}." for row in rows)
     words = (
         "The values are those of the held-out members that are held. Last column: estimated decrease of the minimised "
         f"settled rms error or voltage if the limit were {100 * MORE:g} % looser."
     )
-    return ["## Limits", "", *table(rows, columns), "", *sources, "", words, ""]
+    return ["## Limits", table(rows, columns), sources, words]
 
 
 def _side(row: Row) -> str:

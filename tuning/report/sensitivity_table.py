@@ -98,7 +98,7 @@ def section(found: Row | None) -> list[str]:
         )
     unknown = [f"- Member {row['member']}: {escape_markdown(row['why'])}." for row in found["members"] if row["why"]]
     cells = table(found["members"], columns | (injected if found["injected"] else {}))
-    return ["## Sensitivity", "", *cells, "", *unknown, *[""] * bool(unknown), " ".join(words), ""]
+    return ["## Sensitivity", cells, *(["\n".join(unknown)] if unknown else []), " ".join(words)]
 
 
 def _hidden(row: Row, name: str) -> bool:

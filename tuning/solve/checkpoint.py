@@ -28,7 +28,8 @@ class SearchState:
     """State of a search.
 
     `history`: one row per iteration, of the best point so far. `seconds`: duration so far, s; `earlier`: the part of it
-    before the search was resumed. `converged`: whether no further iteration is needed.
+    before the search was resumed. `converged`: whether no further iteration is needed. `evolution`: CMA-ES, which
+    continues from the best point of the descents; None: the search does not use it.
     """
 
     starts: Starts
@@ -38,7 +39,6 @@ class SearchState:
     interrupted: bool = False
     converged: bool = False
     evolution: Evolution | None = None
-    """CMA-ES, which continues from the best point of the descents; None: the search does not use it"""
 
     @property
     def iteration(self) -> int:

@@ -25,7 +25,11 @@ class SearchResult:
     """Result of all searches and validations (`rounds`).
 
     `problem`, `members`: of the last search. `x` [m]: coordinates of the gains. `error`: step error at x; None if it
-    was not computed. `history`, `seconds`: as in `Course`.
+    was not computed. `history`, `seconds`: as in `Course`. `lost`: number of lost validation members, plus the number
+    of members that are lost or stall with accurate steps. `validation_error`: rms error of the validation members that
+    are held, relative to s_0; inf if it was not computed. `within`: whether the answer is within all limits on the
+    validation members. `complete`: whether neither Ctrl-C nor the end of the time has ended the searches early.
+    `front`: points of the front of error against voltage (`front.FrontPoint`); empty if it was not traced.
     """
 
     problem: TuningProblem
@@ -34,16 +38,11 @@ class SearchResult:
     error: StepError | None
     history: dict[str, np.ndarray]
     lost: int
-    """number of lost validation members, plus the number of members that are lost or stall with accurate steps"""
     seconds: float
     validation_error: float = math.inf
-    """rms error of the validation members that are held, relative to s_0; inf if it was not computed"""
     within: bool = True
-    """whether the answer is within all limits on the validation members"""
     complete: bool = True
-    """whether neither Ctrl-C nor the end of the time has ended the searches early"""
     front: tuple[Any, ...] = ()
-    """points of the front of error against voltage (`front.FrontPoint`); empty if it was not traced"""
 
     @property
     def confirmed(self) -> bool:
@@ -63,7 +62,9 @@ class Course:
 
     `problem`, `members`: the problem and the training ensemble of the next search. `seed`: seed of the random numbers.
     `out`: directory of the checkpoints; None: no checkpoints. `facts`: settings that a checkpoint must match. `resume`:
-    whether to continue from the checkpoints.
+    whether to continue from the checkpoints. `listen`: receives the events of the searches. `minutes`: time of all
+    searches and validations; a search that begins or continues after it ends at its next iteration. `past`: the
+    searches so far. `began`: start of the first search, s.
     """
 
     problem: TuningProblem
@@ -73,13 +74,9 @@ class Course:
     facts: dict[str, Any] = dataclasses.field(default_factory=dict)
     resume: bool = False
     listen: Listener = lambda event: None
-    """receives the events of the searches"""
     minutes: float = math.inf
-    """time of all searches and validations; a search that begins or continues after it ends at its next iteration"""
     past: list[SearchState] = dataclasses.field(default_factory=list)
-    """the searches so far"""
     began: float = dataclasses.field(default_factory=time.perf_counter)
-    """start of the first search, s"""
 
     def search(self, points: np.ndarray) -> np.ndarray:
         """Search from `points` [K, m] and append the search to `past`. Return the best point [m].
