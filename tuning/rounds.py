@@ -15,7 +15,7 @@ from ambjax.results.outputs import described
 from tuning.events import Listener
 from tuning.front import trace_front
 from tuning.judge.evaluate import StepError, describe, step_error
-from tuning.problem.tuning_problem import TuningProblem, problem_of
+from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.course import Course, SearchResult, first_search, training
 from tuning.solve.multipliers import judged_at, search_within_limits
 from tuning.validate import joining, terms_at, validated
@@ -118,11 +118,5 @@ def with_fine_steps(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepErro
 
 
 def finer(problem: TuningProblem) -> TuningProblem | None:
-    """Return the problem with steps half as long, or None after MOST_HALVINGS. The count of rollouts is kept."""
-    if problem.finer >= 2**MOST_HALVINGS:
-        return None
-    threads = problem.engine.threads
-    fine = problem_of(problem.case, problem.tune, finer=2 * problem.finer, threads=threads, front=problem.front)
-    fine = fine.limited(problem.limits)
-    fine.engine.rollouts = problem.engine.rollouts
-    return fine
+    """Return the problem with steps half as long, or None after MOST_HALVINGS."""
+    return problem.refined() if problem.finer < 2**MOST_HALVINGS else None

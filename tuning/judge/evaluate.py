@@ -177,18 +177,12 @@ def summarise(metrics: Mapping[str, np.ndarray]) -> dict[str, Any]:
     as a survivor. Metrics include only held members, because the state of a lost rotor is frozen and its drive is
     off. If no member is held, the summary has no metrics.
     """
-    alive, n = held(metrics), len(metrics["lost_at_s"])
-    survival = wilson(int(alive.sum()), n)
-    ended = metrics["lost_at_s"][~alive]
-    summary: dict[str, Any] = {
-        "members": n,
-        "held": int(alive.sum()),
-        "lost": int(metrics["lost"].sum()),
-        "stalled": int(metrics["stalled"].sum()),
-        "survival": float(survival.value),
-        "survival_low": float(survival.low),
-        "survival_high": float(survival.high),
-    }
+    alive = held(metrics)
+    survival, ended = wilson(int(alive.sum()), len(alive)), metrics["lost_at_s"][~alive]
+    summary: dict[str, Any] = {"members": len(alive), "held": int(alive.sum())}
+    summary |= {name: int(metrics[name].sum()) for name in ("lost", "stalled")}
+    summary |= {"survival": float(survival.value), "survival_low": float(survival.low)}
+    summary["survival_high"] = float(survival.high)
     if ended.size:
         summary |= {"lost_at_s.mean": float(ended.mean()), "lost_at_s.largest": float(ended.max())}
     if not alive.any():

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -46,18 +46,18 @@ class MemberPeak:
     """
 
     member: int
-    linear: float | None
-    frequency_hz: float | None
-    zone: str | None
-    why: str
-    peak: float | None
-    low: float | None
-    high: float | None
-    at_hz: float | None
-    saturated: float | None
-    lost: int
-    repetitions: int
-    largest: dict[str, float]
+    linear: float | None = None
+    frequency_hz: float | None = None
+    zone: str | None = None
+    why: str = ""
+    peak: float | None = None
+    low: float | None = None
+    high: float | None = None
+    at_hz: float | None = None
+    saturated: float | None = None
+    lost: int = 0
+    repetitions: int = 0
+    largest: dict[str, float] = dataclasses.field(default_factory=dict)
 
 
 class Sensitivity(NamedTuple):
@@ -156,23 +156,20 @@ def _responses(of: JudgedMembers, numbers: np.ndarray, repetitions: int, peak: f
 
 def _summary(number: int, analysis: Analysis | str, one: Injection | None) -> MemberPeak:
     """Return the peaks of a member. `analysis`: of `_analysis`. `one`: its injection; None if there was none."""
-    loop: tuple[float | None, float | None, str | None, str]
+    found: dict[str, Any]
     if isinstance(analysis, str):
-        loop = None, None, None, f"it cannot be linearised: {analysis}"
+        found = {"why": f"it cannot be linearised: {analysis}"}
     elif not analysis.stable:
-        loop = None, None, "D", UNSTABLE
+        found = {"zone": "D", "why": UNSTABLE}
     else:
-        loop = analysis.S.height, analysis.S.frequency, analysis.zone, ""
-    if one is None:
-        return MemberPeak(number, *loop, None, None, None, None, None, 0, 0, {})
-    largest = {}
-    if one.S is not None and not one.lost:
-        responses = {name: np.asarray(getattr(one, which)) for name, which in BY_INJECTION.items()}
-        largest = {name: float(np.max(np.abs(response))) for name, response in responses.items()}
-    return MemberPeak(
-        number, *loop, one.peak, one.peak_low, one.peak_high, one.peak_frequency, one.saturated,
-        one.lost, one.members, largest,
-    )  # fmt: skip
+        found = {"linear": analysis.S.height, "frequency_hz": analysis.S.frequency, "zone": analysis.zone}
+    if one is not None:
+        found |= {"peak": one.peak, "low": one.peak_low, "high": one.peak_high, "at_hz": one.peak_frequency}
+        found |= {"saturated": one.saturated, "lost": one.lost, "repetitions": one.members}
+        if one.S is not None and not one.lost:
+            responses = {name: np.asarray(getattr(one, which)) for name, which in BY_INJECTION.items()}
+            found["largest"] = {name: float(np.max(np.abs(response))) for name, response in responses.items()}
+    return MemberPeak(number, **found)
 
 
 class DelayTest(NamedTuple):

@@ -32,7 +32,7 @@ TRACED = ("rms_error_m", "rms_u_V")
 
 @dataclasses.dataclass(frozen=True)
 class TuningProblem:
-    """A case, its settings, and the objective, engine and goal made from them.
+    """A case, its settings, and the engine and goal made from them.
 
     `finer`: factor on the number of integration steps of the search (`method_for`). `limits`: the limits, and the state
     of their augmented Lagrangian. `front`: whether the front of error against voltage is to be traced.
@@ -40,13 +40,17 @@ class TuningProblem:
 
     case: Case
     tune: Tune
-    objective: Objective
     engine: Engine
     goal: Goal
     ranges: list[Range]
     finer: int = 1
     limits: tuple[Limit, ...] = ()
     front: bool = False
+
+    @property
+    def objective(self) -> Objective:
+        """What the search simulates, with its steps."""
+        return self.engine.objective
 
     @property
     def sampled(self) -> bool:
@@ -99,6 +103,14 @@ class TuningProblem:
         """Description of the accurate steps, for the report."""
         return f"{REFINEMENT} times as many steps of the plant" if self.sampled else "adaptive RODAS3"
 
+    def refined(self) -> "TuningProblem":
+        """Return the problem with steps half as long. The count of rollouts is kept."""
+        finer = 2 * self.finer
+        method = method_for(self.case, self.tune.budget.substeps, finer)
+        engine = self._stepping(method, mode=self.engine.mode, threads=self.engine.threads)
+        engine.rollouts = self.engine.rollouts
+        return dataclasses.replace(self, engine=engine, finer=finer)
+
     def limited(self, limits: tuple[Limit, ...]) -> "TuningProblem":
         """Return the problem with these limits."""
         return dataclasses.replace(
@@ -142,9 +154,12 @@ class TuningProblem:
         scenario = self.objective.scenario
         if scenario.sensors.current_bits is None:
             return self.engine, self.reference
-        objective = dataclasses.replace(self.objective, scenario=scenario.with_sensor(bits=None, bits_i=None))
-        exact = dataclasses.replace(self, objective=objective)
-        return exact._stepping(objective.clock.integrator, lanes=FEW), exact.reference
+        exact = scenario.with_sensor(bits=None, bits_i=None)
+        ours, accurate = (
+            Engine(dataclasses.replace(one.objective, scenario=exact), settle=self.case.settle, lanes=FEW)
+            for one in (self.engine, self.reference)
+        )
+        return ours, accurate
 
 
 def method_for(case: Case, substeps: int, finer: int) -> Integrator:
@@ -159,15 +174,13 @@ def method_for(case: Case, substeps: int, finer: int) -> Integrator:
     return dataclasses.replace(method, substeps=finer * method.substeps)
 
 
-def problem_of(
-    case: Case, tune: Tune, *, finer: int = 1, threads: int | None = None, front: bool = False
-) -> TuningProblem:
+def problem_of(case: Case, tune: Tune, *, threads: int | None = None, front: bool = False) -> TuningProblem:
     """Return the tuning problem of a case.
 
-    `finer`: factor on the number of integration steps of the search (`method_for`). `threads`: number of cores; None:
-    all. `front`: whether to trace the front of error against voltage even if tune.objective does not need it.
+    `threads`: number of cores; None: all. `front`: whether to trace the front of error against voltage even if
+    tune.objective does not need it.
     """
-    clock = case.clock.with_method(method_for(case, tune.budget.substeps, finer))
+    clock = case.clock.with_method(method_for(case, tune.budget.substeps, 1))
     limits = tune.limits
     front = front or tune.objective == "knee"
     loop = _loop_range(case, limits.each)
@@ -183,7 +196,7 @@ def problem_of(
     goal = Goal(tune.weights, tune.risk, quantities=tuple(names))
     mode = cheaper_mode(len(tune.space), 1 + len(loss.measures))
     engine = Engine(objective, settle=case.settle, mode=mode, threads=threads)
-    return TuningProblem(case, tune, objective, engine, goal, box, finer, front=front).limited(limits.each)
+    return TuningProblem(case, tune, engine, goal, box, front=front).limited(limits.each)
 
 
 def cheaper_mode(gains: int, outcomes: int) -> str:
