@@ -162,14 +162,15 @@ def _limits(table: Table, case: Case) -> LimitSettings:
     table.only([*KINDS, "survival", "margin", "settling_band_m"], [f"tune.{key}" for key in beside])
     thresholds = {name: table.leaf(name, OTHER_RANGES.get(name, LIMIT_RANGE)) for name in KINDS if name in table.raw}
     _check_speed([table.at(name) for name, most in thresholds.items() if "_1x" in name and most < math.inf], case)
-    u_max, source = float(np.max(np.asarray(case.scenario.u_max))), dict.fromkeys(thresholds, table.path)
-    if "rms_u_V" not in thresholds and math.isfinite(u_max):
-        thresholds["rms_u_V"], source["rms_u_V"] = (
-            VOLTAGE_SHARE * u_max,
-            f"default, {100 * VOLTAGE_SHARE:g} % of actuator.u_max",
-        )
-    if "sensitivity" not in thresholds:
-        thresholds["sensitivity"], source["sensitivity"] = float(case.zones.zone_a), "default, zone A of [sensitivity]"
+    defaults = {
+        "rms_u_V": VOLTAGE_SHARE * float(np.max(np.asarray(case.scenario.u_max))),
+        "sensitivity": float(case.zones.zone_a),
+    }
+    sources = {
+        "rms_u_V": f"default, {100 * VOLTAGE_SHARE:g} % of actuator.u_max",
+        "sensitivity": "default, zone A of [sensitivity]",
+    } | dict.fromkeys(thresholds, table.path)
+    thresholds = defaults | thresholds
     clearance = float(np.min(np.asarray(case.scenario.touchdown)))
     band = table.leaf("settling_band_m", BAND_RANGE, SETTLING_BAND * clearance)
     if "settling_band_m" in table.raw and "settling_s" not in thresholds:
@@ -183,7 +184,7 @@ def _limits(table: Table, case: Case) -> LimitSettings:
     if not LEAST_MARGIN <= table.number("margin", LEAST_MARGIN, f"a number {share}") < 0.5:
         raise ValueError(f"{table.at('margin')} = {table.raw['margin']:g}: it must be a share of each limit, {share}.")
     each = tuple(
-        Limit(name, thresholds[name], source[name], table.number("margin", KINDS[name].margin))
+        Limit(name, thresholds[name], sources[name], table.number("margin", KINDS[name].margin))
         for name in sorted(thresholds)
         if math.isfinite(thresholds[name])
     )

@@ -11,12 +11,12 @@ from ambjax.simulation.integrate import Integrator
 from ambjax.simulation.method import choose_method
 from ambjax.simulation.rosenbrock import AdaptiveRodas3
 from ambjax.simulation.sliding import Slide, slides
-from tuning.problem.config import Tune
+from tuning.problem.config import Tune, seeds
 from tuning.problem.goal import Goal
 from tuning.problem.lanes import Engine
 from tuning.problem.limits import FRONT, Limit, measures
 from tuning.problem.loss import HELD, TERMS, loss_for
-from tuning.problem.members import FEW, LoopRange, Objective
+from tuning.problem.members import FEW, LoopRange, Members, Objective
 from tuning.problem.quantities import KINDS, LimitContext
 from tuning.problem.ranges import Range, bounded
 
@@ -51,6 +51,11 @@ class TuningProblem:
     def objective(self) -> Objective:
         """What the search simulates, with its steps."""
         return self.engine.objective
+
+    def validation(self, numbers: np.ndarray) -> Members:
+        """Return the members of the validation ensemble with these numbers."""
+        budget = self.tune.budget
+        return self.objective.chosen(seeds(budget)[1], numbers, budget.validation)
 
     @property
     def sampled(self) -> bool:
