@@ -164,7 +164,7 @@ MUTATIONS = [
     M("lost rotors, with 0 V, are included in the averages of the limits", "tuning/problem/limits.py",
       "return values[alive] if alive.any() else values", "return values",
       "tests/test_tuning_outcome.py::test_the_voltage_of_a_lost_member_is_excluded_from_the_limits"),
-    M("CVaR is the mean of the smallest losses", "tuning/problem/risk.py", "jnp.sort(losses)[::-1]",
+    M("CVaR is the mean of the smallest losses", "tuning/problem/goal.py", "jnp.sort(losses)[::-1]",
       "jnp.sort(losses)", "tests/test_tuning_space.py::test_cvar_is_the_mean_of_the_worst_share"),
     M("members that accurate steps lose after the judgement do not refute the answer", "tuning/report/judging.py",
       "(error or answer.error).refuted if", "answer.error.refuted if",

@@ -15,11 +15,9 @@ from ambjax.cases.template_text import template
 from ambjax.linear.linear_machine import machine_sensitivity, turning_machines
 from ambjax.results.operating import sensitivity
 from tuning.__main__ import main
-from tuning.machines.lqg_weights import lqg_space
-from tuning.machines.machine_gains import MachineSpace, machine_space
+from tuning.machines.machine_gains import MachineSpace, lqg_space, machine_space
 from tuning.machines.machine_peaks import Peaks
-from tuning.machines.machine_progress import save, saved
-from tuning.machines.machine_search import Settings, searched
+from tuning.machines.machine_search import Settings, save, saved, searched
 from tuning.machines.machine_verdict import judged
 from tuning.machines.nonsmooth import Value, minimise
 from tuning.problem.space import Gain, Space

@@ -24,7 +24,7 @@ from ambjax.results.spread_runs import study_of
 from ambjax.simulation.folds import Named
 from ambjax.world.amplifier import Amplifier, CoilResponse
 from ambjax.world.sensor import Errors, Measurement, Sensor, converted
-from tuning.problem.limit_folds import Typical
+from tuning.problem.quantities import Typical
 
 
 def motion(z=1e-3, z_dot=0.2, i=0.1):

@@ -186,7 +186,7 @@ FAILING = {
     "tuning.report.pictures.front": {"front.png"},
     "tuning.report.folder.render_page": {"report.html"},
     "tuning.report.judging._conditions": set(),
-    "tuning.report.judging.worst": set(),
+    "tuning.judge.evaluate.JudgedMembers.worst": set(),
     "tuning.report.judging.changed_gains": set(),
     "tuning.report.judging.front_table.facts": {"front.png"},
     "tuning.report.outcome.verdict": set(),

@@ -7,7 +7,8 @@ import pytest
 from texts import case_and_tune
 
 from ambjax.linear import linearise, margins_of
-from tuning.judge.late import DELAY_MARGIN, DelayTest, delay_test, not_simulated
+from tuning.judge.evaluate import JudgedMembers
+from tuning.judge.peaks import DELAY_MARGIN, DelayTest, delay_test, not_simulated
 from tuning.problem.limits import PREFIX
 from tuning.problem.tuning_problem import problem_of
 from tuning.report import limit_table
@@ -46,7 +47,7 @@ def test_an_additional_delay_of_several_samples_is_simulated():
     for share in (0.9, 1.1):
         made = problem(share * margin, clock=clock)
         x = made.tune.space.encode(made.tune.space.values(case.cascade))
-        found.append(delay_test(made, x, 1, columns))
+        found.append(delay_test(JudgedMembers(made, x, 1, columns)))
     assert found == [DelayTest(2, 0, 0), DelayTest(2, 0, 2)]
 
 

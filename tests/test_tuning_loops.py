@@ -11,6 +11,7 @@ from texts import case_and_tune
 
 from ambjax.linear import analyse, frequency_lines, injected, linearise
 from ambjax.results.operating import one_period
+from tuning.judge.evaluate import JudgedMembers
 from tuning.judge.peaks import INJECTED, injections
 from tuning.problem.limits import PREFIX
 from tuning.problem.loops import check_loops, loops
@@ -168,7 +169,7 @@ def test_injections_find_the_members_with_the_largest_injected_peak():
     x = problem.objective.space.encode(problem.objective.space.values(problem.case.cascade))
     count = 6
     columns = {"loss.limit.sensitivity": np.arange(count)[::-1] + 1.0, "lost_at_s": np.full(count, np.inf)}
-    found = injections(problem, x, 1, columns)
+    found = injections(JudgedMembers(problem, x, 1, columns))
     assert found.decides
     case, masses = problem.case, problem.objective.chosen(1, np.arange(count), count).values["plant.m"]
     clock = one_period(case)
@@ -190,7 +191,7 @@ def test_injections_find_the_members_with_the_largest_injected_peak():
     # the order of the peaks of |KS| is another one
     columns = {"loss.limit.control_sensitivity": np.ones(count), "lost_at_s": columns["lost_at_s"]}
     by_KS = sorted(range(count), key=lambda k: -np.abs(each[k].KS).max())[:INJECTED]
-    assert [one.member for one in injections(problem, x, 1, columns).peaks] == by_KS != expected
+    assert [one.member for one in injections(JudgedMembers(problem, x, 1, columns)).peaks] == by_KS != expected
 
 
 def found_frequency(problem, m):

@@ -15,18 +15,16 @@ from ambjax.sensors import Sensor
 from ambjax.signals import Sine
 from ambjax.solvers import Slide
 from tuning.__main__ import main
-from tuning.problem.goal import Goal
+from tuning.problem.goal import CVaR, Goal
 from tuning.problem.lanes import Engine
 from tuning.problem.loss import TERMS, loss_for, weigh
 from tuning.problem.members import Objective
-from tuning.problem.ranges import ranges
-from tuning.problem.risk import CVaR
+from tuning.problem.ranges import initial_points, ranges
 from tuning.problem.space import Gain, Space
 from tuning.problem.tuning_problem import problem_of
 from tuning.solve.checkpoint import CheckpointFile
 from tuning.solve.descent import JUMP, begin, step
-from tuning.solve.refine import RACE, best_of, search
-from tuning.solve.screen import initial_points, screen
+from tuning.solve.refine import RACE, best_of, screen, search
 
 PATHS = ("position.c", "position.k", "inversion.gamma", "current.k_i")
 SPACE = Space(tuple(Gain(f"controller.{path}", 0.0, 1e9) for path in PATHS))

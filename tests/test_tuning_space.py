@@ -21,8 +21,8 @@ from ambjax.simulation.span import blank
 from ambjax.solvers import Slide
 from tuning.problem.config import read_tune
 from tuning.problem.gains_table import off
+from tuning.problem.goal import CVaR
 from tuning.problem.loss import TERMS, Loss, loss_for
-from tuning.problem.risk import CVaR
 from tuning.problem.space import CLOSEST, MARGIN, Gain, Space, tunable
 
 GAINS = [Gain("controller.position.c"), Gain("controller.position.c", 3.0), Gain("controller.position.c", 2.0, 5e3)]

@@ -13,7 +13,8 @@ import tuning.rounds
 import tuning.solve.course
 import tuning.validate
 from tuning.judge.evaluate import StepError, comparison_members, describe, step_error, worst_of
-from tuning.problem.tuning_problem import REFERENCE_MEMBERS, REFERENCE_TOLERANCE
+from tuning.problem.members import FEW
+from tuning.problem.tuning_problem import REFERENCE_TOLERANCE
 from tuning.rounds import MOST_HALVINGS, rounds
 from tuning.solve.checkpoint import SearchState
 from tuning.solve.descent import begin
@@ -109,7 +110,7 @@ def test_false_survival_is_refuted():
     assert not np.any(found.engine.terms(x[None], members)["survival"])
     error = step_error(found, x, members)
     assert error.refuted
-    assert error.unconfirmed == error.tried == REFERENCE_MEMBERS
+    assert error.unconfirmed == error.tried == FEW
     np.testing.assert_array_equal(error.unheld.member, members.member)
 
 

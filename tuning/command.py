@@ -20,19 +20,17 @@ from ambjax.page.html_page import page as sliders_page
 from ambjax.results.outputs import check_new, described, directory, files, plain, write_json
 from tuning.events import Listener, Log, teller
 from tuning.machines.machine_tuning import MachinePlan, machine_plan, tune_machine
-from tuning.problem.config import allowed_minutes, read_tune
+from tuning.problem.config import read_tune
 from tuning.problem.gains_table import off
 from tuning.problem.tuning_problem import TuningProblem, problem_of
+from tuning.report.facts import KEY, NOT_JUDGED, REPORT, TUNED, ended, record, search_facts
 from tuning.report.folder import all_laws, put_answer, put_front, put_page, put_report
 from tuning.report.judging import examined
-from tuning.report.record import KEY, REPORT, TUNED, ended, record, search_facts
 from tuning.report.tuned import tuned_case
 from tuning.rounds import rounds
 from tuning.solve.checkpoint import can_resume, checkpoint, has_unfinished_search, mark_directory, remove_all
 
 WRITTEN = (TUNED, "history.npz", "report.html", "report.md", "report.json")
-# Verdict in tuned.toml until the gains are judged.
-NOT_JUDGED = "The tuned gains are not judged."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,6 +131,12 @@ def run(path: str, options: Options, listen: Listener) -> TunedCase:
     Raises ValueError for bad input before anything is written, and in the search as `rounds` does.
     """
     loaded = load(path)  # once: a second read of a pipe would be empty
+    if options.resume and options.out is None:
+        raise ValueError("--resume: the directory of the search is missing. Give it as --out.")
+    if options.resume and not can_resume(pathlib.Path(str(options.out))):
+        raise ValueError(f"--resume: --out {options.out} contains no search. Check --out, or leave out --resume.")
+    if options.minutes is not None and not options.minutes > 0:
+        raise ValueError(f"--budget {options.minutes:g}: it must be above 0, in minutes.")
     plan = (_machine_plan if is_machine(loaded[0]) else _plan)(path, options, loaded)
     with locked(plan.out):
         if not options.resume:
@@ -153,24 +157,14 @@ def _machine_plan(path: str, options: Options, loaded: tuple[dict[str, Any], str
     for name in ("pareto", "page"):
         if getattr(options, name):
             raise ValueError(f"--{name}: the tuning of a machine does not take it. Leave it out.")
-    _check_resume(options)
-    minutes = None if options.minutes is None else allowed_minutes(options.minutes)
-    return machine_plan(path, options.out, minutes, options.settings_of, loaded)
-
-
-def _check_resume(options: Options) -> None:
-    if options.resume and options.out is None:
-        raise ValueError("--resume: the directory of the search is missing. Give it as --out.")
-    if options.resume and not can_resume(pathlib.Path(str(options.out))):
-        raise ValueError(f"--resume: --out {options.out} contains no search. Check --out, or leave out --resume.")
+    return machine_plan(path, options.out, options.minutes, options.settings_of, loaded)
 
 
 def _plan(path: str, options: Options, loaded: tuple[dict[str, Any], str]) -> TuningPlan:
     """Read the case and make the output directory. Raises ValueError for an invalid case or option."""
     case, tune, raw = read_tune(path, options.settings_of, loaded)
-    _check_resume(options)
     if options.minutes is not None:
-        tune = dataclasses.replace(tune, minutes=allowed_minutes(options.minutes))
+        tune = dataclasses.replace(tune, minutes=options.minutes)
     print_warnings(case, path)
     for limit, why in tune.limits.unbreakable:
         say(f"{path}: tune.limits.{limit.name} = {limit.threshold:g} is left out. It cannot be broken: {why}.")
@@ -231,8 +225,7 @@ def _clear(out: pathlib.Path, force: bool) -> None:
         )
     if not force:
         check_new(out, WRITTEN)
-    left = remove_all(out)
-    if left:
+    if left := remove_all(out):
         say(f"{out}: removed {left} checkpoints of an earlier search")
 
 

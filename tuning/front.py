@@ -87,7 +87,7 @@ def trace_front(course: Course, answer: SearchResult) -> SearchResult:
     if not any(point.x is taken.x for point in points):
         points.append(first._replace(factor=round(first.error_m / least.error_m, 3)))
     kept = [point for k, point in enumerate(points) if not any(point.x is other.x for other in points[:k])]
-    return dataclasses.replace(taken, front=tuple(kept), history=course.answer(x, None, 0).history)
+    return dataclasses.replace(taken, front=tuple(kept), history=course.history)
 
 
 def least_of(seen: Sequence[FrontPoint]) -> FrontPoint:

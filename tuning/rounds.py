@@ -1,10 +1,6 @@
-"""Rounds of a search and its validation, repeated until the answer is confirmed.
+"""Rounds: solve, validate, let the members that failed join the training ensemble, repeat. Then the front.
 
-If the error of the integration steps at the optimum is too large, the search
-continues with finer steps. If a limit is not met, it continues with other multipliers. The answer is then validated.
-The members that fail join the training ensemble for the next round (`validate.joining`). If the gains of the case are
-better than every answer, they are the answer. If tune.objective or --pareto requires it, the front of error against
-voltage is traced at the end.
+If the gains of the case are better than every answer, they are the answer.
 """
 
 import dataclasses
@@ -19,7 +15,7 @@ from ambjax.results.outputs import described
 from tuning.events import Listener
 from tuning.front import trace_front
 from tuning.judge.evaluate import StepError, describe, step_error
-from tuning.problem.tuning_problem import TuningProblem, problem_of
+from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.course import Course, SearchResult, first_search, training
 from tuning.solve.multipliers import judged_at, search_within_limits
 from tuning.validate import joining, terms_at, validated
@@ -54,13 +50,8 @@ def rounds(
         problem, training(problem), budget.seed, out, facts, resume, listen, SEARCHING * problem.tune.minutes
     )
     x = first_search(course, start)
-    while True:
-        if course.all_lost:  # no gains hold any member
-            break
-        x, error = with_fine_steps(course, x)
-        limited, within = search_within_limits(course, x)
-        if limited is not x:
-            x, error = limited, None
+    while not course.all_lost:
+        x, error, within = solved(course, x)
         found = validated(course, x, error)
         answers.append(dataclasses.replace(found.result, within=within))
         if not found.failed or course.over or len(answers) >= MOST_ROUNDS:
@@ -75,8 +66,17 @@ def rounds(
     if problem.front and best.good and not course.over:
         course.members = best.members
         best = described("the front of error against voltage", lambda: trace_front(course, best)) or best
-    last = course.answer(x, None, 0)
-    return dataclasses.replace(best, seconds=last.seconds, complete=last.complete)
+    return dataclasses.replace(best, seconds=course.seconds, complete=not course.over)
+
+
+def solved(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepError | None, bool]:
+    """Search from x [m] with steps that are fine enough and multipliers by which the limits are met.
+
+    Returns an optimum [m], its step error if it is known, and whether it is within the limits.
+    """
+    fine, error = with_fine_steps(course, x)
+    x, within = search_within_limits(course, fine)
+    return x, error if x is fine else None, within
 
 
 def _best_of(answers: Sequence[SearchResult]) -> SearchResult:
@@ -118,11 +118,5 @@ def with_fine_steps(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepErro
 
 
 def finer(problem: TuningProblem) -> TuningProblem | None:
-    """Return the problem with steps half as long, or None after MOST_HALVINGS. The count of rollouts is kept."""
-    if problem.finer >= 2**MOST_HALVINGS:
-        return None
-    threads = problem.engine.threads
-    fine = problem_of(problem.case, problem.tune, finer=2 * problem.finer, threads=threads, front=problem.front)
-    fine = fine.limited(problem.limits)
-    fine.engine.rollouts = problem.engine.rollouts
-    return fine
+    """Return the problem with steps half as long, or None after MOST_HALVINGS."""
+    return problem.refined() if problem.finer < 2**MOST_HALVINGS else None

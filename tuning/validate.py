@@ -7,7 +7,6 @@ import jax
 import numpy as np
 
 from tuning.judge.evaluate import StepError, comparison_members, describe, rms, step_error, worst_of
-from tuning.problem.config import seeds
 from tuning.problem.members import Members
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.course import Course, SearchResult
@@ -42,18 +41,16 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
     In continuous time, if no member is lost and the step error does not refute x, the worst members are simulated again
     with accurate steps. `error`: the step error at x, if it is known.
     """
-    problem, budget = course.problem, course.problem.tune.budget
+    problem, count, none = course.problem, course.problem.tune.budget.validation, np.zeros(0, int)
     error = step_error(problem, x) if error is None else error
-    if course.interrupted or not budget.validation:
-        none = np.zeros(0, int)
+    if course.interrupted or not count:
         return Validation(course.answer(x, error, error.unconfirmed), error, none, none)
-    count = budget.validation
     course.tell(f"validating the answer on {count} members")
-    terms = terms_at(problem, x, problem.objective.chosen(seeds(budget)[1], np.arange(count), count))
+    terms = terms_at(problem, x, problem.validation(np.arange(count)))
     share = terms["survival"]
     lost = np.argsort(-share, kind="stable")[: int((share > 0).sum())]
     if not lost.size and not error.refuted and not problem.sampled:
-        worst = problem.objective.chosen(seeds(budget)[1], worst_of(terms["peak"]), count)
+        worst = problem.validation(worst_of(terms["peak"]))
         error = step_error(problem, x, comparison_members(problem).joined(worst))
         course.tell(f"accurate steps, with the worst of {count} validation members: {describe(error)}")
     if lost.size:
@@ -62,7 +59,7 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
     overall = rms(errors[share <= 0]) if (share <= 0).any() else math.inf
     found = course.answer(x, error, lost.size + error.unconfirmed, overall)
     trained = terms_at(problem, x, course.members)["tracking"][: course.members.ordinary]
-    large = largest_unseen(course, errors) if overall > LARGER * math.sqrt(trained.mean()) else np.zeros(0, int)
+    large = largest_unseen(course, errors) if overall > LARGER * math.sqrt(trained.mean()) else none
     return Validation(found, error, lost, large)
 
 
@@ -73,13 +70,11 @@ def joining(course: Course, found: Validation) -> Members:
     stressed ones with half of the additional noise of these, as a margin. Members with large errors join as ordinary
     ones.
     """
-    problem, budget = course.problem, course.problem.tune.budget
-    those = problem.objective.chosen(seeds(budget)[1], found.lost[:MOST_JOINING], budget.validation)
+    problem, those = course.problem, course.problem.validation(found.lost[:MOST_JOINING])
     both: Members = jax.tree.map(lambda a, b: np.concatenate([a, b]), those, found.error.unheld)
     members = course.members.joined(both._replace(noise_factor=both.noise_factor * (1 + problem.tune.stress) / 2))
     course.tell(f"{len(both.member)} lost members and {found.large.size} of large errors join the training ensemble")
-    large = problem.objective.chosen(seeds(budget)[1], found.large, budget.validation)
-    return members.joined(large, stressed=False)
+    return members.joined(problem.validation(found.large), stressed=False)
 
 
 def terms_at(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, np.ndarray]:

@@ -10,11 +10,12 @@ import numpy as np
 from ambjax.ensemble import wilson
 from ambjax.ensemble.study import Study
 from tuning.problem.config import seeds
-from tuning.problem.members import Members
-from tuning.problem.tuning_problem import REFERENCE_MEMBERS, REFERENCE_TOLERANCE, TuningProblem
+from tuning.problem.members import FEW, Members
+from tuning.problem.tuning_problem import REFERENCE_TOLERANCE, TuningProblem
 
-# Largest relative difference of the settled rms errors with the search's steps and with accurate ones. Above it, the
-# steps are refined and the search continues.
+# Largest relative difference of two values that agree: settled rms errors with the search's steps and with accurate
+# ones (above it, the steps are refined), and judged and expected means of a limited quantity (above it, the training
+# ensemble lacks members with large values).
 RESOLVED = 0.1
 
 
@@ -29,23 +30,42 @@ def judge(problem: TuningProblem, x: np.ndarray, seed: int, count: int) -> dict[
     return {name: values[0] for name, values in both.items()}
 
 
-def worst(problem: TuningProblem, judged: dict[str, np.ndarray], seed: int) -> dict[str, Any]:
-    """Return the worst member of the judged ensemble [N].
+class JudgedMembers(NamedTuple):
+    """The first N members of the ensemble with this `seed`, judged at coordinates x [m].
 
-    It is the member whose run ends first (lost or stalled), or else the one with the largest settled error. `replay` is
-    the command that simulates it and returns these values, for the directory of the report; None if the judge's steps
-    differ from those of `ambjax simulate`.
+    `columns` [N]: metrics and terms of the loss, from `judge`.
     """
-    error, lost_at = judged["settled_max_abs_error_m"], judged["lost_at_s"]
-    index = int(np.lexsort((-error, lost_at))[0])
-    case = problem.case
-    study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, seed, len(error))
-    return {
-        "member": index,
-        "settled_max_abs_error_m": float(error[index]),
-        "lost_at_s": float(lost_at[index]),
-        "replay": study.command("tuned.toml", index) if problem.replays else None,
-    }
+
+    problem: TuningProblem
+    x: np.ndarray
+    seed: int
+    columns: Mapping[str, np.ndarray]
+
+    @property
+    def held(self) -> np.ndarray:
+        """The numbers of the members that are held."""
+        return np.flatnonzero(held(self.columns))
+
+    def chosen(self, numbers: np.ndarray) -> Members:
+        """Return the members with these numbers."""
+        return self.problem.objective.chosen(self.seed, numbers, len(self.columns["lost_at_s"]))
+
+    def worst(self) -> dict[str, Any]:
+        """Return the worst member: its run ends first (lost or stalled), or else its settled error is the largest.
+
+        `replay` is the command that simulates it and returns these values, for the directory of the report; None if the
+        judge's steps differ from those of `ambjax simulate`.
+        """
+        error, lost_at = self.columns["settled_max_abs_error_m"], self.columns["lost_at_s"]
+        index = int(np.lexsort((-error, lost_at))[0])
+        case = self.problem.case
+        study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, self.seed, len(error))
+        return {
+            "member": index,
+            "settled_max_abs_error_m": float(error[index]),
+            "lost_at_s": float(lost_at[index]),
+            "replay": study.command("tuned.toml", index) if self.problem.replays else None,
+        }
 
 
 def rms(values: np.ndarray) -> float:
@@ -59,7 +79,8 @@ class StepError(NamedTuple):
     `search_m`, `reference_m` (m): settled rms errors with coarse and with accurate steps, over the `members` that are
     held with both. `relative`: relative difference of these errors; NaN without such members or for `reference_m` = 0.
     `tried`: number of members compared. `lost`, `stalled`: number of members that are held with coarse steps, but lost
-    or stalled with accurate ones. `unheld`: these members.
+    or stalled with accurate ones. `unheld`: these members. `negligible_m`: difference of the errors (m) within the
+    accuracy of the reference, below which the steps count as resolved.
     """
 
     search_m: float
@@ -71,7 +92,6 @@ class StepError(NamedTuple):
     stalled: int
     unheld: Members
     negligible_m: float
-    """difference of the errors (m) within the accuracy of the reference, below which the steps count as resolved"""
 
     @property
     def unconfirmed(self) -> int:
@@ -115,14 +135,14 @@ def describe(error: StepError) -> str:
 
 
 def comparison_members(problem: TuningProblem) -> Members:
-    """Return the members used to compare steps: the first REFERENCE_MEMBERS of the training ensemble."""
+    """Return the members used to compare steps: the first FEW of the training ensemble."""
     count = problem.tune.budget.members
-    return problem.objective.chosen(seeds(problem.tune.budget)[0], np.arange(min(REFERENCE_MEMBERS, count)), count)
+    return problem.objective.chosen(seeds(problem.tune.budget)[0], np.arange(min(FEW, count)), count)
 
 
 def worst_of(values: np.ndarray) -> np.ndarray:
-    """Return the indices of the REFERENCE_MEMBERS largest values [n], largest first."""
-    return np.argsort(-values, kind="stable")[:REFERENCE_MEMBERS]
+    """Return the indices of the FEW largest values [n], largest first."""
+    return np.argsort(-values, kind="stable")[:FEW]
 
 
 def step_error(problem: TuningProblem, x: np.ndarray, members: Members | None = None) -> StepError:
@@ -150,25 +170,19 @@ def held(metrics: Mapping[str, np.ndarray]) -> np.ndarray:
     return ~np.isfinite(metrics["lost_at_s"])
 
 
-def summarise(metrics: dict[str, np.ndarray]) -> dict[str, Any]:
+def summarise(metrics: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Return the statistics of an ensemble [N] for the report: statuses, survival, and metrics over members.
 
     The status of a member whose integration stalled is unknown: the member counts neither as lost nor as held, and not
     as a survivor. Metrics include only held members, because the state of a lost rotor is frozen and its drive is
     off. If no member is held, the summary has no metrics.
     """
-    alive, n = held(metrics), len(metrics["lost_at_s"])
-    survival = wilson(int(alive.sum()), n)
-    ended = metrics["lost_at_s"][~alive]
-    summary: dict[str, Any] = {
-        "members": n,
-        "held": int(alive.sum()),
-        "lost": int(metrics["lost"].sum()),
-        "stalled": int(metrics["stalled"].sum()),
-        "survival": float(survival.value),
-        "survival_low": float(survival.low),
-        "survival_high": float(survival.high),
-    }
+    alive = held(metrics)
+    survival, ended = wilson(int(alive.sum()), len(alive)), metrics["lost_at_s"][~alive]
+    summary: dict[str, Any] = {"members": len(alive), "held": int(alive.sum())}
+    summary |= {name: int(metrics[name].sum()) for name in ("lost", "stalled")}
+    summary |= {"survival": float(survival.value), "survival_low": float(survival.low)}
+    summary["survival_high"] = float(survival.high)
     if ended.size:
         summary |= {"lost_at_s.mean": float(ended.mean()), "lost_at_s.largest": float(ended.max())}
     if not alive.any():

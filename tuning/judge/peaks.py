@@ -1,9 +1,9 @@
-"""The sensitivity of members of an ensemble: linear, and injected, by a test signal in the simulation."""
+"""Tests of judged members: linear and injected peaks of the sensitivity, and an additional delay."""
 
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,18 +11,23 @@ import numpy as np
 
 from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import DEFAULT_LAWS
-from ambjax.linear import Analysis, Injection, analyse, frequency_lines, linearise
+from ambjax.control.processor import MOST_DELAY
+from ambjax.ensemble import run_ensemble
+from ambjax.linear import Analysis, Injection, analyse, frequency_lines, linearise, stability_of
 from ambjax.linear.injection import injection_of
 from ambjax.linear.member_responses import Responses, member_responses
 from ambjax.linear.stability import MOST_TESTED
 from ambjax.results.operating import one_period
+from tuning.judge.evaluate import JudgedMembers
 from tuning.problem.limits import PREFIX, Limit
+from tuning.problem.quantities import LOOPS
 from tuning.problem.tuning_problem import TuningProblem
 
 # INJECTED: number of members, those with the largest peaks, with an injected signal. REPETITIONS: number of
 # injections into each of them, with different noise.
 INJECTED, REPETITIONS = 3, 8
 UNSTABLE = "its linearised loop is not stable"
+DELAY_MARGIN = "delay_margin_s"
 # Limited quantities that an injection measures.
 BY_INJECTION = {"sensitivity": "S", "complementary": "T", "control_sensitivity": "KS"}
 
@@ -41,18 +46,18 @@ class MemberPeak:
     """
 
     member: int
-    linear: float | None
-    frequency_hz: float | None
-    zone: str | None
-    why: str
-    peak: float | None
-    low: float | None
-    high: float | None
-    at_hz: float | None
-    saturated: float | None
-    lost: int
-    repetitions: int
-    largest: dict[str, float]
+    linear: float | None = None
+    frequency_hz: float | None = None
+    zone: str | None = None
+    why: str = ""
+    peak: float | None = None
+    low: float | None = None
+    high: float | None = None
+    at_hz: float | None = None
+    saturated: float | None = None
+    lost: int = 0
+    repetitions: int = 0
+    largest: dict[str, float] = dataclasses.field(default_factory=dict)
 
 
 class Sensitivity(NamedTuple):
@@ -76,38 +81,35 @@ def decides(problem: TuningProblem) -> bool:
     return injects(problem) and any(set_valued_signs(getattr(problem.case.cascade, stage)) for stage in DEFAULT_LAWS)
 
 
-def injections(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray]) -> Sensitivity | None:
-    """Analyse the INJECTED held members with the largest peaks at coordinates x [m]; on a processor, also inject.
+def injections(of: JudgedMembers) -> Sensitivity | None:
+    """Analyse the INJECTED held members with the largest peaks; on a processor, also inject.
 
-    `columns` [N]: result of `judge` for the ensemble with this `seed`. The members are those with the largest linear
-    peak of the first quantity of BY_INJECTION that has a limit. If only injections decide, they are those with the
-    largest injected peak, by one injection into each of the first MOST_TESTED held members. Returns None if no quantity
-    of BY_INJECTION has a limit, or if no member is held.
+    The members are those with the largest linear peak of the first quantity of BY_INJECTION that has a limit. If only
+    injections decide, they are those with the largest injected peak, by one injection into each of the first
+    MOST_TESTED held members. Returns None if no quantity of BY_INJECTION has a limit, or if no member is held.
     """
-    name = next((name for name in BY_INJECTION if f"loss.{PREFIX}{name}" in columns), None)
-    alive = np.flatnonzero(~np.isfinite(columns["lost_at_s"]))
+    name, alive = next((name for name in BY_INJECTION if f"loss.{PREFIX}{name}" in of.columns), None), of.held
     if name is None or not alive.size:
         return None
-    order = alive[np.argsort(-columns[f"loss.{PREFIX}{name}"][alive], kind="stable")]
-    of = _Ensemble(problem, x, seed, len(columns["lost_at_s"]))
-    if not injects(problem):
-        return Sensitivity(tuple(_summary(int(k), of.analysis(k), None) for k in order[:INJECTED]), False)
-    first = of.analysis(order[0])
+    order = alive[np.argsort(-of.columns[f"loss.{PREFIX}{name}"][alive], kind="stable")]
+    if not injects(of.problem):
+        return Sensitivity(tuple(_summary(int(k), _analysis(of, k), None) for k in order[:INJECTED]), False)
+    first = _analysis(of, order[0])
     peak = None if isinstance(first, str) else first.S.frequency
-    if decides(problem):
-        once = of.responses(alive[:MOST_TESTED], 1, peak)
+    if decides(of.problem):
+        once = _responses(of, alive[:MOST_TESTED], 1, peak)
         response = {"S": once.S, "T": once.S - 1, "KS": once.KS}[BY_INJECTION[name]]
         size = np.where(once.held, np.abs(response).max(axis=1), np.inf)
         order = alive[np.argsort(-size, kind="stable")]
-    random = problem.objective.scenario.random
+    random = of.problem.objective.scenario.random
     repetitions = REPETITIONS if random else 1
-    every = of.responses(order[:INJECTED], repetitions, peak)
+    every = _responses(of, order[:INJECTED], repetitions, peak)
     peaks = []
     for at, k in enumerate(order[:INJECTED]):
         own = slice(at * repetitions, (at + 1) * repetitions)
         parts = {name: getattr(every, name)[own] for name in ("S", "KS", "saturated", "held")}
-        peaks.append(_summary(int(k), of.analysis(k), injection_of(every._replace(**parts), random)))
-    return Sensitivity(tuple(peaks), decides(problem))
+        peaks.append(_summary(int(k), _analysis(of, k), injection_of(every._replace(**parts), random)))
+    return Sensitivity(tuple(peaks), decides(of.problem))
 
 
 def reached_of(limit: Limit, columns: Mapping[str, np.ndarray], injected: Sensitivity | None) -> float:
@@ -126,57 +128,93 @@ def reached_of(limit: Limit, columns: Mapping[str, np.ndarray], injected: Sensit
     return max(largest) if injected.decides else max(linear, *largest)
 
 
-class _Ensemble(NamedTuple):
-    """The members of a judged ensemble of `total` members with this `seed`, at coordinates x [m]."""
+def _analysis(of: JudgedMembers, number: int) -> Analysis | str:
+    """Analyse the linearised loop of one member. Return the cause as text if it cannot be linearised."""
+    objective, case = of.problem.objective, of.problem.case
+    cascade, scenario = objective.world(jax.tree.map(lambda a: a[0], of.chosen(np.array([number]))))
+    cascade = objective.space.decode(jnp.asarray(of.x), cascade)
+    scenario = dataclasses.replace(scenario, seed=case.scenario.seed, member=case.scenario.member)
+    try:
+        system = linearise(cascade, scenario, case.clock)
+    except ValueError as error:
+        return str(error)
+    return analyse(system, scenario.plant.m, float(case.clock.sample_period), case.zones.whole)
 
-    problem: TuningProblem
-    x: np.ndarray
-    seed: int
-    total: int
 
-    def analysis(self, number: int) -> Analysis | str:
-        """Analyse the linearised loop of one member. Return the cause as text if it cannot be linearised."""
-        objective, case = self.problem.objective, self.problem.case
-        member = jax.tree.map(lambda a: a[0], objective.chosen(self.seed, np.array([number]), self.total))
-        cascade, scenario = objective.world(member)
-        cascade = objective.space.decode(jnp.asarray(self.x), cascade)
-        scenario = dataclasses.replace(scenario, seed=case.scenario.seed, member=case.scenario.member)
-        try:
-            system = linearise(cascade, scenario, case.clock)
-        except ValueError as error:
-            return str(error)
-        return analyse(system, scenario.plant.m, float(case.clock.sample_period), case.zones.whole)
+def _responses(of: JudgedMembers, numbers: np.ndarray, repetitions: int, peak: float | None) -> Responses:
+    """Inject a test signal into the members `numbers` [n], each `repetitions` times with different noise.
 
-    def responses(self, numbers: np.ndarray, repetitions: int, peak: float | None) -> Responses:
-        """Inject a test signal into the members `numbers` [n], each `repetitions` times with different noise.
-
-        The lines are denser near `peak` (Hz). The results are in the order of the members.
-        """
-        objective, case = self.problem.objective, self.problem.case
-        members = objective.chosen(self.seed, np.repeat(numbers, repetitions), self.total)
-        cascade, scenario = objective.fixed(self.x, members)
-        scenario = dataclasses.replace(scenario, seed=0, member=np.arange(len(numbers) * repetitions))
-        clock = one_period(case)
-        lines = frequency_lines(case.zones.whole, clock, peak)
-        return member_responses(cascade, scenario, clock, lines, amplitude=case.zones.amplitude)
+    The lines are denser near `peak` (Hz). The results are in the order of the members.
+    """
+    case = of.problem.case
+    cascade, scenario = of.problem.objective.fixed(of.x, of.chosen(np.repeat(numbers, repetitions)))
+    scenario = dataclasses.replace(scenario, seed=0, member=np.arange(len(numbers) * repetitions))
+    clock = one_period(case)
+    lines = frequency_lines(case.zones.whole, clock, peak)
+    return member_responses(cascade, scenario, clock, lines, amplitude=case.zones.amplitude)
 
 
 def _summary(number: int, analysis: Analysis | str, one: Injection | None) -> MemberPeak:
-    """Return the peaks of a member. `analysis`: of `_Ensemble`. `one`: its injection; None if there was none."""
-    loop: tuple[float | None, float | None, str | None, str]
+    """Return the peaks of a member. `analysis`: of `_analysis`. `one`: its injection; None if there was none."""
+    found: dict[str, Any]
     if isinstance(analysis, str):
-        loop = None, None, None, f"it cannot be linearised: {analysis}"
+        found = {"why": f"it cannot be linearised: {analysis}"}
     elif not analysis.stable:
-        loop = None, None, "D", UNSTABLE
+        found = {"zone": "D", "why": UNSTABLE}
     else:
-        loop = analysis.S.height, analysis.S.frequency, analysis.zone, ""
-    if one is None:
-        return MemberPeak(number, *loop, None, None, None, None, None, 0, 0, {})
-    largest = {}
-    if one.S is not None and not one.lost:
-        responses = {name: np.asarray(getattr(one, which)) for name, which in BY_INJECTION.items()}
-        largest = {name: float(np.max(np.abs(response))) for name, response in responses.items()}
-    return MemberPeak(
-        number, *loop, one.peak, one.peak_low, one.peak_high, one.peak_frequency, one.saturated,
-        one.lost, one.members, largest,
-    )  # fmt: skip
+        found = {"linear": analysis.S.height, "frequency_hz": analysis.S.frequency, "zone": analysis.zone}
+    if one is not None:
+        found |= {"peak": one.peak, "low": one.peak_low, "high": one.peak_high, "at_hz": one.peak_frequency}
+        found |= {"saturated": one.saturated, "lost": one.lost, "repetitions": one.members}
+        if one.S is not None and not one.lost:
+            responses = {name: np.asarray(getattr(one, which)) for name, which in BY_INJECTION.items()}
+            found["largest"] = {name: float(np.max(np.abs(response))) for name, response in responses.items()}
+    return MemberPeak(number, **found)
+
+
+class DelayTest(NamedTuple):
+    """Number of members tested with the additional delay, and how many of them are lost, or held but not stable."""
+
+    members: int
+    lost: int
+    unstable: int
+
+    @property
+    def fails(self) -> bool:
+        """Whether the delay is not survived: a member is lost or not stable."""
+        return bool(self.lost or self.unstable)
+
+
+def not_simulated(problem: TuningProblem, limit: Limit) -> str:
+    """Return why the additional delay of the limit is not simulated; '' if it is."""
+    cascade, period = problem.case.cascade, float(problem.case.clock.sample_period)
+    if not cascade.sampled:
+        return "the controller runs in continuous time"
+    total = float(np.max(np.asarray(cascade.timing.delay))) + limit.threshold / period
+    if total > MOST_DELAY:
+        return f"the total delay of {total:.3g} samples exceeds the {MOST_DELAY:g} samples that can be simulated"
+    return ""
+
+
+def delay_test(of: JudgedMembers) -> DelayTest | None:
+    """Simulate the LOOPS held members of least delay margin, with the limit on it as an additional delay.
+
+    The prediction of the controller assumes the delay of the case. Returns None without such a limit, if
+    `not_simulated` gives a reason, or if no member is held.
+    """
+    problem, alive = of.problem, of.held
+    limit = next((limit for limit in problem.limits if limit.name == DELAY_MARGIN), None)
+    if limit is None or not_simulated(problem, limit) or not alive.size:
+        return None
+    order = np.argsort(of.columns[f"loss.{PREFIX}{DELAY_MARGIN}"][alive], kind="stable")
+    members = of.chosen(alive[order[:LOOPS]])
+    cascade, scenario = problem.objective.fixed(of.x, members)
+    processor = cascade.timing
+    delay = np.asarray(processor.delay) + limit.threshold / float(problem.case.clock.sample_period)
+    if np.max(delay) > MOST_DELAY:
+        return None
+    cascade = cascade.with_processor(delay=delay, assumed=processor.ahead, predict=processor.predicts)
+    ended = run_ensemble(cascade, scenario, problem.case.clock, fold=None, record_every=0)
+    lost = np.isfinite(ended.trajectory.lost_at)
+    unstable = ~lost & ~stability_of(cascade, scenario, problem.case.clock).stable
+    return DelayTest(len(members.member), int(lost.sum()), int(unstable.sum()))

@@ -1,22 +1,29 @@
-"""The gains of a machine that are tuned: common to all axes, or of one bearing."""
+"""The gains of a machine that are tuned: common to all axes or of one bearing; or the weights of its LQG."""
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from ambjax.cases.machine_case import MachineCase
+from ambjax.cases.machine_linear import LqgProblem, lqg_problem
 from ambjax.cases.rotor_tables import tables_of
 from ambjax.cases.table import Table
+from ambjax.control.lqg import LqgWeights
+from ambjax.extend import canonical
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.whole_machine import Machine, loop_of
 from tuning.problem.gains_table import chosen, flattened
 from tuning.problem.space import Space, read, tunable, with_gain
 
 BEARING = "bearing."
+LQG = "controller.lqg."
+# Not tuned by default: the design depends only on the ratios of the noises to this weight.
+REFERENCE = f"{LQG}force"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +42,11 @@ class MachineSpace:
 
     space: Space
     gains: tuple[MachineGain, ...]
+
+    @property
+    def where(self) -> list[str]:
+        """The paths of the gains in the case file."""
+        return [gain.where for gain in self.gains]
 
     def values(self, case: MachineCase) -> np.ndarray:
         """Return the gains [m] of a case; of the axes of a gain, the geometric mean."""
@@ -101,3 +113,41 @@ def _known(case: MachineCase, raw: dict[str, Any]) -> dict[str, MachineGain]:
         if common:
             found[path] = MachineGain(path, path, path, tuple(common))
     return found
+
+
+class LqgSpace(NamedTuple):
+    """The weights of an LQG that are tuned: a `Space`, and the design."""
+
+    space: Space
+    problem: LqgProblem
+
+    @property
+    def where(self) -> list[str]:
+        """The paths of the weights in the case file."""
+        return self.space.paths
+
+    def values(self, _case: MachineCase) -> np.ndarray:
+        """Return the weights [m] of the case."""
+        return np.array([self.problem.weights[path.removeprefix(LQG)] for path in self.space.paths])
+
+    def decode(self, x: np.ndarray, machine: Machine) -> Machine:
+        """Return the machine with the weights at coordinates x [m]. Its law is not finite if there is no design."""
+        found = {path.removeprefix(LQG): value for path, value in self.space.named(x).items()}
+        try:
+            law = self.problem.law(self.problem.weights | found)
+        except ValueError:
+            law = jax.tree.map(lambda leaf: jnp.full_like(leaf, math.inf), machine.law)
+        return dataclasses.replace(machine, law=canonical(law))
+
+
+def lqg_space(table: Table, case: MachineCase, raw: dict[str, Any]) -> LqgSpace:
+    """Return the weights of the table [tune] of a machine with an LQG; without tune.gains, all but the force.
+
+    Raises ValueError for an unknown weight or an invalid bound.
+    """
+    problem = lqg_problem(Table(raw), case.cases, case.machine.rotor)
+    known = {LQG + one.name: (0.0, float(one.metadata["at_most"])) for one in dataclasses.fields(LqgWeights)}
+    off = [LQG + name for name, weight in problem.weights.items() if not weight > 0]
+    return LqgSpace(
+        chosen(table, known, [path for path in known if path not in (REFERENCE, *off)], off, "machine"), problem
+    )

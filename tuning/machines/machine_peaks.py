@@ -16,15 +16,11 @@ from ambjax.linear.margins import STATIC
 from ambjax.linear.state_space import NEUTRAL, StateSpace
 from ambjax.simulation.whole_machine import Machine
 from ambjax.world.rotation import PER_MINUTE
-from tuning.machines.lqg_weights import LqgSpace
-from tuning.machines.machine_gains import MachineSpace
+from tuning.machines.machine_gains import LqgSpace, MachineSpace
 from tuning.machines.nonsmooth import Value
 
-# Numbers of frequencies on a logarithmic axis; offsets of further ones from each pole, in units of its damping; largest
-# damping ratio of these poles.
-POINTS, BESIDE, LIGHT = 250, (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0), 0.3
-# Change of a coordinate in a difference quotient.
-STEP = 1e-6
+# Offsets of the frequencies beside each light pole, in units of its damping.
+BESIDE = (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0)
 
 
 class Loop(NamedTuple):
@@ -128,14 +124,17 @@ class Peaks:
         return max((float(np.abs(self._response(*one)).max()) for one in at), default=0.0)
 
     def _points(self, rates: np.ndarray) -> np.ndarray:
-        """Return the points s or z at which S is evaluated: of the range of the sensitivity, and beside light poles."""
+        """Return the points s or z at which S is evaluated: 250 over its range, and some beside light poles.
+
+        A pole is light if its damping ratio is below 0.3.
+        """
         size = np.maximum(np.abs(rates), 1e-12)
         end = max(1e4, size.max() / 2, 2 * float(self.zones.f_low))
         low, high = self.zones.range(self.period if self.sampled else None, end)
         damping = -np.real(rates) / size
-        light = (np.imag(rates) > 0) & (damping < LIGHT)
+        light = (np.imag(rates) > 0) & (damping < 0.3)
         beside = np.outer(size[light] / (2 * np.pi), np.ones(len(BESIDE))) * (1 + np.outer(damping[light], BESIDE))
-        f = np.concatenate([np.geomspace(low, high, POINTS), beside.ravel()])
+        f = np.concatenate([np.geomspace(low, high, 250), beside.ravel()])
         s = 2j * np.pi * np.unique([STATIC * low, *f[(f >= low) & (f <= high)]])
         return np.exp(s * self.period) if self.sampled else s
 
@@ -160,6 +159,6 @@ class Peaks:
 
 def _differences(systems: Callable[[np.ndarray], StateSpace], x: np.ndarray) -> tuple[StateSpace, StateSpace]:
     """Return the systems at x [m] and their derivatives [.., m] by forward differences."""
-    now = systems(x)
-    each = [jax.tree.map(lambda a, b: (b - a) / STEP, now, systems(x + STEP * one)) for one in np.eye(len(x))]
+    now, step = systems(x), 1e-6
+    each = [jax.tree.map(lambda a, b: (b - a) / step, now, systems(x + step * one)) for one in np.eye(len(x))]
     return now, jax.tree.map(lambda *own: np.stack(own, -1), *each)

@@ -1,23 +1,19 @@
 """The search for the gains of a machine: descents of the largest peak of |S| from several starts."""
 
 import math
+import pathlib
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ambjax.host.sealed import seal
 from tuning.events import Tell
-from tuning.machines.lqg_weights import LqgSpace
-from tuning.machines.machine_gains import MachineSpace
+from tuning.machines.machine_gains import LqgSpace, MachineSpace
 from tuning.machines.machine_peaks import Peaks
-from tuning.machines.machine_progress import Progress
 from tuning.machines.nonsmooth import Value, minimise
-
-# Standard deviations of the logarithms of the gains of random starts: around the case, and around the best point.
-FAR, NEAR = 0.7, 0.3
-# Default of `minutes`.
-MINUTES = 5.0
+from tuning.solve.checkpoint import restored
 
 Lost = Callable[[np.ndarray], int]
 Over = Callable[[Value], bool]
@@ -35,6 +31,42 @@ class Settings(NamedTuple):
     held_out: int
 
 
+class Progress(NamedTuple):
+    """A search after `number` starts.
+
+    `best`: lowest peak, with the `fewest` members that are lost or beyond a limit. `slowest`: least growth rate of a
+    pole. `seconds`: duration so far, s.
+    """
+
+    number: int
+    best: Value
+    fewest: float
+    slowest: Value
+    seconds: float
+
+    @property
+    def answer(self) -> Value:
+        """The best point; that of the least growth rate if no start could be made stable."""
+        return self.best if np.isfinite(self.best.f) else self.slowest
+
+
+def save(path: pathlib.Path, facts: dict[str, Any], now: Progress) -> None:
+    """Write the checkpoint. `facts`: what a resumed search must match. Raises ValueError if it cannot be written."""
+    numbers = np.array([now.number, now.best.f, now.fewest, now.slowest.f, now.seconds])
+    seal(path, {"best": now.best.x, "slowest": now.slowest.x, "numbers": numbers}, {"fingerprint": facts})
+
+
+def saved(path: pathlib.Path, facts: dict[str, Any], tell: Tell) -> Progress | None:
+    """Return the checkpoint, as `restored` does."""
+
+    def progress(arrays: dict[str, np.ndarray], _: dict[str, Any]) -> Progress:
+        number, best, fewest, slowest, seconds = arrays["numbers"].tolist()
+        best, slowest = (Value(arrays[k], f, 0.0 * arrays[k]) for k, f in (("best", best), ("slowest", slowest)))
+        return Progress(int(number), best, fewest, slowest, seconds)
+
+    return restored(path, facts, progress, "the search", tell)
+
+
 def searched(
     peaks: Peaks,
     settings: Settings,
@@ -46,22 +78,24 @@ def searched(
 ) -> Progress:
     """Return the result of the search.
 
-    From each start, BFGS reduces the largest growth rate until the machine is stable, then the peak. `lost`: number of
+    From each start, BFGS reduces the largest growth rate until the machine is stable, then the peak. The first start is
+    the case. The logarithms of the gains of the others have a standard deviation of 0.3 around those of the best point
+    so far and of 0.7 around those of the case, in turn. `lost`: number of
     members that are lost, or beyond a limit of their simulation, at coordinates [m]. `before`: the search so far, which
     continues. `save`: receives it after each start.
     """
     rng, space, first = np.random.default_rng(settings.seed), settings.space.space, settings.space.space.encode(start)
     none = Value(first, math.inf, np.zeros(len(first)))
     now = before or Progress(0, none, math.inf, none, 0.0)
-    began, minutes = time.monotonic() - now.seconds, settings.minutes if math.isfinite(settings.minutes) else MINUTES
-    over: Over = lambda _: time.monotonic() - began > 60 * minutes  # noqa: E731
+    began = time.monotonic() - now.seconds
+    over: Over = lambda _: time.monotonic() - began > 60 * settings.minutes  # noqa: E731
     rng.normal(size=(now.number, len(first)))  # the draws of the starts before
     for number in range(now.number, settings.starts):
         _, best, fewest, slowest, _ = now
         if number and over(best):
             break
         near = number % 2 == 1 and math.isfinite(best.f)
-        centre, size = (best.x, NEAR) if near else (first, FAR if number else 0.0)
+        centre, size = (best.x, 0.3) if near else (first, 0.7 if number else 0.0)
         held = _stabilised(peaks, space.drawn_back(centre + size * rng.normal(size=len(first))), settings, over)
         slowest = min(slowest, held, key=lambda v: v.f)
         if peaks.stable(held):

@@ -4,9 +4,9 @@ import dataclasses
 import math
 import pathlib
 import tomllib
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, machine_from
@@ -20,14 +20,13 @@ from ambjax.results.machine_study import MachineStudy
 from ambjax.results.outputs import directory, files, plain, write_json
 from ambjax.text.web_page import render_page
 from tuning.events import Tell
-from tuning.machines.lqg_weights import LqgSpace, lqg_space
-from tuning.machines.machine_gains import MachineSpace, machine_space
+from tuning.machines.machine_gains import LqgSpace, MachineSpace, lqg_space, machine_space
 from tuning.machines.machine_peaks import Peaks
-from tuning.machines.machine_progress import save, saved
-from tuning.machines.machine_search import Settings, searched
+from tuning.machines.machine_search import Settings, save, saved, searched
 from tuning.machines.machine_verdict import LIMITS, judged, refused, report_text
 from tuning.problem.config import with_settings_of
-from tuning.report.record import KEY, REPORT, TUNED, record
+from tuning.problem.members import FEW
+from tuning.report.facts import KEY, NOT_JUDGED, REPORT, TUNED, record
 from tuning.report.tuned import tuned
 from tuning.solve.checkpoint import checkpoint
 
@@ -35,11 +34,6 @@ WRITTEN = (TUNED, REPORT, "report.md", "report.html")
 # Keys of [tune] and of [tune.limits] that a machine takes.
 KEYS, SIZES = ("gains", "bounds", "limits", "minutes"), ("seed", "starts", "iterations", "held_out")
 LIMIT: dataclasses.Field = leaf(above=0, at_most=1e12)
-# Default of `held_out`: a machine takes longer to simulate than an axis.
-JUDGED = 16
-# Largest number of members that the search simulates.
-SEARCHED = 4
-NOT_JUDGED = "The tuned gains are not judged."
 
 
 class MachinePlan(NamedTuple):
@@ -80,11 +74,11 @@ def settings_from(raw: dict[str, Any], case: MachineCase) -> Settings:
     return Settings(
         (lqg_space if lqg else machine_space)(own, case, raw),
         {"sensitivity": float(case.zones.zone_a)} | thresholds,
-        min(own.leaf("minutes", NUMBERS["minutes"], math.inf), 1e6),
+        own.leaf("minutes", NUMBERS["minutes"], math.inf),
         sizes["seed"],
         sizes["starts"],
         10 * sizes["iterations"],
-        sizes["held_out"] if "held_out" in own.raw else JUDGED,
+        sizes["held_out"] if "held_out" in own.raw else 16,  # a machine takes longer to simulate than an axis
     )
 
 
@@ -120,10 +114,10 @@ def tune_machine(plan: MachinePlan, resume: bool, tell: Tell) -> tuple[MachineCa
     case, settings, own, path = plan.case, plan.settings, plan.settings.space, plan.out / checkpoint(1)
 
     def case_at(x: np.ndarray, verdict: str = NOT_JUDGED) -> MachineCase:
-        return _written(case, plan.text, own, _gains(own, x), verdict)
+        return _written(case, plan.text, own, own.space.named(x).values(), verdict)
 
     def refused_at(x: np.ndarray) -> int:  # other members than those of the judgement
-        count = refused(case_at(x), settings.limits, settings.seed + 1, min(settings.held_out, SEARCHED))
+        count = refused(case_at(x), settings.limits, settings.seed + 1, min(settings.held_out, FEW))
         return count + (plan.peaks.turning(x) > settings.limits.get("sensitivity_1x", math.inf))
 
     speeds = ", ".join(f"{speed:g}" for speed in case.speeds)
@@ -138,23 +132,18 @@ def tune_machine(plan: MachinePlan, resume: bool, tell: Tell) -> tuple[MachineCa
     report = judged(case, case_at(x), settings.limits, settings.seed, settings.held_out)
     report["gains"] = [
         {"path": one.path, "before": a, "after": b, "at_bound": one.at_bound(b)}
-        for one, a, b in zip(own.space.gains, plan.start.tolist(), _gains(own, x), strict=True)
+        for one, a, b in zip(own.space.gains, plan.start.tolist(), own.space.named(x).values(), strict=True)
     ]
     tuned_case = case_at(x, report["verdict"])
     _put(plan, tuned_case.text, report, complete=found.number == settings.starts)
     return tuned_case, plain(report)
 
 
-def _gains(space: MachineSpace | LqgSpace, x: np.ndarray) -> list[float]:
-    return np.asarray(space.space.gains_at(jnp.asarray(x))).tolist()
-
-
 def _written(
-    case: MachineCase, text: str, space: MachineSpace | LqgSpace, gains: list[float], verdict: str = NOT_JUDGED
+    case: MachineCase, text: str, space: MachineSpace | LqgSpace, gains: Iterable[float], verdict: str = NOT_JUDGED
 ) -> MachineCase:
     """Return the case with these gains [m] in its text."""
-    where = [gain.where for gain in space.gains]
-    text = tuned(text, dict(zip(where, gains, strict=True)), case.name, verdict)
+    text = tuned(text, dict(zip(space.where, gains, strict=True)), case.name, verdict)
     return machine_from(tomllib.loads(text), case.name, text, case.folder)
 
 

@@ -9,6 +9,7 @@ from ambjax.cases.machine_case import MachineCase
 from ambjax.commands.machine_commands import sensitivity_summary
 from ambjax.results.machine_study import MachineStudy
 from ambjax.results.operating import sensitivity
+from tuning.report.facts import Column, table
 
 # Limits of [tune.limits], each with its meaning and the metric whose largest value counts; "": a sensitivity.
 LIMITS = {
@@ -79,35 +80,23 @@ def refused(case: MachineCase, limits: dict[str, float], seed: int, members: int
 
 def report_text(facts: dict[str, Any]) -> str:
     """Return the report in Markdown."""
-
-    def rows(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
-        return "\n".join("| " + " | ".join(row) + " |" for row in (head, ("---",) * len(head), *body))
-
     speeds = zip(facts["before"]["speeds"], facts["sensitivity"]["speeds"], strict=True)
     peaks = [
-        (
-            f"{b['speed_rpm']:g}",
-            axis["name"],
-            _peak(a, old),
-            _peak(b, axis),
-            f"{axis['frequency_hz']:.4g}" if b["stable"] else "-",
-            axis["zone"],
-        )
+        {"rpm": f"{b['speed_rpm']:g}", "axis": axis["name"], "before": _peak(a, old), "after": _peak(b, axis)}
+        | {"Hz": axis["frequency_hz"] if b["stable"] else None, "zone": axis["zone"]}
         for a, b in speeds
         for old, axis in zip(a["axes"], b["axes"], strict=True)
     ]
-    limits = [
-        (row["name"], row["meaning"], f"{row['value']:.4g}", f"{row['threshold']:.4g}", "yes" if row["holds"] else "NO")
-        for row in facts["limits"]
-    ]
-    gains = [(row["path"], f"{row['before']:.6g}", f"{row['after']:.6g}", row["at_bound"]) for row in facts["gains"]]
-    parts = [
-        f"# Tuning of {facts['case']}", facts["verdict"],
-        "## Limits", rows(("limit", "meaning", "value", "at most", "met"), limits),
-        "## Peaks of |S|", rows(("rpm", "axis", "before", "after", "Hz", "zone"), peaks),
-        "## Gains", rows(("gain", "before", "after", "at a bound"), gains),
-    ]  # fmt: skip
-    return "\n\n".join(parts) + "\n"
+    limits: dict[str, Column] = {
+        "limit": ("name", ""), "meaning": ("meaning", ""), "value": ("value", ".4g"), "at most": ("threshold", ".4g"),
+        "met": lambda row: "yes" if row["holds"] else "NO",
+    }  # fmt: skip
+    gains: dict[str, Column] = {
+        "gain": ("path", ""), "before": ("before", ".6g"), "after": ("after", ".6g"), "at a bound": ("at_bound", "")
+    }  # fmt: skip
+    parts = [f"# Tuning of {facts['case']}", facts["verdict"], "## Limits", table(facts["limits"], limits)]
+    parts += ["## Peaks of |S|", table(peaks, {name: (name, ".4g") for name in peaks[0]})]
+    return "\n\n".join([*parts, "## Gains", table(facts["gains"], gains)]) + "\n"
 
 
 def _peak(point: dict[str, Any], axis: dict[str, Any]) -> str:

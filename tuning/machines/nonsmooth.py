@@ -9,11 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Constants of the weak Wolfe conditions, largest number of evaluations of a line search, and largest change of a
-# coordinate in a step.
-DECREASE, CURVATURE, TRIALS, LONGEST = 1e-4, 0.5, 25, 0.5
-# Inverse Hessian of the first step.
-FIRST = 0.01
+# Largest change of a coordinate in a step.
+LONGEST = 0.5
 
 
 class Value(NamedTuple):
@@ -29,7 +26,7 @@ Function = Callable[[np.ndarray], Value]
 
 def minimise(function: Function, start: Value, iterations: int, stop: Callable[[Value], bool]) -> Value:
     """Return the lowest point that BFGS finds from `start`. `stop`: called after each step, ends the search."""
-    now, H = start, FIRST * np.eye(len(start.x))
+    now, H = start, 0.01 * np.eye(len(start.x))  # the first step has no estimate of the curvature
     for number in range(iterations):
         after = _line_search(function, now, -H @ now.gradient)
         if after is None:
@@ -47,16 +44,19 @@ def minimise(function: Function, start: Value, iterations: int, stop: Callable[[
 
 
 def _line_search(function: Function, now: Value, direction: np.ndarray) -> Value | None:
-    """Return a point that meets the weak Wolfe conditions, or the last one that is low enough; None: there is none."""
+    """Return a point that meets the weak Wolfe conditions, or the last one that is low enough; None: there is none.
+
+    The constants of the conditions are 1e-4 and 0.5, as in the paper.
+    """
     direction = direction * min(1.0, LONGEST / max(float(np.abs(direction).max()), 1e-300))
     slope, low, high, step, found = float(now.gradient @ direction), 0.0, math.inf, 1.0, None
     if not slope < 0:
         return None
-    for _ in range(TRIALS):
+    for _ in range(25):
         trial = function(now.x + step * direction)
-        if not trial.f <= now.f + DECREASE * step * slope:
+        if not trial.f <= now.f + 1e-4 * step * slope:
             high = step
-        elif trial.gradient @ direction < CURVATURE * slope and step * np.abs(direction).max() < 2 * LONGEST:
+        elif trial.gradient @ direction < 0.5 * slope and step * np.abs(direction).max() < 2 * LONGEST:
             low, found = step, trial
         else:
             return trial

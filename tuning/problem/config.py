@@ -25,10 +25,10 @@ from ambjax.cases.tune_table import (
 from ambjax.extend import leaf
 from ambjax.host.extensions import NothingToTuneError
 from tuning.problem.gains_table import space_from
+from tuning.problem.goal import CVaR
 from tuning.problem.limits import LEAST_MARGIN, Limit
 from tuning.problem.loss import TERMS
 from tuning.problem.quantities import KINDS
-from tuning.problem.risk import CVaR
 from tuning.problem.space import Space
 from tuning.problem.unbreakable import bounds_of
 
@@ -49,16 +49,17 @@ BAND_RANGE: dataclasses.Field = leaf(at_least=1e-12, at_most=1.0, unit="m")
 
 @dataclasses.dataclass(frozen=True)
 class LimitSettings:
-    """The table [tune.limits]."""
+    """The table [tune.limits].
+
+    `each`: the limits, in the order of their names. `survival`: share of the held-out members that must be held.
+    `band`: of the settling time, m. `unbreakable`: limits that are left out because they cannot be broken, with the
+    reason of each.
+    """
 
     each: tuple[Limit, ...] = ()
-    """the limits, in the order of their names"""
     survival: float = SURVIVING
-    """share of the held-out members that must be held"""
     band: float = 0.0
-    """band of the settling time, m"""
     unbreakable: tuple[tuple[Limit, str], ...] = ()
-    """limits that are left out because they cannot be broken, each with the reason"""
 
     def may_lose(self, members: int) -> int:
         """Return how many of `members` members may be lost."""
@@ -67,18 +68,13 @@ class LimitSettings:
 
 @dataclasses.dataclass(frozen=True)
 class Tune:
-    """The table [tune].
+    """The table [tune]; its numbers are described in `ambjax.cases.tune_table`.
 
-    - `space`: the gains to tune, with their bounds.
-    - `weights`: weights of the terms of the loss, in the order of TERMS.
-    - `early`: weight of errors before run.settle. Errors after it have the weight 1.
-    - `stress`: factor on the sensor noise of the stressed members (`Budget.stressed`).
-    - `gain_margin`: each gain of a stressed member is multiplied or divided by this factor.
-    - `minutes`: time for the whole tuning.
+    `objective`: "knee" or "least_error". `space`: the gains to tune, with their bounds. `weights`: of the terms of the
+    loss, in the order of TERMS.
     """
 
     objective: str
-    """one of OBJECTIVES: "knee" or "least_error" """
     space: Space
     weights: tuple[float, ...]
     limits: LimitSettings
@@ -166,14 +162,15 @@ def _limits(table: Table, case: Case) -> LimitSettings:
     table.only([*KINDS, "survival", "margin", "settling_band_m"], [f"tune.{key}" for key in beside])
     thresholds = {name: table.leaf(name, OTHER_RANGES.get(name, LIMIT_RANGE)) for name in KINDS if name in table.raw}
     _check_speed([table.at(name) for name, most in thresholds.items() if "_1x" in name and most < math.inf], case)
-    u_max, source = float(np.max(np.asarray(case.scenario.u_max))), dict.fromkeys(thresholds, table.path)
-    if "rms_u_V" not in thresholds and math.isfinite(u_max):
-        thresholds["rms_u_V"], source["rms_u_V"] = (
-            VOLTAGE_SHARE * u_max,
-            f"default, {100 * VOLTAGE_SHARE:g} % of actuator.u_max",
-        )
-    if "sensitivity" not in thresholds:
-        thresholds["sensitivity"], source["sensitivity"] = float(case.zones.zone_a), "default, zone A of [sensitivity]"
+    defaults = {
+        "rms_u_V": VOLTAGE_SHARE * float(np.max(np.asarray(case.scenario.u_max))),
+        "sensitivity": float(case.zones.zone_a),
+    }
+    sources = {
+        "rms_u_V": f"default, {100 * VOLTAGE_SHARE:g} % of actuator.u_max",
+        "sensitivity": "default, zone A of [sensitivity]",
+    } | dict.fromkeys(thresholds, table.path)
+    thresholds = defaults | thresholds
     clearance = float(np.min(np.asarray(case.scenario.touchdown)))
     band = table.leaf("settling_band_m", BAND_RANGE, SETTLING_BAND * clearance)
     if "settling_band_m" in table.raw and "settling_s" not in thresholds:
@@ -187,7 +184,7 @@ def _limits(table: Table, case: Case) -> LimitSettings:
     if not LEAST_MARGIN <= table.number("margin", LEAST_MARGIN, f"a number {share}") < 0.5:
         raise ValueError(f"{table.at('margin')} = {table.raw['margin']:g}: it must be a share of each limit, {share}.")
     each = tuple(
-        Limit(name, thresholds[name], source[name], table.number("margin", KINDS[name].margin))
+        Limit(name, thresholds[name], sources[name], table.number("margin", KINDS[name].margin))
         for name in sorted(thresholds)
         if math.isfinite(thresholds[name])
     )
@@ -209,13 +206,6 @@ def _risk(table: Table) -> CVaR:
     if not 0 <= alpha < 1:
         raise ValueError(f"{table.at('alpha')} = {alpha:g}: it must be at least 0 and below 1.")
     return CVaR(alpha)
-
-
-def allowed_minutes(minutes: float) -> float:
-    """Return the number of minutes of --budget. Raises ValueError unless it is above 0."""
-    if not minutes > 0:
-        raise ValueError(f"--budget {minutes:g}: it must be above 0, in minutes.")
-    return minutes
 
 
 def settings(tune: Tune) -> dict[str, Any]:

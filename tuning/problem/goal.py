@@ -1,5 +1,6 @@
 """The goal: the number that the search minimises, computed from the losses of the members."""
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -8,12 +9,10 @@ import numpy as np
 from jax import Array
 
 from ambjax.extend import Scalar, record, static
-from tuning.problem.limit_folds import TINY
 from tuning.problem.limits import LimitTerm
 from tuning.problem.loss import outcomes
 from tuning.problem.members import Members
-from tuning.problem.quantities import KINDS
-from tuning.problem.risk import CVaR
+from tuning.problem.quantities import KINDS, TINY
 
 # Largest goal, a logarithm, whose exponential does not overflow.
 MOST = np.log(np.finfo(float).max)
@@ -22,6 +21,27 @@ MOST = np.log(np.finfo(float).max)
 def shown(goal: np.ndarray | float) -> np.ndarray:
     """Return exp(`goal`), at most exp(MOST), for a text or a picture. It is huge if a limit is far from met."""
     return np.exp(np.minimum(goal, MOST))
+
+
+@dataclasses.dataclass(frozen=True)
+class CVaR:
+    """Conditional value at risk: the mean of the worst share 1 - alpha of the losses; with alpha = 0, their mean.
+
+    Rockafellar and Uryasev, J. Risk 2 (2000) 21-41. It equals the minimum over q of
+    q + mean(max(l - q, 0)) / (1 - alpha), which lies at the alpha quantile. If (1 - alpha) N is not whole, the last of
+    the worst members counts in part.
+    """
+
+    alpha: float = 0.0
+
+    def __call__(self, losses: Array) -> Array:
+        count = losses.shape[0]
+        share = (1 - self.alpha) * count
+        weights = jnp.clip(share - jnp.arange(count), 0.0, 1.0) / share
+        return jnp.sum(weights * jnp.sort(losses)[::-1])
+
+    def __str__(self) -> str:
+        return f"CVaR({self.alpha:g})" if self.alpha else "mean"
 
 
 @record

@@ -1,10 +1,8 @@
 """The engine: evaluates an objective and its derivatives for many gains and members, with common random numbers.
 
 A lane is one rollout of one member under one vector of gains. A kernel processes a fixed number of lanes and is
-compiled once. There are three kernels: one for the terms of the loss, one for their derivatives (with fewer lanes), and
-one for metrics. A new number of starts (vectors of gains) or members does not recompile them. The number of lanes can
-change the last digit of a result, so it does not depend on the number of cores. An engine has one integration method;
-where `tuning.judge.evaluate` uses another, it has its own engine.
+compiled once: for the terms of the loss, for their derivatives (with fewer lanes), or for metrics. The number of lanes
+can change the last digit of a result, so it does not depend on the number of cores.
 """
 
 import dataclasses

@@ -20,8 +20,7 @@ from jax import Array
 
 from ambjax.extend import Scalar, record, static
 from ambjax.simulation.folds import Fold
-from tuning.problem.limit_folds import TINY
-from tuning.problem.quantities import KINDS, Kind, LimitContext
+from tuning.problem.quantities import KINDS, TINY, Kind, LimitContext
 
 # Penalty; at a multiplier of 0, an excess of 10 % adds 0.14 to the goal.
 PENALTY = 30.0
@@ -34,8 +33,6 @@ TOLERANCE_BELOW = 0.01
 LEAST_MARGIN = 0.002
 # Value of `Limit.source` for the limit on the rms error that traces the front of error against voltage.
 FRONT = "the front"
-# An infinite judged value is replaced by this factor times the larger of the limit and the search's value.
-LOST_FACTOR = 10.0
 
 
 @record
@@ -71,7 +68,8 @@ class Limit:
     """A limit, and the state of its augmented Lagrangian.
 
     `name`: key of the quantity in KINDS. `threshold`: the limit, in the unit of the quantity. `source`: origin of the
-    limit (case file, default or FRONT), for the report. `multiplier`: of the augmented Lagrangian. `ratio`: the judge's
+    limit (case file, default or FRONT), for the report. `margin`: relative distance that the search keeps from the
+    limit, on the allowed side. `multiplier`: of the augmented Lagrangian. `ratio`: the judge's
     value divided by the search's value. `history`: (judge's value, multiplier) of every update.
     """
 
@@ -79,7 +77,6 @@ class Limit:
     threshold: float
     source: str = "tune.limits"
     margin: float = 0.0
-    """relative distance that the search keeps from the limit, on the allowed side"""
     multiplier: float = 0.0
     ratio: float = 1.0
     history: tuple[tuple[float, float], ...] = ()
@@ -125,9 +122,9 @@ class Limit:
         """Return the limit after an update of its multiplier at an optimum of the goal.
 
         `tuned`, `judged`: values of the search and of the judge at the optimum. `judged` is infinite if an injection
-        loses the rotor; it is then replaced by LOST_FACTOR times the larger of `tuned` and the limit.
+        loses the rotor; it is then replaced by 10 times the larger of `tuned` and the limit.
         """
-        judged = judged if math.isfinite(judged) else LOST_FACTOR * max(tuned, self.threshold)
+        judged = judged if math.isfinite(judged) else 10 * max(tuned, self.threshold)
         multiplier = max(self.multiplier + PENALTY * float(self.log_excess(self.ratio * tuned)), 0.0)
         ratio = max(judged, TINY) / max(tuned, TINY)
         history = (*self.history, (max(judged, TINY), multiplier))

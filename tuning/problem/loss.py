@@ -14,8 +14,8 @@ from ambjax.simulation.folds import Ending, Fold, Named
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import ALIVE, Row
 from ambjax.world.scenario import Scenario
-from tuning.problem.limit_folds import NORM
 from tuning.problem.limits import PREFIX
+from tuning.problem.quantities import NORM
 
 # Weights of the terms, in the order of TERMS; values of a term, for one member or for many [N].
 Weights = Sequence[float] | np.ndarray | Array
@@ -29,30 +29,26 @@ COSTS = ("effort", "chatter")
 
 
 class Sums(NamedTuple):
-    """State of the fold: sums over samples, values of the last sample, and the states of the limits' folds."""
+    """State of the fold: sums over samples, values of the last sample, and the states of the limits' folds.
+
+    `square`, `power`: weighted sums of the squared error in units of s_0^2, and of the error to the power NORM in units
+    of s_0^NORM. `weight`: sum of the weights. `effort`: integral of u^2, V^2 s. `chatter`: sum of the squared steps of
+    the averaged voltage, V^2. `u`: average of u over the last sample, V. `clearance`: sum of the clearance term.
+    `driven`: number of samples with the rotor held. `time`: time with the drive on, s. `contact_time`: extrapolated
+    time at which |z| reaches the stop, s. `measured`: states of the limits' folds.
+    """
 
     square: Array
-    """weighted sum of the squared error, in units of s_0^2"""
     power: Array
-    """weighted sum of the error to the power NORM, in units of s_0^NORM"""
     weight: Array
-    """sum of the weights"""
     effort: Array
-    """integral of u^2, V^2 s"""
     chatter: Array
-    """sum of the squared steps of the averaged voltage, V^2"""
     u: Array
-    """average of u over the last sample, V"""
     clearance: Array
-    """sum of the clearance term"""
     driven: Array
-    """number of samples with the rotor held"""
     time: Array
-    """time with the drive on, s"""
     contact_time: Array
-    """extrapolated time at which |z| reaches the stop, s"""
     measured: Any
-    """states of the limits' folds"""
 
 
 @record

@@ -18,8 +18,9 @@ from tuning.problem.loss import Loss
 from tuning.problem.quantities import LOOPS
 from tuning.problem.space import Space
 
-# The screen simulates one member in PART, but at least PART ordinary and PART stressed members.
-PART = 4
+# Number of members that are simulated where an ensemble would take too long: with accurate steps, and of a machine in
+# its search. The screen simulates one member in FEW, but at least FEW ordinary and FEW stressed members.
+FEW = 4
 
 
 class LoopRange(NamedTuple):
@@ -71,16 +72,19 @@ class Members(NamedTuple):
 
     @property
     def part(self) -> "Members":
-        """The first 1/PART of the ordinary and of the stressed members, at least PART of each kind."""
+        """The first 1/FEW of the ordinary and of the stressed members, at least FEW of each kind."""
         kinds = self.ordinary, len(self.stressed) - self.ordinary
-        few, some = (max(count // PART, min(PART, count)) for count in kinds)
+        few, some = (max(count // FEW, min(FEW, count)) for count in kinds)
         index = np.concatenate([np.arange(few), np.arange(self.ordinary, self.ordinary + some)])
         return jax.tree.map(lambda a: a[index], self)
 
 
 @dataclasses.dataclass(frozen=True)
 class Objective:
-    """The gains to tune, the simulated world and the loss: the part of a problem that is compiled."""
+    """The gains to tune, the simulated world and the loss: the part of a problem that is compiled.
+
+    `loop`: the analysis of the linearised loops; None: no limit needs it.
+    """
 
     space: Space
     cascade: Cascade
@@ -89,7 +93,6 @@ class Objective:
     loss: Loss
     spread: Spread = Spread()
     loop: LoopRange | None = None
-    """the analysis of the linearised loops; None: no limit needs it"""
 
     def members(self, seed: int, count: int) -> Members:
         """Return the first `count` members of the ensemble with this seed."""

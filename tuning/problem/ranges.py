@@ -1,4 +1,4 @@
-"""Initial search ranges of the gains, from the plant, the clock and the theorem's conditions."""
+"""Search ranges of the gains, from the plant, the clock and the theorem's conditions; and starting points in them."""
 
 import dataclasses
 from collections.abc import Callable
@@ -11,6 +11,7 @@ from jax import Array
 from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import extremes
 from ambjax.control.search import Interval, LowerBound, SearchContext
+from ambjax.ensemble.design import design_points
 from ambjax.linear.stability import KICK
 from ambjax.theorem.conditions import delta_1_on_reference, required
 from tuning.problem.members import Objective
@@ -52,6 +53,19 @@ def ranges(objective: Objective, start: np.ndarray) -> list[Range]:
         if one.times:
             found[gain.path] = _quotient(gain, value, one, objective.cascade, found)
     return [found[gain.path] for gain in gains]
+
+
+def initial_points(space: Space, box: list[Range], start: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """Return coordinates [count + 2, m]: the gains `start` [m], the middle of the ranges `box`, quasi-random points.
+
+    If `count` is 0, the result contains only the gains `start`, [1, m].
+    """
+    if not count:
+        return space.encode(space.clip(start))[None]
+    cube = design_points("sobol", seed, len(space), np.arange(count), count)
+    middle = np.full((1, len(space)), 0.5)
+    gains = np.concatenate([start[None], from_unit_cube(space, box, np.concatenate([middle, cube]))])
+    return np.stack([space.encode(space.clip(g)) for g in gains])
 
 
 def from_unit_cube(space: Space, box: list[Range], cube: np.ndarray) -> np.ndarray:

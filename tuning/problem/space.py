@@ -26,8 +26,8 @@ SHARP = 4.0
 # Largest distance of a coordinate beyond a bound at the start of a search. There, the gain is 3 % away from the bound,
 # and a change of the coordinate changes its logarithm by an eighth of that.
 BEYOND = 0.5
-# Distance of `Gain.inner` from the bounds: a share of the bound, and the largest share of the interval in logarithms.
-MARGIN, SHARE = 0.02, 0.1
+# Distance of `Gain.inner` from the bounds: a share of the bound, at most a tenth of the interval in logarithms.
+MARGIN = 0.02
 # Smallest relative distance of two bounds. Closer bounds leave an interval of the size of the rounding error.
 CLOSEST = 1e-6
 ROOT = "controller"
@@ -78,7 +78,7 @@ class Gain:
         """An interval (low, high) well within the bounds."""
         if self.low == 0.0:
             return CLOSEST**2 * min(self.high, 1.0), self.high / (1 + MARGIN)
-        aside = min(1 + MARGIN, (self.high / self.low) ** SHARE)
+        aside = min(1 + MARGIN, (self.high / self.low) ** 0.1)
         return self.low * aside, self.high / aside
 
     def at_bound(self, gain: float) -> str:
@@ -124,6 +124,10 @@ class Space:
     def gains_at(self, x: Array) -> Array:
         """Return the gains [m] at coordinates x [m]."""
         return jnp.stack([gain.decode(x[j]) for j, gain in enumerate(self.gains)])
+
+    def named(self, x: np.ndarray) -> dict[str, float]:
+        """Return the gains by path at coordinates x [m]."""
+        return dict(zip(self.paths, np.asarray(self.gains_at(jnp.asarray(x))).tolist(), strict=True))
 
     def encode(self, gains: Sequence[float] | np.ndarray) -> np.ndarray:
         """Return the coordinates [m] of gains [m]. Raises ValueError for a gain outside its bounds."""

@@ -11,12 +11,12 @@ from ambjax.simulation.integrate import Integrator
 from ambjax.simulation.method import choose_method
 from ambjax.simulation.rosenbrock import AdaptiveRodas3
 from ambjax.simulation.sliding import Slide, slides
-from tuning.problem.config import Tune
+from tuning.problem.config import Tune, seeds
 from tuning.problem.goal import Goal
 from tuning.problem.lanes import Engine
 from tuning.problem.limits import FRONT, Limit, measures
 from tuning.problem.loss import HELD, TERMS, loss_for
-from tuning.problem.members import LoopRange, Objective
+from tuning.problem.members import FEW, LoopRange, Members, Objective
 from tuning.problem.quantities import KINDS, LimitContext
 from tuning.problem.ranges import Range, bounded
 
@@ -24,35 +24,38 @@ from tuning.problem.ranges import Range, bounded
 # for the accurate steps, and the judge makes the steps of the case. On the tuned loops of tests/test_metrics_dense.py,
 # 24 steps a sample have an error of at most 0.8 % in the settled rms voltage, 12 steps 4.6 %, 3 steps 56 %.
 REFINEMENT = 8
-# Accurate reference: number of members, relative tolerance of the steps.
-REFERENCE_MEMBERS, REFERENCE_TOLERANCE = 4, 1e-6
+# Relative tolerance of the accurate steps.
+REFERENCE_TOLERANCE = 1e-6
 # Quantities that the front of error against voltage needs.
 TRACED = ("rms_error_m", "rms_u_V")
-# Initial multiplier of the limit on the error in the searches for the front, which minimise the voltage. It corresponds
-# to 1.5 % more voltage for 1 % less error.
-EXCHANGE = 3.0
-# Cost of a gradient, divided by that of a rollout: 1 + m in forward mode for m gains, RERUN + SWEEP q in reverse mode
-# for q differentiated quantities (benchmarks/schedules.py, gradients.py).
-SWEEP, RERUN = 4, 5
 
 
 @dataclasses.dataclass(frozen=True)
 class TuningProblem:
-    """A case, its settings, and the objective, engine and goal made from them."""
+    """A case, its settings, and the engine and goal made from them.
+
+    `finer`: factor on the number of integration steps of the search (`method_for`). `limits`: the limits, and the state
+    of their augmented Lagrangian. `front`: whether the front of error against voltage is to be traced.
+    """
 
     case: Case
     tune: Tune
-    objective: Objective
     engine: Engine
     goal: Goal
     ranges: list[Range]
     finer: int = 1
-    """factor on the number of integration steps of the search (`method_for`)"""
     limits: tuple[Limit, ...] = ()
-    """the limits, and the state of their augmented Lagrangian"""
-
     front: bool = False
-    """whether the front of error against voltage is to be traced"""
+
+    @property
+    def objective(self) -> Objective:
+        """What the search simulates, with its steps."""
+        return self.engine.objective
+
+    def validation(self, numbers: np.ndarray) -> Members:
+        """Return the members of the validation ensemble with these numbers."""
+        budget = self.tune.budget
+        return self.objective.chosen(seeds(budget)[1], numbers, budget.validation)
 
     @property
     def sampled(self) -> bool:
@@ -71,7 +74,7 @@ class TuningProblem:
         Adaptive RODAS3 or, on a processor, REFINEMENT times as many steps as in the search.
         """
         accurate = AdaptiveRodas3(REFERENCE_TOLERANCE)
-        return self._stepping(self._fine if self.sampled else accurate, lanes=REFERENCE_MEMBERS)
+        return self._stepping(self._fine if self.sampled else accurate, lanes=FEW)
 
     @functools.cached_property
     def judging(self) -> Engine:
@@ -105,6 +108,14 @@ class TuningProblem:
         """Description of the accurate steps, for the report."""
         return f"{REFINEMENT} times as many steps of the plant" if self.sampled else "adaptive RODAS3"
 
+    def refined(self) -> "TuningProblem":
+        """Return the problem with steps half as long. The count of rollouts is kept."""
+        finer = 2 * self.finer
+        method = method_for(self.case, self.tune.budget.substeps, finer)
+        engine = self._stepping(method, mode=self.engine.mode, threads=self.engine.threads)
+        engine.rollouts = self.engine.rollouts
+        return dataclasses.replace(self, engine=engine, finer=finer)
+
     def limited(self, limits: tuple[Limit, ...]) -> "TuningProblem":
         """Return the problem with these limits."""
         return dataclasses.replace(
@@ -124,7 +135,8 @@ class TuningProblem:
         others = (limit for limit in self.limits if limit.name != "rms_error_m")
         own = [dataclasses.replace(limit, multiplier=0.0, history=()) for limit in others]
         asked = min([factor * error_m, *(one.threshold for one in self.tune.limits.each if one.name == "rms_error_m")])
-        nearly = Limit("rms_error_m", asked, FRONT, KINDS["rms_error_m"].margin, multiplier=EXCHANGE)
+        # the first multiplier corresponds to 1.5 % more voltage for 1 % less error
+        nearly = Limit("rms_error_m", asked, FRONT, KINDS["rms_error_m"].margin, multiplier=3.0)
         limits = tuple(sorted([*own, nearly], key=lambda limit: limit.name))
         return dataclasses.replace(self, goal=goal).limited(limits)
 
@@ -147,9 +159,12 @@ class TuningProblem:
         scenario = self.objective.scenario
         if scenario.sensors.current_bits is None:
             return self.engine, self.reference
-        objective = dataclasses.replace(self.objective, scenario=scenario.with_sensor(bits=None, bits_i=None))
-        exact = dataclasses.replace(self, objective=objective)
-        return exact._stepping(objective.clock.integrator, lanes=REFERENCE_MEMBERS), exact.reference
+        exact = scenario.with_sensor(bits=None, bits_i=None)
+        ours, accurate = (
+            Engine(dataclasses.replace(one.objective, scenario=exact), settle=self.case.settle, lanes=FEW)
+            for one in (self.engine, self.reference)
+        )
+        return ours, accurate
 
 
 def method_for(case: Case, substeps: int, finer: int) -> Integrator:
@@ -164,15 +179,13 @@ def method_for(case: Case, substeps: int, finer: int) -> Integrator:
     return dataclasses.replace(method, substeps=finer * method.substeps)
 
 
-def problem_of(
-    case: Case, tune: Tune, *, finer: int = 1, threads: int | None = None, front: bool = False
-) -> TuningProblem:
+def problem_of(case: Case, tune: Tune, *, threads: int | None = None, front: bool = False) -> TuningProblem:
     """Return the tuning problem of a case.
 
-    `finer`: factor on the number of integration steps of the search (`method_for`). `threads`: number of cores; None:
-    all. `front`: whether to trace the front of error against voltage even if tune.objective does not need it.
+    `threads`: number of cores; None: all. `front`: whether to trace the front of error against voltage even if
+    tune.objective does not need it.
     """
-    clock = case.clock.with_method(method_for(case, tune.budget.substeps, finer))
+    clock = case.clock.with_method(method_for(case, tune.budget.substeps, 1))
     limits = tune.limits
     front = front or tune.objective == "knee"
     loop = _loop_range(case, limits.each)
@@ -188,12 +201,16 @@ def problem_of(
     goal = Goal(tune.weights, tune.risk, quantities=tuple(names))
     mode = cheaper_mode(len(tune.space), 1 + len(loss.measures))
     engine = Engine(objective, settle=case.settle, mode=mode, threads=threads)
-    return TuningProblem(case, tune, objective, engine, goal, box, finer, front=front).limited(limits.each)
+    return TuningProblem(case, tune, engine, goal, box, front=front).limited(limits.each)
 
 
 def cheaper_mode(gains: int, outcomes: int) -> str:
-    """Return "forward" or "reverse": the cheaper mode for the derivatives of `outcomes` quantities in `gains` gains."""
-    return "forward" if 1 + gains <= RERUN + SWEEP * outcomes else "reverse"
+    """Return "forward" or "reverse": the cheaper mode for the derivatives of `outcomes` quantities in `gains` gains.
+
+    A gradient costs 1 + m rollouts in forward mode for m gains, 5 + 4 q in reverse mode for q quantities
+    (benchmarks/schedules.py, gradients.py).
+    """
+    return "forward" if 1 + gains <= 5 + 4 * outcomes else "reverse"
 
 
 def _loop_range(case: Case, limits: tuple[Limit, ...]) -> LoopRange | None:

@@ -1,22 +1,31 @@
-"""The facts of a search: the record from which the verdict, the report and report.json derive."""
+"""The facts of a search: the record from which the verdict, the report and report.json derive.
+
+report.json also contains a checksum of all that its results depend on. By it, `--resume` finds that a search has ended,
+and does not judge its answer again.
+"""
 
 import dataclasses
+import json
 import math
+import pathlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+from ambjax.cases.reader import Case
+from ambjax.host.sealed import checksum_of, flat, provenance
+from ambjax.text.web_page import markdown_table
+from tuning.problem.config import Tune, settings
+from tuning.solve.checkpoint import has_unfinished_search
+
+KEY, TUNED = "record", "tuned.toml"
+# This file is written after the search. The search has ended if the file is newer than all checkpoints.
+REPORT = "report.json"
+# Verdict in tuned.toml until the gains are judged.
+NOT_JUDGED = "The tuned gains are not judged."
 # A row, or a nested table, of report.json.
 Row = dict[str, Any]
-# Metrics shown before and after; all others are in report.json.
-SUMMARY_METRICS = (
-    "settled_rms_error_m",
-    "settled_rms_error_worst_member_m",
-    "settled_max_abs_error_m",
-    "settled_rms_u_V.mean",
-    "max_abs_u_V.largest",
-    "max_abs_i_A.largest",
-    "chatter_V.mean",
-    "clearance_used.largest",
-)
+# A column of a table: the key of a row and the format of its number, or a function of the row.
+Column = tuple[str, str] | Callable[[Row], str]
 # Fields that report.json leaves out if they are None.
 OPTIONAL = ("front", "sensitivity", "stability")
 
@@ -26,16 +35,27 @@ def number(x: float | None, form: str = ".4g") -> str:
     return "-" if x is None or math.isnan(x) else format(x, form)
 
 
+def table(rows: Sequence[Row], columns: Mapping[str, Column]) -> str:
+    """Return a Markdown table of these rows. `columns`: by their heads."""
+
+    def cell(row: Row, column: Column) -> str:
+        if callable(column):
+            return column(row)
+        value = row[column[0]]
+        return (value or "-") if isinstance(value, str) else number(value, column[1])
+
+    cells = [[cell(row, column) for column in columns.values()] for row in rows]
+    return "\n".join(markdown_table(list(columns), cells))
+
+
 @dataclasses.dataclass(frozen=True)
 class TuningFacts:
     """What a search found. Each field is a key of report.json.
 
     `before`, `after`: the held-out members under the case's gains and the tuned ones. `refuted`: why accurate steps
-    contradict the answer; '' if they confirm it.
-    `stability`: of the held-out members with the largest settled errors (`ambjax.linear.Findings`); None if
-    no member was judged. `front`: of error against voltage; None if it was not traced. `front_written`: whether each of
-    its points has a case file. `sensitivity`: peaks of |S| of some held-out members; None if no limit needs it.
-    `next`: the next command, in words. `conditions` is empty if they could not be computed.
+    contradict the answer; '' if they confirm it. `stability`: of the held-out members with the largest settled errors
+    (`ambjax.linear.Findings`). `front_written`: whether each point of the front has a case file. `next`: the next
+    command, in words. What was not computed is None or empty.
     """
 
     case: str
@@ -72,3 +92,35 @@ class TuningFacts:
         """The content of report.json."""
         rows = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return {name: value for name, value in rows.items() if value is not None or name not in OPTIONAL}
+
+
+def search_facts(raw: dict[str, Any], case: Case, tune: Tune) -> Row:
+    """Return what a checkpoint must match: the case, [tune], and the contents of the other files of the case.
+
+    `raw`: content of the case file.
+    """
+    laws = {law.stage: law.digest for law in case.own_laws}
+    if case.controller_file:
+        laws["position"] = case.controller_file.contents.digest
+    laws |= {one.key: one.samples.digest for one in case.recorded}
+    return {"case": raw, "tune": settings(tune), "laws": laws}
+
+
+def record(facts: Row, folder: pathlib.Path) -> str:
+    """Return the SHA-256 of the facts, which include the options that add results, and of tuned.toml in `folder`."""
+    text = (folder / TUNED).read_text(encoding="utf-8")
+    return checksum_of(flat({**provenance(), **facts, "text": text}))
+
+
+def ended(facts: Row, out: pathlib.Path, names: Iterable[str]) -> Row | None:
+    """Return the content of report.json in `out` if a search with these facts (`record`) has ended there, else None.
+
+    `out` must still contain the files `names`, and tuned.toml as it was written.
+    """
+    try:
+        found = json.loads((out / REPORT).read_text(encoding="utf-8"))
+        same = found[KEY] == record(facts, out)
+    except (OSError, ValueError, KeyError, TypeError):  # there is no such record
+        return None
+    whole = same and all((out / name).exists() for name in names)
+    return found if whole and not has_unfinished_search(out, REPORT) else None

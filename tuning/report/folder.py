@@ -5,7 +5,6 @@ import pathlib
 import tomllib
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.reader import Case, case_from
@@ -21,8 +20,7 @@ from tuning.problem.space import Gain, Space, tunable
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.report import document as report
 from tuning.report import front_table, pictures
-from tuning.report.facts import Row, TuningFacts
-from tuning.report.record import TUNED
+from tuning.report.facts import TUNED, Row, TuningFacts
 from tuning.report.tuned import tuned_case
 from tuning.solve.course import SearchResult
 
@@ -33,12 +31,9 @@ def put_answer(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, verd
     The text of tuned.toml is read back first, to check that it is a valid case. `verdict`: first lines of the file.
     `out`: the folder to which the caller moves the files.
     """
-    problem = answer.problem
-    history: dict[str, Any] = answer.history
+    problem, history = answer.problem, dict[str, Any](answer.history)
     np.savez(part / "history.npz", **history)
-    gains = np.asarray(problem.objective.space.gains_at(jnp.asarray(answer.x))).tolist()
-    after = dict(zip(problem.objective.space.paths, gains, strict=True))
-    text, tuned = tuned_case(problem.case, all_laws(problem, after), verdict, out)
+    text, tuned = tuned_case(problem.case, all_laws(problem, problem.objective.space.named(answer.x)), verdict, out)
     (part / TUNED).write_text(text, encoding="utf-8")
     return tuned
 
@@ -82,11 +77,11 @@ def _pictures(problem: TuningProblem, tuned: Cascade, history: Any, front: list[
     """
     paths, settle = problem.objective.space.paths, problem.case.settle
     runs = {"before": problem.case.cascade, "after": tuned}
-    shown = {}
-    for name, cascade in runs.items():
-        run = described(f"the run {name} tuning", functools.partial(nominal, problem, cascade))
-        if run is not None:
-            shown[name] = run
+    found = {
+        name: described(f"the run {name} tuning", functools.partial(nominal, problem, cascade))
+        for name, cascade in runs.items()
+    }
+    shown = {name: run for name, run in found.items() if run is not None}
     draw = {"convergence.png": lambda: pictures.convergence(history, paths)}
     for name, run in shown.items():
         draw[f"{name}.png"] = functools.partial(pictures.nominal, run, f"{name} tuning", settle)

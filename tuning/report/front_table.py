@@ -1,11 +1,9 @@
 """The front of error against voltage in the report: its points, the selected answer, and the case files."""
 
-import jax.numpy as jnp
 import numpy as np
 
-from ambjax.text.web_page import markdown_table
 from tuning.front import KNEE, FrontPoint
-from tuning.report.facts import Row
+from tuning.report.facts import Column, Row, table
 from tuning.solve.course import SearchResult
 
 TITLE = "Error against voltage"
@@ -13,22 +11,16 @@ TITLE = "Error against voltage"
 
 def facts(answer: SearchResult) -> list[Row]:
     """Return a row for each point of the front, in order of its error limit; `taken`: whether it is the answer."""
-    space = answer.problem.objective.space
-    names = _names(answer.front)
+    same = ("sensitivity", "lost", "stalled", "members")
     return [
-        {
-            "factor": point.factor,
-            "settled_rms_error_m": point.error_m,
-            "settled_rms_u_V": point.volts,
-            "sensitivity": point.sensitivity,
-            "lost": point.lost,
-            "stalled": point.stalled,
-            "members": point.members,
+        {"factor": point.factor, "settled_rms_error_m": point.error_m, "settled_rms_u_V": point.volts}
+        | {name: getattr(point, name) for name in same}
+        | {
             "taken": bool(np.array_equal(point.x, answer.x)),
             "file": name,
-            "gains": dict(zip(space.paths, np.asarray(space.gains_at(jnp.asarray(point.x))).tolist(), strict=True)),
+            "gains": answer.problem.objective.space.named(point.x),
         }
-        for point, name in zip(answer.front, names, strict=True)
+        for point, name in zip(answer.front, _names(answer.front), strict=True)
     ]
 
 
@@ -67,34 +59,19 @@ def section(rows: list[Row] | None, written: bool) -> list[str]:
     """Return the section on the front. `written`: whether each point has a case file."""
     if not rows:
         return []
-    files = ["case file"] if written else []
-    cells = [
-        [
-            letter(n),
-            "least" if row["factor"] == 1 else f"{row['factor']:g} times the least",
-            f"{row['settled_rms_error_m']:.3g}",
-            f"{row['settled_rms_u_V']:.4g}",
-            "-" if row["sensitivity"] is None else f"{row['sensitivity']:.3g}",
-            f"{row['lost'] + row['stalled']} of {row['members']}",
-            "**selected**" if row["taken"] else "-",
-            *([f"`{row['file']}`"] if written else []),
-        ]
-        for n, row in enumerate(rows)
-    ]
-    head = [
-        "point",
-        "error limit",
-        "settled rms error (m)",
-        "settled rms u (V)",
-        "peak of \\|S\\|",
-        "lost",
-        "answer",
-        *files,
-    ]
+    columns: dict[str, Column] = {
+        "point": lambda row: letter(rows.index(row)),
+        "error limit": lambda row: "least" if row["factor"] == 1 else f"{row['factor']:g} times the least",
+        "settled rms error (m)": lambda row: f"{row['settled_rms_error_m']:.3g}",
+        "settled rms u (V)": lambda row: f"{row['settled_rms_u_V']:.4g}",
+        "peak of |S|": ("sensitivity", ".3g"),
+        "lost": lambda row: f"{row['lost'] + row['stalled']} of {row['members']}",
+        "answer": lambda row: "**selected**" if row["taken"] else "-",
+    }
+    files: dict[str, Column] = {"case file": lambda row: f"`{row['file']}`"} if written else {}
     words = (
-        "The least rms voltage for each limit of the settled rms error, within the other limits. The values are those "
-        "of members of the validation ensemble. If a sign is set-valued, the peak is the injected one. Only the "
-        "selected answer is judged on the held-out members."
+        "The least rms voltage for each limit of the settled rms error, within the other limits, on members of the "
+        "validation ensemble. Only the selected answer is judged on the held-out members."
     )
     picture = "![Error against voltage; the selected answer is the filled point](front.png)"
-    return [f"## {TITLE}", "", *markdown_table(head, cells), "", words, "", picture, ""]
+    return [f"## {TITLE}", table(rows, columns | files), words, picture]

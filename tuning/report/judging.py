@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,19 +12,17 @@ from ambjax.theorem.advice import advice as on_conditions
 from ambjax.theorem.conditions import Report as Check
 from ambjax.theorem.conditions import check
 from tuning.events import Tell
-from tuning.judge.evaluate import describe, held, judge, step_error, summarise, worst, worst_of
-from tuning.judge.late import delay_test
-from tuning.judge.peaks import injections
+from tuning.judge.evaluate import JudgedMembers, describe, held, judge, step_error, summarise, worst_of
+from tuning.judge.peaks import delay_test, injections
 from tuning.problem.config import seeds, settings
-from tuning.problem.members import Members
-from tuning.problem.tuning_problem import REFERENCE_MEMBERS, TuningProblem
+from tuning.problem.members import FEW, Members
+from tuning.problem.tuning_problem import TuningProblem
 from tuning.report import front_table, limit_table, outcome, sensitivity_table
 from tuning.report.facts import Row, TuningFacts
 from tuning.solve.course import SearchResult
 
-# Change of a coordinate for the sensitivity of a gain.
-STEP = 0.25
-# Fields on the conditions of Theorem 1 if they cannot be computed.
+# The summary of no members, and the fields on the conditions of Theorem 1 if they cannot be computed.
+NO_MEMBERS: Row = {"members": 0, "held": 0, "lost": 0, "stalled": 0}
 NO_CONDITIONS: Row = {"conditions": [], "advice_on_conditions": []}
 
 
@@ -37,14 +34,16 @@ def examined(answer: SearchResult, front_written: bool, tell: Tell) -> TuningFac
     """
     problem, x, members = answer.problem, answer.x, answer.members
     held_out, rollouts = seeds(problem.tune.budget)[2], problem.engine.rollouts
-    judged = _judged(problem, x, held_out, tell)
-    steps = _steps(answer, judged["after"], held_out, tell)
+    before, after = _judged(problem, x, held_out, tell)
+    steps = _steps(answer, after, tell)
     found = {
         "case": problem.case.name,
         "held_out_seed": held_out,
         "trained_on": len(members.member),
         "lost_in_validation": answer.lost,
-        **_ensembles(answer, judged, steps["refuted"], held_out, tell),
+        "before": summarise(before.columns) if before.columns else NO_MEMBERS,
+        **_held_out(after, steps["refuted"], tell),
+        "lost_in_training": int((problem.engine.terms(x[None], members)["survival"] > 0).sum()),
         **steps,
         **(described("the conditions of Theorem 1", lambda: _conditions(problem, x)) or NO_CONDITIONS),
         "search": settings(problem.tune)
@@ -61,67 +60,57 @@ def examined(answer: SearchResult, front_written: bool, tell: Tell) -> TuningFac
     return dataclasses.replace(facts, verdict=verdict, advice=advice, next=outcome.next_command(problem))
 
 
-def _judged(problem: TuningProblem, x: np.ndarray, held_out: int, tell: Tell) -> dict[str, dict[str, np.ndarray]]:
-    """Return the metrics of the held-out members [N] with the gains of the case (`before`) and at x [m] (`after`).
+def _judged(problem: TuningProblem, x: np.ndarray, held_out: int, tell: Tell) -> list[JudgedMembers]:
+    """Return the held-out members with the gains of the case and at x [m]; without columns if there are no members.
 
-    Gains of the case that are outside their bounds, or close to a bound, are clipped. Both results are empty if there
-    are no held-out members.
-    `held_out`: seed of these members.
+    Gains of the case that are outside their bounds, or close to a bound, are clipped. `held_out`: seed of the members.
     """
     space, count = problem.objective.space, problem.tune.budget.held_out
     tell(f"judging on {count} held-out members")
     start = space.encode(space.clip(space.values(problem.case.cascade)))
+    return [
+        JudgedMembers(problem, at, held_out, judge(problem, at, held_out, count) if count else {}) for at in (start, x)
+    ]
+
+
+def _held_out(after: JudgedMembers, refuted: str, tell: Tell) -> Row:
+    """Return the fields on the held-out members. `refuted`: why accurate steps do not confirm the answer, or ''."""
+    problem, columns = after.problem, after.columns
+    if not columns:
+        none = dict.fromkeys(("worst_member", "stability", "sensitivity"))
+        return none | {"after": NO_MEMBERS, "limits": limit_table.facts(problem, columns, NO_MEMBERS, refuted)}
+    tell("the sensitivity of the held-out members")
+    injected, summary = injections(after), summarise(columns)
+    unverified = dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
     return {
-        name: judge(problem, at, held_out, count) if count else {} for name, at in (("before", start), ("after", x))
+        "sensitivity": injected and sensitivity_table.facts(problem, injected),
+        "limits": limit_table.facts(problem, columns, summary, refuted, injected, delay_test(after)),
+        "after": summary | (unverified if refuted else {}),
+        "worst_member": described("the worst member", after.worst),
+        "stability": _stability(after, tell),
     }
 
 
-def _ensembles(answer: SearchResult, judged: dict[str, Any], refuted: str, held_out: int, tell: Tell) -> Row:
-    """Return the fields on the training members and on the held-out members.
-
-    `judged`: from `_judged`. `refuted`: why accurate steps do not confirm the answer; '' if they do. `held_out`: seed
-    of the held-out members.
-    """
-    problem = answer.problem
-    none = {"members": 0, "held": 0, "lost": 0, "stalled": 0}
-    found: Row = {name: summarise(one) if one else dict(none) for name, one in judged.items()}
-    after = judged["after"]
-    tell("the sensitivity of the held-out members")
-    injected = injections(problem, answer.x, held_out, after) if after else None
-    found["sensitivity"] = None if injected is None else sensitivity_table.facts(problem, injected)
-    late = delay_test(problem, answer.x, held_out, after) if after else None
-    found["limits"] = limit_table.facts(problem, after, found["after"], refuted, injected, late)
-    if refuted and after:
-        found["after"] |= dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
-    found["worst_member"] = described("the worst member", lambda: worst(problem, after, held_out)) if after else None
-    found["stability"] = _stability(problem, answer.x, held_out, after, tell) if after else None
-    lost = problem.engine.terms(answer.x[None], answer.members)["survival"] > 0
-    return found | {"lost_in_training": int(lost.sum())}
-
-
-def _stability(problem: TuningProblem, x: np.ndarray, seed: int, columns: dict[str, np.ndarray], tell: Tell) -> Row:
+def _stability(of: JudgedMembers, tell: Tell) -> Row:
     """Return whether the loops of the held members with the largest settled errors are stable (`linear.Findings`)."""
-    index = suspects(columns["settled_max_abs_error_m"], held(columns))
+    problem, index = of.problem, suspects(of.columns["settled_max_abs_error_m"], held(of.columns))
     if not index.size:
         return Findings(0, 0)._asdict()
     tell(f"testing whether the loops of {index.size} held-out members are stable")
-    members = problem.objective.chosen(seed, index, len(columns["lost_at_s"]))
     # in continuous time, the step of the case may be too coarse for these gains
     clock = problem.case.clock if problem.sampled else problem.case.clock.with_method(None)
-    return stability_of(*problem.objective.fixed(x, members), clock).findings()._asdict()
+    return stability_of(*problem.objective.fixed(of.x, of.chosen(index)), clock).findings()._asdict()
 
 
-def _steps(answer: SearchResult, judged: dict[str, np.ndarray], held_out: int, tell: Tell) -> Row:
-    """Return the fields on the errors of the steps.
+def _steps(answer: SearchResult, of: JudgedMembers, tell: Tell) -> Row:
+    """Return the fields on the errors of the steps. `of`: the held-out members.
 
-    In continuous time, the worst and the first of the held-out members are simulated again with accurate steps.
-    `judged`: metrics of these members [N]; empty if there are none. `held_out`: their seed.
+    In continuous time, the worst and the first of them are simulated again with accurate steps.
     """
     problem, error = answer.problem, None
-    if judged and not problem.sampled and answer.confirmed and (alive := np.flatnonzero(held(judged))).size:
-        worst = alive[worst_of(judged["settled_max_abs_error_m"][alive])]
-        those = np.union1d(worst, alive[:REFERENCE_MEMBERS])
-        error = step_error(problem, answer.x, problem.objective.chosen(held_out, those, len(judged["lost_at_s"])))
+    if of.columns and not problem.sampled and answer.confirmed and (alive := of.held).size:
+        worst = alive[worst_of(of.columns["settled_max_abs_error_m"][alive])]
+        error = step_error(problem, answer.x, of.chosen(np.union1d(worst, alive[:FEW])))
         tell(f"accurate steps on the worst and the first of them: {describe(error)}")
     refuted = (error or answer.error).refuted if answer.error else "every member that it was tuned on is lost"
     confirmed = "; ".join(f"accurate steps: {describe(one)}" for one in (error, answer.error) if one)
@@ -146,12 +135,12 @@ def _conditions(problem: TuningProblem, x: np.ndarray) -> Row:
 
 
 def changed_gains(problem: TuningProblem, x: np.ndarray, members: Members) -> tuple[np.ndarray, np.ndarray]:
-    """Return the effect of a change of one gain, up or down by about e^STEP, whichever is worse, by gain [m].
+    """Return the effect of a change of one gain, up or down by about e^0.25, whichever is worse, by gain [m].
 
     The first array is the increase of the risk of least error in per cent, the second the number of members that are
     also lost. The loss of a rotor costs about 1e6 times as much as an error, so the risk has no meaning then.
     """
-    steps = STEP * np.eye(len(x))
+    steps = 0.25 * np.eye(len(x))
     at = x + np.concatenate([np.zeros((1, len(x))), steps, -steps])
     terms = problem.engine.terms(at, members)
     risk, lost = problem.error_goal.score(terms, members), (terms["survival"] > 0).sum(axis=1)

@@ -1,16 +1,15 @@
 """Limits in the report: allowed and reached values, verdicts, and the effect of a limit that is 10 % looser."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from ambjax.text.web_page import markdown_table
-from tuning.judge.late import DELAY_MARGIN, DelayTest, not_simulated
-from tuning.judge.peaks import BY_INJECTION, Sensitivity, reached_of
+from tuning.judge.peaks import BY_INJECTION, DELAY_MARGIN, DelayTest, Sensitivity, not_simulated, reached_of
 from tuning.problem.limits import FRONT, Limit
 from tuning.problem.quantities import Kind
 from tuning.problem.tuning_problem import TuningProblem
-from tuning.report.facts import Row
+from tuning.report.facts import Column, Row, table
 
 # Share by which a limit is loosened to compute the effect.
 MORE = 0.1
@@ -22,15 +21,13 @@ EMPHASISED = (BROKEN, UNVERIFIED)
 
 def facts(
     problem: TuningProblem,
-    columns: dict[str, np.ndarray],
+    columns: Mapping[str, np.ndarray],
     summary: Row,
     refuted: str = "",
     injected: Sensitivity | None = None,
     delayed: DelayTest | None = None,
 ) -> list[Row]:
     """Return a row for each limit and one for survival, from the held-out members' columns [N] and their summary.
-
-    A limit that cannot be broken has a row without a value reached.
 
     `refuted`: why accurate steps do not confirm the answer; '' if they do. `injected`: the injections into some of the
     held-out members. `delayed`: the test of the limit on the delay margin. Fields of a row:
@@ -42,21 +39,32 @@ def facts(
       limit is not active.
     """
     members, held, settings = summary["members"], summary["held"], problem.tune.limits
-    price_unit = "V" if problem.goal.minimised else "m"
-    rows = [
-        _tested(
-            _row(limit, columns, summary, refuted, injected, price_unit),
-            delayed, refuted, not_simulated(problem, limit) if limit.name == DELAY_MARGIN else "",
-        )
-        for limit in _asked(problem)
-    ]  # fmt: skip
+    unit, minimised = ("V", "settled_rms_u_V.mean") if problem.goal.minimised else ("m", "settled_rms_error_m")
+    rows = list[Row]()
+    for limit in _asked(problem):
+        reached = reached_of(limit, columns, injected) if held else None
+        found = _verdict((reached is not None and limit.holds(reached)) if members else None, refuted)
+        active = limit.active(reached)
+        price = summary[minimised] * limit.error_reduction(MORE) if active and held else 0.0
+        row = _blank(limit.name, limit.threshold, unit, limit.kind, source=limit.source, **found)
+        row |= {
+            "what": row["what"] + _by_injection(limit, injected),
+            "saturated": _saturated(limit, reached, injected),
+            "reached": reached,
+            "worst": limit.worst(columns) if held and limit.kind.fold else reached,
+            "margin": limit.margin,
+            "active": active,
+            "multiplier": limit.multiplier,
+            "price": price if found["held"] else None,
+        }
+        reason = not_simulated(problem, limit) if limit.name == DELAY_MARGIN else ""
+        rows.append(_tested(row, delayed, refuted, reason))
     for limit, why in settings.unbreakable:
-        source = f"{limit.source}; {UNBREAKABLE}: {why}"
-        rows.append(_blank(limit.name, limit.threshold, price_unit, limit.kind, source=source, verdict=UNBREAKABLE))
-        rows[-1]["held"] = True
+        found = {"source": f"{limit.source}; {UNBREAKABLE}: {why}", "verdict": UNBREAKABLE, "held": True}
+        rows.append(_blank(limit.name, limit.threshold, unit, limit.kind, **found))
     share = held / members if members else None
-    kept = None if share is None else members - held <= settings.may_lose(members)
-    survival = _blank("survival", settings.survival, price_unit, reached=share, at_least=True)
+    kept = members - held <= settings.may_lose(members) if members else None
+    survival = _blank("survival", settings.survival, unit, reached=share, at_least=True)
     return [*rows, survival | _verdict(kept, refuted)]
 
 
@@ -66,7 +74,7 @@ def _blank(name: str, threshold: float, price_unit: str, kind: Kind | None = Non
         "name": name,
         "unit": kind.unit if kind else "",
         "threshold": threshold,
-        "at_least": False,
+        "at_least": kind.at_least if kind else False,
         "source": "tune.limits",
         "what": f"{kind.words}; {kind.over}" if kind else "share of members held",
         **dict.fromkeys(("reached", "worst", "multiplier", "price")),
@@ -88,34 +96,6 @@ def _verdict(kept: bool | None, refuted: str) -> Row:
     return {"held": None, "verdict": UNVERIFIED} if refuted else {"held": True, "verdict": HELD}
 
 
-def _row(
-    limit: Limit,
-    columns: dict[str, np.ndarray],
-    summary: Row,
-    refuted: str,
-    injected: Sensitivity | None,
-    price_unit: str,
-) -> Row:
-    judged = summary["held"] > 0
-    reached = reached_of(limit, columns, injected) if judged else None
-    kept = limit.holds(reached) if reached is not None else False if summary["members"] else None
-    active, found = limit.active(reached), _verdict(kept, refuted)
-    minimised = {"m": "settled_rms_error_m", "V": "settled_rms_u_V.mean"}[price_unit]
-    price = summary[minimised] * limit.error_reduction(MORE) if active and judged else 0.0
-    row = _blank(limit.name, limit.threshold, price_unit, limit.kind, source=limit.source, **found)
-    return row | {
-        "at_least": limit.kind.at_least,
-        "what": row["what"] + _by_injection(limit, injected),
-        "saturated": _saturated(limit, reached, injected),
-        "reached": reached,
-        "worst": reached if limit.kind.fold is None or not judged else limit.worst(columns),
-        "margin": limit.margin,
-        "active": active,
-        "multiplier": limit.multiplier,
-        "price": price if found["held"] else None,
-    }
-
-
 def _tested(row: Row, delayed: DelayTest | None, refuted: str, reason: str = "") -> Row:
     """Return the row of the delay margin with the result of its test; any other row unchanged.
 
@@ -123,14 +103,15 @@ def _tested(row: Row, delayed: DelayTest | None, refuted: str, reason: str = "")
     """
     if row["name"] != DELAY_MARGIN or (delayed is None and not reason):
         return row
-    words = f"the linear margins decide, because {reason}: the additional delay was not simulated"
-    if delayed is not None:
+    if delayed is None:
+        words = f"the linear margins decide, because {reason}: the additional delay was not simulated"
+    else:
         words = (
             f"with this additional delay {delayed.lost} of {delayed.members} of the worst members are lost, and "
             f"{delayed.unstable} held but not stable"
         )
-    fails = delayed is not None and delayed.fails
-    return row | {"what": f"{row['what']}; {words}"} | (_verdict(False, refuted) | {"price": None} if fails else {})
+    fails = _verdict(False, refuted) | {"price": None} if delayed and delayed.fails else {}
+    return row | {"what": f"{row['what']}; {words}"} | fails
 
 
 def _asked(problem: TuningProblem) -> list[Limit]:
@@ -191,7 +172,7 @@ def section(rows: list[Row]) -> list[str]:
     """Return the section on limits."""
     if not rows:
         return []
-    columns = {
+    columns: dict[str, Column] = {
         "quantity": lambda row: f"`{row['name']}`",
         "limit": lambda row: f"{_side(row)} {row['threshold']:g} {row['unit']}".rstrip(),
         "reached": lambda row: _number(row["reached"], row),
@@ -202,14 +183,12 @@ def section(rows: list[Row]) -> list[str]:
             "-" if row["price"] is None else f"{row['price']:.2g} {row['price_unit']}"
         ),
     }
-    table = markdown_table(list(columns), [[column(row) for column in columns.values()] for row in rows])
-    sources = [f"- {row['name']}: {row['what']}. Source: {row['source']}." for row in rows]
+    sources = "\n".join(f"- {row['name']}: {row['what']}. Source: {row['source']}." for row in rows)
     words = (
-        "The values are those of the held-out members that are held. The last column shows by how much the minimised "
-        f"settled rms error or voltage would decrease if the limit were {100 * MORE:g} % looser. It is estimated from "
-        "the Lagrange multipliers of the optima along the search."
+        "The values are those of the held-out members that are held. Last column: estimated decrease of the minimised "
+        f"settled rms error or voltage if the limit were {100 * MORE:g} % looser."
     )
-    return ["## Limits", "", *table, "", *sources, "", words, ""]
+    return ["## Limits", table(rows, columns), sources, words]
 
 
 def _side(row: Row) -> str:

@@ -1,7 +1,6 @@
 """The outcome of tuning, which determines the exit code, the log and the reports; and the advice if it is not good."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -90,8 +89,8 @@ def outcome_of(facts: TuningFacts, may_lose: int) -> TuningOutcome:
     after, limits = facts.after, {row["name"]: row["verdict"] for row in facts.limits}
     if not after["members"]:
         return TuningOutcome(facts.trained_on, facts.lost_in_training, 0, 0, limits, facts.refuted)
-    found = (facts.stability or {}).get("tested", 0), (facts.stability or {}).get("unstable", 0)
-    return TuningOutcome(after["members"], after["lost"], after["stalled"], may_lose, limits, facts.refuted, *found)
+    tested = {name: (facts.stability or {}).get(name, 0) for name in ("tested", "unstable")}
+    return TuningOutcome(after["members"], after["lost"], after["stalled"], may_lose, limits, facts.refuted, **tested)
 
 
 def verdict(facts: TuningFacts) -> str:
@@ -100,21 +99,22 @@ def verdict(facts: TuningFacts) -> str:
 
 
 def answer(facts: TuningFacts) -> dict[str, str]:
-    """Return the answer by label: held or not, error and voltage, sensitivity, limits.
-
-    An entry that cannot be computed is absent.
-    """
-    entries: dict[str, Callable[[TuningFacts], tuple[str, str]]] = {
-        "held": _held,
-        "error": _sizes,
-        "sensitivity": lambda facts: ("Sensitivity", sensitivity_table.line(facts.sensitivity)),
-        "limits": _limiting,
+    """Return the answer by label. An entry that cannot be computed is absent."""
+    entries: dict[str, Callable[[], str]] = {
+        _label(facts): lambda: _held(facts),
+        "Error and voltage": lambda: _sizes(facts),
+        "Sensitivity": lambda: sensitivity_table.line(facts.sensitivity),
+        "Limited by": lambda: _limiting(facts),
     }
-    found = [described(f"the line on the {name}", functools.partial(entry, facts)) for name, entry in entries.items()]
-    return dict(one for one in found if one)
+    found = {label: described(f"the line '{label}'", entry) for label, entry in entries.items()}
+    return {label: text for label, text in found.items() if text}
 
 
-def _held(facts: TuningFacts) -> tuple[str, str]:
+def _label(facts: TuningFacts) -> str:
+    return "NOT held" if not facts.outcome["rotors_held"] else "Not verified" if facts.refuted else "Held"
+
+
+def _held(facts: TuningFacts) -> str:
     """Return the entry on the rotors that are held."""
     outcome, after = facts.outcome, facts.after
     which = "held-out members" if after["members"] else "training members"
@@ -126,17 +126,16 @@ def _held(facts: TuningFacts) -> tuple[str, str]:
         words += f", {outcome['stalled']} not decided (their integration stalls)"
     tested = "" if facts.stability is None else Findings(**facts.stability).words()
     refuted = f"This result is {UNVERIFIED.upper()}: {facts.refuted}." if facts.refuted else ""
-    label = "NOT held" if not outcome["rotors_held"] else "Not verified" if facts.refuted else "Held"
-    return label, " ".join(filter(None, [f"{words}.", tested, refuted]))
+    return " ".join(filter(None, [f"{words}.", tested, refuted]))
 
 
-def _sizes(facts: TuningFacts) -> tuple[str, str]:
+def _sizes(facts: TuningFacts) -> str:
     """Return the entry on the error and the voltage after tuning, and before it."""
-    label, after, before = "Error and voltage", facts.after, facts.before
+    after, before = facts.after, facts.before
     if not after["members"]:
-        return label, "not measured on held-out members (tune.held_out = 0)."
+        return "not measured on held-out members (tune.held_out = 0)."
     if not after["held"]:
-        return label, "no held-out member is held."
+        return "no held-out member is held."
 
     def change(name: str, unit: str) -> str:
         was = f" (before: {before[name]:.3g})" if before["held"] else ""
@@ -147,10 +146,10 @@ def _sizes(facts: TuningFacts) -> tuple[str, str]:
         f"{change('settled_rms_error_m', 'm')}, largest {after['settled_max_abs_error_m']:.3g} m; "
         f"{change('settled_rms_u_V.mean', 'V')}{'' if most is None else f', largest {most:.3g} V'}."
     )
-    return label, " ".join(filter(None, [words, front_table.sentence(facts.front or [])]))
+    return " ".join(filter(None, [words, front_table.sentence(facts.front or [])]))
 
 
-def _limiting(facts: TuningFacts) -> tuple[str, str]:
+def _limiting(facts: TuningFacts) -> str:
     """Return the entry on the limits that are not held or active, on gains at a bound, and on sensitive gains."""
     words = [*broken(facts.limits), *prices(facts.limits)]
     if ends := [f"{row['path']} = {row['after']:.4g} ({row['at_bound']})" for row in facts.gains if row["at_bound"]]:
@@ -164,9 +163,9 @@ def _limiting(facts: TuningFacts) -> tuple[str, str]:
         f"if {row['path']} changes by a factor of 1.28, {row['sensitivity_lost']} of {facts.trained_on} training "
         "members are also lost"
         for row in facts.gains
-        if row.get("sensitivity_lost")
+        if row["sensitivity_lost"]
     ]
-    return "Limited by", f"{'; '.join(words)}."
+    return f"{'; '.join(words)}."
 
 
 def remedies(
@@ -195,9 +194,9 @@ def remedies(
     if outcome.stalled:
         remedy = STALLED_PLANT if problem.sampled else STALLED
         words.append(f"Not decided: {outcome.stalled} held-out members, whose integration stalls. {remedy}")
-    return " ".join(
-        [*words, *(_causes_of_loss(problem, facts, x, members) if not outcome.rotors_held and outcome.lost else [])]
-    )
+    if not outcome.rotors_held and outcome.lost:
+        words += _causes_of_loss(problem, facts, x, members)
+    return " ".join(words)
 
 
 def next_command(problem: TuningProblem) -> str:
@@ -225,8 +224,7 @@ def _causes_of_loss(problem: TuningProblem, facts: TuningFacts, x: np.ndarray, m
             f"The voltage is at {100 * np.sqrt(effort):.0f} % of its limit (rms), a possible cause, not tested: try "
             f"a supply above {u_max:g} V, less sensor noise, or an observer that attenuates it more."
         )
-    bound = [row["path"] for row in facts.gains if row["at_bound"]]
-    if bound:
+    if bound := [row["path"] for row in facts.gains if row["at_bound"]]:
         words.append(f"Gains at a bound, also a possible cause: {', '.join(bound)}; widen tune.bounds.")
     return [
         *words,

@@ -14,11 +14,8 @@ from ambjax.simulation.trajectory import ALIVE, STALLED, Trajectory
 from tuning.problem.goal import shown
 from tuning.report.front_table import letter
 
-# Largest plotted goal, relative to the least. A lost member raises the goal by about 1e6, and violated limits by up to
-# 1e300, which would hide the other values.
-HIGHEST = 30.0
-# FAINTEST: smallest plotted amplitude, as a share of the largest. FEWEST: smallest number of samples of a spectrum.
-FAINTEST, FEWEST = 1e-5, 16
+# Smallest number of samples of a spectrum.
+FEWEST = 16
 
 
 @own_style
@@ -40,7 +37,7 @@ def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
         ax.plot(frequency, amplitude, color=ORANGE if name == "before" else BLUE, lw=0.8, label=label)
         top = max(top, amplitude.max(initial=0.0))
     ax.set(xlabel="frequency (Hz)", ylabel="amplitude of u (V)", xscale="log", yscale="log")
-    ax.set_ylim(FAINTEST * (top or 1.0), 2 * (top or 1.0))
+    ax.set_ylim(1e-5 * (top or 1.0), 2 * (top or 1.0))
     ax.grid(alpha=0.3, which="both")
     ax.legend(fontsize=8)
     return _png(figure)
@@ -69,9 +66,10 @@ def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     steps = np.arange(1, len(value) + 1)
-    cut = np.minimum(value, value.min() + np.log(HIGHEST))
+    # a lost member raises the goal by about 1e6, and violated limits by up to 1e300, which would hide other values
+    cut = np.minimum(value, value.min() + np.log(30))
     left.plot(steps, shown(cut))
-    label = "objective" if (cut == value).all() else f"objective (cut at {HIGHEST:g} times the least)"
+    label = "objective" if (cut == value).all() else "objective (cut at 30 times the least)"
     left.set(xlabel="iteration", ylabel=label, yscale="log", title="dotted: the training ensemble changes")
     right.plot(steps, gains / gains[-1], label=[path.removeprefix("controller.") for path in paths])
     right.set(xlabel="iteration", ylabel="gain / its final value", yscale="log", title="gains of the best point")

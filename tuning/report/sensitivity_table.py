@@ -3,10 +3,10 @@
 import dataclasses
 
 from ambjax.linear.stability import MOST_TESTED
-from ambjax.text.web_page import escape_markdown, markdown_table
+from ambjax.text.web_page import escape_markdown
 from tuning.judge.peaks import Sensitivity, injects
 from tuning.problem.tuning_problem import TuningProblem
-from tuning.report.facts import Row, number
+from tuning.report.facts import Column, Row, number, table
 
 # Text in place of the linear peak of a loop without one, by its zone.
 NO_PEAK = {"D": "unstable", None: "not computed"}
@@ -66,47 +66,41 @@ def section(found: Row | None) -> list[str]:
     """Return the section on the sensitivity."""
     if found is None:
         return []
-    cells = [
-        [
-            str(row["member"]),
-            *([number(row["linear"]), number(row["frequency_hz"])] if row["linear"] else [NO_PEAK[row["zone"]], "-"]),
-            row["zone"] or "-",
-            *(_injected(row) if found["injected"] else []),
-        ]
-        for row in found["members"]
-    ]
-    head = ["member", "linear peak of |S|", "at (Hz)", "zone"]
-    if found["injected"]:
-        head += ["injected peak", "95 % interval", "at (Hz)", "zone", "saturated"]
+    columns: dict[str, Column] = {
+        "member": lambda row: str(row["member"]),
+        "linear peak of |S|": lambda row: number(row["linear"]) if row["linear"] else NO_PEAK[row["zone"]],
+        "at (Hz)": ("frequency_hz", ".4g"),
+        "zone": lambda row: row["zone"] or "-",
+    }
+    injected: dict[str, Column] = {
+        "injected peak": lambda row: (
+            f"lost: {row['lost']} of {row['repetitions']}" if row["lost"] else number(row["peak"])
+        ),
+        "95 % interval": lambda row: "-" if _hidden(row, "low") else f"{row['low']:.4g} to {row['high']:.4g}",
+        "its frequency (Hz)": lambda row: "-" if _hidden(row, "at_hz") else number(row["at_hz"]),
+        "its zone": lambda row: row["injected_zone"] or "-",
+        "saturated": lambda row: "-" if _hidden(row, "saturated") else f"{100 * row['saturated']:.2g} %",
+    }
     a, b, c = found["zones"]
-    which = "The held-out members with the largest linear peaks."
+    words = [f"Zone A is below {a:g}, B below {b:g}, C below {c:g}."]
     if found["decides"]:
-        which = f"The members with the largest peaks, by one injection into each of up to {MOST_TESTED} members."
-    words = [f"{which} Zone A is below {a:g}, B below {b:g}, C below {c:g}."]
-    if found["decides"]:
-        words.append("A sign is set-valued: the injected peak decides, because no linear loop describes chattering.")
-    elif found["injected"]:
-        words.append("The larger of the linear and the injected peak decides.")
-    else:
         words.append(
-            "In continuous time the linear peak decides. `ambjax sensitivity --inject` measures the peak in a "
-            "simulation."
+            f"The members are those with the largest peaks by one injection into each of up to {MOST_TESTED} members. "
+            "A sign is set-valued: the injected peak decides, because no linear loop describes chattering."
         )
+    else:
+        words.append("The members are those with the largest linear peaks.")
+        words.append(f"The {'larger of the linear and the injected' if found['injected'] else 'linear'} peak decides.")
     if any(row["saturated"] for row in found["members"]):
         words.append(
-            "The supply limits the voltage during the injection, so the injected peak describes the limited loop. A "
-            "smaller `sensitivity.amplitude` measures the loop without this limit."
+            "The supply limits the voltage during the injection. A smaller `sensitivity.amplitude` measures the loop "
+            "without this limit."
         )
     unknown = [f"- Member {row['member']}: {escape_markdown(row['why'])}." for row in found["members"] if row["why"]]
-    unknown += [""] * bool(unknown)
-    return ["## Sensitivity", "", *markdown_table(head, cells), "", *unknown, " ".join(words), ""]
+    cells = table(found["members"], columns | (injected if found["injected"] else {}))
+    return ["## Sensitivity", cells, *(["\n".join(unknown)] if unknown else []), " ".join(words)]
 
 
-def _injected(row: Row) -> list[str]:
-    if row["lost"]:
-        return [f"lost: {row['lost']} of {row['repetitions']}", "-", "-", row["injected_zone"], "-"]
-    if row["peak"] is None:
-        return ["-"] * 5
-    interval = "-" if row["low"] is None else f"{row['low']:.4g} to {row['high']:.4g}"
-    saturated = f"{100 * row['saturated']:.2g} %"
-    return [number(row["peak"]), interval, number(row["at_hz"]), row["injected_zone"], saturated]
+def _hidden(row: Row, name: str) -> bool:
+    """Return whether an injected value is left out: there is none, or the rotor was lost."""
+    return bool(row["lost"]) or row[name] is None

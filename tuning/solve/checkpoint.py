@@ -5,15 +5,17 @@ import json
 import pathlib
 import re
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 
 from ambjax.host.sealed import DamagedError, difference, flat, provenance, seal, unseal, write_whole
+from tuning.events import Tell
 from tuning.solve.descent import Starts
 from tuning.solve.evolution import Evolution
 
+State = TypeVar("State")
 NAME = re.compile(r"round-[0-9]+\.npz")
 # Subfolder of the output directory, and the file in it that marks a search before its first checkpoint.
 FOLDER, MARK = "checkpoints", "search.json"
@@ -26,7 +28,8 @@ class SearchState:
     """State of a search.
 
     `history`: one row per iteration, of the best point so far. `seconds`: duration so far, s; `earlier`: the part of it
-    before the search was resumed. `converged`: whether no further iteration is needed.
+    before the search was resumed. `converged`: whether no further iteration is needed. `evolution`: CMA-ES, which
+    continues from the best point of the descents; None: the search does not use it.
     """
 
     starts: Starts
@@ -36,7 +39,6 @@ class SearchState:
     interrupted: bool = False
     converged: bool = False
     evolution: Evolution | None = None
-    """CMA-ES, which continues from the best point of the descents; None: the search does not use it"""
 
     @property
     def iteration(self) -> int:
@@ -62,7 +64,7 @@ class CheckpointFile:
         path: pathlib.Path | None,
         facts: dict[str, Any],
         round: int = 1,
-        tell: Callable[[str], None] = lambda text: None,
+        tell: Tell = lambda text: None,
     ) -> None:
         self.path, self.round, self.tell = path, round, tell
         self.fingerprint = flat({**provenance(), **facts, "round": round})
@@ -80,33 +82,46 @@ class CheckpointFile:
         seal(self.path, {**leaves, **past, CONVERGED: np.array(progress.converged)}, facts)
 
     def load(self) -> SearchState | None:
-        """Return the saved search, or None if there is none.
+        """Return the saved search, as `restored` does."""
 
-        If the checkpoint is damaged, tells the reason and returns None. Raises ValueError if it belongs to another
-        problem.
-        """
-        if self.path is None or not self.path.exists():
-            return None
-        try:
-            arrays, facts = unseal(self.path)
-            differs = difference(facts["fingerprint"], self.fingerprint)
-            if differs:
-                raise ValueError(
-                    f"--resume: {self.path} belongs to another search: {differs}. "
-                    "Use another --out, or leave out --resume to start a new search."
-                )
+        def state(arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> SearchState:
             starts = Starts(*(jnp.asarray(arrays[f"{LEAF}{name}"]) for name in Starts._fields))
             evolution = Evolution(arrays[ORIGIN], int(arrays[SEED]), arrays[TOLD]) if ORIGIN in arrays else None
             past = {name.removeprefix(PAST): list(rows) for name, rows in arrays.items() if name.startswith(PAST)}
             spent = float(facts["seconds"])
-            done = bool(arrays[CONVERGED])
-            return SearchState(starts, past, spent, spent, converged=done, evolution=evolution)
-        except DamagedError as error:
-            why = str(error)
-        except KeyError:
-            why = "it is not a checkpoint"
-        self.tell(f"{self.path}: {why}; search {self.round} begins again")
+            return SearchState(starts, past, spent, spent, converged=bool(arrays[CONVERGED]), evolution=evolution)
+
+        return restored(self.path, self.fingerprint, state, f"search {self.round}", self.tell)
+
+
+def restored(
+    path: pathlib.Path | None,
+    fingerprint: dict[str, Any],
+    state: Callable[[dict[str, np.ndarray], dict[str, Any]], State],
+    search: str,
+    tell: Tell,
+) -> State | None:
+    """Return the saved state of a search; None if there is none, or if the file is damaged, which `tell` receives.
+
+    `state`: makes it from the arrays and facts of the file. `search`: what begins again if the file is damaged. Raises
+    ValueError if the file belongs to another search.
+    """
+    if path is None or not path.exists():
         return None
+    try:
+        arrays, facts = unseal(path)
+        if differs := difference(facts["fingerprint"], fingerprint):
+            raise ValueError(
+                f"--resume: {path} belongs to another search: {differs}. "
+                "Use another --out, or leave out --resume to start a new search."
+            )
+        return state(arrays, facts)
+    except DamagedError as error:
+        why = str(error)
+    except KeyError:
+        why = "it is not a checkpoint"
+    tell(f"{path}: {why}; {search} begins again")
+    return None
 
 
 def mark_directory(directory: pathlib.Path) -> None:

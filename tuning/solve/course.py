@@ -14,10 +14,10 @@ from tuning.judge.evaluate import StepError
 from tuning.problem.loops import check_loops
 from tuning.problem.loss import TERMS
 from tuning.problem.members import Members
+from tuning.problem.ranges import initial_points
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.checkpoint import CheckpointFile, SearchState, checkpoint
 from tuning.solve.refine import best_of, search
-from tuning.solve.screen import initial_points
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,7 +25,11 @@ class SearchResult:
     """Result of all searches and validations (`rounds`).
 
     `problem`, `members`: of the last search. `x` [m]: coordinates of the gains. `error`: step error at x; None if it
-    was not computed. `history`: arrays of all searches with a row for each iteration.
+    was not computed. `history`, `seconds`: as in `Course`. `lost`: number of lost validation members, plus the number
+    of members that are lost or stall with accurate steps. `validation_error`: rms error of the validation members that
+    are held, relative to s_0; inf if it was not computed. `within`: whether the answer is within all limits on the
+    validation members. `complete`: whether neither Ctrl-C nor the end of the time has ended the searches early.
+    `front`: points of the front of error against voltage (`front.FrontPoint`); empty if it was not traced.
     """
 
     problem: TuningProblem
@@ -34,17 +38,11 @@ class SearchResult:
     error: StepError | None
     history: dict[str, np.ndarray]
     lost: int
-    """number of lost validation members, plus the number of members that are lost or stall with accurate steps"""
     seconds: float
-    """duration of all searches and validations, s, including the searches before a checkpoint was resumed"""
     validation_error: float = math.inf
-    """rms error of the validation members that are held, relative to s_0; inf if it was not computed"""
     within: bool = True
-    """whether the answer is within all limits on the validation members"""
     complete: bool = True
-    """whether neither Ctrl-C nor the end of the time has ended the searches early"""
     front: tuple[Any, ...] = ()
-    """points of the front of error against voltage (`front.FrontPoint`); empty if it was not traced"""
 
     @property
     def confirmed(self) -> bool:
@@ -64,7 +62,9 @@ class Course:
 
     `problem`, `members`: the problem and the training ensemble of the next search. `seed`: seed of the random numbers.
     `out`: directory of the checkpoints; None: no checkpoints. `facts`: settings that a checkpoint must match. `resume`:
-    whether to continue from the checkpoints.
+    whether to continue from the checkpoints. `listen`: receives the events of the searches. `minutes`: time of all
+    searches and validations; a search that begins or continues after it ends at its next iteration. `past`: the
+    searches so far. `began`: start of the first search, s.
     """
 
     problem: TuningProblem
@@ -74,13 +74,9 @@ class Course:
     facts: dict[str, Any] = dataclasses.field(default_factory=dict)
     resume: bool = False
     listen: Listener = lambda event: None
-    """receives the events of the searches"""
     minutes: float = math.inf
-    """time of all searches and validations; a search that begins or continues after it ends at its next iteration"""
     past: list[SearchState] = dataclasses.field(default_factory=list)
-    """the searches so far"""
     began: float = dataclasses.field(default_factory=time.perf_counter)
-    """start of the first search, s"""
 
     def search(self, points: np.ndarray) -> np.ndarray:
         """Search from `points` [K, m] and append the search to `past`. Return the best point [m].
@@ -91,16 +87,14 @@ class Course:
         """
         tune, number = self.problem.tune, len(self.past) + 1
         path = self.out / checkpoint(number) if self.out else None
-        members = f"{len(self.members.member)} members"
-        if len(points) > tune.budget.starts:
-            self.tell(f"search {number}: the best {tune.budget.starts} of {len(points)} points, on {members}")
-        else:
-            self.tell(f"search {number}: from the best point, on {members}")
+        many = len(points) > tune.budget.starts
+        which = f"the best {tune.budget.starts} of {len(points)} points" if many else "from the best point"
+        self.tell(f"search {number}: {which}, on {len(self.members.member)} members")
         progress = search(
             self.problem.engine, self.problem.goal, self.members, points, keep=tune.budget.starts,
             iterations=tune.budget.iterations, seed=self.seed + len(self.past),
             checkpoint_file=CheckpointFile(path, self.facts, number, self.tell), resume=self.resume,
-            on_iteration=self._standing(number), until=self.began + 60 * self.minutes,
+            on_iteration=self._standing(number, []), until=self.began + 60 * self.minutes,
         )  # fmt: skip
         if progress.ended:
             self.tell(f"search {number} is complete; its result is read from {path}")
@@ -131,13 +125,12 @@ class Course:
         """Send an event to the listener."""
         self.listen(Event(text))
 
-    def _standing(self, number: int) -> Callable[[SearchState, float], None]:
-        """Return the function that sends the standing of a search after each iteration. `number`: of the search."""
-        problem, spent = self.problem, []
+    def _standing(self, number: int, spent: list[float]) -> Callable[[SearchState, float], None]:
+        """Return the function that sends the standing of search `number` after an iteration. `spent`: durations, s."""
 
         def send(progress: SearchState, seconds: float) -> None:
             spent.append(seconds)
-            standing = standing_of(problem, progress, number, spent)
+            standing = standing_of(self.problem, progress, number, spent)
             self.listen(Event(standing.text, standing))
 
         return send
@@ -158,16 +151,27 @@ class Course:
         past = self.past[-1].history
         return int(past["lost"][-1]) == past["members"][-1]
 
+    @property
+    def seconds(self) -> float:
+        """Duration of all searches and validations, s, including the searches before a checkpoint was resumed."""
+        return time.perf_counter() - self.began + sum(progress.earlier for progress in self.past)
+
+    @property
+    def history(self) -> dict[str, np.ndarray]:
+        """Arrays of all searches with a row for each iteration."""
+        return {
+            name: np.array([row for one in self.past for row in one.history.get(name, ())])
+            for name in self.past[0].history
+        }
+
     def answer(
         self, x: np.ndarray, error: StepError | None, lost: int, validation_error: float = math.inf
     ) -> SearchResult:
-        """Return the result at x [m]. `error`: step error at x, or None. The others are as in SearchResult."""
-        seconds = time.perf_counter() - self.began + sum(progress.earlier for progress in self.past)
-        names = self.past[0].history
-        history = {name: np.array([row for one in self.past for row in one.history.get(name, ())]) for name in names}
+        """Return the result at x [m]. The others are as in SearchResult."""
         return SearchResult(
-            self.problem, self.members, x, error, history, lost, seconds, validation_error, complete=not self.over
-        )
+            self.problem, self.members, x, error, self.history, lost, self.seconds, validation_error,
+            complete=not self.over,
+        )  # fmt: skip
 
 
 def first_search(course: Course, start: np.ndarray) -> np.ndarray:

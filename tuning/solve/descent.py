@@ -13,12 +13,8 @@ from jax import Array
 from ambjax.extend import record
 from tuning.problem.goal import Goal
 
-# Trust radius: its largest value (1: a factor e of one gain), and its value for the first step, which has no estimate
-# of the curvature.
-LARGEST_RADIUS, FIRST_RADIUS = 1.0, 0.3
-# After a rejected trial, the trust radius is the length of its step times CONTRACTION, or times its square if the trial
-# lies beyond a jump of the function.
-CONTRACTION = 0.5
+# Trust radius of the first step, which has no estimate of the curvature.
+FIRST_RADIUS = 0.3
 # A trial lies beyond a jump if its value, a logarithm, exceeds the best value by this or more, or if its value or
 # gradient is not finite.
 JUMP = 1.0
@@ -52,7 +48,8 @@ def step(start: Starts, value: Array, gradient: Array) -> Starts:
     """Return one start after its trial. `value`, `gradient` [m]: of the goal at the trial.
 
     A trial is rejected if its value is not below the best value, or if its value or gradient is not finite. A rejected
-    trial still updates the inverse Hessian, unless it lies beyond a jump of the function (JUMP).
+    trial still updates the inverse Hessian, unless it lies beyond a jump of the function (JUMP). The trust radius is at
+    most 1, a factor e of one gain. After a rejected trial it is half of its step, beyond a jump a quarter.
     """
     finite = jnp.isfinite(value) & jnp.isfinite(gradient).all()
     gradient = jnp.where(finite, gradient, 0.0)
@@ -60,8 +57,8 @@ def step(start: Starts, value: Array, gradient: Array) -> Starts:
     s = start.trial - start.best
     inverse = _updated_inverse(start, s, gradient - start.gradient, smooth)
     tried = jnp.sqrt(s @ s)
-    wider = jnp.minimum(jnp.maximum(start.radius, 2 * tried), LARGEST_RADIUS)
-    narrower = jnp.where(smooth, CONTRACTION, CONTRACTION**2) * tried
+    wider = jnp.minimum(jnp.maximum(start.radius, 2 * tried), 1.0)
+    narrower = jnp.where(smooth, 0.5, 0.25) * tried
     radius = jnp.where(start.trials == 0, start.radius, jnp.where(accept, wider, narrower))
     best, slope = jnp.where(accept, start.trial, start.best), jnp.where(accept, gradient, start.gradient)
     move = -inverse @ slope

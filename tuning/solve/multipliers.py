@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tuning.judge.evaluate import held, judge
+from tuning.judge.evaluate import RESOLVED, JudgedMembers, held, judge
 from tuning.judge.peaks import injections, injects, reached_of
 from tuning.problem.config import seeds
 from tuning.problem.limits import PREFIX, TOLERANCE_BELOW, Limit
@@ -24,9 +24,6 @@ MOST_UPDATES = 6
 AVERAGING_MEMBERS = 256
 # Largest number of members that join at once for each reason.
 MOST_JOINING = 8
-# If the judged mean of a limited quantity exceeds its expected value by more than this share, the training ensemble
-# lacks members with large values.
-UNEXPECTED = 0.1
 
 
 class Judged(NamedTuple):
@@ -38,7 +35,7 @@ class Judged(NamedTuple):
 
     x: np.ndarray
     numbers: list[tuple[float, float]]
-    columns: dict[str, np.ndarray]
+    columns: Mapping[str, np.ndarray]
 
     def holds(self, limits: Sequence[Limit]) -> bool:
         """Return whether the judge's values are within all limits, without margins."""
@@ -145,7 +142,7 @@ def breaking(
 
     For a limit on the worst member, they are members that break it, if the judged value lacks
     reserve. For a limit on a mean, they are the members with the largest values, if the judged value breaks the limit
-    and exceeds its expected value, the search's value times `Limit.ratio`, by more than UNEXPECTED.
+    and exceeds its expected value, the search's value times `Limit.ratio`, by more than RESOLVED.
 
     `numbers`: the values of the search and of the judge for each limit. `columns` [N]: metrics of the judged members.
     """
@@ -157,7 +154,7 @@ def breaking(
         excess = np.where(held(columns), limit.log_excess(limit.values(columns)), -math.inf)
         if limit.kind.worst and not limit.has_reserve(judged):
             found = np.append(found, largest_unseen(course, np.where(excess > 0, excess, -math.inf)))
-        elif not limit.kind.worst and not limit.holds(judged) and judged > (1 + UNEXPECTED) * limit.ratio * tuned:
+        elif not limit.kind.worst and not limit.holds(judged) and judged > (1 + RESOLVED) * limit.ratio * tuned:
             found = np.append(found, largest_unseen(course, excess))
     total = len(columns["lost_at_s"])
     return problem.objective.chosen(seeds(budget)[1], np.unique(found), total) if found.size else None
@@ -173,9 +170,9 @@ def judged_at(course: Course, x: np.ndarray) -> Judged:
     if not any(limit.kind.worst for limit in problem.limits):
         count = min(count, AVERAGING_MEMBERS)
     course.tell(f"judging the limits on {count} members")
-    columns = judge(problem, x, seed, count)
+    of = JudgedMembers(problem, x, seed, judge(problem, x, seed, count))
     terms, n = problem.engine.terms(x[None], course.members), course.members.ordinary
     tuned = [float(limit.kind.tuned(terms[PREFIX + limit.name][0, :n])) for limit in problem.limits]
-    injected = injections(problem, x, seed, columns) if injects(problem) else None
-    judged = [reached_of(limit, columns, injected) for limit in problem.limits]
-    return Judged(x, list(zip(tuned, judged, strict=True)), columns)
+    injected = injections(of) if injects(problem) else None
+    judged = [reached_of(limit, of.columns, injected) for limit in problem.limits]
+    return Judged(x, list(zip(tuned, judged, strict=True)), of.columns)

@@ -21,16 +21,14 @@ from tuning.problem.quantities import KINDS
 from tuning.solve.checkpoint import CheckpointFile, SearchState
 from tuning.solve.descent import Descent, Starts, begin
 from tuning.solve.evolution import Evolution
-from tuning.solve.screen import screen
 
 # Number of iterations after which only the best start continues.
 RACE = 5
-# A search has converged if its next step, in coordinates, is shorter than this: 0.1 % of a gain.
-SHORTEST = 1e-3
+# A search has converged if its next step, in coordinates, is shorter than this: 0.1 % of a gain. It ends also if the
+# goal, a logarithm, falls by less than this over PATIENCE iterations.
+SHORTEST, PATIENCE = 1e-3, 4
 # A descent switches to CMA-ES at once if its gradient predicts a change of the goal by more than 1 within such a step.
 STEEP = 1 / SHORTEST
-# A descent ends if the goal, a logarithm, falls by less than STALL over PATIENCE iterations.
-STALL, PATIENCE = 1e-3, 4
 # At the end of a descent, the norm of the gradient distinguishes converged descents from those that stop early. In
 # benchmarks/tasks, the former have norms of 0.001 to 0.02, the latter of 0.36 to 1e127. The norm is the change of the
 # goal per factor e of a gain.
@@ -87,6 +85,12 @@ def search(
     except KeyboardInterrupt:
         progress.interrupted = True
     return progress
+
+
+def screen(engine: Engine, members: Members, x: np.ndarray, goal: Goal) -> np.ndarray:
+    """Return the points x [K, m] in the order of their goals on a part of the members, the best first."""
+    some = members.part
+    return x[np.argsort(goal.score(engine.terms(x, some), some), kind="stable")]
 
 
 def iterate(engine: Engine, goal: Goal, members: Members, progress: SearchState, descent: Descent) -> None:
@@ -156,7 +160,7 @@ def _advance(progress: SearchState, seed: int) -> None:
         return
     starts, values = progress.starts, progress.history["value"]
     norm = float(jnp.linalg.norm(starts.gradient)) if np.isfinite(starts.value[0]) else math.inf
-    stalled = len(values) > PATIENCE and values[-1] > values[-1 - PATIENCE] - STALL
+    stalled = len(values) > PATIENCE and values[-1] > values[-1 - PATIENCE] - SHORTEST
     ended = stalled or float(jnp.linalg.norm(starts.trial - starts.best)) <= SHORTEST
     if not norm < STEEP or (ended and norm >= CONVERGED):
         progress.evolution = Evolution(progress.history["x"][-1], seed)
