@@ -19,7 +19,7 @@ from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
 from ambjax.results.outputs import check_new, described, directory, files, plain, write_json
 from tuning.events import Listener, Log, teller
-from tuning.machines.machine_tuning import MachinePlan, machine_plan, tune_machine
+from tuning.machines.machine_tuning import machine_plan, tune_machine
 from tuning.problem.config import read_tune
 from tuning.problem.gains_table import off
 from tuning.problem.tuning_problem import TuningProblem, problem_of
@@ -137,7 +137,12 @@ def run(path: str, options: Options, listen: Listener) -> TunedCase:
         raise ValueError(f"--resume: --out {options.out} contains no search. Check --out, or leave out --resume.")
     if options.minutes is not None and not options.minutes > 0:
         raise ValueError(f"--budget {options.minutes:g}: it must be above 0, in minutes.")
-    plan = (_machine_plan if is_machine(loaded[0]) else _plan)(path, options, loaded)
+    if is_machine(loaded[0]):
+        if refused := next((name for name in ("pareto", "page") if getattr(options, name)), None):
+            raise ValueError(f"--{refused}: the tuning of a machine does not take it. Leave it out.")
+        plan = machine_plan(path, options.out, options.minutes, options.settings_of, loaded)
+    else:
+        plan = _plan(path, options, loaded)
     with locked(plan.out):
         if not options.resume:
             _clear(plan.out, options.force)
@@ -150,14 +155,6 @@ def run(path: str, options: Options, listen: Listener) -> TunedCase:
                 return _tune(plan, path, listen)
             case, report = tune_machine(plan, options.resume, teller(listen))
             return TunedCase(case, report["outcome"]["good"], report, plan.out)
-
-
-def _machine_plan(path: str, options: Options, loaded: tuple[dict[str, Any], str]) -> MachinePlan:
-    """Read a machine and make the output directory. Raises ValueError for an invalid case or option."""
-    for name in ("pareto", "page"):
-        if getattr(options, name):
-            raise ValueError(f"--{name}: the tuning of a machine does not take it. Leave it out.")
-    return machine_plan(path, options.out, options.minutes, options.settings_of, loaded)
 
 
 def _plan(path: str, options: Options, loaded: tuple[dict[str, Any], str]) -> TuningPlan:

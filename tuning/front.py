@@ -60,7 +60,7 @@ def trace_front(course: Course, answer: SearchResult) -> SearchResult:
     does.
     """
     course.problem, x = answer.problem, answer.x
-    first = _point(course, 1.0, judged_at(course, x))
+    first = _point(course, judged_at(course, x))
     if not (math.isfinite(first.error_m) and first.error_m > 0 and first.volts > 0):
         course.tell("no front: with the gains of least error, no member is held, or the error or the voltage is 0")
         return answer
@@ -75,7 +75,7 @@ def trace_front(course: Course, answer: SearchResult) -> SearchResult:
         )
         course.problem = answer.problem.towards_voltage(least.error_m, least.volts, factor)
         found, _ = course.again(chosen(seen, factor).x)
-        seen += [_point(course, factor, one) for one in optima(course, found)[0]]
+        seen += [_point(course, one) for one in optima(course, found)[0]]
     taken = answer
     if not course.interrupted:
         least, course.problem = least_of(seen), answer.problem
@@ -139,7 +139,7 @@ def _validated_point(course: Course, answer: SearchResult, seen: list[FrontPoint
         seen[:] = [point for point in seen if point is not best]
 
 
-def _point(course: Course, factor: float, one: Judged) -> FrontPoint:
+def _point(course: Course, one: Judged) -> FrontPoint:
     """Return a judged optimum as a point of the front."""
     columns, limits = one.columns, course.problem.limits
     alive = held(columns)
@@ -151,6 +151,4 @@ def _point(course: Course, factor: float, one: Judged) -> FrontPoint:
     within = all(limit.holds(values[limit.name]) for limit in others)
     reserve = all(limit.has_reserve(values[limit.name]) for limit in others)
     lost, stalled = (int(columns[name].sum()) for name in ("lost", "stalled"))
-    return FrontPoint(
-        factor, one.x, error, volts, values.get("sensitivity"), lost, stalled, len(alive), within, reserve
-    )
+    return FrontPoint(1.0, one.x, error, volts, values.get("sensitivity"), lost, stalled, len(alive), within, reserve)

@@ -18,7 +18,6 @@ from ambjax.host.extensions import NothingToTuneError
 from ambjax.host.sealed import flat, provenance
 from ambjax.results.machine_study import MachineStudy
 from ambjax.results.outputs import directory, files, plain, write_json
-from ambjax.text.web_page import render_page
 from tuning.events import Tell
 from tuning.machines.machine_gains import LqgSpace, MachineSpace, lqg_space, machine_space
 from tuning.machines.machine_peaks import Peaks
@@ -27,6 +26,7 @@ from tuning.machines.machine_verdict import LIMITS, judged, refused, report_text
 from tuning.problem.config import with_settings_of
 from tuning.problem.members import FEW
 from tuning.report.facts import KEY, NOT_JUDGED, REPORT, TUNED, record
+from tuning.report.folder import put_words
 from tuning.report.tuned import tuned
 from tuning.solve.checkpoint import checkpoint
 
@@ -135,7 +135,11 @@ def tune_machine(plan: MachinePlan, resume: bool, tell: Tell) -> tuple[MachineCa
         for one, a, b in zip(own.space.gains, plan.start.tolist(), own.space.named(x).values(), strict=True)
     ]
     tuned_case = case_at(x, report["verdict"])
-    _put(plan, tuned_case.text, report, complete=found.number == settings.starts)
+    with files(plan.out) as part:
+        (part / TUNED).write_text(tuned_case.text, encoding="utf-8")
+        mark = {KEY: record(plan.record, part)} if found.number == settings.starts else {}
+        write_json(part / REPORT, report | mark)
+        put_words(part, case.name, report_text(report), {})
     return tuned_case, plain(report)
 
 
@@ -145,13 +149,3 @@ def _written(
     """Return the case with these gains [m] in its text."""
     text = tuned(text, dict(zip(space.where, gains, strict=True)), case.name, verdict)
     return machine_from(tomllib.loads(text), case.name, text, case.folder)
-
-
-def _put(plan: MachinePlan, text: str, report: dict[str, Any], complete: bool) -> None:
-    """Write the case with the tuned gains and the report. `complete`: whether no start is left."""
-    words = report_text(report)
-    with files(plan.out) as part:
-        (part / TUNED).write_text(text, encoding="utf-8")
-        write_json(part / REPORT, report | ({KEY: record(plan.record, part)} if complete else {}))
-        (part / "report.md").write_text(words, encoding="utf-8")
-        (part / "report.html").write_text(render_page(words, {}, f"Tuning of {report['case']}"), encoding="utf-8")

@@ -57,11 +57,6 @@ class Members(NamedTuple):
         """The members whose linearised loops the search evaluates: the first LOOPS that are not stressed."""
         return jax.tree.map(lambda a: a[: min(self.ordinary, LOOPS)], self)
 
-    @property
-    def unstressed(self) -> "Members":
-        """The members that are not stressed."""
-        return jax.tree.map(lambda a: a[: self.ordinary], self)
-
     def joined(self, others: "Members", stressed: bool = True) -> "Members":
         """Return these members with `others`, which become stressed or, in front of all members, ordinary.
 

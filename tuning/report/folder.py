@@ -3,6 +3,7 @@
 import functools
 import pathlib
 import tomllib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -43,10 +44,15 @@ def put_report(part: pathlib.Path, cascade: Cascade, answer: SearchResult, facts
     drawn = _pictures(answer.problem, cascade, answer.history, facts.front)
     for name, data in drawn.items():
         (part / name).write_bytes(data)
-    words = report.report_markdown(facts)
+    put_words(part, facts.case, report.report_markdown(facts), drawn, (front_table.TITLE,))
+
+
+def put_words(
+    part: pathlib.Path, case: str, words: str, drawn: Mapping[str, bytes], unfolded: tuple[str, ...] | None = None
+) -> None:
+    """Write the report `words` of a case as report.md and report.html. `drawn`, `unfolded`: as for `render_page`."""
     (part / "report.md").write_text(words, encoding="utf-8")
-    title = f"Tuning of {facts.case}"
-    page = described("report.html", lambda: render_page(words, drawn, title, unfolded=(front_table.TITLE,)))
+    page = described("report.html", lambda: render_page(words, drawn, f"Tuning of {case}", unfolded))
     if page is not None:
         (part / "report.html").write_text(page, encoding="utf-8")
 

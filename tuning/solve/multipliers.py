@@ -130,7 +130,7 @@ def largest_unseen(course: Course, values: np.ndarray) -> np.ndarray:
     """
     members, seed = course.members, seeds(course.problem.tune.budget)[1]
     values = values.copy()
-    values[members.unstressed.member[members.unstressed.seed == seed]] = -math.inf
+    values[members.member[~members.stressed & (members.seed == seed)]] = -math.inf
     largest = np.argsort(-values, kind="stable")[:MOST_JOINING]
     return largest[np.isfinite(values[largest])]
 
