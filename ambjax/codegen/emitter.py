@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
-from ambjax.codegen.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal, split_scan
+from ambjax.codegen.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal, live, split_scan
 from ambjax.codegen.program import Operand, Program, Ref, of
 
 LOOPS = ("scan", "while")
@@ -44,7 +44,7 @@ class _Reader:
         def value(x: Atom) -> Operand:
             return np.asarray(x.val, dtype_of(x))[()] if isinstance(x, Literal) else known[x]
 
-        for eqn in jaxpr.eqns:
+        for eqn in live(jaxpr):
             inner = _law(str(eqn.source_info.name_stack)) or law
             if any(getattr(x.aval, "shape", None) != () for x in [*eqn.invars, *eqn.outvars]):
                 raise ValueError(refusal(eqn.primitive.name, inner, "on arrays"))

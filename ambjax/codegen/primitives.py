@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
-from jax.extend.core import JaxprEqn, Literal, Var
+from jax.extend.core import Jaxpr, JaxprEqn, Literal, Var
 
 from ambjax.numerics.smooth import RECIPROCAL
 
@@ -110,6 +110,16 @@ def dtype_of(x: Atom) -> np.dtype:
 def is_reciprocal(eqn: JaxprEqn) -> bool:
     """Return whether a call computes 1/x by refining a float32 quotient. Exported code divides once instead."""
     return eqn.params.get("name") == RECIPROCAL and len(eqn.invars) == len(eqn.outvars) == 1
+
+
+def live(jaxpr: Jaxpr) -> list[JaxprEqn]:
+    """Return the equations on which the results of a jaxpr depend, in their order."""
+    needed, found = {x for x in jaxpr.outvars if not isinstance(x, Literal)}, list[JaxprEqn]()
+    for eqn in reversed(jaxpr.eqns):
+        if not needed.isdisjoint(eqn.outvars):
+            needed.update(x for x in eqn.invars if not isinstance(x, Literal))
+            found.append(eqn)
+    return found[::-1]
 
 
 def split_scan(params: dict[str, Any], args: list[Argument]) -> tuple[list[Argument], list[Argument]]:

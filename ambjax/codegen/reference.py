@@ -15,7 +15,7 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
 from jax.typing import ArrayLike
 
 from ambjax.codegen.points import Points
-from ambjax.codegen.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal, split_scan
+from ambjax.codegen.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal, live, split_scan
 from ambjax.codegen.trace import Trace, arguments, precision
 
 
@@ -52,7 +52,7 @@ def one_by_one(closed: ClosedJaxpr, args: list[ArrayLike], count: int) -> list[A
     def value(x: Atom) -> ArrayLike:
         return np.asarray(x.val, dtype_of(x)) if isinstance(x, Literal) else known[x]
 
-    for eqn in jaxpr.eqns:
+    for eqn in live(jaxpr):
         results = _one(eqn, [value(x) for x in eqn.invars], count)
         known.update(zip(eqn.outvars, results, strict=True))
     return [value(x) for x in jaxpr.outvars]

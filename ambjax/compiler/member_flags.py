@@ -27,8 +27,7 @@ def moved(closed: ClosedJaxpr, moves: Sequence[bool]) -> list[bool]:
         if any(own) and name in CALLS:
             flags = moved(called(eqn), own)
         elif any(own) and name == "scan":
-            fixed, both = eqn.params["num_consts"], eqn.params["num_consts"] + eqn.params["num_carry"]
-            body = eqn.params["jaxpr"]
+            body, (fixed, both) = eqn.params["jaxpr"], scan_parts(eqn)
             flags = moved(body, [*own[:fixed], *carried_flags(body, own[:both], fixed, own[both:]), *own[both:]])
         elif any(own) and name == "while":
             goes, body, consts, fixed = while_parts(eqn)
@@ -47,6 +46,24 @@ def carried_flags(body: ClosedJaxpr, moves: Sequence[bool], fixed: int, each: Se
         if joined == carried:
             return carried
         carried = joined
+
+
+def scan_parts(eqn: JaxprEqn) -> tuple[int, int]:
+    """Return the number of constants of a scan, and that of constants and carried values together.
+
+    The shapes show them: only inputs and results of a single turn have one axis more outside than inside.
+    """
+    body = eqn.params["jaxpr"].jaxpr
+    both, carried = (
+        sum(len(shape_of(outer)) == len(shape_of(inner)) for outer, inner in zip(outside, inside, strict=True))
+        for outside, inside in ((eqn.invars, body.invars), (eqn.outvars, body.outvars))
+    )
+    return both - carried, both
+
+
+def shape_of(x: Any) -> tuple[int, ...]:
+    """Return the shape of a variable of a jaxpr."""
+    return x.aval.shape
 
 
 def while_parts(eqn: JaxprEqn) -> tuple[ClosedJaxpr, ClosedJaxpr, int, int]:

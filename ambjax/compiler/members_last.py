@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array, lax
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
 
-from ambjax.compiler.member_flags import CALLS, called, carried_flags, moved, while_parts
+from ambjax.compiler.member_flags import CALLS, called, carried_flags, moved, scan_parts, shape_of, while_parts
 
 # Primitives whose operands have one shape, or no axes.
 NAMES = (
@@ -108,7 +108,7 @@ class _Members:
         return jnp.broadcast_to(x if moves or not x.ndim else x[..., None], (*shape, self.size))
 
     def together(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> list:
-        shape = np.broadcast_shapes(*map(_shape, eqn.invars))  # equal up to lengths of 1, or ()
+        shape = np.broadcast_shapes(*map(shape_of, eqn.invars))  # equal up to lengths of 1, or ()
         return [self.wide(x, m, shape) for x, m in zip(values, moves, strict=True)]
 
     def jit(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged:
@@ -135,7 +135,7 @@ class _Members:
         return [(lax.slice(values[0], (*begin, 0), (*end, self.size), strides and (*strides, 1)), True)]
 
     def concatenate(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
-        parts = [self.wide(x, m, _shape(v)) for x, m, v in zip(values, moves, eqn.invars, strict=True)]
+        parts = [self.wide(x, m, shape_of(v)) for x, m, v in zip(values, moves, eqn.invars, strict=True)]
         return [(lax.concatenate(parts, eqn.params["dimension"]), True)]
 
     def dynamic_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
@@ -148,7 +148,7 @@ class _Members:
     def dynamic_update_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         if any(moves[2:]):
             return None
-        whole, part = (self.wide(x, m, _shape(v)) for x, m, v in zip(values, moves, eqn.invars[:2], strict=False))
+        whole, part = (self.wide(x, m, shape_of(v)) for x, m, v in zip(values, moves, eqn.invars[:2], strict=False))
         return [(lax.dynamic_update_slice(whole, part, (*values[2:], _first(eqn))), True)]
 
     def reduced(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
@@ -181,7 +181,7 @@ class _Members:
 
     def scan(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         p = eqn.params
-        fixed, both = p["num_consts"], p["num_consts"] + p["num_carry"]
+        fixed, both = scan_parts(eqn)
         carried = carried_flags(p["jaxpr"], moves[:both], fixed, moves[both:])
         begin, turn = self.loop(p["jaxpr"], values[:both], moves[:both], carried, moves[both:])
         end, stacked = lax.scan(turn, begin, values[both:], p["length"], p["reverse"], p["unroll"])
@@ -193,7 +193,7 @@ class _Members:
     ) -> tuple[list, Callable[..., tuple[list, list]]]:
         """Return the initial values of a loop, and one turn of it: turn(carried values, own inputs) -> both results."""
         fixed = len(values) - len(carried)
-        shapes = list(map(_shape, body.jaxpr.invars[fixed : len(values)]))
+        shapes = list(map(shape_of, body.jaxpr.invars[fixed : len(values)]))
 
         def widened(found: Flagged) -> list:
             return [self.wide(*x, shape) if c else x[0] for x, shape, c in zip(found, shapes, carried, strict=True)]
@@ -209,11 +209,6 @@ def _first(eqn: JaxprEqn) -> Array:
     """Return index 0, with the type of the equation's last operand, an index."""
     index: Any = eqn.invars[-1].aval
     return jnp.zeros((), index.dtype)
-
-
-def _shape(x: Any) -> tuple[int, ...]:
-    """Return the shape of a variable of one member."""
-    return x.aval.shape
 
 
 def _flagged(eqn: JaxprEqn, results: Any, moves: bool) -> Flagged:
