@@ -26,7 +26,6 @@ from ambjax.cases.warned import idealised, reversal, warnings_of
 from ambjax.commands import simulate
 from ambjax.control.processor import Processor
 from ambjax.numerics.declared import within
-from ambjax.pictures import overview
 from ambjax.results.outputs import files
 from ambjax.simulation.clock import Clock
 from ambjax.world.amplifier import Amplifier
@@ -362,20 +361,6 @@ def test_a_finished_study_is_not_mixed_with_a_simulation(capsys):
 # --- disks and streams ---
 
 
-def test_a_full_disk_leaves_no_partial_results(monkeypatch, capsys):
-    path = write(SHORT)
-
-    def full(*args, **more):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(overview, "overview", full)  # the last of three files
-    assert main(["simulate", path, "--out", "there"]) == 2
-    err = capsys.readouterr().err
-    assert "--out there: cannot write there (No space left on device)" in err
-    assert "Traceback" not in err
-    assert not pathlib.Path("there").exists()
-
-
 def test_all_files_are_written_or_none(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
@@ -426,17 +411,15 @@ def uncommented(name):
 @pytest.mark.parametrize("name", ["tracking", "regulation"])
 def test_the_template_lists_every_key_of_tune_with_its_default(name):
     document = uncommented(name)
-    table = document["tune"]
-    with pytest.raises(ValueError, match="Keys allowed here") as refused:
-        read_tune(write(dumps({"tune": {"nothing": 1}})))
-    allowed = str(refused.value).partition("Keys allowed here: ")[2].rstrip(".").split(", ")
-    assert set(table) == set(allowed)
-    with pytest.raises(ValueError, match="Keys allowed here") as refused:
-        read_tune(write(dumps({"tune": {"weights": {"nothing": 1}}})))
-    assert set(table["weights"]) == set(str(refused.value).partition("Keys allowed here: ")[2].rstrip(".").split(", "))
-    with pytest.raises(ValueError, match="Keys allowed here") as refused:
-        read_tune(write(dumps({"tune": {"limits": {"nothing": 1}}})))
-    assert set(table["limits"]) == set(str(refused.value).partition("Keys allowed here: ")[2].rstrip(".").split(", "))
+    table, nothing = document["tune"], {"nothing": 1}
+    for keys, wrong in (
+        (table, nothing),
+        (table["weights"], {"weights": nothing}),
+        (table["limits"], {"limits": nothing}),
+    ):
+        with pytest.raises(ValueError, match="Keys allowed here") as refused:
+            read_tune(write(dumps({"tune": wrong})))
+        assert set(keys) == set(str(refused.value).partition("Keys allowed here: ")[2].rstrip(".").split(", "))
     assert {field.name for field in dataclasses.fields(Budget)} <= set(table)
     # these are examples, and say so; all else is what is left out
     for example in ("gains", "bounds", "risk", "alpha", "limits"):

@@ -42,6 +42,12 @@ def variations():
     yield "limit", law, inversion.Adaptive(), dataclasses.replace(world, u_max=100.0)
     yield "NumPy", Counting(np.float64(20.0), np.float32(25.0), np.asarray(25.0)), inversion.Adaptive(), world
     yield "JAX", Counting(jnp.asarray(20.0), jnp.float32(25.0), 25.0), inversion.Adaptive(), world
+    yield "integer gains", Counting(c=20, k=26, p=20), inversion.Adaptive(), world
+    yield "NumPy integer", Counting(c=np.int32(20)), inversion.Adaptive(), world
+    yield "integer limit", law, inversion.Adaptive(), dataclasses.replace(world, u_max=200)
+    yield "integer amplitude", law, inversion.Adaptive(), dataclasses.replace(world, q_v=Pulse(1, 0.8, 1.3))
+    yield "NumPy seed", law, inversion.Adaptive(), dataclasses.replace(world, seed=np.int32(4))
+    yield "unsigned seed", law, inversion.Adaptive(), dataclasses.replace(world, seed=np.uint32(4))
     yield "JAX seed", law, inversion.Adaptive(), dataclasses.replace(world, seed=jnp.asarray(5), member=np.int64(2))
 
 
@@ -75,22 +81,3 @@ def test_a_change_of_structure_recompiles(caplog):
     before = Counting.traces
     assert compiled(caplog, Cascade(position=Counting()), NOISY, Clock(3, 1e-4, Slide(1)))
     assert Counting.traces > before
-
-
-@pytest.mark.parametrize(
-    "what",
-    [
-        (Counting(c=20, k=26, p=20), NOISY),
-        (Counting(c=np.int32(20)), NOISY),
-        (Counting(), dataclasses.replace(NOISY, u_max=200)),
-        (Counting(), dataclasses.replace(NOISY, q_v=Pulse(1, 0.8, 1.3))),
-        (Counting(), dataclasses.replace(NOISY, seed=np.int32(4))),
-        (Counting(), dataclasses.replace(NOISY, seed=np.uint32(4))),
-    ],
-    ids=["gain", "NumPy gain", "limit", "amplitude", "NumPy seed", "unsigned seed"],
-)
-def test_integers_never_recompile(what, warm):
-    law, scenario = what
-    before = Counting.traces
-    rollout(Cascade(position=law), scenario, SHORT, record_every=0)
-    assert Counting.traces == before

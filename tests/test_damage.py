@@ -81,25 +81,16 @@ def alter(arrays, facts):
     arrays[first(arrays)] = arrays[first(arrays)] + 1e-9
 
 
+CHANGES = {"column missing": drop, "short array": shorten, "other dtype": retype, "column more": add}
 # Whatever may happen to any sealed file: found though nothing is known of what it should hold.
 DAMAGE = {
     "empty": lambda path: path.write_bytes(b""),
     "text": lambda path: path.write_text("not an archive\n"),
     **{f"cut at {share:g}": truncated(share) for share in (0.01, 0.3, 0.7, 0.99)},
     **{f"flipped at {share:g}": flipped(share) for share in (0.0, 0.5, 1.0)},
-    "column missing": rewritten(drop),
-    "short array": rewritten(shorten),
-    "other dtype": rewritten(retype),
-    "column more": rewritten(add),
+    **{kind: rewritten(change) for kind, change in CHANGES.items()},
     "number changed": rewritten(alter),
     "no seal": lambda path: np.savez(path, a=np.zeros(3)),
-}
-# Whole and sealed, but not what belongs there.
-STRANGE = {
-    "column missing": rewritten(drop, again=True),
-    "short array": rewritten(shorten, again=True),
-    "other dtype": rewritten(retype, again=True),
-    "column more": rewritten(add, again=True),
 }
 
 
@@ -183,26 +174,6 @@ def chunk_file(out, number):
     return sorted((out / "chunks").glob("*.npz"))[number]
 
 
-def rejoined(out, damaged, whole):
-    """Return the remarks of a run that resumes a study whose chunk `damaged` is damaged."""
-    store = store_in(out)
-    missing, remarks = compute(store)
-    assert missing == [store.spans()[damaged]]
-    assert store.finish().read_bytes() == whole
-    assert not store.chunks.exists()
-    return remarks
-
-
-@pytest.mark.parametrize("kind", DAMAGE)
-def test_a_damaged_chunk_is_computed_again(kind, begun, whole):
-    path = chunk_file(begun, 1)
-    DAMAGE[kind](path)
-    (remark,) = rejoined(begun, 1, whole)
-    assert str(path) in remark
-    assert "are computed again" in remark
-    assert "\n" not in remark
-
-
 def of_another_span(path):
     path.write_bytes(chunk_file(path.parent.parent, 0).read_bytes())
 
@@ -219,7 +190,8 @@ def unnamed(arrays, facts):
     facts.clear()
 
 
-CHUNK_STRANGE = STRANGE | {
+CHUNK_DAMAGE = DAMAGE | {
+    **{f"sealed: {kind}": rewritten(change, again=True) for kind, change in CHANGES.items()},
     "rows of another chunk": of_another_span,
     "other members": rewritten(renumbered, again=True),
     "another study's": rewritten(of_another_study, again=True),
@@ -227,12 +199,18 @@ CHUNK_STRANGE = STRANGE | {
 }
 
 
-@pytest.mark.parametrize("kind", CHUNK_STRANGE)
-def test_a_chunk_of_another_study_is_computed_again(kind, begun, whole):
+@pytest.mark.parametrize("kind", CHUNK_DAMAGE)
+def test_a_chunk_that_is_damaged_or_of_another_study_is_computed_again(kind, begun, whole):
     path = chunk_file(begun, 1)
-    CHUNK_STRANGE[kind](path)
-    (remark,) = rejoined(begun, 1, whole)
+    CHUNK_DAMAGE[kind](path)
+    store = store_in(begun)
+    missing, (remark,) = compute(store)
+    assert missing == [store.spans()[1]]
+    assert store.finish().read_bytes() == whole
+    assert not store.chunks.exists()
     assert str(path) in remark
+    assert "are computed again" in remark
+    assert "\n" not in remark
 
 
 def test_chunks_are_kept_until_members_npz_is_verified(begun, whole, monkeypatch):
@@ -285,8 +263,8 @@ def test_a_finished_study_whose_file_was_damaged_is_computed_again(kind, begun, 
     path = begun / "members.npz"
     if kind == "gone":
         path.unlink()
-    elif kind in ("short array", "other dtype", "column more", "number changed"):
-        rewritten_plainly({"short array": shorten, "other dtype": retype, "column more": add}.get(kind, alter))(path)
+    elif kind in (*CHANGES, "number changed"):
+        rewritten_plainly(CHANGES.get(kind, alter))(path)
     else:
         DAMAGE[kind](path)
     store = store_in(begun)

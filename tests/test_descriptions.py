@@ -4,15 +4,14 @@ import json
 import pathlib
 
 import pytest
-from test_end_to_end import CASES, COMMANDS, SAMPLED
+from test_end_to_end import CASES, COMMANDS
 from texts import write
 
 from ambjax.__main__ import main
 from ambjax.results import outputs
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
-EVERY = COMMANDS | SAMPLED
-EVERY |= {
+EVERY = COMMANDS | {
     "compare": (
         ["compare", "case.toml", "second.toml", "--members", "4"],
         ("compare.json", "compare.html", "compare.png"),
@@ -87,7 +86,7 @@ def test_a_verification_that_ends_with_an_error_is_not_a_proof(monkeypatch, caps
     monkeypatch.setattr("ambjax.codegen.verify.verify", broken)
     monkeypatch.setattr("ambjax.codegen.verify.COUNT", 10)
     write(CASES["bearing"])
-    assert main([*SAMPLED["export"][0], "--out", "out"]) == 1
+    assert main(["export", "case.toml", "--verify", "--out", "out"]) == 1
     out, err = capsys.readouterr()
     assert "the verification is left out: TypeError" in err
     assert "Some checks FAIL." in out

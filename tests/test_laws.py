@@ -4,9 +4,7 @@ A new law joins by adding a row to LAWS.
 """
 
 import dataclasses
-import inspect
 import itertools
-import re
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +13,7 @@ import pytest
 
 from ambjax import Cascade, Clock, Scenario, rollout
 from ambjax.control import current, inversion, observer, position
-from ambjax.control.base import Law, scaled_steepness
+from ambjax.control.base import scaled_steepness
 from ambjax.control.force import linear_mechanics
 from ambjax.control.pid import PIDState
 from ambjax.control.search import LowerBound, SearchContext
@@ -525,17 +523,3 @@ def test_slope_of_the_sliding_laws_is_their_steepest_rate(stage, p):
 
         steepest = -jax.grad(e_dot)(0.0)
     np.testing.assert_allclose(law.slope(MODEL), steepest, rtol=1e-12)
-
-
-@TABLE
-def test_every_law_has_the_step_that_its_base_class_documents(stage, law):
-    assert list(inspect.signature(law.step).parameters) == list(inspect.signature(Law.step).parameters)[1:]
-
-
-@TABLE
-def test_the_documentation_of_a_law_shows_a_cascade_with_it(stage, law):
-    if isinstance(law, (observer.Direct, position.LinearController, current.OpenLoop, current.AmplifierCurrent)):
-        return  # the default, and laws that require a file or an amplifier
-    (use,) = re.findall(r"`(Cascade\(.*\))`\.", type(law).__doc__)
-    names = {"observer": observer, "position": position, "inversion": inversion, "current": current}
-    assert type(getattr(eval(use, {"Cascade": Cascade} | names), stage)) is type(law)
