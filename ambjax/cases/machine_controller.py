@@ -22,7 +22,6 @@ from ambjax.control.observer import Direct
 from ambjax.control.position import FeedbackLinearisation
 from ambjax.control.rigid_body import RigidBody
 from ambjax.numerics.records import canonical
-from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.rollout import prepare
 from ambjax.simulation.sampled import Sampled
 from ambjax.world.rotor import Rotor
@@ -146,7 +145,8 @@ def rigid_body(
         numbers = {name: float(getattr(models[0], name)) for name in ("mu_0", "n", "R")}
         given = numbers | plant._asdict() | {"m": float(M[number]), "k_z": 0.0, "g": float(-weight[number])}
         parts.append(_coordinate(top, COORDINATES[k], given, read))
-    laws = [canonical(inner_cascade(prepare(part.cascade, part.scenario, part.clock)[0])) for part in parts]
+    systems = [prepare(part.cascade, part.scenario, part.clock)[0] for part in parts]
+    laws = [canonical((one.loop if isinstance(one, Sampled) else one).cascade) for one in systems]
     if len({jax.tree.structure(law) for law in laws}) > 1:
         raise ValueError("controller.tilt, controller.axial: the laws must be of the same kind in all coordinates.")
     law = RigidBody(
@@ -189,11 +189,6 @@ def _coordinate(top: Table, name: str, plant: dict[str, float], read: Callable[[
         raw[key] = {name: top.raw[key][name] for name in names if name in top.raw.get(key, {})}
     axis_controller(raw)
     return read(raw, f"coordinate {name}")
-
-
-def inner_cascade(system: Sampled | ClosedLoop) -> Any:
-    """Return the cascade of a system."""
-    return (system.loop if isinstance(system, Sampled) else system).cascade
 
 
 def inner(system: Any, law: MachineLaw) -> Any:

@@ -194,18 +194,15 @@ def horizons(case: LoopCase, precisions: list[str], *, held: bool = False) -> di
     for k, precision in enumerate(precisions):
         lanes = slice(1 + k * TWINS, 1 + (k + 1) * TWINS)
         parted = {name: farthest(x[lanes], x[0]) for name, x in z_and_u.items()}
-        found[precision] = Horizon(plain, parted, sizes, _count(parted, sizes, alive))
+        far = [np.flatnonzero(~(x <= PARTED * sizes[name])) for name, x in parted.items()]
+        ends = [int(beyond[0]) for beyond in far if beyond.size]
+        found[precision] = Horizon(plain, parted, sizes, min([alive, *ends]))
     return found
 
 
 def farthest(loops: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Return the largest distance of any loop [loops, samples] from the reference up to each sample, [samples]."""
     return np.maximum.accumulate(np.abs(loops - reference).max(axis=0))
-
-
-def _count(parted: dict[str, np.ndarray], sizes: dict[str, float], alive: int) -> int:
-    ends = [np.flatnonzero(~(x <= PARTED * sizes[name])) for name, x in parted.items()]
-    return min([alive, *(int(end[0]) for end in ends if end.size)])
 
 
 @jax.jit

@@ -125,8 +125,5 @@ def _voltages(case: Case) -> tuple[float | None, float | None]:
 
 
 def _facts_table(facts: list[Fact]) -> str:
-    def number(x: float) -> str:
-        return f"{x:.4g}"
-
-    rows = [(fact.words, number(fact.value), fact.unit) for fact in facts if fact.value is not None]
+    rows = [(fact.words, f"{fact.value:.4g}", fact.unit) for fact in facts if fact.value is not None]
     return table(("loop and machine", "value", "unit"), rows)

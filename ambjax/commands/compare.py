@@ -260,9 +260,7 @@ def _draw(compared: Sequence[Compared], path: pathlib.Path) -> None:
         )
         for one in compared
     ]
-    zones = compared[0].case.zones
-    limits = [float(x) for x in (zones.zone_a, zones.zone_b, zones.zone_c)]
     loops = [(first_axis(one.case), one.loop.system) for one in compared]
     spans = [shown_band(case, [system] if system else []) for case, system in loops]
     span = min(low for low, _ in spans), max(high for _, high in spans)
-    comparison.comparison(shown, limits, span, path)
+    comparison.comparison(shown, compared[0].case.zones.limits, span, path)

@@ -11,14 +11,13 @@ from ambjax.commands.machine_commands import once_per_revolution, worst_of_speed
 from ambjax.host.heartbeat import say
 from ambjax.linear import MachineSensitivity, poles_in_s
 from ambjax.linear.linear_machine import turning_machines
-from ambjax.linear.rotor_modes import Mode, modes_of
+from ambjax.linear.rotor_modes import LIGHT, Mode, modes_of
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.operating import sensitivity
 from ambjax.results.outputs import plain, table
 
-# Modes that the second analysis adds to those of a shaft. Modes whose damping ratio is below LIGHT are listed, at most
-# MOST.
-MORE, LIGHT, MOST = 4, 0.3, 8
+# Modes that the second analysis adds to those of a shaft. At most MOST lightly damped modes are listed.
+MORE, MOST = 4, 8
 AXIS_COLUMNS = ("axis", "|z|/clearance", "zone", "weight/force", "force reserve", "peak of |S|", "zone")
 
 

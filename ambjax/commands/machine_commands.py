@@ -92,13 +92,12 @@ def sensitivity(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summa
     measured = _injections(case, points, args.inject)
     out = directory(args.out, f"sensitivity-{case.name}", ANALYSED, args.force)
     summary = sensitivity_summary(points, measured)
-    limits = [float(x) for x in (case.zones.zone_a, case.zones.zone_b, case.zones.zone_c)]
     from ambjax.pictures.machine_pictures import machine_sensitivity_picture
 
     with files(out) as part:
         write_json(part / "sensitivity.json", summary)
         path = part / "sensitivity.png"
-        described(path.name, lambda: machine_sensitivity_picture(points, limits, path, case.name, measured))
+        described(path.name, lambda: machine_sensitivity_picture(points, case.zones.limits, path, case.name, measured))
         names = [name for name in ANALYSED if (part / name).exists()]
     if not args.json:
         print(sensitivity_text(points, measured))

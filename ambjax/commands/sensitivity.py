@@ -138,10 +138,9 @@ def _draw(
     loops = [
         frequency.NamedLoop(point.name, point.system, point.m, point.analysis.margins_at.reading.dm) for point in shown
     ]
-    limits = [float(x) for x in (case.zones.zone_a, case.zones.zone_b, case.zones.zone_c)]
     injected_points = None
     one = None if measured is None else measured.position
     if one is not None and one.S is not None and one.T is not None and one.KS is not None:
         injected_points = frequency.MeasuredPoints(one.frequency, one.S, one.T, one.KS)
     span = shown_band(case, [point.system for point in shown])
-    frequency.sensitivity_picture(case.name, loops, limits, span, path, injected_points)
+    frequency.sensitivity_picture(case.name, loops, case.zones.limits, span, path, injected_points)

@@ -10,7 +10,7 @@ from ambjax.control.base import Requirement, scaled_steepness
 from ambjax.control.defaults import current_rate
 from ambjax.control.sampling import Relay, Sampling, non_oscillating
 from ambjax.control.search import Interval, SearchContext, authority, rate, steepness, switch
-from ambjax.control.stages import CurrentInputs, CurrentLaw, Stateless, unwinding
+from ambjax.control.stages import CurrentInputs, CurrentLaw, OneIntegral, Stateless, unwinding
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, limited, smooth_sign
@@ -79,7 +79,7 @@ class SlidingMode(Stateless, CurrentLaw[tuple[()]]):
 
 
 @record
-class ProportionalIntegral(CurrentLaw[Array]):
+class ProportionalIntegral(OneIntegral, CurrentLaw[Array]):
     """u = k_p (i_ref - i) + L i_ref' + x, x' = k_int (i_ref - i) + k_aw (clip(u) - u), with x in V.
 
     This linear law uses the inductance L at z = 0 and has no motional term. While the supply limits u to clip(u),
@@ -97,9 +97,6 @@ class ProportionalIntegral(CurrentLaw[Array]):
     k_int: Scalar = gain(default=2.33e8, unit="V/A/s", doc="integral gain, 0: none; left out: w_c^2 L/4", zero=True)
     k_aw: Scalar = gain(default=1330.0, unit="1/s", doc="anti-windup rate, 0: none; left out: w_c/4", zero=True)
     memory = (("x", "V", "integral of the current error"),)
-
-    def init(self, model: Plant) -> Array:
-        return jnp.zeros(())
 
     def scale(self, model: Plant) -> Scalar:
         return model.R * model.i_0 / 10 + 1e-3

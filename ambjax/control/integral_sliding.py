@@ -9,7 +9,7 @@ from ambjax.control.defaults import switching_gain, switching_steepness
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, manifold, position_switch, rate, steepness
-from ambjax.control.stages import PositionLaw
+from ambjax.control.stages import OneIntegral, PositionLaw
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
@@ -19,7 +19,7 @@ from ambjax.world.waveforms import Reference
 
 
 @record
-class IntegralSlidingMode(PositionLaw[Array]):
+class IntegralSlidingMode(OneIntegral, PositionLaw[Array]):
     """v_star = (-2 k_z z/m - c e_dot - c_int e + r_ddot + g - k sgn(s))/a, s = e_dot + c e + c_int x, x' = e = z - r.
 
     Eq. (5) with the integral of the error in the sliding variable (Slotine and Li, Applied Nonlinear Control, 1991,
@@ -52,9 +52,6 @@ class IntegralSlidingMode(PositionLaw[Array]):
     def designed(self, model: Plant, sampling: Sampling | None) -> "IntegralSlidingMode":
         w = model.pole
         return IntegralSlidingMode(w, w**2 / 4, switching_gain(model), switching_steepness(model))
-
-    def init(self, model: Plant) -> Array:
-        return jnp.zeros(())
 
     def scale(self, model: Plant) -> Scalar:
         return model.s_0 / 500

@@ -12,7 +12,7 @@ from ambjax.control.defaults import switching_gain, switching_steepness
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, position_switch, rate, steepness
-from ambjax.control.stages import PositionLaw, Stateless
+from ambjax.control.stages import OneIntegral, PositionLaw, Stateless
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, safe_sqrt, smooth_root, smooth_sign
@@ -25,7 +25,7 @@ WIDTH = 0.01
 
 
 @record
-class UtkinSlidingMode(PositionLaw[Array]):
+class UtkinSlidingMode(OneIntegral, PositionLaw[Array]):
     """v_star = (-2 k_z z/m + r_ddot + g - k_p e - k_d e_dot - k sgn(s))/a, s = e_dot + k_d e + x, x' = k_p e.
 
     Integral sliding mode: feedback linearisation, and a sign that cancels the disturbance (V. Utkin and J. Shi, Proc.
@@ -54,9 +54,6 @@ class UtkinSlidingMode(PositionLaw[Array]):
     switching: ClassVar = ("k",)
     memory = (("integral", "m/s", "integral of k_p e"),)
     own_steps = ("implicit", "explicit")
-
-    def init(self, model: Plant) -> Array:
-        return jnp.zeros(())
 
     def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> Array:
         """Return the integral x for which s = 0."""

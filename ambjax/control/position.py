@@ -17,7 +17,7 @@ from ambjax.control.pid import PID as PID
 from ambjax.control.pid import FeedbackLinearisation as FeedbackLinearisation
 from ambjax.control.sampling import Relay, Sampling
 from ambjax.control.search import Interval, SearchContext, authority, manifold, position_switch, rate, steepness
-from ambjax.control.stages import PositionLaw, Stateless
+from ambjax.control.stages import OneIntegral, PositionLaw, Stateless
 from ambjax.control.state_feedback import StateFeedback as StateFeedback
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share, twist
@@ -93,7 +93,7 @@ class SlidingMode(Stateless, PositionLaw[tuple[()]]):
 
 
 @record
-class SuperTwisting(PositionLaw[Array]):
+class SuperTwisting(OneIntegral, PositionLaw[Array]):
     """sigma_dot = -k_1 sqrt|sigma| sgn(sigma) + w, w' = -k_2 sgn(sigma): super-twisting, the paper's future work.
 
     Levant, Int. J. Control 58 (1993) 1247-1263. Both terms are smoothed with p: the root as sigma / (sigma^2 +
@@ -127,9 +127,6 @@ class SuperTwisting(PositionLaw[Array]):
     def designed(self, model: Plant, sampling: Sampling | None) -> "SuperTwisting":
         p, w = switching_steepness(model), model.pole
         return SuperTwisting(w, w / p**0.5, w**2 / 4 / (TWO_OVER_PI * p), p)
-
-    def init(self, model: Plant) -> Array:
-        return jnp.zeros(())
 
     def scale(self, model: Plant) -> Scalar:
         return jnp.abs(model.g) / 50 + 1e-3

@@ -98,6 +98,13 @@ class Stateless(Law):
         return ()
 
 
+class OneIntegral(Law):
+    """A law whose state is one integral that starts at 0: a second base class, before that of the stage."""
+
+    def init(self, model: Plant) -> Array:
+        return jnp.zeros(())
+
+
 def unwinding(k_aw: Scalar, k_int: Scalar) -> Array:
     """Return the anti-windup rate k_aw (1/s) of an integral with the gain k_int, or 0 without an integral."""
     return jnp.where(jnp.asarray(k_int) > 0, k_aw, 0.0)

@@ -9,7 +9,7 @@ from ambjax.control.force import force_of_current, linear_mechanics, resting_cur
 from ambjax.control.regulator import optimal_gains
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
-from ambjax.control.stages import PositionLaw, unwinding
+from ambjax.control.stages import OneIntegral, PositionLaw, unwinding
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
@@ -17,7 +17,7 @@ from ambjax.world.waveforms import Reference
 
 
 @record
-class StateFeedback(PositionLaw[Array]):
+class StateFeedback(OneIntegral, PositionLaw[Array]):
     """v_star = dv/dz z + dv/di i_star, i_star = i_r - k_p e - k_d e_dot - x, x' = k_int e + k_aw (i_star - i).
 
     The linear controller of the textbooks (Schweitzer and Maslen, Magnetic Bearings, 2009, 8.3) demands a current
@@ -38,9 +38,6 @@ class StateFeedback(PositionLaw[Array]):
     k_int: Scalar = gain(default=5310.0, unit="A/m/s", doc="integral gain, 0: none; left out: LQR", zero=True)
     k_aw: Scalar = gain(default=10.6, unit="1/s", doc="anti-windup rate, 0: none; left out: w/50", zero=True)
     memory = (("integral", "A", "integral term"),)
-
-    def init(self, model: Plant) -> Array:
-        return jnp.zeros(())
 
     def scale(self, model: Plant) -> Scalar:
         return model.i_0 / 25

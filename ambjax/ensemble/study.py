@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Callable
 from typing import Any, NamedTuple, Self
 
-import jax
 import numpy as np
 
 from ambjax.control.cascade import Cascade
@@ -85,13 +84,15 @@ class AnyStudy(abc.ABC):
         """Return the study with another sample period, s, and runs of the same duration."""
 
     @abc.abstractmethod
-    def metrics(self, values: dict[str, np.ndarray], members: np.ndarray) -> dict[str, np.ndarray]:
-        """Simulate systems with these values [n] by dotted path, and return their metrics [n].
+    def metrics(
+        self, values: dict[str, np.ndarray], members: np.ndarray, *, lost: bool = False, **how: Any
+    ) -> dict[str, np.ndarray]:
+        """Simulate systems with these values [n] by dotted path, and return lost_at (s) and their metrics, [n] by name.
 
-        `members` [n]: numbers of the members whose random signals they have.
+        `members` [n]: numbers of the members whose random signals they have. `lost` and, in `how`, `call`
+        and `threads` are those of `columns`.
         """
 
-    @abc.abstractmethod
     def columns(
         self, start: int, stop: int, *, call: int | None = None, threads: int | None = None, lost: bool = False
     ) -> dict[str, Any]:
@@ -101,6 +102,10 @@ class AnyStudy(abc.ABC):
         are those of `map_members`. `lost`: start every rotor outside its clearance, so that it is lost at once. Such a
         call compiles the program of the study without the cost of a run.
         """
+        members = np.arange(start, stop)
+        values = self.drawn(members)
+        metrics = self.metrics(values, members, lost=lost, call=call, threads=threads)
+        return {"index": members, **metrics, **{SPREAD + path: x for path, x in values.items()}}
 
     def facts(self) -> dict[str, object]:
         """Return the part of the fingerprint that does not describe the system."""
@@ -165,28 +170,22 @@ class Study(AnyStudy):
         samples = max(round(float(self.clock.duration) / period), 1)
         return dataclasses.replace(self, clock=replaced(self.clock, samples=samples, sample_period=period))
 
-    def metrics(self, values: dict[str, np.ndarray], members: np.ndarray) -> dict[str, np.ndarray]:
-        cascade, scenario = jax.tree.map(np.asarray, self.varied(values, members))
-        return run_ensemble(cascade, scenario, self.clock, fold=Metrics.of(self.settle, scenario)).metrics
+    def metrics(
+        self, values: dict[str, np.ndarray], members: np.ndarray, *, lost: bool = False, **how: Any
+    ) -> dict[str, np.ndarray]:
+        cascade, scenario = self.varied(values, members)
+        if lost:
+            far = np.full(np.shape(scenario.initial.z), 2 * np.max(np.asarray(scenario.limit)))
+            scenario = dataclasses.replace(scenario, initial=dataclasses.replace(scenario.initial, z=far))
+        fold = Metrics.of(self.settle, scenario)
+        outcome = run_ensemble(cascade, scenario, self.clock, fold=fold, **how)
+        return {"lost_at": np.asarray(outcome.trajectory.lost_at), **outcome.metrics}
 
     def member(self, index: int) -> tuple[Cascade, Scenario]:
         """Return the cascade and scenario of one member; all leaves are numbers."""
         values = {path: float(x[0]) for path, x in self.drawn(np.array([index])).items()}
         cascade, scenario = apply(self.cascade, self.scenario, values)
         return cascade, dataclasses.replace(scenario, seed=self.seed, member=index)
-
-    def columns(
-        self, start: int, stop: int, *, call: int | None = None, threads: int | None = None, lost: bool = False
-    ) -> dict[str, Any]:
-        members = np.arange(start, stop)
-        cascade, scenario = self.batch(members)
-        if lost:
-            far = np.full(np.shape(scenario.initial.z), 2 * np.max(np.asarray(scenario.limit)))
-            scenario = dataclasses.replace(scenario, initial=dataclasses.replace(scenario.initial, z=far))
-        fold = Metrics.of(self.settle, scenario)
-        outcome = run_ensemble(cascade, scenario, self.clock, fold=fold, threads=threads, call=call)
-        values = {SPREAD + path: x for path, x in self.drawn(members).items()}
-        return {"index": members, "lost_at": outcome.trajectory.lost_at, **outcome.metrics, **values}
 
     def bands(self, members: int, times: int, until: float = math.inf) -> Bands:
         """Compute the data of a fan chart of the first `members` members, up to time `until` (s) or the end."""

@@ -96,6 +96,11 @@ class Zones:
         return _zone(share, self.clearance_a, self.clearance_b, self.clearance_c)
 
     @property
+    def limits(self) -> list[float]:
+        """The upper limits of the zones A, B and C."""
+        return [float(x) for x in (self.zone_a, self.zone_b, self.zone_c)]
+
+    @property
     def whole(self) -> "Zones":
         """These zones with the whole range of frequencies, in which no peak can be outside."""
         return dataclasses.replace(self, f_high=None)

@@ -11,6 +11,8 @@ from ambjax.world.rotor import Rotor
 RIGID = 5
 # Share of the forward part of a motion, beyond one half, from which on the motion has a direction.
 CIRCULAR = 0.05
+# Damping ratio below which a mode counts as lightly damped.
+LIGHT = 0.3
 # Size of a pole of the z-plane that is a pure delay, and relative size of an imaginary part that is a rounding error.
 DELAY, REAL = 1e-9, 1e-6
 

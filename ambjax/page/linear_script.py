@@ -135,7 +135,7 @@ def linear_script(case: Case) -> LinearScript:
         start = piece_of(_start, "p", (numbers,))
         point = piece_of(_columns, "px", (numbers, x))
     low, high = case.zones.whole.range(case.clock.sample_period)
-    zones = [float(z) for z in (case.zones.zone_a, case.zones.zone_b, case.zones.zone_c)]
+    zones = case.zones.limits
     sizes = {name: len(jax.tree.leaves(getattr(x, name))) for name in ("lagged", "control", "past")}
     facts = {**sizes, "zones": zones, "low": low, "high": high}
     sources = [

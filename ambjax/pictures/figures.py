@@ -155,9 +155,9 @@ def _band(ax: Axes, t: np.ndarray, y: np.ndarray, colour: str) -> tuple[np.ndarr
     return smoothed(t, y, PIXELS)
 
 
-def _first_moments(ax: Axes, trajectory: Trajectory, until: float = 0.01) -> None:
+def _first_moments(ax: Axes, trajectory: Trajectory) -> None:
     """Draw an inset of the first 10 ms, in which the paper's inversion error reaches zero."""
-    early = np.asarray(trajectory.rows.t) <= until
+    early = np.asarray(trajectory.rows.t) <= 0.01
     inset = ax.inset_axes((0.32, 0.3, 0.4, 0.6))
     inset.plot(1e3 * np.asarray(trajectory.rows.t)[early], signal_of(trajectory.rows, "v_tilde")[early], color=BLUE)
     inset.set_title("first 10 ms (time in ms)", fontsize=7, pad=2)

@@ -9,14 +9,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from ambjax.linear.rotor_modes import LIGHT
 from ambjax.pictures.style import own_style
 
 # Largest number of points of a drawn curve.
 MOST_POINTS = 4000
 # Share of a limit from which on the limit is drawn.
 NEAR = 0.5
-# Damping ratio below which a mode counts as lightly damped.
-LIGHT = 0.3
 
 
 @own_style

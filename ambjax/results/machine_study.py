@@ -19,7 +19,7 @@ from ambjax.ensemble.batching import map_members
 from ambjax.ensemble.maps import PERIOD
 from ambjax.ensemble.paths import Place, kinds, places, with_values
 from ambjax.ensemble.spread import Spread, drawn
-from ambjax.ensemble.study import SPREAD, AnyStudy
+from ambjax.ensemble.study import AnyStudy
 from ambjax.linear import linearise_machine
 from ambjax.linear.stability import Findings
 from ambjax.numerics.records import canonical
@@ -116,21 +116,31 @@ class MachineStudy(AnyStudy):
             raise ValueError(f"--x, --y: {error}") from None
         return self._with_clock(self.case, self.clock.with_method(found.clock.method))
 
-    def batch(self, members: np.ndarray) -> tuple[Machine, PerAxis]:
-        """Return the machine of these members [n], and the metrics of its axes; what varies has an axis [n]."""
-        return self.varied(self.drawn(members), members)
-
     def varied(self, values: dict[str, np.ndarray], members: np.ndarray) -> tuple[Machine, PerAxis]:
-        """Return the machine with these values [n] and the random signals of these members [n], as `batch` does."""
+        """Return the machine with these values and random signals of these members [n], and the metrics of its axes.
+
+        What varies has an axis [n].
+        """
         machine = self.case.machine
         parts = [self._axis(values, k, members) for k in range(len(self.case.axes))]
         rotor, start = varied_rotors(machine.rotor, values, self.case.axes), varied_start(machine.start_q, values)
         folds = [canonical(Metrics.of(self.settle, scenario, machine.near)) for _, scenario in parts]
         return machine_of_axes(rotor, parts, self.clock, start, machine.law), PerAxis(stack_axes(folds))
 
-    def metrics(self, values: dict[str, np.ndarray], members: np.ndarray) -> dict[str, np.ndarray]:
+    def metrics(
+        self, values: dict[str, np.ndarray], members: np.ndarray, *, lost: bool = False, **how: Any
+    ) -> dict[str, np.ndarray]:
         machine, fold = self.varied(values, members)
-        return worst_of(run_machines(machine, self.clock, fold).metrics)
+        if lost:
+            far = np.array(machine.start_q)
+            far[..., :3] = FAR * max(float(np.max(np.asarray(one.scenario.limit))) for one in self.case.cases)
+            machine = dataclasses.replace(machine, start_q=far)
+        tree = canonical((machine, self.clock, fold))
+        outcome = map_members(_simulated, tree, plain=_has_long_sums(machine), vectorised=True, **how)
+        columns = {"lost_at": np.asarray(outcome.trajectory.lost_at), **worst_of(outcome.metrics)}
+        for k, axis in enumerate(self.case.axes):
+            columns |= {f"{axis}.{name}": outcome.metrics[name][:, k] for name in self.by_axis}
+        return columns
 
     def _axis(self, values: dict[str, Any], k: int, member: Any) -> tuple[Cascade, Scenario]:
         one = self.case.cases[k]
@@ -153,21 +163,6 @@ class MachineStudy(AnyStudy):
         machine = machine_of_axes(rotor, parts_of(cases), self.clock, start, machine.law)
         name = f"{self.case.name}-{index}"
         return dataclasses.replace(self.case, name=name, machine=machine, cases=tuple(cases))
-
-    def columns(
-        self, start: int, stop: int, *, call: int | None = None, threads: int | None = None, lost: bool = False
-    ) -> dict[str, Any]:
-        members = np.arange(start, stop)
-        machine, fold = self.batch(members)
-        if lost:
-            far = np.array(machine.start_q)
-            far[..., :3] = FAR * max(float(np.max(np.asarray(one.scenario.limit))) for one in self.case.cases)
-            machine = dataclasses.replace(machine, start_q=far)
-        outcome = run_machines(machine, self.clock, fold, threads=threads, call=call)
-        values = {SPREAD + path: x for path, x in self.drawn(members).items()}
-        for k, axis in enumerate(self.case.axes):
-            values |= {f"{axis}.{name}": outcome.metrics[name][:, k] for name in self.by_axis}
-        return {"index": members, "lost_at": outcome.trajectory.lost_at, **worst_of(outcome.metrics), **values}
 
     def findings(self, index: np.ndarray) -> Findings:
         """Test whether the linear loops of the first MOST_TESTED of these members are stable at their first speed."""
@@ -197,14 +192,6 @@ class MachineStudy(AnyStudy):
                 digest.update(np.asarray(x).tobytes())
             facts[name] = digest.hexdigest()[:12]
         return facts
-
-
-def run_machines(
-    machine: Machine, clock: Clock, fold: Fold, *, threads: int | None = None, call: int | None = None
-) -> Result:
-    """Simulate every member of an ensemble of machines. What varies has a leading axis [N]. No rows are recorded."""
-    tree = canonical((machine, clock, fold))
-    return map_members(_simulated, tree, threads=threads, call=call, plain=_has_long_sums(machine), vectorised=True)
 
 
 def _has_long_sums(machine: Machine) -> bool:
