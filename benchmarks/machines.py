@@ -204,7 +204,8 @@ def by_c(kind: Kind, problem: ctypes.Structure, members: int, errors: np.ndarray
 def ensemble(kind: Kind, members: int, samples: int, every: bool = False) -> tuple[MachineCase, Any]:
     """Return the case and its arguments of `run_machines`. `every`: all metrics, not only the largest |z|."""
     case = case_of(kind, samples)
-    machine, fold = MachineStudy(case, 0, members).batch(np.arange(members))
+    study, numbers = MachineStudy(case, 0, members), np.arange(members)
+    machine, fold = study.varied(study.drawn(numbers), numbers)
     return case, (machine, case.clock, fold if every else PerAxis(Peak("z", jnp.zeros(kind.axes))))
 
 

@@ -135,8 +135,7 @@ class MachineStudy(AnyStudy):
             far = np.array(machine.start_q)
             far[..., :3] = FAR * max(float(np.max(np.asarray(one.scenario.limit))) for one in self.case.cases)
             machine = dataclasses.replace(machine, start_q=far)
-        tree = canonical((machine, self.clock, fold))
-        outcome = map_members(_simulated, tree, plain=_has_long_sums(machine), vectorised=True, **how)
+        outcome = run_machines(machine, self.clock, fold, **how)
         columns = {"lost_at": np.asarray(outcome.trajectory.lost_at), **worst_of(outcome.metrics)}
         for k, axis in enumerate(self.case.axes):
             columns |= {f"{axis}.{name}": outcome.metrics[name][:, k] for name in self.by_axis}
@@ -192,6 +191,15 @@ class MachineStudy(AnyStudy):
                 digest.update(np.asarray(x).tobytes())
             facts[name] = digest.hexdigest()[:12]
         return facts
+
+
+def run_machines(machine: Machine, clock: Clock, fold: Fold, **how: Any) -> Result:
+    """Simulate every member of an ensemble of machines. What varies has a leading axis [N]. No rows are recorded.
+
+    `how`: `threads` and `call` of `map_members`.
+    """
+    tree = canonical((machine, clock, fold))
+    return map_members(_simulated, tree, plain=_has_long_sums(machine), vectorised=True, **how)
 
 
 def _has_long_sums(machine: Machine) -> bool:
