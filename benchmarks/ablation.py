@@ -17,13 +17,15 @@ from typing import Any
 
 import _measure
 import default_gains
+import numpy as np
 import tasks
 import tomlkit
 
 from ambjax.cases.template_text import template
 from tuning import validate
 from tuning.__main__ import main as tune
-from tuning.solve import descent, multipliers, refine
+from tuning.problem import limits
+from tuning.solve import course, descent, multipliers, refine
 
 NEVER = 10**9
 FIRST_KINDS = {
@@ -52,10 +54,17 @@ def by_values(raw: dict[str, Any]) -> None:
     constant(refine, STEEP=-1.0)(raw)
 
 
+def unordered(engine: Any, members: Any, x: np.ndarray, goal: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points of the screen in their order, with equal goals."""
+    return x, np.zeros(len(x))
+
+
 # What is switched off, and how.
 MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "nothing": lambda raw: None,
-    "screen: the first points are refined": constant(refine, screen=lambda engine, members, x, goal: x),
+    "screen: the first points are refined": constant(
+        refine, screen=lambda engine, members, x, goal: (x, np.zeros(len(x)))
+    ),
     "starting points: only the case's gains": setting(screen=0),
     "several starts: only the best of the screen": setting(starts=1),
     "CMA-ES": constant(refine, STEEP=math.inf, CONVERGED=math.inf),
@@ -64,6 +73,8 @@ MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "stressed members": setting(stressed=0),
     "validation": setting(validation=0),
     "members of large errors join": constant(validate, LARGER=math.inf),
+    "search around the optimum": constant(course, LOWER=math.inf),
+    "extrapolation of the multipliers": constant(limits, MOST_STEPS=0.0),
     "updates of the multipliers": constant(multipliers, MOST_UPDATES=0),
 }
 

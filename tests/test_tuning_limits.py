@@ -186,6 +186,15 @@ def test_the_reserve_of_a_limit_is_half_of_its_margin(name, sign):
     assert limit.holds(math.exp(boundary))
 
 
+def test_multipliers_are_extrapolated_through_the_last_two_optima():
+    """The goal kappa (g_0 - g)^2 / 2 has the multiplier kappa (g_0 - g) at each optimum, and kappa g_0 at the limit."""
+    limit, kappa, g_0 = Limit("rms_u_V", 10.0), 60.0, 0.3
+    for _ in range(2):
+        g = (kappa * g_0 - limit.multiplier) / (kappa + PENALTY)  # optimum of the goal with the term of the limit
+        limit = limit.updated(10.0 * math.exp(g), 10.0 * math.exp(g))
+    assert limit.multiplier == pytest.approx(kappa * g_0)
+
+
 def test_the_penalty_of_a_limit_is_that_of_an_augmented_lagrangian():
     limit, values = Limit("rms_u_V", 10.0), jnp.full(3, 10.0 * math.exp(0.1))
     assert float(limit.term(values)) == pytest.approx(PENALTY * 0.1**2 / 2)
@@ -196,7 +205,7 @@ def test_the_penalty_of_a_limit_is_that_of_an_augmented_lagrangian():
     assert tighter.multiplier == pytest.approx(0.0)
     # the judged value is 10 % larger than that of the search: from now on the search corrects its values by this ratio
     assert float(tighter.term.excess(jnp.full(3, 10.0))) == pytest.approx(0.1)
-    again = tighter.updated(9.9, 10.0 * math.exp(0.09))
+    again = Limit("rms_u_V", 10.0, ratio=tighter.ratio).updated(9.9, 10.0 * math.exp(0.09))
     assert again.multiplier == pytest.approx(PENALTY * (0.1 + math.log(0.99)))
     assert limit.updated(5.0, 5.0).multiplier == 0.0
     # an injection loses the rotor: the value is ten times the limit, so that the search continues

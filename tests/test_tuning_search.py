@@ -210,7 +210,7 @@ def test_the_screen_orders_the_points_by_their_goal(small):
     points = initial_points(SPACE, ranges(engine.objective, start), start, 8, seed=1)
     assert points.shape == (10, 4)
     np.testing.assert_allclose(points[0], SPACE.encode(start))
-    ordered = screen(engine, members, points, goal)
+    ordered, _ = screen(engine, members, points, goal)
     values = goal.score(engine.terms(ordered, members), members)
     assert np.all(np.diff(values) >= 0)
     np.testing.assert_allclose(np.sort(values), np.sort(goal.score(engine.terms(points, members), members)))

@@ -11,7 +11,7 @@ to the goal, which is a logarithm. At the optimum, a limit that is 1 % looser lo
 
 import dataclasses
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -24,6 +24,8 @@ from tuning.problem.quantities import KINDS, TINY, Kind, LimitContext
 
 # Penalty; at a multiplier of 0, an excess of 10 % adds 0.14 to the goal.
 PENALTY = 30.0
+# Largest extrapolation of a multiplier, in updates.
+MOST_STEPS = 5.0
 # Prefix that marks a limited quantity among the terms of a loss.
 PREFIX = "limit."
 # A limit with a multiplier above 0 is met if g lies between minus this number and half of the margin.
@@ -128,7 +130,7 @@ class Limit:
         multiplier = max(self.multiplier + PENALTY * float(self.log_excess(self.ratio * tuned)), 0.0)
         ratio = max(judged, TINY) / max(tuned, TINY)
         history = (*self.history, (max(judged, TINY), multiplier))
-        return dataclasses.replace(self, multiplier=multiplier, ratio=ratio, history=history)
+        return dataclasses.replace(self, multiplier=_extrapolated(self, history), ratio=ratio, history=history)
 
     def error_reduction(self, more: float) -> float:
         """Return the relative decrease of the minimised rms value if the limit is looser by the share `more`.
@@ -166,6 +168,19 @@ class Limit:
     def values(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the quantity of every member [N] of an ensemble."""
         return np.asarray(columns[self.kind.exact or f"loss.{PREFIX}{self.name}"])
+
+
+def _extrapolated(limit: Limit, history: Sequence[tuple[float, float]]) -> float:
+    """Return the next multiplier: the last one of `history`, or that at g = 0 on the line through the last two.
+
+    The multiplier that minimises at g is the slope of the objective there. Without the line, g falls by a fixed factor
+    in each update, which may be close to 1. An update is at most MOST_STEPS times as long as without it.
+    """
+    (*_, (before, first)), (reached, last) = ((math.nan, math.nan), *history[:-1]), history[-1]
+    g_before, g = float(limit.log_excess(before)), float(limit.log_excess(reached))
+    if not (0 < g < g_before and last > first):
+        return last
+    return last + g * min((last - first) / (g_before - g), MOST_STEPS * PENALTY)
 
 
 def measures(names: Collection[str], limits: tuple[Limit, ...], context: LimitContext) -> dict[str, Fold]:

@@ -21,6 +21,8 @@ from tuning.problem.space import MARGIN, Gain, Space
 END_FACTOR = 3.0
 # Range of a gain for which the law defines none: its value divided and multiplied by this factor.
 DEFAULT_FACTOR = 30.0
+# Half-widths of the neighbourhoods of an optimum, in coordinates: each gain changes by up to e^1.5 and e^3.
+REACHES = 1.5, 3.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +68,13 @@ def initial_points(space: Space, box: list[Range], start: np.ndarray, count: int
     middle = np.full((1, len(space)), 0.5)
     gains = np.concatenate([start[None], from_unit_cube(space, box, np.concatenate([middle, cube]))])
     return np.stack([space.encode(space.clip(g)) for g in gains])
+
+
+def around(x: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """Return coordinates [count + 1, m]: x [m], and quasi-random points around it, alternately within both REACHES."""
+    cube = design_points("sobol", seed, len(x), np.arange(count), count)
+    reach = np.resize(REACHES, count)[:, None]
+    return np.concatenate([x[None], x + reach * (2 * cube - 1)])
 
 
 def from_unit_cube(space: Space, box: list[Range], cube: np.ndarray) -> np.ndarray:

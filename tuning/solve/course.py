@@ -14,10 +14,13 @@ from tuning.judge.evaluate import StepError
 from tuning.problem.loops import check_loops
 from tuning.problem.loss import TERMS
 from tuning.problem.members import Members
-from tuning.problem.ranges import initial_points
+from tuning.problem.ranges import around, initial_points
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.checkpoint import CheckpointFile, SearchState, checkpoint
-from tuning.solve.refine import best_of, search
+from tuning.solve.refine import best_of, screen, search
+
+# The first search is repeated from points around its optimum if their goal, a logarithm, is lower by this or more.
+LOWER = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,12 +180,22 @@ class Course:
 def first_search(course: Course, start: np.ndarray) -> np.ndarray:
     """Search from the gains `start` [m], SI units, and the points of the screen. Return the coordinates [m].
 
-    Raises ValueError as `check_loops` does.
+    A search can end at a jump or a ridge of the goal, with lower values beyond. If a quasi-random point around the
+    optimum has a lower goal, a second search begins at the best of these points. Raises ValueError as `check_loops`
+    does.
     """
     problem, budget = course.problem, course.problem.tune.budget
     points = initial_points(problem.objective.space, problem.ranges, start, budget.screen, course.seed)
     check_loops(problem.objective, points, course.members.searched)
-    return course.search(points)
+    x = course.search(points)
+    if not budget.screen or course.over:
+        return x
+    near, goals = screen(problem.engine, course.members, around(x, budget.screen, course.seed + 1), problem.goal)
+    if goals[0] > goals[np.flatnonzero((near == x).all(1))[0]] - LOWER:
+        return x
+    course.tell("points around this optimum have a lower goal")
+    (_, least), other = best_of(course.past[-1]), course.search(near[: budget.starts])
+    return other if best_of(course.past[-1])[1] < least else x
 
 
 def training(problem: TuningProblem) -> Members:

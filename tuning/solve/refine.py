@@ -67,7 +67,7 @@ def search(
         engine.rollouts = int(progress.history["rollouts"][-1])
     else:
         if len(points) > keep:
-            points = screen(engine, members, points, goal)[:keep]
+            points = screen(engine, members, points, goal)[0][:keep]
         progress = SearchState(begin(jnp.asarray(points)))
     try:
         while not progress.converged and progress.iteration < iterations:
@@ -87,10 +87,12 @@ def search(
     return progress
 
 
-def screen(engine: Engine, members: Members, x: np.ndarray, goal: Goal) -> np.ndarray:
-    """Return the points x [K, m] in the order of their goals on a part of the members, the best first."""
+def screen(engine: Engine, members: Members, x: np.ndarray, goal: Goal) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points x [K, m], the best first, and their goals [K] on a part of the members."""
     some = members.part
-    return x[np.argsort(goal.score(engine.terms(x, some), some), kind="stable")]
+    goals = goal.score(engine.terms(x, some), some)
+    order = np.argsort(goals, kind="stable")
+    return x[order], goals[order]
 
 
 def iterate(engine: Engine, goal: Goal, members: Members, progress: SearchState, descent: Descent) -> None:
