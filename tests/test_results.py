@@ -244,6 +244,10 @@ def test_derivatives_with_respect_to_named_gains_only():
     assert {path: float(x) for path, x in slopes.items()} == {paths[0]: pytest.approx(2 * c * k_i), paths[1]: c**2}
     with pytest.raises(ValueError, match=r"^controller\.position\.cc: .*Did you mean 'controller\.position\.c'"):
         ambjax.gains_of(cascade, ["controller.position.cc"])
+    hard = dataclasses.replace(cascade, position=dataclasses.replace(cascade.position, p=None))
+    with pytest.raises(ValueError, match=r"^controller\.position\.p = None: it has no value"):
+        ambjax.gains_of(hard, ["controller.position.p"])
+    assert ambjax.with_gains(hard, {"controller.position.p": 3.0}).position.p == 3.0
 
 
 def test_a_case_stands_for_its_cascade_scenario_and_clock():

@@ -23,23 +23,29 @@ def gains_of(loop: Cascade | Case, paths: Iterable[str] | None = None) -> dict[s
     - `paths`: the paths; None: those of all numbers of the cascade that have a value.
 
     The dict is a pytree: `jax.grad(lambda gains: f(with_gains(loop, gains)))(gains_of(loop, paths))` returns the
-    derivative with respect to these gains only. Raises ValueError for a path that does not exist.
+    derivative with respect to these gains only. Raises ValueError for a path that does not exist, or without a value.
     """
     if isinstance(paths, str):
         raise ValueError(f'paths = "{paths}": it must be a list. Write ["{paths}"].')
+    if paths is not None and not isinstance(paths, Iterable):
+        raise ValueError(f"paths = {paths!r}: it must be a list of dotted paths, such as controller.position.c.")
+    known = _numbers(loop, paths := None if paths is None else list(paths))
+    if none := [path for path in paths or () if known[path] is None]:
+        raise ValueError(f"{none[0]} = None: it has no value in this loop. Leave it out, or set it by `with_gains`.")
+    chosen = [path for path in known if known[path] is not None] if paths is None else paths
+    return {path: jnp.asarray(known[path], jnp.result_type(float)) for path in chosen}
+
+
+def _numbers(loop: Cascade | Case, paths: Iterable[str] | None) -> dict[str, Any]:
+    """Return the numbers of a controller by path; None: without a value. Raises ValueError for an unknown path."""
     cascade = loop.cascade if isinstance(loop, Case) else loop
     if not isinstance(cascade, Cascade):
         raise ValueError(f"loop = {type(loop).__name__}: it must be a Case, or a Cascade such as `case.cascade`.")
-    if paths is not None and not isinstance(paths, Iterable):
-        raise ValueError(f"paths = {paths!r}: it must be a list of dotted paths, such as controller.position.c.")
     known = places(cascade, Scenario())
-    own = [path for path in known if path.startswith(("controller.", "processor."))]
-    found = {}
-    for path in [one for one in own if known[one].value is not None] if paths is None else paths:
-        if path not in own:
-            raise ValueError(f"{path}: {no_such_number(path, own)}")
-        found[path] = jnp.asarray(known[path].value, jnp.result_type(float))
-    return found
+    own = {path: one.value for path, one in known.items() if path.startswith(("controller.", "processor."))}
+    if unknown := [path for path in paths or () if path not in own]:
+        raise ValueError(f"{unknown[0]}: {no_such_number(unknown[0], list(own))}")
+    return own
 
 
 def with_gains(loop: Loop, gains: Mapping[str, Any]) -> Loop:
@@ -49,7 +55,7 @@ def with_gains(loop: Loop, gains: Mapping[str, Any]) -> Loop:
     """
     if not isinstance(gains, Mapping):
         raise ValueError(f"gains = {gains!r}: it must be a dict of values by dotted path.")
-    gains_of(loop, gains)
+    _numbers(loop, gains)
     if isinstance(loop, Case):
         return dataclasses.replace(loop, cascade=with_gains(loop.cascade, gains))
     return with_values(loop, Scenario(), gains)[0]
