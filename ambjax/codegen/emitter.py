@@ -135,10 +135,11 @@ class _Reader:
         if len(branches) != 2 or self.program.dtype(index).kind != "b":
             raise ValueError(refusal("cond", law, f"of {len(branches)} branches"))
         no, yes = (self.closed(branch, rest, law) for branch in branches)
-        return [
-            self.program.apply("select", (index, b, a), self.program.dtype(a), law)
-            for a, b in zip(no, yes, strict=True)
-        ]
+        return self.selected(index, yes, no, law)
+
+    def selected(self, which: Ref, yes: list[Operand], no: list[Operand], law: str) -> list[Operand]:
+        apply, dtype = self.program.apply, self.program.dtype
+        return [apply("select", (which, a, b), dtype(a), law) for a, b in zip(yes, no, strict=True)]
 
     def _scan(self, params: Any, args: list[Operand], law: str) -> list[Operand]:
         consts, carry = split_scan(params, args)
@@ -151,11 +152,15 @@ class _Reader:
         asked, consts, carry = args[:at], args[at:to], args[to:]
         while True:
             (more,) = self.closed(params["cond_jaxpr"], asked + carry, law)
-            if isinstance(more, Ref):
-                raise ValueError(refusal("while", law, "whose length depends on data"))
-            if not more:
+            if not isinstance(more, Ref) and not more:
                 return carry
-            carry = self.closed(params["body_jaxpr"], consts + carry, law)
+            after = self.closed(params["body_jaxpr"], consts + carry, law)
+            if isinstance(more, Ref):  # a loop of at most one turn is a selection
+                (again,) = self.closed(params["cond_jaxpr"], asked + after, law)
+                if isinstance(again, Ref) or again:
+                    raise ValueError(refusal("while", law, "whose length depends on data"))
+                return self.selected(more, after, carry, law)
+            carry = after
 
 
 def refusal(name: str, law: str, how: str = "") -> str:

@@ -80,8 +80,9 @@ def _one(eqn: JaxprEqn, args: list[ArrayLike], count: int) -> list[ArrayLike]:
     if name == "while":
         at, to = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
         asked, fixed, carry = args[:at], args[at:to], args[to:]
-        while np.all(one_by_one(params["cond_jaxpr"], asked + carry, count)[0]):
-            carry = one_by_one(params["body_jaxpr"], fixed + carry, count)
+        while np.any(more := one_by_one(params["cond_jaxpr"], asked + carry, count)[0]):
+            after = one_by_one(params["body_jaxpr"], fixed + carry, count)
+            carry = list[ArrayLike](jnp.where(more, a, b) for a, b in zip(after, carry, strict=True))
         return carry
     if name in OPS and OPS[name].cost == "call":
         return [_of_library(OPS[name].c99.partition("{f}")[0], args, dtype_of(eqn.outvars[0]), count)]

@@ -83,23 +83,21 @@ class InitialValueProblem(NamedTuple, Generic[Inputs, State]):
         begin, end, limit = lax.stop_gradient((begin, end, self.limit))
         touched = (code == TOUCHED) & (end > begin)
 
-        def newton(now: tuple[Array, Array]) -> tuple[Array, Array]:
-            number, share = now
+        def crossing(now: tuple[Array, Array]) -> tuple[Array, Array]:
             h, sign = end - begin, jnp.where(z_after < 0, -1.0, 1.0)
             a, slope_a, b, slope_b = sign * z, sign * h * z_dot, sign * z_after, sign * h * z_dot_after
             curve, twist = 3 * (b - a) - 2 * slope_a - slope_b, 2 * (a - b) + slope_a + slope_b
-            chord = jnp.clip((limit - a) / away_from_zero(b - a, 1e-30), 0.0, 1.0)
-            share = jnp.where(number == 0, chord, share)
-            beyond = a + share * (slope_a + share * (curve + share * twist)) - limit
-            slope = away_from_zero(slope_a + share * (2 * curve + share * 3 * twist), 1e-30)
-            share = jnp.clip(share - beyond / slope, 0.0, 1.0)
-            return number + 1, jnp.where((number == 4) & (b < limit), 1.0, share)
+            share = jnp.clip((limit - a) / away_from_zero(b - a, 1e-30), 0.0, 1.0)
+            for _ in range(5):
+                beyond = a + share * (slope_a + share * (curve + share * twist)) - limit
+                slope = away_from_zero(slope_a + share * (2 * curve + share * 3 * twist), 1e-30)
+                share = jnp.clip(share - beyond / slope, 0.0, 1.0)
+            if jnp.ndim(share):  # the first axis that reaches its limit
+                share = jnp.min(jnp.where(b < limit, 1.0, share))
+            return jnp.zeros_like(touched), jnp.where(jnp.isfinite(share), begin + share * h, end)
 
-        # No iteration runs in an ensemble of which no member reaches the limit in this step.
-        begin_share = (jnp.int32(0), jnp.ones_like(z))
-        share = lax.while_loop(lambda now: touched & (now[0] < 5), newton, begin_share)[1]
-        first = jnp.min(share)  # the first axis that reaches its limit
-        return jnp.where(touched & jnp.isfinite(first), begin + first * (end - begin), end)
+        # The loop makes one turn, and none in an ensemble of which no member reaches the limit in this step.
+        return lax.while_loop(lambda now: now[0], crossing, (touched, end))[1]
 
     def rates_and_signals(self, inputs: Inputs, state: State) -> tuple[State, Instant]:
         """Return the rates, and the signals to record."""
