@@ -84,7 +84,8 @@ class InitialValueProblem(NamedTuple, Generic[Inputs, State]):
         touched = (code == TOUCHED) & (end > begin)
 
         def crossing(now: tuple[Array, Array]) -> tuple[Array, Array]:
-            h, sign = end - begin, jnp.where(z_after < 0, -1.0, 1.0)
+            h = now[1] - begin  # not `end`: XLA moves what is constant in a loop out of it
+            sign = jnp.where(z_after < 0, -1.0, 1.0)
             a, slope_a, b, slope_b = sign * z, sign * h * z_dot, sign * z_after, sign * h * z_dot_after
             curve, twist = 3 * (b - a) - 2 * slope_a - slope_b, 2 * (a - b) + slope_a + slope_b
             share = jnp.clip((limit - a) / away_from_zero(b - a, 1e-30), 0.0, 1.0)
