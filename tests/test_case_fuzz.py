@@ -273,7 +273,7 @@ def hold(text, path, tally, run):
     for where, values in draw(case.spread, case.cascade, case.scenario, 0, np.arange(8), 8).items():
         low, high = dict(case.spread.entries)[where].support(float(known[where].value or 0.0))
         assert np.all((low <= values) & (values <= high))
-    short = dataclasses.replace(case, clock=dataclasses.replace(case.clock, samples=SAMPLES))
+    short = dataclasses.replace(case, clock=dataclasses.replace(case.clock, samples=SAMPLES), settle=0.0)
     structure = jax.tree.structure((short.cascade, short.scenario, short.clock))
     known = structure in tally.structures
     if run and tally.read % ONE_IN == 0 and (known or len(tally.structures) < MOST_STRUCTURES):

@@ -57,6 +57,7 @@ BAD = {
     "dt a word": ('[clock]\ndt = "fast"\n', ["clock.dt", "auto"]),
     "unstable dt": ("[clock]\ndt = 1e-5\n", ["clock.dt = 1e-05", "stable only up to", "auto", "rodas3"]),
     "unknown method": ('[clock]\ndt = 1e-6\nmethod = "rk5"\n', ["clock.method", "Did you mean 'rk4'"]),
+    "a method without its step": ('[clock]\nmethod = "rk4"\n', ['clock.method = "rk4" needs a step', "clock.dt"]),
     "bad seed": ("[run]\nseed = -1\n", ["run.seed", "whole number"]),
     "settle after the end": ("[run]\nsettle = 5.0\n", ["run.settle", "clock.duration"]),
     "settle behind the last sample": ("[run]\nsettle = 1.99995\n", ["run.settle = 1.99995", "at most 1.9999 s"]),

@@ -133,13 +133,14 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
     cascade, scenario, clock = parts = case.cascade, case.scenario, case.clock
     gains, two = {"controller.position.c": jnp.array([17.0, 18.0])}, dataclasses.replace(scenario, member=np.arange(2))
     late = dataclasses.replace(scenario, q_z=ambjax.signals.Pulse(1.0, 2.0, 1.0))
+    short = dataclasses.replace(case, clock=dataclasses.replace(clock, samples=2))
     A_CASE = r"give a case, .* a Cascade, a Scenario and a Clock"
     refused = [
         (lambda: ambjax.simulate_members(case, 0), "members = 0: it must be a whole number from 1 to"),
         (lambda: ambjax.simulate_members(case, 2.5), "members = 2.5: it"),
         (lambda: ambjax.simulate_members(case, "ten"), "members = 'ten': it"),
         (lambda: ambjax.simulate_members(case, 1, seed=-1), "seed = -1: it must be a whole number from 0 to"),
-        (lambda: ambjax.read_case(3), "path = 3: it must be the path of a file"),
+        (lambda: ambjax.read_case(3), "path = 3: it must be the path of a file.* or a dict"),
         (lambda: ambjax.tune(3), "case = 3: it must be the path of a file"),
         (lambda: ambjax.sensitivity(case, "a"), "r = 'a': it must be a finite number"),
         (lambda: ambjax.gains_of(cascade, 3), "paths = 3: it must be a list"),
@@ -150,6 +151,8 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
         (lambda: ambjax.export(case, prefix=3), "prefix = 3: it must be a C identifier"),
         (lambda: ambjax.survival_map(case, ("plant.m", 1), "plant.R=1:2"), "x = .*: it must be text. Write PATH=LOW"),
         (lambda: ambjax.Metrics.for_case(cascade), "case = Cascade: it must be a "),
+        (lambda: ambjax.Metrics.for_case(short), "run.settle = .* s: it must be at most"),
+        (lambda: ambjax.simulate(short), "run.settle = .* s: it must be at most"),
         (lambda: ambjax.Metrics.of(0.0, 3), "scenario = 3: it must be a Scenario"),
         (lambda: ambjax.template("rigg"), "template = 'rigg': it must be one of tracking"),
         (lambda: ambjax.compare(case), "cases = Case: it must be a list of 2 to 8 cases"),

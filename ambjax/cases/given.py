@@ -11,6 +11,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import require_concrete
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method
+from ambjax.simulation.metrics import settled
 from ambjax.simulation.system import check_parts
 from ambjax.simulation.triple import no_case
 from ambjax.world.scenario import Scenario
@@ -66,19 +67,20 @@ def case_of(function: str, *parts: Any) -> Case:
     check_parts(cascade, scenario, clock.sample_period)
     clock = with_method(clock, cascade, scenario)
     cascade = cascade.on_processor() if cascade.sampled else cascade
-    return Case("case", cascade, scenario, clock, float(clock.duration) / 4)
+    last = float(clock.duration) - float(clock.sample_period)
+    return Case("case", cascade, scenario, clock, min(float(clock.duration) / 4, last))
 
 
 def require_case(case: object, *, machines: bool = False, traced: bool = False) -> None:
-    """Raise ValueError for anything but a `Case`, or with `machines` a `MachineCase`.
+    """Raise ValueError for anything but a `Case`, or with `machines` a `MachineCase`, and if it ends before it settles.
 
     `traced`: whether the numbers may be traced.
     """
     if isinstance(case, MachineCase):
         if not machines:
             raise ValueError("case = MachineCase: this function takes a case of one axis, from ambjax.read_case.")
-        return
-    if not isinstance(case, Case):
+    elif not isinstance(case, Case):
         raise ValueError(f"case = {cut(repr(case))}: it must be a Case, as ambjax.read_case(PATH) returns it.")
-    if not traced:
+    elif not traced:
         require_concrete("case", (case.cascade, case.scenario, case.clock))
+    settled(case.settle, case.clock)

@@ -17,13 +17,14 @@ from ambjax.cases.reach import check_reference
 from ambjax.cases.recordings import RecordedFile, Recordings
 from ambjax.cases.scenario_tables import check_start, scenario_from
 from ambjax.cases.table import Table, check_depth, cut, load
-from ambjax.cases.timing import clock_from, settled
+from ambjax.cases.timing import clock_from
 from ambjax.cases.variation import spread_from
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import Spread, corners, ends
 from ambjax.linear.analysis import Zones
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method
+from ambjax.simulation.metrics import settled
 from ambjax.simulation.sliding import Slide, slides
 from ambjax.simulation.system import check_parts
 from ambjax.simulation.triple import PARTS
@@ -54,6 +55,9 @@ OTHERS = ["tune"]  # read by the tuner, ignored by the other commands
 # A case name appears in titles, paths, tables and pages. UNSAFE: characters that are replaced in it. LONGEST_NAME: its
 # largest length.
 UNSAFE, LONGEST_NAME = re.compile(r"[^\w.+() -]+"), 80
+
+# Kinds of a path, for messages.
+FILE = "the path of a file, as text or a pathlib.Path"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,10 +130,10 @@ def is_machine(raw: dict[str, Any]) -> bool:
     return "bearing" in raw or (isinstance(raw.get("rotor"), dict) and "kind" in raw["rotor"])
 
 
-def require_file(name: str, path: object) -> None:
-    """Raise ValueError unless the argument `name` is the path of a file: text or a pathlib.Path."""
+def require_file(name: str, path: object, kinds: str = FILE) -> None:
+    """Raise ValueError unless the argument `name` is the path of a file. `kinds`: what it may be, for the message."""
     if not isinstance(path, str | pathlib.PurePath):
-        raise ValueError(f"{name} = {cut(repr(path))}: it must be the path of a file, as text or a pathlib.Path.")
+        raise ValueError(f"{name} = {cut(repr(path))}: it must be {kinds}.")
 
 
 def safe_name(text: str) -> str:

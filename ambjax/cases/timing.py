@@ -1,4 +1,4 @@
-"""The table [clock] of a case file: samples, their period, and the integrator; and the check of run.settle."""
+"""The table [clock] of a case file: samples, their period, and the integrator."""
 
 import dataclasses
 import math
@@ -9,6 +9,7 @@ from ambjax.numerics.records import leaf
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
 from ambjax.simulation.integrate import Integrator
+from ambjax.simulation.metrics import ROUNDING
 from ambjax.simulation.rosenbrock import AdaptiveRodas3, Rodas3
 from ambjax.simulation.sliding import Slide
 
@@ -17,9 +18,7 @@ METHODS: dict[str, type] = {"rk4": RK4, "dop853": DOP853, "euler": Euler, "rodas
 SLIDING_SUBSTEPS = 3
 # Largest number of rows of a run; with 16 numbers a row, about 2.5 GB.
 MOST_SAMPLES = 20_000_000
-# FEWEST_SAMPLES: smallest number of samples for the metrics. ROUNDING: relative difference of two times that are taken
-# as equal.
-FEWEST_SAMPLES, ROUNDING = 2, 1e-9
+FEWEST_SAMPLES = 2  # smallest number of samples for the metrics
 # Largest number of steps of a run with a given dt. A run of so many steps takes hours.
 MOST_STEPS = 10_000_000_000
 DURATION = leaf(default=2.0, unit="s", at_least=1e-9, at_most=1e6, doc="simulated time")
@@ -58,17 +57,6 @@ def clock_from(table: Table) -> tuple[Clock, float]:
     return Clock(samples, period, _method(table, period, samples)), duration
 
 
-def settled(settle: float, clock: Clock) -> float:
-    """Return run.settle, s. Raises ValueError if no sample of the run is at or after it."""
-    last = (clock.samples - 1) * float(clock.sample_period)
-    if settle > (1 + ROUNDING) * last:
-        raise ValueError(
-            f"run.settle = {settle:g} s: it must be at most {last:.12g} s, the time of the last sample "
-            f"(clock.duration = {clock.duration:g} s). Lower run.settle, or lengthen clock.duration."
-        )
-    return min(settle, last)
-
-
 def _whole(ratio: float) -> int | None:
     """Return the integer that `ratio` equals within ROUNDING; None if there is none or if it is below 1."""
     nearest = round(ratio) if math.isfinite(ratio) else 0
@@ -78,6 +66,8 @@ def _whole(ratio: float) -> int | None:
 def _method(table: Table, period: float, samples: int) -> Integrator | None:
     dt = table.raw.get("dt", "auto")
     if dt == "auto":
+        if (fixed := table.raw.get("method")) in [name for name in METHODS if name != "sliding"]:
+            raise ValueError(f"{table.at('method')} = {show(fixed)} needs a step: give clock.dt in s.")
         name = table.choice("method", ["auto", "adaptive", "sliding"], "auto") if "method" in table.raw else "auto"
         return {"auto": None, "adaptive": AdaptiveRodas3(), "sliding": Slide(SLIDING_SUBSTEPS)}[name]
     if isinstance(dt, str):

@@ -34,6 +34,7 @@ def read_case(path: str | pathlib.Path | Mapping[str, Any]) -> Case:
         case = reader.case_from(dict(path))
         texts = warnings_of(case)
     else:
+        reader.require_file("path", path, f"{reader.FILE}, or a dict of tables")
         case = reader.read_case(path)
         texts = warnings_of_file(case, path)
     for text in texts:

@@ -10,8 +10,9 @@ from typing import Protocol
 
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, part, record, static
+from ambjax.numerics.records import Scalar, is_traced, leaf, part, record, static
 from ambjax.simulation import orders
+from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Count, Driven, Ending, Fold, Named, Peak, Reaching, Rms, Variation
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import ALIVE, STALLED, Row
@@ -51,13 +52,32 @@ UNITS = {
 REACHED = ("sigma_reached_s", "v_tilde_reached_s", "current_error_reached_s")
 
 
+# Relative difference of two times that are taken as equal.
+ROUNDING = 1e-9
+
+
 class SettledCase(Protocol):
-    """A case with a scenario and a settling time (s), such as that of `read_case`."""
+    """A case with a scenario, a clock and a settling time (s), such as that of `read_case`."""
 
     @property
-    def settle(self) -> Scalar: ...
+    def settle(self) -> float: ...
     @property
     def scenario(self) -> Scenario: ...
+    @property
+    def clock(self) -> Clock: ...
+
+
+def settled(settle: float, clock: Clock) -> float:
+    """Return run.settle, s. Raises ValueError if no sample of the run is at or after it."""
+    if is_traced(clock.sample_period):
+        return settle
+    last = (clock.samples - 1) * float(clock.sample_period)
+    if settle > (1 + ROUNDING) * last:
+        raise ValueError(
+            f"run.settle = {settle:g} s: it must be at most {last:.12g} s, the time of the last sample "
+            f"(clock.duration = {float(clock.duration):g} s). Lower run.settle, or lengthen clock.duration."
+        )
+    return min(settle, last)
 
 
 @record
@@ -114,11 +134,11 @@ class Metrics:
     def for_case(cls, case: SettledCase) -> "Metrics":
         """Return the metrics for a case of `read_case`: `Metrics.of` with its settling time and its scenario.
 
-        Raises ValueError for anything else.
+        Raises ValueError for anything else, and if the run ends before the settling time.
         """
-        if not (hasattr(case, "settle") and hasattr(case, "scenario")):
+        if not all(hasattr(case, name) for name in ("settle", "scenario", "clock")):
             raise ValueError(f"case = {type(case).__name__}: it must be a Case, as ambjax.read_case(PATH) returns it.")
-        return Metrics.of(case.settle, case.scenario)
+        return Metrics.of(settled(case.settle, case.clock), case.scenario)
 
     def _folds(self) -> Named:
         """Return the fold of each metric by name."""

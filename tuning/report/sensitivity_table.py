@@ -24,8 +24,7 @@ def facts(problem: TuningProblem, injected: Sensitivity) -> Row:
         row = {name: value for name, value in dataclasses.asdict(one).items() if name != "largest"}
         row["injected_zone"] = "D" if one.lost else None if one.peak is None else zones.zone(one.peak)
         rows.append(row)
-    limits = [float(x) for x in (zones.zone_a, zones.zone_b, zones.zone_c)]
-    return {"members": rows, "injected": injects(problem), "decides": injected.decides, "zones": limits}
+    return {"members": rows, "injected": injects(problem), "decides": injected.decides, "zones": zones.limits}
 
 
 def line(found: Row | None) -> str:
