@@ -37,10 +37,8 @@ def rig(sensor, u_max):
 SENSORS = {"noise": {"std": 5e-7}, "no sensor": None, "empty table": {}}
 
 
-@pytest.mark.parametrize(
-    "sensor",
-    [pytest.param(x, id=name, marks=() if name == "noise" else pytest.mark.slow) for name, x in SENSORS.items()],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
 def test_the_limit_of_the_supply_and_a_table_of_the_sensor_do_not_cost_accuracy(sensor):
     """With one RK4 step per sample, the kinks at the limit cost 2.2e-6 m here, and the filters 8.7e-8 m."""
     case = rig(sensor, 24.0)

@@ -96,6 +96,7 @@ def test_bad_input_is_refused(change, message):
         run_on_gpu(**arguments)
 
 
+@pytest.mark.slow
 def test_without_the_triton_back_end_the_ordinary_ensemble_runs(monkeypatch):
     monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
     with pytest.warns(UserWarning, match="run_ensemble simulates the members instead"):
