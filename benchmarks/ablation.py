@@ -25,7 +25,7 @@ from ambjax.cases.template_text import template
 from tuning import validate
 from tuning.__main__ import main as tune
 from tuning.problem import limits
-from tuning.solve import course, descent, multipliers, refine
+from tuning.solve import course, descent, evolution, multipliers, refine
 
 NEVER = 10**9
 FIRST_KINDS = {
@@ -68,6 +68,7 @@ MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "starting points: only the case's gains": setting(screen=0),
     "several starts: only the best of the screen": setting(starts=1),
     "CMA-ES": constant(refine, STEEP=math.inf, CONVERGED=math.inf),
+    "large populations of CMA-ES": constant(evolution, POPULATION=1),
     "descent: CMA-ES only": by_values,
     "jumps known to the BFGS": constant(descent, JUMP=math.inf),
     "stressed members": setting(stressed=0),

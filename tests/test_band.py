@@ -98,7 +98,7 @@ def test_the_limits_of_the_tuner_see_a_peak_outside_the_band_of_the_case():
     )
     found = find(system)
     one = resonance(PERIOD)
-    expected = peak(one, lambda f: np.abs(one.sensitivity(f)), 1.0, 0.45 / PERIOD)
+    expected = peak(one, lambda f: np.abs(one.sensitivity(f)), 1.0, 0.5 / PERIOD)
     assert found.sensitivity == pytest.approx(expected.height, rel=1e-6)
     assert found.delay_margin_s == np.inf
 
@@ -107,7 +107,6 @@ def test_the_lines_of_an_injection_reach_the_end_of_the_band():
     clock = Clock(50_000, PERIOD)
     assert frequency_lines(Zones(), clock)[-1] == 22_500.0
     assert frequency_lines(Zones(f_high=2e3), clock)[-1] == 2000.0
-    assert frequency_lines(Zones(f_high=2e3).whole, clock)[-1] == 22_500.0
 
 
 @pytest.mark.slow

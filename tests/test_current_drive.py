@@ -96,6 +96,13 @@ def test_a_held_command_is_followed_exactly_between_samples(kind):
     # RK4 in two substeps of w h = 0.16; the currents are about 1 A
     np.testing.assert_allclose(i[2:], c[1:-1] + (i[1:-1] - c[1:-1]) * decay, rtol=0, atol=2e-6)
     assert np.ptp(i) > 0.1
+    # the voltage of a row is the one that acts: the current begins to follow c_{n-1}
+    plant = world(kind).plant
+    state = plant.start(Measurement(rows.z, rows.z_dot, rows.i))
+    state = state._replace(i_1=rows.i_1, i_2=rows.i_2) if kind == "two-coil" else state
+    rate = np.asarray(plant.measurement(plant.rates(state, rows.u)).i)
+    np.testing.assert_allclose(rate[1:], W * (c - i)[1:], rtol=0, atol=1e-9 * W)
+    assert np.all(np.abs(rows.u) <= rows.u_peak)
 
 
 def test_the_command_is_limited():

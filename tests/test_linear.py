@@ -223,7 +223,8 @@ def test_ranges_and_zones():
     assert zones.range(None, 7e3) == (1.0, 7e3)
     assert zones.range(1e-5) == (1.0, 45e3)
     assert Zones(f_high=2e3).range(1e-5) == (1.0, 2e3)
-    assert Zones(f_high=2e3).whole == zones
+    assert Zones(f_high=2e3).whole(None) == zones
+    assert Zones(f_high=2e3).whole(1e-5).range(1e-5) == (1.0, 0.5 / 1e-5)
     with pytest.raises(ValueError, match="at most half the sampling rate, 500 Hz"):
         Zones(f_high=600.0).range(1e-3)
     with pytest.raises(ValueError, match="must be below f_high"):

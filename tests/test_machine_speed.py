@@ -58,7 +58,7 @@ def test_an_unstable_machine_has_no_peaks_no_zones_and_no_verdict_by_api(tmp_pat
     peaks = [peak for axis in found.axes for peak in (axis.S, axis.T, axis.KS)]
     assert {peak.height for peak in [*peaks, found.sigma]} == {np.inf}
     assert once_per_revolution(found) == [([], [])] * len(weak.axes)
-    (line,) = sensitivity_text([found], {}).splitlines()
+    (line,) = sensitivity_text([found], {}, weak.zones).splitlines()
     assert "NOT STABLE" in line
     response = unbalance_response(weak.machine, weak.clock.sample_period, 100.0)
     assert np.isnan(response.sensors).all()

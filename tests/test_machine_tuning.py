@@ -13,6 +13,7 @@ from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.table import Table
 from ambjax.cases.template_text import template
 from ambjax.linear.linear_machine import machine_sensitivity, turning_machines
+from ambjax.results.machine_study import MachineStudy
 from ambjax.results.operating import sensitivity
 from tuning.__main__ import main
 from tuning.machines.machine_gains import MachineSpace, lqg_space, machine_space
@@ -245,3 +246,18 @@ def test_command(tmp_path, capsys):
     assert [row["holds"] for row in found["limits"]] == [False, False, False, True]
     assert min(row["value"] for row in found["limits"]) > 0
     assert all(name in found["verdict"] for name in one)
+
+
+def test_members_that_are_held_but_not_stable_refute_the_answer():
+    """Delays of up to 8 samples without prediction: the motion grows, too slowly to reach a stop within 2 ms."""
+    raw = raw_case() | {"run": {"settle": 1e-3}, "spread": {"processor": {"delay": {"uniform": [0.5, 8.0]}}}}
+    raw = {name: table for name, table in raw.items() if name != "load"}
+    raw["clock"] |= {"duration": 2e-3}
+    raw["processor"] |= {"predict": False}
+    case = machine_from(raw)
+    facts = judged(case, case, {"sensitivity": 3.0}, 0, 6)
+    stable = MachineStudy(case, 0, 6).stable(MachineStudy(case, 0, 6).drawn(np.arange(6)), np.arange(6))
+    assert 0 < np.sum(~stable) == facts["outcome"]["stability"]["unstable"]
+    assert (facts["outcome"]["held"], facts["outcome"]["good"]) == (6, False)
+    assert "not stable" in facts["verdict"]
+    assert "all limits met" not in facts["verdict"]

@@ -13,7 +13,7 @@ from tuning.solve.evolution import PATIENCE, STALL, Evolution
 CHAOS = {"chaotic": 1e30, "of moderate size": 1e-2}
 
 
-def tried(levels, width=6):
+def tried(levels, width=12):
     """Return a CMA-ES in two dimensions whose populations have these goals, the same for all points of one."""
     return Evolution(np.zeros(2), 1, [np.full(width, level) for level in levels])
 
@@ -22,7 +22,7 @@ def test_the_goals_of_the_populations_determine_the_next_one():
     """Nothing else that draws random numbers meanwhile has an effect."""
     dice, one = np.random.default_rng(2), Evolution(np.array([0.3, -1.0]), 7)
     for _ in range(3):
-        one.tell(one.ask(), dice.random(6))
+        one.tell(one.ask(), dice.random(12))
     again = Evolution(one.origin, one.seed, one.told)
     np.random.seed(0)  # noqa: NPY002
     np.testing.assert_array_equal(again.ask(), one.ask())
@@ -63,8 +63,8 @@ def test_three_limits_hold_in_spite_of_misleading_derivatives(monkeypatch, tmp_p
 
 
 def populations(world):
-    """Return how many populations were drawn: of 6 points in two dimensions, unlike all other calls."""
-    return sum(kind == "terms" and points == 6 for kind, _, _, points in world.calls)
+    """Return how many populations were drawn: of 12 points in two dimensions, unlike all other calls."""
+    return sum(kind == "terms" and points == 12 for kind, _, _, points in world.calls)
 
 
 def test_cma_es_does_not_start_after_a_converged_descent(monkeypatch, tmp_path):

@@ -48,7 +48,7 @@ DIAMETER = leaf(unit="m", at_least=1e-6, at_most=100.0, doc="outer diameter of a
 INNER = leaf(default=0.0, unit="m", at_least=0.0, at_most=100.0, doc="inner diameter of a section")
 MATERIAL = {
     "E": leaf(default=2.1e11, unit="Pa", at_least=1e6, at_most=1e13, doc="Young's modulus"),
-    "rho": leaf(default=7850.0, unit="kg/m^3", at_least=1.0, at_most=1e5, doc="density"),
+    "rho": leaf(default=7850.0, unit="kg/m^3", at_least=100.0, at_most=1e5, doc="density"),
     "nu": leaf(default=0.3, unit="1", at_least=0.0, at_most=0.5, doc="Poisson's ratio"),
 }
 # One program: operation by operation, about 90 would be compiled.

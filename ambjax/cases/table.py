@@ -115,6 +115,8 @@ class Table:
         value = self.raw.get(key, default)
         if value is default:
             return default
+        if getattr(value, "ndim", None) == 0:  # a number of NumPy or JAX, in a dict
+            value = value.item()
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise ValueError(f"{self.at(key)} = {show(value)}: it must be {allowed}{_unquoted(value)}.")
         try:

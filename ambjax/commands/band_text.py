@@ -1,10 +1,12 @@
 """Sentences about maxima at an end of the frequency band of a case, larger ones outside it, and the running speed."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
 from ambjax.linear import Analysis, ResponsePeak, Zones
+from ambjax.linear.linear_machine import AxisSensitivity
 from ambjax.linear.margins import NO_PEAK
 from ambjax.linear.state_space import StateSpace
 from ambjax.world.rotation import PER_MINUTE, Rotation
@@ -18,10 +20,16 @@ RESPONSES = {
 }
 
 
-def band_lines(name: str, analysis: Analysis, zones: Zones) -> list[str]:
-    """Return one sentence for each maximum of a stable loop that is not a peak, or not the largest value."""
+def band_lines(
+    name: str, analysis: Analysis | AxisSensitivity, zones: Zones, fields: Iterable[str] = tuple(RESPONSES)
+) -> list[str]:
+    """Return one sentence for each maximum of a stable loop that is not a peak, or not the largest value.
+
+    `fields`: of RESPONSES, those that are reported.
+    """
     lines = []
-    for field, (words, unit, _, zoned) in RESPONSES.items():
+    for field in fields:
+        words, unit, _, zoned = RESPONSES[field]
         one: ResponsePeak | None = getattr(analysis, field)
         if one is None:
             continue

@@ -158,7 +158,7 @@ def _read(paths: Sequence[str]) -> list[AnyCase]:
 
 def _check_count(count: int, what: str) -> None:
     if not 2 <= count <= MOST_CASES:
-        raise ValueError(f"{count} {what}{'s' * (count > 1)}: give 2 to {MOST_CASES} {what}s.")
+        raise ValueError(f"{count} {what}{'s' * (count != 1)}: give 2 to {MOST_CASES} {what}s.")
 
 
 def _named(cases: Sequence[AnyCase], paths: Sequence[str]) -> list[AnyCase]:

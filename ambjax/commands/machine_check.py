@@ -7,7 +7,7 @@ import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, machine_from
 from ambjax.cases.rotor_body import MODES
-from ambjax.commands.machine_commands import once_per_revolution, worst_of_speeds
+from ambjax.commands.machine_commands import once_per_revolution, outside_lines, worst_of_speeds
 from ambjax.host.heartbeat import say
 from ambjax.linear import MachineSensitivity, poles_in_s
 from ambjax.linear.linear_machine import turning_machines
@@ -76,6 +76,7 @@ def check(case: MachineCase) -> CaseCheck:
         f"sensitivity: {peak if worst.stable else f'no peak and no zone: not stable at {worst.speed:g} rpm'}",
         f"stability: {'stable' if stable else 'NOT STABLE'} at {', '.join(summary['stable'])} rpm{_more(spilled)}",
         table(AXIS_COLUMNS, [(axis, *_cells(own)) for axis, own in axes.items()]),
+        *(line for point in points if point.stable for line in outside_lines(point, case.zones)),
         *(line for point in at_speeds for _, own in point for line in own),
     ]
     if light := _light(modes):

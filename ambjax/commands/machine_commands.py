@@ -8,10 +8,10 @@ from tqdm import tqdm
 
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.rotor_drawing import radial_axes
-from ambjax.commands.band_text import running_facts
+from ambjax.commands.band_text import band_lines, running_facts
 from ambjax.commands.sensitivity_report import injected_numbers, injection_text
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
-from ambjax.linear import Injection, machine_injected
+from ambjax.linear import Injection, Zones, machine_injected
 from ambjax.linear.linear_machine import MachineSensitivity
 from ambjax.linear.margins import Margins
 from ambjax.page.rotor_motion import motion_page
@@ -100,7 +100,7 @@ def sensitivity(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summa
         described(path.name, lambda: machine_sensitivity_picture(points, case.zones.limits, path, case.name, measured))
         names = [name for name in ANALYSED if (part / name).exists()]
     if not args.json:
-        print(sensitivity_text(points, measured))
+        print(sensitivity_text(points, measured, case.zones))
         written(out, ", ".join(names))
     return int(not all(point.stable for point in points)), plain(summary | {"out": str(out)})
 
@@ -137,6 +137,7 @@ def sensitivity_summary(points: list[MachineSensitivity], measured: Measured) ->
             "axes": [
                 {
                     "name": axis.name, "peak": axis.S.height, "frequency_hz": axis.S.frequency, "zone": axis.zone,
+                    "outside_peak": None if axis.S.outside is None else axis.S.outside.height,
                     "peak_T": axis.T.height, "peak_KS": axis.KS.height,
                     "margins": None if axis.margins is None else _margins(axis.margins),
                     "running_speed": facts,
@@ -181,7 +182,13 @@ def _margins(margins: Margins) -> dict[str, float]:
     }  # fmt: skip
 
 
-def sensitivity_text(points: list[MachineSensitivity], measured: Measured) -> str:
+def outside_lines(point: MachineSensitivity, zones: Zones) -> list[str]:
+    """Return `band_lines` of |S| of each axis at a speed at which the machine is stable."""
+    name = f"{{}} at {point.speed:g} rpm"
+    return [line for axis in point.axes for line in band_lines(name.format(axis.name), axis, zones, ["S"])]
+
+
+def sensitivity_text(points: list[MachineSensitivity], measured: Measured, zones: Zones) -> str:
     """Return the tables of the sensitivities, one for each speed."""
     parts = []
     for point in points:
@@ -200,6 +207,7 @@ def sensitivity_text(points: list[MachineSensitivity], measured: Measured) -> st
         parts.append(
             table(("axis", "peak of |S|", "Hz", "zone", "peak of |T|", "gain margin", "phase margin, deg"), rows)
         )
+        parts += outside_lines(point, zones)
         for _, lines in once_per_revolution(point):
             parts += lines
         for k, (axis, one) in enumerate(zip(point.axes, _measured_at(point, measured), strict=True)):

@@ -11,6 +11,7 @@ from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
 from ambjax.linear.margins import (
+    BAND,
     NO_PEAK,
     STATIC,
     LoopMargins,
@@ -100,10 +101,12 @@ class Zones:
         """The upper limits of the zones A, B and C."""
         return [float(x) for x in (self.zone_a, self.zone_b, self.zone_c)]
 
-    @property
-    def whole(self) -> "Zones":
-        """These zones with the whole range of frequencies, in which no peak can be outside."""
-        return dataclasses.replace(self, f_high=None)
+    def whole(self, period: Scalar | None) -> "Zones":
+        """Return these zones with the whole range of frequencies, up to half the sampling rate.
+
+        `period`: sample period, s; None in continuous time.
+        """
+        return dataclasses.replace(self, f_high=None if period is None else 0.5 / float(period))
 
     def range(self, period: Scalar | None, end: float = math.inf) -> tuple[float, float]:
         """Return the lowest and the highest frequency, Hz.
@@ -111,7 +114,7 @@ class Zones:
         `period`: sample period, s; None in continuous time. `end`: the highest frequency in continuous time if f_high
         is not given, Hz. Raises ValueError if the range is empty or exceeds half the sampling rate.
         """
-        low, high = float(self.f_low), end if period is None else 0.45 / float(period)
+        low, high = float(self.f_low), end if period is None else BAND / float(period)
         if self.f_high is not None:
             high = float(self.f_high)
         if period is not None and high > 0.5 / float(period):

@@ -193,7 +193,7 @@ def _growth_and_loop(system: StateSpace, unit: Array) -> tuple[Array, _Loop]:
 def _whole_end(loop: _Loop) -> Array:
     """Return `margins.whole_end` (Hz)."""
     if loop.period is not None:
-        return 0.45 / loop.period
+        return 0.5 / loop.period
     total = jnp.sum(jnp.abs(loop.poles)) + jnp.sum(jnp.abs(loop.zeros))
     return (1 + DECAYED) * total / math.log1p(DECAYED) / (2 * jnp.pi)
 

@@ -29,6 +29,8 @@ EDGE = 1e-4
 BELOW = 1e-3
 # |S - 1| that counts as decayed, in continuous time.
 DECAYED = 0.01
+# End of the default band of a processor, as a share of the sampling rate.
+BAND = 0.45
 
 
 class ResponsePeak(NamedTuple):
@@ -135,13 +137,13 @@ def _peak(magnitude: Magnitude, f: np.ndarray, static: bool = True) -> ResponseP
 
 
 def whole_end(system: StateSpace) -> float:
-    """Return the frequency (Hz) up to which peaks are searched: 0.45 of the sampling rate.
+    """Return the frequency (Hz) up to which peaks are searched: half the sampling rate.
 
     In continuous time, it is a frequency above which |S - 1| stays below DECAYED: with the poles p and the zeros q of
     S, |log S| <= sum |p/s| + sum |q/s| + ..., and the sums are below log(1 + DECAYED) there.
     """
     if system.period is not None:
-        return 0.45 / float(system.period)
+        return 0.5 / float(system.period)
     scaled = system.scaled()
     zeros = np.linalg.eigvals(scaled.A - scaled.B[:, :1] @ scaled.C[:1])
     total = float(np.abs(scaled.poles()).sum() + np.abs(zeros).sum())
@@ -149,10 +151,13 @@ def whole_end(system: StateSpace) -> float:
 
 
 def decayed_end(system: StateSpace, low: float) -> float:
-    """Return the end (Hz) of the band that pictures show: of `whole_end`, the part with |S - 1| above DECAYED."""
-    end = whole_end(system)
+    """Return the end (Hz) of the band that pictures show: BAND of the sampling rate.
+
+    In continuous time, it is the part of `whole_end` with |S - 1| above DECAYED.
+    """
     if system.period is not None:
-        return end
+        return BAND / float(system.period)
+    end = whole_end(system)
     f = scan(system, low, max(end, 2 * low))[1:]
     above = np.flatnonzero(np.abs(np.asarray(system.sensitivity(f)) - 1) > DECAYED)
     return float(f[min(above[-1] + 1, len(f) - 1)]) if above.size else float(f[-1])

@@ -13,6 +13,7 @@ from ambjax.linear.equilibrium import Equilibrium, Point, at_rest, equilibrium, 
 from ambjax.linear.state_space import CommandPath, StateSpace
 from ambjax.numerics.records import Scalar
 from ambjax.numerics.small_matrices import exponential
+from ambjax.simulation.between import at_sample
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
 
@@ -64,9 +65,14 @@ class Lagged:
         u = self.scenario.coil_voltage(jnp.asarray(u), plant)
         return ravel_pytree((self.scenario.plant.rates(plant, u, q_z), lag_rates))[0]
 
-    def voltage(self, x: Array, u: Array) -> Array:
-        """Return the voltage (V) for a command: the command itself, or for a current command the coil voltage."""
-        return self.scenario.coil_voltage(u, self.restore(x)[0]) if self.scenario.drive == "current" else u
+    def voltage(self, x: Array, commands: tuple[Array, ...], delay: Scalar) -> Array:
+        """Return the voltage (V) of a sample: the command u_n, or for current commands the coil voltage at the sample.
+
+        `commands`: u_n, u_{n-1} and so on (V or A). `delay`: in samples.
+        """
+        if self.scenario.drive != "current":
+            return commands[0]
+        return self.scenario.coil_voltage(at_sample(commands, jnp.asarray(delay)), self.restore(x)[0])
 
     def sizes(self, sizes: Point) -> Array:
         """Return the characteristic sizes [N] of the state. `sizes`: those of a `Point`."""
@@ -164,7 +170,7 @@ def _sampled(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, po
         commands = jnp.stack([command.u, *past])
         moved = held.transition @ at + commands @ held.driven + held.disturbed * w[2]
         after = jnp.concatenate([moved, ravel_pytree(after)[0], commands[: len(past)]])
-        u = plant.voltage(at, command.u)
+        u = plant.voltage(at, (command.u, *past), processor.delay)
         return after, jnp.stack([measured.z, measured.z_dot, u, plant.motion(at).z, command.u, measured.i])
 
     x = ravel_pytree((plant.start, laws, past))[0]

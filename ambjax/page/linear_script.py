@@ -1,5 +1,6 @@
 """The linearised loop as JavaScript: the step of the laws and the rates of the plant, with their derivatives."""
 
+import dataclasses
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -134,7 +135,7 @@ def linear_script(case: Case) -> LinearScript:
         x = jax.tree.map(lambda _: zero, x)
         start = piece_of(_start, "p", (numbers,))
         point = piece_of(_columns, "px", (numbers, x))
-    low, high = case.zones.whole.range(case.clock.sample_period)
+    low, high = dataclasses.replace(case.zones, f_high=None).range(case.clock.sample_period)
     zones = case.zones.limits
     sizes = {name: len(jax.tree.leaves(getattr(x, name))) for name in ("lagged", "control", "past")}
     facts = {**sizes, "zones": zones, "low": low, "high": high}

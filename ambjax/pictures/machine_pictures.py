@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from ambjax.linear.margins import BAND
 from ambjax.linear.rotor_modes import LIGHT
 from ambjax.pictures.style import own_style
 
@@ -110,11 +111,12 @@ def machine_sensitivity_picture(
     grid = figure.subplots(1 + (len(shown) > 2), min(len(shown), 2), squeeze=False, sharex=True, sharey=True)
     for ax in list(grid.flat)[len(shown) :]:
         ax.set_axis_off()
+        grid[0, 1].tick_params(labelbottom=True)
     for ax, point in zip(grid.flat, shown, strict=False):
         ax.set_title(f"{point.speed:g} rpm{'' if point.stable else ': not stable'}")
         if not point.stable:
             continue
-        end = 5e3 if point.system.period is None else 0.45 / float(point.system.period)
+        end = 5e3 if point.system.period is None else BAND / float(point.system.period)
         f = np.geomspace(1.0, end, 800)
         c = len(point.axes)
         S = np.asarray(point.system.response(f))[:, :c]

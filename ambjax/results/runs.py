@@ -67,9 +67,12 @@ class CaseRun:
     def save(self, path: str | pathlib.Path) -> None:
         """Write the signals to a file: .npz, .mat (MATLAB version 5), .csv or .parquet (extra `[tables]`).
 
-        Each signal is an array by its name, in SI units. Raises ValueError for another ending.
+        Each signal is an array by its name, in SI units. Raises ValueError for another ending, for a directory that
+        does not exist, and for .parquet without pyarrow.
         """
         path = pathlib.Path(path)
+        if not path.parent.is_dir():
+            raise ValueError(f"save: {path}: the directory {path.parent} does not exist. Make it first.")
         arrays = {name: x for name, x in self.trajectory.arrays().items() if name in SIGNAL_UNITS}
         if path.suffix == ".npz":
             self.trajectory.save(path)
@@ -81,6 +84,7 @@ class CaseRun:
             table = np.column_stack(list(arrays.values()))
             np.savetxt(path, table, "%.17g", ",", header=",".join(arrays), comments="")
         elif path.suffix == ".parquet":
+            extra("pyarrow")
             self.to_pandas().reset_index().to_parquet(path)
         else:
             raise ValueError(f"save: {path}: the file must end in .npz, .mat, .csv or .parquet.")

@@ -26,7 +26,12 @@ def acting(voltages: tuple[Array, ...], delay: Array, period: Scalar, whole: boo
     """
     late = (delay - jnp.floor(delay)) * period
     last = _one_of(voltages, jnp.floor(delay))
-    return [(last, period)] if whole else [(_one_of(voltages, jnp.ceil(delay)), late), (last, period - late)]
+    return [(last, period)] if whole else [(at_sample(voltages, delay), late), (last, period - late)]
+
+
+def at_sample(commands: tuple[Array, ...], delay: Array) -> Array:
+    """Return the command that acts at a sample. `commands`: of this sample and of those before it; `delay`: samples."""
+    return _one_of(commands, jnp.ceil(delay))
 
 
 def _one_of(voltages: tuple[Array, ...], lag: Array) -> Array:

@@ -21,7 +21,7 @@ from ambjax.control.guard import GuardResult, Watch, expected
 from ambjax.control.processor import Processor
 from ambjax.numerics.records import Scalar, record, static
 from ambjax.numerics.smooth import limited
-from ambjax.simulation.between import acting, amplified, lags, plant_status, subproblems
+from ambjax.simulation.between import acting, amplified, at_sample, lags, plant_status, subproblems
 from ambjax.simulation.integrate import Advanced, Integrator, in_turn
 from ambjax.simulation.loop import AddedSignal, ClosedLoop, LoopState, with_signal
 from ambjax.simulation.sampled_state import SampledState
@@ -255,14 +255,16 @@ class Sampled:
     def row(self, t: Scalar, state: SampledState, errors: Errors, alive: Array) -> Row:
         """Return the signals of sample n: the plant's state, u_n, and i_ref before the step of the laws.
 
-        If the command is a current, u_n is the voltage with which the amplifier produces this current in this state.
+        If the command is a current, u is the voltage with which the amplifier produces, in this state, the current
+        commanded for this instant: the one that acts after the delay.
         """
         measured = self.measured(state.plant, state.z_filtered, errors)
         if state.sensed:
             measured = measured._replace(z=state.sensed.z)
         inputs, command = self.loop.inputs(t), state.command
         if self.loop.scenario.drive == "current":
-            command = command._replace(u=self.loop.scenario.coil_voltage(command.u, state.plant, inputs.q_i))
+            i = at_sample((command.u, *state.past), jnp.asarray(self.processor.delay))
+            command = command._replace(u=self.loop.scenario.coil_voltage(i, state.plant, inputs.q_i))
         measured = self.injected(measured, t)
         row = self.loop.signals(t, inputs, state.plant, command, measured, alive)
         if self.wave is not None:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
 from ambjax.numerics.records import Scalar
 from ambjax.numerics.smooth import larger, smaller
@@ -55,8 +55,8 @@ class Span(NamedTuple):
         return self._replace(densities=more)
 
     def shortened(self, by: Scalar) -> "Span":
-        """Return the interval without its last `by` seconds. The means of the densities are kept."""
-        share = 1 - by / jnp.where(self.time > 0, self.time, 1.0)
+        """Return the interval without its last `by` seconds, which have no derivatives. Means of densities are kept."""
+        share = 1 - lax.stop_gradient(by) / jnp.where(self.time > 0, self.time, 1.0)
         return self._replace(
             time=share * self.time, densities=jax.tree.map(lambda total: share * total, self.densities)
         )

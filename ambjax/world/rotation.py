@@ -20,7 +20,7 @@ def _rpm(at_least: float, doc: str, **more: Any) -> Any:
 
 
 def _phase() -> Any:
-    return leaf(default=0.0, unit="rad", at_least=-1e9, at_most=1e9, doc="phase at t = 0")
+    return leaf(default=0.0, unit="rad", at_least=-1e9, at_most=1e9, doc="phase of the sine at t = 0")
 
 
 @record

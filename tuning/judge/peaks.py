@@ -138,7 +138,7 @@ def _analysis(of: JudgedMembers, number: int) -> Analysis | str:
         system = linearise(cascade, scenario, case.clock)
     except ValueError as error:
         return str(error)
-    return analyse(system, scenario.plant.m, float(case.clock.sample_period), case.zones.whole)
+    return analyse(system, scenario.plant.m, float(case.clock.sample_period), case.zones.whole(system.period))
 
 
 def _responses(of: JudgedMembers, numbers: np.ndarray, repetitions: int, peak: float | None) -> Responses:
@@ -150,7 +150,7 @@ def _responses(of: JudgedMembers, numbers: np.ndarray, repetitions: int, peak: f
     cascade, scenario = of.problem.objective.fixed(of.x, of.chosen(np.repeat(numbers, repetitions)))
     scenario = dataclasses.replace(scenario, seed=0, member=np.arange(len(numbers) * repetitions))
     clock = one_period(case)
-    lines = frequency_lines(case.zones.whole, clock, peak)
+    lines = frequency_lines(dataclasses.replace(case.zones, f_high=None), clock, peak)
     return member_responses(cascade, scenario, clock, lines, amplitude=case.zones.amplitude)
 
 

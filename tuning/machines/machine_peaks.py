@@ -130,7 +130,8 @@ class Peaks:
         """
         size = np.maximum(np.abs(rates), 1e-12)
         end = max(1e4, size.max() / 2, 2 * float(self.zones.f_low))
-        low, high = self.zones.range(self.period if self.sampled else None, end)
+        period = self.period if self.sampled else None
+        low, high = self.zones.whole(period).range(period, end)
         damping = -np.real(rates) / size
         light = (np.imag(rates) > 0) & (damping < 0.3)
         beside = np.outer(size[light] / (2 * np.pi), np.ones(len(BESIDE))) * (1 + np.outer(damping[light], BESIDE))

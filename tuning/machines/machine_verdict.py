@@ -1,5 +1,6 @@
 """The verdict on the tuned gains of a machine: its sensitivity, members of its spread, the limits, and the report."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from ambjax.cases.machine_case import MachineCase
 from ambjax.commands.machine_commands import sensitivity_summary
-from ambjax.results.machine_study import MachineStudy
+from ambjax.results.machine_study import LinearFindings, MachineStudy
 from ambjax.results.operating import sensitivity
 from tuning.report.facts import Column, table
 
@@ -27,10 +28,17 @@ LIMITS = {
 
 
 def judged(case: MachineCase, found: MachineCase, limits: dict[str, float], seed: int, members: int) -> dict[str, Any]:
-    """Return the content of report.json but the gains. `case`, `found`: before and after; `members`: to simulate."""
-    each: list[dict[str, Any]] = [sensitivity_summary(sensitivity(one), {}) for one in (case, found)]
+    """Return the content of report.json but the gains. `case`, `found`: before and after; `members`: to simulate.
+
+    The peaks of |S| are those over all frequencies, whatever the band of [sensitivity] is.
+    """
+    period = float(case.clock.sample_period) if case.cases[0].cascade.sampled else None
+    everywhere = [dataclasses.replace(one, zones=one.zones.whole(period)) for one in (case, found)]
+    each: list[dict[str, Any]] = [sensitivity_summary(sensitivity(one), {}) for one in everywhere]
     before, after = each
-    held, simulated = simulate(found, seed, members)
+    study = MachineStudy(found, seed, members)
+    held, simulated = simulate(study)
+    loops = study.findings(np.flatnonzero(held)) if held.any() else LinearFindings(0, 0)
     values: dict[str, Any] = {name: _worst(x, held) for name, x in simulated.items()}
     turning = [fact["S"] for at in after["speeds"] for axis in at["axes"] for fact in axis["running_speed"]]
     linear = {"sensitivity": after["peak"], "sensitivity_1x": max(turning, default=0.0)}
@@ -45,14 +53,15 @@ def judged(case: MachineCase, found: MachineCase, limits: dict[str, float], seed
     words = [
         f"peak of |S| {after['peak']:.4g} ({at}), zone {after['zone']}" if after["stable"] else "NOT STABLE",
         f"{int(held.sum())} of {members} members held",
+        *([] if loops.stable else [f"{loops.unstable} of {loops.tested} members tested not stable"]),
     ]
-    good = bool(after["stable"] and held.all() and not broken)
+    good = bool(after["stable"] and held.all() and loops.stable and not broken)
     if good or broken:
         words.append("all limits met" if good else f"beyond the limits: {', '.join(broken)}")
     return {
         "verdict": f"{'; '.join(words)}.",
         "case": case.name,
-        "outcome": {"good": good, "held": int(held.sum()), "members": members},
+        "outcome": {"good": good, "held": int(held.sum()), "members": members, "stability": loops._asdict()},
         "limits": rows,
         "metrics": values,
         "sensitivity": after,
@@ -64,16 +73,16 @@ def _worst(values: np.ndarray, held: np.ndarray) -> float:
     return float(np.max(values[held])) if held.any() else math.inf
 
 
-def simulate(case: MachineCase, seed: int, members: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def simulate(study: MachineStudy) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return which members [n] are held, and the limited metrics [n] of the worst axis of each."""
-    columns = MachineStudy(case, seed, members).columns(0, members)
-    found = {name: columns.get(metric, np.zeros(members)) for name, (_, metric) in LIMITS.items() if metric}
+    columns = study.columns(0, study.members)
+    found = {name: columns.get(metric, np.zeros(study.members)) for name, (_, metric) in LIMITS.items() if metric}
     return np.isposinf(columns["lost_at"]), found  # at rest there are no amplitudes at the speed
 
 
 def refused(case: MachineCase, limits: dict[str, float], seed: int, members: int) -> int:
     """Return how many members are lost or beyond the limits of a simulation."""
-    held, found = simulate(case, seed, members)
+    held, found = simulate(MachineStudy(case, seed, members))
     within = [found[name] <= most for name, most in limits.items() if name in found]
     return int(np.sum(~np.all([held, *within], axis=0)))
 
