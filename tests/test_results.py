@@ -141,6 +141,7 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
         (lambda: ambjax.simulate_members(case, "ten"), "members = 'ten': it"),
         (lambda: ambjax.simulate_members(case, 1, seed=-1), "seed = -1: it must be a whole number from 0 to"),
         (lambda: ambjax.read_case(3), "path = 3: it must be the path of a file.* or a dict"),
+        (lambda: run.save("nowhere/run.npz"), "nowhere/run.npz: the directory nowhere does not exist"),
         (lambda: ambjax.tune(3), "case = 3: it must be the path of a file"),
         (lambda: ambjax.sensitivity(case, "a"), "r = 'a': it must be a finite number"),
         (lambda: ambjax.gains_of(cascade, 3), "paths = 3: it must be a list"),
@@ -254,7 +255,9 @@ def test_derivatives_with_respect_to_named_gains_only():
 
 
 def test_a_case_stands_for_its_cascade_scenario_and_clock():
-    case = ambjax.read_case({"initial": {"z": 1e-4}, "clock": {"duration": 0.005, "method": "adaptive"}})
+    case = ambjax.read_case(
+        {"initial": {"z": jnp.asarray(1e-4)}, "clock": {"duration": np.float64(0.005), "method": "adaptive"}}
+    )
     faster = ambjax.with_gains(case, {"controller.position.c": 50.0})
     assert (float(faster.cascade.position.c), faster.clock) == (50.0, case.clock)
     assert ambjax.gains_of(faster) == ambjax.gains_of(faster.cascade)
