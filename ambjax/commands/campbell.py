@@ -189,17 +189,17 @@ def unbalance_text(
     case: MachineCase, found: UnbalanceResponse, criticals: list[CriticalSpeed], operating: tuple[float, float]
 ) -> str:
     """Return the critical speeds and the vibration at operating speeds as text."""
+    low, high = operating  # 0: no margin to a rotor at rest
     rows = [
         (
             f"{one.speed:.0f}", case.axes[one.axis], f"{1e6 * one.peak_to_peak:.3g}", f"{one.amplification:.3g}",
-            "none" if one.required is None else f"{one.required:.3g}", f"{one.present:.3g}",
-            "yes" if one.separated else "NO",
+            *(("none" if one.required is None else f"{one.required:.3g}", f"{one.present:.3g}",
+               "yes" if one.separated else "NO") if high else "---"),
         )
         for one in criticals
     ]  # fmt: skip
     limit, largest = _vibration(found, operating)
     header = ("critical speed, rpm", "axis", "um p-p", "AF", "margin required, %", "present, %", "enough")
-    low, high = operating
     speeds = f"{low:g} to {high:g} rpm" if low != high else f"{high:g} rpm"
     last = f"unbalance at {speeds}: {1e6 * largest:.3g} um peak to peak at the sensors; limit A1 {1e6 * limit:.3g} um"
     last += ", exceeded" if largest > limit else ""

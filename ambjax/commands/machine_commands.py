@@ -29,8 +29,8 @@ SIMULATED = ("trajectory.npz", "metrics.json", "overview.png", "runup.png", "mot
 ANALYSED = ("sensitivity.json", "sensitivity.png")
 # Metrics of the printed table, with their headings.
 COLUMNS = {
-    "settled_rms_error_m": "rms error, m",
-    "settled_max_abs_error_m": "largest error, m",
+    "settled_rms_error_m": "settled rms error, m",
+    "settled_max_abs_error_m": "settled largest error, m",
     "clearance_used": "share of clearance",
     "max_abs_i_A": "largest |i|, A",
     "rms_u_V": "rms u, V",

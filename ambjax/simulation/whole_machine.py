@@ -20,6 +20,7 @@ from ambjax.compiler.barrier import materialised
 from ambjax.numerics.records import Scalar, leaf, part, record, static
 from ambjax.numerics.shapes import varying
 from ambjax.numerics.small_matrices import solve, times
+from ambjax.numerics.smooth import away_from_zero
 from ambjax.simulation.between import plant_status
 from ambjax.simulation.edges import NO_EDGES, Edges
 from ambjax.simulation.folds import Ending
@@ -235,8 +236,12 @@ class Machine:
         return times(rows, state.q), times(rows, state.q_dot)
 
     def rest(self, state: MachineState, code: Array) -> MachineState:
+        """Return the state in which a lost rotor is frozen: at rest, moved on in proportion to the limit it reached."""
         axes = self.each(lambda axis, own: axis.rest(own, code), self.at_sensors(state))
-        return MachineState(state.q, jnp.zeros_like(state.q_dot), still(axes), state.law)
+        rows, limits = limited(self)
+        share = jnp.max(jnp.abs(times(rows, state.q)) / limits)
+        q = jnp.where((code == TOUCHED) & (share > 0), state.q / away_from_zero(share, 1e-30), state.q)
+        return MachineState(q, jnp.zeros_like(state.q_dot), still(axes), state.law)
 
     def demands(self, t: Scalar, state: MachineState, errors: Sequence[object]) -> Groups:
         """Return further arguments of the row of each group: the demanded forces, if the row computes the command."""
