@@ -85,8 +85,9 @@ for words in json.load(sys.stdin):
 """
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param("paper", marks=pytest.mark.thorough), pytest.param("bearing", marks=pytest.mark.slow)]
+)
 def test_every_command_writes_all_of_its_files(case, tmp_path):
     (tmp_path / "case.toml").write_text(CASES[case])
     commands = {command: COMMANDS[command] for command in CHOSEN[case]}
