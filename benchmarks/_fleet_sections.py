@@ -58,7 +58,7 @@ def ablation() -> list[str]:
         "observer needs no position sensor: the verdict is right. On C10 and A10L, without restarts, the error was",
         "9.5 % larger, and without growth of the penalty, the voltage exceeded its limit. The search around the",
         "optimum and the extrapolation of the multipliers have replaced them; the columns C10 and A10L compare with",
-        "the tuner that has both.",
+        "the tuner that has both, and F10 and F20-robust with that whose populations are twice the default of `cma`.",
         "",
     ]
     tasks = list(dict.fromkeys(task for _, task, _ in rows))
