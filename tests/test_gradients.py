@@ -175,17 +175,18 @@ def test_the_fast_path_is_differentiable():
 
 SAMPLED = Cascade(processor=Processor(1.0, guard=None))
 DRIVEN = Scenario(initial=Initial(1e-4), u_max=200.0)
-# A load that begins inside a sample (s); an amplifier whose ramps, which depend on the gain c, end inside samples; a
-# delay that is not a whole number of samples. The metrics are smooth over 0.4 % of each number.
+# A load that begins inside a sample (s), which a sensor with a low-pass divides there; an amplifier whose ramps, which
+# depend on the gain c, end inside samples; a delay that is not a whole number of samples. The metrics are smooth over
+# 0.4 % of each number.
 LENGTHS = {
-    "start": (1.13e-3, lambda x: (SAMPLED, dataclasses.replace(DRIVEN, q_z=Pulse(3.0, x, 1.0)))),
+    "start": (1.13e-3, lambda x: (SAMPLED, dataclasses.replace(DRIVEN, q_z=Pulse(3.0, x, 1.0), sensor=LAG))),
     "ramp": (
         17.0,
         lambda x: (with_gains(SAMPLED, {"controller.position.c": x}), dataclasses.replace(DRIVEN, amplifier=SLEW)),
     ),
     "delay": (1.3, lambda x: (with_gains(BETWEEN, {"processor.delay": x}), DRIVEN)),
 }
-SLEW, BETWEEN = Amplifier(slew=3e5), SAMPLED.on_processor(1.0, 2.0, between=True)
+LAG, SLEW, BETWEEN = Sensor(bandwidth=2e3), Amplifier(slew=3e5), SAMPLED.on_processor(1.0, 2.0, between=True)
 
 
 @pytest.mark.slow

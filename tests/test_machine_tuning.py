@@ -1,5 +1,6 @@
 """Tuning of whole machines: derivatives, gains of one bearing, and the command."""
 
+import dataclasses
 import json
 import re
 import tomllib
@@ -12,6 +13,7 @@ import tuning
 from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.table import Table
 from ambjax.cases.template_text import template
+from ambjax.commands.machine_commands import outside_lines
 from ambjax.linear.linear_machine import machine_sensitivity, turning_machines
 from ambjax.results.machine_study import MachineStudy
 from ambjax.results.operating import sensitivity
@@ -63,6 +65,20 @@ def test_the_peak_is_that_of_the_sensitivity(peaks, integral):
     assert found.stability(x).f == pytest.approx(growth, rel=1e-3, abs=1e-6)
     S = [np.diagonal(point.system.response([v / 60])[0]) for point, v in zip(points, case.speeds, strict=True) if v]
     assert found.turning(x) == pytest.approx(np.max(np.abs(S)), rel=1e-9)
+
+
+@pytest.mark.slow
+def test_search_and_verdict_see_peaks_outside_the_band_of_the_case(peaks):
+    """The band ends at 20 Hz, below the peaks."""
+    case, space, found = peaks
+    narrow = dataclasses.replace(case, zones=dataclasses.replace(case.zones, f_high=20.0))
+    x = space.space.encode(space.values(case))
+    assert Peaks(narrow, space).peak(x).f == pytest.approx(found.peak(x).f, rel=1e-9)
+    facts = [judged(one, one, {"sensitivity": 9.0}, 0, 1) for one in (case, narrow)]
+    assert facts[0]["sensitivity"]["peak"] == pytest.approx(facts[1]["sensitivity"]["peak"], rel=1e-3)
+    (first, *_) = sensitivity(narrow)
+    assert len(outside_lines(first, narrow.zones)) == len(narrow.axes)
+    assert not outside_lines(sensitivity(case)[0], case.zones)
 
 
 @pytest.mark.slow

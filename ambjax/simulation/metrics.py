@@ -8,6 +8,7 @@ not. The rms voltages and currents, chatter and copper loss are computed over th
 
 from typing import Protocol
 
+import numpy as np
 from jax import Array
 
 from ambjax.numerics.records import Scalar, is_traced, leaf, part, record, static
@@ -71,11 +72,12 @@ def settled(settle: float, clock: Clock) -> float:
     """Return run.settle, s. Raises ValueError if no sample of the run is at or after it."""
     if is_traced(clock.sample_period):
         return settle
-    last = (clock.samples - 1) * float(clock.sample_period)
+    period = float(np.min(np.asarray(clock.sample_period)))  # the shortest one of an ensemble
+    last = (clock.samples - 1) * period
     if settle > (1 + ROUNDING) * last:
         raise ValueError(
             f"run.settle = {settle:g} s: it must be at most {last:.12g} s, the time of the last sample "
-            f"(clock.duration = {float(clock.duration):g} s). Lower run.settle, or lengthen clock.duration."
+            f"(clock.duration = {last + period:g} s). Lower run.settle, or lengthen clock.duration."
         )
     return min(settle, last)
 
