@@ -37,15 +37,10 @@ LEAST_DAMPING = 0.01
 
 
 class Loop(NamedTuple):
-    """A loop: the map of its state over one sample, its state at rest, and the number of its signals.
-
-    The first components of the state are the signals that the law controls. If there are none, the law acts on its own
-    states.
-    """
+    """A loop: the map of its state over one sample, and its state at rest."""
 
     step: Callable[[Array], Array]
     start: Array
-    signals: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +77,7 @@ def law_poles(cascade: Cascade, clock: Clock) -> list[LawPoles]:
         if set_valued_signs(law) and not implicit:
             lines.append(LawPoles(stage, implicit, math.inf, -1.0))
             continue
-        poles = np.concatenate([_poles(LOOPS[stage](one, cascade.model, sampling)) for one in extremes(law)])
+        poles = np.concatenate([_poles(stage, one, cascade.model, sampling) for one in extremes(law)])
         poles = poles[np.abs(poles - 1) > ROUNDING]
         s = np.log(np.where(np.abs(poles) > 1e-300, poles, 1e-300) + 0j)
         damping = float(np.min(-np.real(s) / np.abs(s), initial=1.0))
@@ -90,11 +85,17 @@ def law_poles(cascade: Cascade, clock: Clock) -> list[LawPoles]:
     return lines
 
 
-def _poles(loop: Loop) -> np.ndarray:
-    """Return the poles of a loop. States that the signals do not change, or that do not change them, have none."""
-    A = np.asarray(compiled_quickly(jax.jacfwd(loop.step), options=QUICKEST)(loop.start))
+def _poles(stage: str, law: Law, model: Plant, sampling: Sampling) -> np.ndarray:
+    """Return the poles of a loop. States that its signals do not change, or that do not change them, have none."""
+    loop_of, signals = LOOPS[stage]
+
+    def matrix(law: Law, model: Plant) -> Array:
+        loop = loop_of(law, model, sampling)
+        return jax.jacfwd(loop.step)(loop.start)
+
+    A = np.asarray(compiled_quickly(matrix, options=QUICKEST)(law, model))
     changing = (np.eye(len(A)) != A).any(1)
-    used = _reached(A, loop.signals) & _reached(A.T, loop.signals) if loop.signals else changing
+    used = _reached(A, signals) & _reached(A.T, signals) if signals else changing
     return np.linalg.eigvals(A[used][:, used])
 
 
@@ -155,7 +156,7 @@ def _position(law: Any, model: Plant, sampling: Sampling) -> Loop:
             z, z_dot = z + h * z_dot + h * h / 2 * rate, z_dot + h * rate
         return ravel_pytree((z, z_dot, after, (v_star, *past)[:kept]))[0]
 
-    return Loop(step, jnp.concatenate([jnp.zeros(2), laws, jnp.full(kept, v)]), 2)
+    return Loop(step, jnp.concatenate([jnp.zeros(2), laws, jnp.full(kept, v)]))
 
 
 def _current(law: Any, model: Plant, sampling: Sampling) -> Loop:
@@ -169,7 +170,7 @@ def _current(law: Any, model: Plant, sampling: Sampling) -> Loop:
     def rate(i: Array, u: Array) -> Array:
         return law.driven(model, u, model.start(rest._replace(i=i))).i
 
-    decay, gain = map(float, jax.grad(rate, (0, 1))(rest.i, u))
+    decay, gain = jax.grad(rate, (0, 1))(rest.i, u)
 
     def step(x: Array) -> Array:
         i, past = x[0], tuple(x[-kept:])
@@ -177,11 +178,11 @@ def _current(law: Any, model: Plant, sampling: Sampling) -> Loop:
         command, after = _advance(law, model, sampling)(inputs, restore(x[1:-kept]))
         for share, voltage in reversed(list(zip(weights, (command, *past), strict=True))):
             h = share * sampling.period
-            reach = math.expm1(decay * h) / decay if decay else h
+            reach = jnp.where(decay == 0, h, jnp.expm1(decay * h) / decay)
             i = i + reach * (rate(rest.i, u) + decay * (i - rest.i) + gain * (voltage - u))
         return ravel_pytree((i, after, (command, *past)[:kept]))[0]
 
-    return Loop(step, jnp.concatenate([rest.i[None], start, jnp.full(kept, u)]), 1)
+    return Loop(step, jnp.concatenate([rest.i[None], start, jnp.full(kept, u)]))
 
 
 def _kept(late: float) -> int:
@@ -196,9 +197,11 @@ def _weights(late: float) -> list[float]:
     return [max(1 - abs(late - lag), 0.0) for lag in range(_kept(late) + 1)]
 
 
-LOOPS: dict[str, Callable[[Any, Plant, Sampling], Loop]] = {
-    "observer": _observer,
-    "position": _position,
-    "inversion": _inversion,
-    "current": _current,
+# The loop of each stage, and the number of signals that its law controls. They are the first components of its state.
+# If there are none, the law acts on its own states.
+LOOPS: dict[str, tuple[Callable[[Any, Plant, Sampling], Loop], int]] = {
+    "observer": (_observer, 0),
+    "position": (_position, 2),
+    "inversion": (_inversion, 0),
+    "current": (_current, 1),
 }
