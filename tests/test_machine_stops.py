@@ -70,6 +70,7 @@ def test_a_falling_rotor_touches_down_by_the_place_and_the_clearance_alone():
         used = run.metrics["axes"]["a.y"]["clearance_used"]
         assert used == pytest.approx(1.0, rel=1e-12)
         assert used == run.metrics["clearance_used"]
+        assert run.lost_why.endswith("on the axis a.y")
 
 
 @pytest.mark.slow  # compiles the rollout of the ensemble

@@ -134,6 +134,7 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
     gains, two = {"controller.position.c": jnp.array([17.0, 18.0])}, dataclasses.replace(scenario, member=np.arange(2))
     late = dataclasses.replace(scenario, q_z=ambjax.signals.Pulse(1.0, 2.0, 1.0))
     short = dataclasses.replace(case, clock=dataclasses.replace(clock, samples=2))
+    periods = float(clock.sample_period) * jnp.array([0.5, 1.0])
     A_CASE = r"give a case, .* a Cascade, a Scenario and a Clock"
     refused = [
         (lambda: ambjax.simulate_members(case, 0), "members = 0: it must be a whole number from 1 to"),
@@ -162,7 +163,11 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
         (lambda: ambjax.rollout(cascade), A_CASE),
         (lambda: ambjax.rollout(parts), A_CASE),
         (lambda: ambjax.rollout(case, scenario), A_CASE),
-        (lambda: ambjax.rollout(ambjax.with_gains(case, gains)), r"c has the shape \[2\]: rollout simulates one"),
+        *[(lambda of=of: of(ambjax.with_gains(case, gains)), r"c has the shape \[2\]: this function takes one member")
+          for of in (ambjax.rollout, ambjax.simulate, ambjax.sensitivity, ambjax.check, ambjax.export,
+                     ambjax.linear.linearise)],
+        (lambda: ambjax.sensitivity(dataclasses.replace(case, clock=dataclasses.replace(clock, sample_period=periods))),
+         r"clock.sample_period has the shape \[2\]: this function takes one member"),
         (lambda: ambjax.rollout(cascade, dataclasses.replace(scenario, reference=0.0), clock),
          r"scenario.reference = 0.0: it must be a record, such as Constant\(\)"),
         (lambda: ambjax.rollout(cascade, late, clock), "q_z.stop = 1.0: it must not be less than start = 2.0"),

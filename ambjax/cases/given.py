@@ -9,6 +9,7 @@ from ambjax.cases.reader import Case
 from ambjax.cases.table import cut
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import require_concrete
+from ambjax.numerics.shapes import require_one_member
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import settled
@@ -72,9 +73,9 @@ def case_of(function: str, *parts: Any) -> Case:
 
 
 def require_case(case: object, *, machines: bool = False, traced: bool = False) -> None:
-    """Raise ValueError for anything but a `Case`, or with `machines` a `MachineCase`, and if it ends before it settles.
+    """Raise ValueError for anything but a `Case` of one member, or with `machines` a `MachineCase`.
 
-    `traced`: whether the numbers may be traced.
+    Also raises it if the case ends before it settles. `traced`: whether the numbers may be traced.
     """
     if isinstance(case, MachineCase):
         if not machines:
@@ -83,4 +84,6 @@ def require_case(case: object, *, machines: bool = False, traced: bool = False) 
         raise ValueError(f"case = {cut(repr(case))}: it must be a Case, as ambjax.read_case(PATH) returns it.")
     elif not traced:
         require_concrete("case", (case.cascade, case.scenario, case.clock))
+    if isinstance(case, Case):
+        require_one_member({"controller": case.cascade, "scenario": case.scenario, "clock": case.clock})
     settled(case.settle, case.clock)

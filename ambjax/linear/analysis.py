@@ -27,6 +27,7 @@ from ambjax.linear.matrices import loop_matrices, rest
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.declared import require_number
 from ambjax.numerics.records import Scalar, canonical, leaf, record, require_concrete
+from ambjax.numerics.shapes import require_one_member
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import prepare
 from ambjax.simulation.triple import takes_case
@@ -181,6 +182,7 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
     """
     require_number("r", r)
     require_concrete("linearise", (cascade, scenario, clock, r))
+    require_one_member({"controller": cascade, "scenario": scenario, "clock": clock})
     inputs = canonical((*linearisation_inputs(cascade, scenario, clock), r))
     system, found = _matrices(*inputs)
     return checked(system, found, r, "" if found else _rest(*inputs).moving())

@@ -55,8 +55,8 @@ def require_one_member(parts: dict[str, object]) -> None:
         path, value = next(leaf for leaf, varies in leaves if varies)
         name = jax.tree_util.keystr(path, simple=True, separator=".")
         raise ValueError(
-            f"{name} has the shape {list(np.shape(value))}: rollout simulates one member. Give one value, or use "
-            "jax.vmap or ambjax.ensemble.run_ensemble for several members."
+            f"{name} has the shape {list(np.shape(value))}: this function takes one member. Give one value, or use "
+            "jax.vmap(ambjax.rollout) or ambjax.ensemble.run_ensemble for several members."
         )
 
 

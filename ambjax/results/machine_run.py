@@ -15,7 +15,7 @@ from ambjax.ensemble.replay import SEGMENT
 from ambjax.numerics.records import canonical
 from ambjax.simulation.metrics import UNITS, Metrics
 from ambjax.simulation.rollout import begin, finish, recorded_segment
-from ambjax.simulation.trajectory import SIGNAL_UNITS, STATUSES
+from ambjax.simulation.trajectory import SIGNAL_UNITS, STATUSES, TOUCHED
 from ambjax.simulation.whole_machine import PerAxis, stack_axes
 
 # Metrics of which the smallest value of the axes is the worst.
@@ -76,11 +76,12 @@ def simulate_machine(case: MachineCase, progress: Callable[[int], object] = lamb
     signals |= {"speed_rpm": rows.speed * 30 / np.pi}
     signals |= {name: np.asarray(getattr(rows.axes, name), np.float64) for name in SIGNAL_UNITS if name != "t"}
     status = outcome.trajectory
-    why = STATUSES[int(status.lost_code)]
     if case.machine.near == "z_stop":
         signals["z_stop"] = np.asarray(rows.axes.z_stop, np.float64)
+    measured, why = {name: np.asarray(x) for name, x in outcome.metrics.items()}, STATUSES[int(status.lost_code)]
+    if status.lost_code == TOUCHED:
+        why += f" on the axis {case.axes[int(np.argmax(measured['clearance_used']))]}"
     signals |= {"lost_at": np.asarray(status.lost_at), "lost_why": np.asarray(why)}
-    measured = {name: np.asarray(x) for name, x in outcome.metrics.items()}
     by_axis = {axis: {name: x[k].item() for name, x in measured.items()} for k, axis in enumerate(case.axes)}
     worst = {name: x.item() for name, x in worst_of(measured).items()}
     return MachineRun(case, signals, worst | {"axes": by_axis}, why)

@@ -18,6 +18,7 @@ from ambjax.control.cascade import DEFAULT_LAWS, Cascade
 from ambjax.control.schedule import extremes, schedules
 from ambjax.control.stages import PositionLaw
 from ambjax.numerics.records import canonical, require_concrete
+from ambjax.numerics.shapes import require_one_member
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Lowest, Named, Peak
 from ambjax.simulation.loop import ClosedLoop
@@ -135,6 +136,7 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float = 0.
     does.
     """
     require_concrete("check", (cascade, scenario, clock))
+    require_one_member({"controller": cascade, "scenario": scenario, "clock": clock})
     check_inputs(cascade, scenario, clock)
     if cascade.sampled:
         cascade, clock = cascade.in_continuous_time(), clock.with_method(None)
