@@ -100,8 +100,7 @@ class TuningProblem:
 
     @property
     def _fine(self) -> Integrator:
-        method: Any = self.objective.clock.method
-        return dataclasses.replace(method, substeps=REFINEMENT * method.substeps)
+        return _finer(self.objective.clock.method, REFINEMENT)
 
     @property
     def accurate(self) -> str:
@@ -175,8 +174,12 @@ def method_for(case: Case, substeps: int, finer: int) -> Integrator:
     """
     if slides(case.cascade, case.scenario):
         return Slide(finer * substeps)
-    method: Any = choose_method(case.cascade, case.scenario, float(case.clock.sample_period), reverse=True)
-    return dataclasses.replace(method, substeps=finer * method.substeps)
+    return _finer(choose_method(case.cascade, case.scenario, float(case.clock.sample_period), reverse=True), finer)
+
+
+def _finer(method: Any, times: int) -> Integrator:
+    """Return an integrator with this many times as many steps."""
+    return dataclasses.replace(method, substeps=times * method.substeps)
 
 
 def problem_of(case: Case, tune: Tune, *, threads: int | None = None, front: bool = False) -> TuningProblem:
