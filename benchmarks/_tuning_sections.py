@@ -14,8 +14,9 @@ def tasks() -> list[str]:
         "`ambjax tune` runs with its defaults, from gains that lose the rotor. Exceptions: E minimises the mean of",
         "the worst tenth of 64 members, and the pole of the observer ranges from 0.999 to 1e4. Errors and voltages are",
         "those of the held-out members. Steps: relative error of the settled rms error due to the steps of the search,",
-        "compared with adaptive RODAS3. u rms: after settling. Processor: processor time of the whole command,",
-        "while other programs ran.",
+        "compared with adaptive RODAS3. u rms: after settling. Not stable: held-out members, of those tested, whose",
+        "motion does not decay without noise and loads. Processor: processor time of the whole command, while other",
+        "programs ran.",
         "",
     ]
     return lines + _tasks(data)
@@ -38,11 +39,15 @@ def _tasks(data: dict[str, Any]) -> list[str]:
     rows = []
     for row in data["tasks"].values():
         cells = [row["title"], f"{row['settled_rms_error_m']:.2e}", f"{row['settled_max_abs_error_m']:.1e}"]
-        cells += [f"{row['lost']} of {row['members']}", f"{row['settled_rms_u_V']:.3g}"]
+        cells += [f"{row['lost']} of {row['members']}", _unstable(row), f"{row['settled_rms_u_V']:.3g}"]
         cells += [f"{100 * row['step_error']:.1g} %", f"{row['rollouts']:,}", f"{row['processor_s']:.0f}"]
         rows.append([*cells, _gains(row)])
-    titles = "task | settled rms error (m) | largest (m) | lost | u rms (V) | steps | rollouts | processor (s) | gains"
-    return table(titles, rows)
+    titles = "task | settled rms error (m) | largest (m) | lost | not stable | u rms (V) | steps | "
+    return table(titles + "rollouts | processor (s) | gains", rows)
+
+
+def _unstable(row: dict[str, Any]) -> str:
+    return f"{row['unstable']} of {row['tested']}"
 
 
 def _gains(row: dict[str, Any]) -> str:
@@ -66,15 +71,15 @@ def sampled_tasks() -> list[str]:
     for row in data["tasks"].values():
         bar = "-" if row["bar_m"] is None else f"{row['bar_m']:.3g}"
         cells = [row["title"], bar, f"{row['settled_rms_error_m']:.2e}"]
-        cells += [f"{row['settled_max_abs_error_m']:.1e}", f"{row['lost']} of {row['members']}"]
+        cells += [f"{row['settled_max_abs_error_m']:.1e}", f"{row['lost']} of {row['members']}", _unstable(row)]
         cells += [f"{row['settled_rms_u_V']:.0f}", f"{row['chatter_V']:.1e}", f"{row['rollouts']:,}"]
         continuous = row.get("continuous", {}).get("processor_s")
         # None: the task ran on another machine than the others
         seconds = "-" if row["processor_s"] is None else f"{row['processor_s']:.0f}"
         cells += [seconds + (f" ({continuous:.0f})" if continuous else ""), _gains(row)]
         rows.append(cells)
-    titles = "task | CMA-ES (m) | settled rms error (m) | largest (m) | lost | u rms (V) | variation of u (V) | "
-    return lines + table(titles + "rollouts | processor (s) | gains", rows)
+    titles = "task | CMA-ES (m) | settled rms error (m) | largest (m) | lost | not stable | u rms (V) | "
+    return lines + table(titles + "variation of u (V) | rollouts | processor (s) | gains", rows)
 
 
 def search() -> list[str]:

@@ -65,6 +65,7 @@ def tuned(path: pathlib.Path, out: pathlib.Path) -> dict[str, Any]:
         "step_error": report["step_error"]["relative"],
         "conditions": {row["name"]: row["margin"] for row in report["conditions"]},
         **{key: after[key] for key in ("members", "lost", "settled_rms_error_m", "settled_max_abs_error_m")},
+        **{key: report["stability"][key] for key in ("tested", "unstable")},
         "settled_rms_u_V": after["settled_rms_u_V.mean"],
         "rms_u_V": after["rms_u_V.mean"],
         "chatter_V": after["chatter_V.mean"],
