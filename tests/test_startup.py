@@ -49,6 +49,7 @@ def test_every_name_of_the_stub_is_public():
     assert "rollout" in ambjax.__all__
     modules = {name for name, home in ambjax._MODULES.items() if home == "ambjax"}
     assert {*ambjax.__all__, *modules} == set(ambjax._MODULES) <= set(dir(ambjax))
+    assert all(name in ambjax._MODULES or name.startswith("_") for name in dir(ambjax))
     assert {"laws", "signals", "plants", "sensors", "actuators", "solvers", "extend", "linear", "theorem"} <= modules
     for name, home in ambjax._MODULES.items():
         exec(f"from {home} import {name}", own := {})
