@@ -324,8 +324,15 @@ def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monke
         ),
         ({"loads": []}, r"loads = \[\]: unknown key\. Did you mean 'load'"),
         ({"bearing": MACHINE["bearing"][:1]}, "determine .* of the .* rigid motions"),
-        ({"bearing": MACHINE["bearing"][2:]}, r"no axis holds y\. .*or a rotor\.gravity that does not"),
+        ({"bearing": MACHINE["bearing"][2:]}, r"no axis holds y\. .*or a rotor\.gravity and loads that do not"),
         ({"bearing": MACHINE["bearing"][:2], "rotor": VERTICAL}, "no axis holds z"),
+        (
+            {
+                "bearing": MACHINE["bearing"][:2],
+                "load": [{"at": 0.0, "direction": [0, 0, 1], "kind": "constant", "value": 1.0}],
+            },
+            "no axis holds z.*loads that do not",
+        ),
         ({"bearing": [{"kind": "radial", "at": 0.0}], "rotor": VERTICAL}, "no axis holds z, beta_x, beta_y"),
         ({"bearing": []}, r"\[\[bearing\]\] is missing"),
         ({"bearing": [{"kind": "radial"}]}, r"bearing\[0\]\.at is missing"),

@@ -229,17 +229,18 @@ def _start(table: Table, rotor: Rotor, count: int) -> tuple[np.ndarray, list[flo
 
 
 def _check_rank(rotor: Rotor, axes: list[BearingAxis]) -> None:
-    """Raise ValueError if magnets or sensors leave a coordinate free that any of them acts on, or a weight.
+    """Raise ValueError if magnets or sensors leave a coordinate free that any of them, a weight or a load acts on.
 
     An axial bearing alone leaves the coordinates across the shaft out; radial bearings must hold all four.
     """
-    gravity, across = np.asarray(rotor.gravity), [k for k in range(RIGID) if k != 2]
+    forces = [np.asarray(rotor.gravity), *(np.asarray(load.along) for load in rotor.loads)]
+    pushed, across = np.any(forces, 0), [k for k in range(RIGID) if k != 2]
     for rows, what in ((rotor.at_magnets, "magnets"), (rotor.at_sensors, "sensors")):
         rigid = np.asarray(rows)[:, :RIGID]
         used = [k for k in range(RIGID) if np.any(rigid[:, k])]
-        needed = [k for k in range(RIGID) if gravity[k] != 0 or (k in across and set(used) & set(across))]
+        needed = [k for k in range(RIGID) if pushed[k] or (k in across and set(used) & set(across))]
         if free := [k for k in needed if k not in used]:
-            other = ", or a rotor.gravity that does not" if np.any(gravity[free]) else ""
+            other = ", or a rotor.gravity and loads that do not" if np.any(pushed[free]) else ""
             names = ", ".join(COORDINATES[k] for k in free)
             raise ValueError(f"bearing: no axis holds {names}. Give a bearing whose {what} act on it{other}.")
         scale = np.abs(rigid[:, used]).max(0)
