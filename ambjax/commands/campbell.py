@@ -12,7 +12,7 @@ from ambjax.commands.reading import read_any_with_warnings
 from ambjax.host.heartbeat import say
 from ambjax.linear.linear_machine import turning_machines
 from ambjax.linear.margins import poles_in_s
-from ambjax.linear.rotor_modes import Mode, modes_of, springs_critical
+from ambjax.linear.rotor_modes import LIGHT, Mode, modes_of, springs_critical
 from ambjax.linear.unbalance_response import (
     CriticalSpeed,
     UnbalanceResponse,
@@ -32,8 +32,8 @@ SPEEDS, BEYOND = 31, 1.3
 SLOWEST = 6000.0
 # Range of the stiffness in the critical-speed map, as shares of |k_s|, and its number of points.
 SOFTEST, STIFFEST, STIFFNESSES = 1e-2, 1e2, 81
-# Damping ratios below which the shape of a mode is drawn: LIGHT, or DAMPED if no mode is lightly damped.
-LIGHT, DAMPED = 0.35, 0.95
+# Damping ratio below which the shape of a mode is drawn if no mode is lightly damped.
+DAMPED = 0.95
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
