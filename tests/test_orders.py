@@ -53,6 +53,21 @@ def test_the_fit_is_exact_for_a_signal_of_these_orders(rotor):
         assert found["u_2x_deg"] == pytest.approx(np.degrees(0.5), rel=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("advance", "resolved"),
+    [(0.2, (1, 2)), (0.249, (1, 2)), (0.25, (1,)), (0.3, (1,)), (1 / 3, (1,)), (0.499, (1,)), (0.5, ()), (0.7, ())],
+)
+def test_an_order_that_the_samples_do_not_resolve_is_0(advance, resolved):
+    """`advance`: turns between two samples."""
+    rotor = Rotation(60 * advance / T)
+    found = folded(
+        Orders(rotor, 0.0), lambda t: sum((k * np.cos(k * angle(rotor, t) - 2.0) for k in resolved), 0 * t), 2000
+    )
+    assert all(np.isfinite(x) for x in found.values())
+    for k in (1, 2):
+        assert found[f"z_{k}x_m"] == pytest.approx(k if k in resolved else 0.0, rel=1e-6)
+
+
 def test_other_orders_do_not_leak_into_the_fit():
     """At 40 samples in a revolution, over whole revolutions, the third order is orthogonal to the first two."""
     rotor = Rotation(60 / (40 * T))

@@ -8,6 +8,7 @@ import numpy as np
 
 from ambjax.cases.forces import bias_flux, forces
 from ambjax.cases.reader import Case
+from ambjax.simulation.orders import ORDERS, ROUNDED
 from ambjax.world.recorded import Recorded
 from ambjax.world.scenario import SLOTS
 
@@ -42,7 +43,7 @@ FREQUENCIES = {"frequency": 1.0, "frequency_end": 1.0, "f_high": 1.0, "speed": 1
 def implausible(case: Case) -> list[str]:
     """Return a warning, in one line, for each implausible number of a case and each implausible relation of two."""
     machine = [*_ranges(case), *_forces(case), *_flux(case), *_limits(case), *_rates(case), *_converter(case)]
-    return [*machine, *_delay(case), *_runout(case), *_aliases(case), *_loads(case)]
+    return [*machine, *_delay(case), *_runout(case), *_aliases(case), *_orders(case), *_loads(case)]
 
 
 def _ranges(case: Case) -> Iterator[str]:
@@ -159,16 +160,43 @@ def _loads(case: Case) -> Iterator[str]:
                 yield f"{path}: grade = {grade:g} mm/s: ISO 21940-11 has G {low:g} to G {high:g}. Is it in m/s?"
 
 
+def _half(case: Case) -> float:
+    """Return half the sampling rate, less rounding errors, Hz."""
+    return (0.5 - ROUNDED) / float(case.clock.sample_period)
+
+
 def _aliases(case: Case) -> Iterator[str]:
-    half = 0.5 / float(case.clock.sample_period)
+    half = _half(case)
     parts = _signals(case) | {"rotor": case.scenario.rotor, "sensor.runout": case.scenario.sensors.runout}
     for path, signal in parts.items():
         for name, high in _frequencies(signal):
-            if high > half:
+            if high >= half:
                 yield (
-                    f"{path}: {name} gives {high:.4g} Hz, above half the sampling rate, {half:.4g} Hz: samples cannot "
-                    "resolve it. Reduce clock.sample_period."
+                    f"{path}: {name} gives {high:.4g} Hz, not below half the sampling rate, {half:.4g} Hz: samples "
+                    "cannot resolve it. Reduce clock.sample_period."
                 )
+
+
+def _orders(case: Case) -> Iterator[str]:
+    """Yield a warning for orders of the rotor's speed that the samples, or the length of the run, do not resolve."""
+    if (rotor := case.scenario.rotor) is None:
+        return
+    half, duration = _half(case), float(case.clock.duration)
+    once = rotor.fastest(duration) / (2 * np.pi)
+    runout = case.scenario.sensors.runout
+    harmonics = [] if runout is None else [int(one.number) for one in runout.harmonics]
+    if high := [order for order in sorted({*ORDERS, *harmonics}) if order * once >= half > once]:
+        least = min(high)
+        zero = " Its metrics are 0." if least in ORDERS else ""
+        yield (
+            f"rotor.speed: {least} times the speed is {least * once:.4g} Hz, not below half the sampling rate, "
+            f"{half:.4g} Hz: samples cannot resolve this order.{zero} Reduce clock.sample_period."
+        )
+    if once and (turns := abs(float(rotor.turns(duration) - rotor.turns(case.settle)))) < 1:
+        yield (
+            f"rotor.speed: the rotor makes {turns:.3g} revolutions after run.settle, and the metrics at 1x and 2x need "
+            "one: they are 0. Extend clock.duration."
+        )
 
 
 def _frequencies(node: object) -> Iterator[tuple[str, float]]:

@@ -31,15 +31,16 @@ class NotchGain:
 
 
 class NotchState(NamedTuple):
-    """State of a notch: the complex signal whose real part it adds to z (m), the mean of y, and the time (s).
+    """State of a notch: the complex signal whose real part it adds to z (m), the mean of y, and the time.
 
-    `t` is () if the speed is constant.
+    `elapsed`: the time since the first reading, in s; on a processor in samples, whose sum is exact in float32 too. It
+    is () if the speed is constant.
     """
 
     real: Array
     imaginary: Array
     mean: Array
-    t: Array | tuple[()]
+    elapsed: Array | tuple[()]
 
 
 @record
@@ -54,8 +55,8 @@ class SynchronousNotch:
     must be below 90 degrees. Below `min_speed` and above `max_speed` the notch is off: c' = (j W - rate) c, so that the
     signal appears and vanishes gradually.
 
-    On a processor, c_{n+1} = exp(j W T) (c_n - 2 rate T g (y_n - m_n)). For a constant speed, the notch is linear and
-    time-invariant. `linear.with_notch_gains` computes the gains.
+    On a processor, c_{n+1} = exp(j W T) (c_n - 2 rate T g (y_n - m_n)), with the mean of W at both samples. For a
+    constant speed, the notch is linear and time-invariant. `linear.with_notch_gains` computes the gains.
     """
 
     removes: str = static(default="force-free", doc='"force-free" or "displacement-free"')
@@ -86,16 +87,16 @@ class SynchronousNotch:
         """Return name, unit and meaning of each state."""
         parts = [("real", "m", "what the notch adds to z"), ("imaginary", "m", "the same, a quarter of a turn earlier")]
         parts.append(("mean", "A" if NULLED[self.removes] == "i" else "m", "mean of the nulled reading"))
-        return [*parts, *[("t", "s", "time, for the speed")] * self.varying]
+        return [*parts, *[("elapsed", "samples", "samples since the first reading, for the speed")] * self.varying]
 
     def at(self, speed: Scalar | None = None) -> "SynchronousNotch":
         """Return the notch at a constant speed (rpm); None: that at t = 0."""
         speed = known(self.rotor).speed if speed is None else speed
         return dataclasses.replace(self, rotor=Rotation(jnp.abs(jnp.asarray(speed))), varying=False)
 
-    def _now(self, state: NotchState) -> tuple[Array, Array, Array, Array]:
+    def _now(self, t: Scalar) -> tuple[Array, Array, Array, Array]:
         """Return the speed (rpm), real and imaginary part of the gain, and whether the notch is on, 1 or 0."""
-        rpm = known(self.rotor).rpm(0.0 if isinstance(state.t, tuple) else state.t)
+        rpm = known(self.rotor).rpm(t)
         size = jnp.abs(rpm)
         real, imaginary = (jnp.asarray(getattr(self.gains[0], name)) for name in ("real", "imaginary"))
         for low, high in itertools.pairwise(self.gains):
@@ -109,26 +110,28 @@ class SynchronousNotch:
 
     def __call__(self, measured: Measurement, state: NotchState) -> tuple[Array, NotchState]:
         """Return z with the signal of the notch, m, and the rate of the state."""
-        rpm, real, imaginary, on = self._now(state)
+        constant = isinstance(state.elapsed, tuple)
+        rpm, real, imaginary, on = self._now(0.0 if constant else state.elapsed)
         W = TWO_PI * PER_MINUTE * rpm
         moving = self._nulled(measured) - state.mean
         drive, decay = -2 * self.rate * on * moving, (1 - on) * self.rate
         a = -W * state.imaginary + real * drive - decay * state.real
         b = W * state.real + imaginary * drive - decay * state.imaginary
-        t = () if isinstance(state.t, tuple) else jnp.ones_like(state.t)
-        return measured.z + state.real, NotchState(a, b, self.rate * moving, t)
+        elapsed = () if constant else jnp.ones_like(state.elapsed)
+        return measured.z + state.real, NotchState(a, b, self.rate * moving, elapsed)
 
     def step(self, measured: Measurement, state: NotchState, period: Scalar) -> tuple[Array, NotchState]:
         """Return z with the signal of the notch, m, and the state at the next sample. `period`: sample period, s."""
-        rpm, real, imaginary, on = self._now(state)
-        later = state.t
+        constant, elapsed = isinstance(state.elapsed, tuple), state.elapsed
+        rpm, real, imaginary, on = self._now(0.0 if constant else elapsed * period)
         moving = self._nulled(measured) - state.mean
         drive, kept = -2 * self.rate * period * on * moving, jnp.maximum(1 - (1 - on) * self.rate * period, 0.0)
         a, b = kept * state.real + real * drive, kept * state.imaginary + imaginary * drive
-        turn = PER_MINUTE * period * rpm
-        if not isinstance(later, tuple):
-            later = later + period
-            turn = known(self.rotor).turns(later) - known(self.rotor).turns(later - period)
-        c, s = jnp.cos(TWO_PI * turn), jnp.sin(TWO_PI * turn)
+        mean_rpm = rpm
+        if not isinstance(elapsed, tuple):
+            elapsed = elapsed + 1.0
+            mean_rpm = (rpm + known(self.rotor).rpm(elapsed * period)) / 2
+        turn = TWO_PI * PER_MINUTE * period * mean_rpm
+        c, s = jnp.cos(turn), jnp.sin(turn)
         a, b = a * c - b * s, a * s + b * c
-        return measured.z + state.real, NotchState(a, b, state.mean + self.rate * period * moving, later)
+        return measured.z + state.real, NotchState(a, b, state.mean + self.rate * period * moving, elapsed)
