@@ -21,7 +21,7 @@ from texts import piped
 import ambjax
 from ambjax import Cascade, Clock, Scenario
 from ambjax.__main__ import main
-from ambjax.cases.reader import read_case
+from ambjax.cases.reader import case_from, read_case
 from ambjax.codegen.c99 import machine
 from ambjax.codegen.c99.machine import Compiled, build
 from ambjax.codegen.c99.package import package_files
@@ -237,6 +237,42 @@ def test_after_the_allowed_number_of_refused_samples_u_is_0_until_a_reading_is_a
     assert answer.u != 0
     far = step(memory, good._replace(z=jnp.asarray(3e-3)))[2]
     assert far.refused  # 2 mm in a sample
+
+
+def test_after_a_failed_step_the_next_readings_are_accepted():
+    """No law has stepped, so that nothing predicts these readings; a refused one gives u = 0."""
+    controller, _, _, inputs, _ = stepping(hard())
+    parameters, memory, _, period = arguments(controller)
+    broken = jax.tree.map(lambda x: x, parameters)._replace(
+        controller=dataclasses.replace(
+            parameters.controller, current=dataclasses.replace(parameters.controller.current, k_i=jnp.asarray(np.nan))
+        )
+    )
+    read, far = frozenset(StepInputs._fields), inputs._replace(z=jnp.asarray(-2e-3))
+    memory, answer, status = controller.step(broken, memory, far, period, read)
+    assert (status.failed, status.refused, memory.started, answer.u) == (True, False, False, 0)
+    lost = controller.step(parameters, memory, far._replace(z=jnp.asarray(np.nan)), period, read)
+    assert (lost[1].u, lost[2].safe, lost[0].started) == (0, True, False)
+    memory, answer, status = controller.step(parameters, memory, far, period, read)
+    assert (status.refused, status.failed, memory.started) == (False, False, True)
+    assert answer.u != 0
+
+
+def test_a_controller_without_a_measured_velocity_reads_none():
+    """Laws that use no velocity, and no observer: the guard predicts with the velocity 0, as in the simulator."""
+    raw = {
+        "controller": {
+            "observer": {"kind": "direct"},
+            "position": {"kind": "chain"},
+            "inversion": {"kind": "linearised"},
+            "current": {"kind": "pi"},
+        },
+        "processor": {"delay": 1.0, "predict": False},
+    }
+    for velocity in (False, True):
+        case = case_from(raw | {"sensor": {"velocity": velocity}})
+        controller = controller_of(case.cascade, case.scenario.command_limit, PERIOD, case.scenario)
+        assert ("z_dot" in trace(controller, "double").read) == velocity
 
 
 def test_without_a_guard_every_reading_is_used():

@@ -131,7 +131,7 @@ def test_default_limits_accept_every_reading_of_a_sensor_without_faults():
         bits, std = float(rng.integers(6, 20)), 10 ** rng.uniform(-8, -4)
         sensor = Sensor(std, gain=rng.uniform(0.8, 1.2), offset=rng.normal() * 1e-5, bits=bits, range_z=1e-2)
         scenario = amb.Scenario(sensor=sensor)
-        guard = Guard().with_limits(amb.plants.Plant(), scenario, T, False)
+        guard = Guard().with_limits(amb.plants.Plant(), scenario, T, True)
         ends = [
             float(sensor.converted(sensor.reading(Measurement(z, 0.0, 0.0), Errors(e, 0.0, 0.0)), 5e-3, 0.25).z)
             for z in (-4.5e-3, 4.5e-3)

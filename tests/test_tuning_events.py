@@ -4,13 +4,29 @@ import math
 import sys
 import time
 
+import numpy as np
 import pytest
 
 from ambjax.host import heartbeat
 from tuning import events
 from tuning.events import Event, Log, Reached, Standing
+from tuning.problem.limits import Limit
+from tuning.problem.quantities import KINDS
 
-STANDING = Standing(1, 3, 40, 2, 1e-6, 5.0, 39, 40, (Reached("sensitivity", 6.0, 3.0, False),), math.nan)
+STANDING = Standing(1, 3, 40, 2, 1e-6, 5.0, 39, 40, (Reached("sensitivity", 6.0, 3.0, False, 6.0),), math.nan)
+
+
+def test_a_norm_over_members_is_no_broken_limit_while_the_worst_member_may_be_within():
+    """Ten equal members at 2.5 A have the 16-norm 2.89 A."""
+    limit = Limit("rms_coil_A", 2.7)
+    norm = float(KINDS["rms_coil_A"].tuned(np.full(10, 2.5)))
+    low = limit.other_bound(norm, 10)
+    assert low == pytest.approx(2.5)
+    assert "from 2.5 to 2.89 (limit 2.7)" in Reached("rms_coil_A", norm, 2.7, limit.holds(norm), low).text
+    assert "2.89 (beyond 2.4)" in Reached("rms_coil_A", norm, 2.4, False, low).text
+    assert "2.89 (within 3)" in Reached("rms_coil_A", norm, 3.0, True, low).text
+    known = limit.updated(norm, 2.5)  # a judged value
+    assert known.other_bound(2.5, 10) == 2.5
 
 
 class Terminal:

@@ -17,16 +17,24 @@ INTERVAL = 2.0
 
 
 class Reached(NamedTuple):
-    """A limit of [tune.limits]: the search's value and the limit itself, in the unit of the quantity."""
+    """A limit of [tune.limits]: the search's value and the limit itself, in the unit of the quantity.
+
+    `value` is a bound of the worst member's value, as the search computes it; `other` is the bound on the other side.
+    `holds`: whether `value` is within the limit.
+    """
 
     name: str
     value: float
     threshold: float
     holds: bool
+    other: float
 
     @property
     def text(self) -> str:
         """The limit as a phrase."""
+        low, high = sorted((self.value, self.other))
+        if not self.holds and low <= self.threshold <= high:
+            return f"{self.name} from {low:.3g} to {high:.3g} (limit {self.threshold:g})"
         return f"{self.name} {self.value:.3g} ({'within' if self.holds else 'beyond'} {self.threshold:g})"
 
 

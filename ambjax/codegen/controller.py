@@ -23,7 +23,7 @@ from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.system import guarded
 from ambjax.world.scenario import Scenario
-from ambjax.world.sensor import Measurement
+from ambjax.world.sensor import Measurement, Sensor
 from ambjax.world.waveforms import Reference
 
 T = TypeVar("T")
@@ -79,9 +79,13 @@ class Parameters(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Controller(Block):
-    """A cascade on its processor as it is exported: its parameters and the sample period, s."""
+    """A cascade on its processor as it is exported: its parameters and the sample period, s.
+
+    `velocity`: whether the velocity is measured.
+    """
 
     parameters: Parameters
+    velocity: bool = True
 
     noun: ClassVar[str] = "controller"
     ports: ClassVar[Any] = StepInputs
@@ -104,6 +108,8 @@ class Controller(Block):
         """Compute one sample. Return the memory for the next one, the outputs and the status."""
         cascade, limits = parameters
         measured = Measurement(*inputs[:3])
+        if not self.velocity:  # the simulator reads 0
+            measured = measured._replace(z_dot=jnp.zeros_like(inputs.z_dot))
         fine = [
             jnp.abs(getattr(inputs, name)) <= getattr(limits, name) for name in StepInputs._fields[3:] if name in read
         ]
@@ -112,7 +118,8 @@ class Controller(Block):
             fine += [processor.delay >= 0, processor.delay <= (processor.most or 0)]
         fine += [jnp.isfinite(p) for p in _steepnesses(cascade)]  # p = inf needs another program
         valid = functools.reduce(jnp.logical_and, fine, jnp.asarray(True))
-        system = Sampled(ClosedLoop(cascade, Scenario(u_max=limits.u_max)), period, 0)
+        sensor = Sensor(velocity=self.velocity)
+        system = Sampled(ClosedLoop(cascade, Scenario(u_max=limits.u_max, sensor=sensor)), period, 0)
         before, watch = memory.before, memory.watch
         state = SampledState(
             plant=(),
@@ -130,8 +137,8 @@ class Controller(Block):
             refused, safe = processor.guard.refused(memory.watch, watch)
         assert not isinstance(after.started, tuple)  # an array in the state stays an array
         laws, started = choose(valid, (after.control, after.started), (memory.laws, memory.started))
-        # an invalid sample resets the guard: the next reading within its limits is accepted
-        watch = choose(valid, watch, jax.tree.map(jnp.zeros_like, watch))
+        # an invalid or failed sample resets the guard: the next reading within its limits is accepted
+        watch = choose(valid & (after.finite != 0), watch, jax.tree.map(jnp.zeros_like, watch))
         kept = Memory(laws, last, after.past[: len(before)], watch, started)
         status = Status(
             jnp.abs(last.u) >= limits.u_max,
@@ -226,10 +233,11 @@ def controller_of(cascade: Cascade, u_max: Scalar, period: float, scenario: Scen
         )
     cascade, period = cascade.on_processor().turning(scenario and scenario.rotor), float(period)
     model = cascade.model
-    cascade = guarded(cascade, scenario or Scenario(plant=model), period)
+    scenario = scenario or Scenario(plant=model)
+    cascade = guarded(cascade, scenario, period)
     limits = StepLimits(u_max, NEAR, *(GAPS * float(model.s_0) / period**n for n in range(4)))
     plain = jax.tree.map(lambda x: float(x) if jnp.shape(x) == () else x, Parameters(cascade, limits))
-    return Controller(plain, period)
+    return Controller(plain, period, scenario.sensors.velocity)
 
 
 def _steepnesses(cascade: Cascade) -> list[Scalar]:

@@ -74,6 +74,6 @@ BITS = {
     "refused": "a reading is NaN, beyond its limit or too far from its prediction: the prediction replaces it",
     "failed": "a law returned a value that is not finite: all laws keep their states, u is held",
     "singular": "(z, i_ref) is near the singular curve of Eq. (9)",
-    "safe": "more than guard.samples readings in a row, or all so far, are refused: u is 0, the laws keep their states",
+    "safe": "more than guard.samples readings in a row, or all so far or since an invalid step, are refused: u is 0",
     "invalid": "the reference, params->processor.delay or a steepness p is NaN or out of range: u is held",
 }

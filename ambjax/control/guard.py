@@ -88,14 +88,14 @@ class Guard:
         """Whether every number is left out."""
         return all(getattr(self, field.name) is None for field in dataclasses.fields(type(self)))
 
-    def with_limits(self, model: Plant, scenario: Scenario, period: Scalar, estimated: bool) -> "Guard":
+    def with_limits(self, model: Plant, scenario: Scenario, period: Scalar, velocity: bool) -> "Guard":
         """Return the guard with every number set; those that are None are derived (docs/processor.md).
 
-        `period`: sample period, s. `estimated`: whether an observer estimates the velocity.
+        `period`: sample period, s. `velocity`: whether the controller reads a measured velocity.
         """
         sensor = scenario.sensors
         limit, clearance = scenario.limit, scenario.limit / scenario.plant.s_0 * model.s_0
-        fall, velocity_error = model.pole * clearance, 1.0 if estimated else sensor.velocity_error
+        fall, velocity_error = model.pole * clearance, sensor.velocity_error if velocity else 1.0
         values = {
             "z": sensor.largest_reading(limit, scenario.plant.s_0),
             "z_dot": GAPS * model.s_0 / period,
@@ -114,8 +114,8 @@ class Guard:
         zero = jnp.zeros(())
         return Watch(Measurement(zero, zero, zero), zero)
 
-    def check(self, model: Plant, measured: Measurement, watch: Watch, period: Scalar, estimated: bool) -> GuardResult:
-        """Accept or replace the readings of a sample. `estimated`: an observer estimates z_dot: no check of it."""
+    def check(self, model: Plant, measured: Measurement, watch: Watch, period: Scalar, velocity: bool) -> GuardResult:
+        """Accept or replace the readings of a sample. `velocity`: whether z_dot is checked too."""
         guard: Any = self  # its numbers are set (`with_limits`)
         (z, _, i), time = watch.expected, (guard.samples - watch.left + 1) * period
         # bound of the model's error in acceleration, m/s^2: the full pull of one magnet at the expected z and i
@@ -124,7 +124,7 @@ class Guard:
         near = (jnp.abs(measured.z - z) <= reach) | (watch.left <= 0)
         fine = Measurement(
             near & (jnp.abs(measured.z) <= guard.z),
-            jnp.asarray(True) if estimated else jnp.abs(measured.z_dot) <= guard.z_dot,
+            jnp.abs(measured.z_dot) <= guard.z_dot if velocity else jnp.asarray(True),
             jnp.abs(measured.i) <= guard.i,
         )
         good = fine.z & fine.z_dot & fine.i

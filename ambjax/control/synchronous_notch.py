@@ -110,20 +110,19 @@ class SynchronousNotch:
 
     def __call__(self, measured: Measurement, state: NotchState) -> tuple[Array, NotchState]:
         """Return z with the signal of the notch, m, and the rate of the state."""
-        constant = isinstance(state.elapsed, tuple)
-        rpm, real, imaginary, on = self._now(0.0 if constant else state.elapsed)
+        rpm, real, imaginary, on = self._now(0.0 if isinstance(state.elapsed, tuple) else state.elapsed)
         W = TWO_PI * PER_MINUTE * rpm
         moving = self._nulled(measured) - state.mean
         drive, decay = -2 * self.rate * on * moving, (1 - on) * self.rate
         a = -W * state.imaginary + real * drive - decay * state.real
         b = W * state.real + imaginary * drive - decay * state.imaginary
-        elapsed = () if constant else jnp.ones_like(state.elapsed)
+        elapsed = () if isinstance(state.elapsed, tuple) else jnp.ones_like(state.elapsed)
         return measured.z + state.real, NotchState(a, b, self.rate * moving, elapsed)
 
     def step(self, measured: Measurement, state: NotchState, period: Scalar) -> tuple[Array, NotchState]:
         """Return z with the signal of the notch, m, and the state at the next sample. `period`: sample period, s."""
-        constant, elapsed = isinstance(state.elapsed, tuple), state.elapsed
-        rpm, real, imaginary, on = self._now(0.0 if constant else elapsed * period)
+        elapsed = state.elapsed
+        rpm, real, imaginary, on = self._now(0.0 if isinstance(elapsed, tuple) else elapsed * period)
         moving = self._nulled(measured) - state.mean
         drive, kept = -2 * self.rate * period * on * moving, jnp.maximum(1 - (1 - on) * self.rate * period, 0.0)
         a, b = kept * state.real + real * drive, kept * state.imaginary + imaginary * drive

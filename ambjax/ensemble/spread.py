@@ -134,7 +134,7 @@ def no_such_number(path: str, known: Iterable[str], where: str = "in this case")
     """Return the message for a path that is not in `known`; it lists similar paths. `where`: scope of `known`."""
     known = list(known)
     hint = hint_of_path(path, known)
-    if path.split(".")[0] == "sensor":
+    if path.split(".")[0] == "sensor" and not any(one.startswith("sensor.") for one in known):
         hint = " This case has no sensor noise; add the table [sensor], with std = 0.0 for example."
     if path == "rotor.acceleration" and "rotor.speed" in known:
         hint = " The table rotor.speed gives it; a spread of rotor.speed shifts the whole table."

@@ -108,6 +108,11 @@ class ClosedLoop(WholeState):
         cascade, scenario = self.cascade.turning(self.scenario.rotor), self.scenario.realised()
         return dataclasses.replace(self, cascade=cascade, scenario=scenario, key=self.scenario.words())
 
+    @property
+    def measures_velocity(self) -> bool:
+        """Whether the controller reads a measured velocity."""
+        return self.scenario.sensors.velocity and not self.cascade.observer.estimates_velocity
+
     def words(self) -> tuple[Scalar, Scalar]:
         """Return the random key of the member as two 32-bit words."""
         return self.scenario.words() if self.key is None else self.key

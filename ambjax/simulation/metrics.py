@@ -1,6 +1,6 @@
 """The metrics of metrics.json, as folds (`ambjax.simulation.folds`).
 
-Errors are evaluated at every sample, also after the rotor is lost; its state is then frozen. Measurement noise is
+Rms errors are evaluated at every sample, also after the rotor is lost; its state is then frozen. Measurement noise is
 constant over a sample: u and v_tilde jump at the start of the sample, and i and e respond within it. Values at the
 samples are therefore not typical, so extremes include the integrator's substeps; those of flux density and force do
 not. The rms voltages and currents, chatter and copper loss are computed over the time during which the drive is on.

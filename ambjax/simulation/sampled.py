@@ -181,8 +181,8 @@ class Sampled:
         """Return the result of the guard, and the readings and the states with which the laws step at this sample."""
         cascade, checked, laws = self.loop.cascade, None, state.control
         if self.processor.guard is not None:
-            estimated = cascade.observer.estimates_velocity
-            checked = self.processor.guard.check(cascade.model, measured, state.watch, self.period, estimated)
+            velocity = self.loop.measures_velocity
+            checked = self.processor.guard.check(cascade.model, measured, state.watch, self.period, velocity)
             measured = checked.reading
         if not isinstance(state.started, tuple):
             laws = cascade.begun(measured, sample, laws, state.started.astype(bool))

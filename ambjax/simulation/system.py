@@ -138,7 +138,7 @@ def guarded(cascade: Cascade, scenario: Scenario, period: Scalar) -> Cascade:
     guard = cascade.timing.guard
     if guard is None:
         return cascade
-    guard = guard.with_limits(cascade.model, scenario, period, cascade.observer.estimates_velocity)
+    guard = guard.with_limits(cascade.model, scenario, period, ClosedLoop(cascade, scenario).measures_velocity)
     return cascade.with_processor(guard=guard)
 
 

@@ -60,7 +60,8 @@ class Rotation:
         """Return the end of the run-up, s; empty if it never ends."""
         if self.speed_end is None:
             return ()
-        return (jnp.maximum((self.speed_end - self.speed) / self.acceleration, 0.0),)
+        still = self.acceleration == 0  # set so in the exported notch, whose speed is measured
+        return (jnp.maximum((self.speed_end - self.speed) / jnp.where(still, 1.0, self.acceleration), 0.0),)
 
     def edges(self) -> tuple[Scalar, ...]:
         """Return the instants (s) at which the rate of the speed jumps."""

@@ -58,9 +58,10 @@ def pages() -> dict[str, str]:
     lines = ["# Metrics and arrays", "", "## `metrics.json`", ""]
     lines += [
         "`ambjax simulate` writes the metrics of a run, `ambjax ensemble` those of every member (`members.npz`). "
-        "Errors are evaluated at every sample. A lost rotor is frozen, and its error counts until the end. Under held "
-        "noise, u, i, e and v_tilde jump at the samples. Their extremes are therefore taken over the substeps of the "
-        "integrator; voltage and copper loss are averaged over time.",
+        "Rms errors, forces, flux density, and amplitudes once and twice per revolution are evaluated at the samples. "
+        "A lost rotor is frozen, and its error counts until the end. Under held noise, u, i, e and v_tilde jump at the "
+        "samples. Their extremes, and those of the errors, are therefore taken over the substeps of the integrator; "
+        "voltage and copper loss are averaged over time.",
         "",
     ]
     lines += table(("metric", "unit", "meaning"), rows(), "keys")

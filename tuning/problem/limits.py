@@ -20,7 +20,7 @@ from jax import Array
 
 from ambjax.extend import Scalar, record, static
 from ambjax.simulation.folds import Fold
-from tuning.problem.quantities import KINDS, TINY, Kind, LimitContext
+from tuning.problem.quantities import KINDS, LOOPS, NORM, TINY, Kind, LimitContext
 
 # Penalty; at a multiplier of 0, an excess of 10 % adds 0.14 to the goal.
 PENALTY = 30.0
@@ -96,6 +96,16 @@ class Limit:
     def holds(self, reached: float) -> bool:
         """Return whether the value `reached` is within the limit, without a margin."""
         return reached >= self.threshold if self.kind.at_least else reached <= self.threshold
+
+    def other_bound(self, reached: float, members: int) -> float:
+        """Return the other bound of the worst member's value, of which `reached` (of the search) is one.
+
+        The 16-norm of N members is between the largest value and N^(1/16) times it. A `ratio` makes it exact.
+        """
+        if not self.kind.worst or self.ratio != 1.0:
+            return reached
+        most = min(members, LOOPS) if self.kind.fold is None else members
+        return reached * most ** ((1 if self.kind.at_least else -1) / NORM)
 
     def has_reserve(self, reached: float) -> bool:
         """Return whether the value `reached` is within the limit by at least half of the margin."""

@@ -214,8 +214,12 @@ def standing_of(problem: TuningProblem, progress: SearchState, number: int, spen
     quantities = dict(zip(problem.goal.quantities, last["quantities"], strict=True))
     volts = quantities.get("rms_u_V", float(np.asarray(loss.u_scale)) * math.sqrt(terms["effort"]))
     values = [(one, one.ratio * float(quantities[one.name])) for one in problem.limits]
-    limits = tuple(Reached(one.name, value, one.threshold, one.holds(value)) for one, value in values)
-    members, starts = int(last["members"]), 0 if progress.converged else len(progress.starts.value)
+    members = int(last["members"])
+    limits = tuple(
+        Reached(one.name, value, one.threshold, one.holds(value), one.other_bound(value, members))
+        for one, value in values
+    )
+    starts = 0 if progress.converged else len(progress.starts.value)
     # the first iteration compiles
     left = (most - progress.iteration) * float(np.median(spent[1:])) if len(spent) > 1 else math.nan
     return Standing(

@@ -116,7 +116,8 @@ def fixed(trace: Trace) -> list[str]:
         lines += [
             f"params->processor.guard: a reading is refused beyond {_ends(trace, 'processor.guard')}, or if it",
             "cannot follow from the last one. The model's prediction replaces it for at most",
-            f"{samples.value:g} samples in a row ({time:g} s); then u = 0.",
+            f"{samples.value:g} samples in a row ({time:g} s); then u = 0. After an invalid or a failed step there is",
+            "no prediction: a reading within its limit is accepted, and a refused one gives u = 0.",
         ]
     else:
         lines += ["No guard: readings are not checked."]
@@ -125,6 +126,13 @@ def fixed(trace: Trace) -> list[str]:
         lines += ["params->processor.delay is not read: nothing is predicted."]
     else:
         lines += [f"params->processor.delay: {delay}, else every step is invalid; for a longer one export again."]
+    for x in (x for x in trace.parameters if x.name.endswith("notch.rotor.speed")):
+        rates = word(x.name).removesuffix(".speed")
+        lines += [
+            f"params->{word(x.name)}: speed of the notch, rpm. Before each step, set it to the measured speed, and",
+            f"all rates in params->{rates} to 0. Without this, the notch has the speed of the case, whose time",
+            "begins at the first step whose readings are all accepted.",
+        ]
     for x in (x for x in trace.parameters if "export again" in x.allowed):
         lines += [f"params->{word(x.name)}: finite, else every step is invalid."]
     return [
