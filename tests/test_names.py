@@ -93,6 +93,7 @@ def runout(amplitude):
         (" \n", "the file is empty"),
         ("[plant]\n", None),
         ("[plant]\ns_0 = 0.005\n", "[plant] omits numbers"),
+        ("[sensor]\nstd = 1e-8\noffset = -1e-3\nstd_z_dot = 1e-6\n", "sensor.offset = -0.001 m is 20 % of the gap"),
         ("[plant]\n" + "\n".join(f"{key} = {value}" for key, value in (GOOD | {"s_0": 0.4}).items()), "millimetres"),
     ],
 )
@@ -128,7 +129,7 @@ def test_python_and_the_commands_give_the_same_warnings(text, said, tmp_path, ca
         ({"iron": {"saturation": 1.4}}, {}, None),
         ({}, sine(50.0, 350.0), "weight and loads reach 365.7 N, but the magnets pull with at most 364.2 N"),
         ({}, sine(50.0, 345.0), None),
-        ({}, sine(6000.0), "disturbance.q_f: frequency gives 6000 Hz, above half the sampling rate, 5000 Hz"),
+        ({}, sine(6000.0), "disturbance.q_f: frequency gives 6000 Hz, not below half the sampling rate, 5000 Hz"),
         ({}, sine(4000.0), None),
         (
             {},
@@ -147,6 +148,12 @@ def test_python_and_the_commands_give_the_same_warnings(text, said, tmp_path, ca
         ({}, step(0.09), None),
         ({}, graded(0.0025), "disturbance.q_z: grade = 0.0025 mm/s: ISO 21940-11 has G 0.4 to G 4000"),
         ({}, graded(2.5), None),
+        ({}, {"rotor": {"speed": 1.5e5}}, "rotor.speed: 2 times the speed is 5000 Hz, not below half the"),
+        ({}, {"rotor": {"speed": 60.0}}, "rotor.speed: the rotor makes 0.0.* revolutions after run.settle"),
+        ({}, {"rotor": {"speed": 6e4}}, None),
+        ({}, {"processor": {}, "sensor": {"bits": 14, "range_z": 1e-9}}, "sensor.range_z = 1e-09: the converter reads"),
+        ({}, {"processor": {}, "sensor": {"bits": 14, "range_i": 0.1}}, "converter reads 4 % of the bias current"),
+        ({}, {"actuator": {"u_max": 48.0, "dead_band": 50.0}, "processor": {}}, "dead_band = 50 V is not below"),
     ],
 )
 def test_inconsistent_numbers_cause_a_warning(plant, tables, said):

@@ -28,6 +28,8 @@ RANGES = {
 # Standard gravity, m/s^2, and the largest plausible ratio of a rotor's weight to the largest force of its bearing. The
 # bearings of a vertical axis may be weaker than the weight.
 GRAVITY, MOST_WEIGHT = 9.81, 10.0
+# Smallest plausible range of a converter, in clearances or bias currents.
+LEAST_RANGE = 0.1
 # Largest plausible limit of a current, in bias currents.
 MOST_CURRENT = 100.0
 # Largest plausible length of a recorded signal, in lengths of the run.
@@ -59,7 +61,7 @@ def _forces(case: Case) -> Iterator[str]:
     if (heavy := GRAVITY * mass) > MOST_WEIGHT * largest:
         yield (
             f"plant.m = {mass:g} kg: the rotor weighs {heavy:.4g} N, {heavy / largest:.3g} times the largest force of "
-            f"the magnets, {largest:.4g} N. Is it in grams?"
+            f"the magnets, {largest:.4g} N. Is it in grams? Or is actuator.i_max too small?"
         )
     if weight <= largest < weight + load:
         yield (
@@ -90,6 +92,9 @@ def _limits(case: Case) -> Iterator[str]:
         if limit is not None and float(limit) > MOST_CURRENT * bias:
             times = f"{float(limit) / bias:.4g} times plant.i_0"
             yield f"{path}.i_max = {float(limit):g} A is {times}. Is it in milliamperes?"
+    dead, u_max = getattr(amplifier, "dead_band", None), float(case.scenario.u_max)
+    if dead is not None and float(dead) >= u_max:
+        yield f"actuator.dead_band = {float(dead):g} V is not below actuator.u_max = {u_max:g} V: no voltage acts."
 
 
 def _rates(case: Case) -> Iterator[str]:
@@ -110,7 +115,13 @@ def _rates(case: Case) -> Iterator[str]:
 
 
 def _converter(case: Case) -> Iterator[str]:
-    sensor = case.scenario.sensors
+    sensor, plant = case.scenario.sensors, case.scenario.plant
+    ranges = (("range_z", float(case.scenario.touchdown), "clearance"), ("range_i", float(plant.i_0), "bias current"))
+    for name, size, what in ranges if sensor.bits is not None else ():
+        given = getattr(sensor, name)
+        if given is not None and float(given) < LEAST_RANGE * size:
+            reads = f"the converter reads {100 * float(given) / size:.3g} % of the {what}"
+            yield f"sensor.{name} = {float(given):g}: {reads}. Is it in another unit?"
     if sensor.bits is None or not sensor.std:
         return
     step = float(sensor.step(case.scenario.plant.s_0))

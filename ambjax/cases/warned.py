@@ -20,7 +20,7 @@ from ambjax.world.scenario import Scenario
 GAPS, AREAS, PERMEABILITIES = (2e-5, 2e-2), (1e-6, 1.0), (6e-7, 2.5e-6)
 # The plant parameter whose default is correct for every machine.
 GRAVITY = "g"
-# Largest plausible standard deviation of the position noise, as a share of the gap.
+# Largest plausible standard deviation of the position noise, and largest offset, as shares of the gap.
 MOST_NOISE = 0.1
 
 
@@ -78,9 +78,10 @@ def _sizes(case: Case) -> Iterator[str]:
 
 def _noise(case: Case) -> Iterator[str]:
     sensor, gap = case.scenario.sensors, case.scenario.plant.s_0
-    if sensor.std > MOST_NOISE * gap:
-        share = 100 * sensor.std / gap
-        yield f"sensor.std = {sensor.std:g} m is {share:.3g} % of the gap, {gap:g} m. Is it in another unit?"
+    for name, size in (("std", sensor.std), ("offset", abs(sensor.offset))):
+        if size > MOST_NOISE * gap:
+            share = f"{100 * size / gap:.3g} % of the gap, {gap:g} m"
+            yield f"sensor.{name} = {getattr(sensor, name):g} m is {share}. Is it in another unit?"
 
 
 def _velocity(case: Case) -> Iterator[str]:
