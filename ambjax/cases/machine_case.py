@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import math
 import pathlib
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
@@ -17,7 +16,6 @@ from ambjax.cases.machine_spread import axis_table, machine_spread, refuse_unuse
 from ambjax.cases.machine_trial import try_machine
 from ambjax.cases.notch_table import notch_from
 from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
-from ambjax.cases.plausibility import orders_unresolved
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
 from ambjax.cases.rotor_numbers import fastest_rotor
 from ambjax.cases.rotor_tables import (
@@ -91,10 +89,7 @@ def first_axis(case: AnyCase) -> Case:
 
 
 def read_machine(path: str | pathlib.Path) -> MachineCase:
-    """Read and check the case file of a machine. Raises ValueError, one line, for an invalid file.
-
-    A speed whose metrics the samples or the length of the run do not resolve causes a UserWarning.
-    """
+    """Read and check the case file of a machine. Raises ValueError, one line, for an invalid file."""
     case = read_any(path)
     if isinstance(case, Case):
         raise ValueError(
@@ -102,14 +97,7 @@ def read_machine(path: str | pathlib.Path) -> MachineCase:
                 f"{path}: it has no [rotor] with a kind, so it is a case of one axis; in Python, read_case reads it."
             )
         )
-    for text in warnings_of_machine(case):
-        warnings.warn(f"{path}: {text}", stacklevel=2)
     return case
-
-
-def warnings_of_machine(case: MachineCase) -> list[str]:
-    """Return one line for each quantity that the run does not resolve."""
-    return list(orders_unresolved(case.machine.rotor.rotation, case.clock, case.settle))
 
 
 def read_any(path: str | pathlib.Path) -> AnyCase:

@@ -2,16 +2,14 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
 from ambjax.cases.forces import bias_flux, forces
 from ambjax.cases.reader import Case
-from ambjax.simulation.clock import Clock
 from ambjax.simulation.orders import ORDERS, ROUNDED
 from ambjax.world.recorded import Recorded
-from ambjax.world.rotation import Rotation
 from ambjax.world.scenario import SLOTS
 
 # Flux density above which common silicon steel begins to saturate, T (Schweitzer and Maslen, Magnetic Bearings, 2009).
@@ -173,13 +171,13 @@ def _loads(case: Case) -> Iterator[str]:
                 yield f"{path}: grade = {grade:g} mm/s: ISO 21940-11 has G {low:g} to G {high:g}. Is it in m/s?"
 
 
-def _half(clock: Clock) -> float:
+def _half(case: Case) -> float:
     """Return half the sampling rate, less rounding errors, Hz."""
-    return (0.5 - ROUNDED) / float(clock.sample_period)
+    return (0.5 - ROUNDED) / float(case.clock.sample_period)
 
 
 def _aliases(case: Case) -> Iterator[str]:
-    half = _half(case.clock)
+    half = _half(case)
     parts = _signals(case) | {"rotor": case.scenario.rotor, "sensor.runout": case.scenario.sensors.runout}
     for path, signal in parts.items():
         for name, high in _frequencies(signal):
@@ -191,19 +189,13 @@ def _aliases(case: Case) -> Iterator[str]:
 
 
 def _orders(case: Case) -> Iterator[str]:
-    if case.scenario.rotor is not None:
-        runout = case.scenario.sensors.runout
-        harmonics = [] if runout is None else [int(one.number) for one in runout.harmonics]
-        yield from orders_unresolved(case.scenario.rotor, case.clock, case.settle, harmonics)
-
-
-def orders_unresolved(rotor: Rotation, clock: Clock, settle: float, harmonics: Sequence[int] = ()) -> Iterator[str]:
-    """Yield a warning for orders of a rotor's speed that the samples, or the length of the run, do not resolve.
-
-    `settle`: start of the evaluation, s. `harmonics`: further orders, of a runout.
-    """
-    half, duration = _half(clock), float(clock.duration)
+    """Yield a warning for orders of the rotor's speed that the samples, or the length of the run, do not resolve."""
+    if (rotor := case.scenario.rotor) is None:
+        return
+    half, duration = _half(case), float(case.clock.duration)
     once = rotor.fastest(duration) / (2 * np.pi)
+    runout = case.scenario.sensors.runout
+    harmonics = [] if runout is None else [int(one.number) for one in runout.harmonics]
     if high := [order for order in sorted({*ORDERS, *harmonics}) if order * once >= half > once]:
         least = min(high)
         zero = " Its metrics are 0." if least in ORDERS else ""
@@ -211,7 +203,7 @@ def orders_unresolved(rotor: Rotation, clock: Clock, settle: float, harmonics: S
             f"rotor.speed: {least} times the speed is {least * once:.4g} Hz, not below half the sampling rate, "
             f"{half:.4g} Hz: samples cannot resolve this order.{zero} Reduce clock.sample_period."
         )
-    if once and (turns := abs(float(rotor.turns(duration) - rotor.turns(settle)))) < 1:
+    if once and (turns := abs(float(rotor.turns(duration) - rotor.turns(case.settle)))) < 1:
         yield (
             f"rotor.speed: the rotor makes {turns:.3g} revolutions after run.settle, and the metrics at 1x and 2x need "
             "one: they are 0. Extend clock.duration."
