@@ -54,11 +54,6 @@ def by_values(raw: dict[str, Any]) -> None:
     constant(refine, STEEP=-1.0)(raw)
 
 
-def unordered(engine: Any, members: Any, x: np.ndarray, goal: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points of the screen in their order, with equal goals."""
-    return x, np.zeros(len(x))
-
-
 # What is switched off, and how.
 MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "nothing": lambda raw: None,

@@ -42,6 +42,8 @@ class World:
     """relative error of the settled error, by number of substeps"""
     rare: Callable[[int, int], float] = lambda seed, number: 0.0
     """slope of the error of a member below a logarithm of -RARE_FROM of the last gain: by seed and number"""
+    valley: float = math.inf
+    """logarithm of the first gain, relative to `best`, of a second and lower optimum; inf: there is none"""
     chaos: float = 0.0
     """size of an error of every derivative, with a sign that changes from point to point"""
     louder: float = 1.0
@@ -82,6 +84,10 @@ class Bowl:
         nothing = 0.0 * beyond
         # voltage grows with the last gain, and is a tenth of the limit where that is best
         each = {"tracking": FLOOR * (1 + (away**2).sum(axis=1)), "effort": 0.01 * np.exp(2 * away[:, -1])}
+        if math.isfinite(self.world.valley):
+            within = abs(away[:, 0].real - self.world.valley) < 1
+            other = 0.1 * FLOOR * (1 + (away[:, 0] - self.world.valley) ** 2 + (away[:, 1:] ** 2).sum(axis=1))
+            each["tracking"] = np.where(within, other, each["tracking"])
         each = {name: term[:, None] + nothing for name, term in each.items()} | {"survival": 1 - np.exp(-beyond)}
         slope = np.array([self.world.rare(*one[:2]) for one in numbered])
         below = -RARE_FROM - away[:, -1:]

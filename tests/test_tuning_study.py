@@ -24,6 +24,7 @@ from tuning.judge.evaluate import RESOLVED, describe, judge, step_error, summari
 from tuning.problem.config import seeds
 from tuning.problem.loss import TERMS
 from tuning.report.judging import changed_gains
+from tuning.solve import course
 from tuning.solve.refine import RACE, best_of, search
 
 
@@ -124,16 +125,33 @@ def test_the_effect_of_a_change_of_each_gain(monkeypatch):
 # --- descent ---
 
 
-def test_after_some_iterations_only_the_best_start_continues(monkeypatch):
-    world = World()
+def test_starts_race_on_a_part_of_the_members_and_the_winner_continues_on_all(monkeypatch):
+    """The optimum of the part loses a member that is not in it, so another start wins."""
+    world = World(limit=lambda seed, number, stressed, accurate: 20.0 if number == 15 else math.inf)
     made = study(monkeypatch, world)
-    begins = np.stack([at(made, c, k) for c, k in ((3.0, 3.0), (60.0, 50.0), (900.0, 2.0), (2.0, 700.0))])
-    members = made.objective.training(1, 4, 2, 1.2, 1.25)
-    found = search(made.engine, made.goal, members, begins, keep=4, iterations=12)
-    starts = [points for kind, *_, points in world.calls if kind == "gradient"]
-    assert starts == [4] * RACE + [1] * (len(starts) - RACE)
-    assert len(found.starts.value) == 1
-    np.testing.assert_allclose(made.objective.space.gains_at(best_of(found)[0]), world.best, rtol=0.05)
+    near = [(0.9 * world.best[0], world.best[1])] * 6
+    begins = np.stack([at(made, *gains) for gains in [*near, (15.0, 60.0), (2.0, 2.0), (3.0, 2.0)]])
+    members = made.objective.training(1, 16, 8, 1.2, 1.25)
+    found = search(made.engine, made.goal, members, begins, keep=9, iterations=12)
+    steps = [(points, len(numbers)) for kind, _, numbers, points in world.calls if kind == "gradient"]
+    assert steps[:15] == [(9, 8)] * RACE + [(5, 8)] * RACE + [(3, 8)] * RACE
+    assert set(steps[15:]) == {(1, 24)}
+    assert len(steps) <= 15 + 12
+    assert int(found.history["lost"][-1]) == 0
+    assert float(made.objective.space.gains_at(best_of(found)[0])[0]) < 20.0
+
+
+@pytest.mark.parametrize("valley", [-6.0, 4.0])
+def test_a_change_of_one_gain_leads_to_a_lower_optimum(monkeypatch, valley):
+    """The descent ends at the optimum nearby; no point between it and the lower one has a lower loss."""
+    bounds = {"controller": {"position": {"c": [1e-3, 1e9], "k": [1e-3, 1e9]}}}
+    made = study(monkeypatch, World(valley=valley), bounds=bounds, screen=8)
+    monkeypatch.setattr(course, "initial_points", lambda space, *_: at(made, 90.0, 50.0)[None])
+    found = course.Course(made, course.training(made), 1)
+    x = course.first_search(found, np.array([90.0, 50.0]))
+    gains = np.asarray(made.objective.space.gains_at(x))
+    np.testing.assert_allclose(gains, World.best * np.array([np.exp(valley), 1.0]), rtol=0.02)
+    assert len(found.past) == 2
 
 
 # --- the command ---

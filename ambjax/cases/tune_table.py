@@ -81,7 +81,7 @@ class Budget:
     held_out: int = _members(1000, 0, "held-out members, on which the tuned gains are judged")
     seed: int = _whole(1, 0, "seed of the training members and of the screen; the other ensembles have other seeds")
     screen: int = _members(128, 0, "number of starting points that are screened; 0: only the gains of the case")
-    starts: int = _whole(4, 1, "number of the best of these points that are refined")
+    starts: int = _whole(16, 1, "number of the best of these points that are refined")
     iterations: int = _whole(40, 1, "largest number of iterations of a search")
     substeps: int = _whole(3, 1, "integration steps per sample")
     front: int = leaf(

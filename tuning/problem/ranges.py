@@ -21,8 +21,8 @@ from tuning.problem.space import MARGIN, Gain, Space
 END_FACTOR = 3.0
 # Range of a gain for which the law defines none: its value divided and multiplied by this factor.
 DEFAULT_FACTOR = 30.0
-# Half-widths of the neighbourhoods of an optimum, in coordinates: each gain changes by up to e^1.5 and e^3.
-REACHES = 1.5, 3.0
+# Changes at an optimum, in coordinates, to find lower optima: of one gain by up to e^8, of several by up to e^3.
+JUMPS, REACH = (-8.0, -6.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 6.0, 8.0), 3.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,10 +71,16 @@ def initial_points(space: Space, box: list[Range], start: np.ndarray, count: int
 
 
 def around(x: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Return coordinates [count + 1, m]: x [m], and quasi-random points around it, alternately within both REACHES."""
-    cube = design_points("sobol", seed, len(x), np.arange(count), count)
-    reach = np.resize(REACHES, count)[:, None]
-    return np.concatenate([x[None], x + reach * (2 * cube - 1)])
+    """Return x [m], each point with one coordinate changed by one of the JUMPS, and `count` random points.
+
+    The shape is [1 + J m + count, m] for J jumps. Each coordinate of a random point changes by up to REACH, or two of
+    them do, in turn.
+    """
+    rng, m = np.random.default_rng(seed), len(x)
+    one = np.kron(np.eye(m), np.reshape(JUMPS, (-1, 1)))
+    two = rng.permuted(np.tile(np.arange(m) < 2, (count, 1)), axis=1)
+    two[::2] = True
+    return x + np.concatenate([np.zeros((1, m)), one, two * rng.uniform(-REACH, REACH, (count, m))])
 
 
 def from_unit_cube(space: Space, box: list[Range], cube: np.ndarray) -> np.ndarray:

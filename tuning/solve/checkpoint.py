@@ -20,7 +20,8 @@ NAME = re.compile(r"round-[0-9]+\.npz")
 # Subfolder of the output directory, and the file in it that marks a search before its first checkpoint.
 FOLDER, MARK = "checkpoints", "search.json"
 # Names of the arrays of a checkpoint, or their beginnings.
-LEAF, PAST, CONVERGED, ORIGIN, SEED, TOLD = "start_", "history_", "converged", "cma_origin", "cma_seed", "cma_told"
+LEAF, PAST, RACED, CONVERGED = "start_", "history_", "raced", "converged"
+ORIGIN, SEED, TOLD = "cma_origin", "cma_seed", "cma_told"
 
 
 @dataclasses.dataclass
@@ -29,7 +30,8 @@ class SearchState:
 
     `history`: one row per iteration, of the best point so far. `seconds`: duration so far, s; `earlier`: the part of it
     before the search was resumed. `converged`: whether no further iteration is needed. `evolution`: CMA-ES, which
-    continues from the best point of the descents; None: the search does not use it.
+    continues from the best point of the descents; None: the search does not use it. `raced`: number of iterations of
+    the race of the starts (`refine.race_length`).
     """
 
     starts: Starts
@@ -39,11 +41,17 @@ class SearchState:
     interrupted: bool = False
     converged: bool = False
     evolution: Evolution | None = None
+    raced: int = 0
 
     @property
     def iteration(self) -> int:
         """Number of iterations so far."""
         return len(self.history.get("value", ()))
+
+    @property
+    def racing(self) -> bool:
+        """Whether several starts continue."""
+        return len(self.starts.value) > 1
 
     @property
     def ended(self) -> bool:
@@ -79,7 +87,8 @@ class CheckpointFile:
             leaves |= {ORIGIN: cma.origin, SEED: np.array(cma.seed), TOLD: np.array(cma.told)}
         past = {f"{PAST}{name}": np.asarray(rows) for name, rows in progress.history.items()}
         facts = {"fingerprint": self.fingerprint, "seconds": progress.seconds}
-        seal(self.path, {**leaves, **past, CONVERGED: np.array(progress.converged)}, facts)
+        ends = {RACED: np.array(progress.raced), CONVERGED: np.array(progress.converged)}
+        seal(self.path, {**leaves, **past, **ends}, facts)
 
     def load(self) -> SearchState | None:
         """Return the saved search, as `restored` does."""
@@ -89,7 +98,8 @@ class CheckpointFile:
             evolution = Evolution(arrays[ORIGIN], int(arrays[SEED]), arrays[TOLD]) if ORIGIN in arrays else None
             past = {name.removeprefix(PAST): list(rows) for name, rows in arrays.items() if name.startswith(PAST)}
             spent = float(facts["seconds"])
-            return SearchState(starts, past, spent, spent, converged=bool(arrays[CONVERGED]), evolution=evolution)
+            ended, raced = bool(arrays[CONVERGED]), int(arrays[RACED])
+            return SearchState(starts, past, spent, spent, converged=ended, evolution=evolution, raced=raced)
 
         return restored(self.path, self.fingerprint, state, f"search {self.round}", self.tell)
 

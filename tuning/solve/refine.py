@@ -1,4 +1,4 @@
-"""The search: a screen, a few steps from each of its best points, then descent or CMA-ES from the best one.
+"""The search: a screen, a race of its best points on few members, then descent or CMA-ES of the winner on all of them.
 
 A search can be interrupted and resumed.
 """
@@ -22,8 +22,9 @@ from tuning.solve.checkpoint import CheckpointFile, SearchState
 from tuning.solve.descent import Descent, Starts, begin
 from tuning.solve.evolution import Evolution
 
-# Number of iterations after which only the best start continues.
-RACE = 5
+# The starts race on a part of the members. After each RACE iterations the better half continues. The last FINALISTS are
+# compared on all members, and the best of them continues alone.
+RACE, FINALISTS = 5, 4
 # A search has converged if its next step, in coordinates, is shorter than this: 0.1 % of a gain. It ends also if the
 # goal, a logarithm, falls by less than this over PATIENCE iterations.
 SHORTEST, PATIENCE = 1e-3, 4
@@ -53,8 +54,8 @@ def search(
 ) -> SearchState:
     """Refine the best `keep` of these points, coordinates [K, m], which a screen selects. Ctrl-C ends the search early.
 
-    The starts descend (`Descent`). After RACE iterations, only the best one continues. If its gradient does not lead to
-    a minimum, it continues with CMA-ES. The search ends after `iterations`.
+    The starts descend (`Descent`) in a race on a part of the members (`_race`), the winner on all members. If its
+    gradient does not lead to a minimum, it continues with CMA-ES. The search ends after `iterations` of the winner.
 
     `seed`: seed of the populations of CMA-ES. `on_iteration`: called after each iteration with the search and the
     duration of the iteration in s. `until`: time of `time.perf_counter` after which the search ends at its next
@@ -68,15 +69,18 @@ def search(
     else:
         if len(points) > keep:
             points = screen(engine, members, points, goal)[0][:keep]
-        progress = SearchState(begin(jnp.asarray(points)))
+        progress = SearchState(begin(jnp.asarray(points)), raced=race_length(len(points)))
     try:
-        while not progress.converged and progress.iteration < iterations:
+        while not progress.converged and progress.iteration < progress.raced + iterations:
             # Before the first iteration, the search has no result to judge, so Ctrl-C ends the process.
             with deferred(INTERRUPT_MESSAGE if progress.history else ""):
                 raise_if_interrupted()
                 before = progress.seconds
-                iterate(engine, goal, members, progress, descent)
-                _advance(progress, seed)
+                iterate(engine, goal, members.part if progress.racing else members, progress, descent)
+                if progress.racing:
+                    _race(engine, goal, members, progress)
+                else:
+                    _advance(progress, seed)
                 progress.seconds = progress.earlier + time.perf_counter() - began
                 checkpoint_file.save(progress)
                 on_iteration(progress, progress.seconds - before)
@@ -85,6 +89,12 @@ def search(
     except KeyboardInterrupt:
         progress.interrupted = True
     return progress
+
+
+def race_length(starts: int) -> int:
+    """Return the number of iterations of a race of this many starts."""
+    halvings = math.ceil(math.log2(max(starts / FINALISTS, 1)))
+    return RACE * (halvings + 1) if starts > 1 else 0
 
 
 def screen(engine: Engine, members: Members, x: np.ndarray, goal: Goal) -> tuple[np.ndarray, np.ndarray]:
@@ -102,7 +112,7 @@ def iterate(engine: Engine, goal: Goal, members: Members, progress: SearchState,
     else:
         x, value, terms = _descended(engine, goal, members, progress, descent)
     past, n = progress.history, members.ordinary
-    if past and not value < past["value"][-1]:
+    if past and int(past["members"][-1]) == len(members.member) and not value < past["value"][-1]:
         row = {name: past[name][-1] for name in ("value", "x", "gains", "lost", "terms", "quantities")}
     else:
         tuned = [float(KINDS[name].tuned(jnp.asarray(terms[PREFIX + name][:n]))) for name in goal.quantities]
@@ -144,8 +154,24 @@ def _evolved(
     return points[first], float(values[first]), {name: one[first] for name, one in terms.items()}
 
 
+def _race(engine: Engine, goal: Goal, members: Members, progress: SearchState) -> None:
+    """After each RACE iterations, select the starts that continue.
+
+    The last one begins again on all members at its best point, with its inverse Hessian.
+    """
+    if progress.iteration % RACE:
+        return
+    starts, keep = progress.starts, (len(progress.starts.value) + 1) // 2
+    values = np.asarray(starts.value)
+    if len(values) <= FINALISTS:
+        values, keep = goal.score(engine.terms(np.asarray(starts.best), members), members), 1
+        starts = starts._replace(trial=starts.best, value=jnp.full(len(values), jnp.inf))
+    best = np.argsort(values, kind="stable")[:keep]
+    progress.starts = Starts(*(leaf[best] for leaf in starts))
+
+
 def _advance(progress: SearchState, seed: int) -> None:
-    """Select the starts that continue, let the last one switch to CMA-ES, or end it.
+    """End the search, or let it switch to CMA-ES.
 
     A descent ends if its step is at most SHORTEST, or if the goal stalls. It switches if the gradient is then
     CONVERGED or more, and at once if it is STEEP. There are two causes of such gradients: in a chaotic loop the
@@ -155,12 +181,7 @@ def _advance(progress: SearchState, seed: int) -> None:
     if progress.evolution is not None:
         progress.converged = progress.evolution.reach <= SHORTEST or progress.evolution.converged
         return
-    if progress.iteration >= RACE:
-        best = int(np.argmin(progress.starts.value))
-        progress.starts = Starts(*(leaf[best : best + 1] for leaf in progress.starts))
-    if len(progress.starts.value) > 1:
-        return
-    starts, values = progress.starts, progress.history["value"]
+    starts, values = progress.starts, progress.history["value"][progress.raced :]
     norm = float(jnp.linalg.norm(starts.gradient)) if np.isfinite(starts.value[0]) else math.inf
     stalled = len(values) > PATIENCE and values[-1] > values[-1 - PATIENCE] - SHORTEST
     ended = stalled or float(jnp.linalg.norm(starts.trial - starts.best)) <= SHORTEST
