@@ -17,6 +17,7 @@ from typing import Any
 
 import _measure
 import default_gains
+import fleet
 import numpy as np
 import tasks
 import tomlkit
@@ -62,6 +63,7 @@ MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     ),
     "starting points: only the case's gains": setting(screen=0),
     "several starts: only the best of the screen": setting(starts=1),
+    "halvings: after five steps the best continues alone": constant(refine, FINALISTS=NEVER),
     "CMA-ES": constant(refine, STEEP=math.inf, CONVERGED=math.inf),
     "large populations of CMA-ES": constant(evolution, POPULATION=1),
     "descent: CMA-ES only": by_values,
@@ -122,6 +124,7 @@ def cases() -> dict[str, dict[str, Any]]:
     files = [*tasks.TASKS.glob("*.toml"), *tasks.TASKS.glob("sampled/*.toml")]
     found = {path.stem: tomllib.loads(path.read_text()) for path in sorted(files)}
     found |= {name: tomllib.loads(template(name)) for name in ("bearing", "rig")}
+    found |= {f"bearing {number}": fleet.bearing(number) for number in (5, 7, 11)}
     for name, laws in FIRST_KINDS.items():
         raw = default_gains.machine("blower")
         stages = zip(("position", "inversion", "current"), laws, strict=True)
