@@ -92,11 +92,11 @@ class Course:
         """
         tune, number = self.problem.tune, len(self.past) + 1
         path = self.out / checkpoint(number) if self.out else None
-        many = len(points) > tune.budget.starts
-        which = f"the best {tune.budget.starts} of {len(points)} points" if many else "from the best point"
-        self.tell(f"search {number}: {which}, on {len(self.members.member)} members")
+        keep = tune.budget.starts
+        which = f"race of {keep} of {len(points)} points, the winner" if len(points) > keep else "from the best point"
+        self.tell(f"search {number}: {which} on {len(self.members.member)} members")
         progress = search(
-            self.problem.engine, self.problem.goal, self.members, points, keep=tune.budget.starts,
+            self.problem.engine, self.problem.goal, self.members, points, keep=keep,
             iterations=tune.budget.iterations, seed=self.seed + len(self.past),
             checkpoint_file=CheckpointFile(path, self.facts, number, self.tell), resume=self.resume,
             on_iteration=self._standing(number, []), until=self.began + 60 * self.minutes,
