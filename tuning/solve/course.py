@@ -17,6 +17,7 @@ from tuning.problem.members import Members
 from tuning.problem.ranges import around, initial_points
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.checkpoint import CheckpointFile, SearchState, checkpoint
+from tuning.solve.descent import Starts
 from tuning.solve.refine import best_of, screen, search
 
 # Number of random points around the first optimum, relative to tune.screen. Near that of C10, 0.5 % of them are lower.
@@ -83,8 +84,10 @@ class Course:
     past: list[SearchState] = dataclasses.field(default_factory=list)
     began: float = dataclasses.field(default_factory=time.perf_counter)
 
-    def search(self, points: np.ndarray) -> np.ndarray:
+    def search(self, points: np.ndarray, earlier: Starts | None = None) -> np.ndarray:
         """Search from `points` [K, m] and append the search to `past`. Return the best point [m].
+
+        `earlier`: as in `refine.search`.
 
         If Ctrl-C ends a later search before its first iteration, the search before it is marked as interrupted, and its
         result is returned. Raises KeyboardInterrupt if Ctrl-C ends the first search before its first iteration, and
@@ -96,7 +99,7 @@ class Course:
         which = f"race of {keep} of {len(points)} points, the winner" if len(points) > keep else "from the best point"
         self.tell(f"search {number}: {which} on {len(self.members.member)} members")
         progress = search(
-            self.problem.engine, self.problem.goal, self.members, points, keep=keep,
+            self.problem.engine, self.problem.goal, self.members, points, keep=keep, earlier=earlier,
             iterations=tune.budget.iterations, seed=self.seed + len(self.past),
             checkpoint_file=CheckpointFile(path, self.facts, number, self.tell), resume=self.resume,
             on_iteration=self._standing(number, []), until=self.began + 60 * self.minutes,
@@ -119,10 +122,10 @@ class Course:
     def again(self, x: np.ndarray) -> tuple[np.ndarray, bool]:
         """Search from x [m] on all members. Return the best point [m], and whether it is another one.
 
-        The search begins at x, drawn back from the bounds (`Space.drawn_back`).
+        It begins at x, drawn back from the bounds (`Space.drawn_back`), with the inverse Hessian of the last search.
         """
         start = self.problem.objective.space.drawn_back(x)
-        found = self.search(start[None])
+        found = self.search(start[None], self.past[-1].starts)
         moved = not np.array_equal(found, start)
         return found if moved else x, moved
 

@@ -44,6 +44,14 @@ def begin(x: Array) -> Starts:
     return Starts(x, x, full(jnp.inf), jnp.zeros_like(x), inverse, full(FIRST_RADIUS), jnp.zeros(count, int))
 
 
+def continued(earlier: Starts, x: Array) -> Starts:
+    """Return the initial state of one start at x [1, m], with the inverse Hessian of the first of the `earlier` starts.
+
+    With two trials, the next pair (s, y) does not change its scale.
+    """
+    return begin(x)._replace(inverse=earlier.inverse[:1], trials=jnp.full(1, 2))
+
+
 def step(start: Starts, value: Array, gradient: Array) -> Starts:
     """Return one start after its trial. `value`, `gradient` [m]: of the goal at the trial.
 

@@ -19,7 +19,7 @@ from tuning.problem.loss import TERMS
 from tuning.problem.members import Members
 from tuning.problem.quantities import KINDS
 from tuning.solve.checkpoint import CheckpointFile, SearchState
-from tuning.solve.descent import Descent, Starts, begin
+from tuning.solve.descent import Descent, Starts, begin, continued
 from tuning.solve.evolution import Evolution
 
 # The starts race on a part of the members. After each RACE iterations the better half continues. The last FINALISTS are
@@ -45,6 +45,7 @@ def search(
     points: np.ndarray,
     *,
     keep: int = 1,
+    earlier: Starts | None = None,
     iterations: int,
     seed: int = 0,
     checkpoint_file: CheckpointFile | None = None,
@@ -57,6 +58,7 @@ def search(
     The starts descend (`Descent`) in a race on a part of the members (`_race`), the winner on all members. If its
     gradient does not lead to a minimum, it continues with CMA-ES. The search ends after `iterations` of the winner.
 
+    `earlier`: starts of an earlier search, with whose inverse Hessian the one start of this search begins.
     `seed`: seed of the populations of CMA-ES. `on_iteration`: called after each iteration with the search and the
     duration of the iteration in s. `until`: time of `time.perf_counter` after which the search ends at its next
     iteration.
@@ -69,7 +71,8 @@ def search(
     else:
         if len(points) > keep:
             points = screen(engine, members, points, goal)[0][:keep]
-        progress = SearchState(begin(jnp.asarray(points)), raced=race_length(len(points)))
+        starts = begin(jnp.asarray(points)) if earlier is None else continued(earlier, jnp.asarray(points))
+        progress = SearchState(starts, raced=race_length(len(points)))
     try:
         while not progress.converged and progress.iteration < progress.raced + iterations:
             # Before the first iteration, the search has no result to judge, so Ctrl-C ends the process.
