@@ -63,9 +63,8 @@ def ablation() -> list[str]:
         "9.5 % larger, and without growth of the penalty, the voltage exceeded its limit. The search around the",
         "optimum and the extrapolation of the multipliers have replaced them; the columns C10 and A10L compare with",
         "the tuner that has both, and F10 and F20-robust with that whose populations are twice the default of `cma`.",
-        "The tasks have few optima. On bearings 5, 7 and 11 the removal of halvings and first phase led to worse ones,",
-        "so the race of 16 starts on a quarter of the members has replaced them. These columns compare with the tuner",
-        "of today.",
+        "Bearings 5 and 7 of the fleet have several optima. Therefore a race of 16 starts on a quarter of the members",
+        "was added; their columns compare with the tuner of today.",
         "",
     ]
     tasks = list(dict.fromkeys(task for _, task, _ in rows))

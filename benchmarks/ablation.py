@@ -124,7 +124,7 @@ def cases() -> dict[str, dict[str, Any]]:
     files = [*tasks.TASKS.glob("*.toml"), *tasks.TASKS.glob("sampled/*.toml")]
     found = {path.stem: tomllib.loads(path.read_text()) for path in sorted(files)}
     found |= {name: tomllib.loads(template(name)) for name in ("bearing", "rig")}
-    found |= {f"bearing {number}": fleet.bearing(number) for number in (5, 7, 11)}
+    found |= {f"bearing {number}": fleet.bearing(number) for number in (5, 7)}
     for name, laws in FIRST_KINDS.items():
         raw = default_gains.machine("blower")
         stages = zip(("position", "inversion", "current"), laws, strict=True)
