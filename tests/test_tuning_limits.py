@@ -292,13 +292,13 @@ def test_the_best_answer_within_the_limits_is_taken_if_the_multipliers_do_not_co
     """
     problem = study(monkeypatch, World(), **TEN)
     course = Course(problem, training(problem), 1)
-    course.past.append(SimpleNamespace(interrupted=False))
+    course.past.append(SimpleNamespace(interrupted=False, starts=None))
     at = {
         k: np.asarray(problem.objective.space.encode(np.array([World.best[0], k])))
         for k in (20.0, 22.0, 25.0, 45.0, 60.0)
     }
     found = iter(ends[1:])
-    monkeypatch.setattr(course, "search", lambda points: at[next(found)])
+    monkeypatch.setattr(course, "search", lambda points, earlier: at[next(found)])
     x, within = search_within_limits(course, at[ends[0]])
     np.testing.assert_array_equal(x, at[25.0])
     assert within
