@@ -126,19 +126,30 @@ def test_the_effect_of_a_change_of_each_gain(monkeypatch):
 
 
 def test_starts_race_on_a_part_of_the_members_and_the_winner_continues_on_all(monkeypatch):
-    """The optimum of the part loses a member that is not in it, so another start wins."""
-    world = World(limit=lambda seed, number, stressed, accurate: 20.0 if number == 15 else math.inf)
+    world = World()
     made = study(monkeypatch, world)
-    near = [(0.9 * world.best[0], world.best[1])] * 6
-    begins = np.stack([at(made, *gains) for gains in [*near, (15.0, 60.0), (2.0, 2.0), (3.0, 2.0)]])
+    begins = np.stack([at(made, c, k) for c in (2.0, 30.0, 400.0) for k in (3.0, 50.0, 700.0)])
     members = made.objective.training(1, 16, 8, 1.2, 1.25)
     found = search(made.engine, made.goal, members, begins, keep=9, iterations=12)
     steps = [(points, len(numbers)) for kind, _, numbers, points in world.calls if kind == "gradient"]
     assert steps[:15] == [(9, 8)] * RACE + [(5, 8)] * RACE + [(3, 8)] * RACE
     assert set(steps[15:]) == {(1, 24)}
     assert len(steps) <= 15 + 12
+    np.testing.assert_array_equal(found.history["x"][15], found.history["x"][14])  # it continues at its best point
+    np.testing.assert_allclose(made.objective.space.gains_at(best_of(found)[0]), world.best, rtol=0.05)
+
+
+def test_the_race_is_decided_on_all_members(monkeypatch):
+    """The lower of two optima loses a member that is not in the part."""
+    world = World(limit=lambda seed, number, *_: 500.0 if number == 15 else math.inf, valley=4.0)
+    made = study(monkeypatch, world, bounds={"controller": {"position": {"c": [1e-3, 1e9], "k": [1e-3, 1e9]}}})
+    begins = np.stack([at(made, 90.0, 60.0), at(made, 5000.0, 60.0)])
+    members = made.objective.training(1, 16, 8, 1.2, 1.25)
+    found = search(made.engine, made.goal, members, begins, keep=2, iterations=12)
+    race = made.objective.space.gains_at(found.history["x"][RACE - 1])
+    np.testing.assert_allclose(race, [world.best[0] * math.exp(4.0), world.best[1]], rtol=0.05)
+    np.testing.assert_allclose(made.objective.space.gains_at(best_of(found)[0]), world.best, rtol=0.05)
     assert int(found.history["lost"][-1]) == 0
-    assert float(made.objective.space.gains_at(best_of(found)[0])[0]) < 20.0
 
 
 @pytest.mark.parametrize("valley", [-6.0, 4.0])
