@@ -20,7 +20,7 @@ from tuning.solve.checkpoint import CheckpointFile, SearchState, checkpoint
 from tuning.solve.descent import Starts
 from tuning.solve.refine import best_of, screen, search
 
-# Number of random points around the first optimum, relative to tune.screen. Near that of C10, very few of them are lower.
+# Number of random points around the first optimum, relative to tune.screen. Near that of C10, very few are lower.
 AROUND = 4
 # A further search begins at a point around the first optimum if the goal there, a logarithm, is lower by this or more.
 LOWER = 0.01
