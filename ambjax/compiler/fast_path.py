@@ -22,6 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from ambjax.compiler.traced_programs import traced_once
+
 log = logging.getLogger(__name__)
 
 MARK = {"inlineable": "false", "xla_cpu_small_call": "true"}
@@ -50,14 +52,14 @@ def one_kernel(function: Callable[..., Result], static_argnames: tuple[str, ...]
     function. Such a call is compiled in the ordinary way, with a line in the log. jax.lax.map with a batch_size keeps
     blocks small.
     """
-    inner = jax.jit(function, static_argnames=static_argnames)
+    inner, once = jax.jit(function, static_argnames=static_argnames), traced_once(function, static_argnames)
     refused: set[tuple[Any, ...]] = set()
     shapes_of = lambda leaves: tuple(map(jnp.shape, leaves))  # noqa: E731
 
     @functools.cache
     def outermost() -> Callable[..., Result]:
         def marked(*args: object, **static: object) -> Result:
-            return _mark(inner(*args, **static))
+            return _mark(once(*args, **static))
 
         return jax.jit(marked, static_argnames=static_argnames, compiler_options=options())
 

@@ -6,6 +6,8 @@ from typing import TypeVar
 
 import jax
 
+from ambjax.compiler.traced_programs import traced_once
+
 Result = TypeVar("Result")
 
 # Options of XLA. On a CPU, the older emitters of fused operations compile faster. The programs are as fast.
@@ -21,7 +23,8 @@ def compiled_quickly(
 
     @functools.cache
     def compiled() -> Callable[..., Result]:
-        return jax.jit(function, static_argnames=static_argnames, compiler_options=supported(options))
+        once = traced_once(function, static_argnames)
+        return jax.jit(once, static_argnames=static_argnames, compiler_options=supported(options))
 
     @functools.wraps(function)
     def call(*args: object, **static: object) -> Result:

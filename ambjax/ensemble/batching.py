@@ -4,6 +4,7 @@ On a CPU, the result of a member does not depend on the other members, nor on it
 order. On a GPU it may, because the compiled program depends on the number of members in a call.
 """
 
+import dataclasses
 import functools
 import os
 from collections.abc import Callable
@@ -73,18 +74,17 @@ def run_ensemble(
     """
     check_recording(fold, record_every)
     tree = canonical((*prepare(cascade, scenario, clock), fold))
-    return map_members(_rollout(record_every), tree, threads=threads, call=call)
+    return map_members(_Rollout(record_every), tree, threads=threads, call=call)
 
 
-@functools.cache
-def _rollout(record_every: int) -> Callable[[tuple[System, Clock, Fold | None]], Result]:
-    """Return the function that simulates one member. It is cached, so that JAX compiles it once."""
+@dataclasses.dataclass(frozen=True)
+class _Rollout:
+    """The function that simulates one member."""
 
-    def one(tree: tuple[System, Clock, Fold | None]) -> Result:
-        system, clock, fold = tree
-        return run(system, clock, fold, record_every)
+    record_every: int
 
-    return one
+    def __call__(self, tree: tuple[System, Clock, Fold | None]) -> Result:
+        return run(*tree, self.record_every)
 
 
 def map_members(

@@ -7,7 +7,6 @@ therefore simulated in a block of the same size as in an ensemble, and copies of
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, SupportsFloat
 
@@ -80,7 +79,7 @@ def record_system(
     count = min(SEGMENT, clock.samples)
     progress, rows, outcomes = map_members(_begun, tree, threads=1, call=CALL), [], list[Result]()
     for first in range(0, clock.samples, count):
-        progress, outcome = map_members(_recorded_segment(count), (*tree, progress, first), threads=1, call=CALL)
+        progress, outcome = map_members(_RecordedSegment(count), (*tree, progress, first), threads=1, call=CALL)
         outcomes = [jax.tree.map(lambda x: x[0], outcome)]
         left = min(count, clock.samples - first)
         # Copy, because the slice would keep the rows of all lanes in memory.
@@ -117,15 +116,13 @@ def _begun(tree: tuple[System, Clock, Fold | None]) -> RolloutState:
     return begin(*tree)
 
 
-@functools.cache
-def _recorded_segment(
-    count: int,
-) -> Callable[[tuple[System, Clock, Fold | None, RolloutState, Scalar]], tuple[RolloutState, Result]]:
-    """Return the simulation of `count` samples. The function is cached, so that it compiles once."""
+@dataclasses.dataclass(frozen=True)
+class _RecordedSegment:
+    """The function that simulates the next `count` samples of one member."""
 
-    def one(tree: tuple[System, Clock, Fold | None, RolloutState, Scalar]) -> tuple[RolloutState, Result]:
+    count: int
+
+    def __call__(self, tree: tuple[System, Clock, Fold | None, RolloutState, Scalar]) -> tuple[RolloutState, Result]:
         system, clock, fold, progress, first = tree
-        progress, rows = recorded_segment(system, clock, fold, progress, first, count)
+        progress, rows = recorded_segment(system, clock, fold, progress, first, self.count)
         return progress, finish(progress, rows, fold)
-
-    return one

@@ -13,6 +13,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 
 import numpy as np
 
+from ambjax.compiler.traced_programs import store_in
 from ambjax.ensemble.study import AnyStudy
 
 # Members in one call of the compiled program on a CPU. The last digit of a result may depend on it. It is fixed, so
@@ -23,10 +24,10 @@ CACHE_SIZE = 256 * 2**20
 
 
 def configure_jax() -> None:
-    """Configure JAX for a command: float64 unless JAX_ENABLE_X64 is set, and a cache of compiled programs.
+    """Configure JAX for a command: float64 unless JAX_ENABLE_X64 is set, and caches of traced and compiled programs.
 
-    Processes share the cache, and its size is at most CACHE_SIZE. If JAX_COMPILATION_CACHE_DIR is set, JAX uses that
-    directory with its own settings instead, and CACHE_SIZE does not apply.
+    Processes share the caches. That of compiled programs has at most CACHE_SIZE. If JAX_COMPILATION_CACHE_DIR is set,
+    JAX uses that directory with its own settings instead, CACHE_SIZE does not apply, and traced programs are not kept.
 
     Raises ValueError if JAX has no device of the kind in JAX_PLATFORMS.
     """
@@ -42,6 +43,7 @@ def configure_jax() -> None:
             cache = pathlib.Path(platformdirs.user_cache_dir("ambjax")) / "programs"
             cache.mkdir(parents=True, exist_ok=True)
             jax.config.update("jax_compilation_cache_dir", str(cache))
+            store_in(cache.with_name("traced"))
             jax.config.update("jax_compilation_cache_max_size", CACHE_SIZE)
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if platforms := os.environ.get("JAX_PLATFORMS"):

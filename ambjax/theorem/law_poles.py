@@ -87,16 +87,17 @@ def law_poles(cascade: Cascade, clock: Clock) -> list[LawPoles]:
 
 def _poles(stage: str, law: Law, model: Plant, sampling: Sampling) -> np.ndarray:
     """Return the poles of a loop. States that its signals do not change, or that do not change them, have none."""
-    loop_of, signals = LOOPS[stage]
-
-    def matrix(law: Law, model: Plant) -> Array:
-        loop = loop_of(law, model, sampling)
-        return jax.jacfwd(loop.step)(loop.start)
-
-    A = np.asarray(compiled_quickly(matrix, options=QUICKEST)(law, model))
+    A, signals = np.asarray(_matrix(law, model, stage=stage, sampling=sampling)), LOOPS[stage][1]
     changing = (np.eye(len(A)) != A).any(1)
     used = _reached(A, signals) & _reached(A.T, signals) if signals else changing
     return np.linalg.eigvals(A[used][:, used])
+
+
+@functools.partial(compiled_quickly, static_argnames=("stage", "sampling"), options=QUICKEST)
+def _matrix(law: Law, model: Plant, *, stage: str, sampling: Sampling) -> Array:
+    """Return the matrix of the linearised loop of a stage."""
+    loop = LOOPS[stage][0](law, model, sampling)
+    return jax.jacfwd(loop.step)(loop.start)
 
 
 def _reached(A: np.ndarray, signals: int) -> np.ndarray:
