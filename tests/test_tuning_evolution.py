@@ -7,7 +7,9 @@ import pytest
 from bowl import World, answer_of, study
 
 from tuning.rounds import rounds
+from tuning.solve.course import Course, training
 from tuning.solve.evolution import PATIENCE, STALL, Evolution
+from tuning.solve.refine import early
 
 # Derivatives of a loop that is chaotic; those of a Bowl's loss are about 1e-4.
 CHAOS = {"chaotic": 1e30, "of moderate size": 1e-2}
@@ -73,6 +75,21 @@ def test_cma_es_does_not_start_after_a_converged_descent(monkeypatch, tmp_path):
     answer_of(monkeypatch, tmp_path / "rough", rough)
     assert populations(smooth) == 0
     assert populations(rough) > PATIENCE
+
+
+@pytest.mark.parametrize(
+    ("chaos", "evolve", "draws"),
+    [("of moderate size", True, True), ("of moderate size", False, False), ("chaotic", False, True)],
+)
+def test_a_descent_that_ends_early_is_continued_by_cma_es_if_asked_and_a_steep_one_always(
+    monkeypatch, chaos, evolve, draws
+):
+    problem = study(monkeypatch, world := World(chaos=CHAOS[chaos]))
+    course = Course(problem, training(problem), 1)
+    start = problem.objective.space.encode(problem.tune.space.values(problem.case.cascade))
+    course.search(np.asarray(start)[None], evolve=evolve)
+    assert (populations(world) > 0) == draws
+    assert early(course.past[-1]) != draws
 
 
 def test_cma_es_has_converged_if_whole_populations_do_not_improve():

@@ -110,14 +110,14 @@ def test_the_other_limits_stay_in_the_search_of_the_knee(monkeypatch, tmp_path):
     problem = problem_of(
         *case_and_tune(document(objective="knee", bounds=BOUNDLESS, limits={"rms_u_V": 15.0, "rms_error_m": 5.3e-5}))
     )
-    towards = problem.towards_voltage(5e-5, 20.0, 1.25)
+    towards = problem.towards_voltage(5e-5, 20.0, 1.25, 3.0)
     limits = {limit.name: limit for limit in towards.limits}
     assert limits["rms_u_V"].threshold == 15.0
     # the user's limit is the tighter one
     assert (limits["rms_error_m"].threshold, limits["rms_error_m"].source) == (5.3e-5, FRONT)
     assert towards.goal.minimised == "rms_u_V"
     assert [limit.threshold for limit in limit_table._asked(towards)] == [5.3e-5, 15.0]
-    tighter = problem.towards_voltage(3e-5, 20.0, 1.25)
+    tighter = problem.towards_voltage(3e-5, 20.0, 1.25, 3.0)
     assert tighter.limits[0].threshold == pytest.approx(1.25 * 3e-5)
     assert [limit.threshold for limit in limit_table._asked(tighter)] == [5.3e-5, 15.0]
     assert problem.error_goal.weights == problem.tune.weights

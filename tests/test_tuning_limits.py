@@ -25,7 +25,7 @@ from tuning.report import limit_table
 from tuning.report.limit_table import MORE
 from tuning.rounds import rounds
 from tuning.solve.course import Course, training
-from tuning.solve.multipliers import breaking, search_within_limits
+from tuning.solve.multipliers import breaking, optima, search_within_limits
 from tuning.validate import Validation
 
 # The voltage of a Bowl is proportional to k: 20 V at the best k, 60, and 10 V at k = 30.
@@ -292,17 +292,59 @@ def test_the_best_answer_within_the_limits_is_taken_if_the_multipliers_do_not_co
     """
     problem = study(monkeypatch, World(), **TEN)
     course = Course(problem, training(problem), 1)
-    course.past.append(SimpleNamespace(interrupted=False, starts=None))
+    course.past.append(SimpleNamespace(interrupted=False, starts=None, converged=False))
     at = {
         k: np.asarray(problem.objective.space.encode(np.array([World.best[0], k])))
         for k in (20.0, 22.0, 25.0, 45.0, 60.0)
     }
     found = iter(ends[1:])
-    monkeypatch.setattr(course, "search", lambda points, earlier: at[next(found)])
+    monkeypatch.setattr(course, "search", lambda points, earlier, evolve: at[next(found)])
     x, within = search_within_limits(course, at[ends[0]])
     np.testing.assert_array_equal(x, at[25.0])
     assert within
     assert next(found, None) is None
+
+
+EARLY = SimpleNamespace(
+    interrupted=False,
+    converged=True,
+    evolution=None,
+    starts=SimpleNamespace(value=np.zeros(1), gradient=np.ones((1, 2))),
+)
+DONE = SimpleNamespace(interrupted=False, converged=True, evolution="CMA-ES", starts=None)
+
+
+@pytest.mark.parametrize(
+    ("limits", "ends", "evolve", "joining"),
+    [
+        # 20 V break the limit of 10 V; the descent moves to 15 V and stays there, until CMA-ES moves it
+        ({"rms_u_V": 10.0}, [45.0, 45.0, 29.9], [False, False, True], 0),
+        # a descent that has ended early within the limit is continued by CMA-ES
+        ({"rms_u_V": 10.0}, [29.9, 29.9], [False, True], 0),
+        # 8 members join once, but not again after a search that ends where it began
+        ({"settling_s": 10.0}, [60.0, 29.0], [False, True], 8),
+    ],
+)
+def test_cma_es_continues_searches_that_stay_where_they_are_and_the_last_one(
+    monkeypatch, limits, ends, evolve, joining
+):
+    problem = study(monkeypatch, World(), limits={"rms_u_V": math.inf} | limits)
+    course, asked, found = Course(problem, training(problem), 1), [], iter(ends)
+    before = len(course.members.member)
+    course.past.append(EARLY)
+
+    def search(points, earlier, evolve):
+        asked.append(evolve)
+        course.past.append(DONE if evolve else EARLY)
+        x = problem.objective.space.encode(np.array([World.best[0], next(found)]))
+        return points[0] if np.allclose(x, points[0]) else np.asarray(x)
+
+    monkeypatch.setattr(course, "search", search)
+    seen, met = optima(course, np.asarray(problem.objective.space.encode(np.array([World.best[0], 60.0]))))
+    assert met
+    assert asked == evolve
+    assert len(seen) == 1 + len(ends)
+    assert len(course.members.member) == before + joining
 
 
 def test_an_answer_within_the_limits_is_preferred_to_one_of_less_error(monkeypatch, tmp_path):

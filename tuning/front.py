@@ -1,9 +1,9 @@
 """The front of error against voltage, and its knee: of the answers near the least error, the one of least voltage.
 
 After the search for the least error e, further searches minimise the rms voltage. Each limits the rms error to a factor
-times e, and starts at the best answer so far. The factor of the knee is KNEE. At a low voltage, a few members may have
-errors many times those of the others. Validation members with such errors join the training ensemble, and the search
-is repeated.
+times e, and starts at that answer so far at which its goal is lowest. The factor of the knee is KNEE. At a low voltage,
+a few members may have errors many times those of the others. Validation members with such errors join the training
+ensemble, and the search is repeated.
 """
 
 import dataclasses
@@ -16,13 +16,19 @@ import numpy as np
 from tuning.judge.evaluate import held, rms
 from tuning.problem.limits import FRONT
 from tuning.solve.course import Course, SearchResult
-from tuning.solve.multipliers import Judged, judged_at, optima
+from tuning.solve.multipliers import MOST_UPDATES, Judged, judged_at, optima
+from tuning.solve.refine import screen
 from tuning.validate import validated
 
 # Limits of the rms error relative to the least error: KNEE for the knee, FACTORS for the points of the front. The first
 # tune.front factors are used, and further ones until there are tune.front points besides that of least error.
 KNEE = 1.25
 FACTORS = (KNEE, 1.1, 1.5, 2.0, 1.05, 3.0)
+# Largest number of searches after updates of the multipliers, except at the knee: each of their optima is a point of
+# the front for its own error.
+FEW_UPDATES = 3
+# First multiplier of the limit on the error at the knee: 1.5 % more voltage for 1 % less error.
+MULTIPLIER = 3.0
 
 
 class FrontPoint(NamedTuple):
@@ -65,7 +71,8 @@ def trace_front(course: Course, answer: SearchResult) -> SearchResult:
         course.tell("no front: with the gains of least error, no member is held, or the error or the voltage is 0")
         return answer
     seen, factors, count = [first], list[float](), answer.problem.tune.budget.front
-    for factor in (*sorted(FACTORS[:count]), *FACTORS[count:]):
+    scale = MULTIPLIER * math.sqrt(math.log(KNEE))
+    for factor in FACTORS:
         if course.over or (len(factors) >= count and len({id(chosen(seen, one)) for one in (1.0, *factors)}) > count):
             break
         factors.append(factor)
@@ -73,14 +80,21 @@ def trace_front(course: Course, answer: SearchResult) -> SearchResult:
         course.tell(
             f"front: least rms voltage with an rms error of at most {factor:g} times the least, {least.error_m:.3g} m"
         )
-        course.problem = answer.problem.towards_voltage(least.error_m, least.volts, factor)
-        found, _ = course.again(chosen(seen, factor).x)
-        seen += [_point(course, one) for one in optima(course, found)[0]]
+        # Near the least error, the error is quadratic in the logarithm of the voltage.
+        multiplier = scale / math.sqrt(math.log(factor))
+        course.problem = answer.problem.towards_voltage(least.error_m, least.volts, factor, multiplier)
+        points = np.array([point.x for point in seen])
+        start = screen(course.problem.engine, course.members, points, course.problem.goal)[0][0]
+        found, _ = course.again(start, evolve=False)
+        updates = MOST_UPDATES if factor == KNEE else FEW_UPDATES
+        seen += [_point(course, one) for one in optima(course, found, updates)[0]]
+        (error,) = (limit for limit in course.problem.limits if limit.source == FRONT)
+        scale = error.multiplier * math.sqrt(math.log(factor))
     taken = answer
     if not course.interrupted:
         least, course.problem = least_of(seen), answer.problem
         if answer.problem.tune.objective == "knee":
-            course.problem = answer.problem.towards_voltage(least.error_m, least.volts, KNEE)
+            course.problem = answer.problem.towards_voltage(least.error_m, least.volts, KNEE, MULTIPLIER)
         taken = _validated_point(course, answer, seen)
     least = least_of(seen)
     points = [least._replace(factor=1.0), *(chosen(seen, factor)._replace(factor=factor) for factor in sorted(factors))]

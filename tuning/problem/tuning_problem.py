@@ -121,12 +121,13 @@ class TuningProblem:
             self, limits=limits, goal=dataclasses.replace(self.goal, limits=tuple(limit.term for limit in limits))
         )
 
-    def towards_voltage(self, error_m: float, volts: float, factor: float) -> "TuningProblem":
+    def towards_voltage(self, error_m: float, volts: float, factor: float, multiplier: float) -> "TuningProblem":
         """Return the problem of least rms voltage, subject to an rms error of at most `factor` times `error_m` (m).
 
         If the case has a smaller limit on the rms error, that limit applies. The other limits are kept. `volts`: rms
         voltage at `error_m`, V. `Goal.unit` is chosen so that (unit volts)^2 = (error_m/s_0)^2. A lost rotor then
-        costs as much, relative to the voltage term, as it did relative to the error.
+        costs as much, relative to the voltage term, as it did relative to the error. `multiplier`: the first one of the
+        limit on the error.
         """
         weights = tuple(weight if name in HELD else 0.0 for name, weight in zip(TERMS, self.tune.weights, strict=True))
         unit = error_m / float(np.asarray(self.objective.loss.s_0)) / volts
@@ -134,8 +135,7 @@ class TuningProblem:
         others = (limit for limit in self.limits if limit.name != "rms_error_m")
         own = [dataclasses.replace(limit, multiplier=0.0, history=()) for limit in others]
         asked = min([factor * error_m, *(one.threshold for one in self.tune.limits.each if one.name == "rms_error_m")])
-        # the first multiplier corresponds to 1.5 % more voltage for 1 % less error
-        nearly = Limit("rms_error_m", asked, FRONT, KINDS["rms_error_m"].margin, multiplier=3.0)
+        nearly = Limit("rms_error_m", asked, FRONT, KINDS["rms_error_m"].margin, multiplier)
         limits = tuple(sorted([*own, nearly], key=lambda limit: limit.name))
         return dataclasses.replace(self, goal=goal).limited(limits)
 

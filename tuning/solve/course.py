@@ -84,10 +84,10 @@ class Course:
     past: list[SearchState] = dataclasses.field(default_factory=list)
     began: float = dataclasses.field(default_factory=time.perf_counter)
 
-    def search(self, points: np.ndarray, earlier: Starts | None = None) -> np.ndarray:
+    def search(self, points: np.ndarray, earlier: Starts | None = None, evolve: bool = True) -> np.ndarray:
         """Search from `points` [K, m] and append the search to `past`. Return the best point [m].
 
-        `earlier`: as in `refine.search`.
+        `earlier`, `evolve`: as in `refine.search`.
 
         If Ctrl-C ends a later search before its first iteration, the search before it is marked as interrupted, and its
         result is returned. Raises KeyboardInterrupt if Ctrl-C ends the first search before its first iteration, and
@@ -100,7 +100,7 @@ class Course:
         self.tell(f"search {number}: {which} on {len(self.members.member)} members")
         progress = search(
             self.problem.engine, self.problem.goal, self.members, points, keep=keep, earlier=earlier,
-            iterations=tune.budget.iterations, seed=self.seed + len(self.past),
+            evolve=evolve, iterations=tune.budget.iterations, seed=self.seed + len(self.past),
             checkpoint_file=CheckpointFile(path, self.facts, number, self.tell), resume=self.resume,
             on_iteration=self._standing(number, []), until=self.began + 60 * self.minutes,
         )  # fmt: skip
@@ -119,13 +119,14 @@ class Course:
             )
         return x
 
-    def again(self, x: np.ndarray) -> tuple[np.ndarray, bool]:
+    def again(self, x: np.ndarray, evolve: bool = True) -> tuple[np.ndarray, bool]:
         """Search from x [m] on all members. Return the best point [m], and whether it is another one.
 
         It begins at x, drawn back from the bounds (`Space.drawn_back`), with the inverse Hessian of the last search.
+        `evolve`: as in `refine.search`.
         """
         start = self.problem.objective.space.drawn_back(x)
-        found = self.search(start[None], self.past[-1].starts)
+        found = self.search(start[None], self.past[-1].starts, evolve)
         moved = not np.array_equal(found, start)
         return found if moved else x, moved
 

@@ -17,6 +17,7 @@ from tuning.problem.config import seeds
 from tuning.problem.limits import PREFIX, TOLERANCE_BELOW, Limit
 from tuning.problem.members import Members
 from tuning.solve.course import Course
+from tuning.solve.refine import early
 
 # Largest number of searches after updates of the multipliers in one round.
 MOST_UPDATES = 6
@@ -62,24 +63,26 @@ def search_within_limits(course: Course, x: np.ndarray) -> tuple[np.ndarray, boo
     return within[int(np.argmin(goal.score(terms, course.members)))], True
 
 
-def optima(course: Course, x: np.ndarray) -> tuple[list[Judged], bool]:
+def optima(course: Course, x: np.ndarray, updates: int = MOST_UPDATES) -> tuple[list[Judged], bool]:
     """Judge the optimum x [m], let the members that break a limit join, or update the multipliers, and search again.
 
-    Returns the judged optima, the first at x, and whether the last one meets all limits. There are at most MOST_UPDATES
-    searches. The loop ends early if the course is over, and if a search ends where it began and this point is within
-    all limits.
+    Returns the judged optima, the first at x, and whether the last one meets all limits. There are at most `updates`
+    searches after updates, and as many after members have joined. After a search that ends where it began, the
+    multipliers are updated, and the next search may use CMA-ES. The other searches use it only if all limits are met
+    and the descent has ended early. The loop ends early if the course is over, and if a search ends where it began and
+    this point is within all limits.
     """
-    seen, moved = list[Judged](), True
-    for update in range(MOST_UPDATES + 1):
+    seen, moved, joins = list[Judged](), True, 0
+    while True:
         one = judged_at(course, x)
         seen.append(one)
-        last = update == MOST_UPDATES or course.over
-        if (last or not join_breaking(course, one)) and _updated(course, one, moved):
-            return seen, True
-        if last:
-            break
-        x, moved = course.again(x)
-    return seen, False
+        last = len(seen) - joins > updates or course.over
+        joined = moved and not last and joins < updates and join_breaking(course, one)
+        joins += joined
+        met = not joined and _updated(course, one, moved)
+        if last or (met and not early(course.past[-1])):
+            return seen, met
+        x, moved = course.again(x, evolve=met or not moved)
 
 
 def _updated(course: Course, one: Judged, moved: bool) -> bool:

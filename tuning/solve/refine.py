@@ -46,6 +46,7 @@ def search(
     *,
     keep: int = 1,
     earlier: Starts | None = None,
+    evolve: bool = True,
     iterations: int,
     seed: int = 0,
     checkpoint_file: CheckpointFile | None = None,
@@ -58,7 +59,8 @@ def search(
     The starts descend (`Descent`) in a race on a part of the members (`_race`), the winner on all members. If its
     gradient does not lead to a minimum, it continues with CMA-ES. The search ends after `iterations` of the winner.
 
-    `earlier`: starts of an earlier search, with whose inverse Hessian the one start of this search begins.
+    `earlier`: starts of an earlier search, with whose inverse Hessian the one start of this search begins. `evolve`:
+    whether CMA-ES continues a descent that ends early; it always does if its gradient is STEEP.
     `seed`: seed of the populations of CMA-ES. `on_iteration`: called after each iteration with the search and the
     duration of the iteration in s. `until`: time of `time.perf_counter` after which the search ends at its next
     iteration.
@@ -83,7 +85,7 @@ def search(
                 if progress.racing:
                     _race(engine, goal, members, progress)
                 else:
-                    _advance(progress, seed)
+                    _advance(progress, seed, evolve)
                 progress.seconds = progress.earlier + time.perf_counter() - began
                 checkpoint_file.save(progress)
                 on_iteration(progress, progress.seconds - before)
@@ -173,25 +175,33 @@ def _race(engine: Engine, goal: Goal, members: Members, progress: SearchState) -
     progress.starts = Starts(*(leaf[best] for leaf in starts))
 
 
-def _advance(progress: SearchState, seed: int) -> None:
+def _advance(progress: SearchState, seed: int, evolve: bool) -> None:
     """End the search, or let it switch to CMA-ES.
 
-    A descent ends if its step is at most SHORTEST, or if the goal stalls. It switches if the gradient is then
-    CONVERGED or more, and at once if it is STEEP. There are two causes of such gradients: in a chaotic loop the
-    derivatives grow with time and do not describe the goal; and a descent stops early at a jump of the goal, beyond
-    which members are lost.
+    A descent ends if its step is at most SHORTEST, or if the goal stalls. If `evolve`, it switches if it has then ended
+    `early`, and it always switches at once if its gradient is STEEP. There are two causes of such gradients: in a
+    chaotic loop the derivatives grow with time and do not describe the goal; and a descent stops early at a jump of the
+    goal, beyond which members are lost.
     """
     if progress.evolution is not None:
         progress.converged = progress.evolution.reach <= SHORTEST or progress.evolution.converged
         return
     starts, values = progress.starts, progress.history["value"][progress.raced :]
-    norm = float(jnp.linalg.norm(starts.gradient)) if np.isfinite(starts.value[0]) else math.inf
     stalled = len(values) > PATIENCE and values[-1] > values[-1 - PATIENCE] - SHORTEST
     ended = stalled or float(jnp.linalg.norm(starts.trial - starts.best)) <= SHORTEST
-    if not norm < STEEP or (ended and norm >= CONVERGED):
-        progress.evolution = Evolution(progress.history["x"][-1], seed)
-    elif ended:
-        progress.converged = True
+    progress.converged = ended
+    if not _slope(starts) < STEEP or (evolve and early(progress)):
+        progress.evolution, progress.converged = Evolution(progress.history["x"][-1], seed), False
+
+
+def early(progress: SearchState) -> bool:
+    """Return whether a descent has ended with a gradient of CONVERGED or more, and CMA-ES has not continued it."""
+    return progress.converged and progress.evolution is None and not _slope(progress.starts) < CONVERGED
+
+
+def _slope(starts: Starts) -> float:
+    """Return the norm of the gradient of the first start; inf before its first trial."""
+    return float(jnp.linalg.norm(starts.gradient[0])) if np.isfinite(starts.value[0]) else math.inf
 
 
 def best_of(progress: SearchState) -> tuple[np.ndarray, float]:
