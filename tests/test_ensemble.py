@@ -89,6 +89,20 @@ def test_the_plain_path_gives_the_same_numbers_and_logs_its_use(monkeypatch, cap
         fast_path.options.cache_clear()
 
 
+@pytest.mark.parametrize(("flags", "level"), [("", 1), ("--xla_backend_optimization_level=2", None)])
+def test_rollouts_are_compiled_with_few_optimisations_unless_the_flags_give_a_level(flags, level, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    fast_path.options.cache_clear()
+    try:
+        if (options := fast_path.options()) is None:
+            pytest.skip("the fast path is not supported here")
+        assert options.get("xla_backend_optimization_level") == level
+        assert ("xla_cpu_prefer_vector_width" in options) == fast_path.has_avx512()
+    finally:
+        monkeypatch.undo()
+        fast_path.options.cache_clear()
+
+
 def test_a_wrong_result_of_the_probe_disables_the_fast_path(monkeypatch, caplog):
     right = fast_path._step
     wrong = lambda y, lib: right(y, lib) if lib is np else jnp.where(y > 20, 0.0, right(y, lib))  # noqa: E731

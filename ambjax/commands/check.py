@@ -51,7 +51,8 @@ def check(case: Case | MachineCase, *, full: bool = False) -> CaseCheck:
     processor, the conditions of Theorem 1 do not count. The zones and the margins of the linearised loop never count.
     The check of a machine fails if the rotor is lost, or if the machine is not stable at one of its speeds.
 
-    `full`: whether the text contains also what does not affect the verdict. Raises ValueError for anything but a case.
+    `full`: whether to compute and write also what does not affect the verdict. Without it, the summary of a case on a
+    processor has None for `method`, `conditions` and `proof` of Theorem 1. Raises ValueError for anything but a case.
     """
     with quiet():
         if isinstance(case, MachineCase):
@@ -64,19 +65,20 @@ def _checked(case: Case, path: str, full: bool) -> CaseCheck:
     from ambjax.commands import check_text
 
     with doing(f"simulating and analysing the loop; {FIRST_RUN}"):
-        report, (loop, sensitivity, machine), on_processor, findings = _results(case)
-    lost = report.lost_at if on_processor is None else on_processor.sampled.lost_at
+        report, (loop, sensitivity, machine), on_processor, findings = _results(case, full)
+    run = report if on_processor is None else on_processor.sampled
+    assert run is not None
     with doing(f"testing the stability of the loop; {FIRST_RUN}"):
-        findings = (findings or _stability(case)) if math.isinf(lost) else None
+        findings = (findings or _stability(case)) if math.isinf(run.lost_at) else None
     summary = {
-        "holds": report.holds,
-        "lost_at_s": report.lost_at,
-        "lost_why": report.lost_why,
-        "cause": _cause(report.cause),
-        "stalled": report.stalled,
-        "method": report.method,
-        "conditions": [_condition(c) for c in report.conditions],
-        "proof": [_condition(c) for c in report.proof],
+        "holds": run.holds,
+        "lost_at_s": run.lost_at,
+        "lost_why": run.lost_why,
+        "cause": _cause(run.cause),
+        "stalled": run.stalled,
+        "method": report and report.method,
+        "conditions": report and [_condition(c) for c in report.conditions],
+        "proof": report and [_condition(c) for c in report.proof],
         "loop": loop,
         "stability": None if findings is None else findings._asdict(),
     }
@@ -85,32 +87,36 @@ def _checked(case: Case, path: str, full: bool) -> CaseCheck:
     if on_processor is not None:
         differs = _delays_differ(case, on_processor, loop)
         summary |= _processor_summary(on_processor, differs)
-    used = report.largest_z if on_processor is None else on_processor.sampled.largest_z
-    summary |= _clearance(case, used)
+    summary |= _clearance(case, run.largest_z)
     steady = findings is None or findings.stable
     summary["holds"] = bool(summary["holds"]) and largest >= weight and steady
     shown = check_text.Checked(case, path, report, findings, on_processor, differs, loop["stable"] is not None)
-    verdict = "\n".join(check_text.verdict(shown, sensitivity[0], used))
+    verdict = "\n".join(check_text.verdict(shown, sensitivity[0], run.largest_z))
     text = "\n\n".join([verdict, "\n".join([*sensitivity[1:], machine]), *check_text.details(shown, full)])
     return CaseCheck(summary["holds"] and loop["stable"] is not None, plain(summary), text)
 
 
-def _results(case: Case) -> tuple[Report, tuple[Summary, list[str], str], OnProcessor | None, Findings | None]:
+def _results(
+    case: Case, full: bool
+) -> tuple[Report | None, tuple[Summary, list[str], str], OnProcessor | None, Findings | None]:
     """Return the report of Theorem 1, the linear loop, the results on the processor, and the stability of the loop.
 
-    The stability is None unless the search of the delay margin has computed it.
+    The report is None for a case on a processor, unless `full`. The stability is None unless the search of the delay
+    margin has computed it.
     """
     with ThreadPoolExecutor(1) as pool:
-        say(f"checking Theorem 1: simulating {float(case.clock.duration):g} s in continuous time")
-        theorem = pool.submit(check_theorem, case.cascade, case.scenario, case.clock, case.settle)
+        theorem = None
+        if full or not case.cascade.sampled:
+            say(f"checking Theorem 1: simulating {float(case.clock.duration):g} s in continuous time")
+            theorem = pool.submit(check_theorem, case.cascade, case.scenario, case.clock, case.settle)
         say("linearising the loop")
         loop, on_processor, findings = acceptance(case), None, None
         if case.cascade.sampled:
             sampled = _sampled(case)
             margins, findings = _margins(case)
             on_processor = OnProcessor(sampled, *margins)
-        report = theorem.result()
-    if report.lost and not case.cascade.sampled:
+        report = theorem and theorem.result()
+    if report is not None and report.lost and not case.cascade.sampled:
         cause = find_cause(_is_lost, case.cascade, case.scenario, case.clock, say)
         report = dataclasses.replace(report, cause=cause)
     return report, loop, on_processor, findings
@@ -172,16 +178,11 @@ def _delays_differ(case: Case, results: OnProcessor, loop: Mapping[str, Any]) ->
 
 
 def _processor_summary(results: OnProcessor, differs: str) -> Summary:
-    """Return the summary of the results on the processor; "holds" is True if all conditions hold."""
+    """Return the summary of the results on the processor."""
     sampled, margin, unknown = results
     laws = [dataclasses.asdict(law) | {"holds": law.holds} for law in sampled.laws]
     return {
-        "holds": sampled.holds,
         "processor": {
-            "lost_at_s": sampled.lost_at,
-            "lost_why": sampled.lost_why,
-            "loss_cause": _cause(sampled.loss_cause),
-            "stalled": sampled.stalled,
             "laws": laws,
             "distance_to_C": sampled.distance[0],
             "distance_to_C_at_s": sampled.distance[1],

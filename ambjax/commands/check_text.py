@@ -41,17 +41,25 @@ class Checked(NamedTuple):
     """Results of a check.
 
     - `path`: name of the case file as given by the user.
-    - `findings`: stability of the loop; None: the rotor is lost. `linear`: whether the loop has a linearisation.
+    - `report`: on Theorem 1; None: not computed. `findings`: stability of the loop; None: the rotor is lost.
+    - `linear`: whether the loop has a linearisation.
     - `differs`: why simulated and linear delay margins differ, or empty.
     """
 
     case: Case
     path: str
-    report: Report
+    report: Report | None
     findings: Findings | None
     on_processor: OnProcessor | None
     differs: str | None
     linear: bool
+
+    @property
+    def run(self) -> Report | SampledReport:
+        """The report on the run that decides: on the processor, if the case has one."""
+        run = self.report if self.on_processor is None else self.on_processor.sampled
+        assert run is not None
+        return run
 
 
 def verdict(checked: Checked, sensitivity: str, largest: float | None) -> list[str]:
@@ -59,39 +67,35 @@ def verdict(checked: Checked, sensitivity: str, largest: float | None) -> list[s
 
     `largest`: largest |z| after run.settle, m; None: the run ends early.
     """
-    case, report, findings = checked.case, checked.report, checked.findings
+    report, findings = checked.report, checked.findings
     failures = list(_failures(checked))
     lines = ["The check passes." if not failures else f"The check FAILS: {'; '.join(failures)}."]
-    if checked.on_processor is None:
-        status = advice.status(report.lost_at, report.lost_why, report.stalled)
-    else:
-        sampled = checked.on_processor.sampled
-        status = advice.status(sampled.lost_at, sampled.lost_why, sampled.stalled, advice.STALLED_PLANT)
-    lines.append(status + _clearance(case, largest))
+    run, stalled = checked.run, advice.STALLED if checked.on_processor is None else advice.STALLED_PLANT
+    lines.append(advice.status(run.lost_at, run.lost_why, run.stalled, stalled) + _clearance(checked.case, largest))
     lines += [] if findings is None else [findings.words()]
-    deciding = [line.holds for line in report.conditions if line.holds is not None]
-    where = (
-        "" if checked.on_processor is None else " in continuous time, without the processor; not part of the verdict"
-    )
-    theorem = f"Theorem 1: {sum(deciding)} of the {len(deciding)} conditions that apply to these laws hold{where}."
-    return [*lines, sensitivity, theorem]
+    lines.append(sensitivity)
+    if report is not None:
+        deciding = [line.holds for line in report.conditions if line.holds is not None]
+        ideal = " in continuous time, without the processor; not part of the verdict"
+        where = "" if checked.on_processor is None else ideal
+        lines.append(
+            f"Theorem 1: {sum(deciding)} of the {len(deciding)} conditions that apply to these laws hold{where}."
+        )
+    return lines
 
 
 def _failures(checked: Checked) -> list[str]:
     """Return what makes the check fail, a few words each."""
-    report, on_processor, found = checked.report, checked.on_processor, []
-    run = report if on_processor is None else on_processor.sampled
+    run, found = checked.run, []
     if math.isfinite(run.lost_at):
         found.append("the run is not decided" if run.stalled else "the rotor is lost")
     if checked.findings is not None and not checked.findings.stable:
         found.append("the loop is not stable")
-    if on_processor is None:
-        found += [f"{line.requires} does not hold" for line in report.conditions if line.holds is False]
+    if isinstance(run, Report):
+        found += [f"{line.requires} does not hold" for line in run.conditions if line.holds is False]
     else:
-        found += [
-            f"the step of the {law.stage} law is not stable" for law in on_processor.sampled.laws if not law.holds
-        ]
-        found += ["the run reaches the singular curve C"] if on_processor.sampled.distance[0] <= 0 else []
+        found += [f"the step of the {law.stage} law is not stable" for law in run.laws if not law.holds]
+        found += ["the run reaches the singular curve C"] if run.distance[0] <= 0 else []
     if not checked.linear:
         found.append("the loop cannot be linearised")
     largest, weight, _ = forces(checked.case)
@@ -123,7 +127,7 @@ def details(checked: Checked, full: bool) -> list[str]:
         parts += [_laws(sampled), *([_bands(sampled)] if full else [])]
         differs = [checked.differs] if checked.differs else []
         parts.append("\n".join([*advice.processor_lines(sampled, margin, unknown), *differs]))
-    if checked.on_processor is None or full:
+    if report is not None and (checked.on_processor is None or full):
         shown = [line for line in report.conditions if line.gain is not None and (full or line.holds is not None)]
         parts += ["Theorem 1:", _conditions(shown), *([_proof(report.proof)] if full else [])]
         parts.append("\n".join(advice.theorem_lines(report, checked.path)))

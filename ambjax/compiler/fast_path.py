@@ -4,7 +4,7 @@ XLA's CPU backend dispatches every fused operation of a loop's body separately, 
 a few hundred floating-point operations that is nearly all the time. A call with the attributes MARK is compiled into
 one function, loops included. On processors with AVX-512 a compiler option also selects vectors of 512 bits.
 
-Neither feature is documented, so both are tested once per process. If the option is not available or changes a
+Neither feature is documented, so both are tested once per process. If an option is not available or changes a
 result, the program runs with the mark only. If the mark alone fails too, the program uses neither, is correct but
 slower, and logs one line. AMBJAX_PLAIN=1 in the environment disables both.
 """
@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 
 MARK = {"inlineable": "false", "xla_cpu_small_call": "true"}
 WIDE = {"xla_cpu_prefer_vector_width": 512}
+# Few optimisations of LLVM: a rollout compiles faster, and is as fast or faster. A level in XLA_FLAGS has priority.
+LEVEL = "xla_backend_optimization_level"
 # Members of the shortest block.
 SHORTEST = 16
 
@@ -114,8 +116,9 @@ def options() -> dict[str, Any] | None:
     if os.environ.get("AMBJAX_PLAIN", "0") not in ("", "0"):
         log.warning("one-kernel path is off: AMBJAX_PLAIN is set. Results are the same, runs are several times slower.")
         return None
-    faults = []
-    for trial in [WIDE, {}] if has_avx512() else [{}]:
+    faults, level = [], {} if LEVEL in os.environ.get("XLA_FLAGS", "") else {LEVEL: 1}
+    wide = WIDE if has_avx512() else {}
+    for trial in (wide | level, wide, {}):
         fault = _probe(trial)
         if not fault:
             return trial

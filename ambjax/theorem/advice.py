@@ -87,8 +87,8 @@ def processor_lines(sampled: SampledReport, margin: Delays, unknown: Delays | No
     words = f"No, {len(lines)} of {len(sampled.laws)} {'is' if len(lines) == 1 else 'are'} not:" if lines else "Yes."
     end = status(sampled.lost_at, sampled.lost_why, sampled.stalled, STALLED_PLANT)
     lines = [f"Is the discrete step of every law stable? {words}", *lines, _curve(*sampled.distance), end]
-    if sampled.loss_cause is not None:
-        lines.append(cause_words(sampled.loss_cause, *LOSS))
+    if sampled.cause is not None:
+        lines.append(cause_words(sampled.cause, *LOSS))
     if sampled.alternates:
         lines.append(_alternates(sampled.alternating or 0.0, sampled.alternation_cause))
     if unknown is None:

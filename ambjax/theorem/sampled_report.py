@@ -79,7 +79,7 @@ class SampledReport:
     unknown. `distance`: smallest distance of (z/s_0, i_ref/i_0) to the singular curve C at the samples (negative beyond
     C), and its time (s). `alternating`: result of `alternation` for the voltage after `settle`, in the run without
     sensor noise; None if that run ends early. `largest_z`: largest |z| (m) at the samples after
-    `settle`, in the run with noise; None if that run ends early. `loss_cause`, `alternation_cause`: results of
+    `settle`, in the run with noise; None if that run ends early. `cause`, `alternation_cause`: results of
     `with_causes`; None if the rotor is not lost, or if the voltage does not alternate.
     """
 
@@ -91,7 +91,7 @@ class SampledReport:
     distance: tuple[float, float] = (math.inf, 0.0)
     alternating: float | None = None
     largest_z: float | None = None
-    loss_cause: Cause | None = None
+    cause: Cause | None = None
     alternation_cause: Cause | None = None
 
     @property
@@ -204,7 +204,7 @@ def with_causes(
 
     case = (cascade, scenario, clock)
     if report.lost:
-        report = dataclasses.replace(report, loss_cause=find_cause(lost, *case, tell))
+        report = dataclasses.replace(report, cause=find_cause(lost, *case, tell))
     if report.alternates:
         quiet = (cascade, _without_noise(scenario), clock)
         report = dataclasses.replace(report, alternation_cause=find_cause(alternating, *quiet, tell))
