@@ -90,7 +90,7 @@ def parser() -> Parser:
         "fails"
     )
     checks = command("check", summary, case=True)
-    meaning = "also print what does not affect the verdict (a case of one axis)"
+    meaning = "also compute and print what does not affect the verdict (a case of one axis)"
     checks.add_argument("--full", action="store_true", help=meaning)
     summary = (
         "modes, critical speeds and unbalance response of a machine against its speed: campbell.html, campbell.json, "

@@ -89,8 +89,8 @@ def test_the_plain_path_gives_the_same_numbers_and_logs_its_use(monkeypatch, cap
         fast_path.options.cache_clear()
 
 
-@pytest.mark.parametrize(("flags", "level"), [("", 1), ("--xla_backend_optimization_level=2", None)])
-def test_rollouts_are_compiled_with_few_optimisations_unless_the_flags_give_a_level(flags, level, monkeypatch):
+@pytest.mark.parametrize(("flags", "level"), [("", 2), ("--xla_backend_optimization_level=1", None)])
+def test_rollouts_are_compiled_without_unrolling_unless_the_flags_give_a_level(flags, level, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", flags)
     fast_path.options.cache_clear()
     try:
