@@ -1,10 +1,10 @@
 """Speed gain of each workaround for XLA's CPU compiler, with the version of jax of the measurement.
 
 Each process turns off one workaround; all run alternately with a process that keeps every workaround, so that both
-meet the same load. Three jobs on one core: 1,024 members of the common workload under held noise (RK4), the gradient of
-task A's loss (sliding steps, 32 lanes), and 1,024 members on a processor with signs (the workload of sampled.py). The
-gain is the time without the workaround over the time with it, a median over the rounds. A workaround whose gain is 1
-under a newer jax can be removed.
+meet the same load. Four jobs on one core: 1,024 members of the common workload under held noise (RK4), the gradient of
+task A's loss (sliding steps, 32 lanes), and two ensembles on a processor with signs (the workload of sampled.py):
+1,024 members in long blocks, and 32 members in a short one. The gain is the time without the workaround over the time
+with it, a median over the rounds. A workaround whose gain is 1 under a newer jax can be removed.
 Run: python benchmarks/workarounds.py [--rounds 5] [NAME ...]
 """
 
@@ -42,6 +42,13 @@ def without_width() -> None:
     from ambjax.compiler import fast_path
 
     fast_path.WIDE = {}
+
+
+def without_level() -> None:
+    """XLA compiles at its default level of optimisation."""
+    from ambjax.compiler import fast_path
+
+    fast_path.LEVEL = {}
 
 
 def without_apart() -> None:
@@ -88,6 +95,7 @@ WITHOUT: dict[str, Callable[[], None]] = {
     "none": lambda: None,
     "mark": without_mark,
     "width": without_width,
+    "level": without_level,
     "apart": without_apart,
     "stored": without_stored,
     "arctan": without_arctan,
@@ -103,7 +111,7 @@ def jobs() -> dict[str, Callable[[], Any]]:
     import sampled
     import workload
 
-    digital = sampled.sampled(MEMBERS, SAMPLES, math.inf)
+    digital, short = sampled.sampled(MEMBERS, SAMPLES, math.inf), sampled.sampled(LANES, 20 * SAMPLES, math.inf)
     work = workload.workload(MEMBERS, SAMPLES, noise=True)
     loss, lanes, axes, _ = gradients.tuner(LANES, SAMPLES)
     slope = gradients.programs(loss, LANES, axes)["forward"]
@@ -111,6 +119,7 @@ def jobs() -> dict[str, Callable[[], Any]]:
         "ensemble": lambda: workload.by_ambjax(work, threads=1),
         "gradient": lambda: jax.block_until_ready(slope(np.zeros(len(gradients.GAINS)), lanes)),
         "processor": lambda: workload.by_ambjax(digital, threads=1),
+        "short": lambda: workload.by_ambjax(short, threads=1),
     }
 
 

@@ -28,9 +28,9 @@ log = logging.getLogger(__name__)
 
 MARK = {"inlineable": "false", "xla_cpu_small_call": "true"}
 WIDE = {"xla_cpu_prefer_vector_width": 512}
-# Level 3, XLA's default, unrolls loops over short blocks: at level 2 a block of 16 or 32 members takes 20 to 35 % less
-# time, one of 64 or more at most 4 % more, and the compilation is shorter. A level in XLA_FLAGS has priority.
-LEVEL = "xla_backend_optimization_level"
+# XLA's default, level 3, unrolls loops over the members of short blocks, which makes them slower; see
+# benchmarks/workarounds.py. A level in XLA_FLAGS has priority.
+LEVEL = {"xla_backend_optimization_level": 2}
 # Members of the shortest block.
 SHORTEST = 16
 
@@ -117,8 +117,8 @@ def options() -> dict[str, Any] | None:
     if os.environ.get("AMBJAX_PLAIN", "0") not in ("", "0"):
         log.warning("one-kernel path is off: AMBJAX_PLAIN is set. Results are the same, runs are several times slower.")
         return None
-    faults, level = [], {} if LEVEL in os.environ.get("XLA_FLAGS", "") else {LEVEL: 2}
-    wide = WIDE if has_avx512() else {}
+    given, faults = os.environ.get("XLA_FLAGS", ""), []
+    wide, level = WIDE if has_avx512() else {}, {} if any(name in given for name in LEVEL) else LEVEL
     for trial in (wide | level, wide, {}):
         fault = _probe(trial)
         if not fault:
