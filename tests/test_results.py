@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import sys
+import tomllib
 
 import jax
 import jax.numpy as jnp
@@ -86,6 +87,16 @@ def test_a_check_returns_its_verdict_and_prints_nothing(path, capfd):
     assert found.holds == found.summary["holds"]
     assert found.text.startswith("The check passes." if found.holds else "The check FAILS")
     assert found.summary["loop"]["peak"] == pytest.approx(ambjax.sensitivity(case).S.height)
+
+
+@pytest.mark.slow
+def test_a_check_on_a_processor_evaluates_theorem_1_only_if_asked():
+    case = case_from(tomllib.loads(CASE) | {"processor": {"delay": 0.5, "predict": False}})
+    brief, full = ambjax.check(case), ambjax.check(case, full=True)
+    assert ("Theorem 1" in brief.text, "Theorem 1" in full.text) == (False, True)
+    assert full.summary["conditions"]
+    # it changes nothing else
+    assert full.summary | dict.fromkeys(("method", "conditions", "proof")) == brief.summary
 
 
 def test_the_pictures_show_the_results(run, members):
