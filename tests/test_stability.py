@@ -5,6 +5,7 @@ import dataclasses
 import json
 import math
 
+import jax
 import numpy as np
 import pytest
 import test_check_processor as sampled
@@ -83,6 +84,24 @@ def test_noise_and_unbalance_do_not_make_a_loop_unstable():
     found = stability_of(case.cascade, members(case), case.clock)
     assert found.stable.all()
     assert found.swing[0] < 1e-3 * SMALL * case.scenario.touchdown
+
+
+def test_a_quiet_run_has_no_load_and_the_compiled_program_of_its_case():
+    """A compiled program depends on the structure of its inputs, not on their values."""
+    turning = amb.signals.Rotation(3000.0)
+    loads = {
+        "q_z": amb.signals.Sum((amb.signals.Sine(2.0, 30.0, 1.0), amb.signals.Ramp(3.0, 0.0, 0.1))),
+        "q_v": amb.signals.Pulse(1.0, 0.0, 0.1),
+        "q_f": amb.signals.Unbalance(120.0, 1.0),
+    }
+    case = case_of(sensor={"std": 1e-6, "bits": 12})
+    scenario = dataclasses.replace(case.scenario, rotor=turning, **loads)
+    calm = module.quiet(scenario)
+    assert jax.tree.structure(calm) == jax.tree.structure(scenario)
+    assert not np.any(calm.sensor.noises)
+    for t in (0.0, 0.05, 0.3):
+        assert scenario.turning().acceleration(t) != 0
+        assert calm.turning().acceleration(t) == 0
 
 
 @pytest.mark.slow

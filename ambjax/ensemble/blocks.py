@@ -7,12 +7,15 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ambjax.numerics.records import Scalar, leaf, record, static
+from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Ending
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import Row
 
 # Initial minimum of a block (its negative: initial maximum), before any value is included.
 NO_VALUE = jnp.inf
+# Number of blocks of `quarters`; a run whose samples are not a multiple of it has one more.
+QUARTERS = 4
 
 
 class BlockValues(NamedTuple):
@@ -77,6 +80,12 @@ class Blocks:
 
     def result(self, carry: Carry, ending: Ending) -> BlockValues:
         return carry.folded
+
+
+def quarters(clock: Clock) -> Blocks:
+    """Return the fold of z and i over the quarters of a run. Runs that use it share their compiled program."""
+    every = max(clock.samples // QUARTERS, 1)
+    return Blocks(("z", "i"), every, -(-clock.samples // every), clock.sample_period)
 
 
 def _combined(values: Array, at: Array, combine: Callable[[Array, Array], Array], x: Array) -> Array:

@@ -7,6 +7,7 @@ import numpy as np
 from ambjax.control.cascade import Cascade
 from ambjax.control.processor import MOST_DELAY, USUAL_DELAY
 from ambjax.ensemble.batching import run_ensemble
+from ambjax.ensemble.blocks import quarters
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.trajectory import STALLED
 from ambjax.theorem.sampled_report import Delays
@@ -41,7 +42,9 @@ def delay_margin(cascade: Cascade, scenario: Scenario, clock: Clock, *, known: b
         for low, high in itertools.pairwise(ends):
             first = len(runs) > 0  # `low` was simulated before
             delays = np.linspace(low, high, DELAYS + first)[first:]
-            ending = run_ensemble(at_delays(cascade, delays, known=known), scenario, clock, fold=None).trajectory
+            late = at_delays(cascade, delays, known=known)
+            # the fold of `stability_of`, which tests these delays in the same compiled program
+            ending = run_ensemble(late, scenario, clock, fold=quarters(clock)).trajectory
             runs.append((delays, np.asarray(ending.lost_at), np.asarray(ending.lost_code)))
             if np.isfinite(runs[-1][1]).any():
                 break

@@ -21,12 +21,14 @@ import numpy as np
 from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import DEFAULT_LAWS, Cascade
 from ambjax.ensemble.batching import run_ensemble, size
-from ambjax.ensemble.blocks import Blocks
+from ambjax.ensemble.blocks import QUARTERS, quarters
 from ambjax.linear.analysis import linearise_members
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.triple import takes_case
+from ambjax.world.ramps import Ramp, Trapezoid
+from ambjax.world.rotation import Unbalance, UnbalanceGrade
 from ambjax.world.scenario import Scenario
-from ambjax.world.waveforms import Constant, Signal, is_random
+from ambjax.world.waveforms import Chirp, Constant, Pulse, Signal, Sine, SmoothStep, Step, Sum, is_random
 
 if TYPE_CHECKING:  # `ambjax simulate` imports this module, and does not need Theorem 1
     from ambjax.theorem.sampled_report import Delays
@@ -46,7 +48,9 @@ GROWN = 10.0
 BORDER = 1e-3
 # Resolution that stands for an ideal converter, bits.
 FINE_BITS = 32
-QUARTERS = 4
+# The field of a load with which all of its values scale.
+SIZES = {Constant: "value", Unbalance: "unbalance", UnbalanceGrade: "grade"}
+SIZES |= dict.fromkeys((Step, Pulse, Sine, SmoothStep, Chirp, Ramp, Trapezoid), "amplitude")
 # Largest number of members of an ensemble whose stability is computed: those with the largest settled errors.
 MOST_TESTED = 64
 
@@ -237,9 +241,7 @@ class _QuietRun(NamedTuple):
 
 def _quiet_run(cascade: Cascade, scenario: Scenario, clock: Clock) -> _QuietRun:
     """Simulate the quiet runs."""
-    every = max(clock.samples // QUARTERS, 1)
-    fold = Blocks(("z", "i"), every, -(-clock.samples // every), clock.sample_period)
-    run = run_ensemble(cascade, quiet(scenario), clock, fold=fold, record_every=0)
+    run = run_ensemble(cascade, quiet(scenario), clock, fold=quarters(clock), record_every=0)
     low, high = ({name: x[:, :QUARTERS] for name, x in part.items()} for part in (run.metrics.low, run.metrics.high))
     swings = np.zeros((len(low["z"]), QUARTERS))
     swings[:, : low["z"].shape[1]] = np.maximum(high["z"] - low["z"], 0.0) / 2
@@ -252,15 +254,27 @@ def _quiet_run(cascade: Cascade, scenario: Scenario, clock: Clock) -> _QuietRun:
 
 
 def quiet(scenario: Scenario) -> Scenario:
-    """Return the scenario of the quiet run. The start is displaced by KICK of the clearance, towards z = 0."""
-    calm = scenario.undisturbed()
-    bits = None if calm.sensors.current_bits is None else FINE_BITS
-    calm = calm.louder(0.0).with_sensor(bits=bits, bits_i=None, outliers=None, dropouts=None)
+    """Return the scenario of the quiet run. The start is displaced by KICK of the clearance, towards z = 0.
+
+    Noise, converters and most loads stay in it, without effect, so that its compiled program is that of the scenario.
+    """
+    loads = {slot: _silent(getattr(scenario, slot)) for slot in ("q_z", "q_v", "q_i", "q_f", "base")}
+    fine = {name: FINE_BITS for name in ("bits", "bits_i") if getattr(scenario.sensors, name) is not None}
+    calm = scenario.louder(0.0).with_sensor(outliers=None, dropouts=None, runout=None, **fine)
     initial, z = scenario.initial, np.asarray(scenario.initial.z, float)
     z = z + np.where(z > 0, -1.0, 1.0) * KICK * np.asarray(scenario.touchdown)
     return dataclasses.replace(
-        calm, reference=Constant(_at_start(scenario.reference)), initial=dataclasses.replace(initial, z=z)
+        calm, **loads, reference=Constant(_at_start(scenario.reference)), initial=dataclasses.replace(initial, z=z)
     )
+
+
+def _silent(load: Signal | None) -> Signal | None:
+    """Return a load of size 0: of the same class if it is one of SIZES or a sum, otherwise a constant."""
+    if isinstance(load, Sum):
+        return Sum(tuple(_silent(term) for term in load.terms))  # pyright: ignore
+    if name := SIZES.get(type(load)):
+        return dataclasses.replace(load, **{name: 0.0 * getattr(load, name)})  # pyright: ignore
+    return None if load is None else Constant()
 
 
 def _at_start(reference: Signal) -> Any:
