@@ -43,7 +43,8 @@ class Point(NamedTuple):
 class Equilibrium(NamedTuple):
     """An equilibrium. `found`: whether Newton's method converged; if not, `point` is not an equilibrium.
 
-    `residual`: the residual at `point`, in the form of a `Point`, relative to the sizes of the states.
+    `residual`: residual before the last step, in the form of a `Point`, relative to the sizes of the states; without an
+    equilibrium, that at `point`.
     """
 
     point: Point
@@ -106,8 +107,9 @@ def equilibrium(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar)
     newton = newton_of(lambda y: residual(y, *held), lax.stop_gradient(flat / sizes))
     found = newton.error <= TOLERANCE * jnp.finfo(flat.dtype).eps
     # one more Newton step with a constant Jacobian: its derivative is that of the implicit function
-    y = newton.y - jnp.where(found, inverse(newton.J) @ residual(newton.y, cascade, scenario), 0.0)
-    return Equilibrium(restore(y * sizes), found, restore(residual(lax.stop_gradient(y), *held)))
+    last = residual(newton.y, cascade, scenario)
+    y = newton.y - jnp.where(found, inverse(newton.J) @ last, 0.0)
+    return Equilibrium(restore(y * sizes), found, restore(lax.stop_gradient(last)))
 
 
 class Newton(NamedTuple):
