@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
-from ambjax.codegen.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal, live, split_scan
+from ambjax.codegen.primitives import CALLS, OPS, SAME, Atom, dtype_of, live, split_scan
 from ambjax.codegen.program import Operand, Program, Ref, of
 
 LOOPS = ("scan", "while")
@@ -53,9 +53,6 @@ class _Reader:
         return [value(x) for x in jaxpr.outvars]
 
     def equation(self, name: str, eqn: JaxprEqn, args: list[Operand], law: str) -> list[Operand]:
-        if is_reciprocal(eqn):
-            dtype = dtype_of(eqn.outvars[0])
-            return [self.program.apply("div", (np.ones((), dtype)[()], args[0]), dtype, law)]
         if name in CALLS:
             inner = next(eqn.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in eqn.params)
             return self.closed(inner, args, law) if isinstance(inner, ClosedJaxpr) else self.jaxpr(inner, [], args, law)

@@ -10,8 +10,6 @@ from typing import Any, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 from jax.extend.core import Jaxpr, JaxprEqn, Literal, Var
 
-from ambjax.numerics.smooth import RECIPROCAL
-
 
 class Op(NamedTuple):
     """Texts in C and JavaScript; NumPy function; kind of cost; whether operands commute, whether the result is a bool.
@@ -105,11 +103,6 @@ def dtype_of(x: Atom) -> np.dtype:
     """Return the dtype of a variable or constant of a trace."""
     aval: Any = x.aval
     return np.dtype(aval.dtype)
-
-
-def is_reciprocal(eqn: JaxprEqn) -> bool:
-    """Return whether a call computes 1/x by refining a float32 quotient. Exported code divides once instead."""
-    return eqn.params.get("name") == RECIPROCAL and len(eqn.invars) == len(eqn.outvars) == 1
 
 
 def live(jaxpr: Jaxpr) -> list[JaxprEqn]:

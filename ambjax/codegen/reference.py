@@ -15,7 +15,7 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
 from jax.typing import ArrayLike
 
 from ambjax.codegen.points import Points
-from ambjax.codegen.primitives import CALLS, OPS, SAME, Atom, dtype_of, is_reciprocal, live, split_scan
+from ambjax.codegen.primitives import CALLS, OPS, SAME, Atom, dtype_of, live, split_scan
 from ambjax.codegen.trace import Trace, arguments, precision
 
 
@@ -63,8 +63,6 @@ def _one(eqn: JaxprEqn, args: list[ArrayLike], count: int) -> list[ArrayLike]:
     whole = lambda closed: closed if isinstance(closed, ClosedJaxpr) else ClosedJaxpr(closed, [])  # noqa: E731
     if name in SAME:
         return args
-    if is_reciprocal(eqn):
-        return [1 / jnp.broadcast_to(jnp.asarray(args[0], dtype_of(eqn.invars[0])), (count,))]
     if name in CALLS:
         inner = next(params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params)
         return one_by_one(whole(inner), args, count)

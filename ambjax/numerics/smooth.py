@@ -63,34 +63,11 @@ SINE_S = {
 }
 
 
-def refined(x: Array) -> Array:
-    """Return 1/x for |x| between 1e-37 and 1e37.
-
-    CPUs divide vectors of float32 much faster than vectors of float64. In float64 on a CPU, the function therefore
-    refines a float32 quotient by one step of third order, with an error of at most about one unit in the last place. In
-    a JAX trace, the function is a call whose name is the value of RECIPROCAL. The exporter writes this call as a
-    quotient.
-    """
-    return _refined_reciprocal(x)
-
-
-@jax.jit
-def _refined_reciprocal(x: Array) -> Array:
-    if x.dtype != jnp.float64 or jax.default_backend() != "cpu":
-        return 1 / x
-    rough = (1 / x.astype(jnp.float32)).astype(jnp.float64)
-    error = 1 - x * rough
-    return rough + rough * (error + error * error)
-
-
-RECIPROCAL = "_refined_reciprocal"
-
-
 @jax.custom_jvp
 @compiled_alone
 def reciprocal(x: Array) -> Array:
-    """Return `refined(x)`. Its derivative does not divide, because divisions would dominate the cost of a gradient."""
-    return refined(x)
+    """Return 1/x. Its derivative does not divide, because divisions would dominate the cost of a gradient."""
+    return 1 / x
 
 
 @reciprocal.defjvp

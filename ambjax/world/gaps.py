@@ -8,7 +8,7 @@ from jax import Array
 
 from ambjax.compiler.barrier import compiled_alone
 from ambjax.numerics.records import Scalar
-from ambjax.numerics.smooth import refined, safe_sqrt
+from ambjax.numerics.smooth import safe_sqrt
 
 # Lower bound of a gap in the divisions, as a share of s_0. The rotor is lost at a larger gap, so the bound acts only on
 # trial stages of an integrator. It keeps the quotients and their derivatives finite.
@@ -44,7 +44,7 @@ def gaps(z: Scalar, s_0: Scalar) -> Gaps:
 @compiled_alone
 def _inverse(z: Array, s_0: Array) -> Array:
     """Return 1 / (upper lower), 1/m^2, with the lower bound of `_product`."""
-    return refined(_product(z, s_0))
+    return 1 / _product(z, s_0)
 
 
 @_inverse.defjvp

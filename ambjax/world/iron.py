@@ -8,7 +8,6 @@ from jax import Array
 
 from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.numerics.records import Scalar, leaf, record
-from ambjax.numerics.smooth import refined
 
 # Smallest slope of the saturation curve: at large currents only the flux through the air still increases.
 AIR = 0.02
@@ -83,7 +82,7 @@ class Iron:
 def _inverse_root(x: Array) -> Array:
     """Return (1 + x^4)^(-1/4)."""
     square = x * x
-    return refined(jnp.sqrt(jnp.sqrt(1 + square * square)))
+    return 1 / jnp.sqrt(jnp.sqrt(1 + square * square))
 
 
 @_inverse_root.defjvp
