@@ -37,10 +37,6 @@ def drawn(monkeypatch):
     return kept
 
 
-def is_png(path):
-    return path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-
-
 def texts(figure):
     """Every word of a figure, its legends included."""
     return " | ".join(words.get_text() for words in figure.findobj(Text))
@@ -53,14 +49,11 @@ def texts(figure):
     ("unit", "size", "expected"),
     [
         ("m", 2.3e-5, (1e6, "µm")),
-        ("m", 4.5e-3, (1e3, "mm")),
         ("m", 1e-3, (1e3, "mm")),
         ("m", 2000.0, (1, "m")),  # no km on a bearing
         ("m/s", 3e-4, (1e6, "µm/s")),
         ("V", 1500.0, (1e-3, "kV")),
-        ("V", 200.0, (1, "V")),
         ("A²/m²", 1e6, (1, "A²/m²")),  # a prefix would be squared with its unit
-        ("kg", 1e-3, (1, "kg")),
         ("1/s", 1e4, (1, "1/s")),
         ("m", 0.0, (1, "m")),
         ("m", np.inf, (1, "m")),
@@ -88,17 +81,22 @@ def test_every_metric_has_its_unit():
     assert set(histograms.CHIEF) <= set(names)
 
 
-def test_labels_keep_text_that_is_not_a_unit():
-    assert label_of("noise std on $z$ (m)", 2e-5) == (pytest.approx(1e6), "noise std on $z$ (µm)")
-    assert label_of("share", 2e-5) == (1.0, "share")
-    assert label_of("mass (kg)", 2e-5) == (1.0, "mass (kg)")
-    assert label_of("plant.A (m^2)", 2e-5) == (1.0, "plant.A (m²)")
-    assert label_of("amplitude (m/s^2)", 0.1) == (1e3, "amplitude (mm/s²)")
-    assert label_of("plant.R (ohm)", 17.0) == (1.0, "plant.R (Ω)")
-    assert label_of("plant.n (1)", 900.0) == (1.0, "plant.n")
+@pytest.mark.parametrize(
+    ("label", "size", "factor", "shown"),
+    [
+        ("noise std on $z$ (m)", 2e-5, 1e6, "noise std on $z$ (µm)"),
+        ("share", 2e-5, 1.0, "share"),
+        ("plant.A (m^2)", 2e-5, 1.0, "plant.A (m²)"),
+        ("amplitude (m/s^2)", 0.1, 1e3, "amplitude (mm/s²)"),
+        ("plant.R (ohm)", 17.0, 1.0, "plant.R (Ω)"),
+        ("plant.n (1)", 900.0, 1.0, "plant.n"),
+    ],
+)
+def test_labels_keep_text_that_is_not_a_unit(label, size, factor, shown):
+    assert label_of(label, size) == (pytest.approx(factor), shown)
 
 
-# ---------------------------------------------------------------- fan
+# ---------------------------------------------------------------- special cases
 
 
 @pytest.mark.parametrize("lost_at", [None, np.array([np.inf]), np.zeros(3)])
@@ -107,10 +105,6 @@ def test_fan_charts_of_special_cases(tmp_path, values, lost_at):
     # one member: all bands alike; NaN: no member left
     bands = {"u": dict.fromkeys(PERCENTS, values)}
     fans.fan(np.linspace(0, 1, 9), bands, {"u": 2.0}, "hard", tmp_path / "fan.png", lost_at=lost_at)
-    assert is_png(tmp_path / "fan.png")
-
-
-# ---------------------------------------------------------------- histograms
 
 
 @pytest.mark.parametrize(
@@ -119,27 +113,20 @@ def test_fan_charts_of_special_cases(tmp_path, values, lost_at):
         np.zeros(5),
         np.full(5, 2e-6),
         np.full(5, np.nan),
-        np.full(5, np.inf),
         np.array([np.nan, np.inf, 1e-6, 2e-6, 3e-6]),
         np.array([0.0, 1e-9, 1e-3, 1.0, 1e200]),
-        np.array([0.0, 0.0, 0.0, 1e-9, 1e-3]),
         np.array([-1.0, 0.0, 1e-3, 1.0, 100.0]),
         np.array([1.0, 1.0, 1.0, 1.0, 1.0 + 2**-52]),
         np.ones(1),
-        np.full(1, np.nan),
     ],
 )
 @pytest.mark.parametrize("all_lost", [False, True])
 def test_histograms_of_special_cases(tmp_path, drawn, values, all_lost):
     columns = {"lost_at": np.full(len(values), 0.1 if all_lost else np.inf), "rms_error_m": values}
     histograms.histograms(columns, tmp_path / "h.png")
-    assert is_png(tmp_path / "h.png")
     shown = drawn[0].axes[0].patches[-1].get_data().values.sum()
     in_range = np.isfinite(values) & ((values > 0) | (drawn[0].axes[0].get_xscale() == "linear"))
     assert shown == in_range.sum()  # no value falls out of the last bin
-
-
-# ---------------------------------------------------------------- tornado
 
 
 def test_tornado_charts_of_special_cases(tmp_path, drawn):
@@ -150,16 +137,11 @@ def test_tornado_charts_of_special_cases(tmp_path, drawn):
         tornado([], "rms_u_V", "", tmp_path / "c.png")
 
 
-# ---------------------------------------------------------------- maps
-
-
-def a_panel(survival, error=None, x=None, y=None):
-    survival = np.asarray(survival, float)
+def a_panel(survival, error=None, x=None):
     ny, nx = survival.shape
     x = np.geomspace(1e-6, 1e-3, nx) if x is None else x
-    y = np.geomspace(1e-5, 1e-3, ny) if y is None else y
     low, high = np.clip(survival - 0.02, 0, 1), np.clip(survival + 0.02, 0, 1)
-    return heatmaps.MapPanel("repaired", x, y, survival, low, high, error)
+    return heatmaps.MapPanel("repaired", x, np.geomspace(1e-5, 1e-3, ny), survival, low, high, error)
 
 
 ALL = np.ones((3, 4))
@@ -168,7 +150,6 @@ ALL = np.ones((3, 4))
 @pytest.mark.parametrize(
     ("survival", "error"),
     [
-        (ALL, None),
         (ALL, 2e-6 * ALL),
         (0 * ALL, np.nan * ALL),
         (0.95 * ALL, 0 * ALL),
@@ -176,14 +157,12 @@ ALL = np.ones((3, 4))
         (np.where(np.eye(3, 4), np.nan, 0.97), None),
         (np.ones((1, 1)), np.ones((1, 1))),
         (np.array([[0.0, 0.5, 1.0]]), np.array([[np.nan, 1e-3, 1e-6]])),
-        (np.array([[0.0], [1.0]]), np.array([[np.nan], [1e-6]])),
         (np.eye(2), np.array([[1e-9, 1e3], [1.0, np.nan]])),
     ],
 )
 def test_maps_of_special_cases(tmp_path, survival, error):
     panels = [a_panel(survival, error), a_panel(0.5 * survival, None)]
     heatmaps.maps(panels, "std (m)", "period (s)", True, False, tmp_path / "m.png", error_metric="rms_error_m")
-    assert is_png(tmp_path / "m.png")
 
 
 def test_maps_refuse_empty_panels_and_zeros_on_a_log_axis(tmp_path):
@@ -207,8 +186,7 @@ def a_run(samples=20_000, period=1e-4, lost_at=np.inf, code=ALIVE, **signals):
 
 def columns(figure):
     """Axes [panels, columns] in the order of the page."""
-    axes = np.array(figure.axes, dtype=object)
-    return axes.reshape(-1, 3)
+    return np.reshape(figure.axes, (-1, 3))
 
 
 def test_a_short_transient_is_enlarged(tmp_path, drawn):
@@ -223,30 +201,23 @@ def test_a_short_transient_is_enlarged(tmp_path, drawn):
     assert titles == ["", "the first 12 ms", "the last 20 ms"]
 
 
-@pytest.mark.parametrize(
-    ("code", "words"), [(TOUCHED, "lost at 0.01 s: touched"), (STALLED, "not decided from 0.01 s")]
-)
-def test_a_loss_ends_the_picture_shortly_after(tmp_path, drawn, code, words):
-    overview(a_run(lost_at=0.01, code=code), "lost", tmp_path / "o.png")
+@pytest.mark.parametrize(("code", "words"), [(TOUCHED, "lost at 0.01 s"), (STALLED, "not decided from 0.01 s")])
+def test_a_loss_ends_the_picture_shortly_after_and_is_distinguished_from_a_stall(tmp_path, drawn, code, words):
+    run = a_run(lost_at=0.01, code=code)
+    overview(run, "lost", tmp_path / "o.png")
     whole, start, end = columns(drawn[0])[0]
     assert whole.get_title(loc="left").startswith(words)
     assert whole.get_xlim() == (0.0, pytest.approx(0.0115))
     assert start.get_xlim()[1] <= 0.01 / 3
     assert end.get_xlim() == (pytest.approx(0.008), pytest.approx(0.0103))
-
-
-@pytest.mark.parametrize(("code", "words"), [(TOUCHED, "lost at 0.01 s"), (STALLED, "not decided from 0.01 s")])
-def test_a_figure_of_the_paper_distinguishes_a_loss_from_a_stall(tmp_path, drawn, code, words):
-    figures.paper_figure(3, a_run(lost_at=0.01, code=code), "regulation", tmp_path / "f.png")
-    said = [text.get_text().split("\n")[0] for ax in drawn[0].axes for text in ax.texts]
-    assert said == [words]
+    figures.paper_figure(3, run, "regulation", tmp_path / "f.png")
+    assert [text.get_text().split("\n")[0] for ax in drawn[1].axes for text in ax.texts] == [words]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("samples", "lost_at"), [(1, 0.0), (1, np.inf), (2, 1e-4), (3, 1.5e-4), (30, np.inf)])
+@pytest.mark.parametrize(("samples", "lost_at"), [(1, 0.0), (1, np.inf), (3, 1.5e-4)])
 def test_runs_of_few_samples_are_drawn(tmp_path, samples, lost_at):
     overview(a_run(samples=samples, lost_at=lost_at, code=TOUCHED), "tiny", tmp_path / "o.png")
-    assert (tmp_path / "o.png").stat().st_size > 1000
 
 
 def test_the_panels_of_the_whole_run_have_the_scale_of_the_settled_part(tmp_path, drawn):
@@ -262,13 +233,10 @@ def test_the_panels_of_the_whole_run_have_the_scale_of_the_settled_part(tmp_path
     assert columns(drawn[1])[0, 0].get_ylim()[1] > 99.0
 
 
-CASE = "[clock]\nduration = 0.05\n"
-
-
 @pytest.fixture
 def case(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    pathlib.Path("case.toml").write_text(CASE)
+    pathlib.Path("case.toml").write_text("[clock]\nduration = 0.05\n")
     return "case.toml"
 
 
@@ -280,9 +248,7 @@ def test_the_command_draws_the_given_interval(case, drawn, capsys):
         assert len(whole["t"]) == 500
 
 
-@pytest.mark.parametrize(
-    "flags", [["--from", "0.05"], ["--to", "0.051"], ["--from", "-1"], ["--from", "nan"], ["--to", "0"]]
-)
+@pytest.mark.parametrize("flags", [["--from", "0.05"], ["--to", "0.051"], ["--from", "-1"], ["--from", "nan"]])
 def test_an_interval_outside_the_run_is_refused(case, flags, capsys):
     assert main(["simulate", case, *flags]) == 2
     error = capsys.readouterr().err
