@@ -2,13 +2,13 @@
 
 import re
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from javascript import run_rows, with_node
 from test_export_blocks import CASES
-from test_export_emitter import EDGES, LOOSE, listed
+from test_export_emitter import LOOSE, check_functions, listed
+from texts import write
 
 from ambjax.__main__ import main
 from ambjax.cases.template_text import template as case_template
@@ -51,21 +51,10 @@ LOOSER = {"erf": 32, "erfc": 512, "sinh": 64, "cosh": 64, "arctanh": 256, "logis
 
 @pytest.mark.slow
 def test_every_primitive_equals_jax(tmp_path):
-    random = np.random.default_rng(1)
-    x = random.choice([-1.0, 1.0], (1500, 2)) * 10.0 ** random.uniform(-3, 1.5, (1500, 2))
-    x = np.concatenate([x, [(a, b) for a in EDGES for b in EDGES]])
     text = script_of(Functions((), 1.0), "all")
     run = "const s = all.start(), y = new Float64Array(all.outputs.length);\n"
-    found = run_rows(text + run + "const run = x => { all.step([], s, x, y); return y; };\n", x, tmp_path)
-    for k, (name, f) in enumerate(listed().items()):
-        with jax.disable_jit():
-            should = np.asarray(f(jnp.asarray(x[:, 0]), jnp.asarray(x[:, 1])))
-        with np.errstate(all="ignore"):
-            off = np.abs(found[:, k] - should) / np.maximum(np.spacing(np.abs(should)), 1e-35)
-        allowed = max(LOOSE.get(name, 4), LOOSER.get(name, 0))
-        wrong = ~((found[:, k] == should) | (np.isnan(found[:, k]) & np.isnan(should)) | (off <= allowed))
-        at = np.flatnonzero(wrong)[:3]
-        assert not wrong.any(), (name, x[at], found[at, k], should[at], off[at])
+    run += "const run = x => { all.step([], s, x, y); return y; };\n"
+    check_functions(lambda x: run_rows(text + run, x, tmp_path), "double", LOOSE | LOOSER)
     assert all(re.search(rf"const {name} = ", text) for name in HELPERS)
 
 
@@ -84,9 +73,8 @@ const run = row => {
 def test_one_step_equals_jax(what, tmp_path):
     traced = trace(blocks_of(*CASES["rig"])[what], "double")
     at = verification_points(traced, 1000)
-    found = run_rows(
-        script(traced, "block") + STEP, np.concatenate([at.parameters, at.state, [at.started], at.inputs]).T, tmp_path
-    ).T
+    rows = np.concatenate([at.parameters, at.state, [at.started], at.inputs]).T
+    found = run_rows(script(traced, "block") + STEP, rows, tmp_path).T
     should = results(traced, at)
     numbers = np.concatenate([should.state, [should.started], should.outputs])
     with np.errstate(all="ignore"):
@@ -99,8 +87,7 @@ def test_one_step_equals_jax(what, tmp_path):
 
 @pytest.mark.slow
 def test_the_command_writes_the_controller_and_refuses_what_javascript_has_not(tmp_path, capsys):
-    one, out = tmp_path / "new.toml", tmp_path / "js"
-    one.write_text(case_template("rig"))
+    one, out = write(case_template("rig"), tmp_path / "new.toml"), tmp_path / "js"
     for _ in range(2):  # its own file is replaced
         assert main(["export", str(one), "--format", "js", "--out", str(out)]) == 0
     text = (out / "amb_new.js").read_text()

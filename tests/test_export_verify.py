@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 from profiles import examples
-from test_export import PERIOD, compiled, drafts, failed, hard
+from test_export import PERIOD, compiled, drafts, failed, hard, placed
 
 from ambjax import Clock, Scenario
 from ambjax.cases.reader import read_case
@@ -17,9 +17,8 @@ from ambjax.codegen.c99.machine import Compiled
 from ambjax.codegen.numbering import UNREAD
 from ambjax.codegen.points import evaluated
 from ambjax.codegen.twins import LEAST, SIGNALS, Horizon, LoopCase
-from ambjax.codegen.verify import Check, _looped, _stepped, checks_page, checks_verdict, holds, verify
+from ambjax.codegen.verify import Check, _looped, checks_page, checks_verdict, holds, verify
 from ambjax.control import position
-from ambjax.control.processor import Processor
 from ambjax.sensors import Sensor
 from ambjax.signals import Sine
 from ambjax.solvers import RK4
@@ -27,52 +26,10 @@ from ambjax.solvers import RK4
 INF = np.inf
 
 
-@pytest.fixture(scope="module")
-def made():
-    """The paper's laws in double precision, with one set-valued sign; the other signs are smoothed."""
-    cascade = hard(position=position.SlidingMode(1440.0, 2.3), processor=Processor(1.0))
-    return drafts(cascade, ["double"], 4000)["double"]
-
-
-def library(source, one, folder, name):
-    """Compile the exported C with this text as a library."""
-    (folder / name).mkdir()
-    (folder / name / "amb.h").write_text(one.files["amb.h"])
-    (folder / name / "amb.c").write_text(source)
-    said = machine.build([folder / name / "amb.c"], folder / name / "amb.so", *machine.SHARED, "-Wno-error")
-    assert not said
-    return Compiled(folder / name / "amb.so", one.trace, "amb")
-
-
-def frozen(one, names):
-    """The source with these parameters written in as constants."""
-    source = one.files["amb.c"]
-    for x in (x for x in one.trace.parameters if x.name in names):
-        source = re.sub(rf"params->{re.escape(x.name)}\b", f"({x.value!r})", source)
-    return source
-
-
-# --- other parameters ---
-
-
 @pytest.mark.slow
-@compiled
-def test_gains_or_limits_written_as_constants_in_the_c_are_found(made, tmp_path):
-    names = {x.name for x in made.trace.parameters}
-    limits = {x for x in names if x.startswith("limits.")}
-    model = {x for x in names if x.startswith("model.")}
-    checks = {}
-    for what, fixed in {"none": set(), "gains": names - limits - model, "model": model, "limits": limits}.items():
-        controller = library(frozen(made, fixed), made, tmp_path, what)
-        checks[what] = [x for name in made.steps for x in _stepped(name, made, "double", controller)]
-    assert not failed(checks.pop("none"))
-    for what, found in checks.items():  # with the case's parameters nothing is wrong
-        assert {x.name.partition(",")[0] for x in failed(found)} == {"parameters"}, what
-
-
-@pytest.mark.slow
-def test_every_parameter_changes_the_result_at_some_point(made):
+def test_every_parameter_changes_the_result_at_some_point():
     """If the C contained this parameter as a constant, a number or a bit would differ at some point."""
+    made = drafts(hard(position=position.SlidingMode(1440.0, 2.3)), ["double"], 4000)["double"]
     at, should = made.steps["parameters"]
     x = np.concatenate([at.parameters, at.state, at.inputs])
     trace = made.trace
@@ -93,9 +50,6 @@ def test_every_parameter_changes_the_result_at_some_point(made):
         (k,) = (k for k, p in read if p.name == name)
         assert refused[at.parameters[k] == wrong].all()
         assert not refused[at.parameters[k] == trace.parameters[k].value].all()
-
-
-# --- the horizon ---
 
 
 def horizon(samples, of=100):
@@ -119,31 +73,28 @@ def test_a_short_horizon_is_not_decisive():
     assert _looped("float", closed_loop.LoopComparison(horizon(LEAST), 1.001 * closed_loop.TIMES)).verdict == "FAILS"
 
 
-# --- slow: a mutant for each row, and many correct programs ---
-
-
 # For each row of the table a change for which it, of all rows of its kind, fails: the file, and what is replaced.
 STEP, COUNTS = "    uint32_t status = 0u;", "    int failed = 0, faults = 0;"
 ROWS = {
     "compiles": ("amb.c", STEP, f"{STEP}\n    int unused;"),
     "compiles, sanitized": ("amb.c", STEP, f"#ifdef __SANITIZE_ADDRESS__\n#error no\n#endif\n{STEP}"),
     "test program": ("amb_test.c", "return failed > 0 || faults > 0;", "return 1;"),
-    "test program, sanitized": (
-        "amb_test.c",
-        COUNTS,
-        f"{COUNTS}\n    volatile int m = {2**31 - 1};\n    faults += m + 1 > 0;",
-    ),
-    "library": (
-        "amb.c",
-        STEP,
-        f"#ifdef __PIC__\n#if __PIC__ == 2 && !defined(__PIE__)\n#error no\n#endif\n#endif\n{STEP}",
-    ),
+    "test program, sanitized": ("amb_test.c", COUNTS, f"{COUNTS} volatile int m = INT32_MAX; faults += m + 1 > 0;"),
+    "library": ("amb.c", STEP, f"#if __PIC__ == 2 && !defined(__PIE__)\n#error no\n#endif\n{STEP}"),
     "one step, numbers": ("amb.c", "output->v_star = ", "output->v_star = 1.000001 * "),
     "one step, status": ("amb.c", "status |= amb_SINGULAR;", "status |= 0u;"),
     "parameters, numbers": ("amb.c", "params->position.c", "1440.0"),
     "parameters, status": ("amb.c", "params->limits.near", "0.1"),
     "closed loop, dz": ("amb.c", "params->position.c", "((1 + 1e-9) * params->position.c)"),
 }
+# Faults of one program, none of which hides another.
+TOGETHER = [
+    ["compiles"],
+    ["compiles, sanitized", "test program", "library"],
+    ["test program, sanitized", "parameters, numbers", "parameters, status"],
+    ["one step, numbers", "one step, status"],
+    ["closed loop, dz"],
+]
 
 
 @compiled
@@ -153,13 +104,16 @@ def test_every_check_fails_for_a_program_with_its_fault():
     made = drafts(hard(), ["double"], 2000, scenario=scenario)["double"]
     case = LoopCase(hard(), scenario, Clock(200, PERIOD, RK4(1)), 0.005)
     rows = verify({"double": made}, case)
-    assert [x.name for x in rows if not x.ok] == []
-    assert {x.name for x in rows} == set(ROWS)
-    for name, (file, old, new) in ROWS.items():
-        assert old in made.files[file], name
-        mutant = dataclasses.replace(made, files={**made.files, file: made.files[file].replace(old, new)})
-        found = {x.name: x.ok for x in verify({"double": mutant}, case)}
-        assert found[name] is False, (name, found)
+    assert not failed(rows)
+    assert {x.name for x in rows} == set(ROWS) == {name for names in TOGETHER for name in names}
+    for names in TOGETHER:
+        files = dict(made.files)
+        for file, old, new in map(ROWS.get, names):
+            assert old in files[file], names
+            files[file] = files[file].replace(old, new)
+        mutant = {"double": dataclasses.replace(made, files=files)}
+        found = {x.name: x.ok for x in verify(mutant, case if names == ["closed loop, dz"] else None)}
+        assert not any(found[name] for name in names), (names, found)
 
 
 TASKS = pathlib.Path(__file__).parents[1] / "benchmarks" / "tasks" / "sampled"
@@ -173,9 +127,7 @@ TUNED = {
 
 @pytest.mark.thorough
 @compiled
-@pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=pytest.mark.slow if x == "F10-signs" else pytest.mark.thorough) for x in TUNED]
-)
+@pytest.mark.parametrize("name", TUNED)
 def test_correct_c_passes_for_every_seed(name, tmp_path):
     text = (TASKS / f"{name}.toml").read_text().partition("[tune]")[0]
     text = text.replace('kind = "kalman"', 'kind = "kalman"\nw = 393.7')
@@ -183,13 +135,14 @@ def test_correct_c_passes_for_every_seed(name, tmp_path):
         text = re.sub(rf"^{gain} = .*$", f"{gain} = {value}", text, flags=re.MULTILINE)
     (tmp_path / "task.toml").write_text(text.replace("duration = 1.0", "duration = 0.5"))
     case = read_case(tmp_path / "task.toml")
-    made = drafts(case.cascade, count=100, scenario=case.scenario)
-    machines = {to: library(one.files["amb.c"], one, tmp_path, to) for to, one in made.items()}
+    machines = {}
+    for to, one in drafts(case.cascade, count=100, scenario=case.scenario).items():
+        placed(tmp_path, one.files)
+        assert not machine.build([tmp_path / "amb.c"], tmp_path / f"{to}.so", *machine.SHARED)
+        machines[to] = Compiled(tmp_path / f"{to}.so", one.trace, "amb")
     for seed in range(examples(2, 6)):
         scenario = dataclasses.replace(case.scenario, seed=seed)
-        found = closed_loop.compare_loops(
-            LoopCase(case.cascade, scenario, case.clock.with_method(RK4(3)), case.settle), machines
-        )
-        for precision, one in found.items():
+        loop = LoopCase(case.cascade, scenario, case.clock.with_method(RK4(3)), case.settle)
+        for precision, one in closed_loop.compare_loops(loop, machines).items():
             assert one.horizon.decisive, (precision, seed)
             assert one.times < 1, (precision, seed, one.times)
