@@ -54,15 +54,9 @@ def targets_of(node, module):
 
 
 @functools.cache
-def tree_of(module):
-    """Syntax tree of a module."""
-    return ast.parse(MODULES[module].read_text())
-
-
-@functools.cache
 def imports(module, *, top_level=False):
     """Return the names of all modules that a module imports; with `top_level`, without imports inside functions."""
-    tree = tree_of(module)
+    tree = ast.parse(MODULES[module].read_text())
     nodes = tree.body if top_level else ast.walk(tree)
     found = [node for node in nodes if isinstance(node, (ast.Import, ast.ImportFrom))]
     return {target for node in found for target in targets_of(node, module)}
@@ -74,8 +68,9 @@ def ours(names):
 
 @pytest.mark.parametrize("module", MODULES)
 def test_modules_import_from_lower_layers_only(module):
-    here = layer_of(module)
+    here, drawn = layer_of(module), any(name.split(".")[0] == "matplotlib" for name in imports(module))
     assert here is not None, f"{module}: give it a layer in the table LAYERS of tests/test_layers.py"
+    assert not drawn or module.startswith(DRAWING), f"{module} imports matplotlib: only {DRAWING} may"
     for target in ours(imports(module)) - {module}:
         assert target in MODULES, f"{module} imports {target}, which is no file of ours"
         there = layer_of(target)
@@ -107,16 +102,10 @@ def test_ambjax_does_not_import_tuning(module):
 def test_tuning_uses_public_names_only(module):
     for target in ours(imports(module)):
         assert not target.startswith("ambjax.numerics"), f"{module} imports {target}: what it needs is in ambjax.extend"
-    for node in ast.walk(tree_of(module)):
+    for node in ast.walk(ast.parse(MODULES[module].read_text())):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("ambjax"):
             private = [alias.name for alias in node.names if alias.name.startswith("_")]
             assert private in ([], ["__version__"]), f"{module} imports {private} from {node.module}"
-
-
-@pytest.mark.parametrize("module", MODULES)
-def test_only_modules_that_draw_import_matplotlib(module):
-    used = any(name.split(".")[0] == "matplotlib" for name in imports(module))
-    assert not used or module.startswith(DRAWING), f"{module} imports matplotlib: only {DRAWING} may"
 
 
 def test_the_import_is_fast_and_does_not_change_the_configuration():

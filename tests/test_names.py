@@ -2,11 +2,11 @@
 
 import json
 import operator
-import pathlib
 import re
 import warnings
 
 import pytest
+from texts import write
 
 import ambjax
 from ambjax.__main__ import main
@@ -26,19 +26,14 @@ from ambjax.commands.reading import read_with_warnings
         ),
         ({"controller": {"position": {"kind": "lqr"}}}, "kind = \"lqr\": .* Did you mean 'state-feedback'"),
         ({"plant": {"mass": 1.0}}, "plant.mass = 1.0: unknown key. Did you mean 'm'"),
-        ({"plant": {"gap": 1.0}}, "Did you mean 's_0'"),
         ({"plant": {"Bias_Current": 1.0}}, "Did you mean 'i_0'"),
         ({"plant": {"q": 1.0}}, "plant.q = 1.0: unknown key. Did you mean 'disturbance.q_z'"),
         ({"plant": {"u_max": 1.0}}, "Did you mean 'actuator.u_max'"),
-        ({"clock": {"fs": 1e4}}, "Did you mean 'sample_period'"),
         ({"disturbance": {"force": {}}}, "Did you mean 'q_z'"),
         ({"disturbance": {"q_z": {"kind": "sine", "freq": 1.0}}}, "Did you mean 'frequency'"),
-        ({"sensor": {"sigma": 1.0}}, "Did you mean 'std'"),
-        ({"plant": {"saturation": 1.2}}, "Did you mean 'plant.iron.saturation'"),
         ({"plant": {"iron": {"B_sat": 1.2}}}, "Did you mean 'saturation'"),
         ({"plant": {"k_s": 1e5}}, "plant.k_s = 100000.0: unknown key. It follows from mu_0, n, A, s_0 and i_0"),
         ({"m": 2.0}, "m = 2.0: unknown key. Did you mean 'plant.m'"),
-        ({"controller": {"position": {"kind": "PID"}}}, "Did you mean 'pid'"),
         ({"disturbance": {"q_z": {"kind": "step", "unit": "n", "amplitude": 1.0}}}, "Did you mean 'N'"),
         ({"sensor": {"runout": {"speed": 100.0}}}, "sensor.runout.harmonics is missing: it must be a list"),
         ({"plant": {"xyzzy": 1.0}}, "xyzzy = 1.0: unknown key. Keys allowed here"),
@@ -70,21 +65,20 @@ def doubts(plant=None, **tables):
     return implausible(case_from({"plant": GOOD | (plant or {}), "clock": {"duration": 0.1}, "run": {}} | tables))
 
 
-def sine(frequency, amplitude=1.0, unit="N"):
-    return {"disturbance": {"q_z": {"kind": "sine", "unit": unit, "amplitude": amplitude, "frequency": frequency}}}
+def sine(frequency, amplitude=1.0):
+    return {"disturbance": {"q_z": {"kind": "sine", "unit": "N", "amplitude": amplitude, "frequency": frequency}}}
 
 
 def step(start):
     return {"disturbance": {"q_z": {"kind": "step", "unit": "N", "amplitude": 1.0, "start": start}}}
 
 
-def graded(grade):
-    load = {"kind": "unbalance-grade", "grade": grade, "service_speed": 1e3, "speed": 1e3}
-    return {"disturbance": {"q_z": [load, {"kind": "constant"}]}}
-
-
 def runout(amplitude):
     return {"sensor": {"runout": {"speed": 100.0, "harmonics": [{"number": 2, "amplitude": amplitude}]}}}
+
+
+UNBALANCE = {"kind": "unbalance", "unbalance": 1e-6, "speed": 4e5}
+GRADED = {"kind": "unbalance-grade", "grade": 0.0025, "service_speed": 1e3, "speed": 1e3}
 
 
 @pytest.mark.parametrize(
@@ -98,8 +92,7 @@ def runout(amplitude):
     ],
 )
 def test_python_and_the_commands_give_the_same_warnings(text, said, tmp_path, capsys):
-    case = tmp_path / "case.toml"
-    case.write_text(text)
+    case = write(text, tmp_path / "case.toml")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         ambjax.read_case(case)
@@ -122,7 +115,7 @@ def test_python_and_the_commands_give_the_same_warnings(text, said, tmp_path, ca
         (
             {},
             {"processor": {}, "actuator": {"i_max": 2500.0}},
-            "actuator.i_max = 2500 A is 1000 times plant.i_0. Is it in milli",
+            "actuator.i_max = 2500 A is 1000 times plant.i_0. Is it in",
         ),
         ({}, {"processor": {}, "actuator": {"i_max": 2.5}}, None),
         ({"iron": {"saturation": 0.5}}, {}, "saturation = 0.5 T is less than the bias flux density .* = 0.653 T"),
@@ -131,11 +124,7 @@ def test_python_and_the_commands_give_the_same_warnings(text, said, tmp_path, ca
         ({}, sine(50.0, 345.0), None),
         ({}, sine(6000.0), "disturbance.q_f: frequency gives 6000 Hz, not below half the sampling rate, 5000 Hz"),
         ({}, sine(4000.0), None),
-        (
-            {},
-            {"disturbance": {"q_z": {"kind": "unbalance", "unbalance": 1e-6, "speed": 4e5}}},
-            "disturbance.q_f: speed gives 6667 Hz",
-        ),
+        ({}, {"disturbance": {"q_z": UNBALANCE}}, "disturbance.q_f: speed gives 6667 Hz"),
         ({}, {"processor": {}, "clock": {"duration": 0.1, "sample_period": 1e-3}}, "has only 1.5 samples. Give"),
         ({}, {"processor": {}, "sensor": {"bandwidth": 50.0}}, "sensor.bandwidth = 50 Hz is less than twice the"),
         ({}, {"processor": {}, "sensor": {"bits": 8, "std": 1e-7}}, "a step of 3.91e-06 m is 39.1 times the noise"),
@@ -146,8 +135,12 @@ def test_python_and_the_commands_give_the_same_warnings(text, said, tmp_path, ca
         ({}, runout(2e-6), None),
         ({}, step(0.1), "disturbance.q_f: start = 0.1 s, but the run ends at clock.duration = 0.1 s"),
         ({}, step(0.09), None),
-        ({}, graded(0.0025), "disturbance.q_z: grade = 0.0025 mm/s: ISO 21940-11 has G 0.4 to G 4000"),
-        ({}, graded(2.5), None),
+        (
+            {},
+            {"disturbance": {"q_z": [GRADED, {"kind": "constant"}]}},
+            "disturbance.q_z: grade = 0.0025 mm/s: ISO 21940",
+        ),
+        ({}, {"disturbance": {"q_z": GRADED | {"grade": 2.5}}}, None),
         ({}, {"rotor": {"speed": 1.5e5}}, "rotor.speed: 2 times the speed is 5000 Hz, not below half the"),
         ({}, {"rotor": {"speed": 60.0}}, "rotor.speed: the rotor makes 0.0.* revolutions after run.settle"),
         ({}, {"rotor": {"speed": 6e4}}, None),
@@ -158,17 +151,13 @@ def test_python_and_the_commands_give_the_same_warnings(text, said, tmp_path, ca
 )
 def test_inconsistent_numbers_cause_a_warning(plant, tables, said):
     found = doubts(plant, **tables)
-    if said is None:
-        assert found == []
-    else:
-        assert any(re.search(said, line) for line in found), found
+    assert any(re.search(said, line) for line in found) if said else not found, found
 
 
 @pytest.mark.parametrize(("end", "doubted"), [(9.9, False), (10.1, True)])
 def test_a_file_in_milliseconds_causes_a_warning(tmp_path, end, doubted):
     """The run lasts 0.1 s, and the file is 100 times as long."""
-    (tmp_path / "force.csv").write_text(f"0,1\n{end},2\n")
-    load = {"kind": "table", "unit": "N", "file": str(tmp_path / "force.csv")}
+    load = {"kind": "table", "unit": "N", "file": str(write(f"0,1\n{end},2\n", tmp_path / "force.csv"))}
     said = f"disturbance.q_f: the file lasts {end:g} s, the run 0.1 s. Are its times in milliseconds?"
     assert (said in doubts(disturbance={"q_z": load})) == doubted
 
@@ -182,12 +171,10 @@ def test_the_printed_forces_agree_with_the_formulas():
 
 
 @pytest.mark.slow
-def test_check_fails_if_the_magnets_cannot_carry_the_rotor(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_check_fails_if_the_magnets_cannot_carry_the_rotor(capsys, elsewhere):
     heavy = "\n".join(f"{name} = {value}" for name, value in (GOOD | {"m": 40.0}).items())
-    pathlib.Path("case.toml").write_text(f"[plant]\n{heavy}\n[clock]\nduration = 0.001\n")
-    assert main(["check", "case.toml"]) == 1
-    words = "the magnets cannot carry the rotor: their largest force is 364.2 N, below its weight of 392.4 N"
-    assert words in capsys.readouterr().out
-    assert main(["check", "case.toml", "--json"]) == 1
+    case = write(f"[plant]\n{heavy}\n[clock]\nduration = 0.001\n")
+    assert main(["check", case]) == 1
+    assert "their largest force is 364.2 N, below its weight of 392.4 N" in capsys.readouterr().out
+    assert main(["check", case, "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["holds"] is False

@@ -44,35 +44,26 @@ def test_the_kernel_equals_the_rollout():
 
 
 RECORDED = Recorded(Samples(np.array([0.0, 1.0]), np.array([0.0, 1e-5])))
-LAWS = {
-    "paper": CASCADE,
-    "others": Cascade(
-        observer=observer.Complementary(np.linspace(1.0, 10.0, MEMBERS)),
-        position=position.SuperTwisting(),
-        inversion=inversion.ClosedForm(),
-    ),
-}
+OTHERS = Cascade(
+    observer=observer.Complementary(np.linspace(1.0, 10.0, MEMBERS)),
+    position=position.SuperTwisting(),
+    inversion=inversion.ClosedForm(),
+)
+# Without random signals, members share the reference, so the kernel computes its sine with scalars.
+SHARED = dataclasses.replace(SCENARIO, q_z=Constant(0.0), q_v=Pulse(1.0, 1e-4, 2e-4), sensor=None)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("laws", "x64", "changes"),
-    [
-        ("paper", True, {}),
-        ("others", False, {}),
-        # without random signals, members share the reference, so the kernel computes its sine with scalars
-        ("paper", False, {"q_z": Constant(0.0), "q_v": Pulse(1.0, 1e-4, 2e-4), "sensor": None}),
-    ],
+    ("laws", "x64", "scenario"),
+    [(CASCADE, True, SCENARIO), (OTHERS, False, SCENARIO), (CASCADE, False, SHARED)],
     ids=("paper", "others", "shared"),
 )
-def test_the_kernel_compiles_for_a_gpu(laws, x64, changes, monkeypatch):
+def test_the_kernel_compiles_for_a_gpu(laws, x64, scenario, monkeypatch):
     # Lowering for CUDA needs no GPU. A primitive that Triton lacks raises here.
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    scenario = dataclasses.replace(SCENARIO, **changes)
     with jax.enable_x64(x64):
-        run = jax.jit(
-            lambda z: run_on_gpu(LAWS[laws], dataclasses.replace(scenario, initial=z), CLOCK, fold=Metrics(2e-4))
-        )
+        run = jax.jit(lambda z: run_on_gpu(laws, dataclasses.replace(scenario, initial=z), CLOCK, fold=Metrics(2e-4)))
         lowered = run.trace(scenario.initial).lower(lowering_platforms=("cuda",)).as_text()
     assert lowered.count("custom_call @__gpu$xla.gpu.triton") == 1
 

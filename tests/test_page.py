@@ -3,12 +3,12 @@
 import dataclasses
 import json
 import pathlib
-import re
 import tomllib
 
 import browser
 import numpy as np
 import pytest
+from texts import write
 
 from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
@@ -121,46 +121,40 @@ def test_ranges_contain_the_values_of_every_preset(case):
             assert one.low <= value <= one.high, one.path
 
 
-def test_a_case_without_a_processor_is_refused_in_one_line(tmp_path, capsys):
-    path = tmp_path / "paper.toml"
-    path.write_text(case_template("tracking"))
-    assert main(["page", str(path), "--out", str(tmp_path / "page.html")]) == 2
-    said = capsys.readouterr().err.splitlines()
-    assert said[-1].endswith("and this case has none. Add the table [processor].")
-    assert not (tmp_path / "page.html").exists()
+OTHER = RIG.replace('kind = "kalman"\nw = 1000.0', 'kind = "ired-1"')
+TABLE = """
+clock.duration = 0.01
+processor = {}
+disturbance.q_z = [{ kind = "table", file = "force.csv" }, { kind = "constant" }]
+"""
 
 
-def test_a_signal_from_a_file_is_refused_in_one_line(tmp_path, capsys):
-    (tmp_path / "force.csv").write_text("0,1\n1,2\n")
-    load = '[[disturbance.q_z]]\nkind = "table"\nfile = "force.csv"\n[[disturbance.q_z]]\nkind = "constant"\n'
-    (tmp_path / "case.toml").write_text(f"{load}[clock]\nduration = 0.01\n[processor]\n")
-    assert main(["page", str(tmp_path / "case.toml")]) == 2
-    (said,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ambjax")]
-    assert 'disturbance.q_z: kind = "table": a page cannot contain a signal from a file.' in said
+@pytest.mark.parametrize(
+    ("text", "words", "said"),
+    [
+        (case_template("tracking"), "page", "and this case has none. Add the table [processor]."),
+        (TABLE, "page", 'disturbance.q_z: kind = "table": a page cannot contain a signal from a file.'),
+        (RIG, "page --also other.toml", "--also other: it differs from"),
+        (RIG, "simulate --page --member 1", "--page shows the case, not a member"),
+        (RIG, "page --out mine.html", "--out mine.html: the file exists"),
+        (RIG, "page --out page.txt", "--out page.txt"),
+    ],
+)
+def test_what_a_page_cannot_show_or_replace_is_refused(text, words, said, elsewhere, capsys):
+    write("0,1\n1,2\n", "force.csv")
+    write(OTHER, "other.toml")
+    write("mine", "mine.html")
+    case, before = write(text, "rig.toml"), sorted(pathlib.Path().iterdir())
+    assert main([*words.split(), case]) == 2
+    assert said in capsys.readouterr().err.splitlines()[-1]
+    assert sorted(pathlib.Path().iterdir()) == before
+    assert pathlib.Path("mine.html").read_text() == "mine"
 
 
 def test_a_notch_is_refused(case):
     cascade = dataclasses.replace(case.cascade, notch=SynchronousNotch())  # the reader would linearise the loop first
     with pytest.raises(ValueError, match="a page cannot contain a notch"):
         page(dataclasses.replace(case, cascade=cascade))
-
-
-def test_a_case_with_another_structure_is_refused_as_a_preset(tmp_path, capsys):
-    one, other = tmp_path / "rig.toml", tmp_path / "other.toml"
-    one.write_text(RIG)
-    other.write_text(RIG.replace('kind = "kalman"\nw = 1000.0', 'kind = "ired-1"'))
-    assert main(["page", str(one), "--also", str(other), "--out", str(tmp_path / "page.html")]) == 2
-    assert "--also other: it differs from" in capsys.readouterr().err
-
-
-def test_an_unusable_path_of_the_page_is_refused_in_one_line(tmp_path, capsys):
-    one, out = tmp_path / "rig.toml", tmp_path / "page.html"
-    one.write_text(RIG)
-    out.write_text("mine")
-    for wrong in (out, tmp_path, tmp_path / "page.txt"):
-        assert main(["page", str(one), "--out", str(wrong)]) == 2
-        assert len(capsys.readouterr().err.splitlines()) == 1
-    assert out.read_text() == "mine"
 
 
 HOSTILE = "</script><img src=x onerror=\"document.title='owned'\">"
@@ -198,12 +192,16 @@ def settled(tab):
     tab.wait("window.ambjax && ambjax.state.sent > 0 && ambjax.state.members === ambjax.state.sent", 60)
 
 
+def choose(tab, preset):
+    menu = "document.getElementById('preset')"
+    tab.run(f"{menu}.value = {preset}; {menu}.dispatchEvent(new Event('change'))")
+    settled(tab)
+
+
 @pytest.fixture
 def fresh(tab):
     """The tab with the numbers of the case."""
-    tab.run("document.getElementById('preset').value = 0")
-    tab.run("document.getElementById('preset').dispatchEvent(new Event('change'))")
-    settled(tab)
+    choose(tab, 0)
     yield tab
     assert tab.errors == []
 
@@ -222,7 +220,7 @@ def typed(tab, path, text):
 @in_browser
 def test_the_trajectory_with_noise_equals_the_simulator(fresh, case):
     rows = simulate(case).trajectory.rows
-    # equal to the order of rounding; the issue of an error would be at least the noise, 5e-7 m
+    # equal to the order of rounding; an error would be at least the noise, 5e-7 m
     for name, tolerance in (("z", 1e-13), ("z_measured", 1e-13), ("u", 1e-6), ("i", 1e-9), ("r", 0)):
         np.testing.assert_allclose(signal(fresh, name), getattr(rows, name), rtol=0, atol=tolerance, err_msg=name)
     upper = float(case.scenario.plant.i_0) + np.asarray(rows.i)
@@ -244,32 +242,24 @@ def test_the_metrics_equal_the_simulator(fresh, case):
 @in_browser
 def test_the_members_equal_those_of_the_ensemble(fresh, case):
     study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, MEMBERS)
-    errors = np.asarray(
-        run_ensemble(*study.batch(np.arange(MEMBERS)), case.clock, fold=None, record_every=1).trajectory.rows.e_z
-    )
+    batch = study.batch(np.arange(MEMBERS))
+    errors = np.asarray(run_ensemble(*batch, case.clock, fold=None, record_every=1).trajectory.rows.e_z)
     low, high = (np.array(fresh.run(f"Array.from(ambjax.state.envelope.{end})")) for end in ("low", "high"))
     np.testing.assert_allclose([low, high], [errors.min(axis=0), errors.max(axis=0)], rtol=0, atol=1e-12)
     assert fresh.run("ambjax.state.envelope.kept") == MEMBERS
 
 
 @in_browser
-def test_sensitivity_is_that_of_the_linear_analysis(fresh, case):
-    for delay in ("1", "1.25"):
-        typed(fresh, "processor.delay", delay)
-        other = rig(re.sub(r"delay = 1.0", f"delay = {delay}", RIG))
-        system = linearise(other.cascade, other.scenario, other.clock)
-        expected = analyse(system, other.scenario.plant.m, other.clock.sample_period, other.zones)
-        S = fresh.run("({...ambjax.state.answer.S})")
-        size = np.abs(np.asarray(system.sensitivity(np.array(S["f"]))))
-        np.testing.assert_allclose(S["size"], size, rtol=1e-7)
-        assert S["peak"] == pytest.approx(expected.S.height, rel=1e-6)
-        assert (S["stable"], S["zone"]) == (expected.stable, expected.zone)
-
-
-@in_browser
-def test_a_fractional_delay_equals_the_simulator(fresh):
-    typed(fresh, "processor.delay", "0.5")
-    other = rig(RIG.replace("delay = 1.0", "delay = 0.5"))
+@pytest.mark.parametrize("delay", ["1.0", "0.5"])
+def test_sensitivity_and_trajectory_with_a_delay_equal_the_analysis_and_the_simulator(fresh, delay):
+    typed(fresh, "processor.delay", delay)
+    other = rig(RIG.replace("delay = 1.0", f"delay = {delay}"))
+    system = linearise(other.cascade, other.scenario, other.clock)
+    expected = analyse(system, other.scenario.plant.m, other.clock.sample_period, other.zones)
+    S = fresh.run("({...ambjax.state.answer.S})")
+    np.testing.assert_allclose(S["size"], np.abs(np.asarray(system.sensitivity(np.array(S["f"])))), rtol=1e-7)
+    assert S["peak"] == pytest.approx(expected.S.height, rel=1e-6)
+    assert (S["stable"], S["zone"]) == (expected.stable, expected.zone)
     np.testing.assert_allclose(signal(fresh, "z"), simulate(other).trajectory.rows.z, rtol=0, atol=1e-12)
 
 
@@ -288,9 +278,7 @@ def test_a_slider_changes_the_response_and_the_preset_restores_it(fresh):
 
 @in_browser
 def test_the_second_preset_has_its_own_numbers(fresh, tuned):
-    fresh.run("document.getElementById('preset').value = 1")
-    fresh.run("document.getElementById('preset').dispatchEvent(new Event('change'))")
-    settled(fresh)
+    choose(fresh, 1)
     np.testing.assert_allclose(signal(fresh, "z"), simulate(tuned).trajectory.rows.z, rtol=0, atol=1e-12)
     assert HOSTILE in fresh.run("ambjax.caseFile()")
 
@@ -299,9 +287,7 @@ def test_the_second_preset_has_its_own_numbers(fresh, tuned):
 def test_an_extreme_value_loses_the_rotor_and_the_page_reports_it(fresh):
     typed(fresh, "controller.position.k", "0.01")
     typed(fresh, "plant.m", "16")
-    said = fresh.run("document.getElementById('status').textContent")
-    assert said.startswith("The rotor is lost at ")
-    assert "touched down" in said
+    assert fresh.run("document.getElementById('status').textContent").startswith("The rotor is lost at ")
     assert fresh.run("document.getElementById('status').classList.contains('lost')")
     assert fresh.run("ambjax.state.envelope.kept") < MEMBERS
     assert fresh.run("ambjax.state.metrics.lost") == 1
@@ -324,9 +310,7 @@ def test_the_case_file_with_these_numbers_simulates_to_the_same_run(fresh):
         typed(fresh, path, text)
     fresh.click("#write")
     text = fresh.run("document.getElementById('text').value")
-    np.testing.assert_allclose(
-        signal(fresh, "z"), simulate(rig(text)).trajectory.rows.z, rtol=0, atol=1e-12, err_msg=text
-    )
+    np.testing.assert_allclose(signal(fresh, "z"), simulate(rig(text)).trajectory.rows.z, rtol=0, atol=1e-12)
     assert "m = 1.64" in text.split("[controller.model]")[1]
     fresh.click("#tune")
     assert fresh.run("document.getElementById('text').value").startswith("ambjax tune ")
@@ -351,44 +335,27 @@ def test_the_drawing_of_the_machine_shows_the_selected_time(fresh):
 
 
 @in_browser
-def test_every_input_has_a_label(fresh):
-    unnamed = "[...document.querySelectorAll('input, select, textarea')].filter("
-    unnamed += "e => !e.labels.length && !e.ariaLabel).length"
-    assert fresh.run(unnamed) == 0
-
-
-@in_browser
-@pytest.mark.parametrize("width", [390, 1280])
-def test_the_page_does_not_scroll_sideways(fresh, width):
-    fresh.size(width)
-    try:
+def test_every_input_has_a_label_and_the_page_does_not_scroll_sideways(fresh):
+    inputs = "[...document.querySelectorAll('input, select, textarea')]"
+    assert fresh.run(f"{inputs}.filter(e => !e.labels.length && !e.ariaLabel).length") == 0
+    for width in (390, 1280):
+        fresh.size(width)
         fresh.wait(f"innerWidth === {width}")
         assert fresh.run("document.documentElement.scrollWidth") <= width
-    finally:
-        fresh.size(1280)
 
 
 @pytest.mark.slow
-def test_the_command_writes_the_page(tmp_path, capsys):
-    one = tmp_path / "rig.toml"
-    one.write_text(RIG)
-    assert main(["page", str(one), "--also", str(one), "--out", str(tmp_path / "new" / "p.html"), "--json"]) == 0
+def test_the_command_writes_the_page(elsewhere, capsys):
+    one = write(RIG, "rig.toml")
+    assert main(["page", one, "--also", one, "--out", "new/p.html", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert pathlib.Path(found["out"]).stat().st_size == found["bytes"]
 
 
 def test_cases_with_different_numbers_share_a_page(case, monkeypatch):
-    other = case_from(tomllib.loads(RIG.replace('kind = "kalman"\nw = 1000.0', 'kind = "ired-1"')), "other", RIG)
+    other = case_from(tomllib.loads(OTHER), "other", RIG)
     louder = rig(RIG.replace("std = 5e-7", "std = 1e-6"), "louder")
     shown = lambda case, others, path: f"{path}: {[one.name for one in (case, *others)]}"  # noqa: E731
     monkeypatch.setattr(html_page, "page", shown)
     found = html_page.pages([case, other, louder], ["a.toml", "b.toml", "c.toml"])
     assert found == {"page.html": "a.toml: ['rig', 'louder']", "page-2.html": "b.toml: ['other']"}
-
-
-def test_page_is_refused_with_a_member(tmp_path, capsys):
-    path = tmp_path / "rig.toml"
-    path.write_text(RIG)
-    assert main(["simulate", str(path), "--page", "--member", "1", "--out", str(tmp_path / "out")]) == 2
-    assert "--page shows the case, not a member" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
