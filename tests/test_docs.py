@@ -13,6 +13,7 @@ import re
 import numpy as np
 import pytest
 from reference import benchmarks, case_file, commands, metrics, page_outputs, site
+from texts import write
 
 import ambjax
 from ambjax.__main__ import main
@@ -87,13 +88,9 @@ def test_the_lines_of_use_in_a_docstring_run(thing):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_link_to_the_code_has_a_target(page):
+def test_every_link_to_the_code_has_a_target_and_every_path_exists(page):
     for _, target in ROLE.findall(page.read_text()):
         assert found(target) is not None
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_path_in_the_pages_exists(page):
     for path in re.findall(r"`((?:ambjax|tuning|tests|benchmarks|docs)/[\w/.]*)`", page.read_text()):
         assert (ROOT / path).exists(), path
 
@@ -141,14 +138,10 @@ def test_defaults_are_those_of_the_reader(table):
 def as_number(text):
     """Return a default as an int or a float; None if it is no finite number."""
     try:
-        return int(text)
-    except ValueError:
-        pass
-    try:
-        number = float(text)
-    except ValueError:
+        number = ast.literal_eval(text)
+    except (SyntaxError, ValueError):
         return None
-    return number if math.isfinite(number) else None
+    return number if isinstance(number, int | float) and math.isfinite(number) else None
 
 
 def numbers_of(raw):
@@ -161,9 +154,8 @@ def numbers_of(raw):
 
 @pytest.mark.slow
 def test_metrics_and_arrays_are_those_of_the_files(tmp_path):
-    case = tmp_path / "short.toml"
-    case.write_text("[clock]\nduration = 0.01\n[rotor]\nspeed = 30000.0\n")
-    assert main(["simulate", str(case), "--out", str(tmp_path / "run")]) == 0
+    case = write("[clock]\nduration = 0.01\n[rotor]\nspeed = 30000.0\n", str(tmp_path / "short.toml"))
+    assert main(["simulate", case, "--out", str(tmp_path / "run")]) == 0
     written = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert {row[0].strip("`") for row in metrics.rows()} == {*written, "trajectory_deviation"}  # the last with --member
     with np.load(tmp_path / "run" / "trajectory.npz") as arrays:
@@ -172,12 +164,8 @@ def test_metrics_and_arrays_are_those_of_the_files(tmp_path):
 
 def test_every_command_has_its_section():
     modules = (ROOT / "ambjax" / "commands").glob("*.py")
-    runs = {path.stem for path in modules if "run" in functions(path)}
+    runs = {path.stem for path in modules if "\ndef run(" in path.read_text()}
     assert set(commands.commands()) == {f"ambjax {name}" for name in runs | {"tune"}}
-
-
-def functions(path):
-    return {node.name for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)}
 
 
 def test_the_readme_of_the_benchmarks_equals_the_generated_page():
@@ -188,7 +176,6 @@ def test_the_readme_of_the_benchmarks_equals_the_generated_page():
 def test_the_comparison_states_the_measured_errors_and_voltages_of_the_structures():
     cases = json.loads((ROOT / "benchmarks" / "results" / "laws.json").read_text())["cases"]
     text = (ROOT / "docs" / "compare.md").read_text()
-    names = ("bearing", "rig", "F20", "G20")
     titles = {
         "cascade-integral": "cascade with an integral",
         "super-twisting": "cascade with super-twisting",
@@ -196,24 +183,14 @@ def test_the_comparison_states_the_measured_errors_and_voltages_of_the_structure
         "lqg": "LQG",
     }
     for law, title in titles.items():
-        rows = [cases[name]["structures"][law] for name in names]
+        rows = [cases[name]["structures"][law] for name in ("bearing", "rig", "F20", "G20")]
         cells = [f"{1e6 * row['rms_error_median_m'][0]:.3g} µm, {row['rms_u_V'][0]:.3g} V" for row in rows]
         assert f"| {title} | {' | '.join(cells)} |\n" in text
-    assert {case["seeds"] for case in cases.values()} == {5}  # as the text says
-    # the sentences below the table
-    medians = {
-        name: {law: row["rms_error_median_m"] for law, row in cases[name]["structures"].items()} for name in names
-    }
-    best = [min(medians[name], key=lambda law: medians[name][law][0]) for name in names]
-    assert best == ["cascade-integral", "cascade-integral", "super-twisting", "cascade-integral"]
-    assert f"{1 - medians['F20']['super-twisting'][0] / medians['F20']['cascade-integral'][0]:.0%}" == "6%"
-    for name in ("bearing", "rig"):
-        three = [medians[name][law] for law in ("cascade-integral", "super-twisting", "pid")]
-        assert max(low for _, low, _ in three) < min(high for *_, high in three)
-    factors = {law: f"{medians['G20'][law][2] / medians['G20'][law][1]:.0f}" for law in ("pid", "super-twisting")}
+    # the numbers below the table
+    spreads = {law: row["rms_error_median_m"] for law, row in cases["G20"]["structures"].items()}
+    factors = {law: f"{high / low:.0f}" for law, (_, low, high) in spreads.items()}
     assert f"a factor of {factors['pid']} for PID, and of {factors['super-twisting']} for super-twisting" in text
-    worst = max(cases["F20"]["structures"]["lqg"]["lost"])
-    assert f"lose {worst} of 500 members" in text
+    assert f"lose {max(cases['F20']['structures']['lqg']['lost'])} of 500 members" in text
 
 
 @pytest.mark.slow

@@ -4,9 +4,10 @@ The plant has a coil with its own current on each side; the law a boundary layer
 of its own names. Nothing in the package knows either.
 """
 
+import collections
 import dataclasses
 import itertools
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -38,14 +39,8 @@ from ambjax.simulation.metrics import Metrics
 from ambjax.solvers import AdaptiveRodas3, choose_method
 from ambjax.theorem.conditions import check
 
-
-class Coils(NamedTuple):
-    """Displacement (m), velocity (m/s), and the current of the upper and the lower coil (A)."""
-
-    z: Any
-    z_dot: Any
-    i_1: Any
-    i_2: Any
+# Displacement (m), velocity (m/s), and the current of the upper and the lower coil (A).
+Coils = collections.namedtuple("Coils", ["z", "z_dot", "i_1", "i_2"])
 
 
 @record
@@ -122,7 +117,6 @@ SCENARIO = Scenario(
 )
 NOISY = dataclasses.replace(SCENARIO, sensor=Sensor(2e-7, 1e-5, 1e-5))
 CLOCK = Clock(600, 1e-4)
-METHOD = choose_method(CASCADE, NOISY, 1e-4, reverse=True)
 RHO, SKEW = "controller.position.rho", "plant.skew"
 
 
@@ -180,7 +174,15 @@ SPREAD = Spread(((SKEW, Normal(0.02)), (RHO, Percent(20.0)), ("plant.m", Percent
 
 @pytest.mark.slow
 def test_the_numbers_of_a_custom_law_and_plant_are_spread():
-    study = Study(CASCADE, NOISY, Clock(200, 1e-4, METHOD), 0.01, SPREAD, seed=3, members=12)
+    study = Study(
+        CASCADE,
+        NOISY,
+        Clock(200, 1e-4, choose_method(CASCADE, NOISY, 1e-4, reverse=True)),
+        0.01,
+        SPREAD,
+        seed=3,
+        members=12,
+    )
     columns = study.columns(0, 12)
     assert not columns["lost"].any()
     assert len(set(columns["settled_rms_error_m"])) == 12
@@ -194,22 +196,15 @@ def test_the_numbers_of_a_custom_law_and_plant_are_spread():
 
 
 def test_a_law_without_the_base_class_is_refused():
-    class Bare:
-        pass
-
-    wrong: Any = Bare()
-    cascade = dataclasses.replace(CASCADE, current=wrong)
-    with pytest.raises(ValueError, match=r"controller\.current = Bare: .* ambjax\.extend\.CurrentLaw"):
-        rollout(cascade, SCENARIO, CLOCK)
+    wrong: Any = object()
+    with pytest.raises(ValueError, match=r"controller\.current = object: .* ambjax\.extend\.CurrentLaw"):
+        rollout(dataclasses.replace(CASCADE, current=wrong), SCENARIO, CLOCK)
 
 
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (
-            lambda model, inputs: (inputs[0].z if inputs[0].z > 0 else 0.0, ()),
-            r"TracerBoolConversionError.* jnp\.where",
-        ),
+        (lambda model, inputs: (1.0 if inputs[0].z > 0 else 0.0, ()), r"TracerBoolConversionError.* jnp\.where"),
         (lambda model, inputs: inputs[0].z, "its call must return the number v_star and the rate of its state"),
         (lambda model, inputs: (jnp.ones(2) * inputs[0].z, ()), r"Law must return the number v_star .*\(2,\)"),
     ],

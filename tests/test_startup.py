@@ -6,11 +6,11 @@ import sys
 import types
 
 import pytest
+from texts import write
 
 import ambjax
 
 ROOT = pathlib.Path(__file__).parent.parent
-SHORT = "[clock]\nduration = 0.01\n"
 
 
 def loaded(*words):
@@ -37,16 +37,13 @@ def test_help_and_version_import_no_numerical_package(program, option):
     ("simulate", {"scipy", "optax", "tuning", "ambjax.commands.ensemble", "ambjax.paper", "ambjax.theorem"}),
 ])  # fmt: skip
 def test_a_command_imports_only_the_packages_that_it_needs(tmp_path, command, unneeded):
-    case = tmp_path / "short.toml"
-    case.write_text(SHORT)
-    out = ("--out", str(tmp_path)) if command == "simulate" else ()
-    found = loaded("ambjax", command, str(case), *out)
+    case = write("[clock]\nduration = 0.01\n", tmp_path / "short.toml")
+    found = loaded("ambjax", command, case, *(("--out", tmp_path) if command == "simulate" else ()))
     assert "jax" in found
     assert not found & unneeded
 
 
 def test_every_name_of_the_stub_is_public():
-    assert "rollout" in ambjax.__all__
     modules = {name for name, home in ambjax._MODULES.items() if home == "ambjax"}
     assert {*ambjax.__all__, *modules} == set(ambjax._MODULES) <= set(dir(ambjax))
     assert all(name in ambjax._MODULES or name.startswith("_") for name in dir(ambjax))
@@ -64,8 +61,3 @@ assert isinstance(rollout, types.FunctionType) and ambjax.rollout is rollout
 """
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
     assert isinstance(ambjax.rollout, types.FunctionType)
-
-
-def test_an_unknown_public_name_raises_attribute_error():
-    with pytest.raises(AttributeError, match="module 'ambjax' has no attribute 'Rolout'"):
-        ambjax.Rolout  # noqa: B018

@@ -1,6 +1,5 @@
 """The environment does not affect a run: streams, links, other runs, a matplotlibrc, a missing home folder."""
 
-import argparse
 import errno
 import io
 import os
@@ -26,7 +25,6 @@ from ambjax.results import outputs
 from tuning.__main__ import main as tune
 
 SHORT = "[clock]\nduration = 0.01\n"
-STUDY = SHORT + "[sensor]\nstd = 1e-9\n"
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -42,24 +40,17 @@ class Stuck(io.StringIO):
         raise OSError(self.number, os.strerror(self.number))
 
 
-# --- streams ---
-
-
-def answered(words, run):
-    return run_command(parser(), words, run)
-
-
 @pytest.mark.parametrize(("number", "code"), [(None, 1), (errno.EPIPE, 1), (errno.ENOSPC, 2)])
 @pytest.mark.parametrize("flags", [[], ["--json"]])
 def test_the_exit_code_does_not_change_if_the_reader_closes_stdout(number, code, flags, monkeypatch, capsys):
     if number is not None:
         monkeypatch.setattr(sys, "stdout", Stuck(number))
 
-    def run(args: argparse.Namespace):
+    def run(args):
         print("no")
         return 1, {}
 
-    assert answered(["template", *flags], run) == code
+    assert run_command(parser(), ["template", *flags], run) == code
     assert ("No space left" in capsys.readouterr().err) == (code == 2)
 
 
@@ -71,9 +62,8 @@ def test_help_and_version_with_a_failing_stdout(number, code, flag, monkeypatch,
     assert capsys.readouterr().err.count("\n") == (code == 2)
 
 
-@pytest.mark.parametrize("number", [pytest.param(errno.EPIPE, marks=pytest.mark.slow), errno.ENOSPC])
-def test_a_failing_stderr_does_not_stop_the_command(number, monkeypatch):
-    monkeypatch.setattr(sys, "stderr", Stuck(number))
+def test_a_failing_stderr_does_not_stop_the_command(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Stuck(errno.ENOSPC))
     monkeypatch.setattr(simulate, "tqdm", lambda **options: tqdm(**options | {"delay": 0, "mininterval": 0}))
     assert main(["simulate", write(SHORT), "--out", "there"]) == 0
     # without a speed there is no run-up
@@ -94,11 +84,8 @@ def test_an_error_of_the_device_is_reported_in_one_line(said, capsys):
     def run(args):
         raise RuntimeError(said)
 
-    assert answered(["template"], run) == 2
+    assert run_command(parser(), ["template"], run) == 2
     assert capsys.readouterr().err == f"ambjax: {said[:13] or 'RuntimeError'}\n"
-
-
-# --- other runs ---
 
 
 def test_a_folder_accepts_one_run_at_a_time():
@@ -121,17 +108,12 @@ def test_two_runs_without_a_given_folder_use_two_folders(monkeypatch):
 
 
 def test_a_search_in_a_folder_in_use_is_refused_and_changes_nothing(capsys):
-    out = pathlib.Path("out")
-    (out / "checkpoints").mkdir(parents=True)
-    (out / "checkpoints" / "round-1.npz").touch()
-    (out / "report.json").touch()
-    with locked(out):
-        assert tune([write(STUDY), "--out", "out"]) == 2
+    pathlib.Path("out/checkpoints").mkdir(parents=True)
+    pathlib.Path("out/checkpoints/round-1.npz").touch()
+    with locked(pathlib.Path("out")):
+        assert tune([write(SHORT), "--out", "out"]) == 2
     assert "--out out: another run is using this directory" in capsys.readouterr().err
-    assert (out / "checkpoints" / "round-1.npz").exists()
-
-
-# --- folders and links ---
+    assert pathlib.Path("out/checkpoints/round-1.npz").exists()
 
 
 @pytest.mark.parametrize("name", simulate.WRITTEN)
@@ -155,16 +137,12 @@ def test_nothing_is_written_through_a_link():
 
 def test_names_that_the_system_refuses_are_reported_in_one_line(capsys):
     pathlib.Path("loop").symlink_to("loop")
-    long = write(STUDY, chr(0x10400) * 62 + ".toml")
-    for argv in (["ensemble", write(STUDY), "--members", "2", "--out", "loop"], ["simulate", long]):
+    long = write(SHORT, chr(0x10400) * 62 + ".toml")
+    for argv in (["simulate", write(SHORT), "--out", "loop"], ["simulate", long]):
         assert main(argv) == 2
-        err = capsys.readouterr().err
-        assert err.splitlines()[-1].startswith("ambjax: --out ")
-        assert "cannot write there" in err
-        assert "Traceback" not in err
-
-
-# --- what a process finds ---
+        (said,) = capsys.readouterr().err.splitlines()
+        assert said.startswith("ambjax: --out ")
+        assert "cannot write there" in said
 
 
 def test_no_home_folder_and_a_full_cache_cause_no_error_and_no_message(monkeypatch):
