@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete
+from texts import write
 
 from ambjax import Cascade, Clock, Scenario
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
 from ambjax.commands.acceptance import acceptance
-from ambjax.compiler.short_compilation import QUICKEST, supported
 from ambjax.control import current, inversion, position
 from ambjax.linear import StateSpace, Zones, frequency_lines, linearise, loop_quantities, peak
 from ambjax.linear.margins import DECAYED, decayed_end, whole_end
@@ -92,11 +92,7 @@ def test_in_continuous_time_the_band_ends_where_S_is_1_for_good(gamma):
 def test_the_limits_of_the_tuner_see_a_peak_outside_the_band_of_the_case():
     """The derivative-free search of the tuner finds the peak of the analysis over the whole range, to 1e-6."""
     system = jax.tree.map(jnp.asarray, resonance(PERIOD))
-    find = jax.jit(
-        lambda system: loop_quantities(system, jnp.asarray(True), 1.0, 5e2, 1.0, delay=False),
-        compiler_options=supported(QUICKEST),
-    )
-    found = find(system)
+    found = jax.jit(lambda system: loop_quantities(system, jnp.asarray(True), 1.0, 5e2, 1.0, delay=False))(system)
     one = resonance(PERIOD)
     expected = peak(one, lambda f: np.abs(one.sensitivity(f)), 1.0, 0.5 / PERIOD)
     assert found.sensitivity == pytest.approx(expected.height, rel=1e-6)
@@ -110,18 +106,13 @@ def test_the_lines_of_an_injection_reach_the_end_of_the_band():
 
 
 @pytest.mark.slow
-def test_the_commands_say_that_a_larger_peak_lies_outside_the_band_of_the_case(tmp_path, capsys):
+def test_the_commands_say_that_a_larger_peak_lies_outside_the_band_of_the_case(elsewhere, capsys):
     """A 50 kHz bearing with a peak above 5 kHz, and a case whose band ends at 2 kHz."""
-    path = tmp_path / "case.toml"
-    path.write_text(BEARING)
-    out = ["--out", str(tmp_path / "out"), "--force"]
-    assert main(["sensitivity", str(path), *out]) == 0
+    assert main(["sensitivity", write(BEARING), "--out", "out"]) == 0
     text = capsys.readouterr().out
-    summary = json.loads((tmp_path / "out" / "sensitivity.json").read_text())
-    loop, verdict, _ = acceptance(read_case(path))  # the first part of `ambjax check`
-    whole = pathlib.Path(tmp_path / "whole.toml")
-    whole.write_text(BEARING.replace("f_high = 2e3, ", ""))
-    main(["sensitivity", str(whole), *out, "--json"])
+    summary = json.loads(pathlib.Path("out/sensitivity.json").read_text())
+    loop, verdict, _ = acceptance(read_case("case.toml"))  # the first part of `ambjax check`
+    main(["sensitivity", write(BEARING.replace("f_high = 2e3, ", ""), "whole.toml"), "--json"])
     full = json.loads(capsys.readouterr().out)
     assert full["zone"] == "D"
     assert 5000 < full["frequency_hz"] < 5300
@@ -135,7 +126,5 @@ def test_the_commands_say_that_a_larger_peak_lies_outside_the_band_of_the_case(t
     said = f"|S| is larger: {full['peak']:.4g} at {full['frequency_hz']:.4g} Hz (zone D)."
     assert said in text
     assert any(said in line for line in verdict)
-    assert verdict[0].startswith("Sensitivity: zone A, largest |S| ")
-    assert "an end of the measured band, so this value is not a peak" in text
     assert summary["injected_at_band_edge"]
     assert 5000 < full["injected_frequency_hz"] < 5300

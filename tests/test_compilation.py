@@ -34,19 +34,15 @@ jax.tree_util.register_dataclass(Counting)
 def variations():
     """The same structure with other numbers, and the same numbers in other types."""
     law, world = Counting(), NOISY
+    other = Scenario(Plant(m=0.6, g=9.8), Sine(1e-3, 1.0), q_v=Pulse(2.0, 0.7, 1.2), sensor=Sensor(2e-6), u_max=100.0)
+    yield "plant, signals and limit", law, inversion.Adaptive(), other
     yield "gains", Counting(c=20.0, k=26.0, p=20.0), inversion.Adaptive(gamma=8e4), world
-    yield "plant", law, inversion.Adaptive(), dataclasses.replace(world, plant=Plant(m=0.6, g=9.8))
-    yield "amplitude", law, inversion.Adaptive(), dataclasses.replace(world, reference=Sine(1e-3, 1.0))
-    yield "noise", law, inversion.Adaptive(), dataclasses.replace(world, sensor=Sensor(2e-6, 0.0, 0.0))
     yield "seed", law, inversion.Adaptive(), dataclasses.replace(world, seed=5, member=2)
-    yield "limit", law, inversion.Adaptive(), dataclasses.replace(world, u_max=100.0)
     yield "NumPy", Counting(np.float64(20.0), np.float32(25.0), np.asarray(25.0)), inversion.Adaptive(), world
     yield "JAX", Counting(jnp.asarray(20.0), jnp.float32(25.0), 25.0), inversion.Adaptive(), world
     yield "integer gains", Counting(c=20, k=26, p=20), inversion.Adaptive(), world
-    yield "NumPy integer", Counting(c=np.int32(20)), inversion.Adaptive(), world
     yield "integer limit", law, inversion.Adaptive(), dataclasses.replace(world, u_max=200)
     yield "integer amplitude", law, inversion.Adaptive(), dataclasses.replace(world, q_v=Pulse(1, 0.8, 1.3))
-    yield "NumPy seed", law, inversion.Adaptive(), dataclasses.replace(world, seed=np.int32(4))
     yield "unsigned seed", law, inversion.Adaptive(), dataclasses.replace(world, seed=np.uint32(4))
     yield "JAX seed", law, inversion.Adaptive(), dataclasses.replace(world, seed=jnp.asarray(5), member=np.int64(2))
 
@@ -56,9 +52,7 @@ def compiled(caplog, *case):
     with jax.log_compiles(), caplog.at_level("WARNING"):
         rollout(*case, record_every=0)
     # the name of a rollout on the fast path, and without it
-    return [
-        message for message in caplog.messages if message.startswith(("Compiling jit(marked)", "Compiling jit(run)"))
-    ]
+    return [said for said in caplog.messages if said.startswith(("Compiling jit(marked)", "Compiling jit(run)"))]
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +65,8 @@ def warm():
 def test_other_numbers_never_recompile(what, warm, caplog):
     _, law, invert, scenario = what
     before = Counting.traces
-    kernels = compiled(caplog, Cascade(position=law, inversion=invert), scenario, SHORT)
+    assert not compiled(caplog, Cascade(position=law, inversion=invert), scenario, SHORT)
     assert Counting.traces == before
-    assert not kernels, kernels
 
 
 def test_a_change_of_structure_recompiles(caplog):
