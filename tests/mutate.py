@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 from mutations import MUTATIONS, Mutation
@@ -31,9 +31,9 @@ PASSED, FAILED = 0, 1
 KILLED, SURVIVED = "killed", "SURVIVED"
 
 
-def mutated(mutation: Mutation, root: pathlib.Path = ROOT) -> str:
+def mutated(mutation: Mutation) -> str:
     """Return the text of the mutated file. Raises ValueError if the mutation does not fit the file."""
-    path, where = root / mutation.file, f"{mutation.file}: '{mutation.fault}'"
+    path, where = ROOT / mutation.file, f"{mutation.file}: '{mutation.fault}'"
     if not path.exists():
         raise ValueError(f"{where}: there is no such file. Adapt it in tests/mutations.py.")
     text = path.read_text(encoding="utf-8")
@@ -51,63 +51,56 @@ def sample(mutations: Sequence[Mutation], share: int) -> list[Mutation]:
     return by_checksum[: math.ceil(len(mutations) / share)]
 
 
-def run(root: pathlib.Path, change: Mutation | None, *words: str) -> tuple[int | None, str]:
+def run(change: Mutation | None, *words: str) -> tuple[int | None, str]:
     """Run pytest in a copy of the project in which one file is changed. Return its exit code and output."""
     with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
         copy = pathlib.Path(folder).resolve()
         for name in COPIED:
-            if (root / name).is_dir():
-                shutil.copytree(root / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
-            elif (root / name).exists():
-                shutil.copy2(root / name, copy / name)
+            if (ROOT / name).is_dir():
+                shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+            else:
+                shutil.copy2(ROOT / name, copy / name)
         if change:
-            (copy / change.file).write_text(mutated(change, root), encoding="utf-8")
+            (copy / change.file).write_text(mutated(change), encoding="utf-8")
         cache = {"JAX_COMPILATION_CACHE_DIR": str(ROOT / ".pytest_cache" / "programs")}
         output = copy / "output.txt"
+        command = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "", "-p", "no:cacheprovider", *words]
+        environment = cache | os.environ | {"PYTHONPATH": str(copy)}
+        limit = LIMIT_S if change else ALL_LIMIT_S
         with output.open("w") as file:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "pytest", "-q", "-x", "-m", "", "-p", "no:cacheprovider", *words],
-                cwd=copy,
-                env=cache | os.environ | {"PYTHONPATH": str(copy)},
-                stdout=file,
-                stderr=file,
-            )
             try:
-                code = process.wait(LIMIT_S if change else ALL_LIMIT_S)
+                done = subprocess.run(command, cwd=copy, env=environment, stdout=file, stderr=file, timeout=limit)
+                code = done.returncode
             except subprocess.TimeoutExpired:
                 code = None
-                process.kill()
-                process.wait()
         return code, output.read_text(encoding="utf-8", errors="replace")
 
 
-def verdict(mutation: Mutation, root: pathlib.Path = ROOT) -> str:
+def verdict(mutation: Mutation) -> str:
     """Return KILLED, SURVIVED, or a text with the reason why the test gave no verdict."""
-    code, output = run(root, mutation, "-n", "0", mutation.test)
+    code, output = run(mutation, "-n", "0", mutation.test)
     if code in (PASSED, FAILED):
         return SURVIVED if code == PASSED else KILLED
     return f"NOT JUDGED (exit code of pytest: {code}): {output.strip()[-300:]}"
 
 
-def hunt(
-    mutations: Sequence[Mutation], root: pathlib.Path = ROOT, jobs: int = 2, say: Callable[[str], None] = print
-) -> int:
+def hunt(mutations: Sequence[Mutation], jobs: int) -> int:
     """Test all mutations and print the verdicts. Return the exit code."""
     tests = sorted({mutation.test for mutation in mutations})
-    say(f"{len(tests)} tests without mutations ...")
-    code, output = run(root, None, "-n", str(jobs), "--dist", "loadscope", *tests)
+    print(f"{len(tests)} tests without mutations ...", flush=True)
+    code, output = run(None, "-n", str(jobs), "--dist", "loadscope", *tests)
     if code != PASSED:
-        say(f"{output}\nThe tests do not pass without mutations: mend them first.")
+        print(f"{output}\nThe tests do not pass without mutations: mend them first.")
         return 1
 
     def one(mutation: Mutation) -> str:
-        found = verdict(mutation, root)
-        say(f"{found}: {mutation.fault} [{mutation.test}]")
+        found = verdict(mutation)
+        print(f"{found}: {mutation.fault} [{mutation.test}]", flush=True)
         return found
 
     with ThreadPoolExecutor(jobs) as pool:
         found = list(pool.map(one, mutations))
-    say(f"{found.count(KILLED)} of {len(found)} mutations were killed.")
+    print(f"{found.count(KILLED)} of {len(found)} mutations were killed.")
     return int(found.count(KILLED) < len(found))
 
 
@@ -120,7 +113,7 @@ def main(argv: list[str] | None = None) -> int:
     chosen = [m for m in MUTATIONS if not args.words or any(w in f"{m.fault} {m.file} {m.test}" for w in args.words)]
     if not chosen:
         parser.error(f"no mutation has {' or '.join(args.words)} in its text.")
-    return hunt(sample(chosen, max(args.share, 1)), jobs=args.jobs, say=lambda text: print(text, flush=True))
+    return hunt(sample(chosen, max(args.share, 1)), args.jobs)
 
 
 if __name__ == "__main__":

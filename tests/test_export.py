@@ -209,8 +209,7 @@ def test_a_refused_reading_is_replaced_by_the_expected_reading(name):
     for value in wrong(getattr(guard, name)):
         bad = inputs._replace(**{name: jnp.asarray(value)})
         after, found, status = step(memory, bad)
-        assert status.refused
-        assert not any((status.safe, status.failed, status.invalid))
+        assert (status.refused, status.safe, status.failed, status.invalid) == (True, False, False, False)
         assert (after.laws, after.last, found) == (should.laws, should.last, answer)
         assert (after.watch.expected, after.watch.left) == (should.watch.expected, guard.samples - 1)
         first = step(controller.start(), bad)
@@ -237,11 +236,9 @@ def test_after_a_failed_step_the_next_readings_are_accepted():
     """No law has stepped, so that nothing predicts these readings; a refused one gives u = 0."""
     controller, _, _, inputs, _ = stepping(hard())
     parameters, memory, _, period = arguments(controller)
-    broken = jax.tree.map(lambda x: x, parameters)._replace(
-        controller=dataclasses.replace(
-            parameters.controller, current=dataclasses.replace(parameters.controller.current, k_i=jnp.asarray(np.nan))
-        )
-    )
+    laws = parameters.controller
+    wrong = dataclasses.replace(laws, current=dataclasses.replace(laws.current, k_i=jnp.asarray(np.nan)))
+    broken = parameters._replace(controller=wrong)
     read, far = frozenset(StepInputs._fields), inputs._replace(z=jnp.asarray(-2e-3))
     memory, answer, status = controller.step(broken, memory, far, period, read)
     assert (status.failed, status.refused, memory.started, answer.u) == (True, False, False, 0)
@@ -326,10 +323,9 @@ def test_an_export_is_reproducible_and_a_gain_changes_one_number():
 def test_every_number_is_symbolic_and_declared():
     made = text(position=Layered(), to="float")
     header, source = made["amb.h"], made["amb.c"]
-    fields = {field.name: field for field in dataclasses.fields(Plant) if field.metadata.get("leaf")}
-    for name, field in fields.items():
-        assert f"params->model.{name}" in source
-        assert f"amb_real {name}; /* [{field.metadata['unit']}, " in header
+    for field in (one for one in dataclasses.fields(Plant) if one.metadata.get("leaf")):
+        assert f"params->model.{field.name}" in source
+        assert f"amb_real {field.name}; /* [{field.metadata['unit']}, " in header
         assert field.metadata["doc"] in header
     assert "params->position.auto_" in source
     assert "amb_real auto_; /* [m/s^2, above 1e-30 and at most 1e+30] reaching gain, under a word of C */" in header
@@ -488,8 +484,7 @@ def test_only_files_of_an_earlier_export_of_the_same_prefix_are_replaced(case, t
     assert main(["export", str(case), "--out", str(out)]) == 0
     case.write_text(CASE.replace("0.01", "0.02"))
     before = contents(out)
-    for name in VERIFIED:  # of the controller that was there before
-        (out / name).write_text(MARK.format(p="rotor"))
+    placed(out, dict.fromkeys(VERIFIED, MARK.format(p="rotor")))  # of the controller that was there before
     assert main(["export", str(case), "--out", str(out), "--precision", "double"]) == 0
     after = contents(out)
     assert set(after) == set(before)
