@@ -96,18 +96,6 @@ def plant_step(machine=None, sensor=None, **inputs):
     return memory, first, step(parameters, memory, ports._replace(**{k: jnp.asarray(x) for k, x in inputs.items()}))
 
 
-def test_the_first_step_reads_the_initial_state_and_the_second_integrates():
-    memory, (outputs, status), (after, later, _) = plant_step(u=10.0)
-    assert outputs.z_true == memory.motion.z == 5e-5
-    assert memory.started
-    assert not any(status)
-    assert later.z_true != outputs.z_true
-    assert after.last == 10.0  # applied one sample late, so that it has not moved the current yet
-    assert after.before == (0.0,)
-    _, _, (_, without, _) = plant_step(u=0.0)
-    assert without.i_true == later.i_true
-
-
 def test_a_rotor_beyond_the_clearance_is_lost_and_frozen():
     _, (_, first), (after, outputs, status) = plant_step({"clearance": 1e-5}, u=10.0)
     assert (first.touched, status.touched, status.diverged) == (True, True, False)

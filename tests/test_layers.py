@@ -45,12 +45,9 @@ def targets_of(node, module):
     """Return the modules that an import statement names: for `from a import b`, a.b if that is a module, else a."""
     if isinstance(node, ast.Import):
         return [alias.name for alias in node.names]
-    base = node.module or ""
-    if node.level:
-        package = module if MODULES[module].name == "__init__.py" else module.rpartition(".")[0]
-        up = package.split(".")[: len(package.split(".")) - node.level + 1]
-        base = ".".join([*up, *([base] if base else [])])
-    return [f"{base}.{alias.name}" if f"{base}.{alias.name}" in MODULES else base for alias in node.names]
+    assert not node.level, f"{module}: write the whole name of the module in place of a relative import"
+    both = [(f"{node.module}.{alias.name}", node.module) for alias in node.names]
+    return [inner if inner in MODULES else outer for inner, outer in both]
 
 
 @functools.cache

@@ -106,14 +106,6 @@ def test_loads_in_a_list_schedules_omitted_gains_and_the_initial_state_have_slid
     np.testing.assert_array_equal(parameter_values(rig(filled(lines, given, values))), expected)
 
 
-def test_a_changed_plant_does_not_change_the_controller_s_model(case):
-    (mass,) = (one for one in sliders(case, []) if one.path == "plant.m")
-    lines, _ = editable_lines(case.text, [mass])
-    document = tomllib.loads(filled(lines, [mass], [2.0]))
-    assert document["plant"]["m"] == 2.0
-    assert document["controller"]["model"] == {"m": mass.value}
-
-
 def test_ranges_contain_the_values_of_every_preset(case):
     louder = rig(RIG.replace("c = 2900.0", "c = 9e5").replace("u_max = 48.0", "u_max = 1.0"))
     for one in sliders(case, [louder]):
