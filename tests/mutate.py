@@ -79,9 +79,8 @@ def run(change: Mutation | None, *words: str) -> tuple[int | None, str]:
 def verdict(mutation: Mutation) -> str:
     """Return KILLED, SURVIVED, or a text with the reason why the test gave no verdict."""
     code, output = run(mutation, "-n", "0", mutation.test)
-    if code in (PASSED, FAILED):
-        return SURVIVED if code == PASSED else KILLED
-    return f"NOT JUDGED (exit code of pytest: {code}): {output.strip()[-300:]}"
+    reason = f"NOT JUDGED (exit code of pytest: {code}): {output.strip()[-300:]}"
+    return {PASSED: SURVIVED, FAILED: KILLED}.get(code, reason)
 
 
 def hunt(mutations: Sequence[Mutation], jobs: int) -> int:

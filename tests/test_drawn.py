@@ -228,15 +228,13 @@ def test_the_number_of_survivors_excludes_the_lost_members(members, drawn):
         assert share[n] == pytest.approx(100 * np.mean(lost_at > x[n]), rel=ROUNDING) or x[n] == x[n + 1]
     lost = np.isfinite(lost_at)
     assert share[-1] == pytest.approx(100 * np.mean(~lost), rel=ROUNDING)
-    assert (x[0], x[-1]) == (0.0, 0.9999)
-    assert ax.get_xlim() == (0.0, 0.9999)
+    assert (x[0], x[-1]) == ax.get_xlim() == (0.0, 0.9999)
     assert f"{members - lost.sum()} of {members} survive" in ax.get_title(loc="right")
     assert f"{lost.sum() - 1} lost, 1 not decided" in ax.get_title(loc="right")
     ticks = rug.get_xdata()
     assert set(ticks) <= set(lost_at)
     assert (ticks.min(), ticks.max()) == (lost_at.min(), 0.9999)
-    if members == 7:
-        assert set(ticks) == set(lost_at[lost])
+    assert members > 7 or set(ticks) == set(lost_at[lost])
 
 
 @pytest.mark.parametrize("log", [False, True])
@@ -308,7 +306,6 @@ def test_the_cells_of_a_map_lie_at_their_coordinates(path, drawn, monkeypatch):
         assert ax.get_xscale() == "log"
         assert ax.get_xlim() == (corners[0, 0, 0], corners[0, -1, 0])
         assert ax.get_ylim() == (corners[0, 0, 1], corners[-1, 0, 1])
-        assert ax.get_ylim()[0] < ax.get_ylim()[1]
     bar = drawn[0].axes[-1]
     assert "µm" in bar.get_ylabel()
     np.testing.assert_allclose(bar.get_ylim(), 1e6 * np.array([np.nanmin(error), np.nanmax(error)]), rtol=ROUNDING)

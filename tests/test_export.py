@@ -187,8 +187,7 @@ def test_an_invalid_reference_does_not_change_the_state():
         for value in wrong(limit):
             bad = inputs._replace(**{name: jnp.asarray(value)})
             after, held, status = step(memory, bad)
-            assert status.invalid
-            assert not status.refused
+            assert (status.invalid, status.refused) == (True, False)
             assert (after.laws, after.last, after.started) == (memory.laws, memory.last, True)
             assert after.before == (memory.last.u,)  # the voltage that is held goes on acting
             assert after.watch.left == 0
@@ -336,7 +335,7 @@ def test_every_number_is_symbolic_and_declared():
     assert not numbers & {0.588, 754.0, 1480.0, 0.121, 41.44, 9.81}
 
 
-def test_the_c_uses_neither_dynamic_memory_nor_input_or_output_nor_in_double_precision_a_float():
+def test_the_c_uses_neither_dynamic_memory_nor_input_or_output_and_in_double_precision_no_float():
     """A float32 quotient, as JAX refines it, would be slower in C and overflow beyond 1e38."""
     source = re.sub(r"/\*.*?\*/", "", text(cascade=CASCADES["Kalman"])["amb.c"], flags=re.DOTALL)
     assert not re.search(r"\bfloat\b|\b\d+\.\d+(e[+-]?\d+)?f\b|\b(sqrt|fabs|atan)f\(", source)
@@ -408,8 +407,8 @@ def test_the_example_of_the_readme_compiles_and_sets_the_inputs_of_the_step(tmp_
 def test_the_stack_is_within_the_bound_of_the_header(tmp_path):
     for to in ("float", "double"):
         made = placed(tmp_path, text(to=to))
-        subprocess.run(["cc", "-std=c99", "-O0", "-fstack-usage", "-c", "amb.c"], cwd=tmp_path, check=True)
-        used = max(int(line.split("\t")[1]) for line in (tmp_path / "amb.su").read_text().splitlines())
+        assert not compiles(tmp_path, "amb.c", "-std=c99", "-O0", "-fstack-usage")
+        used = max(int(line.split("\t")[1]) for line in next(tmp_path.glob("*.su")).read_text().splitlines())
         assert used <= int(re.search(r"Stack: at most (\d+) bytes", made["amb.h"])[1])
 
 
@@ -568,8 +567,6 @@ def test_programs_that_do_not_end_or_have_no_temporary_folder_are_not_judged(cas
     assert "did not end within 1e-09 s, so the check is not decided" in refused(capsys, case, *out)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
     assert "cannot write to the folder for temporary files (No such file" in refused(capsys, case, *out)
-    with pytest.raises(ValueError, match="cannot write to the folder for temporary files"):
-        verify({}, None)
     assert not (tmp_path / "c").exists()
 
 

@@ -41,11 +41,6 @@ def rig(**more):
     return case.cascade, scenario, Clock(400, case.clock.sample_period)
 
 
-def late(delay):
-    """The rig with another delay."""
-    return dataclasses.replace(RIG[0], processor=Processor(delay)), *RIG[1:]
-
-
 RIG = rig()
 CASES = {
     "rig": RIG,
@@ -53,7 +48,7 @@ CASES = {
         plant=TwoCoil(**{f.name: getattr(RIG[1].plant, f.name) for f in dataclasses.fields(TwoCoil)}),
         amplifier=Amplifier(bandwidth=5e3, slew=2e6, dead_band=0.1),
     ),
-    "3.4 samples late": late(3.4),
+    "3.4 samples late": (dataclasses.replace(RIG[0], processor=Processor(3.4)), *RIG[1:]),
 }
 
 

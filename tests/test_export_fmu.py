@@ -40,17 +40,15 @@ def test_the_description_lists_every_number_that_the_block_reads(version):
     rows = root.find("ModelVariables")
     found = {row.get("name"): row for row in rows}
     assert len(found) == len(rows)
-    values = [(row.find("Real") if version == 2 else row) for row in found.values()]
-    starts = {row.get("name"): x.get("start") for row, x in zip(found.values(), values, strict=True) if x is not None}
     own = {x.name: x.value for x in one.parameters if x.allowed != "not read"}
-    assert {name: float(starts[name]) for name in own} == own
+    values = {name: found[name].find("Real") if version == 2 else found[name] for name in own}
+    assert {name: float(value.get("start")) for name, value in values.items()} == own
     assert {name for name, row in found.items() if row.get("causality") == "input"} == one.read
     assert {found[name].get("variability") for name in own} == {"tunable"}
     units = {unit.get("name") for unit in root.find("UnitDefinitions")}
     assert {x.unit for x in variables(one) if x.unit} - units <= {"s"}
     assert all(exponents(unit) is not None for unit in units)
-    references = [row.get("valueReference") for row in rows]
-    assert len(set(references)) == len(references)
+    assert len({row.get("valueReference") for row in rows}) == len(rows)
 
 
 def written(folder, block, version=3, name="amb"):

@@ -28,8 +28,6 @@ from ambjax.commands.reading import read_with_warnings
         ({"plant": {"mass": 1.0}}, "plant.mass = 1.0: unknown key. Did you mean 'm'"),
         ({"plant": {"Bias_Current": 1.0}}, "Did you mean 'i_0'"),
         ({"plant": {"q": 1.0}}, "plant.q = 1.0: unknown key. Did you mean 'disturbance.q_z'"),
-        ({"plant": {"u_max": 1.0}}, "Did you mean 'actuator.u_max'"),
-        ({"disturbance": {"force": {}}}, "Did you mean 'q_z'"),
         ({"disturbance": {"q_z": {"kind": "sine", "freq": 1.0}}}, "Did you mean 'frequency'"),
         ({"plant": {"iron": {"B_sat": 1.2}}}, "Did you mean 'saturation'"),
         ({"plant": {"k_s": 1e5}}, "plant.k_s = 100000.0: unknown key. It follows from mu_0, n, A, s_0 and i_0"),

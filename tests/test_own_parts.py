@@ -18,19 +18,7 @@ from scipy.integrate import solve_ivp
 from ambjax import Cascade, Clock, Initial, Scenario, rollout
 from ambjax.ensemble import Normal, Percent, Spread
 from ambjax.ensemble.study import Study
-from ambjax.extend import (
-    Bearing,
-    Interval,
-    PositionLaw,
-    Requirement,
-    Signals,
-    force_for,
-    gain,
-    leaf,
-    manifold,
-    record,
-    sliding_variable,
-)
+from ambjax.extend import Bearing, PositionLaw, Requirement, Signals, force_for, gain, leaf, record, sliding_variable
 from ambjax.laws import inversion
 from ambjax.sensors import Measurement, Sensor
 from ambjax.signals import Pulse, Sine
@@ -100,10 +88,6 @@ class BoundaryLayer(PositionLaw):
 
     def robust(self, sigma):
         return -self.rho * jnp.tanh(sigma / self.width)
-
-    def ranges(self, context):
-        low = context.w / 3 * float(self.width)
-        return {"decay": manifold(context), "rho": Interval(low, 100 * low, "slope rho/width from w/3 to 33 w")}
 
     def __call__(self, model, inputs, state):
         motion, reference = inputs
