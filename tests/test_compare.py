@@ -9,7 +9,7 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
-from ambjax.commands import compare, comparison_tuning
+from ambjax.commands import compare
 from ambjax.ensemble.study import Study
 from ambjax.host import extensions
 from ambjax.linear import analyse, linearise
@@ -164,33 +164,6 @@ def test_cases_of_one_name_get_different_names(cases, tmp_path):
     other = tmp_path / "soft.toml"
     other.write_text(CASE.format(c=60.0))
     assert [case.name for case in compare._read([str(cases / "soft.toml"), str(other)])] == ["soft (1)", "soft (2)"]
-
-
-@pytest.mark.slow
-def test_each_case_is_tuned_with_the_settings_of_the_first(run, cases, monkeypatch, capsys):
-    """The tuner is replaced. The test checks its arguments, and that its answer is compared."""
-    called = []
-
-    def tune(words, program, nested):
-        called.append(words)
-        print("a verdict")
-        folder = cases / "soft-stiff" / f"tuned-{'soft' if 'soft.toml' in words[0] else 'stiff'}"
-        folder.mkdir()
-        (folder / "tuned.toml").write_text(CASE.format(c=100.0))
-        return 1
-
-    monkeypatch.setattr(comparison_tuning, "extension", lambda name: {"tune": tune}[name])
-    _, summary, out = run("soft", "stiff", flags=["--tune", "--json"])
-    first = str(cases / "soft.toml")
-    assert [words[:3] for words in called] == [
-        [str(cases / f"{name}.toml"), "--settings-of", first] for name in ("soft", "stiff")
-    ]
-    assert [words[4] for words in called] == [str(out / f"tuned-{name}") for name in ("soft", "stiff")]
-    assert [case["case"] for case in summary["cases"]] == ["soft", "stiff"]
-    assert [case["laws"]["position"]["c"] for case in summary["cases"]] == [100.0, 100.0]
-    stdout, err = capsys.readouterr()
-    assert json.loads(stdout)["members"] == MEMBERS  # and nothing else there
-    assert "a verdict" in err
 
 
 def test_the_picture_counts_every_member(cases):

@@ -161,8 +161,12 @@ def interruptible():
 @pytest.mark.usefixtures("interruptible")
 def test_a_comparison_interrupted_and_resumed_is_the_uninterrupted_one(world, capsys):
     """Ctrl-C arrives in the search of the second case."""
-    compare = ["compare", "a.toml", "b.toml", "--tune", "--members", "2"]
+    compare = ["compare", "a.toml", "b.toml", "--tune", "--members", "2", "--json"]
     assert main([*compare, "--out", "whole"]) in (0, 1)
+    printed, err = capsys.readouterr()
+    assert "tune.limits" in err
+    laws = [case["laws"]["position"]["c"] for case in json.loads(printed)["cases"]]  # and nothing else there
+    assert laws == pytest.approx([100.0] * 2, rel=0.01)  # `World.best`
     begun, stop = [], True
 
     def limit(seed, number, stressed, accurate):
@@ -173,7 +177,6 @@ def test_a_comparison_interrupted_and_resumed_is_the_uninterrupted_one(world, ca
         return math.inf
 
     world.limit = limit
-    capsys.readouterr()
     assert main([*compare, "--out", "cut"]) == 130
     assert "--out cut --resume" in capsys.readouterr().err
     stop, before = False, pathlib.Path("cut/tuned-a/tuned.toml").stat().st_mtime_ns

@@ -13,12 +13,10 @@ import pytest
 
 from ambjax import Cascade, Clock, Initial, Metrics, Scenario, rollout
 from ambjax.compiler import fast_path
-from ambjax.control.processor import Processor
 from ambjax.ensemble import Normal, Percent, Spread, map_members, run_ensemble
 from ambjax.ensemble.batching import size
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, Study
-from ambjax.host.sealed import difference
 from ambjax.laws import inversion
 from ambjax.sensors import Sensor
 from ambjax.signals import Sine
@@ -73,48 +71,46 @@ def test_results_do_not_depend_on_calls_threads_or_other_members():
     same(run_ensemble(SMOOTH, some, SHORT, fold=FOLD), jax.tree.map(lambda x: x[60:70], whole), 1e-12)
 
 
-def test_the_plain_path_gives_the_same_numbers_and_logs_its_use(monkeypatch, caplog):
-    if fast_path.options() is None:
-        pytest.skip("the fast path is not supported here")
+@pytest.fixture
+def fresh(monkeypatch):
+    """The options of the fast path are found anew in the test, and after it."""
+    fast_path.options.cache_clear()
+    yield monkeypatch
+    monkeypatch.undo()
+    fast_path.options.cache_clear()
+
+
+needs_fast_path = pytest.mark.skipif("fast_path.options() is None", reason="the fast path is not supported here")
+
+
+@needs_fast_path
+def test_the_plain_path_gives_the_same_numbers_and_logs_its_use(fresh, caplog):
     fast = run_ensemble(SMOOTH, members(20), SHORT, fold=Rms("e_z"))
-    monkeypatch.setenv("AMBJAX_PLAIN", "1")
+    fresh.setenv("AMBJAX_PLAIN", "1")
     fast_path.options.cache_clear()
-    try:
-        with caplog.at_level(logging.WARNING):
-            same(run_ensemble(SMOOTH, members(20), SHORT, fold=Rms("e_z")), fast, 1e-12)
-        assert "AMBJAX_PLAIN" in caplog.text
-        assert len(caplog.records) == 1
-    finally:
-        monkeypatch.undo()
-        fast_path.options.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        same(run_ensemble(SMOOTH, members(20), SHORT, fold=Rms("e_z")), fast, 1e-12)
+    assert "AMBJAX_PLAIN" in caplog.text
+    assert len(caplog.records) == 1
 
 
+@needs_fast_path
 @pytest.mark.parametrize(("flags", "level"), [("", 2), ("--xla_backend_optimization_level=1", None)])
-def test_rollouts_are_compiled_without_unrolling_unless_the_flags_give_a_level(flags, level, monkeypatch):
-    monkeypatch.setenv("XLA_FLAGS", flags)
-    fast_path.options.cache_clear()
-    try:
-        if (options := fast_path.options()) is None:
-            pytest.skip("the fast path is not supported here")
-        assert options.get("xla_backend_optimization_level") == level
-        assert ("xla_cpu_prefer_vector_width" in options) == fast_path.has_avx512()
-    finally:
-        monkeypatch.undo()
-        fast_path.options.cache_clear()
+def test_rollouts_are_compiled_without_unrolling_unless_the_flags_give_a_level(flags, level, fresh):
+    fresh.setenv("XLA_FLAGS", flags)
+    options = fast_path.options()
+    assert options.get("xla_backend_optimization_level") == level
+    assert ("xla_cpu_prefer_vector_width" in options) == fast_path.has_avx512()
 
 
-def test_a_wrong_result_of_the_probe_disables_the_fast_path(monkeypatch, caplog):
+def test_a_wrong_result_of_the_probe_disables_the_fast_path(fresh, caplog):
     right = fast_path._step
-    wrong = lambda y, lib: right(y, lib) if lib is np else jnp.where(y > 20, 0.0, right(y, lib))  # noqa: E731
-    monkeypatch.setattr(fast_path, "_step", wrong)
-    fast_path.options.cache_clear()
-    try:
-        with caplog.at_level(logging.WARNING):
-            assert fast_path.options() is None
-        assert "results are off by" in caplog.text
-    finally:
-        monkeypatch.undo()
-        fast_path.options.cache_clear()
+    fresh.setattr(
+        fast_path, "_step", lambda y, lib: right(y, lib) if lib is np else jnp.where(y > 20, 0, right(y, lib))
+    )
+    with caplog.at_level(logging.WARNING):
+        assert fast_path.options() is None
+    assert "results are off by" in caplog.text
 
 
 @pytest.mark.slow
@@ -223,13 +219,3 @@ def test_resuming_another_study_is_refused_by_the_key_that_differs(change, key, 
     with pytest.raises(ValueError, match=rf"another study: {key} is .* in the file and .* in this run"):
         run(dataclasses.replace(STUDY, **change), tmp_path, resume=True)
     assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_the_fingerprint_of_a_study_contains_its_flags():
-    """Flags are, for example, the discretisation, the prediction and the measured signals.
-
-    They cannot differ between members.
-    """
-    sampled = [dataclasses.replace(STUDY.cascade, processor=Processor(implicit=x)) for x in (True, False)]
-    one, other = (dataclasses.replace(STUDY, cascade=cascade).fingerprint() for cascade in sampled)
-    assert difference(one, other) == "controller.processor.implicit is True in the file and False in this run"

@@ -11,7 +11,6 @@ from bowl import World, answer_of, case_file, study
 from texts import case_and_tune, problem_from
 
 import tuning.command
-import tuning.rounds
 from ambjax import rollout
 from ambjax.simulation.folds import Named
 from ambjax.simulation.metrics import Metrics
@@ -26,7 +25,6 @@ from tuning.report.limit_table import MORE
 from tuning.rounds import rounds
 from tuning.solve.course import Course, training
 from tuning.solve.multipliers import breaking, optima, search_within_limits
-from tuning.validate import Validation
 
 # The voltage of a Bowl is proportional to k: 20 V at the best k, 60, and 10 V at k = 30.
 TEN = {"limits": {"rms_u_V": 10.0, "margin": 0.002}}
@@ -305,62 +303,31 @@ def test_the_best_answer_within_the_limits_is_taken_if_the_multipliers_do_not_co
     assert next(found, None) is None
 
 
-EARLY = SimpleNamespace(
-    interrupted=False,
-    converged=True,
-    evolution=None,
-    starts=SimpleNamespace(value=np.zeros(1), gradient=np.ones((1, 2))),
-)
-DONE = SimpleNamespace(interrupted=False, converged=True, evolution="CMA-ES", starts=None)
-
-
 @pytest.mark.parametrize(
-    ("limits", "ends", "evolve", "joining"),
-    [
-        # 20 V break the limit of 10 V; the descent moves to 15 V and stays there, until CMA-ES moves it
-        ({"rms_u_V": 10.0}, [45.0, 45.0, 29.9], [False, False, True], 0),
-        # a descent that has ended early within the limit is continued by CMA-ES
-        ({"rms_u_V": 10.0}, [29.9, 29.9], [False, True], 0),
-        # 8 members join once, but not again after a search that ends where it began
-        ({"settling_s": 10.0}, [60.0, 29.0], [False, True], 8),
-    ],
+    ("limits", "ends", "joining"),
+    [({"rms_u_V": 10.0}, (29.9, 29.9), 0), ({"settling_s": 10.0}, (60.0, 29.0), 8)],
+    ids=["the descent has ended early within the limit", "members have joined, and the search ends where it began"],
 )
-def test_cma_es_continues_searches_that_stay_where_they_are_and_the_last_one(
-    monkeypatch, limits, ends, evolve, joining
-):
+def test_cma_es_continues_a_search_that_ends_early(monkeypatch, limits, ends, joining):
+    """The descent ends at k = ends[0]; CMA-ES continues it, to k = ends[1], and converges. Members join once."""
     problem = study(monkeypatch, World(), limits={"rms_u_V": math.inf} | limits)
     course, asked, found = Course(problem, training(problem), 1), [], iter(ends)
     before = len(course.members.member)
-    course.past.append(EARLY)
+    state = {"interrupted": False, "converged": True}
+    steep = SimpleNamespace(value=np.zeros(1), gradient=np.ones((1, 2)))
+    course.past.append(SimpleNamespace(**state, evolution=None, starts=steep))
 
-    def search(points, earlier, evolve):
+    def searched(points, earlier, evolve):
         asked.append(evolve)
-        course.past.append(DONE if evolve else EARLY)
+        course.past.append(SimpleNamespace(**state, evolution="CMA-ES", starts=None) if evolve else course.past[-1])
         x = problem.objective.space.encode(np.array([World.best[0], next(found)]))
         return points[0] if np.allclose(x, points[0]) else np.asarray(x)
 
-    monkeypatch.setattr(course, "search", search)
-    seen, met = optima(course, np.asarray(problem.objective.space.encode(np.array([World.best[0], 60.0]))))
+    monkeypatch.setattr(course, "search", searched)
+    _, met = optima(course, np.asarray(problem.objective.space.encode(np.array([World.best[0], 60.0]))))
     assert met
-    assert asked == evolve
-    assert len(seen) == 1 + len(ends)
+    assert asked == [False, True]
     assert len(course.members.member) == before + joining
-
-
-def test_an_answer_within_the_limits_is_preferred_to_one_of_less_error(monkeypatch, tmp_path):
-    """Both rounds lose a validation member; the first ends within the limits, the second exceeds one."""
-    monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", 2)
-    problem = study(monkeypatch, World(), **TEN)
-    start = problem.tune.space.values(problem.case.cascade)
-    errors, within = iter([4e-3, 2e-3]), iter([True, False])
-
-    def validated(course, x, error):
-        return Validation(course.answer(x, error, 1, next(errors, math.inf)), error, np.arange(1), np.zeros(0, int))
-
-    monkeypatch.setattr(tuning.rounds, "search_within_limits", lambda course, x: (x, next(within)))
-    monkeypatch.setattr(tuning.rounds, "validated", validated)
-    assert rounds(problem, start, tmp_path, {"of": "ten"}, False).validation_error == 4e-3
-    assert next(errors, None) is None
 
 
 def test_a_resumed_search_with_limits_gives_the_same_result(monkeypatch, tmp_path):

@@ -11,7 +11,9 @@ import tuning.rounds
 from ambjax.solvers import Slide
 from tuning.problem.config import seeds
 from tuning.problem.loss import TERMS
-from tuning.rounds import rounds
+from tuning.problem.members import FEW
+from tuning.rounds import MOST_HALVINGS, rounds
+from tuning.validate import Validation
 
 TRAINING, VALIDATION, HELD_OUT = 0, 1, 2
 # Fingerprint of the study in a checkpoint.
@@ -116,37 +118,29 @@ def test_without_validation_there_are_no_validation_calls(monkeypatch, tmp_path)
     assert found.lost == 0
 
 
-def test_the_answer_that_loses_the_fewest_members_is_returned(monkeypatch, tmp_path):
-    """There are three rounds, after which 3, 1 and 2 members are lost for all gains."""
+@pytest.mark.parametrize(
+    ("lost", "within", "errors", "best"),
+    [
+        # confirmed answers that lose fewer members are better, then those within the limits, then those of less error
+        ((3, 1, 2), (True, False, True), (1e-3, 4e-3, 1e-3), 1),
+        ((1, 1, 1), (False, True, True), (2e-3, 4e-3, 3e-3), 2),
+    ],
+)
+def test_the_best_answer_of_all_rounds_is_returned(lost, within, errors, best, monkeypatch, tmp_path):
+    """Three rounds end with losses on the validation members; searches and validations are replaced."""
     monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", 3)
-    lost = iter([3, 1, 2])
+    outcomes, inside = iter(zip(lost, errors, strict=True)), iter(within)
 
-    class Moody(World):
-        def __init__(self):
-            super().__init__()
-            self.now = 0
-            self.limit = lambda seed, number, *_: (
-                1e-3 if self.trial and seed == seed_of(VALIDATION) and number < self.now else math.inf
-            )
+    def validated(course, x, error=None):
+        count, size = next(outcomes, (9, 9.0))  # at last, the gains of the case
+        return Validation(course.answer(x, error, count, size), error, np.arange(1), np.zeros(0, int))
 
-        @property
-        def trial(self):
-            """Return whether the last call was for the whole validation ensemble."""
-            kind, seed, numbers, _ = self.calls[-1]
-            return kind == "terms" and seed == seed_of(VALIDATION) and len(numbers) == 10
-
-    class Noticing(list):
-        def append(self, call):
-            super().append(call)
-            if world.trial:
-                world.now = next(lost)
-
-    world = Moody()
-    world.calls = Noticing()
-    found, _ = answer_of(monkeypatch, tmp_path, world)
-    assert found.lost == 1
-    assert len(found.members.member) == 6 + 3  # the second round's: the three that the first lost have joined
-    assert next(lost, None) is None
+    monkeypatch.setattr(tuning.rounds, "search_within_limits", lambda course, x: (x, next(inside)))
+    monkeypatch.setattr(tuning.rounds, "validated", validated)
+    found, _ = answer_of(monkeypatch, tmp_path, World())
+    assert (found.lost, found.within, found.validation_error) == (lost[best], within[best], errors[best])
+    assert len(found.members.member) == 6 + best  # those of its round: a lost member has joined after each earlier one
+    assert next(inside, None) is None
 
 
 def test_steps_that_do_not_resolve_the_answer_are_halved(monkeypatch, tmp_path):
@@ -164,6 +158,8 @@ def test_steps_that_never_resolve_the_answer_are_reported(monkeypatch, tmp_path)
     found, _ = answer_of(monkeypatch, tmp_path, World(bias=lambda substeps: 0.5))
     assert found.error.relative == pytest.approx(0.5)
     assert not found.error.resolved
+    assert not found.good
+    assert found.problem.finer == 2**MOST_HALVINGS
 
 
 def test_members_that_only_accurate_steps_lose_join_too(monkeypatch, tmp_path):
@@ -177,6 +173,15 @@ def test_members_that_only_accurate_steps_lose_join_too(monkeypatch, tmp_path):
     assert 2 in found.members.member[found.members.stressed]
     assert found.error.lost == 0
     assert found.lost == 0
+
+
+def test_worst_validation_members_that_only_accurate_steps_lose_refute_the_answer(monkeypatch, tmp_path):
+    monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", 1)
+    validation = seed_of(VALIDATION)
+    world = World(limit=lambda seed, number, _, accurate: 40.0 if accurate and seed == validation else math.inf)
+    found, _ = answer_of(monkeypatch, tmp_path, world)
+    assert found.error.lost == found.lost == FEW
+    assert not found.good
 
 
 def test_a_search_that_loses_every_member_ends(monkeypatch, tmp_path):
