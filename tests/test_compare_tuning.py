@@ -5,11 +5,13 @@ import json
 import math
 import os
 import pathlib
+import re
 import signal
 import time
 
 import pytest
 from bowl import World, document, instead_of_engines
+from test_own_laws import LAW
 from tomlkit import dumps
 
 import tuning.command
@@ -20,30 +22,6 @@ from ambjax.commands.comparison_tuning import tuned_cases
 from ambjax.host.interrupts import exit_on_interrupt
 
 PATHS = ("a.toml", "b.toml", "c.toml")
-# A law without gains.
-OWN = """
-from ambjax.extend import PositionLaw, force_for, record
-
-
-@record
-class Fixed(PositionLaw):
-    demand = "voltage"
-
-    def init(self, model):
-        return ()
-
-    def scale(self, model):
-        return ()
-
-    def slope(self, model):
-        return 400.0
-
-    def sigma(self, motion, reference):
-        return motion.z_dot - reference.r_dot + 25.0 * (motion.z - reference.r)
-
-    def __call__(self, model, inputs, state):
-        return force_for(0.0, model, *inputs, -400.0 * self.sigma(*inputs)), ()
-"""
 
 
 def write(path, start, **tune):
@@ -122,8 +100,9 @@ def test_what_has_changed_is_not_reused(world, change):
 
 
 def test_a_case_without_gains_is_taken_as_it_is(world, capsys):
-    pathlib.Path("own.py").write_text(OWN)
-    stages = {"position": "own.py:Fixed", "inversion": "linearised", "current": "open-loop"}
+    own = re.sub(r"damp: .*", "", re.sub(r"stiff: .*", 'demand = "voltage"', LAW))
+    pathlib.Path("own.py").write_text(own.replace("self.stiff", "1e4").replace("self.damp", "400.0"))
+    stages = {"position": "own.py:PD", "inversion": "linearised", "current": "open-loop"}
     laws = {stage: {"kind": kind} for stage, kind in stages.items()}
     raw = {name: table for name, table in document().items() if name != "tune"}
     pathlib.Path("b.toml").write_text(dumps(raw | {"controller": laws}))
