@@ -10,6 +10,7 @@ import tomllib
 import jax
 import numpy as np
 import pytest
+from tomlkit import dumps
 
 from ambjax.__main__ import main
 from ambjax.cases.machine_case import machine_from, read_machine
@@ -22,7 +23,7 @@ from ambjax.host.extensions import NothingToTuneError
 from ambjax.linear import machine_sensitivity
 from ambjax.results.case_map import study_and_axes, survival_map
 from ambjax.results.machine_run import simulate_machine
-from ambjax.results.spread_runs import simulate_members, study_of
+from ambjax.results.spread_runs import study_of
 
 MACHINE = tomllib.loads(template("machine"))
 # Spread of the shapes of a flexible rotor.
@@ -49,20 +50,15 @@ def case(spread, **tables):
     return machine_from(raw, "machine")
 
 
-@pytest.fixture
-def flexible():
-    """Return a function: the case of the template with two bending modes, whose bearings have these shapes."""
-
-    def made(spread, shapes=(([0.5, 0.4], [0.4, 0.2]),) * 2, load=0.7):
-        raw = copy.deepcopy(MACHINE)
-        rotor = raw["rotor"] | {"kind": "modal", "modes": [{"frequency": 80.0, "damping": 0.01}, {"frequency": 300.0}]}
-        for bearing, (magnet, sensor) in zip(raw["bearing"], shapes, strict=False):
-            bearing |= {"modes": magnet, "sensor_modes": sensor, "angle": 20.0}
-        for one in (*raw["unbalance"], *raw["load"]):
-            one["modes"] = [load, 0.1]
-        return case(spread, rotor=rotor, **{key: raw[key] for key in ("bearing", "unbalance", "load")})
-
-    return made
+def flexible(spread, shapes=(([0.5, 0.4], [0.4, 0.2]),) * 2, load=0.7, **tables):
+    """The case of the template with two bending modes, whose bearings have these shapes."""
+    raw = copy.deepcopy(MACHINE)
+    rotor = raw["rotor"] | {"kind": "modal", "modes": [{"frequency": 80.0, "damping": 0.01}, {"frequency": 300.0}]}
+    for bearing, (magnet, sensor) in zip(raw["bearing"], shapes, strict=False):
+        bearing |= {"modes": magnet, "sensor_modes": sensor, "angle": 20.0}
+    for one in (*raw["unbalance"], *raw["load"]):
+        one["modes"] = [load, 0.1]
+    return case(spread, rotor=rotor, **{key: raw[key] for key in ("bearing", "unbalance", "load")}, **tables)
 
 
 def test_draws():
@@ -114,24 +110,8 @@ def test_a_worker_process_receives_a_machine_in_double_precision(monkeypatch):
     }
 
 
-@pytest.mark.slow  # compiles the rollout of the ensemble and that of one machine
-def test_members_are_machines():
-    found = simulate_members(case(SPREAD), 3, seed=3)
-    study = found.study
-    for k in range(3):
-        alone = simulate_machine(study.member(k))
-        for name in ("rms_error_m", "max_abs_i_A", "rms_u_V", "clearance_used"):
-            assert found.columns[name][k] == pytest.approx(alone.metrics[name], rel=1e-6), name
-    assert np.ptp(found.columns["rms_error_m"]) > 0
-
-
 def test_numbers_of_the_rotor():
-    raw = copy.deepcopy(MACHINE)
-    raw["rotor"] |= {"kind": "modal", "modes": [{"frequency": 80.0, "damping": 0.01}, {"frequency": 300.0}]}
-    raw["base"] = [{"direction": [2.0, 0.0, 0.0], "kind": "constant", "value": 1.0}]
-    for bearing in raw["bearing"][:2]:
-        bearing |= {"modes": [0.5, 0.4], "sensor_modes": [0.4, 0.2]}
-    rotor = machine_from(raw).machine.rotor
+    rotor = flexible({}, base=[{"direction": [2.0, 0.0, 0.0], "kind": "constant", "value": 1.0}]).machine.rotor
     values = {"rotor.m": 3.0, "rotor.I_t": 0.07, "rotor.I_p": 1e-3, "rotor.modes.1.frequency": 250.0}
     values |= {"rotor.modes.0.damping": 0.02, "unbalance.0.amount": 7.0, "load.0.start": 0.2, "rotor.speed": 10.0}
     values |= {"base.0.value": 5.0, "bearing.left.modes.0": 0.6, "bearing.right.sensor_modes.1": -0.3}
@@ -151,7 +131,7 @@ def test_numbers_of_the_rotor():
     assert other.D[5, 5] == pytest.approx(2 * 0.02 * 2 * np.pi * 80)
 
 
-def test_shapes_of_modes(flexible):
+def test_shapes_of_modes():
     """A member is the machine whose bearings, unbalances and loads are given with its shapes."""
     study = study_of(flexible(SHAPES), 3, 4)
     drawn = {path: x[1] for path, x in study.drawn(np.arange(4)).items()}
@@ -191,22 +171,6 @@ def test_steps_resolve_the_fastest_member():
     assert case(speeds, clock={"duration": 2e-3, "sample_period": 1e-3}).clock.method.substeps > 2 * few
 
 
-@pytest.mark.slow
-def test_command(tmp_path, capsys):
-    text = template("machine").replace("duration = 0.2", "duration = 2e-3").replace("settle = 0.05", "settle = 0.0")
-    path = tmp_path / "m.toml"
-    path.write_text(text + "\n[spread]\nrotor.speed = { uniform = [0.0, 12000.0] }\n")
-    main(["ensemble", str(path), "--members", "3", "--out", str(tmp_path / "e"), "--json"])
-    summary = json.loads(capsys.readouterr().out)
-    assert summary["survivors"] == 3
-    columns = np.load(tmp_path / "e" / "members.npz")
-    main(["simulate", str(path), "--member", "2", "--seed", "0", "--out", str(tmp_path / "s"), "--json"])
-    alone = json.loads(capsys.readouterr().out)
-    assert alone["rms_error_m"] == pytest.approx(columns["rms_error_m"][2], rel=1e-6)
-    speed = np.load(tmp_path / "s" / "trajectory.npz")["speed_rpm"][0]
-    assert speed == pytest.approx(columns["spread.rotor.speed"][2])
-
-
 AREAS = "\n[spread]\nplant.A = { percent = 10 }\n"
 SHORT = [("duration = 0.2", "duration = 1e-3"), ("settle = 0.05", "settle = 0.0")]
 
@@ -224,6 +188,22 @@ def files(tmp_path):
         return str(tmp_path / name)
 
     return written
+
+
+@pytest.mark.slow  # compiles the rollout of the ensemble and that of one machine
+def test_members_are_machines(files, tmp_path, capsys):
+    path = files("m.toml", end=f"\n{dumps({'spread': SPREAD})}")
+    main(["ensemble", path, "--members", "3", "--out", str(tmp_path / "e"), "--json"])
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["survivors"] == 3
+    columns = np.load(tmp_path / "e" / "members.npz")
+    assert np.ptp(columns["rms_error_m"]) > 0
+    main(["simulate", path, "--member", "2", "--seed", "0", "--out", str(tmp_path / "s"), "--json"])
+    alone = json.loads(capsys.readouterr().out)
+    for name in ("rms_error_m", "max_abs_i_A", "rms_u_V", "clearance_used"):
+        assert alone[name] == pytest.approx(columns[name][2], rel=1e-6), name
+    speed = np.load(tmp_path / "s" / "trajectory.npz")["speed_rpm"][0]
+    assert speed == pytest.approx(columns["spread.rotor.speed"][2])
 
 
 @pytest.mark.slow  # compiles the rollout of the ensemble, and the linear analysis

@@ -17,7 +17,7 @@ from texts import write
 
 from ambjax.__main__ import main, parser
 from ambjax.cases.data_sheet import RIG
-from ambjax.cases.reader import case_from, read_case
+from ambjax.cases.reader import read_case
 from ambjax.commands import study_report
 from ambjax.ensemble import replay as replaying
 from ambjax.ensemble.batching import run_ensemble
@@ -81,32 +81,9 @@ def printed(tmp_path_factory):
             patch.setattr(sys, "stdout", said)
             assert main(words) == 0
         with np.load("out/members.npz") as file:
-            columns = {name: file[name] for name in file.files}
-        return (
-            folder,
-            pathlib.Path("said").read_text(),
-            columns,
-            json.loads(pathlib.Path("out/summary.json").read_text()),
-        )
-
-
-def same_bits(metrics, columns, row):
-    """Check that every metric of metrics.json, of which there are at least twelve, equals that of this row."""
-    shared = [name for name in columns if name in metrics]
-    assert len(shared) > 12
-    for name in shared:
-        value = columns[name][row]
-        assert metrics[name] == (value if np.isfinite(value) else None), name
-
-
-def belongs(metrics, out, settle):
-    """Check that the written trajectory is that of the metrics."""
-    # sums of squares in another order: a unit in the last place for each sample
-    with np.load(pathlib.Path(out, "trajectory.npz")) as rows:
-        error, late = rows["z"] - rows["r"], rows["t"] >= settle
-        assert np.sqrt(np.mean(error**2)) == pytest.approx(metrics["rms_error_m"], rel=1e-12)
-        assert np.sqrt(np.mean(error[late] ** 2)) == pytest.approx(metrics["settled_rms_error_m"], rel=1e-12)
-        assert metrics["trajectory_deviation"] <= len(error) * np.finfo(float).eps
+            columns = dict(file)
+        summary = json.loads(pathlib.Path("out/summary.json").read_text())
+        return folder, pathlib.Path("said").read_text(), columns, summary
 
 
 @pytest.mark.slow
@@ -125,8 +102,17 @@ def test_the_printed_command_replays_the_worst_member(printed, monkeypatch, caps
     metrics = json.loads(answer.out)
     worst = summary["worst"][0]["index"]
     assert metrics["settled_max_abs_error_m"] == summary["metrics"]["settled_max_abs_error_m"]["max"]
-    same_bits(metrics, columns, worst)
-    belongs(metrics, "alone", 0.02)
+    shared = [name for name in columns if name in metrics]
+    assert len(shared) > 12
+    for name in shared:
+        value = columns[name][worst]
+        assert metrics[name] == (value if np.isfinite(value) else None), name
+    # the written trajectory is that of the metrics; sums of squares in another order: a unit in the last place a sample
+    with np.load("alone/trajectory.npz") as rows:
+        error, late = rows["z"] - rows["r"], rows["t"] >= 0.02
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(metrics["rms_error_m"], rel=1e-12)
+    assert np.sqrt(np.mean(error[late] ** 2)) == pytest.approx(metrics["settled_rms_error_m"], rel=1e-12)
+    assert metrics["trajectory_deviation"] <= len(error) * np.finfo(float).eps
 
 
 @pytest.mark.slow
@@ -209,14 +195,16 @@ def ended(call):
         return end.code or 0
 
 
-def test_a_case_without_noise_and_spread_is_replayed_unchanged(capsys, monkeypatch):
-    no_pictures(monkeypatch)
-    case = case_from({"clock": {"duration": 0.05}}, "case")
-    study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, 3)
-    assert not study.varies
-    assert study.command("my case.toml", 2) == "ambjax simulate 'my case.toml'"
-
-
-def test_a_latin_hypercube_is_replayed_with_its_size():
-    study = study_of(changed(CASE, {"[spread]\n": '[spread]\ndesign = "latin-hypercube"\n'}))
-    assert study.command("a.toml", 2) == "ambjax simulate a.toml --member 2 --seed 3 --members 66"
+@pytest.mark.parametrize(
+    ("text", "command"),
+    [
+        ("[clock]\nduration = 0.05\n", "ambjax simulate 'my case.toml'"),
+        (
+            changed(CASE, {"[spread]\n": '[spread]\ndesign = "latin-hypercube"\n'}),
+            "ambjax simulate 'my case.toml' --member 2 --seed 3 --members 66",
+        ),
+    ],
+    ids=["no noise and no spread", "latin hypercube"],
+)
+def test_a_replay_needs_no_member_without_noise_and_the_size_of_a_latin_hypercube(text, command):
+    assert study_of(text).command("my case.toml", 2) == command

@@ -182,9 +182,6 @@ sensor.std = 1e-6
 # What is wrong, the lines of [spread], what the message must contain: path, value, what is allowed or the fix.
 BAD = {
     "unknown number": ("plant.mass = { percent = 10 }", ["spread.plant.mass", "Did you mean 'plant.m'", "plant.k_z"]),
-    "a law not in use": ("controller.observer.l = { percent = 10 }", ["spread.controller.observer.l", "position.*"]),
-    "the seed": ("run.seed = { uniform = [0, 9] }", ["spread.run.seed", "run.clearance"]),
-    "the clock": ("clock.dt = { percent = 10 }", ["spread.clock.dt"]),
     "value of a pulse": ("disturbance.q_z.value = { normal = 1 }", ["spread.disturbance.q_z.value", "q_z.shift"]),
     "bare value": ("plant.m = 0.1", ["spread.plant.m = 0.1", "{ percent = 10 }"]),
     "misspelt kind": ("plant.m = { precent = 10 }", ["spread.plant.m.precent", "Did you mean 'percent'"]),

@@ -15,12 +15,8 @@ from profiles import examples
 from texts import write
 
 from ambjax.__main__ import main
-from ambjax.cases.reader import read_case
 from ambjax.commands import ensemble as studies
 from ambjax.commands import pace, study_report, workers
-from ambjax.ensemble import worker
-from ambjax.results.spread_runs import study_of
-from ambjax.simulation.sliding import Slide
 
 CASE = """
 [controller.inversion]
@@ -248,30 +244,10 @@ def test_a_finished_study_is_not_run_again(no_pictures, monkeypatch, capsys):
     assert not pathlib.Path("out", "chunks").exists()
 
 
-# --- the first members ---
-
-
-def test_the_pilot_is_the_first_members(no_pictures):
-    study = study_of(read_case(write(TINY)), 3, 40)
-    columns, seconds = pace.pilot(study)
-    assert seconds > 0
-    again = study.columns(0, 40, call=worker.CALL)
-    assert columns.keys() == again.keys()
-    assert all(np.array_equal(columns[name], again[name]) for name in again)
-    lost = study.columns(0, 40, call=worker.CALL, lost=True)
-    assert np.all(lost["lost_at"] == 0)
-
-
 # --- the sliding step ---
 
 # A sign so hard that explicit steps would have to be a nanosecond long.
 HARD = TINY.replace("gamma = 1e9\np = 25e-6", "gamma = 3.5e5\np = 25.0").replace("2e-3", "2e-2")
-
-
-@pytest.mark.parametrize(("dt", "substeps"), [("", 3), ("dt = 2.5e-5\n", 4)])
-def test_the_sliding_step_can_be_chosen(dt, substeps):
-    case = read_case(write(HARD.replace("dt = 5e-5\n", f'method = "sliding"\n{dt}')))
-    assert case.clock.method == Slide(substeps)
 
 
 @pytest.mark.slow

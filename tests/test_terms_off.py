@@ -39,12 +39,16 @@ R = 1.0
 """)
 
 
-def bearing(**changes):
-    """The case with other entries of its tables."""
+def tables(position=(), **changes):
+    """The tables of the case with other entries, and another position law if its kind is given."""
     given = {name: {**table, **changes.get(name, {})} for name, table in BEARING.items()}
-    given["controller"] = {**BEARING["controller"], **changes.get("controller", {})}
-    given["controller"]["position"] = {**BEARING["controller"]["position"], **changes.get("position", {})}
-    return case_from(given)
+    usual = {} if "kind" in position else BEARING["controller"]["position"]
+    given["controller"]["position"] = {**usual, **dict(position)}
+    return given
+
+
+def bearing(**changes):
+    return case_from(tables(**changes))
 
 
 def analysis(case):
@@ -165,10 +169,7 @@ REFUSED = r"sensor\.velocity = false: the velocity is not measured.*predict = fa
     ids=["chain", "prediction", "difference", "state feedback"],
 )
 def test_a_measured_velocity_is_needed_only_by_laws_that_use_it(changes, reads):
-    if "position" in changes:
-        changes = {"controller": {"position": changes["position"]}}
-    given = {name: {**table, **changes.get(name, {})} for name, table in BEARING.items()}
-    given["controller"] = {**BEARING["controller"], **changes.get("controller", {})}
+    given = tables(**changes)
     cascade = case_from({**given, "sensor": {}}).cascade
     assert cascade.reads_velocity(T) == reads
     if reads:

@@ -29,36 +29,18 @@ def test_a_norm_over_members_is_no_broken_limit_while_the_worst_member_may_be_wi
     assert known.other_bound(2.5, 10) == 2.5
 
 
-class Terminal:
-    """A stream that keeps what is written, and is a terminal or not."""
-
-    def __init__(self, terminal):
-        self.terminal, self.text = terminal, ""
-
-    def write(self, text):
-        self.text += text
-        return len(text)
-
-    def flush(self):
-        pass
-
-    def isatty(self):
-        return self.terminal
-
-
 @pytest.mark.parametrize("terminal", [False, True])
-def test_the_last_line_is_repeated_if_nothing_happens(terminal, monkeypatch):
-    stderr = Terminal(terminal)
-    monkeypatch.setattr(sys, "stderr", stderr)
+def test_the_last_line_is_repeated_if_nothing_happens(terminal, monkeypatch, capsys):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
     monkeypatch.setattr(heartbeat, "SILENCE", 0.1)
     with Log() as log:
         log(Event("compiling"))
         time.sleep(0.4)
-    assert stderr.text.count("compiling") > 1
-    assert ("\r" in stderr.text) == terminal
-    before = stderr.text
+    said = capsys.readouterr().err
+    assert said.count("compiling") > 1
+    assert ("\r" in said) == terminal
     time.sleep(0.3)
-    assert stderr.text == before  # it has ended
+    assert capsys.readouterr().err == ""  # it has ended
 
 
 def test_a_command_says_what_takes_long_and_only_that(monkeypatch, capsys):
@@ -77,16 +59,13 @@ def test_a_command_says_what_takes_long_and_only_that(monkeypatch, capsys):
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize("terminal", [False, True])
-def test_standings_are_written_at_intervals_and_other_events_at_once(terminal, monkeypatch):
-    stderr = Terminal(terminal)
-    monkeypatch.setattr(sys, "stderr", stderr)
-    monkeypatch.setattr(events, "INTERVAL", 0.0)
+def test_standings_are_written_at_intervals_and_other_events_at_once(monkeypatch, capsys):
     log = Log()
-    log(Event(STANDING.text, STANDING))
-    monkeypatch.setattr(events, "INTERVAL", 1e9)
-    log(Event(STANDING.text, STANDING))
+    for interval, event in ((0.0, Event(STANDING.text, STANDING)), (1e9, Event(STANDING.text, STANDING))):
+        monkeypatch.setattr(events, "INTERVAL", interval)
+        log(event)
     for _ in range(3):
         log(Event("join"))
-    assert stderr.text.count("search 1: iteration 3") == 1
-    assert stderr.text.count("join") == 3
+    said = capsys.readouterr().err
+    assert said.count("search 1: iteration 3") == 1
+    assert said.count("join") == 3

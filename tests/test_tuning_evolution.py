@@ -20,17 +20,6 @@ def tried(levels, width=12):
     return Evolution(np.zeros(2), 1, [np.full(width, level) for level in levels])
 
 
-def test_the_goals_of_the_populations_determine_the_next_one():
-    """Nothing else that draws random numbers meanwhile has an effect."""
-    dice, one = np.random.default_rng(2), Evolution(np.array([0.3, -1.0]), 7)
-    for _ in range(3):
-        one.tell(one.ask(), dice.random(12))
-    again = Evolution(one.origin, one.seed, one.told)
-    np.random.seed(0)  # noqa: NPY002
-    np.testing.assert_array_equal(again.ask(), one.ask())
-    assert again.reach == one.reach
-
-
 def test_goals_that_are_not_finite_are_the_worst_ones():
     one = Evolution(np.zeros(2), 1)
     points = one.ask()

@@ -16,7 +16,6 @@ from tomlkit import dumps
 from ambjax import Cascade
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
-from ambjax.control.base import default_law
 from ambjax.laws import position
 from ambjax.plants import Plant
 from tuning.__main__ import main
@@ -134,12 +133,6 @@ def test_on_a_processor_a_steepness_is_searched_by_its_slope(beside):
 # --- defaults that follow the plant ---
 
 
-def test_the_papers_p_is_25_bit_for_bit():
-    for cascade in (Cascade(), Cascade(model=Plant())):
-        assert [cascade.position.p, cascade.inversion.p, cascade.current.p] == [25.0] * 3
-    assert default_law(position.SuperTwisting, Plant()).p == 100.0
-
-
 @pytest.mark.parametrize("name", BEARINGS)
 def test_the_default_p_follows_from_the_scales_of_the_plant(name):
     case = case_from(tomllib.loads(BEARINGS[name]))
@@ -152,8 +145,6 @@ def test_the_default_p_follows_from_the_scales_of_the_plant(name):
         assert getattr(case.cascade, stage) == getattr(Cascade(model=plant), stage)
     laws = '[controller.position]\nkind = "super-twisting"\nk_2 = 3.0\n'
     assert case_from(tomllib.loads(BEARINGS[name] + laws)).cascade.position.p == pytest.approx(4 * k.position.p)
-    given = case_from(tomllib.loads(BEARINGS[name] + "[controller.inversion]\np = 3.0\n")).cascade
-    assert given.inversion.p == 3.0
 
 
 def test_default_laws_are_made_once_from_the_first_model():
@@ -166,7 +157,7 @@ def test_default_laws_are_made_once_from_the_first_model():
     assert Cascade(position=own, model=Plant(i_0=0.5)).position is own
 
 
-# --- a complete answer, and a search from the case's gains alone ---
+# --- a complete answer ---
 
 
 @pytest.mark.parametrize("laws", ["", OTHER_LAWS], ids=["usual laws", "other laws"])
@@ -180,14 +171,6 @@ def test_the_tuned_file_gives_the_tuned_cascade(laws):
     assert again == jax.tree.map(float, space.decode(jnp.asarray(x), found.case.cascade))
     if not laws:
         assert tomllib.loads(text)["controller"]["inversion"]["p"] == found.case.cascade.inversion.p
-
-
-def test_without_a_screen_the_search_starts_from_the_case_only():
-    found = problem_from(BEARINGS["fan"], screen=0)
-    start = found.tune.space.values(found.case.cascade)
-    points = initial_points(found.objective.space, found.ranges, start, 0, 1)
-    assert points.shape == (1, 4)
-    np.testing.assert_allclose(found.objective.space.gains_at(points[0]), start, rtol=1e-12)
 
 
 def write(path, text, **tune):

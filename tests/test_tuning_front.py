@@ -10,7 +10,6 @@ from bowl import FLOOR, RARE_FROM, S_0, World, case_file, document, study
 from texts import case_and_tune
 
 import tuning.command
-import tuning.front
 import tuning.report.folder
 from ambjax.cases.reader import read_case
 from tuning.__main__ import main
@@ -20,7 +19,6 @@ from tuning.problem.limits import FRONT
 from tuning.problem.tuning_problem import problem_of
 from tuning.report import front_table, limit_table
 from tuning.rounds import rounds
-from tuning.solve.course import Course
 
 BOUNDLESS = {"controller": {"position": {"c": [1.0, 1000.0], "k": [0.1, 1000.0]}}}
 
@@ -76,27 +74,6 @@ def test_the_knee_is_the_least_voltage_within_25_percent_of_the_least_error(ran)
     for row in facts["front"]:
         law = read_case(folder / row["file"]).cascade.position
         assert {"controller.position.c": law.c, "controller.position.k": law.k} == row["gains"]
-
-
-@pytest.mark.slow
-def test_a_point_of_the_front_begins_with_the_results_of_the_knee(monkeypatch, tmp_path):
-    """It begins where its goal is lowest: here at the knee, not at the least error. Its multiplier is nearly right."""
-    begun, again, factor = [], Course.again, 1.2
-    monkeypatch.setattr(tuning.front, "FACTORS", (KNEE, factor))
-
-    def recorded(course, x, evolve=True):
-        if not evolve:
-            (limit,) = (one for one in course.problem.limits if one.source == FRONT)
-            begun.append((limit, np.asarray(course.problem.objective.space.gains_at(x))[1]))
-        return again(course, x, evolve)
-
-    monkeypatch.setattr(Course, "again", recorded)
-    problem = study(monkeypatch, World(), objective="knee", front=2, bounds=BOUNDLESS, limits={"rms_u_V": math.inf})
-    rounds(problem, problem.tune.space.values(problem.case.cascade), tmp_path, {}, False)
-    limit, k = next(one for one in begun if one[0].threshold < 1.22 * S_0 * math.sqrt(FLOOR))
-    assert k == pytest.approx(60 * least_voltage(KNEE) / 20, rel=0.06)
-    # of the voltage's square against the error, on the curve of `least_voltage`
-    assert limit.multiplier == pytest.approx(2 * factor**2 / math.sqrt(factor**2 - 1), rel=0.15)
 
 
 @pytest.mark.slow
