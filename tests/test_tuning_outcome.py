@@ -21,7 +21,7 @@ from tuning.problem.config import seeds
 from tuning.problem.limits import Limit
 from tuning.report import judging
 from tuning.report.limit_table import BROKEN, EMPHASISED, HELD, UNJUDGED, UNVERIFIED
-from tuning.report.outcome import ALL_MET, NO_HELD_OUT, NOT_MET, TuningOutcome
+from tuning.report.outcome import ALL_MET, NO_HELD_OUT, NOT_MET
 
 HELD_OUT = seeds(Budget())[2]
 
@@ -42,6 +42,10 @@ OUTCOMES = {
     "lost": (lambda: losing(2), {}, BROKEN, HELD, False),
     "lost, as may be": (lambda: losing(2), {"limits": {"survival": 0.8}}, HELD, HELD, True),
     "not decided": (lambda: World(stalls=lambda s, n, _: (s, n) == (HELD_OUT, 2)), {}, BROKEN, HELD, False),
+    "lost and not decided": (
+        lambda: World(limit=losing(2).limit, stalls=lambda s, n, _: (s, n) == (HELD_OUT, 3)),
+        {"limits": {"survival": 0.8}}, BROKEN, HELD, False,
+    ),
     "a limit not met": (World, {"limits": {"rms_u_V": 0.2}}, HELD, BROKEN, False),
     "not verified": (lambda: losing(1, accurate=True), {}, UNVERIFIED, UNVERIFIED, False),
     "lost and not verified": (
@@ -133,18 +137,6 @@ def test_members_that_are_held_but_not_stable_are_told_everywhere(ran, monkeypat
         assert "2 of 6 members tested are held, but NOT stable" in text
         assert "amplitude 0.0001 m, |i| up to 3 A (bias 0.25 A)" in text
     assert ALL_MET not in (folder / "report.md").read_text()
-
-
-def test_each_reason_against_the_gains_suffices():
-    right = TuningOutcome(10, 0, 0, 1, {"rms_u_V": HELD, "survival": HELD}, "")
-    assert right.good
-    assert TuningOutcome(10, 1, 0, 1, right.limits, "").good
-    for lost, stalled in ((2, 0), (1, 1), (0, 2)):
-        wrong = TuningOutcome(10, lost, stalled, 1, right.limits | {"survival": BROKEN}, "")
-        assert (wrong.good, wrong.rotors_held, wrong.broken) == (False, False, [])
-        assert len(wrong.against) == 1
-    assert TuningOutcome(10, 0, 0, 1, {"rms_u_V": BROKEN}, "").against == ["NOT HELD: rms_u_V"]
-    assert TuningOutcome(10, 0, 0, 1, right.limits, "steps").against == [UNVERIFIED]
 
 
 def test_the_voltage_of_a_lost_member_is_excluded_from_the_limits():

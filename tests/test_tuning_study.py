@@ -3,6 +3,7 @@
 On losses that are formulas (`bowl.py`), so that each is known by hand.
 """
 
+import collections
 import json
 import math
 import os
@@ -125,20 +126,6 @@ def test_the_effect_of_a_change_of_each_gain(monkeypatch):
 # --- descent ---
 
 
-def test_starts_race_on_a_part_of_the_members_and_the_winner_continues_on_all(monkeypatch):
-    world = World()
-    made = study(monkeypatch, world)
-    begins = np.stack([at(made, c, k) for c in (2.0, 30.0, 400.0) for k in (3.0, 50.0, 700.0)])
-    members = made.objective.training(1, 16, 8, 1.2, 1.25)
-    found = search(made.engine, made.goal, members, begins, keep=9, iterations=12)
-    steps = [(points, len(numbers)) for kind, _, numbers, points in world.calls if kind == "gradient"]
-    assert steps[:15] == [(9, 8)] * RACE + [(5, 8)] * RACE + [(3, 8)] * RACE
-    assert set(steps[15:]) == {(1, 24)}
-    assert len(steps) <= 15 + 12
-    np.testing.assert_array_equal(found.history["x"][15], found.history["x"][14])  # it continues at its best point
-    np.testing.assert_allclose(made.objective.space.gains_at(best_of(found)[0]), world.best, rtol=0.05)
-
-
 def test_the_race_is_decided_on_all_members(monkeypatch):
     """The lower of two optima loses a member that is not in the part."""
     world = World(limit=lambda seed, number, *_: 500.0 if number == 15 else math.inf, valley=4.0)
@@ -168,29 +155,13 @@ def test_a_change_of_one_gain_leads_to_a_lower_optimum(monkeypatch, valley):
 # --- the command ---
 
 
-def command(monkeypatch, tmp_path, world, force=False, **tune):
-    """`ambjax tune` in this process, its engine a Bowl: exit code, summary, output directory."""
-    made = study(monkeypatch, world, **tune)
-    path, out = case_file(tmp_path, **tune)
+def command(monkeypatch, tmp_path, world, force=False):
+    """`ambjax tune` in this process, its engine a Bowl, without pictures: whether it is good, report, directory."""
+    study(monkeypatch, world)
+    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: collections.defaultdict(bytes))
+    path, out = case_file(tmp_path)
     tuned = tuning.tune(path, out, force=force)
-    assert json.loads(json.dumps(tuned.report)) is not None
-    return int(not tuned.good), tuned.report, out, made
-
-
-@pytest.mark.slow
-def test_tuned_gains_are_evaluated_on_members_that_the_search_did_not_use(monkeypatch, tmp_path):
-    world = World(limit=lambda seed, number, *_: 400.0)
-    code, summary, _, made = command(monkeypatch, tmp_path, world)
-    training, validation, held_out = seeds(made.tune.budget)
-    assert summary["held_out_seed"] == held_out
-    judged = [numbers for kind, seed, numbers, _ in world.calls if (kind, seed) == ("metrics", held_out)]
-    assert judged[:2] == [tuple(range(6))] * 2  # before and after; then by accurate steps
-    assert held_out not in world.seeds("terms")
-    assert {seed for kind, seed, *_ in world.calls if kind == "gradient"} == {training}
-    assert validation in world.seeds("terms")
-    assert code == 0
-    assert summary["after"]["lost"] == 0
-    assert summary["after"]["settled_rms_error_m"] < summary["before"]["settled_rms_error_m"]
+    return tuned.good, json.loads(json.dumps(tuned.report)), out
 
 
 def test_a_case_from_a_pipe_is_read_once(monkeypatch, tmp_path):
@@ -214,7 +185,7 @@ def test_a_file_whose_gains_could_not_be_written_is_refused_at_the_start(monkeyp
 
 @pytest.mark.slow
 def test_an_unfinished_search_is_kept_and_only_resumed_with_resume(monkeypatch, tmp_path):
-    *_, out, _ = command(monkeypatch, tmp_path, World())
+    *_, out = command(monkeypatch, tmp_path, World())
     left = {path.name for path in (out / "checkpoints").glob("*.npz")}
     mine = out / "checkpoints" / "round-my-net.npz"
     mine.touch()
@@ -254,8 +225,8 @@ def test_a_search_killed_before_its_first_checkpoint_is_resumed(monkeypatch, tmp
 HELD_OUT = seeds(Budget())[2]
 
 
-@pytest.mark.parametrize("status", ["lost", pytest.param("stalled", marks=pytest.mark.slow)])
 @pytest.mark.slow
+@pytest.mark.parametrize("status", ["lost", "stalled"])
 def test_a_member_that_accurate_steps_do_not_hold_is_not_a_survivor(monkeypatch, tmp_path, status):
     """The member is one of those that are simulated again."""
     mine = (HELD_OUT, 1)
@@ -263,8 +234,8 @@ def test_a_member_that_accurate_steps_do_not_hold_is_not_a_survivor(monkeypatch,
         world = World(limit=lambda seed, number, _, accurate: 40.0 if accurate and (seed, number) == mine else math.inf)
     else:
         world = World(stalls=lambda seed, number, accurate: accurate and (seed, number) == mine)
-    code, summary, *_ = command(monkeypatch, tmp_path, world)
-    assert code == 1
+    good, summary, _ = command(monkeypatch, tmp_path, world)
+    assert not good
     assert summary["step_error"]["refuted"] == ""
     assert summary["verified"] is False
     assert summary["after"]["survival"] == "not verified"
