@@ -260,23 +260,6 @@ def test_whole_numbers_are_spread_by_choices():
     assert case_from(tomllib.loads(text)).spread.paths == ("sensor.bits",)
 
 
-def test_a_case_has_its_spread_as_text():
-    text = """
-    [spread]
-    design = "sobol"
-    plant.m = { percent = 10 }
-    plant.k_z = { percent = 10, shape = "normal" }
-    initial.z = { normal = 1e-4 }
-    sensor.std = { log-uniform = [1e-8, 1e-6] }
-    disturbance.q_z.shift = { uniform = [-0.1, 0.1] }
-    actuator.u_max = { choices = [100, 200, 500] }
-    controller.position.c = { percent = 5 }
-    """
-    spread = case_from(tomllib.loads(CASE + text)).spread
-    assert spread == dataclasses.replace(SPREAD, design="sobol")
-    assert case_from({}).spread == Spread()
-
-
 def test_spreads_are_printed_as_in_the_case_file():
     for path, kind in SPREAD.entries:
         text = f"{CASE}[spread]\n{path} = {kind}\n"

@@ -12,7 +12,7 @@ from tuning.solve.evolution import PATIENCE, STALL, Evolution
 from tuning.solve.refine import early
 
 # Derivatives of a loop that is chaotic; those of a Bowl's loss are about 1e-4.
-CHAOS = {"chaotic": 1e30, "of moderate size": 1e-2}
+CHAOS = {"chaotic": 1e30, "of moderate size": 1e-2, "not finite": math.nan}
 
 
 def tried(levels, width=12):
@@ -43,7 +43,7 @@ def test_a_minimum_is_found_in_spite_of_misleading_derivatives(monkeypatch, tmp_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("chaos", CHAOS)
+@pytest.mark.parametrize("chaos", ["chaotic", "of moderate size"])
 def test_three_limits_hold_in_spite_of_misleading_derivatives(monkeypatch, tmp_path, chaos):
     answer, (c, k) = answer_of(monkeypatch, tmp_path, World(chaos=CHAOS[chaos]), limits=LIMITS)
     limits = {limit.name: limit for limit in answer.problem.limits}

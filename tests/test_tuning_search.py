@@ -14,7 +14,6 @@ from ambjax.laws import inversion
 from ambjax.sensors import Sensor
 from ambjax.signals import Sine
 from ambjax.solvers import Slide
-from tuning.__main__ import main
 from tuning.problem.goal import CVaR, Goal
 from tuning.problem.lanes import Engine
 from tuning.problem.loss import TERMS, loss_for, weigh
@@ -23,8 +22,8 @@ from tuning.problem.ranges import initial_points, ranges
 from tuning.problem.space import Gain, Space
 from tuning.problem.tuning_problem import problem_of
 from tuning.solve.checkpoint import CheckpointFile
-from tuning.solve.descent import JUMP, begin, step
-from tuning.solve.refine import RACE, best_of, screen, search
+from tuning.solve.descent import JUMP, begin, continued, step
+from tuning.solve.refine import best_of, screen, search
 
 PATHS = ("position.c", "position.k", "inversion.gamma", "current.k_i")
 SPACE = Space(tuple(Gain(f"controller.{path}", 0.0, 1e9) for path in PATHS))
@@ -128,19 +127,27 @@ def test_stressed_members_have_more_noise_and_only_their_survival_counts():
 # --- optimisers ---
 
 
-def test_bfgs_solves_a_quadratic_in_few_steps():
-    # superlinear: measured 2e-10 of the start after 15 steps in three dimensions, without a line search
-    centre, scales = jnp.asarray([0.7, -0.4, 0.2]), jnp.asarray([1.0, 9.0, 0.3])
+def descended(starts, centre, steps):
+    """Return the first of these starts after steps on a quadratic with its minimum at `centre`, and its distance."""
+    first = jax.tree.map(lambda a: a[0], starts)
+    for _ in range(steps):
+        x = first.trial - centre
+        first = step(first, jnp.sum(SCALES * x**2), 2 * SCALES * x)
+    return first, float(jnp.linalg.norm(first.best - centre))
 
-    def loss(x):
-        return jnp.sum(scales * (x - centre) ** 2)
 
-    def one(start, _):
-        return step(start, *jax.value_and_grad(loss)(start.trial)), None
+SCALES = jnp.asarray([1.0, 9.0, 0.3])
 
-    last, _ = jax.lax.scan(one, jax.tree.map(lambda a: a[0], begin(jnp.zeros((1, 3)))), length=20)
-    assert float(last.value) == pytest.approx(float(loss(last.best)), rel=1e-12)
-    assert float(last.value) < 1e-8 * float(loss(jnp.zeros(3)))
+
+def test_bfgs_solves_a_quadratic_in_few_steps_and_continues_with_its_inverse_hessian():
+    # superlinear: measured 2e-10 of the loss at the start after 15 steps in three dimensions, without a line search
+    centre, move = jnp.asarray([0.7, -0.4, 0.2]), jnp.asarray([0.1, 0.1, -0.1])  # within the first trust radius
+    first, _ = descended(begin(jnp.zeros((1, 3))), centre, 20)
+    assert float(first.value) < 1e-8 * float(jnp.sum(SCALES * centre**2))
+    # if the minimum moves, a quasi-Newton step leads near it: measured 9 % of the distance are left
+    again = continued(jax.tree.map(lambda a: a[None], first), first.best[None])
+    left = [descended(starts, first.best + move, 2)[1] for starts in (again, begin(first.best[None]))]
+    assert left[0] < 0.15 * float(jnp.linalg.norm(move)) < left[1]
 
 
 def test_a_refused_trial_of_bfgs_updates_the_curvature():
@@ -256,31 +263,7 @@ def test_a_resumed_search_is_the_uninterrupted_one(small, tmp_path):
         run(small, checkpoint_file=CheckpointFile(tmp_path / "kept.npz", {"case": 2}), resume=True)
 
 
-@pytest.mark.parametrize("first", [0, RACE])
-@pytest.mark.slow
-def test_a_search_continues_by_values_if_derivatives_are_not_finite(small, first):
-    """If a loop chatters, losses are finite but derivatives overflow."""
-    engine, goal, members, start = small
-
-    class Chattering:
-        objective, rollouts, calls = engine.objective, 0, -1
-
-        def terms(self, x, members):
-            return engine.terms(x, members)
-
-        def gradient(self, x, members, weights):
-            losses, slopes, terms = engine.gradient(x, members, weights)
-            self.calls += 1
-            return losses, np.nan * slopes if self.calls >= first else slopes, terms
-
-    found = run((Chattering(), goal, members, start), iterations=RACE + 6)
-    values = np.array(found.history["value"])
-    assert np.isfinite(best_of(found)[1])
-    assert np.isfinite(values[0]) == (first > 0)
-    assert found.evolution is not None or first > 0
-
-
-# --- [tune] and the command ---
+# --- [tune] ---
 
 
 def parsed(tune, **tables):
@@ -332,17 +315,3 @@ def test_bad_settings_are_refused_with_a_message(tune, says):
 def test_a_gain_that_is_both_spread_and_tuned_is_refused():
     with pytest.raises(ValueError, match=r"spread\.controller\.position\.c"):
         parsed({}, spread={"controller.position.c": {"percent": 5}})
-
-
-def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, capsys):
-    path, out = tmp_path / "case.toml", tmp_path / "out"
-    path.write_text('[tune]\nrisk = "best"\n')
-    assert main([str(path), "--out", str(out)]) == 2
-    said = capsys.readouterr().err
-    assert len(said.splitlines()) == 1
-    assert "Traceback" not in said
-    assert not out.exists()
-    assert main([str(tmp_path / "none.toml")]) == 2
-    path.write_text("[sensor]\nstd = 1e-6\n")
-    assert main([str(path), "--out", str(out), "--resume"]) == 2
-    assert f"--resume: --out {out} contains no search" in capsys.readouterr().err

@@ -86,6 +86,9 @@ def test_the_error_of_the_step_is_measured_against_accurate_ones(monkeypatch, bi
     error = step_error(made, at(made, 100.0, 60.0))
     assert error.relative == pytest.approx(bias, abs=1e-12)
     assert error.resolved == (abs(bias) <= RESOLVED)
+    assert error.refuted == (
+        "" if error.resolved else f"coarser steps give a settled rms error off by {100 * bias:.2g} %"
+    )
     assert error.reference_m == pytest.approx(S_0 * math.sqrt(FLOOR))
     assert (error.members, error.lost) == (4, 0)
 
@@ -108,6 +111,8 @@ def test_an_error_without_a_relative_value_is_given_in_metres(monkeypatch):
     assert zero.refuted == "coarser steps give a settled rms error of 1e-06 m against 0 m"
     assert describe(zero._replace(search_m=0.0)) == "settled rms error of 0 m against 0 m on 4 members"
     assert "of 1e-06 m against no number" in describe(zero._replace(reference_m=math.nan))
+    # errors below the resolution of the reference
+    assert error._replace(search_m=2e-11, reference_m=1e-11, relative=1.0, negligible_m=1e-10).refuted == ""
 
 
 # --- around the optimum ---
