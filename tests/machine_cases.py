@@ -6,6 +6,7 @@ RIG = {"mu_0": 1.2566e-6, "n": 208.0, "A": 2.68e-4, "s_0": 5e-4, "i_0": 2.5, "R"
 PID = {"position": {"kind": "pid"}, "inversion": {"kind": "linearised"}, "current": {"kind": "pi"}}
 CLOCK = {"duration": 0.02, "sample_period": 5e-5}
 SHORT = {"kind": "rigid", "m": 3.273, "I_t": 0.12542, "I_p": 3.643e-3}
+SPIN = SHORT["I_p"] / SHORT["I_t"]
 LEFT = {"name": "left", "kind": "radial", "at": -0.2516}
 RIGHT = {"name": "right", "kind": "radial", "at": 0.2584}
 THRUST = {"name": "thrust", "kind": "axial", "at": 0.1}
@@ -90,8 +91,8 @@ MACHINES = {
         "unbalance": [{"at": 0.1, "amount": 60.0, "phase": 30.0}, {"at": -0.2, "amount": 40.0, "phase": -100.0}],
         "clock": CLOCK,
     },
-    # two bending modes, sensors 15 mm outside the magnets; an unbalance and a pulse of force that act on the modes;
-    # the base shakes, at a slant and with a pulse
+    # two bending modes with gyroscopic terms, also with the tilt; sensors 15 mm outside the magnets; an unbalance and
+    # a pulse of force that act on the modes; the base shakes, at a slant and with a pulse
     "bending": {
         "plant": RIG,
         "rotor": SHORT
@@ -99,6 +100,7 @@ MACHINES = {
             "kind": "modal",
             "speed": 4000.0,
             "modes": [{"frequency": 105.0, "damping": 0.005}, {"frequency": 420.0, "damping": 0.005}],
+            "Gm": [[0.0] * 4, [0.0, SPIN, 0.2, 0.1], [0.0, 0.2, 0.3, -0.1], [0.0, 0.1, -0.1, 0.2]],
         },
         "bearing": [
             LEFT | {"sensor_at": -0.2666, "modes": [-0.45, 0.25], "sensor_modes": [-0.55, 0.4]},

@@ -56,6 +56,10 @@ def machine(case):
     M = np.array([m, m, m, rotor["I_t"], rotor["I_t"], *np.ones(len(w))])
     G = np.zeros((len(M), len(M)))
     G[3, 4], G[4, 3] = rotor["I_p"], -rotor["I_p"]
+    if "Gm" in rotor:  # of mass-normalised coordinates: x, beta_y, x of each mode with y, -beta_x, y of each mode
+        x, y = [0, 4, *range(5, len(M), 2)], [1, 3, *range(6, len(M), 2)]
+        Gm = rotor["Gm"] * np.sqrt(np.outer(M[x], M[x])) * np.where(np.array(y) == 3, -1.0, 1.0)
+        G[np.ix_(x, y)], G[np.ix_(y, x)] = Gm, -Gm.T
     names, tables, b, c = [], [], [], []
     for bearing in case["bearing"]:
         angle, at, shapes = math.radians(bearing.get("angle", 0.0)), bearing.get("at", 0.0), bearing.get("modes", [])
