@@ -29,12 +29,8 @@ EACH = pytest.mark.parametrize("kind", PLANTS)
 
 
 def cascade(bandwidth=HZ, **more):
-    law = {
-        "position": position.StateFeedback().designed(MODEL, None),
-        "inversion": inversion.Linearised(),
-        "model": MODEL,
-    }
-    return Cascade(current=current.AmplifierCurrent(bandwidth), **law | more)
+    law = {"position": position.StateFeedback().designed(MODEL, None), "inversion": inversion.Linearised()}
+    return Cascade(current=current.AmplifierCurrent(bandwidth), **law | {"model": MODEL} | more)
 
 
 def world(kind="lumped", i_max=None, **more):
@@ -63,14 +59,8 @@ def test_the_poles_in_continuous_time_are_those_of_the_textbook():
     law = cascade().position
     k_p, k_d, k_int, k_aw = (float(getattr(law, name)) for name in ("k_p", "k_d", "k_int", "k_aw"))
     a = (MODEL.k_s + 2 * MODEL.k_z) / MODEL.m
-    A = np.array(
-        [
-            [0, 1, 0, 0],
-            [a, 0, MODEL.k_i / MODEL.m, 0],
-            [-W * k_p, -W * k_d, -W, -W],
-            [k_int - k_aw * k_p, -k_aw * k_d, -k_aw, -k_aw],
-        ]
-    )
+    A = [[0, 1, 0, 0], [a, 0, MODEL.k_i / MODEL.m, 0], [-W * k_p, -W * k_d, -W, -W],
+         [k_int - k_aw * k_p, -k_aw * k_d, -k_aw, -k_aw]]  # fmt: skip
     plant = dataclasses.replace(MODEL, g=0.0)
     scenario = dataclasses.replace(world(), plant=plant)
     system, found = loop_matrices(cascade(model=plant), scenario, PERIOD, 0.0)
@@ -133,6 +123,7 @@ def test_the_export_commands_a_current():
     assert (found["limits.u_max"].unit, found["limits.u_max"].value) == ("A", 1.5)
 
 
+CURRENT = {"mode": "current", "bandwidth": 1e3}
 CASE = {"plant": {"R": 1.0}, "clock": {"duration": 0.01, "sample_period": 1e-4}}
 
 
@@ -141,10 +132,10 @@ def read(actuator, **more):
 
 
 def test_a_case_file_gives_the_amplifier_and_its_nominal_bandwidth():
-    case = read({"mode": "current", "bandwidth": 500.0, "i_max": 0.2})
-    assert case.scenario.amplifier == CurrentAmplifier(500.0, 0.2)
-    assert case.cascade.current == current.AmplifierCurrent(500.0)
-    given = read({"mode": "current", "bandwidth": 500.0}, controller={"current": {"bandwidth": 300.0}})
+    case = read(CURRENT | {"i_max": 0.2})
+    assert case.scenario.amplifier == CurrentAmplifier(1e3, 0.2)
+    assert case.cascade.current == current.AmplifierCurrent(1e3)
+    given = read(CURRENT, controller={"current": {"bandwidth": 300.0}})
     assert given.cascade.current == current.AmplifierCurrent(300.0)
 
 
@@ -152,13 +143,9 @@ def test_a_case_file_gives_the_amplifier_and_its_nominal_bandwidth():
     ("actuator", "laws", "words"),
     [
         ({"mode": "current"}, {}, r"actuator\.bandwidth is missing"),
-        (
-            {"mode": "current", "bandwidth": 1e3, "slew": 1e5},
-            {},
-            r"actuator\.slew: an amplifier with mode = \"current\"",
-        ),
+        (CURRENT | {"slew": 1e5}, {}, r"actuator\.slew: an amplifier with mode = \"current\""),
         ({"mode": "torque"}, {}, r"actuator\.mode"),
-        ({"mode": "current", "bandwidth": 1e3}, {"kind": "pi"}, r"ProportionalIntegral commands a voltage\. Leave out"),
+        (CURRENT, {"kind": "pi"}, r"ProportionalIntegral commands a voltage\. Leave out"),
         ({"u_max": 5.0}, {"kind": "amplifier"}, r"AmplifierCurrent commands a current\. Leave out"),
     ],
 )
@@ -176,13 +163,7 @@ def test_adaptive_steps_are_refused_in_continuous_time():
 
 
 @pytest.mark.parametrize(
-    ("tables", "sliding"),
-    [
-        ({}, True),
-        ({"actuator": {"mode": "current", "bandwidth": 3000.0}}, False),
-        ({"run": {"stop_stiffness": 1e8}}, False),
-    ],
-    ids=("voltage", "current", "stop"),
+    ("tables", "sliding"), [({}, True), ({"actuator": CURRENT}, False), ({"run": {"stop_stiffness": 1e8}}, False)]
 )
 def test_the_sliding_step_is_for_a_voltage_drive_without_a_stop(tables, sliding):
     # of these cases, `ambjax tune` takes sliding steps only for the first

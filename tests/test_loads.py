@@ -47,21 +47,6 @@ def test_disturbances_of_several_units_act_together():
     assert one.undisturbed().acceleration(0.2) == 0
 
 
-@pytest.mark.parametrize(
-    ("disturbance", "said"),
-    [
-        ({"q_z": []}, "disturbance.q_z: 0 signals"),
-        ({"q_z": [STEP, 3]}, r"disturbance.q_z\[1\] = 3: it must be a table"),
-        ({"q_z": [STEP | {"unit": "kg"}]}, r"disturbance.q_z\[0\].unit = \"kg\": it must be one of 'm/s\^2', 'N' or"),
-        ({"base": STEP | {"unit": "N"}}, "disturbance.base.unit"),
-        ({"force": STEP}, "disturbance.force"),
-    ],
-)
-def test_wrong_disturbances_are_refused(disturbance, said):
-    with pytest.raises(ValueError, match=said):
-        world(disturbance=disturbance)
-
-
 RPM = 2 * np.pi / 60
 
 
@@ -181,14 +166,10 @@ def test_the_low_pass_of_the_sensor_acts_on_the_runout():
 
 
 def write(tmp_path, name, t, value):
-    file = tmp_path / name
     if name.endswith("npz"):
-        np.savez(file, t=t, value=value)
+        np.savez(tmp_path / name, t=t, value=value)
     else:
-        file.write_text(
-            "t,value\n" + "\n".join(f"{a!r},{b!r}" for a, b in zip(t.tolist(), value.tolist(), strict=True))
-        )
-    return file
+        np.savetxt(tmp_path / name, np.stack([t, value], 1), delimiter=",", header="t,value", comments="")
 
 
 @pytest.mark.parametrize("name", ["load.csv", "load.npz"])
@@ -228,10 +209,10 @@ def test_a_written_case_finds_its_tables(tmp_path):
     assert found.scenario == again.scenario == case.scenario
 
 
-@pytest.mark.parametrize("end", ["csv", "tsv", "txt"])
 @pytest.mark.parametrize("named", [False, True])
 @pytest.mark.parametrize(
-    ("between", "point"), [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("   ", ".")]
+    ("between", "point", "end"),
+    [(",", ".", "csv"), (";", ".", "csv"), (";", ",", "txt"), ("\t", ",", "tsv"), ("   ", ".", "txt")],
 )
 def test_a_text_file_is_read_with_any_separator_and_decimal_mark(between, point, named, end, tmp_path):
     t, value = np.array([0.0, 0.125, 1.0]), np.array([-1.5, 2e-3, 1234.5])
@@ -253,7 +234,6 @@ GOOD = "t,value\n0,1\n1,2\n"
     [
         (None, {}, r"file = \"x.csv\": .*x.csv cannot be read \(No such file or directory\). A path is relative"),
         (GOOD, {"file": "x.doc"}, "must be the path of a file, '.csv', '.tsv', '.txt', '.npz' or '.parquet'"),
-        (GOOD, {"file": 3}, "must be the path of a file"),
         (GOOD, {"columns": ["t"]}, r"columns = \[\"t\"\]: it must be two names"),
         (GOOD, {"columns": ["t", "force"]}, "no column 'force'. Its columns: t, value"),
         (GOOD, {"interpolation": "cubic"}, "interpolation = \"cubic\": it must be one of 'linear' or 'held'"),
@@ -266,10 +246,9 @@ GOOD = "t,value\n0,1\n1,2\n"
         ("0,1\n", {}, "it has 1 rows; give 2 to"),
         ("0,1\n1,\n", {}, "line 2: the cell of column '2' is empty. Give a number"),
         ("0,1\n1,nan\n", {}, "the value of row 2 is nan; each must be a finite number"),
-        ("0,1\n1,inf\n", {}, "the value of row 2 is inf"),
         ("0,1\n2,1\n1,1\n", {}, "times must increase: row 3 has 1 s after 2 s"),
-        ("0,1\n1,x\n", {}, 'line 2: "x" is not a number'),
-        ("0,1\n1\n", {}, "line 2 has 1 columns, but the first line has 2"),
+        ('t,"value\n0,1\n1,2\n', {}, 'a quotation mark " is not closed'),
+        pytest.param('t,"value\n' + "0,1\n" * 50_000, {}, 'a quotation mark " is not closed', id="long"),
     ],
 )
 def test_wrong_tables_are_refused(text, keys, said, tmp_path):
@@ -281,28 +260,18 @@ def test_wrong_tables_are_refused(text, keys, said, tmp_path):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("text", ['t,"value\n0,1\n1,2\n', 't,"value\n' + "0,1\n" * 50_000], ids=("short", "long"))
-def test_an_open_quotation_mark_is_refused(tmp_path, text):
-    (tmp_path / "x.csv").write_text(text)
-    with pytest.raises(ValueError, match='a quotation mark " is not closed'):
-        case_from({"disturbance": {"q_z": {"kind": "table", "file": "x.csv"}}}, folder=tmp_path)
-
-
 def test_wrong_arrays_are_refused(tmp_path):
-    np.savez(tmp_path / "x.npz", t=np.zeros((2, 2)), value=np.zeros(2))
-    table = {"disturbance": {"q_z": {"kind": "table", "file": "x.npz"}}}
-    with pytest.raises(ValueError, match=r"two lists of equal length; their shapes are \(2, 2\), \(2,\)"):
-        case_from(table, folder=tmp_path)
-    np.savez(tmp_path / "x.npz", t=np.arange(2), value=np.array(["a", "b"]))
-    with pytest.raises(ValueError, match="values are not real numbers"):
-        case_from(table, folder=tmp_path)
-    (tmp_path / "x.npz").write_text("no")
-    with pytest.raises(ValueError, match="npz file of plain"):
-        case_from(table, folder=tmp_path)
-    with (tmp_path / "x.npz").open("wb") as file:
-        np.save(file, np.eye(2))
-    with pytest.raises(ValueError, match="npz file of plain"):
-        case_from(table, folder=tmp_path)
+    path, plain = tmp_path / "x.npz", tmp_path / "x.npy"
+    np.save(plain, np.eye(2))
+    for write_file, said in (
+        (lambda: np.savez(path, t=np.zeros((2, 2)), value=np.zeros(2)), r"two lists .*shapes are \(2, 2\), \(2,\)"),
+        (lambda: np.savez(path, t=np.arange(2), value=np.array(["a", "b"])), "values are not real numbers"),
+        (lambda: path.write_text("no"), "npz file of plain"),
+        (lambda: path.write_bytes(plain.read_bytes()), "npz file of plain"),
+    ):
+        write_file()
+        with pytest.raises(ValueError, match=said):
+            case_from({"disturbance": {"q_z": {"kind": "table", "file": "x.npz"}}}, folder=tmp_path)
 
 
 def test_parquet_needs_its_extra(tmp_path):
@@ -318,35 +287,32 @@ def test_parquet_needs_its_extra(tmp_path):
     assert case_from(table, folder=tmp_path).scenario.q_z(0.5) == 2.0
 
 
+TURNING, RUNOUT = {"kind": "unbalance", "unbalance": 1.0, "speed": 1.0}, {"sensor": {"runout": {"speed": 1.0}}}
+
+
+def load(table, name="q_z"):
+    return {"disturbance": {name: table}}
+
+
 @pytest.mark.parametrize(
     ("tables", "said"),
     [
-        (
-            {"disturbance": {"q_i": {"kind": "unbalance", "unbalance": 1.0, "speed": 1.0}}},
-            "gives N, but a signal in A/s",
-        ),
-        ({"reference": {"kind": "unbalance", "unbalance": 1.0, "speed": 1.0}}, "gives N, but a signal in m belongs"),
-        (
-            {"disturbance": {"q_z": {"kind": "unbalance", "unbalance": 1.0, "speed": 1.0, "unit": "m/s^2"}}},
-            "gives N, but a signal in m/s\\^2",
-        ),
-        (
-            ROTATING | {"disturbance": {"q_z": {"kind": "unbalance", "unbalance": 1.0, "speed": 1.0}}},
-            "disturbance.q_z.speed: it turns with",
-        ),
-        ({"disturbance": {"q_z": {"kind": "unbalance", "unbalance": 1.0}}}, r"\[rotor\] is missing: disturbance.q_z"),
+        (load([]), "disturbance.q_z: 0 signals"),
+        (load([STEP, 3]), r"disturbance.q_z\[1\] = 3: it must be a table"),
+        (load([STEP | {"unit": "kg"}]), r"q_z\[0\].unit = \"kg\": it must be one of 'm/s\^2', 'N' or"),
+        (load(STEP | {"unit": "N"}, "base"), "disturbance.base.unit"),
+        (load(STEP, "force"), "disturbance.force"),
+        (load(TURNING, "q_i"), "gives N, but a signal in A/s"),
+        ({"reference": TURNING}, "gives N, but a signal in m belongs"),
+        (load(TURNING | {"unit": "m/s^2"}), "gives N, but a signal in m/s\\^2"),
+        (ROTATING | load(TURNING), "disturbance.q_z.speed: it turns with"),
+        (load({"kind": "unbalance", "unbalance": 1.0}), r"\[rotor\] is missing: disturbance.q_z"),
         ({"rotor": {"speed": 1.0, "speed_end": 2.0}}, "rotor.speed_end = 2: from speed = 1 rpm, an acceleration of 0"),
-        (
-            {"sensor": {"runout": {"speed": 1.0}}},
-            "sensor.runout.harmonics is missing: it must be a list of 1 to 100 tables",
-        ),
-        (
-            {"sensor": {"runout": {"speed": 1.0, "harmonics": [{"number": 0.5, "amplitude": 1.0}]}}},
-            r"sensor.runout.harmonics\[0\].number = 0.5: it must be a whole number",
-        ),
+        (RUNOUT, "sensor.runout.harmonics is missing: it must be a list of 1 to 100 tables"),
+        ({"sensor": {"runout": {"harmonics": [{"number": 0.5, "amplitude": 1.0}]}}}, r"\[0\].number = 0.5: it must be"),
     ],
 )
-def test_wrong_loads_of_a_turning_rotor_are_refused(tables, said):
+def test_wrong_loads_are_refused(tables, said):
     with pytest.raises(ValueError, match=said):
         world(**tables)
 
