@@ -107,35 +107,16 @@ def test_the_page_of_the_motion_shows_the_displacements_of_the_axes(machine, hel
             np.testing.assert_allclose(np.array(motion) @ row, z, rtol=0, atol=1e-4 * np.abs(z).max())
 
 
-def test_a_run_up_has_the_forces_of_the_angle(machine):
-    turning = MACHINE["rotor"] | {"speed": 600.0, "acceleration": 6000.0}
-    unbalance = [{"at": 0.1, "amount": 10.0, "phase": 30.0}]
-    rotor = machine_from(short(MACHINE, rotor=turning, load=[], unbalance=unbalance)).machine.rotor
-    rotor = dataclasses.replace(rotor, gravity=np.zeros(5))
-    U = 10e-6
-
-    def place(t):
-        """Position of the unbalance mass times its mass: its acceleration is the force, with the opposite sign."""
-        angle = 2 * np.pi * (10.0 * t + 100.0 * t * t / 2) + np.pi / 6
-        return jnp.stack([U * jnp.cos(angle), U * jnp.sin(angle)])
-
-    with jax.enable_x64(True):
-        acceleration = jax.jacfwd(jax.jacfwd(place))(jnp.asarray(0.37))
-    force = np.asarray(rotor.forces(0.37))
-    np.testing.assert_allclose(force[:2], -acceleration, rtol=1e-10)
-    np.testing.assert_allclose(force[3:], [-0.1 * force[1], 0.1 * force[0]], rtol=1e-12)
-
-
-# A uniform free beam: (k l)^2 of the first three modes; Euler-Bernoulli, valid for a slender shaft.
-@pytest.mark.parametrize(("mode", "kl"), [(0, 4.730040745), (1, 7.853204624), (2, 10.99560784)])
-def test_a_slender_uniform_shaft_has_the_frequencies_of_the_beam(mode, kl):
+def test_a_slender_uniform_shaft_has_the_frequencies_of_the_beam():
+    """A uniform free beam: k l of the first three modes; Euler-Bernoulli, valid for a slender shaft."""
     length, d, E, rho = 1.0, 2e-3, 2.1e11, 7850.0
     nodes = np.linspace(0, length, 61)
     model = shaft_model([Section(0.0, length, d, 0.0, E, rho, 0.3)], [], nodes, [0] * 60, [0], 3)
     area, I = np.pi / 4 * d**2, np.pi / 64 * d**4
-    expected = (kl / length) ** 2 * np.sqrt(E * I / (rho * area)) / (2 * np.pi)
+    kl = np.array([4.730040745, 7.853204624, 10.99560784])
     # shear and rotary inertia lower the third mode by 4e-5 at this slenderness
-    assert float(model.frequencies[mode]) == pytest.approx(expected, rel=1e-4)
+    expected = (kl / length) ** 2 * np.sqrt(E * I / (rho * area)) / (2 * np.pi)
+    np.testing.assert_allclose(model.frequencies, expected, rtol=1e-4)
     assert float(model.m) == pytest.approx(rho * area * length)
     assert float(model.I_t) == pytest.approx(rho * area * length**3 / 12 + rho * I * length)
     assert abs(float(model.shapes[0, 0])) == pytest.approx(2 / np.sqrt(float(model.m)), rel=1e-4)  # at the end
@@ -309,33 +290,22 @@ def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monke
         ({"rotor": MACHINE["rotor"] | {"I_p": 1.0}}, r"rotor\.I_p = 1: it must be at most 2 I_t"),
         ({"rotor": MACHINE["rotor"] | {"kind": "elastic"}}, r"rotor\.kind = .*must be one of 'rigid'"),
         ({"plant": MACHINE["plant"] | {"m": 2.0}}, r"plant\.m = 2\.0: the rotor gives it"),
-        ({"plant": MACHINE["plant"] | {"g": 9.81}}, r"plant\.g = 9\.81: the rotor gives it"),
         ({"plant": MACHINE["plant"] | {"mass": 2.0}}, r"plant\.mass = 2\.0: unknown key\. Did you mean 'rotor\.m'"),
         (first(plant={"m": 2.0}), r"^bearing\[0\]\.plant\.m = 2\.0: the rotor gives it"),
         (first(plant={"A": -1.0}), r"left\.x: bearing\[0\]\.plant\.A = -1: it must be"),
         (first(stop=0.1), r"bearing\[0\]\.stop = 0\.1: unknown key\. Did you mean 'stop_at'"),
-        (first(stop_at=1e9), r"bearing\[0\]\.stop_at = 1e\+09: it must be a finite number from -100 to 100"),
-        (first(stop_modes=[1.0]), r"bearing\[0\]\.stop_modes"),
         (first(clearance=4e-4), r"left\.x: bearing\[0\]\.clearance = 0\.0004 m: it must be less than the gap"),
         (first(stop_at=-5.0), r"left\.y: initial\.q: at this axis z = .* touch its stop at the start"),
-        (
-            {"spread": {"bearing": {"left": {"clearance": {"uniform": [0.0, 1.0]}}}}},
-            r"spread\.bearing\.left\.clearance =",
-        ),
+        ({"spread": {"bearing": {"left": {"clearance": {"uniform": [0.0, 1.0]}}}}}, r"\.bearing\.left\.clearance ="),
         ({"loads": []}, r"loads = \[\]: unknown key\. Did you mean 'load'"),
         ({"bearing": MACHINE["bearing"][:1]}, "determine .* of the .* rigid motions"),
         ({"bearing": MACHINE["bearing"][2:]}, r"no axis holds y\. .*or a rotor\.gravity and loads that do not"),
-        ({"bearing": MACHINE["bearing"][:2], "rotor": VERTICAL}, "no axis holds z"),
         (
-            {
-                "bearing": MACHINE["bearing"][:2],
-                "load": [{"at": 0.0, "direction": [0, 0, 1], "kind": "constant", "value": 1.0}],
-            },
+            {"bearing": MACHINE["bearing"][:2], "load": [{"direction": [0, 0, 1], "kind": "constant", "value": 1.0}]},
             "no axis holds z.*loads that do not",
         ),
         ({"bearing": [{"kind": "radial", "at": 0.0}], "rotor": VERTICAL}, "no axis holds z, beta_x, beta_y"),
         ({"bearing": []}, r"\[\[bearing\]\] is missing"),
-        ({"bearing": [{"kind": "radial"}]}, r"bearing\[0\]\.at is missing"),
         ({"bearing": [MACHINE["bearing"][0]] * 2}, r"bearing\[1\]\.name = .*needs a name of its own"),
         ({"bearing": [MACHINE["bearing"][0] | {"name": "top.a"}]}, r"bearing\[0\]\.name = .top\.a.: .*without dots"),
         ({"bearing": [*MACHINE["bearing"][:2], {"kind": "axial", "angle": 45.0}]}, r"bearing\[2\]\.angle.*along the"),
@@ -344,7 +314,6 @@ def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monke
         ({"plant": MACHINE["plant"] | {"n": 20.0}}, "must carry .* N, and its magnet gives at most"),
         ({"disturbance": {"q_z": {"kind": "constant"}}}, r"\[disturbance\].*Use \[\[load\]\] or \[\[base"),
         ({"load": [{"direction": [0, 0, 0], "kind": "constant", "value": 1.0}]}, r"load\[0\]\.direction"),
-        ({"unbalance": [{"at": 0.0}]}, r"unbalance\[0\]\.amount is missing"),
         ({"initial": {"q": [0.0, 0.0]}}, r"initial\.q = .*a list of 5 numbers"),
         ({"sensitivity": {"speeds": []}}, r"sensitivity\.speeds"),
         ({"sensitivity": {"speeds": [0.0, 9e3, 0]}}, r"sensitivity\.speeds = .*: 0 rpm is given more than once"),

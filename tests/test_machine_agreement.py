@@ -34,7 +34,8 @@ def test_every_axis_agrees_with_the_independent_program(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in MACHINES if name not in ("rigid", "slanted")])
+# the laws of "five", in another arrangement, are those of the others
+@pytest.mark.parametrize("name", ["gyroscopic", "run-up", "bending", "coordinates"])
 def test_the_sensitivity_agrees_with_the_independent_program(name):
     case = machine_from(tomllib.loads(tomlkit.dumps(MACHINES[name])), name)
     ours = machine_sensitivity(case.machine, case.axes, case.clock.sample_period, case.speeds[0], case.zones)
@@ -49,14 +50,12 @@ SPEED = 9000.0
 
 
 @pytest.mark.slow
-# laws of the axes, in two groups; a law of the machine
-@pytest.mark.parametrize("name", [pytest.param("five", marks=pytest.mark.thorough), "coordinates"])
-def test_the_injected_sensitivity_of_every_axis_is_the_linear_one(name):
+def test_the_injected_sensitivity_of_every_axis_is_the_linear_one():
     """At all lines, within 1 % of the largest |S|: one period of 50 ms does not settle the integrals further.
 
     The amplitude of 1e-7 m is 2e-4 of the gap, and the nonlinear terms are of this size.
     """
-    case = machine_from(MACHINES[name])
+    case = machine_from(MACHINES["coordinates"])
     zones, clock = Zones(f_low=20.0, f_high=2000.0, amplitude=1e-7), dataclasses.replace(case.clock, samples=1000)
     linear = machine_sensitivity(case.machine, case.axes, clock.sample_period, SPEED, zones)
     (found,) = machine_injected(case.machine, clock, zones, [SPEED], [[axis.S.frequency for axis in linear.axes]])

@@ -49,12 +49,12 @@ def signals(raw):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sensor", [{}, {"dropouts": {"rate": 300.0, "duration": 1e-4, "value": "nan"}}])
-def test_rigid_body_coordinates_equal_the_axes_if_the_motions_have_the_same_plant(sensor):
+def test_rigid_body_coordinates_equal_the_axes_if_the_motions_have_the_same_plant():
     """Default gains of each coordinate, from its own nominal plant; a supply that limits; a guard that replaces."""
-    raw = UNCOUPLED | {"sensor": UNCOUPLED["sensor"] | sensor}
+    dropouts = {"rate": 300.0, "duration": 1e-4, "value": "nan"}
+    raw = UNCOUPLED | {"sensor": UNCOUPLED["sensor"] | {"dropouts": dropouts}}
     axes, rigid = signals(raw), signals(changed(raw, coordinates="rigid-body"))
-    assert np.any(axes["refused"]) == bool(sensor)
+    assert np.any(axes["refused"])
     assert not np.isfinite(axes["lost_at"])
     for name in ("z", "i", "u"):
         np.testing.assert_allclose(rigid[name], axes[name], rtol=0, atol=1e-9 * np.abs(axes[name]).max())
@@ -81,10 +81,9 @@ def munich(left, right, modes, **tables):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sensors", [pytest.param((0.155, 0.581), marks=pytest.mark.thorough), (0.071, 0.665)])
-def test_an_lqg_holds_the_munich_rig_with_sensors_beside_its_magnets(sensors):
-    """|S| in zone A between two speeds of the design, with 12 modes. With each of these pairs, a PID is unstable."""
-    case = munich(*sensors, 12)
+def test_an_lqg_holds_the_munich_rig_with_sensors_beside_its_magnets():
+    """|S| in zone A between two speeds of the design. With these sensors, a PID is unstable."""
+    case = munich(0.071, 0.665, 6)
     found = machine_sensitivity(case.machine, case.axes, case.clock.sample_period, 1500.0, case.zones)
     assert found.stable
     assert {axis.zone for axis in found.axes} == {"A"}

@@ -90,10 +90,8 @@ def test_finite_elements_in_a_file_are_the_shaft(own, name, shaft, tmp_path):
 
 
 def test_damping_of_a_file(tmp_path):
-    arrays = finite_elements(4)
-    np.savez(tmp_path / "rotor.npz", **arrays)
-    raw = {"rotor": {"kind": "modal", "file": "rotor.npz"}}
-    body = body_from(Table(raw), tmp_path)
+    np.savez(tmp_path / "rotor.npz", **finite_elements(4))
+    body = body_from(Table({"rotor": {"kind": "modal", "file": "rotor.npz"}}), tmp_path)
     # C = b K is a damping ratio b w / 2
     np.testing.assert_allclose(body.dampings, np.pi * 1e-6 * body.frequencies, rtol=1e-6)
     assert len(body.frequencies) == 4
@@ -107,25 +105,15 @@ def modal_table(rotor):
     G = np.asarray(rotor.G)[np.ix_(real, imaginary)] * np.where(np.array(imaginary) == 3, -1.0, 1.0)
     f = np.sqrt(np.diag(rotor.K) / M)[real] / (2 * np.pi)
     rows = {f"phi_{name}": B[k][real] * weights for name, k in (("left", 0), ("right", 2))}
-    I_t = M[3]
-    centre = MAGNETS[0] - B[0, 4]
-    return {
-        "f_hz": f,
-        "G": G * np.outer(weights, weights),
-        "m": M[0],
-        "It": I_t,
-        "Ip": rotor.G[3, 4],
-        "zc": centre,
-    } | rows
+    inertia = {"m": M[0], "It": M[3], "Ip": rotor.G[3, 4], "zc": MAGNETS[0] - B[0, 4]}
+    return {"f_hz": f, "G": G * np.outer(weights, weights)} | inertia | rows
 
 
 @pytest.mark.slow
 def test_a_modal_table_is_the_shaft(shaft, tmp_path):
-    raw = FLEXIBLE | {"unbalance": []}
     np.savez(tmp_path / "table.npz", **modal_table(shaft))
-    table = {"kind": "modal", "file": "table.npz", "damping": 0.003}
-    rotor = machine_from(raw | {"rotor": table}, "table", "", tmp_path).machine.rotor
-    alike(rotor, shaft, 1e-12)
+    table = {"rotor": {"kind": "modal", "file": "table.npz", "damping": 0.003}, "unbalance": []}
+    alike(machine_from(FLEXIBLE | table, "table", "", tmp_path).machine.rotor, shaft, 1e-12)
 
 
 @pytest.mark.slow
@@ -186,30 +174,10 @@ def test_a_place_without_shapes_is_refused(shaft, tmp_path):
         of_file(tmp_path, modal_table(shaft))  # its unbalance is on the middle disc
 
 
-# The rig of the Federal University of Uberlandia, from amb_models.py of ROSS (Apache-2.0): lengths (m), diameters (mm)
-# of the sections, and places and widths (mm) of its laminations and of the three parts of its disc.
-SECTIONS = [(0.012, 6.35), (0.08, 32), (0.0733, 34.8), (0.0252, 49.9), (0.1675, 19.05), (0.0125, 54), (0.1651, 19.05),
-            (0.0251, 49.9), (0.0734, 34.8), (0.012, 6.35)]  # fmt: skip
-LAMINATIONS = [(112, 8.8), (120.8, 6.4), (127.2, 7.5), (134.8, 5.7), (140.5, 6.4), (146.9, 6.1), (153, 6.2),
-               (159.2, 6.2),
-               (566.9, 6.2), (573.1, 6.2), (579.2, 6.1), (585.6, 6.4), (591.3, 5.7), (598.9, 7.5), (605.3, 6.4),
-               (614.1, 8.8)]  # fmt: skip
-DISC = [(358, 4), (364, 7), (370.5, 14)]
-
-
-def ring(at, width, rho, inner, outer):
-    """A ring of a material: places and sizes in mm."""
-    a, b, w = inner * 1e-3, outer * 1e-3, width * 1e-3
-    m = rho * np.pi / 4 * (b**2 - a**2) * w
-    return {"at": at * 1e-3, "m": m, "I_t": m * (3 * (a**2 + b**2) + 4 * w**2) / 48, "I_p": m * (a**2 + b**2) / 8}
-
-
 def test_the_rotor_of_uberlandia_from_its_geometry():
     """Mass, inertia, free frequencies, and their splits at 10,000 rpm: figures of an independent program."""
-    discs = [ring(*one, 7700, 34.8, 49.8) for one in LAMINATIONS] + [ring(*one, 7850, 54, 120) for one in DISC]
-    elements = [{"length": length, "diameter": d * 1e-3} for length, d in SECTIONS]
-    rotor = {"kind": "shaft", "E": 1.9e11, "rho": 7850.0, "modes": 8, "elements": elements, "discs": discs}
-    body = body_from(Table({"rotor": rotor, "bearing": [{"at": 0.153}, {"at": 0.5669}]}))
+    raw = tomllib.loads(template("machine-ufu"))
+    body = body_from(Table(raw | {"rotor": raw["rotor"] | {"modes": 8}}))
     assert (body.m, body.I_t, body.I_p) == pytest.approx((5.936, 0.18586, 4.795e-3), rel=1e-4)
     np.testing.assert_allclose(body.frequencies[:4], [104.2, 400.3, 768.2, 1117.6], atol=0.05)
     assert body.shapes is not None
