@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from structures import RIG
 
 from ambjax import Scenario, rollout
 from ambjax.actuators import Amplifier
@@ -23,7 +24,6 @@ from ambjax.world.coils import TwoCoil
 from ambjax.world.iron import Iron
 from ambjax.world.sensor import Measurement
 
-RIG = {"m": 1.64, "k_z": 0.0, "mu_0": 1.2566e-6, "n": 208.0, "A": 2.68e-4, "s_0": 5e-4, "i_0": 2.5, "R": 1.0}
 STILL = TwoCoil(**RIG)
 L = float(STILL.L)
 STEP, STEPS = 1e-5, 300

@@ -1,4 +1,4 @@
-"""Reverse mode through a rollout in parts: its memory, and when the tuner uses it."""
+"""The memory of reverse mode through a rollout in parts."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,6 @@ from ambjax.simulation.folds import Rms
 from ambjax.simulation.parts import rolled_in_parts
 from ambjax.simulation.rollout import prepare
 from ambjax.solvers import RK4
-from tuning.problem.tuning_problem import cheaper_mode
 
 
 def gradient_in_parts(samples):
@@ -36,10 +35,3 @@ def test_the_memory_of_a_rollout_in_parts_grows_with_the_square_root_of_its_samp
     sizes = [gradient_in_parts(n).memory_analysis().temp_size_in_bytes for n in (10_000, 40_000)]
     # a part of the memory does not depend on the samples
     assert sizes[1] < 2.1 * sizes[0]
-
-
-@pytest.mark.parametrize(("outcomes", "most"), [(1, 8), (2, 12), (3, 16)])
-def test_the_mode_with_fewer_plain_rollouts_is_used(outcomes, most):
-    """Forward mode takes 1 + m plain rollouts for m gains, reverse mode 5 and 4 for each outcome."""
-    assert cheaper_mode(most, outcomes) == "forward"
-    assert cheaper_mode(most + 1, outcomes) == "reverse"

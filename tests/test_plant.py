@@ -105,13 +105,6 @@ def test_current_for_is_smooth_through_z_zero():
     np.testing.assert_allclose(by_v, 1 / PLANT.dv_di(z, i), rtol=1e-12)
 
 
-def test_current_for_is_finite_where_v_is_out_of_reach():
-    z, v = np.meshgrid(np.linspace(-2, 2, 41) * PLANT.s_0, np.array([-1e12, -1e6, -1e3, 0, 1e3, 1e6, 1e12]))
-    z, v = z.ravel(), v.ravel()
-    gradients = jax.jit(jax.vmap(jax.grad(PLANT.current_for, (0, 1))))(z, v)
-    assert np.all(np.isfinite(np.array([PLANT.current_for(z, v), *gradients])))
-
-
 @pytest.mark.parametrize("share", [-0.5, -0.05, 0.05, 0.5])
 def test_an_unreachable_force_gives_the_current_of_the_nearest_force(share):
     z = share * PLANT.s_0
@@ -152,28 +145,28 @@ def test_distance_to_C_is_zero_on_C_and_known_at_the_origin():
 # --- at and beyond the gap ---
 
 SHARES = np.array([0.9, 0.995, 1.0, 1.0000001, 2.0, 100.0])
-# every (z, i) of +-SHARES s_0 and some currents, none of them on C
-BEYOND = np.stack(np.meshgrid(np.concatenate([SHARES, -SHARES]) * PLANT.s_0, [-100.0, -0.26, 0.0, 0.26, 100.0]))
+# every (z, i) of +-SHARES s_0 and 0, and some currents, none of them on C
+BEYOND = np.stack(np.meshgrid([0.0, *SHARES * PLANT.s_0, *-SHARES * PLANT.s_0], [-100.0, -0.26, 0.0, 0.26, 100.0]))
 
 
-@pytest.mark.parametrize(
-    "function",
-    [
-        PLANT.v,
-        PLANT.dv_dz,
-        PLANT.dv_di,
-        PLANT.z_ddot,
-        lambda z, i: PLANT.i_dot(z, 1.0, i, 10.0),
-        lambda z, v: PLANT.current_for(z, 1e4 * v),
-        lambda z, i: sum(PLANT.equilibrium(z)) + 0 * i,
-        PLANT.singularity,
-        PLANT.distance_to_C,
-    ],
-    ids=["v", "dv_dz", "dv_di", "z_ddot", "i_dot", "current_for", "equilibrium", "singularity", "distance_to_C"],
-)
-def test_finite_with_finite_derivatives_at_and_beyond_the_gap(function):
+FUNCTIONS = {
+    "v": PLANT.v,
+    "dv_dz": PLANT.dv_dz,
+    "dv_di": PLANT.dv_di,
+    "z_ddot": PLANT.z_ddot,
+    "i_dot": lambda z, i: PLANT.i_dot(z, 1.0, i, 10.0),
+    "current_for": lambda z, v: PLANT.current_for(z, 1e4 * v),
+    "current_for, out of reach": lambda z, v: PLANT.current_for(z, 1e10 * v),
+    "equilibrium": lambda z, i: sum(PLANT.equilibrium(z)) + 0 * i,
+    "singularity": PLANT.singularity,
+    "distance_to_C": PLANT.distance_to_C,
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_finite_with_finite_derivatives_at_and_beyond_the_gap(name):
     z, i = BEYOND.reshape(2, -1)
-    value, slopes = jax.jit(jax.vmap(jax.value_and_grad(function, (0, 1))))(z, i)
+    value, slopes = jax.jit(jax.vmap(jax.value_and_grad(FUNCTIONS[name], (0, 1))))(z, i)
     assert np.all(np.isfinite(np.stack([value, *slopes])))
 
 

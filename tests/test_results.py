@@ -13,7 +13,6 @@ import pytest
 import ambjax
 from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
-from ambjax.linear import linearise
 from ambjax.simulation.trajectory import STALLED
 from tuning.__main__ import main as tune_main
 from tuning.command import TunedCase
@@ -121,13 +120,6 @@ def test_a_notebook_shows_the_metrics(run):
     page = dataclasses.replace(run, trajectory=stalled)._repr_html_()
     assert "case: not decided, stalled: the integrator could not meet its tolerance" in page
     assert f"<td>rms_u_V</td><td>{run.metrics['rms_u_V']:.6g}</td><td>V</td>" in page
-
-
-def test_the_sensitivity_equals_the_linear_analysis(path):
-    case = ambjax.read_case(path)
-    at = ambjax.sensitivity(case)
-    system = linearise(case.cascade, case.scenario, case.clock)
-    assert at.S.height == pytest.approx(abs(system.sensitivity(np.array([at.S.frequency]))[0]))
 
 
 def test_the_parts_of_a_case_stand_for_it(path, run):
