@@ -152,6 +152,17 @@ MACHINES = {
 }  # fmt: skip
 
 
+# The linear magnets k_i = 50 N/A and k_s = 1e5 N/m of the Munich rig, and its controller (`Pid`, as pid.npz).
+MUNICH = {
+    "plant": {"mu_0": 1.2566e-6, "n": 208.0, "A": 50 * 0.78e-3**2 / 1.56 / 1.2566e-6 / 208.0**2, "s_0": 0.78e-3,
+              "i_0": 1.56, "R": 0.0},
+    "actuator": {"mode": "current", "bandwidth": 1e6},
+    "controller": {"position": {"kind": "linear", "file": "pid.npz", "output": "current"},
+                   "current": {"kind": "amplifier", "bandwidth": 1e6}},
+    "clock": {"duration": 1e-3, "sample_period": 1e-6},
+}  # fmt: skip
+
+
 # Amplifiers without current: the magnets exert only what their bias gives.
 OFF = {
     "controller": {"position": {"kind": "pid", "k_p": 1.0, "k_d": 1.0, "k_int": 1.0},

@@ -237,8 +237,6 @@ def signal(one, t, middle):
     kind = one["kind"]
     if kind == "sine":
         return one["amplitude"] * math.sin(2 * math.pi * one["frequency"] * t + one.get("phase", 0.0))
-    if kind == "constant":
-        return one["value"]
     return one["amplitude"] * (one["start"] <= middle < one.get("stop", math.inf))
 
 

@@ -56,7 +56,6 @@ HOSTILE = {
     "5,000 digits": ("[plant]\nm = " + "9" * 5000, ["thousands of digits"]),
     "seed of 5,000 digits": ("[run]\nseed = 0x" + "f" * 5000, ["run.seed", "digits", "4294967295"]),
     "gap of an underflow": ("[plant]\ns_0 = 1e-110", ["plant.s_0 = 1e-110", "from 1e-06 to 1 (m)"]),
-    "duration": ("[clock]\nduration = 1e308", ["clock.duration = 1e+308", "1e+06 (s)"]),
     "steps for years": ('[clock]\ndt = 1e-14\nmethod = "rodas3"', ["clock.dt", "2e+14 steps", '"auto"']),
     "settle": ("[run]\nsettle = nan", ["run.settle = nan"]),
     "percentage of an overflow": ("[spread]\nplant.k_z = { percent = 1e308 }", ["spread.plant.k_z", "inf"]),

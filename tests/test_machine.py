@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from machine_cases import Pid
+from machine_cases import MUNICH, Pid
 from scipy.linalg import eig
 
 from ambjax.__main__ import main
@@ -31,8 +31,7 @@ from ambjax.world.shaft import Section, shaft_model
 
 MACHINE = tomllib.loads(template("machine"))
 FLEXIBLE = tomllib.loads(template("machine-flexible"))
-
-
+RADIAL, PUSH = MACHINE["bearing"][:2], {"kind": "constant", "value": 1.0}
 VERTICAL = MACHINE["rotor"] | {"gravity": [0.0, 0.0, -9.81]}
 
 
@@ -169,23 +168,17 @@ def test_campbell_lines_of_the_munich_rig_on_springs():
 
 
 def munich(folder, left, right):
-    """The rig with the linear magnets k_i = 50 N/A and k_s = 1e5 N/m and the published PID, in continuous time."""
+    """The rig with its published PID, in continuous time."""
     from ambjax import save_controller
 
     save_controller(folder / "pid.npz", Pid)
-    s_0, i_0, turns, mu_0 = 0.78e-3, 1.56, 208.0, 1.2566e-6
     rotor = {key: value for key, value in FLEXIBLE["rotor"].items() if key not in ("damping", "speed")}
-    raw = {
+    raw = MUNICH | {
         # damping proportional to the stiffness, 5e-7 s: that of the published figures
         "rotor": rotor | {"modes": 5, "gravity": [0.0] * 3, "damping": [float(np.pi * 5e-7 * f) for f in
                           (22.378, 105.575, 176.527, 212.873, 607.44)]},
         "bearing": [{"name": name, "kind": "radial", "at": at, "sensor_at": sensor} for name, at, sensor in
                     (("left", 0.113, left), ("right", 0.623, right))],
-        "plant": {"mu_0": mu_0, "n": turns, "A": 50 * s_0**2 / i_0 / mu_0 / turns**2, "s_0": s_0, "i_0": i_0, "R": 0.0},
-        "actuator": {"mode": "current", "bandwidth": 1e6},
-        "controller": {"position": {"kind": "linear", "file": "pid.npz", "output": "current"},
-                       "current": {"kind": "amplifier", "bandwidth": 1e6}},
-        "clock": {"duration": 1e-3, "sample_period": 1e-6},
     }  # fmt: skip
     case = machine_from(raw, "munich", "", folder)
     return machine_sensitivity(case.machine, case.axes, case.clock.sample_period, 0.0, case.zones)
@@ -300,20 +293,16 @@ def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monke
         ({"loads": []}, r"loads = \[\]: unknown key\. Did you mean 'load'"),
         ({"bearing": MACHINE["bearing"][:1]}, "determine .* of the .* rigid motions"),
         ({"bearing": MACHINE["bearing"][2:]}, r"no axis holds y\. .*or a rotor\.gravity and loads that do not"),
-        (
-            {"bearing": MACHINE["bearing"][:2], "load": [{"direction": [0, 0, 1], "kind": "constant", "value": 1.0}]},
-            "no axis holds z.*loads that do not",
-        ),
+        ({"bearing": RADIAL, "load": [PUSH | {"direction": [0, 0, 1]}]}, "no axis holds z.*loads that do not"),
         ({"bearing": [{"kind": "radial", "at": 0.0}], "rotor": VERTICAL}, "no axis holds z, beta_x, beta_y"),
         ({"bearing": []}, r"\[\[bearing\]\] is missing"),
         ({"bearing": [MACHINE["bearing"][0]] * 2}, r"bearing\[1\]\.name = .*needs a name of its own"),
         ({"bearing": [MACHINE["bearing"][0] | {"name": "top.a"}]}, r"bearing\[0\]\.name = .top\.a.: .*without dots"),
         ({"bearing": [*MACHINE["bearing"][:2], {"kind": "axial", "angle": 45.0}]}, r"bearing\[2\]\.angle.*along the"),
-        ({"base": [{"direction": [0, 0, 0], "kind": "constant", "value": 1.0}]}, r"base\[0\]\.direction.*not be zero"),
+        ({"base": [PUSH | {"direction": [0, 0, 0]}]}, r"base\[0\]\.direction.*not be zero"),
         ({"load": [{"direction": [1, 0, 0], "kind": "unbalance", "unbalance": 1.0}]}, r"load\[0\].*as \[\[unbalance"),
         ({"plant": MACHINE["plant"] | {"n": 20.0}}, "must carry .* N, and its magnet gives at most"),
         ({"disturbance": {"q_z": {"kind": "constant"}}}, r"\[disturbance\].*Use \[\[load\]\] or \[\[base"),
-        ({"load": [{"direction": [0, 0, 0], "kind": "constant", "value": 1.0}]}, r"load\[0\]\.direction"),
         ({"initial": {"q": [0.0, 0.0]}}, r"initial\.q = .*a list of 5 numbers"),
         ({"sensitivity": {"speeds": []}}, r"sensitivity\.speeds"),
         ({"sensitivity": {"speeds": [0.0, 9e3, 0]}}, r"sensitivity\.speeds = .*: 0 rpm is given more than once"),

@@ -70,7 +70,7 @@ def test_the_injected_sensitivity_of_every_axis_is_the_linear_one():
 @pytest.mark.slow
 def test_the_command_reports_the_injected_beside_the_linear_peak(tmp_path, capsys):
     text = template("machine").replace("std = 2e-7", "std = 1e-9")
-    text = text.replace("[sensitivity]", "[sensitivity]\nf_low = 20.0")
+    text = text.replace("[sensitivity]", "[sensitivity]\nf_low = 50.0")
     path = tmp_path / "m.toml"
     path.write_text(text)
     assert main(["sensitivity", str(path), "--out", str(tmp_path / "s"), "--json"]) == 0

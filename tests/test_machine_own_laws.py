@@ -4,6 +4,7 @@ import pathlib
 
 import numpy as np
 import pytest
+from machine_cases import LEFT, MACHINES, RIGHT, SHORT
 from test_own_laws import LAW
 
 from ambjax.cases.machine_case import machine_from
@@ -37,18 +38,11 @@ class Whole(MachineLaw):
         return demand_of(inputs.scaled(self.mass * wanted), measured), 10 * self.stiff * measured.z
 """
 )
-PLANT = {"mu_0": 1.2566e-6, "n": 200.0, "A": 7.6e-5, "s_0": 3.81e-4, "i_0": 1.444, "R": 1.0}
 INNER = {"inversion": {"kind": "closed-form"}, "current": {"kind": "pi"}}
-MACHINE = {
-    "rotor": {"kind": "rigid", "m": 2.3, "I_t": 0.06, "I_p": 8e-4, "speed": 6000.0},
-    "bearing": [
-        {"name": "left", "kind": "radial", "at": -0.139, "sensor_at": -0.119},
-        {"name": "right", "kind": "radial", "at": 0.241, "plant": {"A": 9e-5}},
-    ],
-    "plant": PLANT,
+MACHINE = MACHINES["rigid"] | {
+    "rotor": SHORT | {"speed": 6000.0},
+    "bearing": [LEFT | {"sensor_at": -0.24}, RIGHT | {"plant": {"A": 3e-4}}],
     "processor": {"delay": 1.0, "predict": False},
-    "initial": {"q": [2e-5, -3e-5, 0.0, 1e-4, 0.0]},
-    "clock": {"duration": 0.01, "sample_period": 5e-5},
 }
 
 

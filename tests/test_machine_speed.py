@@ -5,7 +5,7 @@ import tomllib
 
 import numpy as np
 import pytest
-from machine_cases import Pid
+from machine_cases import MUNICH, Pid
 
 from ambjax import save_controller
 from ambjax.__main__ import main
@@ -21,8 +21,7 @@ from ambjax.pictures.run_up_picture import waterfall
 from ambjax.results.machine_run import simulate_machine
 
 MASS, I_T, I_P, HALF = 3.0, 0.1, 0.04, 0.25
-S_0, I_0, K_I, K_S = 0.78e-3, 1.56, 50.0, 1e5
-MAGNET = {"mu_0": 1.2566e-6, "n": 208.0, "A": K_I * S_0**2 / I_0 / 1.2566e-6 / 208.0**2, "s_0": S_0, "i_0": I_0}
+K_I, K_S = 50.0, 1e5
 
 
 @pytest.fixture(scope="module")
@@ -33,16 +32,11 @@ def rigid(tmp_path_factory):
 
 def machine_of(folder, controller):
     save_controller(folder / "pid.npz", controller)
-    raw = {
+    raw = MUNICH | {
         "rotor": {"kind": "rigid", "m": MASS, "I_t": I_T, "I_p": I_P, "gravity": [0.0] * 3},
         "bearing": [{"name": n, "kind": "radial", "at": at} for n, at in (("left", -HALF), ("right", HALF))],
         "unbalance": [{"at": 0.1, "amount": 10.0, "phase": 30.0}],
-        "plant": MAGNET | {"R": 0.0},
-        "actuator": {"mode": "current", "bandwidth": 1e6},
-        "controller": {"position": {"kind": "linear", "file": "pid.npz", "output": "current"},
-                       "current": {"kind": "amplifier", "bandwidth": 1e6}},
-        "clock": {"duration": 1e-3, "sample_period": 1e-6},
-    }  # fmt: skip
+    }
     return machine_from(raw, "rigid", "", folder)
 
 

@@ -186,13 +186,10 @@ CASE = {"processor": {}, "clock": {"duration": 0.01}}
     ("table", "key", "value", "words"),
     [
         ("sensor", "bits", 14.5, "a whole number from 2 to 32"),
-        ("sensor", "range_z", 0, "range_z"),
         ("sensor", "bandwidth", 0.1, "Hz"),
-        ("sensor", "gain", 0, "from 0.01 to 100"),
         ("sensor", "velocity", 1, "true or false"),
         ("sensor", "velocity", False, 'kind = "kalman"'),
         ("sensor", "bit", 14, "Did you mean 'bits'"),
-        ("actuator", "slew", -1, "V/s"),
         ("actuator", "dead_band", "1", "without quotes"),
         ("actuator", "i_min", 1, "Did you mean 'i_max'"),
     ],

@@ -38,6 +38,13 @@ def answered(tmp_path, capsys, text, *flags):
     return code, *capsys.readouterr(), path
 
 
+def checked(tmp_path, capsys, text):
+    """Return the exit code and the summary of `check`."""
+    path = tmp_path / "case.toml"
+    path.write_text(text)
+    return main(["check", str(path), "--json"]), json.loads(capsys.readouterr().out)
+
+
 def test_the_summary_agrees_with_the_analysis(tmp_path, capsys):
     code, out, _, path = answered(tmp_path, capsys, CASE, "--json")
     summary = json.loads(out)
@@ -136,25 +143,21 @@ CHECKED = "[controller]\n[clock]\nduration = 0.02\n[actuator]\nu_max = 200.0\n"
 @pytest.mark.slow
 def test_check_does_not_succeed_without_a_linearisation(tmp_path, capsys, monkeypatch):
     """All conditions hold, the rotor is held, and the verdict on the linear loop is missing."""
-    path = tmp_path / "case.toml"
-    path.write_text(CHECKED)
 
     def fails(*args):
         raise ValueError("the cause")
 
     monkeypatch.setattr(acceptance, "linearise", fails)
-    assert main(["check", str(path), "--json"]) == 1
-    loop = json.loads(capsys.readouterr().out)["loop"]
+    code, summary = checked(tmp_path, capsys, CHECKED)
+    loop = summary["loop"]
+    assert code == 1
     assert (loop["zone"], loop["stable"], loop["why"]) == (None, None, "the cause")
     assert loop["k_s_N_per_m"] > 0
 
 
 def test_check_begins_with_the_numbers_of_the_machine(tmp_path, capsys):
     """By hand for the plant of Table 1: kappa = mu_0 n^2 A, k_s = kappa i_0^2/s_0^3, k_i = kappa i_0/s_0^2."""
-    path = tmp_path / "case.toml"
-    path.write_text(CHECKED)
-    main(["check", str(path), "--json"])
-    loop = json.loads(capsys.readouterr().out)["loop"]
+    loop = checked(tmp_path, capsys, CHECKED)[1]["loop"]
     kappa = 1.25e-6 * 1480**2 * 0.121
     expected = {
         "k_s_N_per_m": kappa * 0.25**2 / 5e-3**3,
@@ -168,7 +171,7 @@ def test_check_begins_with_the_numbers_of_the_machine(tmp_path, capsys):
     assert loop["zone"] == "D"
     assert loop["converter_step_m"] is None
     assert loop["delay_margin_s"] == min(loop["margins"][at]["delay_margin_s"] for at in ("reading", "command"))
-    main(["check", str(path), "--full"])
+    main(["check", str(tmp_path / "case.toml"), "--full"])
     shown = capsys.readouterr().out
     assert shown.startswith("The check passes.")
     assert "Eq. (14a)" in shown
@@ -253,12 +256,9 @@ def test_the_picture_shows_the_response_and_the_injected_points(tmp_path):
 @pytest.mark.slow
 def test_check_gives_the_zone_of_the_clearance(tmp_path, capsys):
     """The reference moves the rotor by 1 mm of 4.5 mm, which is 22 %: above clearance_b, below clearance_c."""
-    path = tmp_path / "case.toml"
     limits = "clearance_a = 0.1\nclearance_b = 0.2\n"
-    path.write_text(f"{CASE}{limits}[clock]\nduration = 0.4\n[run]\nsettle = 0.3\n")
-    main(["check", str(path), "--json"])
-    found = json.loads(capsys.readouterr().out)
-    case = read_case(path)
+    found = checked(tmp_path, capsys, f"{CASE}{limits}[clock]\nduration = 0.4\n[run]\nsettle = 0.3\n")[1]
+    case = read_case(tmp_path / "case.toml")
     fold = Metrics.of(case.settle, case.scenario)
     used = rollout(case.cascade, case.scenario, case.clock, fold=fold, record_every=0).metrics["settled_clearance_used"]
     assert found["clearance_used"] == pytest.approx(float(used), rel=1e-3)  # extremes of other steps
