@@ -6,55 +6,22 @@ Every function also takes complex numbers with a small imaginary part, which the
 import math
 
 import numpy as np
-from sampled_oracle import relax, spans
+from oracle import TABLE_1, Body
+from sampled_oracle import kalman, relax, spans
 
-PAPER = {"mu_0": 1.25e-6, "n": 1480.0, "A": 0.121, "s_0": 5e-3, "i_0": 0.25, "R": 41.44}
 
-
-class Magnet:
-    """Eqs. (2) and (3) of one axis, or of all axes if its numbers are arrays."""
+class Magnet(Body):
+    """Eqs. (2) and (3) of one axis, or of all axes if its numbers are arrays. Without springs."""
 
     def __init__(self, numbers, m=math.nan, g=math.nan):
-        for name, value in (PAPER | numbers).items():
-            setattr(self, name, value)
-        self.kappa = self.mu_0 * self.n**2 * self.A
-        self.m, self.g, self.a = m, g, self.kappa / (4 * m)
-        self.v_i, self.v_z = 4 * self.i_0 / self.s_0**2, 4 * self.i_0**2 / self.s_0**3
-
-    def v(self, z, i):
-        return ((self.i_0 + i) / (self.s_0 - z)) ** 2 - ((self.i_0 - i) / (self.s_0 + z)) ** 2
-
-    def current_for(self, z, v):
-        """Return the root i of v(z, i) = v that stays finite at z = 0; beyond the largest force, its vertex."""
-        up, down = (self.s_0 - z) ** -2, (self.s_0 + z) ** -2
-        half, curve, last = self.i_0 * (up + down), up - down, self.i_0**2 * (up - down) - v
-        square = half * half - curve * last
-        return -last / (half + square**0.5) if np.real(square) >= 0 else -half / curve
-
-    def force(self, z, currents):
-        """Return v of the currents [1 or 2, axes]."""
-        if len(currents) == 1:
-            return self.v(z, currents[0])
-        return (currents[0] / (self.s_0 - z)) ** 2 - (currents[1] / (self.s_0 + z)) ** 2
-
-    def rates(self, z, z_dot, currents, u):
-        """Return the rates of the currents [1 or 2, axes]."""
-        up, down, bias = self.s_0 - z, self.s_0 + z, self.R * self.i_0
-        if len(currents) == 1:
-            i = currents[0]
-            return np.array([2 * z_dot * i / down + 2 * down / self.kappa * (u - self.R * i)])
-        i, j = currents
-        return np.array([
-            2 * up / self.kappa * (bias + u - self.R * i) - i * z_dot / up,
-            2 * down / self.kappa * (bias - u - self.R * j) + j * z_dot / down,
-        ])  # fmt: skip
+        super().__init__(TABLE_1 | numbers | {"m": m, "g": g, "k_z": 0.0})
 
 
 def defaults(magnet, T, given):
     """Return the default gains of every law, by stage and kind. `given`: the table of the position law."""
-    w, paper = math.sqrt(magnet.a * magnet.v_z), Magnet(PAPER, 0.588)
+    w, paper = math.sqrt(magnet.a * magnet.v_z(0.0, 0.0)), Magnet({}, TABLE_1["m"])
     w_c, L, s_0, i_0 = min(10 * w, 1 / (4 * T)), magnet.kappa / (2 * magnet.s_0), magnet.s_0, magnet.i_0
-    speed = paper.s_0 * math.sqrt(paper.a * paper.v_z) / (s_0 * w)
+    speed = paper.s_0 * math.sqrt(paper.a * paper.v_z(0.0, 0.0)) / (s_0 * w)
     p = 25 * speed if "k" in given else math.pi / (w * s_0)
     p_v, p_i = 25 * (paper.i_0 / paper.s_0 * s_0 / i_0) ** 2, 25 * paper.i_0 / i_0
     return {
@@ -131,21 +98,17 @@ class Laws:
 
     def model_rates(self, y, u):
         (z, z_dot, i), model = y, self.model
-        return np.array([z_dot, model.a * model.v(z, i) - model.g, model.rates(z, z_dot, [i], u)[0]])
+        return np.array([z_dot, model.a * model.v(z, i) - model.g, *model.current_rates(z, z_dot, [i], u)])
 
     def observe(self, state, reading):
         """Update the observer and return its estimate of z, z', i."""
         (z, z_dot, i), T, kind, gains = reading, self.T, self.kind["observer"], self.gains["observer"]
         if kind == "direct":
             return z, z_dot, i
-        z_hat, v, d, w = state.get("z_hat", z), state.get("v_hat", 0.0), state.get("d_hat", 0.0), gains["w"]
         f = self.model.a * self.model.v(z, i) - self.model.g
-        if "f" in state:
-            z_hat = z_hat + T * v + T**2 * (state["f"] / 3 + f / 6 + d / 2)
-            v = v + T * ((state["f"] + f) / 2 + d)
-        e, q = z - z_hat, math.exp(-w * T)
-        z_hat, v = z_hat + (1 - q**3) * e, v + 1.5 * (1 - q) ** 2 * (1 + q) / T * e
-        state.update(z_hat=z_hat, v_hat=v, d_hat=d + (1 - q) ** 3 / T**2 * e, f=f)
+        estimate = state.get("z_hat", z), state.get("v_hat", 0.0), state.get("d_hat", 0.0)
+        z_hat, v, d = kalman(z, f, estimate, state.get("f"), gains["w"], T)
+        state.update(z_hat=z_hat, v_hat=v, d_hat=d, f=f)
         return z_hat, v, i
 
     def position(self, state, z, z_dot, i):
@@ -164,12 +127,12 @@ class Laws:
         """Return the i_ref of the next sample."""
         T, model, gains, kind = self.T, self.model, self.gains["inversion"], self.kind["inversion"]
         if kind == "linearised":
-            return (v_star - model.v_z * z) / model.v_i
+            return (v_star - model.v_z(0.0, 0.0) * z) / model.v_i(0.0, 0.0)
         if kind == "closed-form":
-            return model.current_for(z, v_star)
+            return model.current(z, v_star)
         i_ref = state.setdefault("i_ref", gains["i_ref"])
         w, h = v_star - model.v(z, i_ref), T * gains["gamma"]
-        return model.current_for(z, v_star - w + h * share(w, h, gains["p"]))
+        return model.current(z, v_star - w + h * share(w, h, gains["p"]))
 
     def current(self, state, z, z_dot, i, i_ref, rate, u_max):
         T, model, gains, e = self.T, self.model, self.gains["current"], i - i_ref

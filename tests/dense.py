@@ -8,7 +8,7 @@ import itertools
 import math
 
 import numpy as np
-from oracle import Loop, _edges, _pulse, _reference
+from oracle import Loop, _reference
 from scipy.integrate import solve_ivp
 
 GAUSS, WEIGHTS = np.polynomial.legendre.leggauss(3)
@@ -41,9 +41,6 @@ def metrics(world, samples, period, settle, noise=None, rtol=1e-9, numbers=None)
     """
     numbers = numbers or _numbers
     t = np.arange(samples + 1) * period
-    inputs = (world.q_z, world.q_v, world.q_i)
-    cuts = {edge for signal in (world.reference, *inputs) for edge in _edges(signal) if 0 < edge < t[-1]}
-    cuts = sorted(cuts | set(t))
     noise = np.zeros((samples, 3)) if noise is None else np.asarray(noise)
     loop = Integrals(world)
     y, stop = loop.start(noise[0]), 0.9 * loop.true.s_0
@@ -53,10 +50,7 @@ def metrics(world, samples, period, settle, noise=None, rtol=1e-9, numbers=None)
 
     touched.terminal = True
     rows, squares, integrals, lost_at = [], [], {0.0: y[-6:]}, math.inf
-    for a, b in itertools.pairwise(cuts):
-        middle = (a + b) / 2
-        loop.held = noise[min(np.searchsorted(t, middle) - 1, samples - 1)].tolist()
-        loop.pushed = [_pulse(signal, middle) for signal in inputs]
+    for a, b in loop.pieces(t, set(t), noise):
         more = {"jac": loop.jacobian, "dense_output": True, "events": touched}
         run = solve_ivp(loop.rates, (a, b), y, "Radau", rtol=rtol, atol=1e-3 * rtol * loop.scale, **more)
         assert run.success, run.message

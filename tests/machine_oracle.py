@@ -23,7 +23,8 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
-from axis_oracle import PAPER, Laws, Magnet, rk4
+from axis_oracle import Laws, Magnet, rk4
+from oracle import TABLE_1
 from sampled_oracle import spans
 from scipy.optimize import minimize_scalar
 
@@ -92,8 +93,8 @@ class World:
         self.laws = [Laws(case, tables, m, g) for tables, m, g in each]
         rigid = case.get("controller", {}).get("coordinates") == "rigid-body"
         self.act = RigidLaws(case, parts, self.laws).step if rigid else self.by_axis
-        models = [PAPER | tables["plant"] for tables in parts.tables]
-        self.magnet = Magnet({name: np.array([one[name] for one in models]) for name in PAPER})
+        models = [TABLE_1 | tables["plant"] for tables in parts.tables]
+        self.magnet = Magnet({name: np.array([one[name] for one in models]) for name in TABLE_1})
         self.coils = 2 if case.get("plant", {}).get("kind") == "two-coil" else 1
         self.stop = case.get("run", {}).get("clearance", 0.9 * self.magnet.s_0)
         rotor, n = case["rotor"], len(parts.M)
@@ -134,7 +135,7 @@ class World:
         for one, b in self.loads:
             force = force + signal(one, t, middle) * b
         q_ddot = (force - (parts.D + W * parts.G) @ q_dot - parts.K @ q) / parts.M
-        return np.concatenate([q_dot, q_ddot, self.magnet.rates(z, z_dot, currents, u).ravel()])
+        return np.concatenate([q_dot, q_ddot, *self.magnet.current_rates(z, z_dot, currents, u)])
 
     def by_axis(self, states, readings, past, u_max, W):
         steps = [
@@ -204,7 +205,8 @@ class RigidLaws:
         n = len(self.M)
         q, v, i = y[:n], y[n : 2 * n], y[2 * n :]
         z, z_dot = self.B @ q, self.B @ v
-        moved = [law.model.rates(*each)[0] for law, *each in zip(self.axes, z, z_dot, i[:, None], u, strict=True)]
+        given = zip(self.axes, z, z_dot, i[:, None], u, strict=True)
+        moved = [law.model.current_rates(*each)[0] for law, *each in given]
         return np.concatenate([v, self.by_magnets(z, i) + self.weight - W * self.G @ v / self.M, moved])
 
     def step(self, states, readings, past, u_max, W):
@@ -266,9 +268,7 @@ class Loop:
         self.world, self.substeps = World(case, still=True), substeps
         parts, magnets = self.world.parts, self.world.magnet
         a = magnets.kappa / 4
-        i = np.array(
-            [law.model.current_for(0.0, F / k) for law, F, k in zip(self.world.laws, parts.F_0, a, strict=True)]
-        )
+        i = np.array([law.model.current(0.0, F / k) for law, F, k in zip(self.world.laws, parts.F_0, a, strict=True)])
         y, past = self.world.place(0 * parts.M, i), np.tile(magnets.R * i, (math.ceil(self.world.delay), 1))
         _, self.states, *_ = self.world.sample(0, y, [{"i_ref": one} for one in i], past, substeps=1)
         self.axes = len(parts.names)

@@ -40,18 +40,13 @@ class World:
 
 def solve(world, t, noise=None, rtol=1e-10, method="Radau"):
     """z at the times t (from 0, one per sample). `noise[k]`: errors of z, z_dot, i held from t[k] to t[k + 1]."""
-    inputs = (world.q_z, world.q_v, world.q_i)
-    cuts = {edge for signal in (world.reference, *inputs) for edge in _edges(signal) if 0 < edge < t[-1]}
-    cuts = sorted(cuts | {0.0, t[-1]} | (set() if noise is None else set(t)))
+    cuts = {0.0, t[-1]} if noise is None else set(t)
     noise = np.zeros((len(t), 3)) if noise is None else np.asarray(noise)
     loop = Loop(world)
     y, z = loop.start(noise[0]), np.full(len(t), np.nan)
     z[0] = y[0]
     how = {"jac": loop.jacobian} if method == "Radau" else {}
-    for a, b in itertools.pairwise(cuts):
-        middle = (a + b) / 2
-        loop.held = noise[np.searchsorted(t, middle) - 1].tolist()
-        loop.pushed = [_pulse(signal, middle) for signal in inputs]
+    for a, b in loop.pieces(t, cuts, noise):
         inside = (t > a) & (t <= b)
         at = np.union1d(t[inside], b)
         run = solve_ivp(loop.rates, (a, b), y, method, at, rtol=rtol, atol=1e-3 * rtol * loop.scale, **how)
@@ -119,10 +114,33 @@ class Body:
         return 2 * (self.i_0 + i) * (self.i_0 + i) / (up * up * up) + 2 * (self.i_0 - i) * (self.i_0 - i) / down**3
 
     def current(self, z, v):
-        """The root in i of (U - D) i^2 + 2 i_0 (U + D) i + i_0^2 (U - D) - v = 0 that is finite as U -> D."""
+        """The root in i of (U - D) i^2 + 2 i_0 (U + D) i + i_0^2 (U - D) - v = 0 that is finite as U -> D.
+
+        Beyond the largest force: the current of the nearest one.
+        """
         U, D = 1 / ((self.s_0 - z) * (self.s_0 - z)), 1 / ((self.s_0 + z) * (self.s_0 + z))
         half, last = self.i_0 * (U + D), self.i_0 * self.i_0 * (U - D) - v
-        return -last / (half + (half * half - (U - D) * last) ** 0.5)
+        square = half * half - (U - D) * last
+        return -last / (half + square**0.5) if square.real >= 0 else -half / (U - D)
+
+    def force(self, z, currents):
+        """v of the current i, or of the currents of the upper and the lower coil."""
+        if len(currents) == 1:
+            return self.v(z, *currents)
+        up, down = currents[0] / (self.s_0 - z), currents[1] / (self.s_0 + z)
+        return up * up - down * down
+
+    def current_rates(self, z, z_dot, currents, u):
+        """Eq. (2) of the current i, or of each coil with its own gap and the voltage R i_0 +- u."""
+        up, down, bias = self.s_0 - z, self.s_0 + z, self.R * self.i_0
+        if len(currents) == 1:
+            (i,) = currents
+            return (2 * z_dot / down * i + 2 * down / self.kappa * (u - self.R * i),)
+        i, j = currents
+        return (
+            2 * up / self.kappa * (bias + u - self.R * i) - i * z_dot / up,
+            2 * down / self.kappa * (bias - u - self.R * j) + j * z_dot / down,
+        )
 
 
 class Loop:
@@ -141,6 +159,16 @@ class Loop:
         first = {"complementary": self.gains[0].get("z_hat", measured), "super-twisting": 0.0, "pi": 0.0}
         first["adaptive"] = self.gains[2].get("i_ref", 0.0)
         return np.array([*self.world.initial, *(first[k] for k in self.kinds if k in first)])
+
+    def pieces(self, t, cuts, noise):
+        """Yield the intervals between jumps of the inputs and `cuts`, with the errors and pulses of each set."""
+        inputs = (self.world.q_z, self.world.q_v, self.world.q_i)
+        jumps = {edge for signal in (self.world.reference, *inputs) for edge in _edges(signal) if 0 < edge < t[-1]}
+        for a, b in itertools.pairwise(sorted(jumps | cuts)):
+            middle = (a + b) / 2
+            self.held = noise[min(np.searchsorted(t, middle), len(noise)) - 1].tolist()
+            self.pushed = [_pulse(signal, middle) for signal in inputs]
+            yield a, b
 
     def rates(self, t, y):
         return np.array(self._rates(t, *y.tolist())[0])
@@ -208,10 +236,9 @@ class Loop:
             u = model.kappa / (2 * gap) * (-2 * w / gap * j + i_ref_dot - robust) + model.R * j
             applied = self._limited(u, limit)
 
-        gap = true.s_0 + z
         z_ddot = true.stiffness * z + true.a * true.v(z, i) - true.g + q_z + true.a * q_v
-        i_dot = 2 * z_dot / gap * i + 2 * gap / true.kappa * (applied - true.R * i) + q_i
-        return (z_dot, z_ddot, i_dot, *more), (applied, i - i_ref, v_star - model.v(x, i_ref), r)
+        (i_dot,) = true.current_rates(z, z_dot, (i,), applied)
+        return (z_dot, z_ddot, i_dot + q_i, *more), (applied, i - i_ref, v_star - model.v(x, i_ref), r)
 
     @staticmethod
     def _limited(u, limit):

@@ -76,7 +76,7 @@ class World:
 class Run:
     """Rows [samples] at t_n, NaN after the loss; times in s.
 
-    `seen` [samples, 3]: z, z_dot, i as the laws receive them.
+    `seen` [samples, 3]: z, z_dot, i as the laws receive them. `read` [samples]: the reading of z.
     """
 
     t: np.ndarray
@@ -87,6 +87,7 @@ class Run:
     u: np.ndarray
     v_star: np.ndarray
     seen: np.ndarray
+    read: np.ndarray
     lost_at: float
     singular_at: float
 
@@ -94,21 +95,21 @@ class Run:
 def simulate(world, samples, noise=None, fast=False):
     """Rows 0 .. samples - 1. `noise[n]`: errors of z, z_dot, i at sample n. `fast`: RK4 in place of DOP853."""
     noise = np.zeros((samples, 3)) if noise is None else np.asarray(noise)
-    plant, controller = Driven(world, (TwoCoil if world.kind == "two-coil" else Lumped)(world)), Controller(world)
-    y, rows, lost_at, singular_at = plant.start, np.full((samples, 9), np.nan), math.inf, math.inf
+    plant, controller = Driven(world, Magnets(world, 2 if world.kind == "two-coil" else 1)), Controller(world)
+    y, rows, lost_at, singular_at = plant.start, np.full((samples, 10), np.nan), math.inf, math.inf
     for n in range(samples):
         output = plant.output(y)
         z_read, *others = _measurement(world, plant.sensed(y), noise[n].tolist())
         z_read = world.dropouts.get(n, z_read + world.outliers.get(n, 0.0))
         *row, singular, seen = controller.sample(n, (z_read, *others))
-        rows[n] = *output, *row, *seen
+        rows[n] = *output, *row, *seen, z_read
         singular_at = min(singular_at, n * world.period if singular else math.inf)
         y, touched = _sample(world, plant, controller, n, y, fast) if n < samples - 1 else (y, None)
         if touched is not None:
             lost_at = n * world.period + touched
             break
     t, (z, z_dot, i, i_ref, u, v_star) = np.arange(samples) * world.period, rows[:, :6].T
-    return Run(t, z, z_dot, i, i_ref, u, v_star, rows[:, 6:], lost_at, singular_at)
+    return Run(t, z, z_dot, i, i_ref, u, v_star, rows[:, 6:9], rows[:, 9], lost_at, singular_at)
 
 
 def _measurement(world, output, errors):
@@ -181,49 +182,23 @@ def rk4(rates, y, h):
     return [x + h / 6 * (a + 2 * b + 2 * c + d) for x, a, b, c, d in zip(y, k_1, k_2, k_3, k_4, strict=True)]
 
 
-class Lumped:
-    """Eqs. (1), (2); y = z, z_dot, i."""
+class Magnets:
+    """Eqs. (1), (2); y = z, z_dot, and i or i_1 (upper), i_2 (lower), where each coil has its own gap and flux."""
 
-    scale = np.array([1e-3, 1e-2, 0.1])
-
-    def __init__(self, world):
-        self.body = Body(TABLE_1 | world.plant)
-        self.start, self.stop = list(world.initial), world.touch * self.body.s_0
-
-    def output(self, y):
-        return y
-
-    def rates(self, y, u, q_z=0.0, q_i=0.0):
-        (z, z_dot, i), body = y, self.body
-        gap = body.s_0 + z
-        z_ddot = body.stiffness * z + body.a * body.v(z, i) - body.g + q_z
-        return z_dot, z_ddot, 2 * z_dot / gap * i + 2 * gap / body.kappa * (u - body.R * i) + q_i
-
-
-class TwoCoil:
-    """Each coil with its own gap, flux and voltage R i_0 +- u; y = z, z_dot, i_1 (upper), i_2 (lower)."""
-
-    scale = np.array([1e-3, 1e-2, 0.1, 0.1])
-
-    def __init__(self, world):
+    def __init__(self, world, coils=1):
         self.body = Body(TABLE_1 | world.plant)
         (z, z_dot, i), i_0 = world.initial, self.body.i_0
-        self.start, self.stop = [z, z_dot, i_0 + i, i_0 - i], world.touch * self.body.s_0
+        self.start, self.stop = [z, z_dot, *([i] if coils == 1 else [i_0 + i, i_0 - i])], world.touch * self.body.s_0
+        self.scale = np.array([1e-3, 1e-2, *[0.1] * coils])
 
     def output(self, y):
-        z, z_dot, i_1, i_2 = y
-        return z, z_dot, (i_1 - i_2) / 2
+        return y if len(y) == 3 else (y[0], y[1], (y[2] - y[3]) / 2)
 
     def rates(self, y, u, q_z=0.0, q_i=0.0):
-        (z, z_dot, i_1, i_2), body = y, self.body
-        upper, lower, bias = body.s_0 - z, body.s_0 + z, body.R * body.i_0
-        v = (i_1 / upper) ** 2 - (i_2 / lower) ** 2
-        return (
-            z_dot,
-            body.stiffness * z + body.a * v - body.g + q_z,
-            2 * upper / body.kappa * (bias + u - body.R * i_1) - i_1 * z_dot / upper + q_i,
-            2 * lower / body.kappa * (bias - u - body.R * i_2) + i_2 * z_dot / lower - q_i,
-        )
+        (z, z_dot, *currents), body = y, self.body
+        i_dots = body.current_rates(z, z_dot, currents, u)
+        z_ddot = body.stiffness * z + body.a * body.force(z, currents) - body.g + q_z
+        return z_dot, z_ddot, *(rate + q for rate, q in zip(i_dots, (q_i, -q_i), strict=False))
 
 
 class Driven:
@@ -233,13 +208,8 @@ class Driven:
     """
 
     def __init__(self, world, plant):
-        self.plant, self.body, self.stop, self.u_max, given = (
-            plant,
-            plant.body,
-            plant.stop,
-            world.u_max,
-            world.amplifier,
-        )
+        self.plant, self.body, self.stop, self.u_max = plant, plant.body, plant.stop, world.u_max
+        given = world.amplifier
         self.sensor, self.follow = world.bandwidth, given.get("bandwidth")
         self.slew, self.dead, self.i_max = (given.get(name) for name in ("slew", "dead_band", "i_max"))
         assert self.follow or not self.slew  # else its rate would jump
@@ -299,14 +269,6 @@ def twist(x, state, k_1, k_2, T):
     return 2 * following - state - math.copysign(k_1 * root, x), following
 
 
-def current_for(body, z, v):
-    """Return the current that gives v at z, on the branch of the root that is continuous from z = 0. Eq. (3)."""
-    upper, lower = (body.s_0 - z) ** -2, (body.s_0 + z) ** -2
-    half, curve, rest = body.i_0 * (upper + lower), upper - lower, body.i_0**2 * (upper - lower) - v
-    square = half * half - curve * rest
-    return -rest / (half + math.sqrt(square)) if square >= 0 else -half / curve
-
-
 LAMBDA = {1: (1.5, 1.1), 2: (2.0, 2.12, 1.1)}
 
 
@@ -325,6 +287,16 @@ def robust_differentiator(f, x, L, T):
     for k in reversed(range(m)):
         x[k] += T * x[k + 1] + lam[k] * L * T ** (m - k + 1) * math.copysign(r ** (m - k), b)
     return x[1] if m == 1 else x[1] + T / 2 * x[2], x
+
+
+def kalman(z, f, estimate, before, w, T):
+    """Return the next z, z_dot, d. `f`, `before`: acceleration of the model now and at the last sample, if any."""
+    z_hat, v, d = estimate
+    if before is not None:
+        z_hat += T * v + T * T * (before / 3 + f / 6 + d / 2)
+        v += T * ((before + f) / 2 + d)
+    e, q = z - z_hat, math.exp(-w * T)
+    return z_hat + (1 - q**3) * e, v + 1.5 * (1 - q) ** 2 * (1 + q) / T * e, d + (1 - q) ** 3 / T**2 * e
 
 
 class Velocity:
@@ -356,12 +328,8 @@ class Velocity:
             e = z - z_hat
             self.known = z_hat + T * (v + 3 * w * e), v + T * (f + d + 3 * w * w * e), d + T * w**3 * e, f
             return z_hat, v
-        if before is not None:
-            z_hat += T * v + T * T * (before / 3 + f / 6 + d / 2)
-            v += T * ((before + f) / 2 + d)
-        e, q = z - z_hat, math.exp(-w * T)
-        z_hat, v = z_hat + (1 - q**3) * e, v + 1.5 * (1 - q) ** 2 * (1 + q) / T * e
-        self.known = z_hat, v, d + (1 - q) ** 3 / T**2 * e, f
+        z_hat, v, d = kalman(z, f, (z_hat, v, d), before, w, T)
+        self.known = z_hat, v, d, f
         return z_hat, v
 
     def _robust(self, z, _):
@@ -375,7 +343,7 @@ class Controller:
     """The cascade: the states of its laws, and the voltages that it computed."""
 
     def __init__(self, world):
-        self.world, self.model = world, Lumped(World(plant=world.plant | world.model))
+        self.world, self.model = world, Magnets(World(plant=world.plant | world.model))
         self.z_hat = world.observer[1].get("z_hat")
         if world.observer[0] not in ("direct", "complementary"):
             self.velocity = Velocity(world, lambda z, i: self.model.rates((z, 0.0, i), 0.0)[1])
@@ -427,7 +395,7 @@ class Controller:
         r = _reference(world.reference, (n + (world.delay if world.predict else 0)) * world.period)
         v_star = self._position(seen, r)
         if self.i_ref is None:
-            self.i_ref = 0.0 if world.inversion[0] == "adaptive" else current_for(self.model.body, seen[0], v_star)
+            self.i_ref = 0.0 if world.inversion[0] == "adaptive" else self.model.body.current(seen[0], v_star)
         i_ref, following = self.i_ref, self._inversion(seen[0], v_star)
         u = self._current(seen, (following - i_ref) / world.period)
         self.i_ref = following
@@ -475,7 +443,7 @@ class Controller:
         w, gamma, p = v_star - body.v(z, self.i_ref), gains.get("gamma", math.inf), gains.get("p", math.inf)
         if kind == "adaptive" and not self.implicit:
             return self.i_ref + T * gamma * sgn(w, p) / body.v_i(z, self.i_ref)
-        return current_for(body, z, v_star - relax(w, T * gamma, p))
+        return body.current(z, v_star - relax(w, T * gamma, p))
 
     def _current(self, seen, rate):
         (kind, gains), T, body, (z, z_dot, i) = self.world.current, self.world.period, self.model.body, seen
