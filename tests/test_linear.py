@@ -1,35 +1,24 @@
-"""Linear analysis: matrices against the simulation, margins against python-control, gradients, equilibria."""
-
-import dataclasses
+"""Linear analysis: margins against python-control, the tuner's quantities, noise. Matrices: tests/test_injection.py."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
+from structures import SMOOTH
 
 from ambjax import Cascade, Clock, Scenario
 from ambjax.compiler.short_compilation import QUICKEST, supported
-from ambjax.control import current, inversion, observer, position
+from ambjax.control import current, observer, position
 from ambjax.control.processor import Processor
 from ambjax.linear import StateSpace, Zones, analyse, linearise, loop_quantities, margins_of, noise_gain, peak
-from ambjax.linear.equilibrium import ideal
 from ambjax.plants import Plant
 from ambjax.sensors import Sensor
-from ambjax.simulation.explicit import DOP853
-from ambjax.simulation.rollout import prepare
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.coils import TwoCoil
-from ambjax.world.sensor import Errors
 
 T = 1e-4
 QUICK = supported(QUICKEST)  # each program runs once
 CLOCK = Clock(samples=10, sample_period=T)
-SMOOTH = {
-    "position": position.SlidingMode(c=200.0, k=63.0, p=5.0),
-    "inversion": inversion.Adaptive(gamma=2e6, p=1e-3),
-    "current": current.SlidingMode(k_i=600.0, p=20.0),
-}
 SLUGGISH = Sensor(bandwidth=2000.0, gain=1.05, offset=1e-5)
 # name: cascade's processor and laws, scenario, reference (m)
 LOOPS = {
@@ -48,53 +37,7 @@ def loop_of(name):
     return Cascade(**(SMOOTH | laws), processor=processor), scenario, r
 
 
-def simulated_map(cascade, scenario, r):
-    """S(f) of the map that the simulation makes of one sample, at the equilibrium, with DOP853 in 4 parts."""
-    from ambjax.linear.equilibrium import equilibrium
-
-    quiet = ideal(scenario)
-    quiet = dataclasses.replace(quiet, sensor=quiet.sensor or Sensor())
-    cascade = dataclasses.replace(cascade, processor=dataclasses.replace(cascade.processor, guard=None))
-    system, clock = prepare(cascade, quiet, CLOCK.with_method(DOP853(4)))
-    quiet = dataclasses.replace(quiet, reference=dataclasses.replace(quiet.reference, value=r))
-    system = dataclasses.replace(system, loop=dataclasses.replace(system.loop, scenario=quiet))
-    point, found, _ = equilibrium(system.loop.cascade, quiet, T, r)
-    assert found
-    start = system.start()
-    z, zero = quiet.plant.measurement(point.plant).z, jnp.zeros(())
-    start = start._replace(
-        plant=point.plant, control=point.control, command=start.command._replace(u=point.u), past=(point.u, point.u),
-        z_filtered=start.z_filtered if isinstance(start.z_filtered, tuple) else z,
-        u_a=start.u_a if isinstance(start.u_a, tuple) else point.u + 1e-9,  # off |u_a - u| = 0, which has no slope
-    )  # fmt: skip
-    x, restore = ravel_pytree(start)
-
-    def step(x, e):
-        state = restore(x)
-        errors = Errors(e, zero, zero)
-        read = system.measured(state.plant, state.z_filtered, errors).z
-        state = system.jump(0.0, state, errors)
-        after = system.advance(clock.integrator, errors, 0.0, T, state, clock.integrator.start(T), jnp.asarray(0))
-        return ravel_pytree(after.state)[0], jnp.stack([read, state.command.u])
-
-    assert np.allclose(step(x, 0.0)[0][: len(point.plant)], x[: len(point.plant)], atol=1e-12)  # it rests
-    (A, B), (C, D) = jax.jit(jax.jacfwd(step, (0, 1)), compiler_options=QUICK)(x, 0.0)
-    return StateSpace(*(np.asarray(m) for m in (A, B[:, None], C, D[:, None], jnp.ones_like(x))), np.asarray(T))
-
-
 NAMES = [pytest.param(x, marks=pytest.mark.slow if x == "lags" else pytest.mark.thorough) for x in LOOPS]
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_the_matrices_agree_with_the_simulation(name):
-    cascade, scenario, r = loop_of(name)
-    f = np.geomspace(1.0, 0.45 / T, 40)
-    expected = simulated_map(cascade, scenario, r).response(f)
-    found = linearise(cascade, scenario, CLOCK, r).response(f)
-    # the simulation's low-pass of the sensor is exact only for a cubic motion within a sample
-    error = 1e-6 if name == "lags" else 1e-9
-    assert np.all(np.abs(found[:, 0, 0] / expected[:, 0, 0] - 1) < error)
-    assert np.all(np.abs(found[:, 2, 0] / expected[:, 1, 0] - 1) < 10 * error)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -167,22 +110,6 @@ def test_python_control_gets_the_same_system():
     assert exported.dt == T
     response = exported(np.exp(2j * np.pi * f * T)).transpose(2, 0, 1)
     assert response == pytest.approx(np.asarray(system.response(f)), rel=1e-8)
-
-
-def test_the_loop_becomes_unstable_at_the_delay_margin():
-    """The delay is added at the sensor.
-
-    Below the margin the Nyquist curve does not reach -1; at the margin, a pole is on the axis.
-    """
-    system = linearise(Cascade(**SMOOTH), Scenario(), CLOCK)
-    found = margins_of(system).reading
-    f = np.geomspace(1.0, 1e4, 20_001)
-    L = 1 / system.sensitivity(f) - 1
-    late = np.abs(1 + L * np.exp(-2j * np.pi * f * found.delay))
-    # the curve passes -1 within the spacing of the frequencies
-    assert late.min() < 2e-3
-    early = np.abs(1 + L * np.exp(-2j * np.pi * f * 0.5 * found.delay))
-    assert early.min() > 0.02
 
 
 def test_a_narrow_peak_is_found_and_refined():
