@@ -8,11 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracle import World, solve
 from structures import METHODS
 
 import ambjax as amb
-from ambjax.numerics import linear
 from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.method import QUIET_TIGHT, QUIET_TOLERANCE, TIGHT, TOLERANCE
 from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED
@@ -68,32 +66,6 @@ def test_dop853_on_a_problem_with_known_solution():
     substeps = np.array([4, 6, 8, 12])
     errors = [curved_error(amb.solvers.DOP853(2), n // 2) for n in substeps]
     assert slope(1 / substeps, errors) == pytest.approx(8, abs=0.7)
-
-
-@functools.cache
-def closed_loop():
-    """SMOOTH through TRACKING and its pulse by SciPy, z every 100 us."""
-    bump = ("pulse", {"amplitude": 1.0, "start": 0.01, "stop": 0.02})
-    smooth = ("adaptive", {"gamma": 1e9, "p": 25e-6, "i_ref": 0.0})
-    world = World(inversion=smooth, reference=("sine", {"amplitude": 2.5e-3, "frequency": 2.0}), q_v=bump)
-    return solve(world, np.arange(300) * 1e-4, rtol=1e-11)
-
-
-def closed_loop_error(method, finer=1):
-    run = amb.rollout(SMOOTH, TRACKING, amb.Clock(1200, 1e-4 / finer, method)).trajectory
-    return np.abs(run.rows.z[::finer][:300] - closed_loop()).max()
-
-
-@pytest.mark.parametrize(
-    ("name", "substeps"), [("Euler", 16), ("RK4", 3), pytest.param("Rodas3", 6, marks=pytest.mark.slow)]
-)
-def test_order_on_the_closed_loop(name, substeps):
-    """Without noise, the sample period only sets the step: half the period halves the step, without compilation."""
-    method, order = FIXED[name]
-    finer = np.array([1, 2, 4])
-    errors = [closed_loop_error(method(substeps), n) for n in finer]
-    # Steps of at most half of 1/slope (1.6e4 1/s), errors of 5e-8 to 8e-14, all above the oracle's; three points only.
-    assert slope(1 / finer, errors) == pytest.approx(order, abs=0.3)
 
 
 @every_fixed
@@ -173,11 +145,7 @@ def test_a_stalled_rollout_has_the_status_stalled_and_finite_values():
     assert all(np.isfinite(x).all() for x in trajectory.rows)
 
 
-@pytest.mark.parametrize(
-    "method",
-    [amb.solvers.Euler(10), amb.solvers.RK4(10), amb.solvers.Rodas3(10), amb.solvers.AdaptiveRodas3()],
-    ids=str,
-)
+@every_method
 def test_integration_stops_at_the_first_invalid_state_and_returns_the_last_valid_one(method):
     def status(y):
         return jnp.where(y < 0.55, 0, 2).astype(jnp.int32)
@@ -187,21 +155,12 @@ def test_integration_stops_at_the_first_invalid_state_and_returns_the_last_valid
     )
     assert int(out.code) == 2
     assert float(out.state) < 0.55 <= float(out.t) - 3.0  # y = t - 3: the time is that of the bad state
-    if method.step_size(1.0):
-        assert (float(out.state), float(out.t)) == pytest.approx((0.5, 3.6))
+    if step := method.step_size(1.0):
+        last = math.floor(0.55 / step)
+        assert (float(out.state), float(out.t)) == pytest.approx((last * step, 3 + (last + 1) * step))
 
 
-@pytest.mark.parametrize(
-    "method",
-    [
-        amb.solvers.RK4(3),
-        amb.solvers.DOP853(3),
-        amb.solvers.Rodas3(3),
-        amb.solvers.AdaptiveRodas3(),
-        amb.solvers.AdaptiveCashKarp(1e-3),
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("method", [*METHODS[1:-1], amb.solvers.AdaptiveCashKarp(1e-3)], ids=str)
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_the_time_of_a_touchdown_is_that_of_the_crossing_inside_a_step(method, side):
     """A free fall with a drag that makes z a cubic: z = side (t^2/2 + t^3/6) reaches 0.6 inside a step of a third."""
@@ -246,11 +205,8 @@ def test_an_explicit_step_beyond_its_limit_is_refused(method):
 
 def test_method_choice():
     noisy = dataclasses.replace(TRACKING, sensor=amb.sensors.Sensor(1e-6))
-    for quiet in (
-        None,
-        amb.sensors.Sensor(),
-        amb.sensors.Sensor(gain=1.1, offset=1e-6),
-    ):  # a sensor without noise changes nothing
+    # a sensor without noise changes nothing
+    for quiet in (None, amb.sensors.Sensor(), amb.sensors.Sensor(gain=1.1, offset=1e-6)):
         scenario = dataclasses.replace(TRACKING, sensor=quiet)
         assert amb.solvers.choose_method(SMOOTH, scenario, 1e-4) == amb.solvers.AdaptiveCashKarp(QUIET_TIGHT)
         assert amb.solvers.choose_method(REPAIRED, scenario, 1e-4) == amb.solvers.AdaptiveRodas3(QUIET_TOLERANCE)
@@ -285,9 +241,7 @@ def test_the_chosen_step_resolves_coils_that_settle_within_a_sample(kind):
     assert 0.4 < steepest * method.step_size(period) < 0.5
     wide = amb.Cascade(inversion=amb.laws.inversion.Adaptive(1e3, 25.0))
     for cascade in (sampled, wide):
-        with pytest.raises(
-            ValueError, match=r"only up to 4.6e-05 s, because the current in the coils has slope 6.05e\+04"
-        ):
+        with pytest.raises(ValueError, match=r"only up to 4.6e-05 s, .*current in the coils has slope 6.05e\+04"):
             amb.solvers.with_method(amb.Clock(10, period, amb.solvers.RK4(2)), cascade, world)
 
     @functools.partial(jax.jit, static_argnums=0)
@@ -334,7 +288,7 @@ def test_the_default_clock_works_under_jit_and_in_both_modes_of_differentiation(
         return jnp.abs(amb.rollout(cascade, TRACKING, clock).trajectory.rows.z).max()
 
     gamma = 7.5e4
-    assert jax.jit(peak)(gamma) == pytest.approx(float(peak(gamma)), abs=1e-8)  # m; tests/test_tolerance.py
+    assert jax.jit(peak)(gamma) == pytest.approx(float(peak(gamma)), abs=1e-8)  # m; tests/test_oracle.py
     forward = jax.jacfwd(jax.jit(peak))(gamma)
     # the same steps in both modes, so that only rounding differs
     np.testing.assert_allclose(jax.grad(jax.jit(peak))(gamma), forward, rtol=1e-9)
@@ -349,13 +303,3 @@ def test_a_fixed_number_of_steps_is_not_chosen_from_traced_values():
         amb.solvers.with_method(REPAIRED, TRACKING, amb.Clock(10))
     with pytest.raises(ValueError, match=r"with_method\(clock, cascade, scenario, reverse=True\)"):
         jax.jit(chosen)(1e9)
-
-
-@pytest.mark.parametrize("n", range(1, 9))
-def test_factor_and_solve_agree_with_numpy(n):
-    rng = np.random.default_rng(n)
-    jac, right = rng.normal(size=(n, n)), rng.normal(size=n)
-    jac -= 2 * n * np.eye(n)  # decaying, as a stiff loop is: no row exchanges needed
-    found = linear.solve(linear.factor(jac.tolist(), 0.3), tuple(right))
-    # Backward stable where the diagonal dominates: rounding times a condition number below 10.
-    np.testing.assert_allclose(found, np.linalg.solve(np.eye(n) - 0.3 * jac, right), rtol=1e-13, atol=1e-14)
