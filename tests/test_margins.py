@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from margin_oracle import Change, parts_of
+from structures import RIG
 
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
@@ -22,20 +23,19 @@ from ambjax.simulation.rollout import rollout
 QUICK = supported(QUICKEST)  # each program runs once
 # Each margin lies within this share of the margin of the oracle.
 ERROR = 0.03
-PLANT = {"m": 1.64, "k_z": 0.0, "mu_0": 1.2566e-6, "n": 208.0, "A": 2.68e-4, "s_0": 5e-4, "i_0": 2.5, "R": 1.0}
 SMOOTH = {"inversion": {"gamma": 2e6, "p": 1e-3}, "current": {"k_i": 600.0, "p": 20.0}}
 CURRENT = {"inversion": {"kind": "linearised"}, "current": {"kind": "dead-beat"}}
-RIG = {"plant": PLANT, "clock": {"duration": 0.1, "sample_period": 5e-5}, "processor": {}}
+CASE = {"plant": RIG, "clock": {"duration": 0.1, "sample_period": 5e-5}, "processor": {}}
 
 
 def on(position, observer=None, processor=None, actuator=None, **rest):
     """A case on the plant of the rig."""
     controller = {"position": position, **({"observer": observer} if observer else {}), **rest.pop("laws", CURRENT)}
-    document = RIG | {"controller": controller, "processor": processor or {}, **rest}
+    document = CASE | {"controller": controller, "processor": processor or {}, **rest}
     return case_from(document | ({"actuator": actuator} if actuator else {}), "loop")
 
 
-def continuous(position, plant=PLANT, **laws):
+def continuous(position, plant=RIG, **laws):
     return case_from({"plant": plant, "controller": {"position": position, **laws}}, "loop")
 
 
