@@ -48,18 +48,6 @@ def samples(count=50):
 # --- integral sliding mode ---
 
 
-def test_the_integral_manifold_is_driven_by_the_sign_and_the_disturbance_only():
-    law, q = position.UtkinSlidingMode(), 0.7
-    for z, z_dot, r, r_dot, r_ddot, x in samples():
-        inputs = Measurement(z, z_dot, 0.0), Reference(r, r_dot, r_ddot)
-        v_star, x_dot = law(MODEL, inputs, x)
-        e_ddot = 2 * MODEL.k_z / MODEL.m * z + MODEL.a * v_star - MODEL.g + q - r_ddot
-        s = z_dot - r_dot + law.k_d * (z - r) + x
-        s_dot = e_ddot + law.k_d * (z_dot - r_dot) + x_dot
-        # rounding of terms of some 100 m/s^2
-        np.testing.assert_allclose(s_dot, q - law.k * smooth_sign(s, law.p), atol=1e-11)
-
-
 @pytest.mark.parametrize("sampled", [False, True])
 def test_an_integral_sliding_mode_begins_on_its_manifold(sampled):
     law, reference = position.UtkinSlidingMode(), Sine(2.5e-3, 2.0)

@@ -233,20 +233,6 @@ def test_the_integral_of_the_chain_does_not_wind_up_while_the_supply_is_limited(
 # --- integral sliding mode ---
 
 
-def test_the_integral_sliding_variable_obeys_equation_12():
-    """s' = -k sgn(s) along any motion: the rate of s by the chain rule, with v = v_star and no disturbance."""
-    law, model = position.IntegralSlidingMode(), Plant()
-    rng = np.random.default_rng(3)
-    for z, z_dot, r, r_dot, r_ddot, x in rng.uniform(-1, 1, (50, 6)) * [3e-3, 0.05, 2e-3, 0.03, 0.4, 1e-3]:
-        motion, reference = Measurement(z, z_dot, 0.0), Reference(r, r_dot, r_ddot)
-        v_star, x_dot = law(model, (motion, reference), x)
-        z_ddot = 2 * model.k_z / model.m * z + model.a * v_star - model.g
-        s = z_dot - r_dot + law.c * (z - r) + law.c_int * x
-        s_dot = z_ddot - r_ddot + law.c * (z_dot - r_dot) + law.c_int * x_dot
-        # rounding of terms of some 10 m/s^2
-        np.testing.assert_allclose(s_dot, -law.k * 2 / np.pi * np.arctan(law.p * s), atol=1e-11)
-
-
 @pytest.mark.parametrize("kind", ["sliding-mode", "integral-sliding-mode"])
 def test_a_constant_force_leaves_no_offset_with_the_integral(kind):
     """q_z = 5 m/s^2 within the boundary layer. Without the integral, e = tan(pi q_z/2k)/(p c) by Eqs. (5), (12)."""
