@@ -9,11 +9,8 @@ from scipy.integrate import solve_ivp
 from ambjax import Cascade, Clock, Scenario, rollout
 from ambjax.cases.reader import case_from
 from ambjax.control import inversion
-from ambjax.control.cascade_state import Sample
 from ambjax.control.exact import WIDTH
-from ambjax.control.inversion import StaticInversionState
 from ambjax.control.observer import IRED1, IRED2, Complementary, Difference, Direct, Kalman, Predicted
-from ambjax.control.processor import Processor
 from ambjax.numerics import differentiator
 from ambjax.plants import Plant
 from ambjax.sensors import Sensor
@@ -86,16 +83,6 @@ def test_the_estimates_are_exact_for_polynomials(law, degree):
     late = 100 if degree == 2 else 200
     # rounding of z, 2e-18 m, over T, a few times
     np.testing.assert_allclose(estimate[late:], z_dot[late:], rtol=0, atol=1e-12)
-
-
-def test_difference_is_the_filtered_backward_difference():
-    z = np.cumsum(np.random.default_rng(2).normal(size=400)) * 1e-6
-    law, v, expected = Difference(1700.0), 0.0, [0.0]
-    pole = np.exp(-1700.0 * T)
-    for change in np.diff(z):
-        v = pole * v + (1 - pole) * change / T
-        expected.append(v)
-    np.testing.assert_allclose(list(estimates(law, z))[1], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize(("law", "order", "bound"), [(IRED1(30.0), 1, 1.0), (IRED2(1e4), 2, 1.0)])
@@ -213,46 +200,36 @@ def test_the_differentiators_in_continuous_time(law):
 # --- the cascade behind them ---
 
 
-def right(law, z, z_dot, sampled):
+def right(law, z, z_dot):
     """Return a state for which the estimate is z and z_dot, where z is measured."""
     z, v, zero = jnp.asarray(z), jnp.asarray(z_dot), jnp.zeros(())
-    back = T * v if sampled else 0.0
     if isinstance(law, Difference):
-        return z - (v * T / -jnp.expm1(-law.w * T) if sampled else v / law.w)
+        return z - v / law.w
     if isinstance(law, Kalman):
         return Predicted(z, v, zero, MODEL.z_ddot(z, 0.02))
-    return (z - back, v, zero)[: 2 if isinstance(law, IRED1) else 3]
+    return (z, v, zero)[: 2 if isinstance(law, IRED1) else 3]
 
 
 @EACH
 @pytest.mark.parametrize("law_i", [inversion.Adaptive(), inversion.ClosedForm()], ids=lambda x: type(x).__name__)
 def test_an_exact_estimate_gives_the_command_of_a_measured_velocity(law, law_i):
-    """This includes i_ref' of the closed form.
+    """In continuous time; on a processor: tests/test_sampled.py. This includes i_ref' of the closed form.
 
     It uses the rate of the estimate, because the velocity is not measured.
     """
     z, z_dot, i, reference = 1e-3, 0.03, 0.02, reference_at(Sine(2.5e-3, 2.0), 0.11)
-    seen, blind = (Measurement(jnp.asarray(z), jnp.asarray(v), jnp.asarray(i)) for v in (z_dot, 0.0))
 
-    def commands(law, measured, sampled):
-        cascade = Cascade(law, inversion=law_i, processor=Processor(predict=False) if sampled else None)
-        cascade = cascade.on_processor() if sampled else cascade
+    def commands(law, velocity):
+        cascade, measured = Cascade(law, inversion=law_i), Measurement(*map(jnp.asarray, (z, velocity, i)))
         state = cascade.init(measured)
         if law != Direct():
-            state = state._replace(observer=right(law, z, z_dot, sampled))
-        if sampled and isinstance(law_i, inversion.ClosedForm):  # no first sample, which has no rate
-            state = state._replace(inversion=StaticInversionState(jnp.asarray(0.01), jnp.asarray(1.0)))
-        if sampled:
-            past = (jnp.asarray(40.0), jnp.asarray(-20.0))
-            return cascade.step(measured, state, Sample(reference, T, jnp.asarray(200.0), past))[0]
+            state = state._replace(observer=right(law, z, z_dot))
         return cascade(measured, state, reference, 200.0)[0]
 
-    for sampled in (False, True):
-        expected, given = commands(Direct(), seen, sampled), commands(law, blind, sampled)
-        assert abs(expected.i_ref_dot) > 1
-        for name, a, b in zip(expected._fields, given, expected, strict=True):
-            # the estimate is right to rounding of z over T: 1e-15 m/s
-            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=name)
+    expected, given = commands(Direct(), z_dot), commands(law, 0.0)
+    assert abs(expected.i_ref_dot) > 1
+    for name, a, b in zip(expected._fields, given, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=name)
 
 
 @pytest.mark.parametrize(

@@ -20,22 +20,17 @@ EPS = np.finfo(float).eps
 P = [0.1, 25.0, 1e4]
 
 
+@pytest.mark.parametrize("function", [smooth_sign, smooth_root])
 @pytest.mark.parametrize("p", P)
-def test_smooth_sign_is_odd_and_converges_to_the_sign_as_two_over_pi_p_x(p):
+def test_a_smooth_function_is_odd_and_converges_to_its_limit(function, p):
     x = np.array([1e3, 1e6, 1e9]) / p
-    # 1 - S = 2/(pi p x) + O((p x)^-3): a relative 1e-6 at p x = 1e3; the rest is the cancellation in 1 - S
-    np.testing.assert_allclose(1 - smooth_sign(x, p), TWO_OVER_PI / (p * x), rtol=1e-6, atol=2 * EPS)
-    np.testing.assert_array_equal(smooth_sign(-x, p), -smooth_sign(x, p))
-    assert smooth_sign(0.0, p) == 0
-
-
-@pytest.mark.parametrize("p", P)
-def test_smooth_root_is_odd_and_converges_to_the_root(p):
-    x = np.array([1e3, 1e6, 1e9]) / p
-    # relative distance 1/(4 (p x)^2) <= 2.5e-7
-    np.testing.assert_allclose(smooth_root(x, p), np.sqrt(x), rtol=3e-7)
-    np.testing.assert_array_equal(smooth_root(-x, p), -smooth_root(x, p))
-    assert smooth_root(0.0, p) == 0
+    if function is smooth_sign:
+        # 1 - S = 2/(pi p x) + O((p x)^-3): a relative 1e-6 at p x = 1e3; the rest is the cancellation in 1 - S
+        np.testing.assert_allclose(1 - function(x, p), TWO_OVER_PI / (p * x), rtol=1e-6, atol=2 * EPS)
+    else:  # relative distance 1/(4 (p x)^2) <= 2.5e-7
+        np.testing.assert_allclose(function(x, p), np.sqrt(x), rtol=3e-7)
+    np.testing.assert_array_equal(function(-x, p), -function(x, p))
+    assert function(0.0, p) == 0
 
 
 @pytest.mark.parametrize(("function", "slope"), [(smooth_sign, lambda p: 2 * p / np.pi), (smooth_root, np.sqrt)])

@@ -118,22 +118,6 @@ def test_a_constant_reading_gives_a_constant_command(name, watch):
     np.testing.assert_allclose(np.diff(commands), 0, atol=1e-3 * RIG.i_0)
 
 
-def test_a_linear_controller_starts_in_the_steady_state_of_its_fast_modes():
-    x = [jnp.asarray(v) for v in NOTCHED.steady([jnp.asarray(Z)])]
-    rates = np.array([float(v) for v in NOTCHED.rates(x, [jnp.asarray(Z)])])
-    # only the integrator moves: the rates are a multiple of the null vector of A
-    null = scipy.linalg.null_space(np.array(NOTCHED.A), rcond=1e-9)
-    assert null.shape[1] == 1
-    size = np.linalg.norm(np.array(NOTCHED.B)[:, 0]) * Z
-    np.testing.assert_allclose(rates - null[:, 0] * (null[:, 0] @ rates), 0, atol=1e-9 * size)
-    left = scipy.linalg.null_space(np.array(NOTCHED.A).T, rcond=1e-9)[:, 0]
-    assert abs(left @ np.array(x)) < 1e-9 * np.linalg.norm(x)  # and starts at 0
-    # a step from there has the same output as in steady state, on a processor too
-    _, after = NOTCHED.step(x, [jnp.asarray(Z)], T)
-    moved = np.array(after) - np.array(x)
-    np.testing.assert_allclose(moved - null[:, 0] * (null[:, 0] @ moved), 0, atol=1e-9 * np.linalg.norm(x))
-
-
 @pytest.mark.parametrize("name", ["filtered chain", "pid", "linear"])
 def test_a_start_at_rest_on_the_reference_and_at_an_error_differ_by_the_static_gain_only(name):
     """The largest demanded current in the first samples is that at the first, not a multiple of it."""
