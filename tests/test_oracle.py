@@ -23,6 +23,9 @@ class Case:
     std: float = 0.0  # of the position sensor, m
     solver: str = "Radau"
     tight: Any = amb.solvers.AdaptiveRodas3(tolerance=1e-9)
+    # of methods chosen on their own, m: 4e-6 of the motion
+    most: float = 1e-8
+    most_tight: float = 1e-10
 
 
 def sine(amplitude=2.5e-3, frequency=2.0):
@@ -108,6 +111,21 @@ DROPS = [
     (6.5e-4, 8e8, 2.5e-3, twisting(17.0, 30.0, 50.0, 25.0), pi(), REST, 400.0),
 ]
 CASES += [Case("drop 1", drop(*DROPS[0]), samples=1000), SLOW(Case("drop 2", drop(*DROPS[1]), samples=1000))]
+# Smooth gains, from 0.2 mm off centre onto a smooth step of 2 to 3 ms, whose third derivative jumps inside two samples:
+# the worst two of 3000 drawn at random. An error of the velocity in one step is a kick. No method controls how far a
+# loop carries it: near the edge of losing the rotor, without bound.
+ONTO_STEPS = [
+    # z, slope of the inversion law (1/s), its p, position law, current law, reference
+    (-2e-4, 856.0, 2.16e-6, smc(87.9, 27.4, 13.7), current(162.0, 24.9), smoothstep(3.89e-4, 1.38e-5, 2.27e-3)),
+    (2e-4, 534.0, 4.9e-4, smc(49.8, 38.9, 34.1), current(212.0, 6.04), smoothstep(-3.58e-4, 7.37e-4, 2.93e-3)),
+]
+CASES += [
+    SLOW(Case(
+        f"drop onto a step, {n}", drop(z, math.pi / 2 * slope / p, p, *laws), samples=500, solver="DOP853",
+        tight=amb.solvers.AdaptiveCashKarp(1e-11), most=5e-9, most_tight=2e-9,
+    ))
+    for n, (z, slope, p, *laws) in enumerate(ONTO_STEPS)
+]  # fmt: skip
 
 
 def in_ambjax(case):
@@ -151,10 +169,10 @@ def test_the_rotor_moves_as_in_the_independent_solution(case, record_property):
     print(f"\n{case.name}: {by_itself:.1e} m by itself, {tight:.1e} m tight")
     if np.isfinite(case.world.u_max):
         assert np.abs(rows.u).max() == case.world.u_max  # the case does meet the limit
-    # 4e-6 of the motion. Methods chosen on their own reach 1e-9 (method.py); 5e-9 in drops, or with jumps inside steps.
-    assert by_itself <= 1e-8
+    # Methods chosen on their own reach 1e-9 (method.py); 5e-9 in drops, or with jumps inside steps.
+    assert by_itself <= case.most
     # What is left falls with the tolerance (worst 8e-12, at the kinks of a limited supply): same equations.
-    assert tight <= 1e-10
+    assert tight <= case.most_tight
 
 
 def test_the_error_of_the_independent_solution_is_negligible():
