@@ -233,10 +233,10 @@ class Driven:
             u = y[-1]
             more.append(min(max(rate, -most), most))
         u = math.copysign(max(abs(u) - (self.dead or 0.0), 0.0), u)
-        still, driven = (self.output(self.plant.rates(own, volt, q_z, q_i))[2] for volt in (0.0, 1.0))
-        hold = min(max(still / (still - driven), -self.u_max), self.u_max)
-        if self.i_max and abs(i) >= self.i_max and (u - hold) * i > 0:
-            u = hold
+        if self.i_max and abs(i) >= self.i_max:
+            still, driven = (self.output(self.plant.rates(own, volt, q_z, q_i))[2] for volt in (0.0, 1.0))
+            hold = min(max(still / (still - driven), -self.u_max), self.u_max)
+            u = hold if (u - hold) * i > 0 else u
         return [*self.plant.rates(own, u, q_z, q_i), *more]
 
 

@@ -10,6 +10,7 @@ import pytest
 from structures import METHODS
 
 import ambjax as amb
+from ambjax import signals
 from ambjax.control.processor import Processor
 from ambjax.numerics.records import replaced
 from ambjax.simulation.edges import Edges, most_inside
@@ -17,6 +18,7 @@ from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.world.waveforms import edges_of, knots_of
 
 T = 1e-4
+SINE = signals.Sine(1.0, 2.0)
 SOFT = amb.Cascade(inversion=amb.laws.inversion.Adaptive(2e5), processor=Processor(0.5))
 
 
@@ -97,20 +99,11 @@ def spread(**values):
         (world(np.array([0.1, 0.2]), 0.7), 1),  # between them, too
         (world(**spread(start=[0.1, 0.3], stop=[0.4, 0.5])), 1),
         (world(**spread(start=[0.1, 0.3], stop=[0.2, 0.5])), 2),  # as near as one wishes
-        (amb.Scenario(q_z=amb.signals.Ramp(1.0, 0.10001, 3e-5)), 2),  # both kinks
-        (amb.Scenario(q_z=amb.signals.Recorded(amb.signals.Samples(0.1 + T * np.arange(9), np.arange(9.0) ** 2))), 0),
-        (amb.Scenario(q_z=amb.signals.Recorded(amb.signals.Samples(T / 2.5 * np.arange(99), np.arange(99.0) ** 2))), 2),
-        (
-            amb.Scenario(q_z=amb.signals.Recorded(amb.signals.Samples(T / 2.5 * np.arange(99), np.arange(99.0)))),
-            1,
-        ),  # a straight line
-        (
-            amb.Scenario(
-                q_v=amb.signals.Step(1.0, 0.10003),
-                q_i=amb.signals.Sum((amb.signals.Sine(1.0, 2.0), amb.signals.Step(1.0, 0.10005))),
-            ),
-            2,
-        ),
+        (amb.Scenario(q_z=signals.Ramp(1.0, 0.10001, 3e-5)), 2),  # both kinks
+        (amb.Scenario(q_z=signals.Recorded(signals.Samples(0.1 + T * np.arange(9), np.arange(9.0) ** 2))), 0),
+        (amb.Scenario(q_z=signals.Recorded(signals.Samples(T / 2.5 * np.arange(99), np.arange(99.0) ** 2))), 2),
+        (amb.Scenario(q_z=signals.Recorded(signals.Samples(T / 2.5 * np.arange(99), np.arange(99.0)))), 1),  # straight
+        (amb.Scenario(q_v=signals.Step(1.0, 0.10003), q_i=signals.Sum((SINE, signals.Step(1.0, 0.10005)))), 2),
     ],
 )
 def test_the_number_of_edges_inside_a_sample(scenario, most):

@@ -30,23 +30,16 @@ SHARES = np.concatenate([[0.98, 1.2, 1.5, 1.98], [-1.2, -1.5, -1.98]])
 def struck(guard=Guard(), observer=None, **faults):
     """Return a case with a faulty sensor: the gains of docs/export.md, or gains for a Kalman filter."""
     laws = amb.laws.position.SlidingMode(1440.0, 2.307, math.inf), amb.laws.inversion.Adaptive(7.97e5, math.inf)
-    cascade = amb.Cascade(
-        observer or amb.laws.observer.Direct(),
-        *laws,
-        amb.laws.current.SlidingMode(870.6, math.inf),
-        processor=Processor(guard=guard),
-    )
+    laws = observer or amb.laws.observer.Direct(), *laws, amb.laws.current.SlidingMode(870.6, math.inf)
+    cascade = amb.Cascade(*laws, processor=Processor(guard=guard))
     sensor = Sensor(*NOISE, velocity=observer is None, **faults)
     return cascade, amb.Scenario(reference=amb.signals.Sine(2.5e-3, 2.0), sensor=sensor, u_max=200.0, seed=3)
 
 
-@pytest.mark.parametrize(
-    "observer",
-    [
-        pytest.param(None, id="direct"),
-        pytest.param(amb.laws.observer.Kalman(500.0), id="Kalman", marks=pytest.mark.thorough),
-    ],
-)
+KALMAN_OBSERVER = pytest.param(amb.laws.observer.Kalman(500.0), id="Kalman", marks=pytest.mark.thorough)
+
+
+@pytest.mark.parametrize("observer", [pytest.param(None, id="direct"), KALMAN_OBSERVER])
 def test_one_impossible_reading_is_refused_and_the_rotor_is_held(observer):
     """Outliers of both signs at several samples; without a guard, the same readings lose rotors."""
     found = {}

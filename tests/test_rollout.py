@@ -15,14 +15,11 @@ from ambjax import Cascade, Clock, Initial, Metrics, Scenario, rollout
 from ambjax.compiler import fast_path
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.laws import inversion, position
-from ambjax.numerics.records import record, static
 from ambjax.plants import Plant
 from ambjax.sensors import Sensor
 from ambjax.signals import Pulse, Sine
 from ambjax.simulation.explicit import Euler
-from ambjax.simulation.folds import Driven, Lowest, Named, Peak, Reaching, Rms, Variation
-from ambjax.simulation.loop import INSTANT_TREE
-from ambjax.simulation.span import blank
+from ambjax.simulation.folds import Lowest, Named, Rms, Variation
 from ambjax.simulation.trajectory import DIVERGED, TOUCHED, Row
 from ambjax.solvers import RK4, AdaptiveRodas3
 
@@ -34,38 +31,8 @@ TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.8, 1.3))
 NOISY = dataclasses.replace(TRACKING, sensor=Sensor(1e-6, 1e-4, 1e-4))
 
 
-@record
-class Spans:
-    """A fold that stores every span, [samples] each."""
-
-    samples: int = static()
-
-    def init(self):
-        return jnp.zeros((), int), jax.tree.map(lambda x: jnp.zeros(self.samples) + x, blank(INSTANT_TREE))
-
-    def update(self, carry, row, span):
-        n, kept = carry
-        return n + 1, jax.tree.map(lambda a, x: jax.lax.dynamic_update_index_in_dim(a, x, n, 0), kept, span)
-
-    def result(self, carry, ending):
-        return carry[1]
-
-
-# One structure, so one compiled rollout, for most of what follows: 203 samples, noise, a supply limit, all folds.
-FOLDS = Named(
-    {
-        "peak": Peak("e_z"),
-        "peak_late": Peak("u", 5.05e-3, timed=True),
-        "lowest": Lowest("z"),
-        "rms": Rms("e_z"),
-        "rms_driven": Driven("u_squared", 5.05e-3, root=True),
-        "mean": Driven("heat"),
-        "variation": Variation(5.05e-3),
-        "reaching": Reaching("v_tilde", 0.1),
-        "standard": Metrics(settle=0.01),
-        "spans": Spans(203),
-    }
-)
+# One structure, so one compiled rollout, for most of what follows: 203 samples, noise, a supply limit, all metrics.
+METRICS = Metrics(settle=0.01)
 SHORT = Clock(203, 1e-4, AdaptiveRodas3())
 # Another, cheap to compile, where the method does not matter: explicit steps on smooth gains.
 LIGHT_FOLDS = Named({"rms": Rms("e_z"), "variation": Variation(2e-3), "lowest": Lowest("z")})
@@ -79,14 +46,14 @@ def light(scenario=None, clock=None, record_every=1):
 
 @pytest.fixture(scope="module")
 def short():
-    """A noisy tracking run and its folds."""
-    return rollout(REPAIRED, NOISY, SHORT, fold=FOLDS)
+    """A noisy tracking run and its metrics."""
+    return rollout(REPAIRED, NOISY, SHORT, fold=METRICS)
 
 
 @pytest.fixture(scope="module")
 def lost():
     """The printed gains, with the same compiled rollout."""
-    return rollout(LITERAL, NOISY, SHORT, fold=FOLDS)
+    return rollout(LITERAL, NOISY, SHORT, fold=METRICS)
 
 
 @pytest.fixture(scope="module")
@@ -143,68 +110,6 @@ def test_every_nth_row_is_the_row_of_that_sample(every):
     near(sparse.metrics, dense.metrics, 1e-9)
 
 
-# --- folds ---
-
-
-def by_numpy(rows, spans):
-    """Return every fold of FOLDS, computed from the recorded rows and spans."""
-    t, on = np.asarray(rows.t), np.asarray(rows.alive)
-    seen, time = jax.tree.map(np.asarray, spans), np.asarray(spans.time)
-    u = seen.densities.u[on] / time[on]
-
-    def peak(name, after=0.0):
-        values = np.maximum(np.abs(getattr(rows, name)), getattr(seen.most, name))[t >= after]
-        return values.max(), t[t >= after][np.argmax(values)]
-
-    def rms(x):
-        return np.sqrt(np.mean(np.asarray(x) ** 2))
-
-    def mean(x, after=0.0):
-        return x[t >= after].sum() / time[t >= after].sum() if time[t >= after].sum() else 0.0
-
-    def variation(after):
-        return np.sum(np.abs(np.diff(u[t[on] >= after])))
-
-    def reached(name, band):
-        hit = (np.minimum(np.abs(getattr(rows, name)), getattr(seen.least, name)) <= band) & on
-        return t[hit][0] if hit.any() else np.inf
-
-    return {
-        "peak": peak("e_z")[0],
-        "peak_late": peak("u", 5.05e-3),
-        "lowest": (np.min(rows.z[on]), t[on][np.argmin(rows.z[on])]),
-        "rms": rms(rows.e_z),
-        "rms_driven": np.sqrt(mean(seen.densities.u_squared, 5.05e-3)),
-        "mean": mean(seen.densities.heat),
-        "variation": variation(5.05e-3),
-        "reaching": reached("v_tilde", 0.1),
-    }
-
-
-@pytest.mark.parametrize("run", ["short", "lost"])
-def test_folds_equal_numpy_on_what_was_recorded(run, request):
-    """The standard metrics are compared in tests/test_metrics_dense.py."""
-    out = request.getfixturevalue(run)
-    for name, value in by_numpy(out.trajectory.rows, out.metrics["spans"]).items():
-        # sums in another order: 203 terms
-        np.testing.assert_allclose(out.metrics[name], value, rtol=1e-12, err_msg=name)
-
-
-def test_a_row_has_the_voltage_s_average_over_its_sample(short, lost):
-    for out in (short, lost):
-        span, on = out.metrics["spans"], np.asarray(out.metrics["spans"].time) > 0
-        np.testing.assert_allclose(out.trajectory.rows.u_mean[on], (span.densities.u / span.time)[on], rtol=1e-12)
-        assert np.all(np.asarray(out.trajectory.rows.u_mean)[~on] == 0)
-
-
-def test_a_span_ends_when_the_rotor_is_lost(short, lost):
-    time = np.asarray(short.metrics["spans"].time)
-    np.testing.assert_allclose(time, 1e-4, rtol=1e-12)  # a sum of some ten steps
-    lost_at = float(lost.trajectory.lost_at)
-    # the step that loses the rotor counts up to the crossing of the clearance
-    np.testing.assert_allclose(np.sum(lost.metrics["spans"].time), lost_at, rtol=1e-9)
-
-
 # --- members ---
 
 
@@ -253,16 +158,16 @@ def test_a_lost_rotor_is_frozen_and_finite(lost):
 
 
 def test_a_rotor_that_starts_against_the_stop_is_lost_at_once():
-    out = rollout(REPAIRED, dataclasses.replace(NOISY, initial=Initial(z=-4.6e-3)), SHORT, fold=FOLDS)
+    out = rollout(REPAIRED, dataclasses.replace(NOISY, initial=Initial(z=-4.6e-3)), SHORT, fold=METRICS)
     assert out.trajectory.lost_at == 0
     assert not np.any(out.trajectory.rows.alive)
     assert np.all(np.asarray(out.trajectory.rows.u) == 0)
     assert all(np.all(np.isfinite(x)) for x in out.trajectory.rows)
-    assert out.metrics["standard"]["lost"]
+    assert out.metrics["lost"]
 
 
 def test_a_state_outside_the_range_of_the_model_is_reported():
-    out = rollout(REPAIRED, dataclasses.replace(NOISY, initial=Initial(i=1e5)), SHORT, fold=FOLDS)
+    out = rollout(REPAIRED, dataclasses.replace(NOISY, initial=Initial(i=1e5)), SHORT, fold=METRICS)
     assert int(out.trajectory.lost_code) == DIVERGED
     assert out.trajectory.lost_at == 0
     assert all(np.all(np.isfinite(x)) for x in out.trajectory.rows)
@@ -301,7 +206,7 @@ def test_repaired_regulation_offset_in_the_pulse(tracking):
 
 
 def test_the_supply_limits_the_voltage_that_is_applied(short):
-    limited = rollout(REPAIRED, dataclasses.replace(NOISY, u_max=40.0), SHORT, fold=FOLDS).trajectory
+    limited = rollout(REPAIRED, dataclasses.replace(NOISY, u_max=40.0), SHORT, fold=METRICS).trajectory
     assert np.max(np.abs(short.trajectory.rows.u)) > 40
     assert np.max(np.abs(limited.rows.u)) == 40
 
@@ -387,23 +292,17 @@ def end_of(c):
     return rollout(cascade, NOISY, LIGHT, fold=LIGHT_FOLDS, record_every=0).metrics["rms"]
 
 
-@pytest.mark.parametrize(
-    ("transform", "at"),
-    [
-        (lambda f: f, 17.0),
-        (lambda f: jax.jvp(f, (17.0,), (1.0,)), None),
-        (one_kernel(jax.vmap(end_of)), jnp.array([15.0, 17.0, 20.0])),
-    ],
-    ids=["plain", "jvp", "kernel of vmap"],
-)
-def test_the_fast_path_changes_nothing(transform, at, monkeypatch):
+FAST = {
+    "plain": lambda: end_of(17.0),
+    "jvp": lambda: jax.jvp(end_of, (17.0,), (1.0,)),
+    "kernel of vmap": lambda: one_kernel(jax.vmap(end_of))(jnp.array([15.0, 17.0, 20.0])),
+}
+
+
+@pytest.mark.parametrize("result", FAST.values(), ids=FAST)
+def test_the_fast_path_changes_nothing(result, monkeypatch):
     if fast_path.options() is None:
         pytest.skip("the fast path is not supported here")
-
-    def result():
-        out = transform(end_of) if at is None or np.ndim(at) == 0 else transform(at)
-        return out(at) if callable(out) else out
-
     fast = result()
     monkeypatch.setattr(fast_path, "options", lambda: None)
     # the same operations, fused differently: relative to the largest entry
