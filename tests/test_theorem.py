@@ -69,7 +69,7 @@ def test_delta_1_is_the_derivative_of_a_trajectory():
     assert abs(slope[at]) == pytest.approx(worst.against, rel=1e-5)
     # at the samples of CLOCK; both runs agree to their tolerances
     distance = jax.vmap(plant.signed_distance_to_C)(rows.z[::20], rows.i_ref[::20])
-    assert report["singular curve C"].gain == pytest.approx(distance.min(), rel=1e-4)
+    assert report["singular curve C"].gain == pytest.approx(float(distance.min()), rel=1e-4)
 
 
 def test_delta_1_on_reference_by_hand():
