@@ -135,6 +135,7 @@ def read(coil=None, actuator=None, **more):
     return case_from(raw)
 
 
+@pytest.mark.slow
 def test_an_active_limit_acts_in_the_loop_and_an_inactive_one_does_not():
     plain, far = read(), read({"u_max": 1e4, "i_max": 1e3})
     near = read({"u_max": 48.0, "i_max": 2.55, "unidirectional": True})

@@ -39,6 +39,7 @@ def struck(guard=Guard(), observer=None, **faults):
 KALMAN_OBSERVER = pytest.param(amb.laws.observer.Kalman(500.0), id="Kalman", marks=pytest.mark.thorough)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("observer", [pytest.param(None, id="direct"), KALMAN_OBSERVER])
 def test_one_impossible_reading_is_refused_and_the_rotor_is_held(observer):
     """Outliers of both signs at several samples; without a guard, the same readings lose rotors."""

@@ -266,6 +266,7 @@ def test_command(tmp_path, capsys):
     assert all(name in found["verdict"] for name in one)
 
 
+@pytest.mark.slow
 def test_members_that_are_held_but_not_stable_refute_the_answer():
     """Delays of up to 8 samples without prediction: the motion grows, too slowly to reach a stop within 2 ms."""
     raw = raw_case() | {"run": {"settle": 1e-3}, "spread": {"processor": {"delay": {"uniform": [0.5, 8.0]}}}}

@@ -155,6 +155,7 @@ def test_check_does_not_succeed_without_a_linearisation(tmp_path, capsys, monkey
     assert loop["k_s_N_per_m"] > 0
 
 
+@pytest.mark.slow
 def test_check_begins_with_the_numbers_of_the_machine(tmp_path, capsys):
     """By hand for the plant of Table 1: kappa = mu_0 n^2 A, k_s = kappa i_0^2/s_0^3, k_i = kappa i_0/s_0^2."""
     loop = checked(tmp_path, capsys, CHECKED)[1]["loop"]

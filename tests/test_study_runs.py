@@ -338,6 +338,7 @@ def test_a_cluster_that_does_not_answer_is_reported_in_one_line(monkeypatch, cap
     assert "--cluster nonsense://x: " in refused([*ON_A_CLUSTER, "nonsense://x"], capsys)
 
 
+@pytest.mark.slow
 def test_another_study_in_the_folder_is_refused_and_not_changed(no_pictures, capsys):
     write(TINY)
     argv = ["ensemble", "case.toml", "--members", "9", "--out", "out"]

@@ -42,6 +42,7 @@ def stored(folder):
     return sorted(folder.glob("*"))
 
 
+@pytest.mark.slow
 def test_a_process_traces_nothing_that_another_one_has_traced(tmp_path):
     (tmp_path / "case.toml").write_text(template("rig"))
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}

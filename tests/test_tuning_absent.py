@@ -164,6 +164,7 @@ def test_the_report_is_complete_for_each_kind_of_peak(facts):
         assert ("## Sensitivity" in text) == (found is not None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["facts", "all_lost", "unjudged"])
 def test_the_report_is_complete_without_any_of_the_facts_that_may_be_absent(which, request):
     whole = request.getfixturevalue(which)
