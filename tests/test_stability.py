@@ -19,7 +19,7 @@ from ambjax.cases.reader import case_from
 from ambjax.commands import study_report
 from ambjax.ensemble import run_ensemble
 from ambjax.ensemble.blocks import BlockValues
-from ambjax.ensemble.delays import at_delays
+from ambjax.ensemble.delays import DELAYS, at_delays, delay_margin
 from ambjax.linear import stability as module
 from ambjax.linear.stability import SMALL, Findings, Stability, stability_of
 from ambjax.simulation.rollout import Result
@@ -102,6 +102,22 @@ def test_a_quiet_run_has_no_load_and_the_compiled_program_of_its_case():
     for t in (0.0, 0.05, 0.3):
         assert scenario.turning().acceleration(t) != 0
         assert calm.turning().acceleration(t) == 0
+
+
+@pytest.mark.slow
+def test_the_margin_and_the_stability_at_its_delays_share_a_compiled_program(caplog):
+    case = case_of()
+    clock = dataclasses.replace(case.clock, samples=200)
+    margin = delay_margin(case.cascade, case.scenario, clock, known=False)
+    delays = np.linspace(0.0, margin.held, DELAYS)
+    try:  # in all threads
+        jax.config.update("jax_log_compiles", True)
+        stability_of(late(case, delays), case.scenario, clock)
+    finally:
+        jax.config.update("jax_log_compiles", False)
+    compiled = [message.split()[1] for message in caplog.messages if message.startswith("Compiling ")]
+    assert "jit(_blocks)" in compiled  # the linear loops
+    assert "jit(marked)" not in compiled
 
 
 @pytest.mark.slow
