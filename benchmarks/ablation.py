@@ -52,7 +52,7 @@ def constant(module: Any, **values: Any) -> Callable[[dict[str, Any]], None]:
 
 def by_values(raw: dict[str, Any]) -> None:
     """Refine each start with CMA-ES from its first point on."""
-    constant(refine, STEEP=-1.0)(raw)
+    constant(refine, _slope=lambda starts: math.inf)(raw)
 
 
 # What is switched off, and how.
@@ -63,15 +63,15 @@ MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     ),
     "starting points: only the case's gains": setting(screen=0),
     "several starts: only the best of the screen": setting(starts=1),
-    "halvings: after five steps the best continues alone": constant(refine, FINALISTS=NEVER),
-    "CMA-ES": constant(refine, STEEP=math.inf, CONVERGED=math.inf),
+    "halvings: after five steps the best continues alone": constant(refine, FEW=NEVER),
+    "CMA-ES": constant(refine, _slope=lambda starts: 0.0),
     "large populations of CMA-ES": constant(evolution, POPULATION=1),
     "descent: CMA-ES only": by_values,
     "jumps known to the BFGS": constant(descent, JUMP=math.inf),
     "stressed members": setting(stressed=0),
     "validation": setting(validation=0),
     "members of large errors join": constant(validate, LARGER=math.inf),
-    "search around the optimum": constant(course, LOWER=math.inf),
+    "search around the optimum": constant(course, around=lambda x, count, seed: x[None]),
     "extrapolation of the multipliers": constant(limits, MOST_STEPS=0.0),
     "updates of the multipliers": constant(multipliers, MOST_UPDATES=0),
 }

@@ -31,7 +31,7 @@ from ambjax.cases.table import Table, load
 from ambjax.ensemble.worker import processes
 from tuning.events import Event
 from tuning.problem.config import tune_from
-from tuning.problem.lanes import GRADIENT_LANES, Engine
+from tuning.problem.lanes import LANES, Engine
 from tuning.problem.tuning_problem import TuningProblem, problem_of
 from tuning.solve.course import Course, first_search, training
 
@@ -151,8 +151,8 @@ def cost(repeats: int = 5) -> dict[str, float]:
     for mode in ("value", "forward", "reverse"):
         found, members = problem(None if mode == "value" else mode)
         x = found.objective.space.encode(found.objective.space.clip(held(found)))[None]
-        x, engine = np.repeat(x, GRADIENT_LANES // len(members.member), 0), found.engine
-        engine.lanes = GRADIENT_LANES
+        x, engine = np.repeat(x, LANES // 2 // len(members.member), 0), found.engine
+        engine.lanes = LANES // 2
         weights = found.goal.weights
         call = (lambda e=engine, x=x, m=members: e.terms(x, m)) if mode == "value" else None
         runs[mode] = call or (lambda e=engine, x=x, m=members, w=weights: e.gradient(x, m, w))

@@ -32,7 +32,7 @@ def test_every_number_of_tune_has_a_lower_and_an_upper_bound(path):
     assert -math.inf < low < meta["at_most"] < math.inf
 
     def read(value):
-        return parsed({table: {name: value}} if table else {name: value})
+        return parsed({table: {name: value}} if table else {name: value, "risk": "cvar"})
 
     assert read(meta["at_most"])
     beyond = np.nextafter(meta["at_most"], math.inf)
@@ -60,8 +60,8 @@ def test_whole_numbers_and_bounds_of_tune_have_a_lower_and_an_upper_bound():
             ValueError, match=rf"^tune\.{field.name} = {most + 1}: it must be a whole number from [01] to {most}\.$"
         ):
             parsed({field.name: most + 1})
-        with pytest.raises(ValueError, match=rf"^tune\.{field.name} = 2\.0: it must be a whole number"):
-            parsed({field.name: 2.0})
+        with pytest.raises(ValueError, match=rf"^tune\.{field.name} = 2\.5: it must be a whole number"):
+            parsed({field.name: 2.5})
     for ends in ((0, 1e30), (1, math.inf), (1.0, 1.00001)):
         assert parsed(bounds(*ends)).space.gains[0].high == ends[1]
     for ends in (

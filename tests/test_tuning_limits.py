@@ -66,7 +66,7 @@ def test_limits_are_in_order_and_in_the_fingerprint():
     ("limits", "path", "words"),
     [
         *[({name: "80"}, name, "without quotes") for name in KINDS],
-        ({"margin": 0.5}, "margin", "below 0.5"),
+        ({"margin": 0.5}, "margin", "to 0.49"),
         ({"margin": 0.001}, "margin", "from 0.002"),
         ({"margin": 0}, "margin", "from 0.002"),
         ({"settling_band_m": 1e-5}, "settling_band_m", "Give both"),
@@ -339,7 +339,7 @@ def test_a_resumed_search_with_limits_gives_the_same_result(monkeypatch, tmp_pat
 # --- the command ---
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_command_prints_the_price_of_a_limit(monkeypatch, tmp_path):
     limits = {"rms_u_V": 10.0}
     study(monkeypatch, World(), limits=limits)

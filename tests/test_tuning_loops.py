@@ -12,9 +12,10 @@ from texts import case_and_tune
 from ambjax.linear import analyse, frequency_lines, injected, linearise
 from ambjax.results.operating import one_period
 from tuning.judge.evaluate import JudgedMembers
-from tuning.judge.peaks import INJECTED, injections
+from tuning.judge.peaks import injections
 from tuning.problem.limits import PREFIX
 from tuning.problem.loops import check_loops, loops
+from tuning.problem.members import FEW
 from tuning.problem.quantities import KINDS, LOOPS
 from tuning.problem.tuning_problem import problem_of
 
@@ -170,13 +171,13 @@ def test_injections_find_the_members_with_the_largest_injected_peak():
     linear = analyse(system, masses[0], float(case.clock.sample_period), case.zones).S
     at = frequency_lines(case.zones, clock, linear.frequency)
     each = [injected(case.cascade, world, clock, at, amplitude=5e-5) for world in worlds]
-    expected = sorted(range(count), key=lambda k: -each[k].peak)[:INJECTED]
+    expected = sorted(range(count), key=lambda k: -each[k].peak)[:FEW]
     assert [one.member for one in found.peaks] == expected
     # the same signal, amplitude and plant, in another program
     assert [one.peak for one in found.peaks] == pytest.approx([each[k].peak for k in expected], rel=1e-6)
     # the order of the peaks of |KS| is another one
     columns = {"loss.limit.control_sensitivity": np.ones(count), "lost_at_s": columns["lost_at_s"]}
-    by_KS = sorted(range(count), key=lambda k: -np.abs(each[k].KS).max())[:INJECTED]
+    by_KS = sorted(range(count), key=lambda k: -np.abs(each[k].KS).max())[:FEW]
     assert [one.member for one in injections(JudgedMembers(problem, x, 1, columns)).peaks] == by_KS != expected
 
 

@@ -26,7 +26,8 @@ from tuning.problem.config import seeds
 from tuning.problem.loss import TERMS
 from tuning.report.judging import changed_gains
 from tuning.solve import course
-from tuning.solve.refine import RACE, best_of, search
+from tuning.solve.evolution import PATIENCE
+from tuning.solve.refine import best_of, search
 
 
 def at(made, c, k):
@@ -138,7 +139,7 @@ def test_the_race_is_decided_on_all_members(monkeypatch):
     begins = np.stack([at(made, 90.0, 60.0), at(made, 5000.0, 60.0)])
     members = made.objective.training(1, 16, 8, 1.2, 1.25)
     found = search(made.engine, made.goal, members, begins, keep=2, iterations=12)
-    race = made.objective.space.gains_at(found.history["x"][RACE - 1])
+    race = made.objective.space.gains_at(found.history["x"][PATIENCE - 1])
     np.testing.assert_allclose(race, [world.best[0] * math.exp(4.0), world.best[1]], rtol=0.05)
     np.testing.assert_allclose(made.objective.space.gains_at(best_of(found)[0]), world.best, rtol=0.05)
     assert int(found.history["lost"][-1]) == 0

@@ -10,10 +10,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from ambjax.commands.pace import duration
-from ambjax.host.heartbeat import Heartbeat
-
-# `Log` writes the standing of a search at most once in INTERVAL seconds.
-INTERVAL = 2.0
+from ambjax.host.heartbeat import SILENCE, Heartbeat
 
 
 class Reached(NamedTuple):
@@ -98,8 +95,9 @@ def teller(listen: Listener) -> Tell:
 class Log(Heartbeat):
     """Listener that writes lines to stderr, each with the time since its beginning.
 
-    As a context manager, it also repeats its last line if there is none for some seconds, so that a user sees what
-    takes so long. On a terminal, such repetitions and standings overwrite each other.
+    It writes the standing of a search at most once in half of SILENCE. As a context manager, it also repeats its last
+    line after SILENCE, so that a user sees what takes so long. On a terminal, such repetitions and standings overwrite
+    each other.
     """
 
     def __call__(self, event: Event) -> None:
@@ -107,5 +105,5 @@ class Log(Heartbeat):
             self.text = event.text
             if event.standing is None:
                 self.line(event.text)
-            elif time.monotonic() - self.written >= INTERVAL:
+            elif time.monotonic() - self.written >= SILENCE / 2:
                 self.line(event.text, passing=True)

@@ -22,11 +22,7 @@ from tuning.validate import validated
 
 # Limits of the rms error relative to the least error: KNEE for the knee, FACTORS for the points of the front. The first
 # tune.front factors are used, and further ones until there are tune.front points besides that of least error.
-KNEE = 1.25
-FACTORS = (KNEE, 1.1, 1.5, 2.0, 1.05, 3.0)
-# Largest number of searches after updates of the multipliers, except at the knee: each of their optima is a point of
-# the front for its own error.
-FEW_UPDATES = 3
+KNEE, *_ = FACTORS = (1.25, 1.1, 1.5, 2.0, 1.05, 3.0)
 # First multiplier of the limit on the error at the knee: 1.5 % more voltage for 1 % less error.
 MULTIPLIER = 3.0
 
@@ -86,7 +82,9 @@ def trace_front(course: Course, answer: SearchResult) -> SearchResult:
         points = np.array([point.x for point in seen])
         start = screen(course.problem.engine, course.members, points, course.problem.goal)[0][0]
         found, _ = course.again(start, evolve=False)
-        updates = MOST_UPDATES if factor == KNEE else FEW_UPDATES
+        # Half as many updates of the multipliers are sufficient except at the knee: each of their optima is a point of
+        # the front for its own error.
+        updates = MOST_UPDATES if factor == KNEE else MOST_UPDATES // 2
         seen += [_point(course, one) for one in optima(course, found, updates)[0]]
         (error,) = (limit for limit in course.problem.limits if limit.source == FRONT)
         scale = error.multiplier * math.sqrt(math.log(factor))

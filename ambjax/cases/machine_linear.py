@@ -121,7 +121,7 @@ def lqg_problem(top: Table, cases: Sequence[Case], rotor: Rotor) -> LqgProblem:
     voltage = cases[0].scenario.drive == "voltage"
     given = own.record(LqgWeights, extra=("speeds", "modes"))
     known = (len(rotor.gravity) - RIGID) // 2
-    count = min(own.whole("modes", MODES) if "modes" in own.raw else known, known)
+    count = min(own.leaf("modes", MODES) if "modes" in own.raw else known, known)
     coils, w = _coils(cases, voltage), float(numbers(cases, "pole").max())
     sizes = float(numbers(cases, "s_0").min()), float(numbers(cases, "i_0").min())
     force = float(np.max(coils.k_i * numbers(cases, "i_0")))

@@ -98,7 +98,7 @@ def _of_matrices(arrays: dict[str, np.ndarray], table: Table) -> RotorBody:
             )
     if np.linalg.eigvalsh(own["M"])[0] <= 0:
         raise ValueError("M must be positive definite.")
-    modes = table.whole("modes", MODES)
+    modes = table.leaf("modes", MODES, MODES.default)
     if modes > 2 * count - 2:
         raise ValueError(f"{count} nodes have {2 * count - 2} bending modes, and {table.at('modes')} = {modes}.")
     model = _reduced(own["M"], own["G"], K, nodes, rows=tuple(range(2 * count)), modes=modes)
@@ -146,7 +146,7 @@ def _of_table(arrays: dict[str, np.ndarray], table: Table) -> RotorBody:
     for name, own in zip(names, rows, strict=True):
         if abs(own[0] * scale[0] - 1) > 1e-3:
             raise ValueError(f"{name}[0] = {own[0]:g}: shapes are mass-normalised, so it must be {1 / scale[0]:g}.")
-    modes = table.whole("modes", MODES) if "modes" in table.raw else count - 2
+    modes = table.leaf("modes", MODES) if "modes" in table.raw else count - 2
     if modes > count - 2:
         raise ValueError(f"it has {count - 2} bending modes, and {table.at('modes')} = {modes}.")
     places, kept = centre + rows[:, 1] * scale[1], slice(2, 2 + modes)

@@ -186,7 +186,7 @@ def _shaft(table: Table, places: list[float]) -> RotorBody:
         for layer in layers
         for x in middles
     ]
-    count = table.whole("modes", MODES)
+    count = table.leaf("modes", MODES, MODES.default)
     numbers = tuple(range(len(nodes)))
     model = _shaft_model(sections, discs, nodes, sizes=tuple(sizes), places=numbers, modes=count)
     shapes = np.asarray(model.shapes)

@@ -5,12 +5,12 @@ import difflib
 import pathlib
 import re
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
-from ambjax.numerics.declared import check_number, numbers, within
+from ambjax.numerics.declared import check_number, numbers
 from ambjax.numerics.records import check_leaf, leaves_of
 from ambjax.numerics.shapes import axes_of, check_shapes
 from ambjax.text.synonyms import hint, other_words
@@ -152,18 +152,25 @@ class Table:
         return [each.number(n, None) if field is None else each.leaf(n, field) for n in each.raw]
 
     def leaf(self, key: str, field: dataclasses.Field, default: object = None) -> Any:
-        """Return a number within the bounds of `field`, or the default if left out. Raises ValueError otherwise."""
+        """Return a number within the bounds of `field`, or the default if left out. Raises ValueError otherwise.
+
+        It is an integer if `field` is whole.
+        """
         value = self.number(key, default, numbers(field))
         if key in self.raw:
             check_number(field, self.at(key), value)
-        return value
+        return value if value is None or not field.metadata["whole"] else int(value)
 
-    def whole(self, key: str, field: dataclasses.Field) -> int:
-        """Return an integer within the bounds of `field`, or its default if left out. Raises ValueError otherwise."""
-        value = self.raw.get(key, field.default)
-        if isinstance(value, bool) or not isinstance(value, int) or not within(field.metadata, value):
-            raise ValueError(f"{self.at(key)} = {show(value)}: it must be {numbers(field)}.")
-        return value
+    def leaves(
+        self, fields: Mapping[str, dataclasses.Field], extra: Iterable[str] = (), elsewhere: Iterable[str] = ()
+    ) -> dict[str, Any]:
+        """Return the numbers of the table by name, within the bounds of `fields`; those left out have their defaults.
+
+        `extra`: further keys that the table may have. `elsewhere`: as in `only`. Raises ValueError as `leaf` and `only`
+        do.
+        """
+        self.only([*extra, *fields], elsewhere)
+        return {name: self.leaf(name, field, field.default) for name, field in fields.items()}
 
     def switch(self, key: str) -> bool | None:
         """Return a Boolean; None if left out."""

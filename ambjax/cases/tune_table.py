@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from ambjax.numerics.records import leaf
 
-# Default risk, and alpha of the risk "cvar".
-RISK, ALPHA = "mean", 0.9
+# Ways to combine the losses of the members, the default first.
+RISKS = ("mean", "cvar")
 # Objectives, the default first: least voltage with at most 1.25 times the least error, or the least error itself.
 OBJECTIVES = ("knee", "least_error")
 # Default limit of the rms voltage, as a share of actuator.u_max.
@@ -29,6 +29,7 @@ NUMBERS: dict[str, dataclasses.Field] = {
     "gain_margin": leaf(
         1.25, above=0, at_most=1e6, doc="each gain of a stressed member is multiplied or divided by this factor"
     ),
+    "alpha": leaf(0.9, at_least=0, at_most=0.9999, doc='for "cvar": the mean of the worst 1 - alpha of the losses'),
     "minutes": leaf(
         math.inf,
         above=0,
@@ -121,8 +122,8 @@ def template_lines() -> Iterator[Line]:
     yield from _defaults("weights.", WEIGHTS)
     yield from _limits()
     yield from _defaults("", {name: NUMBERS[name] for name in ("early",)})
-    yield Line('risk = "cvar"', f'how the members\' losses are combined: "cvar" or "mean"; left out: "{RISK}"')
-    yield Line(f"alpha = {ALPHA}", f'for "cvar": the mean of the worst 1 - alpha; left out: {ALPHA}')
+    yield Line('risk = "cvar"', f'how the members\' losses are combined: "cvar" or "mean"; left out: "{RISKS[0]}"')
+    yield from _defaults("", {"alpha": NUMBERS["alpha"]})
     yield from _defaults("", {name: BUDGET[name] for name in ("members", "stressed")})
     yield from _defaults("", {name: NUMBERS[name] for name in ("stress", "gain_margin")})
     yield from _defaults("", {name: field for name, field in BUDGET.items() if name not in ("members", "stressed")})

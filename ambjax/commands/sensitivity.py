@@ -13,6 +13,7 @@ from ambjax.commands.sensitivity_report import Injections, sensitivity_summary, 
 from ambjax.ensemble.study import Study
 from ambjax.host.heartbeat import FIRST_RUN, doing
 from ambjax.linear import Injection, frequency_lines, injected
+from ambjax.linear.injection import REPETITIONS
 from ambjax.linear.multisine import Reading
 from ambjax.results.operating import (
     MEMBERS,
@@ -28,8 +29,6 @@ from ambjax.results.outputs import described, directory, files, plain, write_jso
 from ambjax.results.spread_runs import study_of
 
 WRITTEN = ("sensitivity.json", "sensitivity.png")
-# Members of the injection, which differ in the noise.
-INJECTED = 8
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
@@ -104,7 +103,7 @@ def _injections(case: Case, point: OperatingPoint) -> Injections:
 
 def _injected(case: Case, peak: float, reading: Reading) -> Injection:
     """Inject a multi-sine at one sensor, and measure over one period. Its frequencies are denser near `peak` (Hz)."""
-    clock, members = one_period(case), INJECTED if case.scenario.random else 1
+    clock, members = one_period(case), REPETITIONS if case.scenario.random else 1
     at = frequency_lines(case.zones, clock, peak)
     amplitude = case.zones.amplitude
     if amplitude is not None and reading == "z_dot":

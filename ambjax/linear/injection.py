@@ -25,6 +25,8 @@ from ambjax.world.scenario import Scenario
 # LINES: number of logarithmically spaced lines. NEAR: number of lines near a peak. AROUND: their range as multiples of
 # the frequency of the peak.
 LINES, NEAR, AROUND = 36, 11, (0.75, 1.33)
+# Number of injections into a loop with noise, which differ in the noise.
+REPETITIONS = 8
 
 
 class Injection(NamedTuple):

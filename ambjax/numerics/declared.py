@@ -94,7 +94,7 @@ def check_number(field: dataclasses.Field, name: str, value: object) -> None:
         number = math.nan
     number = math.nan if isinstance(value, str) else number
     if not within(field.metadata, number):
-        shown = f"{value:g}" if isinstance(value, (int, float)) else _shown(value, number)
+        shown = f"{value:.10g}" if isinstance(value, (int, float)) else _shown(value, number)
         raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.")
 
 

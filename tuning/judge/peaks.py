@@ -14,18 +14,16 @@ from ambjax.control.cascade import DEFAULT_LAWS
 from ambjax.control.processor import MOST_DELAY
 from ambjax.ensemble import run_ensemble
 from ambjax.linear import Analysis, Injection, analyse, frequency_lines, linearise, stability_of
-from ambjax.linear.injection import injection_of
+from ambjax.linear.injection import REPETITIONS, injection_of
 from ambjax.linear.member_responses import Responses, member_responses
 from ambjax.linear.stability import MOST_TESTED
 from ambjax.results.operating import one_period
 from tuning.judge.evaluate import JudgedMembers
 from tuning.problem.limits import PREFIX, Limit
+from tuning.problem.members import FEW
 from tuning.problem.quantities import LOOPS
 from tuning.problem.tuning_problem import TuningProblem
 
-# INJECTED: number of members, those with the largest peaks, with an injected signal. REPETITIONS: number of
-# injections into each of them, with different noise.
-INJECTED, REPETITIONS = 3, 8
 UNSTABLE = "its linearised loop is not stable"
 DELAY_MARGIN = "delay_margin_s"
 # Limited quantities that an injection measures.
@@ -82,7 +80,7 @@ def decides(problem: TuningProblem) -> bool:
 
 
 def injections(of: JudgedMembers) -> Sensitivity | None:
-    """Analyse the INJECTED held members with the largest peaks; on a processor, also inject.
+    """Analyse the FEW held members with the largest peaks; on a processor, also inject.
 
     The members are those with the largest linear peak of the first quantity of BY_INJECTION that has a limit. If only
     injections decide, they are those with the largest injected peak, by one injection into each of the first
@@ -93,7 +91,7 @@ def injections(of: JudgedMembers) -> Sensitivity | None:
         return None
     order = alive[np.argsort(-of.columns[f"loss.{PREFIX}{name}"][alive], kind="stable")]
     if not injects(of.problem):
-        return Sensitivity(tuple(_summary(int(k), _analysis(of, k), None) for k in order[:INJECTED]), False)
+        return Sensitivity(tuple(_summary(int(k), _analysis(of, k), None) for k in order[:FEW]), False)
     first = _analysis(of, order[0])
     peak = None if isinstance(first, str) else first.S.frequency
     if decides(of.problem):
@@ -103,9 +101,9 @@ def injections(of: JudgedMembers) -> Sensitivity | None:
         order = alive[np.argsort(-size, kind="stable")]
     random = of.problem.objective.scenario.random
     repetitions = REPETITIONS if random else 1
-    every = _responses(of, order[:INJECTED], repetitions, peak)
+    every = _responses(of, order[:FEW], repetitions, peak)
     peaks = []
-    for at, k in enumerate(order[:INJECTED]):
+    for at, k in enumerate(order[:FEW]):
         own = slice(at * repetitions, (at + 1) * repetitions)
         parts = {name: getattr(every, name)[own] for name in ("S", "KS", "saturated", "held")}
         peaks.append(_summary(int(k), _analysis(of, k), injection_of(every._replace(**parts), random)))

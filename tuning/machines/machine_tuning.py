@@ -61,11 +61,10 @@ class MachinePlan(NamedTuple):
 def settings_from(raw: dict[str, Any], case: MachineCase) -> Settings:
     """Return [tune] of a machine. Raises ValueError, one line, for a key that a machine does not take."""
     own = Table(raw).table("tune")
-    own.only([*KEYS, *SIZES])
+    sizes = own.leaves({name: BUDGET[name] for name in SIZES}, KEYS)
     limits = own.table("limits")
     limits.only(list(LIMITS))
     thresholds = {name: limits.leaf(name, LIMIT) for name in LIMITS if name in limits.raw}
-    sizes = {name: own.whole(name, BUDGET[name]) for name in SIZES}
     lqg = kind_of(raw) == "lqg"
     if case.machine.law is not None and not lqg:
         raise NothingToTuneError(

@@ -10,11 +10,10 @@ import numpy as np
 from ambjax.cases.reader import Case, case_from, load
 from ambjax.cases.table import Table, one_line
 from ambjax.cases.tune_table import (
-    ALPHA,
     BUDGET,
     NUMBERS,
     OBJECTIVES,
-    RISK,
+    RISKS,
     SETTLING_BAND,
     SURVIVAL,
     SURVIVING,
@@ -26,14 +25,14 @@ from ambjax.extend import leaf
 from ambjax.host.extensions import NothingToTuneError
 from tuning.problem.gains_table import space_from
 from tuning.problem.goal import CVaR
-from tuning.problem.limits import LEAST_MARGIN, Limit
+from tuning.problem.limits import Limit
 from tuning.problem.loss import TERMS
 from tuning.problem.quantities import KINDS
 from tuning.problem.space import Space
 from tuning.problem.unbreakable import bounds_of
 
 # Keys of [tune] that are neither in NUMBERS nor in BUDGET.
-OTHER_KEYS = ["objective", "gains", "bounds", "weights", "limits", "risk", "alpha"]
+OTHER_KEYS = ["objective", "gains", "bounds", "weights", "limits", "risk"]
 # Keys of [tune] that depend on the laws of the case.
 KEYS_OF_LAWS = ("gains", "bounds")
 # Allowed range of each limit: OTHER_RANGES by name, LIMIT_RANGE for all others. BAND_RANGE: that of settling_band_m.
@@ -44,6 +43,9 @@ OTHER_RANGES: dict[str, dataclasses.Field] = {
     "sensitivity": leaf(at_least=1, at_most=1e12, infinite=True),
     "delay_margin_s": leaf(above=0, at_most=1e6, unit="s"),
 }
+# The search accepts a judged value beyond `Limit.allowed` by up to half of the margin. The other half is the reserve
+# for the held-out ensemble; with a smaller margin it would be too small.
+MARGIN_RANGE: dataclasses.Field = leaf(at_least=0.002, at_most=0.49)
 BAND_RANGE: dataclasses.Field = leaf(at_least=1e-12, at_most=1.0, unit="m")
 
 
@@ -119,30 +121,32 @@ def with_settings_of(raw: dict[str, Any], settings_of: str | pathlib.Path | None
 
 def tune_from(table: Table, case: Case) -> Tune:
     """Return [tune] of a case. A missing key has its default. Raises ValueError for an invalid table."""
-    table.only([*OTHER_KEYS, *NUMBERS, *BUDGET], [table.at(f"limits.{name}") for name in KINDS])
-    budget = Budget(**{name: table.whole(name, field) for name, field in BUDGET.items()})
-    numbers = {name: table.leaf(name, field, field.default) for name, field in NUMBERS.items()}
+    numbers = table.leaves(NUMBERS | BUDGET, OTHER_KEYS, [table.at(f"limits.{name}") for name in KINDS])
+    objective, risk = (
+        table.choice(key, list(words), words[0]) for key, words in (("objective", OBJECTIVES), ("risk", RISKS))
+    )
+    weights, alpha = table.table("weights").leaves(WEIGHTS), numbers.pop("alpha")
+    if risk == "mean" and "alpha" in table.raw:
+        raise ValueError(f'{table.at("alpha")} applies to risk = "cvar" only; risk is "mean". Remove alpha.')
     return Tune(
-        objective=table.choice("objective", list(OBJECTIVES), OBJECTIVES[0]),
-        space=space_from(table, case),
-        weights=_weights(table.table("weights")),
+        objective=objective,
+        risk=CVaR(0.0 if risk == "mean" else alpha),
+        weights=_weights(weights),
         limits=_limits(table.table("limits"), case),
-        risk=_risk(table),
-        budget=budget,
+        space=space_from(table, case),
+        budget=Budget(**{name: numbers.pop(name) for name in BUDGET}),
         **numbers,
     )
 
 
-def _weights(table: Table) -> tuple[float, ...]:
-    table.only(list(WEIGHTS))
-    given = {name: table.leaf(name, field, field.default) for name, field in WEIGHTS.items()}
+def _weights(given: dict[str, float]) -> tuple[float, ...]:
     if not any(given[name] > 0 for name in ("tracking", "peak")):
         raise ValueError(
-            f"{table.path}.tracking = 0 and {table.path}.peak = 0: no term of the loss depends on the error, "
+            "tune.weights.tracking = 0 and tune.weights.peak = 0: no term of the loss depends on the error, "
             "and effort and chatter, which multiply the error, have no effect. Give one of the two a weight above 0."
         )
     if given["survival"] == 0:
-        raise ValueError(f"{table.path}.survival = 0: losing the rotor would cost nothing. Give it a weight above 0.")
+        raise ValueError("tune.weights.survival = 0: losing the rotor would cost nothing. Give it a weight above 0.")
     return tuple(given[name] for name in TERMS)
 
 
@@ -180,11 +184,9 @@ def _limits(table: Table, case: Case) -> LimitSettings:
             f"{table.at('settling_band_m')} = {band:g} m: it must be below the clearance, {clearance:g} m "
             "(run.clearance, by default 0.9 of plant.s_0)."
         )
-    share = f"from {LEAST_MARGIN:g} to below 0.5"
-    if not LEAST_MARGIN <= table.number("margin", LEAST_MARGIN, f"a number {share}") < 0.5:
-        raise ValueError(f"{table.at('margin')} = {table.raw['margin']:g}: it must be a share of each limit, {share}.")
+    margin = table.leaf("margin", MARGIN_RANGE)
     each = tuple(
-        Limit(name, thresholds[name], sources[name], table.number("margin", KINDS[name].margin))
+        Limit(name, thresholds[name], sources[name], KINDS[name].margin if margin is None else margin)
         for name in sorted(thresholds)
         if math.isfinite(thresholds[name])
     )
@@ -195,17 +197,6 @@ def _limits(table: Table, case: Case) -> LimitSettings:
         band,
         tuple((limit, bounds[limit.name].why) for limit in each if limit.name in bounds),
     )
-
-
-def _risk(table: Table) -> CVaR:
-    if table.choice("risk", ["mean", "cvar"], RISK) == "mean":
-        if "alpha" in table.raw:
-            raise ValueError(f'{table.at("alpha")} applies to risk = "cvar" only; risk is "mean". Remove alpha.')
-        return CVaR()
-    alpha = table.number("alpha", ALPHA, "a number from 0 to below 1")
-    if not 0 <= alpha < 1:
-        raise ValueError(f"{table.at('alpha')} = {alpha:g}: it must be at least 0 and below 1.")
-    return CVaR(alpha)
 
 
 def settings(tune: Tune) -> dict[str, Any]:

@@ -29,11 +29,10 @@ from tuning.problem.members import Members, Objective
 from tuning.problem.space import Space
 
 # Lanes of one kernel call. With 32 lanes XLA unrolls the loops into scalar code, which takes 1.5 times as long.
-LANES = 64
-# Lanes of one kernel call with derivatives. Most iterations need 16 to 64 lanes. With calls of 32 lanes, two cores can
+# A call with derivatives has half as many. Most iterations need 16 to 64 lanes. With calls of 32 lanes, two cores can
 # share 64. In sequence, two such calls take 14 % longer than one of 64 lanes. A call of 16 lanes takes 0.63 of the time
 # of one of 32; a second kernel for few lanes would take longer to compile than it saves in a search.
-GRADIENT_LANES = LANES // 2
+LANES = 64
 
 
 class Lane(NamedTuple):
@@ -107,7 +106,7 @@ class Engine:
     """Compiled evaluation of an objective on `threads` cores (None: all). Each call blocks until its result is ready.
 
     `settle` (s): start of the settled part of the metrics. `mode`: "forward" or "reverse" differentiation. `lanes`:
-    lanes of one kernel call; with derivatives at most GRADIENT_LANES. `rollouts` counts the rollouts so far; `gradient`
+    lanes of one kernel call; with derivatives at most half of LANES. `rollouts` counts the rollouts so far; `gradient`
     counts as 1 + m for each start and member.
     """
 
@@ -165,7 +164,7 @@ class Engine:
         self.rollouts += len(x) * len(members.member) * (len(self.objective.space) + 1)
         each = np.broadcast_to(np.asarray(weights, float), (len(x), len(TERMS)))
         slope = LaneGradient(self.objective.space, self.mode == "reverse")
-        found = self._lanes(slope, x, members, min(self.lanes, GRADIENT_LANES), weights=each, vectorised=True)
+        found = self._lanes(slope, x, members, min(self.lanes, LANES // 2), weights=each, vectorised=True)
         return found if self.objective.loop is None else self._with_loops(found, x, members)
 
     def _with_loops(

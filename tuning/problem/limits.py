@@ -20,7 +20,7 @@ from jax import Array
 
 from ambjax.extend import Scalar, record, static
 from ambjax.simulation.folds import Fold
-from tuning.problem.quantities import KINDS, LOOPS, NORM, TINY, Kind, LimitContext
+from tuning.problem.quantities import KINDS, LOOPS, NEGLIGIBLE, NORM, TINY, Kind, LimitContext
 
 # Penalty; at a multiplier of 0, an excess of 10 % adds 0.14 to the goal.
 PENALTY = 30.0
@@ -28,11 +28,6 @@ PENALTY = 30.0
 MOST_STEPS = 5.0
 # Prefix that marks a limited quantity among the terms of a loss.
 PREFIX = "limit."
-# A limit with a multiplier above 0 is met if g lies between minus this number and half of the margin.
-TOLERANCE_BELOW = 0.01
-# Smallest margin. The search accepts a judged value beyond `Limit.allowed` by up to half of the margin. The other half
-# is the reserve for the held-out ensemble; with a smaller margin it would be too small.
-LEAST_MARGIN = 0.002
 # Value of `Limit.source` for the limit on the rms error that traces the front of error against voltage.
 FRONT = "the front"
 
@@ -124,10 +119,10 @@ class Limit:
     def active(self, reached: float | None) -> bool:
         """Return whether the limit is active: its multiplier is above 0, and `reached` (judged) is near the limit.
 
-        It is near if g is at least -(TOLERANCE_BELOW + margin). `reached`: None if no judged member is held; then only
+        It is near if g is at least -(NEGLIGIBLE + margin). `reached`: None if no judged member is held; then only
         the multiplier decides.
         """
-        near = reached is None or self.log_excess(reached) >= -(TOLERANCE_BELOW + self.margin)
+        near = reached is None or self.log_excess(reached) >= -(NEGLIGIBLE + self.margin)
         return self.multiplier > 0 and near
 
     def updated(self, tuned: float, judged: float) -> "Limit":

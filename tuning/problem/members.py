@@ -18,8 +18,9 @@ from tuning.problem.loss import Loss
 from tuning.problem.quantities import LOOPS
 from tuning.problem.space import Space
 
-# Number of members that are simulated where an ensemble would take too long: with accurate steps, and of a machine in
-# its search. The screen simulates one member in FEW, but at least FEW ordinary and FEW stressed members.
+# Number of members, or of finalists of a race, that are simulated where more would take too long: with accurate steps,
+# with injections, and of a machine in its search. The screen simulates one member in FEW, but at least FEW ordinary and
+# FEW stressed members.
 FEW = 4
 
 

@@ -24,6 +24,8 @@ from ambjax.world.rotation import Rotation
 LOOPS = 16
 # Exponent of the norms that approximate maxima. Over 1e4 samples of noise, the maximum is 1.2 to 1.6 times the norm.
 NORM = 16
+# Differences of logarithms, of a goal or of a limited quantity, that are negligible: 1 %.
+NEGLIGIBLE = 0.01
 # Lower bound of the argument of a logarithm.
 TINY = 1e-30
 

@@ -23,9 +23,6 @@ from ambjax.host.extensions import NothingToTuneError
 # A coordinate bends within 1/SHARP of a bound, in logarithms. A logistic curve over the whole interval would put the
 # bound at infinity, so that a search converges slowly to an optimum at the bound.
 SHARP = 4.0
-# Largest distance of a coordinate beyond a bound at the start of a search. There, the gain is 3 % away from the bound,
-# and a change of the coordinate changes its logarithm by an eighth of that.
-BEYOND = 0.5
 # Distance of `Gain.inner` from the bounds: a share of the bound, at most a tenth of the interval in logarithms.
 MARGIN = 0.02
 # Smallest relative distance of two bounds. Closer bounds leave an interval of the size of the rounding error.
@@ -144,14 +141,15 @@ class Space:
         return np.array([float(np.clip(value, *gain.inner)) for gain, value in zip(self.gains, gains, strict=True)])
 
     def drawn_back(self, x: np.ndarray) -> np.ndarray:
-        """Return x [m] with no coordinate more than BEYOND beyond a bound, so that a search can leave the bound.
+        """Return x [m] with no coordinate more than 2/SHARP beyond a bound, so that a search can leave the bound.
 
-        Farther beyond, a gain hardly depends on its coordinate.
+        There, the gain is 3 % away from the bound, and a change of the coordinate changes its logarithm by an eighth of
+        that. Farther beyond, the gain hardly depends on its coordinate.
         """
         bent = [(gain.low, gain.high) if math.isfinite(gain.high) else (0.0, math.inf) for gain in self.gains]
         with np.errstate(divide="ignore"):
             low, high = np.log(bent).T
-        return np.clip(x, low - BEYOND, high + BEYOND)
+        return np.clip(x, low - 2 / SHARP, high + 2 / SHARP)
 
     def decode(self, x: Array, cascade: Cascade) -> Cascade:
         """Return the cascade with the gains at coordinates x [m]. All other leaves are the same objects."""

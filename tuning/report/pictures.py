@@ -14,9 +14,6 @@ from ambjax.simulation.trajectory import ALIVE, STALLED, Trajectory
 from tuning.problem.goal import shown
 from tuning.report.front_table import letter
 
-# Smallest number of samples of a spectrum.
-FEWEST = 16
-
 
 @own_style
 def nominal(run: Trajectory, name: str, settle: float) -> bytes:
@@ -32,7 +29,7 @@ def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
     for name, run in runs.items():
         t, alive = np.asarray(run.rows.t), np.asarray(run.rows.alive)
         frequency, amplitude = amplitudes(np.asarray(run.rows.u_mean)[alive & (t >= settle)], t[1] - t[0])
-        why = {ALIVE: f"fewer than {FEWEST} samples after", STALLED: "stalled before"}
+        why = {ALIVE: "too few samples after", STALLED: "stalled before"}
         label = name if len(amplitude) else f"{name}: {why.get(int(run.lost_code), 'lost before')} {settle:g} s"
         ax.plot(frequency, amplitude, color=ORANGE if name == "before" else BLUE, lw=0.8, label=label)
         top = max(top, amplitude.max(initial=0.0))
@@ -47,12 +44,11 @@ def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarra
     """Return frequencies (Hz) above 0 and amplitudes of `values`, with the sample period (s) and a Hann window.
 
     A sine of amplitude a at one of these frequencies gives a peak of height a, also at half the sampling rate. Both
-    arrays are empty for fewer than FEWEST samples.
+    arrays are empty for fewer than three samples.
     """
-    n = len(values)
-    if n < FEWEST:
+    n, window = len(values), np.hanning(len(values))
+    if n < 3:
         return np.zeros(0), np.zeros(0)
-    window = np.hanning(n)
     lines = 2 * np.abs(np.fft.rfft(window * (values - values.mean()))) / window.sum()
     if n % 2 == 0:
         lines[-1] /= 2  # above 0, only the line at half the sampling rate has no mirror image

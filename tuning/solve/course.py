@@ -14,6 +14,7 @@ from tuning.judge.evaluate import StepError
 from tuning.problem.loops import check_loops
 from tuning.problem.loss import TERMS
 from tuning.problem.members import Members
+from tuning.problem.quantities import NEGLIGIBLE
 from tuning.problem.ranges import around, initial_points
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.checkpoint import CheckpointFile, SearchState, checkpoint
@@ -22,8 +23,6 @@ from tuning.solve.refine import best_of, screen, search
 
 # Number of random points around the first optimum, relative to tune.screen. Near that of C10, very few are lower.
 AROUND = 4
-# A further search begins at a point around the first optimum if the goal there, a logarithm, is lower by this or more.
-LOWER = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,7 +186,8 @@ def first_search(course: Course, start: np.ndarray) -> np.ndarray:
     """Search from the gains `start` [m], SI units, and the points of the screen. Return the coordinates [m].
 
     A search can end in a valley from which a large change of some gains leads to a lower one. While a point of `around`
-    has a goal that is lower by LOWER, a further search begins there. Raises ValueError as `check_loops` does.
+    has a goal that is lower by NEGLIGIBLE or more, a further search begins there. Raises ValueError as `check_loops`
+    does.
     """
     problem, budget = course.problem, course.problem.tune.budget
     points = initial_points(problem.objective.space, problem.ranges, start, budget.screen, course.seed)
@@ -196,7 +196,7 @@ def first_search(course: Course, start: np.ndarray) -> np.ndarray:
     while budget.screen and not course.over:
         points = around(x, AROUND * budget.screen, course.seed + len(course.past))
         near, goals = screen(problem.engine, course.members, points, problem.goal)
-        if goals[0] > goals[np.flatnonzero((near == x).all(1))[0]] - LOWER:
+        if goals[0] > goals[np.flatnonzero((near == x).all(1))[0]] - NEGLIGIBLE:
             break
         course.tell("with some gains changed, the loss is lower than at this optimum")
         (_, least), other = best_of(course.past[-1]), course.search(near[:1])

@@ -14,8 +14,9 @@ import numpy as np
 from tuning.judge.evaluate import RESOLVED, JudgedMembers, held, judge
 from tuning.judge.peaks import injections, injects, reached_of
 from tuning.problem.config import seeds
-from tuning.problem.limits import PREFIX, TOLERANCE_BELOW, Limit
+from tuning.problem.limits import PREFIX, Limit
 from tuning.problem.members import Members
+from tuning.problem.quantities import NEGLIGIBLE
 from tuning.solve.course import Course
 from tuning.solve.refine import early
 
@@ -96,7 +97,7 @@ def _updated(course: Course, one: Judged, moved: bool) -> bool:
     course.problem, done = course.problem.limited(after), []
     for old, new, (_, judged) in zip(before, after, one.numbers, strict=True):
         idle = old.multiplier == new.multiplier == 0
-        close = new.log_excess(judged) >= -TOLERANCE_BELOW and new.has_reserve(judged)
+        close = new.log_excess(judged) >= -NEGLIGIBLE and new.has_reserve(judged)
         done.append(close or (idle and new.log_excess(judged) <= 0))
         if not (idle and done[-1]):
             _tell(course, new, judged)

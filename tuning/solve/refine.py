@@ -16,20 +16,17 @@ from tuning.problem.goal import Goal
 from tuning.problem.lanes import Engine
 from tuning.problem.limits import PREFIX
 from tuning.problem.loss import TERMS
-from tuning.problem.members import Members
+from tuning.problem.members import FEW, Members
 from tuning.problem.quantities import KINDS
 from tuning.solve.checkpoint import CheckpointFile, SearchState
 from tuning.solve.descent import Descent, Starts, begin, continued
-from tuning.solve.evolution import Evolution
+from tuning.solve.evolution import PATIENCE, Evolution
 
-# The starts race on a part of the members. After each RACE iterations the better half continues. The last FINALISTS are
+# The starts race on a part of the members. After each PATIENCE iterations the better half continues. The last FEW are
 # compared on all members, and the best of them continues alone.
-RACE, FINALISTS = 5, 4
-# A search has converged if its next step, in coordinates, is shorter than this: 0.1 % of a gain. It ends also if the
-# goal, a logarithm, falls by less than this over PATIENCE iterations.
-SHORTEST, PATIENCE = 1e-3, 4
-# A descent switches to CMA-ES at once if its gradient predicts a change of the goal by more than 1 within such a step.
-STEEP = 1 / SHORTEST
+# A search has converged if its next step, in coordinates, is shorter than SHORTEST: 0.1 % of a gain. It ends also if
+# the goal, a logarithm, falls by less than this over PATIENCE iterations.
+SHORTEST = 1e-3
 # At the end of a descent, the norm of the gradient distinguishes converged descents from those that stop early. In
 # benchmarks/tasks, the former have norms of 0.001 to 0.02, the latter of 0.36 to 1e127. The norm is the change of the
 # goal per factor e of a gain.
@@ -60,7 +57,7 @@ def search(
     gradient does not lead to a minimum, it continues with CMA-ES. The search ends after `iterations` of the winner.
 
     `earlier`: starts of an earlier search, with whose inverse Hessian the one start of this search begins. `evolve`:
-    whether CMA-ES continues a descent that ends early; it always does if its gradient is STEEP.
+    whether CMA-ES continues a descent that ends early; it always does if its gradient is steep.
     `seed`: seed of the populations of CMA-ES. `on_iteration`: called after each iteration with the search and the
     duration of the iteration in s. `until`: time of `time.perf_counter` after which the search ends at its next
     iteration.
@@ -98,8 +95,8 @@ def search(
 
 def race_length(starts: int) -> int:
     """Return the number of iterations of a race of this many starts."""
-    halvings = math.ceil(math.log2(max(starts / FINALISTS, 1)))
-    return RACE * (halvings + 1) if starts > 1 else 0
+    halvings = math.ceil(math.log2(max(starts / FEW, 1)))
+    return PATIENCE * (halvings + 1) if starts > 1 else 0
 
 
 def screen(engine: Engine, members: Members, x: np.ndarray, goal: Goal) -> tuple[np.ndarray, np.ndarray]:
@@ -160,15 +157,15 @@ def _evolved(
 
 
 def _race(engine: Engine, goal: Goal, members: Members, progress: SearchState) -> None:
-    """After each RACE iterations, select the starts that continue.
+    """After each PATIENCE iterations, select the starts that continue.
 
     The last one begins again on all members at its best point, with its inverse Hessian.
     """
-    if progress.iteration % RACE:
+    if progress.iteration % PATIENCE:
         return
     starts, keep = progress.starts, (len(progress.starts.value) + 1) // 2
     values = np.asarray(starts.value)
-    if len(values) <= FINALISTS:
+    if len(values) <= FEW:
         values, keep = goal.score(engine.terms(np.asarray(starts.best), members), members), 1
         starts = starts._replace(trial=starts.best, value=jnp.full(len(values), jnp.inf))
     best = np.argsort(values, kind="stable")[:keep]
@@ -179,9 +176,9 @@ def _advance(progress: SearchState, seed: int, evolve: bool) -> None:
     """End the search, or let it switch to CMA-ES.
 
     A descent ends if its step is at most SHORTEST, or if the goal stalls. If `evolve`, it switches if it has then ended
-    `early`, and it always switches at once if its gradient is STEEP. There are two causes of such gradients: in a
-    chaotic loop the derivatives grow with time and do not describe the goal; and a descent stops early at a jump of the
-    goal, beyond which members are lost.
+    `early`. It always switches at once if its gradient is steep: if it predicts a change of the goal by 1 within a step
+    of SHORTEST. There are two causes of such gradients: in a chaotic loop the derivatives grow with time and do not
+    describe the goal; and a descent stops early at a jump of the goal, beyond which members are lost.
     """
     if progress.evolution is not None:
         progress.converged = progress.evolution.reach <= SHORTEST or progress.evolution.converged
@@ -190,7 +187,7 @@ def _advance(progress: SearchState, seed: int, evolve: bool) -> None:
     stalled = len(values) > PATIENCE and values[-1] > values[-1 - PATIENCE] - SHORTEST
     ended = stalled or float(jnp.linalg.norm(starts.trial - starts.best)) <= SHORTEST
     progress.converged = ended
-    if not _slope(starts) < STEEP or (evolve and early(progress)):
+    if not SHORTEST * _slope(starts) < 1 or (evolve and early(progress)):
         progress.evolution, progress.converged = Evolution(progress.history["x"][-1], seed), False
 
 
