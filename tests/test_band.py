@@ -105,7 +105,7 @@ def test_the_lines_of_an_injection_reach_the_end_of_the_band():
     assert frequency_lines(Zones(f_high=2e3), clock)[-1] == 2000.0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_commands_say_that_a_larger_peak_lies_outside_the_band_of_the_case(elsewhere, capsys):
     """A 50 kHz bearing with a peak above 5 kHz, and a case whose band ends at 2 kHz."""
     assert main(["sensitivity", write(BEARING), "--out", "out"]) == 0

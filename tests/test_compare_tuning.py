@@ -136,7 +136,7 @@ def interruptible():
     signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("interruptible")
 def test_a_comparison_interrupted_and_resumed_is_the_uninterrupted_one(world, capsys):
     """Ctrl-C arrives in the search of the second case."""

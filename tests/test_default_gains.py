@@ -177,13 +177,10 @@ LAWS = [
 ]
 
 
-# Laws that take long; the benchmark of the default gains contains every structure.
-LONG = ("sliding-mode", "super-twisting", "terminal-sliding-mode", "utkin-sliding-mode", "feedback-linearisation")
-
-
 @pytest.mark.parametrize(
     "laws",
-    [pytest.param(laws, marks=pytest.mark.thorough if laws[0] in LONG else pytest.mark.slow) for laws in LAWS],
+    # the benchmark of the default gains contains every structure
+    [pytest.param(laws, marks=pytest.mark.slow if laws[0] == "pid" else pytest.mark.thorough) for laws in LAWS],
     ids="/".join,
 )
 def test_untuned_laws_levitate_a_machine_that_is_not_the_papers_in_zone_a(laws):

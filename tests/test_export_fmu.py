@@ -218,9 +218,10 @@ def test_a_changed_gain_a_reset_a_nan_and_a_second_instance(version, tmp_path):
     close(one, other)
 
 
-@pytest.mark.slow
 @compiled
-@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize(
+    "version", [pytest.param(2, marks=pytest.mark.thorough), pytest.param(3, marks=pytest.mark.slow)]
+)
 def test_an_fmu_compiled_again_from_its_sources_gives_the_reference(version, tmp_path):
     """As a real-time target does, the test compiles the sources alone, with another build system."""
     fmpy = pytest.importorskip("fmpy")

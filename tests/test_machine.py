@@ -75,7 +75,7 @@ def test_an_uncoupled_axis_equals_the_case_of_one_axis(machine, held):
         assert held.metrics["axes"]["thrust.z"][name] == pytest.approx(alone.metrics[name], rel=1e-9)
 
 
-@pytest.mark.slow  # compiles the linear machine
+@pytest.mark.thorough
 def test_the_sensitivity_of_a_machine_with_an_axial_bearing_alone_is_that_of_one_axis():
     """The coordinates across the shaft, which nothing holds, count neither as unstable nor in the peak."""
     tables = {key: MACHINE[key] for key in ("plant", "controller", "processor", "actuator", "clock")}
@@ -256,8 +256,13 @@ def test_a_machine_is_differentiable_and_an_ensemble_has_one_entry_per_member(ma
     assert float(members[1]) == pytest.approx(float(displacement(20.0)), rel=1e-12)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["machine", "machine-flexible", "machine-ufu"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(x, marks=pytest.mark.slow if x == "machine" else pytest.mark.thorough)
+        for x in ("machine", "machine-flexible", "machine-ufu")
+    ],
+)
 def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(machine_commands, "_injections", lambda *_: {})  # tests/test_machine_agreement.py
     path = tmp_path / f"{name}.toml"

@@ -67,7 +67,7 @@ def test_the_injected_sensitivity_of_every_axis_is_the_linear_one():
         assert one.peak == pytest.approx(axis.S.height, rel=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_command_reports_the_injected_beside_the_linear_peak(tmp_path, capsys):
     text = template("machine").replace("std = 2e-7", "std = 1e-9")
     text = text.replace("[sensitivity]", "[sensitivity]\nf_low = 50.0")

@@ -60,7 +60,7 @@ def test_rigid_body_coordinates_equal_the_axes_if_the_motions_have_the_same_plan
         np.testing.assert_allclose(rigid[name], axes[name], rtol=0, atol=1e-9 * np.abs(axes[name]).max())
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_rigid_body_coordinates_in_continuous_time_equal_the_axes():
     raw = copy.deepcopy(UNCOUPLED)
     del raw["processor"]

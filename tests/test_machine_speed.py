@@ -143,7 +143,7 @@ def test_the_waterfall_of_a_sweep_follows_its_frequency():
     assert 0.6e-6 < found.amplitude.max() < 2e-6
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_commands_write_what_an_engineer_looks_at(tmp_path, capsys):
     path, turning = tmp_path / "up.toml", "speed = 600.0\nacceleration = 60000.0"
     text = template("machine").replace("speed = 6000.0", turning).replace("duration = 0.2", "duration = 0.05")

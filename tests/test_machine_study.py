@@ -206,7 +206,7 @@ def test_members_are_machines(files, tmp_path, capsys):
     assert speed == pytest.approx(columns["spread.rotor.speed"][2])
 
 
-@pytest.mark.slow  # compiles the rollout of the ensemble, and the linear analysis
+@pytest.mark.thorough
 def test_compare(files, tmp_path):
     still = ("speeds = [0.0, 6000.0, 12000.0]", "speeds = [0.0]")
     soft = ("[processor]", "c = 150.0\n\n[processor]")
@@ -227,7 +227,7 @@ def test_compare(files, tmp_path):
     assert (tmp_path / "c" / "compare.png").exists()
 
 
-@pytest.mark.slow  # compiles the rollout of the cells
+@pytest.mark.thorough
 def test_a_cell_of_a_map_is_a_machine(files):
     x, y = "rotor.speed=6000:30000:2", "initial.q.1=-3e-5:6e-5:2"
     found = survival_map(read_machine(files("m.toml")), x, y).map

@@ -67,7 +67,7 @@ def test_the_peak_is_that_of_the_sensitivity(peaks, integral):
     assert found.turning(x) == pytest.approx(np.max(np.abs(S)), rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_search_and_verdict_see_peaks_outside_the_band_of_the_case(peaks):
     """The band ends at 20 Hz, below the peaks."""
     case, space, found = peaks

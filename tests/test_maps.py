@@ -176,7 +176,7 @@ def test_a_map_is_decisive_if_the_number_of_its_members_allows_it(members):
     assert commands._summary(case_from({}, "one"), one._replace(varied=False))["decisive"] is False
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_command_draws_and_prints_two_cases_side_by_side(tmp_path, capsys):
     for name, gamma in (("one", "1e9"), ("two", "5e8")):
         (tmp_path / f"{name}.toml").write_text(CASE.replace("1e9", gamma))

@@ -88,7 +88,7 @@ clock = { duration = 0.1, sample_period = 1e-4 }
 """
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_simulate_and_compare_state_them(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.toml").write_text(TURNING)

@@ -156,7 +156,7 @@ def test_a_custom_law_and_plant_are_checked():
 SPREAD = Spread(((SKEW, Normal(0.02)), (RHO, Percent(20.0)), ("plant.m", Percent(2.0))))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_numbers_of_a_custom_law_and_plant_are_spread():
     study = Study(
         CASCADE,

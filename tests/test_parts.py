@@ -29,7 +29,7 @@ def gradient_in_parts(samples):
     return jax.jit(jax.value_and_grad(loss)).lower(0.0).compile()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_memory_of_a_rollout_in_parts_grows_with_the_square_root_of_its_samples():
     """Four times as many samples need at most twice the memory: twice as many parts of twice as many samples."""
     sizes = [gradient_in_parts(n).memory_analysis().temp_size_in_bytes for n in (10_000, 40_000)]

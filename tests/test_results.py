@@ -63,7 +63,7 @@ def test_the_dataset_has_the_signals_with_units(run):
     assert {name: data[name].attrs["units"] for name in data} == run.to_pandas().attrs["units"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_comparison_equals_that_of_the_command_and_prints_nothing(path, tmp_path, capfd):
     case = ambjax.read_case(path)
     other = ambjax.with_gains(case, {"controller.position.c": 20.0})
@@ -88,7 +88,7 @@ def test_a_check_returns_its_verdict_and_prints_nothing(path, capfd):
     assert found.summary["loop"]["peak"] == pytest.approx(ambjax.sensitivity(case).S.height)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_check_on_a_processor_evaluates_theorem_1_only_if_asked():
     case = case_from(tomllib.loads(CASE) | {"processor": {"delay": 0.5, "predict": False}})
     brief, full = ambjax.check(case), ambjax.check(case, full=True)

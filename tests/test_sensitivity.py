@@ -140,7 +140,7 @@ def test_bad_input_is_refused_in_one_line(tmp_path, capsys, text, flags, message
 CHECKED = "[controller]\n[clock]\nduration = 0.02\n[actuator]\nu_max = 200.0\n"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_check_does_not_succeed_without_a_linearisation(tmp_path, capsys, monkeypatch):
     """All conditions hold, the rotor is held, and the verdict on the linear loop is missing."""
 

@@ -81,7 +81,7 @@ def test_values_and_derivatives_are_finite_over_six_decades_of_gains():
     assert np.all(np.isfinite(slope))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_derivatives_agree_with_differences_under_noise():
     """Forward derivatives of each member's log rms error agree with differences over 1e-4 in the log of each gain."""
     scenario = dataclasses.replace(TRACKING, sensor=Sensor(1e-6, 1e-4, 1e-4))

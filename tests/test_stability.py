@@ -171,7 +171,7 @@ def command(words, capsys):
     return code, json.loads(capsys.readouterr().out)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("elsewhere")
 def test_every_command_says_that_a_rotor_is_held_in_a_limit_cycle(capsys, monkeypatch):
     """Without prediction, the loop is stable up to 1.12 samples, and the rotor is held up to 1.33 samples."""

@@ -250,7 +250,7 @@ def test_a_finished_study_is_not_run_again(no_pictures, monkeypatch, capsys):
 HARD = TINY.replace("gamma = 1e9\np = 25e-6", "gamma = 3.5e5\np = 25.0").replace("2e-3", "2e-2")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_error_of_the_sliding_step_is_measured_and_printed(no_pictures, capsys):
     write(HARD.replace("dt = 5e-5", 'method = "sliding"'))
     assert main(["ensemble", "case.toml", "--members", "20", "--seed", "3", "--out", "out", "--json"]) == 0

@@ -34,7 +34,7 @@ def problem(limit, **more):
     return problem_of(*case_and_tune(CASE | more | {"tune": {"limits": {DELAY_MARGIN: limit}, "members": 4}}))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_an_additional_delay_of_several_samples_is_simulated():
     """The margin at the command is 5 to 8 samples of this period."""
     period = 1e-4

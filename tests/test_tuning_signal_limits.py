@@ -121,10 +121,12 @@ def test_the_derivatives_of_limited_values_agree_with_differences(case, names, g
     np.testing.assert_allclose(slopes[0, :, 1:, 0], difference, rtol=1e-5)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "name", "most", "excess", "cost"),
-    [(MOVED, "rms_coil_A", 1.66, 1.01, 1.1), (TURNING, "i_1x_A", 6e-5, 1.1, math.inf)],
+    [
+        pytest.param(MOVED, "rms_coil_A", 1.66, 1.01, 1.1, marks=pytest.mark.slow),
+        pytest.param(TURNING, "i_1x_A", 6e-5, 1.1, math.inf, marks=pytest.mark.thorough),
+    ],
 )
 def test_a_search_keeps_a_current_within_its_limit(tmp_path, case, name, most, excess, cost):
     """The least error needs more current than the limit allows."""

@@ -55,7 +55,7 @@ def at(found, gains=None):
     return space.encode(space.clip(found.tune.space.values(found.case.cascade) if gains is None else gains))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_negligible_error_is_that_of_the_reference_relative_to_the_gap(small):
     error = step_error(small, at(small, [17.0, 25.0, 7.5e4, 152.0]))
     assert error.negligible_m == REFERENCE_TOLERANCE * 4e-4

@@ -41,7 +41,7 @@ def advised(answer):
     return re.findall(r"set \[(\S+)\] (\w+) above ([0-9.e-]+\d)", answer)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_following_the_advice_ends_in_a_held_rotor_and_conditions_that_hold(capsys):
     text = template("tracking")
     gamma, wanted = 1000.0, []
