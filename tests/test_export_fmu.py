@@ -201,12 +201,23 @@ def test_a_changed_gain_a_reset_a_nan_and_a_second_instance(version, tmp_path):
     held = one.step(period, z=4e-5, r=np.nan).get("u")["u"]
     assert one.status & bits["invalid"]
     assert held == u
-    for name, wrong in {"position.c": (np.nan, np.inf, -1.0, 0.0, 1e31), "model.m": (-1.0, 0.0, 1e7)}.items():
+    # 1e300 stands for infinity in FMI 2.0 alone
+    infinite, no_end = ([np.inf, 1e300], []) if version == 2 else ([np.inf], [1e300])
+    for name, wrong in {
+        "position.c": (np.nan, np.inf, -1.0, 0.0, 1e31),
+        "model.m": (-1.0, 0.0, 1e7),
+        "processor.guard.samples": (2.5, 0.0, 1e7),
+        "limits.u_max": (np.nan, 1e13, *no_end),
+    }.items():
         for value in wrong:
             with pytest.raises(Exception, match=r"rror|status 3"):
                 one.set(**{name: value})
-    # its bounds, and its value; infinity, and what stands for it in FMI 2.0
-    for name, right in {"model.m": (1e-6, 1e6, 1.64), "limits.u_max": (np.inf, 1e300, 48.0)}.items():
+    # its bounds, and its value
+    for name, right in {
+        "model.m": (1e-6, 1e6, 1.64),
+        "processor.guard.samples": (1.0, 1e6),
+        "limits.u_max": (*infinite, 48.0),
+    }.items():
         for value in right:
             one.set(**{name: value})
     # some tools read every output as a real number

@@ -23,7 +23,8 @@ class Number(NamedTuple):
       first, then values that are not finite or that a step must reject.
     - `among`: values of a state that is a flag or a code, from which the comparison draws; a value that occurs twice is
       drawn twice as often. () for a real number.
-    - `least`, `most`: smallest and largest value of a parameter. `infinite`: whether inf is allowed, too.
+    - `least`, `most`: smallest and largest value of a parameter. `infinite`: whether inf is allowed, too. `whole`:
+      whether only whole numbers are allowed.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Number(NamedTuple):
     least: float = -math.inf
     most: float = math.inf
     infinite: bool = False
+    whole: bool = False
 
 
 def numbers_of(node: Any, path: str = "", home: str = "") -> Iterator[Number]:
@@ -81,7 +83,8 @@ def _number(name: str, field: dataclasses.Field, value: float) -> Number:
     least, most = _bounds(meta)
     unbounded = bool(meta.get("infinite")) and not meta.get("steepness")  # an infinite steepness is another program
     shown = allowed(field, infinity)
-    return Number(name, unit, shown, doc, value, _ends(meta, value), (), least, most, unbounded)
+    ends, whole = _ends(meta, value), bool(meta.get("whole"))
+    return Number(name, unit, shown, doc, value, ends, (), least, most, unbounded, whole)
 
 
 def _bounds(meta: Mapping[str, Any]) -> tuple[float, float]:

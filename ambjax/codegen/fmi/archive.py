@@ -45,10 +45,11 @@ typedef {p}_output model_output;
 #define model_init {p}_init
 #define model_step {p}_step
 
-/* for each parameter, its smallest and its largest finite value, and whether it may be infinite */
+/* for each parameter, its smallest and its largest finite value, whether it may be infinite, and whether it is whole */
 static const double model_least[MODEL_PARAMETERS] = {{{least}}};
 static const double model_most[MODEL_PARAMETERS] = {{{most}}};
 static const unsigned char model_infinite[MODEL_PARAMETERS] = {{{infinite}}};
+static const unsigned char model_whole[MODEL_PARAMETERS] = {{{whole}}};
 
 #endif
 """
@@ -78,6 +79,7 @@ def sources(traced: Trace, identifier: str, origin: Origin, version: int) -> tup
         least=", ".join(_bound(x.least) for x in traced.parameters),
         most=", ".join(_bound(x.most) for x in traced.parameters),
         infinite=", ".join(str(int(x.infinite)) for x in traced.parameters),
+        whole=", ".join(str(int(x.whole)) for x in traced.parameters),
     )
     return found, guid
 

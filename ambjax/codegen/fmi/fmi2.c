@@ -1,5 +1,8 @@
 /* FMI 2.0 for co-simulation: what differs from FMI 3.0. The signatures are those of the standard. */
 
+/* What stands for an infinite parameter: a value from here on. XML of FMI 2.0 cannot contain infinity. */
+#define INFINITE 1e300
+
 #include "fmu_core.h"
 
 #define FMI(name) fmi2##name

@@ -2,6 +2,9 @@
 
 #include <stdbool.h>
 
+/* an infinite parameter: XML of FMI 3.0 can contain infinity */
+#define INFINITE HUGE_VAL
+
 #include "fmu_core.h"
 
 #define FMI(name) fmi3##name

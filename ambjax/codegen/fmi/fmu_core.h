@@ -127,20 +127,20 @@ static int core_get(numbers *x, uint32_t reference, double *value)
     return 1;
 }
 
-/* What stands for an infinite parameter: a value from here on. XML of FMI 2.0 cannot contain infinity. */
-#define INFINITE 1e300
-
 /* Return whether a parameter may have a value, which NaN never is. */
 static int core_allows(uint32_t parameter, double value)
 {
     if (value >= INFINITE && model_infinite[parameter]) {
         return 1;
     }
+    if (model_whole[parameter] && floor(value) != value) {
+        return 0;
+    }
     return value >= model_least[parameter] && value <= model_most[parameter];
 }
 
-/* Write an input or a parameter. Return 0 for any other number, and for a parameter outside its min and max. An input
- * may be NaN: the block reports it in its status. */
+/* Write an input or a parameter. Return 0 for any other number, and for a parameter outside its min and max, or
+ * that must be whole and is not. An input may be NaN: the block reports it in its status. */
 static int core_set(numbers *x, uint32_t reference, double value)
 {
     if (reference >= FIRST_INPUT && reference < FIRST_OUTPUT) {

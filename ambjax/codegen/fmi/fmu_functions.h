@@ -96,7 +96,8 @@ EXPORTED status_t SET_NUMBERS(
     fmu *one = instance;
     for (size_t k = 0; k < count; k++) {
         if (k >= MOST || !core_set(&one->block, references[k], values[k])) {
-            return fail(one, "only inputs and parameters may be set, a parameter to a number from its min to its max");
+            return fail(one, "only inputs and parameters may be set, a parameter to a number from its min to its max, "
+                             "and to a whole number if its description says so");
         }
     }
     return OK;
