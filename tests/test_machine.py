@@ -342,6 +342,14 @@ def test_one_axis_and_a_machine_are_not_confused(tmp_path, capsys):
         read_case(whole)
     with pytest.raises(ValueError, match="so it is a case of one axis"):
         read_machine(alone)
+    with pytest.raises(ValueError, match="so it is a case of one axis"):
+        read_machine(tomllib.loads(alone.read_text()))
+    with pytest.raises(ValueError, match=r"path = 3: it must be the path of a file.*, or a dict of tables"):
+        read_machine(3)
+    tables = tomllib.loads(whole.read_text())
+    read = read_machine(tables)
+    assert tomllib.loads(read.text) == tables
+    jax.tree.map(np.testing.assert_array_equal, read.machine, read_machine(whole).machine)
     for words, said in (
         (["campbell", str(alone)], "ambjax sensitivity"),
         (["simulate", str(whole), "--from", "0"], "ambjax: --from: a machine"),

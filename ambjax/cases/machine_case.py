@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import math
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from ambjax.cases.machine_spread import axis_table, machine_spread, refuse_unuse
 from ambjax.cases.machine_trial import try_machine
 from ambjax.cases.notch_table import notch_from
 from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
-from ambjax.cases.reader import TABLES, Case, case_from, is_machine, require_file, safe_name
+from ambjax.cases.reader import FILE, TABLES, Case, case_from, is_machine, require_file, safe_name
 from ambjax.cases.rotor_numbers import fastest_rotor
 from ambjax.cases.rotor_tables import (
     COORDINATES,
@@ -88,15 +88,22 @@ def first_axis(case: AnyCase) -> Case:
     return case if isinstance(case, Case) else case.cases[0]
 
 
-def read_machine(path: str | pathlib.Path) -> MachineCase:
-    """Read and check the case file of a machine. Raises ValueError, one line, for an invalid file."""
+def read_machine(path: str | pathlib.Path | Mapping[str, Any]) -> MachineCase:
+    """Read and check the case file of a machine. A dict of tables, as from TOML, works too.
+
+    Raises ValueError, one line, if `path` is neither, if the file cannot be read, or if any part of it is invalid.
+    """
+    other = "it has no [rotor] with a kind, so it is a case of one axis; in Python, read_case reads it."
+    if isinstance(path, Mapping):
+        import tomlkit
+
+        if not is_machine(raw := dict(path)):
+            raise ValueError(other)
+        return dataclasses.replace(machine_from(raw), text=tomlkit.dumps(raw))  # `check` and `map` read the text
+    require_file("path", path, f"{FILE}, or a dict of tables")
     case = read_any(path)
     if isinstance(case, Case):
-        raise ValueError(
-            one_line(
-                f"{path}: it has no [rotor] with a kind, so it is a case of one axis; in Python, read_case reads it."
-            )
-        )
+        raise ValueError(one_line(f"{path}: {other}"))
     return case
 
 
