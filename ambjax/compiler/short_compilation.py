@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import TypeVar
 
 import jax
+from jax.core import Tracer
 
 from ambjax.compiler.traced_programs import traced_once
 
@@ -19,7 +20,10 @@ QUICKEST = QUICK | {"xla_backend_optimization_level": 0}
 def compiled_quickly(
     function: Callable[..., Result], static_argnames: tuple[str, ...] = (), options: Mapping[str, bool | int] = QUICK
 ) -> Callable[..., Result]:
-    """Return jit(`function`), compiled with those of `options` that this version of XLA supports."""
+    """Return jit(`function`), compiled with those of `options` that this version of XLA supports.
+
+    Inside a transformation it is `function` itself.
+    """
 
     @functools.cache
     def compiled() -> Callable[..., Result]:
@@ -28,7 +32,8 @@ def compiled_quickly(
 
     @functools.wraps(function)
     def call(*args: object, **static: object) -> Result:
-        return compiled()(*args, **static)
+        traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(args))
+        return (function if traced else compiled())(*args, **static)
 
     return call
 

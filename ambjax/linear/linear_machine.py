@@ -1,5 +1,6 @@
 """Linearisation of a whole machine at rest and constant speed: all loops are closed, each axis has a test signal."""
 
+import functools
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple, TypeVar
 
@@ -7,6 +8,7 @@ import jax
 import numpy as np
 from jax import Array
 
+from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.linear.analysis import Zones
 from ambjax.linear.machine_at_speed import MachineAtSpeed, MachineRest
 from ambjax.linear.machine_matrices import machine_matrices
@@ -56,12 +58,12 @@ class MachineSensitivity(NamedTuple):
         return max(self.axes, key=lambda axis: axis.S.height)
 
 
-@jax.jit
+@functools.partial(compiled_quickly, options=QUICKEST)
 def _at_rest(machine: Machine, W: Scalar, period: Scalar) -> MachineRest:
     return MachineAtSpeed(machine, W, period).rest(MachineAtSpeed(jax.lax.stop_gradient(machine), W, period))
 
 
-@jax.jit
+@functools.partial(compiled_quickly, options=QUICKEST)
 def _matrices(machine: Machine, W: Scalar, period: Scalar, point: MachineRest) -> tuple[StateSpace, Array, Array]:
     return machine_matrices(MachineAtSpeed(machine, W, period), point)
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.compiler.short_compilation import compiled_quickly
 from ambjax.linear.analysis import Zones
 from ambjax.linear.injection import Injection, frequency_lines, injection_of
 from ambjax.linear.linear_machine import machine_rest
@@ -110,7 +111,7 @@ def machine_injected(
     return [tuple(found[n : n + len(gaps)]) for n in range(0, len(found), len(gaps))]
 
 
-@jax.jit
+@compiled_quickly
 def _responses(machine: Machine, clock: Clock, tests: _Test) -> tuple[FourierSums, Array]:
     """Return the `FourierSums` of all axes, and the status codes, of the members."""
     point = machine_rest(machine, clock.sample_period)

@@ -1,7 +1,6 @@
 """Simulate the case of a whole machine."""
 
 import dataclasses
-import functools
 import pathlib
 from collections.abc import Callable
 from typing import Any
@@ -53,8 +52,8 @@ class MachineRun:
 
 
 # Compiled for one machine, without the one-kernel path: with arrays of axes it takes minutes to compile.
-_begun = jax.jit(begin)
-_segment = functools.partial(jax.jit, static_argnames=("count",))(recorded_segment)
+_begun = compiled_quickly(begin, options=QUICKEST)
+_segment = compiled_quickly(recorded_segment, static_argnames=("count",))
 _finished = compiled_quickly(finish, options=QUICKEST)
 
 
