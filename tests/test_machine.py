@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+import re
 import tomllib
 
 import jax
@@ -17,6 +18,7 @@ from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.reader import case_from, read_case
 from ambjax.cases.template_text import template
 from ambjax.commands import machine_commands
+from ambjax.commands.reading import read_any_with_warnings
 from ambjax.linear import linearise
 from ambjax.linear.linear_machine import machine_sensitivity
 from ambjax.numerics.records import canonical
@@ -332,6 +334,17 @@ def test_a_table_given_twice_is_refused_in_one_line(name, advice, tmp_path):
         read_machine(path)
     assert advice in str(refused.value)
     assert "disturbance" not in str(refused.value)
+
+
+def test_an_order_that_the_samples_do_not_resolve_causes_a_warning(tmp_path, capsys):
+    path = tmp_path / "fast.toml"
+    path.write_text(template("machine").replace("speed = 6000.0", "speed = 400000.0"))
+    said = "rotor.speed: 2 times the speed is 1.333e[+]04 Hz, not below half the sampling rate"
+    for given in (path, tomllib.loads(path.read_text())):
+        with pytest.warns(UserWarning, match=said):  # once, not for each axis: another warning is an error
+            read_machine(given)
+    read_any_with_warnings(path)
+    assert len(re.findall(said, capsys.readouterr().err)) == 1
 
 
 def test_one_axis_and_a_machine_are_not_confused(tmp_path, capsys):

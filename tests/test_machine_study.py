@@ -13,7 +13,7 @@ import pytest
 from tomlkit import dumps
 
 from ambjax.__main__ import main
-from ambjax.cases.machine_case import machine_from, read_machine
+from ambjax.cases.machine_case import machine_from, read_any
 from ambjax.cases.rotor_numbers import rotor_places, varied_rotor
 from ambjax.cases.template_text import template
 from ambjax.commands import comparison_tuning
@@ -213,7 +213,7 @@ def test_compare(files, tmp_path):
     paths = [files("one.toml", still, end=AREAS), files("two.toml", still, soft, end=AREAS)]
     code = main(["compare", *paths, "--members", "3", "--out", str(tmp_path / "c")])
     summary = json.loads((tmp_path / "c" / "compare.json").read_text())
-    for row, one in zip(summary["cases"], map(read_machine, paths), strict=True):
+    for row, one in zip(summary["cases"], map(read_any, paths), strict=True):
         errors = chunk(study_of(one, 0, 3), 0, 3, 3)["settled_rms_error_m"]
         point = machine_sensitivity(one.machine, one.axes, 5e-5, 0.0, one.zones)
         assert row["rms_error_median_m"] == np.median(errors)
@@ -230,10 +230,10 @@ def test_compare(files, tmp_path):
 @pytest.mark.thorough
 def test_a_cell_of_a_map_is_a_machine(files):
     x, y = "rotor.speed=6000:30000:2", "initial.q.1=-3e-5:6e-5:2"
-    found = survival_map(read_machine(files("m.toml")), x, y).map
+    found = survival_map(read_any(files("m.toml")), x, y).map
     other = files("o.toml", ("speed = 6000.0", "speed = 30000.0"), ("q = [2e-5, -3e-5,", "q = [2e-5, 6e-5,"))
     for path, cell in ((files("m.toml"), (0, 0)), (other, (1, 1))):
-        alone = simulate_machine(read_machine(path)).metrics
+        alone = simulate_machine(read_any(path)).metrics
         assert found.error[cell] == pytest.approx(alone["settled_max_abs_error_m"], rel=1e-6)
     assert found.survival.min() == 1
     assert found.unstable.max() == 0
@@ -241,17 +241,17 @@ def test_a_cell_of_a_map_is_a_machine(files):
 
 def test_axes_of_a_map(files):
     path = files("m.toml", end=AREAS)
-    study, x, y = study_and_axes(read_machine(path), "plant.A=-10%:10%:2", "rotor.speed=0:4e6:2", 2, None)
+    study, x, y = study_and_axes(read_any(path), "plant.A=-10%:10%:2", "rotor.speed=0:4e6:2", 2, None)
     # one value for all axes, which replaces the spread; the steps resolve the fastest rotor
     assert study.parts(x.path) == tuple(f"bearing.{axis}.plant.A" for axis in study.case.axes)
     assert len(study.parts("bearing.left.plant.A")) == 2
     assert study.parts(y.path) == ("rotor.speed",)
-    assert study.clock.method.substeps > study_of(read_machine(path), None, 2).clock.method.substeps
+    assert study.clock.method.substeps > study_of(read_any(path), None, 2).clock.method.substeps
     halved = study.at_period(2.5e-5)
     assert halved.clock.samples == 2 * study.clock.samples
     for bad, words in (("plant.m=1:2", "Spread rotor.m"), ("rotor.speed=-1e9:0", "rotor.speed must be")):
         with pytest.raises(ValueError, match=words):
-            study_and_axes(read_machine(path), bad, "initial.q.0=0:1e-5", 1, None)
+            study_and_axes(read_any(path), bad, "initial.q.0=0:1e-5", 1, None)
 
 
 def test_tuned_machines_are_compared(files, tmp_path, monkeypatch):
@@ -266,7 +266,7 @@ def test_tuned_machines_are_compared(files, tmp_path, monkeypatch):
         assert words == [paths[0], "--settings-of", paths[0], "--out", str(folder)]
 
     monkeypatch.setattr(comparison_tuning, "extension", lambda name: {"tune": tune}[name])
-    cases = [read_machine(path) for path in paths]
+    cases = [read_any(path) for path in paths]
     options = argparse.Namespace(cases=paths, out=str(tmp_path), resume=False, force=False)
     one, two = comparison_tuning.tuned_cases(cases, tmp_path, options)
     assert (one.name, one.folder) == ("one", tmp_path)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import tuning
-from ambjax.cases.machine_case import machine_from, read_machine
+from ambjax.cases.machine_case import machine_from, read_any
 from ambjax.cases.table import Table
 from ambjax.cases.template_text import template
 from ambjax.commands.machine_commands import outside_lines
@@ -241,7 +241,7 @@ def test_command(tmp_path, capsys):
     # although the default of a gain depends on whether k is given
     assert float(re.findall(r"best peak ([\d.]+)", heard[-1])[-1]) == pytest.approx(after["peak"], rel=1e-3)
     # the file is the answer, with the gains of each bearing in its table
-    again = read_machine(tmp_path / "t" / "tuned.toml")
+    again = read_any(tmp_path / "t" / "tuned.toml")
     assert max(point.worst.S.height for point in sensitivity(again)) == pytest.approx(after["peak"], rel=1e-6)
     raw = tomllib.loads((tmp_path / "t" / "tuned.toml").read_text())
     assert raw["bearing"][0]["controller"]["position"]["k"] == pytest.approx(found.report["gains"][1]["after"])

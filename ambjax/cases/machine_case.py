@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import math
 import pathlib
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
@@ -16,6 +17,7 @@ from ambjax.cases.machine_spread import axis_table, machine_spread, refuse_unuse
 from ambjax.cases.machine_trial import try_machine
 from ambjax.cases.notch_table import notch_from
 from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
+from ambjax.cases.plausibility import unresolved
 from ambjax.cases.reader import FILE, TABLES, Case, case_from, is_machine, require_file, safe_name
 from ambjax.cases.rotor_numbers import fastest_rotor
 from ambjax.cases.rotor_tables import (
@@ -91,7 +93,8 @@ def first_axis(case: AnyCase) -> Case:
 def read_machine(path: str | pathlib.Path | Mapping[str, Any]) -> MachineCase:
     """Read and check the case file of a machine. A dict of tables, as from TOML, works too.
 
-    Raises ValueError, one line, if `path` is neither, if the file cannot be read, or if any part of it is invalid.
+    Speeds whose frequencies the samples do not resolve cause a UserWarning. Raises ValueError, one line, if `path` is
+    neither, if the file cannot be read, or if any part of it is invalid.
     """
     other = "it has no [rotor] with a kind, so it is a case of one axis; in Python, read_case reads it."
     if isinstance(path, Mapping):
@@ -99,12 +102,22 @@ def read_machine(path: str | pathlib.Path | Mapping[str, Any]) -> MachineCase:
 
         if not is_machine(raw := dict(path)):
             raise ValueError(other)
-        return dataclasses.replace(machine_from(raw), text=tomlkit.dumps(raw))  # `check` and `map` read the text
-    require_file("path", path, f"{FILE}, or a dict of tables")
-    case = read_any(path)
-    if isinstance(case, Case):
-        raise ValueError(one_line(f"{path}: {other}"))
+        case = dataclasses.replace(machine_from(raw), text=tomlkit.dumps(raw))  # `check` and `map` read the text
+        texts = unresolved(case.cases)
+    else:
+        require_file("path", path, f"{FILE}, or a dict of tables")
+        case = read_any(path)
+        if isinstance(case, Case):
+            raise ValueError(one_line(f"{path}: {other}"))
+        texts = warnings_of_machine(case, path)
+    for text in texts:
+        warnings.warn(text, stacklevel=2)
     return case
+
+
+def warnings_of_machine(case: MachineCase, path: str | pathlib.Path) -> list[str]:
+    """Return the warnings of a machine that was read from `path`, one line each."""
+    return [one_line(f"{path}: {text}") for text in unresolved(case.cases)]
 
 
 def read_any(path: str | pathlib.Path) -> AnyCase:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -46,6 +46,11 @@ def implausible(case: Case) -> list[str]:
     """Return a warning, in one line, for each implausible number of a case and each implausible relation of two."""
     machine = [*_ranges(case), *_forces(case), *_flux(case), *_limits(case), *_rates(case), *_converter(case)]
     return [*machine, *_delay(case), *_runout(case), *_aliases(case), *_orders(case), *_loads(case)]
+
+
+def unresolved(axes: Iterable[Case]) -> list[str]:
+    """Return a warning, in one line, for each frequency and order of a machine that the samples do not resolve."""
+    return list(dict.fromkeys(text for case in axes for text in [*_aliases(case), *_orders(case)]))
 
 
 def _ranges(case: Case) -> Iterator[str]:

@@ -2,7 +2,7 @@
 
 import pathlib
 
-from ambjax.cases.machine_case import AnyCase, read_any
+from ambjax.cases.machine_case import AnyCase, read_any, warnings_of_machine
 from ambjax.cases.reader import Case, read_case
 from ambjax.cases.warned import warnings_of_file
 from ambjax.host.heartbeat import say
@@ -23,6 +23,8 @@ def read_any_with_warnings(path: str | pathlib.Path) -> AnyCase:
         print_warnings(case, path)
     else:
         print_laws(case, path)
+        for warning in warnings_of_machine(case, path):
+            say(warning)
     return case
 
 
