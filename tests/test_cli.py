@@ -232,7 +232,7 @@ def test_files_of_an_earlier_run_are_overwritten_only_with_force(capsys):
     assert pathlib.Path("out/metrics.json").read_text() == "old"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_lost_rotor_is_reported_and_exits_with_1(capsys):
     path = write(SHORT + "[controller.inversion]\ngamma = 1000.0\n")
     assert main(["simulate", path]) == 1

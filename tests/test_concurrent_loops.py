@@ -24,7 +24,7 @@ loops(problem.objective, x[None].repeat(4, 0), problem.objective.members(0, 16))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_limit_on_the_delay_margin_does_not_stop_two_cores(tmp_path):
     raw = tomlkit.parse(template("bearing"))
     raw["tune"] = {"limits": {"delay_margin_s": 1e-5}}

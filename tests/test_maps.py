@@ -203,7 +203,7 @@ def test_the_command_draws_and_prints_two_cases_side_by_side(tmp_path, capsys):
         ambjax.survival_map(found.case, "plant.m=2:1", Y)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_command_states_the_drawn_outlines_and_the_undecided_cells(tmp_path, capsys, monkeypatch):
     (tmp_path / "case.toml").write_text(CASE + "[spread]\nplant.m = { percent = 1 }\n")
     argv = ["map", str(tmp_path / "case.toml"), "--x", X, "--y", Y, "--out", str(tmp_path / "out"), "--force"]

@@ -188,7 +188,7 @@ f_low = 20.0
 """
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_injected_and_the_linear_peak_are_both_reported(tmp_path, capsys):
     """A smooth loop without noise has one measured member, and its interval is one value.
 

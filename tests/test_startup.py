@@ -30,10 +30,11 @@ def test_help_and_version_import_no_numerical_package(program, option):
     assert not loaded(program, option) & {"jax", "numpy", "scipy", "matplotlib", "optax", "tqdm"}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("command", "unneeded"), [
-    ("check", {"matplotlib", "optax", "tuning", "ambjax.commands.ensemble", "ambjax.paper.evidence"}),
-    ("simulate", {"scipy", "optax", "tuning", "ambjax.commands.ensemble", "ambjax.paper", "ambjax.theorem"}),
+    pytest.param("check", {"matplotlib", "optax", "tuning", "ambjax.commands.ensemble", "ambjax.paper.evidence"},
+                 marks=pytest.mark.slow),
+    pytest.param("simulate", {"scipy", "optax", "tuning", "ambjax.commands.ensemble", "ambjax.paper", "ambjax.theorem"},
+                 marks=pytest.mark.thorough),
 ])  # fmt: skip
 def test_a_command_imports_only_the_packages_that_it_needs(tmp_path, command, unneeded):
     case = write("[clock]\nduration = 0.01\n", tmp_path / "short.toml")
