@@ -94,7 +94,8 @@ def check_number(field: dataclasses.Field, name: str, value: object) -> None:
         number = math.nan
     number = math.nan if isinstance(value, str) else number
     if not within(field.metadata, number):
-        shown = f"{value:.10g}" if isinstance(value, (int, float)) else _shown(value, number)
+        form = ".10g" if field.metadata["whole"] else "g"
+        shown = f"{value:{form}}" if isinstance(value, (int, float)) else _shown(value, number)
         raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.")
 
 
