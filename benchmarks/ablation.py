@@ -55,6 +55,12 @@ def by_values(raw: dict[str, Any]) -> None:
     constant(refine, _slope=lambda starts: math.inf)(raw)
 
 
+def patient(raw: dict[str, Any]) -> None:
+    """Judge progress over six iterations instead of five."""
+    for module in (refine, evolution):
+        constant(module, PATIENCE=6)(raw)
+
+
 # What is switched off, and how.
 MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "nothing": lambda raw: None,
@@ -67,6 +73,7 @@ MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "CMA-ES": constant(refine, _slope=lambda starts: 0.0),
     "large populations of CMA-ES": constant(evolution, POPULATION=1),
     "descent: CMA-ES only": by_values,
+    "patience: six iterations instead of five": patient,
     "jumps known to the BFGS": constant(descent, JUMP=math.inf),
     "stressed members": setting(stressed=0),
     "validation": setting(validation=0),

@@ -13,8 +13,8 @@ from tuning.problem.goal import MOST
 from tuning.problem.quantities import NEGLIGIBLE
 from tuning.solve.descent import FIRST_RADIUS
 
-# Number of iterations over which progress is judged: in a race, of a descent and of CMA-ES. Separate values of 5, 4 and
-# 6 change the errors of eight tasks of benchmarks/ablation.py by less than 1 %.
+# Number of iterations over which progress is judged: in a race, of a descent and of CMA-ES. `benchmarks/ablation.py`
+# tries 6.
 PATIENCE = 5
 # Size of a population, in units of the default of `cma`. Larger ones find lower optima of rugged goals.
 POPULATION = 2
