@@ -1,20 +1,24 @@
 """Linear analysis: margins against python-control, the tuner's quantities, noise. Matrices: tests/test_injection.py."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from structures import SMOOTH
 
-from ambjax import Cascade, Clock, Scenario
+from ambjax import Cascade, Clock, Scenario, rollout
 from ambjax.compiler.short_compilation import QUICKEST, supported
-from ambjax.control import current, observer, position
+from ambjax.control import current, inversion, observer, position
 from ambjax.control.processor import Processor
 from ambjax.linear import StateSpace, Zones, analyse, linearise, loop_quantities, margins_of, noise_gain, peak
+from ambjax.linear.matrices import rest
 from ambjax.plants import Plant
 from ambjax.sensors import Sensor
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.coils import TwoCoil
+from ambjax.world.scenario import Initial
 
 T = 1e-4
 QUICK = supported(QUICKEST)  # each program runs once
@@ -141,6 +145,27 @@ def test_a_missing_equilibrium_is_reported_in_one_line():
     heavy, laws = Scenario(plant=Plant(m=1.5)), SMOOTH | {"position": position.SlidingMode(c=200.0, k=5.0, p=5.0)}
     with pytest.raises(ValueError, match=r"no equilibrium at r = 0\.001 m .* ended where plant\.z_dot still changes"):
         linearise(Cascade(**laws), heavy, CLOCK, 1e-3)
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.5, 3.0])
+def test_set_valued_signs_rest_where_the_simulation_settles_also_if_the_model_has_another_mass(factor):
+    """The state of the inversion law that the model expects is outside the band of the current law."""
+    plant = Plant(1.64, 0.0, 1.2566e-6, 208.0, 2.68e-4, 5e-4, 2.5, 1.0)
+    clock = Clock(samples=4000, sample_period=5e-5)
+    laws = {
+        "observer": observer.Kalman(w=1000.0),
+        "position": position.SlidingMode(c=2900.0, k=9.0, p=np.inf),
+        "inversion": inversion.Adaptive(gamma=7e11, p=np.inf),
+        "current": current.SlidingMode(k_i=1100.0, p=np.inf),
+    }
+    model = dataclasses.replace(plant, m=factor * plant.m)
+    cascade = Cascade(**laws, model=model, processor=Processor(1.0))
+    scenario = Scenario(plant=plant, sensor=Sensor(), initial=Initial(z=0.0, i=0.0))
+    point = rest(cascade.on_processor(), scenario, clock.sample_period, 0.0)
+    assert point.found
+    settled = rollout(cascade, scenario, clock).trajectory.rows.z[-1]
+    # the offset is 1e-7 m; the simulation still approaches it
+    assert settled == pytest.approx(float(point.point.plant.z), rel=1e-3)
 
 
 def test_ranges_and_zones():

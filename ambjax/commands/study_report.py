@@ -158,14 +158,14 @@ def study_tables(summary: dict[str, Any], stable: str = "") -> str:
     def number(x: float | None) -> str:
         return "-" if x is None else f"{x:.4g}"
 
-    rows = []
-    for name in METRICS:
-        metric = summary["metrics"][name]
-        rows.append(
-            (name, *(number(metric[key]["estimate"]) for key in ("median", "q95", "cvar_95")), number(metric["max"]))
-        )
-    head = f"metric over the {summary['survivors']} {summary['metrics_of']}"
-    lines += ["", table((head, "median", "95 % quantile", "mean of worst 5 %", "largest"), rows)]
+    if summary["survivors"]:
+        rows = []
+        for name in METRICS:
+            metric = summary["metrics"][name]
+            shown = [metric[key]["estimate"] for key in ("median", "q95", "cvar_95")] + [metric["max"]]
+            rows.append((name, *map(number, shown)))
+        head = f"metric over the {summary['metrics_of']}"
+        lines += ["", table((head, "median", "95 % quantile", "mean of worst 5 %", "largest"), rows)]
     drivers, account = summary["drivers"][statistics.DECIDING][:5], summary["explained"][statistics.DECIDING]
     if drivers:
         where = f"{statistics.DECIDING} over the {summary['metrics_of']}"

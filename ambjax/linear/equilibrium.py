@@ -177,9 +177,9 @@ def inverse(J: Array) -> Array:
 
 def start_of(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> Point:
     """Return the first point of the iteration: the plant at rest at r (m), and the initial states of the laws there."""
-    plant, inversion = scenario.plant, cascade.inversion.started(cascade.model.equilibrium(r)[0])
-    i, u = plant.equilibrium(r)
-    zero = jnp.zeros_like(i)
+    plant, (i, u) = scenario.plant, scenario.plant.equilibrium(r)
+    # a law that starts at the current of its model may begin outside the boundary layer of the current law
+    inversion, zero = cascade.inversion.started(i), jnp.zeros_like(i)
     state = plant.start(Measurement(zero + r, zero, i))
     measured = reading(scenario, plant.measurement(state), (0.0, 0.0))
     cascade = dataclasses.replace(cascade, inversion=inversion, observer=cascade.observer.started(measured.z))

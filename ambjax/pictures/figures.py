@@ -139,7 +139,6 @@ def draw_panel(
 
 def _keep_scale(ax: Axes, whole: list[np.ndarray]) -> None:
     """Limit the vertical magnification, so that rounding in a settled signal does not look like an event."""
-    ax.ticklabel_format(axis="y", useOffset=False)
     values = np.concatenate(whole)
     (low, high), least = ax.get_ylim(), FLAT * np.ptp(values) if values.size else 0.0
     if high - low < least:
