@@ -147,9 +147,9 @@ def test_a_missing_equilibrium_is_reported_in_one_line():
         linearise(Cascade(**laws), heavy, CLOCK, 1e-3)
 
 
-@pytest.mark.parametrize("factor", [0.8, 1.5, 3.0])
-def test_set_valued_signs_rest_where_the_simulation_settles_also_if_the_model_has_another_mass(factor):
-    """The state of the inversion law that the model expects is outside the band of the current law."""
+@pytest.mark.parametrize(("factor", "offset"), [(0.8, 0.0), (3.0, 0.0), (1.0, 1e-5)])
+def test_set_valued_signs_rest_where_the_simulation_settles_also_with_wrong_models_and_sensors(factor, offset):
+    """At z = 0, and at the current that the model expects, a sign is outside its band."""
     plant = Plant(1.64, 0.0, 1.2566e-6, 208.0, 2.68e-4, 5e-4, 2.5, 1.0)
     clock = Clock(samples=4000, sample_period=5e-5)
     laws = {
@@ -160,11 +160,11 @@ def test_set_valued_signs_rest_where_the_simulation_settles_also_if_the_model_ha
     }
     model = dataclasses.replace(plant, m=factor * plant.m)
     cascade = Cascade(**laws, model=model, processor=Processor(1.0))
-    scenario = Scenario(plant=plant, sensor=Sensor(), initial=Initial(z=0.0, i=0.0))
+    scenario = Scenario(plant=plant, sensor=Sensor(offset=offset, velocity=False), initial=Initial(z=0.0, i=0.0))
     point = rest(cascade.on_processor(), scenario, clock.sample_period, 0.0)
     assert point.found
     settled = rollout(cascade, scenario, clock).trajectory.rows.z[-1]
-    # the offset is 1e-7 m; the simulation still approaches it
+    # the model moves the point of rest by 1e-7 m; the simulation still approaches it
     assert settled == pytest.approx(float(point.point.plant.z), rel=1e-3)
 
 

@@ -22,12 +22,12 @@ from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.waveforms import Constant, Reference, reference_at
 
-# Largest number of Newton trials. Near the equilibrium, five suffice. Far outside the boundary layer of a smoothed
-# sign, more are necessary.
-STEPS = 60
-# A Newton step is halved until the residual decreases. The iteration ends if the remaining fraction of the full step is
-# below SMALLEST.
-SMALLEST = 1e-4
+# Largest number of Newton trials. Near the equilibrium, five suffice; far outside the boundary layer of a sign, more.
+STEPS = 200
+# A Newton step is halved until the residual decreases. If the remaining fraction of the full step is below LEAVING, the
+# method turns to the path of `newton_of`, unless its step along this path is at most SHORTEST. It ends below SMALLEST.
+LEAVING, SMALLEST = 0.1, 1e-4
+SHORTEST = 0.01
 # Largest residual that counts as 0, relative to the sizes of the states, in units of the rounding error.
 TOLERANCE = 1e7
 
@@ -86,7 +86,7 @@ def at_rest(r: Scalar) -> Reference:
 
 
 def equilibrium(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> Equilibrium:
-    """Compute the equilibrium at the constant reference r (m) by damped Newton steps.
+    """Compute the equilibrium at the constant reference r (m) by Newton's method (`newton_of`).
 
     - `cascade`: without a guard; if it has a processor, a result of `Cascade.on_processor`.
     - `scenario`: a result of `ideal`.
@@ -113,11 +113,13 @@ def equilibrium(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar)
 
 
 class Newton(NamedTuple):
-    """State of Newton's method, relative to the sizes of the states.
+    """State of Newton's method for G(y) = `target` G(y_0), relative to the sizes of the states.
 
-    - `y`, `error`, `J`: best point so far, the size of its residual, and its Jacobian.
+    - `y`, `error`, `J`: best point so far for this target, the size of G(y) - target G(y_0), and the Jacobian of G.
     - `direction`, `fraction`: the full step from `y`, and the fraction of it to try.
     - `trial`: the next point to evaluate.
+    - `target`: 1 at the first point y_0, 0 at the equilibrium.
+    - `reached`, `base`: the last target that was reached, and its solution.
     - `number`: trials so far.
     """
 
@@ -127,11 +129,25 @@ class Newton(NamedTuple):
     direction: Array
     fraction: Array
     trial: Array
+    target: Array
+    reached: Array
+    base: Array
     number: Array
+
+    def begun(self, base: Array, reached: Array, target: Array) -> "Newton":
+        """Return the method that begins at the solution `base` for `reached`, with another target."""
+        inf = jnp.full_like(target, jnp.inf)
+        return self._replace(trial=base, base=base, error=inf, reached=reached, target=target)
 
 
 def newton_of(residual: Callable[[Array], Array], y: Array) -> Newton:
-    """Return the last state of a damped Newton's method from y [N] on, for residual(y) = 0. It has no derivatives."""
+    """Return the last state of a damped Newton's method from y [N] on, for residual(y) = 0. It has no derivatives.
+
+    Outside the boundary layer of a sign, the residual hardly depends on the argument of the sign, and the steps fail.
+    Then the method follows the solutions of residual(y) = t residual(y_0) from the first point y_0, where t = 1, to
+    t = 0. It halves the step of t if Newton's method fails, and doubles it otherwise (Newton homotopy).
+    """
+    first, tolerance = residual(y), TOLERANCE * jnp.finfo(y.dtype).eps
 
     def both(y: Array) -> tuple[Array, Array]:
         G = residual(y)
@@ -139,19 +155,27 @@ def newton_of(residual: Callable[[Array], Array], y: Array) -> Newton:
 
     def evaluate(newton: Newton) -> Newton:
         J, G = jax.jacfwd(both, has_aux=True)(newton.trial)
+        G = G - newton.target * first
         better = _size(G) < newton.error
+        y, J, error = where(better, (newton.trial, J, _size(G)), (newton.y, newton.J, newton.error))
         direction = jnp.where(better, inverse(J) @ G, newton.direction)
         fraction = jnp.where(better, 1.0, 0.5 * newton.fraction)
-        y, J = jnp.where(better, newton.trial, newton.y), jnp.where(better, J, newton.J)
-        error = jnp.where(better, _size(G), newton.error)
-        return Newton(y, error, J, direction, fraction, y - fraction * direction, newton.number + 1)
+        after = Newton(y, error, J, direction, fraction, y - fraction * direction, *newton[6:9], newton.number + 1)
+        step, solved = after.reached - after.target, error <= tolerance
+        onward = after.begun(y, after.target, jnp.maximum(after.target - 2 * step, 0.0))
+        back = after.begun(after.base, after.reached, after.target + step / 2)
+        failed = ~solved & (fraction < LEAVING) & (step > SHORTEST)
+        return where(solved & (after.target > 0), onward, where(failed, back._replace(fraction=one), after))
+
+    def where(which: Array, a: Any, b: Any) -> Any:
+        return jax.tree.map(lambda x, y: jnp.where(which, x, y), a, b)
 
     def unfinished(newton: Newton) -> Array:
         return (newton.number < STEPS) & (newton.fraction > SMALLEST) & (newton.error > 0)
 
     one = jnp.ones_like(y[0])
-    first = Newton(y, jnp.inf * one, jnp.eye(y.size, dtype=y.dtype), 0 * y, one, y, jnp.asarray(0))
-    return lax.stop_gradient(lax.while_loop(unfinished, evaluate, first))
+    begin = Newton(y, jnp.inf * one, jnp.eye(y.size, dtype=y.dtype), 0 * y, one, y, 0 * one, one, y, jnp.asarray(0))
+    return lax.stop_gradient(lax.while_loop(unfinished, evaluate, begin))
 
 
 def _size(G: Array) -> Array:
@@ -176,11 +200,21 @@ def inverse(J: Array) -> Array:
 
 
 def start_of(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> Point:
-    """Return the first point of the iteration: the plant at rest at r (m), and the initial states of the laws there."""
-    plant, (i, u) = scenario.plant, scenario.plant.equilibrium(r)
-    # a law that starts at the current of its model may begin outside the boundary layer of the current law
-    inversion, zero = cascade.inversion.started(i), jnp.zeros_like(i)
-    state = plant.start(Measurement(zero + r, zero, i))
+    """Return the first point of the iteration: the plant rests where the sensor reads r (m), the laws begin there.
+
+    At another reading, or at the current that the model needs, a sign may begin outside its boundary layer.
+    """
+    plant, zero = scenario.plant, jnp.zeros(())
+
+    def read(z: Array) -> Array:
+        return reading(scenario, Measurement(z, zero, zero), (0.0, 0.0)).z
+
+    shown, gain = jax.jvp(read, (zero + r,), (zero + 1.0,))
+    z = r - (shown - r) / gain
+    i, u = plant.equilibrium(z)
+    zero = jnp.zeros_like(i)
+    inversion = cascade.inversion.started(i)
+    state = plant.start(Measurement(zero + z, zero, i))
     measured = reading(scenario, plant.measurement(state), (0.0, 0.0))
     cascade = dataclasses.replace(cascade, inversion=inversion, observer=cascade.observer.started(measured.z))
     control = jax.tree.map(lambda x: jnp.asarray(x, zero.dtype), cascade.init(measured))
