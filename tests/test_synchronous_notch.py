@@ -10,6 +10,7 @@ import pytest
 
 from ambjax.cases.machine_case import machine_from
 from ambjax.cases.reader import case_from
+from ambjax.cases.table import Table
 from ambjax.cases.template_text import template
 from ambjax.codegen.c99.source import Origin
 from ambjax.codegen.of_case import block_of
@@ -18,10 +19,13 @@ from ambjax.control.synchronous_notch import NotchGain, NotchState, SynchronousN
 from ambjax.linear import linearise
 from ambjax.linear.linear_machine import linearise_machine
 from ambjax.linear.margins import poles_in_s
+from ambjax.results.gains import with_gains
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.runs import simulate
 from ambjax.world.rotation import Rotation
 from ambjax.world.sensor import Measurement
+from tuning.problem.config import tune_from
+from tuning.problem.tuning_problem import problem_of
 
 RATE, RPM = 20.0, 6000.0
 LAWS = {
@@ -205,3 +209,73 @@ def test_a_wrong_notch_is_refused(raw, said):
 def test_a_wrong_notch_of_a_bearing_is_refused():
     with pytest.raises(ValueError, match=r"axis right.x: controller.notch.kind = .*one of 'force-free'"):
         machine_from(of_machine(({"kind": "none"}, {"kind": "free"})))
+
+
+GAINS = {"controller.position.k_p": 1.5e5, "controller.position.k_d": 500.0}
+
+
+def of_gains(notches):
+    return np.array([(gain.real, gain.imaginary) for gain in notches])
+
+
+def reread():
+    """The case with other gains, read from its tables."""
+    laws = LAWS | {"position": LAWS["position"] | {"k_p": 1.5e5, "k_d": 500.0}}
+    return case_from(with_notch(ON_PROCESSOR | {"controller": laws}, "force-free"))
+
+
+@pytest.mark.slow
+def test_the_notch_of_a_case_follows_its_gains():
+    case, expected = case_from(with_notch(ON_PROCESSOR, "force-free")), of_gains(reread().cascade.notch.gains)
+    before = of_gains(case.cascade.notch.gains)
+    assert np.abs(before - expected).max() > 0.1 * np.abs(expected).max()  # so that the test can fail
+    assert of_gains(with_gains(case, GAINS).cascade.notch.gains) == pytest.approx(expected, rel=1e-6)
+    named = {"controller.notch.gains.0.real": 2.0}
+    assert with_gains(case, GAINS | named).cascade.notch.gains[0].real == 2.0
+
+    def real(k_p):
+        return with_gains(case, GAINS | {"controller.position.k_p": k_p}).cascade.notch.gains[0].real
+
+    step = 1e-2 * 1.5e5  # the error of the difference is 1e-6
+    difference = (real(1.5e5 + step) - real(1.5e5 - step)) / (2 * step)
+    assert jax.grad(real)(1.5e5) == pytest.approx(float(difference), rel=1e-5)
+
+
+@pytest.mark.slow
+def test_the_tuner_simulates_the_notch_that_its_answer_has():
+    """The terms of the loss and the linear peak at other gains are those of the case that is read with them."""
+    short = {"clock": {"duration": 0.02, "sample_period": 1e-4}, "run": {"settle": 0.01}}
+    raw = with_notch(ON_PROCESSOR, "force-free") | short
+    tune = {"gains": list(GAINS), "members": 2, "stressed": 2, "validation": 0}
+
+    def problem(case, raw):
+        return problem_of(case, tune_from(Table(raw | {"tune": tune}).table("tune"), case))
+
+    laws = LAWS | {"position": LAWS["position"] | {"k_p": 1.5e5, "k_d": 500.0}}
+    other = with_notch(raw | {"controller": laws}, "force-free")
+    found = []
+    for one in (raw, other):
+        own = problem(case_from(one), one)
+        members = own.objective.training(0, 2, 2, 1.5, 1.1)
+        x = own.objective.space.encode(np.array(list(GAINS.values())))
+        fixed = own.objective.fixed(x, members)[0].notch.gains
+        found.append((own.engine.terms(x[None], members), own.engine.gradient(x[None], members, np.ones(6))[0], fixed))
+    (terms, outcomes, gains), (expected, others, rest) = found
+    for name, values in terms.items():
+        assert values == pytest.approx(expected[name], rel=1e-6), name
+    assert outcomes == pytest.approx(others, rel=1e-6)
+    assert of_gains(gains) == pytest.approx(of_gains(rest), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_a_notch_has_gains_at_all_speeds_that_vary():
+    """At the ends of a spread, and at the analysed speeds, the gain is the inverse of the response there."""
+    raw = with_notch(ON_PROCESSOR, "force-free") | {"spread": {"rotor": {"speed": {"uniform": [3000.0, 9000.0]}}}}
+    gains = case_from(raw).cascade.notch.gains
+    assert [float(gain.speed) for gain in (gains[0], gains[-1])] == [3000.0, 9000.0]
+    for k, rpm in ((0, 3000.0), (-1, 9000.0)):
+        alone = case_from(with_notch(ON_PROCESSOR | {"rotor": {"speed": rpm}}, "force-free")).cascade.notch.gains
+        assert of_gains(gains)[k] == pytest.approx(of_gains(alone)[0], rel=1e-9)
+    machine = of_machine(({"rate": 10.0}, {"rate": 10.0}, {"kind": "none"})) | {"sensitivity": {"speeds": [4000.0]}}
+    gains = machine_from(machine).cases[0].cascade.notch.gains
+    assert [float(gain.speed) for gain in (gains[0], gains[-1])] == [4000.0, RPM]

@@ -19,7 +19,7 @@ from ambjax.cases.notch_table import notch_from
 from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
 from ambjax.cases.plausibility import unresolved
 from ambjax.cases.reader import FILE, TABLES, Case, case_from, is_machine, require_file, safe_name
-from ambjax.cases.rotor_numbers import fastest_rotor
+from ambjax.cases.rotor_numbers import fastest_rotor, widest_rotation
 from ambjax.cases.rotor_tables import (
     COORDINATES,
     RIGID,
@@ -37,7 +37,7 @@ from ambjax.control.machine_law import MachineLaw
 from ambjax.control.synchronous_notch import SynchronousNotch
 from ambjax.ensemble.spread import Spread
 from ambjax.linear.analysis import Zones
-from ambjax.linear.notch_design import with_machine_gains
+from ambjax.linear.notch_design import speeds_of, with_machine_gains
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
@@ -175,10 +175,9 @@ def machine_from(
     clock = _clock([*cases, *parts], fastest_rotor(rotor, spread), fixed)
     controllers = [merged(top.table("controller").raw, own.table("controller").raw) for own in bearings]
     notches = [notch_of_axis(controllers[axis.bearing], case) for axis, case in zip(axes, cases, strict=True)]
-    if any(notches):
-        found = with_machine_gains(machine_of_axes(rotor, parts_of(cases), clock, q, law), notches, clock)
-        laws = [dataclasses.replace(case.cascade, notch=notch) for case, notch in zip(cases, found, strict=True)]
-        cases = [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
+    speeds = _speeds(top.table("sensitivity"), rotor, float(clock.duration))
+    turning = [*speeds, *speeds_of(widest_rotation(rotor, spread), float(clock.duration))]
+    cases = notched(cases, notches, machine_of_axes(rotor, parts_of(cases), clock, q, law), clock, turning)
     spread = with_notches(spread, of_notches, axes, cases)
     coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
     found_laws = [(own_law,) if own_law else (), *(one.own_laws for one in cases)]
@@ -194,7 +193,7 @@ def machine_from(
         cases=tuple(cases),
         settle=cases[0].settle,
         zones=cases[0].zones,
-        speeds=_speeds(top.table("sensitivity"), rotor, float(clock.duration)),
+        speeds=speeds,
         spread=spread,
         text=text,
         folder=folder,
@@ -216,7 +215,31 @@ def machine_of_axes(
     return machine_of(rotor, systems, jnp.asarray(q), law)
 
 
-def notch_of_axis(controller: dict[str, Any], case: Case) -> tuple[SynchronousNotch, float | None] | None:
+def notched(
+    cases: Sequence[Case],
+    notches: Sequence[SynchronousNotch | None],
+    bare: Machine,
+    clock: Clock,
+    speeds: Sequence[float],
+) -> list[Case]:
+    """Return the cases of the axes with notches whose gains are for these speeds (rpm). `bare`: without notches."""
+    found = with_machine_gains(bare, notches, clock, speeds) if any(notches) else notches
+    laws = [dataclasses.replace(case.cascade, notch=notch) for case, notch in zip(cases, found, strict=True)]
+    return [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
+
+
+def machine_for(case: MachineCase, speeds: Sequence[float]) -> Machine:
+    """Return the machine of a case, with the gains of its notches for these speeds, rpm."""
+    notches, machine = [one.cascade.notch for one in case.cases], case.machine
+
+    def made(cases: Sequence[Case]) -> Machine:
+        return machine_of_axes(machine.rotor, parts_of(cases), case.clock, machine.start_q, machine.law)
+
+    bare = made(notched(case.cases, [None] * len(notches), machine, case.clock, speeds))
+    return made(notched(case.cases, notches, bare, case.clock, speeds)) if any(notches) else machine
+
+
+def notch_of_axis(controller: dict[str, Any], case: Case) -> SynchronousNotch | None:
     """Return `notch_from` of an axis. `controller`: the common table with the keys of its bearing."""
     try:
         return notch_from(Table({"controller": controller}), case.scenario)

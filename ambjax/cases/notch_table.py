@@ -5,6 +5,7 @@ import dataclasses
 from ambjax.cases.table import Table
 from ambjax.control.cascade import Cascade
 from ambjax.control.synchronous_notch import NULLED, SynchronousNotch
+from ambjax.ensemble.spread import Spread, ends
 from ambjax.linear.notch_design import with_notch_gains
 from ambjax.numerics.records import leaf
 from ambjax.simulation.clock import Clock
@@ -19,8 +20,8 @@ PHASE = leaf(
 )  # fmt: skip
 
 
-def notch_from(top: Table, scenario: Scenario) -> tuple[SynchronousNotch, float | None] | None:
-    """Return the notch of [controller.notch] without its gains, and the key `phase`; None if there is no notch."""
+def notch_from(top: Table, scenario: Scenario) -> SynchronousNotch | None:
+    """Return the notch of [controller.notch] without its gains; None if there is no notch."""
     controller = top.table("controller")
     if "notch" not in controller.raw:
         return None
@@ -34,16 +35,18 @@ def notch_from(top: Table, scenario: Scenario) -> tuple[SynchronousNotch, float 
         raise ValueError("[controller.notch]: it follows the speed of the rotor. Give rotor.speed, in rpm.")
     given = Table({key: table.raw[key] for key in NUMBERS if key in table.raw}, table.path)
     notch = given.record(SynchronousNotch)
-    return dataclasses.replace(notch, removes=kind, rotor=rotor, varying=varying), phase
+    return dataclasses.replace(notch, removes=kind, rotor=rotor, varying=varying, phase=phase)
 
 
-def with_notch(top: Table, cascade: Cascade, scenario: Scenario, clock: Clock) -> Cascade:
-    """Return the cascade with the notch of [controller.notch]. Raises ValueError if its loop has no linearisation."""
-    found = notch_from(top, scenario)
-    if found is None:
+def with_gains_of_notch(cascade: Cascade, scenario: Scenario, clock: Clock, spread: Spread) -> Cascade:
+    """Return the cascade with the gains of its notch, if it has one, for all speeds of the spread.
+
+    Raises ValueError if its loop has no linearisation.
+    """
+    rotor = ends(spread, cascade, scenario, ("rotor.",))[1].rotor
+    if cascade.notch is None or rotor is None:
         return cascade
-    notch, phase = found
     try:
-        return with_notch_gains(dataclasses.replace(cascade, notch=notch), scenario, clock, phase)
+        return with_notch_gains(cascade, scenario, clock, rotor)
     except ValueError as error:
         raise ValueError(f"[controller.notch]: its gain cannot be computed: {error}") from None

@@ -11,7 +11,7 @@ import jax
 from ambjax.cases.case_table import case_table, parts_of
 from ambjax.cases.controller_file import ControllerFile
 from ambjax.cases.controller_tables import KINDS, Files, cascade_from, processor_from
-from ambjax.cases.notch_table import with_notch
+from ambjax.cases.notch_table import notch_from, with_gains_of_notch
 from ambjax.cases.own_laws import OwnLaw
 from ambjax.cases.reach import check_reference
 from ambjax.cases.recordings import RecordedFile, Recordings
@@ -181,9 +181,10 @@ def case_from(
             'an observer other than "ired-1" and "ired-2", and actuator.mode = "voltage". Leave out clock.method.'
         )
     check_start(scenario)
-    cascade = with_notch(top, cascade, scenario, clock)
+    cascade = dataclasses.replace(cascade, notch=notch_from(top, scenario))
     settle = duration / 4 if settle is None else settled(settle, clock)
     spread = spread_from(top, cascade, scenario)
+    cascade = with_gains_of_notch(cascade, scenario, clock, spread)
     check_reference(spread, cascade, scenario, clock)
     clock = with_method(clock, *corners(spread, cascade, scenario))
     if cascade.sampled:

@@ -11,8 +11,10 @@ from ambjax.cases.rotor_tables import DAMPING, FREQUENCY, I_P, I_T, MASS, RIGID
 from ambjax.ensemble.paths import Place, numbers_in, with_number
 from ambjax.ensemble.spread import Spread
 from ambjax.numerics.records import leaf
+from ambjax.world.rotation import Rotation
 from ambjax.world.rotor import Rotor
 
+SPEED = ("rotor.speed", "rotor.acceleration")
 # First word of the paths of one bearing or one axis.
 OF_BEARING = "bearing"
 # Shapes of a bending mode: keys of a bearing, for its magnet and its sensor, with their rows of a rotor; and a factor.
@@ -34,7 +36,7 @@ def rotor_places(rotor: Rotor, names: Sequence[str]) -> dict[str, Place]:
     }
     numbers = numbers_in(rotor, "rotor")
     # a table of speeds has no rate of its own
-    table |= {path: numbers[path] for path in ("rotor.speed", "rotor.acceleration")[: 1 if rotor.changes else 2]}
+    table |= {path: numbers[path] for path in SPEED[: 1 if rotor.changes else 2]}
     w = np.sqrt(np.diag(K)[RIGID::2] / np.diag(M)[RIGID::2])
     for j, (own, d) in enumerate(zip(w, np.diag(D)[RIGID::2], strict=True)):
         table[f"rotor.modes.{j}.frequency"] = Place((), FREQUENCY, own / (2 * np.pi))
@@ -121,6 +123,14 @@ def _with_shapes(rotor: Rotor, values: Mapping[str, float], names: Sequence[str]
         ),
         loads=tuple(dataclasses.replace(one, along=one.along * factors) for one in rotor.loads),
     )
+
+
+def widest_rotation(rotor: Rotor, spread: Spread) -> Rotation:
+    """Return the speed of the rotor; its numbers that vary are arrays with both ends, in all combinations."""
+    own = [(path.removeprefix("rotor."), kind) for path, kind in spread.entries if path in SPEED]
+    ends = [kind.support(float(np.asarray(getattr(rotor, name)))) for name, kind in own]
+    grid = np.meshgrid(*ends, indexing="ij")
+    return dataclasses.replace(rotor.rotation, **{name: x for (name, _), x in zip(own, grid, strict=True)})
 
 
 def fastest_rotor(rotor: Rotor, spread: Spread) -> Rotor:

@@ -69,6 +69,9 @@ class SynchronousNotch:
     gains: tuple[NotchGain, ...] = part(default=(), doc="gain at each speed, in between linear")
     rotor: Rotation | None = part(default=None, doc="speed of the rotor; that of a scenario replaces it")
     varying: bool = static(default=False, doc="whether the speed changes during a run")
+    phase: float | None = static(
+        default=None, doc="phase of the response that the notch inverts, degrees; None: that of the linear loop"
+    )
 
     def init(self, measured: Measurement) -> NotchState:
         """Return the state at the first reading: the notch adds nothing."""

@@ -1,82 +1,102 @@
 """Gains of the notch at the speed of the rotor, from the linear loop without the notch."""
 
-import cmath
 import dataclasses
-import math
 from collections.abc import Sequence
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
+from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.control.cascade import Cascade
 from ambjax.control.synchronous_notch import NULLED, NotchGain, SynchronousNotch
 from ambjax.linear.analysis import linearise
 from ambjax.linear.linear_machine import linearise_machine
+from ambjax.linear.matrices import loop_matrices
+from ambjax.numerics.records import Scalar
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.whole_machine import Machine
-from ambjax.world.rotation import PER_MINUTE, Rotation, known
+from ambjax.world.rotation import PER_MINUTE, Rotation
 from ambjax.world.scenario import Scenario
 
-# Number of speeds at which the gain of a notch is computed for a run-up.
+# Largest number of speeds at which the gain of a notch is computed.
 SPEEDS = 33
 
 
-def notch_speeds(rotor: Rotation, notch: SynchronousNotch, duration: float) -> tuple[float, ...]:
-    """Return the speeds (rpm) at which a notch needs its gain: those of a run while it is on, at most SPEEDS."""
-    signed = [float(rotor.rpm(t)) for t in rotor.corners(duration)]
-    first, *_, last = sorted(abs(rpm) for rpm in signed)
-    if not notch.varying:
-        return (first,)
-    if min(signed) < 0 < max(signed):
+def speeds_of(rotor: Rotation, duration: float) -> list[float]:
+    """Return the speeds (rpm) at the corners of a run. Numbers of `rotor` may be arrays, as of a spread."""
+    return np.concatenate([np.ravel(rotor.rpm(t)) for t in rotor.corners(duration)]).tolist()
+
+
+def notch_speeds(notch: SynchronousNotch, speeds: Sequence[float]) -> tuple[float, ...]:
+    """Return the speeds (rpm) of the gains of a notch: from the least to the largest of `speeds`, while it is on."""
+    first, *_, last = sorted(abs(rpm) for rpm in speeds)
+    if min(speeds) < 0 < max(speeds):
         first = 0.0
     last = min(last, max(first, float(notch.max_speed)))
     low = max(first, float(notch.min_speed), last / (4 * SPEEDS))
     return tuple(np.linspace(low, last, SPEEDS).tolist()) if low < last else (last,)
 
 
-def with_notch_gains(cascade: Cascade, scenario: Scenario, clock: Clock, phase: float | None = None) -> Cascade:
-    """Return the cascade whose notch has the gains for its loop.
+def with_notch_gains(cascade: Cascade, scenario: Scenario, clock: Clock, rotor: Rotation) -> Cascade:
+    """Return the cascade whose notch has the gains for its loop, at all speeds of `rotor` (`speeds_of`).
 
-    `phase`: phase (degrees) of the response at all speeds; None: that of the linear loop. Raises ValueError as
-    `linearise` does.
+    Raises ValueError as `linearise` does.
     """
     assert cascade.notch is not None
-    assert scenario.rotor is not None
     system = linearise(dataclasses.replace(cascade, notch=None), scenario, clock)
-    speeds = notch_speeds(scenario.rotor, cascade.notch, float(clock.duration))
+    speeds = notch_speeds(cascade.notch, speeds_of(rotor, float(clock.duration)))
     response = np.asarray(system.response(PER_MINUTE * np.array(speeds)))
-    nulled = response[:, 5, 0] if NULLED[cascade.notch.removes] == "i" else response[:, 0, 0] - 1
-    gains = notch_gains(speeds, nulled, phase)
-    notch = dataclasses.replace(cascade.notch, gains=gains, rotor=scenario.rotor)
-    return dataclasses.replace(cascade, notch=notch)
+    gains = notch_gains(cascade.notch, speeds, response[:, 0, 0], response[:, 5, 0])
+    return dataclasses.replace(cascade, notch=dataclasses.replace(cascade.notch, gains=gains, rotor=scenario.rotor))
 
 
-def notch_gains(speeds: Sequence[float], response: np.ndarray, phase: float | None) -> tuple[NotchGain, ...]:
-    """Return the gains for the responses [speeds] of the nulled reading. `phase`: replaces theirs, degrees."""
-    found = []
-    for speed, G in zip(speeds, response.tolist(), strict=True):
-        g = 1 / (G if phase is None else cmath.rect(abs(G), math.radians(phase)))
-        found.append(NotchGain(speed, g.real, g.imag))
-    return tuple(found)
+def redesigned(cascade: Cascade, scenario: Scenario, period: Scalar) -> tuple[NotchGain, ...]:
+    """Return the gains of a cascade's notch for its loop, at the speeds of the gains that it has.
+
+    The arguments are the results of `linearisation_inputs`. The function is pure, works under jit and vmap, and is
+    differentiable. The gains are NaN if no equilibrium is found.
+    """
+    assert cascade.notch is not None
+    system, found = loop_matrices(dataclasses.replace(cascade, notch=None), scenario, period, 0.0)
+    speeds = [gain.speed for gain in cascade.notch.gains]
+    response = jnp.where(found, system.response(PER_MINUTE * jnp.stack([jnp.asarray(x) for x in speeds])), jnp.nan)
+    return notch_gains(cascade.notch, speeds, response[:, 0, 0], response[:, 5, 0])
+
+
+# For one cascade with concrete numbers.
+redesigned_at_once = compiled_quickly(redesigned, options=QUICKEST)
+
+
+def notch_gains(
+    notch: SynchronousNotch, speeds: Sequence[Scalar], S: Array | np.ndarray, current: Array | np.ndarray
+) -> tuple[NotchGain, ...]:
+    """Return the gains for the responses [speeds] of the reading of z, S, and of the current to a test signal on z."""
+    G: Any = current if NULLED[notch.removes] == "i" else S - 1
+    if notch.phase is not None:
+        G = abs(G) * np.exp(1j * np.radians(notch.phase))
+    parts = [x.tolist() if isinstance(x, np.ndarray) else x for x in ((1 / G).real, (1 / G).imag)]
+    return tuple(NotchGain(speed, parts[0][k], parts[1][k]) for k, speed in enumerate(speeds))
 
 
 def with_machine_gains(
-    machine: Machine, notches: Sequence[tuple[SynchronousNotch, float | None] | None], clock: Clock
+    machine: Machine, notches: Sequence[SynchronousNotch | None], clock: Clock, speeds: Sequence[float]
 ) -> list[SynchronousNotch | None]:
     """Return the notches of the axes with the gains for a machine without notches, all loops closed.
 
-    `notches`: notch and phase (`notch_gains`) of each axis; None: no notch.
+    `notches`: of each axis; None: none. `speeds`: see `notch_speeds`.
     """
     c, found, responses = machine.count, list[SynchronousNotch | None](), dict[float, np.ndarray]()
-    for k, given in enumerate(notches):
-        if given is None:
+    for k, notch in enumerate(notches):
+        if notch is None:
             found.append(None)
             continue
-        notch, phase = given
-        speeds = notch_speeds(known(notch.rotor), notch, float(clock.duration))
-        for speed in (x for x in speeds if x not in responses):
+        own_speeds = notch_speeds(notch, speeds)
+        for speed in (x for x in own_speeds if x not in responses):
             system = linearise_machine(machine, clock.sample_period, speed)
             responses[speed] = np.asarray(system.response(np.array([PER_MINUTE * speed])))[0]
-        own = np.array([responses[speed] for speed in speeds])
-        nulled = own[:, 2 * c + k, k] if NULLED[notch.removes] == "i" else own[:, k, k] - 1
-        found.append(dataclasses.replace(notch, gains=notch_gains(speeds, nulled, phase)))
+        own = np.array([responses[speed] for speed in own_speeds])
+        gains = notch_gains(notch, own_speeds, own[:, k, k], own[:, 2 * c + k, k])
+        found.append(dataclasses.replace(notch, gains=gains))
     return found

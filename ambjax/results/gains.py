@@ -11,6 +11,8 @@ from ambjax.cases.reader import Case
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.paths import places, with_values
 from ambjax.ensemble.spread import no_such_number
+from ambjax.linear.analysis import linearisation_inputs
+from ambjax.linear.notch_design import redesigned_at_once
 from ambjax.world.scenario import Scenario
 
 Loop = TypeVar("Loop", Cascade, Case)
@@ -51,11 +53,18 @@ def _numbers(loop: Cascade | Case, paths: Iterable[str] | None) -> dict[str, Any
 def with_gains(loop: Loop, gains: Mapping[str, Any]) -> Loop:
     """Return the cascade, or the case, with the numbers at these dotted paths replaced. The values may be traced.
 
+    A synchronous notch of a case is designed for its new gains, unless they contain gains of the notch; that of a
+    cascade alone is not, because its design needs the scenario.
+
     Raises ValueError for a path that does not exist.
     """
     if not isinstance(gains, Mapping):
         raise ValueError(f"gains = {gains!r}: it must be a dict of values by dotted path.")
     _numbers(loop, gains)
     if isinstance(loop, Case):
-        return dataclasses.replace(loop, cascade=with_gains(loop.cascade, gains))
+        cascade = with_gains(loop.cascade, gains)
+        if cascade.notch is not None and not any(path.startswith("controller.notch.gains.") for path in gains):
+            anew = redesigned_at_once(*linearisation_inputs(cascade, loop.scenario, loop.clock))
+            cascade = dataclasses.replace(cascade, notch=dataclasses.replace(cascade.notch, gains=anew))
+        return dataclasses.replace(loop, cascade=cascade)
     return with_values(loop, Scenario(), gains)[0]

@@ -130,7 +130,7 @@ def _analysis(of: JudgedMembers, number: int) -> Analysis | str:
     """Analyse the linearised loop of one member. Return the cause as text if it cannot be linearised."""
     objective, case = of.problem.objective, of.problem.case
     cascade, scenario = objective.world(jax.tree.map(lambda a: a[0], of.chosen(np.array([number]))))
-    cascade = objective.space.decode(jnp.asarray(of.x), cascade)
+    cascade = objective.notched(of.x, objective.space.decode(jnp.asarray(of.x), cascade))
     scenario = dataclasses.replace(scenario, seed=case.scenario.seed, member=case.scenario.member)
     try:
         system = linearise(cascade, scenario, case.clock)

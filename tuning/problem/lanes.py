@@ -198,7 +198,8 @@ class Engine:
         start, member = np.divmod(np.arange(len(x) * len(members.member)), len(members.member))
         at = np.asarray(x, jnp.result_type(float))[start]
         selected = jax.tree.map(lambda a: a[member], members)
-        lane = Lane(at, selected, self._world, None if weights is None else weights[start], fold)
+        world = (self.objective.notched(at, self._world[0]), *self._world[1:])
+        lane = Lane(at, selected, world, None if weights is None else weights[start], fold)
         cut = {"threads": self.threads, "call": width, "block": width}
         results = map_members(function, lane, vectorised=vectorised, **cut)
         return jax.tree.map(lambda a: a.reshape(len(x), len(members.member), *a.shape[1:]), results)

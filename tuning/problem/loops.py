@@ -67,7 +67,8 @@ def loops(
     lane = LoopLane(None, *linearisation_inputs(cascade, scenario, objective.clock))
     start, member = np.divmod(np.arange(count * n), n)
     lane = jax.tree.map(lambda a: np.asarray(a)[member] if np.ndim(a) else a, canonical(lane))
-    lane = lane._replace(x=np.asarray(x, jnp.result_type(float))[start])
+    at = np.asarray(x, jnp.result_type(float))[start]
+    lane = lane._replace(x=at, cascade=objective.notched(at, lane.cascade))
     function = LaneLoop(objective.space, objective.loop, float(objective.clock.duration))
     # one call at a time: XLA runs LAPACK on its own threads, and two calls wait for each other for ever
     values, slopes = map_members(function, lane, threads=1, call=LOOPS, block=LOOPS, plain=True)

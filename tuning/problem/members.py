@@ -1,6 +1,7 @@
 """Members of an ensemble, and the objective, which maps gains and a member to the result of a fold."""
 
 import dataclasses
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -8,8 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.control.cascade import Cascade
+from ambjax.control.synchronous_notch import NotchGain
 from ambjax.ensemble import Spread, apply, draw
+from ambjax.extend import Scalar, canonical
+from ambjax.linear import linearisation_inputs
+from ambjax.linear.notch_design import redesigned
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.parts import rolled_in_parts
 from ambjax.simulation.rollout import prepare, rollout
@@ -123,13 +129,26 @@ class Objective:
         )
         return cascade, scenario.louder(members.noise_factor)
 
+    def notched(self, x: np.ndarray, cascade: Cascade) -> Cascade:
+        """Return a cascade with the notch designed for the gains at coordinates x [m], or for those at each x [S, m].
+
+        A notch has the gains of the nominal case, for every member. A cascade without a notch is returned as it is.
+        """
+        if cascade.notch is None:
+            return cascade
+        loop = linearisation_inputs(self.cascade, self.scenario, self.clock)
+        x = np.asarray(x, jnp.result_type(float))
+        gains = jax.tree.map(np.asarray, _designs(*canonical((x.reshape(-1, x.shape[-1]), *loop)), space=self.space))
+        gains = jax.tree.map(lambda a: a.reshape(x.shape[:-1]), gains)
+        return dataclasses.replace(cascade, notch=dataclasses.replace(cascade.notch, gains=gains))
+
     def fixed(self, x: np.ndarray, members: Members) -> tuple[Cascade, Scenario]:
         """Return the cascade with the gains at x [m] and the scenario of members [n]. Varying leaves are arrays [n]."""
         seed = members.seed if np.ptp(members.seed) else int(members.seed[0])
         scenario = dataclasses.replace(self.scenario, member=np.asarray(members.member), seed=seed)
         cascade, scenario = apply(self.cascade, scenario, members.values)
         at = (x + members.shift).T if np.any(members.shift) else x  # [m] or [m, n]
-        cascade = self.space.decode(jnp.asarray(at), cascade)
+        cascade = self.notched(x, self.space.decode(jnp.asarray(at), cascade))
         return cascade, scenario.louder(members.noise_factor) if np.any(members.noise_factor != 1) else scenario
 
     def run(self, x: Array, members: Members, fold: Any, *, in_parts: bool = False) -> Any:
@@ -142,3 +161,9 @@ class Objective:
         if in_parts:
             return rolled_in_parts(*prepare(cascade, scenario, self.clock), fold).metrics
         return rollout(cascade, scenario, self.clock, fold=fold, record_every=0).metrics
+
+
+@partial(compiled_quickly, static_argnames=("space",), options=QUICKEST)
+def _designs(x: Array, cascade: Cascade, scenario: Scenario, period: Scalar, *, space: Space) -> tuple[NotchGain, ...]:
+    """Return the gains of the notch at each x [S, m]; the leaves are arrays [S]."""
+    return jax.vmap(lambda x: redesigned(space.decode(x, cascade), scenario, period))(x)

@@ -128,7 +128,8 @@ def _steps(answer: SearchResult, of: JudgedMembers, tell: Tell) -> Row:
 def _conditions(problem: TuningProblem, x: np.ndarray) -> Row:
     """Return the fields on the theorem's conditions at x [m]."""
     case = problem.case
-    cascade = problem.objective.space.decode(jnp.asarray(x), case.cascade)
+    objective = problem.objective
+    cascade = objective.notched(x, objective.space.decode(jnp.asarray(x), case.cascade))
     line: Check = check(cascade, case.scenario, case.clock.with_method(None))
     rows = [dataclasses.asdict(one) | {"margin": one.margin} for one in line.conditions]
     return {"conditions": rows, "advice_on_conditions": on_conditions(line)}
