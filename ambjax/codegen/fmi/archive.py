@@ -35,22 +35,19 @@ def sources(traced: Trace, identifier: str, origin: Origin, version: int) -> tup
     found = {f"{identifier}.h": writer.header(), f"{identifier}.c": writer.source()}
     found |= {name: (home / name).read_text(encoding="utf-8") for name in names}
     guid = token(traced, identifier, found)
-    found["model.h"] = (
-        (home / "model.h")
-        .read_text(encoding="utf-8")
-        .format(
-            p=identifier,
-            token=guid,
-            inputs=len(traced.inputs),
-            outputs=len(traced.outputs),
-            parameters=len(traced.parameters),
-            states=len(traced.state),
-            reads=int(traced.block.noun != "controller"),
-            least=", ".join(_bound(x.least) for x in traced.parameters),
-            most=", ".join(_bound(x.most) for x in traced.parameters),
-            infinite=", ".join(str(int(x.infinite)) for x in traced.parameters),
-            whole=", ".join(str(int(x.whole)) for x in traced.parameters),
-        )
+    model = (home / "model.h").read_text(encoding="utf-8")
+    found["model.h"] = model.format(
+        p=identifier,
+        token=guid,
+        inputs=len(traced.inputs),
+        outputs=len(traced.outputs),
+        parameters=len(traced.parameters),
+        states=len(traced.state),
+        reads=int(traced.block.noun != "controller"),
+        least=", ".join(_bound(x.least) for x in traced.parameters),
+        most=", ".join(_bound(x.most) for x in traced.parameters),
+        infinite=", ".join(str(int(x.infinite)) for x in traced.parameters),
+        whole=", ".join(str(int(x.whole)) for x in traced.parameters),
     )
     return found, guid
 
