@@ -58,7 +58,7 @@ def study_of(text, members=MEMBERS):
 def no_pictures(patch):
     """Drawing takes longer than these runs."""
     patch.setattr(study_report, "_pictures", lambda *_: None)
-    patch.setattr("ambjax.pictures.overview.overview", lambda *_: None)
+    patch.setattr("ambjax.commands.simulate.drawn", lambda *_: None)
 
 
 def commands(text):

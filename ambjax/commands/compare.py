@@ -34,7 +34,7 @@ from ambjax.page.html_page import check_processor, pages
 from ambjax.results.case_export import guarded_for
 from ambjax.results.machine_study import MachineStudy
 from ambjax.results.operating import MEMBERS, operating_point, sensitivity, shown_band, spread_peaks
-from ambjax.results.outputs import described, directory, files, plain, write_json, written
+from ambjax.results.outputs import described, directory, drawn, files, plain, write_json, written
 from ambjax.results.spread_runs import study_of
 from ambjax.text.web_page import render_page
 
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     summary, compared = _comparison(cases, studies, notes)
     with files(out) as part:
         write_json(part / "compare.json", summary)
-        described("compare.png", lambda: _draw(compared, part / "compare.png"))
+        drawn(part / "compare.png", lambda: _drawn(compared), 110)
         described("compare.html", lambda: _write_html(summary, part))
         for name, html in html_pages.items():
             (part / name).write_text(html, encoding="utf-8")
@@ -244,7 +244,7 @@ def _flops(case: Case) -> int | None:
         return None
 
 
-def _draw(compared: Sequence[Compared], path: pathlib.Path) -> None:
+def _drawn(compared: Sequence[Compared]) -> Any:
     from ambjax.pictures import comparison
 
     shown = [
@@ -263,4 +263,4 @@ def _draw(compared: Sequence[Compared], path: pathlib.Path) -> None:
     loops = [(first_axis(one.case), one.loop.system) for one in compared]
     spans = [shown_band(case, [system] if system else []) for case, system in loops]
     span = min(low for low, _ in spans), max(high for _, high in spans)
-    comparison.comparison(shown, compared[0].case.zones.limits, span, path)
+    return comparison.comparison_figure(shown, compared[0].case.zones.limits, span)
