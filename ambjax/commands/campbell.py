@@ -120,7 +120,6 @@ def operating_range(case: MachineCase) -> tuple[float, float]:
 def _unbalance(
     case: MachineCase, found: UnbalanceResponse, criticals: list[CriticalSpeed], operating: tuple[float, float]
 ) -> dict[str, object]:
-    """Return the response to unbalance as plain data."""
     limit, largest = _vibration(found, operating)
     return {
         "operating_rpm": list(operating),

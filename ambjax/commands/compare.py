@@ -147,7 +147,6 @@ def _studies(cases: Sequence[AnyCase], seed: int | None, members: int) -> list[S
 
 
 def _read(paths: Sequence[str]) -> list[AnyCase]:
-    """Read the cases."""
     _check_count(len(paths), "case file")
     for path in paths:
         same = [other for other in paths if pathlib.Path(other).resolve() == pathlib.Path(path).resolve()]

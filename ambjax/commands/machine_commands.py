@@ -175,7 +175,6 @@ def once_per_revolution(point: MachineSensitivity) -> list[tuple[list[Summary], 
 
 
 def _margins(margins: Margins) -> dict[str, float]:
-    """Return the margins as plain data."""
     return {
         "gain_low": margins.gm_low, "gain_high": margins.gm_high, "phase_deg": margins.pm,
         "delay_s": margins.delay, "disk": margins.dm,
