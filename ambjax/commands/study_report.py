@@ -15,7 +15,7 @@ from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.linear import Findings, stability_of, suspects
 from ambjax.results.machine_study import MachineStudy
 from ambjax.results.outputs import described, drawn, files, plain, table, write_json, written
-from ambjax.text.words import one_line
+from ambjax.text.words import number, one_line
 
 # Files written with members.npz; the last one only if the case has a spread and a member survives.
 WRITTEN = ("summary.json", "fan.png", "histograms.png", "tornado.png")
@@ -154,9 +154,6 @@ def study_tables(summary: dict[str, Any], stable: str = "") -> str:
         lines += [f"{summary['lost']} lost, {summary['stalled']} not decided: {why}"]
     lines += [stable] * bool(stable)
     lines += [f"note: {note}" for note in summary["notes"]]
-
-    def number(x: float | None) -> str:
-        return "-" if x is None else f"{x:.4g}"
 
     rows = []
     for name in METRICS:

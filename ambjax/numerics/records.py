@@ -72,6 +72,11 @@ def leaf(
     return dataclasses.field(default=default, metadata=metadata)
 
 
+def matrix(shape: str, doc: str, **more: Any) -> Any:
+    """Declare a field with a matrix or a vector of any size. The arguments are those of `leaf`."""
+    return leaf(shape=shape, at_least=-1e30, at_most=1e30, doc=doc, **more)
+
+
 # Lower (exclusive) and upper bound of all gains; 0 is allowed where it switches a term off. The bounds are wide,
 # because the unit and the size of a gain depend on the law and the plant.
 GAINS = 1e-30, 1e30

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from ambjax.cases.case_table import UNITS
 from ambjax.cases.reader import Case
 from ambjax.ensemble.paths import SHIFT, Place, places, with_values
 from ambjax.page.loop_functions import longest_delay, loop_parameters
@@ -19,8 +20,6 @@ FACTOR, SHARE = 30.0, 0.5
 # The slider of any other number without a rule in `_range` ends at this multiple of its value (of `_size` if it is 0).
 TIMES = 5.0
 SEED = "run.seed"
-# Unit of a signal's values, by the field of the scenario, for fields of signals that declare no unit.
-UNITS = {"reference": "m", "q_z": "m/s^2", "q_v": "A^2/m^2", "q_i": "A/s", "q_f": "N", "base": "m/s^2"}
 # Prefix of the paths, and title, of each group, in the order of the page.
 GROUPS = {
     "controller.": "Gains",
