@@ -52,7 +52,7 @@ class RigidBody(MachineLaw):
     weights: Array = matrix("c", "weight per mass of each axis, m/s^2")
     forces: Array = matrix("c n", "scaled forces of the magnets, A^2/m^2, per acceleration of each coordinate")
     gyroscopic: Array | None = leaf(
-        default=None, shape="n n", at_least=-1e30, at_most=1e30, optional=True,
+        default=None, shape="n n", at_least=-1e30, at_most=1e30,
         doc="M^-1 G: gyroscopic accelerations to compensate, per speed (rad/s) and rate; none: no compensation",
     )  # fmt: skip
 

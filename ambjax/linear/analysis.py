@@ -51,7 +51,6 @@ class Zones:
         unit="Hz",
         above=0,
         at_most=1e6,
-        optional=True,
         doc="highest frequency; none: 0.45 of the sampling rate, in continuous time where |S - 1| has decayed",
     )
     amplitude: Scalar | None = leaf(
@@ -59,7 +58,6 @@ class Zones:
         unit="m",
         above=0,
         at_most=1,
-        optional=True,
         doc="amplitude of the multi-sine of an injection; none: 1 % of the gap s_0",
     )
     zone_a: Scalar = leaf(

@@ -98,7 +98,7 @@ class Machine:
     axes: tuple[Any, ...] = part(doc="the loops of the groups, `Sampled` or `ClosedLoop`, stacked", channels=True)
     start_q: Array = leaf(shape="n", unit="m or rad", at_least=-10.0, at_most=10.0, doc="coordinates at t = 0, at rest")
     groups: tuple[tuple[int, ...], ...] = static(doc="numbers of the axes of each group")
-    inverse: Array | None = matrix("n n", "inverse of the mass matrix", default=None, optional=True)
+    inverse: Array | None = matrix("n n", "inverse of the mass matrix", default=None)
     cuts: int | None = static(
         default=None,
         doc="largest number of jumps of the rotor's loads inside one sample; None: the number of all jumps",

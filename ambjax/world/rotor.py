@@ -72,10 +72,7 @@ class Rotor:
     loads: tuple[RotorLoad, ...] = part(default=(), doc="loads")
     base: tuple[BaseMotion, ...] = part(default=(), doc="motions of the stator")
     at_stops: Array | None = matrix(
-        "c n",
-        "rows of the displacement at the stop of axis k; None: the stops are at the magnets",
-        default=None,
-        optional=True,
+        "c n", "rows of the displacement at the stop of axis k; None: the stops are at the magnets", default=None
     )
 
     @property
