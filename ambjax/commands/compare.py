@@ -246,19 +246,11 @@ def _flops(case: Case) -> int | None:
 def _drawn(compared: Sequence[Compared]) -> Any:
     from ambjax.pictures import comparison
 
-    shown = [
-        comparison.Contender(
-            one.case.name,
-            one.held,
-            np.asarray(one.columns["settled_rms_error_m"]),
-            np.asarray(one.columns["settled_rms_u_V"]),
-            one.loop.system,
-            one.loop.channel,
-            one.loop.command,
-            str(one.loop.numbers["worst_at"] or ""),
-        )
-        for one in compared
-    ]
+    shown = []
+    for one in compared:
+        errors, volts = (np.asarray(one.columns[name]) for name in ("settled_rms_error_m", "settled_rms_u_V"))
+        loop = one.loop.system, one.loop.channel, one.loop.command, str(one.loop.numbers["worst_at"] or "")
+        shown.append(comparison.Contender(one.case.name, one.held, errors, volts, *loop))
     loops = [(first_axis(one.case), one.loop.system) for one in compared]
     spans = [shown_band(case, [system] if system else []) for case, system in loops]
     span = min(low for low, _ in spans), max(high for _, high in spans)

@@ -258,17 +258,7 @@ def analyse(
     if not system.stable:
         none, no, at = Margins(*[0.0] * 6), NO_PEAK, NO_PEAK if velocity else None
         return Analysis(False, no, no, no, "D", at, none, np.nan, np.inf, poles, LoopMargins(none, none))
-    S, margins = largest(0, 0), margins_of(system)
-    return Analysis(
-        True,
-        S,
-        largest(0, 0, 1.0),
-        largest(2, 0),
-        zones.zone(S.height),
-        largest(1, 1) if velocity else None,
-        margins.smaller,
-        _stiffness(system, float(m), STATIC * low),
-        noise_gain(system, float(period)),
-        poles,
-        margins,
-    )
+    S, T, KS, at = largest(0, 0), largest(0, 0, 1.0), largest(2, 0), largest(1, 1) if velocity else None
+    stiffness, noise = _stiffness(system, float(m), STATIC * low), noise_gain(system, float(period))
+    margins = margins_of(system)
+    return Analysis(True, S, T, KS, zones.zone(S.height), at, margins.smaller, stiffness, noise, poles, margins)

@@ -71,29 +71,16 @@ def sliders(case: Case, others: list[Case]) -> list[Slider]:
     found = []
     for path, place in known.items():
         values = [float(place.value), *(float(t[path].value) for t in tables if _number(t.get(path)))]
-        low, high, log = _range(path, place, values, case)
+        shown = _range(path, place, values, case)
         meta = place.field.metadata
         least = next((x for x in (meta["above"], meta["at_least"]) if x is not None), -math.inf)
         most = math.inf if meta["at_most"] is None else meta["at_most"]
-        most = high if path == "processor.delay" else most  # the program admits no longer delay
+        most = shown[1] if path == "processor.delay" else most  # the program admits no longer delay
         grid = values[0] in edges and path.rpartition(".")[2] in ("start", "stop")
         words = meta["unit"] or UNITS.get(str(place.route[1]), ""), meta["doc"]
-        excluded = meta["above"] is not None
-        one = Slider(
-            path,
-            *words,
-            index[path],
-            values[0],
-            low,
-            high,
-            log,
-            least,
-            most,
-            excluded,
-            path == SEED or bool(meta["whole"]),
-            grid,
-        )
-        found.append(one)
+        limits = least, most, meta["above"] is not None
+        whole = path == SEED or bool(meta["whole"])
+        found.append(Slider(path, *words, index[path], values[0], *shown, *limits, whole, grid))
     order = list(GROUPS)
     return sorted(found, key=lambda one: next(k for k, prefix in enumerate(order) if one.path.startswith(prefix)))
 
