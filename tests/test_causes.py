@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import ambjax as amb
-from ambjax.cases.data_sheet import RIG
 from ambjax.cases.reader import case_from
 from ambjax.theorem import advice, sampled_report
 from ambjax.theorem.causes import NO_PART, Cause, cause_words, find_cause, parts
@@ -102,7 +101,7 @@ def changed(raw, change):
 
 
 def rig(**change):
-    return changed(tomllib.loads(RIG), {"clock": {"duration": 0.15}, "spread": None, **change})
+    return changed(tomllib.loads(amb.template("rig")), {"clock": {"duration": 0.15}, "spread": None, **change})
 
 
 def is_lost(raw):

@@ -5,37 +5,26 @@ No figure is rendered here. Factors from SI are read from the unit that an axis 
 
 import dataclasses
 import math
-import pathlib
 import re
 import types
 
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection, PolyQuadMesh, QuadMesh
-from matplotlib.figure import Figure
 
 import tuning.report.pictures as tuned
 from ambjax.commands import map as map_command
 from ambjax.ensemble.maps import PERIOD, Axis, Map
 from ambjax.pictures import fans, figures, heatmaps, histograms
-from ambjax.pictures.overview import overview
+from ambjax.pictures.overview import overview_figure
 from ambjax.pictures.thinning import BINS, thin
 from ambjax.pictures.tornado import Bar, tornado
 from ambjax.results import case_map
 from ambjax.simulation.trajectory import ALIVE, TOUCHED, Row, Trajectory
 
-NOWHERE = pathlib.Path("not-written")
 PREFIX = {"": 1.0, "m": 1e3, "µ": 1e6, "n": 1e9, "k": 1e-3, "M": 1e-6}
 # A product with a factor and a sum in another order: a few roundings.
 ROUNDING = 1e-12
-
-
-@pytest.fixture(autouse=True)
-def drawn(monkeypatch):
-    """The figures that the test would save; no file is written."""
-    kept = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: kept.append(self))
-    return kept
 
 
 def factor_of(label):
@@ -98,11 +87,11 @@ def check_curve(line, t, y, factor, span):
 
 @pytest.mark.parametrize("number", figures.PAPER_FIGURES)
 @pytest.mark.parametrize(("n", "lost_at"), [(20_001, np.inf), (500, np.inf), (20_001, 0.95991)])
-def test_a_figure_of_the_paper_shows_the_signals_of_its_run(number, n, lost_at, drawn):
+def test_a_figure_of_the_paper_shows_the_signals_of_its_run(number, n, lost_at):
     run = a_run(n, lost_at)
-    figures.paper_figure(number, run, "", NOWHERE)
+    figure = figures.paper_figure(number, run, "")
     t = np.asarray(run.rows.t)
-    for ax, panel in zip(drawn[0].axes, figures.PAPER_FIGURES[number][1], strict=True):
+    for ax, panel in zip(figure.axes, figures.PAPER_FIGURES[number][1], strict=True):
         assert factor_of(ax.get_ylabel()) == panel.factor
         for line, curve in zip(ax.lines, panel.curves, strict=False):
             check_curve(line, t, figures.signal_of(run.rows, curve.signal), panel.factor, (0, min(lost_at, t[-1])))
@@ -113,10 +102,10 @@ def test_a_figure_of_the_paper_shows_the_signals_of_its_run(number, n, lost_at, 
             np.testing.assert_array_equal(line.get_ydata(), run.rows.v_tilde[:101])
 
 
-def test_the_picture_of_the_readings_shows_their_runs(drawn):
+def test_the_picture_of_the_readings_shows_their_runs():
     runs = {"one": a_run(9600), "other": a_run(20_001, 0.03335)}
-    figures.readings(runs, "", 0.5, NOWHERE)
-    axes = np.reshape(drawn[0].axes, (2, 2))
+    figure = figures.readings(runs, "", 0.5)
+    axes = np.reshape(figure.axes, (2, 2))
     for (name, run), (upper, lower) in zip(runs.items(), axes.T, strict=True):
         assert upper.get_title(loc="left") == name
         rows, span = run.rows, (0, min(run.lost_at, run.rows.t[-1]))
@@ -131,16 +120,16 @@ def test_the_picture_of_the_readings_shows_their_runs(drawn):
 @pytest.mark.parametrize(
     ("n", "window"), [(9600, None), (20_001, None), (1500, None), (20_001, (0.03, 0.1)), (1500, (0.03, 0.1))]
 )
-def test_an_overview_shows_the_signals_of_its_run(n, window, drawn):
+def test_an_overview_shows_the_signals_of_its_run(n, window):
     run = a_run(n)
     if n == 9600:  # a signal that is 0 has no panel
         run = dataclasses.replace(run, rows=run.rows._replace(q_i=np.zeros(n)))
-    overview(run, "", NOWHERE, window)
+    figure = overview_figure(run, "", window)
     known = *figures.MOTION, *figures.FORCES, figures.ERROR, figures.AVERAGED, figures.MEASUREMENT
     known = *known, figures.COILS, figures.MAGNETIC, figures.CURRENT_DISTURBANCE
     panels = {panel.ylabel: panel for panel in known}
     t, seen = np.asarray(run.rows.t), set()
-    axes = np.reshape(drawn[0].axes, (-1, 2 if window else 3))
+    axes = np.reshape(figure.axes, (-1, 2 if window else 3))
     for row, column in np.ndindex(axes.shape):
         ax, label = axes[row, column], axes[row, column if window else 0].get_ylabel()
         if not ax.axison:  # beside the last panel of an odd number: the one above has the axis of time
@@ -179,10 +168,10 @@ def bands_of(n, seed=0):
 
 
 @pytest.mark.parametrize("n", [2, 500, 9601])
-def test_a_fan_shows_the_quantiles_of_the_members(n, drawn):
+def test_a_fan_shows_the_quantiles_of_the_members(n):
     t, bands = np.linspace(0, 0.9, n), bands_of(n)
-    fans.fan(t, {"z - r": bands}, {}, "", NOWHERE)
-    (ax,) = drawn[0].axes
+    figure = fans.fan(t, {"z - r": bands}, {}, "")
+    (ax,) = figure.axes
     factor = factor_of(ax.get_ylabel())
     for k, (low, high) in enumerate(((0, 100), (5, 95), (25, 75))):
         assert ax.collections[k].get_label() == f"{low} to {high} %"
@@ -200,27 +189,27 @@ def test_a_fan_shows_the_quantiles_of_the_members(n, drawn):
     np.testing.assert_allclose(y, factor * bands[50][np.searchsorted(t, x)], rtol=ROUNDING)
 
 
-def test_a_median_is_never_smoothed(drawn):
+def test_a_median_is_never_smoothed():
     """A motion that all members share is drawn as it is, however fast it turns."""
     t = np.linspace(0, 0.2, 499)
     values = np.sin(2 * np.pi * 540 * t) + 9 * (t > 0.1)
     values[400:] = np.nan
-    fans.fan(t, {"u": {0: values - 1e-3, 50: values, 100: values + 1e-3}}, {}, "", NOWHERE)
-    (ax,) = drawn[0].axes
+    figure = fans.fan(t, {"u": {0: values - 1e-3, 50: values, 100: values + 1e-3}}, {}, "")
+    (ax,) = figure.axes
     (line,) = ax.lines
     np.testing.assert_array_equal(line.get_xdata(), t)
     np.testing.assert_allclose(line.get_ydata(), factor_of(ax.get_ylabel()) * values, rtol=ROUNDING)
 
 
 @pytest.mark.parametrize("members", [7, 20_000])
-def test_the_number_of_survivors_excludes_the_lost_members(members, drawn):
+def test_the_number_of_survivors_excludes_the_lost_members(members):
     t = np.linspace(0, 0.99, 100)
     lost_at = np.where(np.arange(members) % 2, np.inf, 0.999 * (1 + np.arange(members)) / members)
     lost_at[-1] = 0.9999  # between the last sample and the end of the run
     stalled = np.arange(members) == members - 1
     bands = {"u": {50: np.zeros(100)}}
-    fans.fan(t, bands, {}, "", NOWHERE, lost_at=lost_at, stalled=stalled)
-    ax = drawn[0].axes[-1]
+    figure = fans.fan(t, bands, {}, "", lost_at=lost_at, stalled=stalled)
+    ax = figure.axes[-1]
     step, rug = ax.lines
     x, share = step.get_data()
     assert step.get_drawstyle() == "steps-post"
@@ -238,14 +227,14 @@ def test_the_number_of_survivors_excludes_the_lost_members(members, drawn):
 
 
 @pytest.mark.parametrize("log", [False, True])
-def test_a_histogram_counts_all_members(log, drawn):
+def test_a_histogram_counts_all_members(log):
     rng = np.random.default_rng(5)
     values = 1e-6 * (np.exp(3 * rng.normal(size=500)) if log else 1 + rng.uniform(size=500))
     lost = rng.uniform(size=500) < 0.3
     if log:
         values[7] = 0.0
-    histograms.histograms({"rms_error_m": values, "lost_at": np.where(lost, 0.1, np.inf)}, NOWHERE)
-    ax = drawn[0].axes[0]
+    figure = histograms.histogram_figure({"rms_error_m": values, "lost_at": np.where(lost, 0.1, np.inf)})
+    ax = figure.axes[0]
     assert ax.get_xscale() == ("log" if log else "linear")
     alive, dead = (patch.get_data() for patch in ax.patches)
     shown = factor_of(ax.get_xlabel()) * values
@@ -265,10 +254,10 @@ def test_a_histogram_counts_all_members(log, drawn):
     np.testing.assert_allclose([line.get_xdata()[0] for line in ax.lines], marked, rtol=ROUNDING)
 
 
-def test_a_tornado_shows_the_shares_and_their_intervals(drawn):
+def test_a_tornado_shows_the_shares_and_their_intervals():
     bars = [Bar(f"plant.{k}", share, share / 2, min(1.3 * share, 1), 0.0) for k, share in enumerate((0.2, 1.0, 0.05))]
-    tornado(bars, "rms_u_V", "", NOWHERE)
-    (ax,) = drawn[0].axes
+    figure = tornado(bars, "rms_u_V", "")
+    (ax,) = figure.axes
     names = [label.get_text() for label in ax.get_yticklabels()]
     for row, (name, patch, line) in enumerate(zip(names, ax.patches, ax.lines, strict=True)):
         one = bars[int(name[-1])]
@@ -282,7 +271,7 @@ def test_a_tornado_shows_the_shares_and_their_intervals(drawn):
 
 
 @pytest.mark.parametrize("path", ["initial.z", PERIOD])
-def test_the_cells_of_a_map_lie_at_their_coordinates(path, drawn, monkeypatch):
+def test_the_cells_of_a_map_lie_at_their_coordinates(path, monkeypatch):
     monkeypatch.setattr(case_map, "unit_of", lambda _, axis: "s" if axis.path == PERIOD else "m")
     x, y = Axis(path, np.geomspace(1e-5, 1e-3, 3), True), Axis("initial.z_dot", np.array([1.0, 2.0, 3.0, 4.0]))
     survival = np.arange(12.0).reshape(4, 3) / 11
@@ -290,8 +279,8 @@ def test_the_cells_of_a_map_lie_at_their_coordinates(path, drawn, monkeypatch):
     one = Map(x, y, survival, survival - 0.05, survival + 0.05, error, 0 * error, 0 * survival, 0 * survival, 100)
     other = one._replace(survival=survival[::-1], low=survival[::-1] - 0.05, high=survival[::-1], error=None)
     case = types.SimpleNamespace(name="the case", cascade=None, scenario=None)
-    map_command._draw([case, case], [one, other], NOWHERE)
-    axes = drawn[0].axes[:3]
+    figure = map_command._drawn([case, case], [one, other])
+    axes = figure.axes[:3]
     for ax, shown in zip(axes, (survival, survival[::-1], error), strict=True):
         (mesh,) = (c for c in ax.collections if isinstance(c, QuadMesh | PolyQuadMesh))
         wanted = 100 * shown if shown is not error else 1e6 * error
@@ -306,17 +295,17 @@ def test_the_cells_of_a_map_lie_at_their_coordinates(path, drawn, monkeypatch):
         assert ax.get_xscale() == "log"
         assert ax.get_xlim() == (corners[0, 0, 0], corners[0, -1, 0])
         assert ax.get_ylim() == (corners[0, 0, 1], corners[-1, 0, 1])
-    bar = drawn[0].axes[-1]
+    bar = figure.axes[-1]
     assert "µm" in bar.get_ylabel()
     np.testing.assert_allclose(bar.get_ylim(), 1e6 * np.array([np.nanmin(error), np.nanmax(error)]), rtol=ROUNDING)
 
 
-def test_the_outlines_of_a_map_follow_the_confidence_bounds(drawn):
+def test_the_outlines_of_a_map_follow_the_confidence_bounds():
     x, y = np.arange(4.0), np.arange(3.0)
     survival, low, high = (np.tile(np.arange(4) >= k, (3, 1)).astype(float) for k in (2, 3, 1))
     panel = heatmaps.MapPanel("", x, y, survival, low, high, None)
-    heatmaps.maps([panel], "x", "y", False, False, NOWHERE)
-    outlines = [c for c in drawn[0].axes[0].collections if isinstance(c, LineCollection)]
+    figure = heatmaps.map_figure([panel], "x", "y", False, False)
+    outlines = [c for c in figure.axes[0].collections if isinstance(c, LineCollection)]
     places = [{float(segment[0, 0]) for segment in one.get_segments()} for one in outlines]
     assert places == [{2.5}, {2.5}, {0.5}, {0.5}, {1.5}, {1.5}]  # each a line on its white seam
 

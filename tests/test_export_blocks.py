@@ -15,7 +15,7 @@ from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.codegen.c99.source import Origin
 from ambjax.codegen.fmi.cross_check import run_block
-from ambjax.codegen.of_case import block_of, blocks_of
+from ambjax.codegen.of_case import WHAT, block_of
 from ambjax.codegen.plant_step import plant_of
 from ambjax.codegen.series import series
 from ambjax.codegen.trace import arguments
@@ -54,7 +54,7 @@ CASES = {
 
 @functools.cache
 def blocks(name):
-    return blocks_of(*CASES[name])
+    return {what: block_of(what, *CASES[name]) for what in WHAT}
 
 
 @pytest.mark.slow

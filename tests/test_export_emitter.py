@@ -59,8 +59,7 @@ def compiled(function, to, folder, count):
     with precision(to):
         refs = [program.input(Location("input", name), dtype) for name in "ab"]
         results = traced(program, function, (jnp.ones((), dtype), jnp.ones((), dtype)), refs)
-    order = sorted(n for n in program.needed(results) if program.nodes[n].op != "input")
-    text = Statements(program, order, to, "amb")
+    text = Statements(program, program.order(results), to, "amb")
     lines = ["#include <math.h>", f"typedef {to} amb_real;", "typedef struct { amb_real a, b; } amb_input;"]
     lines += [*text.helpers(), "void amb(const amb_input *input, amb_real *y) {", *text.body()]
     lines += [f"    y[{k}] = {text.operand(x)};" for k, x in enumerate(results)] + ["}"]

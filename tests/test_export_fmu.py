@@ -18,7 +18,7 @@ from ambjax.codegen.c99.source import Origin
 from ambjax.codegen.fmi.archive import packed, sources
 from ambjax.codegen.fmi.cross_check import files_of
 from ambjax.codegen.fmi.description import description, exponents, variables
-from ambjax.codegen.of_case import block_of, blocks_of
+from ambjax.codegen.of_case import WHAT, block_of
 from ambjax.codegen.series import series
 from ambjax.codegen.trace import trace
 from ambjax.codegen.twins import LoopCase, horizons
@@ -150,7 +150,8 @@ def test_controller_and_plant_in_a_loop_equal_simulate(version, name, tmp_path):
     else:
         cascade, scenario, clock = rig()
         clock = clock.with_method(block_of("plant", *rig()).method)
-    blocks, period = blocks_of(cascade, scenario, clock), float(clock.sample_period)
+    period = float(clock.sample_period)
+    blocks = {what: block_of(what, cascade, scenario, clock) for what in WHAT}
     units = [Unit(written(tmp_path, blocks[what], version, what), tmp_path / what) for what in ("controller", "plant")]
     horizon = horizons(LoopCase(cascade, scenario, clock, 0.0), ["double"])["double"]
     count = horizon.samples

@@ -14,7 +14,7 @@ from ambjax.__main__ import main
 from ambjax.cases.template_text import template as case_template
 from ambjax.codegen.block import Block
 from ambjax.codegen.javascript.script import HELPERS, script, script_of
-from ambjax.codegen.of_case import blocks_of
+from ambjax.codegen.of_case import block_of
 from ambjax.codegen.points import verification_points
 from ambjax.codegen.reference import results
 from ambjax.codegen.trace import trace
@@ -71,7 +71,7 @@ const run = row => {
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["controller", "plant", "loop"])
 def test_one_step_equals_jax(what, tmp_path):
-    traced = trace(blocks_of(*CASES["rig"])[what], "double")
+    traced = trace(block_of(what, *CASES["rig"]), "double")
     at = verification_points(traced, 1000)
     rows = np.concatenate([at.parameters, at.state, [at.started], at.inputs]).T
     found = run_rows(script(traced, "block") + STEP, rows, tmp_path).T

@@ -18,6 +18,7 @@ from ambjax.linear.rotor_modes import modes_of, springs_critical
 from ambjax.linear.unbalance_response import UnbalanceResponse, critical_speeds, separation, unbalance_response
 from ambjax.pictures.machine_pictures import machine_sensitivity_picture
 from ambjax.pictures.run_up_picture import waterfall
+from ambjax.pictures.style import save
 from ambjax.results.machine_run import simulate_machine
 
 MASS, I_T, I_P, HALF = 3.0, 0.1, 0.04, 0.25
@@ -59,7 +60,7 @@ def test_an_unstable_machine_has_no_peaks_no_zones_and_no_verdict_by_api(tmp_pat
     text = campbell.unbalance_text(weak, response, critical_speeds(response, (50.0, 90.0)), (50.0, 90.0))
     assert "not judged by A1" in text
     assert "um" not in text
-    machine_sensitivity_picture([found], (3.0, 4.0, 5.0), tmp_path / "S.png", "x")
+    save(machine_sensitivity_picture([found], (3.0, 4.0, 5.0), "x"), tmp_path / "S.png")
     assert campbell.ranges(np.arange(5.0), np.array([True, False, True, True, True])) == "0, 2 to 4"
 
 

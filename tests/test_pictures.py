@@ -14,8 +14,9 @@ from matplotlib.text import Text
 
 from ambjax.__main__ import main
 from ambjax.pictures import fans, figures, heatmaps, histograms
-from ambjax.pictures.overview import overview
+from ambjax.pictures.overview import overview_figure
 from ambjax.pictures.scales import AXIS_UNITS, LABELS, axis_of, label_of, prefix_of
+from ambjax.pictures.style import save
 from ambjax.pictures.tornado import Bar, tornado
 from ambjax.simulation import orders
 from ambjax.simulation.metrics import UNITS, Metrics
@@ -27,11 +28,11 @@ PERCENTS = (0, 5, 25, 50, 75, 95, 100)
 @pytest.fixture(autouse=True)
 def drawn(monkeypatch):
     """The saved figures, which the tests can still inspect. Each file has a low resolution to save time."""
-    kept, save = [], Figure.savefig
+    kept, savefig = [], Figure.savefig
 
     def keep(self, path, **options):
         kept.append(self)
-        save(self, path, **options | {"dpi": 40})
+        savefig(self, path, **options | {"dpi": 40})
 
     monkeypatch.setattr(Figure, "savefig", keep)
     return kept
@@ -99,7 +100,7 @@ def test_labels_keep_text_that_is_not_a_unit(label, size, factor, shown):
 def test_fan_charts_of_special_cases(tmp_path, values, lost_at):
     # one member: all bands alike; NaN: no member left
     bands = {"u": dict.fromkeys(PERCENTS, values)}
-    fans.fan(np.linspace(0, 1, 9), bands, {"u": 2.0}, "hard", tmp_path / "fan.png", lost_at=lost_at)
+    save(fans.fan(np.linspace(0, 1, 9), bands, {"u": 2.0}, "hard", lost_at), tmp_path / "fan.png")
 
 
 @pytest.mark.parametrize(
@@ -118,18 +119,18 @@ def test_fan_charts_of_special_cases(tmp_path, values, lost_at):
 @pytest.mark.parametrize("all_lost", [False, True])
 def test_histograms_of_special_cases(tmp_path, drawn, values, all_lost):
     columns = {"lost_at": np.full(len(values), 0.1 if all_lost else np.inf), "rms_error_m": values}
-    histograms.histograms(columns, tmp_path / "h.png")
+    save(histograms.histogram_figure(columns), tmp_path / "h.png")
     shown = drawn[0].axes[0].patches[-1].get_data().values.sum()
     in_range = np.isfinite(values) & ((values > 0) | (drawn[0].axes[0].get_xscale() == "linear"))
     assert shown == in_range.sum()  # no value falls out of the last bin
 
 
 def test_tornado_charts_of_special_cases(tmp_path, drawn):
-    tornado([Bar("plant.m", 0.0, 0.0, 1.0, 0.0)], "rms_u_V", "nothing explains it", tmp_path / "a.png")
-    tornado([Bar("plant.m", 1.0, 1.0, 1.0, -1.0)], "lost_at_s", "all", tmp_path / "b.png")
+    save(tornado([Bar("plant.m", 0.0, 0.0, 1.0, 0.0)], "rms_u_V", "nothing explains it"), tmp_path / "a.png")
+    save(tornado([Bar("plant.m", 1.0, 1.0, 1.0, -1.0)], "lost_at_s", "all"), tmp_path / "b.png")
     assert any("falls with it" in words.get_text() for words in drawn[1].findobj(Text))
     with pytest.raises(ValueError, match="no drivers"):
-        tornado([], "rms_u_V", "", tmp_path / "c.png")
+        tornado([], "rms_u_V", "")
 
 
 def a_panel(survival, error=None, x=None):
@@ -157,15 +158,14 @@ ALL = np.ones((3, 4))
 )
 def test_maps_of_special_cases(tmp_path, survival, error):
     panels = [a_panel(survival, error), a_panel(0.5 * survival, None)]
-    heatmaps.maps(panels, "std (m)", "period (s)", True, False, tmp_path / "m.png", error_metric="rms_error_m")
+    save(heatmaps.map_figure(panels, "std (m)", "period (s)", True, False, "rms_error_m"), tmp_path / "m.png")
 
 
-def test_maps_refuse_empty_panels_and_zeros_on_a_log_axis(tmp_path):
+def test_maps_refuse_empty_panels_and_zeros_on_a_log_axis():
     with pytest.raises(ValueError, match="no panels"):
-        heatmaps.maps([], "", "", False, False, tmp_path / "m.png")
+        heatmaps.map_figure([], "", "", False, False)
     with pytest.raises(ValueError, match="log axis cannot show"):
-        heatmaps.maps([a_panel(ALL, x=np.arange(4.0))], "x", "y", True, False, tmp_path / "m.png")
-    assert not (tmp_path / "m.png").exists()
+        heatmaps.map_figure([a_panel(ALL, x=np.arange(4.0))], "x", "y", True, False)
 
 
 # ---------------------------------------------------------------- runs
@@ -185,7 +185,7 @@ def columns(figure):
 
 
 def test_a_short_transient_is_enlarged(tmp_path, drawn):
-    overview(a_run(), "a run", tmp_path / "o.png")
+    save(overview_figure(a_run(), "a run"), tmp_path / "o.png")
     whole, start, end = columns(drawn[0])[1]
     assert whole.get_xlim() == (0.0, pytest.approx(1.9999))
     # down to 2 % of the peak after 3.9 ms, thrice of which is seen
@@ -199,32 +199,32 @@ def test_a_short_transient_is_enlarged(tmp_path, drawn):
 @pytest.mark.parametrize(("code", "words"), [(TOUCHED, "lost at 0.01 s"), (STALLED, "not decided from 0.01 s")])
 def test_a_loss_ends_the_picture_shortly_after_and_is_distinguished_from_a_stall(tmp_path, drawn, code, words):
     run = a_run(lost_at=0.01, code=code)
-    overview(run, "lost", tmp_path / "o.png")
+    save(overview_figure(run, "lost"), tmp_path / "o.png")
     whole, start, end = columns(drawn[0])[0]
     assert whole.get_title(loc="left").startswith(words)
     assert whole.get_xlim() == (0.0, pytest.approx(0.0115))
     assert start.get_xlim()[1] <= 0.01 / 3
     assert end.get_xlim() == (pytest.approx(0.008), pytest.approx(0.0103))
-    figures.paper_figure(3, run, "regulation", tmp_path / "f.png")
+    save(figures.paper_figure(3, run, "regulation"), tmp_path / "f.png")
     assert [text.get_text().split("\n")[0] for ax in drawn[1].axes for text in ax.texts] == [words]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("samples", "lost_at"), [(1, 0.0), (1, np.inf), (3, 1.5e-4)])
 def test_runs_of_few_samples_are_drawn(tmp_path, samples, lost_at):
-    overview(a_run(samples=samples, lost_at=lost_at, code=TOUCHED), "tiny", tmp_path / "o.png")
+    save(overview_figure(a_run(samples=samples, lost_at=lost_at, code=TOUCHED), "tiny"), tmp_path / "o.png")
 
 
 def test_the_panels_of_the_whole_run_have_the_scale_of_the_settled_part(tmp_path, drawn):
     t = 1e-4 * np.arange(20_000)
     z = 1e-4 * np.exp(-t / 1e-3) + 2e-7 * np.sin(300 * t)
-    overview(a_run(z=z), "lift-off", tmp_path / "o.png", settle=0.1)
+    save(overview_figure(a_run(z=z), "lift-off", settle=0.1), tmp_path / "o.png")
     whole, start, _ = columns(drawn[0])[0]
     assert whole.get_title(loc="left") == "whole run (axis: values after 0.1 s)"
     assert whole.get_ylim() == (pytest.approx(-0.2 * 1.24, rel=1e-3), pytest.approx(0.2 * 1.24, rel=1e-3))  # um
     assert start.get_ylim()[1] > 99.0
     lost = a_run(z=z, lost_at=1.0, code=TOUCHED)
-    overview(lost, "lost", tmp_path / "o.png", settle=0.1)
+    save(overview_figure(lost, "lost", settle=0.1), tmp_path / "o.png")
     assert columns(drawn[1])[0, 0].get_ylim()[1] > 99.0
 
 

@@ -16,8 +16,8 @@ import pytest
 from texts import write
 
 from ambjax.__main__ import main, parser
-from ambjax.cases.data_sheet import RIG
 from ambjax.cases.reader import read_case
+from ambjax.cases.template_text import template
 from ambjax.commands import study_report
 from ambjax.ensemble import replay as replaying
 from ambjax.ensemble.batching import run_ensemble
@@ -45,7 +45,7 @@ def changed(text, changes):
     return text
 
 
-CASE = changed(RIG, CHANGES)
+CASE = changed(template("rig"), CHANGES)
 SEED, MEMBERS = 3, 66
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -58,7 +58,7 @@ def study_of(text, members=MEMBERS):
 def no_pictures(patch):
     """Drawing takes longer than these runs."""
     patch.setattr(study_report, "_pictures", lambda *_: None)
-    patch.setattr("ambjax.pictures.overview.overview", lambda *_: None)
+    patch.setattr("ambjax.commands.simulate.drawn", lambda *_: None)
 
 
 def commands(text):

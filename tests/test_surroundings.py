@@ -21,6 +21,7 @@ from ambjax.host.lock import LOCK, locked
 from ambjax.host.sealed import write_whole
 from ambjax.host.streams import open_streams
 from ambjax.pictures import tornado
+from ambjax.pictures.style import save
 from ambjax.results import outputs
 from tuning.__main__ import main as tune
 
@@ -174,6 +175,6 @@ def test_a_missing_device_is_reported_in_one_line(error, monkeypatch, capsys):
 def test_pictures_do_not_depend_on_a_matplotlibrc():
     bars = [tornado.Bar(**dict.fromkeys(tornado.Bar._fields, 0.5) | {"path": "plant.m"})]
     with matplotlib.rc_context({"text.usetex": True, "font.size": 30, "axes.facecolor": "red"}):
-        tornado.tornado(bars, "rms_u_V", "all", pathlib.Path("theirs.png"))
-    tornado.tornado(bars, "rms_u_V", "all", pathlib.Path("ours.png"))
+        save(tornado.tornado(bars, "rms_u_V", "all"), pathlib.Path("theirs.png"))
+    save(tornado.tornado(bars, "rms_u_V", "all"), pathlib.Path("ours.png"))
     assert pathlib.Path("theirs.png").read_bytes() == pathlib.Path("ours.png").read_bytes()

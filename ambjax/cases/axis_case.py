@@ -79,7 +79,6 @@ def as_written(message: str, raw: dict[str, Any], bearing: Table, axis: BearingA
 
 
 def _has(raw: object, keys: list[str]) -> bool:
-    """Return whether a table has the value at a path of keys."""
     return not keys or (isinstance(raw, dict) and keys[0] in raw and _has(raw[keys[0]], keys[1:]))
 
 

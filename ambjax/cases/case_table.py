@@ -27,17 +27,10 @@ def parts_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> dict[str, st
     given = {slot: getattr(scenario, slot) for slot in SLOTS}
     signals = {f"{slot} ({UNITS[slot]})": one for slot, one in given.items() if one != Constant()}
     same = _numbers_of(cascade.model) == _numbers_of(scenario.plant)
-    model = None if same else cascade.model
+    plants = {"plant": scenario.plant, "model": None if same else cascade.model}
+    beside = {"notch": cascade.notch, "processor": cascade.processor}
     world = {"rotor": scenario.rotor, "sensor": scenario.sensor, "actuator": scenario.amplifier, "stop": scenario.stop}
-    parts = {
-        "plant": scenario.plant,
-        "model": model,
-        **laws,
-        "notch": cascade.notch,
-        "processor": cascade.processor,
-        **signals,
-        **world,
-    }
+    parts = plants | laws | beside | signals | world
     parts_text = {name: _described(one) for name, one in parts.items() if one is not None}
     supply, period = float(np.max(scenario.u_max)), float(clock.sample_period)
     limit = {"supply": f"{supply:g} V"} if np.isfinite(supply) else {}

@@ -150,7 +150,6 @@ def _nominal(law: Table, kind: type[Law], actuator: Table) -> Table:
 
 
 def _linear(table: Table, files: Files) -> tuple[Law, ControllerFile]:
-    """Return the linear controller of a table, and its file."""
     law = table.record(position.LinearController, extra=("kind", "file", "output"))
     output = table.choice("output", list(OUTPUTS), OUTPUTS[0])
     found = files.controller or controller_file(table, files.folder)

@@ -18,7 +18,7 @@ from ambjax.cases.machine_trial import try_machine
 from ambjax.cases.notch_table import notch_from
 from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
 from ambjax.cases.plausibility import unresolved
-from ambjax.cases.reader import FILE, TABLES, Case, case_from, is_machine, require_file, safe_name
+from ambjax.cases.reader import FILE, TABLES, Case, case_from, is_machine, read_by, require_file, safe_name
 from ambjax.cases.rotor_numbers import fastest_rotor, widest_rotation
 from ambjax.cases.rotor_tables import (
     COORDINATES,
@@ -31,7 +31,7 @@ from ambjax.cases.rotor_tables import (
     vector,
 )
 from ambjax.cases.speed_table import MOST_SPEEDS, listed_speeds
-from ambjax.cases.table import Table, load
+from ambjax.cases.table import Table
 from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.synchronous_notch import SynchronousNotch
@@ -122,13 +122,7 @@ def warnings_of_machine(case: MachineCase, path: str | pathlib.Path) -> list[str
 
 def read_any(path: str | pathlib.Path) -> AnyCase:
     """Read and check a case file: of one axis, or of a whole machine. Raises ValueError, one line, as `read_case`."""
-    require_file("path", path)
-    path = pathlib.Path(path)
-    raw, text = load(path)
-    try:
-        return (machine_from if is_machine(raw) else case_from)(raw, path.stem, text, path.parent)
-    except ValueError as error:
-        raise ValueError(one_line(f"{path}: {error}")) from None
+    return read_by(lambda raw, *rest: (machine_from if is_machine(raw) else case_from)(raw, *rest), path)
 
 
 def machine_from(

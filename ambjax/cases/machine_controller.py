@@ -174,7 +174,6 @@ def nominal(model: Any, b: np.ndarray, kappa: np.ndarray, s_0: np.ndarray, i_0: 
 
 
 def _coordinate(top: Table, name: str, plant: dict[str, float], read: Callable[[dict, str], Case]) -> Case:
-    """Return the case of one coordinate, with the controller of the tables."""
     controller = copy.deepcopy(top.raw.get("controller", {}))
     for table, names in TABLES.items():
         own = top.table("controller").table(table)

@@ -15,7 +15,7 @@ from ambjax.world.scenario import Scenario
 OFF = "none"
 NUMBERS = ("rate", "min_speed", "max_speed")
 PHASE = leaf(
-    default=None, unit="degrees", at_least=-360.0, at_most=360.0, optional=True,
+    default=None, unit="degrees", at_least=-360.0, at_most=360.0,
     doc="phase of the response that the notch inverts; none: that of the linear loop at each speed",
 )  # fmt: skip
 

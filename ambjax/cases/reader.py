@@ -3,8 +3,8 @@
 import dataclasses
 import pathlib
 import re
-from collections.abc import Hashable
-from typing import Any
+from collections.abc import Callable, Hashable
+from typing import Any, TypeVar
 
 import jax
 
@@ -34,6 +34,8 @@ from ambjax.world.coils import TwoCoil
 from ambjax.world.iron import Iron
 from ambjax.world.plant import Plant
 from ambjax.world.scenario import Scenario
+
+T = TypeVar("T")
 
 PLANTS: dict[str, type] = {"lumped": Plant, "two-coil": TwoCoil}
 TABLES = [
@@ -116,11 +118,16 @@ def read_case(path: str | pathlib.Path) -> Case:
 
     Raises ValueError, one line, if `path` is not a path, if the file cannot be read, or if any part of it is invalid.
     """
+    return read_by(case_from, path)
+
+
+def read_by(parse: Callable[[dict[str, Any], str, str, pathlib.Path], T], path: str | pathlib.Path) -> T:
+    """Return parse(tables, name, text, folder) of the case file at `path`. Raises ValueError as `read_case` does."""
     require_file("path", path)
     path = pathlib.Path(path)
     raw, text = load(path)
     try:
-        return case_from(raw, path.stem, text, path.parent)
+        return parse(raw, path.stem, text, path.parent)
     except ValueError as error:
         raise ValueError(one_line(f"{path}: {error}")) from None
 

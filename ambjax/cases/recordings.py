@@ -64,15 +64,12 @@ class Recordings:
         file = (self.folder / written).resolve()
         try:
             found = READERS[file.suffix.lower()](file)
+            return RecordedFile(key, written, file, _checked(*_chosen(found, columns)))
         except OSError as error:
             why = (
                 f"{file} cannot be read ({error.strerror or error}). A path is relative to the folder of the case file"
             )
             raise refuse(f"{why}.") from None
-        except ValueError as error:
-            raise refuse(f"{error}") from None
-        try:
-            return RecordedFile(key, written, file, _checked(*_chosen(found, columns)))
         except ValueError as error:
             raise refuse(f"{error}") from None
 

@@ -34,7 +34,7 @@ def rotor_places(rotor: Rotor, names: Sequence[str]) -> dict[str, Place]:
         "rotor.I_t": Place((), I_T, M[3, 3]),
         "rotor.I_p": Place((), I_P, G[3, 4]),
     }
-    numbers = numbers_in(rotor, "rotor")
+    numbers = dict(numbers_in(rotor, "rotor", ()))
     # a table of speeds has no rate of its own
     table |= {path: numbers[path] for path in SPEED[: 1 if rotor.changes else 2]}
     w = np.sqrt(np.diag(K)[RIGID::2] / np.diag(M)[RIGID::2])

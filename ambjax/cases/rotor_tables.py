@@ -143,7 +143,6 @@ def _places(top: Table) -> list[float]:
 
 
 def _section(table: Table, begin: float, common: Table, sleeve: bool = False) -> Section:
-    """Return a section of the shaft, or a sleeve."""
     table.only(["length", "diameter", "inner_diameter", *MATERIAL, *(["at"] if sleeve else [])])
     material = [table.leaf(name, field, common.leaf(name, field, field.default)) for name, field in MATERIAL.items()]
     outer, inner = needed(table, "diameter", DIAMETER), table.leaf("inner_diameter", INNER, 0.0)

@@ -29,8 +29,3 @@ def block_of(what: str, cascade: Cascade, scenario: Scenario, clock: Clock) -> B
         method = choose_method(cascade, scenario, period, reverse=True)
     plant = plant_of(cascade, scenario, period, method)
     return plant if what == "plant" else loop_of(controller, plant)
-
-
-def blocks_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> dict[str, Block]:
-    """Return all blocks of a case by name. Raises ValueError as `block_of` does."""
-    return {what: block_of(what, cascade, scenario, clock) for what in WHAT}

@@ -268,15 +268,7 @@ def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object
             "method is then RK4, unless clock.method names another."
         )
     resolved = cascade.on_processor()
-    machine = PlantParameters(
-        scenario.plant,
-        scenario.sensor,
-        scenario.amplifier,
-        scenario.stop,
-        scenario.initial,
-        scenario.u_max,
-        scenario.clearance,
-        resolved.timing.delay,
-    )
+    parts = scenario.plant, scenario.sensor, scenario.amplifier, scenario.stop, scenario.initial
+    machine = PlantParameters(*parts, scenario.u_max, scenario.clearance, resolved.timing.delay)
     plain = jax.tree.map(lambda x: float(x) if jnp.shape(x) == () else x, machine)
     return PlantStep(plain, float(period), resolved, method)

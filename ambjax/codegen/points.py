@@ -123,7 +123,6 @@ def _drawn(trace: Trace, random: np.random.Generator, parameters: np.ndarray) ->
 
 
 def _sizes(trace: Trace) -> list[float]:
-    """Return the scale of each state and input."""
     states, inputs = trace.block.sizes()
     return [states[k] for k in trace.keep] + inputs
 

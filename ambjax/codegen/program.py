@@ -96,6 +96,20 @@ class Program:
                 stack += [x.node for x in self.nodes[node].args if isinstance(x, Ref)]
         return seen
 
+    def order(self, outputs: Sequence[Operand]) -> list[int]:
+        """Return the numbers of the nodes on which these operands depend, without inputs, in order of computation."""
+        return sorted(n for n in self.needed(outputs) if self.nodes[n].op != "input")
+
+    def used(self, before: Sequence[Ref], after: Sequence[Operand], outputs: Sequence[Operand]) -> list[int]:
+        """Return the indices of the states on which `outputs` depend, in this step or in a later one."""
+        used: list[int] = []
+        while True:
+            needed = self.needed([*outputs, *(after[k] for k in used)])
+            more = [k for k, ref in enumerate(before) if ref.node in needed]
+            if more == used:
+                return used
+            used = more
+
     def evaluate(self, inputs: Mapping[int, np.ndarray]) -> list[np.ndarray]:
         """Return the value of every node, computed with NumPy. `inputs`: values of the input nodes, of one shape."""
         values: list[np.ndarray] = []

@@ -65,7 +65,7 @@ class Trace:
 
     def order(self) -> list[int]:
         """Return the numbers of the nodes that become statements, in ascending order."""
-        return sorted(n for n in self.program.needed(self.roots()) if self.program.nodes[n].op != "input")
+        return self.program.order(self.roots())
 
     def counts(self) -> Counter:
         """Return the number of operations of each kind in a step."""
@@ -124,7 +124,7 @@ def _traced(block: Block, to: str, read: frozenset[str]) -> Trace:
     after, started = results[: len(states)], results[len(states)]
     outputs, bits = results[len(states) + 1 : -len(block.bits)], results[-len(block.bits) :]
     at = refs[len(parameters) :]
-    keep = _used(program, at[: len(states)], after, [*outputs, *bits, started])
+    keep = program.used(at[: len(states)], after, [*outputs, *bits, started])
     seen = program.needed([*outputs, *bits, started, *(after[k] for k in keep)])
     input_refs = at[len(states) + 1 : -1]
     return Trace(
@@ -144,14 +144,3 @@ def _traced(block: Block, to: str, read: frozenset[str]) -> Trace:
         keep,
         refs,
     )
-
-
-def _used(program: Program, before: list[Ref], after: list[Operand], roots: list[Operand]) -> list[int]:
-    """Return the indices of the states on which `roots` depend, in this step or in a later one."""
-    keep: set[int] = set()
-    while True:
-        seen = program.needed([*roots, *(after[k] for k in keep)])
-        more = {k for k, ref in enumerate(before) if ref.node in seen}
-        if more == keep:
-            return sorted(keep)
-        keep = more

@@ -130,7 +130,6 @@ def deviation(found: np.ndarray, should: np.ndarray, tiny: float) -> np.ndarray:
 
 
 def _looped(precision: str, found: closed_loop.LoopComparison) -> Check:
-    """Return the check of the closed loop over its horizon."""
     name, horizon = "closed loop, dz", found.horizon
     count, samples = horizon.samples, horizon.signals["z"].size
     if not horizon.decisive:

@@ -20,7 +20,7 @@ from ambjax.linear.unbalance_response import (
     critical_speeds,
     unbalance_response,
 )
-from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
+from ambjax.results.outputs import directory, drawn, files, plain, table, write_json, written
 from ambjax.text.web_page import escape_markdown, markdown_table, render_page
 
 PICTURES = ("campbell.png", "rotor.png", "unbalance.png")
@@ -120,7 +120,6 @@ def operating_range(case: MachineCase) -> tuple[float, float]:
 def _unbalance(
     case: MachineCase, found: UnbalanceResponse, criticals: list[CriticalSpeed], operating: tuple[float, float]
 ) -> dict[str, object]:
-    """Return the response to unbalance as plain data."""
     limit, largest = _vibration(found, operating)
     return {
         "operating_rpm": list(operating),
@@ -169,20 +168,17 @@ def _pictures(case: MachineCase, analysed: tuple, found: UnbalanceResponse | Non
     from ambjax.pictures.rotor_pictures import rotor_picture, unbalance_picture
 
     speeds, modes, criticals, springs = analysed
-    described("campbell.png", lambda: campbell_picture(case.name, speeds, modes, part / "campbell.png"))
+    drawn(part / "campbell.png", lambda: campbell_picture(case.name, speeds, modes))
     operating = operating_range(case)
     if springs is None:
         return
     point = next(turning_machines(case.machine, case.clock.sample_period, operating[1:]))
-    drawn = [mode for mode in modes_of(point, case.machine.rotor) if mode.name != "axial" and mode.damping < DAMPED]
-    light = [mode for mode in drawn if mode.damping < LIGHT]
-    picture = part / "rotor.png"
-    described(
-        picture.name, lambda: rotor_picture(case.name, drawing_of(case), light or drawn, springs, operating[1], picture)
-    )
+    bent = [mode for mode in modes_of(point, case.machine.rotor) if mode.name != "axial" and mode.damping < DAMPED]
+    light = [mode for mode in bent if mode.damping < LIGHT]
+    shown = light or bent
+    drawn(part / "rotor.png", lambda: rotor_picture(case.name, drawing_of(case), shown, springs, operating[1]))
     if found is not None and np.isfinite(found.sensors).any():  # stable at a speed
-        path = part / "unbalance.png"
-        described(path.name, lambda: unbalance_picture(case, found, criticals, operating, path))
+        drawn(part / "unbalance.png", lambda: unbalance_picture(case, found, criticals, operating))
 
 
 def unbalance_text(

@@ -178,7 +178,6 @@ def _delays_differ(case: Case, results: OnProcessor, loop: Mapping[str, Any]) ->
 
 
 def _processor_summary(results: OnProcessor, differs: str) -> Summary:
-    """Return the summary of the results on the processor."""
     sampled, margin, unknown = results
     laws = [dataclasses.asdict(law) | {"holds": law.holds} for law in sampled.laws]
     return {

@@ -10,6 +10,7 @@ from ambjax.cases.reader import Case
 from ambjax.cases.warned import idealised
 from ambjax.linear.stability import Findings
 from ambjax.results.outputs import table
+from ambjax.text.words import number
 from ambjax.theorem import advice
 from ambjax.theorem.conditions import Condition, Report
 from ambjax.theorem.sampled_report import Delays, SampledReport
@@ -138,23 +139,10 @@ def details(checked: Checked, full: bool) -> list[str]:
 def _conditions(conditions: list[Condition]) -> str:
     """Return the table of conditions. One that is only informative has no verdict."""
     verdicts = {True: "holds", False: "FAILS", None: ""}
-
-    def number(x: float | None) -> str:
-        return "-" if x is None else f"{x:.5g}"
-
-    rows = [
-        (
-            c.requires,
-            number(c.gain),
-            number(c.against),
-            number(c.margin),
-            c.unit,
-            f"{c.at_s:.5g}",
-            verdicts[c.holds],
-            c.note,
-        )
-        for c in conditions
-    ]
+    rows = []
+    for c in conditions:
+        sides = [number(x, 5) for x in (c.gain, c.against, c.margin)]
+        rows.append((c.requires, *sides, c.unit, number(c.at_s, 5), verdicts[c.holds], c.note))
     head = ("condition", "left", "right", "margin", "unit", "at (s)", "verdict", "note")
     columns = len(head) - (not any(row[-1] for row in rows))  # without an empty column of notes
     return table(head[:columns], [row[:columns] for row in rows])
@@ -181,8 +169,8 @@ def _laws(sampled: SampledReport) -> str:
 
 
 def _bands(sampled: SampledReport) -> str:
-    def number(x: float | None) -> str:
-        return "-" if x is None else "none" if math.isinf(x) else f"{x:.4g}"
+    def limit(x: float | None) -> str:
+        return "none" if x is not None and math.isinf(x) else number(x)
 
     if not sampled.bands:
         return "No bands, because every run ends early."
@@ -191,7 +179,7 @@ def _bands(sampled: SampledReport) -> str:
             b.signal,
             b.unit,
             "the case's" if b.noise else "none",
-            *map(number, (b.gain, b.disturbance, b.band, b.difference, b.bound, b.largest)),
+            *map(limit, (b.gain, b.disturbance, b.band, b.difference, b.bound, b.largest)),
             b.note,
         )
         for b in sampled.bands

@@ -34,7 +34,7 @@ from ambjax.page.html_page import check_processor, pages
 from ambjax.results.case_export import guarded_for
 from ambjax.results.machine_study import MachineStudy
 from ambjax.results.operating import MEMBERS, operating_point, sensitivity, shown_band, spread_peaks
-from ambjax.results.outputs import described, directory, files, plain, write_json, written
+from ambjax.results.outputs import described, directory, drawn, files, plain, write_json, written
 from ambjax.results.spread_runs import study_of
 from ambjax.text.web_page import render_page
 
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     summary, compared = _comparison(cases, studies, notes)
     with files(out) as part:
         write_json(part / "compare.json", summary)
-        described("compare.png", lambda: _draw(compared, part / "compare.png"))
+        drawn(part / "compare.png", lambda: _drawn(compared), 110)
         described("compare.html", lambda: _write_html(summary, part))
         for name, html in html_pages.items():
             (part / name).write_text(html, encoding="utf-8")
@@ -147,7 +147,6 @@ def _studies(cases: Sequence[AnyCase], seed: int | None, members: int) -> list[S
 
 
 def _read(paths: Sequence[str]) -> list[AnyCase]:
-    """Read the cases."""
     _check_count(len(paths), "case file")
     for path in paths:
         same = [other for other in paths if pathlib.Path(other).resolve() == pathlib.Path(path).resolve()]
@@ -244,23 +243,15 @@ def _flops(case: Case) -> int | None:
         return None
 
 
-def _draw(compared: Sequence[Compared], path: pathlib.Path) -> None:
+def _drawn(compared: Sequence[Compared]) -> Any:
     from ambjax.pictures import comparison
 
-    shown = [
-        comparison.Contender(
-            one.case.name,
-            one.held,
-            np.asarray(one.columns["settled_rms_error_m"]),
-            np.asarray(one.columns["settled_rms_u_V"]),
-            one.loop.system,
-            one.loop.channel,
-            one.loop.command,
-            str(one.loop.numbers["worst_at"] or ""),
-        )
-        for one in compared
-    ]
+    shown = []
+    for one in compared:
+        errors, volts = (np.asarray(one.columns[name]) for name in ("settled_rms_error_m", "settled_rms_u_V"))
+        loop = one.loop.system, one.loop.channel, one.loop.command, str(one.loop.numbers["worst_at"] or "")
+        shown.append(comparison.Contender(one.case.name, one.held, errors, volts, *loop))
     loops = [(first_axis(one.case), one.loop.system) for one in compared]
     spans = [shown_band(case, [system] if system else []) for case, system in loops]
     span = min(low for low, _ in spans), max(high for _, high in spans)
-    comparison.comparison(shown, compared[0].case.zones.limits, span, path)
+    return comparison.comparison_figure(shown, compared[0].case.zones.limits, span)

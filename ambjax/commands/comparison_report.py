@@ -153,7 +153,6 @@ def _values(one: Compared, first: Compared) -> dict[str, object]:
 
 
 def _axis(one: Compared, axis: str) -> dict[str, object]:
-    """Return the numbers of an axis of a machine."""
     numbers = {key: one.of(f"{axis}.{metric}", reduce) for key, (metric, reduce) in AXIS_METRICS.items()}
     return {**numbers, **one.loop.axes.get(axis, {})}
 

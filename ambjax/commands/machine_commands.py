@@ -17,7 +17,7 @@ from ambjax.linear.margins import Margins
 from ambjax.page.rotor_motion import motion_page
 from ambjax.results import operating
 from ambjax.results.machine_run import simulate_machine
-from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
+from ambjax.results.outputs import described, directory, drawn, files, plain, table, write_json, written
 from ambjax.simulation.machine_kinds import SampledMachine
 from ambjax.world.rotation import PER_MINUTE
 
@@ -60,16 +60,16 @@ def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]
     metrics = plain(run.metrics) | {
         "lost_why": run.lost_why, "method": str(case.clock.method), "settle_s": case.settle,
     }  # fmt: skip
-    from ambjax.pictures.machine_pictures import machine_picture
+    from ambjax.pictures.machine_pictures import machine_figure
     from ambjax.pictures.run_up_picture import run_up_picture
 
     with files(out) as part:
         run.save(part / "trajectory.npz")
         write_json(part / "metrics.json", metrics)
         title = f"{case.name}: {case.clock.method}"
-        described("overview.png", lambda: machine_picture(case, run.signals, title, part / "overview.png"))
+        drawn(part / "overview.png", lambda: machine_figure(case, run.signals, title))
         if np.ptp(run.signals["speed_rpm"]) > 0:
-            described("runup.png", lambda: run_up_picture(case, run.signals, part / "runup.png"))
+            drawn(part / "runup.png", lambda: run_up_picture(case, run.signals))
         page = described("motion.html", lambda: motion_page(case, run.signals)) if radial_axes(case) else None
         if page is not None:
             (part / "motion.html").write_text(page, encoding="utf-8")
@@ -96,8 +96,8 @@ def sensitivity(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summa
 
     with files(out) as part:
         write_json(part / "sensitivity.json", summary)
-        path = part / "sensitivity.png"
-        described(path.name, lambda: machine_sensitivity_picture(points, case.zones.limits, path, case.name, measured))
+        limits, path = case.zones.limits, part / "sensitivity.png"
+        drawn(path, lambda: machine_sensitivity_picture(points, limits, case.name, measured))
         names = [name for name in ANALYSED if (part / name).exists()]
     if not args.json:
         print(sensitivity_text(points, measured, case.zones))
@@ -175,7 +175,6 @@ def once_per_revolution(point: MachineSensitivity) -> list[tuple[list[Summary], 
 
 
 def _margins(margins: Margins) -> dict[str, float]:
-    """Return the margins as plain data."""
     return {
         "gain_low": margins.gm_low, "gain_high": margins.gm_high, "phase_deg": margins.pm,
         "delay_s": margins.delay, "disk": margins.dm,

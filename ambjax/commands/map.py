@@ -2,7 +2,6 @@
 
 import argparse
 import itertools
-import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,7 +13,7 @@ from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.maps import CERTAIN, GRIDS, Map, grid
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.results.case_map import is_stable, labels, panel, study_and_axes
-from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
+from ambjax.results.outputs import described, directory, drawn, files, plain, table, write_json, written
 
 WRITTEN = ("map.png", "map.json")
 
@@ -34,7 +33,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
                 maps.append(grid(study, x, y, is_stable))
         summary = {"cases": [_summary(case, one) for case, one in zip(cases, maps, strict=True)], "out": str(out)}
         write_json(part / "map.json", summary)
-        described("map.png", lambda: _draw(cases, maps, part / "map.png"))
+        drawn(part / "map.png", lambda: _drawn(cases, maps), 150)
         names = [name for name in WRITTEN if (part / name).exists()]
     if not args.json:
         print(described("the table", lambda: _text(cases, maps)) or "")
@@ -88,11 +87,11 @@ def _confidence_note(one: Map) -> str:
     return f"{runs}: too few for a confidence statement about a cell; give --members {enough} or more"
 
 
-def _draw(cases: Sequence[AnyCase], maps: list[Map], path: pathlib.Path) -> None:
+def _drawn(cases: Sequence[AnyCase], maps: list[Map]) -> Any:
     from ambjax.pictures import heatmaps
 
     panels = [panel(case, one) for case, one in zip(cases, maps, strict=True)]
-    heatmaps.maps(panels, *labels(cases[0], maps[0]), path)
+    return heatmaps.map_figure(panels, *labels(cases[0], maps[0]))
 
 
 def _summary(case: AnyCase, one: Map) -> Mapping[str, object]:

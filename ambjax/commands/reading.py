@@ -19,23 +19,13 @@ def read_with_warnings(path: str | pathlib.Path) -> Case:
 def read_any_with_warnings(path: str | pathlib.Path) -> AnyCase:
     """Read the case file of one axis, as `read_with_warnings` does, or of a whole machine."""
     case = read_any(path)
-    if isinstance(case, Case):
-        print_warnings(case, path)
-    else:
-        print_laws(case, path)
-        for warning in warnings_of_machine(case, path):
-            say(warning)
+    print_warnings(case, path)
     return case
 
 
-def print_laws(case: AnyCase, path: str | pathlib.Path) -> None:
-    """Print the custom laws of a case on stderr, one line each."""
+def print_warnings(case: AnyCase, path: str | pathlib.Path) -> None:
+    """Print the custom laws and the warnings of a case on stderr, one line each."""
     for law in case.own_laws:
         say(one_line(f"{path}: {law}"))
-
-
-def print_warnings(case: Case, path: str | pathlib.Path) -> None:
-    """Print the custom laws and the warnings of a case on stderr, one line each."""
-    print_laws(case, path)
-    for warning in warnings_of_file(case, path):
+    for warning in warnings_of_file(case, path) if isinstance(case, Case) else warnings_of_machine(case, path):
         say(warning)

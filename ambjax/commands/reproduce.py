@@ -16,7 +16,8 @@ from ambjax.host.heartbeat import say
 from ambjax.paper import ledger
 from ambjax.paper.evidence import Evidence, gather
 from ambjax.pictures import figures
-from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
+from ambjax.pictures.style import save
+from ambjax.results.outputs import described, directory, drawn, files, plain, table, write_json, written
 
 Summary = dict[str, object]
 # Labels of the tuned readings in readings.png.
@@ -28,7 +29,8 @@ def _paper_figures(reading: str, evidence: Evidence, out: pathlib.Path) -> None:
     folder.mkdir(exist_ok=True)
     for number, (name, _) in figures.PAPER_FIGURES.items():
         title = f"Figure {number}: {name}, {reading} reading, {'under' if reading in paper.NOISY else 'no'} noise"
-        figures.paper_figure(number, getattr(evidence, name).trajectory, title, folder / f"figure_{number}.png")
+        figure = figures.paper_figure(number, getattr(evidence, name).trajectory, title)
+        save(figure, folder / f"figure_{number}.png", 150)
 
 
 def _names() -> Iterator[str]:
@@ -85,7 +87,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         words = f"the paper's noise (std {std:.2g} m on z), {paper.SUPPLY:g} V"
         words = f"Tracking on a 10 kHz processor with a delay of one sample, under {words}"
         shown = {str(SHOWN_AS.get(name, name)): one.on_processor[True].trajectory for name, one in evidence.items()}
-        described("readings.png", lambda: figures.readings(shown, words, paper.SETTLE, part / "readings.png"))
+        drawn(part / "readings.png", lambda: figures.readings(shown, words, paper.SETTLE))
         claims, noise = ledger.judge_claims(evidence), ledger.noise_table(evidence)
         processor = ledger.processor_table(evidence)
         page = ledger.ledger_markdown(claims, noise, processor, sensitivity)

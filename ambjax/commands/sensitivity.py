@@ -1,7 +1,7 @@
 """`ambjax sensitivity`: sensitivity peaks, ISO 14839-3 zones, margins and stiffness of a case's loop."""
 
 import argparse
-import pathlib
+from typing import Any
 
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reach import largest
@@ -25,7 +25,7 @@ from ambjax.results.operating import (
     shown_band,
     spread_peaks,
 )
-from ambjax.results.outputs import described, directory, files, plain, write_json, written
+from ambjax.results.outputs import described, directory, drawn, files, plain, write_json, written
 from ambjax.results.spread_runs import study_of
 
 WRITTEN = ("sensitivity.json", "sensitivity.png")
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     summary["running_speed"], lines = running_facts(speeds, first.system, first.analysis.S)
     with files(out) as part:
         write_json(part / "sensitivity.json", summary)
-        described("sensitivity.png", lambda: _draw(case, points, spread, measured, part / "sensitivity.png"))
+        drawn(part / "sensitivity.png", lambda: _drawn(case, points, spread, measured), 110)
         names = [name for name in WRITTEN if (part / name).exists()]
     if not args.json:
         tables = described("the table", lambda: text_of(case, points, spread, measured)) or ""
@@ -122,13 +122,7 @@ def _study(case: Case, args: argparse.Namespace) -> Study | None:
     return study_of(case, args.seed, MEMBERS if args.members is None else args.members)
 
 
-def _draw(
-    case: Case,
-    points: list[OperatingPoint],
-    spread: SpreadPeaks | None,
-    measured: Injections | None,
-    path: pathlib.Path,
-) -> None:
+def _drawn(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None, measured: Injections | None) -> Any:
     from ambjax.pictures import frequency
 
     shown = [point for point in points if point.analysis.stable]
@@ -142,4 +136,4 @@ def _draw(
     if one is not None and one.S is not None and one.T is not None and one.KS is not None:
         injected_points = frequency.MeasuredPoints(one.frequency, one.S, one.T, one.KS)
     span = shown_band(case, [point.system for point in shown])
-    frequency.sensitivity_picture(case.name, loops, case.zones.limits, span, path, injected_points)
+    return frequency.frequency_figure(case.name, loops, case.zones.limits, span, injected_points)

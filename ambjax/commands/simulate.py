@@ -18,7 +18,7 @@ from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.replay import Replay, replay
 from ambjax.ensemble.study import Study
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
-from ambjax.results.outputs import described, directory, files, plain, table, write_json, written
+from ambjax.results.outputs import directory, drawn, files, plain, table, write_json, written
 from ambjax.results.runs import simulate
 from ambjax.simulation.metrics import UNITS
 from ambjax.simulation.trajectory import Trajectory
@@ -66,17 +66,17 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     }
     if replayed is not None:
         metrics["trajectory_deviation"] = replayed.deviation
-    from ambjax.pictures.overview import overview
+    from ambjax.pictures.overview import overview_figure
     from ambjax.pictures.run_up_picture import order_picture
 
     rotor = case.scenario.rotor
     with files(out) as part:
         trajectory.save(part / "trajectory.npz")
         write_json(part / "metrics.json", metrics)
-        title, path = f"{case.name}: {case.clock.method}", part / "overview.png"
-        described(path.name, lambda: overview(trajectory, title, path, window, case.settle))
+        title = f"{case.name}: {case.clock.method}"
+        drawn(part / "overview.png", lambda: overview_figure(trajectory, title, window, case.settle))
         if rotor is not None and rotor.acceleration != 0:
-            described("runup.png", lambda: order_picture(trajectory, rotor, title, part / "runup.png"))
+            drawn(part / "runup.png", lambda: order_picture(trajectory, rotor, title))
         for name, page in html.items():
             (part / name).write_text(page, encoding="utf-8")
         names = [name for name in names if (part / name).exists()]

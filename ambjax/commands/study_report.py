@@ -14,8 +14,8 @@ from ambjax.ensemble.study import AnyStudy, Study
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.linear import Findings, stability_of, suspects
 from ambjax.results.machine_study import MachineStudy
-from ambjax.results.outputs import described, files, plain, table, write_json, written
-from ambjax.text.words import one_line
+from ambjax.results.outputs import described, drawn, files, plain, table, write_json, written
+from ambjax.text.words import number, one_line
 
 # Files written with members.npz; the last one only if the case has a spread and a member survives.
 WRITTEN = ("summary.json", "fan.png", "histograms.png", "tornado.png")
@@ -102,21 +102,21 @@ def _pictures(
     from ambjax.pictures import histograms
 
     if isinstance(case, Case) and isinstance(study, Study):
-        described("fan.png", lambda: _fan(case, study, columns, out / "fan.png"))
-    described("histograms.png", lambda: histograms.histograms(columns, out / "histograms.png"))
+        drawn(out / "fan.png", lambda: _fan(case, study, columns), 150)
+    drawn(out / "histograms.png", lambda: histograms.histogram_figure(columns))
     if summary is not None and summary["drivers"][statistics.DECIDING]:  # there are none if no member survives
-        described("tornado.png", lambda: _tornado(summary, out / "tornado.png"))
+        drawn(out / "tornado.png", lambda: _tornado(summary), 150)
 
 
-def _tornado(summary: dict[str, Any], path: pathlib.Path) -> None:
+def _tornado(summary: dict[str, Any]) -> Any:
     from ambjax.pictures import tornado
 
     deciding = statistics.DECIDING
     bars = [tornado.Bar(*(d[k] for k in tornado.Bar._fields)) for d in summary["drivers"][deciding]]
-    tornado.tornado(bars, deciding, summary["explained"][deciding]["says"], path)
+    return tornado.tornado(bars, deciding, summary["explained"][deciding]["says"])
 
 
-def _fan(case: Case, study: Study, columns: dict[str, np.ndarray], path: pathlib.Path) -> None:
+def _fan(case: Case, study: Study, columns: dict[str, np.ndarray]) -> Any:
     from ambjax.pictures import fans
 
     lost_at = columns["lost_at"]
@@ -126,7 +126,7 @@ def _fan(case: Case, study: Study, columns: dict[str, np.ndarray], path: pathlib
     few = np.size(bands.trajectory.lost_at)
     title = case.name if few == study.members else f"{case.name}: bands of {few} of {study.members} members"
     limits = {"z - r": float(np.min(study.scenario.touchdown)), "u": float(np.min(study.scenario.u_max))}
-    fans.fan(bands.t, shown, limits, title, path, lost_at=lost_at, stalled=columns["stalled"])
+    return fans.fan(bands.t, shown, limits, title, lost_at=lost_at, stalled=columns["stalled"])
 
 
 def _quantiles(x: np.ndarray, extremes: tuple[np.ndarray, np.ndarray] | None) -> dict[float, np.ndarray]:
@@ -154,9 +154,6 @@ def study_tables(summary: dict[str, Any], stable: str = "") -> str:
         lines += [f"{summary['lost']} lost, {summary['stalled']} not decided: {why}"]
     lines += [stable] * bool(stable)
     lines += [f"note: {note}" for note in summary["notes"]]
-
-    def number(x: float | None) -> str:
-        return "-" if x is None else f"{x:.4g}"
 
     if summary["survivors"]:
         rows = []

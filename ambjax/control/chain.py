@@ -135,7 +135,6 @@ class FilterChain(PositionLaw[ChainState]):
         return sliding_variable(c, motion, reference)
 
     def _parts(self) -> list[Biquad]:
-        """Return the parts after the PID."""
         parts = [
             lead_lag(self.w_z, self.w_p),
             notch(self.w_1, self.width_1, self.depth_1),
@@ -144,7 +143,6 @@ class FilterChain(PositionLaw[ChainState]):
         return parts if self.w_lp is None else [*parts, low_pass(self.w_lp)]
 
     def _biquads(self, state: ChainState) -> list[tuple[Biquad, tuple[Array, Array]]]:
-        """Return the parts after the PID, each with its state."""
         return list(zip(self._parts(), [x for x in state[2:] if x], strict=True))
 
     def __call__(

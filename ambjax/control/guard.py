@@ -21,7 +21,7 @@ GAPS, CURRENTS, BEYOND = 2.0, 100.0, 1.1
 
 
 def _limit(unit: str, doc: str, least: float = 1e-30) -> Any:
-    return leaf(default=None, unit=unit, at_least=least, at_most=1e30, optional=True, doc=doc)
+    return leaf(default=None, unit=unit, at_least=least, at_most=1e30, doc=doc)
 
 
 class Watch(NamedTuple):
@@ -79,7 +79,6 @@ class Guard:
         at_least=1,
         at_most=1_000_000,
         whole=True,
-        optional=True,
         doc="largest number of successive predictions; none: 1/(pole T); in this time, an error grows by the factor e",
     )
 

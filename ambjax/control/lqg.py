@@ -23,7 +23,6 @@ class LqgWeights:
         unit="m",
         above=0,
         at_most=1.0,
-        optional=True,
         doc="displacement at a sensor that costs as much as `current`; none: s_0/400",
     )
     current: Scalar | None = leaf(
@@ -31,7 +30,6 @@ class LqgWeights:
         unit="A",
         above=0,
         at_most=1e6,
-        optional=True,
         doc="current, and the command that changes it in 1/w, w the pole of the magnets; none: i_0/10",
     )
     noise: Scalar | None = leaf(
@@ -39,7 +37,6 @@ class LqgWeights:
         unit="m",
         above=0,
         at_most=1.0,
-        optional=True,
         doc="noise of a reading, and that of a current as a share of `current`; none: s_0/2000",
     )
     force: Scalar | None = leaf(
@@ -47,7 +44,6 @@ class LqgWeights:
         unit="N",
         above=0,
         at_most=1e9,
-        optional=True,
         doc="force at each magnet, another one in each sample; none: that of the current i_0",
     )
     drift: Scalar | None = leaf(
@@ -55,7 +51,6 @@ class LqgWeights:
         unit="N/s",
         above=0,
         at_most=1e12,
-        optional=True,
         doc="change of the constant force at each magnet in a second; none: 0.03 w times `force`",
     )
     bending: Scalar = leaf(

@@ -45,12 +45,7 @@ class Complementary(Observer[Array]):
     analytic = True
     l: Scalar = gain(default=10.6, unit="1/s", doc="corner between velocity and position sensor; left out: w/50")
     z_hat: Scalar | None = leaf(
-        default=None,
-        unit="m",
-        at_least=-1.0,
-        at_most=1.0,
-        optional=True,
-        doc="initial estimate; none: the first measurement",
+        default=None, unit="m", at_least=-1.0, at_most=1.0, doc="initial estimate; none: the first measurement"
     )
     memory = (("z_hat", "m", "estimate of the displacement"),)
 

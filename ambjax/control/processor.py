@@ -50,7 +50,6 @@ class Processor:
         unit="samples",
         at_least=0,
         at_most=MOST_DELAY,
-        optional=True,
         doc="delay that the prediction assumes; none: the true delay",
     )
     guard: Guard | None = part(default=Guard(), doc="guard of the readings; None: every reading is accepted")

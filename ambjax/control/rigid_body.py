@@ -13,16 +13,12 @@ from ambjax.control.cascade_state import CascadeState, Sample
 from ambjax.control.machine_law import Demanded, MachineInputs, MachineLaw
 from ambjax.control.schedule import extremes, with_gains_at
 from ambjax.control.stages import ForceDemand, begin_law
-from ambjax.numerics.records import leaf, part, record
+from ambjax.numerics.records import leaf, matrix, part, record
 from ambjax.numerics.runge_kutta import rk4_step
 from ambjax.numerics.small_matrices import times
 from ambjax.world.plant import State
 from ambjax.world.sensor import Measurement
 from ambjax.world.waveforms import Reference
-
-
-def _matrix(shape: str, doc: str) -> Any:
-    return leaf(shape=shape, at_least=-1e30, at_most=1e30, doc=doc)
 
 
 class RigidState(NamedTuple):
@@ -49,14 +45,14 @@ class RigidBody(MachineLaw):
     """
 
     laws: Cascade = part(doc="observer, position law and nominal plant of each coordinate", channels=True)
-    from_sensors: Array = _matrix("n c", "C_r^+: coordinates per reading")
-    at_sensors: Array = _matrix("c n", "C_r: displacements at the sensors per coordinate")
-    at_magnets: Array = _matrix("c n", "B_r: displacements at the magnets per coordinate")
-    accelerations: Array = _matrix("n c", "accelerations of the coordinates per acceleration of each axis")
-    weights: Array = _matrix("c", "weight per mass of each axis, m/s^2")
-    forces: Array = _matrix("c n", "scaled forces of the magnets, A^2/m^2, per acceleration of each coordinate")
+    from_sensors: Array = matrix("n c", "C_r^+: coordinates per reading")
+    at_sensors: Array = matrix("c n", "C_r: displacements at the sensors per coordinate")
+    at_magnets: Array = matrix("c n", "B_r: displacements at the magnets per coordinate")
+    accelerations: Array = matrix("n c", "accelerations of the coordinates per acceleration of each axis")
+    weights: Array = matrix("c", "weight per mass of each axis, m/s^2")
+    forces: Array = matrix("c n", "scaled forces of the magnets, A^2/m^2, per acceleration of each coordinate")
     gyroscopic: Array | None = leaf(
-        default=None, shape="n n", at_least=-1e30, at_most=1e30, optional=True,
+        default=None, shape="n n", at_least=-1e30, at_most=1e30,
         doc="M^-1 G: gyroscopic accelerations to compensate, per speed (rad/s) and rate; none: no compensation",
     )  # fmt: skip
 

@@ -1,13 +1,11 @@
 """Linear controllers of a whole machine, with several inputs and outputs."""
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from ambjax.control.machine_law import Demanded, MachineInputs, MachineLaw, demand_of
-from ambjax.numerics.records import leaf, record, static
+from ambjax.numerics.records import matrix, record, static
 from ambjax.numerics.small_matrices import times
 from ambjax.numerics.smooth import limited
 from ambjax.world.rotation import PER_MINUTE
@@ -15,10 +13,6 @@ from ambjax.world.sensor import Measurement
 
 # Inputs of a controller with c axes: the errors r - y; r and y; or r - y and the measured currents.
 ERROR, BOTH, CURRENTS = INPUTS = ("error", "both", "currents")
-
-
-def _matrix(shape: str, doc: str) -> Any:
-    return leaf(shape=shape, at_least=-1e30, at_most=1e30, doc=doc)
 
 
 @record
@@ -32,21 +26,21 @@ class StateSpaceLaw(MachineLaw):
     With inversion.Linearised, the reference of the current law of each axis is the output, or output/R for a voltage.
     """
 
-    A: Array = _matrix("s n n", "state matrices")
-    B: Array = _matrix("s n m", "input matrices")
-    C: Array = _matrix("s c n", "output matrices")
-    D: Array = _matrix("s c m", "matrices from inputs to outputs")
-    E: Array = _matrix("s n c", "anti-windup: what the limit of the command removes")
-    a: Array = _matrix("s n", "constant terms of the states")
-    b: Array = _matrix("s c", "constant terms of the outputs")
-    steady: Array = _matrix("n m", "states at the start per input")
-    start: Array = _matrix("n", "constant terms of the states at the start")
-    sizes: Array = _matrix("n", "characteristic sizes of the states")
-    speeds: Array = _matrix("s", "speeds of the designs in ascending order, rpm")
-    dv_dz: Array = _matrix("c", "slopes of the scaled forces of the linear magnets, A^2/m^3")
-    dv_di: Array = _matrix("c", "the same per current, A/m^2")
-    resting: Array = _matrix("c", "currents that carry the weight, A")
-    resistance: Array = _matrix("c", "commands per current: 1, or the resistance for outputs in V")
+    A: Array = matrix("s n n", "state matrices")
+    B: Array = matrix("s n m", "input matrices")
+    C: Array = matrix("s c n", "output matrices")
+    D: Array = matrix("s c m", "matrices from inputs to outputs")
+    E: Array = matrix("s n c", "anti-windup: what the limit of the command removes")
+    a: Array = matrix("s n", "constant terms of the states")
+    b: Array = matrix("s c", "constant terms of the outputs")
+    steady: Array = matrix("n m", "states at the start per input")
+    start: Array = matrix("n", "constant terms of the states at the start")
+    sizes: Array = matrix("n", "characteristic sizes of the states")
+    speeds: Array = matrix("s", "speeds of the designs in ascending order, rpm")
+    dv_dz: Array = matrix("c", "slopes of the scaled forces of the linear magnets, A^2/m^3")
+    dv_di: Array = matrix("c", "the same per current, A/m^2")
+    resting: Array = matrix("c", "currents that carry the weight, A")
+    resistance: Array = matrix("c", "commands per current: 1, or the resistance for outputs in V")
     inputs: str = static(default=ERROR, doc="inputs of the controller")
     output: str = static(default="current", doc="its outputs: current or voltage")
 

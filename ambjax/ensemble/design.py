@@ -90,7 +90,6 @@ def _sobol(seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
 
 
 def _latin_hypercube(seed: int, dims: int, members: np.ndarray, total: int) -> np.ndarray:
-    """Return points of a Latin hypercube of `total` members."""
     if total * dims > MOST_LATIN:
         raise ValueError(
             f'design = "latin-hypercube": {total:,} members of {dims} quantities exceed the {MOST_LATIN:,} '

@@ -106,19 +106,7 @@ def grid(study: AnyStudy, x: Axis, y: Axis, stable: StabilityTest | None = None)
     median[held] = np.nanmedian(np.where(ended, np.nan, error)[held], axis=-1)
     counts = np.sum(ended & ~stalled, axis=-1), np.sum(stalled, axis=-1)
     paths = tuple(path for path, _ in _entries(study, (x.path, y.path)))
-    return Map(
-        x,
-        y,
-        survival.value,
-        survival.low,
-        survival.high,
-        median,
-        *counts,
-        unstable,
-        study.members,
-        bool(paths) or study.random,
-        paths,
-    )
+    return Map(x, y, *survival, median, *counts, unstable, study.members, bool(paths) or study.random, paths)
 
 
 def with_method_for_axes(study: Study, x: Axis, y: Axis) -> Study:

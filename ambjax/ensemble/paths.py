@@ -42,9 +42,9 @@ def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
     """
     table: dict[str, Place] = {}
     for stage in ("model", "observer", "position", "inversion", "current"):
-        table |= _below(getattr(cascade, stage), f"controller.{stage}", (0, stage))
-    table |= _below(cascade.processor, "processor", (0, "processor"))
-    notch = _below(cascade.notch, "controller.notch", (0, "notch"))
+        table |= numbers_in(getattr(cascade, stage), f"controller.{stage}", (0, stage))
+    table |= numbers_in(cascade.processor, "processor", (0, "processor"))
+    notch = numbers_in(cascade.notch, "controller.notch", (0, "notch"))
     table |= {path: place for path, place in notch if "rotor" not in place.route}  # that of the scenario replaces it
     names = {
         "plant": "plant",
@@ -58,13 +58,13 @@ def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
     acting = [slot for slot in ("q_z", "q_v", "q_f") if not _absent(getattr(scenario, slot))] or ["q_z"]
     names |= {f"disturbance.{slot if len(acting) > 1 else 'q_z'}": slot for slot in acting}
     for path, name in names.items():
-        table |= _below(getattr(scenario, name), path, (1, name))
+        table |= numbers_in(getattr(scenario, name), path, (1, name))
     if scenario.rotor is not None and scenario.rotor.changes:  # a table of speeds has no rate of its own
         table = {path: x for path, x in table.items() if path == "rotor.speed" or not path.startswith("rotor.")}
     fields = {field.name: field for field in dataclasses.fields(scenario)}
     for path, name in (("actuator.u_max", "u_max"), ("run.clearance", "clearance")):
         table[path] = Place((1, name), fields[name], getattr(scenario, name))
-    for path, place in _below(scenario.stop, "run.stop", (1, "stop")):
+    for path, place in numbers_in(scenario.stop, "run.stop", (1, "stop")):
         table[path.replace("stop.", "stop_")] = place
     return table
 
@@ -74,11 +74,11 @@ def _absent(signal: object) -> bool:
     return signal is None or (isinstance(signal, Constant) and not is_traced(signal.value) and not np.any(signal.value))
 
 
-def _below(node: object, path: str, route: tuple[int | str, ...]) -> Iterator[tuple[str, Place]]:
-    """Yield every number in a record and its nested records, by dotted path."""
+def numbers_in(node: object, path: str, route: tuple[int | str, ...]) -> Iterator[tuple[str, Place]]:
+    """Yield every number in a record and its nested records. `path`, `route`: dotted path and `Place.route` of it."""
     if isinstance(node, tuple):
         for index, item in enumerate(node):
-            yield from _below(item, f"{path}.{index}", (*route, index))
+            yield from numbers_in(item, f"{path}.{index}", (*route, index))
     if not dataclasses.is_dataclass(node):
         return
     for field in dataclasses.fields(node):
@@ -94,7 +94,7 @@ def _below(node: object, path: str, route: tuple[int | str, ...]) -> Iterator[tu
         elif field.metadata.get("leaf"):
             yield at[0], Place(at[1], field, value)
         else:
-            yield from _below(value, *at)
+            yield from numbers_in(value, *at)
     if hasattr(node, "shifted"):
         yield f"{path}.{SHIFT}", Place((*route, SHIFT), TIME, 0.0)
 
@@ -138,7 +138,7 @@ def with_values(cascade: Cascade, scenario: Scenario, values: Mapping[str, objec
     """Return the cascade and scenario with the numbers at these paths replaced. Shifts are applied last."""
     known, world = places(cascade, scenario), (cascade, scenario)
     for path in sorted(values, key=lambda path: known[path].route[-1] == SHIFT):
-        world = _set(world, known[path].route, values[path])
+        world = with_number(world, known[path].route, values[path])
     return world
 
 
@@ -148,8 +148,8 @@ def _get(node: Any, route: tuple[int | str, ...]) -> Any:
     return node
 
 
-def _set(node: Any, route: tuple[int | str, ...], value: Any) -> Any:
-    """Return the record, tuple or array `node` with the number at `route` replaced."""
+def with_number(node: Any, route: tuple[int | str, ...], value: Any) -> Any:
+    """Return the record, tuple or array `node` with the number at the route of a `Place` replaced."""
     if not route:
         return value
     step, *rest = route
@@ -157,16 +157,6 @@ def _set(node: Any, route: tuple[int | str, ...], value: Any) -> Any:
         return node.shifted(value)
     if isinstance(step, int):
         if isinstance(node, tuple):
-            return (*node[:step], _set(node[step], tuple(rest), value), *node[step + 1 :])
+            return (*node[:step], with_number(node[step], tuple(rest), value), *node[step + 1 :])
         return with_entry(node, route, value)
-    return replaced(node, **{step: _set(getattr(node, step), tuple(rest), value)})
-
-
-def numbers_in(node: object, path: str) -> dict[str, Place]:
-    """Return every number in a record and its nested records by dotted path. `path`: of the record."""
-    return dict(_below(node, path, ()))
-
-
-def with_number(node: Any, route: tuple[int | str, ...], value: Any) -> Any:
-    """Return the record `node` with the number at the route of a `Place` of `numbers_in` replaced."""
-    return _set(node, route, value)
+    return replaced(node, **{step: with_number(getattr(node, step), tuple(rest), value)})

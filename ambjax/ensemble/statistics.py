@@ -140,7 +140,6 @@ def _as_dict(estimate: Estimate) -> dict[str, float | None]:
 
 
 def _metrics(metrics: Mapping[str, np.ndarray], seed: int, confidence: float) -> dict[str, object]:
-    """Return the statistics of each metric, with intervals, by name."""
     finite = [name for name, x in metrics.items() if x.size and np.isfinite(x).all()]
     intervals = bootstrap([metrics[name] for name in finite], ALPHA, confidence, seed) if finite else {}
     nothing = Estimate(np.inf, np.inf, np.inf)

@@ -51,7 +51,6 @@ class Zones:
         unit="Hz",
         above=0,
         at_most=1e6,
-        optional=True,
         doc="highest frequency; none: 0.45 of the sampling rate, in continuous time where |S - 1| has decayed",
     )
     amplitude: Scalar | None = leaf(
@@ -59,7 +58,6 @@ class Zones:
         unit="m",
         above=0,
         at_most=1,
-        optional=True,
         doc="amplitude of the multi-sine of an injection; none: 1 % of the gap s_0",
     )
     zone_a: Scalar = leaf(
@@ -260,17 +258,7 @@ def analyse(
     if not system.stable:
         none, no, at = Margins(*[0.0] * 6), NO_PEAK, NO_PEAK if velocity else None
         return Analysis(False, no, no, no, "D", at, none, np.nan, np.inf, poles, LoopMargins(none, none))
-    S, margins = largest(0, 0), margins_of(system)
-    return Analysis(
-        True,
-        S,
-        largest(0, 0, 1.0),
-        largest(2, 0),
-        zones.zone(S.height),
-        largest(1, 1) if velocity else None,
-        margins.smaller,
-        _stiffness(system, float(m), STATIC * low),
-        noise_gain(system, float(period)),
-        poles,
-        margins,
-    )
+    S, T, KS, at = largest(0, 0), largest(0, 0, 1.0), largest(2, 0), largest(1, 1) if velocity else None
+    stiffness, noise = _stiffness(system, float(m), STATIC * low), noise_gain(system, float(period))
+    margins = margins_of(system)
+    return Analysis(True, S, T, KS, zones.zone(S.height), at, margins.smaller, stiffness, noise, poles, margins)

@@ -153,32 +153,19 @@ def injected_members(
 
 def injection_of(one: Responses, random: bool, confidence: float = 0.95) -> Injection:
     """Return the means over the members that did not lose the rotor."""
-    members = len(one.held)
-    frequency, amplitude = one.frequency, one.amplitude
     S, KS, saturated = (x[one.held] for x in (one.S, one.KS, one.saturated))
-    lost = members - len(S)
+    counts = len(one.held) - len(S), len(one.held)
+    none = Injection(one.frequency, None, None, None, None, None, None, None, *counts, one.amplitude, None)
     if not len(S):
-        return Injection(frequency, None, None, None, None, None, None, None, lost, members, amplitude, None)
+        return none
     mean = np.mean(S, axis=0)
     k = int(np.argmax(np.abs(mean)))
     peak = float(np.abs(mean[k]))
     # The component of each member's S in the direction of the mean S. Its mean is |mean S|; the mean of |S| is biased.
     along = np.real(S[:, k] * np.conj(mean[k])) / peak
     low, high = _interval(along, confidence) if random else (peak, peak)
-    return Injection(
-        frequency,
-        mean,
-        mean - 1,
-        np.mean(KS, axis=0),
-        peak,
-        low,
-        high,
-        float(frequency[k]),
-        lost,
-        members,
-        amplitude,
-        float(np.mean(saturated)),
-    )
+    peaks = {"peak": peak, "peak_low": low, "peak_high": high, "peak_frequency": float(one.frequency[k])}
+    return none._replace(S=mean, T=mean - 1, KS=np.mean(KS, axis=0), saturated=float(np.mean(saturated)), **peaks)
 
 
 def _interval(x: np.ndarray, confidence: float) -> tuple[float | None, float | None]:

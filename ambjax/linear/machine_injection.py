@@ -6,7 +6,7 @@ The multi-sine is added to the reading of the position sensor of one axis, with 
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,48 +19,14 @@ from ambjax.linear.injection import Injection, frequency_lines, injection_of
 from ambjax.linear.linear_machine import machine_rest
 from ambjax.linear.member_responses import AMPLITUDE, Responses, padded
 from ambjax.linear.multisine import FourierSums, MultiSine, Response, multisine
-from ambjax.numerics.records import Scalar, canonical, leaf, part, record, replaced
+from ambjax.numerics.records import Scalar, canonical, replaced
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.folds import Ending
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.rollout import run
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.trajectory import ALIVE
 from ambjax.simulation.whole_machine import Machine, PlantOnly, loop_of, with_loop
 from ambjax.world.waveforms import Constant
-
-
-class Readings(NamedTuple):
-    """Signals of one axis that a `Response` uses."""
-
-    z_measured: Array
-    u: Array
-
-
-# The axes of a machine share the number of samples.
-SHARED = FourierSums(None, -1, -1, 0)  # pyright: ignore[reportArgumentType]
-
-
-@record
-class MachineResponse:
-    """Fold: a `Response` for each axis. `u_max` [c]: limits of the supplies, V."""
-
-    response: Response = part(doc="the multi-sine and the samples that count")
-    u_max: Array = leaf(shape="c", unit="V", at_least=0, at_most=1e9, doc="limits of the supplies")
-
-    def init(self) -> FourierSums:
-        zero = jnp.zeros((*self.response.init().read.shape, len(self.u_max)))
-        return FourierSums(jnp.asarray(0), zero, zero, zero[0, 0])
-
-    def update(self, carry: FourierSums, row: Any, span: Any) -> FourierSums:
-        def one(carry: FourierSums, z: Array, u: Array, u_max: Array) -> FourierSums:
-            return dataclasses.replace(self.response, u_max=u_max).update(carry, Readings(z, u), span)
-
-        each = jax.vmap(one, in_axes=(SHARED, 0, 0, 0), out_axes=SHARED)
-        return each(carry, row.axes.z_measured, row.axes.u, self.u_max)
-
-    def result(self, carry: FourierSums, ending: Ending) -> FourierSums:
-        return self.response.result(carry, ending)
 
 
 class _Test(NamedTuple):
@@ -134,8 +100,7 @@ def _responses(machine: Machine, clock: Clock, tests: _Test) -> tuple[FourierSum
         rotor = dataclasses.replace(machine.rotor.without_forces(), speed=test.speed, acceleration=jnp.zeros(()))
         axes = tuple(machine.each(calm, rest, machine.split(test.sizes)))
         turning = dataclasses.replace(machine, rotor=rotor, axes=axes, start_q=point.q)
-        fold = MachineResponse(Response(test.wave, jnp.zeros(()), skip), limits)
-        outcome = run(turning, longer, fold, 0)  # pyright: ignore[reportArgumentType]
+        outcome = run(turning, longer, Response(test.wave, limits, skip), 0)  # pyright: ignore[reportArgumentType]
         return outcome.metrics, jnp.asarray(outcome.trajectory.lost_code)
 
     return jax.vmap(one)(tests)

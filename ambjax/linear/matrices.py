@@ -1,6 +1,6 @@
 """Linearisation of the closed loop at an equilibrium: of the map of one sample period, or of the vector field."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,38 +32,50 @@ class HeldPlant(NamedTuple):
     path: CommandPath
 
 
+class LagState(NamedTuple):
+    """State of the plant, of the sensor's low-pass (m) and of the amplifier (V); () for a missing lag."""
+
+    plant: Any
+    z_filtered: Array | tuple[()]
+    u_a: Array | tuple[()]
+
+    def read(self, scenario: Scenario, injected: tuple[Scalar, Scalar]) -> Measurement:
+        """Return the readings plus `injected`: test signals on z (m) and z_dot (m/s)."""
+        motion = scenario.plant.measurement(self.plant)
+        if not isinstance(self.z_filtered, tuple):
+            motion = motion._replace(z=self.z_filtered)
+        return reading(scenario, motion, injected)
+
+    def lag_rates(self, scenario: Scenario, u: Array) -> tuple["LagState", Array]:
+        """Return the rates of the lags under a command u (V or A), without the plant's, and the amplifier's output."""
+        rates, bandwidth = LagState((), (), ()), scenario.sensors.bandwidth
+        if bandwidth is not None:
+            z = scenario.plant.measurement(self.plant).z
+            rates = rates._replace(z_filtered=2 * jnp.pi * bandwidth * (z - jnp.asarray(self.z_filtered)))
+        if isinstance(self.u_a, tuple):
+            return rates, u
+        return rates._replace(u_a=scenario.actuator.slope() * (u - self.u_a)), self.u_a
+
+
+def with_lags(scenario: Scenario, point: Point) -> LagState:
+    """Return the state of plant and lags at rest. `point`: an equilibrium, or the sizes of its components."""
+    low_passed, z = scenario.sensors.bandwidth is not None, scenario.plant.measurement(point.plant).z
+    return LagState(point.plant, z if low_passed else (), point.u if scenario.actuator.slow else ())
+
+
 class Lagged:
-    """The plant of a scenario with the lags of sensor and amplifier; its state is one vector [N]."""
+    """The plant of a scenario with the lags of sensor and amplifier; its state, a `LagState`, is one vector [N]."""
 
     def __init__(self, scenario: Scenario, point: Point):
         self.scenario = scenario
-        self.low_passed = scenario.sensors.bandwidth is not None
-        self.lagged = scenario.actuator.slow
-        z = scenario.plant.measurement(point.plant).z
-        lags = [z] * self.low_passed + [point.u] * self.lagged
-        self.start, self.restore = ravel_pytree((point.plant, lags))
-
-    def motion(self, x: Array) -> Measurement:
-        """Return the true motion and current in a state."""
-        return self.scenario.plant.measurement(self.restore(x)[0])
-
-    def read(self, x: Array, injected: tuple[Scalar, Scalar]) -> Measurement:
-        """Return the readings in a state plus `injected`: test signals on z (m) and z_dot (m/s)."""
-        plant, lags = self.restore(x)
-        motion = self.scenario.plant.measurement(plant)
-        return reading(self.scenario, motion._replace(z=lags[0]) if self.low_passed else motion, injected)
+        self.start, self.restore = ravel_pytree(with_lags(scenario, point))
 
     def rates(self, x: Array, u: Scalar, q_z: Scalar) -> Array:
         """Return the time derivative of the state under a command u (V or A) and a disturbance q_z (m/s^2)."""
-        (plant, lags), sensor, amplifier, lag_rates = self.restore(x), self.scenario.sensors, self.scenario.actuator, []
-        if sensor.bandwidth is not None:
-            z = self.scenario.plant.measurement(plant).z
-            lag_rates.append(2 * jnp.pi * sensor.bandwidth * (z - lags[0]))
-        if self.lagged:
-            lag_rates.append(amplifier.slope() * (u - lags[-1]))
-            u = lags[-1]
-        u = self.scenario.coil_voltage(jnp.asarray(u), plant)
-        return ravel_pytree((self.scenario.plant.rates(plant, u, q_z), lag_rates))[0]
+        state = self.restore(x)
+        rates, u = state.lag_rates(self.scenario, u)
+        u = self.scenario.coil_voltage(jnp.asarray(u), state.plant)
+        return ravel_pytree(rates._replace(plant=self.scenario.plant.rates(state.plant, u, q_z)))[0]
 
     def voltage(self, x: Array, commands: tuple[Array, ...], delay: Scalar) -> Array:
         """Return the voltage (V) of a sample: the command u_n, or for current commands the coil voltage at the sample.
@@ -72,13 +84,7 @@ class Lagged:
         """
         if self.scenario.drive != "current":
             return commands[0]
-        return self.scenario.coil_voltage(at_sample(commands, jnp.asarray(delay)), self.restore(x)[0])
-
-    def sizes(self, sizes: Point) -> Array:
-        """Return the characteristic sizes [N] of the state. `sizes`: those of a `Point`."""
-        z = self.scenario.plant.measurement(sizes.plant).z
-        lags = [z] * self.low_passed + [sizes.u] * self.lagged
-        return ravel_pytree((sizes.plant, lags))[0]
+        return self.scenario.coil_voltage(at_sample(commands, jnp.asarray(delay)), self.restore(x).plant)
 
     def held(self, point: Point, period: Scalar, delay: Scalar, kept: int) -> HeldPlant:
         """Return the linear map of one sample at the equilibrium `point`.
@@ -164,17 +170,19 @@ def _sampled(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, po
 
     def step(x: Array, w: Array) -> tuple[Array, Array]:
         at, laws, past = x[:nx], x[nx : nx + nl], tuple(x[nx + nl :])
-        measured = plant.read(at, (w[0], w[1]))
+        state = plant.restore(at)
+        measured = state.read(scenario, (w[0], w[1]))
         sample = Sample(reference, period, jnp.asarray(jnp.inf), past)
         command, after, _ = cascade.step(measured, restore(laws), sample)
         commands = jnp.stack([command.u, *past])
         moved = held.transition @ at + commands @ held.driven + held.disturbed * w[2]
         after = jnp.concatenate([moved, ravel_pytree(after)[0], commands[: len(past)]])
         u = plant.voltage(at, (command.u, *past), processor.delay)
-        return after, jnp.stack([measured.z, measured.z_dot, u, plant.motion(at).z, command.u, measured.i])
+        z = scenario.plant.measurement(state.plant).z
+        return after, jnp.stack([measured.z, measured.z_dot, u, z, command.u, measured.i])
 
     x = ravel_pytree((plant.start, laws, past))[0]
     (A, B), (C, D) = jax.jacfwd(step, (0, 1))(x, jnp.zeros(3, x.dtype))
     sizes = sizes_of(cascade, scenario, point)
-    scale = ravel_pytree((plant.sizes(sizes), sizes.control, processor.constant_past(sizes.u)))[0]
+    scale = ravel_pytree((with_lags(scenario, sizes), sizes.control, processor.constant_past(sizes.u)))[0]
     return StateSpace(A, B, C, D, scale, jnp.asarray(period), held.path)

@@ -66,6 +66,8 @@ class FourierSums(NamedTuple):
     - `sample`: number of samples so far.
     - `read`, `u` [2, L]: real and imaginary parts of the Fourier sums of the reading (m or m/s) and of u (V).
     - `saturated`: number of samples with |u| at the limit of the supply.
+
+    For a machine of c axes, they are [2, L, c] and [c].
     """
 
     sample: Array
@@ -79,7 +81,7 @@ class Response:
     """Fold: Fourier coefficients, at the frequencies of `wave`, of the reading with e (m or m/s) and of u (V).
 
     - `wave`: the multi-sine.
-    - `u_max`: limit of the supply, V.
+    - `u_max`: limit of the supply, V; [c] for the axes of a machine.
     - `skip`: number of the first sample that counts. The samples from there on are whole periods of the wave.
 
     The result is a `FourierSums` with the coefficients instead of the sums, with `sample` as the number of samples that
@@ -91,15 +93,16 @@ class Response:
     skip: int = static()
 
     def init(self) -> FourierSums:
-        zero = jnp.zeros((2, *self.wave.harmonics.shape), jnp.result_type(float))
+        zero = jnp.zeros((2, *self.wave.harmonics.shape, *jnp.shape(self.u_max)), jnp.result_type(float))
         return FourierSums(jnp.asarray(0), zero, zero, zero[0, 0])
 
     def update(self, carry: FourierSums, row: Any, span: Any) -> FourierSums:
-        angles = self.wave.angles(carry.sample)
+        angles, signals = self.wave.angles(carry.sample), getattr(row, "axes", row)
         counts = carry.sample >= self.skip
         basis = jnp.where(counts, jnp.stack([jnp.cos(angles), -jnp.sin(angles)]), 0.0)
-        read, u = carry.read + basis * row.z_measured, carry.u + basis * row.u
-        saturated = carry.saturated + (counts & (jnp.abs(row.u) >= self.u_max))
+        basis = basis.reshape(*basis.shape, *[1] * jnp.ndim(self.u_max))
+        read, u = carry.read + basis * signals.z_measured, carry.u + basis * signals.u
+        saturated = carry.saturated + (counts & (jnp.abs(signals.u) >= self.u_max))
         return FourierSums(carry.sample + 1, read, u, saturated)
 
     def result(self, carry: FourierSums, ending: Ending) -> FourierSums:

@@ -90,14 +90,9 @@ class Stability(NamedTuple):
         disagree = np.flatnonzero((self.growth * self.duration > BORDER) != self.sustained)
         disagree = [int(k) for k in disagree if np.isfinite(self.growth[k])]
         shown = min(disagree, key=lambda k: (self.stable[k], -self.swing[k]), default=None)
-        return Findings(
-            len(self.stable),
-            int(bad.sum()),
-            self.bias,
-            None if worst is None else float(self.swing[worst]),
-            None if worst is None else float(self.current[worst]),
-            None if shown is None else self._reason(shown),
-        )
+        swing, current = (None if worst is None else float(x[worst]) for x in (self.swing, self.current))
+        reason = None if shown is None else self._reason(shown)
+        return Findings(len(self.stable), int(bad.sum()), self.bias, swing, current, reason)
 
     def _reason(self, k: int) -> str:
         """Return why the linear and the simulated verdict on member k differ."""

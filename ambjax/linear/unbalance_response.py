@@ -144,7 +144,6 @@ def critical_speeds(found: UnbalanceResponse, operating: tuple[float, float]) ->
 
 
 def _peaks(found: UnbalanceResponse, axis: int, operating: tuple[float, float]) -> list[CriticalSpeed]:
-    """Return the peaks of the response of one axis."""
     speeds, size, peaks = found.speeds, np.abs(found.sensors[:, axis]), []
     for k in np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] >= size[2:])) + 1:
         N = float(speeds[k])

@@ -52,7 +52,7 @@ def leaf(
     - `at_most`: inclusive upper bound.
     - `infinite`: whether +inf is also allowed.
     - `whole`: whether only whole numbers are allowed.
-    - `optional`: whether None is allowed.
+    - `optional`: whether None is allowed. It is if None is the default.
 
     Bounds are decades beyond practical values. They ensure that a product of a few numbers neither overflows nor
     underflows to 0. Returns the dataclass field.
@@ -66,10 +66,15 @@ def leaf(
         "at_most": at_most,
         "infinite": infinite,
         "whole": whole,
-        "optional": optional,
+        "optional": optional or default is None,
         "leaf": True,
     }
     return dataclasses.field(default=default, metadata=metadata)
+
+
+def matrix(shape: str, doc: str, **more: Any) -> Any:
+    """Declare a field with a matrix or a vector of any size. The arguments are those of `leaf`."""
+    return leaf(shape=shape, at_least=-1e30, at_most=1e30, doc=doc, **more)
 
 
 # Lower (exclusive) and upper bound of all gains; 0 is allowed where it switches a term off. The bounds are wide,
@@ -89,10 +94,10 @@ def gain(
     """
     above, at_least = (None, 0.0) if zero else (GAINS[0], None)
     plain = leaf(
-        default=default, unit=unit, doc=doc, above=above, at_least=at_least, at_most=GAINS[1], infinite=steepness,
-        optional=optional,
-    )  # fmt: skip
-    return dataclasses.field(default=default, metadata={**plain.metadata, "steepness": steepness})
+        default=default, unit=unit, doc=doc, above=above, at_least=at_least, at_most=GAINS[1], infinite=steepness
+    )
+    metadata = {**plain.metadata, "steepness": steepness, "optional": optional}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 def static(default: object = dataclasses.MISSING, *, doc: str = "") -> Any:

@@ -7,34 +7,11 @@ import jax
 import numpy as np
 
 from ambjax.codegen.emitter import traced
-from ambjax.codegen.javascript.script import HELPERS, js_constant
-from ambjax.codegen.primitives import OPS
+from ambjax.codegen.javascript.script import HELPERS, Statements
 from ambjax.codegen.program import Location, Operand, Program, Ref
 
 # JavaScript definitions of the functions that the generated code calls, and that `Math` lacks or defines differently.
 PRELUDE = "\n".join(f"const {name} = {text};" for name, text in HELPERS.items())
-
-
-class Script:
-    """The nodes of a program as JavaScript. An input has the name of its location. Node 7, if not an input, is `v7`."""
-
-    def __init__(self, program: Program) -> None:
-        self.program = program
-
-    def operand(self, x: Operand) -> str:
-        """Return an operand as a JavaScript expression."""
-        if isinstance(x, Ref):
-            location = self.program.nodes[x.node].location
-            return f"v{x.node}" if location is None else location.name
-        if x.dtype.kind == "b":
-            return "true" if x else "false"
-        text = js_constant(x)
-        return f"({text})" if text.startswith("-") else text
-
-    def statements(self, order: Sequence[int]) -> list[str]:
-        """Return one `const` declaration for each node number in `order`."""
-        nodes = self.program.nodes
-        return [f"const v{n} = {OPS[nodes[n].op].javascript.format(*map(self.operand, nodes[n].args))};" for n in order]
 
 
 class Piece(NamedTuple):
@@ -72,9 +49,10 @@ def operands_of(tree: object) -> list[Any]:
     return jax.tree.leaves(tree, is_leaf=_is_ref)
 
 
-def _order(program: Program, roots: Sequence[Operand]) -> list[int]:
-    """Return the nodes on which the roots depend, without inputs, in order of computation."""
-    return sorted(n for n in program.needed(roots) if program.nodes[n].op != "input")
+def _statements(program: Program) -> Statements:
+    """Return the nodes of a program as JavaScript. An input has the name of its location; node 7 is `v7` otherwise."""
+    locations = [node.location for node in program.nodes if node.location]
+    return Statements(program, {n: f"v{n}" for n in range(len(program.nodes))}, {x: x.name for x in locations})
 
 
 def _fixed(program: Program, order: Sequence[int], given: Sequence[Operand]) -> set[int]:
@@ -94,13 +72,12 @@ def function_source(piece: Piece, name: str, arrays: Sequence[str], results: obj
     - `arrays`: for each argument of the traced function, the name of the JavaScript array that holds its leaves.
     - `results`: pytree of the operands to write.
     """
-    script, roots = Script(piece.program), operands_of(results)
-    order = _order(piece.program, roots)
+    script, roots = _statements(piece.program), operands_of(results)
     needed = piece.program.needed(roots)
     lines = [f"function {name}({', '.join(arrays)}, out) {{"]
     for array, argument in zip(arrays, piece.arguments, strict=True):
         lines += _loads(piece.program, array, operands_of(argument), needed)
-    lines += script.statements(order)
+    lines += map(script.statement, piece.program.order(roots))
     lines += [f"out[{k}] = {script.operand(x)};" for k, x in enumerate(roots)]
     return "\n".join([*lines, "return out;", "}"])
 
@@ -126,21 +103,21 @@ def loop_source(piece: Piece, name: str, shown: Sequence[Operand], always: Seque
     normal random numbers per sample. `run` writes one row per sample into `rows`, unless `rows` is null. `name(P)`
     computes the values that depend only on parameters, once.
     """
-    program, script = piece.program, Script(piece.program)
+    program, script = piece.program, _statements(piece.program)
     parameters, before = operands_of(piece.arguments[0]), operands_of(piece.arguments[1])
     after = operands_of(piece.results[0])
-    kept = _kept(program, before, after, [*shown, *always])
+    kept = program.used(before, after, [*shown, *always])
     roots = [*shown, *(after[k] for k in kept)]
-    order, needed = _order(program, roots), program.needed(roots)
+    order, needed = program.order(roots), program.needed(roots)
     fixed = _fixed(program, order, parameters)
     normals = [_name(program, x) for x in piece.arguments[2]]
     lines = [f"function {name}(P) {{", *_loads(program, "P", parameters, needed)]
-    lines += script.statements([n for n in order if n in fixed])
+    lines += [script.statement(n) for n in order if n in fixed]
     lines += ["return function run(S, from, to, W, rows) {"]
     lines += [f"let {_name(program, before[k])} = S[{k}]{_truth(program, before[k])};" for k in kept]
     lines += ["for (let n0 = from; n0 < to; n0++) {"]
     lines += [f"const {text} = W[3 * n0 + {k}];" for k, text in enumerate(normals)]
-    lines += script.statements([n for n in order if n not in fixed])
+    lines += [script.statement(n) for n in order if n not in fixed]
     if shown:
         writes = [f"rows[at + {k}] = {script.operand(x)};" for k, x in enumerate(shown)]
         lines += ["if (rows !== null) {", f"const at = {len(shown)} * n0;", *writes, "}"]
@@ -160,14 +137,3 @@ def _name(program: Program, x: Ref) -> str:
 def _truth(program: Program, x: Ref) -> str:
     """Return the text that converts a number of an array to a boolean if the input `x` is boolean; else ''."""
     return " !== 0" if program.nodes[x.node].dtype.kind == "b" else ""
-
-
-def _kept(program: Program, before: Sequence[Ref], after: Sequence[Operand], roots: Sequence[Operand]) -> list[int]:
-    """Return the indices of the states on which the roots depend, now or in a later sample."""
-    kept: set[int] = set()
-    while True:
-        needed = program.needed([*roots, *(after[k] for k in kept)])
-        more = {k for k, ref in enumerate(before) if ref.node in needed}
-        if more == kept:
-            return sorted(kept)
-        kept = more

@@ -10,19 +10,11 @@ from jax import Array
 from ambjax.cases.reader import Case
 from ambjax.codegen.trace import precision
 from ambjax.control.cascade_state import CascadeState, Sample
-from ambjax.linear.equilibrium import Point, at_rest, ideal, reading, sizes_of, start_of
+from ambjax.linear.equilibrium import at_rest, ideal, sizes_of, start_of
+from ambjax.linear.matrices import LagState, with_lags
 from ambjax.numerics.records import canonical
 from ambjax.page.functions import function_source, piece_of
 from ambjax.page.loop_functions import Numbers, loop_parameters
-from ambjax.world.scenario import Scenario
-
-
-class LagState(NamedTuple):
-    """State of the plant, of the sensor's low-pass (m) and of the amplifier (V); () for a missing lag."""
-
-    plant: Any
-    z_filtered: Array | tuple[()]
-    u_a: Array | tuple[()]
 
 
 class LoopPoint(NamedTuple):
@@ -73,7 +65,8 @@ def _start(numbers: Numbers) -> tuple[EquilibriumPoint, EquilibriumPoint]:
     numbers = _ideal(numbers)
     point = start_of(numbers.cascade, numbers.scenario, numbers.period, 0.0)
     sizes = sizes_of(numbers.cascade, numbers.scenario, point)
-    return _with_lags(numbers.scenario, point), _with_lags(numbers.scenario, sizes)
+    state, size = (with_lags(numbers.scenario, one) for one in (point, sizes))
+    return (state, point.u, point.control), (size, sizes.u, sizes.control)
 
 
 def _columns(numbers: Numbers, x: LoopPoint) -> tuple[PointValues, list[PointValues]]:
@@ -93,33 +86,16 @@ def _columns(numbers: Numbers, x: LoopPoint) -> tuple[PointValues, list[PointVal
 def _values(numbers: Numbers, x: LoopPoint) -> PointValues:
     """Return the values at a point. `numbers`: those of `_ideal`."""
     scenario = numbers.scenario
-    lagged = x.lagged
-    motion = scenario.plant.measurement(lagged.plant)
-    sensor, amplifier, lags = scenario.sensors, scenario.actuator, LagState((), (), ())
-    u = jnp.asarray(x.acting)
-    read = motion
-    if sensor.bandwidth is not None:
-        lags = lags._replace(z_filtered=2 * jnp.pi * sensor.bandwidth * (motion.z - jnp.asarray(lagged.z_filtered)))
-        read = motion._replace(z=jnp.asarray(lagged.z_filtered))
-    if amplifier.slow:
-        lags = lags._replace(u_a=amplifier.slope() * (u - jnp.asarray(lagged.u_a)))
-        u = jnp.asarray(lagged.u_a)
-    measured = reading(scenario, read, (x.e, 0.0))
+    rates, u = x.lagged.lag_rates(scenario, x.acting)
+    measured = x.lagged.read(scenario, (x.e, jnp.zeros(())))
     sample = Sample(at_rest(0.0), jnp.asarray(numbers.period), jnp.asarray(jnp.inf), x.past)
     command, control, _ = numbers.cascade.step(measured, x.control, sample)
-    return PointValues(lags._replace(plant=scenario.plant.rates(lagged.plant, u)), control, command.u, measured.z)
+    return PointValues(rates._replace(plant=scenario.plant.rates(x.lagged.plant, u)), control, command.u, measured.z)
 
 
 def _ideal(numbers: Numbers) -> Numbers:
     """Return the numbers without parts that cannot be linearised: limits, noise, converters, guard."""
     return numbers._replace(cascade=numbers.cascade.with_processor(guard=None), scenario=ideal(numbers.scenario))
-
-
-def _with_lags(scenario: Scenario, point: Point) -> EquilibriumPoint:
-    """Return an equilibrium with the states of the lags added, at rest."""
-    low_passed, z = scenario.sensors.bandwidth is not None, scenario.plant.measurement(point.plant).z
-    lags = z if low_passed else (), point.u if scenario.actuator.slow else ()
-    return LagState(point.plant, *lags), point.u, point.control
 
 
 def linear_script(case: Case) -> LinearScript:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from ambjax.cases.case_table import UNITS
 from ambjax.cases.reader import Case
 from ambjax.ensemble.paths import SHIFT, Place, places, with_values
 from ambjax.page.loop_functions import longest_delay, loop_parameters
@@ -19,8 +20,6 @@ FACTOR, SHARE = 30.0, 0.5
 # The slider of any other number without a rule in `_range` ends at this multiple of its value (of `_size` if it is 0).
 TIMES = 5.0
 SEED = "run.seed"
-# Unit of a signal's values, by the field of the scenario, for fields of signals that declare no unit.
-UNITS = {"reference": "m", "q_z": "m/s^2", "q_v": "A^2/m^2", "q_i": "A/s", "q_f": "N", "base": "m/s^2"}
 # Prefix of the paths, and title, of each group, in the order of the page.
 GROUPS = {
     "controller.": "Gains",
@@ -72,29 +71,16 @@ def sliders(case: Case, others: list[Case]) -> list[Slider]:
     found = []
     for path, place in known.items():
         values = [float(place.value), *(float(t[path].value) for t in tables if _number(t.get(path)))]
-        low, high, log = _range(path, place, values, case)
+        shown = _range(path, place, values, case)
         meta = place.field.metadata
         least = next((x for x in (meta["above"], meta["at_least"]) if x is not None), -math.inf)
         most = math.inf if meta["at_most"] is None else meta["at_most"]
-        most = high if path == "processor.delay" else most  # the program admits no longer delay
+        most = shown[1] if path == "processor.delay" else most  # the program admits no longer delay
         grid = values[0] in edges and path.rpartition(".")[2] in ("start", "stop")
         words = meta["unit"] or UNITS.get(str(place.route[1]), ""), meta["doc"]
-        excluded = meta["above"] is not None
-        one = Slider(
-            path,
-            *words,
-            index[path],
-            values[0],
-            low,
-            high,
-            log,
-            least,
-            most,
-            excluded,
-            path == SEED or bool(meta["whole"]),
-            grid,
-        )
-        found.append(one)
+        limits = least, most, meta["above"] is not None
+        whole = path == SEED or bool(meta["whole"])
+        found.append(Slider(path, *words, index[path], values[0], *shown, *limits, whole, grid))
     order = list(GROUPS)
     return sorted(found, key=lambda one: next(k for k, prefix in enumerate(order) if one.path.startswith(prefix)))
 

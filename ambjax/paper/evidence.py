@@ -202,7 +202,6 @@ def _uncertain(cascade: Cascade, reading: str) -> Uncertain:
 
 @one_kernel
 def _scan(cascade: Cascade, scenarios: Scenario, clock: Clock) -> dict[str, np.ndarray]:
-    """Return the metrics of each member."""
     fold = Metrics(0.4 * clock.duration)
     return jax.lax.map(lambda s: rollout(cascade, s, clock, fold=fold, record_every=0).metrics, scenarios)
 

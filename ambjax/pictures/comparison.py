@@ -1,7 +1,6 @@
 """The picture of a comparison: sensitivity, control effort, distribution of the error, and error against voltage."""
 
 import itertools
-import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -36,14 +35,6 @@ class Contender(NamedTuple):
     channel: int = 0
     command: int = 2
     where: str = ""
-
-
-@own_style
-def comparison(
-    cases: Sequence[Contender], limits: Sequence[float], span: tuple[float, float], path: pathlib.Path
-) -> None:
-    """Write the picture of `comparison_figure` to a file."""
-    comparison_figure(cases, limits, span).savefig(path, dpi=110)
 
 
 @own_style

@@ -1,7 +1,6 @@
 """Fan charts of ensembles, from arrays in SI units."""
 
 import math
-import pathlib
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -33,11 +32,10 @@ def fan(
     bands: Mapping[str, Mapping[float, np.ndarray]],
     limits: Mapping[str, float],
     title: str,
-    path: pathlib.Path,
     lost_at: np.ndarray | None = None,
     stalled: np.ndarray | None = None,
-) -> None:
-    """Write quantile bands over time, one panel per quantity (keys of QUANTITIES), all in SI units.
+) -> Figure:
+    """Return quantile bands over time, one panel per quantity (keys of QUANTITIES), all in SI units.
 
     `bands[quantity][percent]`: the quantile [T] at the times t [T] (s) over the members not yet lost; NaN if all are
     lost. `limits[quantity]` (> 0): drawn at plus and minus its value if the data come near it. `lost_at` [N] (s, +inf:
@@ -61,7 +59,7 @@ def fan(
     figure.suptitle(title, fontsize=11)
     handles = {label: h for ax in axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
-    figure.savefig(path, dpi=150)
+    return figure
 
 
 def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float, np.ndarray], limit: float) -> None:

@@ -1,6 +1,5 @@
 """Pictures of trajectories: panels of signals, the paper's Figures 3 to 6, the comparison of readings, phase plane."""
 
-import pathlib
 import textwrap
 from typing import NamedTuple
 
@@ -62,8 +61,8 @@ PAPER_FIGURES = {3: ("regulation", MOTION), 4: ("regulation", FORCES), 5: ("trac
 
 
 @own_style
-def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.Path) -> None:
-    """Write the paper's Figure `number`, drawn from a trajectory of its scenario."""
+def paper_figure(number: int, trajectory: Trajectory, title: str) -> Figure:
+    """Return the paper's Figure `number`, drawn from a trajectory of its scenario."""
     _, panels = PAPER_FIGURES[number]
     height = 1.6 * len(panels) + 0.9
     figure = Figure(figsize=(7.0, height))
@@ -77,12 +76,12 @@ def paper_figure(number: int, trajectory: Trajectory, title: str, path: pathlib.
     axes[-1].set_xlabel("time (s)")
     figure.align_ylabels(axes)
     figure.suptitle(title, fontsize=11, y=1 - 0.12 / height)
-    figure.savefig(path, dpi=150)
+    return figure
 
 
 @own_style
-def readings(trajectories: dict[str, Trajectory], title: str, settle: float, path: pathlib.Path) -> None:
-    """Write one picture of a scenario in all readings, one column each: position above, error below."""
+def readings(trajectories: dict[str, Trajectory], title: str, settle: float) -> Figure:
+    """Return one picture of a scenario in all readings, one column each: position above, error below."""
     figure = Figure(figsize=(4.0 * len(trajectories), 4.9), layout="constrained")
     axes = figure.subplots(2, len(trajectories), squeeze=False)
     position = POSITION._replace(curves=(Curve("z_measured", "$z$ measured", "#bbbbbb"), *POSITION.curves))
@@ -96,7 +95,7 @@ def readings(trajectories: dict[str, Trajectory], title: str, settle: float, pat
             words = f"at most {1e6 * late:.2g} µm after {settle:g} s"
             lower.annotate(words, (0.98, 0.06), xycoords="axes fraction", ha="right", fontsize=9, color=INK)
     figure.suptitle(title, fontsize=11)
-    figure.savefig(path, dpi=130)
+    return figure
 
 
 def draw_panel(

@@ -1,6 +1,5 @@
 """Pictures over frequency: sensitivity functions with zones, Nyquist curve with the disk, Bode plot, stiffness."""
 
-import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -39,19 +38,6 @@ class NamedLoop(NamedTuple):
     system: StateSpace
     m: float
     disk: float
-
-
-@own_style
-def sensitivity_picture(
-    title: str,
-    loops: Sequence[NamedLoop],
-    limits: Sequence[float],
-    span: tuple[float, float],
-    path: pathlib.Path,
-    measured: MeasuredPoints | None = None,
-) -> None:
-    """Write the picture of `frequency_figure` to a file."""
-    frequency_figure(title, loops, limits, span, measured).savefig(path, dpi=110)
 
 
 @own_style

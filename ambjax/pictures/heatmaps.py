@@ -1,6 +1,5 @@
 """Heat maps of survival and error over a grid of two quantities."""
 
-import pathlib
 from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
 
@@ -46,20 +45,6 @@ class MapPanel(NamedTuple):
     high: np.ndarray | None
     error: np.ndarray | None
     unstable: np.ndarray | None = None
-
-
-@own_style
-def maps(
-    panels: Sequence[MapPanel],
-    x_label: str,
-    y_label: str,
-    x_log: bool,
-    y_log: bool,
-    path: pathlib.Path,
-    error_metric: str = "settled_max_abs_error_m",
-) -> None:
-    """Write the picture of `map_figure` to a file."""
-    map_figure(panels, x_label, y_label, x_log, y_log, error_metric).savefig(path, dpi=150)
 
 
 @own_style

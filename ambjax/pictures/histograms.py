@@ -1,7 +1,6 @@
 """Histograms of the metrics of an ensemble, from columns in SI units."""
 
 import math
-import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -35,12 +34,6 @@ CHIEF = (
 )
 LOST = {"facecolor": RED, "edgecolor": "white", "hatch": "////", "linewidth": 0.0}
 MARKS: dict[float, tuple[Any, str, str]] = {0.5: ("-", "median", "median"), 0.95: ("--", "95 %", "95 % quantile")}
-
-
-@own_style
-def histograms(columns: Mapping[str, np.ndarray], path: pathlib.Path, metrics: Sequence[str] = CHIEF) -> None:
-    """Write the picture of `histogram_figure` to a file."""
-    histogram_figure(columns, metrics).savefig(path, dpi=130)
 
 
 @own_style

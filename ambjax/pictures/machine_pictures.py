@@ -1,6 +1,5 @@
 """Pictures of a machine: its axes over time and its orbits, and its sensitivity and poles against speed."""
 
-import pathlib
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
@@ -92,20 +91,13 @@ def orbits_of(axes: Sequence[str]) -> list[tuple[str, int, int]]:
 
 
 @own_style
-def machine_picture(case: Any, signals: dict[str, np.ndarray], title: str, path: pathlib.Path) -> None:
-    """Write `machine_figure` to a file."""
-    machine_figure(case, signals, title).savefig(path, dpi=130)
-
-
-@own_style
 def machine_sensitivity_picture(
     points: Sequence[Any],
     limits: Sequence[float],
-    path: pathlib.Path,
     title: str,
     measured: Mapping[float, Sequence[Any]] = MappingProxyType({}),
-) -> None:
-    """Write |S_kk| of every axis and the largest singular value over frequency, a panel for each speed."""
+) -> Figure:
+    """Return |S_kk| of every axis and the largest singular value over frequency, a panel for each speed."""
     shown = list(points)[:4]
     figure = Figure(figsize=(13.0, 4.6 if len(shown) < 3 else 8.2), layout="constrained")
     grid = figure.subplots(1 + (len(shown) > 2), min(len(shown), 2), squeeze=False, sharex=True, sharey=True)
@@ -142,12 +134,12 @@ def machine_sensitivity_picture(
         ax.grid(True, alpha=0.3)
         ax.legend(fontsize="small", loc="lower right")
     figure.suptitle(title)
-    figure.savefig(path, dpi=130)
+    return figure
 
 
 @own_style
-def campbell_picture(title: str, speeds: np.ndarray, modes: Sequence[Sequence[Any]], path: pathlib.Path) -> None:
-    """Write the frequencies of the modes against speed, coloured by their damping ratio, with the line of the speed.
+def campbell_picture(title: str, speeds: np.ndarray, modes: Sequence[Sequence[Any]]) -> Figure:
+    """Return the frequencies of the modes against speed, coloured by their damping ratio, with the line of the speed.
 
     Triangles up are forward modes, triangles down backward ones; unstable modes are red crosses.
     """
@@ -182,4 +174,4 @@ def campbell_picture(title: str, speeds: np.ndarray, modes: Sequence[Sequence[An
     ax.grid(True, alpha=0.3)
     figure.legend(fontsize="small", loc="outside lower center", ncols=5)
     ax.set_title(f"{title}: modes of the closed loops")
-    figure.savefig(path, dpi=130)
+    return figure

@@ -1,7 +1,6 @@
 """The overview of a run: its main signals, over the whole run, and enlarged at its start and at its end."""
 
 import itertools
-import pathlib
 from collections.abc import Collection
 
 import numpy as np
@@ -31,18 +30,6 @@ from ambjax.simulation.trajectory import STALLED, Trajectory
 
 # Largest number of reversals of a chattering voltage in the enlarged end of a run.
 TURNS = 40
-
-
-@own_style
-def overview(
-    trajectory: Trajectory,
-    title: str,
-    path: pathlib.Path,
-    window: tuple[float, float] | None = None,
-    settle: float = 0.0,
-) -> None:
-    """Write the picture of `overview_figure` to a file."""
-    overview_figure(trajectory, title, window, settle).savefig(path, dpi=130)
 
 
 @own_style

@@ -1,6 +1,5 @@
 """Pictures of a turning machine: its rotor with mode shapes, its critical speeds, and its response to unbalance."""
 
-import pathlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -24,10 +23,8 @@ SHAPES = 6
 
 
 @own_style
-def unbalance_picture(
-    case: Any, found: Any, criticals: Sequence[Any], operating: tuple[float, float], path: pathlib.Path
-) -> None:
-    """Write displacement, current and command of every radial axis against speed."""
+def unbalance_picture(case: Any, found: Any, criticals: Sequence[Any], operating: tuple[float, float]) -> Figure:
+    """Return displacement, current and command of every radial axis against speed."""
     speeds = found.speeds
     radial = [k for k, axis in enumerate(case.axes) if not axis.endswith(".z")]
     drive = case.cases[0].scenario.drive
@@ -59,15 +56,14 @@ def unbalance_picture(
     handles, labels = top.get_legend_handles_labels()
     figure.legend(handles, labels, fontsize="small", ncols=5, loc="outside lower center")
     figure.suptitle(f"{case.name}: response to the unbalance, all loops closed (green: operating speeds)")
-    figure.savefig(path, dpi=130)
+    return figure
 
 
 @own_style
 def rotor_picture(
-    title: str, drawing: Any, modes: Sequence[Any], criticals: tuple[np.ndarray, list[np.ndarray], float], speed: float,
-    path: pathlib.Path,
-) -> None:  # fmt: skip
-    """Write the rotor from the side with its planes, mode shapes of the closed loops, and the critical-speed map.
+    title: str, drawing: Any, modes: Sequence[Any], criticals: tuple[np.ndarray, list[np.ndarray], float], speed: float
+) -> Figure:
+    """Return the rotor from the side with its planes, mode shapes of the closed loops, and the critical-speed map.
 
     `drawing`: a `RotorDrawing`. `modes`: those whose shapes are drawn. `criticals`: stiffnesses (N/m), undamped
     critical speeds (rpm) at each, and |k_s| of the magnets. `speed`: rpm.
@@ -83,7 +79,7 @@ def rotor_picture(
         ax.set_xlabel("place from the centre of mass, m" if k >= len(shown) - 2 else "")
     _critical_map(figure.add_subplot(grid[:, 2]), *criticals, speed)
     figure.suptitle(f"{title}: rotor, and modes of the closed loops at {speed:g} rpm")
-    figure.savefig(path, dpi=130)
+    return figure
 
 
 def _rotor(ax: Axes, drawing: Any) -> None:

@@ -1,6 +1,5 @@
 """Pictures of a run-up or run-down, of a machine and of one axis."""
 
-import pathlib
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -46,8 +45,8 @@ def waterfall(x: np.ndarray, speed: np.ndarray, period: float) -> Waterfall:
 
 
 @own_style
-def run_up_picture(case: Any, signals: dict[str, np.ndarray], path: pathlib.Path) -> None:
-    """Write the waterfall and the orbits of each radial bearing, and largest currents and voltages against speed."""
+def run_up_picture(case: Any, signals: dict[str, np.ndarray]) -> Figure:
+    """Return the waterfall and the orbits of each radial bearing, and largest currents and voltages against speed."""
     alive = signals["t"] < float(signals["lost_at"])
     t, speed = signals["t"][alive], signals["speed_rpm"][alive]
     pairs, period = orbits_of([str(name) for name in signals["axes"]])[:3], float(t[1] - t[0])
@@ -86,7 +85,7 @@ def run_up_picture(case: Any, signals: dict[str, np.ndarray], path: pathlib.Path
         orbits.legend(fontsize="xx-small", loc="upper right")
     _limits(figure.add_subplot(grid[-1, :]), case, signals, alive)
     figure.suptitle(f"{case.name}: {speed[0]:.0f} to {speed[-1]:.0f} rpm")
-    figure.savefig(path, dpi=130)
+    return figure
 
 
 def _limits(ax: Any, case: Any, signals: dict[str, np.ndarray], alive: np.ndarray) -> None:
@@ -129,8 +128,8 @@ def once_per_turn(x: np.ndarray, turns: np.ndarray) -> np.ndarray:
 
 
 @own_style
-def order_picture(trajectory: Trajectory, rotor: Rotation, title: str, path: pathlib.Path) -> None:
-    """Write the amplitudes of position and current once per revolution against speed, one point for each turn."""
+def order_picture(trajectory: Trajectory, rotor: Rotation, title: str) -> Figure:
+    """Return the amplitudes of position and current once per revolution against speed, one point for each turn."""
     rows = trajectory.rows
     alive = np.asarray(rows.alive, bool)
     t = jnp.asarray(rows.t)[alive]
@@ -146,4 +145,4 @@ def order_picture(trajectory: Trajectory, rotor: Rotation, title: str, path: pat
         ax.grid(True, alpha=0.3)
     axes[-1].set_xlabel("speed, rpm")
     figure.suptitle(title)
-    figure.savefig(path, dpi=130)
+    return figure

@@ -1,6 +1,5 @@
 """Tornado charts: the share of a metric's variation that each spread quantity explains."""
 
-import pathlib
 import textwrap
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -28,8 +27,8 @@ class Bar(NamedTuple):
 
 
 @own_style
-def tornado(drivers: Sequence[Bar], metric: str, says: str, path: pathlib.Path) -> None:
-    """Write a chart with the share of a metric's variation that each driver explains, the largest on top.
+def tornado(drivers: Sequence[Bar], metric: str, says: str) -> Figure:
+    """Return a chart with the share of a metric's variation that each driver explains, the largest on top.
 
     The chart has at most MOST_DRIVERS bars, coloured by the trend, with whiskers from low to high. `says`: the text
     below the title. Raises ValueError without drivers.
@@ -58,7 +57,7 @@ def tornado(drivers: Sequence[Bar], metric: str, says: str, path: pathlib.Path) 
     trends = dict.fromkeys(_trend(one) for one in bars)
     keys = [Patch(color=TRENDS[trend], label=trend) for trend in TRENDS if trend in trends]
     figure.legend(handles=keys, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
-    figure.savefig(path, dpi=150)
+    return figure
 
 
 def _trend(one: Bar) -> str:

@@ -121,7 +121,6 @@ class ExportedCase:
             (part / name).write_bytes(content if isinstance(content, bytes) else content.encode())
 
     def _repr_html_(self) -> str:
-        """Return the names of the files, and the table of the checks."""
         names = f"{self.plan.block.noun} of {self.plan.case.name}: {', '.join(self.files)}"
         rows = [(*check[:4], check.verdict) for check in self.checks]
         return notebook_table(names, ("check", "precision", "found", "allowed", "verdict"), rows)
@@ -180,7 +179,6 @@ def planned(
 
 
 def _choice(name: str, value: object, allowed: tuple[object, ...]) -> None:
-    """Raise ValueError unless an option has one of the allowed values."""
     if value not in allowed:
         raise ValueError(f"{name} = {value!r}: it must be one of {', '.join(map(repr, allowed))}.")
 

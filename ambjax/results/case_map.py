@@ -66,7 +66,6 @@ class CaseMap:
         return map_figure([panel(self.case, self.map)], *labels(self.case, self.map))
 
     def _repr_html_(self) -> str:
-        """Return the table of the ranges of the arrays."""
         one = self.map
         head = f"{self.case.name}: {one.members} member(s) in each cell of {one.x.path} and {one.y.path}"
         grids = {name: getattr(one, name)[np.isfinite(getattr(one, name))] for name in GRIDS}

@@ -159,6 +159,17 @@ def described(name: str, describe: Callable[[], Described]) -> Described | None:
         return None
 
 
+def drawn(path: pathlib.Path, draw: Callable[[], Any], dpi: int = 130) -> None:
+    """Write the Figure that `draw` returns to a file. An error costs this picture only, as in `described`."""
+
+    def write() -> None:
+        from ambjax.pictures.style import save
+
+        save(draw(), path, dpi)
+
+    described(path.name, write)
+
+
 def fault(error: Exception) -> str:
     """Return an error in one sentence or more. One that is not a ValueError is a defect: its place is added."""
     words = str(error) or type(error).__name__

@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.compiler.barrier import materialised
-from ambjax.numerics.records import Scalar, leaf, part, record, static
+from ambjax.numerics.records import Scalar, leaf, matrix, part, record, static
 from ambjax.numerics.shapes import varying
 from ambjax.numerics.small_matrices import solve, times
 from ambjax.numerics.smooth import away_from_zero
@@ -98,9 +98,7 @@ class Machine:
     axes: tuple[Any, ...] = part(doc="the loops of the groups, `Sampled` or `ClosedLoop`, stacked", channels=True)
     start_q: Array = leaf(shape="n", unit="m or rad", at_least=-10.0, at_most=10.0, doc="coordinates at t = 0, at rest")
     groups: tuple[tuple[int, ...], ...] = static(doc="numbers of the axes of each group")
-    inverse: Array | None = leaf(
-        default=None, shape="n n", at_least=-1e30, at_most=1e30, optional=True, doc="inverse of the mass matrix"
-    )
+    inverse: Array | None = matrix("n n", "inverse of the mass matrix", default=None)
     cuts: int | None = static(
         default=None,
         doc="largest number of jumps of the rotor's loads inside one sample; None: the number of all jumps",

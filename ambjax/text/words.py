@@ -8,6 +8,11 @@ def one_line(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
+def number(x: float | None, digits: int = 4) -> str:
+    """Return a number for a table, with a number of digits; "-" for None."""
+    return "-" if x is None else f"{x:.{digits}g}"
+
+
 def command(*words: str) -> str:
     """Return a command for a message, between backticks, with words quoted as a shell requires."""
     return f"`{shlex.join(words)}`"

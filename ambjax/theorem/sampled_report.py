@@ -163,17 +163,11 @@ def check_sampled(
     lasting = [(one.rows, noise) for one, noise in runs if np.isinf(one.lost_at)]
     bands = [line for rows, noise in lasting for line in _bands(cascade, scenario, clock, settled, rows, noise)]
     alternating = alternation(np.asarray(calm.rows.u)[settled:]) if np.isinf(calm.lost_at) else None
+    largest = _peak(np.asarray(outcome.rows.z)[settled:]) if np.isinf(outcome.lost_at) else None
     stalled = int(outcome.lost_code) == STALLED
-    return SampledReport(
-        law_poles(cascade, clock),
-        bands,
-        float(outcome.lost_at),
-        outcome.lost_why,
-        stalled,
-        _smallest_distance(outcome, scenario.plant),
-        alternating,
-        _peak(np.asarray(outcome.rows.z)[settled:]) if np.isinf(outcome.lost_at) else None,
-    )
+    ending = float(outcome.lost_at), outcome.lost_why, stalled
+    distance = _smallest_distance(outcome, scenario.plant)
+    return SampledReport(law_poles(cascade, clock), bands, *ending, distance, alternating, largest)
 
 
 def with_causes(

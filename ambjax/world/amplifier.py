@@ -39,22 +39,15 @@ class Amplifier:
     """
 
     bandwidth: Scalar | None = leaf(
-        default=None,
-        unit="Hz",
-        at_least=1,
-        at_most=1e6,
-        optional=True,
-        doc="bandwidth of the voltage, first order; none: no lag",
+        default=None, unit="Hz", at_least=1, at_most=1e6, doc="bandwidth of the voltage, first order; none: no lag"
     )
     slew: Scalar | None = leaf(
-        default=None, unit="V/s", at_least=1e-3, at_most=1e15, optional=True, doc="largest rate of u; none: no limit"
+        default=None, unit="V/s", at_least=1e-3, at_most=1e15, doc="largest rate of u; none: no limit"
     )
     dead_band: Scalar | None = leaf(
-        default=None, unit="V", at_least=0, at_most=1e12, optional=True, doc="subtracted from |u|; none: 0"
+        default=None, unit="V", at_least=0, at_most=1e12, doc="subtracted from |u|; none: 0"
     )
-    i_max: Scalar | None = leaf(
-        default=None, unit="A", at_least=1e-9, at_most=1e6, optional=True, doc="limit of |i|; none: no limit"
-    )
+    i_max: Scalar | None = leaf(default=None, unit="A", at_least=1e-9, at_most=1e6, doc="limit of |i|; none: no limit")
     coil: CoilLimits | None = part(default=None, doc="limits of each coil of a `TwoCoil`; None: no limits")
 
     mode: ClassVar[str] = "voltage"
@@ -125,7 +118,7 @@ class CurrentAmplifier:
         default=1e3, unit="Hz", at_least=1, at_most=1e6, doc="bandwidth of the current loop, first order"
     )
     i_max: Scalar | None = leaf(
-        default=None, unit="A", at_least=1e-9, at_most=1e6, optional=True, doc="limit of the command; none: no limit"
+        default=None, unit="A", at_least=1e-9, at_most=1e6, doc="limit of the command; none: no limit"
     )
     mode: ClassVar[str] = "current"
     slow: ClassVar[bool] = False

@@ -37,7 +37,6 @@ class CoilLimits:
         unit="V",
         at_least=1e-9,
         at_most=1e12,
-        optional=True,
         doc="limit of the |voltage| of a coil, R i_0 included; none: no limit",
     )
     i_max: Scalar | None = leaf(
@@ -45,7 +44,6 @@ class CoilLimits:
         unit="A",
         at_least=1e-9,
         at_most=1e6,
-        optional=True,
         doc="limit of the |current| of a coil, i_0 included; none: no limit",
     )
     unidirectional: bool = static(default=False, doc="whether the current of a coil cannot become negative")

@@ -43,7 +43,6 @@ def _at() -> Any:
         unit="s",
         at_least=0,
         at_most=1e6,
-        optional=True,
         doc="time of one more fault, rounded to the nearest sample; none: no other fault",
     )
 

@@ -34,13 +34,13 @@ class Iron:
     """
 
     saturation: Scalar | None = leaf(
-        default=None, unit="T", at_least=1e-3, at_most=1e3, optional=True, doc="flux density limit of the core"
+        default=None, unit="T", at_least=1e-3, at_most=1e3, doc="flux density limit of the core"
     )
     leakage: Scalar | None = leaf(
-        default=None, unit="1", at_least=1, at_most=10, optional=True, doc="flux of a coil over flux of its gap, z = 0"
+        default=None, unit="1", at_least=1, at_most=10, doc="flux of a coil over flux of its gap, z = 0"
     )
     eddy: Scalar | None = leaf(
-        default=None, unit="s", at_least=1e-7, at_most=1.0, optional=True, doc="lag of the flux behind the current"
+        default=None, unit="s", at_least=1e-7, at_most=1.0, doc="lag of the flux behind the current"
     )
 
     def core(self, plant: Any, i: Scalar, inverse: Scalar) -> Array:

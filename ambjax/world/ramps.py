@@ -1,13 +1,11 @@
 """Signals that consist of straight lines: ramp and trapezoid."""
 
-import dataclasses
-
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record
-from ambjax.world.waveforms import hull
+from ambjax.world.waveforms import hull, later
 
 
 def _share(t: Scalar, start: Scalar, duration: Scalar) -> Array:
@@ -37,9 +35,7 @@ class Ramp:
         """Return the times of the two kinks, s."""
         return (self.start, self.start + self.duration)
 
-    def shifted(self, by: Scalar) -> "Ramp":
-        """Return the signal, `by` seconds later."""
-        return dataclasses.replace(self, start=self.start + by)
+    shifted = later
 
 
 @record
@@ -68,6 +64,4 @@ class Trapezoid:
         top, down = self.start + self.rise, self.start + self.rise + self.hold
         return (self.start, top, down, down + self.fall)
 
-    def shifted(self, by: Scalar) -> "Trapezoid":
-        """Return the signal, `by` seconds later."""
-        return dataclasses.replace(self, start=self.start + by)
+    shifted = later

@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record, static
+from ambjax.world.waveforms import later
 
 
 class Knots(NamedTuple):
@@ -90,6 +91,4 @@ class Recorded:
         changes = np.abs(np.diff(rates)) > 1e-9 * np.max(np.abs(rates), initial=0.0)
         return (Knots(times[1:][changes] if self.held else times[changes], self.start),)
 
-    def shifted(self, by: Scalar) -> "Recorded":
-        """Return the signal, `by` seconds later."""
-        return dataclasses.replace(self, start=self.start + by)
+    shifted = later

@@ -43,7 +43,7 @@ class Rotation:
     speed: Scalar = _rpm(-1e7, "speed at t = 0")
     acceleration: Scalar = leaf(default=0.0, unit="rpm/s", at_least=-1e9, at_most=1e9, doc="rate of the speed")
     speed_end: Scalar | None = _rpm(
-        -1e7, "speed at which the run-up or run-down ends; none: it never ends", default=None, optional=True
+        -1e7, "speed at which the run-up or run-down ends; none: it never ends", default=None
     )
     changes: tuple[SpeedChange, ...] = part(default=(), doc="later changes of the rate, of a table of speeds")
 

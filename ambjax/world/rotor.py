@@ -1,13 +1,12 @@
 """The rotor of a machine with several magnetic bearing axes: rigid, or with bending modes."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, part, record
+from ambjax.numerics.records import Scalar, leaf, matrix, part, record
 from ambjax.numerics.small_matrices import times
 from ambjax.numerics.smooth import TWO_PI, sine
 from ambjax.world.rotation import GRAM_MM, PER_MINUTE, Rotation, SpeedChange
@@ -15,17 +14,13 @@ from ambjax.world.scenario import SIGNAL_STREAM, SLOTS
 from ambjax.world.waveforms import Signal, edges_of, realised
 
 
-def _matrix(shape: str, unit: str, doc: str) -> Any:
-    return leaf(shape=shape, unit=unit, at_least=-1e30, at_most=1e30, doc=doc)
-
-
 @record
 class RotorUnbalance:
     """An unbalance at a place of the shaft. It turns with the rotor."""
 
     amount: Scalar = leaf(unit="g mm", at_least=0, at_most=1e9, doc="unbalance mass times its distance from the axis")
-    along_x: Array = _matrix("n", "1", "forces on the coordinates per force along x at the place")
-    along_y: Array = _matrix("n", "1", "the same for y")
+    along_x: Array = matrix("n", "forces on the coordinates per force along x at the place", unit="1")
+    along_y: Array = matrix("n", "the same for y", unit="1")
     phase: Scalar = leaf(
         default=0.0, unit="degrees", at_least=-1e6, at_most=1e6, doc="angle from the x axis at rotor angle 0"
     )
@@ -43,7 +38,7 @@ class RotorLoad:
     """A load on the rotor, in N, at a place and in a direction."""
 
     signal: Signal = part(doc="the load over time, N")
-    along: Array = _matrix("n", "1", "forces on the coordinates per unit of the load")
+    along: Array = matrix("n", "forces on the coordinates per unit of the load", unit="1")
 
 
 @record
@@ -51,7 +46,7 @@ class BaseMotion:
     """A motion of the stator along a direction. q is relative to the stator, so that -M `along` times it acts on q."""
 
     signal: Signal = part(doc="the acceleration of the stator over time, m/s^2")
-    along: Array = _matrix("n", "1", "unit vector of the direction as x, y, z; 0 for the other coordinates")
+    along: Array = matrix("n", "unit vector of the direction as x, y, z; 0 for the other coordinates", unit="1")
 
 
 @record
@@ -63,26 +58,21 @@ class Rotor:
     one in y. A point of the shaft at l (m from the centre of mass) moves by (x + l beta_y, y - l beta_x, z).
     """
 
-    M: Array = _matrix("n n", "", "mass matrix")
-    D: Array = _matrix("n n", "", "damping matrix")
-    G: Array = _matrix("n n", "", "gyroscopic matrix")
-    K: Array = _matrix("n n", "", "stiffness matrix")
-    at_magnets: Array = _matrix("c n", "", "rows b_k: z_k = b_k q is the displacement at the magnet of axis k")
-    at_sensors: Array = _matrix("c n", "", "rows c_k: c_k q is what the sensor of axis k sees")
-    gravity: Array = _matrix("n", "", "weight, as forces on the coordinates")
+    M: Array = matrix("n n", "mass matrix")
+    D: Array = matrix("n n", "damping matrix")
+    G: Array = matrix("n n", "gyroscopic matrix")
+    K: Array = matrix("n n", "stiffness matrix")
+    at_magnets: Array = matrix("c n", "rows b_k: z_k = b_k q is the displacement at the magnet of axis k")
+    at_sensors: Array = matrix("c n", "rows c_k: c_k q is what the sensor of axis k sees")
+    gravity: Array = matrix("n", "weight, as forces on the coordinates")
     speed: Scalar = leaf(default=0.0, unit="rpm", at_least=-1e7, at_most=1e7, doc="speed at t = 0")
     acceleration: Scalar = leaf(default=0.0, unit="rpm/s", at_least=-1e9, at_most=1e9, doc="rate of the speed")
     changes: tuple[SpeedChange, ...] = part(default=(), doc="later changes of the rate, of a table of speeds")
     unbalances: tuple[RotorUnbalance, ...] = part(default=(), doc="unbalances")
     loads: tuple[RotorLoad, ...] = part(default=(), doc="loads")
     base: tuple[BaseMotion, ...] = part(default=(), doc="motions of the stator")
-    at_stops: Array | None = leaf(
-        default=None,
-        shape="c n",
-        at_least=-1e30,
-        at_most=1e30,
-        optional=True,
-        doc="rows of the displacement at the stop of axis k; None: the stops are at the magnets",
+    at_stops: Array | None = matrix(
+        "c n", "rows of the displacement at the stop of axis k; None: the stops are at the magnets", default=None
     )
 
     @property

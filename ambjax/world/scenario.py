@@ -76,12 +76,7 @@ class Scenario:
         default=None, doc="amplifier; None: the coils receive the commanded voltage"
     )
     clearance: Scalar | None = leaf(
-        default=None,
-        unit="m",
-        at_least=1e-9,
-        at_most=1.0,
-        optional=True,
-        doc="|z| at which the rotor touches down; none: 0.9 s_0",
+        default=None, unit="m", at_least=1e-9, at_most=1.0, doc="|z| at which the rotor touches down; none: 0.9 s_0"
     )
     stop: Stop | None = part(
         default=None, doc="the touchdown bearing at the clearance; None: a rotor that reaches the clearance is lost"

@@ -66,7 +66,6 @@ class Sensor:
         unit="Hz",
         at_least=1,
         at_most=1e9,
-        optional=True,
         doc="bandwidth of the position sensor, first order; none: no lag",
     )
     bits: Scalar | None = leaf(
@@ -74,7 +73,6 @@ class Sensor:
         at_least=2,
         at_most=32,
         whole=True,
-        optional=True,
         doc="resolution of the converter of z and i; none: not rounded",
     )
     bits_i: Scalar | None = leaf(
@@ -82,7 +80,6 @@ class Sensor:
         at_least=2,
         at_most=32,
         whole=True,
-        optional=True,
         doc="resolution of the converter of i, if it is another one; none: that of z",
     )
     range_z: Scalar | None = leaf(
@@ -90,7 +87,6 @@ class Sensor:
         unit="m",
         at_least=1e-9,
         at_most=1.0,
-        optional=True,
         doc="the converter reads z from -range_z to range_z; none: s_0",
     )
     range_i: Scalar | None = leaf(
@@ -98,7 +94,6 @@ class Sensor:
         unit="A",
         at_least=1e-9,
         at_most=1e6,
-        optional=True,
         doc="the converter reads i from -range_i to range_i; none: 2 i_0",
     )
     velocity: bool = static(default=True, doc="whether z_dot is measured; if not, an observer must estimate it")

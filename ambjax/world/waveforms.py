@@ -5,7 +5,7 @@ signal has a method `realised(key)`, which draws the function of time for one me
 """
 
 import dataclasses
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,8 @@ from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, part, record
 from ambjax.numerics.smooth import TWO_PI, sine
+
+T = TypeVar("T")
 
 
 class Signal(Protocol):
@@ -30,6 +32,11 @@ class Signal(Protocol):
 def hull(*values: Scalar | np.ndarray) -> tuple[float, float]:
     """Return the minimum and maximum of several numbers or arrays."""
     return float(min(map(np.min, values))), float(max(map(np.max, values)))
+
+
+def later(signal: T, by: Scalar) -> T:
+    """Return the signal, `by` seconds later."""
+    return dataclasses.replace(signal, start=signal.start + by)  # pyright: ignore
 
 
 def _swing(amplitude: Scalar, first: Scalar | np.ndarray, last: Scalar | np.ndarray) -> tuple[float, float]:
@@ -79,9 +86,7 @@ class Step:
         """Return the time of the jump, s."""
         return (self.start,)
 
-    def shifted(self, by: Scalar) -> "Step":
-        """Return the signal, `by` seconds later."""
-        return dataclasses.replace(self, start=self.start + by)
+    shifted = later
 
 
 @record
@@ -161,9 +166,7 @@ class SmoothStep:
         """Return the times at which the third derivative jumps, s."""
         return (self.start, self.start + self.duration)
 
-    def shifted(self, by: Scalar) -> "SmoothStep":
-        """Return the signal, `by` seconds later."""
-        return dataclasses.replace(self, start=self.start + by)
+    shifted = later
 
 
 @record

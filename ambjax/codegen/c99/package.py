@@ -6,16 +6,7 @@ from ambjax.codegen.block import Block
 from ambjax.codegen.c99.notes import fixed, notes_of, order_of_work
 from ambjax.codegen.c99.source import Origin, Writer
 from ambjax.codegen.c99.statements import c_constant, word
-from ambjax.codegen.c99.texts import (
-    BLOCK_FAULT_TEST,
-    BLOCK_START_TEST,
-    FAULT_TEST,
-    MAKEFILE,
-    MARK,
-    README,
-    START_TEST,
-    TEST,
-)
+from ambjax.codegen.c99.texts import MARK, filled
 from ambjax.codegen.points import Points, verification_points
 from ambjax.codegen.program import PRECISIONS
 from ambjax.codegen.reference import Results, results
@@ -40,7 +31,8 @@ def package_files(block: Block, precision: str, prefix: str, origin: Origin) -> 
 def files_of_trace(traced: Trace, prefix: str, origin: Origin) -> dict[str, str]:
     """Return the files of a traced block, texts by name."""
     writer, at = Writer(traced, prefix, origin), verification_points(traced, VECTORS, seed=1)
-    vectors, makefile = _vectors(writer, at, results(traced, at)), MAKEFILE.format(p=prefix)
+    makefile = filled("Makefile", p=prefix, mark=MARK.format(p=prefix))
+    vectors = _vectors(writer, at, results(traced, at))
     texts = (writer.header(), writer.source(), _test(writer), vectors, makefile, _readme(writer))
     return dict(zip((name.format(p=prefix) for name in NAMES), texts, strict=True))
 
@@ -118,8 +110,10 @@ def _test(writer: Writer) -> str:
         ),
         "zeros": "\n".join(f"    input.{name} = {c_constant(0, t.precision)};" for name in inputs),
     }
+    fault["step"] = filled("step_with_nan.c", **fault)
     texts = _controller_faults(writer, fault) if t.block.noun == "controller" else _block_faults(writer, fault)
-    return TEST.format(
+    return filled(
+        "test.c",
         banner=writer.banner(f"{p}_test.c"),
         p=p,
         P=p.upper(),
@@ -144,13 +138,13 @@ def _controller_faults(writer: Writer, fault: dict[str, str]) -> tuple[str, str]
         "effect": "refused" if guard else "accepted and make a law fail",
         "unseen": unseen,
     }
-    return FAULT_TEST.format(**fault, **more), START_TEST.format(**fault)
+    return filled("fault_test.c", **fault, **more), filled("start_test.c", **fault)
 
 
 def _block_faults(writer: Writer, fault: dict[str, str]) -> tuple[str, str]:
     """Return the parts of the test program for bad inputs and for the start of a plant or a loop."""
     finite = "".join(f" || !isfinite(output.{word(x.name)})" for x, _ in writer.trace.outputs)
-    return BLOCK_FAULT_TEST.format(**fault, finite=finite), BLOCK_START_TEST.format(**fault)
+    return filled("block_fault_test.c", **fault, finite=finite), filled("block_start_test.c", **fault)
 
 
 def _readme(writer: Writer) -> str:
@@ -162,7 +156,8 @@ def _readme(writer: Writer) -> str:
     written_ = {command: "u"} if controller else {name: name for name in t.block.outputs}
     bits = ("SAFE", "FAILED", "INVALID") if controller else ("INVALID", "TOUCHED", "DIVERGED")
     notes = order_of_work(t) if controller else notes_of(t)
-    return README.format(
+    return filled(
+        "README.md",
         p=p,
         P=p.upper(),
         mark=MARK.format(p=p),

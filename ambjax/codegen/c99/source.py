@@ -9,7 +9,7 @@ import numpy as np
 from ambjax._version import __version__
 from ambjax.codegen.c99.notes import ABOUT, notes_of
 from ambjax.codegen.c99.statements import Statements, c_constant, word
-from ambjax.codegen.c99.texts import HEADER, MARK, SOURCE
+from ambjax.codegen.c99.texts import MARK, filled
 from ambjax.codegen.numbering import UNREAD, Number
 from ambjax.codegen.trace import Trace
 
@@ -103,7 +103,8 @@ class Writer:
     def source(self) -> str:
         """Return the source file, PREFIX.c."""
         zeros = [f"    state->{word(x.name)} = {c_constant(0, self.trace.precision)};" for x, _ in self.trace.state]
-        return SOURCE.format(
+        return filled(
+            "source.c",
             p=self.prefix,
             P=self.prefix.upper(),
             banner=self.banner(f"{self.prefix}.c"),
@@ -128,7 +129,8 @@ class Writer:
         """Return the header file, PREFIX.h."""
         p, t = self.prefix, self.trace
         inputs = [x._replace(allowed="" if x.name in t.read else UNREAD) for x in t.inputs]
-        return HEADER.format(
+        return filled(
+            "header.h",
             p=p,
             P=p.upper(),
             banner=self.banner(f"{p}.h"),

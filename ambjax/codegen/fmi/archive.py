@@ -20,39 +20,6 @@ SYSTEMS = {
     "darwin": ("darwin", "darwin", ".dylib"),
     "win32": ("win", "windows", ".dll"),
 }
-MODEL = """/* The block of this FMU, for fmu_core.h. */
-
-#ifndef MODEL_H
-#define MODEL_H
-
-#include "{p}.h"
-
-#define MODEL_TOKEN "{token}"
-#define MODEL_INPUTS {inputs}
-#define MODEL_OUTPUTS {outputs}
-#define MODEL_PARAMETERS {parameters}
-#define MODEL_STATES {states}
-#define MODEL_PERIOD {p}_SAMPLE_PERIOD
-/* 1 if the block computes outputs at the start time: a plant and a loop read their sensors there */
-#define MODEL_READS_AT_START {reads}
-
-typedef {p}_params model_params;
-typedef {p}_state model_state;
-typedef {p}_input model_input;
-typedef {p}_output model_output;
-
-#define model_default {p}_default
-#define model_init {p}_init
-#define model_step {p}_step
-
-/* for each parameter, its smallest and its largest finite value, whether it may be infinite, and whether it is whole */
-static const double model_least[MODEL_PARAMETERS] = {{{least}}};
-static const double model_most[MODEL_PARAMETERS] = {{{most}}};
-static const unsigned char model_infinite[MODEL_PARAMETERS] = {{{infinite}}};
-static const unsigned char model_whole[MODEL_PARAMETERS] = {{{whole}}};
-
-#endif
-"""
 
 
 def sources(traced: Trace, identifier: str, origin: Origin, version: int) -> tuple[dict[str, str], str]:
@@ -68,7 +35,8 @@ def sources(traced: Trace, identifier: str, origin: Origin, version: int) -> tup
     found = {f"{identifier}.h": writer.header(), f"{identifier}.c": writer.source()}
     found |= {name: (home / name).read_text(encoding="utf-8") for name in names}
     guid = token(traced, identifier, found)
-    found["model.h"] = MODEL.format(
+    model = (home / "model.h").read_text(encoding="utf-8")
+    found["model.h"] = model.format(
         p=identifier,
         token=guid,
         inputs=len(traced.inputs),

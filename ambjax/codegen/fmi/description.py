@@ -135,7 +135,6 @@ def description(traced: Trace, identifier: str, case: str, guid: str, sources: l
 
 
 def _variable(x: Variable, form: Form) -> str:
-    """Return the element of a variable, with its bounds and its start value."""
     numbers = f" unit={quoteattr(x.unit)}" if x.unit else ""
     for name, value in (("min", x.least), ("max", x.most), ("start", x.start)):
         if value is not None:

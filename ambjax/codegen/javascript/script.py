@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Mapping
 from typing import SupportsFloat
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from ambjax.codegen.block import Block
 from ambjax.codegen.numbering import Number
 from ambjax.codegen.primitives import OPS
-from ambjax.codegen.program import PERIOD, STARTED, Operand, Ref
+from ambjax.codegen.program import PERIOD, STARTED, Location, Operand, Program, Ref
 from ambjax.codegen.trace import Trace, trace
 
 # Functions that the rows of OPS use, and that `Math` lacks or defines differently. They treat NaN and the sign of 0 as
@@ -42,8 +43,7 @@ def script_of(block: Block, name: str) -> str:
 
 def script(traced: Trace, name: str) -> str:
     """Return JavaScript that defines the constant `name` as in `script_of`. `traced`: a trace in double precision."""
-    body = Body(traced)
-    block = traced.block
+    body, block = Body(traced), traced.block
     lists = {
         "parameters": traced.parameters,
         "states": [x for x, _ in traced.state],
@@ -94,31 +94,17 @@ def _entries(numbers: list[Number], kind: str, read: frozenset[str]) -> str:
     return "\n".join(rows)
 
 
-class Body:
-    """The step of a trace as JavaScript statements.
+class Statements:
+    """Nodes of a program as JavaScript. `names`: names of nodes by number. `inputs`: texts that read the inputs."""
 
-    The step reads the parameters from the array `p` and the inputs from `x`, updates the states and the flag `started`
-    in `s`, and writes the outputs into `y`.
-    """
-
-    def __init__(self, traced: Trace) -> None:
-        self.trace, self.program, self.order = traced, traced.program, traced.order()
-        self.names = {n: f"v{k}" for k, n in enumerate(self.order)}
-        groups = {"params": traced.parameters, "state": [x for x, _ in traced.state], "input": traced.inputs}
-        arrays = {"params": "p", "state": "s", "input": "x"}
-        self.locations = {
-            (group, one.name): f"{arrays[group]}[{k}]" for group, xs in groups.items() for k, one in enumerate(xs)
-        }
+    def __init__(self, program: Program, names: Mapping[int, str], inputs: Mapping[Location, str]) -> None:
+        self.program, self.names, self.inputs = program, names, inputs
 
     def operand(self, x: Operand) -> str:
         """Return an operand as a JavaScript expression."""
         if isinstance(x, Ref):
             location = self.program.nodes[x.node].location
-            if location is None:
-                return self.names[x.node]
-            if location == PERIOD:
-                return "period"
-            return f"(s[{len(self.trace.state)}] !== 0)" if location == STARTED else self.locations[location]
+            return self.names[x.node] if location is None else self.inputs[location]
         if x.dtype.kind == "b":
             return "true" if x else "false"
         text = js_constant(x)
@@ -129,7 +115,23 @@ class Body:
         node = self.program.nodes[n]
         text = OPS[node.op].javascript.format(*map(self.operand, node.args))
         rounded = f"Math.fround({text})" if node.dtype == np.float32 else text
-        return f"  const {self.names[n]} = {rounded};"
+        return f"const {self.names[n]} = {rounded};"
+
+
+class Body(Statements):
+    """The step of a trace as JavaScript statements.
+
+    The step reads the parameters from the array `p` and the inputs from `x`, updates the states and the flag `started`
+    in `s`, and writes the outputs into `y`.
+    """
+
+    def __init__(self, traced: Trace) -> None:
+        self.trace, self.order = traced, traced.order()
+        groups = [("params", "p", traced.parameters), ("input", "x", traced.inputs)]
+        groups += [("state", "s", [x for x, _ in traced.state])]
+        inputs = {Location(group, x.name): f"{array}[{k}]" for group, array, xs in groups for k, x in enumerate(xs)}
+        inputs |= {PERIOD: "period", STARTED: f"(s[{len(traced.state)}] !== 0)"}
+        super().__init__(traced.program, {n: f"v{k}" for k, n in enumerate(self.order)}, inputs)
 
     def statements(self) -> list[str]:
         """Return all statements. A comment with the name of a law precedes the statements of that law."""
@@ -138,7 +140,7 @@ class Body:
             if (node := self.program.nodes[n]).law != law:
                 law = node.law
                 lines.append(f"  // {re.sub(r'[^ -~]', '?', law) or 'the cascade'}")
-            lines.append(self.statement(n))
+            lines.append(f"  {self.statement(n)}")
         return lines
 
     def step(self) -> list[str]:
