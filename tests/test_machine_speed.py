@@ -18,7 +18,7 @@ from ambjax.linear.linear_machine import machine_sensitivity, turning_machines
 from ambjax.linear.rotor_modes import modes_of, springs_critical
 from ambjax.linear.unbalance_response import UnbalanceResponse, critical_speeds, separation, unbalance_response
 from ambjax.pictures.machine_pictures import machine_sensitivity_picture
-from ambjax.pictures.run_up_picture import waterfall
+from ambjax.pictures.run_up_picture import last_turn, waterfall
 from ambjax.results.machine_run import simulate_machine
 
 MASS, I_T, I_P, HALF = 3.0, 0.1, 0.04, 0.25
@@ -172,6 +172,14 @@ def test_the_waterfall_of_a_sweep_follows_its_frequency():
     # a window covers 1/12 of the sweep, 7 Hz, and lowers the peak of the spectrum
     np.testing.assert_allclose(highest, found.speeds / 60, atol=2.0)
     assert 0.6e-6 < found.amplitude.max() < 2e-6
+
+
+def test_an_orbit_is_one_turn_also_where_the_speed_passes_0():
+    t = np.linspace(0, 2.0, 2001)
+    turns = 10 * (2 * t - t**2)  # 1200 rpm to -1200 rpm
+    assert last_turn(turns, 1000) == slice(1000 - 317, 1001)  # sqrt(1/10) s
+    assert last_turn(turns, 2000) == slice(1948, 2001)  # 10 (t - 1)^2 = 9 at 1.94868 s
+    assert last_turn(turns, 10) == slice(0, 11)
 
 
 @pytest.mark.thorough
