@@ -97,7 +97,9 @@ def parser() -> Parser:
         "campbell.png, rotor.png, unbalance.png"
     )
     campbell = command("campbell", summary, case=True, out=True)
-    campbell.add_argument("--to", type=float, metavar="RPM", help="largest speed (default: 1.3 times that of the case)")
+    campbell.add_argument(
+        "--to", type=float, metavar="RPM", help="largest speed, above 0 (default: 1.3 times that of the case)"
+    )
     summary = "sensitivity peaks with ISO 14839-3 zones, margins, stiffness: sensitivity.json, sensitivity.png"
     sensitivity = command("sensitivity", summary, case=True, out=True)
     sensitivity.add_argument("--members", type=int, metavar="N", help="members of [spread] to analyse (default: 100)")

@@ -1,5 +1,6 @@
 """Machines against their speed: response to unbalance, critical speeds, and modes, against closed forms."""
 
+import dataclasses
 import json
 import tomllib
 
@@ -17,7 +18,7 @@ from ambjax.linear.linear_machine import machine_sensitivity, turning_machines
 from ambjax.linear.rotor_modes import modes_of, springs_critical
 from ambjax.linear.unbalance_response import UnbalanceResponse, critical_speeds, separation, unbalance_response
 from ambjax.pictures.machine_pictures import machine_sensitivity_picture
-from ambjax.pictures.run_up_picture import waterfall
+from ambjax.pictures.run_up_picture import last_turn, waterfall
 from ambjax.pictures.style import save
 from ambjax.results.machine_run import simulate_machine
 
@@ -64,9 +65,10 @@ def test_an_unstable_machine_has_no_peaks_no_zones_and_no_verdict_by_api(tmp_pat
     assert campbell.ranges(np.arange(5.0), np.array([True, False, True, True, True])) == "0, 2 to 4"
 
 
-def test_the_unbalance_response_of_a_rigid_rotor_is_the_closed_form(rigid):
-    found = unbalance_response(rigid.machine, rigid.clock.sample_period, 9000.0)
-    W = found.speeds[1:] * np.pi / 30
+@pytest.mark.parametrize("way", [1, -1])
+def test_the_unbalance_response_of_a_rigid_rotor_is_the_closed_form(rigid, way):
+    found = unbalance_response(rigid.machine, rigid.clock.sample_period, way * 9000.0)
+    W = way * found.speeds[1:] * np.pi / 30
     stiffness = 2 * (K_I * (5000 + 1500 / (1j * W) + 5j * W) - K_S)  # of both bearings
     force = 1e-5 * W**2 * np.exp(1j * np.pi / 6)
     x = force / (stiffness - MASS * W**2)
@@ -78,6 +80,34 @@ def test_the_unbalance_response_of_a_rigid_rotor_is_the_closed_form(rigid):
         np.testing.assert_allclose(found.sensors[1:, axis + 1], -1j * (x + place * tilt), rtol=1e-3)
     current = -(stiffness / 2 + K_S) / K_I * found.magnets[1:, 0]
     np.testing.assert_allclose(found.current[1:, 0], current, rtol=1e-3)
+
+
+def test_a_scan_that_ends_below_an_operating_speed_is_not_judged(rigid):
+    found = unbalance_response(rigid.machine, rigid.clock.sample_period, 4000.0)
+    text = campbell.unbalance_text(rigid, found, [], (3000.0, 6000.0))
+    assert text.endswith("unbalance at 3000 to 6000 rpm: not judged by A1, because the scan ends at 4000 rpm")
+    assert "limit A1" in campbell.unbalance_text(rigid, found, [], (3000.0, 4000.0))
+
+
+@pytest.mark.parametrize("to", ["inf", "nan", "1e9", "0"])
+def test_an_end_of_the_scan_that_is_no_speed_is_refused(tmp_path, capsys, to):
+    (tmp_path / "case.toml").write_text(template("machine"))
+    assert main(["campbell", str(tmp_path / "case.toml"), "--to", to, "--out", str(tmp_path / "c")]) == 2
+    assert capsys.readouterr().err.endswith("it must be above 0 rpm and at most 1e+07 rpm.\n")
+
+
+@pytest.mark.thorough
+def test_the_scan_has_the_direction_of_the_speeds(tmp_path, capsys, rigid):
+    with pytest.raises(ValueError, match="3000, -6000 rpm, have both signs"):
+        campbell.direction(dataclasses.replace(rigid, speeds=(3000.0, -6000.0)))
+    path = tmp_path / "back.toml"
+    path.write_text(template("machine").replace("= 6000.0", "= -6000.0").replace("[0.0, 6000.0, 12000.0]", "[-6000.0]"))
+    assert main(["campbell", str(path), "--out", str(tmp_path / "c")]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("0 to -7800 rpm: stable")
+    assert "unbalance at -6000 rpm: " in text
+    found = json.loads((tmp_path / "c" / "campbell.json").read_text())
+    assert found["speeds_rpm"][-1] == found["unbalance"]["speeds_rpm"][-1] == pytest.approx(-7800.0)
 
 
 @pytest.mark.slow
@@ -123,8 +153,9 @@ def test_critical_speeds_of_a_rigid_rotor_on_springs(rigid):
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
-def test_modes_have_the_names_and_directions_of_the_motion(rigid):
-    (still, turning) = turning_machines(rigid.machine, rigid.clock.sample_period, (0.0, 9000.0))
+@pytest.mark.parametrize("way", [1, -1])
+def test_modes_have_the_names_and_directions_of_the_motion(rigid, way):
+    (still, turning) = turning_machines(rigid.machine, rigid.clock.sample_period, (0.0, way * 9000.0))
     slow = [mode for mode in modes_of(still, rigid.machine.rotor) if 1 < mode.frequency < 1e3]
     assert [mode.name for mode in slow] == ["translation"] * 2 + ["tilt"] * 2
     stiffness, damping = 2 * (K_I * 5000 - K_S), 2 * K_I * 5
@@ -142,6 +173,14 @@ def test_the_waterfall_of_a_sweep_follows_its_frequency():
     # a window covers 1/12 of the sweep, 7 Hz, and lowers the peak of the spectrum
     np.testing.assert_allclose(highest, found.speeds / 60, atol=2.0)
     assert 0.6e-6 < found.amplitude.max() < 2e-6
+
+
+def test_an_orbit_is_one_turn_also_where_the_speed_passes_0():
+    t = np.linspace(0, 2.0, 2001)
+    turns = 10 * (2 * t - t**2)  # 1200 rpm to -1200 rpm
+    assert last_turn(turns, 1000) == slice(1000 - 317, 1001)  # sqrt(1/10) s
+    assert last_turn(turns, 2000) == slice(1948, 2001)  # 10 (t - 1)^2 = 9 at 1.94868 s
+    assert last_turn(turns, 10) == slice(0, 11)
 
 
 @pytest.mark.thorough

@@ -1,6 +1,7 @@
 """`ambjax campbell`: modes, critical speeds and response to unbalance of a machine against its speed."""
 
 import argparse
+import dataclasses
 import pathlib
 
 import numpy as np
@@ -30,6 +31,8 @@ WRITTEN = ("campbell.json", *PICTURES, "campbell.html")
 SPEEDS, BEYOND = 31, 1.3
 # End of the range for a rotor that does not turn, rpm.
 SLOWEST = 6000.0
+# Largest speed that --to takes, rpm: the bound of rotor.speed.
+FASTEST = 1e7
 # Range of the stiffness in the critical-speed map, as shares of |k_s|, and its number of points.
 SOFTEST, STIFFEST, STIFFNESSES = 1e-2, 1e2, 81
 # Damping ratio below which the shape of a mode is drawn if no mode is lightly damped.
@@ -37,7 +40,7 @@ DAMPED = 0.95
 
 
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
-    """Analyse a machine at speeds from 0 on, and draw it. Exit code 1 if the machine is unstable at one of them."""
+    """Analyse a machine from 0 on in the direction of its speeds, and draw it. Exit code 1 if it is unstable at one."""
     case = read_any_with_warnings(args.case)
     if isinstance(case, Case):
         raise ValueError(
@@ -46,11 +49,12 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
         )
     fastest = max(abs(speed) for speed in case.speeds)
     end = args.to if args.to is not None else BEYOND * fastest or SLOWEST
-    if not end > 0:
-        raise ValueError(f"--to {end:g}: it must be above 0 rpm.")
+    if args.to is not None and not 0 < end <= FASTEST:
+        raise ValueError(f"--to {end:g}: it must be above 0 rpm and at most {FASTEST:g} rpm.")
+    way = direction(case)
     out = directory(args.out, f"campbell-{case.name}", WRITTEN, args.force)
     say(f"linearising the machine at {SPEEDS} speeds or more")
-    speeds = np.linspace(0.0, end, SPEEDS)
+    speeds = np.linspace(0.0, way * end, SPEEDS)
     points = list(turning_machines(case.machine, case.clock.sample_period, speeds))
     systems = [point.system.without_idle() for point in points]
     poles = [poles_in_s(system) for system in systems]
@@ -60,7 +64,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     unstable = [float(speed) for speed in speeds[wrong]]
     operating = operating_range(case)
     turned = case.machine.rotor.unbalances and radial_axes(case)
-    found = unbalance_response(case.machine, case.clock.sample_period, end) if turned else None
+    found = unbalance_response(case.machine, case.clock.sample_period, way * end) if turned else None
     criticals = [] if found is None else critical_speeds(found, operating)
     springs = _on_springs(case) if radial_axes(case) else None
     summary = {
@@ -72,7 +76,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
         and dict(zip(("stiffness_N_per_m", "speeds_rpm", "k_s"), springs, strict=True)),
     }  # fmt: skip
     words = f"unstable at {ranges(speeds, wrong)} rpm" if unstable else "stable"
-    text = f"0 to {end:g} rpm: {words}; largest real part of a pole {growth.max():.4g} 1/s"
+    text = f"0 to {way * end:g} rpm: {words}; largest real part of a pole {growth.max():.4g} 1/s"
     text += "" if found is None else "\n" + unbalance_text(case, found, criticals, operating)
     with files(out) as part:
         write_json(part / "campbell.json", summary)
@@ -104,8 +108,19 @@ def ranges(speeds: np.ndarray, wrong: np.ndarray) -> str:
     return ", ".join(f"{low:g}" if low == high else f"{low:g} to {high:g}" for low, high in groups)
 
 
+def direction(case: MachineCase) -> int:
+    """Return the sign of the speeds of the case, 1 for a rotor at rest. Raises ValueError for speeds of both signs."""
+    if min(case.speeds) < 0 < max(case.speeds):
+        listed = ", ".join(f"{speed:g}" for speed in case.speeds)
+        raise ValueError(
+            f"campbell: the speeds of the case, {listed} rpm, have both signs, and one scan has one direction. "
+            "Give sensitivity.speeds of one sign."
+        )
+    return -1 if min(case.speeds) < 0 else 1
+
+
 def operating_range(case: MachineCase) -> tuple[float, float]:
-    """Return the lowest and the highest operating speed, rpm: the speeds of the case above 0.
+    """Return the lowest and the highest operating speed without sign, rpm: the speeds of the case other than 0.
 
     A run-up, or the speed 0 beside others, counts as a transient: only its end counts.
     """
@@ -121,11 +136,12 @@ def _unbalance(
     case: MachineCase, found: UnbalanceResponse, criticals: list[CriticalSpeed], operating: tuple[float, float]
 ) -> dict[str, object]:
     limit, largest = _vibration(found, operating)
+    way = direction(case)
     return {
-        "operating_rpm": list(operating),
+        "operating_rpm": [way * speed for speed in operating],
         "critical_speeds": [
             {
-                "speed_rpm": one.speed, "axis": case.axes[one.axis], "peak_to_peak_m": one.peak_to_peak,
+                "speed_rpm": way * one.speed, "axis": case.axes[one.axis], "peak_to_peak_m": one.peak_to_peak,
                 "amplification_factor": one.amplification, "separation_required_percent": one.required,
                 "separation_percent": one.present, "separated": one.separated,
             }
@@ -133,7 +149,7 @@ def _unbalance(
         ],
         "a1_limit_m": limit,
         "largest_peak_to_peak_m": largest,
-        "speeds_rpm": found.speeds,
+        "speeds_rpm": way * found.speeds,
         "amplitudes": {
             name: {axis: np.abs(getattr(found, name)[:, k]) for k, axis in enumerate(case.axes)}
             for name in ("sensors", "magnets", "current", "command")
@@ -144,11 +160,11 @@ def _unbalance(
 def _vibration(found: UnbalanceResponse, operating: tuple[float, float]) -> tuple[float, float]:
     """Return A1 at the highest operating speed, and the largest displacement at a sensor at operating speeds, m.
 
-    The displacement is NaN if the machine is not stable at one of these speeds.
+    The displacement is NaN if the machine is not stable at one of these speeds, or if the scan ends below one of them.
     """
     size = 2 * np.abs(found.sensors).max(1)
     between = (found.speeds > operating[0]) & (found.speeds < operating[1])
-    ends = np.interp(operating, found.speeds, size)
+    ends = np.interp(operating, found.speeds, size, right=np.nan)
     return float(a1_limit(operating[1])), float(np.max([*ends, *size[between]]))
 
 
@@ -168,15 +184,17 @@ def _pictures(case: MachineCase, analysed: tuple, found: UnbalanceResponse | Non
     from ambjax.pictures.rotor_pictures import rotor_picture, unbalance_picture
 
     speeds, modes, criticals, springs = analysed
-    drawn(part / "campbell.png", lambda: campbell_picture(case.name, speeds, modes))
-    operating = operating_range(case)
+    way, operating = direction(case), operating_range(case)
+    case = dataclasses.replace(case, name=case.name + ", negative speeds" * (way < 0))
+    drawn(part / "campbell.png", lambda: campbell_picture(case.name, abs(speeds), modes))
     if springs is None:
         return
-    point = next(turning_machines(case.machine, case.clock.sample_period, operating[1:]))
+    speed = way * operating[1]
+    point = next(turning_machines(case.machine, case.clock.sample_period, [speed]))
     bent = [mode for mode in modes_of(point, case.machine.rotor) if mode.name != "axial" and mode.damping < DAMPED]
     light = [mode for mode in bent if mode.damping < LIGHT]
     shown = light or bent
-    drawn(part / "rotor.png", lambda: rotor_picture(case.name, drawing_of(case), shown, springs, operating[1]))
+    drawn(part / "rotor.png", lambda: rotor_picture(case.name, drawing_of(case), shown, springs, speed))
     if found is not None and np.isfinite(found.sensors).any():  # stable at a speed
         drawn(part / "unbalance.png", lambda: unbalance_picture(case, found, criticals, operating))
 
@@ -185,10 +203,10 @@ def unbalance_text(
     case: MachineCase, found: UnbalanceResponse, criticals: list[CriticalSpeed], operating: tuple[float, float]
 ) -> str:
     """Return the critical speeds and the vibration at operating speeds as text."""
-    low, high = operating  # 0: no margin to a rotor at rest
+    way, (low, high) = direction(case), operating  # 0: no margin to a rotor at rest
     rows = [
         (
-            f"{one.speed:.0f}", case.axes[one.axis], f"{1e6 * one.peak_to_peak:.3g}", f"{one.amplification:.3g}",
+            f"{way * one.speed:.0f}", case.axes[one.axis], f"{1e6 * one.peak_to_peak:.3g}", f"{one.amplification:.3g}",
             *(("none" if one.required is None else f"{one.required:.3g}", f"{one.present:.3g}",
                "yes" if one.separated else "NO") if high else "---"),
         )
@@ -196,10 +214,12 @@ def unbalance_text(
     ]  # fmt: skip
     limit, largest = _vibration(found, operating)
     header = ("critical speed, rpm", "axis", "um p-p", "AF", "margin required, %", "present, %", "enough")
-    speeds = f"{low:g} to {high:g} rpm" if low != high else f"{high:g} rpm"
+    speeds = (f"{way * low:g} to " if low != high else "") + f"{way * high:g} rpm"
     last = f"unbalance at {speeds}: {1e6 * largest:.3g} um peak to peak at the sensors; limit A1 {1e6 * limit:.3g} um"
     last += ", exceeded" if largest > limit else ""
     if np.isnan(largest):
-        last = f"unbalance at {speeds}: not judged by A1, because the machine is unstable at one of these speeds"
+        end = float(found.speeds[-1])
+        why = "the machine is unstable at one of these speeds" if high <= end else f"the scan ends at {way * end:g} rpm"
+        last = f"unbalance at {speeds}: not judged by A1, because {why}"
     none = "no critical speed with a peak" + " at the stable speeds" * bool(np.isnan(found.sensors).any())
     return "\n".join([table(header, rows) if rows else none, *([last] if high else [])])

@@ -49,7 +49,8 @@ def check(case: Case | MachineCase, *, full: bool = False) -> CaseCheck:
     The check of an axis fails if a condition fails, if the rotor is lost, if the integrator stalls, if the rotor is
     held but the loop is not stable, if the magnets cannot carry the rotor, or if the loop cannot be linearised. On a
     processor, the conditions of Theorem 1 do not count. The zones and the margins of the linearised loop never count.
-    The check of a machine fails if the rotor is lost, or if the machine is not stable at one of its speeds.
+    The check of a machine fails if the rotor is lost, if the machine is not stable at one of its speeds, or if it
+    has no linearisation.
 
     `full`: whether to compute and write also what does not affect the verdict. Without it, the summary of a case on a
     processor has None for `method`, `conditions` and `proof` of Theorem 1. Raises ValueError for anything but a case.

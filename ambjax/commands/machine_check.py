@@ -6,14 +6,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, machine_from
-from ambjax.cases.rotor_body import MODES
+from ambjax.cases.rotor_body import DAMPING, MODES
 from ambjax.commands.machine_commands import once_per_revolution, outside_lines, worst_of_speeds
 from ambjax.host.heartbeat import say
 from ambjax.linear import MachineSensitivity, poles_in_s
-from ambjax.linear.linear_machine import turning_machines
+from ambjax.linear.linear_machine import sensitivity_of, turning_machines
 from ambjax.linear.rotor_modes import LIGHT, Mode, modes_of
 from ambjax.results.machine_run import simulate_machine
-from ambjax.results.operating import sensitivity
 from ambjax.results.outputs import plain, table
 
 # Modes that the second analysis adds to those of a shaft. At most MOST lightly damped modes are listed.
@@ -37,25 +36,57 @@ class CaseCheck(NamedTuple):
 def check(case: MachineCase) -> CaseCheck:
     """Check a machine: held in its run, clearance, force, stability and zones at its speeds, and spill-over.
 
-    It fails if the rotor is lost, or if the machine is not stable at one of its speeds, also with more modes.
+    It fails if the rotor is lost, or if the machine is not stable at one of its speeds, also with more modes, or has no
+    linearisation.
     """
     say(f"simulating {case.clock.samples} samples")
     run = simulate_machine(case)
-    say(f"linearising at {', '.join(f'{speed:g}' for speed in case.speeds)} rpm")
-    points = sensitivity(case)
+    linear = _linear(case)
     share = float(run.metrics["settled_clearance_used"])
-    axes = {axis: _axis(case, k, run.metrics["axes"][axis], points) for k, axis in enumerate(case.axes)}
-    turning = turning_machines(case.machine, case.clock.sample_period, case.speeds)
-    modes = {point.speed: modes_of(own, case.machine.rotor) for point, own in zip(points, turning, strict=True)}
-    spilled = _spill_over(case)
-    worst = worst_of_speeds(points)
-    at_speeds = [once_per_revolution(point) for point in points]
+    axes = {axis: _axis(case, k, run.metrics["axes"][axis], linear.points) for k, axis in enumerate(case.axes)}
     summary = {
         "held": not run.lost,
         "lost_why": run.lost_why,
         "clearance_used": share,
         "clearance_zone": "D" if run.lost else case.zones.clearance_zone(share),
         "axes": axes,
+        **linear.summary,
+    }
+    held = "held" if summary["held"] else f"LOST ({run.lost_why})"
+    lines = [
+        f"run: {held}; settled |z| reaches {share:.3g} of the clearance, zone {summary['clearance_zone']}",
+        *linear.verdict,
+        table(AXIS_COLUMNS, [(axis, *_cells(own)) for axis, own in axes.items()]),
+        *linear.details,
+    ]
+    return CaseCheck(not run.lost and linear.stable, plain(summary), "\n".join(lines))
+
+
+class _Linear(NamedTuple):
+    """What the linear machine adds to a check: its verdict, the points of the speeds, numbers, and lines of text."""
+
+    stable: bool
+    points: list[MachineSensitivity]
+    summary: dict[str, Any]
+    verdict: list[str]
+    details: list[str]
+
+
+def _linear(case: MachineCase) -> _Linear:
+    """Analyse the linear machine at its speeds, also with more modes."""
+    say(f"linearising at {', '.join(f'{speed:g}' for speed in case.speeds)} rpm")
+    try:
+        turning = list(turning_machines(case.machine, case.clock.sample_period, case.speeds))
+    except ValueError as error:
+        nothing = dict.fromkeys(("stable", "zone", "peak", "axis", "speed_rpm"))
+        return _Linear(False, [], nothing | {"why": str(error)}, [f"sensitivity: no zone and no margins: {error}"], [])
+    both = list(zip(turning, case.speeds, strict=True))
+    points = [sensitivity_of(point, case.axes, speed, case.zones) for point, speed in both]
+    modes = {speed: modes_of(point, case.machine.rotor) for point, speed in both}
+    spilled, untested = _spill_over(case)
+    worst = worst_of_speeds(points)
+    at_speeds = [once_per_revolution(point) for point in points]
+    summary = {
         "stable": {f"{point.speed:g}": point.stable for point in points},
         "zone": worst.worst.zone,
         "peak": worst.worst.S.height,
@@ -66,63 +97,67 @@ def check(case: MachineCase) -> CaseCheck:
         },
         "modes": {f"{speed:g}": [mode.numbers() for mode in own] for speed, own in modes.items()},
         "growth_with_more_modes_per_s": spilled,
+        "more_modes_why": untested,
     }
     stable = all(point.stable for point in points) and all(rate <= 0 for rate in spilled.values())
-    held = "held" if summary["held"] else f"LOST ({run.lost_why})"
     at = f"{worst.worst.name} at {worst.speed:g} rpm"
     peak = f"peak {worst.worst.S.height:.4g} ({at}), zone {worst.worst.zone}"
-    lines = [
-        f"run: {held}; settled |z| reaches {share:.3g} of the clearance, zone {summary['clearance_zone']}",
+    more = f"not tested with more bending modes: {untested}"
+    if spilled:
+        more = f"with up to {MORE} more bending modes the largest growth rate is {max(spilled.values()):.3g} 1/s"
+    verdict = [
         f"sensitivity: {peak if worst.stable else f'no peak and no zone: not stable at {worst.speed:g} rpm'}",
-        f"stability: {'stable' if stable else 'NOT STABLE'} at {', '.join(summary['stable'])} rpm{_more(spilled)}",
-        table(AXIS_COLUMNS, [(axis, *_cells(own)) for axis, own in axes.items()]),
-        *(line for point in points if point.stable for line in outside_lines(point, case.zones)),
-        *(line for point in at_speeds for _, own in point for line in own),
+        f"stability: {'stable' if stable else 'NOT STABLE'} at {', '.join(summary['stable'])} rpm; {more}",
     ]
+    details = [line for point in points if point.stable for line in outside_lines(point, case.zones)]
+    details += [line for point in at_speeds for _, own in point for line in own]
     if light := _light(modes):
-        lines.append(table(("lightly damped mode", "Hz", "damping ratio", "rpm"), light))
-    return CaseCheck(not run.lost and stable, plain(summary), "\n".join(lines))
+        details.append(table(("lightly damped mode", "Hz", "damping ratio", "rpm"), light))
+    return _Linear(stable, points, summary, verdict, details)
 
 
-def _spill_over(case: MachineCase) -> dict[str, float]:
-    """Return the largest real part of a pole (1/s) with MORE modes, by speed; {} for a rotor without a geometry."""
+def _spill_over(case: MachineCase) -> tuple[dict[str, float], str]:
+    """Return the largest real part of a pole (1/s) with MORE modes by speed; if it is empty, also why."""
     raw = tomllib.loads(case.text) if case.text else {}
-    if raw.get("rotor", {}).get("kind") != "shaft" or isinstance(raw["rotor"].get("damping"), list):
-        return {}
-    known, most = (len(case.coordinates) - 5) // 2, MODES.metadata["at_most"]
-    if known == most:
-        return {}
-    raw["rotor"]["modes"] = min(known + MORE, most)
+    rotor, known = raw.get("rotor", {}), (len(case.coordinates) - 5) // 2
+    more = min(MORE, MODES.metadata["at_most"] - known)
+    if rotor.get("kind") != "shaft":
+        return {}, "only a rotor of the kind shaft has further modes"
+    if not more:
+        return {}, f"the rotor has {known} already, the largest number"
+    rotor["modes"] = known + more
+    if isinstance(given := rotor.get("damping"), list):  # further modes are damped as the last one
+        rotor["damping"] = given + given[-1:] * more if given else DAMPING.default
     raw.pop("initial", None)  # it has the coordinates of the rotor with fewer modes
     if raw.get("controller", {}).get("kind") == "lqg":  # the same controller
         raw["controller"]["lqg"] = {"modes": known} | raw["controller"].get("lqg", {})
-    more = machine_from(raw, case.name, folder=case.folder)
-    points = turning_machines(more.machine, case.clock.sample_period, case.speeds)
+    try:
+        machine = machine_from(raw, case.name, folder=case.folder).machine
+        points = list(turning_machines(machine, case.clock.sample_period, case.speeds))
+    except ValueError as error:
+        return {}, str(error)
     growth = [float(np.max(np.real(poles_in_s(point.system.without_idle())))) for point in points]
-    return {f"{speed:g}": rate for speed, rate in zip(case.speeds, growth, strict=True)}
-
-
-def _more(spilled: dict[str, float]) -> str:
-    if not spilled:
-        return ""
-    return f"; with up to {MORE} more bending modes the largest growth rate is {max(spilled.values()):.3g} 1/s"
+    return {f"{speed:g}": rate for speed, rate in zip(case.speeds, growth, strict=True)}, ""
 
 
 def _axis(case: MachineCase, k: int, metrics: dict[str, float], points: list[MachineSensitivity]) -> dict[str, object]:
-    """Return what is checked of one axis: clearance and force as shares, and the largest sensitivity at any speed."""
+    """Return what is checked of one axis: clearance and force as shares, and the largest sensitivity at any speed.
+
+    Without points, the sensitivity is None.
+    """
     scenario, share = case.cases[k].scenario, float(metrics["settled_clearance_used"])
-    worst = max((point.axes[k] for point in points), key=lambda axis: (axis.zone, axis.S.height))
+    worst = max((point.axes[k] for point in points), key=lambda axis: (axis.zone, axis.S.height), default=None)
     carried = abs(float(scenario.plant.m * scenario.plant.g)) / float(scenario.largest_force)
     used = max(float(metrics["force_used"]), carried)
     return {
         "clearance_used": share, "clearance_zone": case.zones.clearance_zone(share), "force_carried": carried,
-        "force_reserve": 1 - used, "peak": worst.S.height, "zone": worst.zone,
+        "force_reserve": 1 - used, "peak": worst and worst.S.height, "zone": worst and worst.zone,
     }  # fmt: skip
 
 
 def _cells(own: dict[str, Any]) -> list[str]:
-    """Return the cells of an axis; no peak and no zone if the machine is unstable at one of its speeds."""
-    shown = own if np.isfinite(own["peak"]) else own | {"peak": "-", "zone": "-"}
+    """Return the cells of an axis; no peak and no zone if the machine is unstable at a speed or not linearised."""
+    shown = own if own["peak"] is not None and np.isfinite(own["peak"]) else own | {"peak": "-", "zone": "-"}
     return [*map(_short, shown.values())]
 
 

@@ -22,7 +22,8 @@ class Mode(NamedTuple):
 
     - `pole`: 1/s, with a positive imaginary part. `name`: the motion with the largest share of the kinetic energy:
       "translation", "tilt", "axial" or "bending 1" and so on.
-    - `whirl`: "forward", "backward", "planar", or "" for an axial motion. `shape` [n]: coordinates, complex.
+    - `whirl`: "forward" (as the rotor turns), "backward", "planar", or "" for an axial motion.
+    - `shape` [n]: coordinates, complex.
     """
 
     pole: complex
@@ -65,7 +66,7 @@ def modes_of(point: TurningMachine, rotor: Rotor) -> list[Mode]:
     n, masses = len(np.asarray(rotor.gravity)), np.diag(np.asarray(rotor.M))
     shapes = np.asarray(system.C)[-n:] @ vectors
     found = [
-        Mode(complex(pole), *_described(shape, masses), shape)
+        Mode(complex(pole), *_described(shape, masses, -1 if point.W < 0 else 1), shape)
         for pole, shape in zip(values, shapes.T, strict=True)
         if pole.imag > REAL * abs(pole)
     ]
@@ -78,15 +79,15 @@ def planes_of(shape: np.ndarray) -> np.ndarray:
     return np.concatenate([[[x, y], [beta_y, -beta_x]], shape[RIGID:].reshape(-1, 2)])
 
 
-def _described(shape: np.ndarray, masses: np.ndarray) -> tuple[str, str]:
-    """Return name and direction of a motion."""
+def _described(shape: np.ndarray, masses: np.ndarray, way: int) -> tuple[str, str]:
+    """Return name and direction of a motion. `way`: sign of the speed."""
     weights = np.concatenate([masses[[0, 3]], masses[RIGID::2]])
     pairs = planes_of(shape)
     energy = weights * np.sum(np.abs(pairs) ** 2, 1)
     if masses[2] * abs(shape[2]) ** 2 > energy.max():
         return "axial", ""
     k = int(np.argmax(energy))
-    forward = np.sum(weights * np.abs(pairs[:, 0] + 1j * pairs[:, 1]) ** 2) / 2 / np.sum(energy)
+    forward = np.sum(weights * np.abs(pairs[:, 0] + way * 1j * pairs[:, 1]) ** 2) / 2 / np.sum(energy)
     whirl = "planar" if abs(forward - 0.5) < CIRCULAR else "forward" if forward > 0.5 else "backward"
     return ("translation", "tilt")[k] if k < 2 else f"bending {k - 1}", whirl
 

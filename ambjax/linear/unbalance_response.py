@@ -25,7 +25,7 @@ class UnbalanceResponse(NamedTuple):
     """Complex amplitudes against speed: a signal is Re(a exp(j W t)), with the rotor angle W t.
 
     They are NaN at speeds at which the machine is not stable, because no motion there is periodic.
-    - `speeds` [S]: rpm. `magnets`, `sensors` [S, c]: displacements at the magnets and at the sensors, m.
+    - `speeds` [S]: rpm, without sign. `magnets`, `sensors` [S, c]: displacements at the magnets and at the sensors, m.
     - `current` [S, c]: A. `command` [S, c]: commands of the laws, V, or A for commanded currents.
     """
 
@@ -63,16 +63,16 @@ def a1_limit(speed: np.ndarray | float) -> np.ndarray:
 
 
 def unbalance_response(machine: Machine, period: Scalar, end: float) -> UnbalanceResponse:
-    """Return the response to the unbalances of the rotor from 0 to `end` (rpm), dense near each critical speed.
+    """Return the response to the unbalances of the rotor from 0 to `end` (rpm, with sign), dense near criticals.
 
     `period`: sample period, s. On a processor the amplitudes are those at the samples. Raises ValueError as
     `linearise_machine` does.
     """
     speeds = np.linspace(0.0, end, SCAN)
     points = list(turning_machines(machine, period, speeds))
-    added = np.array([x for x in _near_crossings(speeds, points) if 0 < x < end])
+    added = np.array([x for x in _near_crossings(speeds, points) if 0 < x / end < 1])
     points += turning_machines(machine, period, added)
-    speeds = np.concatenate([speeds, added])
+    speeds = np.abs(np.concatenate([speeds, added]))
     found = np.array([_amplitudes(point, machine.rotor) for point in points])
     order, c = np.argsort(speeds), machine.count
     _, command, current, q = np.split(found[order], [c, 2 * c, 3 * c], axis=1)
@@ -82,7 +82,7 @@ def unbalance_response(machine: Machine, period: Scalar, end: float) -> Unbalanc
 
 def _near_crossings(speeds: np.ndarray, points: Sequence[TurningMachine]) -> np.ndarray:
     """Return speeds (rpm) near those at which the frequency of a lightly damped pole is the speed."""
-    lines, found = [], []
+    way, speeds, lines, found = np.sign(speeds[-1]), np.abs(speeds), [], []
     for point in points:
         poles = poles_in_s(point.system.without_idle())
         lines.append(poles[(np.imag(poles) > 0) & (np.abs(np.real(poles)) < DAMPED * np.abs(poles))] * 30 / np.pi)
@@ -96,7 +96,7 @@ def _near_crossings(speeds: np.ndarray, points: Sequence[TurningMachine]) -> np.
                 found.append(speed * (1 + width * np.linspace(-1, 1, NEAR)))
     # both directions of a mode may have nearly the same frequency: their speeds are merged
     near = np.unique(np.concatenate([[], *found]))
-    return near[np.concatenate([[True], np.diff(near) > 1e-5 * near[1:]])] if near.size else near
+    return way * near[np.concatenate([[True], np.diff(near) > 1e-5 * near[1:]])] if near.size else near
 
 
 def _amplitudes(point: TurningMachine, rotor: Rotor) -> np.ndarray:

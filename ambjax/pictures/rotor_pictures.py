@@ -66,7 +66,7 @@ def rotor_picture(
     """Return the rotor from the side with its planes, mode shapes of the closed loops, and the critical-speed map.
 
     `drawing`: a `RotorDrawing`. `modes`: those whose shapes are drawn. `criticals`: stiffnesses (N/m), undamped
-    critical speeds (rpm) at each, and |k_s| of the magnets. `speed`: rpm.
+    critical speeds (rpm) at each, and |k_s| of the magnets. `speed`: rpm, with sign.
     """
     shown = list(modes)[:SHAPES]
     figure = Figure(figsize=(13.0, 9.0), layout="constrained")
@@ -75,9 +75,9 @@ def rotor_picture(
     _rotor(side, drawing)
     for k, mode in enumerate(shown):
         ax = figure.add_subplot(grid[1 + k // 2, k % 2], sharex=side)
-        _shape(ax, drawing, mode)
+        _shape(ax, drawing, mode, -1 if speed < 0 else 1)
         ax.set_xlabel("place from the centre of mass, m" if k >= len(shown) - 2 else "")
-    _critical_map(figure.add_subplot(grid[:, 2]), *criticals, speed)
+    _critical_map(figure.add_subplot(grid[:, 2]), *criticals, abs(speed))
     figure.suptitle(f"{title}: rotor, and modes of the closed loops at {speed:g} rpm")
     return figure
 
@@ -109,11 +109,14 @@ def _rotor(ax: Axes, drawing: Any) -> None:
     ax.set_title("M magnet, S sensor, T stop, U unbalance, + centre of mass, dark: disc", fontsize="medium")
 
 
-def _shape(ax: Axes, drawing: Any, mode: Any) -> None:
-    """Draw the shape of a mode: the circular part of its orbit along the shaft, in phase and 90 degrees behind."""
+def _shape(ax: Axes, drawing: Any, mode: Any, way: int) -> None:
+    """Draw the shape of a mode: the circular part of its orbit along the shaft, in phase and 90 degrees behind.
+
+    `way`: sign of the speed.
+    """
     pairs = planes_of(mode.shape)
     turn = -1j if mode.whirl == "backward" else 1j
-    parts = pairs[:, 0] + turn * pairs[:, 1]
+    parts = pairs[:, 0] + way * turn * pairs[:, 1]
     if mode.whirl == "planar":
         parts = pairs[:, int(np.argmax(np.sum(np.abs(pairs) ** 2, 0)))]
     along = np.column_stack([np.ones_like(drawing.at), drawing.at, drawing.shapes])

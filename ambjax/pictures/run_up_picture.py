@@ -44,11 +44,21 @@ def waterfall(x: np.ndarray, speed: np.ndarray, period: float) -> Waterfall:
     return Waterfall(speed[starts + length // 2], np.fft.rfftfreq(PADDED * length, period), amplitude)
 
 
+def last_turn(turns: np.ndarray, end: int) -> slice:
+    """Return the samples of the last whole turn before the sample `end`, or all before it if there is none.
+
+    `turns`: angle of the rotor at each sample, in turns.
+    """
+    before = np.flatnonzero(np.abs(turns[:end] - turns[end]) >= 1 - 1e-9)
+    return slice(int(before[-1]) if before.size else 0, end + 1)
+
+
 @own_style
 def run_up_picture(case: Any, signals: dict[str, np.ndarray]) -> Figure:
     """Return the waterfall and the orbits of each radial bearing, and largest currents and voltages against speed."""
     alive = signals["t"] < float(signals["lost_at"])
     t, speed = signals["t"][alive], signals["speed_rpm"][alive]
+    turns = np.asarray(case.machine.rotor.rotation.turns(t))
     pairs, period = orbits_of([str(name) for name in signals["axes"]])[:3], float(t[1] - t[0])
     figure = Figure(figsize=(13.0, 3.6 * (len(pairs) + 1)), layout="constrained")
     grid = figure.add_gridspec(len(pairs) + 1, 2, width_ratios=[2.2, 1])
@@ -73,8 +83,7 @@ def run_up_picture(case: Any, signals: dict[str, np.ndarray]) -> Figure:
         orbits = figure.add_subplot(grid[row, 1])
         for place in np.linspace(0.02, 1.0, ORBITS):
             end_of = int(place * (len(t) - 1))
-            turn = max(int(60 / max(abs(speed[end_of]), 1.0) / period), 2)
-            part = slice(max(end_of - turn, 0), end_of + 1)
+            part = last_turn(turns, end_of)
             u, v = (1e6 * (signals["z"][alive, k][part]) for k in (x, y))
             orbits.plot(u, v, linewidth=0.9, label=f"{speed[end_of]:.0f} rpm")
         orbits.set_aspect("equal", adjustable="datalim")
