@@ -33,9 +33,9 @@ ELSEWHERE = ("controller", "reference", "disturbance", "spread")
 # Records that a user of the Python interface constructs.
 LAWS = {kind for kinds in KINDS.values() for kind in kinds.values()}
 SPACES = (ambjax, ambjax.signals, ambjax.plants, ambjax.sensors, ambjax.actuators, ambjax.solvers)
-PUBLIC = {one for space in SPACES for name in space.__all__ if isinstance(one := getattr(space, name), type)}
+PUBLIC = {one for space in SPACES for name in space.__all__ if dataclasses.is_dataclass(one := getattr(space, name))}
 RECORDS = sorted(
-    {kind for kind in PUBLIC if hasattr(kind, "__post_init__")} | {*LAWS, *SIGNALS.values()},
+    {kind for kind in PUBLIC if any(field.metadata for field in dataclasses.fields(kind))} | {*LAWS, *SIGNALS.values()},
     key=lambda kind: f"{kind.__module__}.{kind.__qualname__}",
 )
 ROWS = [(name, {}) for name in [*TABLES, *OTHERS, "tune.weights", "tune.limits"] if name not in ELSEWHERE]

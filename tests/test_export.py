@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import tempfile
+import tomllib
 import types
 from typing import Any
 
@@ -25,7 +26,7 @@ from ambjax.cases.reader import case_from, read_case
 from ambjax.codegen.c99 import machine
 from ambjax.codegen.c99.machine import Compiled, build
 from ambjax.codegen.c99.package import package_files
-from ambjax.codegen.c99.source import Origin
+from ambjax.codegen.c99.source import Origin, Writer
 from ambjax.codegen.c99.texts import MARK
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.interface import StepInputs
@@ -39,7 +40,7 @@ from ambjax.control.processor import Processor
 from ambjax.extend import PositionLaw
 from ambjax.numerics.records import gain, record
 from ambjax.plants import Plant
-from ambjax.results.case_export import VERIFIED
+from ambjax.results.case_export import VERIFIED, planned
 from ambjax.sensors import Sensor
 from ambjax.signals import Sine
 from ambjax.solvers import RK4
@@ -510,6 +511,19 @@ def test_a_case_from_a_pipe_is_read_once(elsewhere, tmp_path):
     assert main(["export", piped(CASE), "--prefix", "amb", "--out", str(tmp_path / "c"), "--json"]) == 0
     digest = hashlib.sha256(CASE.encode()).hexdigest()
     assert f"SHA-256 of the case: {digest} */" in (tmp_path / "c" / "amb.h").read_text()
+
+
+def test_only_a_case_as_it_was_read_has_a_checksum(tmp_path):
+    (tmp_path / "amb.toml").write_text(CASE)
+    case, digest = read_case(tmp_path / "amb.toml"), hashlib.sha256(CASE.encode()).hexdigest()
+    changed = ambjax.with_gains(case, {"controller.position.c": 300.0})
+    made = case_from(tomllib.loads(CASE), "amb")
+    moved = dataclasses.replace(case, scenario=dataclasses.replace(case.scenario, u_max=99.0))
+    plans = [planned(one, "controller", "c", None, None, None, False) for one in (case, changed, made, moved)]
+    assert [plan.origin.digest for plan in plans] == [digest, "", "", ""]
+    for plan in plans[:2]:
+        shown = types.SimpleNamespace(trace=plan, prefix="amb", origin=plan.origin)  # of a `Writer`
+        assert ("SHA-256" in Writer.banner(shown, "amb.h")) == bool(plan.origin.digest)  # pyright: ignore
 
 
 def refused(capsys, *arguments):

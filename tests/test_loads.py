@@ -231,7 +231,7 @@ GOOD = "t,value\n0,1\n1,2\n"
         ('0,1\n1,"1,500"\n', {}, 'line 2: "1,500" is not a number'),
         ("0;1\n1;1.234,5\n", {}, 'line 2: "1.234,5" is not a number'),
         ("t,a,b\n0,1,2\n1,2,3\n", {}, "it has the columns t, a, b; name those"),
-        ("0,1\n", {}, "it has 1 rows; give 2 to"),
+        ("0,1\n", {}, "times and values have 1 rows; give 2 to"),
         ("0,1\n1,\n", {}, "line 2: the cell of column '2' is empty. Give a number"),
         ("0,1\n1,nan\n", {}, "the value of row 2 is nan; each must be a finite number"),
         ("0,1\n2,1\n1,1\n", {}, "times must increase: row 3 has 1 s after 2 s"),
@@ -260,6 +260,26 @@ def test_wrong_arrays_are_refused(tmp_path):
         write_file()
         with pytest.raises(ValueError, match=said):
             case_from({"disturbance": {"q_z": {"kind": "table", "file": "x.npz"}}}, folder=tmp_path)
+
+
+def test_samples_are_checked_and_converted():
+    Samples = amb.signals.Samples
+    for times, values, said in (
+        ([0, 1], [0, np.nan], "the value of row 2 is nan; each must be a finite number"),
+        ([0, 2, 1], [0, 0, 0], "times must increase: row 3 has 1 s after 2 s"),
+        ([0, 1], [0, 1, 2], r"equal length; their shapes are \(2,\), \(3,\)"),
+        ([], [], "times and values have 0 rows; give 2 to 200,000"),
+        ([[0, 1], [2]], [0, 1], "times are not real numbers"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            Samples(times, values)
+    with pytest.raises(ValueError, match="values are not real numbers"):
+        jax.jit(lambda x: Samples([0, 1], x))(T[:2])
+    found = Samples([0, 1], jax.numpy.asarray([2.0, 3.0], "float32"))
+    assert found == Samples(np.array([0.0, 1.0]), np.array([2.0, 3.0]))
+    assert {type(x) for x in (found.times, found.values)} == {np.ndarray}
+    assert found.values.dtype == np.float64
+    assert amb.signals.Recorded(found)(0.5) == 2.5
 
 
 def test_parquet_needs_its_extra(tmp_path):

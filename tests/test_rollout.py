@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import Cascade, Clock, Initial, Metrics, Scenario, rollout
+from ambjax import Cascade, Clock, Initial, Metrics, Processor, Scenario, rollout
+from ambjax.actuators import CoilLimits
 from ambjax.compiler import fast_path
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.laws import inversion, position
 from ambjax.plants import Plant
-from ambjax.sensors import Sensor
-from ambjax.signals import Pulse, Sine
+from ambjax.sensors import Dropouts, Sensor
+from ambjax.signals import Pulse, Recorded, Sine, Sum
 from ambjax.simulation.explicit import Euler
 from ambjax.simulation.folds import Lowest, Named, Rms, Variation
 from ambjax.simulation.trajectory import DIVERGED, TOUCHED, Row
@@ -240,9 +241,17 @@ def test_bad_input_is_refused_with_its_path(change, path):
         (lambda: dataclasses.replace(Plant(), n=np.float32(-1.0)), r"^Plant\.n = .*-1.*: it must be"),
         (lambda: Scenario(u_max=None), r"^Scenario\.u_max = None: it must be"),
         (lambda: Sine(np.nan, 2.0), r"^Sine\.amplitude = nan: it must be"),
+        (lambda: Processor(implicit="explicit"), r"^Processor\.implicit = 'explicit': it must be True or False\.$"),
+        (lambda: Processor(predict="no"), r"^Processor\.predict = 'no': it must be True or False or None\.$"),
+        (lambda: Sensor(velocity="no"), r"^Sensor\.velocity = 'no': it must be True or False\.$"),
+        (lambda: CoilLimits(unidirectional=1), r"^CoilLimits\.unidirectional = 1: it must be True or False\.$"),
+        (lambda: Dropouts(value="foo"), r"^Dropouts\.value = 'foo': it must be one of 'hold', 'nan', 'zero', "),
+        (lambda: Processor(guard=3), r"^Processor\.guard = 3: it must be a record of type Guard or None\.$"),
+        (lambda: Sum(Sine(1.0, 2.0)), r"^Sum\.terms = Sine\(.*: it must be a tuple\.$"),
+        (lambda: Recorded(3), r"^Recorded\.samples = 3: it must be a record of type Samples\.$"),
     ],
 )
-def test_a_record_refuses_a_number_outside_its_range(build, message):
+def test_a_record_refuses_a_value_that_a_field_does_not_allow(build, message):
     with pytest.raises(ValueError, match=message):
         build()
 

@@ -16,6 +16,8 @@ from ambjax.cases.controller_tables import KINDS
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
+from ambjax.linear import loop_matrices
+from ambjax.simulation.rollout import prepare
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import DIVERGED
 from ambjax.solvers import RK4
@@ -216,6 +218,43 @@ def test_a_part_of_an_ensemble_uses_the_program_of_the_whole():
         assert (processor.whole, processor.most, processor.predicts) == (False, 2, True)
     alone = cascade_of(delay=0.0).on_processor().processor
     assert (alone.whole, alone.most, alone.predicts) == (True, 0, False)
+
+
+DELAYS = np.array([1.0, 0.0, 1.5, 2.0, 3.0, -1.0])
+
+
+@pytest.mark.parametrize("between", [False, True])
+def test_a_traced_delay_that_the_program_does_not_support_makes_the_start_nan(between):
+    prepared = amb.Cascade(processor=Processor(1.0)).on_processor(*[2.0] * between, between=between)
+    scenario = amb.Scenario(initial=amb.Initial(z=1e-5))
+
+    def start(delay):
+        cascade = amb.with_gains(prepared, {"processor.delay": delay})
+        return prepare(cascade, scenario, SHORT.with_method(RK4(1)))[0].loop.scenario.initial.z
+
+    expected = np.where([True, True, between, between, False, False], 1e-5, np.nan)
+    np.testing.assert_array_equal(jax.vmap(start)(DELAYS), expected)
+
+
+@pytest.mark.slow
+def test_a_traced_delay_that_the_program_does_not_support_gives_nan():
+    prepared = amb.Cascade(processor=Processor(1.0)).on_processor()
+    scenario, clock = amb.Scenario(initial=amb.Initial(z=1e-5)), amb.Clock(5, 1e-4, RK4(1))
+
+    def of(delay):
+        cascade = amb.with_gains(prepared, {"processor.delay": delay})
+        found = loop_matrices(cascade, scenario, clock.sample_period, 0.0)[1]
+        return amb.rollout(cascade, scenario, clock).trajectory.rows.z[-1], found
+
+    z, found = jax.jit(jax.vmap(of))(DELAYS)
+    np.testing.assert_allclose(z, [*(of(delay)[0] for delay in DELAYS[:2]), *[np.nan] * 4], rtol=1e-9)
+    np.testing.assert_array_equal(found, [True, True, False, False, False, False])
+
+
+@pytest.mark.parametrize("delay", ["a", np.nan, -1.0, 50.0])
+def test_a_delay_out_of_range_is_refused(delay):
+    with pytest.raises(ValueError, match=r"^delay = .*: it must be a finite number from 0 to 10 "):
+        amb.Cascade(processor=Processor(1.0)).on_processor(delay, 2.0)
 
 
 def test_a_delay_that_is_set_later_is_predicted():

@@ -17,8 +17,6 @@ from ambjax.world.recorded import Recorded, Samples
 INTERPOLATIONS = ["linear", "held"]
 KEYS = ["file", "columns", "interpolation", "scale", "start"]
 FIELDS = {field.name: field for field in dataclasses.fields(Recorded)}
-# Largest number of rows. The rows are constants of the compiled program.
-MOST_ROWS = 200_000
 
 
 class RecordedFile(NamedTuple):
@@ -52,7 +50,7 @@ class Recordings:
         return Recorded(one.samples, held, scale, start)
 
     def _opened(self, key: str, written: object, columns: tuple[str, str] | None) -> RecordedFile:
-        """Read and check the file at the path `written`, the value of `key`. Raises ValueError if that fails."""
+        """Read the file at the path `written`, the value of `key`. Raises ValueError if that fails."""
 
         def refuse(why: str) -> ValueError:
             return ValueError(f"{key} = {show(written)}: {why}")
@@ -64,7 +62,7 @@ class Recordings:
         file = (self.folder / written).resolve()
         try:
             found = READERS[file.suffix.lower()](file)
-            return RecordedFile(key, written, file, _checked(*_chosen(found, columns)))
+            return RecordedFile(key, written, file, Samples(*_chosen(found, columns)))
         except OSError as error:
             why = (
                 f"{file} cannot be read ({error.strerror or error}). A path is relative to the folder of the case file"
@@ -101,26 +99,6 @@ def _chosen(found: dict[str, np.ndarray], columns: tuple[str, str] | None) -> tu
         if name not in found:
             raise ValueError(f"it has no column '{name}'. Its columns: {listed}.")
     return found[columns[0]], found[columns[1]]
-
-
-def _checked(times: np.ndarray, values: np.ndarray) -> Samples:
-    """Return the samples. Raises ValueError for a wrong shape, a number that is not finite, or times not in order."""
-    shapes = np.shape(times), np.shape(values)
-    if any(len(shape) != 1 for shape in shapes) or shapes[0] != shapes[1]:
-        raise ValueError(
-            f"times and values must be two lists of equal length; their shapes are {shapes[0]}, {shapes[1]}."
-        )
-    if not 2 <= times.size <= MOST_ROWS:
-        raise ValueError(f"it has {times.size:,} rows; give 2 to {MOST_ROWS:,}.")
-    for what, x in (("time", times), ("value", values)):
-        if not np.issubdtype(x.dtype, np.number) or np.iscomplexobj(x):
-            raise ValueError(f"its {what}s are not real numbers.")
-        if (wrong := np.flatnonzero(~np.isfinite(x))).size:
-            raise ValueError(f"the {what} of row {wrong[0] + 1} is {x[wrong[0]]}; each must be a finite number.")
-    if (wrong := np.flatnonzero(np.diff(times) <= 0)).size:
-        row = wrong[0] + 1
-        raise ValueError(f"times must increase: row {row + 1} has {times[row]:g} s after {times[row - 1]:g} s.")
-    return Samples(np.asarray(times, float), np.asarray(values, float))
 
 
 def _csv(file: pathlib.Path) -> dict[str, np.ndarray]:

@@ -232,7 +232,8 @@ class Cascade:
         """Fix all choices that determine the compiled program, so that the cascade can be used in jit, grad or vmap.
 
         A sign with steepness inf becomes set-valued. The program also supports the delays `delays` (samples) and, if
-        `between` is true, every delay between them. Raises ValueError as `Processor.resolved` does.
+        `between` is true, every delay between them. With another delay set inside jit, grad or vmap, a rollout is lost
+        at t = 0 with z = NaN. Raises ValueError as `Processor.resolved` does.
         """
         laws = {stage: with_set_valued_signs(getattr(self, stage)) for stage in DEFAULT_LAWS}
         return dataclasses.replace(self, **laws, processor=self.timing.resolved(*delays, between=between))

@@ -11,7 +11,8 @@ from jax import Array, lax
 
 from ambjax.control.guard import Guard
 from ambjax.control.sampling import Sampling
-from ambjax.numerics.records import Scalar, derived, is_traced, leaf, part, record, replaced, static
+from ambjax.numerics.declared import check_number
+from ambjax.numerics.records import Scalar, derived, is_traced, leaf, leaves_of, part, record, replaced, static
 from ambjax.numerics.runge_kutta import rk4_step
 from ambjax.world.plant import Plant, State
 from ambjax.world.sensor import Measurement
@@ -83,8 +84,11 @@ class Processor:
 
         The program supports the processor's own delay and the delays `others`; with `between`, also every delay between
         them. Larger numbers `most` and `kept`, and a `whole` that is False, are not changed. A part of an ensemble thus
-        runs the same program as the whole ensemble. Raises ValueError if a delay is traced and `most` is None.
+        runs the same program as the whole ensemble. Raises ValueError for a number in `others` that is no delay, and if
+        a delay is traced and `most` is None.
         """
+        for other in others:
+            check_number(leaves_of(Processor)[0], "delay", other)
         traced = "delay" if is_traced(self.delay) else "assumed"
         if is_traced(getattr(self, traced)):
             if self.most is None:
@@ -100,6 +104,16 @@ class Processor:
         most = max(self.most or 0, ahead)
         kept = max(self.kept or 0, most, longest, math.ceil(USUAL_DELAY))
         return replaced(self, whole=whole, most=most, kept=kept)
+
+    def supported(self, whole: bool = False) -> Array:
+        """Return whether the program of `resolved` has room for this delay and this horizon of the prediction.
+
+        `whole`: whether the program also needs a whole number of samples, if the field `whole` says so.
+        """
+        own, (delay, ahead) = self.resolved(), map(jnp.asarray, (self.delay, self.ahead))
+        fits = (delay >= 0) & (delay <= (own.kept or 0))
+        fits &= (ahead >= 0) & (ahead <= (own.most or 0)) if own.predicts else True
+        return fits & (delay == jnp.round(delay)) if whole and own.whole else fits
 
     def remembered(self, u: Array, *past: Array) -> tuple[Array, ...]:
         """Return the past commands of the next sample. `u`, `past`: the command of this sample and those before it."""

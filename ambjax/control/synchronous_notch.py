@@ -59,7 +59,7 @@ class SynchronousNotch:
     constant speed, the notch is linear and time-invariant. `linear.with_notch_gains` computes the gains.
     """
 
-    removes: str = static(default="force-free", doc='"force-free" or "displacement-free"')
+    removes: str = static(default="force-free", choices=tuple(NULLED), doc='"force-free" or "displacement-free"')
     rate: Scalar = leaf(default=10.0, unit="1/s", at_least=1e-6, at_most=1e6, doc="rate at which the notch converges")
     min_speed: Scalar = leaf(default=0.0, unit="rpm", at_least=0, at_most=1e7, doc="speed from which the notch is on")
     max_speed: Scalar = leaf(

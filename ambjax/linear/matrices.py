@@ -116,13 +116,13 @@ def loop_matrices(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scala
     - `period`: sample period, s; not used in continuous time.
 
     The function is pure, works under jit and vmap, and is differentiable in all gains and parameters. Returns the state
-    space, and whether an equilibrium was found; if not, the matrices have no meaning. They are not finite if a law has
-    no derivative at the equilibrium.
+    space, and whether an equilibrium was found and the processor supports its delay (`Cascade.on_processor`); if not,
+    the matrices have no meaning. They are not finite if a law has no derivative at the equilibrium.
     """
     cascade, scenario = _linear_parts(cascade, scenario)
     point, found, _ = equilibrium(cascade, scenario, period, r)
     build = _sampled if cascade.sampled else _continuous
-    return build(cascade, scenario, period, r, point), found
+    return build(cascade, scenario, period, r, point), found & cascade.timing.supported()
 
 
 def rest(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> Equilibrium:

@@ -1,10 +1,12 @@
 """What the fields of records declare, as text for messages and docstrings, and as checks of values."""
 
 import dataclasses
+import functools
 import math
 import textwrap
+import types
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import numpy as np
 import numpy.typing as npt
@@ -97,6 +99,33 @@ def check_number(field: dataclasses.Field, name: str, value: object) -> None:
         form = ".10g" if field.metadata["whole"] else "g"
         shown = f"{value:{form}}" if isinstance(value, (int, float)) else _shown(value, number)
         raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.")
+
+
+@functools.cache
+def kinds(field: dataclasses.Field) -> tuple[type, ...]:
+    """Return the classes that a field which is no number allows; () if its values are not checked. Cached.
+
+    Checked are bool, tuples, records and None: a part of another class, such as a signal, needs only its methods.
+    """
+    given: tuple[Any, ...] = get_args(field.type) if isinstance(field.type, types.UnionType) else (field.type,)
+    named = tuple(get_origin(one) or one for one in given)
+    known = all(one in (bool, tuple, types.NoneType) or dataclasses.is_dataclass(one) for one in named)
+    return named if known else ()
+
+
+# What a class also admits: NumPy's booleans, and a list for a tuple.
+ALSO = {bool: (np.bool_,), tuple: (list,)}
+WORDS = {bool: "True or False", tuple: "a tuple", types.NoneType: "None"}
+
+
+def check_fixed(field: dataclasses.Field, name: str, value: object) -> None:
+    """Raise ValueError if the static field, or the part, `field` does not allow `value`."""
+    choices, named = field.metadata.get("choices"), kinds(field)
+    fits = value in choices if choices else isinstance(value, named + sum((ALSO.get(one, ()) for one in named), ()))
+    if not fits:
+        words = [WORDS.get(one) or f"a record of type {one.__name__}" for one in named]
+        allowed = f"one of {', '.join(map(repr, choices))}" if choices else " or ".join(words)
+        raise ValueError(f"{name} = {textwrap.shorten(repr(value), 60)}: it must be {allowed}.")
 
 
 def require_number(

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from jax import Array
 from jax.core import Tracer
 
-from ambjax.numerics.declared import check_number, item
+from ambjax.numerics.declared import check_fixed, check_number, item, kinds
 from ambjax.numerics.shapes import axes_of, check_shapes
 
 T = TypeVar("T")
@@ -100,9 +100,12 @@ def gain(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def static(default: object = dataclasses.MISSING, *, doc: str = "") -> Any:
-    """Declare a field that is part of the tree structure. Its value is hashable and never traced."""
-    return dataclasses.field(default=default, metadata={"static": True, "doc": doc})
+def static(default: object = dataclasses.MISSING, *, doc: str = "", choices: tuple[str, ...] = ()) -> Any:
+    """Declare a field that is part of the tree structure. Its value is hashable and never traced.
+
+    `choices`: the allowed values; (): every value of the annotated type.
+    """
+    return dataclasses.field(default=default, metadata={"static": True, "doc": doc, "choices": choices})
 
 
 def derived(*, init: Literal[False] = False) -> Any:
@@ -137,9 +140,9 @@ def record(cls: type[T]) -> type[T]:
     The type becomes part of the tree structure. With JAX's `register_dataclass`, the structures of two types with equal
     static fields compare equal, so that JAX could run the compiled program of one law for another.
 
-    The constructor checks each leaf that is a plain number. It skips traced values and arrays; `validate` checks arrays
-    before a rollout. JAX rebuilds records without the constructor. `record` appends a list
-    of the fields to the docstring.
+    The constructor checks each leaf that is a plain number, and the type of other fields (`declared.kinds`). It skips
+    traced numbers and arrays; `validate` checks arrays before a rollout. JAX rebuilds records without the constructor.
+    `record` appends a list of the fields to the docstring.
     """
     _check_at_construction(cls)
     record_type = dataclasses.dataclass(frozen=True)(cls)
@@ -177,7 +180,7 @@ def _check_at_construction(cls: type) -> None:
     own = cls.__dict__.get("__post_init__")
 
     def check(self: object) -> None:
-        """Check the numbers. Raise ValueError for a number outside its range."""
+        """Check the fields. Raise ValueError for a number outside its range, or a value of another type."""
         if own is not None:
             own(self)
         if type(self) is not cls:  # a subclass that is not a record: JAX may construct it with other values
@@ -189,6 +192,9 @@ def _check_at_construction(cls: type) -> None:
                 continue  # skips `check_leaf`, because tracing constructs many records
             if isinstance(value, (int, float, str, np.number)) or value is None:
                 check_leaf(field, f"{type(self).__name__}.{field.name}", value)
+        for field in _fixed(type(self)):
+            if given[field.name] is not field.default:
+                check_fixed(field, f"{type(self).__name__}.{field.name}", given[field.name])
         for field in _shaped(type(self)):
             if isinstance(given[field.name], (list, tuple)):  # one leaf, not one for each number
                 given[field.name] = np.asarray(given[field.name], float)
@@ -270,6 +276,13 @@ def _fields(kind: type) -> tuple[tuple[dataclasses.Field, bool], ...]:
 def leaves_of(kind: type) -> tuple[dataclasses.Field, ...]:
     """Return the fields of a record type that are leaves. Cached."""
     return tuple(field for field, is_leaf in _fields(kind) if is_leaf)
+
+
+@functools.cache
+def _fixed(kind: type) -> tuple[dataclasses.Field, ...]:
+    """Return the fields of a record type that are no leaves, and whose values are limited. Cached."""
+    fields = [field for field, is_leaf in _fields(kind) if not is_leaf and field.init]
+    return tuple(field for field in fields if field.metadata.get("choices") or kinds(field))
 
 
 @functools.cache

@@ -6,6 +6,7 @@ import hashlib
 import json
 import pathlib
 import re
+import tomllib
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from ambjax.cases.case_table import notebook_table
 from ambjax.cases.given import of_case
-from ambjax.cases.reader import Case
+from ambjax.cases.reader import Case, case_from
 from ambjax.codegen import verify
 from ambjax.codegen.block import Block
 from ambjax.codegen.c99 import machine, package, texts
@@ -31,6 +32,7 @@ from ambjax.ensemble.spread import ends
 from ambjax.host.arguments import names_arguments
 from ambjax.results.outputs import described, directory, files, plain, spare
 from ambjax.simulation.system import guarded
+from ambjax.simulation.triple import PARTS
 
 FORMATS = ("c", "fmu", "js")
 # Files of the verification.
@@ -81,8 +83,7 @@ class Plan(NamedTuple):
     @property
     def origin(self) -> Origin:
         """Name and checksum of the case, and the description of the block."""
-        digest = hashlib.sha256(self.case.text.encode()).hexdigest()
-        return Origin(self.case.name, digest, self.block.described())
+        return Origin(self.case.name, _digest(self.case), self.block.described())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,6 +177,14 @@ def planned(
     if verified:
         machine.check_compiler()
     return Plan(case, block, format, fmi or 3, precision or "float", name, verified)
+
+
+def _digest(case: Case) -> str:
+    """Return the SHA-256 of the text of a case; '' without a text, or if the case was changed after it was read."""
+    read = case_from(tomllib.loads(case.text), case.name, known=case)
+    (a, known), (b, given) = (jax.tree.flatten([getattr(one, name) for name in PARTS]) for one in (read, case))
+    same = known == given and all(map(np.array_equal, a, b))
+    return hashlib.sha256(case.text.encode()).hexdigest() if same and case.text else ""
 
 
 def _choice(name: str, value: object, allowed: tuple[object, ...]) -> None:

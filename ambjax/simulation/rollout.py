@@ -18,7 +18,7 @@ from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.method import with_method
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.span import Span
-from ambjax.simulation.system import check_inputs, check_recording, system_of
+from ambjax.simulation.system import check_inputs, check_recording, started, system_of
 from ambjax.simulation.trajectory import ALIVE, Row, Trajectory, first_time
 from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
@@ -118,7 +118,7 @@ def prepare(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[ClosedL
     """
     check_inputs(cascade, scenario, clock)
     clock = with_method(clock, cascade, scenario)
-    return system_of(cascade, scenario, clock), clock
+    return system_of(cascade, started(cascade, scenario), clock), clock
 
 
 def run(system: System, clock: Clock, fold: Fold | None, record_every: int) -> Result:

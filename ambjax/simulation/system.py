@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ambjax.control.cascade import Cascade
@@ -120,6 +121,18 @@ def _check_laws(cascade: Cascade, sample_period: Scalar) -> None:
                 f"controller.{stage} = {type(law).__name__}: it does not take the {demand} that "
                 f"{type(cascade.position).__name__} demands. Leave out [controller.{stage}] to get a law that takes it."
             )
+
+
+def started(cascade: Cascade, scenario: Scenario) -> Scenario:
+    """Return the scenario. If a traced delay is none that the program supports, z is NaN at t = 0, and thus afterwards.
+
+    Otherwise the rollout would use another delay, because the program is fixed before the value is known.
+    """
+    timing = cascade.timing
+    if not (is_traced(timing.delay) or is_traced(timing.assumed)):
+        return scenario
+    z = jnp.where(timing.supported(whole=True), scenario.initial.z, jnp.nan)
+    return dataclasses.replace(scenario, initial=dataclasses.replace(scenario.initial, z=z))
 
 
 def system_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> ClosedLoop | Sampled:

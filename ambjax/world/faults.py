@@ -78,7 +78,7 @@ class Dropouts:
         default=5e-4, unit="s", at_least=0, at_most=1e6, doc="duration, rounded to whole samples, at least one"
     )
     at: Scalar | None = _at()
-    value: str = static(default=VALUES[0], doc="reading during a dropout")
+    value: str = static(default=VALUES[0], choices=VALUES, doc="reading during a dropout")
 
     def onset(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Array:
         """Return whether a dropout begins at a sample."""

@@ -7,10 +7,14 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, record, static
 from ambjax.world.waveforms import later
+
+# Largest number of rows. The rows are constants of the compiled program.
+MOST_ROWS = 200_000
 
 
 class Knots(NamedTuple):
@@ -29,11 +33,30 @@ class Knots(NamedTuple):
 class Samples:
     """Values [n] at increasing times [n] (s), float64, n >= 2. Two `Samples` are equal if their numbers are.
 
+    Lists, and arrays of other types, are converted. Raises ValueError for another shape, a number that is not finite,
+    or times not in order.
+
     Use it for the numbers of a `Recorded` signal: `signals.Samples(np.array([0.0, 0.1]), np.array([0.0, 5.0]))`.
     """
 
     times: np.ndarray
     values: np.ndarray
+
+    def __post_init__(self) -> None:
+        times, values = (_numbers(f.name, getattr(self, f.name)) for f in dataclasses.fields(self))
+        if times.ndim != 1 or times.shape != values.shape:
+            raise ValueError(
+                f"times and values must be two lists of equal length; their shapes are {times.shape}, {values.shape}."
+            )
+        if not 2 <= times.size <= MOST_ROWS:
+            raise ValueError(f"times and values have {times.size:,} rows; give 2 to {MOST_ROWS:,}.")
+        for what, x in (("time", times), ("value", values)):
+            if (wrong := np.flatnonzero(~np.isfinite(x))).size:
+                raise ValueError(f"the {what} of row {wrong[0] + 1} is {x[wrong[0]]}; each must be a finite number.")
+        if (wrong := np.flatnonzero(np.diff(times) <= 0)).size:
+            row = wrong[0] + 1
+            raise ValueError(f"times must increase: row {row + 1} has {times[row]:g} s after {times[row - 1]:g} s.")
+        self.__dict__.update(times=times, values=values)
 
     @functools.cached_property
     def digest(self) -> str:
@@ -45,6 +68,17 @@ class Samples:
 
     def __hash__(self) -> int:
         return hash(self.digest)
+
+
+def _numbers(what: str, given: npt.ArrayLike) -> np.ndarray:
+    """Return real numbers as float64. Raises ValueError if they are traced, or not real numbers."""
+    try:
+        x = np.asarray(given)
+        if np.issubdtype(x.dtype, np.number) and not np.iscomplexobj(x):
+            return np.asarray(x, float)
+    except (TypeError, ValueError):  # traced, or lists of several lengths
+        pass
+    raise ValueError(f"{what} are not real numbers.")
 
 
 @record

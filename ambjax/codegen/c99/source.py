@@ -17,7 +17,7 @@ SLACK = 256  # bytes of a stack frame in addition to its numbers: saved register
 
 
 class Origin(NamedTuple):
-    """The origin of a block: name of the case, SHA-256 of its file, and the block in words."""
+    """The origin of a block: name of the case, SHA-256 of its file ('' if it has none), and the block in words."""
 
     case: str
     digest: str
@@ -120,7 +120,8 @@ class Writer:
         lines = [
             f"{file}: the {self.trace.block.noun} of case '{self.origin.case}' as C99, written by ambjax {__version__}."
         ]
-        lines += [MARK.format(p=self.prefix), f"SHA-256 of the case: {self.origin.digest}"]
+        lines += [MARK.format(p=self.prefix)]
+        lines += [f"SHA-256 of the case: {self.origin.digest}"] if self.origin.digest else []
         return "/* " + "\n * ".join(lines) + " */"
 
     # --- the header ---
