@@ -225,16 +225,20 @@ def test_planes_share_the_unbalance_of_a_grade():
 
 
 def test_runout_turns_with_the_rotor():
-    """Over one turn, a sensor at rest reads the harmonic, with the angle of the unbalance."""
+    """Over one turn, a sensor at rest reads the harmonic, with the angle of the unbalance, later by its own angle."""
     turning = MACHINE["rotor"] | {"speed": 600.0, "acceleration": 6000.0}
     sensor = {"velocity": False, "runout": {"harmonics": [{"amplitude": 1e-6, "number": 2, "phase": 0.3}]}}
-    case = machine_from(short(MACHINE, rotor=turning, sensor=sensor))
+    left, right, thrust = MACHINE["bearing"]
+    bearings = [left, right | {"angle": 30.0}, thrust]
+    case = machine_from(short(MACHINE, rotor=turning, sensor=sensor, bearing=bearings))
     t = np.linspace(0, 0.2, 9)
     angle = 2 * np.pi * (10.0 * t + 100.0 * t * t / 2)
-    for one in case.cases:
+    tilt = np.radians(30.0)
+    for name, one, own in zip(case.axes, case.cases, [0.0, np.pi / 2, tilt, tilt + np.pi / 2, 0.0], strict=True):
         runout = one.scenario.turning().sensors.runout
         assert runout is not None
-        np.testing.assert_allclose([float(runout(x)) for x in t], 1e-6 * np.sin(2 * angle + 0.3), atol=1e-18)
+        expected = 1e-6 * np.sin(2 * (angle - own) + 0.3)
+        np.testing.assert_allclose([float(runout(x)) for x in t], expected, atol=1e-18, err_msg=name)
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import math
 import re
 from typing import Any
 
@@ -50,6 +51,17 @@ def axis_tables(
         own["sensitivity"].pop("speeds", None)
     limited, (q, i) = axis.magnet if "stop_stiffness" in run else axis.stop, start
     return own | {"initial": {"z": float(limited @ q), "i": i}}
+
+
+def with_runout_at(axis: BearingAxis, case: Case) -> Case:
+    """Return the case of a radial axis with the runout that its sensor reads: its angle later than one along x."""
+    sensor, (x, y) = case.scenario.sensor, axis.sensor[:2]
+    if sensor is None or sensor.runout is None or not (x or y):
+        return case
+    angle = math.atan2(y, x)
+    later = [dataclasses.replace(one, phase=one.phase - one.number * angle) for one in sensor.runout.harmonics]
+    runout = dataclasses.replace(sensor.runout, harmonics=tuple(later))
+    return dataclasses.replace(case, scenario=case.scenario.with_sensor(runout=runout))
 
 
 def _check_plant(table: Table, kind: type) -> None:

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.cases.axis_case import MACHINE_TABLES, as_written, axis_tables, check_axis, stop_slope
+from ambjax.cases.axis_case import MACHINE_TABLES, as_written, axis_tables, check_axis, stop_slope, with_runout_at
 from ambjax.cases.machine_controller import inner, kind_of, law_from, merged
 from ambjax.cases.machine_spread import axis_table, machine_spread, refuse_unused, with_notches
 from ambjax.cases.machine_trial import try_machine
@@ -157,7 +157,7 @@ def machine_from(
         own |= table
         of_notches.append(turning)
         written = functools.partial(as_written, raw=raw, bearing=bearing, axis=axis)
-        case = read(own, f"axis {axis.name}", written)
+        case = with_runout_at(axis, read(own, f"axis {axis.name}", written))
         check_axis(case, axis, force, q)
         cases.append(case)
     own_law = own_machine_law(kind, folder) if is_own(kind := kind_of(raw)) else None
