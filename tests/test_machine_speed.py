@@ -14,6 +14,8 @@ from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.template_text import template
 from ambjax.commands import campbell
 from ambjax.commands.machine_commands import once_per_revolution, sensitivity_text
+from ambjax.commands.sensitivity_report import injection_text
+from ambjax.linear.injection import Injection
 from ambjax.linear.linear_machine import machine_sensitivity, turning_machines
 from ambjax.linear.rotor_modes import modes_of, springs_critical
 from ambjax.linear.unbalance_response import UnbalanceResponse, critical_speeds, separation, unbalance_response
@@ -173,6 +175,15 @@ def test_the_waterfall_of_a_sweep_follows_its_frequency():
     # a window covers 1/12 of the sweep, 7 Hz, and lowers the peak of the spectrum
     np.testing.assert_allclose(highest, found.speeds / 60, atol=2.0)
     assert 0.6e-6 < found.amplitude.max() < 2e-6
+
+
+def test_the_text_of_an_injection_gives_the_zone_of_its_peak(rigid):
+    system = machine_sensitivity(rigid.machine, rigid.axes, rigid.clock.sample_period, 0.0, rigid.zones).system
+    one = np.ones(1)
+    measured = Injection(10 * one, one, one, one, 3.5, 3.5, 3.5, 10.0, 0, 1, 1e-6, 0.0)
+    assert "at 10 Hz, zone B (the linear peak: zone A), an end" in injection_text(system, measured, rigid.zones, "A")
+    assert "at 10 Hz, zone B, an end" in injection_text(system, measured, rigid.zones, "B")
+    assert "zone" not in injection_text(system, measured, None)
 
 
 def test_an_orbit_is_one_turn_also_where_the_speed_passes_0():

@@ -210,5 +210,5 @@ def sensitivity_text(points: list[MachineSensitivity], measured: Measured, zones
         for _, lines in once_per_revolution(point):
             parts += lines
         for k, (axis, one) in enumerate(zip(point.axes, _measured_at(point, measured), strict=True)):
-            parts += [] if one is None else [injection_text(point.system, one, k, f" at {axis.name}")]
+            parts += [] if one is None else [injection_text(point.system, one, zones, axis.zone, k, f" at {axis.name}")]
     return "\n".join(parts)

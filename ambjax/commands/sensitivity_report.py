@@ -114,13 +114,22 @@ def _at_edge(measured: Injection) -> bool | None:
     return None if measured.peak is None else measured.peak_frequency in measured.frequency[[0, -1]]
 
 
-def injection_text(system: StateSpace, measured: Injection, channel: int = 0, at: str = "", unit: str = "m") -> str:
-    """Describe the measured sensitivity at one sensor in one line."""
+def injection_text(
+    system: StateSpace, measured: Injection, zones: Zones | None, linear: str = "", channel: int = 0, at: str = ""
+) -> str:
+    """Describe the measured sensitivity at one sensor in one line.
+
+    `zones`: those of the position sensor; None at the velocity sensor. `linear`: zone of the linear peak.
+    """
+    unit = "m/s" if zones is None else "m"
     how = f"Injected{at} into the simulation (multi-sine of {measured.amplitude:.3g} {unit}"
     how += f", {measured.members} members)" if measured.members > 1 else ")"
     if measured.peak is None:
         return f"{how}: the rotor is lost, so no sensitivity can be measured."
     text = f"{how}: |S| peaks at {measured.peak:.4g} at {measured.peak_frequency:.4g} Hz"
+    if zones is not None:
+        zone = zones.zone(measured.peak)
+        text += f", zone {zone}" + f" (the linear peak: zone {linear})" * (zone != linear)
     if _at_edge(measured):
         text += ", an end of the measured band, so this value is not a peak"
     if measured.peak_low is not None and measured.members > 1:
@@ -163,8 +172,8 @@ def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None
         rows += [f"{UNSTABLE} {growth}"]
     if measured is not None:
         system, velocity = points[0].system, measured.velocity
-        rows += [injection_text(system, measured.position)]
-        rows += [] if velocity is None else [injection_text(system, velocity, 1, " at the velocity sensor", "m/s")]
+        rows += [injection_text(system, measured.position, zones, one.zone)]
+        rows += [] if velocity is None else [injection_text(system, velocity, None, "", 1, " at the velocity sensor")]
     if spread is not None:
         rows += [
             f"Of {spread.members} members of [spread], {spread.stable} are stable and {spread.zone_a} are in zone A; "
