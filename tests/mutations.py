@@ -224,7 +224,7 @@ MUTATIONS = [
       "and not _holds(out / name, mark)", "and False",
       "tests/test_export.py::test_only_files_of_an_earlier_export_of_the_same_prefix_are_replaced"),
     M("the constructor of a record does not check the ranges of numbers", "ambjax/numerics/records.py",
-      "if isinstance(value, (int, float, str, np.number)) or value is None:", "if value is None:",
+      "if isinstance(value, (int, float, str, list, tuple, np.number)) or value is None:", "if value is None:",
       "tests/test_rollout.py::test_a_record_refuses_a_value_that_a_field_does_not_allow"),
     M("a failed check of an export does not change the result", "ambjax/results/case_export.py",
       "return verify.holds(self.checks) if self.checks else None", "return True if self.checks else None",

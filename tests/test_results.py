@@ -13,6 +13,7 @@ import pytest
 import ambjax
 from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
+from ambjax.results.case_export import ExportedCase
 from ambjax.simulation.trajectory import STALLED
 from tuning.__main__ import main as tune_main
 from tuning.command import TunedCase
@@ -135,6 +136,7 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
     case = ambjax.read_case(path)
     cascade, scenario, clock = case.cascade, case.scenario, case.clock
     gains, two = {"controller.position.c": jnp.array([17.0, 18.0])}, dataclasses.replace(scenario, member=np.arange(2))
+    none = dataclasses.replace(scenario, member=np.arange(0))
     late = dataclasses.replace(scenario, q_z=ambjax.signals.Pulse(1.0, 2.0, 1.0))
     short = dataclasses.replace(case, clock=dataclasses.replace(clock, samples=2))
     periods = float(clock.sample_period) * jnp.array([0.5, 1.0])
@@ -144,6 +146,21 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
         (lambda: ambjax.simulate_members(case, 1, seed=-1), "seed = -1: it must be a whole number from 0 to"),
         (lambda: ambjax.read_case(3), "path = 3: it must be the path of a file.* or a dict"),
         (lambda: run.save("nowhere/run.npz"), "nowhere/run.npz: the directory nowhere does not exist"),
+        (lambda: run.save(3), "path = 3: it must be the path of a file"),
+        (lambda: ambjax.save_controller("nowhere/p.npz", None), "nowhere/p.npz: the directory nowhere does not exist"),
+        (lambda: ExportedCase.write(None, 3), "folder = 3: it must be the path of a folder"),
+        (lambda: ambjax.Case("x", scenario, cascade, clock, 0.0), r"Case.cascade = Scenario.*: it must be a Cascade\."),
+        (lambda: ambjax.Case(3, cascade, scenario, clock, 0.0), r"Case.name = 3: it must be a str\."),
+        (lambda: dataclasses.replace(case, settle=-1), "Case.settle = -1: it must be a finite number of at least 0"),
+        (lambda: ambjax.vector_field(case).f(0.0, np.zeros(3)), r"y has the shape \[3\]: it must be \[4\]"),
+        (lambda: ambjax.vector_field(case).named(np.zeros(3)), r"y has the shape \[3\]: it must be \[4\]"),
+        (lambda: ambjax.rollout(case, fold=ambjax.extend.Rms("foo")), "of = 'foo': it must be a signal of a row: t, "),
+        (lambda: ambjax.rollout(case, fold=ambjax.extend.Peak(lambda r: r.z)), "of = <.*: it must be a signal of a"),
+        (lambda: ambjax.rollout(ambjax.with_gains(case, {"controller.position.c": [17.0, 18.0]})),
+         r"c has the shape \[2\]: this function takes one member"),
+        (lambda: ambjax.rollout(ambjax.with_gains(case, {"controller.position.c": np.True_})), "c = .*True.*: it must"),
+        (lambda: ambjax.ensemble.run_ensemble(cascade, none, clock, fold=None),
+         r"scenario.member = array\(\[\].*: it must be a whole number from 0"),
         (lambda: ambjax.sensitivity(case, "a"), "r = 'a': it must be a finite number"),
         (lambda: ambjax.gains_of(cascade, 3), "paths = 3: it must be a list"),
         (lambda: ambjax.gains_of(cascade, "controller.position.c"), r'a list. Write \["controller.position.c"\]'),

@@ -238,6 +238,8 @@ def test_bad_input_is_refused_with_its_path(change, path):
     [
         (lambda: Plant(m=0.0), r"^Plant\.m = 0: it must be a finite number from 1e-06 to 1e\+06 \(kg\)\.$"),
         (lambda: Plant(m="4"), r"^Plant\.m = '4': it must be"),
+        (lambda: Plant(m=True), r"^Plant\.m = True: it must be"),
+        (lambda: Plant(m=["4", 1.0]), r"^Plant\.m = \['4', 1\.0\]: it must be"),
         (lambda: dataclasses.replace(Plant(), n=np.float32(-1.0)), r"^Plant\.n = .*-1.*: it must be"),
         (lambda: Scenario(u_max=None), r"^Scenario\.u_max = None: it must be"),
         (lambda: Sine(np.nan, 2.0), r"^Sine\.amplitude = nan: it must be"),

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase
-from ambjax.cases.reader import Case, is_machine, read_case, require_file
-from ambjax.cases.table import load, one_line
+from ambjax.cases.reader import Case, is_machine, read_case
+from ambjax.cases.table import load, one_line, require_file
 from ambjax.commands.reading import print_warnings
 from ambjax.host.arguments import names_arguments
 from ambjax.host.heartbeat import say

@@ -9,7 +9,7 @@ import numpy as np
 
 from ambjax.cases.own_laws import path_from
 from ambjax.cases.recordings import npz_arrays
-from ambjax.cases.table import Table, show
+from ambjax.cases.table import Table, file_to_write, show
 from ambjax.control.linear_controller import state_space_of
 from ambjax.control.realisation import Realisation, realisation
 
@@ -100,9 +100,10 @@ def save_controller(path: str | pathlib.Path, system: Any) -> None:
     """Write a system of python-control or SciPy into an .npz or .mat file that a case file may name.
 
     `system`: a transfer function, or an object with the matrices A, B, C, D; with the period dt (s). Without it, or if
-    it is None or 0, the system is continuous. Raises ValueError for another ending of the path, and as `state_space_of`
-    and `realisation` do.
+    it is None or 0, the system is continuous. Raises ValueError for another ending of the path, for a directory that
+    does not exist, and as `state_space_of` and `realisation` do.
     """
+    path = file_to_write("save_controller", path)
     system = state_space_of(system)
     dt = getattr(system, OPTIONAL, None)
     arrays = {name: np.asarray(getattr(system, name)) for name in NAMES}
@@ -110,7 +111,7 @@ def save_controller(path: str | pathlib.Path, system: Any) -> None:
     arrays[OPTIONAL] = np.asarray(0.0 if dt is None else dt)
     if not str(path).endswith(ENDINGS):
         raise ValueError(f"{path}: the file must end in .npz or .mat.")
-    if pathlib.Path(path).suffix == ENDINGS[0]:
+    if path.suffix == ENDINGS[0]:
         np.savez(path, **arrays)  # pyright: ignore[reportArgumentType]
     else:
         import scipy.io

@@ -18,7 +18,7 @@ from ambjax.cases.machine_trial import try_machine
 from ambjax.cases.notch_table import notch_from
 from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
 from ambjax.cases.plausibility import unresolved
-from ambjax.cases.reader import FILE, TABLES, Case, case_from, is_machine, read_by, require_file, safe_name
+from ambjax.cases.reader import TABLES, Case, case_from, is_machine, read_by, safe_name
 from ambjax.cases.rotor_numbers import fastest_rotor, widest_rotation
 from ambjax.cases.rotor_tables import (
     COORDINATES,
@@ -31,7 +31,7 @@ from ambjax.cases.rotor_tables import (
     vector,
 )
 from ambjax.cases.speed_table import MOST_SPEEDS, listed_speeds
-from ambjax.cases.table import Table
+from ambjax.cases.table import FILE, Table, require_file
 from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.synchronous_notch import SynchronousNotch

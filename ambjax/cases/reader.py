@@ -3,7 +3,7 @@
 import dataclasses
 import pathlib
 import re
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from typing import Any, TypeVar
 
 import jax
@@ -16,12 +16,13 @@ from ambjax.cases.own_laws import OwnLaw
 from ambjax.cases.reach import check_reference
 from ambjax.cases.recordings import RecordedFile, Recordings
 from ambjax.cases.scenario_tables import check_start, scenario_from
-from ambjax.cases.table import Table, check_depth, cut, load
+from ambjax.cases.table import Table, check_depth, cut, load, require_file
 from ambjax.cases.timing import clock_from
 from ambjax.cases.variation import spread_from
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import Spread, corners, ends
 from ambjax.linear.analysis import Zones
+from ambjax.numerics.declared import require_number
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import settled
@@ -58,9 +59,6 @@ OTHERS = ["tune"]  # read by the tuner, ignored by the other commands
 # largest length.
 UNSAFE, LONGEST_NAME = re.compile(r"[^\w.+() -]+"), 80
 
-# Kinds of a path, for messages.
-FILE = "the path of a file, as text or a pathlib.Path"
-
 
 @dataclasses.dataclass(frozen=True)
 class Case:
@@ -88,6 +86,12 @@ class Case:
     zones: Zones = Zones()
     recorded: tuple[RecordedFile, ...] = ()
 
+    def __post_init__(self) -> None:
+        for name, kind in {"name": str, "cascade": Cascade, "scenario": Scenario, "clock": Clock}.items():
+            if not isinstance(value := getattr(self, name), kind):
+                raise ValueError(f"Case.{name} = {cut(repr(value))}: it must be a {kind.__name__}.")
+        require_number("Case.settle", self.settle, 0)
+
     def _repr_html_(self) -> str:
         """Return the table of the parts of the case and their numbers, for notebooks."""
         return case_table(self.name, parts_of(self.cascade, self.scenario, self.clock), self.spread.paths)
@@ -110,7 +114,14 @@ def _flatten(case: Case) -> tuple[tuple[tuple[Hashable, object], ...], _Facts]:
     return parts, _Facts(getattr(case, name) for name in fields if name not in PARTS)
 
 
-jax.tree_util.register_pytree_with_keys(Case, _flatten, lambda facts, parts: Case(facts[0], *parts, *facts[1:]))
+def _unflatten(facts: _Facts, parts: Iterable[object]) -> Case:
+    """Return a case without the checks of the constructor: JAX puts other things than numbers into a tree."""
+    case, fields = object.__new__(Case), [field.name for field in dataclasses.fields(Case)]
+    case.__dict__.update(zip([*PARTS, *(name for name in fields if name not in PARTS)], (*parts, *facts), strict=True))
+    return case
+
+
+jax.tree_util.register_pytree_with_keys(Case, _flatten, _unflatten)
 
 
 def read_case(path: str | pathlib.Path) -> Case:
@@ -135,12 +146,6 @@ def read_by(parse: Callable[[dict[str, Any], str, str, pathlib.Path], T], path: 
 def is_machine(raw: dict[str, Any]) -> bool:
     """Return whether a parsed case file describes a whole machine."""
     return "bearing" in raw or (isinstance(raw.get("rotor"), dict) and "kind" in raw["rotor"])
-
-
-def require_file(name: str, path: object, kinds: str = FILE) -> None:
-    """Raise ValueError unless the argument `name` is the path of a file. `kinds`: what it may be, for the message."""
-    if not isinstance(path, str | pathlib.PurePath):
-        raise ValueError(f"{name} = {cut(repr(path))}: it must be {kinds}.")
 
 
 def safe_name(text: str) -> str:

@@ -18,6 +18,8 @@ from ambjax.text.words import one_line
 
 # Largest number of characters of a key or a value in a message.
 LONGEST = 60
+# Kinds of a path, for messages.
+FILE = "the path of a file, as text or a pathlib.Path"
 # Largest depth of nested tables and lists. A sum of sums needs less. The readers are recursive and rely on this limit.
 DEEPEST = 32
 # Tables of which a case may have several.
@@ -249,3 +251,18 @@ def quoted(words: list[str]) -> str:
     """Return the words as 'a', 'b' or 'c'."""
     names = [f"'{w}'" for w in words]
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
+
+
+def require_file(name: str, path: object, kinds: str = FILE) -> None:
+    """Raise ValueError unless the argument `name` is the path of a file. `kinds`: what it may be, for the message."""
+    if not isinstance(path, str | pathlib.PurePath):
+        raise ValueError(f"{name} = {cut(repr(path))}: it must be {kinds}.")
+
+
+def file_to_write(function: str, path: str | pathlib.Path) -> pathlib.Path:
+    """Return the argument `path` of a function. Raises ValueError unless it is the path of a file in a folder."""
+    require_file("path", path)
+    path = pathlib.Path(path)
+    if not path.parent.is_dir():
+        raise ValueError(f"{function}: {path}: the directory {path.parent} does not exist. Make it first.")
+    return path

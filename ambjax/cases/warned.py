@@ -13,6 +13,7 @@ from ambjax.cases import reader
 from ambjax.cases.plausibility import implausible
 from ambjax.cases.reach import reach, widest
 from ambjax.cases.reader import Case
+from ambjax.cases.table import FILE, require_file
 from ambjax.text.words import one_line
 from ambjax.world.scenario import Scenario
 
@@ -34,7 +35,7 @@ def read_case(path: str | pathlib.Path | Mapping[str, Any]) -> Case:
         case = reader.case_from(dict(path))
         texts = warnings_of(case)
     else:
-        reader.require_file("path", path, f"{reader.FILE}, or a dict of tables")
+        require_file("path", path, f"{FILE}, or a dict of tables")
         case = reader.read_case(path)
         texts = warnings_of_file(case, path)
     for text in texts:

@@ -1,5 +1,6 @@
 """What the fields of records declare, as text for messages and docstrings, and as checks of values."""
 
+import contextlib
 import dataclasses
 import functools
 import math
@@ -89,15 +90,15 @@ def within(meta: Mapping[str, Any], value: npt.ArrayLike) -> bool:
 
 
 def check_number(field: dataclasses.Field, name: str, value: object) -> None:
-    """Raise ValueError if `field` does not allow `value`, a number or an array."""
-    try:
-        number = value if isinstance(value, (int, float)) else np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        number = math.nan
-    number = math.nan if isinstance(value, str) else number
-    if not within(field.metadata, number):
+    """Raise ValueError if `field` does not allow `value`, a number or an array. Booleans and texts are no numbers."""
+    plain = isinstance(value, (int, float)) and not isinstance(value, bool)
+    number: Any = value if plain else math.nan
+    with contextlib.suppress(TypeError, ValueError):
+        if not plain and np.asarray(value).dtype.kind not in "bUS":
+            number = np.asarray(value, dtype=float)
+    if not (np.size(number) and within(field.metadata, number)):
         form = ".10g" if field.metadata["whole"] else "g"
-        shown = f"{value:{form}}" if isinstance(value, (int, float)) else _shown(value, number)
+        shown = f"{value:{form}}" if plain else _shown(value, number)
         raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.")
 
 
@@ -154,4 +155,4 @@ def require_number(
 
 def _shown(value: object, number: npt.ArrayLike) -> str:
     """Return the text of an invalid value for a message: the range of an array, or the value as Python shows it."""
-    return f"{np.min(number):g} to {np.max(number):g}" if np.ndim(number) else repr(value)
+    return f"{np.min(number):g} to {np.max(number):g}" if np.ndim(number) and np.size(number) else repr(value)

@@ -20,7 +20,7 @@ from jax import Array
 from jax.core import Tracer
 
 from ambjax.numerics.declared import check_fixed, check_number, item, kinds
-from ambjax.numerics.shapes import axes_of, check_shapes
+from ambjax.numerics.shapes import check_shapes
 
 T = TypeVar("T")
 
@@ -140,9 +140,9 @@ def record(cls: type[T]) -> type[T]:
     The type becomes part of the tree structure. With JAX's `register_dataclass`, the structures of two types with equal
     static fields compare equal, so that JAX could run the compiled program of one law for another.
 
-    The constructor checks each leaf that is a plain number, and the type of other fields (`declared.kinds`). It skips
-    traced numbers and arrays; `validate` checks arrays before a rollout. JAX rebuilds records without the constructor.
-    `record` appends a list of the fields to the docstring.
+    The constructor checks each leaf that is a plain number or a list, which becomes an array, and the type of other
+    fields (`declared.kinds`). It skips traced numbers and arrays; `validate` checks arrays before a rollout. JAX
+    rebuilds records without the constructor. `record` appends a list of the fields to the docstring.
     """
     _check_at_construction(cls)
     record_type = dataclasses.dataclass(frozen=True)(cls)
@@ -188,16 +188,16 @@ def _check_at_construction(cls: type) -> None:
         given = self.__dict__
         for field, low, high in _leaves(type(self)):
             value = given[field.name]
-            if value is field.default or (type(value) is float and low < value < high):
+            fine = value is field.default and not isinstance(value, (list, tuple))
+            if fine or (type(value) is float and low < value < high):
                 continue  # skips `check_leaf`, because tracing constructs many records
-            if isinstance(value, (int, float, str, np.number)) or value is None:
+            if isinstance(value, (int, float, str, list, tuple, np.number)) or value is None:
                 check_leaf(field, f"{type(self).__name__}.{field.name}", value)
+            if isinstance(value, (list, tuple)):  # one leaf, not one for each number
+                given[field.name] = np.asarray(value, None if field.metadata["whole"] else float)
         for field in _fixed(type(self)):
             if given[field.name] is not field.default:
                 check_fixed(field, f"{type(self).__name__}.{field.name}", given[field.name])
-        for field in _shaped(type(self)):
-            if isinstance(given[field.name], (list, tuple)):  # one leaf, not one for each number
-                given[field.name] = np.asarray(given[field.name], float)
 
     cls.__post_init__ = check  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -283,12 +283,6 @@ def _fixed(kind: type) -> tuple[dataclasses.Field, ...]:
     """Return the fields of a record type that are no leaves, and whose values are limited. Cached."""
     fields = [field for field, is_leaf in _fields(kind) if not is_leaf and field.init]
     return tuple(field for field in fields if field.metadata.get("choices") or kinds(field))
-
-
-@functools.cache
-def _shaped(kind: type) -> tuple[dataclasses.Field, ...]:
-    """Return the leaves of a record type that are arrays. Cached."""
-    return tuple(field for field in leaves_of(kind) if axes_of(field))
 
 
 @functools.cache

@@ -16,6 +16,7 @@ import numpy as np
 from ambjax.cases.case_table import notebook_table
 from ambjax.cases.given import of_case
 from ambjax.cases.reader import Case, case_from
+from ambjax.cases.table import require_file
 from ambjax.codegen import verify
 from ambjax.codegen.block import Block
 from ambjax.codegen.c99 import machine, package, texts
@@ -112,6 +113,7 @@ class ExportedCase:
         verify.json are removed. Raises ValueError, and writes nothing, if the folder cannot be written, or if another
         file in it has one of the names.
         """
+        require_file("folder", folder, "the path of a folder, as text or a pathlib.Path")
         with destination(str(folder), "", self.plan) as (out, part):
             self.put(part)
         return out

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase
+from ambjax.cases.table import file_to_write
 from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.ensemble.replay import SEGMENT
 from ambjax.numerics.records import canonical
@@ -41,8 +42,8 @@ class MachineRun:
         return bool(self.metrics["lost"])
 
     def save(self, path: str | pathlib.Path) -> None:
-        """Write the signals to an .npz file, in SI units."""
-        np.savez_compressed(path, **self.signals)  # pyright: ignore[reportArgumentType]
+        """Write the signals to an .npz file, in SI units. Raises ValueError for a directory that does not exist."""
+        np.savez_compressed(file_to_write("save", path), **self.signals)  # pyright: ignore[reportArgumentType]
 
     def plot(self) -> Any:
         """Return a matplotlib Figure with the motion, the currents and the voltages of all axes, and the orbits."""

@@ -11,6 +11,7 @@ from ambjax.cases.case_table import notebook_table
 from ambjax.cases.given import of_case
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
+from ambjax.cases.table import file_to_write
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.replay import record_member
 from ambjax.host.extensions import extra
@@ -70,9 +71,7 @@ class CaseRun:
         Each signal is an array by its name, in SI units. Raises ValueError for another ending, for a directory that
         does not exist, and for .parquet without pyarrow.
         """
-        path = pathlib.Path(path)
-        if not path.parent.is_dir():
-            raise ValueError(f"save: {path}: the directory {path.parent} does not exist. Make it first.")
+        path = file_to_write("save", path)
         arrays = {name: x for name, x in self.trajectory.arrays().items() if name in SIGNAL_UNITS}
         if path.suffix == ".npz":
             self.trajectory.save(path)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
@@ -43,7 +44,12 @@ def vector_field(case: Case) -> VectorField:
     cascade, scenario = canonical((case.cascade, scenario))
     loop = ClosedLoop(cascade, scenario.louder(0.0)).realised()
     errors = loop.sensor_errors(0)
-    y_0, named = ravel_pytree(loop.start())
+    y_0, restored = ravel_pytree(loop.start())
+
+    def named(y: Any) -> LoopState:
+        if jnp.shape(y) != y_0.shape:
+            raise ValueError(f"y has the shape {list(jnp.shape(y))}: it must be {list(y_0.shape)}, as that of y_0.")
+        return restored(jnp.asarray(y))
 
     @jax.jit
     def f(t: Any, y: Any, args: Any = None) -> Array:

@@ -48,6 +48,13 @@ def _zero() -> Array:
     return jnp.zeros((), jnp.result_type(float))
 
 
+def _signal(row: Row, name: str) -> Array:
+    """Return a signal of a row. Raises ValueError if it has none of this name."""
+    if not isinstance(name, str) or not hasattr(row, name):
+        raise ValueError(f"of = {name!r}: it must be a signal of a row: {', '.join([*row._fields, 'e_z', 'e'])}.")
+    return getattr(row, name)
+
+
 @record
 class Peak:
     """Largest absolute value of a signal, also between samples if the span contains its extremes."""
@@ -61,7 +68,7 @@ class Peak:
 
     def update(self, carry: tuple[Array, Array], row: Row, span: Span) -> tuple[Array, Array]:
         peak, when = carry
-        value = jnp.abs(getattr(row, self.of))
+        value = jnp.abs(_signal(row, self.of))
         if self.of in getattr(span.most, "_fields", ()):
             value = larger(value, getattr(span.most, self.of))
         new = (value > peak) & (row.t >= self.after)
@@ -82,7 +89,7 @@ class Lowest:
 
     def update(self, carry: tuple[Array, Array], row: Row, span: Span) -> tuple[Array, Array]:
         least, when = carry
-        value = getattr(row, self.of)
+        value = _signal(row, self.of)
         new = (value < least) & row.alive
         return jnp.where(new, value, least), jnp.where(new, row.t, when)
 
@@ -107,7 +114,7 @@ class Rms:
     def update(self, carry: tuple[Array, Array], row: Row, span: Span) -> tuple[Array, Array]:
         total, count = carry
         counts = (row.t >= self.after) & (row.alive if self.driven else True)
-        return total + jnp.where(counts, getattr(row, self.of) ** 2, 0.0), count + counts
+        return total + jnp.where(counts, _signal(row, self.of) ** 2, 0.0), count + counts
 
     def result(self, carry: tuple[Array, Array], ending: Ending) -> Array:
         return safe_sqrt(carry[0] / jnp.maximum(carry[1], 1))
@@ -168,7 +175,7 @@ class Count:
         return _zero()
 
     def update(self, carry: Array, row: Row, span: Span) -> Array:
-        return carry + getattr(row, self.of)
+        return carry + _signal(row, self.of)
 
     def result(self, carry: Array, ending: Ending) -> Array:
         return carry
@@ -185,7 +192,7 @@ class Reaching:
         return _zero() + jnp.inf
 
     def update(self, carry: Array, row: Row, span: Span) -> Array:
-        value = jnp.abs(getattr(row, self.of))
+        value = jnp.abs(_signal(row, self.of))
         if self.of in getattr(span.least, "_fields", ()):
             value = smaller(value, getattr(span.least, self.of))
         return first_time((value <= self.band) & row.alive, row.t, carry)
