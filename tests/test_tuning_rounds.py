@@ -110,6 +110,17 @@ def test_the_answer_is_not_worse_than_the_gains_of_the_case_if_these_meet_the_li
     assert (gains == pytest.approx([100.0, 60.0])) == (not limits)
 
 
+def test_an_answer_beyond_a_limit_gives_way_to_gains_of_the_case_within_it(monkeypatch, tmp_path):
+    """The only search ends beyond a limit. Its time is over, as with a short budget."""
+    monkeypatch.setattr(tuning.rounds, "search_within_limits", lambda course, x: (x, False))
+    laws = {"controller": {"position": {"c": 90.0, "k": 60.0}}}
+    made = study(monkeypatch, World(), laws, limits={"rms_u_V": 30.0}, minutes=1e-9)  # the voltage is 20 V
+    found = rounds(made, np.array([90.0, 60.0]), tmp_path, TOLD, False)
+    gains = np.asarray(found.problem.objective.space.gains_at(found.x))
+    assert found.within
+    assert gains == pytest.approx([90.0, 60.0])
+
+
 def test_without_validation_there_are_no_validation_calls(monkeypatch, tmp_path):
     world = World(limit=lambda seed, number, *_: math.inf if seed == 1 else 40.0)
     found, gains = answer_of(monkeypatch, tmp_path, world, validation=0)

@@ -61,7 +61,7 @@ def rounds(
     if not answers:
         return course.answer(x, None, budget.validation)
     best = _best_of(answers)
-    if not course.over:
+    if not (course.interrupted or (course.over and best.within)):
         best = _best_of([best, *_given(course, start, best)])
     if problem.front and best.good and not course.over:
         course.members = best.members
@@ -85,15 +85,16 @@ def _best_of(answers: Sequence[SearchResult]) -> SearchResult:
 
 
 def _given(course: Course, start: np.ndarray, best: SearchResult) -> list[SearchResult]:
-    """Return the gains of the case, `start` [m], as a validated answer if their error is less than that of `best`.
+    """Return the gains of the case, `start` [m], as a validated answer if they may be better than `best`.
 
-    The error on the training members decides whether they are validated.
+    They are validated if they hold all training members, and if `best` breaks a limit or has a larger error than theirs
+    on these members.
     """
     space = course.problem.objective.space
     x = space.encode(space.clip(start))
     terms = terms_at(course.problem, x, course.members)
     error = math.sqrt(terms["tracking"][: course.members.ordinary].mean())
-    if (terms["survival"] > 0).any() or error >= best.validation_error:
+    if (terms["survival"] > 0).any() or (best.within and error >= best.validation_error):
         return []
     within = judged_at(course, x).holds(course.problem.limits)
     return [dataclasses.replace(validated(course, x).result, within=within)]
