@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.cases.machine_case import MachineCase
+from ambjax.compiler.short_compilation import QUICK, supported
 from ambjax.extend import canonical
 from ambjax.linear.linear_machine import machine_loop, machine_rest
 from ambjax.linear.machine_at_speed import MachineRest
@@ -54,8 +55,9 @@ class Peaks:
             return jax.lax.map(one, speeds)
 
         self._both: Callable[[np.ndarray], tuple[StateSpace, StateSpace]]
+        quick = supported(QUICK)
         if isinstance(space, LqgSpace):  # the weights do not move the rotor
-            rest, compiled = machine_rest(machine, self.period), jax.jit(systems)
+            rest, compiled = machine_rest(machine, self.period), jax.jit(systems, compiler_options=quick)
             self._both = lambda x: _differences(lambda x: compiled(space.decode(x, machine), rest), x)
         else:  # the machine is an argument, because constants are not arrays of JAX
 
@@ -64,7 +66,7 @@ class Peaks:
                 found = systems(own, machine_rest(own, self.period))
                 return found, found
 
-            both = jax.jit(jax.jacfwd(at, has_aux=True))
+            both = jax.jit(jax.jacfwd(at, has_aux=True), compiler_options=quick)
             self._both = lambda x: both(jnp.asarray(x), machine)[::-1]
         self._last: tuple[np.ndarray, list[Loop]] | None = None
 
