@@ -62,9 +62,9 @@ def sampled_tasks() -> list[str]:
     lines += [
         "`ambjax tune` runs as in the tuning tasks, on a processor of 10 or 20 kHz with a delay of one sample. CMA-ES:",
         "settled rms error that CMA-ES reached in 2 x 900 evaluations on 6 members with an independent simulator of",
-        "the same loop. Variation of u: total variation of the voltage after settling. Processor: processor time;",
-        "in brackets, that of the same task in continuous time. The values of p are those of the position, inversion",
-        "and current laws. c is at most a fifth of the sampling rate, l at least 0.05 1/s.",
+        "the same loop. Variation of u: total variation of the voltage after settling. Processor: processor time,",
+        "while other programs ran; in brackets, that of the same task in continuous time. The values of p are those of",
+        "the position, inversion and current laws. c is at most a fifth of the sampling rate, l at least 0.05 1/s.",
         "",
     ]
     rows = []
