@@ -79,9 +79,8 @@ def verdict(checked: Checked, sensitivity: str, largest: float | None) -> list[s
         deciding = [line.holds for line in report.conditions if line.holds is not None]
         ideal = " in continuous time, without the processor; not part of the verdict"
         where = "" if checked.on_processor is None else ideal
-        lines.append(
-            f"Theorem 1: {sum(deciding)} of the {len(deciding)} conditions that apply to these laws hold{where}."
-        )
+        held = f"{sum(deciding)} of the {len(deciding)} conditions that apply to these laws hold{where}"
+        lines.append(f"Theorem 1: {held if deciding else 'no condition applies to these laws'}.")
     return lines
 
 
