@@ -21,6 +21,7 @@ from ambjax.results.operating import sensitivity
 from ambjax.simulation.rollout import Result, prepare, rollout
 from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Trajectory
 from ambjax.theorem import advice, sampled_report
+from ambjax.theorem.conditions import check
 from ambjax.theorem.law_poles import law_poles
 from ambjax.theorem.law_signals import LawSignalsRecorder
 from ambjax.theorem.sampled_report import Delays, SampledReport, rolled
@@ -258,6 +259,21 @@ def test_the_distance_to_the_singular_curve_is_that_of_the_sampled_run():
     calm = sampled_report.check_sampled(crossing, world, clock, 0.005)
     assert calm.holds
     assert calm.distance[0] > 0
+
+
+def test_a_linear_inversion_may_cross_the_singular_curve():
+    """It does not divide by dv/di. The textbook's loop lifts the rotor from beyond half of the gap."""
+    laws = amb.laws.position.FeedbackLinearisation(4e5, 2e3), amb.laws.inversion.Linearised()
+    cascade = amb.Cascade(amb.laws.observer.Direct(), *laws, amb.laws.current.ProportionalIntegral())
+    clock, world = amb.Clock(300, 1e-4), amb.Scenario(initial=amb.Initial(-3e-3))
+    sampled = dataclasses.replace(cascade, processor=amb.Processor(0.0))
+    assert np.isfinite(amb.rollout(sampled, world, clock).trajectory.singular_at)
+    report = sampled_report.check_sampled(sampled, world, clock, 0.005)
+    assert report.distance[0] == math.inf
+    assert not any("singular" in line for line in advice.processor_lines(report, Delays(2.0, None, None, 0.1), None))
+    in_time = check(cascade, world, clock)
+    assert not any(line.holds is False for line in in_time.conditions)
+    assert "No condition applies" in advice.theorem_lines(in_time, "case.toml")[0]
 
 
 def test_the_margin_is_between_a_delay_that_holds_and_one_that_does_not():

@@ -17,6 +17,7 @@ from ambjax.ensemble.maps import Axis, grid
 from ambjax.ensemble.study import Study
 from ambjax.laws import inversion
 from ambjax.plants import Plant
+from ambjax.results.case_map import study_and_axes
 from ambjax.sensors import Sensor
 from ambjax.simulation.folds import Peak
 from ambjax.solvers import RK4, AdaptiveRodas3
@@ -137,6 +138,11 @@ def test_bad_axes_are_refused_in_one_line(x, y, words, tmp_path, capsys, monkeyp
     assert error.startswith("ambjax: ")
     assert words in error
     assert not out.exists()
+
+
+def test_per_cent_of_a_negative_number_make_an_ascending_axis():
+    _, x, y = study_and_axes(case_from({}), "plant.k_z=-20%:10%:2", "plant.m=-20%:10%:2", 1, 0)
+    np.testing.assert_allclose([x.values, y.values], [np.array([1.1, 0.8]) * -754.0, np.array([0.8, 1.1]) * 0.588])
 
 
 @pytest.mark.parametrize(

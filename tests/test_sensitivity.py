@@ -1,18 +1,21 @@
 """`ambjax sensitivity`: numbers against the analysis, the picture against its data, and messages for bad input."""
 
 import json
+import tomllib
 
 import numpy as np
 import pytest
 
 from ambjax.__main__ import main
-from ambjax.cases.reader import read_case
+from ambjax.cases.reader import case_from, read_case
+from ambjax.cases.template_text import template
 from ambjax.commands import acceptance
 from ambjax.commands.sensitivity_report import _measured_numbers
 from ambjax.linear import MemberPeaks, Zones, analyse, linearise
 from ambjax.pictures.frequency import MeasuredPoints, NamedLoop, frequency_figure
 from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import rollout
+from ambjax.world.sensor import Measurement
 
 CASE = """
 [reference]
@@ -153,6 +156,27 @@ def test_check_does_not_succeed_without_a_linearisation(tmp_path, capsys, monkey
     assert code == 1
     assert (loop["zone"], loop["stable"], loop["why"]) == (None, None, "the cause")
     assert loop["k_s_N_per_m"] > 0
+
+
+@pytest.mark.parametrize("kind", ["lumped", "two-coil"])
+def test_the_numbers_of_the_machine_contain_its_iron(kind):
+    """Difference quotients of the acceleration and of the current's rate."""
+    rig = tomllib.loads(template("rig"))
+    rig["plant"] |= {"kind": kind, "iron": {"saturation": 0.7, "leakage": 1.1}}
+    case = case_from(rig)
+    plant, facts = case.scenario.plant, {fact.key: fact.value for fact in acceptance.machine(case)}
+
+    def rates(z=0.0, i=0.0, u=0.0):
+        return plant.measurement(plant.rates(plant.start(Measurement(z, 0.0, i)), u))
+
+    def slope(x, h):
+        return float(plant.m * (rates(**{x: h}).z_dot - rates(**{x: -h}).z_dot) / (2 * h))
+
+    assert facts["k_s_N_per_m"] == pytest.approx(slope("z", 1e-8), rel=1e-5)
+    assert facts["unstable_pole_per_s"] == pytest.approx((facts["k_s_N_per_m"] / plant.m) ** 0.5)
+    assert facts["k_i_N_per_A"] == pytest.approx(slope("i", 1e-5), rel=1e-5)
+    assert facts["current_slew_A_per_s"] == pytest.approx(float(rates(u=48.0).i), rel=1e-9)
+    assert facts["bias_flux_T"] == pytest.approx(float(plant.flux_density(plant.start(Measurement(0.0, 0.0, 0.0)))))
 
 
 @pytest.mark.slow

@@ -155,6 +155,20 @@ def test_only_an_oscillation_that_the_linear_loop_does_not_explain_is_sustained(
 
 
 @pytest.mark.slow
+def test_a_current_loop_that_alternates_between_the_limits_of_the_supply_is_not_stable():
+    """Its gain is far too high. The rotor hardly moves, but no sign of a law chatters."""
+    laws = {"position": {"kind": "pid"}, "inversion": {"kind": "closed-form"}, "current": {"kind": "pi", "k_p": 2000.0}}
+    clock = {"duration": 0.05, "sample_period": 5e-5}
+    supply = {"mode": "voltage", "bandwidth": None, "u_max": 72.0}
+    case = case_of(controller=laws, actuator=supply, clock=clock)
+    found = stability_of(case.cascade, members(case), case.clock)
+    assert found.swing[0] < SMALL * case.scenario.touchdown
+    assert found.growth[0] > 1000
+    assert not found.stable[0]
+    assert "the limit of the supply" in found.findings().reason
+
+
+@pytest.mark.slow
 def test_a_limit_cycle_that_the_linear_loop_does_not_have_is_found_and_explained():
     """A dead band of the amplifier: the linear loop, which has none, is stable."""
     change = {"actuator": {"mode": "voltage", "bandwidth": None, "dead_band": 0.8}}

@@ -2,7 +2,13 @@
 
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
+from jax import Array
+
 from ambjax.cases.reader import Case
+from ambjax.world.bearing import Bearing
+from ambjax.world.sensor import Measurement
 
 
 class Forces(NamedTuple):
@@ -28,7 +34,36 @@ def forces(case: Case) -> Forces:
     return Forces(largest, m * abs(float(plant.g)), load)
 
 
+class LinearMagnet(NamedTuple):
+    """The true magnets at z = i = 0, with the saturation and the leakage of their iron.
+
+    `k_s`: negative stiffness, N/m. `k_i`: force per current, N/A. `L`: voltage per rate of the current, H. `flux`: flux
+    density of the cores, T.
+    """
+
+    k_s: Array
+    k_i: Array
+    L: Array
+    flux: Array
+
+
+@jax.jit
+def linear_magnet(plant: Bearing) -> LinearMagnet:
+    """Return the derivatives of the force and of the current's rate at z = i = 0."""
+    zero = jnp.zeros(())
+    rest = plant.start(Measurement(zero, zero, zero))
+
+    def force(z: Array, i: Array) -> Array:
+        return plant.m * plant.a * plant.pull((plant.i_0 + i, plant.i_0 - i), z)
+
+    def rate(u: Array) -> Array:
+        return plant.measurement(plant.rates(rest, u)).i
+
+    k_s, k_i = jax.grad(force, (0, 1))(zero, zero)
+    return LinearMagnet(k_s, k_i, 1 / jax.grad(rate)(zero), plant.flux_density(rest))
+
+
 def bias_flux(case: Case) -> float:
-    """Return the flux density of the bias current, mu_0 n i_0/(2 s_0) for two gaps in series, T."""
+    """Return the flux density of the bias current without saturation and leakage, mu_0 n i_0/(2 s_0), T."""
     plant = case.scenario.plant
     return float(plant.mu_0) * float(plant.n) * float(plant.i_0) / (2 * float(plant.s_0))

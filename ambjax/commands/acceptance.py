@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from ambjax.cases.forces import bias_flux, forces
+from ambjax.cases.forces import forces, linear_magnet
 from ambjax.cases.reader import Case
 from ambjax.commands.band_text import band_lines, band_numbers, running_facts, running_speeds
 from ambjax.control.base import set_valued_signs
@@ -88,18 +88,18 @@ def machine(case: Case) -> list[Fact]:
     plant, sensor = case.scenario.plant, case.scenario.sensors
     (force, weight, load), period = forces(case), float(case.clock.sample_period)
     (u_max, reserve), step = _voltages(case), float(sensor.step(plant.s_0)) or None
-    slew = None if u_max is None else u_max / float(plant.L)
+    k_s, k_i, L, flux = map(float, linear_magnet(plant))
+    slew = None if u_max is None else u_max / L
+    pole = math.sqrt(abs(k_s) / float(plant.m))
     std = float(sensor.std)
     return [
         Fact("force_reserve", "largest force / weight", force / weight if weight else None, "1"),
         Fact("load_reserve", "largest force / (weight + largest load)", force / (weight + load) if load else None, "1"),
-        Fact("k_s_N_per_m", "negative stiffness k_s", float(plant.k_s), "N/m"),
-        Fact("k_i_N_per_A", "force per current k_i", float(plant.k_i), "N/A"),
-        Fact("unstable_pole_per_s", "unstable pole sqrt(k_s/m)", float(plant.pole), "1/s"),
-        Fact(
-            "samples_per_time_constant", "samples per time constant of the pole", 1 / (period * float(plant.pole)), "1"
-        ),
-        Fact("bias_flux_T", "bias flux density", bias_flux(case), "T"),
+        Fact("k_s_N_per_m", "negative stiffness k_s", k_s, "N/m"),
+        Fact("k_i_N_per_A", "force per current k_i", k_i, "N/A"),
+        Fact("unstable_pole_per_s", "unstable pole sqrt(k_s/m)", pole, "1/s"),
+        Fact("samples_per_time_constant", "samples per time constant of the pole", 1 / (period * pole), "1"),
+        Fact("bias_flux_T", "bias flux density", flux, "T"),
         Fact("current_slew_A_per_s", "slew rate of the current, u_max/L", slew, "A/s"),
         Fact("coil_voltage_reserve_V", "voltage of a coil above the bias, coil.u_max - R i_0", reserve, "V"),
         Fact("converter_step_m", "converter step of z", step, "m"),

@@ -79,9 +79,8 @@ def verdict(checked: Checked, sensitivity: str, largest: float | None) -> list[s
         deciding = [line.holds for line in report.conditions if line.holds is not None]
         ideal = " in continuous time, without the processor; not part of the verdict"
         where = "" if checked.on_processor is None else ideal
-        lines.append(
-            f"Theorem 1: {sum(deciding)} of the {len(deciding)} conditions that apply to these laws hold{where}."
-        )
+        held = f"{sum(deciding)} of the {len(deciding)} conditions that apply to these laws hold{where}"
+        lines.append(f"Theorem 1: {held if deciding else 'no condition applies to these laws'}.")
     return lines
 
 
@@ -130,7 +129,7 @@ def details(checked: Checked, full: bool) -> list[str]:
         parts.append("\n".join([*advice.processor_lines(sampled, margin, unknown), *differs]))
     if report is not None and (checked.on_processor is None or full):
         shown = [line for line in report.conditions if line.gain is not None and (full or line.holds is not None)]
-        parts += ["Theorem 1:", _conditions(shown), *([_proof(report.proof)] if full else [])]
+        parts += ["Theorem 1:", *([_conditions(shown)] if shown else []), *([_proof(report.proof)] if full else [])]
         parts.append("\n".join(advice.theorem_lines(report, checked.path)))
         parts += [CONTINUOUS] if checked.on_processor is not None else []
     return parts if full else [*parts, "--full prints every table."]

@@ -241,6 +241,7 @@ class Linearised(StaticInversion):
 
     analytic = True
     accepts: ClassVar = ("force", "voltage")
+    singular = False
 
     def inverse(self, model: Plant, z: Array, v_star: Array) -> Array:
         return (v_star - model.dv_dz(0.0, 0.0) * z) / model.dv_di(0.0, 0.0)

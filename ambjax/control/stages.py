@@ -160,10 +160,12 @@ class PositionLaw(Law, Generic[State]):
 class InversionLaw(Law, Generic[State]):
     """Base class of an inversion law: its input is the demanded force, its output the demanded current.
 
-    `accepts`: the demands of a position law (`PositionLaw.demand`) with which the law can be combined.
+    `accepts`: the demands of a position law (`PositionLaw.demand`) with which the law can be combined. `singular`:
+    whether the law solves v(z, i_ref) = v_star, or divides by dv/di, so that i_ref must not reach the curve C, Eq. (9).
     """
 
     accepts: ClassVar[tuple[str, ...]] = ("force",)
+    singular: ClassVar[bool] = True
 
     @abc.abstractmethod
     def init(self, model: Plant) -> State: ...

@@ -8,8 +8,9 @@ the run exceeds SMALL times the clearance, and is not smaller than that of the t
 does not count, nor does the motion of a stable linear loop whose own decay is that slow.
 
 - A sustained motion is not stable, whatever the linear verdict.
-- Without one, an unstable linear loop is not stable either, unless its motion had the time to grow and did not: then it
-  chatters within SMALL of the clearance, as a steep sign with explicit steps does.
+- Without one, an unstable linear loop is not stable either, unless a law evaluates its sign at the start of a sample,
+  and the motion had the time to grow and did not: then that sign chatters within SMALL of the clearance. Without such
+  a sign, a limit of the supply may keep the motion small, while the voltage alternates between its limits.
 - The linear loop of a set-valued sign is valid only inside the band of the sign, so the quiet run alone decides.
 """
 
@@ -108,6 +109,8 @@ class Stability(NamedTuple):
         grows = f"the linear loop is unstable (it grows at {rate:.3g} 1/s)"
         if self.stable[k]:
             return f"{grows}, but the motion stays within {self.swing[k]:.3g} m: it chatters"
+        if rate * self.duration > GROWN:
+            return f"{grows}, but the limit of the supply or another nonlinearity keeps the motion small"
         return f"{grows}, too slowly to appear in a run of {self.duration:.3g} s"
 
 
@@ -159,10 +162,16 @@ def stability_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> Stabilit
     slow = (growth < 0) & (-growth * duration / QUARTERS < -np.log1p(-DECAY))
     persists = (swing > SMALL * clearance) & (swing > (1 - DECAY) * run.swings[:, -2]) & run.returns & ~slow
     sustained = run.lost | persists
-    chatters = (growth * duration > GROWN) & (swing <= SMALL * clearance)
+    chatters = _may_chatter(cascade) & (growth * duration > GROWN) & (swing <= SMALL * clearance)
     stable = ~(sustained | ((growth * duration > BORDER) & ~chatters))
     bias = float(np.max(np.asarray(scenario.plant.i_0)))
     return Stability(stable, growth, sustained, swing, run.current, run.lost, duration, bias)
+
+
+def _may_chatter(cascade: Cascade) -> bool:
+    """Return whether a law on a processor evaluates a sign at the start of a sample, as explicit steps do."""
+    signs = (law for law in cascade.laws if law.stiff or law.size(cascade.model) is not None)
+    return cascade.sampled and not all(cascade.timing.implicit and law.has_own_step(True) for law in signs)
 
 
 def suspects(error: np.ndarray, held: np.ndarray) -> np.ndarray:

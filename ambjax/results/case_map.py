@@ -187,6 +187,8 @@ def _axis(flag: str, text: str, case: AnyCase) -> Axis:
         count = int(parts[2]) if len(parts) == 3 else COUNT
     except ValueError as error:
         raise refuse(str(error)) from None
+    if nominal is not None and nominal < 0 and all(part.endswith("%") for part in parts[:2]):
+        low, high = high, low  # -20% of a negative number is the larger one
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise refuse(f"LOW must be less than HIGH, both finite; they are {low:g} and {high:g}")
     if not 2 <= count <= MOST_CELLS:

@@ -32,7 +32,9 @@ def theorem_lines(report: Report, case: str) -> list[str]:
     """Return the lines below the table of `ambjax check`. `case`: file name as given by the user."""
     deciding = [line for line in report.conditions if line.holds is not None]
     fails = [line for line in deciding if not line.holds]
-    if not fails:
+    if not deciding:
+        words = "No condition applies to these laws."
+    elif not fails:
         words = f"Yes, all {len(deciding)} that apply to these laws do."
     else:
         words = f"No, {len(fails)} of {len(deciding)} {'does' if len(fails) == 1 else 'do'} not:"
@@ -86,7 +88,8 @@ def processor_lines(sampled: SampledReport, margin: Delays, unknown: Delays | No
     ]
     words = f"No, {len(lines)} of {len(sampled.laws)} {'is' if len(lines) == 1 else 'are'} not:" if lines else "Yes."
     end = status(sampled.lost_at, sampled.lost_why, sampled.stalled, STALLED_PLANT)
-    lines = [f"Is the discrete step of every law stable? {words}", *lines, _curve(*sampled.distance), end]
+    lines = [f"Is the discrete step of every law stable? {words}", *lines]
+    lines += [_curve(*sampled.distance)] * math.isfinite(sampled.distance[0]) + [end]
     if sampled.cause is not None:
         lines.append(cause_words(sampled.cause, *LOSS))
     if sampled.alternates:

@@ -2,7 +2,8 @@
 
 The conditions are k > Q_z, k_i > Q_i, gamma > Delta_1 (Eq. 7), and (z, i_ref) off the singular curve C (Eq. 9). Each
 law declares the gain that its condition bounds (`Requirement`). For a law without such a gain the condition is not
-applicable. The steps of the proof are reported as residuals (see `ambjax.theorem.proof`).
+applicable, nor is that on C with an inversion law that is not singular there (`linearised`). The steps of the proof are
+reported as residuals (see `ambjax.theorem.proof`).
 """
 
 import dataclasses
@@ -231,7 +232,8 @@ def _conditions(
     ]
     curve = "distance of (z/s_0, i_ref/i_0) to C > 0"
     lines += constant_sigma(cascade.position)
-    return [*lines, Condition("singular curve C", curve, distance, 0.0, at, "1", distance > 0), *remarks]
+    holds, note = (distance > 0, "") if cascade.inversion.singular else (None, "the law in use has no such condition")
+    return [*lines, Condition("singular curve C", curve, distance, 0.0, at, "1", holds, note), *remarks]
 
 
 def constant_sigma(law: PositionLaw) -> list[Condition]:

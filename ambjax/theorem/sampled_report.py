@@ -77,10 +77,10 @@ class SampledReport:
     `bands`: of the runs that do not end early. `lost_at`: time at which the run with noise ends early, s; inf if it
     does not. `lost_why`: the reason. `stalled`: whether the integrator stalled at `lost_at`; the rotor's status is then
     unknown. `distance`: smallest distance of (z/s_0, i_ref/i_0) to the singular curve C at the samples (negative beyond
-    C), and its time (s). `alternating`: result of `alternation` for the voltage after `settle`, in the run without
-    sensor noise; None if that run ends early. `largest_z`: largest |z| (m) at the samples after
-    `settle`, in the run with noise; None if that run ends early. `cause`, `alternation_cause`: results of
-    `with_causes`; None if the rotor is not lost, or if the voltage does not alternate.
+    C), and its time (s); inf for an inversion law that is not singular on C. `alternating`: result of `alternation` for
+    the voltage after `settle`, in the run without sensor noise; None if that run ends early. `largest_z`: largest |z|
+    (m) at the samples after `settle`, in the run with noise; None if that run ends early. `cause`, `alternation_cause`:
+    results of `with_causes`; None if the rotor is not lost, or if the voltage does not alternate.
     """
 
     laws: list[LawPoles]
@@ -166,7 +166,7 @@ def check_sampled(
     largest = _peak(np.asarray(outcome.rows.z)[settled:]) if np.isinf(outcome.lost_at) else None
     stalled = int(outcome.lost_code) == STALLED
     ending = float(outcome.lost_at), outcome.lost_why, stalled
-    distance = _smallest_distance(outcome, scenario.plant)
+    distance = _smallest_distance(outcome, scenario.plant) if cascade.inversion.singular else (math.inf, 0.0)
     return SampledReport(law_poles(cascade, clock), bands, *ending, distance, alternating, largest)
 
 
