@@ -217,18 +217,6 @@ def test_files_of_an_earlier_run_are_overwritten_only_with_force(capsys):
     assert pathlib.Path("out/metrics.json").read_text() == "old"
 
 
-@pytest.mark.thorough
-def test_a_lost_rotor_is_reported_and_exits_with_1(capsys):
-    path = write(SHORT + "[controller.inversion]\ngamma = 1000.0\n")
-    assert main(["simulate", path]) == 1
-    assert "lost at 0.01" in capsys.readouterr().err
-    metrics = json.loads(pathlib.Path("out/simulate-case/metrics.json").read_text())
-    assert metrics["lost"] is True
-    assert 0.005 < metrics["lost_at_s"] < 0.02
-    with np.load("out/simulate-case/trajectory.npz") as data:
-        assert str(data["lost_why"]).startswith("touched down")
-
-
 @pytest.mark.slow
 def test_check_exits_with_0_if_the_conditions_hold_and_1_otherwise(capsys):
     sine = SHORT + '[reference]\nkind = "sine"\namplitude = 2.5e-3\nfrequency = 2.0\n'

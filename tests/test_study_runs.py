@@ -341,11 +341,8 @@ def test_another_study_in_the_folder_is_refused_and_not_changed(no_pictures, cap
     assert main(argv) == 0
     capsys.readouterr()
     assert "--out out: it already holds a study. Add --resume" in refused(argv, capsys)
-    for key, other in (("seed", ["--seed", "5"]), ("members", ["--members", "8"]), ("chunk", ["--chunk", "4"])):
-        assert f"another study: {key} is " in refused([*argv, *other, "--resume"], capsys)
-    write(TINY.replace("percent = 10", "percent = 9"))
-    assert "another study: spread.plant.m is " in refused([*argv, "--resume"], capsys)
-    for text in ("{", "3", "[1]"):
+    assert "another study: seed is " in refused([*argv, "--seed", "5", "--resume"], capsys)
+    for text in ("3", "[1]"):  # tests/test_damage.py has other damage, tests/test_ensemble.py other differences
         write(text, "out/study.json")
         assert "study.json: cannot be read" in refused([*argv, "--resume"], capsys)
     pathlib.Path("out/study.json").unlink()
