@@ -18,8 +18,16 @@ LARGEST = 512 * 2**20
 # Resident memory above which the programs of a module are released when it ends (bytes).
 MUCH = 700 * 2**20
 
-# Modules with single tests of half a minute and more.
-LONG = ("test_mutations.py", "test_end_to_end.py", "test_paper.py", "test_stability.py", "test_default_gains.py")
+# Modules with few tests, some of which take 10 s and more.
+LONG = (
+    "test_mutations.py",
+    "test_paper.py",
+    "test_study_runs.py",
+    "test_machine.py",
+    "test_end_to_end.py",
+    "test_docs.py",
+)
+LONG += ("test_machine_tuning.py", "test_stability.py", "test_case_fuzz.py")
 
 # Workers whose threads share the cores take an eighth more time.
 _worker = os.environ.get("PYTEST_XDIST_WORKER", "")

@@ -272,6 +272,7 @@ def test_a_machine_is_differentiable_and_an_ensemble_has_one_entry_per_member(ma
 )
 def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(machine_commands, "_injections", lambda *_: {})  # tests/test_machine_agreement.py
+    monkeypatch.setattr(machine_commands, "drawn", lambda *_: None)  # drawing takes longer than the run
     path = tmp_path / f"{name}.toml"
     path.write_text(template(name))
     assert main(["simulate", str(path), "--out", str(tmp_path / "run"), "--json"]) == 0
