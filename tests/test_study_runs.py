@@ -43,7 +43,7 @@ initial.z = {{ normal = 1e-6 }}
 """
 TINY = CASE.format(duration="2e-3")
 # Some 50 ms for each chunk, so that something can happen in the middle of a run.
-LONGER, MEMBERS, CHUNKS = CASE.format(duration="0.1"), 1536, 48
+LONGER, MEMBERS, CHUNKS = CASE.format(duration="0.05"), 1536, 48
 RUN = ["ensemble", "case.toml", "--members", str(MEMBERS), "--chunk", "32", "--seed", "3"]
 
 
