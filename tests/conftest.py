@@ -18,8 +18,8 @@ LARGEST = 512 * 2**20
 # Resident memory above which the programs of a module are released when it ends (bytes).
 MUCH = 700 * 2**20
 
-# Modules with single tests of half a minute and more.
-LONG = ("test_mutations.py", "test_end_to_end.py", "test_paper.py", "test_stability.py", "test_default_gains.py")
+# Modules with few tests, some of which take 10 s and more.
+LONG = "mutations", "paper", "study_runs", "machine", "end_to_end", "docs", "machine_tuning", "stability", "case_fuzz"
 
 # Workers whose threads share the cores take an eighth more time.
 _worker = os.environ.get("PYTEST_XDIST_WORKER", "")
@@ -61,7 +61,7 @@ def pytest_collection_modifyitems(config, items):
         items[:] = [item for item in items if not item.get_closest_marker("thorough")]
     result = yield
     sizes = collections.Counter(item.path.name for item in items)
-    items.sort(key=lambda item: (item.path.name not in LONG, -sizes[item.path.name]))
+    items.sort(key=lambda item: (item.path.stem.removeprefix("test_") not in LONG, -sizes[item.path.name]))
     return result
 
 

@@ -115,8 +115,8 @@ def rows(start, stop):
     return {"index": index, "lost_at": np.where(index % 7, np.inf, 0.1), "lost": index % 7 == 0, "x": np.sin(index)}
 
 
-def store_in(out, resume=True, chunk=CHUNK, facts=FACTS):
-    store = Store(out, facts, MEMBERS, chunk)
+def store_in(out, resume=True, chunk=CHUNK):
+    store = Store(out, FACTS, MEMBERS, chunk)
     store.check(4, resume)
     store.begin()
     return store
@@ -262,8 +262,6 @@ def test_the_chunk_size_of_the_directory_is_the_default(begun, whole):
     assert store.finish().read_bytes() == whole
     with pytest.raises(ValueError, match="another study: chunk is 20 in the file and 10 in this run"):
         store_in(begun, chunk=10)
-    with pytest.raises(ValueError, match="another study: seed is 3 in the file and 5 in this run"):
-        store_in(begun, facts=FACTS | {"seed": 5})
 
 
 def test_a_study_that_ended_before_its_first_chunk_is_resumed(tmp_path, whole):

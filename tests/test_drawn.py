@@ -189,18 +189,6 @@ def test_a_fan_shows_the_quantiles_of_the_members(n):
     np.testing.assert_allclose(y, factor * bands[50][np.searchsorted(t, x)], rtol=ROUNDING)
 
 
-def test_a_median_is_never_smoothed():
-    """A motion that all members share is drawn as it is, however fast it turns."""
-    t = np.linspace(0, 0.2, 499)
-    values = np.sin(2 * np.pi * 540 * t) + 9 * (t > 0.1)
-    values[400:] = np.nan
-    figure = fans.fan(t, {"u": {0: values - 1e-3, 50: values, 100: values + 1e-3}}, {}, "")
-    (ax,) = figure.axes
-    (line,) = ax.lines
-    np.testing.assert_array_equal(line.get_xdata(), t)
-    np.testing.assert_allclose(line.get_ydata(), factor_of(ax.get_ylabel()) * values, rtol=ROUNDING)
-
-
 @pytest.mark.parametrize("members", [7, 20_000])
 def test_the_number_of_survivors_excludes_the_lost_members(members):
     t = np.linspace(0, 0.99, 100)

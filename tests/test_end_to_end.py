@@ -1,13 +1,12 @@
 """Each command from its arguments to its files, on the paper's scenario and on a sampled bearing."""
 
 import json
-import os
 import pathlib
-import subprocess
-import sys
 
 import pytest
+from texts import write
 
+from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
 
 # The paper's tracking scenario in continuous time, from the printed gains, with small noise.
@@ -72,43 +71,21 @@ COMMANDS = {
 CHOSEN = {"paper": ("tune",), "bearing": ("map", "sensitivity", "export", "page")}
 
 
-# Runs commands one after the other in one process, so that their programs are compiled once. Prints the exit code and
-# the output of each as a line of JSON.
-SHELL = """
-import contextlib, io, json, sys
-from ambjax.__main__ import main
-for words in json.load(sys.stdin):
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said):
-        code = main(words)
-    print(json.dumps([code, said.getvalue()]), flush=True)
-"""
-
-
+@pytest.mark.usefixtures("elsewhere")
 @pytest.mark.parametrize(
     "case", [pytest.param("paper", marks=pytest.mark.thorough), pytest.param("bearing", marks=pytest.mark.slow)]
 )
-def test_every_command_writes_all_of_its_files(case, tmp_path):
-    (tmp_path / "case.toml").write_text(CASES[case])
-    commands = {command: COMMANDS[command] for command in CHOSEN[case]}
-    lines = [
-        [*words, *([] if "--out" in words else ["--out", command]), "--json"]
-        for command, (words, _) in commands.items()
-    ]
-    done = subprocess.run(
-        [sys.executable, "-c", SHELL], input=json.dumps(lines), cwd=tmp_path, capture_output=True, text=True,
-        timeout=400, check=False, env=os.environ | {"XDG_CACHE_HOME": str(tmp_path.parent / "cache")},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    results = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [code in (0, 1) for code, _ in results] == [True] * len(lines), done.stderr
-    for _, said in results:
-        json.loads(said)
-    assert "Traceback" not in done.stderr
-    assert "is left out" not in done.stderr
-    assert "Warning" not in done.stderr
-    for command, (_, names) in commands.items():
+def test_every_command_writes_all_of_its_files(case, capsys):
+    """An error in a description would end its command (conftest.py)."""
+    write(CASES[case])
+    for command in CHOSEN[case]:
+        words, names = COMMANDS[command]
+        assert main([*words, *([] if "--out" in words else ["--out", command]), "--json"]) in (0, 1)
+        said = capsys.readouterr()
+        json.loads(said.out)
+        assert "Traceback" not in said.err
+        assert "Warning" not in said.err
         for name in names:
-            assert (tmp_path / command / name).stat().st_size > 0, (command, name)
-    for path in tmp_path.rglob("tuned.toml"):
-        read_case(pathlib.Path(path))
+            assert pathlib.Path(command, name).stat().st_size > 0, (command, name)
+    for path in pathlib.Path().rglob("tuned.toml"):
+        read_case(path)

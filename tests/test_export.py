@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from profiles import THOROUGH
-from texts import piped, write
+from texts import piped, refusal, write
 
 import ambjax
 from ambjax import Cascade, Clock, Scenario
@@ -491,7 +491,7 @@ def test_only_files_of_an_earlier_export_of_the_same_prefix_are_replaced(case, t
     assert [name for name in before if before[name] != after[name]] == [x for x in before if x != "Makefile"]
     # nor is what another prefix or a person wrote, whatever stands in the others' place
     capsys.readouterr()
-    assert f"--out {out}: Makefile exists" in refused(capsys, case, "--out", out, "--prefix", "roto")
+    assert f"--out {out}: Makefile exists" in refusal(capsys, "export", case, "--out", out, "--prefix", "roto")
     others = {
         "README.md": lambda path: path.write_bytes(b"mine \xff"),
         "verify.json": lambda path: path.write_text("{}"),
@@ -502,7 +502,7 @@ def test_only_files_of_an_earlier_export_of_the_same_prefix_are_replaced(case, t
         (other := tmp_path / name).mkdir()
         make(other / name)
         held = contents(other)
-        assert f"--out {other}: {name} exists" in refused(capsys, case, "--out", other)
+        assert f"--out {other}: {name} exists" in refusal(capsys, "export", case, "--out", other)
         assert contents(other) == held
     assert contents(out) == after
 
@@ -526,28 +526,15 @@ def test_only_a_case_as_it_was_read_has_a_checksum(tmp_path):
         assert ("SHA-256" in Writer.banner(shown, "amb.h")) == bool(plan.origin.digest)  # pyright: ignore
 
 
-def refused(capsys, *arguments):
-    """Return the line on stderr of a command that is refused."""
-    try:
-        code = main(["export", *map(str, arguments)])
-    except SystemExit as stop:
-        code = stop.code
-    said = capsys.readouterr()
-    assert code == 2
-    assert said.out == ""
-    assert len(said.err.strip().splitlines()) == 1
-    return said.err
-
-
 def test_what_cannot_be_exported_is_refused_in_one_line(case, tmp_path, capsys, monkeypatch):
     out = tmp_path / "c"
     plain = write("[clock]\nduration = 0.01\n", "plain.toml")
-    assert "[processor] is missing" in refused(capsys, plain, "--out", out)
+    assert "[processor] is missing" in refusal(capsys, "export", plain, "--out", out)
     for option in ("--precision half", "--prefix 1st", "--prefix math"):
-        assert option.partition(" ")[0] in refused(capsys, case, "--out", out, *option.split())
-    assert "cannot write there" in refused(capsys, case, "--out", tmp_path / plain / "c")
+        assert option.partition(" ")[0] in refusal(capsys, "export", case, "--out", out, *option.split())
+    assert "cannot write there" in refusal(capsys, "export", case, "--out", tmp_path / plain / "c")
     monkeypatch.setenv("CC", "no-such-compiler")
-    assert "there is no C compiler (no-such-compiler)" in refused(capsys, case, "--out", out, "--verify")
+    assert "there is no C compiler (no-such-compiler)" in refusal(capsys, "export", case, "--out", out, "--verify")
     assert not out.exists()
 
 
@@ -570,7 +557,7 @@ def test_a_failing_compiler_is_reported(case, tmp_path, capsys, monkeypatch, doe
     (cc := tmp_path / "mycc").write_text(does)
     cc.chmod(0o755)
     monkeypatch.setenv("CC", str(cc))
-    assert f"--verify: {message.format(cc=cc)}" in refused(capsys, case, "--out", tmp_path / "c", "--verify")
+    assert f"--verify: {message.format(cc=cc)}" in refusal(capsys, "export", case, "--out", tmp_path / "c", "--verify")
     assert not (tmp_path / "c").exists()
 
 
@@ -578,9 +565,9 @@ def test_a_failing_compiler_is_reported(case, tmp_path, capsys, monkeypatch, doe
 def test_programs_that_do_not_end_or_have_no_temporary_folder_are_not_judged(case, tmp_path, capsys, monkeypatch):
     out = ("--out", tmp_path / "c", "--verify")
     monkeypatch.setattr(machine, "TIME_LIMIT", 1e-9)
-    assert "did not end within 1e-09 s, so the check is not decided" in refused(capsys, case, *out)
+    assert "did not end within 1e-09 s, so the check is not decided" in refusal(capsys, "export", case, *out)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
-    assert "cannot write to the folder for temporary files (No such file" in refused(capsys, case, *out)
+    assert "cannot write to the folder for temporary files (No such file" in refusal(capsys, "export", case, *out)
     assert not (tmp_path / "c").exists()
 
 

@@ -489,6 +489,7 @@ def test_a_pid_steps_its_filter_and_its_anti_windup_by_backward_euler():
     law, T = position.PID(w_f=3e4, k_aw=2e4), 1e-4
     for z, z_dot, i, d, r, r_dot, r_ddot, x in samples(50):
         inputs = Measurement(z, z_dot, i), Reference(r, r_dot, r_ddot)
+        assert law.begin(MODEL, inputs) == PIDState(z_dot - r_dot, 0.0)
         v_star, after = law.step(MODEL, inputs, PIDState(d, x), T)
         close(after.rate, d + T * law.w_f * (z_dot - r_dot - after.rate), 1.0)
         demanded = law(MODEL, inputs, after)

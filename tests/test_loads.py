@@ -234,7 +234,6 @@ GOOD = "t,value\n0,1\n1,2\n"
         ("0,1\n", {}, "times and values have 1 rows; give 2 to"),
         ("0,1\n1,\n", {}, "line 2: the cell of column '2' is empty. Give a number"),
         ("0,1\n1,nan\n", {}, "the value of row 2 is nan; each must be a finite number"),
-        ("0,1\n2,1\n1,1\n", {}, "times must increase: row 3 has 1 s after 2 s"),
         ('t,"value\n0,1\n1,2\n', {}, 'a quotation mark " is not closed'),
         pytest.param('t,"value\n' + "0,1\n" * 50_000, {}, 'a quotation mark " is not closed', id="long"),
     ],

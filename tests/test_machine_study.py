@@ -10,6 +10,7 @@ import tomllib
 import jax
 import numpy as np
 import pytest
+from texts import refusal
 from tomlkit import dumps
 
 from ambjax.__main__ import main
@@ -283,5 +284,4 @@ def test_compare_refuses(files, tmp_path, capsys):
         ([machine, other, "--page"], "--page: a machine"),
         ([machine, other], "Give both cases the same [spread]"),
     ):
-        assert main(["compare", *argv, "--out", str(tmp_path / "no")]) == 2
-        assert words in capsys.readouterr().err
+        assert words in refusal(capsys, "compare", *argv, "--out", tmp_path / "no")

@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from texts import refusal
 
 import ambjax
 from ambjax import Cascade, Clock, Initial, Scenario, paper, rollout
@@ -133,10 +134,9 @@ def test_bad_axes_are_refused_in_one_line(x, y, words, tmp_path, capsys, monkeyp
     pulse = '[disturbance.q_z]\nkind = "pulse"\namplitude = 0.1\nstart = 0.1\nstop = 0.2\n'
     (tmp_path / "case.toml").write_text(CASE.replace("settle = 1e-3", "settle = 1.5e-3") + pulse)
     out = tmp_path / "out"
-    assert main(["map", str(tmp_path / "case.toml"), "--x", x, "--y", y, "--out", str(out)]) == 2
-    error = capsys.readouterr().err.strip().splitlines()[-1]
-    assert error.startswith("ambjax: ")
-    assert words in error
+    said = refusal(capsys, "map", tmp_path / "case.toml", "--x", x, "--y", y, "--out", out)
+    assert said.startswith("ambjax: ")
+    assert words in said
     assert not out.exists()
 
 
@@ -159,8 +159,7 @@ def test_the_axes_are_checked_for_every_case_before_any_run(x, y, words, tmp_pat
     for name, text in (("one", sine), ("two", rounded)):
         (tmp_path / f"{name}.toml").write_text(text)
     one, two, out = (str(tmp_path / name) for name in ("one.toml", "two.toml", "out"))
-    assert main(["map", one, "--against", two, "--x", x, "--y", y, "--out", out]) == 2
-    assert words in capsys.readouterr().err.splitlines()[-1]
+    assert words in refusal(capsys, "map", one, "--against", two, "--x", x, "--y", y, "--out", out)
     assert not (tmp_path / "out").exists()
 
 

@@ -9,7 +9,7 @@ import tomllib
 
 import jax
 import pytest
-from texts import write
+from texts import refusal, write
 
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
@@ -90,8 +90,7 @@ def test_every_command_accepts_a_custom_law_and_prints_the_imported_file(command
 def test_nothing_is_imported_unless_a_case_names_it(case, capsys):
     write("raise SystemExit(3)", "mine.py")
     read_case(write("[clock]\nduration = 0.01\n", "plain.toml"))
-    assert main(["simulate", "case.toml"]) == 2
-    assert "importing it raised SystemExit: 3 (line 1)." in capsys.readouterr().err
+    assert "importing it raised SystemExit: 3 (line 1)." in refusal(capsys, "simulate", "case.toml")
 
 
 def test_a_path_is_relative_to_the_case_file(case, monkeypatch):

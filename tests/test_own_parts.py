@@ -1,4 +1,4 @@
-"""A custom plant and a custom law, defined in this file: simulated, checked and spread.
+"""A custom plant and a custom law, defined in this file: simulated and checked.
 
 The plant has a coil with its own current on each side; the law a boundary layer in place of a smoothed sign, and gains
 of its own names. Nothing in the package knows either.
@@ -16,15 +16,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ambjax import Cascade, Clock, Initial, Scenario, rollout
-from ambjax.ensemble import Normal, Percent, Spread
-from ambjax.ensemble.study import Study
 from ambjax.extend import Bearing, PositionLaw, Requirement, Signals, force_for, gain, leaf, record, sliding_variable
 from ambjax.laws import inversion
-from ambjax.sensors import Measurement, Sensor
+from ambjax.sensors import Measurement
 from ambjax.signals import Pulse, Sine
 from ambjax.simulation.loop import ClosedLoop
-from ambjax.simulation.metrics import Metrics
-from ambjax.solvers import AdaptiveRodas3, choose_method
+from ambjax.solvers import AdaptiveRodas3
 from ambjax.theorem.conditions import check
 
 # Displacement (m), velocity (m/s), and the current of the upper and the lower coil (A).
@@ -99,9 +96,10 @@ CASCADE = Cascade(position=BoundaryLayer(), inversion=inversion.Adaptive(1e9, 25
 SCENARIO = Scenario(
     plant=TwoCoils(), reference=Sine(1e-3, 5.0), q_v=Pulse(0.5, 0.02, 0.04), initial=Initial(2e-4), u_max=400.0
 )
-NOISY = dataclasses.replace(SCENARIO, sensor=Sensor(2e-7, 1e-5, 1e-5))
+
+
 CLOCK = Clock(600, 1e-4)
-RHO, SKEW = "controller.position.rho", "plant.skew"
+RHO = "controller.position.rho"
 
 
 @pytest.mark.slow
@@ -151,32 +149,6 @@ def test_a_custom_law_and_plant_are_checked():
     assert residual.against < 1e-5 * 0.031
     weak = dataclasses.replace(CASCADE, position=BoundaryLayer(rho=0.01))
     assert next(line for line in check(weak, SCENARIO, CLOCK).conditions if line.path == RHO).holds is False
-
-
-SPREAD = Spread(((SKEW, Normal(0.02)), (RHO, Percent(20.0)), ("plant.m", Percent(2.0))))
-
-
-@pytest.mark.thorough
-def test_the_numbers_of_a_custom_law_and_plant_are_spread():
-    study = Study(
-        CASCADE,
-        NOISY,
-        Clock(200, 1e-4, choose_method(CASCADE, NOISY, 1e-4, reverse=True)),
-        0.01,
-        SPREAD,
-        seed=3,
-        members=12,
-    )
-    columns = study.columns(0, 12)
-    assert not columns["lost"].any()
-    assert len(set(columns["settled_rms_error_m"])) == 12
-    cascade, scenario = study.member(5)
-    assert scenario.plant.skew == columns["spread." + SKEW][5]
-    assert cascade.position.rho == columns["spread." + RHO][5]
-    alone = rollout(cascade, scenario, study.clock, fold=Metrics.of(0.01, scenario)).metrics
-    # the same arithmetic in another order
-    assert float(alone["rms_error_m"]) == pytest.approx(columns["rms_error_m"][5], rel=1e-9)
-    assert study.fingerprint()["plant.kind"] == "TwoCoils"
 
 
 def test_a_law_without_the_base_class_is_refused():

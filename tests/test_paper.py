@@ -128,6 +128,12 @@ def test_reproduce(tmp_path, monkeypatch):
     assert error["verdict"] == findings.HOLDS
     assert error["value"] < 1e-5
     assert found["The rotor is held under sensor noise of variance 1e-7"]["tuned"]["verdict"] == findings.HOLDS
+    # with each of four numbers of the plant 10 % smaller or larger; the printed gains lose every rotor
+    robust = found["Accurate and robust positioning"]
+    changes = [f"{name} {sign}10 %" for name in ("m", "k_z", "R", "A") for sign in "-+"]
+    assert robust["literal"]["cause"] == "lost with the true " + ", ".join(changes)
+    errors = {name: robust[name]["value"] for name in ("repaired", "tuned", "sampled")}
+    assert errors == pytest.approx({"repaired": 2.4e-4, "tuned": 4.5e-6, "sampled": 1.9e-6}, rel=0.03)
     # on the processor
     processor = {(row["reading"], row["noise"]): row for row in written["processor"]}
     assert set(processor) == {(one, True) for one in paper.READINGS} | {("literal", False), ("repaired", False)}

@@ -268,50 +268,6 @@ def test_a_delay_that_is_set_later_is_predicted():
     assert found == expected
 
 
-def loss_of(clock, p, closed=False):
-    settled = cascade_of(p).on_processor()
-
-    def loss(logs):
-        c, k, gamma, k_i = np.array([1440.0, 2.3, 8e5, 870.0]) * jnp.exp(logs)
-        adaptive = dataclasses.replace(settled.inversion, gamma=gamma)
-        cascade = dataclasses.replace(
-            settled,
-            position=dataclasses.replace(settled.position, c=c, k=k),
-            inversion=amb.laws.inversion.ClosedForm() if closed else adaptive,
-            current=dataclasses.replace(settled.current, k_i=k_i),
-        )
-        return 1e9 * amb.rollout(cascade, NOISY, clock, fold=amb.simulation.folds.Rms("e_z"), record_every=0).metrics
-
-    return loss
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("p", "closed"),
-    [
-        (INF, False),
-        pytest.param(2.0, False, marks=pytest.mark.thorough),
-        pytest.param(INF, True, marks=pytest.mark.thorough),
-    ],
-)
-def test_gradients_three_ways_and_finite_over_six_decades_of_gains(p, closed):
-    """All cases share one program in reverse mode, because tracing takes most of the time."""
-    loss, step = loss_of(amb.Clock(100, 1e-4, RK4(2)), p, closed), 1e-5
-    at = np.array([0.1, -0.2, 0.05, 0.1])
-    near = at + step * np.concatenate([0 * np.eye(4)[:1], np.eye(4), -np.eye(4)])
-    points = np.concatenate([near, np.random.default_rng(4).uniform(-6.9, 6.9, (491, 4))])
-    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(loss)))(points)
-    assert np.isfinite(values).all()
-    assert np.isfinite(slopes).all()
-    reverse, scale = slopes[0], np.abs(slopes[0]).max()
-    direction = np.array([0.3, -0.8, 0.5, 1.0])
-    forward = jax.jit(lambda x, along: jax.jvp(loss, (x,), (along,))[1])(at, direction)
-    np.testing.assert_allclose(forward, reverse @ direction, rtol=0, atol=1e-10 * scale)
-    # central differences: their error is step^2 times a third derivative; where no clip switches, as here
-    differences = (values[1:5] - values[5:9]) / (2 * step)
-    np.testing.assert_allclose(reverse, differences, rtol=0, atol=1e-6 * scale)
-
-
 def test_a_lost_rotor_is_frozen_with_its_drive_off():
     cascade = dataclasses.replace(cascade_of(25.0), inversion=amb.laws.inversion.Adaptive(1000.0))
     trajectory = amb.rollout(cascade, NOISY, SHORT).trajectory

@@ -5,6 +5,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from texts import refusal
 
 from ambjax.__main__ import main
 from ambjax.cases.reader import case_from, read_case
@@ -132,11 +133,8 @@ def test_an_unstable_loop_has_no_peaks_and_no_zone(tmp_path, capsys):
     ],
 )
 def test_bad_input_is_refused_in_one_line(tmp_path, capsys, text, flags, message):
-    code, out, err, _ = answered(tmp_path, capsys, text, *flags)
-    assert code == 2
-    assert out == ""
-    assert err.count("\n") == 1
-    assert message in err
+    (tmp_path / "case.toml").write_text(text)
+    assert message in refusal(capsys, "sensitivity", tmp_path / "case.toml", "--out", tmp_path / "out", *flags)
     assert not (tmp_path / "out").exists()
 
 

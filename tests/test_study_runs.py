@@ -12,7 +12,7 @@ import time
 import numpy as np
 import pytest
 from profiles import examples
-from texts import write
+from texts import refusal, write
 
 from ambjax.__main__ import main
 from ambjax.commands import ensemble as studies
@@ -43,7 +43,7 @@ initial.z = {{ normal = 1e-6 }}
 """
 TINY = CASE.format(duration="2e-3")
 # Some 50 ms for each chunk, so that something can happen in the middle of a run.
-LONGER, MEMBERS, CHUNKS = CASE.format(duration="0.1"), 1536, 48
+LONGER, MEMBERS, CHUNKS = CASE.format(duration="0.05"), 1536, 48
 RUN = ["ensemble", "case.toml", "--members", str(MEMBERS), "--chunk", "32", "--seed", "3"]
 
 
@@ -300,11 +300,7 @@ BAD = {
 def refused(argv, capsys):
     """Return the line of a refusal, after a check that nothing is written."""
     before = sorted(pathlib.Path().rglob("*"))
-    assert main(argv) == 2, argv
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.count("\n") == 1, err
-    assert "Traceback" not in err
+    err = refusal(capsys, *argv)
     assert sorted(pathlib.Path().rglob("*")) == before, "something was written"
     return err
 
@@ -345,11 +341,8 @@ def test_another_study_in_the_folder_is_refused_and_not_changed(no_pictures, cap
     assert main(argv) == 0
     capsys.readouterr()
     assert "--out out: it already holds a study. Add --resume" in refused(argv, capsys)
-    for key, other in (("seed", ["--seed", "5"]), ("members", ["--members", "8"]), ("chunk", ["--chunk", "4"])):
-        assert f"another study: {key} is " in refused([*argv, *other, "--resume"], capsys)
-    write(TINY.replace("percent = 10", "percent = 9"))
-    assert "another study: spread.plant.m is " in refused([*argv, "--resume"], capsys)
-    for text in ("{", "3", "[1]"):
+    assert "another study: seed is " in refused([*argv, "--seed", "5", "--resume"], capsys)
+    for text in ("3", "[1]"):  # tests/test_damage.py has other damage, tests/test_ensemble.py other differences
         write(text, "out/study.json")
         assert "study.json: cannot be read" in refused([*argv, "--resume"], capsys)
     pathlib.Path("out/study.json").unlink()

@@ -11,7 +11,7 @@ import jax
 import matplotlib
 import platformdirs
 import pytest
-from texts import write
+from texts import refusal, write
 from tqdm import tqdm
 
 from ambjax.__main__ import main, parser, run_command
@@ -112,8 +112,8 @@ def test_a_search_in_a_folder_in_use_is_refused_and_changes_nothing(capsys):
     pathlib.Path("out/checkpoints").mkdir(parents=True)
     pathlib.Path("out/checkpoints/round-1.npz").touch()
     with locked(pathlib.Path("out")):
-        assert tune([write(SHORT), "--out", "out"]) == 2
-    assert "--out out: another run is using this directory" in capsys.readouterr().err
+        said = refusal(capsys, write(SHORT), "--out", "out", program=tune)
+    assert "--out out: another run is using this directory" in said
     assert pathlib.Path("out/checkpoints/round-1.npz").exists()
 
 
@@ -121,8 +121,8 @@ def test_a_search_in_a_folder_in_use_is_refused_and_changes_nothing(capsys):
 def test_a_folder_in_place_of_a_file_is_refused_before_the_computation(name, monkeypatch, capsys):
     monkeypatch.setattr(simulate, "simulate", None)
     pathlib.Path("out", name).mkdir(parents=True)
-    assert main(["simulate", write(SHORT), "--out", "out"]) == 2
-    assert f"--out out: {name} exists and is a folder. Move it, or choose" in capsys.readouterr().err
+    said = refusal(capsys, "simulate", write(SHORT), "--out", "out")
+    assert f"--out out: {name} exists and is a folder. Move it, or choose" in said
 
 
 def test_nothing_is_written_through_a_link():
@@ -140,8 +140,7 @@ def test_names_that_the_system_refuses_are_reported_in_one_line(capsys):
     pathlib.Path("loop").symlink_to("loop")
     long = write(SHORT, chr(0x10400) * 62 + ".toml")
     for argv in (["simulate", write(SHORT), "--out", "loop"], ["simulate", long]):
-        assert main(argv) == 2
-        (said,) = capsys.readouterr().err.splitlines()
+        said = refusal(capsys, *argv)
         assert said.startswith("ambjax: --out ")
         assert "cannot write there" in said
 
@@ -166,10 +165,7 @@ def test_a_missing_device_is_reported_in_one_line(error, monkeypatch, capsys):
 
     monkeypatch.setenv("JAX_PLATFORMS", "abacus")
     monkeypatch.setattr(jax, "default_backend", backend)
-    assert main(["template"]) == 2
-    err = capsys.readouterr().err
-    assert err.startswith("ambjax: JAX_PLATFORMS=abacus: ")
-    assert err.count("\n") == 1
+    assert refusal(capsys, "template").startswith("ambjax: JAX_PLATFORMS=abacus: ")
 
 
 def test_pictures_do_not_depend_on_a_matplotlibrc():

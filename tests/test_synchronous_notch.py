@@ -27,7 +27,7 @@ from ambjax.world.sensor import Measurement
 from tuning.problem.config import tune_from
 from tuning.problem.tuning_problem import problem_of
 
-RATE, RPM = 20.0, 6000.0
+RATE, RPM = 40.0, 6000.0
 LAWS = {
     "position": {"kind": "pid", "k_p": 1e5, "k_d": 800.0, "k_int": 1e-3},
     "inversion": {"kind": "closed-form"},
@@ -38,8 +38,8 @@ TURNING = {
     "controller": LAWS,
     "rotor": {"speed": RPM},
     "disturbance": {"q_z": {"kind": "unbalance", "unbalance": 0.05, "phase": 0.2}},
-    "clock": {"duration": 0.7, "sample_period": 1e-4},
-    "run": {"settle": 0.65},
+    "clock": {"duration": 0.36, "sample_period": 1e-4},
+    "run": {"settle": 0.33},
 }
 ON_PROCESSOR = TURNING | {"processor": {"delay": 1.0}}
 
@@ -61,7 +61,7 @@ def without():
 )
 def test_the_notch_removes_the_speed_from_one_signal(without, which, raw, kind, nulled):
     run = simulate(case_from(with_notch(raw, kind)))
-    # exp(-20 * 0.65) = 2e-6 of what the start contains
+    # exp(-40 * 0.33) = 2e-6 of what the start contains
     assert run.metrics[nulled] < 1e-4 * without[which][nulled]
     other = {"i_1x_A": "z_1x_m", "z_1x_m": "i_1x_A"}[nulled]
     assert run.metrics[other] > 0.3 * without[which][other]

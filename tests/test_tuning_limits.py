@@ -1,6 +1,5 @@
 """Limits: how they are read and measured, whether the search respects them, their price, and their report."""
 
-import collections
 import math
 from types import SimpleNamespace
 
@@ -8,11 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bowl import World, answer_of, case_file, study
+from bowl import World, answer_of, study
 from texts import case_and_tune, problem_from
 
-import tuning.command
-import tuning.report.folder
 from ambjax import rollout
 from ambjax.simulation.folds import Named
 from ambjax.simulation.metrics import Metrics
@@ -337,27 +334,6 @@ def test_a_resumed_search_with_limits_gives_the_same_result(monkeypatch, tmp_pat
 
 
 # --- the command ---
-
-
-@pytest.mark.thorough
-def test_the_command_prints_the_price_of_a_limit(monkeypatch, tmp_path):
-    limits = {"rms_u_V": 10.0}
-    study(monkeypatch, World(), limits=limits)
-    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: collections.defaultdict(bytes))
-    path, out = case_file(tmp_path, limits=limits)
-    tuned = tuning.tune(path, out)
-    assert tuned.good
-    summary = tuned.report
-    row, survival = summary["limits"]
-    assert (row["name"], row["threshold"], row["held"], row["active"]) == ("rms_u_V", 10.0, True, True)
-    assert row["reached"] == pytest.approx(summary["after"]["settled_rms_u_V.mean"])
-    assert row["price"] > 0
-    assert row["price_unit"] == "m"
-    assert (survival["reached"], survival["held"]) == (1.0, True)
-    assert "is at its limit, 10: a limit 10 % higher would reduce the settled rms error by about" in summary["verdict"]
-    text = (out / "report.md").read_text()
-    assert "## Limits" in text
-    assert "| `rms_u_V` | at most 10 V |" in text
 
 
 def test_the_allowed_number_of_lost_members_is_a_whole_number():

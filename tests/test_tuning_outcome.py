@@ -39,6 +39,7 @@ def losing(*numbers, accurate=False):
 # the gains meet all requirements. The voltage of a Bowl is 0.33 V at the lower bound of k.
 OUTCOMES = {
     "held": (World, {}, HELD, HELD, True),
+    "at its limit": (World, {"limits": {"rms_u_V": 10.0}}, HELD, HELD, True),
     "lost": (lambda: losing(2), {}, BROKEN, HELD, False),
     "lost, as may be": (lambda: losing(2), {"limits": {"survival": 0.8}}, HELD, HELD, True),
     "not decided": (lambda: World(stalls=lambda s, n, _: (s, n) == (HELD_OUT, 2)), {}, BROKEN, HELD, False),
@@ -84,12 +85,16 @@ def test_all_outputs_give_the_same_verdict(kind, ran):
     assert [outcome["good"], code] == [good, int(not good)]
     for row in rows.values():
         assert row["held"] == {HELD: True, BROKEN: False}.get(row["verdict"])
-        assert (row["price"] is None) or row["held"]
+    priced = [name for name, row in rows.items() if row["price"]]
+    assert priced == ["rms_u_V"] * (kind == "at its limit")
+    if priced:
+        assert rows["rms_u_V"]["reached"] == pytest.approx(facts["after"]["settled_rms_u_V.mean"])
     assert facts["verified"] == (not facts["refuted"])
     # its words
     words = facts["verdict"]
     assert words.startswith(ALL_MET) == (good and survival == HELD)
     assert words.startswith(NO_HELD_OUT) == (survival == UNJUDGED)
+    assert ("a limit 10 % higher would reduce the settled rms error by about" in words) == bool(priced)
     assert words.startswith(NOT_MET) == (not good)
     for name, row in rows.items():
         assert (f"tune.limits.{name} is {BROKEN}" in words) == (row["verdict"] == BROKEN)

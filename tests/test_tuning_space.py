@@ -12,12 +12,10 @@ from hypothesis import strategies as st
 from texts import case_and_tune
 
 from ambjax import Cascade, Clock, Initial, Processor, Scenario, rollout
-from ambjax.cases.template_text import template
 from ambjax.laws import current, inversion
 from ambjax.signals import Pulse, Sine
 from ambjax.simulation.folds import Rms
 from ambjax.solvers import Slide
-from tuning.problem.config import read_tune
 from tuning.problem.gains_table import off
 from tuning.problem.goal import CVaR
 from tuning.problem.loss import TERMS, loss_for
@@ -121,17 +119,6 @@ def test_a_processor_tunes_finite_steepnesses_by_default():
     sampled = case_and_tune(text | {"processor": {}})[1].space.paths
     assert [path for path in sampled if path.endswith(".p")] == ["controller.position.p", "controller.current.p"]
     assert set(continuous) < set(sampled)
-
-
-@pytest.mark.parametrize("name", ["tracking", "regulation"])
-def test_the_commented_tune_table_of_the_template_is_valid(name, tmp_path):
-    head, heading, tail = template(name).partition("# [tune]")
-    path = tmp_path / "mine.toml"
-    path.write_text(head + "\n".join(line.removeprefix("# ") for line in (heading + tail).splitlines()))
-    tune = read_tune(path)[1]
-    assert tune.space.paths == [C, K]
-    assert (tune.space.gains[0].low, tune.space.gains[0].high) == (1.0, 500.0)
-    assert isinstance(tune.risk, CVaR)
 
 
 # --- risk ---

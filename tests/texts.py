@@ -1,9 +1,10 @@
-"""Helpers for the text of a case file: write it to the folder of a test, and read it with its [tune]."""
+"""Helpers for the text of a case file: write it, read it with its [tune], and the line with which it is refused."""
 
 import os
 import pathlib
 import tomllib
 
+from ambjax.__main__ import main
 from ambjax.cases.reader import case_from
 from ambjax.cases.table import Table
 from tuning.problem.config import tune_from
@@ -34,6 +35,23 @@ def piped(text):
     os.write(here, text.encode())
     os.close(here)
     return f"/dev/fd/{there}"
+
+
+def refusal(capsys, *words, program=main):
+    """Return the line on stderr of a command that refuses its words: exit code 2, nothing on stdout.
+
+    Only warnings, which begin with the name of a case file, may precede it.
+    """
+    try:
+        code = program([str(word) for word in words])
+    except SystemExit as stop:
+        code = stop.code
+    out, err = capsys.readouterr()
+    *warned, said = err.splitlines()
+    assert (code, out) == (2, ""), err
+    assert all(".toml: " in line for line in warned), err
+    assert said.isprintable()
+    return f"{said}\n"
 
 
 def case_and_tune(document, **tune):
