@@ -75,6 +75,17 @@ def pid(y, r, state, k_p=3e5, k_int=3e7, k_d=1e3, w_f=1e4, k_aw=20.0):
     return (free - x) / A, (d, (x + T * (k_int * e + k_aw * (free - A * v(y[0], y[2])))) / (1 + T * k_aw))
 
 
+def chain(y, r, state, k_p=2e4, k_int=5e5, k_d=20.0, w_f=1e4, k_aw=300.0):
+    z, _, i = y
+    stiffness, per_ampere = 4 * I_0**2 / S_0**3, 4 * I_0 / S_0**2
+    e, c = z - r[0], 2 / T
+    x, e_before, d = (0.0, e, 0.0) if state is None else state
+    d = (k_d * c * (e - e_before) - (1 - c / w_f) * d) / (1 + c / w_f)
+    i_star = (r[2] - A * stiffness * r[0] + G) / (A * per_ampere) - (k_p * e + x + T * k_int * e / 2 + d)
+    h = T * k_aw
+    return stiffness * z + per_ampere * i_star, (x + T * k_int * e + h / (1 + h) * (i_star - i), e, d)
+
+
 def adaptive(y, v_star, i_ref, gamma=1e11, p=1e-6):
     i_ref = 0.0 if i_ref is None else i_ref
     return i_ref, current_for(y[0], v_star - relaxed(v_star - v(y[0], i_ref), T * gamma, p))
@@ -152,6 +163,12 @@ def simulate(position, inversion, current, delay, predict):
             ({"kind": "integral-sliding-mode", "c": 300.0, "c_int": 2e4, "k": 50.0, "p": 40.0},
              {"kind": "closed-form"}, {"kind": "dead-beat", "share": 0.5}),
             1.0, True, marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            (chain, closed_form, pi),
+            ({"kind": "chain", "k_p": 2e4, "k_int": 5e5, "k_d": 20.0, "w_f": 1e4, "k_aw": 300.0},
+             {"kind": "closed-form"}, {"kind": "pi", "k_p": 40.0, "k_int": 5e4, "k_aw": 1000.0}),
+            1.4, False, marks=pytest.mark.slow,
         ),
     ],
 )  # fmt: skip
