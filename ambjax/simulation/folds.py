@@ -1,8 +1,6 @@
 """Folds: accumulators of metrics, updated sample by sample. They store few numbers, whatever the length of a run.
 
-A fold is a record with `init() -> carry`, `update(carry, row, span) -> carry` and `result(carry, ending) -> numbers`.
-`row` contains the signals at the start of a sample; `span` contains extremes and integrals of signals from there to the
-next sample (`simulation.span`, `loop.Sizes`, `loop.Densities`).
+`Fold` is their interface.
 """
 
 from collections.abc import Mapping
@@ -37,7 +35,13 @@ class Ending(NamedTuple):
 
 
 class Fold(Protocol[Carry, Result]):
-    """Interface of a fold."""
+    """Interface of a fold: a record that sees each sample of a run once. Its methods work under jit, vmap and grad.
+
+    - `init()`: the carry before the first sample: arrays of fixed shapes.
+    - `update(carry, row, span)`: the next carry. `row` contains the signals at the start of a sample; `span` contains
+      extremes and integrals of signals from there to the next (`simulation.span`, `loop.Sizes`, `loop.Densities`).
+    - `result(carry, ending)`: the numbers, as `Result.metrics`. `ending`: loss and duration of the run.
+    """
 
     def init(self) -> Carry: ...
     def update(self, carry: Carry, row: Row, span: Span) -> Carry: ...
