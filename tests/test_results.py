@@ -132,6 +132,20 @@ def test_the_parts_of_a_case_stand_for_it(path, run):
     assert ambjax.sensitivity(*parts).S == ambjax.sensitivity(case).S
 
 
+@ambjax.extend.record
+class Growing:
+    """A fold whose carry grows."""
+
+    def init(self):
+        return np.zeros(())
+
+    def update(self, carry, row, span):
+        return carry, row.z
+
+    def result(self, carry, ending):
+        return carry
+
+
 def test_bad_input_is_refused_by_name(path, run, monkeypatch):
     case = ambjax.read_case(path)
     cascade, scenario, clock = case.cascade, case.scenario, case.clock
@@ -190,6 +204,7 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
         (lambda: ambjax.rollout(cascade, scenario, dataclasses.replace(clock, samples=0)), "clock.samples = 0: it"),
         (lambda: ambjax.rollout(case, fold=ambjax.Metrics), "fold = .* a fold"),
         (lambda: ambjax.rollout(case, fold=type("Mine", (), {"init": float})()), "or a record with the"),
+        (lambda: ambjax.rollout(case, fold=Growing()), r"Growing has the shapes .*`update` \(\(\), \(\)\)"),
         (lambda: ambjax.rollout(case, record_every=-1), "record_every = -1"),
         (lambda: ambjax.Scenario(seed=2.5), "Scenario.seed = 2.5: it must be a whole number"),
         (lambda: ambjax.linear.injected(case, [100.0], periods=0), "periods = 0: it must be a whole number of"),

@@ -6,6 +6,7 @@
 from collections.abc import Mapping
 from typing import NamedTuple, Protocol, TypeVar
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -46,6 +47,18 @@ class Fold(Protocol[Carry, Result]):
     def init(self) -> Carry: ...
     def update(self, carry: Carry, row: Row, span: Span) -> Carry: ...
     def result(self, carry: Carry, ending: Ending) -> Result: ...
+
+
+def updated(fold: Fold[Carry, Result], carry: Carry, row: Row, span: Span) -> Carry:
+    """Return the next carry of a fold. Raises ValueError if it has another structure or another shape."""
+    after = fold.update(carry, row, span)
+    before, found = (jax.tree.map(jnp.shape, x) for x in (carry, after))
+    if before != found:
+        raise ValueError(
+            f"fold: the carry of {type(fold).__name__} has the shapes {before}, and after `update` {found}: they must "
+            "be equal. Return from `update` what `init` returns."
+        )
+    return after
 
 
 def _zero() -> Array:
