@@ -132,6 +132,20 @@ def test_the_parts_of_a_case_stand_for_it(path, run):
     assert ambjax.sensitivity(*parts).S == ambjax.sensitivity(case).S
 
 
+@ambjax.extend.record
+class Growing:
+    """A fold whose carry grows."""
+
+    def init(self):
+        return np.zeros(())
+
+    def update(self, carry, row, span):
+        return carry, row.z
+
+    def result(self, carry, ending):
+        return carry
+
+
 def test_bad_input_is_refused_by_name(path, run, monkeypatch):
     case = ambjax.read_case(path)
     cascade, scenario, clock = case.cascade, case.scenario, case.clock
@@ -189,6 +203,8 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
          r"clock\.method\.substeps = 0: it must be a whole number of at least 1"),
         (lambda: ambjax.rollout(cascade, scenario, dataclasses.replace(clock, samples=0)), "clock.samples = 0: it"),
         (lambda: ambjax.rollout(case, fold=ambjax.Metrics), "fold = .* a fold"),
+        (lambda: ambjax.rollout(case, fold=type("Mine", (), {"init": float})()), "or a record with the"),
+        (lambda: ambjax.rollout(case, fold=Growing()), r"Growing has the shapes .*`update` \(\(\), \(\)\)"),
         (lambda: ambjax.rollout(case, record_every=-1), "record_every = -1"),
         (lambda: ambjax.Scenario(seed=2.5), "Scenario.seed = 2.5: it must be a whole number"),
         (lambda: ambjax.linear.injected(case, [100.0], periods=0), "periods = 0: it must be a whole number of"),
@@ -207,6 +223,12 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
     for f in [*(f for f in of_a_case if f not in traceable), ambjax.linear.linearise, ambjax.theorem.check]:
         traced = jax.grad(lambda c, f=f: f(ambjax.with_gains(case, {"controller.position.c": c})))
         refused.append((lambda traced=traced: traced(17.0), r"a number is traced, .* Use ambjax\.rollout"))
+    traced = jax.grad(
+        lambda c: ambjax.ensemble.run_ensemble(dataclasses.replace(cascade, position=c), two, clock, fold=None)
+    )
+    refused.append((lambda: traced(cascade.position), "^ensemble: a number is traced"))
+    read = jax.jit(lambda c: ambjax.read_case({"controller": {"position": {"c": c}}}).cascade)
+    refused.append((lambda: read(17.0), "^controller.position.c: the number is traced. Read the case outside jit"))
     for call, said in refused:
         with pytest.raises(ValueError, match=said):
             call()

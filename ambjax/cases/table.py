@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.numerics.declared import check_number, numbers
-from ambjax.numerics.records import check_leaf, leaves_of
+from ambjax.numerics.records import check_leaf, is_traced, leaves_of
 from ambjax.numerics.shapes import axes_of, check_shapes
 from ambjax.text.synonyms import hint, other_words
 from ambjax.text.words import one_line
@@ -117,6 +117,11 @@ class Table:
         value = self.raw.get(key, default)
         if value is default:
             return default
+        if is_traced(value):
+            raise ValueError(
+                f"{self.at(key)}: the number is traced. Read the case outside jit, vmap and grad; inside, change its "
+                "numbers by ambjax.with_gains or dataclasses.replace."
+            )
         if getattr(value, "ndim", None) == 0:  # a number of NumPy or JAX, in a dict
             value = value.item()
         if isinstance(value, bool) or not isinstance(value, (int, float)):

@@ -21,7 +21,7 @@ from ambjax.compiler.fast_path import block_length, one_kernel
 from ambjax.compiler.short_compilation import compiled_quickly
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.declared import require_number
-from ambjax.numerics.records import canonical
+from ambjax.numerics.records import canonical, require_concrete
 from ambjax.numerics.shapes import varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Fold
@@ -119,8 +119,9 @@ def map_members(
 
     Returns NumPy arrays in member order, every leaf with a leading axis [N].
 
-    Raises ValueError if the lengths of two leaves differ, or if no leaf is an array.
+    Raises ValueError if the lengths of two leaves differ, if no leaf is an array, or if one is traced.
     """
+    require_concrete("ensemble", tree)
     compiled = compiled_quickly if plain else one_kernel
     for name, value in (("threads", threads), ("call", call), ("block", block)):
         require_number(name, value, 1, whole=True, optional=True)

@@ -1,13 +1,12 @@
 """Folds: accumulators of metrics, updated sample by sample. They store few numbers, whatever the length of a run.
 
-A fold is a record with `init() -> carry`, `update(carry, row, span) -> carry` and `result(carry, ending) -> numbers`.
-`row` contains the signals at the start of a sample; `span` contains extremes and integrals of signals from there to the
-next sample (`simulation.span`, `loop.Sizes`, `loop.Densities`).
+`Fold` is their interface.
 """
 
 from collections.abc import Mapping
 from typing import NamedTuple, Protocol, TypeVar
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -37,11 +36,29 @@ class Ending(NamedTuple):
 
 
 class Fold(Protocol[Carry, Result]):
-    """Interface of a fold."""
+    """Interface of a fold: a record that sees each sample of a run once. Its methods work under jit, vmap and grad.
+
+    - `init()`: the carry before the first sample: arrays of fixed shapes.
+    - `update(carry, row, span)`: the next carry. `row` contains the signals at the start of a sample; `span` contains
+      extremes and integrals of signals from there to the next (`simulation.span`, `loop.Sizes`, `loop.Densities`).
+    - `result(carry, ending)`: the numbers, as `Result.metrics`. `ending`: loss and duration of the run.
+    """
 
     def init(self) -> Carry: ...
     def update(self, carry: Carry, row: Row, span: Span) -> Carry: ...
     def result(self, carry: Carry, ending: Ending) -> Result: ...
+
+
+def updated(fold: Fold[Carry, Result], carry: Carry, row: Row, span: Span) -> Carry:
+    """Return the next carry of a fold. Raises ValueError if it has another structure or another shape."""
+    after = fold.update(carry, row, span)
+    before, found = (jax.tree.map(jnp.shape, x) for x in (carry, after))
+    if before != found:
+        raise ValueError(
+            f"fold: the carry of {type(fold).__name__} has the shapes {before}, and after `update` {found}: they must "
+            "be equal. Return from `update` what `init` returns."
+        )
+    return after
 
 
 def _zero() -> Array:

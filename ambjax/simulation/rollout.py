@@ -12,7 +12,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import Scalar, canonical
 from ambjax.numerics.shapes import require_one_member
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.folds import Ending, Fold
+from ambjax.simulation.folds import Ending, Fold, updated
 from ambjax.simulation.integrate import Advanced, Integrator, choose
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.method import with_method
@@ -225,7 +225,7 @@ def one_sample(
         method, period = clock.integrator, clock.sample_period
         after = system.advance(method, errors, t, period, state, memory, ending.lost_code)
         row = system.completed(row, after.span)
-        folded = folded if fold is None else fold.update(folded, row, after.span)
+        folded = folded if fold is None else updated(fold, folded, row, after.span)
         lost_now = alive & (after.code != ALIVE)
         resting = system.rest(after.state, after.code)
         state = jax.tree.map(lambda a, b: jnp.where(lost_now, a, b), resting, after.state)

@@ -57,8 +57,12 @@ def require_records(name: str, node: Any) -> None:
 
 def check_recording(fold: object, record_every: object) -> None:
     """Raise ValueError for arguments of `rollout` that are not a fold, or not a number of samples."""
-    if fold is not None and (isinstance(fold, type) or not hasattr(fold, "init")):
-        raise ValueError(f"fold = {fold!r}: it must be a fold, such as ambjax.Metrics.for_case(case), or None.")
+    complete = all(hasattr(fold, method) for method in ("init", "update", "result"))
+    if fold is not None and (isinstance(fold, type) or jax.tree_util.all_leaves([fold]) or not complete):
+        raise ValueError(
+            f"fold = {fold!r}: it must be a fold, such as ambjax.Metrics.for_case(case) or a record with the methods "
+            "of ambjax.extend.Fold, or None."
+        )
     require_number("record_every", record_every, 0, whole=True)
 
 
