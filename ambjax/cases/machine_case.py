@@ -20,16 +20,7 @@ from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
 from ambjax.cases.plausibility import unresolved
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, read_by, safe_name
 from ambjax.cases.rotor_numbers import fastest_rotor, widest_rotation
-from ambjax.cases.rotor_tables import (
-    COORDINATES,
-    RIGID,
-    BearingAxis,
-    axes_from,
-    body_from,
-    rotor_from,
-    tables_of,
-    vector,
-)
+from ambjax.cases.rotor_tables import COORDINATES, RIGID, BearingAxis, axes_and_rotor, tables_of, vector
 from ambjax.cases.speed_table import MOST_SPEEDS, listed_speeds
 from ambjax.cases.table import FILE, Table, require_file
 from ambjax.control.cascade import Cascade
@@ -133,11 +124,10 @@ def machine_from(
     if "disturbance" in raw:
         raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] or [[base]] instead.")
     top.only([*(name for name in TABLES if name != "disturbance"), *MACHINE_TABLES[1:], "tune"], ("rotor.m",))
-    body, bearings = body_from(top, folder), tables_of(top, "bearing")
+    bearings = tables_of(top, "bearing")
     if not bearings:
         raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
-    axes = axes_from(bearings, body)
-    rotor = rotor_from(top, body, axes, folder)
+    axes, rotor = axes_and_rotor(top, folder)
     q, currents = _start(top.table("initial"), rotor, len(axes))
     _check_rank(rotor, axes)
     masses, forces = _shares(rotor)
@@ -173,7 +163,8 @@ def machine_from(
     turning = [*speeds, *speeds_of(widest_rotation(rotor, spread), float(clock.duration))]
     cases = notched(cases, notches, machine_of_axes(rotor, parts_of(cases), clock, q, law), clock, turning)
     spread = with_notches(spread, of_notches, axes, cases)
-    coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
+    modes = range((len(rotor.gravity) - RIGID) // 2)
+    coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in modes for d in "xy"))
     found_laws = [(own_law,) if own_law else (), *(one.own_laws for one in cases)]
     machine = machine_of_axes(rotor, parts_of(cases), clock, q, law)
     if own_law is not None:
