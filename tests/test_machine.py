@@ -16,6 +16,7 @@ from scipy.linalg import eig
 from ambjax.__main__ import main
 from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.reader import case_from, read_case
+from ambjax.cases.rotor_numbers import varied_rotor
 from ambjax.cases.template_text import template
 from ambjax.commands import machine_commands
 from ambjax.commands.reading import read_any_with_warnings
@@ -222,6 +223,9 @@ def test_planes_share_the_unbalance_of_a_grade():
     case = machine_from(changed(MACHINE, unbalance=[*planes, {"at": 0.0, "amount": 3.0}]))
     half = 2.3 * 2.5e-3 / (2 * np.pi * 100.0) / 1e-6 / 2
     np.testing.assert_allclose([one.amount for one in case.machine.rotor.unbalances], [half, half, 3.0], rtol=1e-12)
+    # the grade is per mass; an amount that is given itself does not follow the mass
+    heavy = varied_rotor(case.machine.rotor, {"unbalance.1.amount": 1.0, "rotor.m": 4.6})
+    np.testing.assert_allclose([one.amount for one in heavy.unbalances], [2 * half, 1.0, 3.0], rtol=1e-12)
 
 
 def test_runout_turns_with_the_rotor():
