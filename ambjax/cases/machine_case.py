@@ -28,7 +28,7 @@ from ambjax.control.machine_law import MachineLaw
 from ambjax.control.synchronous_notch import SynchronousNotch
 from ambjax.ensemble.spread import Spread
 from ambjax.linear.analysis import Zones
-from ambjax.linear.notch_design import speeds_of, with_machine_gains
+from ambjax.linear.notch_design import following, speeds_of, with_machine_gains
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
@@ -37,6 +37,7 @@ from ambjax.simulation.method import ACCURATE, TOUCHED, slopes
 from ambjax.simulation.rollout import prepare
 from ambjax.simulation.whole_machine import Machine
 from ambjax.text.words import one_line
+from ambjax.world.rotation import Rotation
 from ambjax.world.rotor import Rotor
 from ambjax.world.scenario import Scenario
 
@@ -158,9 +159,10 @@ def machine_from(
     fixed = not isinstance(raw.get("clock", {}).get("dt", "auto"), str)
     clock = _clock([*cases, *parts], fastest_rotor(rotor, spread), fixed)
     controllers = [merged(top.table("controller").raw, own.table("controller").raw) for own in bearings]
-    notches = [notch_of_axis(controllers[axis.bearing], case) for axis, case in zip(axes, cases, strict=True)]
+    widest = widest_rotation(rotor, spread)
+    notches = [notch_of_axis(controllers[axis.bearing], case, widest) for axis, case in zip(axes, cases, strict=True)]
     speeds = _speeds(top.table("sensitivity"), rotor, float(clock.duration))
-    turning = [*speeds, *speeds_of(widest_rotation(rotor, spread), float(clock.duration))]
+    turning = [*speeds, *speeds_of(widest, float(clock.duration))]
     cases = notched(cases, notches, machine_of_axes(rotor, parts_of(cases), clock, q, law), clock, turning)
     spread = with_notches(spread, of_notches, axes, cases)
     modes = range((len(rotor.gravity) - RIGID) // 2)
@@ -213,23 +215,30 @@ def notched(
     return [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
 
 
-def machine_for(case: MachineCase, speeds: Sequence[float]) -> Machine:
-    """Return the machine of a case, with the gains of its notches for these speeds, rpm."""
+def with_notches_for(case: MachineCase, speeds: Sequence[float]) -> MachineCase:
+    """Return the case with the gains of its notches for its controllers and these speeds, rpm."""
     notches, machine = [one.cascade.notch for one in case.cases], case.machine
+    if not any(notches):
+        return case
 
     def made(cases: Sequence[Case]) -> Machine:
         return machine_of_axes(machine.rotor, parts_of(cases), case.clock, machine.start_q, machine.law)
 
     bare = made(notched(case.cases, [None] * len(notches), machine, case.clock, speeds))
-    return made(notched(case.cases, notches, bare, case.clock, speeds)) if any(notches) else machine
+    cases = tuple(notched(case.cases, notches, bare, case.clock, speeds))
+    return dataclasses.replace(case, cases=cases, machine=made(cases))
 
 
-def notch_of_axis(controller: dict[str, Any], case: Case) -> SynchronousNotch | None:
-    """Return `notch_from` of an axis. `controller`: the common table with the keys of its bearing."""
+def notch_of_axis(controller: dict[str, Any], case: Case, rotor: Rotation) -> SynchronousNotch | None:
+    """Return `notch_from` of an axis for a rotor whose numbers may be arrays.
+
+    `controller`: the common table with the keys of its bearing.
+    """
     try:
-        return notch_from(Table({"controller": controller}), case.scenario)
+        notch = notch_from(Table({"controller": controller}), case.scenario)
     except ValueError as error:
         raise ValueError(f"{case.name}: {error}") from None
+    return notch and following(notch, rotor)
 
 
 def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:

@@ -11,10 +11,11 @@ from jax import Array
 from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.control.cascade import Cascade
 from ambjax.control.synchronous_notch import NULLED, NotchGain, SynchronousNotch
-from ambjax.linear.analysis import linearise
+from ambjax.ensemble.batching import map_members
+from ambjax.linear.analysis import linearisation_inputs, linearise
 from ambjax.linear.linear_machine import linearise_machine
 from ambjax.linear.matrices import loop_matrices
-from ambjax.numerics.records import Scalar
+from ambjax.numerics.records import Scalar, canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.whole_machine import Machine
 from ambjax.world.rotation import PER_MINUTE, Rotation
@@ -49,7 +50,13 @@ def with_notch_gains(cascade: Cascade, scenario: Scenario, clock: Clock, rotor: 
     speeds = notch_speeds(cascade.notch, speeds_of(rotor, float(clock.duration)))
     response = np.asarray(system.response(PER_MINUTE * np.array(speeds)))
     gains = notch_gains(cascade.notch, speeds, response[:, 0, 0], response[:, 5, 0])
-    return dataclasses.replace(cascade, notch=dataclasses.replace(cascade.notch, gains=gains, rotor=scenario.rotor))
+    notch = dataclasses.replace(following(cascade.notch, rotor), gains=gains, rotor=scenario.rotor)
+    return dataclasses.replace(cascade, notch=notch)
+
+
+def following(notch: SynchronousNotch, rotor: Rotation) -> SynchronousNotch:
+    """Return the notch for a rotor whose numbers may be arrays: it follows a speed that changes in one of them."""
+    return dataclasses.replace(notch, varying=notch.varying or bool(np.any(np.asarray(rotor.acceleration) != 0)))
 
 
 def redesigned(cascade: Cascade, scenario: Scenario, period: Scalar) -> tuple[NotchGain, ...]:
@@ -67,6 +74,16 @@ def redesigned(cascade: Cascade, scenario: Scenario, period: Scalar) -> tuple[No
 
 # For one cascade with concrete numbers.
 redesigned_at_once = compiled_quickly(redesigned, options=QUICKEST)
+
+
+def redesigned_members(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[NotchGain, ...]:
+    """Return the gains of `redesigned` of every member of an ensemble, whose varying leaves are arrays [N]."""
+    # threads: see `linearise_members`
+    return map_members(_redesigned, canonical(linearisation_inputs(cascade, scenario, clock)), threads=1, plain=True)
+
+
+def _redesigned(tree: tuple[Cascade, Scenario, Scalar]) -> tuple[NotchGain, ...]:
+    return redesigned(*tree)
 
 
 def notch_gains(
