@@ -22,7 +22,7 @@ from ambjax.cases.reader import TABLES, Case, case_from, is_machine, read_by, sa
 from ambjax.cases.rotor_numbers import fastest_rotor, widest_rotation
 from ambjax.cases.rotor_tables import COORDINATES, RIGID, BearingAxis, axes_and_rotor, tables_of, vector
 from ambjax.cases.speed_table import MOST_SPEEDS, listed_speeds
-from ambjax.cases.table import FILE, Table, require_file
+from ambjax.cases.table import FILE, Table, require_file, show
 from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.synchronous_notch import SynchronousNotch
@@ -125,6 +125,9 @@ def machine_from(
     if "disturbance" in raw:
         raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] or [[base]] instead.")
     top.only([*(name for name in TABLES if name != "disturbance"), *MACHINE_TABLES[1:], "tune"], ("rotor.m",))
+    if (method := top.table("clock").raw.get("method", "auto")) not in ("auto", "rk4", "dop853", "euler"):
+        words = "'rk4', 'dop853' or 'euler' with a number for clock.dt, or leave it out"
+        raise ValueError(f"clock.method = {show(method)}: a machine takes equal explicit steps. Give {words}.")
     bearings = tables_of(top, "bearing")
     if not bearings:
         raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
