@@ -32,9 +32,10 @@ def test_a_lost_rotor_without_an_equilibrium_has_a_verdict(tmp_path, capsys):
         text = text.replace(f"\nat = {at}", f"\nat = {at}\nsensor_at = {end}", 1)
     (tmp_path / "far.toml").write_text(text)
     assert main(["check", str(tmp_path / "far.toml")]) == 1
-    run, sensitivity, *_ = capsys.readouterr().out.splitlines()
+    run, sensitivity, _, _, *axes = capsys.readouterr().out.splitlines()
     assert run.startswith("run: LOST (touched down")
     assert sensitivity.startswith("sensitivity: no zone and no margins: no equilibrium")
+    assert [line.split()[2] for line in axes] == ["D"] * 4
 
 
 @pytest.mark.slow
@@ -52,11 +53,23 @@ def test_the_check_says_why_there_is_no_test_with_more_modes():
     assert machine_check._spill_over(rigid) == ({}, "only a rotor of the kind shaft has further modes")
 
 
+def with_notch():
+    laws = FLEXIBLE["controller"] | {"notch": {"kind": "displacement-free", "rate": 5.0}}
+    return read_machine(FLEXIBLE | {"rotor": FLEXIBLE["rotor"] | {"modes": 1}, "controller": laws})
+
+
+@pytest.mark.slow
+def test_a_notch_at_rest_grows_by_rounding_errors_only():
+    """At 0 rpm, one of the two states of a notch has a pole at 0."""
+    found = machine_check._linear(with_notch())
+    assert found.summary["growth_with_more_modes_per_s"] == {"0": 0.0}
+    assert found.holds
+
+
 @pytest.mark.slow
 def test_the_larger_rotor_has_the_notches_of_the_case(monkeypatch):
     """The gain of a notch is that of the designed rotor: the machine in service has no other."""
-    laws = FLEXIBLE["controller"] | {"notch": {"kind": "displacement-free", "rate": 5.0}}
-    case = read_machine(FLEXIBLE | {"rotor": FLEXIBLE["rotor"] | {"modes": 1}, "controller": laws})
+    case = with_notch()
     taken, machines = machine_check.turning_machines, []
     monkeypatch.setattr(machine_check, "turning_machines", lambda one, *rest: machines.append(one) or taken(one, *rest))
     assert machine_check._spill_over(case)[0]

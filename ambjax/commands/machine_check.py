@@ -15,7 +15,7 @@ from ambjax.linear import MachineSensitivity, poles_in_s
 from ambjax.linear.linear_machine import sensitivity_of, turning_machines
 from ambjax.linear.margins import STATIC
 from ambjax.linear.rotor_modes import LIGHT, Mode, modes_of
-from ambjax.results.machine_run import simulate_machine
+from ambjax.results.machine_run import MachineRun, simulate_machine
 from ambjax.results.outputs import plain, table
 
 # Modes that the second analysis adds to those of a shaft. At most MOST lightly damped modes are listed.
@@ -49,12 +49,12 @@ def check(case: MachineCase) -> CaseCheck:
     run = simulate_machine(case)
     linear = _linear(case)
     share = float(run.metrics["settled_clearance_used"])
-    axes = {axis: _axis(case, k, run.metrics["axes"][axis], linear.points) for k, axis in enumerate(case.axes)}
+    axes = {axis: _axis(case, k, run, linear.points) for k, axis in enumerate(case.axes)}
     summary = {
         "held": not run.lost,
         "lost_why": run.lost_why,
         "clearance_used": share,
-        "clearance_zone": "D" if run.lost else case.zones.clearance_zone(share),
+        "clearance_zone": _zone(case, run, share),
         "axes": axes,
         **linear.summary,
     }
@@ -174,23 +174,32 @@ def _spill_over(case: MachineCase) -> tuple[dict[str, float], str]:
         points = list(turning_machines(machine, case.clock.sample_period, case.speeds))
     except ValueError as error:
         return {}, str(error)
-    growth = [float(np.max(np.real(poles_in_s(point.system.without_idle())))) for point in points]
-    return {f"{speed:g}": rate for speed, rate in zip(case.speeds, growth, strict=True)}, ""
+    found = {}
+    for speed, system in zip(case.speeds, (point.system.without_idle() for point in points), strict=True):
+        rate = float(np.max(np.real(poles_in_s(system))))
+        found[f"{speed:g}"] = min(rate, 0.0) if system.stable else rate  # a mode at rest, but for rounding
+    return found, ""
 
 
-def _axis(case: MachineCase, k: int, metrics: dict[str, float], points: list[MachineSensitivity]) -> dict[str, object]:
+def _axis(case: MachineCase, k: int, run: MachineRun, points: list[MachineSensitivity]) -> dict[str, object]:
     """Return what is checked of one axis: clearance and force as shares, and the largest sensitivity at any speed.
 
     Without points, the sensitivity is None.
     """
+    metrics = run.metrics["axes"][case.axes[k]]
     scenario, share = case.cases[k].scenario, float(metrics["settled_clearance_used"])
     worst = max((point.axes[k] for point in points), key=lambda axis: (axis.zone, axis.S.height), default=None)
     carried = abs(float(scenario.plant.m * scenario.plant.g)) / float(scenario.largest_force)
     used = max(float(metrics["force_used"]), carried)
     return {
-        "clearance_used": share, "clearance_zone": case.zones.clearance_zone(share), "force_carried": carried,
+        "clearance_used": share, "clearance_zone": _zone(case, run, share), "force_carried": carried,
         "force_reserve": 1 - used, "peak": worst and worst.S.height, "zone": worst and worst.zone,
     }  # fmt: skip
+
+
+def _zone(case: MachineCase, run: MachineRun, share: float) -> str:
+    """Return the zone of a share of the clearance; D if the rotor is lost."""
+    return "D" if run.lost else case.zones.clearance_zone(share)
 
 
 def _cells(own: dict[str, Any]) -> list[str]:
