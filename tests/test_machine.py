@@ -17,6 +17,7 @@ from texts import refusal
 from ambjax.__main__ import main
 from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.reader import case_from, read_case
+from ambjax.cases.rotor_numbers import varied_rotor
 from ambjax.cases.template_text import template
 from ambjax.commands import machine_commands
 from ambjax.commands.reading import read_any_with_warnings
@@ -223,6 +224,9 @@ def test_planes_share_the_unbalance_of_a_grade():
     case = machine_from(changed(MACHINE, unbalance=[*planes, {"at": 0.0, "amount": 3.0}]))
     half = 2.3 * 2.5e-3 / (2 * np.pi * 100.0) / 1e-6 / 2
     np.testing.assert_allclose([one.amount for one in case.machine.rotor.unbalances], [half, half, 3.0], rtol=1e-12)
+    # the grade is per mass; an amount that is given itself does not follow the mass
+    heavy = varied_rotor(case.machine.rotor, {"unbalance.1.amount": 1.0, "rotor.m": 4.6})
+    np.testing.assert_allclose([one.amount for one in heavy.unbalances], [2 * half, 1.0, 3.0], rtol=1e-12)
 
 
 def test_runout_turns_with_the_rotor():
@@ -309,6 +313,7 @@ def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monke
         ({"bearing": RADIAL, "load": [PUSH | {"direction": [0, 0, 1]}]}, "no axis holds z.*loads that do not"),
         ({"bearing": [{"kind": "radial", "at": 0.0}], "rotor": VERTICAL}, "no axis holds z, beta_x, beta_y"),
         ({"bearing": []}, r"\[\[bearing\]\] is missing"),
+        ({"clock": MACHINE["clock"] | {"dt": 1e-6, "method": "rodas3"}}, r"clock\.method = .rodas3.*Give 'rk4'"),
         ({"bearing": [MACHINE["bearing"][0]] * 2}, r"bearing\[1\]\.name = .*needs a name of its own"),
         ({"bearing": [MACHINE["bearing"][0] | {"name": "top.a"}]}, r"bearing\[0\]\.name = .top\.a.: .*without dots"),
         ({"bearing": [*MACHINE["bearing"][:2], {"kind": "axial", "angle": 45.0}]}, r"bearing\[2\]\.angle.*along the"),

@@ -1,13 +1,17 @@
 """`ambjax check` of a machine: its verdict without an equilibrium, and the test with more bending modes."""
 
 import tomllib
+from typing import Any
 
+import jax
+import numpy as np
 import pytest
 
 from ambjax.__main__ import main
 from ambjax.cases.machine_case import read_machine
 from ambjax.cases.template_text import template
 from ambjax.commands import machine_check
+from ambjax.commands.machine_check import LEAST_OFFSET
 
 FLEXIBLE = tomllib.loads(template("machine-flexible")) | {"sensitivity": {"speeds": [0.0]}}
 
@@ -28,9 +32,10 @@ def test_a_lost_rotor_without_an_equilibrium_has_a_verdict(tmp_path, capsys):
         text = text.replace(f"\nat = {at}", f"\nat = {at}\nsensor_at = {end}", 1)
     (tmp_path / "far.toml").write_text(text)
     assert main(["check", str(tmp_path / "far.toml")]) == 1
-    run, sensitivity, *_ = capsys.readouterr().out.splitlines()
+    run, sensitivity, _, _, *axes = capsys.readouterr().out.splitlines()
     assert run.startswith("run: LOST (touched down")
     assert sensitivity.startswith("sensitivity: no zone and no margins: no equilibrium")
+    assert [line.split()[2] for line in axes] == ["D"] * 4
 
 
 @pytest.mark.slow
@@ -46,3 +51,51 @@ def test_the_check_says_why_there_is_no_test_with_more_modes():
     assert machine_check._spill_over(with_rotor(modes=20)) == ({}, "the rotor has 20 already, the largest number")
     rigid = read_machine(tomllib.loads(template("machine")))
     assert machine_check._spill_over(rigid) == ({}, "only a rotor of the kind shaft has further modes")
+
+
+def with_notch():
+    laws = FLEXIBLE["controller"] | {"notch": {"kind": "displacement-free", "rate": 5.0}}
+    return read_machine(FLEXIBLE | {"rotor": FLEXIBLE["rotor"] | {"modes": 1}, "controller": laws})
+
+
+@pytest.mark.slow
+def test_a_notch_at_rest_grows_by_rounding_errors_only():
+    """At 0 rpm, one of the two states of a notch has a pole at 0."""
+    found = machine_check._linear(with_notch())
+    assert found.summary["growth_with_more_modes_per_s"] == {"0": 0.0}
+    assert found.holds
+
+
+@pytest.mark.slow
+def test_the_larger_rotor_has_the_notches_of_the_case(monkeypatch):
+    """The gain of a notch is that of the designed rotor: the machine in service has no other."""
+    case = with_notch()
+    taken, machines = machine_check.turning_machines, []
+    monkeypatch.setattr(machine_check, "turning_machines", lambda one, *rest: machines.append(one) or taken(one, *rest))
+    assert machine_check._spill_over(case)[0]
+    assert len(machines[0].rotor.gravity) == len(case.coordinates) + 8
+    expected, found = (
+        [np.asarray(x) for loop in one.loops() for x in jax.tree.leaves(loop.cascade.notch)]
+        for one in (case.machine, machines[0])
+    )
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("third", [True, False])
+def test_integral_actions_on_three_bearings_of_a_rigid_rotor_drift_apart(third):
+    """The least offset is the static gain of the discrete map, which is nearly singular with three bearings."""
+    raw: dict[str, Any] = tomllib.loads(template("machine")) | {"sensitivity": {"speeds": [6000.0]}}
+    if third:
+        raw["bearing"].insert(2, {"name": "middle", "kind": "radial", "at": 0.05})
+    case = read_machine(raw)
+    linear = machine_check._linear(case)
+    assert (linear.holds, linear.summary["stable"]) == (not third, {"6000": True})
+    assert ("sensors: NOT BORNE" in "\n".join(linear.verdict)) == third
+    system, c = linear.points[0].system, len(case.axes)
+    A, B, C, D = (np.asarray(x) for x in (system.A, system.B, system.C, system.D))
+    static = np.abs(C @ np.linalg.solve(np.eye(len(A)) - A, B) + D)[2 * c : 3 * c]
+    share = float(case.cases[0].scenario.plant.i_0) / static.max() / (0.9 * 3.81e-4)
+    assert (share < LEAST_OFFSET) == third
+    # a pole at 1 - 4e-7 loses 7 of 16 digits
+    assert linear.summary["sensor_offset_borne"] == pytest.approx(share, rel=1e-5)

@@ -16,6 +16,7 @@ from ambjax.cases.template_text import template
 from ambjax.commands import campbell
 from ambjax.commands.machine_commands import once_per_revolution, sensitivity_text
 from ambjax.commands.sensitivity_report import injection_text
+from ambjax.linear import rotor_modes
 from ambjax.linear.injection import Injection
 from ambjax.linear.linear_machine import machine_sensitivity, turning_machines
 from ambjax.linear.rotor_modes import modes_of, springs_critical
@@ -166,6 +167,10 @@ def test_modes_have_the_names_and_directions_of_the_motion(rigid, way):
     fast = [mode for mode in modes_of(turning, rigid.machine.rotor) if 1 < mode.frequency < 1e3]
     tilts = [mode for mode in fast if mode.name == "tilt"]
     assert [mode.whirl for mode in tilts] == ["backward", "forward"]  # nutation is forward, and faster
+    # the vectors of a double pole at rest are any of its plane, such as two circles
+    circle = np.array([1.0, -1j, 0.0, 0.0, 0.0])
+    found = [rotor_modes._described(circle, np.ones(5), speed)[1] for speed in (way, 0)]
+    assert found == ["forward" if way > 0 else "backward", "planar"]
 
 
 def test_the_waterfall_of_a_sweep_follows_its_frequency():

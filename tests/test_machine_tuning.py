@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 import tomllib
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -66,6 +67,25 @@ def test_the_peak_is_that_of_the_sensitivity(peaks, integral):
     assert found.stability(x).f == pytest.approx(growth, rel=1e-3, abs=1e-6)
     S = [np.diagonal(point.system.response([v / 60])[0]) for point, v in zip(points, case.speeds, strict=True) if v]
     assert found.turning(x) == pytest.approx(np.max(np.abs(S)), rel=1e-9)
+
+
+@pytest.mark.slow  # compiles the loop and its derivatives
+def test_the_search_designs_the_notches_for_its_gains():
+    """Poles and peak are those of the machine that is read with the gains, and so are the derivatives."""
+    raw: dict[str, Any] = raw_case(gains=["controller.position.k_d"]) | {"sensitivity": {"speeds": [6000.0]}}
+    raw["controller"] |= {"notch": {"kind": "displacement-free", "rate": 20.0}}
+    raw["bearing"][2]["controller"] = {"notch": {"kind": "none"}}
+    case, space = space_of(raw)
+    found, k_d = Peaks(case, space), 1.6 * space.values(case)[0]
+    pid = {"position": PARTS["position"] | {"k_d": float(k_d)}}
+    same = machine_from(raw | {"controller": raw["controller"] | pid})
+    point = machine_sensitivity(same.machine, same.axes, same.clock.sample_period, 6000.0, same.zones)
+    x, h = space.space.encode([k_d]), 1e-5
+    assert found.stability(x).f == pytest.approx(np.max(np.real(point.poles)), rel=1e-4)
+    assert np.exp(found.peak(x).f) == pytest.approx(point.worst.S.height, rel=1e-3)
+    for function in (found.stability, found.peak):
+        step = (function(x + h).f - function(x - h).f) / (2 * h)
+        assert function(x).gradient == pytest.approx(step, rel=0.02)
 
 
 @pytest.mark.thorough

@@ -18,7 +18,8 @@ from ambjax.ensemble.maps import Axis, grid
 from ambjax.ensemble.study import Study
 from ambjax.laws import inversion
 from ambjax.plants import Plant
-from ambjax.results.case_map import study_and_axes
+from ambjax.results.case_map import study_and_axes, survival_map
+from ambjax.results.runs import simulate
 from ambjax.sensors import Sensor
 from ambjax.simulation.folds import Peak
 from ambjax.solvers import RK4, AdaptiveRodas3
@@ -89,6 +90,35 @@ def test_one_member_is_the_nominal_case():
     several = grid(dataclasses.replace(wide, members=2), x, y)
     assert several.drawn == ("initial.z",)
     assert np.all(several.error > 10 * nominal.error)  # thrown off by 100 times what noise does
+
+
+TURNING = {
+    "controller": {
+        "position": {"kind": "pid", "k_p": 1e5, "k_d": 800.0, "k_int": 1e-3},
+        "inversion": {"kind": "closed-form"}, "current": {"kind": "pi", "k_p": 8e4, "k_int": 5e7},
+        "notch": {"kind": "displacement-free", "rate": 40.0},
+    },
+    "rotor": {"speed": 6000.0},
+    "disturbance": {"q_z": {"kind": "unbalance", "unbalance": 0.05}},
+    "clock": {"duration": 0.1, "sample_period": 1e-4},
+    "run": {"settle": 0.08},
+    "processor": {"delay": 1.0},
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("y", ["rotor.speed=3000:9000:2", "clock.sample_period=5e-5:1e-4:2"])
+def test_each_cell_has_a_notch_for_its_controller_and_its_speed(y):
+    """A cell equals the case whose file has its numbers."""
+    found = survival_map(case_from(TURNING), "controller.position.k_p=6e4:2e5:2", y).map
+    (table, key), laws = y.partition("=")[0].split("."), TURNING["controller"]
+    for row, value in enumerate(found.y.values):
+        for column, k_p in enumerate(found.x.values):
+            own = {"controller": laws | {"position": laws["position"] | {"k_p": float(k_p)}}}
+            raw = TURNING | own | {table: TURNING[table] | {key: float(value)}}
+            alone = simulate(case_from(raw)).metrics["settled_max_abs_error_m"]
+            # the steps of the map are those for all cells
+            assert found.error[row, column] == pytest.approx(alone, rel=1e-3)
 
 
 CASE = """

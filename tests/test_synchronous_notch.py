@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax.cases.machine_case import machine_from
+from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.reader import case_from
 from ambjax.cases.table import Table
 from ambjax.cases.template_text import template
@@ -16,11 +16,14 @@ from ambjax.codegen.c99.source import Origin
 from ambjax.codegen.of_case import block_of
 from ambjax.codegen.verify import draft, holds, verify
 from ambjax.control.synchronous_notch import NotchGain, NotchState, SynchronousNotch
+from ambjax.ensemble.maps import PERIOD
 from ambjax.linear import linearise
 from ambjax.linear.linear_machine import linearise_machine
 from ambjax.linear.margins import poles_in_s
+from ambjax.results.case_map import study_and_axes
 from ambjax.results.gains import with_gains
 from ambjax.results.machine_run import simulate_machine
+from ambjax.results.map_notches import notch_gains
 from ambjax.results.runs import simulate
 from ambjax.world.rotation import Rotation
 from ambjax.world.sensor import Measurement
@@ -279,3 +282,40 @@ def test_a_notch_has_gains_at_all_speeds_that_vary():
     machine = of_machine(({"rate": 10.0}, {"rate": 10.0}, {"kind": "none"})) | {"sensitivity": {"speeds": [4000.0]}}
     gains = machine_from(machine).cases[0].cascade.notch.gains
     assert [float(gain.speed) for gain in (gains[0], gains[-1])] == [4000.0, RPM]
+
+
+@pytest.mark.slow
+def test_a_notch_follows_the_speed_of_each_member():
+    """A notch has a state for a speed that changes in some members, though that of the case is constant."""
+    faster = {"spread": {"rotor": {"acceleration": {"uniform": [0.0, 1e4]}}}}
+    assert case_from(with_notch(ON_PROCESSOR, "force-free") | faster).cascade.notch.varying
+    machine = machine_from(of_machine(({"rate": 10.0}, {"kind": "none"}, {"kind": "none"})) | faster)
+    assert machine.cases[0].cascade.notch.varying
+    assert machine.cases[2].cascade.notch is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("y", ["rotor.speed=3000:9000:2", "clock.sample_period=5e-5:1e-4:2"])
+def test_the_notches_in_the_map_of_a_machine_are_those_of_each_cell(y):
+    """The gains are those of the machine that is read with the numbers of the cell."""
+
+    def machine(k_int, speed=RPM, period=5e-5):
+        pid = {"position": {"kind": "pid", "k_int": k_int}, "inversion": {"kind": "linearised"}}
+        raw = of_machine(({"rate": 10.0}, {"kind": "displacement-free"}, {"kind": "none"}), **pid)
+        clock = raw["clock"] | {"sample_period": period}
+        return raw | {"clock": clock, "rotor": raw["rotor"] | {"speed": speed}, "sensitivity": {"speeds": [speed]}}
+
+    path, _, values = y.partition("=")
+    study, *_ = study_and_axes(read_machine(machine(1e7)), "controller.position.k_int=1e6:1e7:2", y, 1, None)
+    low = float(values.split(":")[0])
+    if path == PERIOD:
+        study, own, other = study.at_period(low), {PERIOD: np.full(2, low)}, machine(1e6, period=low)
+    else:
+        own, other = {path: np.array([9000.0, low])}, machine(1e6, low)
+    laws = {part: np.array([1e7, 1e6]) for part in study.parts("controller.position.k_int")}
+    found = notch_gains(study, laws | own)
+    for axis, one in zip(study.case.axes, machine_from(other).cases, strict=True):
+        for name in ("real", "imaginary") if one.cascade.notch else ():
+            expected = float(getattr(one.cascade.notch.gains[0], name))
+            gains = f"bearing.{axis}.controller.notch.gains.0.{name}"
+            assert found[gains][1] == pytest.approx(expected, rel=1e-6)

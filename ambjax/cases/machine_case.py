@@ -20,24 +20,15 @@ from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
 from ambjax.cases.plausibility import unresolved
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, read_by, safe_name
 from ambjax.cases.rotor_numbers import fastest_rotor, widest_rotation
-from ambjax.cases.rotor_tables import (
-    COORDINATES,
-    RIGID,
-    BearingAxis,
-    axes_from,
-    body_from,
-    rotor_from,
-    tables_of,
-    vector,
-)
+from ambjax.cases.rotor_tables import COORDINATES, RIGID, BearingAxis, axes_and_rotor, tables_of, vector
 from ambjax.cases.speed_table import MOST_SPEEDS, listed_speeds
-from ambjax.cases.table import FILE, Table, require_file
+from ambjax.cases.table import FILE, Table, require_file, show
 from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.synchronous_notch import SynchronousNotch
 from ambjax.ensemble.spread import Spread
 from ambjax.linear.analysis import Zones
-from ambjax.linear.notch_design import speeds_of, with_machine_gains
+from ambjax.linear.notch_design import following, speeds_of, with_machine_gains
 from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
@@ -46,6 +37,7 @@ from ambjax.simulation.method import ACCURATE, TOUCHED, slopes
 from ambjax.simulation.rollout import prepare
 from ambjax.simulation.whole_machine import Machine
 from ambjax.text.words import one_line
+from ambjax.world.rotation import Rotation
 from ambjax.world.rotor import Rotor
 from ambjax.world.scenario import Scenario
 
@@ -133,11 +125,13 @@ def machine_from(
     if "disturbance" in raw:
         raise ValueError("[disturbance]: a machine with [rotor] does not take it. Use [[load]] or [[base]] instead.")
     top.only([*(name for name in TABLES if name != "disturbance"), *MACHINE_TABLES[1:], "tune"], ("rotor.m",))
-    body, bearings = body_from(top, folder), tables_of(top, "bearing")
+    if (method := top.table("clock").raw.get("method", "auto")) not in ("auto", "rk4", "dop853", "euler"):
+        words = "'rk4', 'dop853' or 'euler' with a number for clock.dt, or leave it out"
+        raise ValueError(f"clock.method = {show(method)}: a machine takes equal explicit steps. Give {words}.")
+    bearings = tables_of(top, "bearing")
     if not bearings:
         raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
-    axes = axes_from(bearings, body)
-    rotor = rotor_from(top, body, axes, folder)
+    axes, rotor = axes_and_rotor(top, folder)
     q, currents = _start(top.table("initial"), rotor, len(axes))
     _check_rank(rotor, axes)
     masses, forces = _shares(rotor)
@@ -168,12 +162,14 @@ def machine_from(
     fixed = not isinstance(raw.get("clock", {}).get("dt", "auto"), str)
     clock = _clock([*cases, *parts], fastest_rotor(rotor, spread), fixed)
     controllers = [merged(top.table("controller").raw, own.table("controller").raw) for own in bearings]
-    notches = [notch_of_axis(controllers[axis.bearing], case) for axis, case in zip(axes, cases, strict=True)]
+    widest = widest_rotation(rotor, spread)
+    notches = [notch_of_axis(controllers[axis.bearing], case, widest) for axis, case in zip(axes, cases, strict=True)]
     speeds = _speeds(top.table("sensitivity"), rotor, float(clock.duration))
-    turning = [*speeds, *speeds_of(widest_rotation(rotor, spread), float(clock.duration))]
+    turning = [*speeds, *speeds_of(widest, float(clock.duration))]
     cases = notched(cases, notches, machine_of_axes(rotor, parts_of(cases), clock, q, law), clock, turning)
     spread = with_notches(spread, of_notches, axes, cases)
-    coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in range(len(body.frequencies)) for d in "xy"))
+    modes = range((len(rotor.gravity) - RIGID) // 2)
+    coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in modes for d in "xy"))
     found_laws = [(own_law,) if own_law else (), *(one.own_laws for one in cases)]
     machine = machine_of_axes(rotor, parts_of(cases), clock, q, law)
     if own_law is not None:
@@ -222,23 +218,30 @@ def notched(
     return [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
 
 
-def machine_for(case: MachineCase, speeds: Sequence[float]) -> Machine:
-    """Return the machine of a case, with the gains of its notches for these speeds, rpm."""
+def with_notches_for(case: MachineCase, speeds: Sequence[float]) -> MachineCase:
+    """Return the case with the gains of its notches for its controllers and these speeds, rpm."""
     notches, machine = [one.cascade.notch for one in case.cases], case.machine
+    if not any(notches):
+        return case
 
     def made(cases: Sequence[Case]) -> Machine:
         return machine_of_axes(machine.rotor, parts_of(cases), case.clock, machine.start_q, machine.law)
 
     bare = made(notched(case.cases, [None] * len(notches), machine, case.clock, speeds))
-    return made(notched(case.cases, notches, bare, case.clock, speeds)) if any(notches) else machine
+    cases = tuple(notched(case.cases, notches, bare, case.clock, speeds))
+    return dataclasses.replace(case, cases=cases, machine=made(cases))
 
 
-def notch_of_axis(controller: dict[str, Any], case: Case) -> SynchronousNotch | None:
-    """Return `notch_from` of an axis. `controller`: the common table with the keys of its bearing."""
+def notch_of_axis(controller: dict[str, Any], case: Case, rotor: Rotation) -> SynchronousNotch | None:
+    """Return `notch_from` of an axis for a rotor whose numbers may be arrays.
+
+    `controller`: the common table with the keys of its bearing.
+    """
     try:
-        return notch_from(Table({"controller": controller}), case.scenario)
+        notch = notch_from(Table({"controller": controller}), case.scenario)
     except ValueError as error:
         raise ValueError(f"{case.name}: {error}") from None
+    return notch and following(notch, rotor)
 
 
 def _speeds(table: Table, rotor: Rotor, duration: float) -> tuple[float, ...]:

@@ -32,7 +32,7 @@ def unbalance_from(table: Table, body: RotorBody, graded: int) -> RotorUnbalance
         amount = float(body.m * grade.eccentricity / GRAM_MM / graded)
     else:
         amount = needed(table, "amount", AMOUNT)
-    return RotorUnbalance(amount, x, y, table.leaf("phase", PHASE, 0.0))
+    return RotorUnbalance(amount, x, y, table.leaf("phase", PHASE, 0.0), graded="grade" in table.raw)
 
 
 def load_from(table: Table, body: RotorBody, recordings: Recordings) -> RotorLoad:

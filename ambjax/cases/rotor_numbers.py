@@ -77,7 +77,8 @@ def varied_rotors(rotor: Rotor, values: Mapping[str, Any], names: Sequence[str])
 def varied_rotor(rotor: Rotor, values: Mapping[str, float], names: Sequence[str] = ()) -> Rotor:
     """Return the rotor with these numbers of `rotor_places`. `names`: of the axes.
 
-    The weight follows the mass. The polar inertia scales the gyroscopic terms of the bending modes too.
+    The weight and the unbalance of a grade follow the mass. The polar inertia scales the gyroscopic terms of the
+    bending modes too.
     """
     known = rotor_places(rotor, names)
     M, D, G, K, gravity = (np.array(x, float) for x in (rotor.M, rotor.D, rotor.G, rotor.K, rotor.gravity))
@@ -85,7 +86,11 @@ def varied_rotor(rotor: Rotor, values: Mapping[str, float], names: Sequence[str]
         if known[path].route:
             rotor = with_number(rotor, known[path].route, x)
         elif path == "rotor.m":
-            M[range(3), range(3)], gravity = x, gravity * (x / M[0, 0])
+            ratio = x / M[0, 0]
+            M[range(3), range(3)], gravity = x, gravity * ratio
+            for k, one in enumerate(rotor.unbalances):
+                if one.graded and f"unbalance.{k}.amount" not in values:
+                    rotor = with_number(rotor, ("unbalances", k, "amount"), one.amount * ratio)
         elif path == "rotor.I_t":
             M[(3, 4), (3, 4)] = x
         elif path == "rotor.I_p":

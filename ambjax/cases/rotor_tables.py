@@ -288,3 +288,10 @@ def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pat
         loads=tuple(load_from(one, body, Recordings(folder, ())) for one in tables_of(top, "load")),
         base=tuple(base_from(one, n, Recordings(folder, ())) for one in tables_of(top, "base")),
     )
+
+
+def axes_and_rotor(top: Table, folder: pathlib.Path) -> tuple[list[BearingAxis], Rotor]:
+    """Return the axes and the rotor of a case file."""
+    body = body_from(top, folder)
+    axes = axes_from(tables_of(top, "bearing"), body)
+    return axes, rotor_from(top, body, axes, folder)

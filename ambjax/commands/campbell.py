@@ -6,7 +6,7 @@ import pathlib
 
 import numpy as np
 
-from ambjax.cases.machine_case import MachineCase, machine_for
+from ambjax.cases.machine_case import MachineCase, with_notches_for
 from ambjax.cases.reader import Case
 from ambjax.cases.rotor_drawing import drawing_of, radial_axes
 from ambjax.commands.reading import read_any_with_warnings
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     out = directory(args.out, f"campbell-{case.name}", WRITTEN, args.force)
     say(f"linearising the machine at {SPEEDS} speeds or more")
     speeds = np.linspace(0.0, way * end, SPEEDS)
-    case = dataclasses.replace(case, machine=machine_for(case, speeds.tolist()))
+    case = with_notches_for(case, speeds.tolist())
     points = list(turning_machines(case.machine, case.clock.sample_period, speeds))
     systems = [point.system.without_idle() for point in points]
     poles = [poles_in_s(system) for system in systems]

@@ -5,18 +5,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ambjax.cases.machine_case import MachineCase, machine_from
+from ambjax.cases.machine_case import MachineCase, machine_of_axes, parts_of
 from ambjax.cases.rotor_body import DAMPING, MODES
+from ambjax.cases.rotor_tables import axes_and_rotor
+from ambjax.cases.table import Table
 from ambjax.commands.machine_commands import once_per_revolution, outside_lines, worst_of_speeds
 from ambjax.host.heartbeat import say
 from ambjax.linear import MachineSensitivity, poles_in_s
 from ambjax.linear.linear_machine import sensitivity_of, turning_machines
+from ambjax.linear.margins import STATIC
 from ambjax.linear.rotor_modes import LIGHT, Mode, modes_of
-from ambjax.results.machine_run import simulate_machine
+from ambjax.results.machine_run import MachineRun, simulate_machine
 from ambjax.results.outputs import plain, table
 
 # Modes that the second analysis adds to those of a shaft. At most MOST lightly damped modes are listed.
 MORE, MOST = 4, 8
+# Smallest constant offset of one sensor, as a share of its clearance, that the magnets must bear: sensors are hardly
+# aligned better.
+LEAST_OFFSET = 0.01
 AXIS_COLUMNS = ("axis", "|z|/clearance", "zone", "weight/force", "force reserve", "peak of |S|", "zone")
 
 
@@ -36,19 +42,19 @@ class CaseCheck(NamedTuple):
 def check(case: MachineCase) -> CaseCheck:
     """Check a machine: held in its run, clearance, force, stability and zones at its speeds, and spill-over.
 
-    It fails if the rotor is lost, or if the machine is not stable at one of its speeds, also with more modes, or has no
-    linearisation.
+    It fails if the rotor is lost, or if the machine is not stable at one of its speeds, also with more modes, has no
+    linearisation, or cannot bear the offset of a sensor.
     """
     say(f"simulating {case.clock.samples} samples")
     run = simulate_machine(case)
     linear = _linear(case)
     share = float(run.metrics["settled_clearance_used"])
-    axes = {axis: _axis(case, k, run.metrics["axes"][axis], linear.points) for k, axis in enumerate(case.axes)}
+    axes = {axis: _axis(case, k, run, linear.points) for k, axis in enumerate(case.axes)}
     summary = {
         "held": not run.lost,
         "lost_why": run.lost_why,
         "clearance_used": share,
-        "clearance_zone": "D" if run.lost else case.zones.clearance_zone(share),
+        "clearance_zone": _zone(case, run, share),
         "axes": axes,
         **linear.summary,
     }
@@ -59,13 +65,13 @@ def check(case: MachineCase) -> CaseCheck:
         table(AXIS_COLUMNS, [(axis, *_cells(own)) for axis, own in axes.items()]),
         *linear.details,
     ]
-    return CaseCheck(not run.lost and linear.stable, plain(summary), "\n".join(lines))
+    return CaseCheck(not run.lost and linear.holds, plain(summary), "\n".join(lines))
 
 
 class _Linear(NamedTuple):
     """What the linear machine adds to a check: its verdict, the points of the speeds, numbers, and lines of text."""
 
-    stable: bool
+    holds: bool
     points: list[MachineSensitivity]
     summary: dict[str, Any]
     verdict: list[str]
@@ -86,6 +92,7 @@ def _linear(case: MachineCase) -> _Linear:
     spilled, untested = _spill_over(case)
     worst = worst_of_speeds(points)
     at_speeds = [once_per_revolution(point) for point in points]
+    offset, not_borne = _offset(case, points)
     summary = {
         "stable": {f"{point.speed:g}": point.stable for point in points},
         "zone": worst.worst.zone,
@@ -98,6 +105,7 @@ def _linear(case: MachineCase) -> _Linear:
         "modes": {f"{speed:g}": [mode.numbers() for mode in own] for speed, own in modes.items()},
         "growth_with_more_modes_per_s": spilled,
         "more_modes_why": untested,
+        "sensor_offset_borne": offset,
     }
     stable = all(point.stable for point in points) and all(rate <= 0 for rate in spilled.values())
     at = f"{worst.worst.name} at {worst.speed:g} rpm"
@@ -109,50 +117,89 @@ def _linear(case: MachineCase) -> _Linear:
         f"sensitivity: {peak if worst.stable else f'no peak and no zone: not stable at {worst.speed:g} rpm'}",
         f"stability: {'stable' if stable else 'NOT STABLE'} at {', '.join(summary['stable'])} rpm; {more}",
     ]
+    verdict += not_borne
     details = [line for point in points if point.stable for line in outside_lines(point, case.zones)]
     details += [line for point in at_speeds for _, own in point for line in own]
     if light := _light(modes):
         details.append(table(("lightly damped mode", "Hz", "damping ratio", "rpm"), light))
-    return _Linear(stable, points, summary, verdict, details)
+    return _Linear(stable and not not_borne, points, summary, verdict, details)
+
+
+def _offset(case: MachineCase, points: list[MachineSensitivity]) -> tuple[float | None, list[str]]:
+    """Return the least constant offset of one sensor, as a share of its clearance, that takes a whole bias current.
+
+    It is that of the static response of the linear machine: about 0 if integral actions drift apart; None if no speed
+    is stable. Also the line of the verdict on an offset below LEAST_OFFSET.
+    """
+    stops, biases = (
+        np.array([float(np.min(np.asarray(x))) for x in values])
+        for values in zip(*((one.scenario.touchdown, one.scenario.plant.i_0) for one in case.cases), strict=True)
+    )
+    c, found = len(stops), []
+    for system in (point.system for point in points if point.stable):
+        H = np.asarray(system.response(np.array([STATIC * float(case.zones.f_low)])))[0, 2 * c : 3 * c]
+        currents = np.abs(H) * stops / biases[:, None]
+        i, k = np.unravel_index(np.argmax(currents), currents.shape)
+        found.append((float(1 / currents[i, k]), case.axes[k], case.axes[i]))
+    least, sensor, magnet = min(found, default=(None, "", ""))
+    if least is None or least >= LEAST_OFFSET:
+        return least, []
+    return least, [
+        f"sensors: NOT BORNE: a constant offset of the sensor of {sensor} of {least:.2g} of its clearance takes the "
+        f"bias current of {magnet} in the end. Integral actions of more axes than the rotor has rigid motions drift "
+        'apart: let only two radial bearings integrate, or set coordinates = "rigid-body".'
+    ]
 
 
 def _spill_over(case: MachineCase) -> tuple[dict[str, float], str]:
-    """Return the largest real part of a pole (1/s) with MORE modes by speed; if it is empty, also why."""
+    """Return the largest real part of a pole (1/s) by speed, with MORE modes under the same controller.
+
+    If it is empty, also why.
+    """
     raw = tomllib.loads(case.text) if case.text else {}
-    rotor, known = raw.get("rotor", {}), (len(case.coordinates) - 5) // 2
+    table, known = raw.get("rotor", {}), (len(case.coordinates) - 5) // 2
     more = min(MORE, MODES.metadata["at_most"] - known)
-    if rotor.get("kind") != "shaft":
+    if table.get("kind") != "shaft":
         return {}, "only a rotor of the kind shaft has further modes"
     if not more:
         return {}, f"the rotor has {known} already, the largest number"
-    rotor["modes"] = known + more
-    if isinstance(given := rotor.get("damping"), list):  # further modes are damped as the last one
-        rotor["damping"] = given + given[-1:] * more if given else DAMPING.default
-    raw.pop("initial", None)  # it has the coordinates of the rotor with fewer modes
-    if raw.get("controller", {}).get("kind") == "lqg":  # the same controller
-        raw["controller"]["lqg"] = {"modes": known} | raw["controller"].get("lqg", {})
+    table["modes"] = known + more
+    if isinstance(given := table.get("damping"), list):  # further modes are damped as the last one
+        table["damping"] = given + given[-1:] * more if given else DAMPING.default
     try:
-        machine = machine_from(raw, case.name, folder=case.folder).machine
+        rotor = axes_and_rotor(Table(raw), case.folder)[1]
+        machine = machine_of_axes(
+            rotor, parts_of(case.cases), case.clock, np.zeros(len(rotor.gravity)), case.machine.law
+        )
         points = list(turning_machines(machine, case.clock.sample_period, case.speeds))
     except ValueError as error:
         return {}, str(error)
-    growth = [float(np.max(np.real(poles_in_s(point.system.without_idle())))) for point in points]
-    return {f"{speed:g}": rate for speed, rate in zip(case.speeds, growth, strict=True)}, ""
+    found = {}
+    for speed, system in zip(case.speeds, (point.system.without_idle() for point in points), strict=True):
+        rate = float(np.max(np.real(poles_in_s(system))))
+        found[f"{speed:g}"] = min(rate, 0.0) if system.stable else rate  # a mode at rest, but for rounding
+    return found, ""
 
 
-def _axis(case: MachineCase, k: int, metrics: dict[str, float], points: list[MachineSensitivity]) -> dict[str, object]:
+def _axis(case: MachineCase, k: int, run: MachineRun, points: list[MachineSensitivity]) -> dict[str, object]:
     """Return what is checked of one axis: clearance and force as shares, and the largest sensitivity at any speed.
 
     Without points, the sensitivity is None.
     """
+    metrics = run.metrics["axes"][case.axes[k]]
     scenario, share = case.cases[k].scenario, float(metrics["settled_clearance_used"])
     worst = max((point.axes[k] for point in points), key=lambda axis: (axis.zone, axis.S.height), default=None)
     carried = abs(float(scenario.plant.m * scenario.plant.g)) / float(scenario.largest_force)
     used = max(float(metrics["force_used"]), carried)
     return {
-        "clearance_used": share, "clearance_zone": case.zones.clearance_zone(share), "force_carried": carried,
+        "clearance_used": share, "clearance_zone": _zone(case, run, share), "force_carried": carried,
         "force_reserve": 1 - used, "peak": worst and worst.S.height, "zone": worst and worst.zone,
     }  # fmt: skip
+
+
+def _zone(case: MachineCase, run: MachineRun, share: float) -> str:
+    """Return the zone of a share of the clearance; D if the rotor is lost."""
+    return "D" if run.lost else case.zones.clearance_zone(share)
 
 
 def _cells(own: dict[str, Any]) -> list[str]:

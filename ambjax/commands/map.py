@@ -10,9 +10,9 @@ import numpy as np
 from ambjax.cases.machine_case import AnyCase
 from ambjax.commands.reading import read_any_with_warnings
 from ambjax.ensemble.intervals import wilson
-from ambjax.ensemble.maps import CERTAIN, GRIDS, Map, grid
+from ambjax.ensemble.maps import CERTAIN, GRIDS, Map
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
-from ambjax.results.case_map import is_stable, labels, panel, study_and_axes
+from ambjax.results.case_map import computed, labels, panel, study_and_axes
 from ambjax.results.outputs import described, directory, drawn, files, plain, table, write_json, written
 
 WRITTEN = ("map.png", "map.json")
@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
             if args.members == 1 and case.spread.entries:
                 say(f"{case.name}: nominal, because one member does not draw the [spread]; --members 2 or more do.")
             with doing(f"{case.name}: simulating the cells; {FIRST_RUN}"):
-                maps.append(grid(study, x, y, is_stable))
+                maps.append(computed(study, x, y))
         summary = {"cases": [_summary(case, one) for case, one in zip(cases, maps, strict=True)], "out": str(out)}
         write_json(part / "map.json", summary)
         drawn(part / "map.png", lambda: _drawn(cases, maps), 150)

@@ -81,24 +81,28 @@ class Map(NamedTuple):
 StabilityTest = Callable[[AnyStudy, dict[str, np.ndarray], np.ndarray], np.ndarray]
 
 
-def grid(study: AnyStudy, x: Axis, y: Axis, stable: StabilityTest | None = None) -> Map:
+# Returns the numbers that the controllers of cells are designed with, [N] by dotted path, from the values of the axes.
+Design = Callable[[AnyStudy, dict[str, np.ndarray]], dict[str, np.ndarray]]
+
+
+def grid(study: AnyStudy, x: Axis, y: Axis, stable: StabilityTest | None = None, design: Design | None = None) -> Map:
     """Compute a map with `study.members` members in every cell.
 
     An axis may be any number of `study.places()`, or clock.sample_period. All cells with the same sample period run in
     one ensemble. Sample periods run one after the other, each for the duration of the case. Member k has the same noise
     in each cell. With one member the case is nominal: no spread, and the noise of member 0. With more members, the
     case's spread applies to all quantities that are not axes. `stable`: the test of member 0 of each cell; None:
-    `unstable` is 0.
+    `unstable` is 0. `design`: of numbers that follow from the values of the axes; PERIOD is one of them.
 
     Raises ValueError for a path that does not exist, for two equal paths, and for values of an axis that a case of one
     axis does not allow.
     """
     if x.path == PERIOD:
-        transpose = grid(study, y, x, stable)
+        transpose = grid(study, y, x, stable, design)
         return transpose._replace(x=x, y=y, **{k: getattr(transpose, k).T for k in GRIDS})
     _check(study, x, y)
     studies = [(study, y)] if y.path != PERIOD else [(study.at_period(float(p)), None) for p in y.values]
-    rows = [_cells(one, x, axis, stable) for one, axis in studies]
+    rows = [_cells(one, x, axis, stable, design) for one, axis in studies]
     ended, stalled, error, unstable = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     survival = wilson(np.sum(~ended, axis=-1), study.members)
     held = ~ended.all(axis=-1)
@@ -156,7 +160,9 @@ def _check(study: AnyStudy, x: Axis, y: Axis) -> None:
         raise ValueError(f"--{name} {error.path}={low:g}:{high:g}: {error.reason}") from None
 
 
-def _cells(study: AnyStudy, x: Axis, y: Axis | None, stable: StabilityTest | None) -> tuple[np.ndarray, ...]:
+def _cells(
+    study: AnyStudy, x: Axis, y: Axis | None, stable: StabilityTest | None, design: Design | None
+) -> tuple[np.ndarray, ...]:
     """Return, for each member, whether it is lost or stalled, whether it is stalled, and its settled error, m.
 
     The settled error is the largest settled |z - r|. Each array has shape [ny, nx, members]. The last array, [ny, nx],
@@ -170,7 +176,11 @@ def _cells(study: AnyStudy, x: Axis, y: Axis | None, stable: StabilityTest | Non
     spread = Spread(_entries(study, tuple(axes)), study.spread.design)
     values = drawn(spread, study.places(), study.seed, np.arange(study.members), study.members)
     values = {k: v[member] for k, v in values.items()}
-    values |= {part: v for path, v in axes.items() for part in study.parts(path)}
+    axes = {part: v for path, v in axes.items() for part in study.parts(path)}
+    values |= axes
+    if design is not None:
+        own = {} if y is not None else {PERIOD: np.full(len(member), float(study.clock.sample_period))}
+        values |= design(study, axes | own)
     metrics = study.metrics(values, member)
     ended, stalled, error = np.isfinite(metrics["lost_at_s"]), metrics["stalled"], metrics["settled_max_abs_error_m"]
     unstable = np.zeros(shape[:2], bool).ravel()

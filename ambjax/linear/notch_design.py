@@ -1,6 +1,7 @@
 """Gains of the notch at the speed of the rotor, from the linear loop without the notch."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,12 +12,14 @@ from jax import Array
 from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.control.cascade import Cascade
 from ambjax.control.synchronous_notch import NULLED, NotchGain, SynchronousNotch
-from ambjax.linear.analysis import linearise
-from ambjax.linear.linear_machine import linearise_machine
+from ambjax.ensemble.batching import map_members
+from ambjax.linear.analysis import linearisation_inputs, linearise
+from ambjax.linear.linear_machine import linearise_machine, machine_loop, machine_rest
 from ambjax.linear.matrices import loop_matrices
-from ambjax.numerics.records import Scalar
+from ambjax.numerics.records import Scalar, canonical
+from ambjax.numerics.smooth import TWO_PI
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.whole_machine import Machine
+from ambjax.simulation.whole_machine import Machine, with_loop
 from ambjax.world.rotation import PER_MINUTE, Rotation
 from ambjax.world.scenario import Scenario
 
@@ -49,7 +52,13 @@ def with_notch_gains(cascade: Cascade, scenario: Scenario, clock: Clock, rotor: 
     speeds = notch_speeds(cascade.notch, speeds_of(rotor, float(clock.duration)))
     response = np.asarray(system.response(PER_MINUTE * np.array(speeds)))
     gains = notch_gains(cascade.notch, speeds, response[:, 0, 0], response[:, 5, 0])
-    return dataclasses.replace(cascade, notch=dataclasses.replace(cascade.notch, gains=gains, rotor=scenario.rotor))
+    notch = dataclasses.replace(following(cascade.notch, rotor), gains=gains, rotor=scenario.rotor)
+    return dataclasses.replace(cascade, notch=notch)
+
+
+def following(notch: SynchronousNotch, rotor: Rotation) -> SynchronousNotch:
+    """Return the notch for a rotor whose numbers may be arrays: it follows a speed that changes in one of them."""
+    return dataclasses.replace(notch, varying=notch.varying or bool(np.any(np.asarray(rotor.acceleration) != 0)))
 
 
 def redesigned(cascade: Cascade, scenario: Scenario, period: Scalar) -> tuple[NotchGain, ...]:
@@ -69,15 +78,61 @@ def redesigned(cascade: Cascade, scenario: Scenario, period: Scalar) -> tuple[No
 redesigned_at_once = compiled_quickly(redesigned, options=QUICKEST)
 
 
+def redesigned_members(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[NotchGain, ...]:
+    """Return the gains of `redesigned` of every member of an ensemble, whose varying leaves are arrays [N]."""
+    # threads: see `linearise_members`
+    return map_members(_redesigned, canonical(linearisation_inputs(cascade, scenario, clock)), threads=1, plain=True)
+
+
+def _redesigned(tree: tuple[Cascade, Scenario, Scalar]) -> tuple[NotchGain, ...]:
+    return redesigned(*tree)
+
+
 def notch_gains(
     notch: SynchronousNotch, speeds: Sequence[Scalar], S: Array | np.ndarray, current: Array | np.ndarray
 ) -> tuple[NotchGain, ...]:
     """Return the gains for the responses [speeds] of the reading of z, S, and of the current to a test signal on z."""
-    G: Any = current if NULLED[notch.removes] == "i" else S - 1
-    if notch.phase is not None:
-        G = abs(G) * np.exp(1j * np.radians(notch.phase))
-    parts = [x.tolist() if isinstance(x, np.ndarray) else x for x in ((1 / G).real, (1 / G).imag)]
+    inverse = _inverse(notch, S, current)
+    parts = [x.tolist() if isinstance(x, np.ndarray) else x for x in (inverse.real, inverse.imag)]
     return tuple(NotchGain(speed, parts[0][k], parts[1][k]) for k, speed in enumerate(speeds))
+
+
+def _inverse(notch: SynchronousNotch, S: Any, current: Any) -> Any:
+    """Return the inverse of the response that a notch nulls."""
+    G = current if NULLED[notch.removes] == "i" else S - 1
+    return 1 / (G if notch.phase is None else abs(G) * np.exp(1j * np.radians(notch.phase)))
+
+
+def machine_at_speed(machine: Machine, W: Scalar, period: Scalar) -> Machine:
+    """Return a machine whose notches are designed for its own loops at the speed W (rad/s), for this speed alone.
+
+    It works under jit, vmap and differentiation. Below the least speed of its gains, they are those for that speed.
+    """
+    notches = [loop.cascade.notch for loop in machine.loops()]
+    lowest = [jnp.min(jnp.asarray(notch.gains[0].speed)) for notch in notches if notch is not None]
+    if not lowest:
+        return machine
+    bare, W = _with_notches(machine, [None] * len(notches)), jnp.abs(W)
+    W = jnp.maximum(W, TWO_PI * PER_MINUTE * functools.reduce(jnp.minimum, lowest))
+    H = machine_loop(bare, W, period, machine_rest(bare, period)).response(W[None] / TWO_PI)[0]
+    c, designed = machine.count, list[SynchronousNotch | None]()
+    responses = machine.split((jnp.diagonal(H[:c]), jnp.diagonal(H[2 * c : 3 * c])))
+    for notch, own in zip(notches, responses, strict=True):
+        if notch is not None:
+            g = _inverse(notch, *own)
+            gains = tuple(dataclasses.replace(gain, real=g.real, imaginary=g.imag) for gain in notch.gains)
+            notch = dataclasses.replace(notch, gains=gains)
+        designed.append(notch)
+    return _with_notches(machine, designed)
+
+
+def _with_notches(machine: Machine, notches: Sequence[SynchronousNotch | None]) -> Machine:
+    """Return the machine with these notches, stacked for each group."""
+    axes = []
+    for axis, loop, notch in zip(machine.axes, machine.loops(), notches, strict=True):
+        cascade = dataclasses.replace(loop.cascade, notch=notch)
+        axes.append(with_loop(axis, dataclasses.replace(loop, cascade=cascade)))
+    return dataclasses.replace(machine, axes=tuple(axes))
 
 
 def with_machine_gains(

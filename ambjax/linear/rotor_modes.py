@@ -66,7 +66,7 @@ def modes_of(point: TurningMachine, rotor: Rotor) -> list[Mode]:
     n, masses = len(np.asarray(rotor.gravity)), np.diag(np.asarray(rotor.M))
     shapes = np.asarray(system.C)[-n:] @ vectors
     found = [
-        Mode(complex(pole), *_described(shape, masses, -1 if point.W < 0 else 1), shape)
+        Mode(complex(pole), *_described(shape, masses, int(np.sign(point.W))), shape)
         for pole, shape in zip(values, shapes.T, strict=True)
         if pole.imag > REAL * abs(pole)
     ]
@@ -80,7 +80,7 @@ def planes_of(shape: np.ndarray) -> np.ndarray:
 
 
 def _described(shape: np.ndarray, masses: np.ndarray, way: int) -> tuple[str, str]:
-    """Return name and direction of a motion. `way`: sign of the speed."""
+    """Return name and direction of a motion. `way`: sign of the speed; at 0, the two planes of a mode are equal."""
     weights = np.concatenate([masses[[0, 3]], masses[RIGID::2]])
     pairs = planes_of(shape)
     energy = weights * np.sum(np.abs(pairs) ** 2, 1)
@@ -88,7 +88,7 @@ def _described(shape: np.ndarray, masses: np.ndarray, way: int) -> tuple[str, st
         return "axial", ""
     k = int(np.argmax(energy))
     forward = np.sum(weights * np.abs(pairs[:, 0] + way * 1j * pairs[:, 1]) ** 2) / 2 / np.sum(energy)
-    whirl = "planar" if abs(forward - 0.5) < CIRCULAR else "forward" if forward > 0.5 else "backward"
+    whirl = "planar" if not way or abs(forward - 0.5) < CIRCULAR else "forward" if forward > 0.5 else "backward"
     return ("translation", "tilt")[k] if k < 2 else f"bending {k - 1}", whirl
 
 

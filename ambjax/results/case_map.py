@@ -19,6 +19,7 @@ from ambjax.host.extensions import extra
 from ambjax.linear import stability_of
 from ambjax.numerics.declared import numbers, within
 from ambjax.results.machine_study import MachineStudy
+from ambjax.results.map_notches import notch_gains, with_speeds_for
 from ambjax.results.spread_runs import study_of
 
 COUNT = 21
@@ -95,7 +96,12 @@ def survival_map(case: AnyCase, x: str, y: str, *, members: int = 1, seed: int |
         if not isinstance(axis, str):
             raise ValueError(f"{name} = {axis!r}: it must be text. Write {FORM}.")
     study, first, second = study_and_axes(case, x, y, members, seed)
-    return CaseMap(case, grid(study, first, second, is_stable))
+    return CaseMap(case, computed(study, first, second))
+
+
+def computed(study: AnyStudy, x: Axis, y: Axis) -> Map:
+    """Return `grid`, with the test of stability, and with notches that are designed for the controller of each cell."""
+    return grid(study, x, y, is_stable, notch_gains)
 
 
 def is_stable(study: AnyStudy, values: dict[str, np.ndarray], members: np.ndarray) -> np.ndarray:
@@ -116,9 +122,10 @@ def study_and_axes(
     if cells * members > MOST_CELLS:
         raise ValueError(f"--members {members}: with {cells} cells, more than {MOST_CELLS:,} runs. Reduce either.")
     _check_samples(case, first, second, members)
+    axes = {axis.path: axis.values for axis in (first, second)}
     if isinstance(study, MachineStudy):
-        return study.with_steps_for({axis.path: axis.values for axis in (first, second)}), first, second
-    return with_method_for_axes(study, first, second), first, second
+        return study.with_steps_for(axes), first, second
+    return with_speeds_for(with_method_for_axes(study, first, second), axes), first, second
 
 
 def _places(case: AnyCase) -> dict[str, Place]:

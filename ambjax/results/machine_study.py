@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import hashlib
+import math
 import tomllib
 from collections.abc import Mapping
 from typing import Any, Self
@@ -10,9 +11,9 @@ from typing import Any, Self
 import jax
 import numpy as np
 
-from ambjax.cases.machine_case import MachineCase, machine_from, machine_of_axes, parts_of
+from ambjax.cases.machine_case import MachineCase, machine_from, machine_of_axes, parts_of, with_notches_for
 from ambjax.cases.machine_spread import axis_values, machine_places, shared, varied_start
-from ambjax.cases.rotor_numbers import varied_rotors
+from ambjax.cases.rotor_numbers import OF_BEARING, SPEED, varied_rotors
 from ambjax.compiler.members_last import SHORT, members_last
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
@@ -98,14 +99,20 @@ class MachineStudy(AnyStudy):
         return shared(self._numbers(), self.case.axes).get(path, (path,))
 
     def at_period(self, period: float) -> Self:
-        case = _reread(self.case, {PERIOD: period})
+        case, notches = _reread(self.case, {PERIOD: period}), [one.cascade.notch for one in self.case.cases]
+        laws = [dataclasses.replace(one.cascade, notch=own) for one, own in zip(case.cases, notches, strict=True)]
+        cases = [dataclasses.replace(one, cascade=law) for one, law in zip(case.cases, laws, strict=True)]
+        case = with_notches_for(dataclasses.replace(case, cases=tuple(cases)), gain_speeds(self.case))
         return self._with_clock(case, case.clock.with_method(self.clock.method))
 
     def _with_clock(self, case: MachineCase, clock: Clock) -> Self:
         return dataclasses.replace(self, case=dataclasses.replace(case, clock=clock))
 
     def with_steps_for(self, axes: dict[str, np.ndarray]) -> Self:
-        """Return the study with integration steps for all values of these numbers, by dotted path of `places`."""
+        """Return the study with integration steps, and gains of the notches, for all values of these numbers.
+
+        `axes`: the values by dotted path of `places`.
+        """
         wide: dict[str, object] = {}
         for path, x in axes.items():
             low, high = float(x.min()), float(x.max())
@@ -114,7 +121,20 @@ class MachineStudy(AnyStudy):
             found = _reread(self.case, wide)
         except ValueError as error:
             raise ValueError(f"--x, --y: {error}") from None
-        return self._with_clock(self.case, self.clock.with_method(found.clock.method))
+        turning = any(path in SPEED for path in axes)  # the notches are designed for these speeds
+        case = dataclasses.replace(found, spread=self.case.spread) if turning else self.case
+        return self._with_clock(case, self.clock.with_method(found.clock.method))
+
+    def notch_gains(self, values: dict[str, float]) -> dict[str, float]:
+        """Return the gains of the notches by dotted path, designed for the nominal machine with these values.
+
+        They are NaN if that machine has no linearisation.
+        """
+        cases = [dataclasses.replace(one, cascade=self._axis(values, k, 0)[0]) for k, one in enumerate(self.case.cases)]
+        with contextlib.suppress(ValueError):
+            found = with_notches_for(dataclasses.replace(self.case, cases=tuple(cases)), gain_speeds(self.case))
+            return _gains(found)
+        return dict.fromkeys(_gains(self.case), math.nan)
 
     def varied(self, values: dict[str, np.ndarray], members: np.ndarray) -> tuple[Machine, PerAxis]:
         """Return the machine with these values and random signals of these members [n], and the metrics of its axes.
@@ -191,6 +211,21 @@ class MachineStudy(AnyStudy):
                 digest.update(np.asarray(x).tobytes())
             facts[name] = digest.hexdigest()[:12]
         return facts
+
+
+def gain_speeds(case: MachineCase) -> list[float]:
+    """Return the speeds (rpm) of the gains of all notches."""
+    notches = (one.cascade.notch for one in case.cases)
+    return [float(gain.speed) for notch in notches if notch for gain in notch.gains]
+
+
+def _gains(case: MachineCase) -> dict[str, float]:
+    notches = {axis: one.cascade.notch for axis, one in zip(case.axes, case.cases, strict=True)}
+    return {
+        f"{OF_BEARING}.{axis}.controller.notch.gains.{k}.{name}": float(getattr(gain, name))
+        for axis, notch in notches.items() if notch
+        for k, gain in enumerate(notch.gains) for name in ("real", "imaginary")
+    }  # fmt: skip
 
 
 def run_machines(machine: Machine, clock: Clock, fold: Fold, **how: Any) -> Result:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, matrix, part, record
+from ambjax.numerics.records import Scalar, leaf, matrix, part, record, static
 from ambjax.numerics.small_matrices import times
 from ambjax.numerics.smooth import TWO_PI, sine
 from ambjax.world.rotation import GRAM_MM, PER_MINUTE, Rotation, SpeedChange
@@ -24,6 +24,7 @@ class RotorUnbalance:
     phase: Scalar = leaf(
         default=0.0, unit="degrees", at_least=-1e6, at_most=1e6, doc="angle from the x axis at rotor angle 0"
     )
+    graded: bool = static(default=False, doc="whether the amount is that of a balance quality grade, per mass")
 
     def force(self, turns: Array, W: Array, W_dot: Array) -> Array:
         """Return the forces [n] on the coordinates. `turns`: rotor angle. `W`, `W_dot`: speed (rad/s) and its rate."""

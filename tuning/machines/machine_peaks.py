@@ -14,6 +14,7 @@ from ambjax.extend import canonical
 from ambjax.linear.linear_machine import machine_loop, machine_rest
 from ambjax.linear.machine_at_speed import MachineRest
 from ambjax.linear.margins import STATIC
+from ambjax.linear.notch_design import machine_at_speed
 from ambjax.linear.state_space import NEUTRAL, StateSpace
 from ambjax.simulation.whole_machine import Machine
 from ambjax.world.rotation import PER_MINUTE
@@ -49,7 +50,7 @@ class Peaks:
 
         def systems(machine: Machine, rest: MachineRest) -> StateSpace:
             def one(W: Array) -> StateSpace:
-                found = machine_loop(machine, W, self.period, rest).scaled()
+                found = machine_loop(machine_at_speed(machine, W, self.period), W, self.period, rest).scaled()
                 return found._replace(C=found.C[: self.count], D=found.D[: self.count], period=None)
 
             return jax.lax.map(one, speeds)
