@@ -201,8 +201,31 @@ def test_the_committed_outputs_are_those_of_the_cells(name):
     assert not re.search(r"/(tmp|work|root|home|Users)/", (ROOT / "docs" / f"{name}.md").read_text())
 
 
-def test_the_gallery_links_sections_and_its_pictures_are_small():
-    for page, anchor in re.findall(r"\(([\w-]+)\.md#([\w-]+)\)", (ROOT / "docs" / "gallery.md").read_text()):
-        titles = re.findall(r"^#+ (.+)$", (ROOT / "docs" / f"{page}.md").read_text(), flags=re.MULTILINE)
-        assert anchor in {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}, (page, anchor)
+def anchors(page):
+    """Return the anchors of a page: its targets and its titles as GitHub and MyST write them."""
+    text = page.read_text()
+    titles = re.findall(r"^#+ (.+)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), flags=re.MULTILINE)
+    slugs = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+    return slugs | set(re.findall(r"^\(([\w-]+)\)=$", text, flags=re.MULTILINE))
+
+
+LINKING = [*ROOT.glob("*.md"), *PAGES, *sorted((ROOT / "docs" / "generated").glob("*.md"))]
+
+
+@pytest.mark.parametrize("page", LINKING, ids=lambda page: page.stem)
+def test_every_link_to_a_file_has_its_file_and_its_section(page):
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    for name, anchor in re.findall(r"\]\(([^)#\s]*)#?([^)\s]*)\)", text):
+        target = (page.parent / name) if name else page
+        made = target.parent == site.FOLDER and target.stem == "api"
+        assert made or "://" in name or target.exists(), name
+        assert not anchor or target.suffix != ".md" or made or anchor in anchors(target), f"{name}#{anchor}"
+
+
+@pytest.mark.parametrize("name", ["tuning", "limits"])
+def test_a_page_of_the_tuner_is_short(name):
+    assert len((ROOT / "docs" / f"{name}.md").read_text().split()) <= 900
+
+
+def test_the_pictures_of_the_pages_are_small():
     assert sum(path.stat().st_size for path in page_outputs.PICTURES.iterdir()) < 1e6  # bytes
