@@ -60,7 +60,7 @@ def parser() -> Parser:
     simulate.add_argument("--to", dest="end", type=float, metavar="T", help="plot the run up to time T (s)")
     _page_option(simulate)
     ensemble = command(
-        "ensemble", "simulate many members: members.npz, summary.json, histograms.png", case=True, out=True
+        "ensemble", "simulate many members of [spread]: members.npz, summary.json, pictures", case=True, out=True
     )
     ensemble.add_argument("--members", type=int, metavar="N", required=True, help="number of members")
     _seed_option(ensemble)
@@ -119,7 +119,7 @@ def parser() -> Parser:
     compare.add_argument("--resume", action="store_true", help="continue the interrupted tunings of --tune in --out")
     _seed_option(compare)
     _page_option(compare)
-    summary = "write the controller, the plant or the loop of a case with [processor] as C or as an FMU"
+    summary = "write the controller, the plant or the loop of a case with [processor] as C, FMU or JavaScript"
     export = command("export", summary, case=True, out=True)
     parts = ["controller", "plant", "loop"]
     export.add_argument("--what", choices=parts, default="controller", help="part to export (default: controller)")
