@@ -90,6 +90,16 @@ def test_a_public_function_shows_a_call_with_its_own_arguments(name):
     inspect.signature(function).bind_partial(*own.args, **{str(word.arg): word.value for word in own.keywords})
 
 
+def test_indented_lines_of_a_docstring_are_code_on_the_page(monkeypatch):
+    pytest.importorskip("sphinx")
+    monkeypatch.syspath_prepend(ROOT / "docs" / "_ext")
+    from docstrings import restructured
+
+    text = ["Use `a_b`.", "", "- `c`: a long", "  line", "", "    run = f(a_b)", "", "    g(*run)", "", "End *"]
+    code = ["::", "", "    run = f(a_b)", "", "    g(*run)"]
+    assert restructured(text) == ["Use ``a_b``.", "", "- ``c``: a long", "  line", "", *code, "", "End \\*"]
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_every_link_to_the_code_has_a_target_and_every_path_exists(page):
     for _, target in ROLE.findall(page.read_text()):
