@@ -78,7 +78,11 @@ def parser() -> Parser:
     summary = "map survival and error over a grid of two quantities: map.png, map.json"
     grid = command("map", summary, case=True, out=True)
     for axis in ("--x", "--y"):
-        form, meaning = "PATH=LOW:HIGH[:COUNT][:log]", "quantity on this axis and its range, in SI units or per cent"
+        form = "PATH=LOW:HIGH[:COUNT][:log]"
+        meaning = (
+            "quantity on this axis and its range, such as initial.z=-2e-4:2e-4 (SI units) or plant.m=-20%%:20%%:11; "
+            "COUNT: 21 if left out; log: logarithmic"
+        )
         grid.add_argument(axis, metavar=form, required=True, help=meaning)
     grid.add_argument("--members", type=int, metavar="N", default=1, help="members per cell (default: 1)")
     grid.add_argument(
