@@ -60,7 +60,7 @@ def parser() -> Parser:
     simulate.add_argument("--to", dest="end", type=float, metavar="T", help="plot the run up to time T (s)")
     _page_option(simulate)
     ensemble = command(
-        "ensemble", "simulate many members: members.npz, summary.json, histograms.png", case=True, out=True
+        "ensemble", "simulate many members of [spread]: members.npz, summary.json, pictures", case=True, out=True
     )
     ensemble.add_argument("--members", type=int, metavar="N", required=True, help="number of members")
     _seed_option(ensemble)
@@ -78,7 +78,11 @@ def parser() -> Parser:
     summary = "map survival and error over a grid of two quantities: map.png, map.json"
     grid = command("map", summary, case=True, out=True)
     for axis in ("--x", "--y"):
-        form, meaning = "PATH=LOW:HIGH[:COUNT][:log]", "quantity on this axis and its range, in SI units or per cent"
+        form = "PATH=LOW:HIGH[:COUNT][:log]"
+        meaning = (
+            "quantity on this axis and its range, such as initial.z=-2e-4:2e-4 (SI units) or plant.m=-20%%:20%%:11; "
+            "COUNT: 21 if left out; log: logarithmic"
+        )
         grid.add_argument(axis, metavar=form, required=True, help=meaning)
     grid.add_argument("--members", type=int, metavar="N", default=1, help="members per cell (default: 1)")
     grid.add_argument(
@@ -119,7 +123,7 @@ def parser() -> Parser:
     compare.add_argument("--resume", action="store_true", help="continue the interrupted tunings of --tune in --out")
     _seed_option(compare)
     _page_option(compare)
-    summary = "write the controller, the plant or the loop of a case with [processor] as C or as an FMU"
+    summary = "write the controller, the plant or the loop of a case with [processor] as C, FMU or JavaScript"
     export = command("export", summary, case=True, out=True)
     parts = ["controller", "plant", "loop"]
     export.add_argument("--what", choices=parts, default="controller", help="part to export (default: controller)")

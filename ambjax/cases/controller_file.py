@@ -97,11 +97,13 @@ def _of_mat(path: pathlib.Path) -> dict[str, np.ndarray]:
 
 
 def save_controller(path: str | pathlib.Path, system: Any) -> None:
-    """Write a system of python-control or SciPy into an .npz or .mat file that a case file may name.
+    """Write a linear controller of python-control or SciPy into an .npz or .mat file, for `kind = "linear"` of a case.
 
     `system`: a transfer function, or an object with the matrices A, B, C, D; with the period dt (s). Without it, or if
     it is None or 0, the system is continuous. Raises ValueError for another ending of the path, for a directory that
-    does not exist, and as `state_space_of` and `realisation` do.
+    does not exist, and for matrices that are not those of a controller (`state_space_of`, `realisation`).
+
+        ambjax.save_controller("controller.npz", control.tf([2e4, 5e6], [1.0, 3e4]))
     """
     path = file_to_write("save_controller", path)
     system = state_space_of(system)

@@ -87,6 +87,8 @@ def read_machine(path: str | pathlib.Path | Mapping[str, Any]) -> MachineCase:
 
     Speeds whose frequencies the samples do not resolve cause a UserWarning. Raises ValueError, one line, if `path` is
     neither, if the file cannot be read, or if any part of it is invalid.
+
+        machine = ambjax.read_machine("machine.toml")
     """
     other = "it has no [rotor] with a kind, so it is a case of one axis; in Python, read_case reads it."
     if isinstance(path, Mapping):

@@ -58,9 +58,13 @@ def _number(value: float) -> str:
 
 
 def template(scenario: str) -> str:
-    """Return an annotated case file: the paper's "tracking" or "regulation" with repaired gains, or one of MACHINES.
+    """Return a case file with comments, as `ambjax template` prints it. Raises ValueError for another name.
 
-    Raises ValueError for another name.
+    - "tracking", "regulation": the scenarios of the paper with repaired gains, and every key of a case file.
+    - "rig", "bearing": a laboratory bearing, and a bearing from a data sheet, both on a processor.
+    - "machine", "machine-flexible", "machine-ufu": whole machines with a rigid or a flexible rotor.
+
+        pathlib.Path("my.toml").write_text(ambjax.template("rig"))
     """
     known = ["tracking", "regulation", *MACHINES]
     if scenario not in known:

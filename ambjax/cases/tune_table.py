@@ -76,9 +76,7 @@ class Budget:
     stressed: int = _members(
         8, 0, "members with more noise and changed gains, which must be held but whose error does not count"
     )
-    validation: int = _members(
-        2000, 0, "members of the validation; those lost with the tuned gains join the stressed ones"
-    )
+    validation: int = _members(2000, 0, "members of the validation; those that fail join the training ensemble")
     held_out: int = _members(1000, 0, "held-out members, on which the tuned gains are judged")
     seed: int = _whole(1, 0, "seed of the training members and of the screen; the other ensembles have other seeds")
     screen: int = _members(128, 0, "number of starting points that are screened; 0: only the gains of the case")
@@ -116,9 +114,9 @@ def template_lines() -> Iterator[Line]:
     )
     yield Line(
         "bounds.controller.position.c = [1.0, 500.0]",
-        "bounds of one gain; left out: from plant and theory, see the report; by default, c",
+        "bounds of one gain; left out: from plant and theory, see the report; the upper one is",
     )
-    yield Line("", "is at most a fifth of the sampling rate, others 3 times the end of their range or start")
+    yield Line("", "then 3 times the end of the range or the gain of the case; for c, a fifth of the sampling rate")
     yield from _defaults("weights.", WEIGHTS)
     yield from _limits()
     yield from _defaults("", {name: NUMBERS[name] for name in ("early",)})

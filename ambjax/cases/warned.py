@@ -30,6 +30,8 @@ def read_case(path: str | pathlib.Path | Mapping[str, Any]) -> Case:
 
     A value that is valid but probably unintended, such as millimetres given as metres, causes a UserWarning. Raises
     ValueError, one line, if `path` is neither, if the file cannot be read, or if any part of it is invalid.
+
+        case = ambjax.read_case("my.toml")
     """
     if isinstance(path, Mapping):
         case = reader.case_from(dict(path))

@@ -54,6 +54,8 @@ def check(case: Case | MachineCase, *, full: bool = False) -> CaseCheck:
 
     `full`: whether to compute and write also what does not affect the verdict. Without it, the summary of a case on a
     processor has None for `method`, `conditions` and `proof` of Theorem 1. Raises ValueError for anything but a case.
+
+        print(ambjax.check(case).text)
     """
     with quiet():
         if isinstance(case, MachineCase):

@@ -111,6 +111,8 @@ def compare(cases: Sequence[AnyCase], members: int = 1, *, seed: int | None = No
 
     Raises ValueError for anything but cases, for another number of them, if their spreads differ, and as
     `simulate_members` does.
+
+        print(ambjax.compare([case, other], 200).table())
     """
     if not isinstance(cases, Sequence) or isinstance(cases, str):
         raise ValueError(f"cases = {type(cases).__name__}: it must be a list of 2 to {MOST_CASES} cases.")

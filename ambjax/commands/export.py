@@ -1,4 +1,4 @@
-"""`ambjax export`: write the controller, plant or loop of a case as C or as an FMU, and verify the C against JAX."""
+"""`ambjax export`: write controller, plant or loop of a case as C, FMU or JavaScript, and verify the C against JAX."""
 
 import argparse
 

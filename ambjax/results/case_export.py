@@ -154,6 +154,8 @@ def export(
 
     Writes no files: see `ExportedCase.write`. Returns an `ExportedCase`; a failed check is a result, see its `ok`.
     Raises ValueError for an option that is not allowed, a case that cannot be exported, and a missing compiler.
+
+        ambjax.export(case, verify=True).write("c")
     """
     return generated(planned(case, what, format, fmi, precision, prefix, verify))
 

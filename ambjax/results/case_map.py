@@ -90,7 +90,11 @@ def survival_map(case: AnyCase, x: str, y: str, *, members: int = 1, seed: int |
     - `members`: number of members in each cell; 1 is the nominal case, and 2 or more draw the spread of the case.
     - `seed`: of the spread and the noise; None: `run.seed` of the case.
 
-    Raises ValueError for an unknown quantity, a range that the case does not allow, and too many runs.
+    Returns a `CaseMap`. Raises ValueError for an unknown quantity, a range that the case does not allow, and too many
+    runs.
+
+        grid = ambjax.survival_map(case, "initial.z=-2e-4:2e-4:21", "plant.m=-20%:20%:11")
+        grid.map.survival  # [11, 21]
     """
     for name, axis in (("x", x), ("y", y)):
         if not isinstance(axis, str):

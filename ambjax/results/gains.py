@@ -24,8 +24,11 @@ def gains_of(loop: Cascade | Case, paths: Iterable[str] | None = None) -> dict[s
     - `loop`: a cascade, or a case.
     - `paths`: the paths; None: those of all numbers of the cascade that have a value.
 
-    The dict is a pytree: `jax.grad(lambda gains: f(with_gains(loop, gains)))(gains_of(loop, paths))` returns the
-    derivative with respect to these gains only. Raises ValueError for a path that does not exist, or without a value.
+    Use it for derivatives with respect to these gains only: the dict is a pytree. Raises ValueError for a path that
+    does not exist, or without a value.
+
+        gains = ambjax.gains_of(case, ["controller.position.c"])
+        jax.grad(lambda gains: f(ambjax.with_gains(case, gains)))(gains)
     """
     if isinstance(paths, str):
         raise ValueError(f'paths = "{paths}": it must be a list. Write ["{paths}"].')
@@ -51,12 +54,13 @@ def _numbers(loop: Cascade | Case, paths: Iterable[str] | None) -> dict[str, Any
 
 
 def with_gains(loop: Loop, gains: Mapping[str, Any]) -> Loop:
-    """Return the cascade, or the case, with the numbers at these dotted paths replaced. The values may be traced.
+    """Return a cascade or a case with other gains. `gains`: values by dotted path, in the units of the case file.
 
-    A synchronous notch of a case is designed for its new gains, unless they contain gains of the notch; that of a
-    cascade alone is not, because its design needs the scenario.
+    The values may be traced. A synchronous notch of a case is designed for its new gains, unless they contain gains of
+    the notch; that of a cascade alone is not, because its design needs the scenario. Raises ValueError for a path that
+    does not exist, and for a number outside its range; arrays and traced values are not checked.
 
-    Raises ValueError for a path that does not exist.
+        ambjax.with_gains(case, {"controller.position.c": 20.0})
     """
     if not isinstance(gains, Mapping):
         raise ValueError(f"gains = {gains!r}: it must be a dict of values by dotted path.")

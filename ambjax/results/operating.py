@@ -82,12 +82,17 @@ def sensitivity(case: Case, r: float = 0.0) -> analysis.Analysis: ...
 def sensitivity(case: Cascade, scenario: Scenario, clock: Clock, /, r: float = 0.0) -> analysis.Analysis: ...
 @of_case(machines=True)
 def sensitivity(case: Case | MachineCase, r: float = 0.0) -> Analysis | list[MachineSensitivity]:
-    """Return the `Analysis` of a case, linearised at a constant reference r (m); of a machine, one for each speed.
+    """Linearise the loop of a case, and return its peaks of |S|, |T| and |KS|, zone, margins and stiffness.
 
-    `case`: from `read_case` or `read_machine`; or a cascade, a scenario and a clock.
-    The analysis contains the peaks of |S|, |T| and |KS|, the zone, the margins and the stiffness.
-    `ambjax.linear` contains functions for the single steps, and for the measurement of S by injection of a test signal.
-    Raises ValueError as `linearise` does.
+    - `case`: from `read_case` or `read_machine`; or a cascade, a scenario and a clock.
+    - `r`: constant reference, m; a machine has none.
+
+    Returns an `Analysis`; for a machine, a list with one `MachineSensitivity` for each speed. `ambjax.linear` contains
+    functions for the single steps, and for the measurement of S by injection of a test signal. Raises ValueError if the
+    loop has no equilibrium at r or no derivative there, and as `rollout` does.
+
+        loop = ambjax.sensitivity(case)
+        loop.S.height, loop.zone, loop.margins.pm  # 1, "A" to "D", degrees
     """
     if isinstance(case, MachineCase):
         points = turning_machines(case.machine, case.clock.sample_period, case.speeds)

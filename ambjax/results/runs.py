@@ -127,8 +127,12 @@ def simulate(case: Case | MachineCase, progress: Progress = lambda samples: None
     - `case`: from `read_case` or `read_machine`; or a cascade, a scenario and a clock.
     - `progress`: called with the number of new samples after each part of the run.
 
-    Returns a `CaseRun`, or a `MachineRun` of a machine. Raises ValueError for anything but a case, and as `rollout`
-    does. A lost rotor is no error: see `CaseRun.lost`. Nor is a stalled run: see the metric `stalled`.
+    Returns a `CaseRun`, or a `MachineRun` of a machine. A lost rotor is no error: see `CaseRun.lost`. Nor is a stalled
+    run: see the metric `stalled`. For derivatives and batches use `rollout`. Raises ValueError for anything but a case,
+    and as `rollout` does.
+
+        run = ambjax.simulate(ambjax.read_case("my.toml"))
+        run.metrics["settled_rms_error_m"]  # m
     """
     if not callable(progress):
         raise ValueError(f"progress = {progress!r}: it must be a function of the number of new samples.")

@@ -32,8 +32,12 @@ class VectorField(NamedTuple):
 def vector_field(case: Case) -> VectorField:
     """Return the equations of the closed loop of a case, for scipy.integrate.solve_ivp or a diffrax.ODETerm.
 
-    Sensor noise is left out, because it is held over samples. A solver does not stop where the rotor touches down.
-    Raises ValueError for a controller on a processor, because its loop is not a differential equation.
+    Returns a `VectorField`. Sensor noise is left out, because it is held over samples. A solver does not stop where the
+    rotor touches down. Raises ValueError for a controller on a processor, because its loop is not a differential
+    equation.
+
+        field = ambjax.vector_field(case)
+        scipy.integrate.solve_ivp(field.f, (0.0, 0.1), field.y_0, "Radau")
     """
     if case.cascade.sampled:
         raise ValueError(

@@ -93,6 +93,9 @@ def rollout(
 ) -> Result:
     """Simulate `scenario.plant` under `cascade` for `clock.samples` sample periods. `rollout(case)` works too.
 
+    Use it for derivatives and batches: the function is pure and jitted, and works under jit, vmap, jvp and grad, with
+    every method. `simulate` returns the metrics, tables and pictures of one run.
+
     - `fold`: accumulated at every sample, so that metrics need no stored trajectory; None: no metrics.
     - `record_every`: a row is recorded at the start of the first of so many samples; 0: no rows.
 
@@ -100,9 +103,11 @@ def rollout(
     (`loop.DIVERGENCE`), or the integrator stalls. `Trajectory.lost_code` then gives the reason, and values and
     derivatives stay finite.
 
-    The function is pure and jitted. It works under jit, vmap, jvp and grad, with every method.
+    Raises ValueError for an invalid gain, parameter or clock, for arrays of members outside `vmap`, and for a step of
+    the integrator above its stability limit.
 
-    Raises ValueError for an invalid gain, parameter or clock, and as `with_method` does.
+        rows = ambjax.rollout(case).trajectory.rows
+        rows.z  # m, [rows]
     """
     loop, clock = prepare(cascade, scenario, clock)
     check_recording(fold, record_every)

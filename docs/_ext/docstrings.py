@@ -1,4 +1,4 @@
-"""Convert plain-text docstrings with `names` in backticks for autodoc, and resolve links."""
+"""Convert plain-text docstrings with `names` in backticks and indented code for autodoc, and resolve links."""
 
 import operator
 import re
@@ -23,7 +23,18 @@ def process(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: li
     """Rewrite the lines in place."""
     if len(lines) and NOTHING.fullmatch(lines[0]):
         lines.clear()
-    lines[:] = [plain(line) for line in lines]
+    lines[:] = restructured(lines)
+
+
+def restructured(lines: list[str]) -> list[str]:
+    """Return the lines of a docstring as reStructuredText. A block indented by four spaces is code."""
+    found, inside = [], False
+    for before, line in zip(["", *lines], lines, strict=False):
+        begins = line.startswith("    ") and not before.strip() and not inside
+        inside = begins or (inside and (not line.strip() or line.startswith("    ")))
+        found += ["::", ""] if begins else []
+        found.append(line if inside else plain(line))
+    return found
 
 
 def elsewhere(app: Sphinx, env: Any, node: Any, text: Any) -> Any:

@@ -9,6 +9,7 @@ from ambjax.cases.controller_tables import KINDS
 from ambjax.cases.notch_table import PHASE
 from ambjax.cases.reader import OTHERS, TABLES, case_from
 from ambjax.cases.scenario_tables import FIELDS, SETTLE, SIGNALS, STOP
+from ambjax.cases.speed_table import OWN_SPEED, RUN_UP
 from ambjax.cases.table import Table
 from ambjax.cases.template_text import template
 from ambjax.cases.timing import DURATION
@@ -46,6 +47,8 @@ SETTINGS: dict[str, dataclasses.Field] = {
     "run.stop_damping": STOP["damping"],
     "controller.notch.phase": PHASE,
 }
+_SPEED = {field.name: field for field in dataclasses.fields(Rotation)} | {"duration": RUN_UP}
+SETTINGS |= {f"sensor.runout.{key}": _SPEED[key] for key in OWN_SPEED}
 # Meaning of each table, and its default.
 WORDS = {
     "plant": "The true plant. A key that is left out has its value in Table 1 of the paper.",
@@ -77,7 +80,9 @@ WORDS = {
     "measured without error.",
     "sensor.outliers": "Single wrong readings of the position. See [faults](../sensors.md#faults).",
     "sensor.dropouts": "Intervals without a reading of the position. See [faults](../sensors.md#faults).",
-    "sensor.runout": "Runout of the surface that the position sensor reads. See [runout](../loads.md#runout).",
+    "sensor.runout": "Runout of the surface that the position sensor reads. It turns with `[rotor]`; only a case "
+    "without `[rotor]` gives a speed here. See [runout](../loads.md#runout).",
+    "sensor.runout.speed": "left out: that of [rotor]",
     "actuator": "The supply and the amplifier. Default: both are ideal.",
     "actuator.coil": "Limits of the voltage and of the current of each coil. Default: none. See "
     "[limits of each coil](../magnet.md#coil-limits).",

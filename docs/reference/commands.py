@@ -54,4 +54,4 @@ def _meaning(action: argparse.Action) -> str:
     default = "" if action.default is None or "(default" in (action.help or "") else f" (default: {action.default})"
     choices = f"one of {', '.join(map(str, action.choices))}{default}" if action.choices else ""
     needed = "required" if action.option_strings and action.required else ""
-    return "; ".join(filter(None, (action.help, choices, needed)))
+    return "; ".join(filter(None, ((action.help or "").replace("%%", "%"), choices, needed)))
