@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from ambjax.linear.late_command import NONE, command_delay
+from ambjax.linear.late_command import command_delay
 from ambjax.linear.margins import DECAYED, STATIC
 from ambjax.linear.state_space import NEUTRAL, StateSpace
 from ambjax.numerics.records import Scalar
@@ -25,6 +25,8 @@ ROUNDS, LOCAL = 4, 17
 MOST = 1e3
 # Values of these quantities for a loop without an equilibrium, divided by MOST.
 NO_EQUILIBRIUM = 100.0
+# Delay margin of a loop without one, times the lowest frequency.
+NONE = 1e12
 # Step of the logarithm of the frequency in the difference quotient for the slope of L at a crossing.
 SLOPE_STEP = 1e-4
 
@@ -131,7 +133,8 @@ def loop_quantities(
     heights = jnp.abs(response[0, 0, 0]), jnp.abs(response[1, 0, 0] - 1), jnp.abs(response[2, 2, 0])
     margin = jnp.asarray(jnp.inf)
     if delay:
-        margin = jnp.minimum(_delay_margin(scaled, loop, low), command_delay(scaled, low, _fastest(loop, low)))
+        f = jnp.geomspace(low, _fastest(loop, low), CROSSING_POINTS)
+        margin = jnp.minimum(jnp.minimum(_delay_margin(scaled, loop, f), command_delay(scaled, f)), NONE / low)
     running = None if speeds is None else jnp.max(jnp.abs(scaled.response(speeds)[:, 0, 0]))
     fastest = jnp.max(jnp.abs(poles)) if system.period is None else 1 / system.period
     stable = fine & (growth < NEUTRAL * fastest)
@@ -224,12 +227,11 @@ def _refined(loop: _Loop, f: Array, size: Array, low: Scalar, high: Scalar, whic
     return best
 
 
-def _delay_margin(system: StateSpace, loop: _Loop, low: Scalar) -> Array:
+def _delay_margin(system: StateSpace, loop: _Loop, f: Array) -> Array:
     """Return the delay margin (s) at the reading: the smallest lag/(2 pi f) over the frequencies f at which |L| = 1.
 
-    Without such a frequency it is NONE/low.
+    Without such a frequency it is inf. `f`: frequencies of the scan.
     """
-    f = jnp.geomspace(low, _fastest(loop, low), CROSSING_POINTS)
     L = loop.transfer(f)
     size = jnp.log(jnp.abs(L))
     crosses = size[:-1] * size[1:] < 0
@@ -247,7 +249,7 @@ def _delay_margin(system: StateSpace, loop: _Loop, low: Scalar) -> Array:
     shift = -jnp.log(jnp.abs(L[1])) / jnp.real(slope)
     lag = _lag(L[1]) + jnp.imag(slope) * shift
     delay = lag / (2 * jnp.pi * f0 * jnp.exp(shift))
-    return jnp.where(jnp.any(crosses), delay, NONE / low)
+    return jnp.where(jnp.any(crosses), delay, jnp.inf)
 
 
 def _lag(L: Array) -> Array:

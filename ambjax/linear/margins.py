@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ambjax.linear.held_command import HeldCommand
+from ambjax.linear.late_command import command_delay
 from ambjax.linear.state_space import Place, StateSpace
 
 # Number of logarithmically spaced frequencies in a scan, in addition to those near poles.
@@ -25,6 +25,8 @@ DOUBLINGS, SETTLED = 60, 1e-13
 GOLDEN = (math.sqrt(5) - 1) / 2
 # Relative distance from an end of the band, or from the value there, within which a maximum counts as one at this end.
 EDGE = 1e-4
+# Largest number of steps to a crossing.
+ROUNDS = 60
 # Below the band, frequencies from this share of its lowest one on are searched.
 BELOW = 1e-3
 # |S - 1| that counts as decayed, in continuous time.
@@ -203,35 +205,26 @@ def _scanned(system: StateSpace) -> np.ndarray:
 def _margins(system: StateSpace, place: Place, scanned: np.ndarray) -> Margins:
     """Return the margins at one place. `scanned`: frequencies, Hz, of which the first stands for 0."""
 
-    held = None
-    if place == "command" and system.period is not None:
-        held = HeldCommand(system)
-
     def L(f: np.ndarray) -> np.ndarray:
-        return np.asarray(system.loop_transfer(f, place)) if held is None else held.transfer(f)
+        return np.asarray(system.loop_transfer(f, place))
 
     f = scanned[1:]
     along = L(f)
-    real = [L(np.array([x]))[0].real for x in _crossings(lambda x: np.imag(L(x)), f, np.imag(along))]
-    if system.period is not None:
-        real.append(along[-1].real)  # L is real at half the sampling rate
-    real.append(along[0].real)  # and at 0, which the lowest frequency stands for here
+    # L is real at half the sampling rate, and at 0, which the lowest frequency stands for here
+    real = [*np.real(L(_crossings(lambda x: np.imag(L(x)), f, np.imag(along)))), along[0].real]
+    real += [along[-1].real] if system.period is not None else []
     # L is exactly 0 at half the sampling rate if the controller has a zero there, as after a bilinear transform
     gains = [float(-1 / x) for x in real if x and math.isfinite(x) and -1 / x > 1e-9]
-    phases, delays = [], []
-    for x in _crossings(lambda x: _log(L(x)), f, _log(along)):
-        lag = math.pi + float(np.angle(L(np.array([x]))[0]))
-        phases.append(math.degrees(min(lag, 2 * math.pi - lag)))
-        delays.append(lag / (2 * math.pi * x))
-    if held is not None:
-        delays = held.delays(f)
+    crossings = _crossings(lambda x: _log(L(x)), f, _log(along))
+    lags = math.pi + np.angle(L(crossings))
+    delay = command_delay(system, f) if place == "command" else np.min(lags / (2 * np.pi * crossings), initial=np.inf)
     disk = _peak(lambda f: np.abs(1 / (1 + L(f)) - 0.5), scanned).height
     return Margins(
         min(gains, key=lambda x: abs(math.log(x)), default=math.inf),
         max((x for x in gains if x < 1), default=0.0),
         min((x for x in gains if x >= 1), default=math.inf),
-        min(phases, default=math.inf),
-        min(delays, default=math.inf),
+        float(np.min(np.degrees(np.minimum(lags, 2 * np.pi - lags)), initial=np.inf)),
+        float(delay),
         1 / disk,
     )
 
@@ -241,18 +234,22 @@ def _log(response: np.ndarray) -> np.ndarray:
     return np.log(np.maximum(np.abs(response), np.finfo(float).tiny))
 
 
-def _crossings(function: Magnitude, f: np.ndarray, values: np.ndarray) -> list[float]:
-    """Return the frequencies (Hz) at which a function crosses 0. `values`: its values at the scan f."""
-    from scipy.optimize import brentq
-
-    def one(x: float) -> float:
-        return float(function(np.array([x]))[0])
-
+def _crossings(function: Magnitude, f: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the frequencies (Hz) at which a function crosses 0, by the Illinois method. `values`: at the scan f."""
+    k = np.flatnonzero(values[:-1] * values[1:] < 0)
     # the sign of a rounding error at one end may be another one in the scan, which solves for all frequencies together
-    changes = [k for k in np.flatnonzero(values[:-1] * values[1:] < 0) if one(f[k]) * one(f[k + 1]) < 0]
-    found = [float(brentq(one, f[k], f[k + 1], xtol=1e-300, rtol=1e-14)) for k in changes]  # pyright: ignore
+    k = k[function(f[k]) * function(f[k + 1]) < 0]
+    a, x = f[k], f[k + 1]
+    at_a, at_x = function(a), function(x)
+    for _ in range(ROUNDS if k.size else 0):
+        b, at_b = x, at_x
+        x = b - at_b * (b - a) / (at_b - at_a)
+        at_x = function(x)
+        a, at_a = np.where(at_x * at_b < 0, (b, at_b), (a, at_a / 2))
+        if np.all(np.abs(x - b) <= 1e-15 * x):
+            break
     # at a pole of the function its sign changes, but its value does not cross 0
-    return [x for x, k in zip(found, changes, strict=True) if abs(one(x)) <= 1e-3 * max(abs(values[k]), 1e-30)]
+    return x[np.abs(at_x) <= 1e-3 * np.maximum(np.abs(values[k]), 1e-30)]
 
 
 def noise_gain(system: StateSpace, period: float) -> float:

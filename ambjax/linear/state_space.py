@@ -139,34 +139,34 @@ class StateSpace(NamedTuple):
         A, _, C, *_ = self.scaled()
         return _solved(A.T, self.point(frequency), C[4][:, None])[:, : len(self.known_path.b), 0]
 
-    def command_effect(self, frequency: Array | np.ndarray, late: Scalar = 0.0) -> Array:
-        """Return the effect [F, n] of a unit command on the states of the plant, in the units of `scaled`.
+    def command_effect(self, frequency: Array | np.ndarray, late: Any = 0.0) -> Any:
+        """Return the effect [..., F, n] of a unit command on the states of the plant, in the units of `scaled`.
 
-        `late`: additional delay of the command, s. On a processor, the effect is that of the hold, which begins after
-        the delay and ends one sample later.
+        `late`: additional delay of the command, s, [F] or [..., 1]. On a processor, the effect is that of the hold,
+        which begins after the delay and ends one sample later.
         """
         path = self.scaled().known_path
         np_ = array_module(self.A)
-        s = 2j * np.pi * np_.asarray(frequency)[:, None]
+        s = 2j * np.pi * np_.asarray(frequency)
         if self.period is None:
-            return path.b * np_.exp(-s * late)
+            return path.b * np_.exp(-s * late)[..., None]
         delay = path.delay + late / self.period
-        whole, back = np_.floor(delay), np_.exp(-s * self.period)
+        whole, back = np_.floor(delay), np_.exp(-s * self.period)[..., None]
         new, before = path.held(delay - whole, self.period)
-        return np_.exp(-s * self.period * whole) * (new + before * back)
+        return np_.exp(-s * self.period * whole)[..., None] * (new + before * back)
 
-    def loop_transfer(self, frequency: Array | np.ndarray, place: Place, late: Scalar = 0.0) -> Array:
+    def loop_transfer(self, frequency: Array | np.ndarray, place: Place, late: Any = 0.0) -> Any:
         """Return the loop transfer L [F], broken at the position reading or at the command, at frequencies [F] in Hz.
 
-        `late`: additional delay (s) at this place. At the command, the loop is broken between the laws and the plant:
-        the laws remember their own commands. S = 1/(1 + L) is the response of the signal at this place to a signal that
-        is added to it.
+        `late`: additional delay (s) at this place, or delays [F] or [..., 1]. At the command, the loop is broken
+        between the laws and the plant: the laws remember their own commands. S = 1/(1 + L) is the response of the
+        signal at this place to a signal that is added to it.
         """
         np_ = array_module(self.A)
         if place == "reading":
             return (1 / self.sensitivity(frequency) - 1) * np_.exp(-2j * np.pi * np_.asarray(frequency) * late)
         row, own = self.command_row(frequency), self.command_effect(frequency)
-        effect = self.command_effect(frequency, late)
+        effect = own if isinstance(late, float) and late == 0 else self.command_effect(frequency, late)
         return -np_.sum(row * effect, -1) / (1 + np_.sum(row * own, -1))
 
     def poles(self) -> np.ndarray:

@@ -41,10 +41,10 @@ def times(matrix: Array | None, x: Array) -> Array:
 
 
 def exponential(A: Array) -> Array:
-    """Return the exponential of A [n, n], by scaling, a Taylor polynomial and repeated squaring."""
-    size = lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(A), 0)))
+    """Return the exponentials of A [..., n, n], by scaling, a Taylor polynomial and repeated squaring."""
+    size = lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(A), -2)))
     squarings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(size, 1e-300) / NORM)), 0, MOST_SQUARINGS)
-    scaled, one = A * 2.0**-squarings, jnp.eye(len(A), dtype=A.dtype)
+    scaled, one = A * 2.0**-squarings, jnp.eye(A.shape[-1], dtype=A.dtype)
     X = one
     for k in range(DEGREE, 0, -1):
         X = one + scaled @ X / k
