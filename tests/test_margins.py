@@ -39,8 +39,8 @@ def continuous(position, plant=RIG, **laws):
     return case_from({"plant": plant, "controller": {"position": position, **laws}}, "loop")
 
 
-def of_template():
-    raw = tomllib.loads(template("rig"))
+def of_template(**tables):
+    raw = tomllib.loads(template("rig")) | tables
     return case_from({key: raw[key] for key in raw if key not in ("tune", "spread")}, "rig")
 
 
@@ -83,6 +83,11 @@ LOOPS = {
                                 actuator={"bandwidth": 4e3}, laws=CURRENT | {"current": {"kind": "pi"}}),
     "state feedback, dead-beat": lambda: on({"kind": "state-feedback"}),
     "state feedback, 3.4 samples late": lambda: slow(3.4),
+    # with a delay at the command, it is unstable from 24 to 27 us, and again from 50 us on
+    "super-twisting, 2.5 samples late": lambda: of_template(
+        processor={"delay": 2.5, "predict": True},
+        controller={"observer": {"kind": "kalman"}, "position": {"kind": "super-twisting"},
+                    "inversion": {"kind": "adaptive"}, "current": {"kind": "dead-beat"}}),
 }  # fmt: skip
 # Loops whose parts the others have.
 REPEATED = ("cascade, explicit", "cascade, continuous", "PID, dead-beat", "state feedback, dead-beat")
