@@ -210,25 +210,6 @@ f_low = 20.0
 """
 
 
-@pytest.mark.thorough
-def test_the_injected_and_the_linear_peak_are_both_reported(tmp_path, capsys):
-    """A smooth loop without noise has one measured member, and its interval is one value.
-
-    1 % of the gap is a small amplitude for it.
-    """
-    code, out, _, _ = answered(tmp_path, capsys, PROCESSOR, "--json")
-    summary = json.loads(out)
-    assert code == 0
-    assert summary["injected_members"] == 1
-    assert summary["injected_low"] == summary["injected_high"] == summary["injected_peak"]
-    assert summary["injected_peak"] == pytest.approx(summary["injected_linear_there"], rel=0.02)
-    assert summary["injected_velocity_frequency_hz"] == 40.0
-    # half the amplitude, at both sensors: half the pole times the gap
-    _, out, _, _ = answered(tmp_path, capsys, f"{PROCESSOR}amplitude = 2.5e-5\n")
-    assert "Injected into the simulation (multi-sine of 2.5e-05 m)" in out
-    assert "Injected at the velocity sensor into the simulation (multi-sine of 0.0133 m/s)" in out
-
-
 def test_the_measured_members_are_counted_by_zone():
     """A peak at the limit of zone A is in zone B. A lost rotor is the worst member and has no peak."""
     held = MemberPeaks(np.array([2.9, 3.0, 2.5]), np.full(3, 40.0), np.zeros(3, bool))
