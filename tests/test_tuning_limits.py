@@ -185,6 +185,10 @@ def test_multipliers_are_extrapolated_through_the_last_two_optima():
         g = (kappa * g_0 - limit.multiplier) / (kappa + PENALTY)  # optimum of the goal with the term of the limit
         limit = limit.updated(10.0 * math.exp(g), 10.0 * math.exp(g))
     assert limit.multiplier == pytest.approx(kappa * g_0)
+    stuck = Limit("rms_u_V", 10.0)  # a search that hardly moved: its line leads too far
+    for g in (0.2, 0.19):
+        stuck = stuck.updated(10.0 * math.exp(g), 10.0 * math.exp(g))
+    assert stuck.multiplier == pytest.approx(PENALTY * (0.2 + 0.19))
 
 
 def test_the_penalty_of_a_limit_is_that_of_an_augmented_lagrangian():
