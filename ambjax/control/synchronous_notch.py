@@ -93,9 +93,11 @@ class SynchronousNotch:
         return [*parts, *[("elapsed", "samples", "samples since the first reading, for the speed")] * self.varying]
 
     def at(self, speed: Scalar | None = None) -> "SynchronousNotch":
-        """Return the notch at a constant speed (rpm); None: that at t = 0."""
-        speed = known(self.rotor).speed if speed is None else speed
-        return dataclasses.replace(self, rotor=Rotation(jnp.abs(jnp.asarray(speed))), varying=False)
+        """Return the notch at a constant speed (rpm), with the gain for it alone; None: that at t = 0."""
+        speed = jnp.abs(jnp.asarray(known(self.rotor).speed if speed is None else speed))
+        notch = dataclasses.replace(self, rotor=Rotation(speed), varying=False)
+        _, real, imaginary, _ = notch._now(0.0)
+        return dataclasses.replace(notch, gains=(NotchGain(speed, real, imaginary),))
 
     def _now(self, t: Scalar) -> tuple[Array, Array, Array, Array]:
         """Return the speed (rpm), real and imaginary part of the gain, and whether the notch is on, 1 or 0."""

@@ -120,6 +120,7 @@ class Newton(NamedTuple):
     - `trial`: the next point to evaluate.
     - `target`: 1 at the first point y_0, 0 at the equilibrium.
     - `reached`, `base`: the last target that was reached, and its solution.
+    - `first`: G(y_0), from the first trial on.
     - `number`: trials so far.
     """
 
@@ -132,6 +133,7 @@ class Newton(NamedTuple):
     target: Array
     reached: Array
     base: Array
+    first: Array
     number: Array
 
     def begun(self, base: Array, reached: Array, target: Array) -> "Newton":
@@ -147,7 +149,7 @@ def newton_of(residual: Callable[[Array], Array], y: Array) -> Newton:
     Then the method follows the solutions of residual(y) = t residual(y_0) from the first point y_0, where t = 1, to
     t = 0. It halves the step of t if Newton's method fails, and doubles it otherwise (Newton homotopy).
     """
-    first, tolerance = residual(y), TOLERANCE * jnp.finfo(y.dtype).eps
+    tolerance = TOLERANCE * jnp.finfo(y.dtype).eps
 
     def both(y: Array) -> tuple[Array, Array]:
         G = residual(y)
@@ -155,12 +157,13 @@ def newton_of(residual: Callable[[Array], Array], y: Array) -> Newton:
 
     def evaluate(newton: Newton) -> Newton:
         J, G = jax.jacfwd(both, has_aux=True)(newton.trial)
+        first = jnp.where(newton.number == 0, G, newton.first)
         G = G - newton.target * first
         better = _size(G) < newton.error
         y, J, error = where(better, (newton.trial, J, _size(G)), (newton.y, newton.J, newton.error))
         direction = jnp.where(better, inverse(J) @ G, newton.direction)
         fraction = jnp.where(better, 1.0, 0.5 * newton.fraction)
-        after = Newton(y, error, J, direction, fraction, y - fraction * direction, *newton[6:9], newton.number + 1)
+        after = Newton(y, error, J, direction, fraction, y - fraction * direction, *newton[6:9], first, newton.number + 1)
         step, solved = after.reached - after.target, error <= tolerance
         onward = after.begun(y, after.target, jnp.maximum(after.target - 2 * step, 0.0))
         back = after.begun(after.base, after.reached, after.target + step / 2)
@@ -174,7 +177,8 @@ def newton_of(residual: Callable[[Array], Array], y: Array) -> Newton:
         return (newton.number < STEPS) & (newton.fraction > SMALLEST) & (newton.error > 0)
 
     one = jnp.ones_like(y[0])
-    begin = Newton(y, jnp.inf * one, jnp.eye(y.size, dtype=y.dtype), 0 * y, one, y, 0 * one, one, y, jnp.asarray(0))
+    J = jnp.eye(y.size, dtype=y.dtype)
+    begin = Newton(y, jnp.inf * one, J, 0 * y, one, y, 0 * one, one, y, 0 * y, jnp.asarray(0))
     return lax.stop_gradient(lax.while_loop(unfinished, evaluate, begin))
 
 

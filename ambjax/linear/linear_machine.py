@@ -11,7 +11,7 @@ from jax import Array
 from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.linear.analysis import Zones
 from ambjax.linear.machine_at_speed import MachineAtSpeed, MachineRest
-from ambjax.linear.machine_matrices import machine_matrices
+from ambjax.linear.machine_matrices import machine_matrices, rests
 from ambjax.linear.margins import NO_PEAK, Margins, ResponsePeak, peak, poles_in_s, reading_margins, whole_end
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar, canonical
@@ -65,7 +65,8 @@ def _at_rest(machine: Machine, W: Scalar, period: Scalar) -> MachineRest:
 
 @functools.partial(compiled_quickly, options=QUICKEST)
 def _matrices(machine: Machine, W: Scalar, period: Scalar, point: MachineRest) -> tuple[StateSpace, Array, Array]:
-    return machine_matrices(MachineAtSpeed(machine, W, period), point)
+    own = MachineAtSpeed(machine, W, period)
+    return *machine_matrices(own, point), rests(own, point)
 
 
 def machine_rest(machine: Machine, period: Scalar) -> MachineRest:
@@ -115,8 +116,8 @@ def turning_machines(machine: Machine, period: Scalar, speeds: Iterable[float]) 
         if found is None or not found[-1]:  # the point of rest does not depend on the speed, or hardly
             point = _at_rest(machine, W, period)
             found = _matrices(machine, W, period, point)
-        system, free, rests = found
-        if not rests:
+        system, free, at_rest = found
+        if not at_rest:
             raise ValueError(
                 "no equilibrium of the machine was found, so it has no linearisation: `ambjax simulate` shows whether "
                 "the rotor is held."

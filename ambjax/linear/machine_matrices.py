@@ -17,11 +17,15 @@ from ambjax.world.sensor import Measurement
 AtRest = tuple[MachineRest, MachineRest, Array, Array]
 
 
-def machine_matrices(own: MachineAtSpeed, point: MachineRest) -> tuple[StateSpace, Array, Array]:
-    """Return the state space at a point, its A under constant commands, and whether the machine rests there."""
+def rests(own: MachineAtSpeed, point: MachineRest) -> Array:
+    """Return whether the machine rests at a point."""
+    deviation = own.deviation(point, ravel_pytree(own.start()[1])[0])
+    return jnp.max(jnp.abs(deviation)) <= TOLERANCE * jnp.finfo(deviation.dtype).eps
+
+
+def machine_matrices(own: MachineAtSpeed, point: MachineRest) -> tuple[StateSpace, Array]:
+    """Return the state space at a point, and its A under constant commands."""
     sizes = own.start()[1]
-    deviation = own.deviation(point, ravel_pytree(sizes)[0])
-    found = jnp.max(jnp.abs(deviation)) <= TOLERANCE * jnp.finfo(deviation.dtype).eps
     amplified = tuple(u if on else () for u, on in zip(point.u, own.lagged, strict=True))
     body, restore = ravel_pytree((point.q, jnp.zeros_like(point.q), point.plant, own.sensed(point.q), amplified))
     fastest = jnp.max(own.machine.join([scenario.plant.pole for scenario in own.scenario]))
@@ -53,7 +57,7 @@ def machine_matrices(own: MachineAtSpeed, point: MachineRest) -> tuple[StateSpac
         ((A, B), (C, D)), scale = _sampled(own, (point, sizes, body, body_sizes), free, read)
     else:
         ((A, B), (C, D)), scale = _continuous(own, (point, sizes, body, body_sizes), moved, read)
-    return StateSpace(A, B, C, D, scale, jnp.asarray(own.period) if own.sampled else None), free[0], found
+    return StateSpace(A, B, C, D, scale, jnp.asarray(own.period) if own.sampled else None), free[0]
 
 
 def _outputs(own: MachineAtSpeed, measured: Sequence[Measurement], u: Groups, x: Array) -> Array:

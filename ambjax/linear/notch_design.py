@@ -120,8 +120,7 @@ def machine_at_speed(machine: Machine, W: Scalar, period: Scalar) -> Machine:
     for notch, own in zip(notches, responses, strict=True):
         if notch is not None:
             g = _inverse(notch, *own)
-            gains = tuple(dataclasses.replace(gain, real=g.real, imaginary=g.imag) for gain in notch.gains)
-            notch = dataclasses.replace(notch, gains=gains)
+            notch = dataclasses.replace(notch, gains=(NotchGain(notch.gains[0].speed, g.real, g.imag),))
         designed.append(notch)
     return _with_notches(machine, designed)
 
