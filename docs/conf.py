@@ -14,6 +14,7 @@ for name, folder in (("PATH", pathlib.Path(sys.executable).parent), ("PYTHONPATH
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": str(HERE / "_build" / "programs")}
     os.environ |= {"JAX_COMPILATION_CACHE_MAX_SIZE": str(2**30)}
+os.environ |= {"OPENBLAS_NUM_THREADS": "1"}  # as in the commands
 os.environ |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
 os.environ |= {"PYTHONWARNINGS": "ignore:Error reading persistent,ignore:Error writing persistent"}
 

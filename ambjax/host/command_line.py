@@ -78,6 +78,8 @@ def run_command(parser: argparse.ArgumentParser, words: list[str] | None, run: R
         logging.captureWarnings(True)
         # XLA's own messages, such as that on a slow compilation; JAX raises errors
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    # the matrices of NumPy and SciPy are small here, and threads wait for each other on a busy machine
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.set_threshold(*GC_THRESHOLDS)
     atexit.register(gc.freeze)  # without this, the collector would scan all objects once more at exit
     with lenient() as stdout:

@@ -163,7 +163,8 @@ def newton_of(residual: Callable[[Array], Array], y: Array) -> Newton:
         y, J, error = where(better, (newton.trial, J, _size(G)), (newton.y, newton.J, newton.error))
         direction = jnp.where(better, inverse(J) @ G, newton.direction)
         fraction = jnp.where(better, 1.0, 0.5 * newton.fraction)
-        after = Newton(y, error, J, direction, fraction, y - fraction * direction, *newton[6:9], first, newton.number + 1)
+        trial, number = y - fraction * direction, newton.number + 1
+        after = Newton(y, error, J, direction, fraction, trial, *newton[6:9], first, number)
         step, solved = after.reached - after.target, error <= tolerance
         onward = after.begun(y, after.target, jnp.maximum(after.target - 2 * step, 0.0))
         back = after.begun(after.base, after.reached, after.target + step / 2)
