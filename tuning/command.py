@@ -3,13 +3,14 @@
 import contextlib
 import dataclasses
 import pathlib
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case, is_machine, read_case
-from ambjax.cases.table import load, one_line, require_file
+from ambjax.cases.table import FILE, load, one_line, require_file
 from ambjax.commands.reading import print_warnings
 from ambjax.host.arguments import names_arguments
 from ambjax.host.heartbeat import say
@@ -26,10 +27,12 @@ from tuning.problem.tuning_problem import TuningProblem, problem_of
 from tuning.report.facts import KEY, NOT_JUDGED, REPORT, TUNED, ended, record, search_facts
 from tuning.report.folder import all_laws, put_answer, put_front, put_page, put_report
 from tuning.report.judging import examined
-from tuning.report.tuned import tuned_case
+from tuning.report.tuned import text_of, tuned_case
 from tuning.rounds import rounds
 from tuning.solve.checkpoint import can_resume, checkpoint, has_unfinished_search, mark_directory, remove_all
 
+# The tables of a case and their text.
+Loaded = tuple[dict[str, Any], str]
 WRITTEN = (TUNED, "history.npz", "report.html", "report.md", "report.json")
 
 
@@ -87,7 +90,7 @@ class TuningPlan(NamedTuple):
 
 @names_arguments(budget="minutes")
 def tune(
-    case: str | pathlib.Path,
+    case: str | pathlib.Path | Mapping[str, Any],
     out: str | pathlib.Path | None = None,
     *,
     resume: bool = False,
@@ -100,7 +103,7 @@ def tune(
 ) -> TunedCase:
     """Tune the gains of a case file, as `ambjax tune` does, and write the same files.
 
-    - `case`: path of the case file. Its table [tune] selects the gains, the limits and the budget.
+    - `case`: path of the case file, or a dict of its tables. The table [tune] selects the gains, limits and budget.
     - `out`: directory of the results; None: a new one under ./out.
     - `resume`: continue the search whose checkpoints are in `out`.
     - `force`: overwrite the files of an earlier search in `out`.
@@ -116,21 +119,26 @@ def tune(
         tuned = ambjax.tune("my.toml", "tuned", minutes=10)
         print(tuned.good, tuned.case.cascade)
     """
-    for name, path in (("case", case), ("out", out), ("settings_of", settings_of)):
-        if path is not None or name == "case":
+    for name, path in (("out", out), ("settings_of", settings_of)):
+        if path is not None:
             require_file(name, path)
+    loaded = None
+    if isinstance(case, Mapping):
+        loaded, case = (dict(case), text_of(case)), "case"
+    require_file("case", case, f"{FILE}, or a dict of tables")
     folder, other = (None if path is None else str(path) for path in (out, settings_of))
     options = Options(folder, resume, force, pareto, page, other, minutes)
     with contextlib.ExitStack() as stack:
-        return run(str(case), options, listen or stack.enter_context(Log()))
+        return run(str(case), options, listen or stack.enter_context(Log()), loaded)
 
 
-def run(path: str, options: Options, listen: Listener) -> TunedCase:
+def run(path: str, options: Options, listen: Listener, loaded: Loaded | None = None) -> TunedCase:
     """Tune the case file at `path`, write the results, and return them. `listen`: receives the events.
 
+    `loaded`: its contents as of `load`; None: they are read.
     Raises ValueError for bad input before anything is written, and in the search as `rounds` does.
     """
-    loaded = load(path)  # once: a second read of a pipe would be empty
+    loaded = loaded or load(path)  # once: a second read of a pipe would be empty
     if options.resume and options.out is None:
         raise ValueError("--resume: the directory of the search is missing. Give it as --out.")
     if options.resume and not can_resume(pathlib.Path(str(options.out))):
@@ -157,7 +165,7 @@ def run(path: str, options: Options, listen: Listener) -> TunedCase:
             return TunedCase(case, report["outcome"]["good"], report, plan.out)
 
 
-def _plan(path: str, options: Options, loaded: tuple[dict[str, Any], str]) -> TuningPlan:
+def _plan(path: str, options: Options, loaded: Loaded) -> TuningPlan:
     """Read the case and make the output directory. Raises ValueError for an invalid case or option."""
     case, tune, raw = read_tune(path, options.settings_of, loaded)
     if options.minutes is not None:

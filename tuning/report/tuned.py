@@ -13,6 +13,7 @@ from tomlkit.items import InlineTable, Table
 from ambjax.cases.own_laws import relocated
 from ambjax.cases.reader import Case, case_from
 from ambjax.cases.recordings import relocated_files
+from ambjax.cases.table import one_line
 
 FIRST = "Tuned by ambjax tune from the case"
 AUTO = "auto"
@@ -66,6 +67,14 @@ def tuned(text: str, gains: Mapping[str, float | str], case: str, verdict: str) 
         raise ValueError(f"gains cannot be written into it ({why}). Give each law a table [controller.STAGE].") from why
     head = [f"# {CONTROL.sub(_escaped, line)}" for line in (f"{FIRST} '{case}'.", verdict)]
     return "\n".join([*head, "", body.strip()]) + "\n"
+
+
+def text_of(tables: Mapping[str, Any]) -> str:
+    """Return the text of a case of these tables. Raises ValueError for a value that TOML does not have."""
+    try:
+        return tomlkit.dumps(tables)
+    except (TOMLKitError, TypeError, ValueError) as why:
+        raise ValueError(one_line(f"case: a dict of tables has numbers, words, lists and dicts ({why}).")) from None
 
 
 def _words(path: str) -> list[Any]:
