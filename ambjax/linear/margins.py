@@ -15,14 +15,13 @@ from ambjax.linear.state_space import Place, StateSpace
 
 # Number of logarithmically spaced frequencies in a scan, in addition to those near poles.
 POINTS = 600
-# Relative width of the bracket of a peak's frequency at which its refinement ends.
-NARROW = 1e-6
+# Relative width of the bracket of a peak's frequency at which its refinement ends, and points of each of its scans.
+NARROW, LOCAL = 1e-6, 17
 # Frequency that stands for 0, as a share of the lowest one. At 0 itself the response of an integrator is not finite.
 STATIC = 1e-6
 # DOUBLINGS: most doublings of the time over which the response to noise is summed, 1e18 samples. SETTLED: relative
 # change in a doubling below which the variance is final.
 DOUBLINGS, SETTLED = 60, 1e-13
-GOLDEN = (math.sqrt(5) - 1) / 2
 # Relative distance from an end of the band, or from the value there, within which a maximum counts as one at this end.
 EDGE = 1e-4
 # Largest number of steps to a crossing.
@@ -130,12 +129,12 @@ def _peak(magnitude: Magnitude, f: np.ndarray, static: bool = True) -> ResponseP
         return ResponsePeak(float(size[0]), 0.0)
     left, right = f[max(k - 1, first)], f[min(k + 1, len(f) - 1)]
     while right > left * (1 + NARROW):
-        a, b = right - GOLDEN * (right - left), left + GOLDEN * (right - left)
-        at_a, at_b = magnitude(np.array([a, b]))
-        left, right = (left, b) if at_a > at_b else (a, right)
+        near = np.linspace(left, right, LOCAL)
+        best = int(np.argmax(magnitude(near)))
+        left, right = near[max(best - 1, 0)], near[min(best + 1, LOCAL - 1)]
     tried = np.array([f[k], 0.5 * (left + right)])
-    best = magnitude(tried)
-    return ResponsePeak(float(best.max()), float(tried[best.argmax()]))
+    size = magnitude(tried)
+    return ResponsePeak(float(size.max()), float(tried[size.argmax()]))
 
 
 def whole_end(system: StateSpace) -> float:

@@ -225,9 +225,9 @@ def _exponential(M: np.ndarray) -> np.ndarray:
     return total
 
 
-# From this order and this number of points on, a factorisation of A for all points takes less time than one for each:
-# 13 ms in place of 124 ms for 120 states, 600 points and 5 inputs. SciPy, which has it, takes 0.2 s to import.
-ORDER, POINTS = 20, 16
+# From this number of states times points on, a factorisation of A for all points takes less time than one for each:
+# 0.43 ms in place of 3.1 ms for 11 states, 750 points and 3 inputs.
+MANY = 500
 
 
 def resolvent(A: np.ndarray, z: np.ndarray, B: np.ndarray) -> np.ndarray:
@@ -237,7 +237,7 @@ def resolvent(A: np.ndarray, z: np.ndarray, B: np.ndarray) -> np.ndarray:
     at all points at once. Both ways are backward stable; they differ by 1e-10 and less for a machine of 140 states.
     """
     n, many = len(A), len(z)
-    if n < ORDER or many < POINTS:
+    if n * many < MANY:
         return np.linalg.solve(z[:, None, None] * np.eye(n) - A, np.broadcast_to(B + 0j, (many, *B.shape)))
     T, Q, scale = _schur(np.ascontiguousarray(A, float).tobytes(), n)
     right, y = Q.conj().T @ (B / scale), np.empty((n, many, B.shape[1]), complex)
