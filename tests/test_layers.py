@@ -80,9 +80,9 @@ def test_imports_have_no_cycles():
     list(graphlib.TopologicalSorter(graph).static_order())
 
 
-# Ensembles, linear analysis, the design of default gains, and controllers in files.
+# Ensembles, linear analysis, the design of default gains, controllers in files, and the number of threads.
 SCIPY = ("ambjax.ensemble", "ambjax.linear", "ambjax.control.regulator", "ambjax.results.runs")
-SCIPY += ("ambjax.control.realisation", "ambjax.control.lqg", "ambjax.cases.controller_file")
+SCIPY += ("ambjax.control.realisation", "ambjax.control.lqg", "ambjax.cases.controller_file", "ambjax.host.one_thread")
 
 
 @pytest.mark.parametrize("module", [m for m in MODULES if m.startswith("ambjax")])

@@ -16,6 +16,7 @@ from ambjax.host.arguments import names_arguments
 from ambjax.host.heartbeat import say
 from ambjax.host.interrupts import reporting
 from ambjax.host.lock import locked
+from ambjax.host.one_thread import one_thread
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
 from ambjax.results.outputs import check_new, described, directory, files, plain, write_json
@@ -128,7 +129,7 @@ def tune(
     require_file("case", case, f"{FILE}, or a dict of tables")
     folder, other = (None if path is None else str(path) for path in (out, settings_of))
     options = Options(folder, resume, force, pareto, page, other, minutes)
-    with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack, one_thread():
         return run(str(case), options, listen or stack.enter_context(Log()), loaded)
 
 

@@ -20,6 +20,7 @@ from ambjax.commands.machine_check import CaseCheck
 from ambjax.commands.reading import read_any_with_warnings
 from ambjax.control.cascade import Cascade
 from ambjax.host.heartbeat import FIRST_RUN, doing, quiet, say
+from ambjax.host.one_thread import one_thread
 from ambjax.linear.stability import Findings, stability_of
 from ambjax.results.outputs import plain
 from ambjax.simulation.clock import Clock
@@ -43,6 +44,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
 
 
 @of_case(machines=True)
+@one_thread()
 def check(case: Case | MachineCase, *, full: bool = False) -> CaseCheck:
     """Check a case of one axis or of a machine, as `ambjax check` does.
 

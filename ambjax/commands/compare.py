@@ -30,6 +30,7 @@ from ambjax.commands.study_report import findings_of
 from ambjax.ensemble.study import AnyStudy, Study
 from ambjax.ensemble.worker import CALL, chunk
 from ambjax.host.heartbeat import FIRST_RUN, doing, is_quiet, quiet, say
+from ambjax.host.one_thread import one_thread
 from ambjax.page.html_page import check_processor, pages
 from ambjax.results.case_export import guarded_for
 from ambjax.results.machine_study import MachineStudy
@@ -102,6 +103,7 @@ class Comparison(NamedTuple):
         return comparison_table(self.summary)
 
 
+@one_thread()
 def compare(cases: Sequence[AnyCase], members: int = 1, *, seed: int | None = None) -> Comparison:
     """Compare cases, or machines, on the same members of their spread, as `ambjax compare` does.
 

@@ -16,6 +16,7 @@ from ambjax.ensemble.spread import no_such_number
 from ambjax.ensemble.study import AnyStudy, Study
 from ambjax.host.arguments import names_arguments
 from ambjax.host.extensions import extra
+from ambjax.host.one_thread import one_thread
 from ambjax.linear import stability_of
 from ambjax.numerics.declared import numbers, within
 from ambjax.results.machine_study import MachineStudy
@@ -80,6 +81,7 @@ class CaseMap:
 
 @of_case(machines=True)
 @names_arguments()
+@one_thread()
 def survival_map(case: AnyCase, x: str, y: str, *, members: int = 1, seed: int | None = None) -> CaseMap:
     """Return survival and error over a grid of two quantities of a case, as `ambjax map` computes them.
 

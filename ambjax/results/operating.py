@@ -12,6 +12,7 @@ from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.study import Study
+from ambjax.host.one_thread import one_thread
 from ambjax.linear import (
     PLACES,
     Analysis,
@@ -81,6 +82,7 @@ def sensitivity(case: Case, r: float = 0.0) -> analysis.Analysis: ...
 @overload
 def sensitivity(case: Cascade, scenario: Scenario, clock: Clock, /, r: float = 0.0) -> analysis.Analysis: ...
 @of_case(machines=True)
+@one_thread()
 def sensitivity(case: Case | MachineCase, r: float = 0.0) -> Analysis | list[MachineSensitivity]:
     """Linearise the loop of a case, and return its peaks of |S|, |T| and |KS|, zone, margins and stiffness.
 
