@@ -10,7 +10,7 @@ from jax import Array
 
 from ambjax.codegen.c99.machine import Compiled
 from ambjax.codegen.controller import Controller, controller_of
-from ambjax.codegen.interface import BITS, OUTPUTS
+from ambjax.codegen.interface import OUTPUTS, Status
 from ambjax.codegen.loop_step import LoopStep
 from ambjax.codegen.plant_step import PlantStep
 from ambjax.codegen.series import series
@@ -25,8 +25,8 @@ from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.system import sampled_of
 from ambjax.world.sensor import Errors
 
-FAULTS = [1 << k for k, name in enumerate(BITS) if name in ("invalid", "failed")]
-(REFUSED,) = (1 << k for k, name in enumerate(BITS) if name == "refused")
+FAULTS = [1 << k for k, name in enumerate(Status._fields) if name in ("invalid", "failed")]
+(REFUSED,) = (1 << k for k, name in enumerate(Status._fields) if name == "refused")
 
 
 class ControllerState(NamedTuple):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.codegen.block import Block, Ports, law_lines, scales
-from ambjax.codegen.interface import BITS, INPUTS, Status, StepInputs, StepOutputs, outputs_of
+from ambjax.codegen.interface import INPUTS, Status, StepInputs, StepOutputs, meanings, outputs_of
 from ambjax.codegen.numbering import Number, earlier, numbers_of
 from ambjax.control.base import memory_of
 from ambjax.control.cascade import Cascade
@@ -90,7 +90,7 @@ class Controller(Block):
     noun: ClassVar[str] = "controller"
     ports: ClassVar[Any] = StepInputs
     inputs: ClassVar[Ports] = INPUTS
-    bits = BITS
+    bits = meanings(Status)
     crowded = ("saturated", "refused")
 
     @property
