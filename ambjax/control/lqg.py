@@ -10,6 +10,7 @@ import numpy as np
 
 from ambjax.control.regulator import riccati_gain
 from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.small_matrices import held
 
 
 @record
@@ -112,7 +113,7 @@ class SampledRotor(NamedTuple):
 
 def sampled_model(rotor: RotorModel, coils: LinearCoils, period: float, delay: float) -> SampledRotor:
     """Return the map of one sample. `pushed` [N, c]: effect of constant forces (N) at the magnets. `delay`: samples."""
-    import scipy.linalg
+    from scipy.linalg import expm
 
     n, c = len(rotor.M), len(coils.R)
     inverse, zero = np.linalg.inv(rotor.M), np.zeros
@@ -127,14 +128,9 @@ def sampled_model(rotor: RotorModel, coils: LinearCoils, period: float, delay: f
     constant = np.concatenate([zero(n), inverse @ rotor.constant, zero(c)])[:, None]
     late = delay - np.floor(delay)
 
-    def held(inputs: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-        m = inputs.shape[1]
-        whole = scipy.linalg.expm(np.block([[A, inputs], [zero((m, len(A) + m))]]) * time)
-        return whole[: len(A), : len(A)], whole[: len(A), len(A) :]
-
-    step, effects = held(np.hstack([u, force, constant]), period)
-    rest, new = held(u, (1 - late) * period)
-    _, old = held(u, late * period)
+    step, effects = held(A, np.hstack([u, force, constant]), period, expm)
+    rest, new = held(A, u, (1 - late) * period, expm)
+    _, old = held(A, u, late * period, expm)
     kept = int(np.ceil(delay))
     by_lag = [zero(new.shape) for _ in range(kept + 1)]
     by_lag[int(np.floor(delay))] += new
