@@ -47,10 +47,7 @@ class StepLimits:
 
     u_max: Scalar = dataclasses.field(metadata=U_MAX.metadata)
     near: Scalar = leaf(
-        unit="1",
-        at_least=-1e30,
-        at_most=1,
-        doc="threshold of Eq. (9) for the bit `singular`; 1 at rest, 0 on the curve",
+        unit="1", at_least=-1e30, at_most=1, doc="threshold of Eq. (9) of the bit `singular`; 1 at rest, 0 on the curve"
     )
     r: Scalar = _end("r", "m")
     r_dot: Scalar = _end("r_dot", "m/s")

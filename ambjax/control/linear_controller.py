@@ -69,9 +69,7 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
     analytic = True
     gain: Scalar = records.gain(default=1.0, unit="1", doc="factor of the controller's output")
     output: str = static(
-        default=OUTPUTS[0],
-        choices=OUTPUTS,
-        doc="quantity that the controller returns: a current (A) or a voltage (V)",
+        default=OUTPUTS[0], choices=OUTPUTS, doc="quantity that the controller returns: a current (A) or a voltage (V)"
     )
     realisation: Realisation = static(default=LEAD, doc="matrices of the controller")
     own_steps = ("implicit", "explicit")

@@ -4,7 +4,7 @@ The filter also estimates a constant force at each magnet, and the feedback keep
 these forces and the weight. The sensors then read what the bending of the shaft moves them by.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,46 +13,29 @@ from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.numerics.small_matrices import held
 
 
+def _size(unit: str, most: float, doc: str) -> Any:
+    """Declare a weight or a standard deviation. None: its default for the machine."""
+    return leaf(default=None, unit=unit, above=0, at_most=most, doc=doc)
+
+
 @record
 class LqgWeights:
-    """LqgWeights of the design. The feedback minimises the sum of the squares of displacements and commands, each
+    """Weights of the design. The feedback minimises the sum of the squares of displacements and commands, each
     relative to its weight; the filter assumes white noise of readings and forces with these standard deviations.
     """
 
-    error: Scalar | None = leaf(
-        default=None,
-        unit="m",
-        above=0,
-        at_most=1.0,
-        doc="displacement at a sensor that costs as much as `current`; none: s_0/400",
+    error: Scalar | None = _size("m", 1.0, "displacement at a sensor that costs as much as `current`; none: s_0/400")
+    current: Scalar | None = _size(
+        "A", 1e6, "current, and the command that changes it in 1/w, w the pole of the magnets; none: i_0/10"
     )
-    current: Scalar | None = leaf(
-        default=None,
-        unit="A",
-        above=0,
-        at_most=1e6,
-        doc="current, and the command that changes it in 1/w, w the pole of the magnets; none: i_0/10",
+    noise: Scalar | None = _size(
+        "m", 1.0, "noise of a reading, and that of a current as a share of `current`; none: s_0/2000"
     )
-    noise: Scalar | None = leaf(
-        default=None,
-        unit="m",
-        above=0,
-        at_most=1.0,
-        doc="noise of a reading, and that of a current as a share of `current`; none: s_0/2000",
+    force: Scalar | None = _size(
+        "N", 1e9, "force at each magnet, another one in each sample; none: that of the current i_0"
     )
-    force: Scalar | None = leaf(
-        default=None,
-        unit="N",
-        above=0,
-        at_most=1e9,
-        doc="force at each magnet, another one in each sample; none: that of the current i_0",
-    )
-    drift: Scalar | None = leaf(
-        default=None,
-        unit="N/s",
-        above=0,
-        at_most=1e12,
-        doc="change of the constant force at each magnet in a second; none: 0.03 w times `force`",
+    drift: Scalar | None = _size(
+        "N/s", 1e12, "change of the constant force at each magnet in a second; none: 0.03 w times `force`"
     )
     bending: Scalar = leaf(
         default=0.3, unit="1", at_least=0, at_most=1e3,
