@@ -19,7 +19,7 @@ LARGEST = 512 * 2**20
 MUCH = 700 * 2**20
 
 # Modules with few tests, some of which take 10 s and more.
-LONG = "mutations", "paper", "study_runs", "machine", "end_to_end", "docs", "machine_tuning", "stability", "case_fuzz"
+LONG = "mutations", "paper", "study_runs", "machine", "docs", "machine_tuning", "stability", "case_fuzz"
 
 # Workers whose threads share the cores take an eighth more time.
 _worker = os.environ.get("PYTEST_XDIST_WORKER", "")

@@ -4,17 +4,41 @@ import json
 import pathlib
 
 import pytest
-from test_end_to_end import CASES, COMMANDS
 from texts import write
 
 from ambjax.__main__ import main
 from ambjax.results import outputs
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
-COMPARE = ["compare", "case.toml", "second.toml", "--members", "4"]
-EVERY = COMMANDS | {
+# A bearing from a data sheet on a processor, without a velocity sensor.
+BEARING = """
+plant = { m = 2.4, k_z = 0.0, mu_0 = 1.2566e-6, n = 300.0, A = 2.0e-4, s_0 = 5e-4, i_0 = 2.0, R = 1.0 }
+controller.observer = { kind = "kalman" }
+controller.position = { kind = "pid", k_p = 2e5 }
+controller.inversion = { kind = "linearised" }
+controller.current = { kind = "pi" }
+processor = { delay = 1.0 }
+sensor = { std = 3e-7, std_i = 2e-3, velocity = false, bits = 14 }
+actuator = { u_max = 72.0 }
+initial = { z = 2e-5 }
+clock = { duration = 0.03, sample_period = 6.25e-5 }
+run = { settle = 0.015 }
+spread = { plant.m = { percent = 10 } }
+"""
+MAP = ["map", "case.toml", "--x", "plant.m=-10%:10%:2", "--y", "initial.z=1e-5:2e-5:2"]
+# For each command: its arguments, and the files that it writes.
+COMMANDS = {
+    "ensemble": (
+        ["ensemble", "case.toml", "--members", "4"],
+        ("members.npz", "summary.json", "fan.png", "histograms.png"),
+    ),
     "simulate": (["simulate", "case.toml"], ("trajectory.npz", "metrics.json", "overview.png")),
-    "compare": (COMPARE, ("compare.json", "compare.html", "compare.png")),
+    "map": (MAP, ("map.json", "map.png")),
+    "sensitivity": (["sensitivity", "case.toml", "--members", "2"], ("sensitivity.json", "sensitivity.png")),
+    "compare": (
+        ["compare", "case.toml", "second.toml", "--members", "4"],
+        ("compare.json", "compare.html", "compare.png"),
+    ),
 }
 
 
@@ -51,9 +75,9 @@ def test_an_error_in_a_description_costs_only_that_description(name, monkeypatch
     monkeypatch.setattr(outputs, "STRICT", False)
     for function in FAILING[name]:
         monkeypatch.setattr(function, broken)
-    write(CASES["bearing"])
-    write(CASES["bearing"].replace("k_p = 2e5", "k_p = 3e5"), "second.toml")
-    words, names = EVERY[command]
+    write(BEARING)
+    write(BEARING.replace("k_p = 2e5", "k_p = 3e5"), "second.toml")
+    words, names = COMMANDS[command]
     assert main([*words, "--out", "out"]) == 0
     out, err = capsys.readouterr()
     lines = [line for line in err.splitlines() if " is left out: " in line]
@@ -73,7 +97,7 @@ def test_a_verification_that_ends_with_an_error_is_not_a_proof(monkeypatch, caps
     monkeypatch.setattr(outputs, "STRICT", False)
     monkeypatch.setattr("ambjax.codegen.verify.verify", broken)
     monkeypatch.setattr("ambjax.codegen.verify.COUNT", 10)
-    write(CASES["bearing"])
+    write(BEARING)
     assert main(["export", "case.toml", "--verify", "--out", "out"]) == 1
     out, err = capsys.readouterr()
     assert "the verification is left out: TypeError" in err

@@ -328,42 +328,6 @@ def test_equation_5_sets_the_rate_of_sigma(law):
             np.testing.assert_allclose(law.sigma(motion, reference), sigma, rtol=1e-12, atol=1e-16)
 
 
-def test_equation_6_gives_the_error_dynamics_of_equation_8():
-    # v_tilde_dot = d - gamma S(v_tilde), d = v_star_dot - dv_dz z_dot; here v_star moves at a given rate
-    law = inversion.Adaptive()
-    for z, z_dot, _, i_ref, *_, w in samples(40):
-        v_star, v_star_dot = 1e4 * w, 3e5 * z_dot
-        demand, rate = law(MODEL, ForceDemand(z, z_dot, v_star, v_star_dot), i_ref)
-        assert demand.i_ref == i_ref
-        assert demand.i_ref_dot == rate
-        v_tilde, v_tilde_dot = jax.jvp(
-            lambda v, z, i: v - MODEL.v(z, i), (v_star, z, i_ref), (v_star_dot, z_dot, float(rate))
-        )
-        d = v_star_dot - MODEL.dv_dz(z, i_ref) * z_dot
-        close(v_tilde_dot, d - law.gamma * smooth_sign(v_tilde, law.p), 1e6)
-
-
-def test_equation_11_gives_the_error_dynamics_of_equation_10():
-    law, q_i = current.SlidingMode(), 3.0
-    for z, z_dot, i, i_ref, *_, w in samples(40):
-        i_ref_dot = 10 * w
-        inputs = CurrentInputs(Measurement(z, z_dot, i), CurrentDemand(i_ref, i_ref_dot), np.inf)
-        u, _ = law(MODEL, inputs, ())
-        e_dot = MODEL.i_dot(z, z_dot, i, u, q_i) - i_ref_dot
-        close(e_dot, -law.k_i * smooth_sign(i - i_ref, law.p) + q_i, 200.0)
-
-
-def test_closed_form_inversion_has_no_error():
-    law = inversion.ClosedForm()
-    for z, z_dot, *_, w in samples(40):
-        z, v_star, v_star_dot = z / 2, 5e3 * w, 1e5 * z_dot  # at 3 mm such forces are out of reach
-        demand, state = law(MODEL, ForceDemand(z, z_dot, v_star, v_star_dot), ())
-        assert state == ()
-        close(MODEL.v(z, demand.i_ref), v_star, 1e5)
-        # and its rate keeps it so: v_star_dot = dv_dz z_dot + dv_di i_ref_dot
-        close(MODEL.dv_dz(z, demand.i_ref) * z_dot + MODEL.dv_di(z, demand.i_ref) * demand.i_ref_dot, v_star_dot, 1e6)
-
-
 def test_linearised_inversion_is_exact_at_the_origin_and_without_a_force():
     law, force = inversion.Linearised(), lambda z, v: float(law.inverse(MODEL, z, v))
     for z in (-3e-3, 0.0, 2e-3):  # no force: i = -i_0 z/s_0 gives both gaps the same ratio of current to gap
@@ -373,21 +337,6 @@ def test_linearised_inversion_is_exact_at_the_origin_and_without_a_force():
     # elsewhere the error is of third order: eight times as large at twice z and v_star
     errors = [float(MODEL.v(k * 1e-5, force(k * 1e-5, k * 10.0)) - k * 10.0) for k in (1, 2)]
     assert errors[1] / errors[0] == pytest.approx(8, rel=0.01)
-
-
-@pytest.mark.parametrize("law", [inversion.ClosedForm(), inversion.Linearised()], ids=lambda x: type(x).__name__)
-def test_static_inversion_on_a_processor_commands_each_step_of_its_root_once(law):
-    T, model = 1e-4, MODEL
-    state, roots, reached = law.init_sampled(model), [], None
-    for z, z_dot, *_, w in samples(20):
-        z, v_star = z / 2, 5e3 * w
-        demand, state = law.step(model, ForceDemand(z, z_dot, v_star, 0.0), state, T)
-        roots.append(float(law.inverse(model, z, v_star)))
-        # the first sample begins without a jump; the rate leads to the next sample's i_ref
-        assert demand.i_ref == (roots[0] if reached is None else reached)
-        reached = state.i_ref
-        close(demand.i_ref + T * demand.i_ref_dot, roots[-1], 1.0)
-        close(reached, roots[-1], 1.0)
 
 
 @pytest.mark.parametrize("watch", [observer.Direct(), observer.Complementary()], ids=lambda x: type(x).__name__)

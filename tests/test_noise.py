@@ -15,19 +15,6 @@ from ambjax.sensors import Sensor
 NOISY = Scenario(sensor=Sensor(1e-6, 1e-4, 1e-4))
 
 
-def test_noise_is_held_per_sample_and_gaussian():
-    # long enough for statistics without a rollout: the hold of 20,000 samples of one member
-    scenario = dataclasses.replace(NOISY, seed=3, member=1)
-    w = jax.jit(jax.vmap(lambda k: scenario.sensor.noise(scenario.words(), k)))(jnp.arange(20_000))
-    for x, std in zip(w, (1e-6, 1e-4, 1e-4), strict=True):
-        x = np.asarray(x) / std
-        # five standard errors: 5/sqrt(20000) of mean and of autocorrelation, 5/sqrt(40000) of the deviation
-        assert abs(np.mean(x)) < 0.036
-        assert abs(np.std(x) - 1) < 0.025
-        assert abs(np.mean(x[1:] * x[:-1])) < 0.036
-    assert abs(np.mean(np.asarray(w.z) * np.asarray(w.i))) / 1e-10 < 0.036
-
-
 def test_the_random_words_are_those_of_jax_random():
     """Threefry is implemented here, because kernels on accelerators cannot call jax.random.
 
@@ -41,7 +28,7 @@ def test_the_random_words_are_those_of_jax_random():
 
 @pytest.mark.parametrize("x64", [True, False])
 def test_the_normal_numbers_have_a_normal_distribution(x64):
-    """The Kolmogorov-Smirnov test, the tail beyond 4, and no correlation of numbers, squares or large values."""
+    """The Kolmogorov-Smirnov test, the tail beyond 4, and no correlation of numbers, squares, large values, samples."""
     with jax.enable_x64(x64):
         drawn = jax.jit(jax.vmap(lambda k: normals(Scenario(seed=1).words(), k)))(jnp.arange(400_000))
         for w in map(np.asarray, drawn):
@@ -50,6 +37,8 @@ def test_the_normal_numbers_have_a_normal_distribution(x64):
             assert stats.kstest(w.astype(float), "norm").pvalue > 1e-3
             # 25 expected; Poisson's five standard deviations
             assert 0 < np.sum(np.abs(w) > 4) < 51
+            assert abs(np.mean(w[1:] * w[:-1])) < 5 / 400_000**0.5  # five standard errors
+    np.testing.assert_array_equal(NOISY.sensor.scaled((1.0, 2.0, 4.0)), (1e-6, 2e-4, 4e-4))
     drawn = np.asarray(drawn)[:, :40_000]
     for function in (lambda w: w, np.square, lambda w: np.abs(w) > 2, np.sign):
         correlation = np.corrcoef(function(drawn).astype(float)) - np.eye(3)

@@ -40,16 +40,6 @@ def test_a_plant_with_given_stiffness_force_per_current_and_inductance():
         np.testing.assert_allclose(1 / plant.measurement(plant.rates(rest, 1.0)).i, L, rtol=1e-9)
 
 
-def test_derived_constants_of_table_1():
-    # derived by hand from Table 1, to the digits given here
-    np.testing.assert_allclose(PLANT.kappa, 0.3313, atol=5e-5)
-    np.testing.assert_allclose(PLANT.a, 0.14086, atol=5e-6)
-    np.testing.assert_allclose(PLANT.L, 33.1, atol=0.05)
-    np.testing.assert_allclose(PLANT.dv_di(0.0, 0.0), 4.0e4, rtol=1e-14)
-    np.testing.assert_allclose(PLANT.dv_dz(0.0, 0.0), 2.0e6, rtol=1e-14)
-    np.testing.assert_allclose(np.sqrt(PLANT.k_s / PLANT.m), 528, rtol=0.01)
-
-
 @PLANTS
 def test_closed_form_derivatives_equal_autodiff(plant):
     z, i = points(plant)

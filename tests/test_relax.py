@@ -86,19 +86,3 @@ def test_derivatives_are_those_of_the_equation(function):
             np.testing.assert_allclose(slope[n], difference, rtol=2e-7, atol=1e-9)
     forward = jax.jacfwd(function, (0, 1, 2))(*point)
     np.testing.assert_allclose(forward, slope, rtol=1e-12)
-
-
-def test_an_integrator_behind_the_relay_ends_at_the_disturbance():
-    """The system is x+ = x + T (u + w) with |w| < k.
-
-    Once the band is reached, |x| <= T |w| for every k, and u is -w of the previous sample.
-    """
-    T, k, x, past = 1e-3, 50.0, 0.7, 0.0
-    for n in range(100):
-        w = 3 * np.sin(0.05 * n)
-        u = -k * float(share(x, T * k, None))
-        x += T * (u + w)
-        if n > 40:
-            assert abs(x - T * w) < 1e-15
-            assert abs(u + past) < 1e-9
-        past = w

@@ -37,11 +37,7 @@ def parser(program: str = PROGRAM) -> argparse.ArgumentParser:
         "--page", action="store_true", help="also write page.html, with sliders and presets (needs [processor])"
     )
     top.add_argument(
-        "--budget",
-        dest="minutes",
-        type=float,
-        metavar="MINUTES",
-        help="time for the whole tuning (default: tune.minutes)",
+        "--budget", dest="minutes", type=float, metavar="MINUTES", help="time of the tuning (default: tune.minutes)"
     )
     top.add_argument("--json", action="store_true", help="print only the content of report.json")
     top.add_argument("--version", action="version", version=f"ambjax {__version__}")

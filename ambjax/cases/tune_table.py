@@ -31,12 +31,7 @@ NUMBERS: dict[str, dataclasses.Field] = {
     ),
     "alpha": leaf(0.9, at_least=0, at_most=0.9999, doc='for "cvar": the mean of the worst 1 - alpha of the losses'),
     "minutes": leaf(
-        math.inf,
-        above=0,
-        at_most=1e6,
-        infinite=True,
-        unit="min",
-        doc="min; time for the whole tuning; inf: until it ends",
+        math.inf, above=0, at_most=1e6, infinite=True, unit="min", doc="min; time of the whole tuning; inf: no limit"
     ),
 }
 

@@ -10,23 +10,23 @@ from jax import Array
 
 from ambjax.codegen.c99.machine import Compiled
 from ambjax.codegen.controller import Controller, controller_of
-from ambjax.codegen.interface import BITS, OUTPUTS
+from ambjax.codegen.interface import OUTPUTS, Status
 from ambjax.codegen.loop_step import LoopStep
 from ambjax.codegen.plant_step import PlantStep
 from ambjax.codegen.series import series
 from ambjax.codegen.trace import arguments
-from ambjax.codegen.twins import AroundLoop, Horizon, LoopCase, farthest, horizons
+from ambjax.codegen.twins import Horizon, LoopCase, farthest, horizons
 from ambjax.control.cascade_state import Command
 from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.integrate import Advanced
 from ambjax.simulation.rollout import begin, segment
+from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.system import sampled_of
 from ambjax.world.sensor import Errors
 
-FAULTS = [1 << k for k, name in enumerate(BITS) if name in ("invalid", "failed")]
-(REFUSED,) = (1 << k for k, name in enumerate(BITS) if name == "refused")
+FAULTS = [1 << k for k, name in enumerate(Status._fields) if name in ("invalid", "failed")]
+(REFUSED,) = (1 << k for k, name in enumerate(Status._fields) if name == "refused")
 
 
 class ControllerState(NamedTuple):
@@ -59,7 +59,7 @@ class Machines:
 
 
 @record
-class CompiledLoop(AroundLoop):
+class CompiledLoop(Sampled):
     """The sampled loop whose laws are the compiled controller `which` of `machines`."""
 
     which: Scalar = 0.0
@@ -67,12 +67,12 @@ class CompiledLoop(AroundLoop):
 
     def start(self) -> SampledState:
         zero = jnp.zeros(())
-        return self.loop.start()._replace(control=ControllerState(jnp.zeros(self.machines.room), zero, zero))
+        return super().start()._replace(control=ControllerState(jnp.zeros(self.machines.room), zero, zero))
 
     def jump(self, t: Scalar, state: SampledState, errors: Errors) -> SampledState:
-        state, measured = self.loop.read(state, errors)
-        memory, processor = state.control, self.loop.processor
-        inputs = jnp.stack([*measured, *self.loop.reference(t)])
+        state, measured = self.read(state, errors)
+        memory, processor = state.control, self.processor
+        inputs = jnp.stack([*measured, *self.reference(t)])
         shapes = jax.ShapeDtypeStruct((self.machines.room,), float), jax.ShapeDtypeStruct((2 + len(OUTPUTS),), float)
         numbers, rest = jax.pure_callback(
             self.machines.step, shapes, self.which, memory.numbers, memory.started, inputs, vmap_method="sequential"
@@ -86,9 +86,6 @@ class CompiledLoop(AroundLoop):
         if watch and guard:  # from `left`, `Sampled.row` finds whether a reading was refused
             watch = watch._replace(left=jnp.where(rest[1].astype(int) & REFUSED, 0.0, jnp.asarray(guard.samples)))
         return state._replace(control=after, command=command, past=past, finite=finite, watch=watch)
-
-    def advance(self, *now: Any) -> Advanced:
-        return self.loop.advance(*now)
 
 
 class LoopComparison(NamedTuple):
@@ -115,7 +112,7 @@ def compare_loops(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, Lo
     given = sampled_of(case.cascade, case.scenario, case.clock)
     host, found = Machines(*machines.values()), {}
     for which, (precision, horizon) in enumerate(horizons(case, list(machines)).items()):
-        looped = CompiledLoop(given, which=which, machines=host)
+        looped = CompiledLoop(**vars(given), which=which, machines=host)
         found[precision] = LoopComparison(
             horizon, times_of(_displacement(looped, case.clock, horizon.samples), horizon)
         )

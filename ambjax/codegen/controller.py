@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.codegen.block import Block, Ports, law_lines, scales
-from ambjax.codegen.interface import BITS, INPUTS, Status, StepInputs, StepOutputs, outputs_of
+from ambjax.codegen.interface import INPUTS, Status, StepInputs, StepOutputs, meanings, outputs_of
 from ambjax.codegen.numbering import Number, earlier, numbers_of
 from ambjax.control.base import memory_of
 from ambjax.control.cascade import Cascade
@@ -47,10 +47,7 @@ class StepLimits:
 
     u_max: Scalar = dataclasses.field(metadata=U_MAX.metadata)
     near: Scalar = leaf(
-        unit="1",
-        at_least=-1e30,
-        at_most=1,
-        doc="threshold of Eq. (9) for the bit `singular`; 1 at rest, 0 on the curve",
+        unit="1", at_least=-1e30, at_most=1, doc="threshold of Eq. (9) of the bit `singular`; 1 at rest, 0 on the curve"
     )
     r: Scalar = _end("r", "m")
     r_dot: Scalar = _end("r_dot", "m/s")
@@ -90,7 +87,7 @@ class Controller(Block):
     noun: ClassVar[str] = "controller"
     ports: ClassVar[Any] = StepInputs
     inputs: ClassVar[Ports] = INPUTS
-    bits = BITS
+    bits = meanings(Status)
     crowded = ("saturated", "refused")
 
     @property

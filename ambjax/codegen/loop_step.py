@@ -8,29 +8,26 @@ from jax import Array
 
 from ambjax.codegen.block import Block, Ports
 from ambjax.codegen.controller import Controller, Memory, Parameters
-from ambjax.codegen.interface import BITS, INPUTS, OUTPUTS, Status, StepInputs, StepOutputs
+from ambjax.codegen.interface import (
+    DISTURBANCES,
+    INPUTS,
+    OUTPUTS,
+    REFERENCES,
+    LoopInputs,
+    PlantInputs,
+    PlantOutputs,
+    PlantStatus,
+    Status,
+    StepInputs,
+    StepOutputs,
+    meanings,
+    units_of,
+)
 from ambjax.codegen.numbering import Number
-from ambjax.codegen.plant_ports import DISTURBANCES, LOSSES, READINGS, PlantInputs, PlantOutputs
 from ambjax.codegen.plant_step import PlantMemory, PlantParameters, PlantStep
 from ambjax.numerics.records import Scalar
 from ambjax.simulation.integrate import choose
 from ambjax.simulation.trajectory import ALIVE
-
-REFERENCES = {name: port for name, port in INPUTS.items() if name not in READINGS}
-
-
-class LoopInputs(NamedTuple):
-    """Inputs of a step: disturbances over the sample before it, random numbers of the sensors, and the reference."""
-
-    q_z: Array
-    q_i: Array
-    w_z: Array
-    w_z_dot: Array
-    w_i: Array
-    r: Array
-    r_dot: Array
-    r_ddot: Array
-    r_dddot: Array
 
 
 class LoopMemory(NamedTuple):
@@ -72,15 +69,15 @@ class LoopStep(Block):
 
     noun: ClassVar[str] = "loop"
     ports: ClassVar[Any] = LoopInputs
-    inputs: ClassVar[Ports] = DISTURBANCES | REFERENCES
-    outputs: ClassVar[Ports] = OUTPUTS | READINGS
+    inputs: ClassVar[Ports] = {name: (INPUTS | units_of(PlantInputs))[name] for name in LoopInputs._fields}
+    outputs: ClassVar[Ports] = OUTPUTS | units_of(PlantOutputs)
     bits = (
-        BITS
+        meanings(Status)
+        | meanings(PlantStatus)
         | {
             "invalid": "the reference or a parameter of the controller is NaN or out of range: u is held; or an input "
             "of the plant is not finite: 0 replaces it; or the plant's delay is out of range"
         }
-        | LOSSES
     )
     crowded = ("saturated", "refused", "touched", "diverged")
 

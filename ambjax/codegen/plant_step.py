@@ -16,16 +16,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.codegen.block import Block, Ports, scales
+from ambjax.codegen.interface import PlantInputs, PlantOutputs, PlantStatus, meanings, units_of
 from ambjax.codegen.numbering import Number, earlier, numbers_of
-from ambjax.codegen.plant_ports import (
-    COORDINATES,
-    DISTURBANCES,
-    LOSSES,
-    READINGS,
-    PlantInputs,
-    PlantOutputs,
-    PlantStatus,
-)
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import Command
 from ambjax.control.processor import MOST_DELAY
@@ -45,6 +37,16 @@ from ambjax.world.touchdown import Stop
 from ambjax.world.waveforms import Constant
 
 FIELDS = {field.name: field.metadata for field in dataclasses.fields(Scenario)}
+COORDINATES = {
+    "z": ("m", "rotor displacement"),
+    "z_dot": ("m/s", "rotor velocity"),
+    "i": ("A", "current deviation"),
+    "i_1": ("A", "current of the upper coil"),
+    "i_2": ("A", "current of the lower coil"),
+    "delayed": ("A", "delayed current deviation that determines the flux, with eddy currents"),
+    "delayed_1": ("A", "delayed current that determines the flux of the upper coil, with eddy currents"),
+    "delayed_2": ("A", "delayed current that determines the flux of the lower coil, with eddy currents"),
+}
 
 
 class PlantMemory(NamedTuple):
@@ -116,9 +118,9 @@ class PlantStep(Block):
 
     noun: ClassVar[str] = "plant"
     ports: ClassVar[Any] = PlantInputs
-    inputs: ClassVar[Ports] = {"u": ("V", "voltage commanded at the last sample"), **DISTURBANCES}
-    outputs: ClassVar[Ports] = READINGS
-    bits = LOSSES | {"invalid": "the delay is out of range, or an input is not finite and is replaced by 0"}
+    inputs: ClassVar[Ports] = units_of(PlantInputs)
+    outputs: ClassVar[Ports] = units_of(PlantOutputs)
+    bits = meanings(PlantStatus)
     crowded = ("touched", "diverged")
 
     @property

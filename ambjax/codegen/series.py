@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.codegen.loop_step import LoopInputs
+from ambjax.codegen.interface import LoopInputs
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.gaussian import normals
 from ambjax.numerics.records import Scalar, canonical

@@ -7,7 +7,7 @@ While the twins stay close to JAX's loop, a correct program does too.
 """
 
 import dataclasses
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +21,11 @@ from ambjax.control.cascade_state import Command
 from ambjax.control.guard import Watch
 from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.integrate import Advanced, Integrator
+from ambjax.simulation.integrate import Advanced
 from ambjax.simulation.rollout import run
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.sampled_state import SampledState
-from ambjax.simulation.span import Span
 from ambjax.simulation.system import sampled_of
-from ambjax.simulation.trajectory import Row
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors
 from ambjax.world.waveforms import Constant
@@ -71,35 +69,7 @@ class Horizon(NamedTuple):
 
 
 @record
-class AroundLoop:
-    """Base class of a system around the loop of a processor. A subclass defines `start`, `jump` and `advance`."""
-
-    loop: Sampled
-
-    def realised(self) -> Self:
-        return dataclasses.replace(self, loop=self.loop.realised())
-
-    def sensor_errors(self, sample: Scalar) -> Errors:
-        return self.loop.sensor_errors(sample)
-
-    def status(self, state: SampledState) -> Array:
-        return self.loop.status(state)
-
-    def rest(self, state: SampledState, code: Array) -> SampledState:
-        return self.loop.rest(state, code)
-
-    def row(self, t: Scalar, state: SampledState, errors: Errors, alive: Array) -> Row:
-        return self.loop.row(t, state, errors, alive)
-
-    def completed(self, row: Row, span: Span) -> Row:
-        return self.loop.completed(row, span)
-
-    def singularity(self, row: Row) -> Array:
-        return self.loop.singularity(row)
-
-
-@record
-class Twin(AroundLoop):
+class Twin(Sampled):
     """The loop with every state changed at every sample. `seed` draws the signs.
 
     The change of a number is `unit` times its magnitude or its scale, whichever is larger.
@@ -109,39 +79,28 @@ class Twin(AroundLoop):
     unit: Scalar = 0.0
     held: bool = static(default=False, doc="disturbances are constant over each sample")
 
-    def start(self) -> SampledState:
-        return self.loop.start()
-
     def jump(self, t: Scalar, state: SampledState, errors: Errors) -> SampledState:
         """Change the states, compute the laws' step from them, and change the resulting command."""
-        sample = jnp.rint(t / self.loop.period).astype(jnp.int32)
+        sample = jnp.rint(t / self.period).astype(jnp.int32)
         key = jax.random.fold_in(jax.random.key(jnp.asarray(self.seed, jnp.int32)), sample)
         before, after = jax.random.split(key)
         moved = self._moved(before, state, self._sizes(state))
         # flags, counters and the state of a faulty sensor are not changed
         watch = moved.watch._replace(left=state.watch.left) if state.watch else ()
         state = moved._replace(finite=state.finite, watch=watch, started=state.started, sensed=state.sensed)
-        stepped = self.loop.jump(t, state, errors)
+        stepped = super().jump(t, state, errors)
         return stepped._replace(command=self._moved(after, stepped.command, self._sizes(stepped).command))
 
-    def advance(
-        self,
-        method: Integrator,
-        errors: Errors,
-        t: Scalar,
-        period: Scalar,
-        state: SampledState,
-        *rest: Any,
-        **named: Any,
-    ) -> Advanced:
+    def advance(self, *now: Any, **named: Any) -> Advanced:
         if not self.held:
-            return self.loop.advance(method, errors, t, period, state, *rest, **named)
-        loop = self.loop.loop
+            return super().advance(*now, **named)
+        method, errors, t, period, *rest = now
+        loop = self.loop
         outside, none = loop.inputs(just_after(t)), loop.scenario.undisturbed()
         scenario = dataclasses.replace(none, q_z=Constant(outside.q_z), q_i=Constant(outside.q_i))
         # the exported plant has no time: t = 0 at the start of each sample
         held = Sampled(dataclasses.replace(loop, scenario=scenario), period, 0)
-        after = held.advance(method, errors, jnp.zeros(()), period, state, *rest, **named)
+        after = held.advance(method, errors, jnp.zeros(()), period, *rest, **named)
         return after._replace(t=t + after.t)
 
     def _moved(self, key: Array, state: T, sizes: T) -> T:
@@ -157,11 +116,11 @@ class Twin(AroundLoop):
         The scale of a voltage includes the voltage that changes the current by i_ref within one sample, because the
         laws divide the difference of two references by the period.
         """
-        cascade, plant = self.loop.loop.cascade, self.loop.loop.scenario.plant
+        cascade, plant = self.loop.cascade, self.loop.scenario.plant
         model = cascade.model
         i, v = jnp.asarray(model.i_0) / 25, jnp.asarray(model.v_size)
         gap = jnp.maximum(model.s_0 - jnp.abs(plant.measurement(state.plant).z), 0.01 * model.s_0)
-        driven = model.L * model.s_0 / gap * jnp.maximum(jnp.abs(state.command.i_ref), i) / self.loop.period
+        driven = model.L * model.s_0 / gap * jnp.maximum(jnp.abs(state.command.i_ref), i) / self.period
         volt = i if cascade.current.commands == "current" else jnp.abs(model.R * model.i_0) + driven
         return SampledState(
             plant=plant.scale(),
@@ -180,7 +139,7 @@ class Twin(AroundLoop):
 def horizons(case: LoopCase, precisions: list[str], *, held: bool = False) -> dict[str, Horizon]:
     """Simulate JAX's loop and its twins. Return the horizon of each precision."""
     given = sampled_of(case.cascade, case.scenario, case.clock)
-    twin, clock = canonical((Twin(given, held=held), case.clock))
+    twin, clock = canonical((Twin(**vars(given), held=held), case.clock))
     units = [0.0] + [float(np.finfo(PRECISIONS[x]).eps) for x in precisions for _ in range(TWINS)]
     signals, r, lost_at = _together(twin, clock, jnp.asarray(units), jnp.arange(len(units)))
     z_and_u = {name: np.asarray(x) for name, x in zip(SIGNALS, signals, strict=True)}

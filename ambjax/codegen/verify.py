@@ -18,6 +18,7 @@ from ambjax.codegen.program import PRECISIONS
 from ambjax.codegen.reference import Results, results
 from ambjax.codegen.trace import Trace, trace
 from ambjax.codegen.twins import LEAST, PARTED, TWINS, LoopCase
+from ambjax.text.words import markdown_table
 
 # Number of points (states and inputs) at which one step is compared.
 COUNT = 10_000
@@ -144,14 +145,10 @@ def _looped(precision: str, found: closed_loop.LoopComparison) -> Check:
 
 def checks_page(checks: list[Check], case: str, mark: str, noun: str = "controller") -> str:
     """Return the checks as a Markdown page that ends with the line `mark`."""
-    rows = [f"| {x.name} | {x.precision} | {x.found} | {x.allowed} | {x.verdict} |" for x in checks]
-    verdict = checks_verdict(checks)
-    head = "| check | precision | found | allowed | verdict |\n|---|---|---|---|---|"
-    return (
-        f"# The {noun} of case '{case}' as C, compared with JAX\n\n{verdict}\n\n{head}\n"
-        + "\n".join(rows)
-        + f"\n\n{NOTES}\n{mark}\n"
-    )
+    rows = [(*x[:4], x.verdict) for x in checks]
+    lines = [f"# The {noun} of case '{case}' as C, compared with JAX", "", checks_verdict(checks), ""]
+    lines += markdown_table(("check", "precision", "found", "allowed", "verdict"), rows)
+    return "\n".join([*lines, "", NOTES, mark, ""])
 
 
 def holds(checks: list[Check]) -> bool:

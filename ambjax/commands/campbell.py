@@ -22,7 +22,8 @@ from ambjax.linear.unbalance_response import (
     unbalance_response,
 )
 from ambjax.results.outputs import directory, drawn, files, plain, table, write_json, written
-from ambjax.text.web_page import escape_markdown, markdown_table, render_page
+from ambjax.text.web_page import escape_markdown, render_page
+from ambjax.text.words import markdown_table
 
 PICTURES = ("campbell.png", "rotor.png", "unbalance.png")
 WRITTEN = ("campbell.json", *PICTURES, "campbell.html")

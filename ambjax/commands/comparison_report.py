@@ -16,6 +16,7 @@ from ambjax.results.operating import MEMBERS
 from ambjax.results.outputs import table
 from ambjax.simulation import orders
 from ambjax.text import web_page
+from ambjax.text.words import markdown_table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,13 +185,13 @@ def comparison_markdown(summary: Mapping[str, Any]) -> str:
     rows = [[q.words.replace("|", "\\|"), *_marked(q, summary), q.unit] for q in _shown(summary)]
     lines = ["# Comparison of controllers", "", _words(summary), ""]
     lines += [f"- {web_page.escape_markdown(note)}" for note in summary["differences"]] + [""]
-    lines += [*web_page.markdown_table(["", *names, "unit"], rows), "", "![Comparison](compare.png)", ""]
+    lines += [*markdown_table(["", *names, "unit"], rows), "", "![Comparison](compare.png)", ""]
     for name, case in zip(names, summary["cases"], strict=True):
         numbers = [
             [stage, str(law["kind"]), ", ".join(f"{key} = {value:.6g}" for key, value in law.items() if key != "kind")]
             for stage, law in case["laws"].items()
         ]
-        lines += [f"## {name}", "", *web_page.markdown_table(["stage", "law", "gains"], numbers), ""]
+        lines += [f"## {name}", "", *markdown_table(["stage", "law", "gains"], numbers), ""]
     return "\n".join(lines) + "\n"
 
 

@@ -87,7 +87,8 @@ class _Members:
     def one(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged:
         """Return the results of one equation."""
         name, params = eqn.primitive.name, eqn.params
-        if name in CALLS and name not in RULES:
+        rule = self.reduced if name in REDUCTIONS else getattr(self, f"rule_{name}", None)
+        if name in CALLS and rule is None:
             return self.evaluated(called(eqn), values, moves)
         if not any(moves):
             return _flagged(eqn, eqn.primitive.bind(*values, **params), False)
@@ -95,8 +96,7 @@ class _Members:
             return _flagged(eqn, eqn.primitive.bind(*self.together(eqn, values, moves), **params), True)
         if name in SAME_AXES:
             return _flagged(eqn, eqn.primitive.bind(*values, **params), True)
-        rule = RULES.get(name)
-        if rule is not None and (found := rule(self, eqn, values, moves)) is not None:
+        if rule is not None and (found := rule(eqn, values, moves)) is not None:  # None: the rule does not apply
             return found
         axes = [-1 if moving else None for moving in moves]
         mapped = jax.vmap(lambda *x: eqn.primitive.bind(*x, **params), axes, -1, axis_size=self.size)
@@ -111,7 +111,7 @@ class _Members:
         shape = np.broadcast_shapes(*map(shape_of, eqn.invars))  # equal up to lengths of 1, or ()
         return [self.wide(x, m, shape) for x, m in zip(values, moves, strict=True)]
 
-    def jit(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged:
+    def rule_jit(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged:
         def inner(*values: Any) -> list:
             return [x for x, _ in self.evaluated(called(eqn), values, moves)]
 
@@ -119,33 +119,35 @@ class _Members:
         found = (inner if eqn.params["inline"] else jax.jit(inner))(*values)
         return list(zip(found, moved(called(eqn), moves), strict=True))
 
-    def broadcast_in_dim(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
+    rule_pjit = rule_jit
+
+    def rule_broadcast_in_dim(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         shape, dims = eqn.params["shape"], eqn.params["broadcast_dimensions"]
         return [(lax.broadcast_in_dim(values[0], (*shape, self.size), (*dims, len(shape))), True)]
 
-    def reshape(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
+    def rule_reshape(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         return [(lax.reshape(values[0], (*eqn.params["new_sizes"], self.size)), True)]
 
-    def transpose(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
+    def rule_transpose(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         order = eqn.params["permutation"]
         return [(lax.transpose(values[0], (*order, len(order))), True)]
 
-    def slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
+    def rule_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         begin, end, strides = (eqn.params[x] for x in ("start_indices", "limit_indices", "strides"))
         return [(lax.slice(values[0], (*begin, 0), (*end, self.size), strides and (*strides, 1)), True)]
 
-    def concatenate(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
+    def rule_concatenate(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         parts = [self.wide(x, m, shape_of(v)) for x, m, v in zip(values, moves, eqn.invars, strict=True)]
         return [(lax.concatenate(parts, eqn.params["dimension"]), True)]
 
-    def dynamic_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
+    def rule_dynamic_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         if any(moves[1:]):
             return None
         return [
             (lax.dynamic_slice(values[0], (*values[1:], _first(eqn)), (*eqn.params["slice_sizes"], self.size)), True)
         ]
 
-    def dynamic_update_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
+    def rule_dynamic_update_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         if any(moves[2:]):
             return None
         whole, part = (self.wide(x, m, shape_of(v)) for x, m, v in zip(values, moves, eqn.invars[:2], strict=False))
@@ -159,7 +161,7 @@ class _Members:
         parts = [lax.index_in_dim(x, n, axis, False) for n in range(x.shape[axis])]
         return [(functools.reduce(REDUCTIONS[eqn.primitive.name], parts), True)]
 
-    def while_loop(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged:
+    def rule_while(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged:
         goes, body, consts, fixed = while_parts(eqn)
         carried = carried_flags(body, moves[consts:], fixed, ())
         own_end = moved(goes, [*moves[:consts], *carried])[0]  # members end at different turns
@@ -179,7 +181,7 @@ class _Members:
             end = lax.while_loop(going, lambda x: turn(x)[0], begin)
         return list(zip(end, carried, strict=True))
 
-    def scan(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
+    def rule_scan(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         p = eqn.params
         fixed, both = scan_parts(eqn)
         carried = carried_flags(p["jaxpr"], moves[:both], fixed, moves[both:])
@@ -213,20 +215,3 @@ def _first(eqn: JaxprEqn) -> Array:
 
 def _flagged(eqn: JaxprEqn, results: Any, moves: bool) -> Flagged:
     return [(x, moves) for x in (results if eqn.primitive.multiple_results else [results])]
-
-
-# Rules of primitives by name; None as a result: the rule does not apply.
-RULES: dict[str, Callable[[_Members, JaxprEqn, list, list[bool]], Flagged | None]] = {
-    "broadcast_in_dim": _Members.broadcast_in_dim,
-    "concatenate": _Members.concatenate,
-    "dynamic_slice": _Members.dynamic_slice,
-    "dynamic_update_slice": _Members.dynamic_update_slice,
-    "jit": _Members.jit,
-    "pjit": _Members.jit,
-    "reshape": _Members.reshape,
-    "scan": _Members.scan,
-    "slice": _Members.slice,
-    "transpose": _Members.transpose,
-    "while": _Members.while_loop,
-    **dict.fromkeys(REDUCTIONS, _Members.reduced),
-}

@@ -13,7 +13,7 @@ from ambjax.control.force import force_of_current, linear_mechanics, resting_cur
 from ambjax.control.regulator import optimal_gains
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
-from ambjax.control.stages import PositionLaw, unwinding
+from ambjax.control.stages import PositionInputs, PositionLaw, unwinding
 from ambjax.numerics.biquad import Biquad, lead_lag, low_pass, notch
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.world.plant import Plant
@@ -89,12 +89,12 @@ class FilterChain(PositionLaw[ChainState]):
     def init(self, model: Plant) -> ChainState:
         return jax.tree.map(jnp.zeros_like, self.scale(model))
 
-    def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> ChainState:
+    def begin(self, model: Plant, inputs: PositionInputs) -> ChainState:
         """Return the filters in the steady state for the first error, and an integral of 0."""
         e = jnp.asarray(inputs[0].z - inputs[1].r)
         return self._begun(self.k_d * self.w_f * e, self.k_p * e, [part.steady for part in self._parts()])
 
-    def begin_sampled(self, model: Plant, inputs: tuple[Measurement, Reference], period: Scalar) -> ChainState:
+    def begin_sampled(self, model: Plant, inputs: PositionInputs, period: Scalar) -> ChainState:
         """Return the filters in the steady state for the error of the first sample, and an integral of 0."""
         e = jnp.asarray(inputs[0].z - inputs[1].r)
         parts = [functools.partial(part.steady_sampled, period=period) for part in self._parts()]
@@ -145,9 +145,7 @@ class FilterChain(PositionLaw[ChainState]):
     def _biquads(self, state: ChainState) -> list[tuple[Biquad, tuple[Array, Array]]]:
         return list(zip(self._parts(), [x for x in state[2:] if x], strict=True))
 
-    def __call__(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: ChainState
-    ) -> tuple[Array, ChainState]:
+    def __call__(self, model: Plant, inputs: PositionInputs, state: ChainState) -> tuple[Array, ChainState]:
         motion, reference = inputs
         e = motion.z - reference.r
         # k_d s/(1 + s/w_f) = k_d w_f (1 - w_f/(s + w_f)): the state is k_d w_f^2/(s + w_f) e
@@ -164,9 +162,7 @@ class FilterChain(PositionLaw[ChainState]):
         lead, first, second, *last = rest
         return ChainState(derivative, integral, lead, first, second, last[0] if last else ())
 
-    def step(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: ChainState, period: Scalar
-    ) -> tuple[Array, ChainState]:
+    def step(self, model: Plant, inputs: PositionInputs, state: ChainState, period: Scalar) -> tuple[Array, ChainState]:
         """Step each part by the bilinear transform.
 
         The anti-windup adds h (i_star - i)/(1 + h) to the integral, h = k_aw T.

@@ -9,7 +9,7 @@ from ambjax.control.defaults import switching_gain, switching_steepness
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, manifold, position_switch, rate, steepness
-from ambjax.control.stages import OneIntegral, PositionLaw
+from ambjax.control.stages import OneIntegral, PositionInputs, PositionLaw
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
@@ -66,12 +66,12 @@ class IntegralSlidingMode(OneIntegral, PositionLaw[Array]):
         """Return e_dot + c e, the sliding variable without its integral."""
         return sliding_variable(self.c, motion, reference)
 
-    def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: Array) -> tuple[Array, Array]:
+    def __call__(self, model: Plant, inputs: PositionInputs, state: Array) -> tuple[Array, Array]:
         motion, reference = inputs
         s = self.sigma(motion, reference) + self.c_int * state
         return self._force(model, inputs, -self.k * smooth_sign(s, self.p)), self._integrated(inputs)
 
-    def _force(self, model: Plant, inputs: tuple[Measurement, Reference], robust: Array) -> Array:
+    def _force(self, model: Plant, inputs: PositionInputs, robust: Array) -> Array:
         motion, reference = inputs
         return force_for(self.c, model, motion, reference, robust - self.c_int * (motion.z - reference.r))
 
@@ -80,15 +80,13 @@ class IntegralSlidingMode(OneIntegral, PositionLaw[Array]):
         c_int = rate(context, 1 / 30, 2, "corner sqrt(c_int) from w/30 to 2 w", power=2)
         return {"c": manifold(context), "c_int": c_int, "k": k, **steepness(context, "k")}
 
-    def step(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: Array, period: Scalar
-    ) -> tuple[Array, Array]:
+    def step(self, model: Plant, inputs: PositionInputs, state: Array, period: Scalar) -> tuple[Array, Array]:
         """Step with the sign of s at the end of the step, as `SlidingMode` does; x+ = x + T e."""
         motion, reference = inputs
         s = self.sigma(motion, reference) + self.c_int * state
         robust = -self.k * share(s, period * self.k, self.p)
         return self._force(model, inputs, robust), state + period * self._integrated(inputs)
 
-    def _integrated(self, inputs: tuple[Measurement, Reference]) -> Array:
+    def _integrated(self, inputs: PositionInputs) -> Array:
         """Return the rate of the integral: the error, or 0 if its gain c_int is 0."""
         return jnp.where(jnp.asarray(self.c_int) > 0, inputs[0].z - inputs[1].r, 0.0)

@@ -11,7 +11,7 @@ from jax import Array
 from ambjax.control.force import force_of_current, linear_mechanics, sliding_variable
 from ambjax.control.realisation import FREQUENCIES, Matrices, Realisation, realisation
 from ambjax.control.search import Interval, SearchContext
-from ambjax.control.stages import PositionLaw
+from ambjax.control.stages import PositionInputs, PositionLaw
 from ambjax.numerics import records
 from ambjax.numerics.records import Scalar, is_traced, record, static
 from ambjax.world.plant import Plant
@@ -69,9 +69,7 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
     analytic = True
     gain: Scalar = records.gain(default=1.0, unit="1", doc="factor of the controller's output")
     output: str = static(
-        default=OUTPUTS[0],
-        choices=OUTPUTS,
-        doc="quantity that the controller returns: a current (A) or a voltage (V)",
+        default=OUTPUTS[0], choices=OUTPUTS, doc="quantity that the controller returns: a current (A) or a voltage (V)"
     )
     realisation: Realisation = static(default=LEAD, doc="matrices of the controller")
     own_steps = ("implicit", "explicit")
@@ -122,7 +120,7 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
     def init(self, model: Plant) -> tuple[Array, ...]:
         return (jnp.zeros(()),) * len(self.realisation.A)
 
-    def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> tuple[Array, ...]:
+    def begin(self, model: Plant, inputs: PositionInputs) -> tuple[Array, ...]:
         """Return the state of `Realisation.steady`, in continuous time and for the bilinear transform."""
         return self.realisation.steady(self._inputs(inputs))
 
@@ -143,7 +141,7 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
         """Return the rate of the error: a linear controller has no manifold."""
         return sliding_variable(0.0, motion, reference)
 
-    def _inputs(self, inputs: tuple[Measurement, Reference]) -> list[Array]:
+    def _inputs(self, inputs: PositionInputs) -> list[Array]:
         (motion, reference), count = inputs, len(self.realisation.D)
         r, z = jnp.asarray(reference.r), jnp.asarray(motion.z)
         return [r - z] if count == 1 else [r, z]
@@ -154,14 +152,14 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
         return force_of_current(model, z, model.g / linear_mechanics(model).b + i)
 
     def __call__(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[Array, ...]
+        self, model: Plant, inputs: PositionInputs, state: tuple[Array, ...]
     ) -> tuple[Array, tuple[Array, ...]]:
         w = self._inputs(inputs)
         y = self.realisation.output(state, w)
         return self._force(model, inputs[0].z, y), self.realisation.rates(state, w)
 
     def step(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[Array, ...], period: Scalar
+        self, model: Plant, inputs: PositionInputs, state: tuple[Array, ...], period: Scalar
     ) -> tuple[Array, tuple[Array, ...]]:
         """Step by the bilinear transform."""
         y, after = self.realisation.step(state, self._inputs(inputs), period)

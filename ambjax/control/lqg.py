@@ -4,54 +4,38 @@ The filter also estimates a constant force at each magnet, and the feedback keep
 these forces and the weight. The sensors then read what the bending of the shaft moves them by.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ambjax.control.regulator import riccati_gain
 from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.small_matrices import held
+
+
+def _size(unit: str, most: float, doc: str) -> Any:
+    """Declare a weight or a standard deviation. None: its default for the machine."""
+    return leaf(default=None, unit=unit, above=0, at_most=most, doc=doc)
 
 
 @record
 class LqgWeights:
-    """LqgWeights of the design. The feedback minimises the sum of the squares of displacements and commands, each
+    """Weights of the design. The feedback minimises the sum of the squares of displacements and commands, each
     relative to its weight; the filter assumes white noise of readings and forces with these standard deviations.
     """
 
-    error: Scalar | None = leaf(
-        default=None,
-        unit="m",
-        above=0,
-        at_most=1.0,
-        doc="displacement at a sensor that costs as much as `current`; none: s_0/400",
+    error: Scalar | None = _size("m", 1.0, "displacement at a sensor that costs as much as `current`; none: s_0/400")
+    current: Scalar | None = _size(
+        "A", 1e6, "current, and the command that changes it in 1/w, w the pole of the magnets; none: i_0/10"
     )
-    current: Scalar | None = leaf(
-        default=None,
-        unit="A",
-        above=0,
-        at_most=1e6,
-        doc="current, and the command that changes it in 1/w, w the pole of the magnets; none: i_0/10",
+    noise: Scalar | None = _size(
+        "m", 1.0, "noise of a reading, and that of a current as a share of `current`; none: s_0/2000"
     )
-    noise: Scalar | None = leaf(
-        default=None,
-        unit="m",
-        above=0,
-        at_most=1.0,
-        doc="noise of a reading, and that of a current as a share of `current`; none: s_0/2000",
+    force: Scalar | None = _size(
+        "N", 1e9, "force at each magnet, another one in each sample; none: that of the current i_0"
     )
-    force: Scalar | None = leaf(
-        default=None,
-        unit="N",
-        above=0,
-        at_most=1e9,
-        doc="force at each magnet, another one in each sample; none: that of the current i_0",
-    )
-    drift: Scalar | None = leaf(
-        default=None,
-        unit="N/s",
-        above=0,
-        at_most=1e12,
-        doc="change of the constant force at each magnet in a second; none: 0.03 w times `force`",
+    drift: Scalar | None = _size(
+        "N/s", 1e12, "change of the constant force at each magnet in a second; none: 0.03 w times `force`"
     )
     bending: Scalar = leaf(
         default=0.3, unit="1", at_least=0, at_most=1e3,
@@ -112,7 +96,7 @@ class SampledRotor(NamedTuple):
 
 def sampled_model(rotor: RotorModel, coils: LinearCoils, period: float, delay: float) -> SampledRotor:
     """Return the map of one sample. `pushed` [N, c]: effect of constant forces (N) at the magnets. `delay`: samples."""
-    import scipy.linalg
+    from scipy.linalg import expm
 
     n, c = len(rotor.M), len(coils.R)
     inverse, zero = np.linalg.inv(rotor.M), np.zeros
@@ -127,14 +111,9 @@ def sampled_model(rotor: RotorModel, coils: LinearCoils, period: float, delay: f
     constant = np.concatenate([zero(n), inverse @ rotor.constant, zero(c)])[:, None]
     late = delay - np.floor(delay)
 
-    def held(inputs: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-        m = inputs.shape[1]
-        whole = scipy.linalg.expm(np.block([[A, inputs], [zero((m, len(A) + m))]]) * time)
-        return whole[: len(A), : len(A)], whole[: len(A), len(A) :]
-
-    step, effects = held(np.hstack([u, force, constant]), period)
-    rest, new = held(u, (1 - late) * period)
-    _, old = held(u, late * period)
+    step, effects = held(A, np.hstack([u, force, constant]), period, expm)
+    rest, new = held(A, u, (1 - late) * period, expm)
+    _, old = held(A, u, late * period, expm)
     kept = int(np.ceil(delay))
     by_lag = [zero(new.shape) for _ in range(kept + 1)]
     by_lag[int(np.floor(delay))] += new

@@ -12,7 +12,7 @@ from ambjax.control.defaults import switching_gain, switching_steepness
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, position_switch, rate, steepness
-from ambjax.control.stages import OneIntegral, PositionLaw, Stateless
+from ambjax.control.stages import OneIntegral, PositionInputs, PositionLaw, Stateless
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, safe_sqrt, smooth_root, smooth_sign
@@ -55,7 +55,7 @@ class UtkinSlidingMode(OneIntegral, PositionLaw[Array]):
     memory = (("integral", "m/s", "integral of k_p e"),)
     own_steps = ("implicit", "explicit")
 
-    def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> Array:
+    def begin(self, model: Plant, inputs: PositionInputs) -> Array:
         """Return the integral x for which s = 0."""
         return -sliding_variable(self.k_d, *inputs)
 
@@ -76,11 +76,11 @@ class UtkinSlidingMode(OneIntegral, PositionLaw[Array]):
     def sigma(self, motion: Measurement, reference: Reference) -> Array:
         return sliding_variable(self.k_p / self.k_d, motion, reference)
 
-    def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: Array) -> tuple[Array, Array]:
+    def __call__(self, model: Plant, inputs: PositionInputs, state: Array) -> tuple[Array, Array]:
         s = sliding_variable(self.k_d, *inputs) + state
         return self._force(model, inputs, smooth_sign(s, self.p)), self.k_p * (inputs[0].z - inputs[1].r)
 
-    def _force(self, model: Plant, inputs: tuple[Measurement, Reference], sign: Array) -> Array:
+    def _force(self, model: Plant, inputs: PositionInputs, sign: Array) -> Array:
         motion, reference = inputs
         return force_for(0.0, model, motion, reference, -self.k_d * self.sigma(motion, reference) - self.k * sign)
 
@@ -92,9 +92,7 @@ class UtkinSlidingMode(OneIntegral, PositionLaw[Array]):
             **steepness(context, "k"),
         }
 
-    def step(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: Array, period: Scalar
-    ) -> tuple[Array, Array]:
+    def step(self, model: Plant, inputs: PositionInputs, state: Array, period: Scalar) -> tuple[Array, Array]:
         """Step with the sign of s at the end of the step."""
         motion, reference = inputs
         sign = share(sliding_variable(self.k_d, *inputs) + state, period * self.k, self.p)
@@ -142,12 +140,10 @@ class TerminalSlidingMode(Stateless, PositionLaw[tuple[()]]):
     def _speed(self, motion: Measurement, reference: Reference) -> Array:
         return (motion.z_dot - reference.r_dot) / (self.c * self.l)
 
-    def __call__(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[()]
-    ) -> tuple[Array, tuple[()]]:
+    def __call__(self, model: Plant, inputs: PositionInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
         return self._force(model, inputs, smooth_sign(self.sigma(*inputs), self.p)), ()
 
-    def _force(self, model: Plant, inputs: tuple[Measurement, Reference], sign: Array) -> Array:
+    def _force(self, model: Plant, inputs: PositionInputs, sign: Array) -> Array:
         root = smooth_root(self._speed(*inputs), 1 / WIDTH)
         return force_for(0.0, model, *inputs, -2 / 3 * self.c**2 * self.l * root - self.k * sign)
 
@@ -160,9 +156,7 @@ class TerminalSlidingMode(Stateless, PositionLaw[tuple[()]]):
             **steepness(context, "k"),
         }
 
-    def step(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[()], period: Scalar
-    ) -> tuple[Array, tuple[()]]:
+    def step(self, model: Plant, inputs: PositionInputs, state: tuple[()], period: Scalar) -> tuple[Array, tuple[()]]:
         """Step with the sign of sigma at the end of the step.
 
         d sigma/d e_dot = 3/2 |y|^(1/2) is evaluated at the largest |y| that can occur in the step.

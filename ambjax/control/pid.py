@@ -8,7 +8,7 @@ from jax import Array
 from ambjax.control.force import force_for, sliding_variable
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
-from ambjax.control.stages import PositionLaw, Stateless, unwinding
+from ambjax.control.stages import PositionInputs, PositionLaw, Stateless, unwinding
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
@@ -56,7 +56,7 @@ class PID(PositionLaw[PIDState]):
     def scale(self, model: Plant) -> PIDState:
         return PIDState(jnp.asarray(model.sigma_size), jnp.abs(model.g) / 50 + 1e-3)
 
-    def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> PIDState:
+    def begin(self, model: Plant, inputs: PositionInputs) -> PIDState:
         """Return the filter in the steady state for the first rate of the error, and an integral of 0."""
         rate = jnp.asarray(inputs[0].z_dot - inputs[1].r_dot)
         return PIDState(rate, jnp.zeros_like(rate))
@@ -74,7 +74,7 @@ class PID(PositionLaw[PIDState]):
         """Return e_dot + (k_p/k_d) e: without filter and integral, e_ddot = -k_d sigma."""
         return sliding_variable(self.k_p / self.k_d, motion, reference)
 
-    def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: PIDState) -> tuple[Array, PIDState]:
+    def __call__(self, model: Plant, inputs: PositionInputs, state: PIDState) -> tuple[Array, PIDState]:
         motion, reference = inputs
         e, e_dot = motion.z - reference.r, motion.z_dot - reference.r_dot
         v_star = self._force(model, inputs, state.rate, state.integral)
@@ -82,7 +82,7 @@ class PID(PositionLaw[PIDState]):
         integral = self.k_int * e + unwinding(self.k_aw, self.k_int) * lacking
         return v_star, PIDState(self.w_f * (e_dot - state.rate), integral)
 
-    def _force(self, model: Plant, inputs: tuple[Measurement, Reference], rate: Array, integral: Scalar) -> Array:
+    def _force(self, model: Plant, inputs: PositionInputs, rate: Array, integral: Scalar) -> Array:
         motion, reference = inputs
         wanted = -self.k_p * (motion.z - reference.r) - self.k_d * rate - integral
         return force_for(0.0, model, motion, reference, wanted)
@@ -96,9 +96,7 @@ class PID(PositionLaw[PIDState]):
             "k_aw": rate(context, 1e-3, 1, "rate from w/1000 to w"),
         }
 
-    def step(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: PIDState, period: Scalar
-    ) -> tuple[Array, PIDState]:
+    def step(self, model: Plant, inputs: PositionInputs, state: PIDState, period: Scalar) -> tuple[Array, PIDState]:
         """Step the filter and the anti-windup by backward Euler, which is stable for any rate.
 
         d+ = d + T w_f (e_dot - d+); v_star uses d+ and x; x+ = x + T (k_int e + k_aw (a v_star(x+) - a v(z, i))).
@@ -139,9 +137,7 @@ class FeedbackLinearisation(Stateless, PositionLaw[tuple[()]]):
         """Return e_dot + (k_p/k_d) e: e_ddot = -k_d sigma."""
         return sliding_variable(self.k_p / self.k_d, motion, reference)
 
-    def __call__(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[()]
-    ) -> tuple[Array, tuple[()]]:
+    def __call__(self, model: Plant, inputs: PositionInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
         motion, reference = inputs
         return force_for(0.0, model, motion, reference, -self.k_d * self.sigma(motion, reference)), ()
 

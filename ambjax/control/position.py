@@ -17,7 +17,7 @@ from ambjax.control.pid import PID as PID
 from ambjax.control.pid import FeedbackLinearisation as FeedbackLinearisation
 from ambjax.control.sampling import Relay, Sampling
 from ambjax.control.search import Interval, SearchContext, authority, manifold, position_switch, rate, steepness
-from ambjax.control.stages import OneIntegral, PositionLaw, Stateless
+from ambjax.control.stages import OneIntegral, PositionInputs, PositionLaw, Stateless
 from ambjax.control.state_feedback import StateFeedback as StateFeedback
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share, twist
@@ -66,9 +66,7 @@ class SlidingMode(Stateless, PositionLaw[tuple[()]]):
     def sigma(self, motion: Measurement, reference: Reference) -> Array:
         return sliding_variable(self.c, motion, reference)
 
-    def __call__(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[()]
-    ) -> tuple[Array, tuple[()]]:
+    def __call__(self, model: Plant, inputs: PositionInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
         motion, reference = inputs
         robust = self.robust(self.sigma(motion, reference))
         return force_for(self.c, model, motion, reference, robust), ()
@@ -83,9 +81,7 @@ class SlidingMode(Stateless, PositionLaw[tuple[()]]):
         k = position_switch(context, self.p)
         return {"c": manifold(context), "k": k, **steepness(context, "k")}
 
-    def step(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: tuple[()], period: Scalar
-    ) -> tuple[Array, tuple[()]]:
+    def step(self, model: Plant, inputs: PositionInputs, state: tuple[()], period: Scalar) -> tuple[Array, tuple[()]]:
         """Step with the sign of sigma at the end of the step: without disturbance sigma does not overshoot 0."""
         motion, reference = inputs
         robust = -self.k * share(self.sigma(motion, reference), period * self.k, self.p)
@@ -143,7 +139,7 @@ class SuperTwisting(OneIntegral, PositionLaw[Array]):
     def sigma(self, motion: Measurement, reference: Reference) -> Array:
         return sliding_variable(self.c, motion, reference)
 
-    def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: Array) -> tuple[Array, Array]:
+    def __call__(self, model: Plant, inputs: PositionInputs, state: Array) -> tuple[Array, Array]:
         motion, reference = inputs
         sigma = self.sigma(motion, reference)
         robust = state - self.k_1 * smooth_root(sigma, self.p)
@@ -164,9 +160,7 @@ class SuperTwisting(OneIntegral, PositionLaw[Array]):
         root = authority(context, (context.w**3 * size) ** 0.5, (1e-3, 0.3), "sqrt(w^3 s_0)")
         return {"k_1": root, "k_2": authority(context, context.w**3 * size, (1e-5, 0.1), "w^3 s_0")}
 
-    def step(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: Array, period: Scalar
-    ) -> tuple[Array, Array]:
+    def step(self, model: Plant, inputs: PositionInputs, state: Array, period: Scalar) -> tuple[Array, Array]:
         """Step with both terms at the end of the step (R. Seeber and B. Andritsch, Automatica 173 (2025) 112027).
 
         The robust term is -k_1 root(y) + 2 w+ - w, where w+ = w - T k_2 sgn(y), and y solves

@@ -34,11 +34,7 @@ class Processor:
     """
 
     delay: Scalar = leaf(
-        default=1.0,
-        unit="samples",
-        at_least=0,
-        at_most=MOST_DELAY,
-        doc="time from the measurement until the voltage acts",
+        default=1.0, unit="samples", at_least=0, at_most=MOST_DELAY, doc="time from the reading until the voltage acts"
     )
     implicit: bool = static(
         default=True, doc="implicit steps, which evaluate signs at the end of the step; otherwise explicit Euler steps"

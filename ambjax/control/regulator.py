@@ -3,6 +3,7 @@
 import numpy as np
 
 from ambjax.control.force import linear_mechanics
+from ambjax.numerics.small_matrices import held
 from ambjax.world.plant import Plant
 
 # Weights: the error, as a share of s_0, and the current, as a share of i_0, that cost the same.
@@ -32,11 +33,10 @@ def weights(model: Plant) -> tuple[np.ndarray, float]:
 
 def discretised(A: np.ndarray, B: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the map of one period (s) with the input held; the integral takes a step of explicit Euler."""
-    import scipy.linalg
+    from scipy.linalg import expm
 
-    whole = scipy.linalg.expm(np.block([[A[1:, 1:], B[1:]], [np.zeros((1, 3))]]) * period)
     F, G = np.eye(3), np.zeros((3, 1))
-    F[0, 1], F[1:, 1:], G[1:] = period, whole[:2, :2], whole[:2, 2:]
+    F[0, 1], (F[1:, 1:], G[1:]) = period, held(A[1:, 1:], B[1:], period, expm)
     return F, G
 
 

@@ -15,7 +15,7 @@ test in `tests/test_laws.py`.
 """
 
 import abc
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,8 @@ from ambjax.world.waveforms import Reference
 
 # State of a law: any pytree of scalars; () if the law has none.
 State = TypeVar("State")
+# Input of a position law: the estimated motion and current, and the reference.
+PositionInputs: TypeAlias = tuple[Measurement, Reference]
 
 
 class ForceDemand(NamedTuple):
@@ -139,14 +141,14 @@ class PositionLaw(Law, Generic[State]):
     @abc.abstractmethod
     def init(self, model: Plant) -> State: ...
 
-    def begin(self, model: Plant, inputs: tuple[Measurement, Reference]) -> State:
+    def begin(self, model: Plant, inputs: PositionInputs) -> State:
         """Return the state at t = 0 in continuous time, from the first estimate and reference; by default `init`.
 
         Filters start in the steady state for this estimate, so that the first command is not that of a jump from 0.
         """
         return self.init(model)
 
-    def begin_sampled(self, model: Plant, inputs: tuple[Measurement, Reference], period: Scalar) -> object:
+    def begin_sampled(self, model: Plant, inputs: PositionInputs, period: Scalar) -> object:
         """Return the state before the first call of `step`, from the estimate and the reference of this sample."""
         return self.init_sampled(model) if has_sampled_state(self) else self.begin(model, inputs)
 
@@ -154,7 +156,7 @@ class PositionLaw(Law, Generic[State]):
     def sigma(self, motion: Measurement, reference: Reference) -> Array: ...
 
     @abc.abstractmethod
-    def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: State, /) -> tuple[Array, State]: ...
+    def __call__(self, model: Plant, inputs: PositionInputs, state: State, /) -> tuple[Array, State]: ...
 
 
 class InversionLaw(Law, Generic[State]):
@@ -213,9 +215,7 @@ def has_sampled_state(law: Law) -> bool:
     return type(law).init_sampled is not Law.init_sampled
 
 
-def begin_law(
-    law: PositionLaw, inputs: tuple[Measurement, Reference], *, model: Plant, period: Scalar, implicit: bool
-) -> Any:
+def begin_law(law: PositionLaw, inputs: PositionInputs, *, model: Plant, period: Scalar, implicit: bool) -> Any:
     """Return the state of a position law before its first step on a processor (`step_law`)."""
     if law.has_own_step(implicit) or has_sampled_state(law):
         return law.begin_sampled(model, inputs, period)

@@ -9,7 +9,7 @@ from ambjax.control.force import force_of_current, linear_mechanics, resting_cur
 from ambjax.control.regulator import optimal_gains
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
-from ambjax.control.stages import OneIntegral, PositionLaw, unwinding
+from ambjax.control.stages import OneIntegral, PositionInputs, PositionLaw, unwinding
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
@@ -57,13 +57,13 @@ class StateFeedback(OneIntegral, PositionLaw[Array]):
         """Return e_dot + (k_p/k_d) e, the error that the feedback of e and e_dot drives to zero."""
         return motion.z_dot - reference.r_dot + self.k_p / self.k_d * (motion.z - reference.r)
 
-    def __call__(self, model: Plant, inputs: tuple[Measurement, Reference], state: Array) -> tuple[Array, Array]:
+    def __call__(self, model: Plant, inputs: PositionInputs, state: Array) -> tuple[Array, Array]:
         motion, reference = inputs
         i_star = self._current(model, inputs) - state
         rate = self.k_int * (motion.z - reference.r) + unwinding(self.k_aw, self.k_int) * (i_star - motion.i)
         return force_of_current(model, motion.z, i_star), rate
 
-    def _current(self, model: Plant, inputs: tuple[Measurement, Reference]) -> Array:
+    def _current(self, model: Plant, inputs: PositionInputs) -> Array:
         """Return the demanded current (A) without the integral term."""
         return resting_current(model, inputs[1]) - self.k_d * self.sigma(*inputs)
 
@@ -76,9 +76,7 @@ class StateFeedback(OneIntegral, PositionLaw[Array]):
             "k_aw": rate(context, 1e-3, 1, "rate from w/1000 to w"),
         }
 
-    def step(
-        self, model: Plant, inputs: tuple[Measurement, Reference], state: Array, period: Scalar
-    ) -> tuple[Array, Array]:
+    def step(self, model: Plant, inputs: PositionInputs, state: Array, period: Scalar) -> tuple[Array, Array]:
         """Step the anti-windup by backward Euler: x+ = x + T (k_int e + k_aw (i_star(x+) - i)). The output uses x."""
         motion, reference = inputs
         free, leak = self._current(model, inputs), period * unwinding(self.k_aw, self.k_int)

@@ -54,11 +54,7 @@ class Zones:
         doc="highest frequency; none: 0.45 of the sampling rate, in continuous time where |S - 1| has decayed",
     )
     amplitude: Scalar | None = leaf(
-        default=None,
-        unit="m",
-        above=0,
-        at_most=1,
-        doc="amplitude of the multi-sine of an injection; none: 1 % of the gap s_0",
+        default=None, unit="m", above=0, at_most=1, doc="amplitude of an injected multi-sine; none: 1 % of the gap s_0"
     )
     zone_a: Scalar = leaf(
         default=3.0, unit="1", at_least=1, at_most=1e3, doc="upper limit of zone A for the peak of |S|"
@@ -68,11 +64,7 @@ class Zones:
         default=5.0, unit="1", at_least=1, at_most=1e3, doc="upper limit of zone C; above it is zone D"
     )
     clearance_a: Scalar = leaf(
-        default=0.3,
-        unit="1",
-        above=0,
-        at_most=1,
-        doc="upper limit of zone A for the largest |z|, as a share of the clearance",
+        default=0.3, unit="1", above=0, at_most=1, doc="upper limit of zone A for max |z| as a share of the clearance"
     )
     clearance_b: Scalar = leaf(default=0.4, unit="1", above=0, at_most=1, doc="upper limit of zone B")
     clearance_c: Scalar = leaf(

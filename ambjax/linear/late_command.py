@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ambjax.linear.state_space import StateSpace, array_module
+from ambjax.linear.state_space import StateSpace
+from ambjax.numerics.small_matrices import array_module
 
 # PARTS: number of parts of a sample for which crossings of |L| = 1 are found. TURNS: number of further turns of L.
 PARTS, TURNS = 16, 3

@@ -12,6 +12,7 @@ import numpy as np
 
 from ambjax.linear.late_command import command_delay
 from ambjax.linear.state_space import Place, StateSpace
+from ambjax.numerics.small_matrices import held
 
 # Number of logarithmically spaced frequencies in a scan, in addition to those near poles.
 POINTS = 600
@@ -264,9 +265,7 @@ def noise_gain(system: StateSpace, period: float) -> float:
     scaled = system.scaled()
     A, b, c = np.asarray(scaled.A), np.asarray(scaled.B)[:, :1], np.asarray(scaled.C)[3]
     if system.period is None:
-        n = len(A)
-        whole = expm(np.block([[A, b], [np.zeros((1, n + 1))]]) * period)
-        A, b = whole[:n, :n], whole[:n, n:]
+        A, b = held(A, b, period, expm)
     covariance, variance, before = b @ b.T, float((c @ b)[0] ** 2), -1.0
     for _ in range(DOUBLINGS):
         if variance > 0 and variance - before <= SETTLED * variance:

@@ -12,7 +12,7 @@ from ambjax.control.cascade_state import Sample
 from ambjax.linear.equilibrium import Equilibrium, Point, at_rest, equilibrium, ideal, reading, sizes_of
 from ambjax.linear.state_space import CommandPath, StateSpace
 from ambjax.numerics.records import Scalar
-from ambjax.numerics.small_matrices import exponential
+from ambjax.numerics.small_matrices import held
 from ambjax.simulation.between import at_sample
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
@@ -96,16 +96,8 @@ class Lagged:
         )
         path = CommandPath(A, B[:, 0], jnp.asarray(delay))
         driven = jnp.stack(path.effects(jnp.asarray(period), kept))
-        transition, disturbed = _integrated(A, B[:, 1], period)
-        return HeldPlant(transition, driven, disturbed, path)
-
-
-def _integrated(A: Array, b: Array, h: Scalar) -> tuple[Array, Array]:
-    """Return exp(A h), and the integral of exp(A t) b over t from 0 to h (s)."""
-    n = len(b)
-    table = jnp.zeros((n + 1, n + 1), A.dtype).at[:n].set(jnp.concatenate([A, b[:, None]], 1) * h)
-    whole = exponential(table)
-    return whole[:n, :n], whole[:n, n]
+        transition, disturbed = held(A, B[:, 1:], period)
+        return HeldPlant(transition, driven, disturbed[:, 0], path)
 
 
 def loop_matrices(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> tuple[StateSpace, Array]:

@@ -1,7 +1,6 @@
 """A linear state space with the inputs and outputs of the closed loop, its frequency response and its poles."""
 
 import functools
-import math
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -10,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.numerics.records import Scalar
-from ambjax.numerics.small_matrices import exponential, solve
+from ambjax.numerics.small_matrices import array_module, held, solve
 
 # Places at which the loop can be broken: the reading of the position sensor, and the command of the laws.
 Place = Literal["reading", "command"]
@@ -21,11 +20,6 @@ INPUTS = ("e_z", "e_z_dot", "q_z")
 # Outputs: the readings of z (m) and z_dot (m/s), test signals included, the voltage u (V), the true position z (m), and
 # the command of the laws (V, or A for a commanded current), and the reading of i (A).
 OUTPUTS = ("z_read", "z_dot_read", "u", "z", "command", "i_read")
-
-
-def array_module(x: Array | np.ndarray) -> Any:
-    """Return the module that computes with an array: NumPy for its own, else jax.numpy."""
-    return np if isinstance(x, np.ndarray) else jnp
 
 
 class CommandPath(NamedTuple):
@@ -46,12 +40,10 @@ class CommandPath(NamedTuple):
         command, per unit; the second is that of the command before it.
         """
         np_ = array_module(self.A)
-        expm = _exponential if np_ is np else exponential
-        b, fraction = self.b.reshape(len(self.b), -1), np_.asarray(fraction)[..., None, None]
-        n, c = b.shape
-        table = np_.concatenate([np_.concatenate([self.A, b], 1), np_.zeros((c, n + c))]) * period
-        late, early = expm(table * (1 - fraction)), expm(table * fraction)
-        new, old = late[..., :n, n:], late[..., :n, :n] @ early[..., :n, n:]
+        A, b = self.A * period, self.b.reshape(len(self.b), -1) * period
+        fraction = np_.asarray(fraction)[..., None, None]
+        (passed, new), (_, early) = held(A, b, 1 - fraction), held(A, b, fraction)
+        old = passed @ early
         return (new, old) if self.b.ndim > 1 else (new[..., 0], old[..., 0])
 
     def effects(self, period: Scalar, kept: int) -> list[Array]:
@@ -206,23 +198,6 @@ def _solved(A: Any, z: Any, B: Any) -> Any:
     if isinstance(A, np.ndarray):
         return resolvent(A, z, B)
     return solve(z[:, None, None] * np.eye(len(A)) - A, jnp.broadcast_to(B + 0j, (*z.shape, *B.shape)))
-
-
-def _exponential(M: np.ndarray) -> np.ndarray:
-    """Return exp(M) of small matrices [..., n, n] by scaling, a Taylor polynomial of degree 13, and squaring.
-
-    SciPy's function uses the threads of its linear algebra, whose start takes longer than the computation.
-    """
-    size = float(np.abs(M).sum(axis=-1).max(initial=0.0))
-    halvings = max(0, math.ceil(math.log2(size)) + 1) if size else 0
-    small, total = M / 2.0**halvings, np.broadcast_to(np.eye(M.shape[-1]), M.shape)
-    term = total
-    for k in range(1, 14):
-        term = term @ small / k
-        total = total + term
-    for _ in range(halvings):
-        total = total @ total
-    return total
 
 
 # From this number of states times points on, a factorisation of A for all points takes less time than one for each:

@@ -9,6 +9,7 @@ from ambjax.linear import Zones, analyse, linearise
 from ambjax.paper.claims import CLAIMS, SIGMA_RADIUS
 from ambjax.paper.evidence import Evidence
 from ambjax.paper.readings import CLOCK, PROCESSOR, SAMPLED, SUPPLY, TABLE_2, TUNED, Tuned, cascade, scenario
+from ambjax.text.words import markdown_table
 
 
 def _gains(gains: Tuned) -> str:
@@ -95,38 +96,6 @@ def sensitivity_table(readings: Iterable[str]) -> list[dict[str, object]]:
     return rows
 
 
-def _sensitivity_lines(rows: list[dict[str, Any]]) -> list[str]:
-    lines = ["", "## Sensitivity (linear, at rest at r = 0; zones of ISO 14839-3)", ""]
-    lines += [
-        "| reading | position sensor: peak of \\|S\\|, zone | velocity sensor | static stiffness |",
-        "|---|---|---|---|",
-    ]
-    for row in rows:
-        cells = [
-            f"{row[f'{key}peak']:.4g} at {row[f'{key}frequency_hz']:.3g} Hz, **{row[f'{key}zone']}**"
-            for key in ("", "velocity_")
-        ]
-        lines.append(f"| {row['reading']} | {' | '.join(cells)} | {row['static_stiffness_N_per_m']:.3g} N/m |")
-    return lines
-
-
-def _processor_lines(rows: list[dict[str, Any]]) -> list[str]:
-    lines = ["", "## All readings on the processor of `sampled` (tracking, pulse included)", ""]
-    lines += [
-        "| reading | noise and supply | lost | largest error after settling | voltage, rms |",
-        "|---|---|---|---|---|",
-    ]
-    for row in rows:
-        under = f"the paper's, {SUPPLY:g} V" if row["noise"] else "none, no limit"
-        if math.isfinite(row["lost_at_s"]):
-            status = "not decided: stalled at" if row["stalled"] else "at"
-            lines.append(f"| {row['reading']} | {under} | {status} {1e3 * row['lost_at_s']:.3g} ms | - | - |")
-        else:
-            error, u = row["settled_max_abs_error_m"], row["settled_rms_u_V"]
-            lines.append(f"| {row['reading']} | {under} | no | {error:.2e} m | {u:.3g} V |")
-    return lines
-
-
 def ledger_markdown(
     rows: list[dict[str, Any]],
     noise: list[dict[str, Any]],
@@ -137,30 +106,50 @@ def ledger_markdown(
 
     Its arguments are the results of `judge_claims`, `noise_table`, `processor_table` and `sensitivity_table`.
     """
-    readings = list(rows[0]["findings"])
+    heads = [head for reading in rows[0]["findings"] for head in (f"{reading}: ours", f"{reading}: verdict")]
     lines = ["# Ledger: the paper's claims, per reading", ""]
     lines += [
         "`literal`: Table 2 as printed. `repaired`: gamma = 7.5e4, disturbance as scaled force. Both without noise."
     ]
     lines += [f"`tuned`: {TUNED_WORDS}.", f"`sampled`: {SAMPLED_WORDS}.", ""]
-    lines += ["| claim | section | paper | " + " | ".join(f"{r}: ours | {r}: verdict" for r in readings) + " |"]
-    lines += ["|" + "---|" * (3 + 2 * len(readings))]
-    for row in rows:
-        cells = [f"{f['ours']} | **{f['verdict']}**" for f in row["findings"].values()]
-        lines.append(f"| {row['says']} | {row['where']} | {row['paper']} | " + " | ".join(cells) + " |")
-    lines += ["", "## Criteria and causes", ""]
+    verdicts = [[cell for f in row["findings"].values() for cell in (f["ours"], f"**{f['verdict']}**")] for row in rows]
+    claims = [(row["says"], row["where"], row["paper"], *own) for row, own in zip(rows, verdicts, strict=True)]
+    lines += [*markdown_table(("claim", "section", "paper", *heads), claims), "", "## Criteria and causes", ""]
     for row in rows:
         lines.append(f"- **{row['says']}** ({row['criterion']})")
         lines += [f"  - {name}: {f['verdict']}; {f['cause']}" for name, f in row["findings"].items()]
     lines += ["", "## Noise at which the rotor is held (regulation without the pulse, noise on z only, two seeds)", ""]
-    lines += [
-        "| reading | sample period | duration | largest std | std with max \\|sigma\\| = 6e-6 m/s |",
-        "|---|---|---|---|---|",
+    head = ("reading", "sample period", "duration", "largest std", "std with max |sigma| = 6e-6 m/s")
+    lines += markdown_table(head, [_noise_cells(n) for n in noise])
+    lines += ["", "## All readings on the processor of `sampled` (tracking, pulse included)", ""]
+    head = ("reading", "noise and supply", "lost", "largest error after settling", "voltage, rms")
+    lines += markdown_table(head, [_processor_cells(row) for row in processor])
+    lines += ["", "## Sensitivity (linear, at rest at r = 0; zones of ISO 14839-3)", ""]
+    head = ("reading", "position sensor: peak of |S|, zone", "velocity sensor", "static stiffness")
+    return "\n".join([*lines, *markdown_table(head, [_sensitivity_cells(row) for row in sensitivity])]) + "\n"
+
+
+def _noise_cells(n: dict[str, Any]) -> tuple[str, ...]:
+    survived, gives = (
+        f"{n[name]:.1e} m" if n[name] else "none" for name in ("largest_std_survived_m", "std_for_sigma_6e-6_m")
+    )
+    if n["undecided_std_m"]:
+        survived += f", not decided at {n['undecided_std_m']:.1e} m"
+    return n["reading"], f"{n['sample_period_s']:g} s", f"{n['horizon_s']:g} s", survived, gives
+
+
+def _processor_cells(row: dict[str, Any]) -> tuple[str, ...]:
+    under = f"the paper's, {SUPPLY:g} V" if row["noise"] else "none, no limit"
+    if math.isfinite(row["lost_at_s"]):
+        status = "not decided: stalled at" if row["stalled"] else "at"
+        return row["reading"], under, f"{status} {1e3 * row['lost_at_s']:.3g} ms", "-", "-"
+    error, u = row["settled_max_abs_error_m"], row["settled_rms_u_V"]
+    return row["reading"], under, "no", f"{error:.2e} m", f"{u:.3g} V"
+
+
+def _sensitivity_cells(row: dict[str, Any]) -> tuple[str, ...]:
+    peaks = [
+        f"{row[f'{key}peak']:.4g} at {row[f'{key}frequency_hz']:.3g} Hz, **{row[f'{key}zone']}**"
+        for key in ("", "velocity_")
     ]
-    for n in noise:
-        gives = f"{n['std_for_sigma_6e-6_m']:.1e} m" if n["std_for_sigma_6e-6_m"] else "none"
-        survived = f"{n['largest_std_survived_m']:.1e} m" if n["largest_std_survived_m"] else "none"
-        if n["undecided_std_m"]:
-            survived += f", not decided at {n['undecided_std_m']:.1e} m"
-        lines.append(f"| {n['reading']} | {n['sample_period_s']:g} s | {n['horizon_s']:g} s | {survived} | {gives} |")
-    return "\n".join([*lines, *_processor_lines(processor), *_sensitivity_lines(sensitivity)]) + "\n"
+    return row["reading"], *peaks, f"{row['static_stiffness_N_per_m']:.3g} N/m"

@@ -10,11 +10,7 @@ class Clock:
 
     samples: int = static(default=20_000, doc="number of sample periods")
     sample_period: Scalar = leaf(
-        default=1e-4,
-        unit="s",
-        at_least=1e-9,
-        at_most=1e6,
-        doc="sample period; each measurement error is held for this time",
+        default=1e-4, unit="s", at_least=1e-9, at_most=1e6, doc="sample period; each measurement error is held for it"
     )
     method: Integrator | None = part(default=None, doc="the integrator; None: `ambjax.solvers.with_method` chooses it")
     # Largest number of edges of disturbances inside one sample of a processor, from `with_method`; None: of all edges.

@@ -100,8 +100,7 @@ class Machine:
     groups: tuple[tuple[int, ...], ...] = static(doc="numbers of the axes of each group")
     inverse: Array | None = matrix("n n", "inverse of the mass matrix", default=None)
     cuts: int | None = static(
-        default=None,
-        doc="largest number of jumps of the rotor's loads inside one sample; None: the number of all jumps",
+        default=None, doc="largest number of jumps of the rotor's loads in one sample; None: the number of all jumps"
     )
     law: Any = part(default=None, doc="law that demands the forces of all axes; none: each axis has its own laws")
 

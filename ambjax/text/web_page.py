@@ -30,12 +30,6 @@ def escape_markdown(text: str) -> str:
     return PUNCTUATION.sub(r"\\\1", visible)
 
 
-def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return a Markdown table. Cells are Markdown; `|` is escaped."""
-    lines = [head, ["---"] * len(head), *rows]
-    return ["| " + " | ".join(cell.replace("\\|", "|").replace("|", "\\|") for cell in line) + " |" for line in lines]
-
-
 def render_page(text: str, pictures: Mapping[str, bytes], title: str, unfolded: Collection[str] | None = None) -> str:
     """Return the HTML page. `pictures`: PNG data by file name; images with these names are embedded. A sentence
     replaces an image without data.

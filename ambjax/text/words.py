@@ -1,6 +1,7 @@
 """Text for messages."""
 
 import shlex
+from collections.abc import Sequence
 
 
 def one_line(text: str) -> str:
@@ -16,3 +17,9 @@ def number(x: float | None, digits: int = 4) -> str:
 def command(*words: str) -> str:
     """Return a command for a message, between backticks, with words quoted as a shell requires."""
     return f"`{shlex.join(words)}`"
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return a Markdown table. Cells are Markdown; `|` is escaped."""
+    lines = [head, ["---"] * len(head), *rows]
+    return ["| " + " | ".join(cell.replace("\\|", "|").replace("|", "\\|") for cell in line) + " |" for line in lines]

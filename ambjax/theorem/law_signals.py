@@ -1,6 +1,6 @@
 """The loop on a processor, with rows of sigma, v_tilde and e as the laws compute them, and of the plant."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -70,16 +70,9 @@ class LawSignalsRecorder:
         return LawSignalsState(after, LawSignals(sigma, command.v_tilde, estimate.i - command.i_ref))
 
     def advance(
-        self,
-        method: Integrator,
-        errors: Errors,
-        t: Scalar,
-        period: Scalar,
-        state: LawSignalsState,
-        memory: object,
-        code: Array,
+        self, method: Integrator, errors: Errors, t: Scalar, period: Scalar, state: Any, *rest: Any, **named: Any
     ) -> Advanced:
-        after = self.loop.advance(method, errors, t, period, state.loop, memory, code)
+        after = self.loop.advance(method, errors, t, period, state.loop, *rest, **named)
         return after._replace(state=state._replace(loop=after.state))
 
     def status(self, state: LawSignalsState) -> Array:

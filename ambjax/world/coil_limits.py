@@ -33,18 +33,10 @@ class CoilLimits:
     """
 
     u_max: Scalar | None = leaf(
-        default=None,
-        unit="V",
-        at_least=1e-9,
-        at_most=1e12,
-        doc="limit of the |voltage| of a coil, R i_0 included; none: no limit",
+        default=None, unit="V", at_least=1e-9, at_most=1e12, doc="limit of |R i_0 +- u| at a coil; none: no limit"
     )
     i_max: Scalar | None = leaf(
-        default=None,
-        unit="A",
-        at_least=1e-9,
-        at_most=1e6,
-        doc="limit of the |current| of a coil, i_0 included; none: no limit",
+        default=None, unit="A", at_least=1e-9, at_most=1e6, doc="limit of a coil's |current|, with i_0; none: no limit"
     )
     unidirectional: bool = static(default=False, doc="whether the current of a coil cannot become negative")
 

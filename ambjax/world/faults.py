@@ -29,11 +29,7 @@ class Sensed(NamedTuple):
 
 def _rate() -> Any:
     return leaf(
-        default=0.0,
-        unit="1/s",
-        at_least=0,
-        at_most=1e9,
-        doc="mean number per second; the probability is the same at every sample",
+        default=0.0, unit="1/s", at_least=0, at_most=1e9, doc="mean number per second, equally likely at every sample"
     )
 
 

@@ -62,18 +62,10 @@ class Sensor:
     offset: Scalar = leaf(default=0.0, unit="m", at_least=-1.0, at_most=1.0, doc="offset of the position sensor")
     gain: Scalar = leaf(default=1.0, unit="1", at_least=0.01, at_most=100, doc="gain of the position sensor, ideally 1")
     bandwidth: Scalar | None = leaf(
-        default=None,
-        unit="Hz",
-        at_least=1,
-        at_most=1e9,
-        doc="bandwidth of the position sensor, first order; none: no lag",
+        default=None, unit="Hz", at_least=1, at_most=1e9, doc="bandwidth of the position sensor, order 1; none: no lag"
     )
     bits: Scalar | None = leaf(
-        default=None,
-        at_least=2,
-        at_most=32,
-        whole=True,
-        doc="resolution of the converter of z and i; none: not rounded",
+        default=None, at_least=2, at_most=32, whole=True, doc="bits of the converter of z and i; none: not rounded"
     )
     bits_i: Scalar | None = leaf(
         default=None,
@@ -83,18 +75,10 @@ class Sensor:
         doc="resolution of the converter of i, if it is another one; none: that of z",
     )
     range_z: Scalar | None = leaf(
-        default=None,
-        unit="m",
-        at_least=1e-9,
-        at_most=1.0,
-        doc="the converter reads z from -range_z to range_z; none: s_0",
+        default=None, unit="m", at_least=1e-9, at_most=1.0, doc="the converter reads z within +-range_z; none: s_0"
     )
     range_i: Scalar | None = leaf(
-        default=None,
-        unit="A",
-        at_least=1e-9,
-        at_most=1e6,
-        doc="the converter reads i from -range_i to range_i; none: 2 i_0",
+        default=None, unit="A", at_least=1e-9, at_most=1e6, doc="the converter reads i within +-range_i; none: 2 i_0"
     )
     velocity: bool = static(default=True, doc="whether z_dot is measured; if not, an observer must estimate it")
     outliers: Outliers | None = part(default=None, doc="single wrong readings of the position; None: no such fault")

@@ -5,7 +5,8 @@ import math
 from collections.abc import Callable
 
 from ambjax.results.outputs import described
-from ambjax.text.web_page import escape_markdown, markdown_table
+from ambjax.text.web_page import escape_markdown
+from ambjax.text.words import markdown_table
 from tuning.report import front_table, limit_table, sensitivity_table
 from tuning.report.facts import Column, Row, TuningFacts, number, table
 from tuning.report.outcome import answer

@@ -13,7 +13,7 @@ from typing import Any
 
 from ambjax.cases.reader import Case
 from ambjax.host.sealed import checksum_of, flat, provenance
-from ambjax.text.web_page import markdown_table
+from ambjax.text.words import markdown_table
 from tuning.problem.config import Tune, settings
 from tuning.solve.checkpoint import has_unfinished_search
 

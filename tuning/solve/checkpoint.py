@@ -68,11 +68,7 @@ class CheckpointFile:
     """
 
     def __init__(
-        self,
-        path: pathlib.Path | None,
-        facts: dict[str, Any],
-        round: int = 1,
-        tell: Tell = lambda text: None,
+        self, path: pathlib.Path | None, facts: dict[str, Any], round: int = 1, tell: Tell = lambda text: None
     ) -> None:
         self.path, self.round, self.tell = path, round, tell
         self.fingerprint = flat({**provenance(), **facts, "round": round})
