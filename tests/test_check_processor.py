@@ -16,7 +16,7 @@ from ambjax.control.processor import Processor
 from ambjax.control.sampling import Relay, band, disturbance
 from ambjax.ensemble import delays as searched
 from ambjax.ensemble.delays import DELAYS, delay_margin
-from ambjax.linear.stability import quiet
+from ambjax.linear.quiet_run import quiet
 from ambjax.results.operating import sensitivity
 from ambjax.simulation.rollout import Result, prepare, rollout
 from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Trajectory

@@ -20,7 +20,7 @@ from ambjax.commands import study_report
 from ambjax.ensemble import run_ensemble
 from ambjax.ensemble.blocks import BlockValues
 from ambjax.ensemble.delays import DELAYS, at_delays, delay_margin
-from ambjax.linear import stability as module
+from ambjax.linear import quiet_run, stability
 from ambjax.linear.stability import SMALL, Findings, Stability, stability_of
 from ambjax.simulation.rollout import Result
 from ambjax.simulation.trajectory import Trajectory
@@ -96,7 +96,7 @@ def test_a_quiet_run_has_no_load_and_the_compiled_program_of_its_case():
     }
     case = case_of(sensor={"std": 1e-6, "bits": 12})
     scenario = dataclasses.replace(case.scenario, rotor=turning, **loads)
-    calm = module.quiet(scenario)
+    calm = quiet_run.quiet(scenario)
     assert jax.tree.structure(calm) == jax.tree.structure(scenario)
     assert not np.any(calm.sensor.noises)
     for t in (0.0, 0.05, 0.3):
@@ -148,19 +148,19 @@ def test_only_an_oscillation_that_the_linear_loop_does_not_explain_is_sustained(
         {"z": z.min(1)[None], "i": -np.ones((1, 4))}, {"z": z.max(1)[None], "i": np.ones((1, 4))}, None, None
     )
     run = Result(Trajectory(None, np.array([np.inf]), np.zeros(1), None), values)
-    monkeypatch.setattr(module, "run_ensemble", lambda *_, **__: run)
+    monkeypatch.setattr(quiet_run, "run_ensemble", lambda *_, **__: run)
     rate = -0.2 / float(case.clock.duration) if motion == "slow decay" else -50.0
-    monkeypatch.setattr(module, "_growth", lambda *_: np.array([rate]))
+    monkeypatch.setattr(stability, "_growth", lambda *_: np.array([rate]))
     assert stability_of(case.cascade, members(case), case.clock).stable[0] == (motion != "limit cycle")
 
 
 @pytest.mark.slow
-def test_a_current_loop_that_alternates_between_the_limits_of_the_supply_is_not_stable():
-    """Its gain is far too high. The rotor hardly moves, but no sign of a law chatters."""
-    laws = {"position": {"kind": "pid"}, "inversion": {"kind": "closed-form"}, "current": {"kind": "pi", "k_p": 2000.0}}
+@pytest.mark.parametrize("position", [{"kind": "pid"}, {"kind": "sliding-mode", "p": math.inf}])
+def test_a_current_loop_that_alternates_between_the_limits_of_the_supply_is_not_stable(position):
+    """Its gain is far too high. The rotor hardly moves, but no sign of a law causes that, also if the loop has one."""
+    laws = {"position": position, "inversion": {"kind": "closed-form"}, "current": {"kind": "pi", "k_p": 2000.0}}
     clock = {"duration": 0.05, "sample_period": 5e-5}
-    supply = {"mode": "voltage", "bandwidth": None, "u_max": 72.0}
-    case = case_of(controller=laws, actuator=supply, clock=clock)
+    case = case_of(controller=laws, actuator={"mode": "voltage", "bandwidth": None, "u_max": 72.0}, clock=clock)
     found = stability_of(case.cascade, members(case), case.clock)
     assert found.swing[0] < SMALL * case.scenario.touchdown
     assert found.growth[0] > 1000

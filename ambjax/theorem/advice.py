@@ -163,10 +163,10 @@ def _stable(margin: Delays) -> str:
         return ""
     if margin.swing_m is None or margin.current_A is None:
         return f" The loop is stable at all {margin.tested} delays tested up to there."
-    upto = "at none of them from the first on" if margin.stable is None else f"up to {_samples(margin.stable)} samples"
+    upto = "not stable:" if margin.stable is None else f"stable up to {_samples(margin.stable)} samples only: beyond,"
     return (
-        f" The loop is stable {upto} only: beyond, the rotor is held, but its motion does not decay without noise and "
-        f"loads (amplitude up to {margin.swing_m:.3g} m, |i| up to {margin.current_A:.3g} A)."
+        f" The loop is {upto} the rotor is held, but its motion does not decay without noise and loads "
+        f"(amplitude up to {margin.swing_m:.3g} m, |i| up to {margin.current_A:.3g} A)."
     )
 
 
