@@ -168,6 +168,7 @@ def test_the_poles_of_a_current_law_are_those_of_the_delayed_recursion(late):
         assert found.radius == pytest.approx(np.abs(z).max(), abs=1e-7)  # a double root is exact to 1e-8
         s = np.log(z[np.abs(z) > 1e-9] + 0j)
         assert found.damping == pytest.approx((-s.real / np.abs(s)).min(initial=1.0), abs=1e-6)
+        assert found.remedies[2:] == ("set predict = true",) * (late > 0)
 
 
 T0, SIGN = 1e-4, 2 / np.pi

@@ -241,9 +241,5 @@ def test_one_record_gives_the_verdict_and_the_reason(name):
     assert (facts.reason is None) == (reason is None)
     assert reason is None or reason in facts.reason
     assert ("differ" in said) == (reason is not None)
-    if not stable:
-        assert "3 A (bias 2 A)" in said
-
-
-def test_no_member_tested_is_no_verdict():
-    assert Findings(0, 0).words() == ""
+    assert stable or "3 A (bias 2 A)" in said
+    assert not Findings(0, 0).words()  # no member tested is no verdict

@@ -18,7 +18,6 @@ FALL_SHARE = 0.9
 TRANSIENT_FACTOR = 2.0
 # Clauses on a lost rotor for `cause_words`.
 LOSS = ("the rotor is lost", "the rotor is held")
-IMPLICIT = 'discretisation = "implicit"'
 # Advice for a run in which the integrator stalled.
 STALLED = (
     "Lower the steepness p of the laws ([controller.inversion] p first), "
@@ -81,8 +80,7 @@ def processor_lines(sampled: SampledReport, margin: Delays, unknown: Delays | No
     """
     lines = [
         f"- {law.stage}: the largest |pole| is {number(law.radius)} and must be less than 1, the least damping ratio "
-        f"is {number(law.damping)} and must be at least {LEAST_DAMPING:g}. Lower the gain or p, shorten "
-        f"clock.sample_period, or set {IMPLICIT} and predict = true."
+        f"is {number(law.damping)} and must be at least {LEAST_DAMPING:g}. Remedy: {', or '.join(law.remedies)}."
         for law in sampled.laws
         if not law.holds
     ]

@@ -185,9 +185,8 @@ def remedies(
             "that are at them."
         )
     if outcome.unstable and facts.stability is not None:
-        words.append(
-            f"{Findings(**facts.stability).words()} Add tune.limits.sensitivity or tune.limits.delay_margin_s."
-        )
+        absent = [f"tune.limits.{name}" for name in ("sensitivity", "delay_margin_s") if name not in outcome.limits]
+        words.append(Findings(**facts.stability).words() + f" Add {' or '.join(absent)}." * bool(absent))
     if outcome.broken:
         keys = ", ".join(f"tune.limits.{name}" for name in outcome.broken)
         words.append(f"Not held: {keys}. Loosen these limits, tune more gains (also each p), or raise tune.screen.")
