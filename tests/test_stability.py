@@ -65,9 +65,8 @@ def test_below_the_margin_stable_above_it_held_but_not_stable_far_above_it_lost(
     size, current = swings(case, CYCLE)
     assert found.swing[1] == pytest.approx(size[-1], rel=0.1)
     assert found.current[1] == pytest.approx(current, rel=0.1)
-    # it rattles in more than a tenth of the gap, with more than the bias current
-    assert found.swing[1] > 0.1 * 5e-4
-    assert found.current[1] > 2.0
+    assert found.swing[1] > 0.1 * 5e-4  # a tenth of the gap
+    assert found.current[1] > 2.0  # the bias current
     facts = found._replace(**{k: getattr(found, k)[:2] for k in Stability._fields[:-2]}).findings()
     assert (facts.tested, facts.unstable, facts.reason) == (2, 1, None)
     assert "1 of 2 members tested are held, but NOT stable" in facts.words()
@@ -176,8 +175,7 @@ def test_a_limit_cycle_that_the_linear_loop_does_not_have_is_found_and_explained
     found = stability_of(case.cascade, members(case), case.clock)
     assert found.growth[0] < 0
     assert not found.stable[0]
-    facts = found.findings()
-    assert "The linear and the simulated verdict differ: the linear loop is stable" in facts.words()
+    assert "The linear and the simulated verdict differ: the linear loop is stable" in found.findings().words()
 
 
 def command(words, capsys):
@@ -194,8 +192,7 @@ def test_every_command_says_that_a_rotor_is_held_in_a_limit_cycle(capsys, monkey
         write(dumps(CASE | {"processor": {"delay": d, "predict": False}}), f"{d}.toml") for d in (0.9, 1.25)
     )
     code, found = command(["check", cycles], capsys)
-    assert code == 1
-    assert (found["lost_at_s"], found["holds"]) == (None, False)
+    assert (code, found["lost_at_s"], found["holds"]) == (1, None, False)
     facts = found["stability"]
     assert facts["unstable"] == 1
     assert found["processor"]["delay_margin"]["stable"] is None
@@ -205,8 +202,7 @@ def test_every_command_says_that_a_rotor_is_held_in_a_limit_cycle(capsys, monkey
     # one loop, one limit cycle, in another program
     assert found["stability"]["swing_m"] == pytest.approx(facts["swing_m"], rel=0.05)
     code, found = command(["compare", good, cycles, "--members", "2"], capsys)
-    assert code == 1
-    assert [case["not_stable"] for case in found["cases"]] == [0, 2]
+    assert [code, *(case["not_stable"] for case in found["cases"])] == [1, 0, 2]
     axes = ["--x", "processor.delay=0.9:1.6:3", "--y", "initial.z=1e-5:2e-5:2"]
     code, found = command(["map", cycles, *axes], capsys)
     (one,) = found["cases"]
