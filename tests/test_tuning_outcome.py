@@ -54,7 +54,7 @@ OUTCOMES = {
         lambda: World(limit=lambda s, n, _, f: 40.0 if s == HELD_OUT and (n == 2 or (n == 1 and f)) else math.inf),
         {}, BROKEN, UNVERIFIED, False,
     ),
-    "every one lost": (lambda: losing(*range(6)), {}, BROKEN, BROKEN, False),
+    "every one lost": (lambda: losing(*range(6)), {"risk": "cvar"}, BROKEN, BROKEN, False),
     "no held-out members": (World, {"held_out": 0}, UNJUDGED, UNJUDGED, True),
 }  # fmt: skip
 
@@ -120,8 +120,8 @@ def test_all_outputs_give_the_same_verdict(kind, ran):
     assert table == {
         name: f"**{r['verdict']}**" if r["verdict"] in EMPHASISED else r["verdict"] for name, r in rows.items()
     }
-    # what it is that is wrong
     after, advice = facts["after"], facts["advice"]
+    assert ("risk = 'cvar'" in advice) == ("Rotors are lost: " in advice and "risk" not in tune)
     assert ("Rotors are lost: " in advice) == (survival == BROKEN and after["lost"] > 0)
     assert (f"Not decided: {after['stalled']} held-out members" in advice) == (after["stalled"] > 0)
     assert (f"{after['stalled']} not decided (their integration stalls)" in words) == (after["stalled"] > 0)
