@@ -160,9 +160,9 @@ def stability_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> Stabilit
     persists = (swing > SMALL * clearance) & (swing > (1 - DECAY) * run.swings[:, -2]) & run.returns & ~slow
     sustained = run.lost | persists
     chatters = _may_chatter(cascade) & (growth * duration > GROWN) & (swing <= SMALL * clearance)
-    excused = run.busy & (chatters | _set_valued(cascade))
+    excused = run.busy & ~sustained & (chatters | _set_valued(cascade))
     if excused.any():
-        least = _least_growth(cascade, scenario, clock)
+        least = _least_growth(cascade, scenario, clock, excused)
         other = excused & (least * duration > GROWN)
         growth, chatters = np.where(other, least, growth), chatters & ~other
     stable = ~(sustained | ((growth * duration > BORDER) & ~chatters))
@@ -184,9 +184,9 @@ def _may_chatter(cascade: Cascade) -> bool:
     return cascade.sampled and not all(cascade.timing.implicit and law.has_own_step(True) for law in _signs(cascade))
 
 
-def _least_growth(cascade: Cascade, scenario: Scenario, clock: Clock) -> np.ndarray:
+def _least_growth(cascade: Cascade, scenario: Scenario, clock: Clock, excused: np.ndarray) -> np.ndarray:
     """Return the least growth rate of the linear loop of each member [N] over smoothed signs of the steepnesses SOFTER,
-    1/s; NaN without a linear verdict, or if a sign has no steepness.
+    1/s; NaN without a linear verdict, or if a sign has no steepness. It ends if no `excused` member [N] grows.
     """
     least = np.full(size((cascade, scenario)), np.nan)
     names = {stage: steepnesses(getattr(cascade, stage)) for stage in DEFAULT_LAWS}
@@ -201,7 +201,7 @@ def _least_growth(cascade: Cascade, scenario: Scenario, clock: Clock) -> np.ndar
             for (stage, law), share in zip(usual.items(), shares, strict=True)
         }
         least = np.fmin(least, _growth(dataclasses.replace(cascade, **laws), scenario, clock))
-        if (least * float(clock.duration) <= GROWN).all():
+        if (least * float(clock.duration) <= GROWN)[excused].all():
             break
     return least
 
