@@ -83,7 +83,7 @@ def test_the_larger_rotor_has_the_notches_of_the_case(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("third", [True, False])
-def test_integral_actions_on_three_bearings_of_a_rigid_rotor_drift_apart(third):
+def test_integral_actions_on_three_bearings_of_a_rigid_rotor_drift_apart(third, monkeypatch):
     """The least offset is the static gain of the discrete map, which is nearly singular with three bearings."""
     raw: dict[str, Any] = tomllib.loads(template("machine")) | {"sensitivity": {"speeds": [6000.0]}}
     if third:
@@ -92,6 +92,8 @@ def test_integral_actions_on_three_bearings_of_a_rigid_rotor_drift_apart(third):
     linear = machine_check._linear(case)
     assert (linear.holds, linear.summary["stable"]) == (not third, {"6000": True})
     assert ("sensors: NOT BORNE" in "\n".join(linear.verdict)) == third
+    monkeypatch.setattr(machine_check, "LEAST_OFFSET", np.inf)
+    assert ("drift apart" in machine_check._offset(case, linear.points)[1][0]) == third
     system, c = linear.points[0].system, len(case.axes)
     A, B, C, D = (np.asarray(x) for x in (system.A, system.B, system.C, system.D))
     static = np.abs(C @ np.linalg.solve(np.eye(len(A)) - A, B) + D)[2 * c : 3 * c]

@@ -22,6 +22,7 @@ from ambjax.ensemble import worker
 from ambjax.ensemble.worker import chunk
 from ambjax.host.extensions import NothingToTuneError
 from ambjax.linear import machine_sensitivity
+from ambjax.results import machine_study
 from ambjax.results.case_map import study_and_axes, survival_map
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.spread_runs import study_of
@@ -166,12 +167,6 @@ def test_refused(spread, words):
         case(spread, **lqg)
 
 
-def test_steps_resolve_the_fastest_member():
-    few = case({}, clock={"duration": 2e-3, "sample_period": 1e-3}).clock.method.substeps
-    speeds = {"rotor": {"speed": {"uniform": [0.0, 4e6]}}}
-    assert case(speeds, clock={"duration": 2e-3, "sample_period": 1e-3}).clock.method.substeps > 2 * few
-
-
 AREAS = "\n[spread]\nplant.A = { percent = 10 }\n"
 SHORT = [("duration = 0.2", "duration = 1e-3"), ("settle = 0.05", "settle = 0.0")]
 
@@ -240,7 +235,7 @@ def test_a_cell_of_a_map_is_a_machine(files):
     assert found.unstable.max() == 0
 
 
-def test_axes_of_a_map(files):
+def test_axes_of_a_map(files, monkeypatch):
     path = files("m.toml", end=AREAS)
     study, x, y = study_and_axes(read_any(path), "plant.A=-10%:10%:2", "rotor.speed=0:4e6:2", 2, None)
     # one value for all axes, which replaces the spread; the steps resolve the fastest rotor
@@ -250,6 +245,11 @@ def test_axes_of_a_map(files):
     assert study.clock.method.substeps > study_of(read_any(path), None, 2).clock.method.substeps
     halved = study.at_period(2.5e-5)
     assert halved.clock.samples == 2 * study.clock.samples
+    tested = []  # all speeds, but only that of the cell if they vary
+    monkeypatch.setattr(machine_study, "turning_machines", lambda *x: tested.append(x[2]) or [])
+    for values in ({}, {"rotor.speed": np.array([9e3])}):
+        study.stable(values, np.arange(1))
+    assert tested == [{0.0, 6000.0, 12000.0}, {9000.0}]
     for bad, words in (("plant.m=1:2", "Spread rotor.m"), ("rotor.speed=-1e9:0", "rotor.speed must be")):
         with pytest.raises(ValueError, match=words):
             study_and_axes(read_any(path), bad, "initial.q.0=0:1e-5", 1, None)

@@ -21,9 +21,9 @@ from ambjax.linear import linearise
 from ambjax.linear.linear_machine import linearise_machine
 from ambjax.linear.margins import poles_in_s
 from ambjax.results.case_map import study_and_axes
+from ambjax.results.cell_gains import notch_gains
 from ambjax.results.gains import with_gains
 from ambjax.results.machine_run import simulate_machine
-from ambjax.results.map_notches import notch_gains
 from ambjax.results.runs import simulate
 from ambjax.world.rotation import Rotation
 from ambjax.world.sensor import Measurement

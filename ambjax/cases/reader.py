@@ -3,6 +3,7 @@
 import dataclasses
 import pathlib
 import re
+import tomllib
 from collections.abc import Callable, Hashable, Iterable
 from typing import Any, TypeVar
 
@@ -207,6 +208,12 @@ def case_from(
     zones.check(clock.sample_period if cascade.sampled else None)
     read = tuple(recordings.read)
     return Case(safe_name(name), cascade, scenario, clock, settle, spread, text, assumed, own, matrices, zones, read)
+
+
+def cascade_at(case: Case, period: float) -> Cascade:
+    """Return the cascade that the file of a case on a processor gives at another sample period, s, without a notch."""
+    top, known = Table(tomllib.loads(case.text)), Files(pathlib.Path(), case.own_laws, case.controller_file)
+    return cascade_from(top, _plant(top.table("plant")), processor_from(top.table("processor")), period, known)[0]
 
 
 def _plant(table: Table) -> Bearing:

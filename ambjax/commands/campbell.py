@@ -13,7 +13,7 @@ from ambjax.commands.reading import read_any_with_warnings
 from ambjax.host.heartbeat import say
 from ambjax.linear.linear_machine import turning_machines
 from ambjax.linear.margins import poles_in_s
-from ambjax.linear.rotor_modes import LIGHT, Mode, modes_of, springs_critical
+from ambjax.linear.rotor_modes import LIGHT, OTHERS, Mode, modes_of, springs_critical
 from ambjax.linear.unbalance_response import (
     CriticalSpeed,
     UnbalanceResponse,
@@ -193,7 +193,8 @@ def _pictures(case: MachineCase, analysed: tuple, found: UnbalanceResponse | Non
         return
     speed = way * operating[1]
     point = next(turning_machines(case.machine, case.clock.sample_period, [speed]))
-    bent = [mode for mode in modes_of(point, case.machine.rotor) if mode.name != "axial" and mode.damping < DAMPED]
+    flat = ("axial", *OTHERS)
+    bent = [mode for mode in modes_of(point, case.machine.rotor) if mode.name not in flat and mode.damping < DAMPED]
     light = [mode for mode in bent if mode.damping < LIGHT]
     shown = light or bent
     drawn(part / "rotor.png", lambda: rotor_picture(case.name, drawing_of(case), shown, springs, speed))

@@ -7,7 +7,7 @@ import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, machine_of_axes, parts_of
 from ambjax.cases.rotor_body import DAMPING, MODES
-from ambjax.cases.rotor_tables import axes_and_rotor
+from ambjax.cases.rotor_tables import RIGID, axes_and_rotor
 from ambjax.cases.table import Table
 from ambjax.commands.machine_commands import once_per_revolution, outside_lines, worst_of_speeds
 from ambjax.host.heartbeat import say
@@ -144,10 +144,14 @@ def _offset(case: MachineCase, points: list[MachineSensitivity]) -> tuple[float 
     least, sensor, magnet = min(found, default=(None, "", ""))
     if least is None or least >= LEAST_OFFSET:
         return least, []
+    drift = (
+        " Integral actions of more axes than the rotor has rigid motions drift apart: let only two radial bearings "
+        'integrate, or set coordinates = "rigid-body".'
+    )
+    rigid = np.linalg.matrix_rank(np.asarray(case.machine.rotor.at_magnets)[:, :RIGID])
     return least, [
         f"sensors: NOT BORNE: a constant offset of the sensor of {sensor} of {least:.2g} of its clearance takes the "
-        f"bias current of {magnet} in the end. Integral actions of more axes than the rotor has rigid motions drift "
-        'apart: let only two radial bearings integrate, or set coordinates = "rigid-body".'
+        f"bias current of {magnet} in the end." + drift * bool(case.machine.law is None and c > rigid)
     ]
 
 

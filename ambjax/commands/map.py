@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
             if args.members == 1 and case.spread.entries:
                 say(f"{case.name}: nominal, because one member does not draw the [spread]; --members 2 or more do.")
             with doing(f"{case.name}: simulating the cells; {FIRST_RUN}"):
-                maps.append(computed(study, x, y))
+                maps.append(computed(case, study, x, y))
         summary = {"cases": [_summary(case, one) for case, one in zip(cases, maps, strict=True)], "out": str(out)}
         write_json(part / "map.json", summary)
         drawn(part / "map.png", lambda: _drawn(cases, maps), 150)

@@ -174,7 +174,7 @@ def default_law(
     if set(kind.switching).isdisjoint(given):
         return law
     scaled = scaled_steepness(kind(), model)
-    return dataclasses.replace(law, **{name: getattr(scaled, name) for name in _steepnesses(law)})
+    return dataclasses.replace(law, **{name: getattr(scaled, name) for name in steepnesses(law)})
 
 
 def is_table_1(model: Plant) -> bool:
@@ -195,10 +195,11 @@ def scaled_steepness(law: L, model: Plant) -> L:
     size, usual = law.size(model), law.size(Plant())
     if size is None or usual is None:
         return law
-    return dataclasses.replace(law, **{name: getattr(law, name) * (usual / size) for name in _steepnesses(law)})
+    return dataclasses.replace(law, **{name: getattr(law, name) * (usual / size) for name in steepnesses(law)})
 
 
-def _steepnesses(law: Law) -> list[str]:
+def steepnesses(law: Law) -> list[str]:
+    """Return the names of the steepnesses of the signs of a law."""
     return [field.name for field in dataclasses.fields(law) if field.metadata.get("steepness")]
 
 
@@ -217,7 +218,7 @@ def set_valued_signs(law: Law) -> list[str]:
     Raises ValueError if a steepness is inf for some members only.
     """
     names = []
-    for name in _steepnesses(law):
+    for name in steepnesses(law):
         value = getattr(law, name)
         if is_traced(value) or isinstance(value, GainFunction):
             continue

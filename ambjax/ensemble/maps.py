@@ -180,7 +180,7 @@ def _cells(
     values |= axes
     if design is not None:
         own = {} if y is not None else {PERIOD: np.full(len(member), float(study.clock.sample_period))}
-        values |= design(study, axes | own)
+        values = design(study, axes | own) | values
     metrics = study.metrics(values, member)
     ended, stalled, error = np.isfinite(metrics["lost_at_s"]), metrics["stalled"], metrics["settled_max_abs_error_m"]
     unstable = np.zeros(shape[:2], bool).ravel()

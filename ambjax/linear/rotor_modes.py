@@ -13,6 +13,11 @@ RIGID = 5
 CIRCULAR = 0.05
 # Damping ratio below which a mode counts as lightly damped.
 LIGHT = 0.3
+# Share of the rotor in a mode from which on the mode has the name of a motion. The rotor has about half of its modes if
+# an observer copies its states, and less than a quarter of those of integrals, filters and delays.
+LEAST = 0.3
+# Names of the other modes: of coils, amplifiers and low-passes, and of the laws and the delay of their commands.
+OTHERS = ("actuator", "controller")
 # Size of a pole of the z-plane that is a pure delay, and relative size of an imaginary part that is a rounding error.
 DELAY, REAL = 1e-9, 1e-6
 
@@ -21,8 +26,8 @@ class Mode(NamedTuple):
     """A pole with the motion of the rotor in it.
 
     - `pole`: 1/s, with a positive imaginary part. `name`: the motion with the largest share of the kinetic energy:
-      "translation", "tilt", "axial" or "bending 1" and so on.
-    - `whirl`: "forward" (as the rotor turns), "backward", "planar", or "" for an axial motion.
+      "translation", "tilt", "axial" or "bending 1" and so on; one of OTHERS if the rotor has less than LEAST of it.
+    - `whirl`: "forward" (as the rotor turns), "backward", "planar", or "" for an axial motion and for OTHERS.
     - `shape` [n]: coordinates, complex.
     """
 
@@ -56,21 +61,35 @@ class Mode(NamedTuple):
 
 def modes_of(point: TurningMachine, rotor: Rotor) -> list[Mode]:
     """Return the oscillating modes of a machine in the order of their frequencies."""
-    system = point.system.without_idle().scaled()
-    values, vectors = np.linalg.eig(np.asarray(system.A))
+    system, sampled = point.system.without_idle().scaled(), point.system.period is not None
+    A, n, masses = np.asarray(system.A), len(np.asarray(rotor.gravity)), np.diag(np.asarray(rotor.M))
+    values, vectors = np.linalg.eig(A)
+    lasting = np.abs(values) > DELAY * sampled
+    values, vectors = values[lasting], vectors[:, lasting]
+    moving = ~np.asarray(point.system.idle())
+    shares = _shares(A, vectors, [int(moving[:end].sum()) for end in (2 * n, len(point.free))])
+    # a negative real pole alternates from sample to sample: it is no oscillation of the rotor
+    kept = (np.abs(np.imag(values)) > REAL * np.abs(values)) | (np.real(values) > 0) | (not sampled)
     if system.period is not None:
-        # a negative real pole alternates from sample to sample: it is no oscillation of the rotor
-        size = np.abs(values)
-        kept = (size > DELAY) & ((np.abs(np.imag(values)) > REAL * size) | (np.real(values) > 0))
-        values, vectors = np.log(values[kept] + 0j) / float(system.period), vectors[:, kept]
-    n, masses = len(np.asarray(rotor.gravity)), np.diag(np.asarray(rotor.M))
-    shapes = np.asarray(system.C)[-n:] @ vectors
-    found = [
-        Mode(complex(pole), *_described(shape, masses, int(np.sign(point.W))), shape)
-        for pole, shape in zip(values, shapes.T, strict=True)
-        if pole.imag > REAL * abs(pole)
-    ]
+        values = np.log(values + 0j) / float(system.period)
+    shapes, way, found = (np.asarray(system.C)[-n:] @ vectors).T, int(np.sign(point.W)), []
+    for pole, share, shape in zip(values[kept], shares[kept], shapes[kept], strict=True):
+        if pole.imag > REAL * abs(pole):
+            words = _described(shape, masses, way) if share[0] >= LEAST else (OTHERS[int(np.argmax(share[1:]))], "")
+            found.append(Mode(complex(pole), *words, shape))
     return sorted(found, key=lambda mode: mode.frequency)
+
+
+def _shares(A: np.ndarray, vectors: np.ndarray, ends: list[int]) -> np.ndarray:
+    """Return the shares of groups of states in modes [modes, groups]: sums of participation factors |w_i v_i|.
+
+    `vectors` [N, modes]: right eigenvectors v of A, without those of pure delays, which need not be complete. The rows
+    w of the left ones have w v = 1, and 0 with the other v. `ends`: numbers of the first states of the later groups.
+    """
+    values, left = np.linalg.eig(A.T)
+    left = left[:, np.argsort(-np.abs(values))[: vectors.shape[1]]].T
+    factors = np.abs(np.linalg.lstsq(left @ vectors, left, rcond=None)[0]).T * np.abs(vectors)
+    return np.add.reduceat(factors, [0, *ends], axis=0).T / factors.sum(0)[:, None]
 
 
 def planes_of(shape: np.ndarray) -> np.ndarray:

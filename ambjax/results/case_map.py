@@ -1,6 +1,7 @@
 """`survival_map`: the map of the command `ambjax map` as a Python object."""
 
 import dataclasses
+import functools
 import math
 from typing import Any
 
@@ -19,8 +20,8 @@ from ambjax.host.extensions import extra
 from ambjax.host.one_thread import one_thread
 from ambjax.linear import stability_of
 from ambjax.numerics.declared import numbers, within
+from ambjax.results.cell_gains import gains_of_cells, with_speeds_for
 from ambjax.results.machine_study import MachineStudy
-from ambjax.results.map_notches import notch_gains, with_speeds_for
 from ambjax.results.spread_runs import study_of
 
 COUNT = 21
@@ -89,6 +90,7 @@ def survival_map(case: AnyCase, x: str, y: str, *, members: int = 1, seed: int |
     - `x`, `y`: quantity and range of each axis, in the form of the command's options: "PATH=LOW:HIGH[:COUNT][:log]".
       LOW and HIGH are in SI units, or changes of the value in the case in per cent: -20% is 0.8 times this value.
       COUNT is 21 by default.
+      A default that follows the sample period follows clock.sample_period; other gains are those of the case.
     - `members`: number of members in each cell; 1 is the nominal case, and 2 or more draw the spread of the case.
     - `seed`: of the spread and the noise; None: `run.seed` of the case.
 
@@ -102,12 +104,12 @@ def survival_map(case: AnyCase, x: str, y: str, *, members: int = 1, seed: int |
         if not isinstance(axis, str):
             raise ValueError(f"{name} = {axis!r}: it must be text. Write {FORM}.")
     study, first, second = study_and_axes(case, x, y, members, seed)
-    return CaseMap(case, computed(study, first, second))
+    return CaseMap(case, computed(case, study, first, second))
 
 
-def computed(study: AnyStudy, x: Axis, y: Axis) -> Map:
-    """Return `grid`, with the test of stability, and with notches that are designed for the controller of each cell."""
-    return grid(study, x, y, is_stable, notch_gains)
+def computed(case: AnyCase, study: AnyStudy, x: Axis, y: Axis) -> Map:
+    """Return `grid` of a study of a case, with the test of stability, and with the default gains of each cell."""
+    return grid(study, x, y, is_stable, functools.partial(gains_of_cells, case))
 
 
 def is_stable(study: AnyStudy, values: dict[str, np.ndarray], members: np.ndarray) -> np.ndarray:

@@ -21,7 +21,8 @@ from ambjax.ensemble.maps import PERIOD
 from ambjax.ensemble.paths import Place, kinds, places, with_values
 from ambjax.ensemble.spread import Spread, drawn
 from ambjax.ensemble.study import AnyStudy
-from ambjax.linear import linearise_machine
+from ambjax.linear.linear_machine import turning_machines
+from ambjax.linear.notch_design import speeds_of
 from ambjax.linear.stability import Findings
 from ambjax.numerics.records import canonical
 from ambjax.numerics.shapes import map_varying
@@ -184,19 +185,23 @@ class MachineStudy(AnyStudy):
         return dataclasses.replace(self.case, name=name, machine=machine, cases=tuple(cases))
 
     def findings(self, index: np.ndarray) -> Findings:
-        """Test whether the linear loops of the first MOST_TESTED of these members are stable at their first speed."""
+        """Test whether the linear loops of the first MOST_TESTED of these members are stable."""
         tested = index[:MOST_TESTED]
         return LinearFindings(len(tested), int(np.sum(~self.stable(self.drawn(tested), tested))))
 
     def stable(self, values: dict[str, np.ndarray], members: np.ndarray) -> np.ndarray:
-        """Return whether the linear loops of each system of `varied` are stable [n]; not without an equilibrium."""
+        """Return whether the linear loops of each system of `varied` are stable [n]; not without an equilibrium.
+
+        They are tested at the speeds of the run, and at those of the case unless the speed varies.
+        """
         machine, _ = self.varied(values, members)
-        found = np.zeros(len(members), bool)
+        found, given = np.zeros(len(members), bool), () if any(path in SPEED for path in values) else self.case.speeds
         for k in range(len(members)):
             one = map_varying(lambda x, k=k: x[k], machine)
             with contextlib.suppress(ValueError):
-                speed = float(np.asarray(one.rotor.speed))
-                found[k] = linearise_machine(one, self.clock.sample_period, speed).stable
+                speeds = {*speeds_of(one.rotor.rotation, float(self.clock.duration)), *given}
+                points = turning_machines(one, self.clock.sample_period, speeds)
+                found[k] = all(point.system.without_idle().stable for point in points)
         return found
 
     def fingerprint(self) -> dict[str, object]:

@@ -18,7 +18,6 @@ FALL_SHARE = 0.9
 TRANSIENT_FACTOR = 2.0
 # Clauses on a lost rotor for `cause_words`.
 LOSS = ("the rotor is lost", "the rotor is held")
-IMPLICIT = 'discretisation = "implicit"'
 # Advice for a run in which the integrator stalled.
 STALLED = (
     "Lower the steepness p of the laws ([controller.inversion] p first), "
@@ -81,8 +80,7 @@ def processor_lines(sampled: SampledReport, margin: Delays, unknown: Delays | No
     """
     lines = [
         f"- {law.stage}: the largest |pole| is {number(law.radius)} and must be less than 1, the least damping ratio "
-        f"is {number(law.damping)} and must be at least {LEAST_DAMPING:g}. Lower the gain or p, shorten "
-        f"clock.sample_period, or set {IMPLICIT} and predict = true."
+        f"is {number(law.damping)} and must be at least {LEAST_DAMPING:g}. Remedy: {', or '.join(law.remedies)}."
         for law in sampled.laws
         if not law.holds
     ]
@@ -163,10 +161,10 @@ def _stable(margin: Delays) -> str:
         return ""
     if margin.swing_m is None or margin.current_A is None:
         return f" The loop is stable at all {margin.tested} delays tested up to there."
-    upto = "at none of them from the first on" if margin.stable is None else f"up to {_samples(margin.stable)} samples"
+    upto = "not stable:" if margin.stable is None else f"stable up to {_samples(margin.stable)} samples only: beyond,"
     return (
-        f" The loop is stable {upto} only: beyond, the rotor is held, but its motion does not decay without noise and "
-        f"loads (amplitude up to {margin.swing_m:.3g} m, |i| up to {margin.current_A:.3g} A)."
+        f" The loop is {upto} the rotor is held, but its motion does not decay without noise and loads "
+        f"(amplitude up to {margin.swing_m:.3g} m, |i| up to {margin.current_A:.3g} A)."
     )
 
 

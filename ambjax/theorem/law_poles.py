@@ -18,7 +18,7 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 
 from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
-from ambjax.control.base import Law, set_valued_signs
+from ambjax.control.base import Law, set_valued_signs, steepnesses
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState
 from ambjax.control.sampling import Sampling
@@ -49,13 +49,14 @@ class LawPoles:
 
     `implicit`: whether the law makes an implicit step. `radius`: largest magnitude of a pole; inf for an explicit step
     of a set-valued sign. `damping`: smallest damping ratio of a pole, -Re(s)/|s| for z = exp(s); 1 if no pole
-    oscillates.
+    oscillates. `remedies`: what to change if the law is not stable, and the case does not have yet.
     """
 
     stage: str
     implicit: bool
     radius: float
     damping: float
+    remedies: tuple[str, ...] = ()
 
     @property
     def holds(self) -> bool:
@@ -73,16 +74,25 @@ def law_poles(cascade: Cascade, clock: Clock) -> list[LawPoles]:
         gains = any("steepness" in field.metadata for field in dataclasses.fields(law))
         if not gains or (isinstance(law, PositionLaw) and law.demand == "voltage"):
             continue
-        implicit = law.has_own_step(sampling.implicit)
+        implicit, remedies = law.has_own_step(sampling.implicit), _remedies(stage, law, cascade, sampling)
         if set_valued_signs(law) and not implicit:
-            lines.append(LawPoles(stage, implicit, math.inf, -1.0))
+            lines.append(LawPoles(stage, implicit, math.inf, -1.0, remedies))
             continue
         poles = np.concatenate([_poles(stage, one, cascade.model, sampling) for one in extremes(law)])
         poles = poles[np.abs(poles - 1) > ROUNDING]
         s = np.log(np.where(np.abs(poles) > 1e-300, poles, 1e-300) + 0j)
         damping = float(np.min(-np.real(s) / np.abs(s), initial=1.0))
-        lines.append(LawPoles(stage, implicit, float(np.max(np.abs(poles), initial=0.0)), damping))
+        lines.append(LawPoles(stage, implicit, float(np.max(np.abs(poles), initial=0.0)), damping, remedies))
     return lines
+
+
+def _remedies(stage: str, law: Law, cascade: Cascade, sampling: Sampling) -> tuple[str, ...]:
+    """Return what makes the poles of a law slower or better damped: only what is not set and affects this law."""
+    implicit = not sampling.implicit and law.has_own_step(True)
+    predict = bool(LOOPS[stage][1]) and sampling.late > 0 and not cascade.timing.predicts
+    keys = ['discretisation = "implicit"'] * implicit + ["predict = true"] * predict
+    gains = "lower the gain or p" if steepnesses(law) else "lower the gains"
+    return (gains, "shorten clock.sample_period", *[f"set {' and '.join(keys)}"] * bool(keys))
 
 
 def _poles(stage: str, law: Law, model: Plant, sampling: Sampling) -> np.ndarray:

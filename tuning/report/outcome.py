@@ -185,9 +185,8 @@ def remedies(
             "that are at them."
         )
     if outcome.unstable and facts.stability is not None:
-        words.append(
-            f"{Findings(**facts.stability).words()} Add tune.limits.sensitivity or tune.limits.delay_margin_s."
-        )
+        absent = [f"tune.limits.{name}" for name in ("sensitivity", "delay_margin_s") if name not in outcome.limits]
+        words.append(Findings(**facts.stability).words() + f" Add {' or '.join(absent)}." * bool(absent))
     if outcome.broken:
         keys = ", ".join(f"tune.limits.{name}" for name in outcome.broken)
         words.append(f"Not held: {keys}. Loosen these limits, tune more gains (also each p), or raise tune.screen.")
@@ -220,13 +219,12 @@ def _causes_of_loss(problem: TuningProblem, facts: TuningFacts, x: np.ndarray, m
     effort = problem.engine.terms(x[None], members)["effort"].mean()
     u_max = float(np.asarray(problem.case.scenario.u_max))
     if np.isfinite(u_max) and effort > 0.25:
+        noisy = problem.case.scenario.louder(0.0).sensor != problem.case.scenario.sensor
         words.append(
-            f"The voltage is at {100 * np.sqrt(effort):.0f} % of its limit (rms), a possible cause, not tested: try "
-            f"a supply above {u_max:g} V, less sensor noise, or an observer that attenuates it more."
+            f"The voltage is at {100 * np.sqrt(effort):.0f} % of its limit (rms), a possible cause, not tested: try a "
+            f"supply above {u_max:g} V" + ", less sensor noise, or an observer that attenuates it more" * noisy + "."
         )
     if bound := [row["path"] for row in facts.gains if row["at_bound"]]:
         words.append(f"Gains at a bound, also a possible cause: {', '.join(bound)}; widen tune.bounds.")
-    return [
-        *words,
-        "For a larger margin, raise tune.members or set risk = 'cvar'. For other starting points, raise tune.screen.",
-    ]
+    cvar = "" if problem.tune.risk.alpha else " or set risk = 'cvar'"
+    return [*words, f"For a larger margin, raise tune.members{cvar}. For other starting points, raise tune.screen."]

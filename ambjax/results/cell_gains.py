@@ -1,12 +1,15 @@
-"""The notches of a map: gains at the speeds of its axes, and for the controller of each cell."""
+"""The controllers of the cells of a map: default gains at their sample period, and gains of their notches."""
 
 import dataclasses
 
 import numpy as np
 
+from ambjax.cases.machine_case import AnyCase
 from ambjax.cases.notch_table import with_gains_of_notch
+from ambjax.cases.reader import Case, cascade_at
 from ambjax.ensemble.distributions import Uniform
 from ambjax.ensemble.maps import PERIOD
+from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import Spread, apply
 from ambjax.ensemble.study import AnyStudy, Study
 from ambjax.linear.analysis import linearisation_inputs
@@ -15,6 +18,34 @@ from ambjax.results.machine_study import MachineStudy
 
 # First words of the numbers of a controller, for which its notch is designed. Other numbers are those of its machine.
 GAINS, DESIGNED = ".notch.gains.", (".controller.", ".processor.", f".{PERIOD}")
+
+
+def gains_of_cells(case: AnyCase, study: AnyStudy, axes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the numbers of the controllers of cells, by dotted path, that follow from the axes.
+
+    `axes`: the values [N] of the axes by dotted path.
+    """
+    values = default_gains(case, study, axes) if isinstance(case, Case) else {}  # a machine is read again, and has them
+    return values | notch_gains(study, axes | values)
+
+
+def default_gains(case: Case, study: AnyStudy, axes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the default gains [N] of a case that differ at the sample period of these cells, by dotted path.
+
+    A gain with another value than in the file of the case was set in Python, and stays. Raises ValueError if the file
+    has no default there.
+    """
+    if PERIOD not in axes or not case.text or not case.cascade.sampled:
+        return {}
+    try:
+        usual, new = (
+            {path: place.value for path, place in places(cascade_at(case, period), case.scenario).items()}
+            for period in (float(case.clock.sample_period), float(study.clock.sample_period))
+        )
+    except ValueError as error:
+        raise ValueError(f"{PERIOD}={float(study.clock.sample_period):g}: {error}") from None
+    same = {path for path, place in study.places().items() if path in new and place.value == usual[path] != new[path]}
+    return {path: np.full(len(axes[PERIOD]), new[path]) for path in same - set(axes)}
 
 
 def with_speeds_for(study: Study, axes: dict[str, np.ndarray]) -> Study:

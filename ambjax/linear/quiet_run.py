@@ -1,0 +1,89 @@
+"""Quiet runs: runs without noise and loads at a constant reference, from a displaced start."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ambjax.control.cascade import Cascade
+from ambjax.ensemble.batching import run_ensemble
+from ambjax.ensemble.blocks import QUARTERS, quarters
+from ambjax.simulation.clock import Clock
+from ambjax.world.ramps import Ramp, Trapezoid
+from ambjax.world.rotation import Unbalance, UnbalanceGrade
+from ambjax.world.scenario import Scenario
+from ambjax.world.waveforms import Chirp, Constant, Pulse, Signal, Sine, SmoothStep, Step, Sum, is_random
+
+# Displacement of the start of a quiet run, as a share of the clearance.
+KICK = 0.01
+# Share of the smaller one of the ranges of z in two quarters that both have in common if z oscillates.
+SHARED = 0.5
+# Share of the bias current below which the current in the last quarter of a quiet run is constant.
+CALM = 1e-4
+# Resolution that stands for an ideal converter, bits.
+FINE_BITS = 32
+# The field of a load with which all of its values scale.
+SIZES = {Constant: "value", Unbalance: "unbalance", UnbalanceGrade: "grade"}
+SIZES |= dict.fromkeys((Step, Pulse, Sine, SmoothStep, Chirp, Ramp, Trapezoid), "amplitude")
+
+
+class QuietRun(NamedTuple):
+    """Results of the quiet runs of members.
+
+    - `swings`: half peak-to-peak value of z in each quarter [N, QUARTERS], m; 0 after a loss.
+    - `returns`: whether z returns, in the last quarter, to most of the range of the third one [N]; False for a creep.
+    - `current`: largest |i| in the last quarter in which the rotor is held [N], A.
+    - `busy`: whether the current changes by more than CALM in the last quarter [N]; False after a loss.
+    - `lost`: whether the rotor is lost [N].
+    """
+
+    swings: np.ndarray
+    returns: np.ndarray
+    current: np.ndarray
+    busy: np.ndarray
+    lost: np.ndarray
+
+
+def quiet_run(cascade: Cascade, scenario: Scenario, clock: Clock) -> QuietRun:
+    """Simulate the quiet runs."""
+    run = run_ensemble(cascade, quiet(scenario), clock, fold=quarters(clock), record_every=0)
+    low, high = ({name: x[:, :QUARTERS] for name, x in part.items()} for part in (run.metrics.low, run.metrics.high))
+    swings = np.zeros((len(low["z"]), QUARTERS))
+    swings[:, : low["z"].shape[1]] = np.maximum(high["z"] - low["z"], 0.0) / 2
+    common = np.minimum(high["z"][:, -1], high["z"][:, -2:][:, 0]) - np.maximum(low["z"][:, -1], low["z"][:, -2:][:, 0])
+    returns = common / 2 > SHARED * swings[:, -2:].min(axis=1)
+    most = np.maximum(high["i"], -low["i"])
+    last = np.maximum(np.sum(np.isfinite(most), axis=1) - 1, 0)
+    current = most[np.arange(len(most)), last]
+    current, lost = np.where(np.isfinite(current), current, 0.0), np.isfinite(run.trajectory.lost_at)
+    busy = high["i"][:, -1] - low["i"][:, -1] > CALM * np.asarray(scenario.plant.i_0)
+    return QuietRun(swings, returns, current, busy, lost)
+
+
+def quiet(scenario: Scenario) -> Scenario:
+    """Return the scenario of the quiet run. The start is displaced by KICK of the clearance, towards z = 0.
+
+    Noise, converters and most loads stay in it, without effect, so that its compiled program is that of the scenario.
+    """
+    loads = {slot: _silent(getattr(scenario, slot)) for slot in ("q_z", "q_v", "q_i", "q_f", "base")}
+    fine = {name: FINE_BITS for name in ("bits", "bits_i") if getattr(scenario.sensors, name) is not None}
+    calm = scenario.louder(0.0).with_sensor(outliers=None, dropouts=None, runout=None, **fine)
+    initial, z = scenario.initial, np.asarray(scenario.initial.z, float)
+    z = z + np.where(z > 0, -1.0, 1.0) * KICK * np.asarray(scenario.touchdown)
+    return dataclasses.replace(
+        calm, **loads, reference=Constant(_at_start(scenario.reference)), initial=dataclasses.replace(initial, z=z)
+    )
+
+
+def _silent(load: Signal | None) -> Signal | None:
+    """Return a load of size 0: of the same class if it is one of SIZES or a sum, otherwise a constant."""
+    if isinstance(load, Sum):
+        return Sum(tuple(_silent(term) for term in load.terms))  # pyright: ignore
+    if name := SIZES.get(type(load)):
+        return dataclasses.replace(load, **{name: 0.0 * getattr(load, name)})  # pyright: ignore
+    return None if load is None else Constant()
+
+
+def _at_start(reference: Signal) -> Any:
+    """Return the reference at t = 0, m; 0 for one that is drawn for each member."""
+    return 0.0 if is_random(reference) else np.asarray(reference(0.0))
