@@ -28,7 +28,7 @@ from ambjax.cases.rotor_file import body_of_file
 from ambjax.cases.rotor_loads import base_from, load_from, unbalance_from
 from ambjax.cases.speed_table import speed_of
 from ambjax.cases.table import Table, show
-from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
+from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly, precision
 from ambjax.numerics.records import leaf
 from ambjax.world.rotor import Rotor
 from ambjax.world.shaft import Disc, Section, shaft_model
@@ -187,7 +187,8 @@ def _shaft(table: Table, places: list[float]) -> RotorBody:
     ]
     count = table.leaf("modes", MODES, MODES.default)
     numbers = tuple(range(len(nodes)))
-    model = _shaft_model(sections, discs, nodes, sizes=tuple(sizes), places=numbers, modes=count)
+    with precision("double"):  # the bending modes are small differences of stiffnesses
+        model = _shaft_model(sections, discs, nodes, sizes=tuple(sizes), places=numbers, modes=count)
     shapes = np.asarray(model.shapes)
 
     def at(place: float) -> np.ndarray:
