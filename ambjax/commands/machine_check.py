@@ -107,22 +107,29 @@ def _linear(case: MachineCase) -> _Linear:
         "more_modes_why": untested,
         "sensor_offset_borne": offset,
     }
-    stable = all(point.stable for point in points) and all(rate <= 0 for rate in spilled.values())
+    spills = any(rate > 0 for rate in spilled.values())
     at = f"{worst.worst.name} at {worst.speed:g} rpm"
     peak = f"peak {worst.worst.S.height:.4g} ({at}), zone {worst.worst.zone}"
     more = f"not tested with more bending modes: {untested}"
     if spilled:
-        more = f"with up to {MORE} more bending modes the largest growth rate is {max(spilled.values()):.3g} 1/s"
+        rate = f"{'NOT STABLE: ' if spills else ''}the largest growth rate is {max(spilled.values()):.3g} 1/s"
+        more = f"with up to {MORE} more bending modes {rate}"
+    found = [
+        f"{word} at {', '.join(f'{one.speed:g}' for one in points if one.stable == stable)} rpm"
+        for word, stable in (("NOT STABLE", False), ("stable", True))
+        if stable in [one.stable for one in points]
+    ]
     verdict = [
         f"sensitivity: {peak if worst.stable else f'no peak and no zone: not stable at {worst.speed:g} rpm'}",
-        f"stability: {'stable' if stable else 'NOT STABLE'} at {', '.join(summary['stable'])} rpm; {more}",
+        f"stability: {'; '.join([*found, more])}",
     ]
     verdict += not_borne
     details = [line for point in points if point.stable for line in outside_lines(point, case.zones)]
     details += [line for point in at_speeds for _, own in point for line in own]
     if light := _light(modes):
         details.append(table(("lightly damped mode", "Hz", "damping ratio", "rpm"), light))
-    return _Linear(stable and not not_borne, points, summary, verdict, details)
+    holds = all(point.stable for point in points) and not spills and not not_borne
+    return _Linear(holds, points, summary, verdict, details)
 
 
 def _offset(case: MachineCase, points: list[MachineSensitivity]) -> tuple[float | None, list[str]]:
