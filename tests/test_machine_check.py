@@ -1,5 +1,6 @@
 """`ambjax check` of a machine: its verdict without an equilibrium, and the test with more bending modes."""
 
+import dataclasses
 import tomllib
 from typing import Any
 
@@ -46,7 +47,19 @@ def test_further_modes_are_damped_as_the_last_one_of_a_list():
 def test_the_check_says_why_there_is_no_test_with_more_modes():
     assert machine_check._spill_over(with_rotor(modes=20)) == ({}, "the rotor has 20 already, the largest number")
     rigid = read_machine(tomllib.loads(template("machine")))
-    assert machine_check._spill_over(rigid) == ({}, "only a rotor of the kind shaft has further modes")
+    assert machine_check._spill_over(rigid) == ({}, "only a rotor of the kind shaft or of a file has further modes")
+
+
+def test_a_file_is_asked_for_as_many_more_modes_as_it_has(monkeypatch):
+    asked = []
+
+    def read(top, folder):
+        asked.append(top.raw["rotor"]["modes"])
+        raise ValueError("it has 6")
+
+    monkeypatch.setattr(machine_check, "axes_and_rotor", read)
+    case = dataclasses.replace(with_rotor(), text='rotor = { kind = "modal", file = "a.npz" }')
+    assert (machine_check._spill_over(case), asked) == (({}, "it has 6"), [10, 9, 8, 7])
 
 
 def with_notch():

@@ -1,5 +1,6 @@
 """`check` of a whole machine."""
 
+import pathlib
 import tomllib
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from ambjax.linear.margins import STATIC
 from ambjax.linear.rotor_modes import LIGHT, Mode, modes_of
 from ambjax.results.machine_run import MachineRun, simulate_machine
 from ambjax.results.outputs import plain, table
+from ambjax.world.rotor import Rotor
 
 # Modes that the second analysis adds to those of a shaft. At most MOST lightly damped modes are listed.
 MORE, MOST = 4, 8
@@ -166,15 +168,12 @@ def _spill_over(case: MachineCase) -> tuple[dict[str, float], str]:
     raw = tomllib.loads(case.text) if case.text else {}
     table, known = raw.get("rotor", {}), (len(case.coordinates) - 5) // 2
     more = min(MORE, MODES.metadata["at_most"] - known)
-    if table.get("kind") != "shaft":
-        return {}, "only a rotor of the kind shaft has further modes"
+    if table.get("kind") != "shaft" and "file" not in table:
+        return {}, "only a rotor of the kind shaft or of a file has further modes"
     if not more:
         return {}, f"the rotor has {known} already, the largest number"
-    table["modes"] = known + more
-    if isinstance(given := table.get("damping"), list):  # further modes are damped as the last one
-        table["damping"] = given + given[-1:] * more if given else DAMPING.default
     try:
-        rotor = axes_and_rotor(Table(raw), case.folder)[1]
+        rotor = _with_modes(raw, known, known + more, case.folder)
         machine = machine_of_axes(
             rotor, parts_of(case.cases), case.clock, np.zeros(len(rotor.gravity)), case.machine.law
         )
@@ -186,6 +185,20 @@ def _spill_over(case: MachineCase) -> tuple[dict[str, float], str]:
         rate = float(np.max(np.real(poles_in_s(system))))
         found[f"{speed:g}"] = min(rate, 0.0) if system.stable else rate  # a mode at rest, but for rounding
     return found, ""
+
+
+def _with_modes(raw: dict[str, Any], known: int, count: int, folder: pathlib.Path) -> Rotor:
+    """Return the rotor with `count` modes, or with as many above `known` as it has. Raises ValueError if none."""
+    more, given = count - known, raw["rotor"].get("damping")
+    if isinstance(given, list):  # further modes are damped as the last one
+        given = given + given[-1:] * more if given else DAMPING.default
+    own = raw["rotor"] | {"modes": count} | ({} if given is None else {"damping": given})
+    try:
+        return axes_and_rotor(Table(raw | {"rotor": own}), folder)[1]
+    except ValueError:
+        if more == 1:
+            raise
+    return _with_modes(raw, known, count - 1, folder)
 
 
 def _axis(case: MachineCase, k: int, run: MachineRun, points: list[MachineSensitivity]) -> dict[str, object]:
