@@ -14,7 +14,7 @@ from ambjax.codegen.c99.statements import Statements
 from ambjax.codegen.emitter import traced
 from ambjax.codegen.primitives import OPS
 from ambjax.codegen.program import PRECISIONS, Location, Program
-from ambjax.codegen.trace import precision
+from ambjax.compiler.short_compilation import precision
 
 UNARY = {
     **{name: getattr(jnp, name) for name in ("exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "floor", "ceil")},

@@ -21,6 +21,7 @@ from ambjax.cases.rotor_numbers import varied_rotor
 from ambjax.cases.template_text import template
 from ambjax.commands import machine_commands
 from ambjax.commands.reading import read_any_with_warnings
+from ambjax.compiler.short_compilation import precision
 from ambjax.linear import linearise
 from ambjax.linear.linear_machine import machine_sensitivity
 from ambjax.numerics.records import canonical
@@ -35,7 +36,7 @@ from ambjax.world.shaft import Section, shaft_model
 
 MACHINE = tomllib.loads(template("machine"))
 FLEXIBLE = tomllib.loads(template("machine-flexible"))
-RADIAL, PUSH = MACHINE["bearing"][:2], {"kind": "constant", "value": 1.0}
+RADIAL, PUSH, DRIVE = MACHINE["bearing"][:2], {"kind": "constant", "value": 1.0}, {"mode": "current", "bandwidth": 1e3}
 VERTICAL = MACHINE["rotor"] | {"gravity": [0.0, 0.0, -9.81]}
 
 
@@ -113,8 +114,7 @@ def test_the_page_of_the_motion_shows_the_displacements_of_the_axes(machine, hel
 def test_a_slender_uniform_shaft_has_the_frequencies_of_the_beam():
     """A uniform free beam: k l of the first three modes; Euler-Bernoulli, valid for a slender shaft."""
     length, d, E, rho = 1.0, 2e-3, 2.1e11, 7850.0
-    nodes = np.linspace(0, length, 61)
-    model = shaft_model([Section(0.0, length, d, 0.0, E, rho, 0.3)], [], nodes, [0] * 60, [0], 3)
+    model = shaft_model([Section(0.0, length, d, 0.0, E, rho, 0.3)], [], np.linspace(0, length, 61), [0] * 60, [0], 3)
     area, I = np.pi / 4 * d**2, np.pi / 64 * d**4
     kl = np.array([4.730040745, 7.853204624, 10.99560784])
     # shear and rotary inertia lower the third mode by 4e-5 at this slenderness
@@ -125,31 +125,20 @@ def test_a_slender_uniform_shaft_has_the_frequencies_of_the_beam():
     assert abs(float(model.shapes[0, 0])) == pytest.approx(2 / np.sqrt(float(model.m)), rel=1e-4)  # at the end
 
 
-def test_the_shaft_is_differentiable_in_its_geometry():
-    nodes = np.linspace(0, 1.0, 21)
-
-    def frequency(d):
-        return shaft_model([Section(0.0, 1.0, d, 0.0, 2.1e11, 7850.0, 0.3)], [], nodes, [0] * 20, [0], 1).frequencies[0]
-
-    slope, h = float(jax.grad(frequency)(0.02)), 1e-6
-    difference = float(frequency(0.02 + h) - frequency(0.02 - h)) / (2 * h)
-    assert slope == pytest.approx(difference, rel=1e-6)  # error of a central difference: h^2 and rounding/h
-
-
 MBTR_SHAPES = {"left": [-0.4587, -0.0004, 0.1728, 0.136, -0.2031], "right": [-0.4649, 0.0419, 0.088, -0.1208, -0.0117]}
 
 
 def test_the_rotor_of_the_munich_rig_from_its_geometry():
     """Mass, inertia, free frequencies and shapes: published model of the TUM rig (AMrotor), 4 to 6 digits."""
-    rotor = machine_from(short(changed(FLEXIBLE, rotor=FLEXIBLE["rotor"] | {"modes": 5}))).machine.rotor
+    with precision("float"):  # the precision of a user who does not set float64
+        rotor = machine_from(short(changed(FLEXIBLE, rotor=FLEXIBLE["rotor"] | {"modes": 5}))).machine.rotor
     np.testing.assert_allclose(np.diag(rotor.M)[[0, 3]], [3.273, 0.12542], rtol=1e-4)
     assert rotor.G[3, 4] == pytest.approx(3.643e-3, rel=1e-4)
-    frequencies = np.sqrt(np.diag(rotor.K)[5::2]) / (2 * np.pi)
-    np.testing.assert_allclose(frequencies, [22.38, 105.57, 176.53, 212.87, 607.4], rtol=1e-4)
+    Hz = np.sqrt(np.diag(rotor.K)[5::2]) / (2 * np.pi)
+    np.testing.assert_allclose(Hz, [22.38, 105.57, 176.53, 212.87, 607.4], rtol=1e-4)
     for k, name in ((0, "left"), (2, "right")):
-        ours = np.asarray(rotor.at_magnets)[k, 5::2]
         # the sign of a shape is arbitrary, and the table has four digits
-        np.testing.assert_allclose(np.abs(ours), np.abs(MBTR_SHAPES[name]), atol=2e-4)
+        np.testing.assert_allclose(abs(rotor.at_magnets[k, 5::2]), np.abs(MBTR_SHAPES[name]), atol=2e-4)
 
 
 def test_campbell_lines_of_the_munich_rig_on_springs():
@@ -297,9 +286,8 @@ def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monke
     ("change", "said"),
     [
         ({"rotor": {"kind": "rigid"}}, r"rotor\.m is missing"),
-        ({"rotor": MACHINE["rotor"] | {"I_p": 1.0}}, r"rotor\.I_p = 1: it must be at most 2 I_t"),
-        ({"rotor": MACHINE["rotor"] | {"kind": "elastic"}}, r"rotor\.kind = .*must be one of 'rigid'"),
-        ({"plant": MACHINE["plant"] | {"m": 2.0}}, r"plant\.m = 2\.0: the rotor gives it"),
+        ({"rotor": FLEXIBLE["rotor"] | {"discs": [{"at": 0, "m": 1, "I_t": 1, "I_p": 3}]}}, "I_p = 3: .*at most 2 I_t"),
+        (first(at=0.2409), r"left\.y: rotor\.gravity and these places: of the share of this axis, g = "),
         ({"plant": MACHINE["plant"] | {"mass": 2.0}}, r"plant\.mass = 2\.0: unknown key\. Did you mean 'rotor\.m'"),
         (first(plant={"m": 2.0}), r"^bearing\[0\]\.plant\.m = 2\.0: the rotor gives it"),
         (first(plant={"A": -1.0}), r"left\.x: bearing\[0\]\.plant\.A = -1: it must be"),
@@ -321,13 +309,14 @@ def test_the_templates_are_held_and_in_zone_a_or_b(name, tmp_path, capsys, monke
         ({"load": [{"direction": [1, 0, 0], "kind": "unbalance", "unbalance": 1.0}]}, r"load\[0\].*as \[\[unbalance"),
         ({"plant": MACHINE["plant"] | {"n": 20.0}}, "must carry .* N, and its magnet gives at most"),
         ({"disturbance": {"q_z": {"kind": "constant"}}}, r"\[disturbance\].*Use \[\[load\]\] or \[\[base"),
-        ({"initial": {"q": [0.0, 0.0]}}, r"initial\.q = .*a list of 5 numbers"),
-        ({"sensitivity": {"speeds": []}}, r"sensitivity\.speeds"),
+        ({"initial": {"q": [0.0, 0.0]}}, r"initial\.q has 2 numbers: it must have 5"),
         ({"sensitivity": {"speeds": [0.0, 9e3, 0]}}, r"sensitivity\.speeds = .*: 0 rpm is given more than once"),
         ({"rotor": FLEXIBLE["rotor"] | {"m": 3.0}}, r"rotor\.m = 3\.0: it follows from the geometry"),
         ({"rotor": MACHINE["rotor"] | {"kind": "modal"}}, r"rotor\.modes is missing: give \[\[rotor\.modes"),
         ({"unbalance": [{"amount": 1.0, "grade": 2.5}]}, r"unbalance\[0\]\.grade: give amount, or grade .*not both"),
         ({"controller": {"kind": "pid"}}, r"controller\.kind = .pid.: it is a law of each axis.*position\.kind"),
+        ({"controller": {"kind": "linear", "output": "voltage"}, "actuator": DRIVE}, "output = .voltage.: ampl"),
+        ({"controller": {"kind": "lqg"}, "processor": {"predict": True}}, r"processor\.predict = true"),
         ({"controller": {"position": {"kind": "pdi"}}}, "axis left.x: controller.position.kind"),
     ],
 )

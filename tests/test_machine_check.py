@@ -1,5 +1,6 @@
 """`ambjax check` of a machine: its verdict without an equilibrium, and the test with more bending modes."""
 
+import dataclasses
 import tomllib
 from typing import Any
 
@@ -23,11 +24,7 @@ def with_rotor(**changes):
 @pytest.mark.slow
 def test_a_lost_rotor_without_an_equilibrium_has_a_verdict(tmp_path, capsys):
     """Each sensor is at an end of the shaft, behind a node of the first bending mode."""
-    text = (
-        template("machine-flexible")
-        .replace("duration = 0.4", "duration = 0.05")
-        .replace("settle = 0.2", "settle = 0.0")
-    )
+    text = template("machine-flexible").replace("duration = 0.4", "duration = 0.05").replace("settle = 0.2", "")
     for at, end in (("0.113", "0.0"), ("0.623", "0.702")):
         text = text.replace(f"\nat = {at}", f"\nat = {at}\nsensor_at = {end}", 1)
     (tmp_path / "far.toml").write_text(text)
@@ -50,7 +47,19 @@ def test_further_modes_are_damped_as_the_last_one_of_a_list():
 def test_the_check_says_why_there_is_no_test_with_more_modes():
     assert machine_check._spill_over(with_rotor(modes=20)) == ({}, "the rotor has 20 already, the largest number")
     rigid = read_machine(tomllib.loads(template("machine")))
-    assert machine_check._spill_over(rigid) == ({}, "only a rotor of the kind shaft has further modes")
+    assert machine_check._spill_over(rigid) == ({}, "only a rotor of the kind shaft or of a file has further modes")
+
+
+def test_a_file_is_asked_for_as_many_more_modes_as_it_has(monkeypatch):
+    asked = []
+
+    def read(top, folder):
+        asked.append(top.raw["rotor"]["modes"])
+        raise ValueError("it has 6")
+
+    monkeypatch.setattr(machine_check, "axes_and_rotor", read)
+    case = dataclasses.replace(with_rotor(), text='rotor = { kind = "modal", file = "a.npz" }')
+    assert (machine_check._spill_over(case), asked) == (({}, "it has 6"), [10, 9, 8, 7])
 
 
 def with_notch():
@@ -59,11 +68,15 @@ def with_notch():
 
 
 @pytest.mark.slow
-def test_a_notch_at_rest_grows_by_rounding_errors_only():
+def test_a_notch_at_rest_grows_by_rounding_errors_only(monkeypatch):
     """At 0 rpm, one of the two states of a notch has a pole at 0."""
     found = machine_check._linear(with_notch())
     assert found.summary["growth_with_more_modes_per_s"] == {"0": 0.0}
     assert found.holds
+    monkeypatch.setattr(machine_check, "_spill_over", lambda case: ({"0": 3.0}, ""))
+    found = machine_check._linear(with_notch())
+    assert not found.holds
+    assert "stability: stable at 0 rpm; with up to 4 more bending modes NOT STABLE" in found.verdict[1]
 
 
 @pytest.mark.slow

@@ -102,10 +102,9 @@ def test_an_lqg_holds_the_munich_rig_in_a_run():
     [
         ({"kind": "lqr"}, "controller.kind = .*must be one of"),
         ({"kind": "lqg", "lqg": {"speeds": [10.0, 0.0]}}, "controller.lqg.speeds = .*ascending order"),
-        ({"kind": "lqg", "lqg": {"errors": 1.0}}, "controller.lqg.errors"),
+        ({"kind": "lqg", "lqg": {"modes": 3}}, "controller.lqg.modes = 3: the rotor has 0 bending modes"),
         ({"kind": "linear"}, "controller.file is missing"),
         ({"file": "a.npz"}, 'controller.file is for kind = "linear"'),
-        ({"coordinates": "modal"}, "controller.coordinates = .*must be one of"),
         ({"tilt": {"position": {"k_p": 1.0}}}, r'controller\.tilt is for coordinates = "rigid-body"'),
         ({"coordinates": "rigid-body", "tilt": {"current": {}}}, r"controller\.tilt\.current"),
         ({"coordinates": "rigid-body", "tilt": {"position": {"kind": "pid"}}}, "same kind in all coordinates"),

@@ -54,7 +54,7 @@ def test_a_range_of_speeds_is_a_list_of_them():
     assert listed("-3000:6000:4") == listed([-3000.0, 0.0, 3000.0, 6000.0])
 
 
-@pytest.mark.parametrize("speeds", ["", "0:6000", "6000:0:3", "0:6000:1", "0:6000:2.5", "0:inf:3", "0:1:101", 6000.0])
+@pytest.mark.parametrize("speeds", [[], "", "0:6000", "6:0:3", "0:6000:1", "0:6:2.5", "0:inf:3", "0:1:101", 6000.0])
 def test_a_wrong_range_of_speeds_is_refused(speeds):
     with pytest.raises(ValueError, match=r"sensitivity\.speeds = .*LOW:HIGH:COUNT"):
         listed(speeds)

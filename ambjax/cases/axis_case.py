@@ -78,6 +78,8 @@ def as_written(message: str, raw: dict[str, Any], bearing: Table, axis: BearingA
     """Return a message about the case of an axis with the path that the machine's file `raw` has."""
     name, label = axis.name.rpartition(".")[::2]
     message = NOT_OF_MACHINE.sub("", message.replace("initial.z =", "initial.q: at this axis z =", 1))
+    for key, whole in (("m", "rotor.m and the places of the bearings"), ("g", "rotor.gravity and these places")):
+        message = re.sub(rf"^plant\.{key} =", f"{whole}: of the share of this axis, {key} =", message)
     found = re.match(r"\w+(\.\w+)*", message)
     first, *others = found[0].split(".") if found else [""]
     if (first, *others) == ("run", "clearance") and "clearance" in bearing.raw:

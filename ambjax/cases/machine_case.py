@@ -265,6 +265,9 @@ def _start(table: Table, rotor: Rotor, count: int) -> tuple[np.ndarray, list[flo
     n, given = len(rotor.gravity), table.raw.get("q", [])
     q = np.zeros(n)
     length = n if isinstance(given, list) and len(given) == n else RIGID
+    if isinstance(given, list) and given and len(given) != length:
+        sizes = " or ".join(map(str, sorted({RIGID, n})))
+        raise ValueError(f"{table.at('q')} has {len(given)} numbers: it must have {sizes}, those of all coordinates.")
     q[:length] = vector(table, "q", length, np.zeros(length))
     current = table.raw.get("i", 0.0)
     return q, vector(table, "i", count).tolist() if isinstance(current, list) else [current] * count

@@ -46,6 +46,8 @@ def linear(top: Table, cases: list[Case], folder: pathlib.Path) -> StateSpaceLaw
     table, c = top.table("controller"), len(cases)
     table.only(["kind", "file", "output", "model", "current", "notch"])
     output = table.choice("output", list(OUTPUTS), OUTPUTS[0])
+    if output == OUTPUTS[1] and any(case.scenario.drive == "current" for case in cases):
+        raise ValueError(f'{table.at("output")} = "voltage": amplifiers with actuator.mode = "current" take currents.')
     convert = lambda A, B, C, D, dt=0.0: several((A, B, C, D), dt, c)  # noqa: E731
     matrices, steady, dt = contents_of(table, folder, convert)[2]
     period = float(cases[0].clock.sample_period) if cases[0].cascade.sampled else None
@@ -121,7 +123,9 @@ def lqg_problem(top: Table, cases: Sequence[Case], rotor: Rotor) -> LqgProblem:
     voltage = cases[0].scenario.drive == "voltage"
     given = own.record(LqgWeights, extra=("speeds", "modes"))
     known = (len(rotor.gravity) - RIGID) // 2
-    count = min(own.leaf("modes", MODES) if "modes" in own.raw else known, known)
+    count = own.leaf("modes", MODES, known)
+    if count > known:
+        raise ValueError(f"{own.at('modes')} = {count}: the rotor has {known} bending modes. Give at most as many.")
     coils, w = _coils(cases, voltage), float(numbers(cases, "pole").max())
     sizes = float(numbers(cases, "s_0").min()), float(numbers(cases, "i_0").min())
     force = float(np.max(coils.k_i * numbers(cases, "i_0")))

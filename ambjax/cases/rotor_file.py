@@ -8,7 +8,7 @@ import numpy as np
 from ambjax.cases.controller_file import ENDINGS, arrays_of
 from ambjax.cases.rotor_body import DAMPING, MODES, RotorBody, dampings_of
 from ambjax.cases.table import Table, show
-from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
+from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly, precision
 from ambjax.world.shaft import reduced
 
 MATRICES, TABLE, SHAPES = ("M", "K", "G", "nodes"), ("f_hz", "m", "It", "Ip", "zc"), "phi_"
@@ -101,7 +101,8 @@ def _of_matrices(arrays: dict[str, np.ndarray], table: Table) -> RotorBody:
     modes = table.leaf("modes", MODES, MODES.default)
     if modes > 2 * count - 2:
         raise ValueError(f"{count} nodes have {2 * count - 2} bending modes, and {table.at('modes')} = {modes}.")
-    model = _reduced(own["M"], own["G"], K, nodes, rows=tuple(range(2 * count)), modes=modes)
+    with precision("double"):  # the bending modes are small differences of stiffnesses
+        model = _reduced(own["M"], own["G"], K, nodes, rows=tuple(range(2 * count)), modes=modes)
     if float(model.I_p) < 0:
         raise ValueError("G has the opposite sign: G[tilt about x, tilt about y] must be the polar inertia.")
     shapes, frequencies = np.asarray(model.shapes), np.asarray(model.frequencies)

@@ -16,7 +16,8 @@ from jax.typing import ArrayLike
 
 from ambjax.codegen.points import Points
 from ambjax.codegen.primitives import CALLS, OPS, SAME, Atom, dtype_of, live, split_scan
-from ambjax.codegen.trace import Trace, arguments, precision
+from ambjax.codegen.trace import Trace, arguments
+from ambjax.compiler.short_compilation import precision
 
 
 class Results(NamedTuple):

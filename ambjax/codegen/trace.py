@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections import Counter
-from contextlib import AbstractContextManager
 from typing import Any
 
 import jax.numpy as jnp
@@ -14,15 +13,8 @@ from ambjax.codegen.emitter import traced
 from ambjax.codegen.numbering import UNREAD, Number
 from ambjax.codegen.primitives import COUNTED, OPS
 from ambjax.codegen.program import PERIOD, PRECISIONS, STARTED, Location, Operand, Program, Ref
+from ambjax.compiler.short_compilation import precision
 from ambjax.numerics.records import canonical
-
-
-def precision(name: str) -> AbstractContextManager[object]:
-    """Return a context manager in which JAX computes in single ("float") or double ("double") precision."""
-    import jax.experimental
-
-    home: Any = jax if hasattr(jax, "enable_x64") else jax.experimental
-    return home.enable_x64(name == "double")
 
 
 def arguments(block: Block) -> tuple[Any, Any, Any, Array]:

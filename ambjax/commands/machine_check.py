@@ -1,5 +1,6 @@
 """`check` of a whole machine."""
 
+import pathlib
 import tomllib
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from ambjax.linear.margins import STATIC
 from ambjax.linear.rotor_modes import LIGHT, Mode, modes_of
 from ambjax.results.machine_run import MachineRun, simulate_machine
 from ambjax.results.outputs import plain, table
+from ambjax.world.rotor import Rotor
 
 # Modes that the second analysis adds to those of a shaft. At most MOST lightly damped modes are listed.
 MORE, MOST = 4, 8
@@ -107,22 +109,29 @@ def _linear(case: MachineCase) -> _Linear:
         "more_modes_why": untested,
         "sensor_offset_borne": offset,
     }
-    stable = all(point.stable for point in points) and all(rate <= 0 for rate in spilled.values())
+    spills = any(rate > 0 for rate in spilled.values())
     at = f"{worst.worst.name} at {worst.speed:g} rpm"
     peak = f"peak {worst.worst.S.height:.4g} ({at}), zone {worst.worst.zone}"
     more = f"not tested with more bending modes: {untested}"
     if spilled:
-        more = f"with up to {MORE} more bending modes the largest growth rate is {max(spilled.values()):.3g} 1/s"
+        rate = f"{'NOT STABLE: ' if spills else ''}the largest growth rate is {max(spilled.values()):.3g} 1/s"
+        more = f"with up to {MORE} more bending modes {rate}"
+    found = [
+        f"{word} at {', '.join(f'{one.speed:g}' for one in points if one.stable == stable)} rpm"
+        for word, stable in (("NOT STABLE", False), ("stable", True))
+        if stable in [one.stable for one in points]
+    ]
     verdict = [
         f"sensitivity: {peak if worst.stable else f'no peak and no zone: not stable at {worst.speed:g} rpm'}",
-        f"stability: {'stable' if stable else 'NOT STABLE'} at {', '.join(summary['stable'])} rpm; {more}",
+        f"stability: {'; '.join([*found, more])}",
     ]
     verdict += not_borne
     details = [line for point in points if point.stable for line in outside_lines(point, case.zones)]
     details += [line for point in at_speeds for _, own in point for line in own]
     if light := _light(modes):
         details.append(table(("lightly damped mode", "Hz", "damping ratio", "rpm"), light))
-    return _Linear(stable and not not_borne, points, summary, verdict, details)
+    holds = all(point.stable for point in points) and not spills and not not_borne
+    return _Linear(holds, points, summary, verdict, details)
 
 
 def _offset(case: MachineCase, points: list[MachineSensitivity]) -> tuple[float | None, list[str]]:
@@ -163,15 +172,12 @@ def _spill_over(case: MachineCase) -> tuple[dict[str, float], str]:
     raw = tomllib.loads(case.text) if case.text else {}
     table, known = raw.get("rotor", {}), (len(case.coordinates) - 5) // 2
     more = min(MORE, MODES.metadata["at_most"] - known)
-    if table.get("kind") != "shaft":
-        return {}, "only a rotor of the kind shaft has further modes"
+    if table.get("kind") != "shaft" and "file" not in table:
+        return {}, "only a rotor of the kind shaft or of a file has further modes"
     if not more:
         return {}, f"the rotor has {known} already, the largest number"
-    table["modes"] = known + more
-    if isinstance(given := table.get("damping"), list):  # further modes are damped as the last one
-        table["damping"] = given + given[-1:] * more if given else DAMPING.default
     try:
-        rotor = axes_and_rotor(Table(raw), case.folder)[1]
+        rotor = _with_modes(raw, known, known + more, case.folder)
         machine = machine_of_axes(
             rotor, parts_of(case.cases), case.clock, np.zeros(len(rotor.gravity)), case.machine.law
         )
@@ -183,6 +189,20 @@ def _spill_over(case: MachineCase) -> tuple[dict[str, float], str]:
         rate = float(np.max(np.real(poles_in_s(system))))
         found[f"{speed:g}"] = min(rate, 0.0) if system.stable else rate  # a mode at rest, but for rounding
     return found, ""
+
+
+def _with_modes(raw: dict[str, Any], known: int, count: int, folder: pathlib.Path) -> Rotor:
+    """Return the rotor with `count` modes, or with as many above `known` as it has. Raises ValueError if none."""
+    more, given = count - known, raw["rotor"].get("damping")
+    if isinstance(given, list):  # further modes are damped as the last one
+        given = given + given[-1:] * more if given else DAMPING.default
+    own = raw["rotor"] | {"modes": count} | ({} if given is None else {"damping": given})
+    try:
+        return axes_and_rotor(Table(raw | {"rotor": own}), folder)[1]
+    except ValueError:
+        if more == 1:
+            raise
+    return _with_modes(raw, known, count - 1, folder)
 
 
 def _axis(case: MachineCase, k: int, run: MachineRun, points: list[MachineSensitivity]) -> dict[str, object]:

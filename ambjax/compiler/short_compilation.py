@@ -1,8 +1,9 @@
-"""Faster compilation, for functions that the fast path does not support or that run only a few times."""
+"""Faster compilation, for functions that run only a few times or that the fast path refuses; precision of JAX."""
 
 import functools
 from collections.abc import Callable, Mapping
-from typing import TypeVar
+from contextlib import AbstractContextManager
+from typing import Any, TypeVar
 
 import jax
 from jax.core import Tracer
@@ -36,6 +37,14 @@ def compiled_quickly(
         return (function if traced else compiled())(*args, **static)
 
     return call
+
+
+def precision(name: str) -> AbstractContextManager[object]:
+    """Return a context manager in which JAX computes in single ("float") or double ("double") precision."""
+    import jax.experimental
+
+    home: Any = jax if hasattr(jax, "enable_x64") else jax.experimental
+    return home.enable_x64(name == "double")
 
 
 def supported(options: Mapping[str, bool | int]) -> dict[str, bool | int]:

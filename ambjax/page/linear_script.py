@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.cases.reader import Case
-from ambjax.codegen.trace import precision
+from ambjax.compiler.short_compilation import precision
 from ambjax.control.cascade_state import CascadeState, Sample
 from ambjax.linear.equilibrium import at_rest, ideal, sizes_of, start_of
 from ambjax.linear.matrices import LagState, with_lags

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.cases.reader import Case
-from ambjax.codegen.trace import precision
+from ambjax.compiler.short_compilation import precision
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import Scalar, canonical, replaced
 from ambjax.page.functions import function_source, loop_source, operands_of, piece_of

@@ -11,7 +11,8 @@ from jax import Array
 from ambjax.codegen.block import Block
 from ambjax.codegen.of_case import block_of
 from ambjax.codegen.series import series
-from ambjax.codegen.trace import arguments, precision
+from ambjax.codegen.trace import arguments
+from ambjax.compiler.short_compilation import precision
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import replaced
 from ambjax.simulation.clock import Clock
