@@ -93,12 +93,14 @@ def test_a_quiet_run_has_no_load_and_the_compiled_program_of_its_case():
         "q_z": amb.signals.Sum((amb.signals.Sine(2.0, 30.0, 1.0), amb.signals.Ramp(3.0, 0.0, 0.1))),
         "q_v": amb.signals.Pulse(1.0, 0.0, 0.1),
         "q_f": amb.signals.Unbalance(120.0, 1.0),
+        "reference": amb.signals.Constant(np.array([1e-5, 2e-5])),  # of two members
     }
     case = case_of(sensor={"std": 1e-6, "bits": 12})
     scenario = dataclasses.replace(case.scenario, rotor=turning, **loads)
     calm = module.quiet(scenario)
     assert jax.tree.structure(calm) == jax.tree.structure(scenario)
     assert not np.any(calm.sensor.noises)
+    np.testing.assert_array_equal(calm.reference.value, loads["reference"].value)
     for t in (0.0, 0.05, 0.3):
         assert scenario.turning().acceleration(t) != 0
         assert calm.turning().acceleration(t) == 0

@@ -17,6 +17,7 @@ does not count, nor does the motion of a stable linear loop whose own decay is t
 import dataclasses
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import jax
 import numpy as np
 
 from ambjax.control.base import set_valued_signs
@@ -24,6 +25,7 @@ from ambjax.control.cascade import DEFAULT_LAWS, Cascade
 from ambjax.ensemble.batching import run_ensemble, size
 from ambjax.ensemble.blocks import QUARTERS, quarters
 from ambjax.linear.analysis import linearise_members
+from ambjax.numerics.shapes import varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.triple import takes_case
 from ambjax.world.ramps import Ramp, Trapezoid
@@ -282,5 +284,10 @@ def _silent(load: Signal | None) -> Signal | None:
 
 
 def _at_start(reference: Signal) -> Any:
-    """Return the reference at t = 0, m; 0 for one that is drawn for each member."""
-    return 0.0 if is_random(reference) else np.asarray(reference(0.0))
+    """Return the reference of each member at t = 0, m; 0 for one that is drawn for each member."""
+    if is_random(reference):
+        return 0.0
+    varies = varying(reference)
+    axes = jax.tree.unflatten(jax.tree.structure(reference), [0 if own else None for own in varies])
+    at_start = lambda one: one(0.0)  # noqa: E731
+    return np.asarray((jax.vmap(at_start, (axes,)) if any(varies) else at_start)(reference))
