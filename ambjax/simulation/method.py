@@ -19,7 +19,7 @@ from ambjax.world.scenario import Scenario
 
 # Product of step and slope at which RK4 is accurate to about 1e-9 m on smooth gains (benchmarks/work_precision.py).
 ACCURATE = 1.0
-# On a processor: product of step and plant pole at which the error of RK4 is below 1e-11 m. The motion under a held
+# On a processor: product of step and plant slope at which the error of RK4 is below 1e-11 m. The motion under a held
 # voltage is not stiff.
 SAMPLED = 0.02
 # The coils may be stiff. SETTLED: product of step and R/L at which the error of RK4 is below 1e-11 m and 1e-6 A in a
