@@ -17,7 +17,7 @@ class Clock:
         doc="sample period; each measurement error is held for this time",
     )
     method: Integrator | None = part(default=None, doc="the integrator; None: `ambjax.solvers.with_method` chooses it")
-    # Largest number of edges of disturbances inside one sample of a processor, from `with_method`; None: of all edges.
+    # Largest number of edges inside one sample, from `with_method`. None: of all edges on a processor, otherwise 0.
     cuts: int | None = derived()
 
     @property
