@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ambjax import Cascade, Clock, Initial, Processor, Scenario, rollout
+from ambjax import Cascade, Clock, Initial, Processor, Scenario, rollout, signals
 from ambjax.cases.reader import case_from
 from ambjax.codegen.controller import controller_of
 from ambjax.control import current, inversion, observer, position
@@ -14,6 +14,7 @@ from ambjax.linear import injected, linearise, loop_matrices
 from ambjax.plants import Plant
 from ambjax.simulation.integrate import FixedSteps
 from ambjax.simulation.sliding import Slide, slides
+from ambjax.simulation.system import system_of
 from ambjax.solvers import AdaptiveCashKarp, AdaptiveRodas3, with_method
 from ambjax.world.amplifier import CurrentAmplifier
 from ambjax.world.coils import TwoCoil
@@ -152,12 +153,14 @@ def test_a_law_and_an_amplifier_with_different_commands_are_refused_in_one_line(
         read(actuator, controller={"current": laws} if laws else {})
 
 
-def test_adaptive_steps_are_refused_in_continuous_time():
-    assert isinstance(with_method(Clock(10, PERIOD), cascade(), world()).method, FixedSteps)
-    with pytest.raises(ValueError, match=r"controls the current requires fixed steps.*dt = 'auto'"):
-        rollout(cascade(), world(), Clock(10, PERIOD, AdaptiveRodas3()))
-    with pytest.raises(ValueError, match="requires fixed steps in continuous"):
-        rollout(cascade(), world(), Clock(10, PERIOD, AdaptiveCashKarp()))
+def test_in_continuous_time_steps_have_a_fixed_number_and_end_at_jumps():
+    load = world(q_z=signals.Step(1.0, PERIOD / 2))
+    clock = with_method(Clock(10, PERIOD), cascade(), load)
+    assert isinstance(clock.method, FixedSteps)
+    assert system_of(cascade(), load, clock).problem(None).edges.most == 1
+    for method in (AdaptiveRodas3(), AdaptiveCashKarp()):
+        with pytest.raises(ValueError, match=r"controls the current requires fixed steps.*dt = 'auto'"):
+            rollout(cascade(), load, Clock(10, PERIOD, method))
 
 
 @pytest.mark.parametrize(

@@ -254,6 +254,8 @@ def test_the_chosen_step_resolves_coils_that_settle_within_a_sample(kind):
 
     error = np.abs(np.subtract(moved(method.substeps), moved(20 * method.substeps)))
     np.testing.assert_array_less(error, [1e-11, 1e-6, 1e-6])
+    sprung = dataclasses.replace(world, plant=kind(**LIGHT | {"k_z": -2e6}))  # 4e6 N/m: 6325 1/s
+    assert amb.solvers.choose_method(sampled, sprung, period).step_size(period) * 6325 < 0.02
     stiff = dataclasses.replace(world, plant=dataclasses.replace(plant, R=1e4))
     assert isinstance(amb.solvers.choose_method(sampled, stiff, period), amb.solvers.AdaptiveRodas3)
     assert amb.solvers.choose_method(sampled, stiff, period, reverse=True) == amb.solvers.Rodas3(64)

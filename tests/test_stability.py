@@ -86,18 +86,18 @@ def test_noise_and_unbalance_do_not_make_a_loop_unstable():
 
 
 def test_a_quiet_run_has_no_load_and_the_compiled_program_of_its_case():
-    """A compiled program depends on the structure of its inputs, not on their values."""
-    turning = amb.signals.Rotation(3000.0)
     loads = {
         "q_z": amb.signals.Sum((amb.signals.Sine(2.0, 30.0, 1.0), amb.signals.Ramp(3.0, 0.0, 0.1))),
         "q_v": amb.signals.Pulse(1.0, 0.0, 0.1),
         "q_f": amb.signals.Unbalance(120.0, 1.0),
+        "reference": amb.signals.Constant(np.array([1e-5, 2e-5])),  # of two members
     }
-    case = case_of(sensor={"std": 1e-6, "bits": 12})
-    scenario = dataclasses.replace(case.scenario, rotor=turning, **loads)
+    noisy = case_of(sensor={"std": 1e-6, "bits": 12}).scenario
+    scenario = dataclasses.replace(noisy, rotor=amb.signals.Rotation(3000.0), **loads)
     calm = quiet_run.quiet(scenario)
     assert jax.tree.structure(calm) == jax.tree.structure(scenario)
     assert not np.any(calm.sensor.noises)
+    np.testing.assert_array_equal(calm.reference.value, loads["reference"].value)
     for t in (0.0, 0.05, 0.3):
         assert scenario.turning().acceleration(t) != 0
         assert calm.turning().acceleration(t) == 0

@@ -45,7 +45,7 @@ FREQUENCIES = {"frequency": 1.0, "frequency_end": 1.0, "f_high": 1.0, "speed": 1
 def implausible(case: Case) -> list[str]:
     """Return a warning, in one line, for each implausible number of a case and each implausible relation of two."""
     machine = [*_ranges(case), *_forces(case), *_flux(case), *_limits(case), *_rates(case), *_converter(case)]
-    return [*machine, *_delay(case), *_runout(case), *_aliases(case), *_orders(case), *_loads(case)]
+    return [*machine, *_delay(case), *_runout(case), *_aliases(case), *_orders(case), *_loads(case), *_faults(case)]
 
 
 def unresolved(axes: Iterable[Case]) -> list[str]:
@@ -174,6 +174,19 @@ def _loads(case: Case) -> Iterator[str]:
             if grade and not GRADES[0] <= grade <= GRADES[1]:
                 low, high = GRADES
                 yield f"{path}: grade = {grade:g} mm/s: ISO 21940-11 has G {low:g} to G {high:g}. Is it in m/s?"
+
+
+def _faults(case: Case) -> Iterator[str]:
+    """Yield a warning for each kind of fault of the position sensor that never occurs."""
+    duration = float(case.clock.duration)
+    for name in ("outliers", "dropouts"):
+        fault, path = getattr(case.scenario.sensors, name), f"sensor.{name}"
+        if fault is None or fault.rate or any(one.startswith(f"{path}.") for one in case.spread.paths):
+            continue
+        if fault.at is None:
+            yield f"{path}: no fault occurs, because its rate is 0. Give rate, 1/s, or at, s."
+        elif float(fault.at) > duration - float(case.clock.sample_period) / 2:
+            yield f"{path}: at = {float(fault.at):g} s, but the run ends at clock.duration = {duration:g} s."
 
 
 def _half(case: Case) -> float:

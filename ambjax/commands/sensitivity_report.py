@@ -125,7 +125,7 @@ def injection_text(
     how = f"Injected{at} into the simulation (multi-sine of {measured.amplitude:.3g} {unit}"
     how += f", {measured.members} members)" if measured.members > 1 else ")"
     if measured.peak is None:
-        return f"{how}: the rotor is lost, so no sensitivity can be measured."
+        return f"{how}: the rotor is lost, so no sensitivity can be measured. Use a smaller sensitivity.amplitude."
     text = f"{how}: |S| peaks at {measured.peak:.4g} at {measured.peak_frequency:.4g} Hz"
     if zones is not None:
         zone = zones.zone(measured.peak)

@@ -102,9 +102,11 @@ def _drivers(
 
 
 def _notes(n: int, metrics: Mapping[str, np.ndarray], confidence: float) -> list[str]:
-    """Return notes on intervals that may be wrong with n survivors: of the CVaR, and of the std of heavy tails."""
+    """Return notes on statistics that may mislead: of equal members, of the CVaR, and of the std of heavy tails."""
     if not n:
         return ["no member survives: there are no statistics of the metrics"]
+    if n > 1 and all(np.all(x == x[0]) for x in metrics.values()):
+        return ["all survivors have the same metrics, for lack of noise and [spread]: the intervals have no meaning"]
     notes, level, tail = [], f"{100 * confidence:g} %", (1 - ALPHA) * n
     if tail < TAIL:
         least = math.ceil(TAIL / (1 - ALPHA) - 1e-9)

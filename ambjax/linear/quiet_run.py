@@ -3,11 +3,13 @@
 import dataclasses
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.blocks import QUARTERS, quarters
+from ambjax.numerics.shapes import varying
 from ambjax.simulation.clock import Clock
 from ambjax.world.ramps import Ramp, Trapezoid
 from ambjax.world.rotation import Unbalance, UnbalanceGrade
@@ -85,5 +87,10 @@ def _silent(load: Signal | None) -> Signal | None:
 
 
 def _at_start(reference: Signal) -> Any:
-    """Return the reference at t = 0, m; 0 for one that is drawn for each member."""
-    return 0.0 if is_random(reference) else np.asarray(reference(0.0))
+    """Return the reference of each member at t = 0, m; 0 for one that is drawn for each member."""
+    if is_random(reference):
+        return 0.0
+    varies = varying(reference)
+    axes = jax.tree.unflatten(jax.tree.structure(reference), [0 if own else None for own in varies])
+    at_start = lambda one: one(0.0)  # noqa: E731
+    return np.asarray((jax.vmap(at_start, (axes,)) if any(varies) else at_start)(reference))

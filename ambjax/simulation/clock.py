@@ -13,7 +13,7 @@ class Clock:
         default=1e-4, unit="s", at_least=1e-9, at_most=1e6, doc="sample period; each measurement error is held for it"
     )
     method: Integrator | None = part(default=None, doc="the integrator; None: `ambjax.solvers.with_method` chooses it")
-    # Largest number of edges of disturbances inside one sample of a processor, from `with_method`; None: of all edges.
+    # Largest number of edges inside one sample, from `with_method`. None: of all edges on a processor, otherwise 0.
     cuts: int | None = derived()
 
     @property

@@ -1,6 +1,6 @@
 """Edges: instants at which the rates of a problem, or a derivative of them, jump. Steps end at edges.
 
-In continuous time, only adaptive steps end at edges. Steps of a fixed number may contain a jump there.
+In continuous time, steps of a fixed number may contain a jump, unless an amplifier controls the current.
 
 A method has its nominal order only on steps in which the rates are smooth. A jump inside a step causes an error of
 first order in the step length for every method, and a kink one of second order.

@@ -12,7 +12,7 @@ from jax import Array
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
 from ambjax.control.stages import ForceDemand
-from ambjax.numerics.records import Scalar, part, record
+from ambjax.numerics.records import Scalar, part, record, static
 from ambjax.numerics.smooth import larger, limited
 from ambjax.simulation.edges import Edges
 from ambjax.simulation.integrate import InitialValueProblem, WholeState
@@ -100,6 +100,7 @@ class ClosedLoop(WholeState):
         default=None, doc="the three normal numbers of the sensors' noise in a sample; None: drawn from the key"
     )
     wave: AddedSignal | None = part(default=None, doc="test signal; None: none")
+    cuts: int = static(default=0, doc="largest number of edges in a sample at which a fixed number of steps ends")
 
     def realised(self) -> Self:
         """Return the loop of one member, with its random signals drawn and the random key of its sensors."""
@@ -236,7 +237,7 @@ class ClosedLoop(WholeState):
         rates = lambda inputs, x: self.rates(inputs, x, errors)  # noqa: E731
         observed = lambda inputs, x: self.observed(inputs, x, errors)  # noqa: E731
         jumps = sum(map(jnp.abs, self.scenario.sensors.noises)) > 0
-        edges = Edges(self.scenario.edges(reference=True), 0, self.scenario.knots(reference=True))
+        edges = Edges(self.scenario.edges(reference=True), self.cuts, self.scenario.knots(reference=True))
         return InitialValueProblem(
             self.inputs,
             rates,

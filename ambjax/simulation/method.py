@@ -19,7 +19,7 @@ from ambjax.world.scenario import Scenario
 
 # Product of step and slope at which RK4 is accurate to about 1e-9 m on smooth gains (benchmarks/work_precision.py).
 ACCURATE = 1.0
-# On a processor: product of step and plant pole at which the error of RK4 is below 1e-11 m. The motion under a held
+# On a processor: product of step and plant slope at which the error of RK4 is below 1e-11 m. The motion under a held
 # voltage is not stiff.
 SAMPLED = 0.02
 # The coils may be stiff. SETTLED: product of step and R/L at which the error of RK4 is below 1e-11 m and 1e-6 A in a
@@ -159,9 +159,9 @@ def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: 
 
     A clock without a method gets the result of `choose_method`, or adaptive RODAS3 where jit or vmap hides the values
     from which that chooses; otherwise the method is checked against its stability limit, unless the sample period or a
-    slope is traced. For a cascade on a processor, the function also computes `cuts`, the largest number of edges of
-    disturbances inside one sample. A larger `cuts` of the clock is kept, so that a part of an ensemble runs the
-    compiled program of the whole.
+    slope is traced. For a cascade on a processor, and where fixed steps are required, the function also computes
+    `cuts`, the largest number of edges inside one sample. A larger `cuts` of the clock is kept, so that a part of an
+    ensemble runs the compiled program of the whole.
 
     Raises ValueError for an explicit step above the stability limit; the message names step, limit and fix. Raises
     ValueError also for adaptive steps if an amplifier controls the current in continuous time, and UnknownSlopeError if
@@ -189,7 +189,8 @@ def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: 
         )
     elif clock.method.limit is not None:
         _check_limit(clock, clock.method.limit, cascade, scenario)
-    if not cascade.sampled or (cuts := most_inside(scenario, clock.sample_period)) is None:
+    fixed = _fixed_only(cascade, scenario)
+    if not (cascade.sampled or fixed) or (cuts := most_inside(scenario, clock.sample_period, fixed)) is None:
         return clock
     return replaced(clock, cuts=max(cuts, clock.cuts or 0))
 

@@ -141,7 +141,9 @@ def started(cascade: Cascade, scenario: Scenario) -> Scenario:
 
 def system_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> ClosedLoop | Sampled:
     """Return the closed loop of the cascade, in continuous time or on its processor."""
-    return sampled_of(cascade, scenario, clock) if cascade.sampled else ClosedLoop(cascade, scenario)
+    if cascade.sampled:
+        return sampled_of(cascade, scenario, clock)
+    return ClosedLoop(cascade, scenario, cuts=clock.cuts or 0)
 
 
 def sampled_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> Sampled:

@@ -96,8 +96,11 @@ class Bearing(Generic[S]):
         raise NotImplementedError
 
     def slope(self) -> Scalar:
-        """Return the fastest rate of the plant's motion, 1/s. The step size is chosen from it."""
-        return self.pole
+        """Return the fastest rate of the plant's motion, 1/s, on its magnets or its passive bearings.
+
+        The step size is chosen from it.
+        """
+        return jnp.maximum(self.pole, safe_sqrt(2 * abs(self.k_z) / self.m))
 
     def flux_slope(self) -> Scalar:
         """Return the rate at which the flux follows the current, 1/s; 0 if there is no lag."""
