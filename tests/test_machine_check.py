@@ -1,6 +1,7 @@
 """`ambjax check` of a machine: its verdict without an equilibrium, and the test with more bending modes."""
 
 import dataclasses
+import math
 import tomllib
 from typing import Any
 
@@ -13,6 +14,7 @@ from ambjax.cases.machine_case import read_machine
 from ambjax.cases.template_text import template
 from ambjax.commands import machine_check
 from ambjax.commands.machine_check import LEAST_OFFSET
+from ambjax.commands.sensitivity_report import signs_note
 
 FLEXIBLE = tomllib.loads(template("machine-flexible")) | {"sensitivity": {"speeds": [0.0]}}
 
@@ -48,6 +50,14 @@ def test_the_check_says_why_there_is_no_test_with_more_modes():
     assert machine_check._spill_over(with_rotor(modes=20)) == ({}, "the rotor has 20 already, the largest number")
     rigid = read_machine(tomllib.loads(template("machine")))
     assert machine_check._spill_over(rigid) == ({}, "only a rotor of the kind shaft or of a file has further modes")
+
+
+def test_the_check_names_set_valued_signs_whose_band_the_linear_machine_assumes():
+    raw = tomllib.loads(template("machine"))
+    hard = raw | {"controller": raw["controller"] | {"position": {"kind": "super-twisting", "p": math.inf}}}
+    notes = [signs_note(read_machine(one).cases) for one in (raw, hard)]
+    assert not notes[0]
+    assert notes[1][0].startswith("controller.position: the signs are set-valued")
 
 
 def test_a_file_is_asked_for_as_many_more_modes_as_it_has(monkeypatch):

@@ -11,6 +11,7 @@ from ambjax.cases.rotor_body import DAMPING, MODES
 from ambjax.cases.rotor_tables import RIGID, axes_and_rotor
 from ambjax.cases.table import Table
 from ambjax.commands.machine_commands import once_per_revolution, outside_lines, worst_of_speeds
+from ambjax.commands.sensitivity_report import signs_note
 from ambjax.host.heartbeat import say
 from ambjax.linear import MachineSensitivity, poles_in_s
 from ambjax.linear.linear_machine import sensitivity_of, turning_machines
@@ -125,7 +126,7 @@ def _linear(case: MachineCase) -> _Linear:
         f"sensitivity: {peak if worst.stable else f'no peak and no zone: not stable at {worst.speed:g} rpm'}",
         f"stability: {'; '.join([*found, more])}",
     ]
-    verdict += not_borne
+    verdict += [*signs_note(case.cases), *not_borne]
     details = [line for point in points if point.stable for line in outside_lines(point, case.zones)]
     details += [line for point in at_speeds for _, own in point for line in own]
     if light := _light(modes):

@@ -9,7 +9,7 @@ from tqdm import tqdm
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.rotor_drawing import radial_axes
 from ambjax.commands.band_text import band_lines, running_facts
-from ambjax.commands.sensitivity_report import injected_numbers, injection_text
+from ambjax.commands.sensitivity_report import injected_numbers, injection_text, signs_note
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.linear import Injection, Zones, machine_injected
 from ambjax.linear.linear_machine import MachineSensitivity
@@ -100,7 +100,7 @@ def sensitivity(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summa
         drawn(path, lambda: machine_sensitivity_picture(points, limits, case.name, measured))
         names = [name for name in ANALYSED if (part / name).exists()]
     if not args.json:
-        print(sensitivity_text(points, measured, case.zones))
+        print("\n".join([sensitivity_text(points, measured, case.zones), *signs_note(case.cases)]))
         written(out, ", ".join(names))
     return int(not all(point.stable for point in points)), plain(summary | {"out": str(out)})
 

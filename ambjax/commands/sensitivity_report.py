@@ -1,6 +1,6 @@
 """The summary of `ambjax sensitivity` as plain data, and as text."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -29,6 +29,16 @@ def set_valued(case: Case) -> list[str]:
     if not case.cascade.sampled:
         return []
     return [f"controller.{stage}" for stage in DEFAULT_LAWS if set_valued_signs(getattr(case.cascade, stage))]
+
+
+def signs_note(cases: Sequence[Case]) -> list[str]:
+    """Return the line on the set-valued signs of a case, or of the axes of a machine; none without such signs."""
+    if not (signs := sorted({name for case in cases for name in set_valued(case)})):
+        return []
+    return [
+        f"{', '.join(signs)}: the signs are set-valued. The linear analysis applies while the signal of each law "
+        "stays inside its band, that is, without chattering."
+    ]
 
 
 def sensitivity_summary(
@@ -182,11 +192,7 @@ def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None
         if spread.failed:
             rows += [f"{spread.failed} of them have no equilibrium at r = 0 m, and so no linearised loop."]
         rows += [] if spread.measured is None else [_measured_text(spread.measured, case.zones)]
-    if signs := set_valued(case):
-        rows += [
-            f"{', '.join(signs)}: the signs are set-valued. The linear analysis applies while the signal of each law "
-            "stays inside its band, that is, without chattering."
-        ]
+    rows += signs_note([case])
     if one.S_velocity is not None and one.stable:
         larger = "velocity" if one.S_velocity.height > one.S.height else "position"
         rows += [
