@@ -13,6 +13,7 @@ from ambjax.compiler.short_compilation import QUICKEST, supported
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.processor import Processor
 from ambjax.linear import StateSpace, Zones, analyse, linearise, loop_quantities, margins_of, noise_gain, peak
+from ambjax.linear.equilibrium import newton_of
 from ambjax.linear.matrices import rest
 from ambjax.plants import Plant
 from ambjax.sensors import Sensor
@@ -138,6 +139,14 @@ def test_the_noise_gain_agrees_with_a_long_run():
         z.append(c @ x)
         x = A @ x + b * one
     assert np.std(z) == pytest.approx(noise_gain(system, T), rel=0.03)
+
+
+@pytest.mark.parametrize(("steepness", "slope"), [(1e2, 1e-4), (1e4, 1e-2), (1e6, 1e-2)])
+def test_the_search_of_an_equilibrium_ends_from_far_outside_the_band_of_a_sign(steepness, slope):
+    """Damped steps alone end at a residual of 0.99 and above: without the homotopy, the sign hides the root near 1."""
+    found = newton_of(lambda y: jnp.tanh(steepness * (y - 1)) + slope * y, jnp.zeros(1))
+    assert float(found.y[0]) == pytest.approx(1.0, abs=2 * slope)
+    assert float(found.error) < 1e-9  # the rounding of y near 1, times the steepness
 
 
 def test_a_missing_equilibrium_is_reported_in_one_line():
