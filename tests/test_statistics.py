@@ -125,7 +125,7 @@ def test_the_interval_is_infinite_if_the_resamples_do_not_determine_it():
     for moments in bootstrap([np.array([1.0, 2.0, 4.0])]).values():
         assert np.all(moments.low <= moments.value)
         assert moments.high[0] == np.inf  # one resample in nine is one value thrice
-    (note,) = summary(columns(201), [], seed=0)["notes"]  # two of whom do not survive
+    (note,) = summary(columns(201), [], seed=0)["notes"]  # two members do not survive
     assert note.split(": ")[0] + note[-27:] == "the worst 5 % are 9.95 survivors use at least 200 survivors"
     assert summary(columns(202), [], seed=0)["notes"] == []
     (note,) = summary({name: np.repeat(x[5:6], 9) for name, x in columns(202).items()}, [], seed=0)["notes"]

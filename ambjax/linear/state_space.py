@@ -200,8 +200,7 @@ def _solved(A: Any, z: Any, B: Any) -> Any:
     return solve(z[:, None, None] * np.eye(len(A)) - A, jnp.broadcast_to(B + 0j, (*z.shape, *B.shape)))
 
 
-# From this number of states times points on, a factorisation of A for all points takes less time than one for each:
-# 0.43 ms in place of 3.1 ms for 11 states, 750 points and 3 inputs.
+# From this number of states times points on, a factorisation of A for all points takes less time than one for each.
 MANY = 500
 
 
