@@ -35,6 +35,8 @@ from ambjax.world.scenario import Scenario
 
 _matrices = compiled_quickly(loop_matrices, options=QUICKEST)
 _rest = compiled_quickly(rest, options=QUICKEST)
+# Members that one call linearises: ensembles of all sizes share one compiled program.
+CALL = 64
 
 
 @record
@@ -206,8 +208,9 @@ def linearise_members(
     Returns the matrices, each with a leading axis [N], and whether an equilibrium was found for each member [N]; if
     not, the matrices of the member have no meaning. `checked` examines one member. Raises ValueError as `rollout` does.
     """
+    inputs = canonical((*linearisation_inputs(cascade, scenario, clock), r))
     # one call at a time: XLA runs LAPACK on its own threads, and two calls may deadlock
-    return map_members(_member, canonical((*linearisation_inputs(cascade, scenario, clock), r)), threads=1, plain=True)
+    return map_members(_member, inputs, threads=1, call=CALL, plain=True)
 
 
 def _member(tree: Any) -> tuple[StateSpace, Any]:

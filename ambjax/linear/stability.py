@@ -29,6 +29,7 @@ from ambjax.ensemble.batching import size
 from ambjax.ensemble.blocks import QUARTERS
 from ambjax.linear.analysis import linearise_members
 from ambjax.linear.quiet_run import KICK, quiet_run
+from ambjax.numerics.shapes import map_varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
@@ -162,8 +163,9 @@ def stability_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> Stabilit
     chatters = _may_chatter(cascade) & (growth * duration > GROWN) & (swing <= SMALL * clearance)
     excused = run.busy & ~sustained & (chatters | _set_valued(cascade))
     if excused.any():
-        least = _least_growth(cascade, scenario, clock, excused)
-        other = excused & (least * duration > GROWN)
+        least = np.full_like(growth, np.nan)
+        least[excused] = _least_growth(*map_varying(lambda x: x[excused], (cascade, scenario)), clock)
+        other = least * duration > GROWN
         growth, chatters = np.where(other, least, growth), chatters & ~other
     stable = ~(sustained | ((growth * duration > BORDER) & ~chatters))
     bias = float(np.max(np.asarray(scenario.plant.i_0)))
@@ -184,9 +186,9 @@ def _may_chatter(cascade: Cascade) -> bool:
     return cascade.sampled and not all(cascade.timing.implicit and law.has_own_step(True) for law in _signs(cascade))
 
 
-def _least_growth(cascade: Cascade, scenario: Scenario, clock: Clock, excused: np.ndarray) -> np.ndarray:
+def _least_growth(cascade: Cascade, scenario: Scenario, clock: Clock) -> np.ndarray:
     """Return the least growth rate of the linear loop of each member [N] over smoothed signs of the steepnesses SOFTER,
-    1/s; NaN without a linear verdict, or if a sign has no steepness. It ends if no `excused` member [N] grows.
+    1/s; NaN without a linear verdict, or if a sign has no steepness. The search for a member ends if it does not grow.
     """
     least = np.full(size((cascade, scenario)), np.nan)
     names = {stage: steepnesses(getattr(cascade, stage)) for stage in DEFAULT_LAWS}
@@ -200,9 +202,11 @@ def _least_growth(cascade: Cascade, scenario: Scenario, clock: Clock, excused: n
             stage: dataclasses.replace(law, **{name: share * most[stage] * getattr(law, name) for name in names[stage]})
             for (stage, law), share in zip(usual.items(), shares, strict=True)
         }
-        least = np.fmin(least, _growth(dataclasses.replace(cascade, **laws), scenario, clock))
-        if (least * float(clock.duration) <= GROWN)[excused].all():
+        grows = ~(least * float(clock.duration) <= GROWN)
+        if not grows.any():
             break
+        softer = map_varying(lambda x, grows=grows: x[grows], (dataclasses.replace(cascade, **laws), scenario))
+        least[grows] = np.fmin(least[grows], _growth(*softer, clock))
     return least
 
 
