@@ -31,6 +31,7 @@ if not THOROUGH:
     os.environ.setdefault("XLA_FLAGS", quick.flags())
 
 os.environ.setdefault("JAX_ENABLE_X64", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the commands
 # The position in the source of every operation would be collected in each lowering.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
