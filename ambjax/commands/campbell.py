@@ -212,7 +212,9 @@ def unbalance_text(
     way, (low, high) = direction(case), operating  # 0: no margin to a rotor at rest
     rows = [
         (
-            f"{way * one.speed:.0f}", case.axes[one.axis], f"{1e6 * one.peak_to_peak:.3g}", f"{one.amplification:.3g}",
+            f"{way * one.speed:.0f}", case.axes[one.axis],
+            *((f"{1e6 * one.peak_to_peak:.3g}", f"{one.amplification:.3g}") if np.isfinite(one.amplification)
+              else ("-", "undamped")),
             *(("none" if one.required is None else f"{one.required:.3g}", f"{one.present:.3g}",
                "yes" if one.separated else "NO") if high else "---"),
         )
