@@ -26,7 +26,8 @@ import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, machine_from
 from ambjax.cases.template_text import template
-from ambjax.results.machine_study import MachineStudy, run_machines
+from ambjax.ensemble.machines import run_machines
+from ambjax.results.machine_study import MachineStudy
 from ambjax.simulation.folds import Peak
 from ambjax.simulation.whole_machine import PerAxis
 

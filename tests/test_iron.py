@@ -14,8 +14,10 @@ from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.plants import Plant
 from ambjax.solvers import RK4
+from ambjax.world.amplifier import Amplifier
 from ambjax.world.coils import TwoCoil
 from ambjax.world.iron import Iron
+from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
 
 # At the bias current, the flux density of the cores is 0.65 T.
@@ -126,6 +128,8 @@ def test_the_largest_force_is_that_at_the_bias_or_the_limit():
     plant = Plant(**RIG)
     assert float(plant.largest_force()) == pytest.approx(float(plant.k_i) * 2.5, rel=1e-12)
     assert float(plant.largest_force(1.0)) == pytest.approx(float(plant.k_i) * 1.0, rel=1e-12)
+    limits = {"u_max": 0.8 * plant.R, "amplifier": Amplifier(dead_band=0.1 * plant.R)}  # 0.7 A at rest
+    assert float(Scenario(plant, **limits).largest_force) == pytest.approx(float(plant.k_i) * 0.7, rel=1e-12)
     saturated = dataclasses.replace(plant, iron=Iron(saturation=LIMIT))
     b = 1.2566e-6 * 208 * 5.0 / (2 * 5e-4)
     share = 0.98 * (1 + (b / LIMIT) ** 4) ** -0.25 + 0.02

@@ -14,7 +14,11 @@ from ambjax.cases.machine_case import read_machine
 from ambjax.cases.template_text import template
 from ambjax.commands import machine_check
 from ambjax.commands.machine_check import LEAST_OFFSET
+from ambjax.commands.machine_commands import sensitivity_summary, sensitivity_text
 from ambjax.commands.sensitivity_report import signs_note
+from ambjax.linear import StateSpace, Zones
+from ambjax.linear.linear_machine import TurningMachine, sensitivity_of
+from ambjax.linear.machine_stability import machine_stability
 
 FLEXIBLE = tomllib.loads(template("machine-flexible")) | {"sensitivity": {"speeds": [0.0]}}
 
@@ -39,7 +43,7 @@ def test_a_lost_rotor_without_an_equilibrium_has_a_verdict(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_further_modes_are_damped_as_the_last_one_of_a_list():
-    found, why = machine_check._spill_over(with_rotor(modes=2, damping=[0.003, 0.003]))
+    found, why, _ = machine_check._spill_over(with_rotor(modes=2, damping=[0.003, 0.003]))
     assert found
     assert not why
     assert found == machine_check._spill_over(with_rotor(modes=2, damping=0.003))[0]
@@ -47,17 +51,51 @@ def test_further_modes_are_damped_as_the_last_one_of_a_list():
 
 
 def test_the_check_says_why_there_is_no_test_with_more_modes():
-    assert machine_check._spill_over(with_rotor(modes=20)) == ({}, "the rotor has 20 already, the largest number")
+    assert machine_check._spill_over(with_rotor(modes=20)) == (
+        {},
+        "the rotor has 20 already, the largest number",
+        False,
+    )
     rigid = read_machine(tomllib.loads(template("machine")))
-    assert machine_check._spill_over(rigid) == ({}, "only a rotor of the kind shaft or of a file has further modes")
+    assert machine_check._spill_over(rigid)[1] == "only a rotor of the kind shaft or of a file has further modes"
 
 
-def test_the_check_names_set_valued_signs_whose_band_the_linear_machine_assumes():
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "growth", "held"),
+    [
+        ("integral-sliding-mode", -125.0, False),
+        pytest.param("super-twisting", 2519.0, True, marks=pytest.mark.thorough),
+    ],
+)
+def test_a_run_decides_on_the_stability_of_a_machine_with_set_valued_signs(kind, growth, held):
+    """The verdict of the linear machine inside the bands of the signs is wrong in both cases."""
     raw = tomllib.loads(template("machine"))
-    hard = raw | {"controller": raw["controller"] | {"position": {"kind": "super-twisting", "p": math.inf}}}
-    notes = [signs_note(read_machine(one).cases) for one in (raw, hard)]
-    assert not notes[0]
-    assert notes[1][0].startswith("controller.position: the signs are set-valued")
+    laws, clock = raw["controller"] | {"position": {"kind": kind, "p": math.inf}}, raw["clock"] | {"duration": 0.1}
+    hard = read_machine(raw | {"controller": laws, "clock": clock, "bearing": raw["bearing"][:2]})
+    assert signs_note(hard.cases)
+    found = machine_stability(hard.machine, hard.clock, [(0, 6000.0)], np.array([growth]))
+    assert found.stable.tolist() == [held]
+    assert (found.swing[0] < 1e-8) == held
+    smooth = read_machine(raw)
+    assert not signs_note(smooth.cases)
+    assert machine_stability(smooth.machine, smooth.clock, [(0, 6000.0)], np.array([growth])) is None
+
+
+@pytest.mark.parametrize(
+    ("pole", "run", "linear", "zone"),
+    [(0.5, None, True, "A"), (1.5, None, False, "D"), (1.5, True, False, None), (0.5, False, False, "D")],
+)
+def test_a_machine_has_peaks_if_the_linear_machine_and_its_runs_are_stable(pole, run, linear, zone):
+    one = np.eye(1)
+    system = StateSpace(pole * one, one, 0.1 * np.ones((3, 1)), np.eye(3)[:, :1], np.ones(1), np.array(1e-3))
+    found = sensitivity_of(TurningMachine(system, one, 0.0), ("x",), 0.0, Zones(), run, None if run else 1e-5)
+    assert (found.stable, found.linear, found.axes[0].zone) == (linear if run is None else run, linear, zone)
+    assert np.isfinite(found.worst.S.height) == linear
+    text = sensitivity_text([found], {}, Zones())
+    assert ("there are no peaks" in text) == (not linear)
+    assert ("a motion of 1e-05 m does not decay" in text) == (not found.stable)
+    assert sensitivity_summary([found], {})["zone"] == zone
 
 
 def test_a_file_is_asked_for_as_many_more_modes_as_it_has(monkeypatch):
@@ -69,7 +107,7 @@ def test_a_file_is_asked_for_as_many_more_modes_as_it_has(monkeypatch):
 
     monkeypatch.setattr(machine_check, "axes_and_rotor", read)
     case = dataclasses.replace(with_rotor(), text='rotor = { kind = "modal", file = "a.npz" }')
-    assert (machine_check._spill_over(case), asked) == (({}, "it has 6"), [10, 9, 8, 7])
+    assert (machine_check._spill_over(case), asked) == (({}, "it has 6", False), [10, 9, 8, 7])
 
 
 def with_notch():
@@ -83,7 +121,7 @@ def test_a_notch_at_rest_grows_by_rounding_errors_only(monkeypatch):
     found = machine_check._linear(with_notch())
     assert found.summary["growth_with_more_modes_per_s"] == {"0": 0.0}
     assert found.holds
-    monkeypatch.setattr(machine_check, "_spill_over", lambda case: ({"0": 3.0}, ""))
+    monkeypatch.setattr(machine_check, "_spill_over", lambda case: ({"0": 3.0}, "", True))
     found = machine_check._linear(with_notch())
     assert not found.holds
     assert "stability: stable at 0 rpm; with up to 4 more bending modes NOT STABLE" in found.verdict[1]

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import tomllib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -130,15 +131,20 @@ def test_the_unbalance_response_is_that_of_the_simulation_at_constant_speed():
         np.testing.assert_allclose(simulated, ours[-1, :4], rtol=0.01)
 
 
-@pytest.mark.parametrize("damping", [0.01, 0.05])
+@pytest.mark.parametrize("damping", [0.01, 0.05, 1e-14])
 def test_the_amplification_factor_of_one_mode_is_that_of_its_damping(damping):
-    speeds = 3000 * np.unique(np.concatenate([np.linspace(0, 2, 121), 1 + 4 * damping * np.linspace(-1, 1, 33)]))
+    near = 1 + max(4 * damping, 1e-3) * np.linspace(-1, 1, 33)
+    speeds = 3000 * np.unique(np.concatenate([np.linspace(0, 2, 121), near]))
     r = speeds / 3000
     response = (1e-6 * r**2 / (1 - r**2 + 2j * damping * r))[:, None]
-    (one,) = critical_speeds(UnbalanceResponse(speeds, response, response, response, response), (6000.0, 8000.0))
+    found = UnbalanceResponse(speeds, response, response, response, response)
+    (one,) = critical_speeds(found, (6000.0, 8000.0))
     assert one.speed == pytest.approx(3000, rel=3 * damping**2)
-    assert one.amplification == pytest.approx(1 / (2 * damping), rel=0.02)
-    assert one.peak_to_peak == pytest.approx(1e-6 / damping, rel=0.02)
+    undamped = damping < 1e-9  # within rounding errors
+    assert one.amplification == (np.inf if undamped else pytest.approx(1 / (2 * damping), rel=0.02))
+    assert one.peak_to_peak == (np.inf if undamped else pytest.approx(1e-6 / damping, rel=0.02))
+    case = SimpleNamespace(axes=("x",), speeds=(6000.0,))
+    assert ("undamped" in campbell.unbalance_text(case, found, [one], (6000.0, 6000.0))) == undamped
     assert one.present == pytest.approx(50, abs=1)
 
 

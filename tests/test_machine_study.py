@@ -4,8 +4,10 @@ import argparse
 import copy
 import dataclasses
 import json
+import math
 import pickle
 import tomllib
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -21,7 +23,7 @@ from ambjax.commands import comparison_tuning
 from ambjax.ensemble import worker
 from ambjax.ensemble.worker import chunk
 from ambjax.host.extensions import NothingToTuneError
-from ambjax.linear import machine_sensitivity
+from ambjax.linear import Stability, machine_sensitivity
 from ambjax.results import machine_study
 from ambjax.results.case_map import study_and_axes, survival_map
 from ambjax.results.machine_run import simulate_machine
@@ -250,6 +252,17 @@ def test_axes_of_a_map(files, monkeypatch):
     for values in ({}, {"rotor.speed": np.array([9e3])}):
         study.stable(values, np.arange(1))
     assert tested == [{0.0, 6000.0, 12000.0}, {9000.0}]
+    runs = Stability(
+        *np.array([[True, False, True], [math.nan] * 3, [0, 1, 0], [1.0, 3.0, 2.0], [2.0] * 3, [0] * 3]), 1.0, 2.0
+    )
+    monkeypatch.setattr(machine_study, "growth_of", lambda system: -1.0)
+    monkeypatch.setattr(machine_study, "turning_machines", lambda *x: [SimpleNamespace(system=None)] * 3)
+    for found, words in (
+        (None, "The linearised loops of all 1"),
+        (runs._replace(stable=runs.stable > 0), "amplitude 3 m"),
+    ):
+        monkeypatch.setattr(machine_study, "machine_stability", lambda *_, found=found: found)
+        assert words in study.findings(np.arange(1)).words()
     for bad, words in (("plant.m=1:2", "Spread rotor.m"), ("rotor.speed=-1e9:0", "rotor.speed must be")):
         with pytest.raises(ValueError, match=words):
             study_and_axes(read_any(path), bad, "initial.q.0=0:1e-5", 1, None)

@@ -102,7 +102,7 @@ def check_axis(case: Case, axis: BearingAxis, force: float, q: np.ndarray) -> No
     if abs(force) > most:
         raise ValueError(
             f"axis {axis.name}: it must carry {abs(force):.4g} N, and its magnet gives at most {most:.4g} N at the "
-            "centre. Increase plant.n, plant.A or plant.i_0, or reduce plant.s_0."
+            "centre. Increase plant.n, plant.A, plant.i_0 or the limits of [actuator], or reduce plant.s_0."
         )
     if abs(z := float(axis.magnet @ q)) >= gap:
         raise ValueError(

@@ -22,8 +22,7 @@ class Forces(NamedTuple):
 def forces(case: Case) -> Forces:
     """Return the forces of a case, for the plant without [spread].
 
-    The largest force is that at z = 0 for i = i_0, where one magnet is off. If the amplifier or the limit of a coil
-    limits |i| to less, it is the force at this limit. The load is the sum of the bounds of all signals that disturb z.
+    The largest force is `Scenario.largest_force`. The load is the sum of the bounds of all signals that disturb z.
     """
     scenario, plant = case.scenario.turning(), case.scenario.plant
     m, largest = float(plant.m), float(scenario.largest_force)

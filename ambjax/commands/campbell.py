@@ -12,6 +12,7 @@ from ambjax.cases.rotor_drawing import drawing_of, radial_axes
 from ambjax.commands.reading import read_any_with_warnings
 from ambjax.host.heartbeat import say
 from ambjax.linear.linear_machine import turning_machines
+from ambjax.linear.machine_stability import growth_of, machine_stability
 from ambjax.linear.margins import poles_in_s
 from ambjax.linear.rotor_modes import LIGHT, OTHERS, Mode, modes_of, springs_critical
 from ambjax.linear.unbalance_response import (
@@ -62,7 +63,9 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     poles = [poles_in_s(system) for system in systems]
     modes = [modes_of(point, case.machine.rotor) for point in points]
     growth = np.array([float(np.max(np.real(own))) for own in poles])
-    wrong = np.array([not system.stable for system in systems])
+    rates, at = np.array([growth_of(system) for system in systems]), [(0, float(speed)) for speed in speeds]
+    runs = machine_stability(case.machine, case.clock, at, rates)
+    wrong = rates > 0 if runs is None else ~runs.stable
     unstable = [float(speed) for speed in speeds[wrong]]
     operating = operating_range(case)
     turned = case.machine.rotor.unbalances and radial_axes(case)
@@ -209,7 +212,9 @@ def unbalance_text(
     way, (low, high) = direction(case), operating  # 0: no margin to a rotor at rest
     rows = [
         (
-            f"{way * one.speed:.0f}", case.axes[one.axis], f"{1e6 * one.peak_to_peak:.3g}", f"{one.amplification:.3g}",
+            f"{way * one.speed:.0f}", case.axes[one.axis],
+            *((f"{1e6 * one.peak_to_peak:.3g}", f"{one.amplification:.3g}") if np.isfinite(one.amplification)
+              else ("-", "undamped")),
             *(("none" if one.required is None else f"{one.required:.3g}", f"{one.present:.3g}",
                "yes" if one.separated else "NO") if high else "---"),
         )

@@ -63,6 +63,8 @@ def loop_of_machine(points: Sequence[MachineSensitivity]) -> ComparedLoop:
     """Return the loops of a machine: the largest peaks and the smallest margins of its axes at its speeds."""
     if not all(point.stable for point in points):
         return no_loop(False)
+    if not all(point.linear for point in points):  # stable, but without peaks
+        return ComparedLoop({**no_loop(None).numbers, "stable": True})
     rows = [(axis, point) for point in points for axis in point.axes]
     worst, at = max(rows, key=lambda row: row[0].S.height)
     margins = [axis.margins for axis, _ in rows if axis.margins is not None]

@@ -13,11 +13,13 @@ from ambjax.cases.table import Table
 from ambjax.commands.machine_commands import once_per_revolution, outside_lines, worst_of_speeds
 from ambjax.commands.sensitivity_report import signs_note
 from ambjax.host.heartbeat import say
-from ambjax.linear import MachineSensitivity, poles_in_s
-from ambjax.linear.linear_machine import sensitivity_of, turning_machines
+from ambjax.linear import MachineSensitivity
+from ambjax.linear.linear_machine import turning_machines
+from ambjax.linear.machine_stability import growth_of, machine_stability
 from ambjax.linear.margins import STATIC
 from ambjax.linear.rotor_modes import LIGHT, Mode, modes_of
 from ambjax.results.machine_run import MachineRun, simulate_machine
+from ambjax.results.operating import points_of
 from ambjax.results.outputs import plain, table
 from ambjax.world.rotor import Rotor
 
@@ -89,10 +91,9 @@ def _linear(case: MachineCase) -> _Linear:
     except ValueError as error:
         nothing = dict.fromkeys(("stable", "zone", "peak", "axis", "speed_rpm"))
         return _Linear(False, [], nothing | {"why": str(error)}, [f"sensitivity: no zone and no margins: {error}"], [])
-    both = list(zip(turning, case.speeds, strict=True))
-    points = [sensitivity_of(point, case.axes, speed, case.zones) for point, speed in both]
-    modes = {speed: modes_of(point, case.machine.rotor) for point, speed in both}
-    spilled, untested = _spill_over(case)
+    points = points_of(case, turning)
+    modes = {one.speed: modes_of(point, case.machine.rotor) for point, one in zip(turning, points, strict=True)}
+    spilled, untested, spills = _spill_over(case)
     worst = worst_of_speeds(points)
     at_speeds = [once_per_revolution(point) for point in points]
     offset, not_borne = _offset(case, points)
@@ -100,7 +101,7 @@ def _linear(case: MachineCase) -> _Linear:
         "stable": {f"{point.speed:g}": point.stable for point in points},
         "zone": worst.worst.zone,
         "peak": worst.worst.S.height,
-        "axis": worst.worst.name if worst.stable else None,
+        "axis": worst.worst.name if worst.linear else None,
         "speed_rpm": worst.speed,
         "running_speed": {
             axis: [fact for point in at_speeds for fact in point[k][0]] for k, axis in enumerate(case.axes)
@@ -110,7 +111,6 @@ def _linear(case: MachineCase) -> _Linear:
         "more_modes_why": untested,
         "sensor_offset_borne": offset,
     }
-    spills = any(rate > 0 for rate in spilled.values())
     at = f"{worst.worst.name} at {worst.speed:g} rpm"
     peak = f"peak {worst.worst.S.height:.4g} ({at}), zone {worst.worst.zone}"
     more = f"not tested with more bending modes: {untested}"
@@ -122,14 +122,15 @@ def _linear(case: MachineCase) -> _Linear:
         for word, stable in (("NOT STABLE", False), ("stable", True))
         if stable in [one.stable for one in points]
     ]
+    why = "the linear machine is not" if worst.stable else "not"
     verdict = [
-        f"sensitivity: {peak if worst.stable else f'no peak and no zone: not stable at {worst.speed:g} rpm'}",
-        f"stability: {'; '.join([*found, more])}",
+        f"sensitivity: {peak if worst.linear else f'no peak and no zone: {why} stable at {worst.speed:g} rpm'}",
+        f"stability: {'; '.join([*found, more])}{max(points, key=lambda one: one.swing or 0.0).swings}",
     ]
     verdict += [*signs_note(case.cases), *not_borne]
-    details = [line for point in points if point.stable for line in outside_lines(point, case.zones)]
+    details = [line for point in points if point.linear for line in outside_lines(point, case.zones)]
     details += [line for point in at_speeds for _, own in point for line in own]
-    if light := _light(modes):
+    if light := _light({one.speed: modes[one.speed] for one in points if one.linear or not one.stable}):
         details.append(table(("lightly damped mode", "Hz", "damping ratio", "rpm"), light))
     holds = all(point.stable for point in points) and not spills and not not_borne
     return _Linear(holds, points, summary, verdict, details)
@@ -146,7 +147,7 @@ def _offset(case: MachineCase, points: list[MachineSensitivity]) -> tuple[float 
         for values in zip(*((one.scenario.touchdown, one.scenario.plant.i_0) for one in case.cases), strict=True)
     )
     c, found = len(stops), []
-    for system in (point.system for point in points if point.stable):
+    for system in (point.system for point in points if point.linear):
         H = np.asarray(system.response(np.array([STATIC * float(case.zones.f_low)])))[0, 2 * c : 3 * c]
         currents = np.abs(H) * stops / biases[:, None]
         i, k = np.unravel_index(np.argmax(currents), currents.shape)
@@ -165,18 +166,18 @@ def _offset(case: MachineCase, points: list[MachineSensitivity]) -> tuple[float 
     ]
 
 
-def _spill_over(case: MachineCase) -> tuple[dict[str, float], str]:
+def _spill_over(case: MachineCase) -> tuple[dict[str, float], str, bool]:
     """Return the largest real part of a pole (1/s) by speed, with MORE modes under the same controller.
 
-    If it is empty, also why.
+    Also return why there are none, and whether this machine is not stable at a speed.
     """
     raw = tomllib.loads(case.text) if case.text else {}
     table, known = raw.get("rotor", {}), (len(case.coordinates) - 5) // 2
     more = min(MORE, MODES.metadata["at_most"] - known)
     if table.get("kind") != "shaft" and "file" not in table:
-        return {}, "only a rotor of the kind shaft or of a file has further modes"
+        return {}, "only a rotor of the kind shaft or of a file has further modes", False
     if not more:
-        return {}, f"the rotor has {known} already, the largest number"
+        return {}, f"the rotor has {known} already, the largest number", False
     try:
         rotor = _with_modes(raw, known, known + more, case.folder)
         machine = machine_of_axes(
@@ -184,12 +185,11 @@ def _spill_over(case: MachineCase) -> tuple[dict[str, float], str]:
         )
         points = list(turning_machines(machine, case.clock.sample_period, case.speeds))
     except ValueError as error:
-        return {}, str(error)
-    found = {}
-    for speed, system in zip(case.speeds, (point.system.without_idle() for point in points), strict=True):
-        rate = float(np.max(np.real(poles_in_s(system))))
-        found[f"{speed:g}"] = min(rate, 0.0) if system.stable else rate  # a mode at rest, but for rounding
-    return found, ""
+        return {}, str(error), False
+    growth = np.array([growth_of(point.system) for point in points])
+    found = machine_stability(machine, case.clock, [(0, speed) for speed in case.speeds], growth)
+    stable = growth <= 0 if found is None else found.stable
+    return dict(zip(map("{:g}".format, case.speeds), growth.tolist(), strict=True)), "", not stable.all()
 
 
 def _with_modes(raw: dict[str, Any], known: int, count: int, folder: pathlib.Path) -> Rotor:
@@ -213,7 +213,7 @@ def _axis(case: MachineCase, k: int, run: MachineRun, points: list[MachineSensit
     """
     metrics = run.metrics["axes"][case.axes[k]]
     scenario, share = case.cases[k].scenario, float(metrics["settled_clearance_used"])
-    worst = max((point.axes[k] for point in points), key=lambda axis: (axis.zone, axis.S.height), default=None)
+    worst = max((point.axes[k] for point in points), key=lambda axis: (axis.S.height, axis.zone or ""), default=None)
     carried = abs(float(scenario.plant.m * scenario.plant.g)) / float(scenario.largest_force)
     used = max(float(metrics["force_used"]), carried)
     return {

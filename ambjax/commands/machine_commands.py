@@ -107,7 +107,7 @@ def sensitivity(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summa
 
 def worst_of_speeds(points: list[MachineSensitivity]) -> MachineSensitivity:
     """Return the sensitivity at the speed with the largest peak; an unstable one first."""
-    return max(points, key=lambda point: (not point.stable, point.worst.S.height))
+    return max(points, key=lambda point: (not point.stable, not point.linear, point.worst.S.height))
 
 
 def _injections(case: MachineCase, points: list[MachineSensitivity], everywhere: bool) -> Measured:
@@ -121,7 +121,7 @@ def _injections(case: MachineCase, points: list[MachineSensitivity], everywhere:
     if not at:
         return {}
     with doing(f"measuring the sensitivity by injection into the simulation; {FIRST_RUN}"):
-        peaks = [[axis.S.frequency for axis in point.axes] for point in at]
+        peaks = [[axis.S.frequency if point.linear else None for axis in point.axes] for point in at]
         speeds = [point.speed for point in at]
         found = machine_injected(case.machine, operating.one_period(case), case.zones, speeds, peaks)
     return dict(zip(speeds, found, strict=True))
@@ -141,7 +141,7 @@ def sensitivity_summary(points: list[MachineSensitivity], measured: Measured) ->
                     "peak_T": axis.T.height, "peak_KS": axis.KS.height,
                     "margins": None if axis.margins is None else _margins(axis.margins),
                     "running_speed": facts,
-                    **injected_numbers(point.system, one, k),
+                    **injected_numbers(point.system if point.linear else None, one, k),
                 }
                 for k, (axis, one, (facts, _)) in enumerate(
                     zip(point.axes, _measured_at(point, measured), once_per_revolution(point), strict=True)
@@ -156,7 +156,7 @@ def sensitivity_summary(points: list[MachineSensitivity], measured: Measured) ->
     axis = worst.worst
     first: Summary = {
         "stable": all(point.stable for point in points), "peak": axis.S.height, "frequency_hz": axis.S.frequency,
-        "zone": axis.zone, "axis": axis.name if worst.stable else None, "speed_rpm": worst.speed,
+        "zone": axis.zone, "axis": axis.name if worst.linear else None, "speed_rpm": worst.speed,
     }  # fmt: skip
     own: dict[str, Any] = at[points.index(worst)]
     first |= {key: x for key, x in own["axes"][worst.axes.index(axis)].items() if key.startswith("injected")}
@@ -192,13 +192,20 @@ def sensitivity_text(points: list[MachineSensitivity], measured: Measured, zones
     parts = []
     for point in points:
         rows = [
-            (axis.name, f"{axis.S.height:.4g}", f"{axis.S.frequency:.4g}", axis.zone, f"{axis.T.height:.4g}",
+            (axis.name, f"{axis.S.height:.4g}", f"{axis.S.frequency:.4g}", axis.zone or "", f"{axis.T.height:.4g}",
              *(["", ""] if axis.margins is None else [f"{axis.margins.gm:.3g}", f"{axis.margins.pm:.3g}"]))
             for axis in point.axes
         ]  # fmt: skip
         slow = f"largest real part of a pole {np.max(np.real(point.poles)):.4g} 1/s"
-        if not point.stable:
-            parts.append(f"{point.speed:g} rpm: NOT STABLE, so there are no peaks, zones and margins; {slow}")
+        measured_at = zip(point.axes, _measured_at(point, measured), strict=True)
+        injected = [
+            injection_text(point.system if point.linear else None, one, zones, axis.zone or "", k, f" at {axis.name}")
+            for k, (axis, one) in enumerate(measured_at) if one is not None
+        ]  # fmt: skip
+        if not point.linear:
+            word = "stable, but the linear machine is not" if point.stable else "NOT STABLE"
+            none = "so there are no peaks, zones and margins"
+            parts += [f"{point.speed:g} rpm: {word}, {none}; {slow}{point.swings}", *injected]
             continue
         parts.append(f"{point.speed:g} rpm: stable; {slow}")
         single = f"{point.sigma.height:.4g}", f"{point.sigma.frequency:.4g}"
@@ -209,6 +216,5 @@ def sensitivity_text(points: list[MachineSensitivity], measured: Measured, zones
         parts += outside_lines(point, zones)
         for _, lines in once_per_revolution(point):
             parts += lines
-        for k, (axis, one) in enumerate(zip(point.axes, _measured_at(point, measured), strict=True)):
-            parts += [] if one is None else [injection_text(point.system, one, zones, axis.zone, k, f" at {axis.name}")]
+        parts += injected
     return "\n".join(parts)

@@ -37,7 +37,7 @@ def signs_note(cases: Sequence[Case]) -> list[str]:
         return []
     return [
         f"{', '.join(signs)}: the signs are set-valued. The linear analysis applies while the signal of each law "
-        "stays inside its band, that is, without chattering."
+        "stays inside its band, that is, without chattering; runs without noise and loads decide on the stability."
     ]
 
 
@@ -91,10 +91,11 @@ def _position_numbers(point: OperatingPoint, measured: Injections | None) -> dic
     }
 
 
-def injected_numbers(system: StateSpace, one: Injection | None, channel: int = 0) -> dict[str, object]:
+def injected_numbers(system: StateSpace | None, one: Injection | None, channel: int = 0) -> dict[str, object]:
     """Return the numbers of the measured sensitivity at one sensor.
 
-    Without a measurement, only the peak and the ends of its interval are returned, each as None.
+    Without a measurement, only the peak and the ends of its interval are returned, each as None. `system`: None if it
+    is not stable.
     """
     if one is None:
         return {"injected_peak": None, "injected_low": None, "injected_high": None}
@@ -112,9 +113,9 @@ def injected_numbers(system: StateSpace, one: Injection | None, channel: int = 0
     }
 
 
-def _linear_there(system: StateSpace, measured: Injection, channel: int) -> float | None:
+def _linear_there(system: StateSpace | None, measured: Injection, channel: int) -> float | None:
     """Return the linear |S| at the frequency of the injected peak. `channel`: number of the sensor's input."""
-    if measured.peak_frequency is None:
+    if measured.peak_frequency is None or system is None:
         return None
     return float(np.abs(system.response(np.array([measured.peak_frequency])))[0, channel, channel])
 
@@ -125,11 +126,17 @@ def _at_edge(measured: Injection) -> bool | None:
 
 
 def injection_text(
-    system: StateSpace, measured: Injection, zones: Zones | None, linear: str = "", channel: int = 0, at: str = ""
+    system: StateSpace | None,
+    measured: Injection,
+    zones: Zones | None,
+    linear: str = "",
+    channel: int = 0,
+    at: str = "",
 ) -> str:
     """Describe the measured sensitivity at one sensor in one line.
 
-    `zones`: those of the position sensor; None at the velocity sensor. `linear`: zone of the linear peak.
+    `system`: None if it is not stable. `zones`: those of the position sensor; None at the velocity sensor. `linear`:
+    zone of the linear peak.
     """
     unit = "m/s" if zones is None else "m"
     how = f"Injected{at} into the simulation (multi-sine of {measured.amplitude:.3g} {unit}"
@@ -139,12 +146,13 @@ def injection_text(
     text = f"{how}: |S| peaks at {measured.peak:.4g} at {measured.peak_frequency:.4g} Hz"
     if zones is not None:
         zone = zones.zone(measured.peak)
-        text += f", zone {zone}" + f" (the linear peak: zone {linear})" * (zone != linear)
+        text += f", zone {zone}" + f" (the linear peak: zone {linear})" * bool(linear and zone != linear)
     if _at_edge(measured):
         text += ", an end of the measured band, so this value is not a peak"
     if measured.peak_low is not None and measured.members > 1:
         text += f" (95 % interval {measured.peak_low:.4g} to {measured.peak_high:.4g})"
-    text += f"; the linear value there is {_linear_there(system, measured, channel):.4g}."
+    there = _linear_there(system, measured, channel)
+    text += "." if there is None else f"; the linear value there is {there:.4g}."
     if measured.lost:
         text += f" {measured.lost} of {measured.members} members lose the rotor and are left out."
     if measured.saturated:

@@ -32,25 +32,34 @@ class AxisSensitivity(NamedTuple):
     S: ResponsePeak
     T: ResponsePeak
     KS: ResponsePeak
-    zone: str
+    zone: str | None
     margins: Margins | None
 
 
 class MachineSensitivity(NamedTuple):
     """Sensitivity of a machine at one speed, with all loops closed.
 
-    - `speed`: rpm. `stable`: whether no mode grows. If one does, the peaks are infinite, and the zones D.
+    - `speed`: rpm. `stable`: whether the machine is stable. `linear`: whether it is, and no mode of the linear
+      machine grows. If not, the peaks are infinite, and the zones D, or None if the machine is stable.
     - `axes`: the peaks of each axis. `sigma`: peak of the largest singular value of the matrix S.
     - `poles`: poles of the machine, 1/s, in the order of decreasing real part.
     - `system`: the linear system, with inputs e_k at the sensors, and outputs as of `linearise_machine`.
+    - `swing`: amplitude of a motion that does not decay in a run without noise and loads, m; None without one.
     """
 
     speed: float
     stable: bool
+    linear: bool
     axes: tuple[AxisSensitivity, ...]
     sigma: ResponsePeak
     poles: np.ndarray
     system: StateSpace
+    swing: float | None = None
+
+    @property
+    def swings(self) -> str:
+        """The swing as part of a sentence."""
+        return "" if self.swing is None else f"; without noise and loads, a motion of {self.swing:.3g} m does not decay"
 
     @property
     def worst(self) -> AxisSensitivity:
@@ -130,19 +139,33 @@ def turning_machines(machine: Machine, period: Scalar, speeds: Iterable[float]) 
 def machine_sensitivity(
     machine: Machine, names: tuple[str, ...], period: Scalar, speed: float, zones: Zones
 ) -> MachineSensitivity:
-    """Return the sensitivity of a machine at a constant speed (rpm). Raises ValueError as `linearise_machine` does.
+    """Return the sensitivity of a linear machine at a constant speed (rpm). Raises as `linearise_machine` does.
 
     `names`: of the axes. `period`: sample period, s. `zones`: frequency range and limits.
     """
     return sensitivity_of(next(turning_machines(machine, period, [speed])), names, speed, zones)
 
 
-def sensitivity_of(point: TurningMachine, names: tuple[str, ...], speed: float, zones: Zones) -> MachineSensitivity:
-    """Return the sensitivity of a linear machine. `speed`: rpm. The others as for `machine_sensitivity`."""
+def sensitivity_of(
+    point: TurningMachine,
+    names: tuple[str, ...],
+    speed: float,
+    zones: Zones,
+    stable: bool | None = None,
+    swing: float | None = None,
+) -> MachineSensitivity:
+    """Return the sensitivity of a linear machine.
+
+    `speed`: rpm. `stable`, `swing`: by runs; None: the linear machine decides.
+
+    The others are those of `machine_sensitivity`.
+    """
     system, c = point.system.without_idle(), len(names)
     end = whole_end(system)
     low, high = zones.range(None if system.period is None else float(system.period), max(end, 2 * float(zones.f_low)))
-    stable = system.stable
+    linear = system.stable
+    stable = linear if stable is None else stable
+    linear = linear and stable
 
     responses: dict[bytes, np.ndarray] = {}
 
@@ -154,7 +177,7 @@ def sensitivity_of(point: TurningMachine, names: tuple[str, ...], speed: float, 
         return responses[key]
 
     def largest(magnitude: Callable) -> ResponsePeak:
-        if not stable:
+        if not linear:
             return NO_PEAK
         return peak(system, lambda f: magnitude(response(f)), low, high, end)
 
@@ -164,8 +187,9 @@ def sensitivity_of(point: TurningMachine, names: tuple[str, ...], speed: float, 
         T = largest(lambda H, k=k: np.abs(H[:, k, k] - 1))
         KS = largest(lambda H, k=k: np.abs(H[:, c + k, k]))
         own = system._replace(B=system.B[:, [k]], C=system.C[[k]], D=system.D[[k]][:, [k]])
-        margins = reading_margins(own) if stable else None
-        axes.append(AxisSensitivity(name, S, T, KS, zones.zone(S.height), margins))
+        margins = reading_margins(own) if linear else None
+        axes.append(AxisSensitivity(name, S, T, KS, zones.zone(S.height) if linear or not stable else None, margins))
     sigma = largest(lambda H: np.linalg.norm(H[:, :c], 2, axis=(1, 2)))
     poles = poles_in_s(system)
-    return MachineSensitivity(speed, stable, tuple(axes), sigma, poles[np.argsort(-np.real(poles))], system)
+    poles = poles[np.argsort(-np.real(poles))]
+    return MachineSensitivity(speed, stable, linear, tuple(axes), sigma, poles, system, swing)

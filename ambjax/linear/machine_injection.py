@@ -38,13 +38,14 @@ class _Test(NamedTuple):
 
 
 def machine_injected(
-    machine: Machine, clock: Clock, zones: Zones, speeds: Sequence[float], peaks: Sequence[Sequence[float]]
+    machine: Machine, clock: Clock, zones: Zones, speeds: Sequence[float], peaks: Sequence[Sequence[float | None]]
 ) -> list[tuple[Injection, ...]]:
     """Measure the sensitivity at the position sensor of each axis, at constant speeds (rpm).
 
     - `clock`: its samples are one period of the multi-sine. The first period is not evaluated, the second one is.
     - `zones`: frequency range, and `amplitude`; None: 1 % of the gap of the axis.
-    - `peaks`: frequencies (Hz) by speed and axis, at which there is a line, and near which there are more.
+    - `peaks`: frequencies (Hz) by speed and axis, at which there is a line, and near which there are more; None: not
+      known.
 
     The rotor is at rest in its bearings under its weight, without unbalance, loads and runout. Returns an `Injection`
     for each axis at each speed.
@@ -55,7 +56,8 @@ def machine_injected(
     waves = []
     for _, k, peak in axes:
         f = frequency_lines(zones, clock, peak)
-        f = np.append(f, np.clip(peak, f[0], f[-1]))  # the peak of a bending mode is narrow
+        if peak is not None:
+            f = np.append(f, np.clip(peak, f[0], f[-1]))  # the peak of a bending mode is narrow
         harmonics = np.unique(np.round(f * float(clock.duration)).astype(int))
         waves.append(multisine(harmonics, clock.samples, float(clock.sample_period), float(amplitudes[k])))
     most = max(len(wave.harmonics) for wave in waves)

@@ -30,12 +30,13 @@ SIZES |= dict.fromkeys((Step, Pulse, Sine, SmoothStep, Chirp, Ramp, Trapezoid), 
 
 
 class QuietRun(NamedTuple):
-    """Results of the quiet runs of members.
+    """Results of the quiet runs of members with c axes.
 
-    - `swings`: half peak-to-peak value of z in each quarter [N, QUARTERS], m; 0 after a loss.
-    - `returns`: whether z returns, in the last quarter, to most of the range of the third one [N]; False for a creep.
-    - `current`: largest |i| in the last quarter in which the rotor is held [N], A.
-    - `busy`: whether the current changes by more than CALM in the last quarter [N]; False after a loss.
+    - `swings`: half peak-to-peak value of z in each quarter [N, c, QUARTERS], m; 0 after a loss.
+    - `returns`: whether z returns, in the last quarter, to most of the range of the third one [N, c]; False for a
+      creep.
+    - `current`: largest |i| in the last quarter in which the rotor is held [N, c], A.
+    - `busy`: whether a current changes by more than CALM in the last quarter [N]; False after a loss.
     - `lost`: whether the rotor is lost [N].
     """
 
@@ -47,19 +48,31 @@ class QuietRun(NamedTuple):
 
 
 def quiet_run(cascade: Cascade, scenario: Scenario, clock: Clock) -> QuietRun:
-    """Simulate the quiet runs."""
+    """Simulate the quiet runs of one axis."""
     run = run_ensemble(cascade, quiet(scenario), clock, fold=quarters(clock), record_every=0)
-    low, high = ({name: x[:, :QUARTERS] for name, x in part.items()} for part in (run.metrics.low, run.metrics.high))
-    swings = np.zeros((len(low["z"]), QUARTERS))
-    swings[:, : low["z"].shape[1]] = np.maximum(high["z"] - low["z"], 0.0) / 2
-    common = np.minimum(high["z"][:, -1], high["z"][:, -2:][:, 0]) - np.maximum(low["z"][:, -1], low["z"][:, -2:][:, 0])
-    returns = common / 2 > SHARED * swings[:, -2:].min(axis=1)
+    bias = np.asarray(scenario.plant.i_0)[..., None]
+    low, high = ({k: x[:, None] for k, x in one.items()} for one in (run.metrics.low, run.metrics.high))
+    return quiet_run_of(low, high, np.asarray(run.trajectory.lost_at), bias)
+
+
+def quiet_run_of(
+    low: dict[str, np.ndarray], high: dict[str, np.ndarray], lost_at: np.ndarray, bias: np.ndarray
+) -> QuietRun:
+    """Return the results of runs from the extremes of z and i in each quarter [N, c, QUARTERS or more].
+
+    `lost_at` [N]: s; inf if the rotor is held. `bias`: currents, A.
+    """
+    low, high = ({name: x[..., :QUARTERS] for name, x in part.items()} for part in (low, high))
+    swings = np.zeros((*low["z"].shape[:-1], QUARTERS))
+    swings[..., : low["z"].shape[-1]] = np.maximum(high["z"] - low["z"], 0.0) / 2
+    before = high["z"][..., -2:][..., 0], low["z"][..., -2:][..., 0]
+    common = np.minimum(high["z"][..., -1], before[0]) - np.maximum(low["z"][..., -1], before[1])
+    returns = common / 2 > SHARED * swings[..., -2:].min(axis=-1)
     most = np.maximum(high["i"], -low["i"])
-    last = np.maximum(np.sum(np.isfinite(most), axis=1) - 1, 0)
-    current = most[np.arange(len(most)), last]
-    current, lost = np.where(np.isfinite(current), current, 0.0), np.isfinite(run.trajectory.lost_at)
-    busy = high["i"][:, -1] - low["i"][:, -1] > CALM * np.asarray(scenario.plant.i_0)
-    return QuietRun(swings, returns, current, busy, lost)
+    last = np.maximum(np.sum(np.isfinite(most), axis=-1) - 1, 0)
+    current = np.take_along_axis(most, last[..., None], axis=-1)[..., 0]
+    busy = np.any(high["i"][..., -1] - low["i"][..., -1] > CALM * bias, axis=-1)
+    return QuietRun(swings, returns, np.where(np.isfinite(current), current, 0.0), busy, np.isfinite(lost_at))
 
 
 def quiet(scenario: Scenario) -> Scenario:

@@ -1,4 +1,4 @@
-"""Stability of loops whose rotor is held: stable, or held but not stable.
+"""Stability of loops whose rotor is held: stable, or held but not stable. A loop is that of an axis or of a machine.
 
 Two verdicts are combined. The linear one is that of the poles of the loop linearised at r = 0. The simulated one is
 that of a quiet run: the case without noise, converter, faults, runout and disturbances, at a constant reference, from a
@@ -19,23 +19,20 @@ does not count, nor does the motion of a stable linear loop whose own decay is t
 
 import dataclasses
 import itertools
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from ambjax.control.base import Law, set_valued_signs, steepnesses, with_default_steepness
 from ambjax.control.cascade import DEFAULT_LAWS, Cascade
-from ambjax.ensemble.batching import size
 from ambjax.ensemble.blocks import QUARTERS
 from ambjax.linear.analysis import linearise_members
-from ambjax.linear.quiet_run import KICK, quiet_run
+from ambjax.linear.quiet_run import KICK, QuietRun, quiet_run
 from ambjax.numerics.shapes import map_varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
-
-if TYPE_CHECKING:  # `ambjax simulate` imports this module, and does not need Theorem 1
-    from ambjax.theorem.sampled_report import Delays
 
 # Half peak-to-peak value of z, as a share of the clearance, below which a sustained motion does not count. The chatter
 # of set-valued signs that act a sample late reaches 0.0025.
@@ -77,10 +74,9 @@ class Stability(NamedTuple):
     duration: float
     bias: float
 
-    @property
-    def first(self) -> "Stability":
-        """The stability of the first member."""
-        return self._replace(**{name: getattr(self, name)[:1] for name in self._fields[:-2]})
+    def of(self, rows: Any) -> "Stability":
+        """Return the stability of some members. `rows`: their index in the arrays."""
+        return self._replace(**{name: getattr(self, name)[rows] for name in self._fields[:-2]})
 
     def findings(self) -> "Findings":
         """Return the summary that all reports use."""
@@ -153,23 +149,88 @@ def stability_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> Stabilit
     The result has no meaning for a member whose rotor is lost in the case's own run. Raises ValueError as `rollout`
     does.
     """
-    growth, duration = _growth(cascade, scenario, clock), float(clock.duration)
-    clearance = np.broadcast_to(np.asarray(scenario.touchdown, float), growth.shape)
-    run = quiet_run(cascade, scenario, clock)
-    swing = np.where(run.lost, clearance, run.swings[:, -1])
+    return judged(_Axis(cascade, scenario, clock))
+
+
+class Tested(Protocol):
+    """N loops whose stability is tested, each with c axes.
+
+    - `period`, `duration`: sample period and length of a run, s. `clearance`: that of each axis, [N, c], [c] or one
+      number, m. `bias`: largest bias current, A.
+    - `cascades`: those with all laws of the loops. `growth`: largest growth rate of each linear loop that is
+      `chosen` [N] with these cascades, 1/s; NaN without a linear verdict. `quiet`: the quiet runs.
+    """
+
+    @property
+    def period(self) -> Any: ...
+    @property
+    def duration(self) -> float: ...
+    @property
+    def clearance(self) -> np.ndarray: ...
+    @property
+    def bias(self) -> float: ...
+    @property
+    def cascades(self) -> Sequence[Cascade]: ...
+    def growth(self, cascades: Sequence[Cascade], chosen: np.ndarray) -> np.ndarray: ...
+    def quiet(self) -> QuietRun: ...
+
+
+class _Axis(NamedTuple):
+    """The loops of one axis."""
+
+    cascade: Cascade
+    scenario: Scenario
+    clock: Clock
+
+    @property
+    def period(self) -> Any:
+        return self.clock.sample_period
+
+    @property
+    def duration(self) -> float:
+        return float(self.clock.duration)
+
+    @property
+    def clearance(self) -> np.ndarray:
+        return np.asarray(self.scenario.touchdown, float)[..., None]
+
+    @property
+    def bias(self) -> float:
+        return float(np.max(np.asarray(self.scenario.plant.i_0)))
+
+    @property
+    def cascades(self) -> Sequence[Cascade]:
+        return [self.cascade]
+
+    def growth(self, cascades: Sequence[Cascade], chosen: np.ndarray) -> np.ndarray:
+        return _growth(*map_varying(lambda x: np.asarray(x)[chosen], (cascades[0], self.scenario)), self.clock)
+
+    def quiet(self) -> QuietRun:
+        return quiet_run(*self)
+
+
+def judged(tested: Tested) -> Stability:
+    """Return the stability of loops from both verdicts."""
+    run, duration = tested.quiet(), tested.duration
+    growth = np.full(len(run.lost), np.nan)
+    if not has_set_valued(tested.cascades):
+        growth = tested.growth(tested.cascades, np.full(len(growth), True))
+    clearance = np.broadcast_to(tested.clearance, run.current.shape)
+    swing = np.where(run.lost[:, None], clearance, run.swings[..., -1])
     slow = (growth < 0) & (-growth * duration / QUARTERS < -np.log1p(-DECAY))
-    persists = (swing > SMALL * clearance) & (swing > (1 - DECAY) * run.swings[:, -2]) & run.returns & ~slow
+    large = swing > SMALL * clearance
+    persists = (large & (swing > (1 - DECAY) * run.swings[..., -2]) & run.returns).any(1) & ~slow
     sustained = run.lost | persists
-    chatters = _may_chatter(cascade) & (growth * duration > GROWN) & (swing <= SMALL * clearance)
-    excused = run.busy & ~sustained & (chatters | _set_valued(cascade))
+    chatters = may_chatter(tested.cascades) & (growth * duration > GROWN) & ~large.any(1)
+    excused = run.busy & ~sustained & (chatters | has_set_valued(tested.cascades))
     if excused.any():
-        least = np.full_like(growth, np.nan)
-        least[excused] = _least_growth(*map_varying(lambda x: x[excused], (cascade, scenario)), clock)
+        least = _least_growth(tested, excused)
         other = least * duration > GROWN
         growth, chatters = np.where(other, least, growth), chatters & ~other
     stable = ~(sustained | ((growth * duration > BORDER) & ~chatters))
-    bias = float(np.max(np.asarray(scenario.plant.i_0)))
-    return Stability(stable, growth, sustained, swing, run.current, run.lost, duration, bias)
+    widest = np.argmax(swing / clearance, axis=1)[:, None]
+    size = np.take_along_axis(swing, widest, axis=1)[:, 0]
+    return Stability(stable, growth, sustained, size, run.current.max(1), run.lost, duration, tested.bias)
 
 
 def _signs(cascade: Cascade) -> list[Law]:
@@ -177,37 +238,49 @@ def _signs(cascade: Cascade) -> list[Law]:
     return [law for law in cascade.laws if law.stiff or law.size(cascade.model) is not None]
 
 
-def _set_valued(cascade: Cascade) -> bool:
-    return any(set_valued_signs(law) for law in cascade.laws)
+def has_set_valued(cascades: Sequence[Cascade]) -> bool:
+    """Return whether a law has a set-valued sign."""
+    return any(set_valued_signs(law) for cascade in cascades for law in cascade.laws)
 
 
-def _may_chatter(cascade: Cascade) -> bool:
+def may_chatter(cascades: Sequence[Cascade]) -> bool:
     """Return whether a law on a processor evaluates a sign at the start of a sample, as explicit steps do."""
-    return cascade.sampled and not all(cascade.timing.implicit and law.has_own_step(True) for law in _signs(cascade))
+    laws = [(cascade.timing.implicit, law) for cascade in cascades if cascade.sampled for law in _signs(cascade)]
+    return not all(implicit and law.has_own_step(True) for implicit, law in laws)
 
 
-def _least_growth(cascade: Cascade, scenario: Scenario, clock: Clock) -> np.ndarray:
-    """Return the least growth rate of the linear loop of each member [N] over smoothed signs of the steepnesses SOFTER,
-    1/s; NaN without a linear verdict, or if a sign has no steepness. The search for a member ends if it does not grow.
+def _least_growth(tested: Tested, excused: np.ndarray) -> np.ndarray:
+    """Return the least growth rate of each `excused` loop [N] over smoothed signs of the steepnesses SOFTER, 1/s.
+
+    It is NaN without a linear verdict, or if a sign has no steepness. A loop that does not grow is done.
     """
-    least = np.full(size((cascade, scenario)), np.nan)
-    names = {stage: steepnesses(getattr(cascade, stage)) for stage in DEFAULT_LAWS}
-    if not all(map(steepnesses, _signs(cascade))):
+    least, own, grows = np.full(len(excused), np.nan), tested.cascades, excused.copy()
+    if not all(steepnesses(law) for cascade in own for law in _signs(cascade)):
         return least
-    usual = {k: with_default_steepness(getattr(cascade, k), cascade.model) for k in names if names[k]}
-    one = dataclasses.replace(cascade, **usual)
-    most = {k: np.minimum(1.0, FASTEST / np.asarray(clock.sample_period * one.slopes()[k])) for k in usual}
-    for shares in itertools.product(SOFTER, repeat=len(usual)):
-        laws = {
-            stage: dataclasses.replace(law, **{name: share * most[stage] * getattr(law, name) for name in names[stage]})
-            for (stage, law), share in zip(usual.items(), shares, strict=True)
-        }
-        grows = ~(least * float(clock.duration) <= GROWN)
+    stages = [stage for stage in DEFAULT_LAWS if any(steepnesses(getattr(cascade, stage)) for cascade in own)]
+    for shares in itertools.product(SOFTER, repeat=len(stages)):
+        softer = dict(zip(stages, shares, strict=True))
+        cascades = [_softened(cascade, softer, tested.period) for cascade in own]
+        least[grows] = np.fmin(least[grows], tested.growth(cascades, grows))
+        grows &= ~(least * tested.duration <= GROWN)
         if not grows.any():
             break
-        softer = map_varying(lambda x, grows=grows: x[grows], (dataclasses.replace(cascade, **laws), scenario))
-        least[grows] = np.fmin(least[grows], _growth(*softer, clock))
     return least
+
+
+def _softened(cascade: Cascade, shares: dict[str, float], period: Any) -> Cascade:
+    """Return the cascade with smoothed signs. `shares`: of the steepnesses SOFTER, by stage. `period`: s."""
+    names = {stage: steepnesses(getattr(cascade, stage)) for stage in shares}
+    usual = {k: with_default_steepness(getattr(cascade, k), cascade.model) for k in names if names[k]}
+    one = dataclasses.replace(cascade, **usual)
+    most = {k: np.minimum(1.0, FASTEST / np.asarray(period * one.slopes()[k])) for k in usual}
+    laws = {
+        stage: dataclasses.replace(
+            law, **{name: shares[stage] * most[stage] * getattr(law, name) for name in names[stage]}
+        )
+        for stage, law in usual.items()
+    }
+    return dataclasses.replace(cascade, **laws)
 
 
 def suspects(error: np.ndarray, held: np.ndarray) -> np.ndarray:
@@ -216,41 +289,8 @@ def suspects(error: np.ndarray, held: np.ndarray) -> np.ndarray:
     return np.sort(alive[np.argsort(-np.asarray(error)[alive], kind="stable")[:MOST_TESTED]])
 
 
-def with_stability(
-    margin: "Delays", cascade: Cascade, scenario: Scenario, clock: Clock, *, known: bool
-) -> tuple["Delays", Findings | None]:
-    """Return a result of `delay_margin` with the delays, up to its `held`, up to which the loop is stable.
-
-    `DELAYS` delays are tested; a second pass divides the step after the last one that is stable. `known`: as in
-    `delay_margin`. Also returns the findings at the case's own delay; None if the rotor is not held there.
-    """
-    from ambjax.ensemble.delays import DELAYS, at_delays
-
-    if margin.held is None:
-        return margin, None
-    own = float(cascade.timing.delay)
-    first = own if margin.held >= own else 0.0
-
-    def tried(low: float, high: float) -> tuple[np.ndarray, Stability]:
-        delays = np.linspace(low, high, DELAYS)
-        return delays, stability_of(at_delays(cascade, delays, known=known), scenario, clock)
-
-    delays, found = tried(first, margin.held)
-    at_own = found.first.findings() if first == own else None
-    if found.stable.all():
-        return margin._replace(stable=margin.held, tested=DELAYS), at_own
-    facts, at = found.findings(), int(np.argmin(found.stable))
-    stable = None
-    if at:
-        finer, again = tried(delays[at - 1], delays[at])
-        stable = float(finer[max(int(np.argmin(again.stable)) - 1, 0)])
-    return margin._replace(stable=stable, swing_m=facts.swing_m, current_A=facts.current_A, tested=DELAYS), at_own
-
-
 def _growth(cascade: Cascade, scenario: Scenario, clock: Clock) -> np.ndarray:
     """Return the largest growth rate of the linear loop of each member [N], 1/s; NaN where there is no verdict."""
-    if _set_valued(cascade):
-        return np.full(size((cascade, scenario)), np.nan)
     system, found = linearise_members(cascade, scenario, clock)
     A, sizes = np.asarray(system.A), np.asarray(system.sizes)
     known = np.asarray(found, bool) & np.isfinite(A).all((1, 2)) & np.isfinite(sizes).all(1)

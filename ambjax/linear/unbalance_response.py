@@ -19,6 +19,8 @@ DAMPED = 0.35
 HALF_POWER = np.sqrt(0.5)
 # API 684 and API 617: a critical speed with a smaller amplification factor needs no separation margin.
 CRITICALLY_DAMPED = 2.5
+# Above this amplification factor, the damping of a mode is a rounding error.
+UNDAMPED = 1e6
 
 
 class UnbalanceResponse(NamedTuple):
@@ -40,7 +42,8 @@ class CriticalSpeed(NamedTuple):
     """A peak of the response to unbalance, by API 684.
 
     - `speed`: N_c, rpm. `axis`: number of the axis whose sensor moves most. `peak_to_peak`: there, m.
-    - `amplification`: N_c/(N_2 - N_1), with the speeds at which the response is 0.707 of the peak.
+    - `amplification`: N_c/(N_2 - N_1), with the speeds at which the response is 0.707 of the peak. It is inf for an
+      undamped mode, as `peak_to_peak` is.
     - `required`, `present`: separation margin from the operating speeds, %; None: no margin is required.
     """
 
@@ -138,7 +141,7 @@ def critical_speeds(found: UnbalanceResponse, operating: tuple[float, float]) ->
     peaks = [one for axis in range(found.sensors.shape[1]) for one in _peaks(found, axis, operating)]
     peaks, kept = sorted(peaks, key=lambda one: -one.peak_to_peak), list[CriticalSpeed]()
     for one in peaks:  # the axes show the same critical speed, each with its own size
-        if all(abs(one.speed - other.speed) * other.amplification > other.speed for other in kept):
+        if all(abs(one.speed - other.speed) * min(other.amplification, UNDAMPED) > other.speed for other in kept):
             kept.append(one)
     return sorted(kept, key=lambda one: one.speed)
 
@@ -151,8 +154,9 @@ def _peaks(found: UnbalanceResponse, axis: int, operating: tuple[float, float]) 
         sides = [abs(end - N) for end in ends if end is not None]
         if not sides:
             continue  # a shoulder of a larger peak
-        AF = N / (sum(sides) * 2 / len(sides))  # a side that another peak hides has the width of the other one
-        peaks.append(CriticalSpeed(N, axis, 2 * float(size[k]), AF, *separation(N, AF, operating)))
+        width = sum(sides) * 2 / len(sides)  # a side that another peak hides has the width of the other one
+        AF, height = (N / width, 2 * float(size[k])) if UNDAMPED * width > N else (np.inf, np.inf)
+        peaks.append(CriticalSpeed(N, axis, height, AF, *separation(N, AF, operating)))
     return peaks
 
 

@@ -106,7 +106,7 @@ def machine_sensitivity_picture(
         grid[0, 1].tick_params(labelbottom=True)
     for ax, point in zip(grid.flat, shown, strict=False):
         ax.set_title(f"{point.speed:g} rpm{'' if point.stable else ': not stable'}")
-        if not point.stable:
+        if not point.linear:
             continue
         end = 5e3 if point.system.period is None else BAND / float(point.system.period)
         f = np.geomspace(1.0, end, 800)

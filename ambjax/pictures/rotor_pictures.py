@@ -42,8 +42,8 @@ def unbalance_picture(case: Any, found: Any, criticals: Sequence[Any], operating
     top.semilogy(speeds[1:], 1e6 * a1_limit(speeds[1:]), "k--", linewidth=1.0, label="A1 of API 684")
     for one in criticals:
         top.annotate(
-            f"{one.speed:.0f} rpm\nAF {one.amplification:.2g}", (one.speed, 1e6 * one.peak_to_peak), ha="center",
-            xytext=(0, 6), textcoords="offset points", fontsize="small",
+            f"{one.speed:.0f} rpm\nAF {one.amplification:.2g}", (one.speed, min(1e6 * one.peak_to_peak, largest)),
+            ha="center", xytext=(0, 6), textcoords="offset points", fontsize="small",
         )  # fmt: skip
     for ax in (top, middle, bottom):
         ax.grid(True, alpha=0.3, which="both")

@@ -14,23 +14,21 @@ import numpy as np
 from ambjax.cases.machine_case import MachineCase, machine_from, machine_of_axes, parts_of, with_notches_for
 from ambjax.cases.machine_spread import axis_values, machine_places, shared, varied_start
 from ambjax.cases.rotor_numbers import OF_BEARING, SPEED, varied_rotors
-from ambjax.compiler.members_last import SHORT, members_last
 from ambjax.control.cascade import Cascade
-from ambjax.ensemble.batching import map_members
+from ambjax.ensemble.machines import run_machines
 from ambjax.ensemble.maps import PERIOD
 from ambjax.ensemble.paths import Place, kinds, places, with_values
 from ambjax.ensemble.spread import Spread, drawn
 from ambjax.ensemble.study import AnyStudy
 from ambjax.linear.linear_machine import turning_machines
+from ambjax.linear.machine_stability import growth_of, machine_stability
 from ambjax.linear.notch_design import speeds_of
-from ambjax.linear.stability import Findings
+from ambjax.linear.stability import Findings, Stability
 from ambjax.numerics.records import canonical
 from ambjax.numerics.shapes import map_varying
 from ambjax.results.machine_run import worst_of
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.folds import Fold
 from ambjax.simulation.metrics import Metrics
-from ambjax.simulation.rollout import Result, run
 from ambjax.simulation.whole_machine import Machine, PerAxis, stack_axes
 from ambjax.world.scenario import Scenario
 
@@ -185,24 +183,38 @@ class MachineStudy(AnyStudy):
         return dataclasses.replace(self.case, name=name, machine=machine, cases=tuple(cases))
 
     def findings(self, index: np.ndarray) -> Findings:
-        """Test whether the linear loops of the first MOST_TESTED of these members are stable."""
+        """Test whether the machines of the first MOST_TESTED of these members are stable."""
         tested = index[:MOST_TESTED]
-        return LinearFindings(len(tested), int(np.sum(~self.stable(self.drawn(tested), tested))))
+        stable, found = self._stability(self.drawn(tested), tested)
+        return LinearFindings(len(tested), int(np.sum(~stable))) if found is None else found.findings()
 
     def stable(self, values: dict[str, np.ndarray], members: np.ndarray) -> np.ndarray:
-        """Return whether the linear loops of each system of `varied` are stable [n]; not without an equilibrium.
+        """Return whether each system of `varied` is stable [n] (`machine_stability`); not without an equilibrium.
 
         They are tested at the speeds of the run, and at those of the case unless the speed varies.
         """
+        return self._stability(values, members)[0]
+
+    def _stability(self, values: dict[str, np.ndarray], members: np.ndarray) -> tuple[np.ndarray, Stability | None]:
+        """Return `stable`, and the stability of each system at its worst speed; None: the linear loops decide."""
         machine, _ = self.varied(values, members)
-        found, given = np.zeros(len(members), bool), () if any(path in SPEED for path in values) else self.case.speeds
+        given = () if any(path in SPEED for path in values) else self.case.speeds
+        at, rates = list[tuple[int, float]](), list[float]()
         for k in range(len(members)):
             one = map_varying(lambda x, k=k: x[k], machine)
+            speeds = {*speeds_of(one.rotor.rotation, float(self.clock.duration)), *given}
+            own = [math.inf] * len(speeds)
             with contextlib.suppress(ValueError):
-                speeds = {*speeds_of(one.rotor.rotation, float(self.clock.duration)), *given}
-                points = turning_machines(one, self.clock.sample_period, speeds)
-                found[k] = all(point.system.without_idle().stable for point in points)
-        return found
+                own = [growth_of(point.system) for point in turning_machines(one, self.clock.sample_period, speeds)]
+            at += [(k, speed) for speed, _ in zip(speeds, own, strict=False)]
+            rates += own
+        found, growth = machine_stability(machine, self.clock, at, np.array(rates)), np.array(rates)
+        of, stable = np.array([k for k, _ in at], int), growth <= 0 if found is None else found.stable
+        every = np.array([stable[of == k].all() for k in range(len(members))])
+        if found is None:
+            return every, None
+        order = np.lexsort((-found.swing, found.stable, of))  # of each member, the worst speed first
+        return every, found.of(order[np.unique(of[order], return_index=True)[1]])
 
     def fingerprint(self) -> dict[str, object]:
         machine, facts = self.case.machine, self.facts()
@@ -231,25 +243,6 @@ def _gains(case: MachineCase) -> dict[str, float]:
         for axis, notch in notches.items() if notch
         for k, gain in enumerate(notch.gains) for name in ("real", "imaginary")
     }  # fmt: skip
-
-
-def run_machines(machine: Machine, clock: Clock, fold: Fold, **how: Any) -> Result:
-    """Simulate every member of an ensemble of machines. What varies has a leading axis [N]. No rows are recorded.
-
-    `how`: `threads` and `call` of `map_members`.
-    """
-    tree = canonical((machine, clock, fold))
-    return map_members(_simulated, tree, plain=_has_long_sums(machine), vectorised=True, **how)
-
-
-def _has_long_sums(machine: Machine) -> bool:
-    """Return whether a product of a matrix has a sum of more than SHORT terms, which XLA refuses in one kernel."""
-    matrices = [x for x in jax.tree.leaves(machine.law) if np.ndim(x) > 1]
-    return max(np.shape(x)[-1] for x in (machine.rotor.gravity, *matrices)) > SHORT
-
-
-def _simulated(tree: tuple[Machine, Clock, Fold], axes: object) -> Result:
-    return members_last(lambda one: run(one[0], one[1], one[2], 0), axes)(tree)
 
 
 def _reread(case: MachineCase, changes: Mapping[str, object]) -> MachineCase:

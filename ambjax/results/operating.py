@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+from collections.abc import Sequence
 from typing import NamedTuple, overload
 
 import jax
@@ -29,7 +30,8 @@ from ambjax.linear import (
     linearise,
     linearise_members,
 )
-from ambjax.linear.linear_machine import MachineSensitivity, sensitivity_of, turning_machines
+from ambjax.linear.linear_machine import MachineSensitivity, TurningMachine, sensitivity_of, turning_machines
+from ambjax.linear.machine_stability import growth_of, machine_stability
 from ambjax.numerics.records import replaced
 from ambjax.simulation.clock import Clock
 from ambjax.world.scenario import Scenario
@@ -97,10 +99,20 @@ def sensitivity(case: Case | MachineCase, r: float = 0.0) -> Analysis | list[Mac
         loop.S.height, loop.zone, loop.margins.pm  # 1, "A" to "D", degrees
     """
     if isinstance(case, MachineCase):
-        points = turning_machines(case.machine, case.clock.sample_period, case.speeds)
-        both = zip(points, case.speeds, strict=True)
-        return [sensitivity_of(point, case.axes, speed, case.zones) for point, speed in both]
+        return points_of(case, list(turning_machines(case.machine, case.clock.sample_period, case.speeds)))
     return operating_point(case, "nominal", r).analysis
+
+
+def points_of(case: MachineCase, turning: Sequence[TurningMachine]) -> list[MachineSensitivity]:
+    """Return the sensitivity of a machine at its speeds, with its stability there. `turning`: its linear machines."""
+    growth = np.array([growth_of(point.system) for point in turning])
+    found = machine_stability(case.machine, case.clock, [(0, speed) for speed in case.speeds], growth)
+    runs = [(None, None)] * len(growth)
+    if found is not None:
+        pairs = zip(found.stable, found.swing, strict=True)
+        runs = [(bool(stable), None if stable else float(swing)) for stable, swing in pairs]
+    each = zip(turning, case.speeds, runs, strict=True)
+    return [sensitivity_of(point, case.axes, speed, case.zones, *found) for point, speed, found in each]
 
 
 def _velocity_sensor(case: Case) -> bool:

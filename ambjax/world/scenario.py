@@ -142,8 +142,15 @@ class Scenario:
     @property
     @jax.jit  # compiles one program instead of one for each operation
     def largest_force(self) -> Scalar:
-        """The magnetic force (N) at z = 0 for i = i_0, or for the limit of |i| if it is below i_0."""
-        return self.plant.largest_force(self.actuator.current_limit(self.plant.i_0))
+        """The largest lasting magnetic force (N) at z = 0: for i = i_0, or the limit of |i| if it is below i_0.
+
+        The voltage limits |i| at rest, too: R |i| is at most the limit of the supply or of a coil, less the dead band.
+        """
+        i_max, R = self.actuator.current_limit(self.plant.i_0), jnp.asarray(self.plant.R)
+        dead = getattr(self.actuator, "dead_band", None)
+        most = jnp.maximum(self.voltage_limit - (0.0 if dead is None else dead), 0.0)
+        driven = jnp.where(R > 0, most / jnp.where(R > 0, R, 1.0), jnp.inf)
+        return self.plant.largest_force(driven if i_max is None else jnp.minimum(i_max, driven))
 
     @property
     def current_slope(self) -> Scalar:

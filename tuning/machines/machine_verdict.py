@@ -50,8 +50,10 @@ def judged(case: MachineCase, found: MachineCase, limits: dict[str, float], seed
     ]
     broken = [row["name"] for row in rows if not row["holds"]]
     at = f"{after['axis']} at {after['speed_rpm']:g} rpm"
+    peak = f"peak of |S| {after['peak']:.4g} ({at}), zone {after['zone']}"
+    none = "stable, but the linear machine is not, so it has no peaks"
     words = [
-        f"peak of |S| {after['peak']:.4g} ({at}), zone {after['zone']}" if after["stable"] else "NOT STABLE",
+        (none if after["zone"] is None else peak) if after["stable"] else "NOT STABLE",
         f"{int(held.sum())} of {members} members held",
         *([] if loops.stable else [f"{loops.unstable} of {loops.tested} members tested not stable"]),
     ]

@@ -1,0 +1,33 @@
+"""Simulation of ensembles of machines."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from ambjax.compiler.members_last import SHORT, members_last
+from ambjax.ensemble.batching import map_members
+from ambjax.numerics.records import canonical
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.folds import Fold
+from ambjax.simulation.rollout import Result, run
+from ambjax.simulation.whole_machine import Machine
+
+
+def run_machines(machine: Machine, clock: Clock, fold: Fold, **how: Any) -> Result:
+    """Simulate every member of an ensemble of machines. What varies has a leading axis [N]. No rows are recorded.
+
+    `how`: `threads`, `call` and `plain` of `map_members`.
+    """
+    tree = canonical((machine, clock, fold))
+    return map_members(_simulated, tree, vectorised=True, **({"plain": _has_long_sums(machine)} | how))
+
+
+def _has_long_sums(machine: Machine) -> bool:
+    """Return whether a product of a matrix has a sum of more than SHORT terms, which XLA refuses in one kernel."""
+    matrices = [x for x in jax.tree.leaves(machine.law) if np.ndim(x) > 1]
+    return max(np.shape(x)[-1] for x in (machine.rotor.gravity, *matrices)) > SHORT
+
+
+def _simulated(tree: tuple[Machine, Clock, Fold], axes: object) -> Result:
+    return members_last(lambda one: run(one[0], one[1], one[2], 0), axes)(tree)
