@@ -268,6 +268,9 @@ def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
     words = ["--resume", "--force", "--pareto", "--page", "--settings-of", str(path), "--budget", "2"]
     assert tune_main([str(path), "--out", str(tmp_path), *words]) == 1
     assert given[0] == given[1]
+    for name, value in {"minutes": "3", "listen": 3}.items():
+        with pytest.raises(ValueError, match=f"{name} = '?3'?: it must be"):
+            ambjax.tune(path, **{name: value})
 
 
 @pytest.mark.slow
