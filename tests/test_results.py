@@ -129,6 +129,8 @@ def test_the_parts_of_a_case_stand_for_it(path, run):
     again = ambjax.simulate(*parts)
     np.testing.assert_array_equal(again.trajectory.rows.z, run.trajectory.rows.z)
     assert again.metrics["max_abs_i_A"] == run.metrics["max_abs_i_A"]
+    inside = jax.jit(lambda: ambjax.simulate(ambjax.read_case(path)).trajectory.rows.z)()
+    np.testing.assert_array_equal(inside, run.trajectory.rows.z)
     assert ambjax.sensitivity(*parts).S == ambjax.sensitivity(case).S
 
 
@@ -144,6 +146,12 @@ class Growing:
 
     def result(self, carry, ending):
         return carry
+
+
+@ambjax.extend.record
+class Float(Growing):
+    def update(self, carry, row, span):
+        return float(row.z)
 
 
 def test_bad_input_is_refused_by_name(path, run, monkeypatch):
@@ -203,9 +211,16 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
          r"clock\.method\.substeps = 0: it must be a whole number of at least 1"),
         (lambda: ambjax.rollout(cascade, scenario, dataclasses.replace(clock, samples=0)), "clock.samples = 0: it"),
         (lambda: ambjax.rollout(case, fold=ambjax.Metrics), "fold = .* a fold"),
-        (lambda: ambjax.rollout(case, fold=type("Mine", (), {"init": float})()), "or a record with the"),
+        (lambda: ambjax.rollout(case, fold=ambjax.extend.Named({"a": 3})), "fold.a = 3: it must be a fold, "),
+        (lambda: ambjax.rollout(case, fold=ambjax.extend.Named([])), r"fold.folds = \[\]: it must be a dict of folds"),
+        (lambda: ambjax.rollout(case, fold=Float()), r"Float.update raised Concret.*\. Compute with jax.numpy w"),
+        (lambda: ambjax.linear.injected(case, "a"), "injection.frequencies: they must be at least"),
+        (lambda: ambjax.read_case({3: {}}), "case: the key 3 must be text"),
+        (lambda: ambjax.simulate(cascade, dataclasses.replace(scenario, q_f=len), clock), "q_f = .*: it must be"),
+        (lambda: ambjax.simulate(dataclasses.replace(cascade, position=ambjax.laws.position.PID), scenario, clock),
+         r"position = the class PID: it is not a law of this stage\. Write PID\(\)"),
         (lambda: ambjax.rollout(case, fold=Growing()), r"Growing has the shapes .*`update` \(\(\), \(\)\)"),
-        (lambda: ambjax.rollout(case, record_every=-1), "record_every = -1"),
+        (lambda: jax.jit(lambda n: ambjax.rollout(case, record_every=n))(1), "record_every = a traced number: it must"),
         (lambda: ambjax.Scenario(seed=2.5), "Scenario.seed = 2.5: it must be a whole number"),
         (lambda: ambjax.linear.injected(case, [100.0], periods=0), "periods = 0: it must be a whole number of"),
         (lambda: ambjax.ensemble.run_ensemble(cascade, two, clock, fold=None, threads=-1), "threads = -1"),
@@ -229,6 +244,7 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
     refused.append((lambda: traced(cascade.position), "^ensemble: a number is traced"))
     read = jax.jit(lambda c: ambjax.read_case({"controller": {"position": {"c": c}}}).cascade)
     refused.append((lambda: read(17.0), "^controller.position.c: the number is traced. Read the case outside jit"))
+    refused.append((lambda: jax.jit(lambda: ambjax.linear.linearise(case))(), "^linearise: a number is traced"))
     for call, said in refused:
         with pytest.raises(ValueError, match=said):
             call()
@@ -252,6 +268,9 @@ def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
     words = ["--resume", "--force", "--pareto", "--page", "--settings-of", str(path), "--budget", "2"]
     assert tune_main([str(path), "--out", str(tmp_path), *words]) == 1
     assert given[0] == given[1]
+    for name, value in {"minutes": "3", "listen": 3}.items():
+        with pytest.raises(ValueError, match=f"{name} = '?3'?: it must be"):
+            ambjax.tune(path, **{name: value})
 
 
 @pytest.mark.slow

@@ -49,7 +49,7 @@ class TunedCase:
 
     case: Case | MachineCase
     good: bool
-    report: dict[str, Any]
+    report: dict[str, Any] = dataclasses.field(repr=False)
     directory: pathlib.Path
 
 
@@ -123,6 +123,10 @@ def tune(
     for name, path in (("out", out), ("settings_of", settings_of)):
         if path is not None:
             require_file(name, path)
+    if not (listen is None or callable(listen)):
+        raise ValueError(f"listen = {listen!r}: it must be a function of an event.")
+    if not isinstance(minutes, (int, float, type(None))):
+        raise ValueError(f"minutes = {minutes!r}: it must be a number above 0.")
     loaded = None
     if isinstance(case, Mapping):
         loaded, case = (dict(case), text_of(case)), "case"

@@ -1,8 +1,11 @@
 """The case that a function is given: a `Case`, a `MachineCase`, or a cascade, a scenario and a clock."""
 
+import contextlib
 import functools
 from collections.abc import Callable
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, cast, overload
+
+import jax
 
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
@@ -13,7 +16,7 @@ from ambjax.numerics.shapes import require_one_member
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import settled
-from ambjax.simulation.system import check_parts
+from ambjax.simulation.system import check_parts, require_records
 from ambjax.simulation.triple import no_case
 from ambjax.world.scenario import Scenario
 
@@ -45,10 +48,11 @@ def of_case(
     def decorate(function: Callable[Concatenate[C, P], R]) -> OfCase[C, P, R]:
         @functools.wraps(function)
         def called(*args: Any, **named: Any) -> R:
-            if args and isinstance(args[0], Cascade):
-                args = (case_of(function.__name__, *args[:3]), *args[3:])
-            require_case(args[0] if args else named.get("case"), machines=machines, traced=traced)
-            return function(*args, **named)
+            with contextlib.nullcontext() if traced else jax.ensure_compile_time_eval():  # inside jit, as outside it
+                if args and isinstance(args[0], Cascade):
+                    args = (case_of(function.__name__, *args[:3]), *args[3:])
+                require_case(args[0] if args else named.get("case"), machines=machines, traced=traced)
+                return function(*args, **named)
 
         return cast(OfCase[C, P, R], called)
 
@@ -85,5 +89,6 @@ def require_case(case: object, *, machines: bool = False, traced: bool = False) 
     elif not traced:
         require_concrete("case", (case.cascade, case.scenario, case.clock))
     if isinstance(case, Case):
+        require_records("scenario", case.scenario)
         require_one_member({"controller": case.cascade, "scenario": case.scenario, "clock": case.clock})
     settled(case.settle, case.clock)

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -91,19 +92,20 @@ def read_machine(path: str | pathlib.Path | Mapping[str, Any]) -> MachineCase:
         machine = ambjax.read_machine("machine.toml")
     """
     other = "it has no [rotor] with a kind, so it is a case of one axis; in Python, read_case reads it."
-    if isinstance(path, Mapping):
-        import tomlkit
+    with jax.ensure_compile_time_eval():
+        if isinstance(path, Mapping):
+            import tomlkit
 
-        if not is_machine(raw := dict(path)):
-            raise ValueError(other)
-        case = dataclasses.replace(machine_from(raw), text=tomlkit.dumps(raw))  # `check` and `map` read the text
-        texts = unresolved(case.cases)
-    else:
-        require_file("path", path, f"{FILE}, or a dict of tables")
-        case = read_any(path)
-        if isinstance(case, Case):
-            raise ValueError(one_line(f"{path}: {other}"))
-        texts = warnings_of_machine(case, path)
+            if not is_machine(raw := dict(path)):
+                raise ValueError(other)
+            case = dataclasses.replace(machine_from(raw), text=tomlkit.dumps(raw))  # `check` and `map` read the text
+            texts = unresolved(case.cases)
+        else:
+            require_file("path", path, f"{FILE}, or a dict of tables")
+            case = read_any(path)
+            if isinstance(case, Case):
+                raise ValueError(one_line(f"{path}: {other}"))
+            texts = warnings_of_machine(case, path)
     for text in texts:
         warnings.warn(text, stacklevel=2)
     return case

@@ -93,6 +93,8 @@ class Table:
     def __init__(self, raw: Any, path: str = "") -> None:
         if not isinstance(raw, dict):
             raise ValueError(f"{path} = {show(raw)}: it must be a table. Write [{path}] and its keys below it.")
+        if wrong := [key for key in raw if not isinstance(key, str)]:
+            raise ValueError(f"{path or 'case'}: the key {wrong[0]!r} must be text.")
         self.raw, self.path = raw, path
 
     def at(self, key: str) -> str:

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import jax
 import numpy as np
 
 from ambjax.cases import reader
@@ -33,13 +34,14 @@ def read_case(path: str | pathlib.Path | Mapping[str, Any]) -> Case:
 
         case = ambjax.read_case("my.toml")
     """
-    if isinstance(path, Mapping):
-        case = reader.case_from(dict(path))
-        texts = warnings_of(case)
-    else:
-        require_file("path", path, f"{FILE}, or a dict of tables")
-        case = reader.read_case(path)
-        texts = warnings_of_file(case, path)
+    with jax.ensure_compile_time_eval():
+        if isinstance(path, Mapping):
+            case = reader.case_from(dict(path))
+            texts = warnings_of(case)
+        else:
+            require_file("path", path, f"{FILE}, or a dict of tables")
+            case = reader.read_case(path)
+            texts = warnings_of_file(case, path)
     for text in texts:
         warnings.warn(text, stacklevel=2)
     return case

@@ -11,9 +11,16 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 from jax import Array
+from jax.core import Tracer
 
 Result = TypeVar("Result")
+
+
+def in_trace(node: object) -> bool:
+    """Return whether a number of the pytree is traced, or jit traces the caller: then it traces every result."""
+    return any(isinstance(x, Tracer) for x in (jnp.zeros(()), *jax.tree.leaves(node)))
 
 
 def compiled_alone(function: Callable[..., Result]) -> Callable[..., Result]:

@@ -20,8 +20,8 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
+from ambjax.compiler.barrier import in_trace
 from ambjax.compiler.traced_programs import traced_once
 
 log = logging.getLogger(__name__)
@@ -69,7 +69,7 @@ def one_kernel(function: Callable[..., Result], static_argnames: tuple[str, ...]
     @functools.wraps(function)
     def call(*args: object, **static: object) -> Result:
         leaves = jax.tree.leaves(args)
-        if any(isinstance(x, Tracer) for x in leaves) or options() is None:
+        if in_trace(leaves) or options() is None:
             return inner(*args, **static)
         if not refused or shapes_of(leaves) not in refused:
             try:

@@ -6,8 +6,8 @@ from contextlib import AbstractContextManager
 from typing import Any, TypeVar
 
 import jax
-from jax.core import Tracer
 
+from ambjax.compiler.barrier import in_trace
 from ambjax.compiler.traced_programs import traced_once
 
 Result = TypeVar("Result")
@@ -33,8 +33,7 @@ def compiled_quickly(
 
     @functools.wraps(function)
     def call(*args: object, **static: object) -> Result:
-        traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(args))
-        return (function if traced else compiled())(*args, **static)
+        return (function if in_trace(args) else compiled())(*args, **static)
 
     return call
 

@@ -91,8 +91,8 @@ def reason(error: BaseException, file: pathlib.Path | None = None) -> str:
     if isinstance(error, SyntaxError) and line is not None:
         words = error.msg  # str(error) contains the line too
     fix = ""
-    if isinstance(error, (jax.errors.TracerBoolConversionError, jax.errors.TracerArrayConversionError)):
-        fix = ". Compute with jax.numpy, and use jnp.where in place of `if`, `and` and `or`"
+    if isinstance(error, (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)):
+        fix = ". Compute with jax.numpy without float(), and use jnp.where in place of `if`, `and` and `or`"
     return f"raised {type(error).__name__}: {words.rstrip('.')}{'' if line is None else f' (line {line})'}{fix}"
 
 

@@ -116,8 +116,8 @@ def _at_rest(cascade: Cascade, scenario: Scenario, r: float) -> tuple[Cascade, S
 
 def _harmonics(frequencies: Sequence[float] | np.ndarray, clock: Clock) -> np.ndarray:
     """Return the harmonics [L] of 1/duration nearest to the frequencies (Hz), sorted, each once."""
-    f, base = np.asarray(frequencies, float), 1 / float(clock.duration)
-    harmonics = np.unique(np.round(f / base))
+    f, base = np.asarray(frequencies), 1 / float(clock.duration)
+    harmonics = np.unique(np.round(f / base)) if f.dtype.kind in "iuf" else np.zeros(0)
     if not harmonics.size or not np.isfinite(f).all() or harmonics[0] < 1 or harmonics[-1] >= clock.samples / 2:
         raise ValueError(
             f"injection.frequencies: they must be at least {base:g} Hz, the inverse of {clock.samples} samples, "

@@ -150,7 +150,8 @@ def require_number(
         ends = [f"of at least {low:g}"] if math.isfinite(low) else []
         ends = [f"from {low:.10g} to {high:.10g}"] if math.isfinite(high) else ends
         kind = "a whole number" if whole else "a finite number"
-        raise ValueError(f"{name} = {value!r}: it must be {' '.join([kind, *ends])}.")
+        shown = "a traced number" if isinstance(value, Tracer) else repr(value)
+        raise ValueError(f"{name} = {shown}: it must be {' '.join([kind, *ends])}.")
 
 
 def _shown(value: object, number: npt.ArrayLike) -> str:

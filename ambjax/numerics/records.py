@@ -19,6 +19,7 @@ import numpy.typing as npt
 from jax import Array
 from jax.core import Tracer
 
+from ambjax.compiler.barrier import in_trace
 from ambjax.numerics.declared import check_fixed, check_number, item, kinds
 from ambjax.numerics.shapes import check_shapes
 
@@ -223,8 +224,8 @@ def is_traced(x: object) -> bool:
 
 
 def require_concrete(name: str, node: object) -> None:
-    """Raise ValueError if a number of the pytree is traced. `name`: what it is, for the message."""
-    if any(is_traced(x) for x in jax.tree.leaves(node)):
+    """Raise ValueError if a number of the pytree or the caller is traced. `name`: what it is, for the message."""
+    if in_trace(node):
         raise ValueError(
             f"{name}: a number is traced, and this function does not work inside jit, vmap or grad. Use ambjax.rollout "
             "there, or ambjax.linear.loop_matrices for the linearised loop."

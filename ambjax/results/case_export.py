@@ -97,7 +97,7 @@ class ExportedCase:
     """
 
     plan: Plan
-    files: Mapping[str, str | bytes]
+    files: Mapping[str, str | bytes] = dataclasses.field(repr=False)
     checks: list[verify.Check]
 
     @property

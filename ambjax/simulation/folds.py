@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.control.law_trial import reason
 from ambjax.numerics.records import Scalar, leaf, record, static
 from ambjax.numerics.smooth import larger, safe_sqrt, smaller
 from ambjax.simulation.span import Span
@@ -50,8 +51,11 @@ class Fold(Protocol[Carry, Result]):
 
 
 def updated(fold: Fold[Carry, Result], carry: Carry, row: Row, span: Span) -> Carry:
-    """Return the next carry of a fold. Raises ValueError if it has another structure or another shape."""
-    after = fold.update(carry, row, span)
+    """Return the next carry of a fold. Raises ValueError if it has another structure or shape, or if `update` fails."""
+    try:
+        after = fold.update(carry, row, span)
+    except (TypeError, AttributeError) as error:  # JAX raises a TypeError where a traced number has no value
+        raise ValueError(f"fold: {type(fold).__name__}.update {reason(error)}.") from error
     before, found = (jax.tree.map(jnp.shape, x) for x in (carry, after))
     if before != found:
         raise ValueError(

@@ -1,6 +1,7 @@
 """The closed loop of a case, in continuous time or on a processor."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -14,6 +15,7 @@ from ambjax.control.stages import STAGES
 from ambjax.numerics.declared import require_number
 from ambjax.numerics.records import Scalar, is_traced, validate
 from ambjax.simulation.clock import Clock
+from ambjax.simulation.folds import Named
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.sampled import Sampled
 from ambjax.world.scenario import Scenario
@@ -24,13 +26,7 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
     for name, value, kind in (("cascade", cascade, Cascade), ("scenario", scenario, Scenario), ("clock", clock, Clock)):
         if not isinstance(value, kind):
             raise ValueError(f"{name} = {type(value).__name__}: it must be a {kind.__name__}.")
-    for stage, base in STAGES.items():
-        law = getattr(cascade, stage)
-        if not isinstance(law, base):
-            raise ValueError(
-                f"controller.{stage} = {type(law).__name__}: it is not a law of this stage. Derive the class from "
-                f"ambjax.extend.{base.__name__}."
-            )
+    _check_stages(cascade)
     for name, value in (("cascade", cascade), ("scenario", scenario), ("clock", clock)):
         require_records(name, value)
     for stage in STAGES:
@@ -42,6 +38,16 @@ def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
     validate(clock, "clock")
     require_number("clock.samples", clock.samples, 1, whole=True)
     require_number("clock.method.substeps", getattr(clock.method, "substeps", 1), 1, whole=True)
+
+
+def _check_stages(cascade: Cascade) -> None:
+    for stage, base in STAGES.items():
+        law = getattr(cascade, stage)
+        if not isinstance(law, base):
+            name = f"the class {law.__name__}" if isinstance(law, type) else type(law).__name__
+            derive = f"Derive the class from ambjax.extend.{base.__name__}"
+            fix = f"Write {law.__name__}()" if isinstance(law, type) else derive
+            raise ValueError(f"controller.{stage} = {name}: it is not a law of this stage. {fix}.")
 
 
 def require_records(name: str, node: Any) -> None:
@@ -57,17 +63,28 @@ def require_records(name: str, node: Any) -> None:
 
 def check_recording(fold: object, record_every: object) -> None:
     """Raise ValueError for arguments of `rollout` that are not a fold, or not a number of samples."""
+    if fold is not None:
+        _check_fold("fold", fold)
+    require_number("record_every", record_every, 0, whole=True)
+
+
+def _check_fold(path: str, fold: object) -> None:
     complete = all(hasattr(fold, method) for method in ("init", "update", "result"))
-    if fold is not None and (isinstance(fold, type) or jax.tree_util.all_leaves([fold]) or not complete):
+    if isinstance(fold, type) or jax.tree_util.all_leaves([fold]) or not complete:
         raise ValueError(
-            f"fold = {fold!r}: it must be a fold, such as ambjax.Metrics.for_case(case) or a record with the methods "
+            f"{path} = {fold!r}: it must be a fold, such as ambjax.Metrics.for_case(case) or a record with the methods "
             "of ambjax.extend.Fold, or None."
         )
-    require_number("record_every", record_every, 0, whole=True)
+    if isinstance(fold, Named):
+        if not isinstance(fold.folds, Mapping):
+            raise ValueError(f"{path}.folds = {fold.folds!r}: it must be a dict of folds by name.")
+        for name, one in fold.folds.items():
+            _check_fold(f"{path}.{name}", one)
 
 
 def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> None:
     """Raise ValueError, with the path and the fix, for parts of a loop that are not compatible. `sample_period`: s."""
+    _check_stages(cascade)
     _check_laws(cascade, sample_period)
     if not cascade.sampled:
         cascade.check_smooth()
