@@ -12,7 +12,7 @@ import pytest
 
 import ambjax
 from ambjax.__main__ import main
-from ambjax.cases.reader import case_from
+from ambjax.cases.reader import case_from, is_as_written
 from ambjax.results.case_export import ExportedCase
 from ambjax.simulation.trajectory import STALLED
 from tuning.__main__ import main as tune_main
@@ -256,10 +256,11 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
 
 def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
     """The search itself is that of the command, which tests/test_tuning_search.py tests."""
-    given = []
+    given, loaded = [], []
 
     def tuned(*words):
         given.append(words[:2])
+        loaded.append(words[3:])
         return TunedCase(ambjax.read_case(path), False, {"verdict": "none"}, tmp_path)
 
     monkeypatch.setattr("tuning.command.run", tuned)
@@ -271,6 +272,17 @@ def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
     for name, value in {"minutes": "3", "listen": 3}.items():
         with pytest.raises(ValueError, match=f"{name} = '?3'?: it must be"):
             ambjax.tune(path, **{name: value})
+    case = ambjax.read_case(path)
+    changed = ambjax.with_gains(case, {"controller.position.c": 20.0})
+    ambjax.tune(changed)
+    (tables, text), known = loaded[-1]
+    assert known is changed
+    assert tables["controller"]["position"]["c"] == 20.0
+    assert is_as_written(dataclasses.replace(changed, text=text))
+    assert not is_as_written(changed)
+    for other, said in {"": "made of parts", text: "more than its gains"}.items():
+        with pytest.raises(ValueError, match=said):
+            ambjax.tune(dataclasses.replace(case, text=other, settle=0.0))
 
 
 @pytest.mark.slow

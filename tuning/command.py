@@ -3,14 +3,15 @@
 import contextlib
 import dataclasses
 import pathlib
+import tomllib
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ambjax.cases.machine_case import MachineCase
+from ambjax.cases.machine_case import AnyCase, MachineCase
 from ambjax.cases.reader import Case, is_machine, read_case
-from ambjax.cases.table import FILE, load, one_line, require_file
+from ambjax.cases.table import FILE, load, one_line, require_file, text_of
 from ambjax.commands.reading import print_warnings
 from ambjax.host.arguments import names_arguments
 from ambjax.host.heartbeat import say
@@ -28,7 +29,7 @@ from tuning.problem.tuning_problem import TuningProblem, problem_of
 from tuning.report.facts import KEY, NOT_JUDGED, REPORT, TUNED, ended, record, search_facts
 from tuning.report.folder import all_laws, put_answer, put_front, put_page, put_report
 from tuning.report.judging import examined
-from tuning.report.tuned import text_of, tuned_case
+from tuning.report.tuned import text_with_gains, tuned_case
 from tuning.rounds import rounds
 from tuning.solve.checkpoint import can_resume, checkpoint, has_unfinished_search, mark_directory, remove_all
 
@@ -91,7 +92,7 @@ class TuningPlan(NamedTuple):
 
 @names_arguments(budget="minutes")
 def tune(
-    case: str | pathlib.Path | Mapping[str, Any],
+    case: str | pathlib.Path | Mapping[str, Any] | AnyCase,
     out: str | pathlib.Path | None = None,
     *,
     resume: bool = False,
@@ -104,7 +105,8 @@ def tune(
 ) -> TunedCase:
     """Tune the gains of a case file, as `ambjax tune` does, and write the same files.
 
-    - `case`: path of the case file, or a dict of its tables. The table [tune] selects the gains, limits and budget.
+    - `case`: path of the case file, a dict of its tables, or a case that was read; its gains may be those of
+      `with_gains`. The table [tune] selects the gains, limits and budget.
     - `out`: directory of the results; None: a new one under ./out.
     - `resume`: continue the search whose checkpoints are in `out`.
     - `force`: overwrite the files of an earlier search in `out`.
@@ -127,20 +129,26 @@ def tune(
         raise ValueError(f"listen = {listen!r}: it must be a function of an event.")
     if not isinstance(minutes, (int, float, type(None))):
         raise ValueError(f"minutes = {minutes!r}: it must be a number above 0.")
-    loaded = None
+    loaded, known = None, None
     if isinstance(case, Mapping):
         loaded, case = (dict(case), text_of(case)), "case"
-    require_file("case", case, f"{FILE}, or a dict of tables")
+    elif isinstance(case, (Case, MachineCase)):
+        text, known = text_with_gains(case), case if isinstance(case, Case) else None
+        loaded, case = (tomllib.loads(text), text), pathlib.Path(getattr(case, "folder", ""), f"{case.name}.toml")
+    require_file("case", case, f"{FILE}, a dict of tables, or a case that was read")
     folder, other = (None if path is None else str(path) for path in (out, settings_of))
     options = Options(folder, resume, force, pareto, page, other, minutes)
     with contextlib.ExitStack() as stack, one_thread():
-        return run(str(case), options, listen or stack.enter_context(Log()), loaded)
+        return run(str(case), options, listen or stack.enter_context(Log()), loaded, known)
 
 
-def run(path: str, options: Options, listen: Listener, loaded: Loaded | None = None) -> TunedCase:
+def run(
+    path: str, options: Options, listen: Listener, loaded: Loaded | None = None, known: Case | None = None
+) -> TunedCase:
     """Tune the case file at `path`, write the results, and return them. `listen`: receives the events.
 
-    `loaded`: its contents as of `load`; None: they are read.
+    `loaded`: its contents as of `load`; None: they are read. `known`: a case that names the same files; they are not
+    read again.
     Raises ValueError for bad input before anything is written, and in the search as `rounds` does.
     """
     loaded = loaded or load(path)  # once: a second read of a pipe would be empty
@@ -155,7 +163,7 @@ def run(path: str, options: Options, listen: Listener, loaded: Loaded | None = N
             raise ValueError(f"--{refused}: the tuning of a machine does not take it. Leave it out.")
         plan = machine_plan(path, options.out, options.minutes, options.settings_of, loaded)
     else:
-        plan = _plan(path, options, loaded)
+        plan = _plan(path, options, loaded, known)
     with locked(plan.out):
         if not options.resume:
             _clear(plan.out, options.force)
@@ -170,9 +178,9 @@ def run(path: str, options: Options, listen: Listener, loaded: Loaded | None = N
             return TunedCase(case, report["outcome"]["good"], report, plan.out)
 
 
-def _plan(path: str, options: Options, loaded: Loaded) -> TuningPlan:
+def _plan(path: str, options: Options, loaded: Loaded, known: Case | None) -> TuningPlan:
     """Read the case and make the output directory. Raises ValueError for an invalid case or option."""
-    case, tune, raw = read_tune(path, options.settings_of, loaded)
+    case, tune, raw = read_tune(path, options.settings_of, loaded, known)
     if options.minutes is not None:
         tune = dataclasses.replace(tune, minutes=options.minutes)
     print_warnings(case, path)

@@ -23,7 +23,7 @@ from ambjax.cases.reader import TABLES, Case, case_from, is_machine, read_by, sa
 from ambjax.cases.rotor_numbers import fastest_rotor, widest_rotation
 from ambjax.cases.rotor_tables import COORDINATES, RIGID, BearingAxis, axes_and_rotor, tables_of, vector
 from ambjax.cases.speed_table import MOST_SPEEDS, listed_speeds
-from ambjax.cases.table import FILE, Table, require_file, show
+from ambjax.cases.table import FILE, Table, require_file, show, text_of
 from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.synchronous_notch import SynchronousNotch
@@ -94,11 +94,9 @@ def read_machine(path: str | pathlib.Path | Mapping[str, Any]) -> MachineCase:
     other = "it has no [rotor] with a kind, so it is a case of one axis; in Python, read_case reads it."
     with jax.ensure_compile_time_eval():
         if isinstance(path, Mapping):
-            import tomlkit
-
             if not is_machine(raw := dict(path)):
                 raise ValueError(other)
-            case = dataclasses.replace(machine_from(raw), text=tomlkit.dumps(raw))  # `check` and `map` read the text
+            case = dataclasses.replace(machine_from(raw), text=text_of(raw))  # `check` and `map` read the text
             texts = unresolved(case.cases)
         else:
             require_file("path", path, f"{FILE}, or a dict of tables")

@@ -8,6 +8,7 @@ from collections.abc import Callable, Hashable, Iterable
 from typing import Any, TypeVar
 
 import jax
+import numpy as np
 
 from ambjax.cases.case_table import case_table, parts_of
 from ambjax.cases.controller_file import ControllerFile
@@ -208,6 +209,17 @@ def case_from(
     zones.check(clock.sample_period if cascade.sampled else None)
     read = tuple(recordings.read)
     return Case(safe_name(name), cascade, scenario, clock, settle, spread, text, assumed, own, matrices, zones, read)
+
+
+def is_as_written(case: Case) -> bool:
+    """Return whether the numbers of a case are those of its text, so that it was not changed after it was read."""
+    read = case_from(tomllib.loads(case.text), case.name, known=case)
+    (a, known), (b, given) = (jax.tree.flatten([getattr(one, name) for name in PARTS]) for one in (read, case))
+    same = all(getattr(read, name) == getattr(case, name) for name in ("settle", "spread", "zones"))
+    # the gains of a notch are computed, and differ by rounding
+    return (
+        same and known == given and all(np.allclose(x, y, 1e-9, 0.0, equal_nan=True) for x, y in zip(a, b, strict=True))
+    )
 
 
 def cascade_at(case: Case, period: float) -> Cascade:

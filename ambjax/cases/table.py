@@ -28,6 +28,23 @@ SEVERAL = r"disturbance\.\w+|bearing|unbalance|load|base|rotor\.(?:modes|element
 MOST_BYTES = 10_000_000
 
 
+def text_of(tables: Mapping[str, Any]) -> str:
+    """Return the text of a case of these tables. Raises ValueError for a value that TOML does not have."""
+    import tomlkit  # the commands read files, and need it rarely
+    from tomlkit.exceptions import TOMLKitError
+
+    def plain(x: Any) -> Any:
+        if isinstance(x, Mapping):
+            return {key: plain(value) for key, value in x.items()}
+        x = x.tolist() if hasattr(x, "tolist") else x  # arrays and numbers of NumPy and JAX
+        return [plain(one) for one in x] if isinstance(x, (list, tuple)) else x
+
+    try:
+        return tomlkit.dumps(plain(tables))
+    except (TOMLKitError, TypeError, ValueError) as why:
+        raise ValueError(one_line(f"case: a dict of tables has numbers, words, lists and dicts ({why}).")) from None
+
+
 def load(path: str | pathlib.Path) -> tuple[dict[str, Any], str]:
     """Return a case file as parsed TOML, not yet checked, and its text.
 

@@ -14,7 +14,7 @@ from ambjax.cases import reader
 from ambjax.cases.plausibility import implausible
 from ambjax.cases.reach import reach, widest
 from ambjax.cases.reader import Case
-from ambjax.cases.table import FILE, require_file
+from ambjax.cases.table import FILE, require_file, text_of
 from ambjax.text.words import one_line
 from ambjax.world.scenario import Scenario
 
@@ -36,7 +36,7 @@ def read_case(path: str | pathlib.Path | Mapping[str, Any]) -> Case:
     """
     with jax.ensure_compile_time_eval():
         if isinstance(path, Mapping):
-            case = reader.case_from(dict(path))
+            case = dataclasses.replace(reader.case_from(dict(path)), text=text_of(path))
             texts = warnings_of(case)
         else:
             require_file("path", path, f"{FILE}, or a dict of tables")

@@ -6,7 +6,6 @@ import hashlib
 import json
 import pathlib
 import re
-import tomllib
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from ambjax.cases.case_table import notebook_table
 from ambjax.cases.given import of_case
-from ambjax.cases.reader import Case, case_from
+from ambjax.cases.reader import Case, is_as_written
 from ambjax.cases.table import require_file
 from ambjax.codegen import verify
 from ambjax.codegen.block import Block
@@ -33,7 +32,6 @@ from ambjax.ensemble.spread import ends
 from ambjax.host.arguments import names_arguments
 from ambjax.results.outputs import described, directory, files, plain, spare
 from ambjax.simulation.system import guarded
-from ambjax.simulation.triple import PARTS
 
 FORMATS = ("c", "fmu", "js")
 # Files of the verification.
@@ -185,10 +183,7 @@ def planned(
 
 def _digest(case: Case) -> str:
     """Return the SHA-256 of the text of a case; '' without a text, or if the case was changed after it was read."""
-    read = case_from(tomllib.loads(case.text), case.name, known=case)
-    (a, known), (b, given) = (jax.tree.flatten([getattr(one, name) for name in PARTS]) for one in (read, case))
-    same = known == given and all(map(np.array_equal, a, b))
-    return hashlib.sha256(case.text.encode()).hexdigest() if same and case.text else ""
+    return hashlib.sha256(case.text.encode()).hexdigest() if case.text and is_as_written(case) else ""
 
 
 def _choice(name: str, value: object, allowed: tuple[object, ...]) -> None:

@@ -92,18 +92,19 @@ def read_tune(
     path: str | pathlib.Path,
     settings_of: str | pathlib.Path | None = None,
     loaded: tuple[dict[str, Any], str] | None = None,
+    known: Case | None = None,
 ) -> tuple[Case, Tune, dict[str, Any]]:
     """Return the case, [tune] and the raw document of a case file.
 
     `settings_of`: a case file whose [tune] replaces that of the case, except for the keys `gains` and `bounds`.
-    `loaded`: document and text of the file; None: they are read. Raises ValueError with a message of one line for an
-    invalid file.
+    `loaded`: document and text of the file; None: they are read. `known`: a case that names the same files. Raises
+    ValueError with a message of one line for an invalid file.
     """
     raw, text = loaded or load(path)
     name = pathlib.Path(path).stem
     raw = with_settings_of(raw, settings_of)
     try:
-        case = case_from(raw, name, text, pathlib.Path(path).parent)
+        case = case_from(raw, name, text, pathlib.Path(path).parent, known)
         return case, tune_from(Table(raw).table("tune"), case), raw
     except ValueError as error:
         kind = NothingToTuneError if isinstance(error, NothingToTuneError) else ValueError

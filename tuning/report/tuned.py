@@ -1,24 +1,30 @@
 """tuned.toml: the user's case file, with its comments, and the tuned gains."""
 
+import dataclasses
 import pathlib
 import re
 import tomllib
 from collections.abc import Mapping
 from typing import Any
 
+import jax
+import numpy as np
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import InlineTable, Table
 
+from ambjax.cases.machine_case import MachineCase, machine_from
 from ambjax.cases.own_laws import relocated
-from ambjax.cases.reader import Case, case_from
+from ambjax.cases.reader import Case, case_from, is_as_written
 from ambjax.cases.recordings import relocated_files
-from ambjax.cases.table import one_line
+from ambjax.results.gains import gains_of
 
 FIRST = "Tuned by ambjax tune from the case"
 AUTO = "auto"
 # First lines of tuned.toml. They are removed when the file is tuned again.
 HEAD = re.compile(rf"\A# {FIRST} [^\n]*\n(#[^\n]*\n)?\n?")
+# Numbers of a controller that are no gains, or follow from them.
+NO_GAINS = ("controller.model.", "controller.notch.gains.", "processor.")
 # Characters that a comment must not contain; surrogates come from file names that are not UTF-8.
 CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 
@@ -55,8 +61,15 @@ def tuned(text: str, gains: Mapping[str, float | str], case: str, verdict: str) 
     The text begins with a comment: the name of the case and the verdict. Raises ValueError if the text cannot be
     changed in this way.
     """
+    body = with_numbers(HEAD.sub("", text.replace("\r\n", "\n")), gains)
+    head = [f"# {CONTROL.sub(_escaped, line)}" for line in (f"{FIRST} '{case}'.", verdict)]
+    return "\n".join([*head, "", body.strip()]) + "\n"
+
+
+def with_numbers(text: str, gains: Mapping[str, float | str]) -> str:
+    """Return the text of a case file with the values of `tuned`, without its comment. Raises ValueError as it does."""
     try:
-        document = tomlkit.parse(HEAD.sub("", text.replace("\r\n", "\n")))
+        document = tomlkit.parse(text)
         for path, value in gains.items():
             *tables, name = _words(path)
             _put(_table(document, tables), name, value if isinstance(value, str) else float(value))
@@ -65,16 +78,24 @@ def tuned(text: str, gains: Mapping[str, float | str], case: str, verdict: str) 
             raise ValueError("what is written would be another case")
     except (TOMLKitError, ValueError, TypeError, KeyError) as why:
         raise ValueError(f"gains cannot be written into it ({why}). Give each law a table [controller.STAGE].") from why
-    head = [f"# {CONTROL.sub(_escaped, line)}" for line in (f"{FIRST} '{case}'.", verdict)]
-    return "\n".join([*head, "", body.strip()]) + "\n"
+    return body
 
 
-def text_of(tables: Mapping[str, Any]) -> str:
-    """Return the text of a case of these tables. Raises ValueError for a value that TOML does not have."""
-    try:
-        return tomlkit.dumps(tables)
-    except (TOMLKitError, TypeError, ValueError) as why:
-        raise ValueError(one_line(f"case: a dict of tables has numbers, words, lists and dicts ({why}).")) from None
+def text_with_gains(case: Case | MachineCase) -> str:
+    """Return the text of a case with its gains. Raises ValueError if more than gains was changed after it was read."""
+    if not case.text:
+        raise ValueError("case: it was made of parts, and has no tables. Give a path, or a dict of tables.")
+    if isinstance(case, MachineCase):
+        read = machine_from(tomllib.loads(case.text), case.name, case.text, case.folder)
+        same = all(map(np.array_equal, *(jax.tree.leaves((one.machine, one.clock)) for one in (read, case))))
+    elif not (same := is_as_written(case)):
+        gains = {path: float(x) for path, x in gains_of(case).items() if not path.startswith(NO_GAINS)}
+        text = with_numbers(case.text, gains)
+        case = dataclasses.replace(case, text=text)
+        same = is_as_written(case)
+    if not same:
+        raise ValueError("case: more than its gains was changed after it was read. Change its tables, and read them.")
+    return case.text
 
 
 def _words(path: str) -> list[Any]:
