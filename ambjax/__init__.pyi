@@ -24,6 +24,7 @@ from ambjax.control.cascade import Cascade as Cascade
 from ambjax.control.guard import Guard as Guard
 from ambjax.control.processor import Processor as Processor
 from ambjax.results.case_export import export as export
+from ambjax.results.case_file import save_case as save_case
 from ambjax.results.case_map import survival_map as survival_map
 from ambjax.results.gains import gains_of as gains_of
 from ambjax.results.gains import with_gains as with_gains

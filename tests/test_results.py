@@ -256,11 +256,10 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
 
 def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
     """The search itself is that of the command, which tests/test_tuning_search.py tests."""
-    given, loaded = [], []
+    given = []
 
     def tuned(*words):
         given.append(words[:2])
-        loaded.append(words[3:])
         return TunedCase(ambjax.read_case(path), False, {"verdict": "none"}, tmp_path)
 
     monkeypatch.setattr("tuning.command.run", tuned)
@@ -272,17 +271,25 @@ def test_tune_is_the_command_as_a_function(path, tmp_path, monkeypatch):
     for name, value in {"minutes": "3", "listen": 3}.items():
         with pytest.raises(ValueError, match=f"{name} = '?3'?: it must be"):
             ambjax.tune(path, **{name: value})
+
+
+def test_a_case_with_other_gains_can_be_tuned_and_saved(path, tmp_path, monkeypatch):
+    monkeypatch.setattr("tuning.command.run", lambda *words: words)
     case = ambjax.read_case(path)
     changed = ambjax.with_gains(case, {"controller.position.c": 20.0})
-    ambjax.tune(changed)
-    (tables, text), known = loaded[-1]
-    assert known is changed
-    assert tables["controller"]["position"]["c"] == 20.0
-    assert is_as_written(dataclasses.replace(changed, text=text))
     assert not is_as_written(changed)
+    ambjax.save_case(tmp_path / "mine.toml", changed)
+    saved = ambjax.read_case(tmp_path / "mine.toml")
+    assert is_as_written(dataclasses.replace(changed, text=saved.text))
+    (tables, text), known = ambjax.tune(changed)[3:]
+    assert known is changed
+    assert text == saved.text
+    assert tables["controller"]["position"]["c"] == 20.0
     for other, said in {"": "made of parts", text: "more than its gains"}.items():
         with pytest.raises(ValueError, match=said):
             ambjax.tune(dataclasses.replace(case, text=other, settle=0.0))
+    with pytest.raises(ValueError, match="case = str: it must be a case"):
+        ambjax.save_case(tmp_path / "mine.toml", str(path))
 
 
 @pytest.mark.slow

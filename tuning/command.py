@@ -20,6 +20,7 @@ from ambjax.host.lock import locked
 from ambjax.host.one_thread import one_thread
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
+from ambjax.results.case_file import text_with_gains
 from ambjax.results.outputs import check_new, described, directory, files, plain, write_json
 from tuning.events import Listener, Log, teller
 from tuning.machines.machine_tuning import machine_plan, tune_machine
@@ -29,7 +30,7 @@ from tuning.problem.tuning_problem import TuningProblem, problem_of
 from tuning.report.facts import KEY, NOT_JUDGED, REPORT, TUNED, ended, record, search_facts
 from tuning.report.folder import all_laws, put_answer, put_front, put_page, put_report
 from tuning.report.judging import examined
-from tuning.report.tuned import text_with_gains, tuned_case
+from tuning.report.tuned import tuned_case
 from tuning.rounds import rounds
 from tuning.solve.checkpoint import can_resume, checkpoint, has_unfinished_search, mark_directory, remove_all
 
