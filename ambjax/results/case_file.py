@@ -13,10 +13,10 @@ from ambjax.cases.own_laws import relocated
 from ambjax.cases.reader import Case, is_as_written
 from ambjax.cases.recordings import relocated_files
 from ambjax.cases.table import file_to_write
-from ambjax.results.gains import gains_of
+from ambjax.ensemble.paths import places
 
 # Numbers of a controller that are no gains, or follow from them.
-NO_GAINS = ("controller.model.", "controller.notch.gains.", "processor.")
+NO_GAINS = ("controller.model.", "controller.notch.gains.")
 
 
 def save_case(path: str | pathlib.Path, case: Case) -> None:
@@ -47,7 +47,9 @@ def text_with_gains(case: AnyCase) -> str:
         read = machine_from(tomllib.loads(case.text), case.name, case.text, case.folder)
         same = all(map(np.array_equal, *(jax.tree.leaves((one.machine, one.clock)) for one in (read, case))))
     elif not (same := is_as_written(case)):
-        gains = {path: float(x) for path, x in gains_of(case).items() if not path.startswith(NO_GAINS)}
+        known = places(case.cascade, case.scenario).items()
+        own = [(path, one.value) for path, one in known if path.startswith("controller.") and one.value is not None]
+        gains = {path: float(x) for path, x in own if not path.startswith(NO_GAINS)}
         text = with_numbers(case.text, gains)
         case = dataclasses.replace(case, text=text)
         same = is_as_written(case)
