@@ -66,7 +66,7 @@ def _forces(case: Case) -> Iterator[str]:
     if (heavy := GRAVITY * mass) > MOST_WEIGHT * largest:
         yield (
             f"plant.m = {mass:g} kg: the rotor weighs {heavy:.4g} N, {heavy / largest:.3g} times the largest force of "
-            f"the magnets, {largest:.4g} N. Is it in grams? Or is actuator.i_max too small?"
+            f"the magnets, {largest:.4g} N. Is it in grams? Or is actuator.i_max or u_max too small?"
         )
     if weight <= largest < weight + load:
         yield (

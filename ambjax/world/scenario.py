@@ -148,8 +148,9 @@ class Scenario:
         """
         i_max, R = self.actuator.current_limit(self.plant.i_0), jnp.asarray(self.plant.R)
         dead = getattr(self.actuator, "dead_band", None)
-        most = jnp.maximum(self.voltage_limit - (0.0 if dead is None else dead), 0.0)
-        driven = jnp.where(R > 0, most / jnp.where(R > 0, R, 1.0), jnp.inf)
+        most = self.voltage_limit - (0.0 if dead is None else dead)
+        limits = (R > 0) & (most > 0)  # the reader warns of an amplifier that gives nothing
+        driven = jnp.where(limits, most / jnp.where(limits, R, 1.0), jnp.inf)
         return self.plant.largest_force(driven if i_max is None else jnp.minimum(i_max, driven))
 
     @property
