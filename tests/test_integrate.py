@@ -230,20 +230,14 @@ def test_method_choice():
 
 def test_the_chosen_steps_resolve_the_loads():
     """One step of RK4 sees a constant in a sine of twice the sampling rate."""
-    held, once = amb.Cascade(processor=amb.Processor()), 0.5 / (2 * np.pi)
+    held, world = amb.Cascade(processor=amb.Processor()), amb.Scenario(q_f=amb.signals.Sine(1.0, 2e4))
     for cascade, reverse in ((held, False), (SMOOTH, True)):
-        steps = [
-            amb.solvers.choose_method(cascade, amb.Scenario(q_f=amb.signals.Sine(1.0, f)), 1e-4, reverse=reverse)
-            for f in (1.0, 2e4)
-        ]
-        assert steps[0].step_size(1e-4) > steps[1].step_size(1e-4)
-        assert 0.9 * once < 2e4 * steps[1].step_size(1e-4) <= once
+        step = amb.solvers.choose_method(cascade, world, 1e-4, reverse=reverse).step_size(1e-4)
+        assert 0.45 < 2 * np.pi * 2e4 * step <= 0.5
     with pytest.raises(ValueError, match=r"a load of 1e\+07 Hz needs 12567 steps in a sample"):
         amb.solvers.choose_method(held, amb.Scenario(base=amb.signals.Sine(1.0, 1e7)), 1e-4)
-    raw = tomllib.loads(template("machine"))
-    for f, substeps in ((2e4, 13), (1e4, 7)):
-        load = {"kind": "sine", "amplitude": 1.0, "frequency": f, "direction": [0.0, 1.0, 0.0]}
-        assert amb.read_machine(raw | {"base": [load]}).clock.method.substeps == substeps
+    load = {"kind": "sine", "amplitude": 1.0, "frequency": 2e4, "direction": [0.0, 1.0, 0.0]}
+    assert amb.read_machine(tomllib.loads(template("machine")) | {"base": [load]}).clock.method.substeps == 13
 
 
 # R / L of a wide gap times the sample is 12: two substeps, which suffice for the motion, are unstable
