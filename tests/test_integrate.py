@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+import tomllib
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ import pytest
 from structures import METHODS
 
 import ambjax as amb
+from ambjax.cases.template_text import template
 from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.method import QUIET_TIGHT, QUIET_TOLERANCE, TIGHT, TOLERANCE
 from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED
@@ -224,6 +226,18 @@ def test_method_choice():
     assert isinstance(amb.solvers.choose_method(SMOOTH, TRACKING, 1e-4, reverse=True), amb.solvers.RK4)
     mine = amb.Clock(method=amb.solvers.Rodas3(4))
     assert amb.solvers.with_method(mine, REPAIRED, TRACKING) is mine
+
+
+def test_the_chosen_steps_resolve_the_loads():
+    """One step of RK4 sees a constant in a sine of twice the sampling rate."""
+    held, world = amb.Cascade(processor=amb.Processor()), amb.Scenario(q_f=amb.signals.Sine(1.0, 2e4))
+    for cascade, reverse in ((held, False), (SMOOTH, True)):
+        step = amb.solvers.choose_method(cascade, world, 1e-4, reverse=reverse).step_size(1e-4)
+        assert 0.45 < 2 * np.pi * 2e4 * step <= 0.5
+    with pytest.raises(ValueError, match=r"a load of 1e\+07 Hz needs 12567 steps in a sample"):
+        amb.solvers.choose_method(held, amb.Scenario(base=amb.signals.Sine(1.0, 1e7)), 1e-4)
+    load = {"kind": "sine", "amplitude": 1.0, "frequency": 2e4, "direction": [0.0, 1.0, 0.0]}
+    assert amb.read_machine(tomllib.loads(template("machine")) | {"base": [load]}).clock.method.substeps == 13
 
 
 # R / L of a wide gap times the sample is 12: two substeps, which suffice for the motion, are unstable

@@ -16,7 +16,7 @@ from ambjax.__main__ import main
 from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.template_text import template
 from ambjax.commands import campbell
-from ambjax.commands.machine_commands import once_per_revolution, sensitivity_text
+from ambjax.commands.machine_commands import once_per_revolution
 from ambjax.commands.sensitivity_report import injection_text
 from ambjax.linear import rotor_modes
 from ambjax.linear.injection import Injection
@@ -57,11 +57,7 @@ def test_an_unstable_machine_has_no_peaks_no_zones_and_no_verdict_by_api(tmp_pat
     weak = machine_of(tmp_path, Weak)
     found = machine_sensitivity(weak.machine, weak.axes, weak.clock.sample_period, 6000.0, weak.zones)
     assert not found.stable
-    peaks = [peak for axis in found.axes for peak in (axis.S, axis.T, axis.KS)]
-    assert {peak.height for peak in [*peaks, found.sigma]} == {np.inf}
     assert once_per_revolution(found) == [([], [])] * len(weak.axes)
-    (line,) = sensitivity_text([found], {}, weak.zones).splitlines()
-    assert "NOT STABLE" in line
     response = unbalance_response(weak.machine, weak.clock.sample_period, 100.0)
     assert np.isnan(response.sensors).all()
     text = campbell.unbalance_text(weak, response, critical_speeds(response, (50.0, 90.0)), (50.0, 90.0))

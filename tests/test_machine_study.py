@@ -21,6 +21,7 @@ from ambjax.cases.rotor_numbers import rotor_places, varied_rotor
 from ambjax.cases.template_text import template
 from ambjax.commands import comparison_tuning
 from ambjax.ensemble import worker
+from ambjax.ensemble.study import PERIOD
 from ambjax.ensemble.worker import chunk
 from ambjax.host.extensions import NothingToTuneError
 from ambjax.linear import Stability, machine_sensitivity
@@ -245,8 +246,14 @@ def test_axes_of_a_map(files, monkeypatch):
     assert len(study.parts("bearing.left.plant.A")) == 2
     assert study.parts(y.path) == ("rotor.speed",)
     assert study.clock.method.substeps > study_of(read_any(path), None, 2).clock.method.substeps
-    halved = study.at_period(2.5e-5)
+    halved = study.at(PERIOD, 2.5e-5)
     assert halved.clock.samples == 2 * study.clock.samples
+    assert study.rereads("processor.delay")
+    assert not study.rereads("controller.position.c")
+    for one, count in (("controller.model.A", 5), ("bearing.left.controller.model.A", 2)):
+        assert study.rereads(one)
+        gains, own = ([case.cascade.position.c for case in of.case.cases] for of in (study, study.at(one, 9e-5)))
+        assert np.not_equal(gains, own).sum() == count
     tested = []  # all speeds, but only that of the cell if they vary
     monkeypatch.setattr(machine_study, "turning_machines", lambda *x: tested.append(x[2]) or [])
     for values in ({}, {"rotor.speed": np.array([9e3])}):

@@ -11,15 +11,16 @@ from tomlkit import dumps
 import ambjax
 from ambjax import Cascade, Clock, Initial, Scenario, paper, rollout
 from ambjax.__main__ import main
-from ambjax.cases.reader import case_from
+from ambjax.cases.reader import cascade_at, case_from
 from ambjax.commands import map as commands
 from ambjax.ensemble import Normal, Spread, maps, wilson
 from ambjax.ensemble import study as studies
 from ambjax.ensemble.maps import Axis, grid
-from ambjax.ensemble.study import Study
-from ambjax.laws import inversion
+from ambjax.ensemble.study import PERIOD, Study
+from ambjax.laws import current, inversion
 from ambjax.plants import Plant
 from ambjax.results.case_map import study_and_axes, survival_map
+from ambjax.results.cell_gains import default_gains
 from ambjax.results.runs import simulate
 from ambjax.sensors import Sensor
 from ambjax.simulation.folds import Peak
@@ -120,6 +121,22 @@ def test_each_cell_has_the_default_gains_and_a_notch_for_its_controller_and_its_
             alone = simulate(case_from(raw)).metrics["settled_max_abs_error_m"]
             # the steps of the map are those for all cells
             assert found.error[row, column] == pytest.approx(alone, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("path", "low", "gain"), [(PERIOD, 2e-4, "w"), ("processor.delay", 0.5, "share"), ("controller.model.m", 3.0, "w")]
+)
+def test_the_default_gains_of_a_cell_are_those_of_a_file_with_its_numbers(path, low, gain):
+    raw = {"clock": TURNING["clock"], "processor": {"delay": 1.0, "predict": False}}
+    raw |= {"controller": {"current": {"kind": "dead-beat"}}}
+    case, axes = case_from(raw, text=dumps(raw)), {path: np.array([low, 1.3 * low])}
+    study, name = Study(case.cascade, case.scenario, case.clock, 0.0, case.spread, 0, 1), f"controller.current.{gain}"
+    found = default_gains(case, study, axes)[name]
+    for ours, value in zip(found, axes[path], strict=True):
+        changed = (value, {}) if path == PERIOD else (1e-4, {path: value})
+        assert ours == getattr(cascade_at(case, *changed).current, gain) != getattr(case.cascade.current, gain)
+    own = dataclasses.replace(case.cascade, current=current.DeadBeat(3.0, 0.3))  # set in Python
+    assert name not in default_gains(case, dataclasses.replace(study, cascade=own), axes)
 
 
 CASE = """

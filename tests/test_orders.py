@@ -1,13 +1,11 @@
 """Amplitude and phase once and twice per revolution, and the fold that computes them."""
 
-import json
 import tomllib
 
 import jax
 import numpy as np
 import pytest
 
-from ambjax.__main__ import main
 from ambjax.cases.machine_case import machine_from
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
@@ -79,33 +77,6 @@ def test_other_orders_do_not_leak_into_the_fit():
 def test_without_a_whole_revolution_nothing_is_known():
     found = folded(Orders(Rotation(60.0), 0.0), np.cos, 2000)
     assert not any(found.values())
-
-
-TURNING = """
-rotor = { speed = 6000.0 }
-disturbance.q_z = { kind = "unbalance", unbalance = 5.0 }
-clock = { duration = 0.1, sample_period = 1e-4 }
-"""
-
-
-@pytest.mark.thorough
-def test_simulate_and_compare_state_them(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "a.toml").write_text(TURNING)
-    (tmp_path / "b.toml").write_text(TURNING.replace("5.0", "2.5"))
-    assert main(["simulate", "a.toml", "--out", "a"]) == 0
-    metrics, run = json.loads((tmp_path / "a/metrics.json").read_text()), np.load(tmp_path / "a/trajectory.npz")
-    settled = run["t"] > 0.03
-    turn = np.exp(-2j * np.pi * 100.0 * run["t"][settled])
-    for name in SIGNALS:
-        amplitude = 2 * np.mean(run[name][settled] * turn)
-        assert metrics[f"{name}_1x_{SIGNALS[name]}"] == pytest.approx(abs(amplitude), rel=0.02)
-        assert metrics[f"{name}_1x_deg"] == pytest.approx(np.degrees(np.angle(amplitude)), abs=2.0)
-    assert main(["compare", "a.toml", "b.toml", "--members", "1", "--out", "c"]) == 0
-    first, second = json.loads((tmp_path / "c/compare.json").read_text())["cases"]
-    assert first["z_1x_m"] == pytest.approx(metrics["z_1x_m"], rel=1e-9)
-    assert first["z_1x_m"] / second["z_1x_m"] == pytest.approx(2.0, rel=0.1)
-    assert "median amplitude of z at 1x" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -64,21 +64,6 @@ def test_the_dataset_has_the_signals_with_units(run):
     assert {name: data[name].attrs["units"] for name in data} == run.to_pandas().attrs["units"]
 
 
-@pytest.mark.thorough
-def test_a_comparison_equals_that_of_the_command_and_prints_nothing(path, tmp_path, capfd):
-    case = ambjax.read_case(path)
-    other = ambjax.with_gains(case, {"controller.position.c": 20.0})
-    found = ambjax.compare([case, other], 4)
-    assert capfd.readouterr() == ("", "")
-    assert [row["case"] for row in found.summary["cases"]] == ["case (1)", "case (2)"]
-    alone = ambjax.simulate_members(other, 4).columns["settled_rms_error_m"]
-    assert np.array_equal(found.compared[1].columns["settled_rms_error_m"], alone)
-    assert found.summary["cases"][1]["peak"] == ambjax.sensitivity(other).S.height
-    assert "case (2)" in found.table()
-    with pytest.raises(ValueError, match="1 case: give 2 to 8 cases"):
-        ambjax.compare([case])
-
-
 @pytest.mark.slow
 def test_a_check_returns_its_verdict_and_prints_nothing(path, capfd):
     case = ambjax.read_case(path)

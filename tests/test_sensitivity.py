@@ -11,9 +11,12 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import case_from, read_case
 from ambjax.cases.template_text import template
 from ambjax.commands import acceptance
-from ambjax.commands.sensitivity_report import _measured_numbers
-from ambjax.linear import MemberPeaks, Zones, analyse, linearise
+from ambjax.commands.comparison_loop import loop_of_axis
+from ambjax.commands.sensitivity_report import UNSTABLE, WITHOUT, _measured_numbers, text_of
+from ambjax.linear import MemberPeaks, Stability, StateSpace, Zones, analyse, linearise
+from ambjax.linear.state_space import CommandPath
 from ambjax.pictures.frequency import MeasuredPoints, NamedLoop, frequency_figure
+from ambjax.results import operating
 from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import rollout
 from ambjax.world.sensor import Measurement
@@ -175,6 +178,27 @@ def test_the_numbers_of_the_machine_contain_its_iron(kind):
     assert facts["k_i_N_per_A"] == pytest.approx(slope("i", 1e-5), rel=1e-5)
     assert facts["current_slew_A_per_s"] == pytest.approx(float(rates(u=48.0).i), rel=1e-9)
     assert facts["bias_flux_T"] == pytest.approx(float(plant.flux_density(plant.start(Measurement(0.0, 0.0, 0.0)))))
+
+
+@pytest.mark.parametrize(
+    ("pole", "held", "zone", "words"),
+    [(0.5, True, "A", ""), (0.5, False, "D", UNSTABLE), (1.5, True, None, WITHOUT), (1.5, False, "D", UNSTABLE)],
+)
+def test_a_run_decides_on_a_loop_with_set_valued_signs(monkeypatch, pole, held, zone, words):
+    case, one = case_from(tomllib.loads(template("rig"))), np.eye(1)
+    path = CommandPath(0.0 * one, one[0], np.array(1.0))
+    system = StateSpace(
+        pole * one, 0.1 * np.ones((1, 3)), np.ones((6, 1)), np.eye(6)[:, :3], np.ones(1), np.array(1e-3), path
+    )
+    found = Stability(*(np.array([x]) for x in (held, np.nan, not held, 0.0, 0.0, False)), 1.0, 1.0)
+    monkeypatch.setattr(operating, "linearise", lambda *_: system)
+    monkeypatch.setattr(operating, "stability_of", lambda *_: found)
+    point = operating.operating_point(case, "nominal", 0.0)
+    assert (point.stable, point.zone) == (held, zone)
+    assert np.isfinite(point.analysis.S.height) == (zone == "A")
+    assert words in text_of(case, [point], None, None)
+    assert loop_of_axis(point, None).numbers["stable"] == held
+    assert loop_of_axis(point, None).numbers["zone"] == zone
 
 
 @pytest.mark.slow

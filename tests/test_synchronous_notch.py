@@ -309,7 +309,7 @@ def test_the_notches_in_the_map_of_a_machine_are_those_of_each_cell(y):
     study, *_ = study_and_axes(read_machine(machine(1e7)), "controller.position.k_int=1e6:1e7:2", y, 1, None)
     low = float(values.split(":")[0])
     if path == PERIOD:
-        study, own, other = study.at_period(low), {PERIOD: np.full(2, low)}, machine(1e6, period=low)
+        study, own, other = study.at(PERIOD, low), {PERIOD: np.full(2, low)}, machine(1e6, period=low)
     else:
         own, other = {path: np.array([9000.0, low])}, machine(1e6, low)
     laws = {part: np.array([1e7, 1e6]) for part in study.parts("controller.position.k_int")}

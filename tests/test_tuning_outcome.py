@@ -14,12 +14,14 @@ import tuning.command
 import tuning.report.folder
 import tuning.rounds
 from ambjax.cases.tune_table import Budget
+from ambjax.control.cascade import Cascade
 from ambjax.linear import Findings
 from ambjax.text.web_page import escape_markdown
 from tuning.__main__ import main
 from tuning.judge.evaluate import summarise
 from tuning.problem.config import seeds
 from tuning.problem.limits import Limit
+from tuning.problem.space import Gain, Space, tunable
 from tuning.report import judging
 from tuning.report.limit_table import BROKEN, EMPHASISED, HELD, UNJUDGED, UNVERIFIED
 from tuning.report.outcome import ALL_MET, NO_HELD_OUT, NOT_MET, TuningOutcome, remedies
@@ -144,6 +146,19 @@ def test_members_that_are_held_but_not_stable_are_told_everywhere(ran, monkeypat
     for text in (facts["verdict"], facts["advice"], out, err, (folder / "tuned.toml").read_text()):
         assert re.search(r"2 of 6 members tested are held, but NOT stable.*0\.0001 m, .i. up to 3 A \(bias", text)
     assert ALL_MET not in (folder / "report.md").read_text()
+
+
+def test_the_advice_names_the_gains_that_are_not_tuned():
+    broken, cascade = TuningOutcome(6, 0, 0, 0, {"rms_u_V": BROKEN}, "", 6, 0), Cascade()
+    first, *rest = tunable(cascade)
+    for paths, words in (([first, *rest], "widen tune.bounds,"), (rest, f"tune also {first},")):
+        space = Space(tuple(Gain(path, 0.0, math.inf) for path in paths))
+        problem = types.SimpleNamespace(
+            tune=types.SimpleNamespace(space=space), case=types.SimpleNamespace(cascade=cascade)
+        )
+        assert f"Not held: tune.limits.rms_u_V. Loosen these limits, {words}" in remedies(
+            problem, None, broken, None, None
+        )
 
 
 def test_the_voltage_of_a_lost_member_is_excluded_from_the_limits():

@@ -34,13 +34,14 @@ from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
 from ambjax.simulation.machine_kinds import machine_of
-from ambjax.simulation.method import ACCURATE, TOUCHED, slopes
+from ambjax.simulation.method import ACCURATE, DRIVEN, TOUCHED, slopes
 from ambjax.simulation.rollout import prepare
 from ambjax.simulation.whole_machine import Machine
 from ambjax.text.words import one_line
 from ambjax.world.rotation import Rotation
 from ambjax.world.rotor import Rotor
 from ambjax.world.scenario import Scenario
+from ambjax.world.waveforms import frequencies_of
 
 # Product of step and angular frequency of a mode (or of nutation) at which the relative error of RK4 in one period is
 # below 1e-6.
@@ -319,7 +320,9 @@ def _clock(cases: list[Case], rotor: Rotor, fixed: bool) -> Clock:
     W = rotor.rotation.fastest(float(clock.duration))
     M, K, G = (np.asarray(x) for x in (rotor.M, rotor.K, rotor.G))
     fastest = max(math.sqrt(float(np.max(np.diag(K) / np.diag(M)))), float(W * np.max(np.abs(G) / np.diag(M)[:, None])))
-    needed = period * max(fastest / MODE, stop_slope(rotor, cases) / TOUCHED)
+    signals = tuple(one.signal for one in (*rotor.loads, *rotor.base))
+    load = 2 * math.pi * max((high for _, high in frequencies_of(signals)), default=0.0)
+    needed = period * max(fastest / MODE, stop_slope(rotor, cases) / TOUCHED, max(load, float(W)) / DRIVEN)
     substeps = most.substeps if fixed else max(most.substeps, math.ceil(needed))
     if substeps > MOST_SUBSTEPS:
         raise ValueError(

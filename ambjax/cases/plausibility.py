@@ -1,6 +1,5 @@
 """Warnings about unlikely values: quantities in a wrong unit, and loads or rates that the machine cannot follow."""
 
-import dataclasses
 import math
 from collections.abc import Iterable, Iterator
 
@@ -11,6 +10,7 @@ from ambjax.cases.reader import Case
 from ambjax.simulation.orders import ORDERS, ROUNDED
 from ambjax.world.recorded import Recorded
 from ambjax.world.scenario import SLOTS
+from ambjax.world.waveforms import frequencies_of
 
 # Flux density above which common silicon steel begins to saturate, T (Schweitzer and Maslen, Magnetic Bearings, 2009).
 MOST_FLUX = 1.2
@@ -38,8 +38,6 @@ LONGEST_FILE = 100.0
 MOST_RUNOUT = 0.5
 # Smallest plausible delay that is not 0, in samples; balance quality grades of ISO 21940-11, mm/s.
 LEAST_DELAY, GRADES = 0.01, (0.4, 4000.0)
-# Fields of signals that are a frequency, and their factor to Hz.
-FREQUENCIES = {"frequency": 1.0, "frequency_end": 1.0, "f_high": 1.0, "speed": 1 / 60, "speed_end": 1 / 60}
 
 
 def implausible(case: Case) -> list[str]:
@@ -66,7 +64,7 @@ def _forces(case: Case) -> Iterator[str]:
     if (heavy := GRAVITY * mass) > MOST_WEIGHT * largest:
         yield (
             f"plant.m = {mass:g} kg: the rotor weighs {heavy:.4g} N, {heavy / largest:.3g} times the largest force of "
-            f"the magnets, {largest:.4g} N. Is it in grams? Or is actuator.i_max too small?"
+            f"the magnets, {largest:.4g} N. Is it in grams? Or is actuator.i_max or u_max too small?"
         )
     if weight <= largest < weight + load:
         yield (
@@ -198,7 +196,7 @@ def _aliases(case: Case) -> Iterator[str]:
     half = _half(case)
     parts = _signals(case) | {"rotor": case.scenario.rotor, "sensor.runout": case.scenario.sensors.runout}
     for path, signal in parts.items():
-        for name, high in _frequencies(signal):
+        for name, high in frequencies_of(signal):
             if high >= half:
                 yield (
                     f"{path}: {name} gives {high:.4g} Hz, not below half the sampling rate, {half:.4g} Hz: samples "
@@ -226,17 +224,3 @@ def _orders(case: Case) -> Iterator[str]:
             f"rotor.speed: the rotor makes {turns:.3g} revolutions after run.settle, and the metrics at 1x and 2x need "
             "one: they are 0. Extend clock.duration."
         )
-
-
-def _frequencies(node: object) -> Iterator[tuple[str, float]]:
-    """Yield the name and the value (Hz) of each frequency in a signal and its parts."""
-    if isinstance(node, tuple):
-        for item in node:
-            yield from _frequencies(item)
-    elif dataclasses.is_dataclass(node):
-        for field in dataclasses.fields(node):
-            value = getattr(node, field.name)
-            if field.name in FREQUENCIES and value is not None:
-                yield field.name, FREQUENCIES[field.name] * float(np.max(np.asarray(value)))
-            elif isinstance(value, tuple) or dataclasses.is_dataclass(value):
-                yield from _frequencies(value)

@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 import re
 import tomllib
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from typing import Any, TypeVar
 
 import jax
@@ -18,7 +18,7 @@ from ambjax.cases.own_laws import OwnLaw
 from ambjax.cases.reach import check_reference
 from ambjax.cases.recordings import RecordedFile, Recordings
 from ambjax.cases.scenario_tables import check_start, scenario_from
-from ambjax.cases.table import Table, check_depth, cut, load, require_file
+from ambjax.cases.table import Table, check_depth, cut, load, put, require_file
 from ambjax.cases.timing import clock_from
 from ambjax.cases.variation import spread_from
 from ambjax.control.cascade import Cascade
@@ -227,10 +227,17 @@ def is_as_written(case: Case) -> bool:
     return same and known == given and all(np.array_equal(*pair) for pair in pairs)
 
 
-def cascade_at(case: Case, period: float) -> Cascade:
-    """Return the cascade that the file of a case on a processor gives at another sample period, s, without a notch."""
-    top, known = Table(tomllib.loads(case.text)), Files(pathlib.Path(), case.own_laws, case.controller_file)
-    return cascade_from(top, _plant(top.table("plant")), processor_from(top.table("processor")), period, known)[0]
+def cascade_at(case: Case, period: float, changes: Mapping[str, float]) -> Cascade:
+    """Return the cascade that the file of a case gives with other numbers, without a notch.
+
+    `period`: sample period, s. `changes`: numbers of controller and processor by dotted path.
+    """
+    raw, known = tomllib.loads(case.text), Files(pathlib.Path(), case.own_laws, case.controller_file)
+    for path, value in changes.items():
+        put(raw, path, value)
+    top = Table(raw)
+    processor = processor_from(top.table("processor")) if "processor" in raw else None
+    return cascade_from(top, _plant(top.table("plant")), processor, period if processor else None, known)[0]
 
 
 def _plant(table: Table) -> Bearing:

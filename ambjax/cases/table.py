@@ -104,6 +104,14 @@ def check_depth(raw: object) -> None:
         raise ValueError(f"tables or lists are nested deeper than {DEEPEST} levels. Use fewer.")
 
 
+def put(raw: dict[str, Any], path: str, value: object) -> None:
+    """Set the value at a dotted path of a parsed TOML document, whose tables are made as needed."""
+    *stems, key = path.split(".")
+    for stem in stems:
+        raw = raw.setdefault(stem, {})
+    raw[key] = value
+
+
 class Table:
     """A TOML table that is read strictly: an unknown key is an error, and each error names its dotted path."""
 

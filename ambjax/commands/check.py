@@ -146,7 +146,7 @@ def _margins(case: Case) -> tuple[tuple[Delays, Delays | None], Findings | None]
     Also returns the stability of the loop; None if an ensemble of delays does not contain the case.
     """
     from ambjax.ensemble.delays import DELAYS, delay_margin
-    from ambjax.linear.delay_stability import with_stability
+    from ambjax.linear.stability import with_stability
 
     loop = (case.cascade, case.scenario, case.clock)
 

@@ -46,11 +46,11 @@ def loop_of_axis(point: OperatingPoint, peaks: SpreadPeaks | None) -> ComparedLo
     worst: dict[str, object] = {}
     if peaks is not None:
         worst["unstable"] = peaks.members - peaks.stable
-        if not worst["unstable"] and peaks.point is not None:
+        if not worst["unstable"] and peaks.point is not None and peaks.point.analysis.stable:
             worst["worst_peak"] = peaks.point.analysis.S.height
     loop = point.analysis
     if not loop.stable:
-        return ComparedLoop({**no_loop(False).numbers, **worst})
+        return ComparedLoop({**no_loop(False).numbers, **worst, "stable": point.stable, "zone": point.zone})
     margins, at, outside = loop.margins, loop.margins_at, loop.S.outside
     found = (loop.S.height, loop.S.frequency, loop.T.height, loop.KS.height, margins.gm_low, margins.gm_high)
     found += (margins.pm, margins.delay, margins.dm, loop.stiffness)

@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
         points, missing = _points(case)
     spread = None if study is None else _spread(case, study, points[0])
     measured = None
-    if points[0].analysis.stable and (args.inject or case.cascade.sampled):
+    if points[0].stable and (args.inject or case.cascade.sampled):
         with doing(f"measuring the sensitivity by injection into the simulation; {FIRST_RUN}"):
             measured = _injections(case, points[0])
     out = directory(args.out, f"sensitivity-{case.name}", WRITTEN, args.force)
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
         tables = described("the table", lambda: text_of(case, points, spread, measured)) or ""
         print("\n".join([tables, *(f"{name}: {missing[name]}" for name in missing), *lines]))
         written(out, ", ".join(names))
-    stable = all(point.analysis.stable for point in points) and (spread is None or spread.stable == spread.members)
+    stable = all(point.stable for point in points) and (spread is None or spread.stable == spread.members)
     return int(bool(missing) or not stable), plain(summary | {"out": str(out)})
 
 
@@ -68,7 +68,7 @@ def _spread(case: Case, study: Study, point: OperatingPoint) -> SpreadPeaks:
     """Return the peaks of the members; with set-valued signs and a stable `point`, also those of an injection."""
     with doing(f"linearising the loops of the members; {FIRST_RUN}"):
         spread = spread_peaks(case, study)
-    if not set_valued(case) or not point.analysis.stable:
+    if not set_valued(case) or not point.stable:
         return spread
     with doing(f"measuring the sensitivity of the members by injection into the simulation; {FIRST_RUN}"):
         return spread._replace(measured=measured_peaks(case, study, point.analysis.S.frequency))

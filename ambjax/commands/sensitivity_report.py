@@ -15,6 +15,7 @@ from ambjax.results.operating import OperatingPoint, SpreadPeaks, analysis_summa
 from ambjax.results.outputs import table
 
 UNSTABLE = "The nominal loop is not stable, so it has no peaks, no zone and no margins, and nothing is injected."
+WITHOUT = "The nominal loop is stable, but its linear loop is not, and has no peaks, no zone and no margins."
 
 
 class Injections(NamedTuple):
@@ -51,7 +52,8 @@ def sensitivity_summary(
     """Return the numbers of sensitivity.json: of the equilibria `points`, the spread, and the injection."""
 
     def numbers(point: OperatingPoint) -> dict[str, object]:
-        return analysis_summary(point.analysis) | band_numbers(point.analysis, zones)
+        own = {"stable": point.stable, "zone": point.zone}
+        return analysis_summary(point.analysis) | own | band_numbers(point.analysis, zones)
 
     rows: list[dict[str, object]] = [
         {"point": point.name, "reference_m": point.r, **numbers(point)} for point in points
@@ -83,9 +85,9 @@ def _measured_numbers(peaks: MemberPeaks, zones: Zones) -> dict[str, object]:
 def _position_numbers(point: OperatingPoint, measured: Injections | None) -> dict[str, object]:
     """Return the numbers of the measured sensitivity at both sensors; those of `injected_numbers` without one."""
     if measured is None:
-        return injected_numbers(point.system, None)
+        return injected_numbers(None, None)
     velocity = measured.velocity
-    return injected_numbers(point.system, measured.position) | {
+    return injected_numbers(point.system if point.analysis.stable else None, measured.position) | {
         "injected_velocity_peak": None if velocity is None else velocity.peak,
         "injected_velocity_frequency_hz": None if velocity is None else velocity.peak_frequency,
     }
@@ -187,10 +189,10 @@ def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None
         stiffness = f"{_number(one.stiffness)} N/m" if np.isfinite(one.stiffness) else "infinite"
         rows += [f"Static stiffness: {stiffness}. Rms of z per rms of position noise: {_number(one.noise)}. {growth}"]
     else:
-        rows += [f"{UNSTABLE} {growth}"]
+        rows += [f"{WITHOUT if points[0].stable else UNSTABLE} {growth}"]
     if measured is not None:
-        system, velocity = points[0].system, measured.velocity
-        rows += [injection_text(system, measured.position, zones, one.zone)]
+        system, velocity = points[0].system if one.stable else None, measured.velocity
+        rows += [injection_text(system, measured.position, zones, points[0].zone or "")]
         rows += [] if velocity is None else [injection_text(system, velocity, None, "", 1, " at the velocity sensor")]
     if spread is not None:
         rows += [
@@ -226,7 +228,7 @@ def _measured_text(peaks: MemberPeaks, zones: Zones) -> str:
 def _row(point: OperatingPoint) -> tuple[str, ...]:
     one = point.analysis
     if not one.stable:
-        return (point.name, "unstable", *["-"] * 4)
+        return (point.name, "no peak" if point.stable else "unstable", *["-"] * 4)
     S, T, KS = (_number(x.height) + (" (at edge)" if x.at_edge else "") for x in (one.S, one.T, one.KS))
     return (point.name, S, _number(one.S.frequency), one.zone, T, KS)
 

@@ -9,10 +9,9 @@ import numpy as np
 from ambjax.ensemble.distributions import Choice, Distribution, Uniform
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.spread import STEP_PATHS, Spread, SpreadError, check_spread, corners, drawn, ends, no_such_number
-from ambjax.ensemble.study import AnyStudy, Study
+from ambjax.ensemble.study import PERIOD, AnyStudy, Study
 from ambjax.simulation.method import choose_method
 
-PERIOD = "clock.sample_period"
 # Survival of a cell is certain if the lower end of its interval is at least this share.
 CERTAIN = 0.95
 # Fields of a Map with one value per cell.
@@ -88,8 +87,9 @@ Design = Callable[[AnyStudy, dict[str, np.ndarray]], dict[str, np.ndarray]]
 def grid(study: AnyStudy, x: Axis, y: Axis, stable: StabilityTest | None = None, design: Design | None = None) -> Map:
     """Compute a map with `study.members` members in every cell.
 
-    An axis may be any number of `study.places()`, or clock.sample_period. All cells with the same sample period run in
-    one ensemble. Sample periods run one after the other, each for the duration of the case. Member k has the same noise
+    An axis may be any number of `study.places()`, or clock.sample_period. All cells of one study run in one ensemble.
+    Values that need a study of their own (`AnyStudy.rereads`) run one after the other, each for the duration of the
+    case. Member k has the same noise
     in each cell. With one member the case is nominal: no spread, and the noise of member 0. With more members, the
     case's spread applies to all quantities that are not axes. `stable`: the test of member 0 of each cell; None:
     `unstable` is 0. `design`: of numbers that follow from the values of the axes; PERIOD is one of them.
@@ -101,8 +101,10 @@ def grid(study: AnyStudy, x: Axis, y: Axis, stable: StabilityTest | None = None,
         transpose = grid(study, y, x, stable, design)
         return transpose._replace(x=x, y=y, **{k: getattr(transpose, k).T for k in GRIDS})
     _check(study, x, y)
-    studies = [(study, y)] if y.path != PERIOD else [(study.at_period(float(p)), None) for p in y.values]
-    rows = [_cells(one, x, axis, stable, design) for one, axis in studies]
+    rows = []
+    for row, own in _studies(study, y):
+        parts = [_cells(one, axis or x, own, stable, design) for one, axis in _studies(row, x)]
+        rows.append([np.concatenate(part, axis=1) for part in zip(*parts, strict=True)])
     ended, stalled, error, unstable = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     survival = wilson(np.sum(~ended, axis=-1), study.members)
     held = ~ended.all(axis=-1)
@@ -111,6 +113,14 @@ def grid(study: AnyStudy, x: Axis, y: Axis, stable: StabilityTest | None = None,
     counts = np.sum(ended & ~stalled, axis=-1), np.sum(stalled, axis=-1)
     paths = tuple(path for path, _ in _entries(study, (x.path, y.path)))
     return Map(x, y, *survival, median, *counts, unstable, study.members, bool(paths) or study.random, paths)
+
+
+def _studies(study: AnyStudy, axis: Axis) -> list[tuple[AnyStudy, Axis | None]]:
+    """Return the studies for the values of an axis, each with its part of the axis; None: its sample period."""
+    if not study.rereads(axis.path):
+        return [(study, axis)]
+    each = [(study.at(axis.path, float(value)), axis._replace(values=np.array([value]))) for value in axis.values]
+    return [(one, None if axis.path == PERIOD else part) for one, part in each]
 
 
 def with_method_for_axes(study: Study, x: Axis, y: Axis) -> Study:

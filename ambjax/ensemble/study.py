@@ -21,6 +21,9 @@ from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.world.scenario import Scenario
 
+# Path of the sample period, which a map may vary.
+PERIOD = "clock.sample_period"
+
 SPREAD = "spread."
 # Largest number of columns of members.npz besides those of the spread, to estimate the disk space of a study.
 COLUMNS = 34
@@ -79,9 +82,13 @@ class AnyStudy(abc.ABC):
         """Return the paths of the numbers that a path of `places` stands for: itself, or those of several axes."""
         return (path,)
 
+    def rereads(self, path: str) -> bool:
+        """Return whether each value of this number needs a study of its own (`at`)."""
+        return path == PERIOD
+
     @abc.abstractmethod
-    def at_period(self, period: float) -> Self:
-        """Return the study with another sample period, s, and runs of the same duration."""
+    def at(self, path: str, value: float) -> Self:
+        """Return the study with another value of a number for which `rereads` is true; runs have the same duration."""
 
     @abc.abstractmethod
     def metrics(
@@ -166,9 +173,10 @@ class Study(AnyStudy):
     def places(self) -> dict[str, Place]:
         return places(self.cascade, self.scenario)
 
-    def at_period(self, period: float) -> Self:
-        samples = max(round(float(self.clock.duration) / period), 1)
-        return dataclasses.replace(self, clock=replaced(self.clock, samples=samples, sample_period=period))
+    def at(self, path: str, value: float) -> Self:
+        assert path == PERIOD
+        samples = max(round(float(self.clock.duration) / value), 1)
+        return dataclasses.replace(self, clock=replaced(self.clock, samples=samples, sample_period=value))
 
     def metrics(
         self, values: dict[str, np.ndarray], members: np.ndarray, *, lost: bool = False, **how: Any

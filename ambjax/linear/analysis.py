@@ -230,7 +230,12 @@ def linearisation_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> 
 
 
 def analyse(
-    system: StateSpace, m: Scalar, period: Scalar, zones: Zones | None = None, velocity: bool = False
+    system: StateSpace,
+    m: Scalar,
+    period: Scalar,
+    zones: Zones | None = None,
+    velocity: bool = False,
+    held: bool = True,
 ) -> Analysis:
     """Analyse a linearised loop.
 
@@ -238,6 +243,7 @@ def analyse(
     - `period`: time for which a value of the noise is held in continuous time, s; not used on a processor.
     - `zones`: frequency range and zones; None: the defaults.
     - `velocity`: whether the velocity has its own sensor.
+    - `held`: False for a loop that a run shows not to be stable (`stability_of`), whatever its poles are.
 
     Raises ValueError as `Zones.range` does.
     """
@@ -250,7 +256,7 @@ def analyse(
 
     poles = poles_in_s(system)
     poles = poles[np.argsort(-np.real(poles))]
-    if not system.stable:
+    if not (held and system.stable):
         none, no, at = Margins(*[0.0] * 6), NO_PEAK, NO_PEAK if velocity else None
         return Analysis(False, no, no, no, "D", at, none, np.nan, np.inf, poles, LoopMargins(none, none))
     S, T, KS, at = largest(0, 0), largest(0, 0, 1.0), largest(2, 0), largest(1, 1) if velocity else None

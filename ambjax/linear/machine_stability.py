@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -13,15 +12,12 @@ from ambjax.ensemble.machines import run_machines
 from ambjax.linear.linear_machine import turning_machines
 from ambjax.linear.margins import poles_in_s
 from ambjax.linear.quiet_run import KICK, QuietRun, quiet, quiet_run_of
-from ambjax.linear.stability import GROWN, Stability, has_set_valued, judged, may_chatter
+from ambjax.linear.stability import GROWN, Stability, Tested, has_set_valued, judged, may_chatter
 from ambjax.linear.state_space import StateSpace
-from ambjax.numerics.records import Scalar
 from ambjax.numerics.shapes import map_varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop
-from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.whole_machine import Machine, PerAxis, loop_of, stack_axes, with_loop
-from ambjax.world.scenario import Scenario
+from ambjax.simulation.whole_machine import Machine, PerAxis, stack_axes, with_loop
 from ambjax.world.waveforms import Constant
 
 # Number of the coordinates of a rigid rotor, which the displaced start of a quiet run moves.
@@ -54,7 +50,18 @@ def machine_stability(
     members, speeds = (np.array(x) for x in zip(*at, strict=True))
     one = map_varying(lambda x: np.asarray(x)[members], machine)
     rotor = dataclasses.replace(one.rotor.without_forces(), speed=speeds, acceleration=0.0, changes=())
-    found = judged(_Machines(dataclasses.replace(one, rotor=rotor, cuts=None), clock))
+    machine = dataclasses.replace(one, rotor=rotor, cuts=None)
+    bias = max(float(np.max(np.asarray(loop.scenario.plant.i_0))) for loop in machine.loops())
+    found = judged(
+        Tested(
+            _cascades(machine),
+            lambda own, chosen: _growth(machine, own, chosen, clock),
+            lambda: _quiet_run(machine, bias, clock),
+            _clearance(machine),
+            bias,
+            clock,
+        )
+    )
     return found._replace(stable=found.stable & ~(smooth & np.isinf(growth)))
 
 
@@ -64,82 +71,47 @@ def _cascades(machine: Machine) -> list[Cascade]:
     return [loop.cascade for loop in machine.loops()] + ([whole] if isinstance(whole, Cascade) else [])
 
 
-def _of_axes(machine: Machine, name: str) -> np.ndarray:
-    """Return a number of the scenario of every axis, [c] or [N, c]."""
-    parts = [np.asarray(getattr(loop.scenario, name), float) for loop in machine.loops()]
+def _growth(machine: Machine, cascades: Sequence[Cascade], chosen: np.ndarray, clock: Clock) -> np.ndarray:
+    """Return the growth rate of each chosen machine with these cascades, 1/s; NaN without a linearisation."""
+    groups, rates = len(machine.axes), []
+    loops = [dataclasses.replace(loop, cascade=own) for loop, own in zip(machine.loops(), cascades, strict=False)]
+    law = dataclasses.replace(machine.law, laws=cascades[groups]) if cascades[groups:] else machine.law
+    machine = dataclasses.replace(machine, axes=tuple(map(with_loop, machine.axes, loops)), law=law)
+    for k in np.flatnonzero(chosen):
+        one = map_varying(lambda x, k=k: np.asarray(x)[k], machine)
+        try:
+            rates.append(growth_of(next(turning_machines(one, clock.sample_period, [float(one.rotor.speed)])).system))
+        except ValueError:
+            rates.append(np.nan)
+    return np.array(rates)
+
+
+def _quiet_run(machine: Machine, bias: float, clock: Clock) -> QuietRun:
+    """Simulate the quiet runs. The start is displaced by KICK of the clearance at each axis, towards z = 0."""
+    rotor, q = machine.rotor, np.asarray(machine.start_q)
+    rows = np.asarray(rotor.at_magnets if rotor.at_stops is None else rotor.at_stops)
+    moved = np.where(np.sum(rows * q[..., None, :], -1) > 0, -1.0, 1.0) * KICK * _clearance(machine)
+    rigid = np.sum(np.linalg.pinv(rows[..., :RIGID]) * moved[..., None, :], -1)
+    q = q + np.concatenate([rigid, np.zeros((*rigid.shape[:-1], q.shape[-1] - RIGID))], -1)
+    loops = [_calm(loop, len(group)) for loop, group in zip(machine.loops(), machine.groups, strict=True)]
+    machine = dataclasses.replace(machine, axes=tuple(map(with_loop, machine.axes, loops)), start_q=q)
+    fold = dataclasses.replace(quarters(clock), of=(near := machine.near, "i"))
+    # the fold of the axes has a scatter, which the one-kernel path does not support
+    run = run_machines(machine, clock, PerAxis(stack_axes([fold] * machine.count)), plain=True)
+    low, high = ({"z": part[near], "i": part["i"]} for part in (run.metrics.low, run.metrics.high))
+    return quiet_run_of(low, high, np.asarray(run.trajectory.lost_at), np.array(bias))
+
+
+def _clearance(machine: Machine) -> np.ndarray:
+    """Return the clearance of every axis, m, [c] or [N, c]."""
+    parts = [np.asarray(loop.scenario.touchdown, float) for loop in machine.loops()]
     lead = np.broadcast_shapes(*(x.shape[:-1] for x in parts))
     order = np.argsort(np.concatenate(machine.groups))
     return np.concatenate([np.broadcast_to(x, (*lead, x.shape[-1])) for x in parts], -1)[..., order]
 
 
-class _Machines(NamedTuple):
-    """N machines without loads, each at a constant speed."""
-
-    machine: Machine
-    clock: Clock
-
-    @property
-    def period(self) -> Scalar:
-        return self.clock.sample_period
-
-    @property
-    def duration(self) -> float:
-        return float(self.clock.duration)
-
-    @property
-    def clearance(self) -> np.ndarray:
-        return _of_axes(self.machine, "touchdown")
-
-    @property
-    def bias(self) -> float:
-        return max(float(np.max(loop.scenario.plant.i_0)) for loop in self.machine.loops())
-
-    @property
-    def cascades(self) -> Sequence[Cascade]:
-        return _cascades(self.machine)
-
-    def growth(self, cascades: Sequence[Cascade], chosen: np.ndarray) -> np.ndarray:
-        groups = len(self.machine.axes)
-        axes = [
-            with_loop(axis, dataclasses.replace(loop_of(axis), cascade=own))
-            for axis, own in zip(self.machine.axes, cascades[:groups], strict=True)
-        ]
-        law = dataclasses.replace(self.machine.law, laws=cascades[groups]) if cascades[groups:] else self.machine.law
-        machine, rates = dataclasses.replace(self.machine, axes=tuple(axes), law=law), []
-        for k in np.flatnonzero(chosen):
-            one = map_varying(lambda x, k=k: np.asarray(x)[k], machine)
-            try:
-                rates.append(growth_of(next(turning_machines(one, self.period, [float(one.rotor.speed)])).system))
-            except ValueError:  # no linearisation
-                rates.append(np.nan)
-        return np.array(rates)
-
-    def quiet(self) -> QuietRun:
-        axes = [_calm(axis, len(group)) for axis, group in zip(self.machine.axes, self.machine.groups, strict=True)]
-        machine = dataclasses.replace(self.machine, axes=tuple(axes), start_q=self._displaced())
-        near = machine.near
-        fold = dataclasses.replace(quarters(self.clock), of=(near, "i"))
-        # the fold of the axes has a scatter, which the one-kernel path does not support
-        run = run_machines(machine, self.clock, PerAxis(stack_axes([fold] * machine.count)), plain=True)
-        low, high = ({"z": part[near], "i": part["i"]} for part in (run.metrics.low, run.metrics.high))
-        return quiet_run_of(low, high, np.asarray(run.trajectory.lost_at), np.array(self.bias))
-
-    def _displaced(self) -> np.ndarray:
-        """Return coordinates that are displaced by KICK of the clearance at each axis, towards z = 0."""
-        rotor, q = self.machine.rotor, np.asarray(self.machine.start_q)
-        rows = np.asarray(rotor.at_magnets if rotor.at_stops is None else rotor.at_stops)
-        z = np.sum(rows * q[..., None, :], -1)
-        moved = np.where(z > 0, -1.0, 1.0) * KICK * self.clearance
-        rigid = np.sum(np.linalg.pinv(rows[..., :RIGID]) * moved[..., None, :], -1)
-        return q + np.concatenate([rigid, np.zeros((*rigid.shape[:-1], q.shape[-1] - RIGID))], -1)
-
-
-def _calm(axis: Sampled | ClosedLoop, count: int) -> Sampled | ClosedLoop:
+def _calm(loop: ClosedLoop, count: int) -> ClosedLoop:
     """Return the loops of a group of `count` axes in a quiet run, at the reference 0."""
-
-    def stacked(x: Any) -> Any:
-        return np.full(count, x) if np.ndim(x) == 0 else x
-
-    loop = loop_of(axis)
-    scenario: Scenario = quiet(dataclasses.replace(loop.scenario, reference=Constant(0.0)))
-    return with_loop(axis, dataclasses.replace(loop, scenario=jax.tree.map(stacked, scenario)))
+    scenario = quiet(dataclasses.replace(loop.scenario, reference=Constant(0.0)))
+    stacked = jax.tree.map(lambda x: np.full(count, x) if np.ndim(x) == 0 else x, scenario)
+    return dataclasses.replace(loop, scenario=stacked)

@@ -19,8 +19,8 @@ does not count, nor does the motion of a stable linear loop whose own decay is t
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -33,6 +33,9 @@ from ambjax.numerics.shapes import map_varying
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
+
+if TYPE_CHECKING:  # `ambjax simulate` imports this module, and does not need Theorem 1
+    from ambjax.theorem.sampled_report import Delays
 
 # Half peak-to-peak value of z, as a share of the clearance, below which a sustained motion does not count. The chatter
 # of set-valued signs that act a sample late reaches 0.0025.
@@ -149,72 +152,40 @@ def stability_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> Stabilit
     The result has no meaning for a member whose rotor is lost in the case's own run. Raises ValueError as `rollout`
     does.
     """
-    return judged(_Axis(cascade, scenario, clock))
+    return judged(
+        Tested(
+            [cascade],
+            lambda own, chosen: _growth(*map_varying(lambda x: np.asarray(x)[chosen], (own[0], scenario)), clock),
+            lambda: quiet_run(cascade, scenario, clock),
+            np.asarray(scenario.touchdown, float)[..., None],
+            float(np.max(np.asarray(scenario.plant.i_0))),
+            clock,
+        )
+    )
 
 
-class Tested(Protocol):
+class Tested(NamedTuple):
     """N loops whose stability is tested, each with c axes.
 
-    - `period`, `duration`: sample period and length of a run, s. `clearance`: that of each axis, [N, c], [c] or one
-      number, m. `bias`: largest bias current, A.
-    - `cascades`: those with all laws of the loops. `growth`: largest growth rate of each linear loop that is
-      `chosen` [N] with these cascades, 1/s; NaN without a linear verdict. `quiet`: the quiet runs.
+    `cascades`: those with all laws. `growth`: largest growth rate of each linear loop that is chosen (bool [N]) with
+    these cascades, 1/s; NaN without a linear verdict. `quiet`: simulates the quiet runs. `clearance`: of each axis, m, [N, c] or one for all N.
+    `bias`: largest bias current, A.
     """
 
-    @property
-    def period(self) -> Any: ...
-    @property
-    def duration(self) -> float: ...
-    @property
-    def clearance(self) -> np.ndarray: ...
-    @property
-    def bias(self) -> float: ...
-    @property
-    def cascades(self) -> Sequence[Cascade]: ...
-    def growth(self, cascades: Sequence[Cascade], chosen: np.ndarray) -> np.ndarray: ...
-    def quiet(self) -> QuietRun: ...
-
-
-class _Axis(NamedTuple):
-    """The loops of one axis."""
-
-    cascade: Cascade
-    scenario: Scenario
+    cascades: Sequence[Cascade]
+    growth: Callable[[Sequence[Cascade], np.ndarray], np.ndarray]
+    quiet: Callable[[], QuietRun]
+    clearance: np.ndarray
+    bias: float
     clock: Clock
-
-    @property
-    def period(self) -> Any:
-        return self.clock.sample_period
-
-    @property
-    def duration(self) -> float:
-        return float(self.clock.duration)
-
-    @property
-    def clearance(self) -> np.ndarray:
-        return np.asarray(self.scenario.touchdown, float)[..., None]
-
-    @property
-    def bias(self) -> float:
-        return float(np.max(np.asarray(self.scenario.plant.i_0)))
-
-    @property
-    def cascades(self) -> Sequence[Cascade]:
-        return [self.cascade]
-
-    def growth(self, cascades: Sequence[Cascade], chosen: np.ndarray) -> np.ndarray:
-        return _growth(*map_varying(lambda x: np.asarray(x)[chosen], (cascades[0], self.scenario)), self.clock)
-
-    def quiet(self) -> QuietRun:
-        return quiet_run(*self)
 
 
 def judged(tested: Tested) -> Stability:
     """Return the stability of loops from both verdicts."""
-    run, duration = tested.quiet(), tested.duration
-    growth = np.full(len(run.lost), np.nan)
+    run, duration = tested.quiet(), float(tested.clock.duration)
+    growth, everyone = np.full(len(run.lost), np.nan), np.full(len(run.lost), True)
     if not has_set_valued(tested.cascades):
-        growth = tested.growth(tested.cascades, np.full(len(growth), True))
+        growth = tested.growth(tested.cascades, everyone)
     clearance = np.broadcast_to(tested.clearance, run.current.shape)
     swing = np.where(run.lost[:, None], clearance, run.swings[..., -1])
     slow = (growth < 0) & (-growth * duration / QUARTERS < -np.log1p(-DECAY))
@@ -260,9 +231,9 @@ def _least_growth(tested: Tested, excused: np.ndarray) -> np.ndarray:
     stages = [stage for stage in DEFAULT_LAWS if any(steepnesses(getattr(cascade, stage)) for cascade in own)]
     for shares in itertools.product(SOFTER, repeat=len(stages)):
         softer = dict(zip(stages, shares, strict=True))
-        cascades = [_softened(cascade, softer, tested.period) for cascade in own]
+        cascades = [_softened(cascade, softer, tested.clock.sample_period) for cascade in own]
         least[grows] = np.fmin(least[grows], tested.growth(cascades, grows))
-        grows &= ~(least * tested.duration <= GROWN)
+        grows &= ~(least * float(tested.clock.duration) <= GROWN)
         if not grows.any():
             break
     return least
@@ -287,6 +258,37 @@ def suspects(error: np.ndarray, held: np.ndarray) -> np.ndarray:
     """Return the indices of the held members with the largest settled errors, ascending, at most MOST_TESTED."""
     alive = np.flatnonzero(held)
     return np.sort(alive[np.argsort(-np.asarray(error)[alive], kind="stable")[:MOST_TESTED]])
+
+
+def with_stability(
+    margin: "Delays", cascade: Cascade, scenario: Scenario, clock: Clock, *, known: bool
+) -> tuple["Delays", Findings | None]:
+    """Return a result of `delay_margin` with the delays, up to its `held`, up to which the loop is stable.
+
+    `DELAYS` delays are tested; a second pass divides the step after the last one that is stable. `known`: as in
+    `delay_margin`. Also returns the findings at the case's own delay; None if the rotor is not held there.
+    """
+    from ambjax.ensemble.delays import DELAYS, at_delays
+
+    if margin.held is None:
+        return margin, None
+    own = float(cascade.timing.delay)
+    first = own if margin.held >= own else 0.0
+
+    def tried(low: float, high: float) -> tuple[np.ndarray, Stability]:
+        delays = np.linspace(low, high, DELAYS)
+        return delays, stability_of(at_delays(cascade, delays, known=known), scenario, clock)
+
+    delays, found = tried(first, margin.held)
+    at_own = found.of([0]).findings() if first == own else None
+    if found.stable.all():
+        return margin._replace(stable=margin.held, tested=DELAYS), at_own
+    facts, at = found.findings(), int(np.argmin(found.stable))
+    stable = None
+    if at:
+        finer, again = tried(delays[at - 1], delays[at])
+        stable = float(finer[max(int(np.argmin(again.stable)) - 1, 0)])
+    return margin._replace(stable=stable, swing_m=facts.swing_m, current_A=facts.current_A, tested=DELAYS), at_own
 
 
 def _growth(cascade: Cascade, scenario: Scenario, clock: Clock) -> np.ndarray:

@@ -90,7 +90,8 @@ def survival_map(case: AnyCase, x: str, y: str, *, members: int = 1, seed: int |
     - `x`, `y`: quantity and range of each axis, in the form of the command's options: "PATH=LOW:HIGH[:COUNT][:log]".
       LOW and HIGH are in SI units, or changes of the value in the case in per cent: -20% is 0.8 times this value.
       COUNT is 21 by default.
-      A default that follows the sample period follows clock.sample_period; other gains are those of the case.
+      A gain that the file leaves out has the default for clock.sample_period, processor and controller.model of the
+      cell; other gains are those of the case.
     - `members`: number of members in each cell; 1 is the nominal case, and 2 or more draw the spread of the case.
     - `seed`: of the spread and the noise; None: `run.seed` of the case.
 

@@ -1,4 +1,4 @@
-"""The controllers of the cells of a map: default gains at their sample period, and gains of their notches."""
+"""The controllers of the cells of a map: default gains for their numbers, and gains of their notches."""
 
 import dataclasses
 
@@ -16,6 +16,8 @@ from ambjax.linear.analysis import linearisation_inputs
 from ambjax.linear.notch_design import redesigned_at_once, redesigned_members
 from ambjax.results.machine_study import MachineStudy
 
+# First words of the numbers for which default gains are designed.
+OF_DESIGN = ("controller.model.", "processor.", PERIOD)
 # First words of the numbers of a controller, for which its notch is designed. Other numbers are those of its machine.
 GAINS, DESIGNED = ".notch.gains.", (".controller.", ".processor.", f".{PERIOD}")
 
@@ -25,27 +27,38 @@ def gains_of_cells(case: AnyCase, study: AnyStudy, axes: dict[str, np.ndarray]) 
 
     `axes`: the values [N] of the axes by dotted path.
     """
-    values = default_gains(case, study, axes) if isinstance(case, Case) else {}  # a machine is read again, and has them
+    values = default_gains(case, study, axes) if isinstance(case, Case) else {}  # a machine is read again (`rereads`)
     return values | notch_gains(study, axes | values)
 
 
 def default_gains(case: Case, study: AnyStudy, axes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the default gains [N] of a case that differ at the sample period of these cells, by dotted path.
+    """Return the default gains [N] of a case that the file has with the numbers of these cells, by dotted path.
 
     A gain with another value than in the file of the case was set in Python, and stays. Raises ValueError if the file
     has no default there.
     """
-    if PERIOD not in axes or not case.text or not case.cascade.sampled:
+    own = {path: x for path, x in axes.items() if path.startswith(OF_DESIGN)}
+    if not own or not case.text:
         return {}
-    try:
-        usual, new = (
-            {path: place.value for path, place in places(cascade_at(case, period), case.scenario).items()}
-            for period in (float(case.clock.sample_period), float(study.clock.sample_period))
-        )
-    except ValueError as error:
-        raise ValueError(f"{PERIOD}={float(study.clock.sample_period):g}: {error}") from None
-    same = {path for path, place in study.places().items() if path in new and place.value == usual[path] != new[path]}
-    return {path: np.full(len(axes[PERIOD]), new[path]) for path in same - set(axes)}
+    usual = _numbers(case, float(case.clock.sample_period), {})
+    designs, cell = np.unique(np.stack(list(own.values()), 1), axis=0, return_inverse=True)
+    period, found = float(study.clock.sample_period), []
+    for design in designs.tolist():
+        values = dict(zip(own, design, strict=True))
+        try:
+            found.append(_numbers(case, values.pop(PERIOD, period), values))
+        except ValueError as error:
+            raise ValueError(f"{', '.join(f'{path}={x:g}' for path, x in values.items())}: {error}") from None
+    same = {path for path, place in study.places().items() if path in usual and place.value == usual[path]}
+    rows = {path: [one.get(path) for one in found] for path in same - set(axes)}
+    changed = {path: x for path, x in rows.items() if None not in (usual[path], *x) and x != [usual[path]] * len(x)}
+    return {path: np.array(x)[cell.ravel()] for path, x in changed.items()}
+
+
+def _numbers(case: Case, period: float, changes: dict[str, float]) -> dict[str, float | None]:
+    """Return the numbers of the controller that the file of a case gives with these changes, by dotted path."""
+    known = places(cascade_at(case, period, changes), case.scenario)
+    return {path: place.value for path, place in known.items() if path.startswith(("controller.", "processor."))}
 
 
 def with_speeds_for(study: Study, axes: dict[str, np.ndarray]) -> Study:

@@ -14,12 +14,12 @@ import numpy as np
 from ambjax.cases.machine_case import MachineCase, machine_from, machine_of_axes, parts_of, with_notches_for
 from ambjax.cases.machine_spread import axis_values, machine_places, shared, varied_start
 from ambjax.cases.rotor_numbers import OF_BEARING, SPEED, varied_rotors
+from ambjax.cases.table import put
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.machines import run_machines
-from ambjax.ensemble.maps import PERIOD
 from ambjax.ensemble.paths import Place, kinds, places, with_values
 from ambjax.ensemble.spread import Spread, drawn
-from ambjax.ensemble.study import AnyStudy
+from ambjax.ensemble.study import PERIOD, AnyStudy
 from ambjax.linear.linear_machine import turning_machines
 from ambjax.linear.machine_stability import growth_of, machine_stability
 from ambjax.linear.notch_design import speeds_of
@@ -97,8 +97,14 @@ class MachineStudy(AnyStudy):
     def parts(self, path: str) -> tuple[str, ...]:
         return shared(self._numbers(), self.case.axes).get(path, (path,))
 
-    def at_period(self, period: float) -> Self:
-        case, notches = _reread(self.case, {PERIOD: period}), [one.cascade.notch for one in self.case.cases]
+    def rereads(self, path: str) -> bool:
+        """Return whether the defaults, or the law of the machine, may be designed with this number of the file."""
+        first, *rest = path.split(".")
+        nominal = (rest[1:] if first == OF_BEARING else [first, *rest])[:-1] == ["controller", "model"]
+        return path == PERIOD or first == "processor" or nominal
+
+    def at(self, path: str, value: float) -> Self:
+        case, notches = _reread(self.case, {path: value}), [one.cascade.notch for one in self.case.cases]
         laws = [dataclasses.replace(one.cascade, notch=own) for one, own in zip(case.cases, notches, strict=True)]
         cases = [dataclasses.replace(one, cascade=law) for one, law in zip(case.cases, laws, strict=True)]
         case = with_notches_for(dataclasses.replace(case, cases=tuple(cases)), gain_speeds(self.case))
@@ -251,9 +257,13 @@ def _reread(case: MachineCase, changes: Mapping[str, object]) -> MachineCase:
         raise ValueError(f"{case.name}: it has no file. Read it with read_machine.")
     raw = tomllib.loads(case.text)
     for path, value in changes.items():
-        *stems, key = path.split(".")
-        node = raw
-        for stem in stems:
-            node = node.setdefault(stem, {})
-        node[key] = value
+        if path.startswith("controller.model."):  # on all axes
+            for one in raw["bearing"]:
+                put(one, path, value)
+        elif path.startswith(f"{OF_BEARING}."):
+            _, name, own = path.split(".", 2)
+            names = [one.get("name", f"bearing{k + 1}") for k, one in enumerate(raw["bearing"])]
+            put(raw["bearing"][names.index(name)], own, value)
+        else:
+            put(raw, path, value)
     return machine_from(raw, case.name, case.text, case.folder)

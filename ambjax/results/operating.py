@@ -1,6 +1,7 @@
 """Operating points: linearised loops of a case at its equilibria, and of the members of its spread."""
 
 import contextlib
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import NamedTuple, overload
@@ -12,6 +13,7 @@ from ambjax.cases.given import of_case
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
 from ambjax.control.cascade import Cascade
+from ambjax.ensemble.replay import as_member
 from ambjax.ensemble.study import Study
 from ambjax.host.one_thread import one_thread
 from ambjax.linear import (
@@ -29,25 +31,42 @@ from ambjax.linear import (
     linear_machine,
     linearise,
     linearise_members,
+    stability_of,
 )
 from ambjax.linear.linear_machine import MachineSensitivity, TurningMachine, sensitivity_of, turning_machines
 from ambjax.linear.machine_stability import growth_of, machine_stability
+from ambjax.linear.stability import has_set_valued
 from ambjax.numerics.records import replaced
 from ambjax.simulation.clock import Clock
-from ambjax.world.scenario import Scenario
+from ambjax.world.scenario import Initial, Scenario
+from ambjax.world.waveforms import Constant
 
 # Number of members of [spread] that `ambjax compare` analyses, and `ambjax sensitivity` without --members.
 MEMBERS = 100
 
 
 class OperatingPoint(NamedTuple):
-    """An analysed loop: its name, the reference r (m) of its equilibrium, mass m (kg), matrices and analysis."""
+    """An analysed loop: its name, the reference r (m) of its equilibrium, mass m (kg), matrices and analysis.
+
+    `held`: whether the loop is stable in a run without noise and loads; None: no sign is set-valued, so no run decides.
+    """
 
     name: str
     r: float
     m: float
     system: StateSpace
     analysis: Analysis
+    held: bool | None = None
+
+    @property
+    def stable(self) -> bool:
+        """Whether the loop is stable. If it is, but the linear loop is not, there are no peaks."""
+        return self.analysis.stable if self.held is None else self.held
+
+    @property
+    def zone(self) -> str | None:
+        """Zone of the peak of |S|; None for a stable loop without peaks."""
+        return self.analysis.zone if self.analysis.stable or not self.stable else None
 
 
 class SpreadPeaks(NamedTuple):
@@ -72,8 +91,14 @@ class SpreadPeaks(NamedTuple):
 def operating_point(case: Case, name: str, r: float) -> OperatingPoint:
     """Linearise and analyse the loop of a case at a constant reference r (m). Raises ValueError as `linearise` does."""
     system = linearise(case.cascade, case.scenario, case.clock, r)
-    m = float(case.scenario.plant.m)
-    return OperatingPoint(name, r, m, system, _analysis(case, system, m, _velocity_sensor(case)))
+    m, held = float(case.scenario.plant.m), None
+    if has_set_valued([case.cascade]):
+        scenario = as_member(case.scenario)
+        if r:
+            start = Initial(r, 0.0, float(scenario.plant.equilibrium(r)[0]))
+            scenario = dataclasses.replace(scenario, reference=Constant(r), initial=start)
+        held = bool(stability_of(case.cascade, scenario, case.clock).stable[0])
+    return OperatingPoint(name, r, m, system, _analysis(case, system, m, _velocity_sensor(case), held), held)
 
 
 # Modules in these types: the documentation would find two classes of each name, one of them in `ambjax.linear`.
@@ -100,7 +125,8 @@ def sensitivity(case: Case | MachineCase, r: float = 0.0) -> Analysis | list[Mac
     """
     if isinstance(case, MachineCase):
         return points_of(case, list(turning_machines(case.machine, case.clock.sample_period, case.speeds)))
-    return operating_point(case, "nominal", r).analysis
+    system = linearise(case.cascade, case.scenario, case.clock, r)
+    return _analysis(case, system, float(case.scenario.plant.m), _velocity_sensor(case))
 
 
 def points_of(case: MachineCase, turning: Sequence[TurningMachine]) -> list[MachineSensitivity]:
@@ -120,8 +146,8 @@ def _velocity_sensor(case: Case) -> bool:
     return case.scenario.sensors.velocity and case.cascade.reads_velocity(case.clock.sample_period)
 
 
-def _analysis(case: Case, system: StateSpace, m: float, velocity: bool) -> Analysis:
-    return analyse(system, m, case.clock.sample_period, case.zones, velocity)
+def _analysis(case: Case, system: StateSpace, m: float, velocity: bool, held: bool | None = None) -> Analysis:
+    return analyse(system, m, case.clock.sample_period, case.zones, velocity, held is not False)
 
 
 def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPeaks:
@@ -129,6 +155,9 @@ def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPea
     members = study.members if most is None else min(study.members, most)
     cascade, scenario = study.batch(np.arange(members))
     systems, found = linearise_members(cascade, scenario, study.clock)
+    held: list[bool | None] = [None] * members
+    if has_set_valued([case.cascade]):
+        held = stability_of(cascade, scenario, study.clock).stable.tolist()
     peaks, good, velocity = np.full(members, math.inf), np.zeros(members, bool), _velocity_sensor(case)
     masses = np.broadcast_to(np.asarray(scenario.plant.m, float), (members,))
     analyses: list[Analysis | None] = []
@@ -137,14 +166,16 @@ def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPea
         one, loop = None, jax.tree.map(lambda x, k=k: np.asarray(x)[k], systems)
         with contextlib.suppress(ValueError):  # the member has no linearisation
             loop = checked(loop, found[k], 0.0)
-            one = _analysis(case, loop, float(masses[k]), velocity)
+            one = _analysis(case, loop, float(masses[k]), velocity, held[k])
         loops.append(loop)
         analyses.append(one)
-        if one is not None and one.stable:
-            peaks[k], good[k] = one.S.height, True
-    worst, zone_a = int(np.argmax(peaks)), sum(one is not None and one.stable and one.zone == "A" for one in analyses)
+        if one is not None:
+            peaks[k], good[k] = one.S.height, one.stable if held[k] is None else held[k]
+    worst = int(np.lexsort((-peaks, good))[0])  # the first one that is not stable, if there is one
+    zone_a = sum(one is not None and one.stable and one.zone == "A" for one in analyses)
     one = analyses[worst]
-    point = None if one is None else OperatingPoint(f"member {worst}", 0.0, float(masses[worst]), loops[worst], one)
+    parts = f"member {worst}", 0.0, float(masses[worst]), loops[worst]
+    point = None if one is None else OperatingPoint(*parts, one, held[worst])
     failed = sum(one is None for one in analyses)
     return SpreadPeaks(members, int(good.sum()), int(zone_a), worst, point, failed=failed)
 

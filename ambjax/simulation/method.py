@@ -32,8 +32,10 @@ LAGGED = 0.5
 # elastic contact by up to 1.1e-4 of its value, and by up to 1.2e-3 with damping (tests/test_touchdown.py).
 TOUCHED = 0.05
 # Product of step and amplifier rate at which the error of RK4 in the current is 1e-9 A. The amplifier's voltage is a
-# known function of time.
+# known function of time. The same for the angular frequency of a load, with an error of 2e-5 of its impulse.
 DRIVEN = 0.5
+# Largest number of substeps for a load: it has 40 periods in a sample.
+MOST_DRIVEN = 512
 # Names of the plant's slopes in messages.
 PLANT, COILS, FLUX, STOP = "plant", "current in the coils", "flux behind the current", "rotor on its stop"
 # The same in continuous time, for steps of a fixed number.
@@ -104,22 +106,29 @@ def choose_method(cascade: Cascade, scenario: Scenario, sample_period: float, *,
     """
     named = slopes(cascade, scenario)
     slope = max(named.values())
-    fixed_only, noisy = _fixed_only(cascade, scenario), _noisy(scenario)
+    fixed_only, noisy, load = _fixed_only(cascade, scenario), _noisy(scenario), scenario.load_rate()
+    loaded = math.ceil(sample_period * load / DRIVEN)
     if cascade.sampled:
         settled = math.ceil(sample_period * max(named[COILS] / SETTLED, named[FLUX] / LAGGED))
         amplifier = scenario.actuator
         rate = float(np.max(np.asarray(amplifier.slope()))) if amplifier.slow else 0.0
         touched = named.get(STOP, 0.0) / TOUCHED
         driven = math.ceil(sample_period * max(named[PLANT] / SAMPLED, touched, rate / DRIVEN))
+        if loaded > MOST_DRIVEN:
+            raise ValueError(
+                f"clock.sample_period = {sample_period:g} s: a load of {load / (2 * math.pi):.4g} Hz needs {loaded} "
+                f"steps in a sample, and at most {MOST_DRIVEN} are allowed. Shorten it, or lower the frequency."
+            )
+        driven = max(driven, loaded)
         substeps, fixed = max(driven, settled, 1), max(driven, MOST_SETTLED)
         explicit = settled <= MOST_SETTLED
     else:
-        substeps = max(math.ceil(sample_period * slope / ACCURATE), 1)
+        substeps = max(math.ceil(sample_period * slope / ACCURATE), loaded, 1)
         explicit = reverse and substeps <= MOST_SUBSTEPS
-        fixed = math.ceil(sample_period / math.sqrt(CORNER / slope))
+        fixed = max(math.ceil(sample_period / math.sqrt(CORNER / slope)), loaded)
         smooth = fixed_only or (noisy and _smooth_inside(cascade, scenario, sample_period))
         if smooth and not reverse and substeps <= MOST_SUBSTEPS:
-            return DOP853(max(math.ceil(sample_period * slope / NOISY), 1))
+            return DOP853(max(math.ceil(sample_period * max(slope, load) / NOISY), 1))
     if explicit:
         return RK4(substeps)
     if reverse or fixed_only:

@@ -17,7 +17,7 @@ from ambjax.world.recorded import Knots
 from ambjax.world.rotation import Rotation, turned
 from ambjax.world.sensor import IdealSensor, Measurement, Sensor
 from ambjax.world.touchdown import Stop
-from ambjax.world.waveforms import Constant, Signal, edges_of, is_random, knots_of, realised
+from ambjax.world.waveforms import Constant, Signal, edges_of, frequencies_of, is_random, knots_of, realised
 
 # Numbers that are folded into a member's key, for the random streams of the design and of the signals. The sensors use
 # other streams of this key (`numerics.gaussian.STREAMS`, `faults`), with the sample number as counter.
@@ -148,8 +148,9 @@ class Scenario:
         """
         i_max, R = self.actuator.current_limit(self.plant.i_0), jnp.asarray(self.plant.R)
         dead = getattr(self.actuator, "dead_band", None)
-        most = jnp.maximum(self.voltage_limit - (0.0 if dead is None else dead), 0.0)
-        driven = jnp.where(R > 0, most / jnp.where(R > 0, R, 1.0), jnp.inf)
+        most = self.voltage_limit - (0.0 if dead is None else dead)
+        limits = (R > 0) & (most > 0)  # the reader warns of an amplifier that gives nothing
+        driven = jnp.where(limits, most / jnp.where(limits, R, 1.0), jnp.inf)
         return self.plant.largest_force(driven if i_max is None else jnp.minimum(i_max, driven))
 
     @property
@@ -157,6 +158,11 @@ class Scenario:
         """The fastest rate of the current, 1/s: R/L of a coil, or that of the amplifier's current loop if greater."""
         coils = self.plant.coil_slope(self.limit)
         return coils if self.drive == "voltage" else jnp.maximum(jnp.asarray(coils), self.actuator.slope())
+
+    def load_rate(self) -> float:
+        """Return the largest angular frequency of the loads of all members, 1/s; 0 where it is traced."""
+        loads = [getattr(self, slot) for slot in SLOTS[1:]]
+        return 2 * np.pi * max((high for _, high in frequencies_of(tuple(loads))), default=0.0)
 
     def pushed(self, q_z: Array, motion: Measurement) -> Array:
         """Return the disturbance q_z (m/s^2) plus the acceleration by the stop, for the true motion of the rotor."""

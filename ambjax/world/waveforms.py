@@ -5,6 +5,7 @@ signal has a method `realised(key)`, which draws the function of time for one me
 """
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import jax
@@ -12,10 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, part, record
+from ambjax.numerics.records import Scalar, is_traced, leaf, part, record
 from ambjax.numerics.smooth import TWO_PI, sine
 
 T = TypeVar("T")
+# Fields of signals that are a frequency, and their factor to Hz.
+FREQUENCIES = {"frequency": 1.0, "frequency_end": 1.0, "f_high": 1.0, "speed": 1 / 60, "speed_end": 1 / 60}
 
 
 class Signal(Protocol):
@@ -281,3 +284,17 @@ def reference_at(signal: Signal, t: Scalar) -> Reference:
 
     (r, r_dot, r_ddot), (_, _, r_dddot) = jax.jvp(second, (t,), (jnp.ones_like(t),))
     return Reference(r, r_dot, r_ddot, r_dddot)
+
+
+def frequencies_of(node: object) -> Iterator[tuple[str, float]]:
+    """Yield the name and the largest value (Hz) of each frequency in a signal and its parts that has a number."""
+    if isinstance(node, tuple):
+        for item in node:
+            yield from frequencies_of(item)
+    elif dataclasses.is_dataclass(node):
+        for field in dataclasses.fields(node):
+            value = getattr(node, field.name)
+            if field.name in FREQUENCIES and value is not None and not is_traced(value):
+                yield field.name, FREQUENCIES[field.name] * float(np.max(np.asarray(value)))
+            elif isinstance(value, tuple) or dataclasses.is_dataclass(value):
+                yield from frequencies_of(value)

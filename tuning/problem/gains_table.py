@@ -78,6 +78,12 @@ def off(cascade: Cascade) -> list[str]:
     return [path for path in tunable(cascade) if np.any(np.asarray(read(cascade, path)) == 0)]
 
 
+def left_out(space: Space, cascade: Cascade) -> list[str]:
+    """Return the paths of the gains that a search could tune, but that are not in the space."""
+    fixed = {*space.paths, *off(cascade)}
+    return [path for path in tunable(cascade) if path not in fixed and np.all(np.isfinite(read(cascade, path)))]
+
+
 def flattened(raw: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Flatten nested tables to dotted keys. TOML reads controller.position.c = [1, 2] as nested tables."""
     flat: dict[str, Any] = {}

@@ -8,6 +8,7 @@ import numpy as np
 from ambjax.linear import Findings
 from ambjax.results.outputs import described
 from ambjax.theorem.advice import STALLED, STALLED_PLANT
+from tuning.problem.gains_table import left_out
 from tuning.problem.members import Members
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.report import front_table, sensitivity_table
@@ -189,7 +190,9 @@ def remedies(
         words.append(Findings(**facts.stability).words() + f" Add {' or '.join(absent)}." * bool(absent))
     if outcome.broken:
         keys = ", ".join(f"tune.limits.{name}" for name in outcome.broken)
-        words.append(f"Not held: {keys}. Loosen these limits, tune more gains (also each p), or raise tune.screen.")
+        others = ", ".join(left_out(problem.tune.space, problem.case.cascade))
+        more = f"tune also {others}" if others else "widen tune.bounds"
+        words.append(f"Not held: {keys}. Loosen these limits, {more}, or raise tune.screen.")
     if outcome.stalled:
         remedy = STALLED_PLANT if problem.sampled else STALLED
         words.append(f"Not decided: {outcome.stalled} held-out members, whose integration stalls. {remedy}")
