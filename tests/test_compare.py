@@ -144,7 +144,7 @@ def test_differences_other_than_the_laws_are_named(run, cases, capsys):
         (["soft", "none"], [], "none.toml"),
         (["soft", "stiff"], ["--members", "0"], "--members 0: it must be a whole number from 1"),
         (["soft", "stiff"], ["--seed", "-1"], "--seed -1"),
-        (["soft", "spread"], [], "spread.plant.m = { percent = 5 }, and soft"),
+        (["soft", "spread"], [], "spread.plant.m = { percent = 5 }, and "),
         (["soft", "fixed"], [], "spread.plant.m = none, and"),
     ],
 )
