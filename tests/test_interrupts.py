@@ -45,6 +45,12 @@ CASES = {
         "with exit_on_interrupt('p'), deferred('It ends.'):\n interrupt()\n time.sleep(0.2)\n interrupt()\n ever()",
         "p: It ends. Ctrl-C again ends it at once.\np: interrupted.\n",
     ),
+    "before its files are complete": (
+        "import pathlib\nfrom ambjax.results.outputs import files\nos.mkdir('out')\n"
+        "with exit_on_interrupt('p'), files(pathlib.Path('out')) as part:\n"
+        " (part / 'a').write_text('')\n interrupt()\n ever()",
+        "p: interrupted.\n",
+    ),
     "stderr is full": (
         "w = os.pipe()[1]\nos.set_blocking(w, False)\ntry:\n while True: os.write(w, bytes(65536))\n"
         "except BlockingIOError: os.set_blocking(w, True)\nos.dup2(w, 2)\nwith exit_on_interrupt('p'):\n"
@@ -59,14 +65,15 @@ CASES = {
 }
 
 
-def run(code):
-    return subprocess.run([sys.executable, "-c", HEAD + code], capture_output=True, text=True, timeout=50)
+def run(code, folder=None):
+    return subprocess.run([sys.executable, "-c", HEAD + code], capture_output=True, text=True, timeout=50, cwd=folder)
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_ctrl_c_ends_the_program_at_once_with_one_line(case):
+def test_ctrl_c_ends_the_program_at_once_with_one_line(case, tmp_path):
     code, said = CASES[case]
-    done = run(code)
+    done = run(code, tmp_path)
+    assert not list(tmp_path.iterdir())
     assert done.returncode == 130, done.stderr
     assert done.stderr.endswith(said)
     assert case == "below a bar" or done.stderr == said
