@@ -11,6 +11,7 @@ from ambjax.cases.reader import read_case
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
 from ambjax.commands import compare
+from ambjax.commands.comparison_report import Quantity, _marked
 from ambjax.ensemble.study import Study
 from ambjax.host import extensions
 from ambjax.linear import analyse, linearise
@@ -86,6 +87,11 @@ def test_the_numbers_are_those_of_the_study_and_of_the_analysis(two, cases):
     assert html.count("data:image/png;base64,") == 1
     assert f"<strong>{stiff['rms_error_median_m']:.4g}</strong>" in html
     assert '<td class="short">settled rms error, median</td>' in html
+
+
+def test_only_a_number_that_is_printed_as_better_is_bold():
+    cells = [_marked(Quantity("peak", "", ""), {"cases": [{"peak": x}, {"peak": 1.69404}]}) for x in (1.69401, 1.6)]
+    assert cells == [["1.694", "1.694"], ["**1.6**", "1.694"]]
 
 
 def check_row(row, case, c):
