@@ -28,14 +28,6 @@ CASES = {
         "with exit_on_interrupt('p'):\n while True:\n  try:\n   interrupt()\n   ever()\n  except BaseException: pass",
         "p: interrupted.\n",
     ),
-    "in another thread": (
-        "with exit_on_interrupt('p'):\n threading.Thread(target=interrupt).start()\n ever()",
-        "p: interrupted.\n",
-    ),
-    "something is kept": (
-        "with exit_on_interrupt('p'), reporting(lambda: '3 are kept'):\n interrupt()\n ever()",
-        "p: interrupted: 3 are kept.\n",
-    ),
     "while it is being kept": (
         "n = [0]\nwith exit_on_interrupt('p'), reporting(lambda: f'{n[0]} are kept'):\n with uninterrupted():\n"
         "  interrupt()\n  time.sleep(0.2)\n  n[0] = 1\n ever()",
