@@ -11,6 +11,7 @@ from ambjax.cases.reader import read_case
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
 from ambjax.commands import compare
+from ambjax.commands.comparison_report import Quantity, _marked
 from ambjax.ensemble.study import Study
 from ambjax.host import extensions
 from ambjax.linear import analyse, linearise
@@ -88,6 +89,11 @@ def test_the_numbers_are_those_of_the_study_and_of_the_analysis(two, cases):
     assert '<td class="short">settled rms error, median</td>' in html
 
 
+def test_only_a_number_that_is_printed_as_better_is_bold():
+    cells = [_marked(Quantity("peak", "", ""), {"cases": [{"peak": x}, {"peak": 1.69404}]}) for x in (1.69401, 1.6)]
+    assert cells == [["1.694", "1.694"], ["**1.6**", "1.694"]]
+
+
 def check_row(row, case, c):
     """Check the row of a case whose position law has the gain c. Return the error of each member."""
     study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, MEMBERS)
@@ -144,7 +150,7 @@ def test_differences_other_than_the_laws_are_named(run, cases, capsys):
         (["soft", "none"], [], "none.toml"),
         (["soft", "stiff"], ["--members", "0"], "--members 0: it must be a whole number from 1"),
         (["soft", "stiff"], ["--seed", "-1"], "--seed -1"),
-        (["soft", "spread"], [], "spread.plant.m = Percent(percent=5.0, shape='uniform'), and"),
+        (["soft", "spread"], [], "spread.plant.m = { percent = 5 }, and "),
         (["soft", "fixed"], [], "spread.plant.m = none, and"),
     ],
 )

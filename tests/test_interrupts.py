@@ -28,14 +28,6 @@ CASES = {
         "with exit_on_interrupt('p'):\n while True:\n  try:\n   interrupt()\n   ever()\n  except BaseException: pass",
         "p: interrupted.\n",
     ),
-    "in another thread": (
-        "with exit_on_interrupt('p'):\n threading.Thread(target=interrupt).start()\n ever()",
-        "p: interrupted.\n",
-    ),
-    "something is kept": (
-        "with exit_on_interrupt('p'), reporting(lambda: '3 are kept'):\n interrupt()\n ever()",
-        "p: interrupted: 3 are kept.\n",
-    ),
     "while it is being kept": (
         "n = [0]\nwith exit_on_interrupt('p'), reporting(lambda: f'{n[0]} are kept'):\n with uninterrupted():\n"
         "  interrupt()\n  time.sleep(0.2)\n  n[0] = 1\n ever()",
@@ -44,6 +36,12 @@ CASES = {
     "again": (
         "with exit_on_interrupt('p'), deferred('It ends.'):\n interrupt()\n time.sleep(0.2)\n interrupt()\n ever()",
         "p: It ends. Ctrl-C again ends it at once.\np: interrupted.\n",
+    ),
+    "before its files are complete": (
+        "import pathlib\nfrom ambjax.results.outputs import files\nos.mkdir('out')\n"
+        "with exit_on_interrupt('p'), files(pathlib.Path('out')) as part:\n"
+        " (part / 'a').write_text('')\n interrupt()\n ever()",
+        "p: interrupted.\n",
     ),
     "stderr is full": (
         "w = os.pipe()[1]\nos.set_blocking(w, False)\ntry:\n while True: os.write(w, bytes(65536))\n"
@@ -59,14 +57,15 @@ CASES = {
 }
 
 
-def run(code):
-    return subprocess.run([sys.executable, "-c", HEAD + code], capture_output=True, text=True, timeout=50)
+def run(code, folder=None):
+    return subprocess.run([sys.executable, "-c", HEAD + code], capture_output=True, text=True, timeout=50, cwd=folder)
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_ctrl_c_ends_the_program_at_once_with_one_line(case):
+def test_ctrl_c_ends_the_program_at_once_with_one_line(case, tmp_path):
     code, said = CASES[case]
-    done = run(code)
+    done = run(code, tmp_path)
+    assert not list(tmp_path.iterdir())
     assert done.returncode == 130, done.stderr
     assert done.stderr.endswith(said)
     assert case == "below a bar" or done.stderr == said

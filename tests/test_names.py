@@ -159,6 +159,9 @@ def test_the_printed_forces_agree_with_the_formulas():
 @pytest.mark.slow
 def test_check_fails_if_the_magnets_cannot_carry_the_rotor(capsys, elsewhere):
     heavy = "\n".join(f"{name} = {value}" for name, value in (GOOD | {"m": 40.0}).items())
+    falling = write(f"[plant]\n{heavy}\n[processor]\n[clock]\nduration = 0.02\n")
+    assert main(["simulate", falling, "--out", "lost"]) == 1
+    assert "No gains hold it: the magnets cannot carry the rotor: their largest" in capsys.readouterr().err
     case = write(f"[plant]\n{heavy}\n[clock]\nduration = 0.001\n")
     assert main(["check", case]) == 1
     assert "their largest force is 364.2 N, below its weight of 392.4 N" in capsys.readouterr().out

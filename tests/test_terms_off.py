@@ -3,7 +3,6 @@
 import dataclasses
 import tomllib
 
-import jax
 import numpy as np
 import pytest
 from test_structures import RIG
@@ -143,16 +142,6 @@ def test_an_integral_without_gain_does_not_remove_the_offset_of_a_heavier_rotor(
     assert abs(float(point.control.position.integral)) < 1e-12  # of 0.2 m/s^2: rounding
     # 1e-6: the equilibrium is exact to 1e-9 of the size of z, a fiftieth of the gap
     assert float(point.plant.z) == pytest.approx(-0.1 * RIG.g / law.k_p, rel=1e-6)
-
-
-def test_the_low_pass_is_off_unless_it_is_given():
-    """With a corner of 1e9 1/s, its effect at the peak of 85 Hz is 1e-6; with the former default 20 w it was 28 %."""
-    absent, high = analysis(bearing()), analysis(bearing(position={"w_lp": 1e9}))
-    assert absent.S.height == pytest.approx(high.S.height, rel=1e-4)
-    law = bearing().cascade.position
-    assert law.w_lp is None
-    assert law.memory == position.FilterChain(w_lp=1e9).memory[:-2]
-    assert len(jax.tree.leaves(law.init(RIG))) == len(law.memory) == 8
 
 
 REFUSED = r"sensor\.velocity = false: the velocity is not measured.*predict = false"

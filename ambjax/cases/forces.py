@@ -18,6 +18,12 @@ class Forces(NamedTuple):
     weight: float
     load: float
 
+    @property
+    def too_small(self) -> str:
+        """Why the magnets cannot carry the rotor; empty if they can."""
+        words = f"their largest force is {self.largest:.4g} N, below its weight of {self.weight:.4g} N"
+        return f"the magnets cannot carry the rotor: {words}" if self.largest < self.weight else ""
+
 
 def forces(case: Case) -> Forces:
     """Return the forces of a case, for the plant without [spread].

@@ -98,11 +98,7 @@ def _failures(checked: Checked) -> list[str]:
         found += ["the run reaches the singular curve C"] if run.distance[0] <= 0 else []
     if not checked.linear:
         found.append("the loop cannot be linearised")
-    largest, weight, _ = forces(checked.case)
-    if largest < weight:
-        words = f"their largest force is {largest:.4g} N, below its weight of {weight:.4g} N"
-        found.append(f"the magnets cannot carry the rotor: {words}")
-    return found
+    return [*found, *filter(None, [forces(checked.case).too_small])]
 
 
 def _clearance(case: Case, largest: float | None) -> str:

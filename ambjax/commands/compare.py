@@ -190,10 +190,13 @@ def _differences(paths: Sequence[str], cases: Sequence[AnyCase], studies: Sequen
         names = [name for name in differing if not MAY_DIFFER.match(name)]
         spread = [name for name in names if name.startswith("spread.")]
         if spread:
-            name = spread[0]
+            own, its = (
+                dict(one.spread.entries).get(spread[0].removeprefix("spread."), facts.get(spread[0], "none"))
+                for one, facts in ((study, other), (studies[0], first))
+            )
             raise ValueError(
-                f"{path}: {name} = {other.get(name, 'none')}, and {paths[0]} has {first.get(name, 'none')}: the "
-                "members would not be the same. Give both cases the same [spread]."
+                f"{path}: {spread[0]} = {own}, and {paths[0]} has {its}: the members would not be the same. Give both "
+                "cases the same [spread]."
             )
         if names:
             shown = [f"{name} ({first.get(name, 'none')} and {other.get(name, 'none')})" for name in names[:6]]

@@ -237,10 +237,11 @@ def _cell(value: object) -> str:
 
 
 def _marked(quantity: Quantity, summary: Mapping[str, Any]) -> list[str]:
-    """Return the cells of a row, the best one bold if not all are equal."""
+    """Return the cells of a row, those with the best printed number bold if not all are equal."""
     values = [quantity.value(case) for case in summary["cases"]]
-    known = [value for value in values if isinstance(value, (int, float))]
-    if quantity.less is None or len(set(known)) < 2:
-        return [_cell(value) for value in values]
-    best = min(known) if quantity.less else max(known)
-    return [f"**{_cell(value)}**" if value == best else _cell(value) for value in values]
+    cells = [_cell(value) for value in values]
+    known = {cell: value for value, cell in zip(values, cells, strict=True) if isinstance(value, (int, float))}
+    if quantity.less is None or len(known) < 2:
+        return cells
+    best = (min if quantity.less else max)(known, key=lambda cell: known[cell])
+    return [f"**{cell}**" if cell == best else cell for cell in cells]

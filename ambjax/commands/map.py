@@ -21,7 +21,12 @@ WRITTEN = ("map.png", "map.json")
 def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
     """Simulate the cells of a map for each case and write map.png and map.json."""
     cases = [read_any_with_warnings(path) for path in [args.case, *(args.against or [])]]
-    ready = [study_and_axes(case, args.x, args.y, args.members, args.seed) for case in cases]
+    ready = [study_and_axes(cases[0], args.x, args.y, args.members, args.seed)]
+    for path, case in zip(args.against or [], cases[1:], strict=True):
+        try:
+            ready += [study_and_axes(case, args.x, args.y, args.members, args.seed)]
+        except ValueError as error:
+            raise ValueError(f"--against {path}: {error}") from None
     out = directory(args.out, f"map-{cases[0].name}", WRITTEN, args.force)
     with files(out) as part:
         maps = []

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from tqdm import tqdm
 
+from ambjax.cases.forces import forces
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
 from ambjax.cases.warned import reversal
@@ -94,6 +95,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
             f" {command('ambjax', 'check', args.case)} compares the gains with the conditions of Theorem 1{which}; "
             f"{command('ambjax', 'tune', args.case)} searches for gains that hold the rotor."
         )
+        too_small = forces(case).too_small  # then no gains hold the rotor
+        look = f" No gains hold it: {too_small}." if too_small else look
         say(words if metrics["stalled"] else words + look)
     return int(ended), metrics | {"out": str(out)}
 

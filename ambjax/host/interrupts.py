@@ -7,7 +7,9 @@ process. No finished work is lost, because every result is written to disk, comp
 
 import contextlib
 import os
+import pathlib
 import select
+import shutil
 import signal
 import sys
 import threading
@@ -25,6 +27,7 @@ class _Handler:
     report: Callable[[], str] | None = None
     deferral = ""
     pending = False
+    unfinished: pathlib.Path | None = None
 
     def __init__(self) -> None:
         self.busy = threading.Lock()
@@ -42,6 +45,10 @@ class _Handler:
             except Exception as error:  # raised by the report
                 self._print(f"interrupted; it is not known which results are kept ({type(error).__name__}).")
             finally:
+                if self.unfinished is not None:
+                    shutil.rmtree(self.unfinished, ignore_errors=True)
+                    with contextlib.suppress(OSError):
+                        self.unfinished.parent.rmdir()
                 os._exit(INTERRUPTED)
 
     def _print(self, words: str) -> None:
@@ -70,6 +77,8 @@ def exit_on_interrupt(program: str) -> Iterator[None]:
     if os.name == "posix":
         os.set_blocking(write_end, False)
     _handler.program, _handler.pending = program, False
+    # Python's tracker of semaphores, a process, outlives this one, and would warn of those of the worker processes
+    sys.warnoptions.append("ignore:resource_tracker:UserWarning")
     before = signal.signal(signal.SIGINT, lambda *_: None), signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
     thread = threading.Thread(target=_read_signals, args=(read_end,), daemon=True)
     thread.start()
@@ -115,6 +124,16 @@ def uninterrupted() -> Iterator[None]:
     """Delay Ctrl-C until the end of this short block, so that the report includes the files written in it."""
     with _handler.busy:
         yield
+
+
+@contextlib.contextmanager
+def removed_by_interrupt(folder: pathlib.Path) -> Iterator[None]:
+    """Remove `folder`, and its parent if that is then empty, if a Ctrl-C ends the process in this block."""
+    _handler.unfinished = folder
+    try:
+        yield
+    finally:
+        _handler.unfinished = None
 
 
 def raise_if_interrupted() -> None:

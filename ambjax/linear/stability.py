@@ -168,8 +168,8 @@ class Tested(NamedTuple):
     """N loops whose stability is tested, each with c axes.
 
     `cascades`: those with all laws. `growth`: largest growth rate of each linear loop that is chosen (bool [N]) with
-    these cascades, 1/s; NaN without a linear verdict. `quiet`: simulates the quiet runs. `clearance`: of each axis, m, [N, c] or one for all N.
-    `bias`: largest bias current, A.
+    these cascades, 1/s; NaN without a linear verdict. `quiet`: simulates the quiet runs. `clearance`: of each axis, m,
+    [N, c] or one for all N. `bias`: largest bias current, A.
     """
 
     cascades: Sequence[Cascade]

@@ -113,7 +113,8 @@ def machine_sensitivity_picture(
         c = len(point.axes)
         S = np.asarray(point.system.response(f))[:, :c]
         for k, axis in enumerate(point.axes):
-            (line,) = ax.loglog(f, np.abs(S[:, k, k]), label=f"{axis.name}: {axis.S.height:.3g}", linewidth=1.0)
+            label, look = f"{axis.name}: {axis.S.height:.3g}", ("-", "--")[k % 2]
+            (line,) = ax.loglog(f, np.abs(S[:, k, k]), look, label=label, linewidth=1.0)
             one = measured[point.speed][k] if point.speed in measured else None
             if one is not None and one.S is not None:
                 label = "injected" if k == len(point.axes) - 1 else None

@@ -31,11 +31,12 @@ def unbalance_picture(case: Any, found: Any, criticals: Sequence[Any], operating
     figure = Figure(figsize=(11.0, 9.0), layout="constrained")
     top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=[2, 1, 1])
     for k in radial:
-        line = top.semilogy(speeds, 2e6 * np.abs(found.sensors[:, k]), label=f"{case.axes[k]}, sensor")[0]
+        look = ("-", "--")[k % 2]  # x and y of a bearing often agree
+        line = top.semilogy(speeds, 2e6 * np.abs(found.sensors[:, k]), look, label=f"{case.axes[k]}, sensor")[0]
         if not np.allclose(found.sensors[:, k], found.magnets[:, k], equal_nan=True):
             top.semilogy(speeds, 2e6 * np.abs(found.magnets[:, k]), ":", color=line.get_color(), label="at its magnet")
-        middle.plot(speeds, np.abs(found.current[:, k]), label=case.axes[k])
-        bottom.plot(speeds, np.abs(found.command[:, k]))
+        middle.plot(speeds, np.abs(found.current[:, k]), look, label=case.axes[k])
+        bottom.plot(speeds, np.abs(found.command[:, k]), look)
     sizes = 2e6 * np.abs(found.sensors[1:, radial])
     largest = float(sizes.max(where=np.isfinite(sizes), initial=1e-3))
     top.set_ylim(largest * 1e-3, max(3 * largest, 40.0))
@@ -43,7 +44,8 @@ def unbalance_picture(case: Any, found: Any, criticals: Sequence[Any], operating
     for one in criticals:
         top.annotate(
             f"{one.speed:.0f} rpm\nAF {one.amplification:.2g}", (one.speed, min(1e6 * one.peak_to_peak, largest)),
-            ha="center", xytext=(0, 6), textcoords="offset points", fontsize="small",
+            ha="center", xytext=(0, 6), textcoords="offset points", fontsize="small", zorder=5,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1},
         )  # fmt: skip
     for ax in (top, middle, bottom):
         ax.grid(True, alpha=0.3, which="both")

@@ -18,7 +18,7 @@ import numpy as np
 
 from ambjax.ensemble.store import MANIFEST, RESULT
 from ambjax.host.heartbeat import say
-from ambjax.host.interrupts import uninterrupted
+from ambjax.host.interrupts import removed_by_interrupt, uninterrupted
 from ambjax.text.words import one_line
 
 Described = TypeVar("Described")
@@ -128,7 +128,8 @@ def files(out: pathlib.Path) -> Iterator[pathlib.Path]:
         try:
             with tempfile.TemporaryDirectory(prefix=".ambjax-", dir=out, ignore_cleanup_errors=True) as folder:
                 part = pathlib.Path(folder)
-                yield part
+                with removed_by_interrupt(part):
+                    yield part
                 names = sorted((p.relative_to(part) for p in part.rglob("*") if p.is_file()), key=_order)
                 check_places(out, names)
                 with uninterrupted():
