@@ -75,6 +75,7 @@ def test_the_search_designs_the_notches_for_its_gains():
     raw: dict[str, Any] = raw_case(gains=["controller.position.k_d"]) | {"sensitivity": {"speeds": [6000.0]}}
     raw["controller"] |= {"notch": {"kind": "displacement-free", "rate": 20.0}}
     raw["bearing"][2]["controller"] = {"notch": {"kind": "none"}}
+    raw["processor"] |= {"predict": False}  # compiles faster
     case, space = space_of(raw)
     found, k_d = Peaks(case, space), 1.6 * space.values(case)[0]
     pid = {"position": PARTS["position"] | {"k_d": float(k_d)}}

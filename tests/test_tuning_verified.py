@@ -86,8 +86,14 @@ def test_worst_of_returns_the_largest_values():
 def test_steps_are_compared_without_the_converter(small):
     """Two runs diverge after one different rounding of the converter, however fine their steps are."""
     assert small.steps == (small.engine, small.reference)
-    converted = problem_from(SMALL.replace("std = 2e-7", "std = 2e-7\nbits = 12") + "[processor]\n")
-    assert [engine.objective.scenario.sensor.bits for engine in converted.steps] == [None, None]
+    converted = problem_from(
+        SMALL.replace("std = 2e-7", "std = 2e-7\nbits = 12").replace("ity = inf", "ity = 3.0") + "[processor]\n"
+    )
+    compared = [one.objective for one in converted.steps]
+    assert [(one.scenario.sensor.bits, one.loop) for one in compared] == [
+        (None, None)
+    ] * 2  # linear loops have no steps
     assert converted.engine.objective.scenario.sensor.bits == 12
+    assert converted.engine.objective.loop is not None
     ours, accurate = (engine.objective.clock.method for engine in converted.steps)
     assert ours == converted.engine.objective.clock.method != accurate

@@ -138,8 +138,9 @@ class Objective:
             return cascade
         loop = linearisation_inputs(self.cascade, self.scenario, self.clock)
         x = np.asarray(x, jnp.result_type(float))
-        gains = jax.tree.map(np.asarray, _designs(*canonical((x.reshape(-1, x.shape[-1]), *loop)), space=self.space))
-        gains = jax.tree.map(lambda a: a.reshape(x.shape[:-1]), gains)
+        rows, place = np.unique(x.reshape(-1, x.shape[-1]), axis=0, return_inverse=True)  # the members share a start
+        gains = _designs(*canonical((rows, *loop)), space=self.space)
+        gains = jax.tree.map(lambda a: np.asarray(a)[place.reshape(x.shape[:-1])], gains)
         return dataclasses.replace(cascade, notch=dataclasses.replace(cascade.notch, gains=gains))
 
     def fixed(self, x: np.ndarray, members: Members) -> tuple[Cascade, Scenario]:

@@ -160,7 +160,7 @@ class TuningProblem:
             return self.engine, self.reference
         exact = scenario.with_sensor(bits=None, bits_i=None)
         ours, accurate = (
-            Engine(dataclasses.replace(one.objective, scenario=exact), settle=self.case.settle, lanes=FEW)
+            Engine(dataclasses.replace(one.objective, scenario=exact, loop=None), settle=self.case.settle, lanes=FEW)
             for one in (self.engine, self.reference)
         )
         return ours, accurate
