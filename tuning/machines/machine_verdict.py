@@ -111,4 +111,6 @@ def report_text(facts: dict[str, Any]) -> str:
 
 
 def _peak(point: dict[str, Any], axis: dict[str, Any]) -> str:
-    return f"{axis['peak']:.4g}" if point["stable"] else "unstable"
+    if not point["stable"]:
+        return "unstable"
+    return f"{axis['peak']:.4g}" if math.isfinite(axis["peak"]) else "none"
