@@ -20,10 +20,10 @@ def run_machines(machine: Machine, clock: Clock, fold: Fold, **how: Any) -> Resu
     `how`: `threads`, `call` and `plain` of `map_members`.
     """
     tree = canonical((machine, clock, fold))
-    return map_members(_simulated, tree, vectorised=True, **({"plain": _has_long_sums(machine)} | how))
+    return map_members(_simulated, tree, vectorised=True, **({"plain": has_long_sums(machine)} | how))
 
 
-def _has_long_sums(machine: Machine) -> bool:
+def has_long_sums(machine: Machine) -> bool:
     """Return whether a product of a matrix has a sum of more than SHORT terms, which XLA refuses in one kernel."""
     matrices = [x for x in jax.tree.leaves(machine.law) if np.ndim(x) > 1]
     return max(np.shape(x)[-1] for x in (machine.rotor.gravity, *matrices)) > SHORT
