@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.compiler.short_compilation import compiled_quickly
+from ambjax.compiler.fast_path import one_kernel
 from ambjax.linear.analysis import Zones
 from ambjax.linear.injection import Injection, frequency_lines, injection_of
 from ambjax.linear.linear_machine import machine_rest
+from ambjax.linear.machine_at_speed import MachineRest
 from ambjax.linear.member_responses import AMPLITUDE, Responses, padded
 from ambjax.linear.multisine import FourierSums, MultiSine, Response, multisine
 from ambjax.numerics.records import Scalar, canonical, replaced
@@ -30,11 +31,11 @@ from ambjax.world.waveforms import Constant
 
 
 class _Test(NamedTuple):
-    """A member: the speed (rpm), and the multi-sine with the amplitudes [c] of its cosines on each axis."""
+    """A member: the speed (rpm), and the multi-sine on one axis."""
 
     speed: Scalar
     wave: MultiSine
-    sizes: Array
+    axis: Scalar
 
 
 def machine_injected(
@@ -59,28 +60,26 @@ def machine_injected(
         harmonics = np.unique(np.round(f * float(clock.duration)).astype(int))
         waves.append(multisine(harmonics, clock.samples, float(clock.sample_period), float(amplitudes[k])))
     most = max(len(wave.harmonics) for wave in waves)
-    tests = [
-        _Test(float(speed), padded(wave, most), np.where(np.arange(len(gaps)) == k, wave.size, 0.0))  # pyright: ignore
-        for (speed, k, _), wave in zip(axes, waves, strict=True)
-    ]
-    tests = jax.tree.map(lambda *x: np.stack(x), *canonical(tests))
-    sums, code = _responses(*canonical((machine, clock, tests)))
+    tests = [_Test(float(speed), padded(wave, most), k) for (speed, k, _), wave in zip(axes, waves, strict=True)]
+    tests = canonical(jax.tree.map(lambda *x: np.stack(x), *tests))
+    machine, clock = canonical((machine, clock))
+    point = machine_rest(machine, clock.sample_period)
+    sums, code = _responses(machine, clock, point, tests)
     random = any(np.any(np.asarray(x)) for loop in machine.loops() for x in loop.scenario.sensors.noises)
     found = []
     for n, ((_, k, _), wave) in enumerate(zip(axes, waves, strict=True)):
         count = len(wave.harmonics)
         e = float(wave.size) * np.exp(1j * np.asarray(wave.phases))
-        S, KS = ((x[n, 0, :count, k] + 1j * x[n, 1, :count, k])[None] / e for x in map(np.asarray, sums[1:3]))
+        S, KS = ((x[n, 0, :count] + 1j * x[n, 1, :count])[None] / e for x in map(np.asarray, sums[1:3]))
         frequency, held = np.asarray(wave.harmonics) / float(clock.duration), np.asarray(code[n : n + 1]) == ALIVE
-        saturated = np.asarray(sums.saturated)[n : n + 1, k]
+        saturated = np.asarray(sums.saturated)[n : n + 1]
         found.append(injection_of(Responses(frequency, S, KS, saturated, held, float(amplitudes[k])), random))
     return [tuple(found[n : n + len(gaps)]) for n in range(0, len(found), len(gaps))]
 
 
-@compiled_quickly
-def _responses(machine: Machine, clock: Clock, tests: _Test) -> tuple[FourierSums, Array]:
-    """Return the `FourierSums` of all axes, and the status codes, of the members."""
-    point = machine_rest(machine, clock.sample_period)
+@one_kernel
+def _responses(machine: Machine, clock: Clock, point: MachineRest, tests: _Test) -> tuple[FourierSums, Array]:
+    """Return the `FourierSums`, and the status codes, of the members. `point`: the machine at rest."""
     zero = jnp.zeros_like(point.q)
     rest = machine.moving(machine.rotor.at_magnets, point.q, zero, tuple(map(PlantOnly, point.plant)))
     limits = machine.join([jnp.asarray(loop.scenario.voltage_limit) for loop in machine.loops()])
@@ -98,9 +97,11 @@ def _responses(machine: Machine, clock: Clock, tests: _Test) -> tuple[FourierSum
             return dataclasses.replace(loop, wave=wave)
 
         rotor = dataclasses.replace(machine.rotor.without_forces(), speed=test.speed, acceleration=jnp.zeros(()))
-        axes = tuple(machine.each(calm, rest, machine.split(test.sizes)))
+        axis = jnp.asarray(test.axis).astype(int)
+        sizes = jnp.where(jnp.arange(len(limits)) == axis, test.wave.size, 0.0)
+        axes = tuple(machine.each(calm, rest, machine.split(sizes)))
         turning = dataclasses.replace(machine, rotor=rotor, axes=axes, start_q=point.q)
-        outcome = run(turning, longer, Response(test.wave, limits, skip), 0)  # pyright: ignore[reportArgumentType]
+        outcome = run(turning, longer, Response(test.wave, limits[axis], skip, axis), 0)  # pyright: ignore[reportArgumentType]
         return outcome.metrics, jnp.asarray(outcome.trajectory.lost_code)
 
     return jax.vmap(one)(tests)

@@ -66,8 +66,6 @@ class FourierSums(NamedTuple):
     - `sample`: number of samples so far.
     - `read`, `u` [2, L]: real and imaginary parts of the Fourier sums of the reading (m or m/s) and of u (V).
     - `saturated`: number of samples with |u| at the limit of the supply.
-
-    For a machine of c axes, they are [2, L, c] and [c].
     """
 
     sample: Array
@@ -81,8 +79,9 @@ class Response:
     """Fold: Fourier coefficients, at the frequencies of `wave`, of the reading with e (m or m/s) and of u (V).
 
     - `wave`: the multi-sine.
-    - `u_max`: limit of the supply, V; [c] for the axes of a machine.
+    - `u_max`: limit of the supply, V.
     - `skip`: number of the first sample that counts. The samples from there on are whole periods of the wave.
+    - `axis`: number of the axis, of a machine.
 
     The result is a `FourierSums` with the coefficients instead of the sums, with `sample` as the number of samples that
     count, and with `saturated` as their share.
@@ -91,19 +90,19 @@ class Response:
     wave: MultiSine
     u_max: Scalar
     skip: int = static()
+    axis: Array | None = None
 
     def init(self) -> FourierSums:
-        zero = jnp.zeros((2, *self.wave.harmonics.shape, *jnp.shape(self.u_max)), jnp.result_type(float))
+        zero = jnp.zeros((2, *self.wave.harmonics.shape), jnp.result_type(float))
         return FourierSums(jnp.asarray(0), zero, zero, zero[0, 0])
 
     def update(self, carry: FourierSums, row: Any, span: Any) -> FourierSums:
-        angles, signals = self.wave.angles(carry.sample), getattr(row, "axes", row)
+        angles = self.wave.angles(carry.sample)
+        z, u = (row.z_measured, row.u) if self.axis is None else (row.axes.z_measured[self.axis], row.axes.u[self.axis])
         counts = carry.sample >= self.skip
         basis = jnp.where(counts, jnp.stack([jnp.cos(angles), -jnp.sin(angles)]), 0.0)
-        basis = basis.reshape(*basis.shape, *[1] * jnp.ndim(self.u_max))
-        read, u = carry.read + basis * signals.z_measured, carry.u + basis * signals.u
-        saturated = carry.saturated + (counts & (jnp.abs(signals.u) >= self.u_max))
-        return FourierSums(carry.sample + 1, read, u, saturated)
+        saturated = carry.saturated + (counts & (jnp.abs(u) >= self.u_max))
+        return FourierSums(carry.sample + 1, carry.read + basis * z, carry.u + basis * u, saturated)
 
     def result(self, carry: FourierSums, ending: Ending) -> FourierSums:
         count = carry.sample - self.skip
