@@ -13,9 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.compiler.fast_path import one_kernel
-from ambjax.compiler.short_compilation import compiled_quickly
-from ambjax.ensemble.machines import has_long_sums
+from ambjax.ensemble.machines import compiled_for_machines
 from ambjax.linear.analysis import Zones
 from ambjax.linear.injection import Injection, frequency_lines, injection_of
 from ambjax.linear.linear_machine import machine_rest
@@ -68,8 +66,7 @@ def machine_injected(
     tests = canonical(jax.tree.map(lambda *x: np.stack(x), *tests))
     machine, clock = canonical((machine, clock))
     point = machine_rest(machine, clock.sample_period)
-    program = _plain if has_long_sums(machine) else _kernel
-    sums, code = program(machine, clock, point, tests)
+    sums, code = _responses(machine, clock, point, tests)
     random = any(np.any(np.asarray(x)) for loop in machine.loops() for x in loop.scenario.sensors.noises)
     found = []
     for n, ((_, k, _), wave) in enumerate(zip(axes, waves, strict=True)):
@@ -82,6 +79,7 @@ def machine_injected(
     return [tuple(found[n : n + len(gaps)]) for n in range(0, len(found), len(gaps))]
 
 
+@compiled_for_machines
 def _responses(machine: Machine, clock: Clock, point: MachineRest, tests: _Test) -> tuple[FourierSums, Array]:
     """Return the `FourierSums`, and the status codes, of the members. `point`: the machine at rest."""
     zero = jnp.zeros_like(point.q)
@@ -109,6 +107,3 @@ def _responses(machine: Machine, clock: Clock, point: MachineRest, tests: _Test)
         return outcome.metrics, jnp.asarray(outcome.trajectory.lost_code)
 
     return jax.vmap(one)(tests)
-
-
-_kernel, _plain = one_kernel(_responses), compiled_quickly(_responses)

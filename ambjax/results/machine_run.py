@@ -11,6 +11,7 @@ import numpy as np
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.table import file_to_write
 from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
+from ambjax.ensemble.machines import compiled_for_machines
 from ambjax.ensemble.replay import SEGMENT
 from ambjax.numerics.records import canonical
 from ambjax.simulation.metrics import UNITS, Metrics
@@ -52,9 +53,8 @@ class MachineRun:
         return machine_figure(self.case, self.signals, self.case.name)
 
 
-# Compiled for one machine, without the one-kernel path: with arrays of axes it takes minutes to compile.
 _begun = compiled_quickly(begin, options=QUICKEST)
-_segment = compiled_quickly(recorded_segment, static_argnames=("count",))
+_segment = compiled_for_machines(recorded_segment, static_argnames=("count",))
 _finished = compiled_quickly(finish, options=QUICKEST)
 
 
