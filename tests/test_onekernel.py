@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ambjax import Cascade, Clock, Initial, Metrics, Scenario
+from ambjax.compiler.fast_path import block_length
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble, run_on_gpu
 from ambjax.laws import inversion, observer, position
@@ -94,3 +95,11 @@ def test_without_the_triton_back_end_the_ordinary_ensemble_runs(monkeypatch):
         found = run_on_gpu(CASCADE, SCENARIO, CLOCK, fold=Peak("e_z"), interpret=True)
     expected = run_ensemble(CASCADE, SCENARIO, CLOCK, fold=Peak("e_z"), threads=1)
     assert all(map(np.array_equal, jax.tree.leaves(found), jax.tree.leaves(expected)))
+
+
+def test_little_of_the_blocks_is_padding():
+    for members in range(1, 3000):
+        block = block_length(members)
+        blocks = -(-members // block)
+        assert block % 16 == 0
+        assert blocks * block - members < (16 * blocks if blocks > 1 else max(members, 16))

@@ -102,11 +102,15 @@ def block_length(members: int) -> int:
     it usually has at most 64 members. Blocks of 128 are slower on Intel's cores with AVX-512. On AMD's they are faster,
     unless much of the last block is padding; they are used from 256 members on. If there are few
     members, the block is shorter, so that little of it is padding: a step of 16 members takes half as long in a block
-    of 16 as in a block of 64. Blocks of 8 are hardly faster than blocks of 16.
+    of 16 as in a block of 64. Blocks of 8 are hardly faster than blocks of 16. Several blocks have nearly the same
+    length, for the same reason.
     """
     number = jnp.result_type(float).itemsize
     longest = (1024 if members >= 256 and has_avx512() and "AuthenticAMD" in _cpuinfo() else 512) // number
-    return min(max(SHORTEST, 1 << (members - 1).bit_length()), longest)
+    if members <= longest:
+        return max(SHORTEST, 1 << (members - 1).bit_length())
+    blocks = -(-members // longest)
+    return -(-members // (blocks * SHORTEST)) * SHORTEST
 
 
 @functools.cache
