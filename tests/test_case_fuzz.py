@@ -45,10 +45,7 @@ WORDS = ["", "auto", "1.0", "a\nb", "\x7f<b>|", "x" * 300]
 NESTED = [[], [1.0], [1.0, 2.0], ["a", 1], [[[]]], DEEP, {}, {"kind": "sine"}, {"percent": 1e308}]
 SPREADS = [{"log-uniform": [1e-200, 1e200]}, {"uniform": [-1e308, 1e308]}, {"normal": 5e-324}]
 HOSTILE = st.one_of(
-    st.sampled_from([*NUMBERS, *WHOLE, *WORDS, *NESTED, *SPREADS]),
-    st.floats(),
-    st.integers(),
-    st.text(max_size=5),
+    st.sampled_from([*NUMBERS, *WHOLE, *WORDS, *NESTED, *SPREADS]), st.floats(), st.integers(), st.text(max_size=5)
 )
 
 
@@ -163,8 +160,7 @@ DOCUMENT = st.fixed_dictionaries(
         ),
         "spread": st.dictionaries(st.sampled_from(SPREAD_PATHS), SPREAD, max_size=3).flatmap(
             lambda table: st.fixed_dictionaries(
-                {path: st.just(how) for path, how in table.items()},
-                optional={"design": st.sampled_from([*DESIGNS])},
+                {path: st.just(how) for path, how in table.items()}, optional={"design": st.sampled_from([*DESIGNS])}
             )
         ),
     },

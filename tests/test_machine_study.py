@@ -35,10 +35,7 @@ MACHINE = tomllib.loads(template("machine"))
 FACTOR = "rotor.modes.0.scale"
 SHAPES = {
     "rotor": {"modes": {"0": {"scale": {"percent": 20}}}},
-    "bearing": {
-        "left": {"modes": {"0": {"percent": 10}}},
-        "right": {"sensor_modes": {"1": {"uniform": [-0.1, 0.3]}}},
-    },
+    "bearing": {"left": {"modes": {"0": {"percent": 10}}}, "right": {"sensor_modes": {"1": {"uniform": [-0.1, 0.3]}}}},
 }
 SPREAD = {
     "plant": {"A": {"percent": 10}},

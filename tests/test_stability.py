@@ -239,3 +239,21 @@ def test_one_record_gives_the_verdict_and_the_reason(name):
     assert ("differ" in said) == (reason is not None)
     assert stable or "3 A (bias 2 A)" in said
     assert not Findings(0, 0).words()  # no member tested is no verdict
+
+
+def test_softer_signs_are_tried_for_the_loops_that_still_grow():
+    """Of three loops that are excused, the first is stable with every sign, the second with the softest one only."""
+    law, tried = amb.laws.position.SlidingMode(p=None), []
+
+    def growth(cascades, chosen):
+        p = cascades[0].position.p
+        tried.append((p, chosen.tolist()))
+        softest = p < 0.05 * tried[0][0]
+        return np.where([False, not softest, True, True], 1e6, -1.0)[chosen]
+
+    cascade, clock = amb.Cascade(position=law, processor=amb.Processor()), amb.Clock(1000)
+    loops = stability.Tested([cascade], growth, lambda: None, np.array(1e-3), 1.0, clock)
+    least = stability._least_growth(loops, np.array([True, True, True, False]))
+    np.testing.assert_array_equal(least, [-1.0, -1.0, 1e6, np.nan])
+    assert tried[0][1] == [True, True, True, False]
+    assert tried[1][1] == [False, True, True, False]

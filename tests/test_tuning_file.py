@@ -29,10 +29,7 @@ gains = [
   "controller.position.c", # alone
 ]
 """
-CHANGED = {
-    "{ c = 17,": "{ c = 20.5,",
-    "gamma = 1_000.0   # printed\n": "gamma = 150000.0   # printed\np = 3.0\n",
-}
+CHANGED = {"{ c = 17,": "{ c = 20.5,", "gamma = 1_000.0   # printed\n": "gamma = 150000.0   # printed\np = 3.0\n"}
 WRITTEN = "# Tuned by ambjax tune from the case 'fan'.\n# None is lost.\n\n" + functools.reduce(
     lambda text, change: text.replace(*change), CHANGED.items(), f"{GIVEN}\n[controller.current]\nk_i = 9.0\n"
 )

@@ -80,11 +80,7 @@ def test_lanes_equal_rollouts(engines):
         assert terms[name][0, k] == pytest.approx(float(alone[name]), rel=1e-9)
 
 
-LATE = {
-    "controller": {"inversion": {"gamma": 7.5e4}},
-    "processor": {"delay": 1.0},
-    "clock": {"duration": 0.005},
-}
+LATE = {"controller": {"inversion": {"gamma": 7.5e4}}, "processor": {"delay": 1.0}, "clock": {"duration": 0.005}}
 
 
 @pytest.mark.thorough

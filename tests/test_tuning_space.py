@@ -72,8 +72,7 @@ def test_a_search_begins_where_a_gain_depends_on_its_coordinate():
 
 
 @pytest.mark.parametrize(
-    ("gains", "says"),
-    [((), "empty"), ((Gain(C), Gain(C)), "twice"), ((Gain(C, 5.0, 2.0),), "low < high")],
+    ("gains", "says"), [((), "empty"), ((Gain(C), Gain(C)), "twice"), ((Gain(C, 5.0, 2.0),), "low < high")]
 )
 def test_an_impossible_space_is_refused(gains, says):
     with pytest.raises(ValueError, match=says):

@@ -66,13 +66,13 @@ def test_a_summary_is_pooled_and_counts_the_lost_and_the_stalled():
     }
     pooled = summarise(found)
     # the status of a stalled member is not known: it counts neither as lost nor as a survivor
-    assert (
-        pooled["members"],
-        pooled["lost"],
-        pooled["stalled"],
-        pooled["held"],
-        pooled["survival"],
-    ) == (4, 1, 1, 2, 0.5)
+    assert (pooled["members"], pooled["lost"], pooled["stalled"], pooled["held"], pooled["survival"]) == (
+        4,
+        1,
+        1,
+        2,
+        0.5,
+    )
     theirs = stats.binomtest(2, 4).proportion_ci(0.95, method="wilson")
     assert (pooled["survival_low"], pooled["survival_high"]) == pytest.approx((theirs.low, theirs.high))
     assert pooled["settled_rms_error_m"] == pytest.approx(math.sqrt(2.5) * 1e-6)  # of the two that are held
