@@ -113,7 +113,7 @@ def theorem_bounds(objective: Objective) -> dict[str, float]:
 
     Delta_1 is evaluated on the ideal motion z = r. Q_z and Q_i are maxima over the samples of the clock.
     """
-    cascade, scenario, clock = objective.cascade, objective.scenario, objective.clock
+    cascade, scenario, clock = objective.cascade, objective.scenario.turning(), objective.clock
     t = jnp.arange(clock.samples) * clock.sample_period
 
     def largest(signal: Callable[[Array], Array]) -> float:
