@@ -194,7 +194,7 @@ def test_the_search_descends_and_keeps_the_best(small):
 
 
 def test_the_screen_orders_the_points_by_their_goal(small):
-    """With this few members, a part of them is all."""
+    """With this few members, a part of them is all. Of many points, it sees the first and the best 16 on a pair."""
     engine, goal, members, start = small
     points = initial_points(SPACE, ranges(engine.objective, start), start, 8, seed=1)
     assert points.shape == (10, 4)
@@ -203,6 +203,10 @@ def test_the_screen_orders_the_points_by_their_goal(small):
     values = goal.score(engine.terms(ordered, members), members)
     assert np.all(np.diff(values) >= 0)
     np.testing.assert_allclose(np.sort(values), np.sort(goal.score(engine.terms(points, members), members)))
+    many = np.concatenate([ordered[::-1], points + 1.0, points - 1.0])
+    many, pair = many[np.argsort(-goal.score(engine.terms(many, members.pair), members.pair))], members.pair.member
+    ordered, _ = screen(engine, members, many, goal)
+    assert (pair.tolist(), len(ordered), (ordered == many[0]).all(1).sum()) == ([0, 4], 17, 1)
 
 
 @pytest.fixture

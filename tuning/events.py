@@ -41,8 +41,8 @@ class Standing(NamedTuple):
     `number`: of the search, from 1. `iteration`, `most`: number of its iterations, and their largest number.
     `starts`: number of starts that continue. `error_m`, `u_V`: settled rms error (m) and rms voltage (V). `held`,
     `members`: number of members that are held, and of all. `limits`: the limits. `left_s`: largest time left in this
-    search, s; NaN if it is not known yet. `goal`: the minimised number. `rollouts`: number of rollouts of all searches
-    so far.
+    search, s; NaN if it is not known yet, or if the search has converged. `goal`: the minimised number. `rollouts`:
+    number of rollouts of all searches so far.
     """
 
     number: int

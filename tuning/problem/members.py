@@ -75,9 +75,20 @@ class Members(NamedTuple):
     @property
     def part(self) -> "Members":
         """The first 1/FEW of the ordinary and of the stressed members, at least FEW of each kind."""
-        kinds = self.ordinary, len(self.stressed) - self.ordinary
-        few, some = (max(count // FEW, min(FEW, count)) for count in kinds)
-        index = np.concatenate([np.arange(few), np.arange(self.ordinary, self.ordinary + some)])
+        return self._first(*(max(count // FEW, min(FEW, count)) for count in self._kinds))
+
+    @property
+    def pair(self) -> "Members":
+        """The first member of each kind."""
+        return self._first(*(min(count, 1) for count in self._kinds))
+
+    @property
+    def _kinds(self) -> tuple[int, int]:
+        """The numbers of ordinary and of stressed members."""
+        return self.ordinary, len(self.stressed) - self.ordinary
+
+    def _first(self, ordinary: int, stressed: int) -> "Members":
+        index = np.concatenate([np.arange(ordinary), np.arange(self.ordinary, self.ordinary + stressed)])
         return jax.tree.map(lambda a: a[index], self)
 
 

@@ -194,6 +194,7 @@ def first_search(course: Course, start: np.ndarray) -> np.ndarray:
     check_loops(problem.objective, points, course.members.searched)
     x = course.search(points)
     while budget.screen and not course.over:
+        course.tell("comparing this optimum with points at which some gains are changed")
         points = around(x, AROUND * budget.screen, course.seed + len(course.past))
         near, goals = screen(problem.engine, course.members, points, problem.goal)
         if goals[0] > goals[np.flatnonzero((near == x).all(1))[0]] - NEGLIGIBLE:
@@ -229,7 +230,7 @@ def standing_of(problem: TuningProblem, progress: SearchState, number: int, spen
     )
     starts = 0 if progress.converged else len(progress.starts.value)
     # the first iteration compiles
-    left = (most - progress.iteration) * float(np.median(spent[1:])) if len(spent) > 1 else math.nan
+    left = (most - progress.iteration) * float(np.median(spent[1:])) if len(spent) > 1 and starts else math.nan
     return Standing(
         number, progress.iteration, most, starts, float(np.asarray(loss.s_0)) * math.sqrt(terms["tracking"]), volts,
         members - int(last["lost"]), members, limits, left, float(last["value"]), int(last["rollouts"]),

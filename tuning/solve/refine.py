@@ -22,8 +22,8 @@ from tuning.solve.checkpoint import CheckpointFile, SearchState
 from tuning.solve.descent import Descent, Starts, begin, continued
 from tuning.solve.evolution import PATIENCE, Evolution
 
-# The starts race on a part of the members. After each PATIENCE iterations the better half continues. The last FEW are
-# compared on all members, and the best of them continues alone.
+# The starts race on a pair of members, at most 2 FEW of them on a part. After each PATIENCE iterations the better half
+# continues. The last FEW are compared on all members, and the best of them continues alone.
 # A search has converged if its next step, in coordinates, is shorter than SHORTEST: 0.1 % of a gain. It ends also if
 # the goal, a logarithm, falls by less than this over PATIENCE iterations.
 SHORTEST = 1e-3
@@ -53,7 +53,7 @@ def search(
 ) -> SearchState:
     """Refine the best `keep` of these points, coordinates [K, m], which a screen selects. Ctrl-C ends the search early.
 
-    The starts descend (`Descent`) in a race on a part of the members (`_race`), the winner on all members. If its
+    The starts descend (`Descent`) in a race on a few of the members (`_race`), the winner on all members. If its
     gradient does not lead to a minimum, it continues with CMA-ES. The search ends after `iterations` of the winner.
 
     `earlier`: starts of an earlier search, with whose inverse Hessian the one start of this search begins. `evolve`:
@@ -78,7 +78,7 @@ def search(
             with deferred(INTERRUPT_MESSAGE if progress.history else ""):
                 raise_if_interrupted()
                 before = progress.seconds
-                iterate(engine, goal, members.part if progress.racing else members, progress, descent)
+                iterate(engine, goal, _heat(members, progress.starts), progress, descent)
                 if progress.racing:
                     _race(engine, goal, members, progress)
                 else:
@@ -100,8 +100,15 @@ def race_length(starts: int) -> int:
 
 
 def screen(engine: Engine, members: Members, x: np.ndarray, goal: Goal) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points x [K, m], the best first, and their goals [K] on a part of the members."""
+    """Return the best of the points x [K, m] and their goals on a part of the members, the best first.
+
+    Of many points, the part evaluates only the first one and those that are best on a pair of members.
+    """
     some = members.part
+    if len(x) > FEW**2:
+        goals = goal.score(engine.terms(x, members.pair), members.pair)
+        best = np.argsort(goals, kind="stable")[: max(len(x) // FEW, FEW**2)]
+        x = x[np.union1d(best, 0)]
     goals = goal.score(engine.terms(x, some), some)
     order = np.argsort(goals, kind="stable")
     return x[order], goals[order]
@@ -159,7 +166,7 @@ def _evolved(
 def _race(engine: Engine, goal: Goal, members: Members, progress: SearchState) -> None:
     """After each PATIENCE iterations, select the starts that continue.
 
-    The last one begins again on all members at its best point, with its inverse Hessian.
+    On other members, a start begins again at its best point, with its inverse Hessian.
     """
     if progress.iteration % PATIENCE:
         return
@@ -167,9 +174,16 @@ def _race(engine: Engine, goal: Goal, members: Members, progress: SearchState) -
     values = np.asarray(starts.value)
     if len(values) <= FEW:
         values, keep = goal.score(engine.terms(np.asarray(starts.best), members), members), 1
-        starts = starts._replace(trial=starts.best, value=jnp.full(len(values), jnp.inf))
     best = np.argsort(values, kind="stable")[:keep]
     progress.starts = Starts(*(leaf[best] for leaf in starts))
+    if len(_heat(members, progress.starts).member) != len(_heat(members, starts).member):
+        progress.starts = progress.starts._replace(trial=progress.starts.best, value=jnp.full(keep, jnp.inf))
+
+
+def _heat(members: Members, starts: Starts) -> Members:
+    """Return the members on which the starts race, or all for one start."""
+    count = len(starts.value)
+    return members if count == 1 else members.part if count <= 2 * FEW else members.pair
 
 
 def _advance(progress: SearchState, seed: int, evolve: bool) -> None:
