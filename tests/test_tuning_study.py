@@ -183,7 +183,7 @@ def test_a_case_from_a_pipe_is_read_once(monkeypatch, tmp_path):
 def test_a_file_whose_gains_could_not_be_written_is_refused_at_the_start(monkeypatch, tmp_path):
     """The error occurs before the search."""
     broken = "[plant]\nm = 1.0\nx = 1.0\n"
-    monkeypatch.setattr("tuning.report.tuned.tuned", lambda *_: broken)
+    monkeypatch.setattr("tuning.report.folder.tuned", lambda *_: broken)
     with pytest.raises(ValueError, match=r"case.toml: plant.x = 1.0: unknown key"):
         command(monkeypatch, tmp_path, World())
     assert not (tmp_path / "out").exists()

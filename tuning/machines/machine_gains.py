@@ -15,9 +15,10 @@ from ambjax.cases.rotor_tables import tables_of
 from ambjax.cases.table import Table
 from ambjax.control.lqg import LqgWeights
 from ambjax.extend import canonical
+from ambjax.host.sealed import flat
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.whole_machine import Machine, loop_of
-from tuning.problem.gains_table import chosen, flattened
+from tuning.problem.gains_table import chosen
 from tuning.problem.space import Space, read, tunable, with_gain
 
 BEARING = "bearing."
@@ -108,7 +109,7 @@ def _known(case: MachineCase, raw: dict[str, Any]) -> dict[str, MachineGain]:
             own = f"{BEARING}{name}.{path}"
             if axes:
                 found[own] = MachineGain(own, path, f"bearing[{number}].{path}", axes)
-            if path not in flattened({"controller": table.raw.get("controller", {})}):
+            if path not in flat({"controller": table.raw.get("controller", {})}):
                 common += axes
         if common:
             found[path] = MachineGain(path, path, path, tuple(common))

@@ -19,10 +19,17 @@ from ambjax.linear.state_space import NEUTRAL, StateSpace
 from ambjax.simulation.whole_machine import Machine
 from ambjax.world.rotation import PER_MINUTE
 from tuning.machines.machine_gains import LqgSpace, MachineSpace
-from tuning.machines.nonsmooth import Value
 
 # Offsets of the frequencies beside each light pole, in units of its damping.
 BESIDE = (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0)
+
+
+class Value(NamedTuple):
+    """A point [m], the value of a function there, and its gradient [m]. A value of inf has no gradient."""
+
+    x: np.ndarray
+    f: float
+    gradient: np.ndarray
 
 
 class Loop(NamedTuple):

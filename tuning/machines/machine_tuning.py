@@ -26,8 +26,7 @@ from tuning.machines.machine_verdict import LIMITS, judged, refused, report_text
 from tuning.problem.config import with_settings_of
 from tuning.problem.members import FEW
 from tuning.report.facts import KEY, NOT_JUDGED, REPORT, TUNED, record
-from tuning.report.folder import put_words
-from tuning.report.tuned import tuned
+from tuning.report.folder import put_words, tuned
 from tuning.solve.checkpoint import checkpoint
 
 WRITTEN = (TUNED, REPORT, "report.md", "report.html")

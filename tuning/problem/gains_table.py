@@ -13,6 +13,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import no_such_number
 from ambjax.extend import GAINS
 from ambjax.host.extensions import NothingToTuneError
+from ambjax.host.sealed import flat
 from tuning.problem.space import CLOSEST, Gain, Space, knots, read, tunable
 
 
@@ -55,7 +56,7 @@ def chosen(
     paths = table.raw.get("gains", default)
     if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
         raise ValueError(f'{table.at("gains")} = {show(paths)}: give a list of paths, as in ["controller.position.c"].')
-    bounds = flattened(table.table("bounds").raw)
+    bounds = flat(table.table("bounds").raw)
     paths = [one for path in paths for one in whole.get(path, [path])]
     bounds = {one: ends for path, ends in bounds.items() for one in whole.get(path, [path])}
     for path in [*paths, *bounds]:
@@ -82,14 +83,6 @@ def left_out(space: Space, cascade: Cascade) -> list[str]:
     """Return the paths of the gains that a search could tune, but that are not in the space."""
     fixed = {*space.paths, *off(cascade)}
     return [path for path in tunable(cascade) if path not in fixed and np.all(np.isfinite(read(cascade, path)))]
-
-
-def flattened(raw: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Flatten nested tables to dotted keys. TOML reads controller.position.c = [1, 2] as nested tables."""
-    flat: dict[str, Any] = {}
-    for key, value in raw.items():
-        flat |= flattened(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return flat
 
 
 def bound_of(raw: Any, path: str, table: Table) -> tuple[float, float]:
