@@ -17,10 +17,10 @@ import tuning.rounds
 from ambjax.results import outputs
 from ambjax.text.web_page import render_page
 from tuning.__main__ import main
-from tuning.judge.peaks import UNSTABLE
 from tuning.report import document as report
 from tuning.report import judging, pictures
 from tuning.report.outcome import outcome_of, verdict
+from tuning.report.sensitivity_table import UNSTABLE
 from tuning.report.sensitivity_table import line as sensitivity_line
 
 # --- one member's peak of |S| --------------------------------------------------------------------------------------

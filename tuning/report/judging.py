@@ -83,7 +83,7 @@ def _held_out(after: JudgedMembers, refuted: str, tell: Tell) -> Row:
     injected, summary = injections(after), summarise(columns)
     unverified = dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
     return {
-        "sensitivity": injected and sensitivity_table.facts(problem, injected),
+        "sensitivity": injected and sensitivity_table.facts(problem.case.zones, injected),
         "limits": limit_table.facts(problem, columns, summary, refuted, injected, delay_test(after)),
         "after": summary | (unverified if refuted else {}),
         "worst_member": described("the worst member", after.worst),
