@@ -3,7 +3,6 @@
 On losses that are formulas (`bowl.py`), so that each is known by hand.
 """
 
-import collections
 import json
 import math
 import os
@@ -164,7 +163,7 @@ def test_a_change_of_one_gain_leads_to_a_lower_optimum(monkeypatch, valley):
 def command(monkeypatch, tmp_path, world, force=False):
     """`ambjax tune` in this process, its engine a Bowl, without pictures: whether it is good, report, directory."""
     study(monkeypatch, world)
-    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: collections.defaultdict(bytes))
+    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: None)
     path, out = case_file(tmp_path)
     tuned = tuning.tune(path, out, force=force)
     return tuned.good, json.loads(json.dumps(tuned.report)), out

@@ -126,7 +126,6 @@ def _stabilised(peaks: Peaks, x: np.ndarray, settings: Settings, over: Over) -> 
 
 
 def _descent(peaks: Peaks, x: np.ndarray, settings: Settings, over: Over) -> list[Value]:
-    """Return the points of a descent of the peak."""
     path = [peaks.peak(x)]
 
     def followed(value: Value) -> bool:

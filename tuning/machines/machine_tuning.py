@@ -38,15 +38,14 @@ LIMIT: dataclasses.Field = leaf(above=0, at_most=1e12)
 class MachinePlan(NamedTuple):
     """The checked input of the tuning of a machine.
 
-    `start`: initial gains [m]. `text`: of the case file. `record`: what a resumed search must match. `out`: directory.
-    `names`: the files that the tuning writes.
+    `start`: initial gains [m]. `record`: what a resumed search must match. `out`: directory. `names`: the files that
+    the tuning writes.
     """
 
     case: MachineCase
     settings: Settings
     start: np.ndarray
     peaks: Peaks
-    text: str
     record: dict[str, Any]
     out: pathlib.Path
     names: tuple[str, ...] = WRITTEN
@@ -88,23 +87,23 @@ def machine_plan(
     `settings_of`: a case file whose [tune] replaces that of the case, except for gains and bounds. `loaded`: document
     and text of the file.
     """
-    file, text = pathlib.Path(path), loaded[1]
+    file = pathlib.Path(path)
     try:
         raw = with_settings_of(loaded[0], settings_of)
-        case = machine_from(raw, file.stem, text, file.parent)
+        case = machine_from(raw, file.stem, loaded[1], file.parent)
         settings = settings_from(raw, case)
         if minutes is not None:
             settings = settings._replace(minutes=minutes)
         start = settings.space.values(case)
         settings.space.space.encode(start)
         # the default of a gain may depend on whether another one is given
-        peaks = Peaks(_written(case, text, settings.space, start.tolist()), settings.space)
+        peaks = Peaks(_written(case, settings.space, start.tolist()), settings.space)
     except ValueError as why:
         kind = NothingToTuneError if isinstance(why, NothingToTuneError) else ValueError
         raise kind(one_line(f"{path}: {why}")) from None
     record = {"case": raw, "study": MachineStudy(case, 0, 1).fingerprint()}
     place = directory(out, f"tune-{case.name}", WRITTEN, force=True)
-    return MachinePlan(case, settings, start, peaks, text, record, place)
+    return MachinePlan(case, settings, start, peaks, record, place)
 
 
 def tune_machine(plan: MachinePlan, resume: bool, tell: Tell) -> tuple[MachineCase, dict[str, Any]]:
@@ -112,7 +111,7 @@ def tune_machine(plan: MachinePlan, resume: bool, tell: Tell) -> tuple[MachineCa
     case, settings, own, path = plan.case, plan.settings, plan.settings.space, plan.out / checkpoint(1)
 
     def case_at(x: np.ndarray, verdict: str = NOT_JUDGED) -> MachineCase:
-        return _written(case, plan.text, own, own.space.named(x).values(), verdict)
+        return _written(case, own, own.space.named(x).values(), verdict)
 
     def refused_at(x: np.ndarray) -> int:  # other members than those of the judgement
         count = refused(case_at(x), settings.limits, settings.seed + 1, min(settings.held_out, FEW))
@@ -137,13 +136,13 @@ def tune_machine(plan: MachinePlan, resume: bool, tell: Tell) -> tuple[MachineCa
         (part / TUNED).write_text(tuned_case.text, encoding="utf-8")
         mark = {KEY: record(plan.record, part)} if found.number == settings.starts else {}
         write_json(part / REPORT, report | mark)
-        put_words(part, case.name, report_text(report), {})
+        put_words(part, case.name, report_text(report))
     return tuned_case, plain(report)
 
 
 def _written(
-    case: MachineCase, text: str, space: MachineSpace | LqgSpace, gains: Iterable[float], verdict: str = NOT_JUDGED
+    case: MachineCase, space: MachineSpace | LqgSpace, gains: Iterable[float], verdict: str = NOT_JUDGED
 ) -> MachineCase:
     """Return the case with these gains [m] in its text."""
-    text = tuned(text, dict(zip(space.where, gains, strict=True)), case.name, verdict)
+    text = tuned(case.text, dict(zip(space.where, gains, strict=True)), case.name, verdict)
     return machine_from(tomllib.loads(text), case.name, text, case.folder)

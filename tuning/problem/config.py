@@ -25,11 +25,10 @@ from ambjax.extend import leaf
 from ambjax.host.extensions import NothingToTuneError
 from tuning.problem.gains_table import space_from
 from tuning.problem.goal import CVaR
-from tuning.problem.limits import Limit
+from tuning.problem.limits import Limit, bounds_of
 from tuning.problem.loss import TERMS
 from tuning.problem.quantities import KINDS
 from tuning.problem.space import Space
-from tuning.problem.unbreakable import bounds_of
 
 # Keys of [tune] that are neither in NUMBERS nor in BUDGET.
 OTHER_KEYS = ["objective", "gains", "bounds", "weights", "limits", "risk"]

@@ -28,13 +28,10 @@ def space_from(table: Table, case: Case) -> Space:
     known = tunable(cascade)
     if not known:
         raise NothingToTuneError("the laws of this case have no gains to tune.")
-    most = {path: float(np.max(np.asarray(read(cascade, path)))) for path in known}
-    idle = off(cascade)
-    default = [path for path in tunable(cascade, steepness=cascade.sampled) if path not in idle]
-    default = [path for path in default if math.isfinite(most[path])] or known
+    default = _usable(cascade, steepness=cascade.sampled) or known
     stems = dict.fromkeys(path.rpartition(".")[0] for path in known if path.count(".") > 2)
     whole = {stem: knots(cascade, stem) for stem in stems}
-    space = chosen(table, dict.fromkeys(known, (0.0, math.inf)), default, idle, "case", whole)
+    space = chosen(table, dict.fromkeys(known, (0.0, math.inf)), default, off(cascade), "case", whole)
     if clash := [path for path in space.paths if path in case.spread.paths]:
         raise ValueError(f"spread.{clash[0]} is in tune.gains too. Remove it from one of them.")
     return space
@@ -81,8 +78,13 @@ def off(cascade: Cascade) -> list[str]:
 
 def left_out(space: Space, cascade: Cascade) -> list[str]:
     """Return the paths of the gains that a search could tune, but that are not in the space."""
-    fixed = {*space.paths, *off(cascade)}
-    return [path for path in tunable(cascade) if path not in fixed and np.all(np.isfinite(read(cascade, path)))]
+    return [path for path in _usable(cascade) if path not in space.paths]
+
+
+def _usable(cascade: Cascade, steepness: bool = True) -> list[str]:
+    """Return the paths of the gains that are neither 0 nor infinite. `steepness`: as for `tunable`."""
+    found, idle = tunable(cascade, steepness=steepness), off(cascade)
+    return [path for path in found if path not in idle and np.all(np.isfinite(read(cascade, path)))]
 
 
 def bound_of(raw: Any, path: str, table: Table) -> tuple[float, float]:

@@ -16,11 +16,11 @@ from ambjax.ensemble.replay import record_member
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
 from ambjax.results.case_file import files_from
-from ambjax.results.outputs import described
+from ambjax.results.outputs import described, drawn
 from ambjax.simulation.rollout import rollout
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.text.web_page import render_page
-from tuning.problem.space import Gain, Space, tunable
+from tuning.problem.space import read, tunable
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.report import document as report
 from tuning.report import front_table, pictures
@@ -50,18 +50,18 @@ def put_answer(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, verd
 
 def put_report(part: pathlib.Path, cascade: Cascade, answer: SearchResult, facts: TuningFacts) -> None:
     """Write the report and its pictures into the folder `part`. `cascade`: the controller with the tuned gains."""
-    drawn = _pictures(answer.problem, cascade, answer.history, facts.front)
-    for name, data in drawn.items():
-        (part / name).write_bytes(data)
-    put_words(part, facts.case, report.report_markdown(facts), drawn, (front_table.TITLE,))
+    _pictures(part, answer.problem, cascade, answer.history, facts.front)
+    put_words(part, facts.case, report.report_markdown(facts), (front_table.TITLE,))
 
 
-def put_words(
-    part: pathlib.Path, case: str, words: str, drawn: Mapping[str, bytes], unfolded: tuple[str, ...] | None = None
-) -> None:
-    """Write the report `words` of a case as report.md and report.html. `drawn`, `unfolded`: as for `render_page`."""
+def put_words(part: pathlib.Path, case: str, words: str, unfolded: tuple[str, ...] | None = None) -> None:
+    """Write the report `words` of a case as report.md and report.html, with the pictures in the folder `part`.
+
+    `unfolded`: as for `render_page`.
+    """
     (part / "report.md").write_text(words, encoding="utf-8")
-    page = described("report.html", lambda: render_page(words, drawn, f"Tuning of {case}", unfolded))
+    found = {path.name: path.read_bytes() for path in part.glob("*.png")}
+    page = described("report.html", lambda: render_page(words, found, f"Tuning of {case}", unfolded))
     if page is not None:
         (part / "report.html").write_text(page, encoding="utf-8")
 
@@ -85,27 +85,24 @@ def put_page(part: pathlib.Path, case: Case, path: str) -> None:
     (part / NAME).write_text(sliders_page(case, found, path), encoding="utf-8")
 
 
-def _pictures(problem: TuningProblem, tuned: Cascade, history: Any, front: list[Row] | None) -> dict[str, bytes]:
-    """Return the pictures of the report as PNG data by file name. `tuned`: the controller with the tuned gains.
+def _pictures(
+    part: pathlib.Path, problem: TuningProblem, tuned: Cascade, history: Any, front: list[Row] | None
+) -> None:
+    """Draw the pictures of the report into the folder `part`. `tuned`: the controller with the tuned gains.
 
     A picture that cannot be drawn is left out.
     """
-    paths, settle = problem.objective.space.paths, problem.case.settle
-    runs = {"before": problem.case.cascade, "after": tuned}
-    found = {
-        name: described(f"the run {name} tuning", functools.partial(nominal, problem, cascade))
-        for name, cascade in runs.items()
-    }
-    shown = {name: run for name, run in found.items() if run is not None}
-    draw = {"convergence.png": lambda: pictures.convergence(history, paths)}
-    for name, run in shown.items():
-        draw[f"{name}.png"] = functools.partial(pictures.nominal, run, f"{name} tuning", settle)
-    if shown:
-        draw["spectrum.png"] = lambda: pictures.spectrum(shown, settle)
+    paths, settle, runs = problem.objective.space.paths, problem.case.settle, dict[str, Trajectory]()
+    for name, cascade in (("before", problem.case.cascade), ("after", tuned)):
+        run = described(f"the run {name} tuning", functools.partial(nominal, problem, cascade))
+        if run is not None:
+            runs[name] = run
+            drawn(part / f"{name}.png", functools.partial(pictures.nominal, run, f"{name} tuning", settle), 110)
+    drawn(part / "convergence.png", lambda: pictures.convergence(history, paths), 110)
+    if runs:
+        drawn(part / "spectrum.png", lambda: pictures.spectrum(runs, settle), 110)
     if front:
-        draw["front.png"] = lambda: pictures.front(front)
-    drawn = {name: described(name, one) for name, one in draw.items()}
-    return {name: data for name, data in drawn.items() if data is not None}
+        drawn(part / "front.png", lambda: pictures.front(front), 110)
 
 
 def nominal(problem: TuningProblem, cascade: Cascade) -> Trajectory:
@@ -125,8 +122,8 @@ def all_laws(problem: TuningProblem, tuned: dict[str, float]) -> dict[str, float
 
     tuned.toml lists all gains, because the default of a steepness p depends on the plant.
     """
-    everything = Space(tuple(Gain(path) for path in tunable(problem.case.cascade, idle=True)))
-    return dict(zip(everything.paths, everything.values(problem.case.cascade).tolist(), strict=True)) | tuned
+    cascade = problem.case.cascade
+    return {path: float(read(cascade, path)) for path in tunable(cascade, idle=True)} | tuned
 
 
 def tuned_case(case: Case, gains: Mapping[str, float], verdict: str, out: pathlib.Path) -> tuple[str, Case]:

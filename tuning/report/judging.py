@@ -126,7 +126,6 @@ def _steps(answer: SearchResult, of: JudgedMembers, tell: Tell) -> Row:
 
 
 def _conditions(problem: TuningProblem, x: np.ndarray) -> Row:
-    """Return the fields on the theorem's conditions at x [m]."""
     case = problem.case
     objective = problem.objective
     cascade = objective.notched(x, objective.space.decode(jnp.asarray(x), case.cascade))

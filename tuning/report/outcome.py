@@ -116,7 +116,6 @@ def _label(facts: TuningFacts) -> str:
 
 
 def _held(facts: TuningFacts) -> str:
-    """Return the entry on the rotors that are held."""
     outcome, after = facts.outcome, facts.after
     which = "held-out members" if after["members"] else "training members"
     kept = outcome["members"] - outcome["lost"] - outcome["stalled"]
@@ -131,7 +130,6 @@ def _held(facts: TuningFacts) -> str:
 
 
 def _sizes(facts: TuningFacts) -> str:
-    """Return the entry on the error and the voltage after tuning, and before it."""
     after, before = facts.after, facts.before
     if not after["members"]:
         return "not measured on held-out members (tune.held_out = 0)."
