@@ -150,11 +150,6 @@ class DelayTest(NamedTuple):
     lost: int
     unstable: int
 
-    @property
-    def fails(self) -> bool:
-        """Whether the delay is not survived: a member is lost or not stable."""
-        return bool(self.lost or self.unstable)
-
 
 def not_simulated(problem: TuningProblem, limit: Limit) -> str:
     """Return why the additional delay of the limit is not simulated; '' if it is."""

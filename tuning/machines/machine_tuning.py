@@ -26,6 +26,7 @@ from tuning.machines.machine_peaks import Peaks
 from tuning.machines.machine_search import Settings, save, saved, searched
 from tuning.problem.config import with_settings_of
 from tuning.problem.members import FEW
+from tuning.problem.quantities import KINDS
 from tuning.report.facts import KEY, NOT_JUDGED, REPORT, TUNED, Column, record, table
 from tuning.report.folder import put_words, tuned
 from tuning.solve.checkpoint import checkpoint
@@ -34,18 +35,18 @@ WRITTEN = (TUNED, REPORT, "report.md", "report.html")
 # Keys of [tune] and of [tune.limits] that a machine takes.
 KEYS, SIZES = ("gains", "bounds", "limits", "minutes"), ("seed", "starts", "iterations", "held_out")
 LIMIT: dataclasses.Field = leaf(above=0, at_most=1e12)
-# Limits of [tune.limits], each with its meaning and the metric whose largest value counts; "": a sensitivity.
+# Limits of [tune.limits], each with its meaning. The largest value counts of the metric `Kind.exact`.
 LIMITS = {
-    "sensitivity": ("peak of \\|S\\| of the worst axis at any speed", ""),
-    "rms_u_V": ("rms voltage after run.settle, V", "settled_rms_u_V"),
-    "max_u_V": ("largest voltage, V", "max_abs_u_V"),
-    "max_abs_i_A": ("largest absolute current, A", "max_abs_i_A"),
-    "rms_error_m": ("rms error after run.settle, m", "settled_rms_error_m"),
-    "largest_error_m": ("largest error after run.settle, m", "settled_max_abs_error_m"),
-    "clearance_used": ("largest share of the clearance", "clearance_used"),
-    "z_1x_m": ("largest amplitude of z at the speed, m", "z_1x_m"),
-    "i_1x_A": ("largest amplitude of a current at the speed, A", "i_1x_A"),
-    "sensitivity_1x": ("largest \\|S\\| of an axis at a speed, where the rotor turns with it", ""),
+    "sensitivity": "peak of \\|S\\| of the worst axis at any speed",
+    "rms_u_V": "rms voltage after run.settle, V",
+    "max_u_V": "largest voltage, V",
+    "max_abs_i_A": "largest absolute current, A",
+    "rms_error_m": "rms error after run.settle, m",
+    "largest_error_m": "largest error after run.settle, m",
+    "clearance_used": "largest share of the clearance",
+    "z_1x_m": "largest amplitude of z at the speed, m",
+    "i_1x_A": "largest amplitude of a current at the speed, A",
+    "sensitivity_1x": "largest \\|S\\| of an axis at a speed, where the rotor turns with it",
 }
 
 
@@ -181,7 +182,7 @@ def judged(case: MachineCase, found: MachineCase, limits: dict[str, float], seed
     linear = {"sensitivity": after["peak"], "sensitivity_1x": max(turning, default=0.0)}
     values |= linear if after["stable"] else dict.fromkeys(linear, math.inf)
     rows: list[dict[str, Any]] = [
-        {"name": name, "meaning": LIMITS[name][0], "value": values[name], "threshold": most}
+        {"name": name, "meaning": LIMITS[name], "value": values[name], "threshold": most}
         | {"holds": bool(values[name] <= most and (name in linear or held.all()))}
         for name, most in limits.items()
     ]
@@ -211,7 +212,8 @@ def judged(case: MachineCase, found: MachineCase, limits: dict[str, float], seed
 def simulate(study: MachineStudy) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return which members [n] are held, and the limited metrics [n] of the worst axis of each."""
     columns = study.columns(0, study.members)
-    found = {name: columns.get(metric, np.zeros(study.members)) for name, (_, metric) in LIMITS.items() if metric}
+    exact = {name: KINDS[name].exact for name in LIMITS}
+    found = {name: columns.get(one, np.zeros(study.members)) for name, one in exact.items() if one}
     return np.isposinf(columns["lost_at"]), found  # at rest there are no amplitudes at the speed
 
 

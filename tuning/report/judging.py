@@ -126,8 +126,7 @@ def _steps(answer: SearchResult, of: JudgedMembers, tell: Tell) -> Row:
 
 
 def _conditions(problem: TuningProblem, x: np.ndarray) -> Row:
-    case = problem.case
-    objective = problem.objective
+    case, objective = problem.case, problem.objective
     cascade = objective.notched(x, objective.space.decode(jnp.asarray(x), case.cascade))
     line: Check = check(cascade, case.scenario, case.clock.with_method(None))
     rows = [dataclasses.asdict(one) | {"margin": one.margin} for one in line.conditions]

@@ -110,7 +110,7 @@ def _tested(row: Row, delayed: DelayTest | None, refuted: str, reason: str = "")
             f"with this additional delay {delayed.lost} of {delayed.members} of the worst members are lost, and "
             f"{delayed.unstable} held but not stable"
         )
-    fails = _verdict(False, refuted) | {"price": None} if delayed and delayed.fails else {}
+    fails = _verdict(False, refuted) | {"price": None} if delayed and (delayed.lost or delayed.unstable) else {}
     return row | {"what": f"{row['what']}; {words}"} | fails
 
 
