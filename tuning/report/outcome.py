@@ -101,18 +101,15 @@ def verdict(facts: TuningFacts) -> str:
 
 def answer(facts: TuningFacts) -> dict[str, str]:
     """Return the answer by label. An entry that cannot be computed is absent."""
+    label = "NOT held" if not facts.outcome["rotors_held"] else "Not verified" if facts.refuted else "Held"
     entries: dict[str, Callable[[], str]] = {
-        _label(facts): lambda: _held(facts),
+        label: lambda: _held(facts),
         "Error and voltage": lambda: _sizes(facts),
         "Sensitivity": lambda: sensitivity_table.line(facts.sensitivity),
         "Limited by": lambda: _limiting(facts),
     }
     found = {label: described(f"the line '{label}'", entry) for label, entry in entries.items()}
     return {label: text for label, text in found.items() if text}
-
-
-def _label(facts: TuningFacts) -> str:
-    return "NOT held" if not facts.outcome["rotors_held"] else "Not verified" if facts.refuted else "Held"
 
 
 def _held(facts: TuningFacts) -> str:
