@@ -37,7 +37,7 @@ from ambjax.world.waveforms import Chirp, Pulse, Sine, SmoothStep, Step
 from tuning.__main__ import main as tune
 from tuning.problem.config import read_tune, settings
 from tuning.problem.loss import Loss
-from tuning.report.tuned import tuned
+from tuning.report.folder import tuned
 
 SHORT = "[clock]\nduration = 0.01\n"
 

@@ -37,7 +37,7 @@ def world(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     one = World()
     instead_of_engines(monkeypatch, one)
-    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: {})
+    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: None)
     for path, start in zip(PATHS, (20.0, 40.0, 200.0), strict=True):
         write(path, start)
     return one

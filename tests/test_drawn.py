@@ -298,14 +298,8 @@ def test_the_outlines_of_a_map_follow_the_confidence_bounds():
     assert places == [{2.5}, {2.5}, {0.5}, {0.5}, {1.5}, {1.5}]  # each a line on its white seam
 
 
-@pytest.fixture
-def kept(monkeypatch):
-    """Keep the figures of the tuner instead of their PNG files."""
-    monkeypatch.setattr(tuned, "_png", lambda figure: figure)
-
-
 @pytest.mark.parametrize("n", [1000, 1001])
-def test_the_spectrum_has_the_amplitudes_of_its_sines(n, kept):
+def test_the_spectrum_has_the_amplitudes_of_its_sines(n):
     t = 1e-4 * np.arange(n)
     lines = {10.0 * round(n / 100) / (n * 1e-3): 3.0, 100 / (n * 1e-4): 7.0}  # Hz, whole periods in the run: V
     u = sum(size * np.sin(2 * np.pi * f * t) for f, size in lines.items())
@@ -322,7 +316,7 @@ def test_the_spectrum_has_the_amplitudes_of_its_sines(n, kept):
     assert frequency[-1] == pytest.approx(5000 if n % 2 == 0 else 5000 * (1 - 1 / n), rel=ROUNDING)
 
 
-def test_the_picture_of_the_convergence_shows_the_history_of_the_search(kept):
+def test_the_picture_of_the_convergence_shows_the_history_of_the_search():
     rng = np.random.default_rng(2)
     value = np.minimum.accumulate(rng.normal(size=9))
     gains = np.exp(rng.normal(size=(9, 2)))
@@ -338,7 +332,7 @@ def test_the_picture_of_the_convergence_shows_the_history_of_the_search(kept):
     assert dotted == [4.5, 4.5]
 
 
-def test_points_of_the_front_that_lose_members_are_marked(kept):
+def test_points_of_the_front_that_lose_members_are_marked():
     rows = [
         {"settled_rms_error_m": e, "settled_rms_u_V": u, "lost": lost, "stalled": 0, "taken": e == 2e-7}
         for e, u, lost in ((3e-6, 20.0, 0), (1e-6, 30.0, 4), (2e-7, 90.0, 0))

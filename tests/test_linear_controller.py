@@ -23,7 +23,7 @@ from ambjax.linear import linearise
 from ambjax.plants import Plant
 from ambjax.world.sensor import Measurement
 from ambjax.world.waveforms import Reference
-from tuning.report.tuned import tuned_case
+from tuning.report.folder import tuned_case
 
 MODEL, PERIOD = Plant(), 1e-4
 W = 2 * np.pi * np.array([1.0, 30.0, 100.0, 700.0, 2e3])

@@ -14,7 +14,7 @@ from ambjax.commands.sensitivity import references
 from ambjax.ensemble.spread import apply
 from ambjax.linear import linearise
 from ambjax.world.rotation import Rotation
-from tuning.report.tuned import tuned_case
+from tuning.report.folder import tuned_case
 
 STEP = {"kind": "step", "amplitude": 20.0, "start": 0.1}
 SINE = {"kind": "sine", "amplitude": 8.0, "frequency": 300.0}

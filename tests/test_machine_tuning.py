@@ -21,10 +21,9 @@ from ambjax.results.machine_study import MachineStudy
 from ambjax.results.operating import sensitivity
 from tuning.__main__ import main
 from tuning.machines.machine_gains import MachineSpace, lqg_space, machine_space
-from tuning.machines.machine_peaks import Peaks
-from tuning.machines.machine_search import Settings, save, saved, searched
-from tuning.machines.machine_verdict import judged
-from tuning.machines.nonsmooth import Value, minimise
+from tuning.machines.machine_peaks import Peaks, Value
+from tuning.machines.machine_search import Settings, minimise, save, saved, searched
+from tuning.machines.machine_tuning import judged
 from tuning.problem.space import Gain, Space
 
 PARTS = {"position": {"kind": "pid"}, "inversion": {"kind": "linearised"}, "current": {"kind": "pi"}}

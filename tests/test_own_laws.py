@@ -13,7 +13,7 @@ from texts import refusal, write
 
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
-from tuning.report.tuned import tuned_case
+from tuning.report.folder import tuned_case
 
 LAW = '''
 import jax.numpy as jnp

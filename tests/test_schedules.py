@@ -22,7 +22,7 @@ from tuning.problem.config import tune_from
 from tuning.problem.ranges import from_unit_cube
 from tuning.problem.space import tunable
 from tuning.problem.tuning_problem import problem_of
-from tuning.report.tuned import tuned
+from tuning.report.folder import tuned
 
 AT, VALUES = (0.0, 1e-5, 4e-5), (100.0, 300.0, 200.0)
 # A short run of a few laws, with one scheduled gain per stage.

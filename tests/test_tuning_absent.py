@@ -9,6 +9,7 @@ import tomllib
 import numpy as np
 import pytest
 from bowl import World, case_file, instead_of_engines
+from matplotlib.figure import Figure
 from test_tuning_outcome import losing
 
 import tuning.command
@@ -17,10 +18,10 @@ import tuning.rounds
 from ambjax.results import outputs
 from ambjax.text.web_page import render_page
 from tuning.__main__ import main
-from tuning.judge.peaks import UNSTABLE
 from tuning.report import document as report
 from tuning.report import judging, pictures
 from tuning.report.outcome import outcome_of, verdict
+from tuning.report.sensitivity_table import UNSTABLE
 from tuning.report.sensitivity_table import line as sensitivity_line
 
 # --- one member's peak of |S| --------------------------------------------------------------------------------------
@@ -98,7 +99,7 @@ def facts_of(world, folder, *flags, **tune):
     found, examined = [], judging.examined
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tuning.command, "examined", lambda *args: found.append(examined(*args)) or found[0])
-        patch.setattr(tuning.report.folder, "_pictures", lambda *_: {})
+        patch.setattr(tuning.report.folder, "_pictures", lambda *_: None)
         tuned(world, folder, *flags, **tune)
     return found[0]
 
@@ -219,7 +220,7 @@ def lenient(monkeypatch):
     monkeypatch.setattr(outputs, "STRICT", False)
     monkeypatch.setattr("tuning.report.folder.nominal", lambda *_: object())
     for name in DRAWN:
-        monkeypatch.setattr(pictures, name, lambda *_: b"\x89PNG")
+        monkeypatch.setattr(pictures, name, lambda *_: Figure(figsize=(1, 1)))
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 import tomlkit
 
 from ambjax.cases.reader import case_from
-from tuning.report.tuned import tuned, tuned_case
+from tuning.report.folder import tuned, tuned_case
 
 GIVEN = """# the fan of hall 3
 

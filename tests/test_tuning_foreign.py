@@ -21,8 +21,7 @@ from ambjax.plants import Plant
 from tuning.__main__ import main
 from tuning.problem.ranges import initial_points, theorem_bounds
 from tuning.problem.space import MARGIN, read
-from tuning.report.folder import all_laws
-from tuning.report.tuned import tuned
+from tuning.report.folder import all_laws, tuned
 
 CASES = pathlib.Path(__file__).parent / "cases"
 BEARINGS = {path.stem: path.read_text() for path in sorted(CASES.glob("*.toml"))}

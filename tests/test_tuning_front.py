@@ -1,6 +1,5 @@
 """The front of error against voltage, and its knee: on formulas with a known answer, in report and case files."""
 
-import collections
 import json
 import math
 
@@ -26,7 +25,7 @@ BOUNDLESS = {"controller": {"position": {"c": [1.0, 1000.0], "k": [0.1, 1000.0]}
 @pytest.fixture
 def ran(monkeypatch, tmp_path, capsys):
     """Run the command on a Bowl without pictures: exit code, facts, the verdict printed, folder."""
-    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: collections.defaultdict(bytes))
+    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: None)
 
     def run(pareto=True, **tune):
         study(monkeypatch, World(), **tune)

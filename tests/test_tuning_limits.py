@@ -11,6 +11,7 @@ from bowl import World, answer_of, study
 from texts import case_and_tune, problem_from
 
 from ambjax import rollout
+from ambjax.linear import Injection
 from ambjax.simulation.folds import Named
 from ambjax.simulation.metrics import Metrics
 from tuning.judge.peaks import MemberPeak, Sensitivity
@@ -347,11 +348,11 @@ def test_the_allowed_number_of_lost_members_is_a_whole_number():
 
 
 def test_the_reported_saturation_is_that_of_the_deciding_injection():
-    peak = dict.fromkeys(MemberPeak.__dataclass_fields__) | {"repetitions": 8}
-    peaks = [
-        MemberPeak(**peak | {"largest": {"sensitivity": size}, "saturated": share})
-        for size, share in ((2.5, 0.1), (3.2, 0.15))
-    ]
+    def peak(size, share):
+        one = np.array([size])
+        return MemberPeak(0, "", Injection(one, one, one, one, size, None, None, 1.0, 0, 8, 1e-6, share))
+
+    peaks = [peak(2.5, 0.1), peak(3.2, 0.15)]
     limit = SimpleNamespace(name="sensitivity")
     assert limit_table._saturated(limit, 3.2, Sensitivity(tuple(peaks), False)) == 0.15
     assert limit_table._saturated(limit, 3.3, Sensitivity(tuple(peaks), False)) is None  # a linear value decides

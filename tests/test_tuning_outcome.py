@@ -1,6 +1,5 @@
 """Exit code, log, report, JSON and tuned.toml agree for each kind of outcome."""
 
-import collections
 import json
 import math
 import re
@@ -64,7 +63,7 @@ OUTCOMES = {
 @pytest.fixture
 def ran(monkeypatch, tmp_path, capsys):
     """Run the command on a Bowl without pictures. Return exit code, facts, stdout, stderr and folder."""
-    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: collections.defaultdict(bytes))
+    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: None)
     monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", 1)
 
     def run(world, tune):

@@ -3,7 +3,6 @@
 On losses that are formulas (`bowl.py`), so that each is known by hand.
 """
 
-import collections
 import json
 import math
 import os
@@ -164,7 +163,7 @@ def test_a_change_of_one_gain_leads_to_a_lower_optimum(monkeypatch, valley):
 def command(monkeypatch, tmp_path, world, force=False):
     """`ambjax tune` in this process, its engine a Bowl, without pictures: whether it is good, report, directory."""
     study(monkeypatch, world)
-    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: collections.defaultdict(bytes))
+    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: None)
     path, out = case_file(tmp_path)
     tuned = tuning.tune(path, out, force=force)
     return tuned.good, json.loads(json.dumps(tuned.report)), out
@@ -183,7 +182,7 @@ def test_a_case_from_a_pipe_is_read_once(monkeypatch, tmp_path):
 def test_a_file_whose_gains_could_not_be_written_is_refused_at_the_start(monkeypatch, tmp_path):
     """The error occurs before the search."""
     broken = "[plant]\nm = 1.0\nx = 1.0\n"
-    monkeypatch.setattr("tuning.report.tuned.tuned", lambda *_: broken)
+    monkeypatch.setattr("tuning.report.folder.tuned", lambda *_: broken)
     with pytest.raises(ValueError, match=r"case.toml: plant.x = 1.0: unknown key"):
         command(monkeypatch, tmp_path, World())
     assert not (tmp_path / "out").exists()

@@ -14,9 +14,8 @@ from ambjax.simulation.folds import Named
 from ambjax.simulation.metrics import Metrics
 from ambjax.world.coil_limits import difference
 from ambjax.world.coils import Currents
-from tuning.problem.limits import measures
+from tuning.problem.limits import bounds_of, measures
 from tuning.problem.quantities import KINDS, LimitContext
-from tuning.problem.unbreakable import bounds_of
 from tuning.report import limit_table
 
 TWO_COIL = {"plant": {"kind": "two-coil"}, "processor": {"delay": 1.0}}

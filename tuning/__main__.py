@@ -81,7 +81,6 @@ def _run(args: argparse.Namespace) -> tuple[int, object]:
 
 
 def _print(tuned: "TunedCase") -> None:
-    """Print the verdict, the gains and the files."""
     from ambjax.results.outputs import written
 
     print(tuned.report["verdict"])

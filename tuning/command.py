@@ -28,9 +28,8 @@ from tuning.problem.config import read_tune
 from tuning.problem.gains_table import off
 from tuning.problem.tuning_problem import TuningProblem, problem_of
 from tuning.report.facts import KEY, NOT_JUDGED, REPORT, TUNED, ended, record, search_facts
-from tuning.report.folder import all_laws, put_answer, put_front, put_page, put_report
+from tuning.report.folder import all_laws, put_answer, put_front, put_page, put_report, tuned_case
 from tuning.report.judging import examined
-from tuning.report.tuned import tuned_case
 from tuning.rounds import rounds
 from tuning.solve.checkpoint import can_resume, checkpoint, has_unfinished_search, mark_directory, remove_all
 

@@ -181,8 +181,8 @@ def summarise(metrics: Mapping[str, np.ndarray]) -> dict[str, Any]:
     survival, ended = wilson(int(alive.sum()), len(alive)), metrics["lost_at_s"][~alive]
     summary: dict[str, Any] = {"members": len(alive), "held": int(alive.sum())}
     summary |= {name: int(metrics[name].sum()) for name in ("lost", "stalled")}
-    summary |= {"survival": float(survival.value), "survival_low": float(survival.low)}
-    summary["survival_high"] = float(survival.high)
+    bounds = {f"survival_{name}": float(getattr(survival, name)) for name in ("low", "high")}
+    summary |= {"survival": float(survival.value)} | bounds
     if ended.size:
         summary |= {"lost_at_s.mean": float(ended.mean()), "lost_at_s.largest": float(ended.max())}
     if not alive.any():

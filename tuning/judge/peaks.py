@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,38 +24,29 @@ from tuning.problem.members import FEW
 from tuning.problem.quantities import LOOPS
 from tuning.problem.tuning_problem import TuningProblem
 
-UNSTABLE = "its linearised loop is not stable"
 DELAY_MARGIN = "delay_margin_s"
 # Limited quantities that an injection measures.
 BY_INJECTION = {"sensitivity": "S", "complementary": "T", "control_sensitivity": "KS"}
 
 
-@dataclasses.dataclass(frozen=True)
-class MemberPeak:
-    """The linear and the injected peak of |S| of one member.
+class MemberPeak(NamedTuple):
+    """The peaks of the sensitivity of one member.
 
-    `linear`, `frequency_hz`, `zone`: of the linearised loop. If it is not stable, they are None, None and "D"; if it
-    could not be computed, all are None. `why`: which of the two, with the cause; '' otherwise.
-
-    `peak`, `low`, `high`, `at_hz`: injected, with the 95 % interval; None if all injections lose the rotor or the laws
-    run in continuous time. `saturated`: share of samples with the supply at its limit. `repetitions`: number of
-    injections; 0 in continuous time. `lost`: in how many of them the rotor is lost or the run stalls. `largest`:
-    injected peaks of |S|, |T| and |KS| by the name of the limit; empty without injections, or if `lost` > 0.
+    `linear`: analysis of the linearised loop; a text: why it cannot be linearised. `injected`: the injections; None if
+    the laws run in continuous time.
     """
 
     member: int
-    linear: float | None = None
-    frequency_hz: float | None = None
-    zone: str | None = None
-    why: str = ""
-    peak: float | None = None
-    low: float | None = None
-    high: float | None = None
-    at_hz: float | None = None
-    saturated: float | None = None
-    lost: int = 0
-    repetitions: int = 0
-    largest: dict[str, float] = dataclasses.field(default_factory=dict)
+    linear: Analysis | str
+    injected: Injection | None = None
+
+    @property
+    def largest(self) -> dict[str, float]:
+        """Injected peaks by the name of the limit; empty without injections, or if one of them loses the rotor."""
+        if self.injected is None or self.injected.lost:
+            return {}
+        responses = {name: np.asarray(getattr(self.injected, which)) for name, which in BY_INJECTION.items()}
+        return {name: float(np.max(np.abs(response))) for name, response in responses.items()}
 
 
 class Sensitivity(NamedTuple):
@@ -91,7 +82,7 @@ def injections(of: JudgedMembers) -> Sensitivity | None:
         return None
     order = alive[np.argsort(-of.columns[f"loss.{PREFIX}{name}"][alive], kind="stable")]
     if not injects(of.problem):
-        return Sensitivity(tuple(_summary(int(k), _analysis(of, k), None) for k in order[:FEW]), False)
+        return Sensitivity(tuple(MemberPeak(int(k), _analysis(of, k)) for k in order[:FEW]), False)
     first = _analysis(of, order[0])
     peak = None if isinstance(first, str) else first.S.frequency
     if decides(of.problem):
@@ -106,7 +97,7 @@ def injections(of: JudgedMembers) -> Sensitivity | None:
     for at, k in enumerate(order[:FEW]):
         own = slice(at * repetitions, (at + 1) * repetitions)
         parts = {name: getattr(every, name)[own] for name in ("S", "KS", "saturated", "held")}
-        peaks.append(_summary(int(k), _analysis(of, k), injection_of(every._replace(**parts), random)))
+        peaks.append(MemberPeak(int(k), _analysis(of, k), injection_of(every._replace(**parts), random)))
     return Sensitivity(tuple(peaks), decides(of.problem))
 
 
@@ -120,7 +111,7 @@ def reached_of(limit: Limit, columns: Mapping[str, np.ndarray], injected: Sensit
     linear = limit.reached(columns)
     if limit.name not in BY_INJECTION or injected is None:
         return linear
-    largest = [one.largest.get(limit.name, math.inf) for one in injected.peaks if one.repetitions]
+    largest = [one.largest.get(limit.name, math.inf) for one in injected.peaks if one.injected]
     if not largest:
         return linear
     return max(largest) if injected.decides else max(linear, *largest)
@@ -152,35 +143,12 @@ def _responses(of: JudgedMembers, numbers: np.ndarray, repetitions: int, peak: f
     return member_responses(cascade, scenario, clock, lines, amplitude=case.zones.amplitude)
 
 
-def _summary(number: int, analysis: Analysis | str, one: Injection | None) -> MemberPeak:
-    """Return the peaks of a member. `analysis`: of `_analysis`. `one`: its injection; None if there was none."""
-    found: dict[str, Any]
-    if isinstance(analysis, str):
-        found = {"why": f"it cannot be linearised: {analysis}"}
-    elif not analysis.stable:
-        found = {"zone": "D", "why": UNSTABLE}
-    else:
-        found = {"linear": analysis.S.height, "frequency_hz": analysis.S.frequency, "zone": analysis.zone}
-    if one is not None:
-        found |= {"peak": one.peak, "low": one.peak_low, "high": one.peak_high, "at_hz": one.peak_frequency}
-        found |= {"saturated": one.saturated, "lost": one.lost, "repetitions": one.members}
-        if one.S is not None and not one.lost:
-            responses = {name: np.asarray(getattr(one, which)) for name, which in BY_INJECTION.items()}
-            found["largest"] = {name: float(np.max(np.abs(response))) for name, response in responses.items()}
-    return MemberPeak(number, **found)
-
-
 class DelayTest(NamedTuple):
     """Number of members tested with the additional delay, and how many of them are lost, or held but not stable."""
 
     members: int
     lost: int
     unstable: int
-
-    @property
-    def fails(self) -> bool:
-        """Whether the delay is not survived: a member is lost or not stable."""
-        return bool(self.lost or self.unstable)
 
 
 def not_simulated(problem: TuningProblem, limit: Limit) -> str:

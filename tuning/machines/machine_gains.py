@@ -15,9 +15,10 @@ from ambjax.cases.rotor_tables import tables_of
 from ambjax.cases.table import Table
 from ambjax.control.lqg import LqgWeights
 from ambjax.extend import canonical
+from ambjax.host.sealed import flat
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.whole_machine import Machine, loop_of
-from tuning.problem.gains_table import chosen, flattened
+from tuning.problem.gains_table import chosen
 from tuning.problem.space import Space, read, tunable, with_gain
 
 BEARING = "bearing."
@@ -35,6 +36,10 @@ class MachineGain:
     where: str
     axes: tuple[int, ...]
 
+    def values(self, case: MachineCase) -> list[float]:
+        """Return the gain of each of its axes."""
+        return [float(read(case.cases[k].cascade, self.inner)) for k in self.axes]
+
 
 @dataclasses.dataclass(frozen=True)
 class MachineSpace:
@@ -50,8 +55,7 @@ class MachineSpace:
 
     def values(self, case: MachineCase) -> np.ndarray:
         """Return the gains [m] of a case; of the axes of a gain, the geometric mean."""
-        each = [[float(read(case.cases[k].cascade, gain.inner)) for k in gain.axes] for gain in self.gains]
-        return np.array([math.exp(np.mean(np.log(one))) for one in each])
+        return np.array([math.exp(np.mean(np.log(gain.values(case)))) for gain in self.gains])
 
     def decode(self, x: Array, machine: Machine) -> Machine:
         """Return the machine with the gains at coordinates x [m]."""
@@ -79,7 +83,7 @@ def machine_space(table: Table, case: MachineCase, raw: dict[str, Any]) -> Machi
     for an unknown gain or an invalid bound.
     """
     known = _known(case, raw)
-    unusable = [path for path, gain in known.items() if not _usable(gain, case)]
+    unusable = [path for path, gain in known.items() if not all(0 < one < math.inf for one in gain.values(case))]
     default = [path for path in known if path.startswith("controller.position.") and path not in unusable]
     space = chosen(table, dict.fromkeys(known, (0.0, math.inf)), default, unusable, "machine")
     gains = tuple(known[path] for path in space.paths)
@@ -88,10 +92,6 @@ def machine_space(table: Table, case: MachineCase, raw: dict[str, Any]) -> Machi
         if any(taken.count((gain.inner, k)) > 1 for k in gain.axes) and not gain.path.startswith(BEARING):
             raise ValueError(f"{table.at('gains')}: {gain.path} and a bearing's own are both named. Keep one of them.")
     return MachineSpace(space, gains)
-
-
-def _usable(gain: MachineGain, case: MachineCase) -> bool:
-    return all(0 < float(read(case.cases[k].cascade, gain.inner)) < math.inf for k in gain.axes)
 
 
 def _known(case: MachineCase, raw: dict[str, Any]) -> dict[str, MachineGain]:
@@ -108,7 +108,7 @@ def _known(case: MachineCase, raw: dict[str, Any]) -> dict[str, MachineGain]:
             own = f"{BEARING}{name}.{path}"
             if axes:
                 found[own] = MachineGain(own, path, f"bearing[{number}].{path}", axes)
-            if path not in flattened({"controller": table.raw.get("controller", {})}):
+            if path not in flat({"controller": table.raw.get("controller", {})}):
                 common += axes
         if common:
             found[path] = MachineGain(path, path, path, tuple(common))

@@ -19,20 +19,26 @@ from ambjax.linear.state_space import NEUTRAL, StateSpace
 from ambjax.simulation.whole_machine import Machine
 from ambjax.world.rotation import PER_MINUTE
 from tuning.machines.machine_gains import LqgSpace, MachineSpace
-from tuning.machines.nonsmooth import Value
 
 # Offsets of the frequencies beside each light pole, in units of its damping.
 BESIDE = (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0)
 
 
+class Value(NamedTuple):
+    """A point [m], the value of a function there, and its gradient [m]. A value of inf has no gradient."""
+
+    x: np.ndarray
+    f: float
+    gradient: np.ndarray
+
+
 class Loop(NamedTuple):
-    """A linear system in NumPy, with its eigenvalues `values` and eigenvectors, and its derivatives `moves` [.., m]."""
+    """A linear system in NumPy without idle states, its derivatives `moves` [.., m], eigenvalues and eigenvectors."""
 
     system: StateSpace
     moves: StateSpace
     values: np.ndarray
     vectors: np.ndarray
-    kept: np.ndarray
 
 
 class Peaks:
@@ -76,14 +82,8 @@ class Peaks:
         if self._last is None or not np.array_equal(self._last[0], x):
             found = jax.tree.map(np.asarray, self._both(x))
             each = [jax.tree.map(lambda a, k=k: a[k], found) for k in range(len(found[0].A))]
-            self._last = x.copy(), [self._loop(*one) for one in each]
+            self._last = x.copy(), [_loop(*one) for one in each]
         return self._last[1]
-
-    def _loop(self, system: StateSpace, moves: StateSpace) -> Loop:
-        kept = ~np.asarray(system.idle())
-        if not np.isfinite(system.A).all():
-            return Loop(system, moves, np.array([np.inf]), np.eye(1), kept)
-        return Loop(system, moves, *np.linalg.eig(system.A[kept][:, kept]), kept)
 
     def rates(self, loop: Loop) -> np.ndarray:
         """Return the poles, 1/s."""
@@ -98,7 +98,7 @@ class Peaks:
         if not np.isfinite(rates[n][k]):
             return Value(x, np.inf, np.zeros(len(x)))
         left, right = np.linalg.inv(loop.vectors)[k], loop.vectors[:, k]
-        slope = np.einsum("i,ijm,j->m", left, loop.moves.A[loop.kept][:, loop.kept], right)
+        slope = np.einsum("i,ijm,j->m", left, loop.moves.A, right)
         slope = slope / (loop.values[k] * self.period) if self.sampled else slope
         return Value(x, float(rates[n][k].real), slope.real)
 
@@ -145,20 +145,24 @@ class Peaks:
     def _response(self, loop: Loop, at: np.ndarray) -> np.ndarray:
         """Return S_kk [points, axes]."""
         _, B, C, D, *_ = loop.system
-        own = C[:, loop.kept] @ loop.vectors, np.linalg.solve(loop.vectors, B[loop.kept])
+        own = C @ loop.vectors, np.linalg.solve(loop.vectors, B)
         return np.einsum("ck,fk,kc->fc", own[0], 1 / (at[:, None] - loop.values), own[1]) + np.diagonal(D)
 
     def _slope(self, loop: Loop, at: complex, axis: int) -> np.ndarray:
         """Return the derivatives [m] of S_kk of an axis at a point."""
-        kept, (A, B, C, _, *_), moves = loop.kept, loop.system, loop.moves
-        matrix = at * np.eye(int(kept.sum())) - A[kept][:, kept]
-        right, left = np.linalg.solve(matrix, B[kept, axis] + 0j), np.linalg.solve(matrix.T, C[axis, kept] + 0j)
-        return (
-            moves.D[axis, axis]
-            + right @ moves.C[axis, kept]
-            + left @ moves.B[kept, axis]
-            + np.einsum("i,ijm,j->m", left, moves.A[kept][:, kept], right)
-        )
+        (A, B, C, *_), moves = loop.system, loop.moves
+        matrix = at * np.eye(len(A)) - A
+        right, left = np.linalg.solve(matrix, B[:, axis] + 0j), np.linalg.solve(matrix.T, C[axis] + 0j)
+        moved = np.einsum("i,ijm,j->m", left, moves.A, right)
+        return moves.D[axis, axis] + right @ moves.C[axis] + left @ moves.B[:, axis] + moved
+
+
+def _loop(system: StateSpace, moves: StateSpace) -> Loop:
+    kept, finite = ~np.asarray(system.idle()), np.isfinite(system.A).all()
+    system, moves = (one._replace(A=one.A[kept][:, kept], B=one.B[kept], C=one.C[:, kept]) for one in (system, moves))
+    if not finite:
+        return Loop(system, moves, np.array([np.inf]), np.eye(1))
+    return Loop(system, moves, *np.linalg.eig(system.A))
 
 
 def _differences(systems: Callable[[np.ndarray], StateSpace], x: np.ndarray) -> tuple[StateSpace, StateSpace]:

@@ -1,4 +1,8 @@
-"""The search for the gains of a machine: descents of the largest peak of |S| from several starts."""
+"""The search for the gains of a machine: descents of the largest peak of |S| from several starts.
+
+They are by BFGS with a weak Wolfe line search, for functions that are not smooth at their minima: Lewis and Overton,
+Nonsmooth optimization via quasi-Newton methods, Math. Program. 141 (2013), 135-163.
+"""
 
 import math
 import pathlib
@@ -11,12 +15,14 @@ import numpy as np
 from ambjax.host.sealed import seal
 from tuning.events import Tell
 from tuning.machines.machine_gains import LqgSpace, MachineSpace
-from tuning.machines.machine_peaks import Peaks
-from tuning.machines.nonsmooth import Value, minimise
+from tuning.machines.machine_peaks import Peaks, Value
 from tuning.solve.checkpoint import restored
 
 Lost = Callable[[np.ndarray], int]
 Over = Callable[[Value], bool]
+Function = Callable[[np.ndarray], Value]
+# Largest change of a coordinate in a step.
+LONGEST = 0.5
 
 
 class Settings(NamedTuple):
@@ -120,7 +126,6 @@ def _stabilised(peaks: Peaks, x: np.ndarray, settings: Settings, over: Over) -> 
 
 
 def _descent(peaks: Peaks, x: np.ndarray, settings: Settings, over: Over) -> list[Value]:
-    """Return the points of a descent of the peak."""
     path = [peaks.peak(x)]
 
     def followed(value: Value) -> bool:
@@ -151,3 +156,43 @@ def _kept(peaks: Peaks, path: list[Value], settings: Settings, lost: Lost, over:
         return value if good else Value(x, math.inf, np.zeros(len(x)))
 
     return minimise(guarded, path[first], settings.iterations, over), 0
+
+
+def minimise(function: Function, start: Value, iterations: int, stop: Over) -> Value:
+    """Return the lowest point that BFGS finds from `start`. `stop`: called after each step, ends the search."""
+    now, H = start, 0.01 * np.eye(len(start.x))  # the first step has no estimate of the curvature
+    for number in range(iterations):
+        after = _line_search(function, now, -H @ now.gradient)
+        if after is None:
+            break
+        s, y = after.x - now.x, after.gradient - now.gradient
+        now = after
+        if stop(now):
+            break
+        if s @ y > 0:
+            if number == 0:
+                H = np.eye(len(s)) * (s @ y) / (y @ y)
+            left = np.eye(len(s)) - np.outer(s, y) / (s @ y)
+            H = left @ H @ left.T + np.outer(s, s) / (s @ y)
+    return now
+
+
+def _line_search(function: Function, now: Value, direction: np.ndarray) -> Value | None:
+    """Return a point that meets the weak Wolfe conditions, or the last one that is low enough; None: there is none.
+
+    The constants of the conditions are 1e-4 and 0.5, as in the paper.
+    """
+    direction = direction * min(1.0, LONGEST / max(float(np.abs(direction).max()), 1e-300))
+    slope, low, high, step, found = float(now.gradient @ direction), 0.0, math.inf, 1.0, None
+    if not slope < 0:
+        return None
+    for _ in range(25):
+        trial = function(now.x + step * direction)
+        if not trial.f <= now.f + 1e-4 * step * slope:
+            high = step
+        elif trial.gradient @ direction < 0.5 * slope and step * np.abs(direction).max() < 2 * LONGEST:
+            low, found = step, trial
+        else:
+            return trial
+        step = (low + high) / 2 if math.isfinite(high) else 2 * step
+    return found

@@ -25,11 +25,10 @@ from ambjax.extend import leaf
 from ambjax.host.extensions import NothingToTuneError
 from tuning.problem.gains_table import space_from
 from tuning.problem.goal import CVaR
-from tuning.problem.limits import Limit
+from tuning.problem.limits import Limit, bounds_of
 from tuning.problem.loss import TERMS
 from tuning.problem.quantities import KINDS
 from tuning.problem.space import Space
-from tuning.problem.unbreakable import bounds_of
 
 # Keys of [tune] that are neither in NUMBERS nor in BUDGET.
 OTHER_KEYS = ["objective", "gains", "bounds", "weights", "limits", "risk"]
@@ -167,15 +166,11 @@ def _limits(table: Table, case: Case) -> LimitSettings:
     table.only([*KINDS, "survival", "margin", "settling_band_m"], [f"tune.{key}" for key in beside])
     thresholds = {name: table.leaf(name, OTHER_RANGES.get(name, LIMIT_RANGE)) for name in KINDS if name in table.raw}
     _check_speed([table.at(name) for name, most in thresholds.items() if "_1x" in name and most < math.inf], case)
-    defaults = {
-        "rms_u_V": VOLTAGE_SHARE * float(np.max(np.asarray(case.scenario.u_max))),
-        "sensitivity": float(case.zones.zone_a),
-    }
-    sources = {
-        "rms_u_V": f"default, {100 * VOLTAGE_SHARE:g} % of actuator.u_max",
-        "sensitivity": "default, zone A of [sensitivity]",
-    } | dict.fromkeys(thresholds, table.path)
-    thresholds = defaults | thresholds
+    u_max, share = float(np.max(np.asarray(case.scenario.u_max))), f"{100 * VOLTAGE_SHARE:g} %"
+    given = {
+        "rms_u_V": (VOLTAGE_SHARE * u_max, f"default, {share} of actuator.u_max"),
+        "sensitivity": (float(case.zones.zone_a), "default, zone A of [sensitivity]"),
+    } | {name: (threshold, table.path) for name, threshold in thresholds.items()}
     clearance = float(np.min(np.asarray(case.scenario.touchdown)))
     band = table.leaf("settling_band_m", BAND_RANGE, SETTLING_BAND * clearance)
     if "settling_band_m" in table.raw and "settling_s" not in thresholds:
@@ -187,17 +182,15 @@ def _limits(table: Table, case: Case) -> LimitSettings:
         )
     margin = table.leaf("margin", MARGIN_RANGE)
     each = tuple(
-        Limit(name, thresholds[name], sources[name], KINDS[name].margin if margin is None else margin)
-        for name in sorted(thresholds)
-        if math.isfinite(thresholds[name])
+        Limit(name, threshold, source, KINDS[name].margin if margin is None else margin)
+        for name, (threshold, source) in sorted(given.items())
+        if math.isfinite(threshold)
     )
-    bounds = {name: bound for name, bound in bounds_of(case).items() if thresholds.get(name, 0.0) >= bound.most}
-    return LimitSettings(
-        tuple(limit for limit in each if limit.name not in bounds),
-        table.leaf("survival", SURVIVAL, SURVIVING),
-        band,
-        tuple((limit, bounds[limit.name].why) for limit in each if limit.name in bounds),
-    )
+    ends = bounds_of(case)
+    why = {one.name: ends[one.name].why for one in each if one.name in ends and one.threshold >= ends[one.name].most}
+    kept = tuple(limit for limit in each if limit.name not in why)
+    unbreakable = tuple((limit, why[limit.name]) for limit in each if limit.name in why)
+    return LimitSettings(kept, table.leaf("survival", SURVIVAL, SURVIVING), band, unbreakable)
 
 
 def settings(tune: Tune) -> dict[str, Any]:

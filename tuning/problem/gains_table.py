@@ -13,6 +13,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import no_such_number
 from ambjax.extend import GAINS
 from ambjax.host.extensions import NothingToTuneError
+from ambjax.host.sealed import flat
 from tuning.problem.space import CLOSEST, Gain, Space, knots, read, tunable
 
 
@@ -27,13 +28,10 @@ def space_from(table: Table, case: Case) -> Space:
     known = tunable(cascade)
     if not known:
         raise NothingToTuneError("the laws of this case have no gains to tune.")
-    most = {path: float(np.max(np.asarray(read(cascade, path)))) for path in known}
-    idle = off(cascade)
-    default = [path for path in tunable(cascade, steepness=cascade.sampled) if path not in idle]
-    default = [path for path in default if math.isfinite(most[path])] or known
+    default = _usable(cascade, steepness=cascade.sampled) or known
     stems = dict.fromkeys(path.rpartition(".")[0] for path in known if path.count(".") > 2)
     whole = {stem: knots(cascade, stem) for stem in stems}
-    space = chosen(table, dict.fromkeys(known, (0.0, math.inf)), default, idle, "case", whole)
+    space = chosen(table, dict.fromkeys(known, (0.0, math.inf)), default, off(cascade), "case", whole)
     if clash := [path for path in space.paths if path in case.spread.paths]:
         raise ValueError(f"spread.{clash[0]} is in tune.gains too. Remove it from one of them.")
     return space
@@ -55,7 +53,7 @@ def chosen(
     paths = table.raw.get("gains", default)
     if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
         raise ValueError(f'{table.at("gains")} = {show(paths)}: give a list of paths, as in ["controller.position.c"].')
-    bounds = flattened(table.table("bounds").raw)
+    bounds = flat(table.table("bounds").raw)
     paths = [one for path in paths for one in whole.get(path, [path])]
     bounds = {one: ends for path, ends in bounds.items() for one in whole.get(path, [path])}
     for path in [*paths, *bounds]:
@@ -80,16 +78,13 @@ def off(cascade: Cascade) -> list[str]:
 
 def left_out(space: Space, cascade: Cascade) -> list[str]:
     """Return the paths of the gains that a search could tune, but that are not in the space."""
-    fixed = {*space.paths, *off(cascade)}
-    return [path for path in tunable(cascade) if path not in fixed and np.all(np.isfinite(read(cascade, path)))]
+    return [path for path in _usable(cascade) if path not in space.paths]
 
 
-def flattened(raw: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Flatten nested tables to dotted keys. TOML reads controller.position.c = [1, 2] as nested tables."""
-    flat: dict[str, Any] = {}
-    for key, value in raw.items():
-        flat |= flattened(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return flat
+def _usable(cascade: Cascade, steepness: bool = True) -> list[str]:
+    """Return the paths of the gains that are neither 0 nor infinite. `steepness`: as for `tunable`."""
+    found, idle = tunable(cascade, steepness=steepness), off(cascade)
+    return [path for path in found if path not in idle and np.all(np.isfinite(read(cascade, path)))]
 
 
 def bound_of(raw: Any, path: str, table: Table) -> tuple[float, float]:

@@ -1,7 +1,6 @@
 """The goal: the number that the search minimises, computed from the losses of the members."""
 
 import dataclasses
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -82,6 +81,4 @@ class Goal:
         return np.where(np.isfinite(values), values, np.inf)
 
 
-@partial(jax.jit, static_argnames="ordinary")
-def _compiled(goal: Goal, outcomes: Array, ordinary: int) -> Array:
-    return goal(outcomes, ordinary)
+_compiled = jax.jit(Goal.__call__, static_argnames="ordinary")

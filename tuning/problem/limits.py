@@ -7,19 +7,25 @@ Optimization, 2006, 17.3). With g = log(reached / allowed), or log(allowed / rea
 
 to the goal, which is a logarithm. At the optimum, a limit that is 1 % looser lowers the objective, exp(goal), by
 `multiplier` %.
+
+Some limits cannot be broken (`bounds_of`): no held member can exceed them, whatever its gains.
 """
 
 import dataclasses
 import math
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.cases.reach import reach
+from ambjax.cases.reader import Case
+from ambjax.ensemble.spread import ends
 from ambjax.extend import Scalar, record, static
 from ambjax.simulation.folds import Fold
+from ambjax.world.scenario import Scenario
 from tuning.problem.quantities import KINDS, LOOPS, NEGLIGIBLE, NORM, TINY, Kind, LimitContext
 
 # Penalty; at a multiplier of 0, an excess of 10 % adds 0.14 to the goal.
@@ -32,6 +38,8 @@ MOST_STEPS = 5.0
 PREFIX = "limit."
 # Value of `Limit.source` for the limit on the rms error that traces the front of error against voltage.
 FRONT = "the front"
+# Prefixes of the paths on which the bounds of quantities depend.
+PATHS = ("actuator.u_max", "actuator.coil.u_max", "reference.", "plant.s_0", "run.clearance")
 
 
 @record
@@ -199,3 +207,40 @@ def measures(names: Collection[str], limits: tuple[Limit, ...], context: LimitCo
     thresholds = {limit.name: limit.threshold for limit in limits}
     folds = {name: KINDS[name].fold for name in names}
     return {name: fold(context, thresholds.get(name, 1.0)) for name, fold in folds.items() if fold is not None}
+
+
+class Ceiling(NamedTuple):
+    """Number that a limited quantity of a held member cannot exceed (in the unit of the quantity), and the reason."""
+
+    most: float
+    why: str
+
+
+def bounds_of(case: Case) -> dict[str, Ceiling]:
+    """Return the bounds of the quantities that have one, by the name of the limit.
+
+    A current has none: the supply may be too weak to keep it within `actuator.i_max`.
+    """
+    scenario = ends(case.spread, case.cascade, case.scenario, PATHS)[1]
+    volts, key = _voltage(scenario)
+    near, far = float(np.max(scenario.limit)), reach(scenario, case.clock)
+    voltage = Ceiling(volts, f"|u| is at most {volts:g} V ({key})")
+    error = Ceiling(near + far, f"|z| of a held rotor is below {near:g} m, and |r| is at most {far:g} m")
+    found = {"max_u_V": voltage, "rms_u_V": voltage}
+    found["chatter_V_per_s"] = Ceiling(2 * volts / float(case.clock.sample_period), f"{voltage.why} in each sample")
+    found |= dict.fromkeys(("rms_error_m", "largest_error_m", "overshoot_m"), error)
+    # with an elastic stop, |z| may exceed the clearance
+    used = near / float(np.max(case.scenario.touchdown))
+    return found | {"clearance_used": Ceiling(used, "a rotor that reaches the clearance is lost")}
+
+
+def _voltage(scenario: Scenario) -> tuple[float, str]:
+    """Return the largest |u| (V) that the drive can apply, inf if it has no limit, and the key that sets it."""
+    supply, coil = float(np.max(scenario.u_max)), scenario.actuator.coil
+    if coil is None:
+        return supply, "actuator.u_max"
+    each = math.inf if coil.u_max is None else float(np.max(coil.u_max))
+    # to hold the current of a coil, its amplifier may apply more than the commanded voltage
+    if each < supply or coil.i_max is not None or coil.unidirectional:
+        return each, "actuator.coil.u_max"
+    return supply, "actuator.u_max"

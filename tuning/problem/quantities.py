@@ -98,16 +98,6 @@ def pooled(values: Array) -> Array:
     return jnp.sqrt(jnp.mean(values**2) + TINY)
 
 
-def worst_loop(values: Array) -> Array:
-    """Return `largest` over the members whose loops the search linearises."""
-    return largest(values[:LOOPS])
-
-
-def smallest_loop(values: Array) -> Array:
-    """Return a smooth minimum over the members whose loops the search linearises: 1 / (16-norm of the inverses)."""
-    return 1 / largest(1 / values[:LOOPS])
-
-
 def largest(values: Array) -> Array:
     """Return the 16-norm over members: smooth, and not below the maximum."""
     top = jax.lax.stop_gradient(jnp.maximum(jnp.max(values), TINY))
@@ -148,19 +138,12 @@ def _once(name: str) -> Callable[[LimitContext, float], Fold]:
     return fold
 
 
-def _coils(case: LimitContext, threshold: float) -> Fold:
-    return Scaled(Named({name: Rms(name, case.settle, driven=True) for name in ("i_1", "i_2")}))
-
-
-def _chatter(case: LimitContext, threshold: float) -> Fold:
-    return Scaled(Variation(case.settle), case.duration - case.settle)
-
-
 _mean = partial(Kind, over="mean over members", tuned=jnp.mean, judged=np.mean, margin=MEAN_MARGIN)
 _pooled = partial(Kind, over="root mean square over members", tuned=pooled, judged=pooled, margin=MEAN_MARGIN)
 _worst = partial(Kind, over="of the worst member", tuned=largest, judged=np.max, margin=WORST_MARGIN, worst=True)
-_loop = partial(_worst, fold=None, exact=None, tuned=worst_loop, margin=LOOP_MARGIN)
-_least = partial(_loop, tuned=smallest_loop, judged=np.min, at_least=True)
+# Over the members whose loops the search linearises: a smooth maximum, and a smooth minimum.
+_loop = partial(_worst, fold=None, exact=None, tuned=lambda values: largest(values[:LOOPS]), margin=LOOP_MARGIN)
+_least = partial(_loop, tuned=lambda values: 1 / largest(1 / values[:LOOPS]), judged=np.min, at_least=True)
 
 KINDS: dict[str, Kind] = {
     "rms_error_m": _pooled(
@@ -174,10 +157,12 @@ KINDS: dict[str, Kind] = {
     "max_u_V": _worst("V", "largest voltage of the run", lambda case, most: Typical("u_peak", most), "max_abs_u_V"),
     "max_abs_i_A": _worst("A", "largest current of the run", lambda case, _: Peak("i"), "max_abs_i_A"),
     "rms_coil_A": _worst(
-        "A", "root mean square current from run.settle on, bias included, of the coil where it is larger", _coils, None
+        "A", "root mean square current from run.settle on, bias included, of the coil where it is larger",
+        lambda case, _: Scaled(Named({name: Rms(name, case.settle, driven=True) for name in ("i_1", "i_2")})), None,
     ),
     "chatter_V_per_s": _mean(
-        "V/s", "variation of the voltage, averaged over each sample, per second from run.settle on", _chatter, None
+        "V/s", "variation of the voltage, averaged over each sample, per second from run.settle on",
+        lambda case, _: Scaled(Variation(case.settle), case.duration - case.settle), None,
     ),
     "largest_error_m": _worst(
         "m", "largest |z - r| from run.settle on", lambda case, _: Peak("e_z", case.settle), "settled_max_abs_error_m"

@@ -32,7 +32,6 @@ def report_markdown(facts: TuningFacts) -> str:
 
 
 def _gains(facts: TuningFacts) -> list[str]:
-    """Return the sections on the gains and on the nominal run."""
     columns: dict[str, Column] = {
         "gain": ("path", ""), "before": ("before", ".6g"), "after": ("after", ".6g"),
         "searched from": ("low", ".3g"), "searched to": ("high", ".3g"),
@@ -64,7 +63,6 @@ def _sensitivity(row: Row, trained_on: int) -> str:
 
 
 def _held_out(facts: TuningFacts) -> list[str]:
-    """Return the section on the held-out members."""
     both = facts.before, facts.after
     if not facts.after["members"]:
         return ["There is no held-out ensemble (tune.held_out = 0)."]
@@ -81,7 +79,6 @@ def _held_out(facts: TuningFacts) -> list[str]:
 
 
 def _worst(worst: Row | None) -> list[str]:
-    """Describe the worst member, with the command that simulates it alone."""
     if worst is None:
         return []
     status = f"largest settled error {worst['settled_max_abs_error_m']:.4g} m"
@@ -98,7 +95,6 @@ def _survival(one: Row) -> str:
 
 
 def _conditions(facts: TuningFacts) -> list[str]:
-    """Return the section on the conditions of Theorem 1, left > right."""
     if not facts.conditions:
         return []
     columns: dict[str, Column] = {
@@ -115,7 +111,6 @@ def _conditions(facts: TuningFacts) -> list[str]:
 
 
 def _course(facts: TuningFacts) -> list[str]:
-    """Return the section on the search: its settings, its cost, and the error of its steps."""
     how = facts.search
     lines = [
         f"- risk: {how['risk']} over {how['members']} members (seed {how['seed']})",

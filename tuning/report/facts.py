@@ -90,8 +90,7 @@ class TuningFacts:
     @property
     def table(self) -> Row:
         """The content of report.json."""
-        rows = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return {name: value for name, value in rows.items() if value is not None or name not in OPTIONAL}
+        return {name: value for name, value in vars(self).items() if value is not None or name not in OPTIONAL}
 
 
 def search_facts(raw: dict[str, Any], case: Case, tune: Tune) -> Row:

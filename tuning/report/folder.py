@@ -2,28 +2,37 @@
 
 import functools
 import pathlib
+import re
 import tomllib
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from ambjax.cases.edited import with_numbers
 from ambjax.cases.reader import Case, case_from
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.replay import record_member
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
-from ambjax.results.outputs import described
+from ambjax.results.case_file import files_from
+from ambjax.results.outputs import described, drawn
 from ambjax.simulation.rollout import rollout
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.text.web_page import render_page
-from tuning.problem.space import Gain, Space, tunable
+from tuning.problem.space import read, tunable
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.report import document as report
 from tuning.report import front_table, pictures
 from tuning.report.facts import TUNED, Row, TuningFacts
-from tuning.report.tuned import tuned_case
 from tuning.solve.course import SearchResult
+
+FIRST = "Tuned by ambjax tune from the case"
+AUTO = "auto"
+# First lines of tuned.toml. They are removed when the file is tuned again.
+HEAD = re.compile(rf"\A# {FIRST} [^\n]*\n(#[^\n]*\n)?\n?")
+# Characters that a comment must not contain; surrogates come from file names that are not UTF-8.
+CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 
 
 def put_answer(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, verdict: str) -> Case:
@@ -41,18 +50,18 @@ def put_answer(part: pathlib.Path, out: pathlib.Path, answer: SearchResult, verd
 
 def put_report(part: pathlib.Path, cascade: Cascade, answer: SearchResult, facts: TuningFacts) -> None:
     """Write the report and its pictures into the folder `part`. `cascade`: the controller with the tuned gains."""
-    drawn = _pictures(answer.problem, cascade, answer.history, facts.front)
-    for name, data in drawn.items():
-        (part / name).write_bytes(data)
-    put_words(part, facts.case, report.report_markdown(facts), drawn, (front_table.TITLE,))
+    _pictures(part, answer.problem, cascade, answer.history, facts.front)
+    put_words(part, facts.case, report.report_markdown(facts), (front_table.TITLE,))
 
 
-def put_words(
-    part: pathlib.Path, case: str, words: str, drawn: Mapping[str, bytes], unfolded: tuple[str, ...] | None = None
-) -> None:
-    """Write the report `words` of a case as report.md and report.html. `drawn`, `unfolded`: as for `render_page`."""
+def put_words(part: pathlib.Path, case: str, words: str, unfolded: tuple[str, ...] | None = None) -> None:
+    """Write the report `words` of a case as report.md and report.html, with the pictures in the folder `part`.
+
+    `unfolded`: as for `render_page`.
+    """
     (part / "report.md").write_text(words, encoding="utf-8")
-    page = described("report.html", lambda: render_page(words, drawn, f"Tuning of {case}", unfolded))
+    found = {path.name: path.read_bytes() for path in part.glob("*.png")}
+    page = described("report.html", lambda: render_page(words, found, f"Tuning of {case}", unfolded))
     if page is not None:
         (part / "report.html").write_text(page, encoding="utf-8")
 
@@ -76,27 +85,24 @@ def put_page(part: pathlib.Path, case: Case, path: str) -> None:
     (part / NAME).write_text(sliders_page(case, found, path), encoding="utf-8")
 
 
-def _pictures(problem: TuningProblem, tuned: Cascade, history: Any, front: list[Row] | None) -> dict[str, bytes]:
-    """Return the pictures of the report as PNG data by file name. `tuned`: the controller with the tuned gains.
+def _pictures(
+    part: pathlib.Path, problem: TuningProblem, tuned: Cascade, history: Any, front: list[Row] | None
+) -> None:
+    """Draw the pictures of the report into the folder `part`. `tuned`: the controller with the tuned gains.
 
     A picture that cannot be drawn is left out.
     """
-    paths, settle = problem.objective.space.paths, problem.case.settle
-    runs = {"before": problem.case.cascade, "after": tuned}
-    found = {
-        name: described(f"the run {name} tuning", functools.partial(nominal, problem, cascade))
-        for name, cascade in runs.items()
-    }
-    shown = {name: run for name, run in found.items() if run is not None}
-    draw = {"convergence.png": lambda: pictures.convergence(history, paths)}
-    for name, run in shown.items():
-        draw[f"{name}.png"] = functools.partial(pictures.nominal, run, f"{name} tuning", settle)
-    if shown:
-        draw["spectrum.png"] = lambda: pictures.spectrum(shown, settle)
+    paths, settle, runs = problem.objective.space.paths, problem.case.settle, dict[str, Trajectory]()
+    for name, cascade in (("before", problem.case.cascade), ("after", tuned)):
+        run = described(f"the run {name} tuning", functools.partial(nominal, problem, cascade))
+        if run is not None:
+            runs[name] = run
+            drawn(part / f"{name}.png", functools.partial(pictures.nominal, run, f"{name} tuning", settle), 110)
+    drawn(part / "convergence.png", lambda: pictures.convergence(history, paths), 110)
+    if runs:
+        drawn(part / "spectrum.png", lambda: pictures.spectrum(runs, settle), 110)
     if front:
-        draw["front.png"] = lambda: pictures.front(front)
-    drawn = {name: described(name, one) for name, one in draw.items()}
-    return {name: data for name, data in drawn.items() if data is not None}
+        drawn(part / "front.png", lambda: pictures.front(front), 110)
 
 
 def nominal(problem: TuningProblem, cascade: Cascade) -> Trajectory:
@@ -116,5 +122,38 @@ def all_laws(problem: TuningProblem, tuned: dict[str, float]) -> dict[str, float
 
     tuned.toml lists all gains, because the default of a steepness p depends on the plant.
     """
-    everything = Space(tuple(Gain(path) for path in tunable(problem.case.cascade, idle=True)))
-    return dict(zip(everything.paths, everything.values(problem.case.cascade).tolist(), strict=True)) | tuned
+    cascade = problem.case.cascade
+    return {path: float(read(cascade, path)) for path in tunable(cascade, idle=True)} | tuned
+
+
+def tuned_case(case: Case, gains: Mapping[str, float], verdict: str, out: pathlib.Path) -> tuple[str, Case]:
+    """Return the text of tuned.toml for the folder `out`, and its case. Raises ValueError if the text is no valid case.
+
+    If the integration step of the case is too coarse for the tuned gains, "auto" replaces clock.dt and clock.method,
+    and the first lines of the text say so.
+
+    The custom laws, the linear controller and the recorded signals are those of `case`: a change of their files during
+    the search has no effect.
+    """
+    values = {**gains, **files_from(case, out)}
+    text = tuned(case.text, values, case.name, verdict)
+    try:
+        return text, case_from(tomllib.loads(text), case.name, known=case)
+    except ValueError as error:
+        steps = [key for key in ("dt", "method") if tomllib.loads(case.text).get("clock", {}).get(key, AUTO) != AUTO]
+        if not steps:
+            raise
+        words = f'{verdict} In [clock], "{AUTO}" replaces {" and ".join(steps)} of the case: {error}'
+        text = tuned(case.text, {**values, **{f"clock.{key}": AUTO for key in steps}}, case.name, words)
+        return text, case_from(tomllib.loads(text), case.name, known=case)
+
+
+def tuned(text: str, gains: Mapping[str, float | str], case: str, verdict: str) -> str:
+    """Return the text of `with_numbers` after a comment: the name of the case and the verdict."""
+    body = with_numbers(HEAD.sub("", text.replace("\r\n", "\n")), gains)
+    head = [f"# {CONTROL.sub(_escaped, line)}" for line in (f"{FIRST} '{case}'.", verdict)]
+    return "\n".join([*head, "", body.strip()]) + "\n"
+
+
+def _escaped(character: re.Match[str]) -> str:
+    return f"\\u{ord(character[0]):04x}"

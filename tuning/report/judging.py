@@ -83,7 +83,7 @@ def _held_out(after: JudgedMembers, refuted: str, tell: Tell) -> Row:
     injected, summary = injections(after), summarise(columns)
     unverified = dict.fromkeys(("survival", "survival_low", "survival_high"), limit_table.UNVERIFIED)
     return {
-        "sensitivity": injected and sensitivity_table.facts(problem, injected),
+        "sensitivity": injected and sensitivity_table.facts(problem.case.zones, injected),
         "limits": limit_table.facts(problem, columns, summary, refuted, injected, delay_test(after)),
         "after": summary | (unverified if refuted else {}),
         "worst_member": described("the worst member", after.worst),
@@ -126,9 +126,7 @@ def _steps(answer: SearchResult, of: JudgedMembers, tell: Tell) -> Row:
 
 
 def _conditions(problem: TuningProblem, x: np.ndarray) -> Row:
-    """Return the fields on the theorem's conditions at x [m]."""
-    case = problem.case
-    objective = problem.objective
+    case, objective = problem.case, problem.objective
     cascade = objective.notched(x, objective.space.decode(jnp.asarray(x), case.cascade))
     line: Check = check(cascade, case.scenario, case.clock.with_method(None))
     rows = [dataclasses.asdict(one) | {"margin": one.margin} for one in line.conditions]

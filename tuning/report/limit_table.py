@@ -110,7 +110,7 @@ def _tested(row: Row, delayed: DelayTest | None, refuted: str, reason: str = "")
             f"with this additional delay {delayed.lost} of {delayed.members} of the worst members are lost, and "
             f"{delayed.unstable} held but not stable"
         )
-    fails = _verdict(False, refuted) | {"price": None} if delayed and delayed.fails else {}
+    fails = _verdict(False, refuted) | {"price": None} if delayed and (delayed.lost or delayed.unstable) else {}
     return row | {"what": f"{row['what']}; {words}"} | fails
 
 
@@ -122,7 +122,7 @@ def _asked(problem: TuningProblem) -> list[Limit]:
 
 def _by_injection(limit: Limit, injected: Sensitivity | None) -> str:
     """Return the text about the injection; '' if injections do not measure the quantity."""
-    if limit.name not in BY_INJECTION or injected is None or not injected.peaks[0].repetitions:
+    if limit.name not in BY_INJECTION or injected is None or injected.peaks[0].injected is None:
         return ""
     those = f"by injection into {len(injected.peaks)} of the worst members"
     return f"; {those}" if injected.decides else f", or its value {those}, if that is larger"
@@ -131,7 +131,8 @@ def _by_injection(limit: Limit, injected: Sensitivity | None) -> str:
 def _saturated(limit: Limit, reached: float | None, injected: Sensitivity | None) -> float | None:
     """Return the share of saturated samples of the injection whose value is `reached`; None if no injection gave it."""
     peaks = () if injected is None else injected.peaks
-    return next((one.saturated for one in peaks if one.largest.get(limit.name, np.nan) == reached), None)
+    those = (one.injected for one in peaks if one.injected and one.largest.get(limit.name, np.nan) == reached)
+    return next((one.saturated for one in those), None)
 
 
 def _at_the_supply(row: Row) -> str:

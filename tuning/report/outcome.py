@@ -101,8 +101,9 @@ def verdict(facts: TuningFacts) -> str:
 
 def answer(facts: TuningFacts) -> dict[str, str]:
     """Return the answer by label. An entry that cannot be computed is absent."""
+    label = "NOT held" if not facts.outcome["rotors_held"] else "Not verified" if facts.refuted else "Held"
     entries: dict[str, Callable[[], str]] = {
-        _label(facts): lambda: _held(facts),
+        label: lambda: _held(facts),
         "Error and voltage": lambda: _sizes(facts),
         "Sensitivity": lambda: sensitivity_table.line(facts.sensitivity),
         "Limited by": lambda: _limiting(facts),
@@ -111,12 +112,7 @@ def answer(facts: TuningFacts) -> dict[str, str]:
     return {label: text for label, text in found.items() if text}
 
 
-def _label(facts: TuningFacts) -> str:
-    return "NOT held" if not facts.outcome["rotors_held"] else "Not verified" if facts.refuted else "Held"
-
-
 def _held(facts: TuningFacts) -> str:
-    """Return the entry on the rotors that are held."""
     outcome, after = facts.outcome, facts.after
     which = "held-out members" if after["members"] else "training members"
     kept = outcome["members"] - outcome["lost"] - outcome["stalled"]
@@ -131,7 +127,6 @@ def _held(facts: TuningFacts) -> str:
 
 
 def _sizes(facts: TuningFacts) -> str:
-    """Return the entry on the error and the voltage after tuning, and before it."""
     after, before = facts.after, facts.before
     if not after["members"]:
         return "not measured on held-out members (tune.held_out = 0)."

@@ -1,6 +1,5 @@
-"""Pictures of a search and its answer, as PNG."""
+"""Pictures of a search and its answer."""
 
-import io
 from typing import Any
 
 import numpy as np
@@ -16,14 +15,14 @@ from tuning.report.front_table import letter
 
 
 @own_style
-def nominal(run: Trajectory, name: str, settle: float) -> bytes:
-    """Draw z - r and u (averaged over each sample) of a run, as in the overview of `ambjax simulate`, as PNG."""
-    return _png(overview_figure(run, name, settle=settle, shown=(ERROR.ylabel, AVERAGED.ylabel)))
+def nominal(run: Trajectory, name: str, settle: float) -> Figure:
+    """Draw z - r and u (averaged over each sample) of a run, as in the overview of `ambjax simulate`."""
+    return overview_figure(run, name, settle=settle, shown=(ERROR.ylabel, AVERAGED.ylabel))
 
 
 @own_style
-def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
-    """Draw the amplitude spectrum of u (V, averaged over each sample) of runs by name after `settle` (s), as PNG."""
+def spectrum(runs: dict[str, Trajectory], settle: float) -> Figure:
+    """Draw the amplitude spectrum of u (V, averaged over each sample) of runs by name after `settle` (s)."""
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     ax, top = figure.subplots(), 0.0
     for name, run in runs.items():
@@ -37,7 +36,7 @@ def spectrum(runs: dict[str, Trajectory], settle: float) -> bytes:
     ax.set_ylim(1e-5 * (top or 1.0), 2 * (top or 1.0))
     ax.grid(alpha=0.3, which="both")
     ax.legend(fontsize=8)
-    return _png(figure)
+    return figure
 
 
 def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
@@ -56,8 +55,8 @@ def amplitudes(values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarra
 
 
 @own_style
-def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
-    """Draw the goal and the gains of the best point over the iterations, as PNG."""
+def convergence(history: dict[str, np.ndarray], paths: list[str]) -> Figure:
+    """Draw the goal and the gains of the best point over the iterations."""
     value, gains = history["value"], history["gains"]
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -74,12 +73,12 @@ def convergence(history: dict[str, np.ndarray], paths: list[str]) -> bytes:
         for at in np.flatnonzero(np.diff(history["members"])):
             ax.axvline(at + 1.5, color="0.5", ls=":", lw=1)
         ax.grid(alpha=0.3)
-    return _png(figure)
+    return figure
 
 
 @own_style
-def front(rows: list[dict[str, Any]]) -> bytes:
-    """Draw settled rms error against settled rms voltage, as PNG. A cross marks a point with lost or stalled members.
+def front(rows: list[dict[str, Any]]) -> Figure:
+    """Draw settled rms error against settled rms voltage. A cross marks a point with lost or stalled members.
 
     The label of each point contains its letter in the table, its error and its voltage.
     """
@@ -107,10 +106,4 @@ def front(rows: list[dict[str, Any]]) -> bytes:
     low, high = ax.get_xlim()
     ax.set_xlim(low, high + 0.3 * (high - low))  # space for the text next to the last point
     ax.grid(alpha=0.3, which="both")
-    return _png(figure)
-
-
-def _png(figure: Any) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
+    return figure

@@ -1,30 +1,46 @@
 """The sensitivity in the report: linear and injected peaks of |S| of held-out members, and their zones."""
 
-import dataclasses
-
+from ambjax.linear import Zones
 from ambjax.linear.stability import MOST_TESTED
 from ambjax.text.web_page import escape_markdown
-from tuning.judge.peaks import Sensitivity, injects
-from tuning.problem.tuning_problem import TuningProblem
+from tuning.judge.peaks import MemberPeak, Sensitivity
 from tuning.report.facts import Column, Row, number, table
 
+UNSTABLE = "its linearised loop is not stable"
 # Text in place of the linear peak of a loop without one, by its zone.
 NO_PEAK = {"D": "unstable", None: "not computed"}
 
 
-def facts(problem: TuningProblem, injected: Sensitivity) -> Row:
-    """Return plain data: a row for each member of `injected`, and the limits of the zones.
+def facts(zones: Zones, found: Sensitivity) -> Row:
+    """Return plain data: a row for each member, and the limits of the zones.
 
-    `zone` of a row is that of the linear peak, `injected_zone` that of the injected one. `why`: why there is no linear
-    peak; '' if there is one.
+    Fields of a row:
+
+    - `linear`, `frequency_hz`, `zone`: peak of |S| of the linearised loop. If it is not stable, they are None, None and
+      "D"; if it could not be computed, all are None. `why`: which of the two, with the cause; '' otherwise.
+    - `peak`, `low`, `high`, `at_hz`: injected, with the 95 % interval; None if all injections lose the rotor or the
+      laws run in continuous time. `injected_zone`: its zone. `saturated`: share of samples with the supply at its
+      limit. `repetitions`: number of injections; 0 in continuous time. `lost`: in how many of them the rotor is lost or
+      the run stalls.
     """
-    zones = problem.case.zones
-    rows = []
-    for one in injected.peaks:
-        row = {name: value for name, value in dataclasses.asdict(one).items() if name != "largest"}
-        row["injected_zone"] = "D" if one.lost else None if one.peak is None else zones.zone(one.peak)
-        rows.append(row)
-    return {"members": rows, "injected": injects(problem), "decides": injected.decides, "zones": zones.limits}
+    injected = any(one.injected for one in found.peaks)
+    rows = [_row(one, zones) for one in found.peaks]
+    return {"members": rows, "injected": injected, "decides": found.decides, "zones": zones.limits}
+
+
+def _row(one: MemberPeak, zones: Zones) -> Row:
+    row: Row = {"member": one.member} | dict.fromkeys(("linear", "frequency_hz", "zone")) | {"why": ""}
+    if isinstance(one.linear, str):
+        row["why"] = f"it cannot be linearised: {one.linear}"
+    elif not one.linear.stable:
+        row |= {"zone": "D", "why": UNSTABLE}
+    else:
+        row |= {"linear": one.linear.S.height, "frequency_hz": one.linear.S.frequency, "zone": one.linear.zone}
+    row |= dict.fromkeys(("peak", "low", "high", "at_hz", "saturated")) | {"lost": 0, "repetitions": 0}
+    if (at := one.injected) is not None:
+        row |= {"peak": at.peak, "low": at.peak_low, "high": at.peak_high, "at_hz": at.peak_frequency}
+        row |= {"saturated": at.saturated, "lost": at.lost, "repetitions": at.members}
+    return row | {"injected_zone": "D" if row["lost"] else None if row["peak"] is None else zones.zone(row["peak"])}
 
 
 def line(found: Row | None) -> str:
