@@ -15,8 +15,9 @@ from ambjax.cases.rotor_tables import tables_of
 from ambjax.cases.table import Table
 from ambjax.control.lqg import LqgWeights
 from ambjax.extend import canonical
+from ambjax.simulation.machine_axes import loop_of
 from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.whole_machine import Machine, loop_of
+from ambjax.simulation.whole_machine import Machine
 from tuning.problem.gains_table import chosen, flattened
 from tuning.problem.space import Space, read, tunable, with_gain
 
