@@ -192,7 +192,7 @@ class Cascade:
 
         point = (sample.reference, measured.z, measured.z_dot, state.observer, state.position)
         (z, v_star), (now, estimate, *after) = demanded(*point)
-        z_ddot, rates = self.model.z_ddot(estimate.z, estimate.i), [*after]
+        z_ddot, rates = self.model.z_ddot(estimate.z, estimate.i), list[Any](after)
         if period is not None:
             rates = jax.tree.map(lambda a, b: (b - a) / period, [state.observer, state.position], after)
         if estimated:

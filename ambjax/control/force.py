@@ -15,17 +15,17 @@ def sliding_variable(c: Scalar, motion: Measurement, reference: Reference) -> Ar
     return motion.z_dot - reference.r_dot + c * (motion.z - reference.r)
 
 
-def sigma_by_c(law: Any, motion: Measurement, reference: Reference) -> Array:
+def sigma_by_c(self: Any, motion: Measurement, reference: Reference) -> Array:
     """Return `sigma` of a law with the rate `c` on its sliding manifold: e_dot + c e."""
-    return sliding_variable(law.c, motion, reference)
+    return sliding_variable(self.c, motion, reference)
 
 
-def sigma_by_gains(law: Any, motion: Measurement, reference: Reference) -> Array:
+def sigma_by_gains(self: Any, motion: Measurement, reference: Reference) -> Array:
     """Return `sigma` of a law with the gains k_p and k_d: e_dot + (k_p/k_d) e, the error that the feedback removes."""
-    return sliding_variable(law.k_p / law.k_d, motion, reference)
+    return sliding_variable(self.k_p / self.k_d, motion, reference)
 
 
-def sigma_size(law: Any, model: Plant) -> Scalar:
+def sigma_size(self: Any, model: Plant) -> Scalar:
     """Return `size` of a law whose sign has the argument sigma, m/s."""
     return model.sigma_size
 

@@ -103,7 +103,7 @@ class UtkinSlidingMode(OneIntegral, PositionLaw[Array]):
     35th IEEE Conf. Decision and Control, 1996, 4591-4596). x starts at -(e_dot + k_d e), so that s = 0 from the
     beginning: there is no reaching phase, and for |q_z| < k the error follows e_ddot = -k_p e - k_d e_dot at all times,
     up to the smoothing of the sign.
-    `integral_sliding.IntegralSlidingMode` starts its integral at 0 instead. A trajectory does not contain s; it reports
+    `IntegralSlidingMode` starts its integral at 0 instead. A trajectory does not contain s; it reports
     e_dot + (k_p/k_d) e as sigma. The default k_p and k_d for a model place a double pole at -w/3, where w is
     the unstable pole of the magnets.
 

@@ -108,7 +108,7 @@ class OneIntegral(Law):
         return jnp.zeros(())
 
 
-def no_slope(law: Law, model: Plant) -> Scalar:
+def no_slope(self: Law, model: Plant) -> Scalar:
     """Return `slope` of a law that passes its input on: 0."""
     return 0.0
 

@@ -25,7 +25,7 @@ def axpy(state: S, *terms: tuple[Scalar, S]) -> S:
     return state
 
 
-def choose(condition: Array, yes: S, no: S) -> S:
+def choose(condition: Array | bool, yes: S, no: S) -> S:
     """Apply jnp.where to every leaf of two states."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 

@@ -10,7 +10,7 @@ import functools
 import itertools
 import operator
 from collections.abc import Sequence
-from typing import Self
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -155,7 +155,7 @@ class Sampled:
         """Return the state with the results of the laws, and whether they are kept."""
         (command, control, estimate), past = stepped, sample.past
         command = command._replace(u=limited(command.u, sample.u_max))
-        new = materialised((control, command, self._next_guard_state(checked, estimate, (command.u, *past))))
+        new: Any = materialised((control, command, self._next_guard_state(checked, estimate, (command.u, *past))))
         # The sum is 0 only if every number is finite: 0 times NaN or infinity is NaN.
         finite = materialised(sum(0.0 * x for x in jax.tree.leaves(new))) == 0
         keeps = finite if checked is None else finite & checked.steps

@@ -64,7 +64,8 @@ class LawSignalsRecorder(Extended):
         return LawSignalsState(after, LawSignals(sigma, command.v_tilde, estimate.i - command.i_ref))
 
     def advance(self, method: Integrator, errors: Errors, begin: Begin[LawSignalsState], period: Scalar) -> Advanced:
-        after = self.loop.advance(method, errors, begin._replace(state=begin.state.loop), period)
+        first = Begin(begin.t, begin.state.loop, begin.memory, begin.code)
+        after = self.loop.advance(method, errors, first, period)
         return after._replace(state=begin.state._replace(loop=after.state))
 
     def row(self, t: Scalar, state: LawSignalsState, errors: Errors, alive: Array) -> LawSignalsRow:
