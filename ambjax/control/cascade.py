@@ -42,7 +42,6 @@ from ambjax.world.waveforms import Reference
 _CONTINUOUS = Processor(delay=0.0, predict=False, guard=None)
 # Marks a law that is not given. `Cascade.__post_init__` replaces it by the default law.
 _LEFT_OUT: Any = None
-# The default law of each stage.
 DEFAULT_LAWS = {
     "observer": observer.Direct,
     "position": position.SlidingMode,
