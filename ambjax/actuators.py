@@ -7,7 +7,6 @@ For example:
     Scenario(u_max=48.0, amplifier=actuators.Amplifier(bandwidth=2e3))
 """
 
-from ambjax.world.amplifier import Amplifier, CurrentAmplifier
-from ambjax.world.coil_limits import CoilLimits
+from ambjax.world.amplifier import Amplifier, CoilLimits, CurrentAmplifier
 
 __all__ = ["Amplifier", "CoilLimits", "CurrentAmplifier"]

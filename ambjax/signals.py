@@ -7,9 +7,8 @@ For example:
     Scenario(reference=signals.Sine(1e-4, 20.0), q_z=signals.Step(0.5, start=0.1))
 """
 
-from ambjax.world.band_noise import BandNoise
 from ambjax.world.ramps import Ramp, Trapezoid
-from ambjax.world.recorded import Recorded, Samples
+from ambjax.world.recorded import BandNoise, Recorded, Samples
 from ambjax.world.rotation import Rotation, Unbalance, UnbalanceGrade
 from ambjax.world.waveforms import Chirp, Constant, Pulse, Sine, SmoothStep, Step, Sum
 

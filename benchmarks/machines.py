@@ -28,8 +28,7 @@ from ambjax.cases.machine_case import MachineCase, machine_from
 from ambjax.cases.template_text import template
 from ambjax.ensemble.machines import run_machines
 from ambjax.results.machine_study import MachineStudy
-from ambjax.simulation.folds import Peak
-from ambjax.simulation.whole_machine import PerAxis
+from ambjax.simulation.folds import Peak, PerAxis
 
 MEMBERS, SAMPLES, REPEATS = 1024, 500, 9
 # Vectors that machines.c interleaves, of which two are faster with smooth signs and one with set-valued signs.

@@ -29,8 +29,7 @@ from ambjax.numerics.declared import within
 from ambjax.results.outputs import files
 from ambjax.simulation.clock import Clock
 from ambjax.world.amplifier import Amplifier
-from ambjax.world.coils import TwoCoil
-from ambjax.world.plant import Plant
+from ambjax.world.plant import Plant, TwoCoil
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Sensor
 from ambjax.world.waveforms import Chirp, Pulse, Sine, SmoothStep, Step

@@ -26,8 +26,8 @@ from ambjax.theorem.law_poles import law_poles
 from ambjax.theorem.law_signals import LawSignalsRecorder
 from ambjax.theorem.sampled_report import Delays, SampledReport, rolled
 from ambjax.world.amplifier import Amplifier
-from ambjax.world.coils import TwoCoil
 from ambjax.world.faults import Outliers
+from ambjax.world.plant import TwoCoil
 
 INF = math.inf
 LATE = [0.0, 0.2, 0.25, 0.4, 0.5, 0.8, 1.0, 1.3, 1.5, 2.0, 3.4]

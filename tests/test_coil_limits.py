@@ -17,11 +17,11 @@ from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.codegen.numbering import numbers_of
 from ambjax.commands.acceptance import machine
-from ambjax.simulation.integrate import InitialValueProblem
+from ambjax.simulation.integrate import Begin, InitialValueProblem
 from ambjax.solvers import RK4
-from ambjax.world.coil_limits import CoilLimits, difference
-from ambjax.world.coils import TwoCoil
+from ambjax.world.amplifier import CoilLimits, difference
 from ambjax.world.iron import Iron
+from ambjax.world.plant import TwoCoil
 from ambjax.world.sensor import Measurement
 
 STILL = TwoCoil(**RIG)
@@ -53,7 +53,7 @@ def driven(scenario, u, state, steps=STEPS, clamped=True):
         return moving._replace(z=0.0 * x.z, z_dot=0.0 * x.z) if clamped else moving
 
     problem = InitialValueProblem(lambda _: u, rates, plant.scale(), lambda _: jnp.asarray(0))
-    return RK4(steps).advance(problem, 0.0, steps * STEP, state, ()).state
+    return RK4(steps).advance(problem, Begin(0.0, state, ()), steps * STEP).state
 
 
 def free(i, volt, time):

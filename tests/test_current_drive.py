@@ -17,7 +17,7 @@ from ambjax.simulation.sliding import Slide, slides
 from ambjax.simulation.system import system_of
 from ambjax.solvers import AdaptiveCashKarp, AdaptiveRodas3, with_method
 from ambjax.world.amplifier import CurrentAmplifier
-from ambjax.world.coils import TwoCoil
+from ambjax.world.plant import TwoCoil
 from ambjax.world.sensor import Measurement
 from tuning.problem.tuning_problem import method_for
 

@@ -14,7 +14,7 @@ from ambjax import signals
 from ambjax.control.processor import Processor
 from ambjax.numerics.records import replaced
 from ambjax.simulation.edges import Edges, most_inside
-from ambjax.simulation.integrate import InitialValueProblem
+from ambjax.simulation.integrate import Begin, InitialValueProblem
 from ambjax.world.waveforms import edges_of, knots_of
 
 T = 1e-4
@@ -73,7 +73,7 @@ def test_an_integral_is_exact_wherever_the_rate_jumps_or_has_a_kink(method, name
     edges = Edges(edges_of(signal), len(edges_of(signal)) + sum(len(one.times) for one in knots), knots)
     rates = lambda inputs, state: signal(inputs)  # noqa: E731
     problem = InitialValueProblem(lambda t: t, rates, 1.0, lambda state: jnp.int32(0), edges=edges)
-    end = method.advance(problem, 1.0, 1.0, jnp.zeros(()), method.start(1.0))
+    end = method.advance(problem, Begin(1.0, jnp.zeros(()), method.start(1.0)), 1.0)
     assert float(end.t) == 2.0
     if name == "linear" and isinstance(method, amb.solvers.Euler):
         return  # not exact for a straight line
@@ -107,7 +107,7 @@ def spread(**values):
     ],
 )
 def test_the_number_of_edges_inside_a_sample(scenario, most):
-    assert most_inside(scenario, T) == most
+    assert most_inside(scenario.edges(), T, scenario.knots()) == most
     assert amb.solvers.with_method(amb.Clock(10, T), SOFT, scenario).cuts == most
     clock = replaced(amb.Clock(10, T), cuts=1)  # counted for the whole of which this is a part
     assert amb.solvers.with_method(clock, SOFT, scenario).cuts == max(most, 1)
@@ -119,7 +119,7 @@ def test_derivatives_in_the_time_of_an_edge():
     def end(start):
         rates = lambda t, y: amb.signals.Step(2.0, start)(t) - y  # noqa: E731
         problem = InitialValueProblem(lambda t: t, rates, 1.0, lambda state: jnp.int32(0), edges=Edges((start,), 1))
-        return amb.solvers.RK4(20).advance(problem, 1.0, 1.0, jnp.zeros(()), ()).state
+        return amb.solvers.RK4(20).advance(problem, Begin(1.0, jnp.zeros(()), ()), 1.0).state
 
     at = 1.337
     slopes = [derivative(end)(at) for derivative in (jax.jacfwd, jax.grad)]

@@ -29,8 +29,8 @@ from ambjax.simulation.rosenbrock import AdaptiveRodas3
 from ambjax.simulation.trajectory import TOUCHED
 from ambjax.solvers import RK4
 from ambjax.world.amplifier import Amplifier
-from ambjax.world.coils import TwoCoil
 from ambjax.world.faults import Dropouts, Outliers
+from ambjax.world.plant import TwoCoil
 from ambjax.world.rotation import Runout
 
 

@@ -13,7 +13,7 @@ from structures import METHODS
 
 import ambjax as amb
 from ambjax.cases.template_text import template
-from ambjax.simulation.integrate import InitialValueProblem
+from ambjax.simulation.integrate import Begin, InitialValueProblem
 from ambjax.simulation.method import QUIET_TIGHT, QUIET_TOLERANCE, TIGHT, TOLERANCE
 from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED
 
@@ -30,7 +30,7 @@ def problem(rates, scale=1.0, status=lambda state: jnp.zeros((), jnp.int32)):
 @functools.partial(jax.jit, static_argnames=("rates",))
 def end_of(method, rates, t, span, state):
     scale = jax.tree.map(jnp.ones_like, state)
-    return method.advance(problem(rates, scale), t, span, state, method.start(span)).state
+    return method.advance(problem(rates, scale), Begin(t, state, method.start(span)), span).state
 
 
 def curved(t, state):
@@ -152,9 +152,8 @@ def test_integration_stops_at_the_first_invalid_state_and_returns_the_last_valid
     def status(y):
         return jnp.where(y < 0.55, 0, 2).astype(jnp.int32)
 
-    out = method.advance(
-        problem(lambda t, y: jnp.ones(()), status=status), 3.0, 1.0, jnp.asarray(0.0), method.start(1.0)
-    )
+    begin = Begin(3.0, jnp.asarray(0.0), method.start(1.0))
+    out = method.advance(problem(lambda t, y: jnp.ones(()), status=status), begin, 1.0)
     assert int(out.code) == 2
     assert float(out.state) < 0.55 <= float(out.t) - 3.0  # y = t - 3: the time is that of the bad state
     if step := method.step_size(1.0):
@@ -175,12 +174,12 @@ def test_the_time_of_a_touchdown_is_that_of_the_crossing_inside_a_step(method, s
 
     fall = problem(rates, (1.0, 1.0), status)._replace(motion=lambda state: state, limit=0.6)
     zero = jnp.zeros(())
-    out = method.advance(fall, 0.0, 2.0, (zero, zero), method.start(2.0))
+    out = method.advance(fall, Begin(0.0, (zero, zero), method.start(2.0)), 2.0)
     assert int(out.code) == TOUCHED
     exact = float(np.real(np.roots([1 / 6, 1 / 2, 0.0, -0.6])[2]))
     # Methods of order 3 and more are exact for this cubic, and so is the cubic between the ends of a step.
     assert float(out.t) == pytest.approx(exact, rel=1e-12)
-    one = lambda x: method.advance(fall, 0.0, 2.0, (x, zero), method.start(2.0)).t  # noqa: E731
+    one = lambda x: method.advance(fall, Begin(0.0, (x, zero), method.start(2.0)), 2.0).t  # noqa: E731
     assert float(jax.jacfwd(one)(zero)) == 0.0  # the time is no function of the state to JAX
 
 
@@ -191,7 +190,7 @@ def test_a_divergent_solution_ends_with_a_status_and_a_finite_state(method):
         return jnp.where(jnp.abs(y) < 1e3, 0, 2).astype(jnp.int32)
 
     p = problem(lambda t, y: jnp.exp(y), status=status)
-    out = method.advance(p, 0.0, 10.0, jnp.asarray(0.0), method.start(10.0))  # y = -log(1 - t)
+    out = method.advance(p, Begin(0.0, jnp.asarray(0.0), method.start(10.0)), 10.0)  # y = -log(1 - t)
     assert int(out.code) in (2, STALLED)
     assert np.isfinite(float(out.state))
 
@@ -264,7 +263,7 @@ def test_the_chosen_step_resolves_coils_that_settle_within_a_sample(kind):
             lambda t: (), lambda _, x: plant.rates(x, 10.0), plant.scale(), lambda x: jnp.int32(0)
         )
         start = plant.start(amb.world.sensor.Measurement(*map(jnp.asarray, (1e-4, 0.0, -0.2))))
-        return plant.measurement(amb.solvers.RK4(substeps).advance(held, 0.0, period, start, ()).state)
+        return plant.measurement(amb.solvers.RK4(substeps).advance(held, Begin(0.0, start, ()), period).state)
 
     error = np.abs(np.subtract(moved(method.substeps), moved(20 * method.substeps)))
     np.testing.assert_array_less(error, [1e-11, 1e-6, 1e-6])

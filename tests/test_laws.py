@@ -14,6 +14,7 @@ import pytest
 from ambjax import Cascade, Clock, Scenario, rollout
 from ambjax.control import current, inversion, observer, position
 from ambjax.control.base import scaled_steepness
+from ambjax.control.cascade_state import Sample
 from ambjax.control.force import linear_mechanics
 from ambjax.control.pid import PIDState
 from ambjax.control.search import LowerBound, SearchContext
@@ -355,13 +356,13 @@ def test_the_rates_of_the_demand_are_derivatives_along_the_nominal_solution(watc
             observer=() if not has_state(watch) else x[3], position=() if not has_state(law) else x[7]
         )
         t = 0.1 + 30 * jnp.abs(x[4])
-        _, _, rates = cascade.demand(motion, state, reference_at(reference, t))
+        _, _, rates, _ = cascade.demand(motion, state, Sample(reference_at(reference, t)))
         seen = motion.z if not has_state(watch) else x[3]
         moved = Measurement(x[0] + s * x[1], x[1] + s * MODEL.z_ddot(seen, x[2]), x[2])
         later = jax.tree.map(
             lambda a, b: a + s * b, state, state._replace(observer=rates.observer, position=rates.position)
         )
-        return cascade.demand(moved, later, reference_at(reference, t + s))[0]
+        return cascade.demand(moved, later, Sample(reference_at(reference, t + s)))[0]
 
     h = 1e-8
     for x in samples(50):

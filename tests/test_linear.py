@@ -18,7 +18,7 @@ from ambjax.linear.matrices import rest
 from ambjax.plants import Plant
 from ambjax.sensors import Sensor
 from ambjax.world.amplifier import Amplifier
-from ambjax.world.coils import TwoCoil
+from ambjax.world.plant import TwoCoil
 from ambjax.world.scenario import Initial
 
 T = 1e-4

@@ -29,9 +29,8 @@ from ambjax.page.rotor_motion import motion_of
 from ambjax.pictures.machine_pictures import machine_figure
 from ambjax.results.machine_run import simulate_machine
 from ambjax.results.runs import simulate
-from ambjax.simulation.folds import Rms
+from ambjax.simulation.folds import PerAxis, Rms
 from ambjax.simulation.rollout import run
-from ambjax.simulation.whole_machine import PerAxis
 from ambjax.world.shaft import Section, shaft_model
 
 MACHINE = tomllib.loads(template("machine"))

@@ -9,9 +9,8 @@ from scipy.integrate import solve_ivp
 from ambjax import Cascade, Clock, Scenario, rollout
 from ambjax.cases.reader import case_from
 from ambjax.control import inversion
-from ambjax.control.exact import WIDTH
+from ambjax.control.exact import LAM, WIDTH
 from ambjax.control.observer import IRED1, IRED2, Complementary, Difference, Direct, Kalman, Predicted
-from ambjax.numerics import differentiator
 from ambjax.plants import Plant
 from ambjax.sensors import Sensor
 from ambjax.signals import Sine
@@ -183,7 +182,7 @@ def test_the_differentiators_in_continuous_time(law):
     """They are exact except for the smoothed sign, which delays them by about (width/L)^(1/(m+1)) seconds."""
     order = 1 if isinstance(law, IRED1) else 2
     late = (WIDTH * MODEL.s_0 / law.L) ** (1 / (order + 1))
-    assert law.slope(MODEL) == pytest.approx(differentiator.LAM[order][0] / late)
+    assert law.slope(MODEL) == pytest.approx(LAM[order][0] / late)
 
     def rates(t, x):
         return jnp.stack(law(MODEL, Measurement(motion(t, jnp)[0], 0.0, 0.0), tuple(x))[1])

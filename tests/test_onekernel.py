@@ -17,7 +17,7 @@ from ambjax.sensors import Sensor
 from ambjax.signals import Constant, Pulse, Recorded, Samples, Sine
 from ambjax.simulation.folds import Named, Peak, Variation
 from ambjax.solvers import RK4, AdaptiveRodas3
-from ambjax.world.band_noise import BandNoise
+from ambjax.world.recorded import BandNoise
 
 MEMBERS, CLOCK = 37, Clock(5, 1e-4, RK4(2))
 CASCADE = Cascade(inversion=inversion.Adaptive(np.linspace(1e8, 1e9, MEMBERS), 25e-6))

@@ -17,12 +17,13 @@ from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
 from ambjax.linear import loop_matrices
+from ambjax.simulation.integrate import Begin
 from ambjax.simulation.rollout import prepare
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import DIVERGED
 from ambjax.solvers import RK4
 from ambjax.world.amplifier import Amplifier
-from ambjax.world.coils import TwoCoil
+from ambjax.world.plant import TwoCoil
 
 INF = math.inf
 
@@ -307,7 +308,7 @@ def test_a_law_whose_result_is_not_finite_keeps_its_state_and_ends_the_run():
     lost = start._replace(plant=start.plant._replace(i=jnp.asarray(jnp.inf)))
     after = system.jump(0.0, lost, system.sensor_errors(0))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((after.control, after.command)))
-    ended = system.advance(RK4(1), system.sensor_errors(0), 0.0, 1e-4, after, (), jnp.asarray(0))
+    ended = system.advance(RK4(1), system.sensor_errors(0), Begin(0.0, after, (), jnp.asarray(0)), 1e-4)
     assert ended.code == DIVERGED
 
 

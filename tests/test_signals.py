@@ -11,7 +11,7 @@ from ambjax import Cascade, Clock, Scenario, rollout
 from ambjax.laws import inversion
 from ambjax.signals import BandNoise, Chirp, Constant, Pulse, Sine, SmoothStep, Step, Sum
 from ambjax.solvers import RK4
-from ambjax.world.band_noise import LINES
+from ambjax.world.recorded import LINES
 from ambjax.world.waveforms import reference_at
 
 T = np.array([0.0, 0.013, 0.1, 0.2501, 0.77, 3.0])

@@ -15,6 +15,7 @@ from ambjax.control.processor import Processor
 from ambjax.control.sampling import Sampling
 from ambjax.linear import analyse, linearise
 from ambjax.linear.equilibrium import equilibrium, ideal
+from ambjax.simulation.system import reads_velocity
 
 T = 5e-5
 # A bearing with a current amplifier: chain without observer, PD unless k_int is given.
@@ -160,7 +161,7 @@ REFUSED = r"sensor\.velocity = false: the velocity is not measured.*predict = fa
 def test_a_measured_velocity_is_needed_only_by_laws_that_use_it(changes, reads):
     given = tables(**changes)
     cascade = case_from({**given, "sensor": {}}).cascade
-    assert cascade.reads_velocity(T) == reads
+    assert reads_velocity(cascade, T) == reads
     if reads:
         with pytest.raises(ValueError, match=REFUSED):
             case_from(given)

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 import ambjax as amb
 from ambjax.cases.reader import case_from
 from ambjax.ensemble.spread import apply
-from ambjax.numerics.runge_kutta import rk4_step
+from ambjax.numerics.linear import rk4_step
 from ambjax.simulation.method import TOUCHED
 from ambjax.world.sensor import Measurement
 from ambjax.world.touchdown import DAMPING_DEPTH

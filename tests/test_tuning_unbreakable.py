@@ -12,8 +12,8 @@ from ambjax import rollout
 from ambjax.extend import canonical
 from ambjax.simulation.folds import Named
 from ambjax.simulation.metrics import Metrics
-from ambjax.world.coil_limits import difference
-from ambjax.world.coils import Currents
+from ambjax.world.amplifier import difference
+from ambjax.world.plant import Currents
 from tuning.problem.limits import bounds_of, measures
 from tuning.problem.quantities import KINDS, LimitContext
 from tuning.report import limit_table

@@ -13,11 +13,10 @@ from ambjax.cases.table import cut
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import require_concrete
 from ambjax.numerics.shapes import require_one_member
-from ambjax.simulation.clock import Clock
+from ambjax.simulation.clock import Clock, no_case
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import settled
 from ambjax.simulation.system import check_parts, require_records
-from ambjax.simulation.triple import no_case
 from ambjax.world.scenario import Scenario
 
 P = ParamSpec("P")

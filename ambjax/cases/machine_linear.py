@@ -16,8 +16,8 @@ from ambjax.cases.table import Table, show
 from ambjax.control.current import AmplifierCurrent
 from ambjax.control.linear_controller import OUTPUTS, SAME_PERIOD
 from ambjax.control.lqg import DesignedController, LinearCoils, LqgWeights, RotorModel, design
+from ambjax.control.machine_law import BOTH, CURRENTS, ERROR, StateSpaceLaw
 from ambjax.control.realisation import several
-from ambjax.control.state_space_law import BOTH, CURRENTS, ERROR, StateSpaceLaw
 from ambjax.world.rotation import PER_MINUTE
 from ambjax.world.rotor import Rotor
 

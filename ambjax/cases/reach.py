@@ -9,9 +9,8 @@ import numpy as np
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import Spread, ends
 from ambjax.simulation.clock import Clock
-from ambjax.world.band_noise import BandNoise
 from ambjax.world.ramps import Trapezoid
-from ambjax.world.recorded import Recorded
+from ambjax.world.recorded import BandNoise, Recorded
 from ambjax.world.scenario import Scenario
 from ambjax.world.waveforms import Sum
 

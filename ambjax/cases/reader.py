@@ -25,17 +25,15 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import Spread, corners, ends
 from ambjax.linear.analysis import Zones
 from ambjax.numerics.declared import require_number
-from ambjax.simulation.clock import Clock
+from ambjax.simulation.clock import PARTS, Clock
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import settled
 from ambjax.simulation.sliding import Slide, slides
 from ambjax.simulation.system import check_parts
-from ambjax.simulation.triple import PARTS
 from ambjax.text.words import one_line
 from ambjax.world.bearing import Bearing
-from ambjax.world.coils import TwoCoil
 from ambjax.world.iron import Iron
-from ambjax.world.plant import Plant
+from ambjax.world.plant import Plant, TwoCoil
 from ambjax.world.scenario import Scenario
 
 T = TypeVar("T")

@@ -10,13 +10,11 @@ from ambjax.cases.table import Table, show
 from ambjax.numerics.records import leaf
 from ambjax.simulation.clock import Clock
 from ambjax.world import waveforms
-from ambjax.world.amplifier import Amplifier, CurrentAmplifier
-from ambjax.world.band_noise import BandNoise
+from ambjax.world.amplifier import Amplifier, CoilLimits, CurrentAmplifier
 from ambjax.world.bearing import Bearing
-from ambjax.world.coil_limits import CoilLimits
 from ambjax.world.faults import VALUES, Dropouts, Outliers
 from ambjax.world.ramps import Ramp, Trapezoid
-from ambjax.world.recorded import Recorded
+from ambjax.world.recorded import BandNoise, Recorded
 from ambjax.world.rotation import Harmonic, Runout, Unbalance, UnbalanceGrade
 from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.sensor import Sensor

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.numerics.declared import check_number, numbers
-from ambjax.numerics.records import check_leaf, is_traced, leaves_of
+from ambjax.numerics.declared import check_number, leaves_of, numbers
+from ambjax.numerics.records import check_leaf, is_traced
 from ambjax.numerics.shapes import axes_of, check_shapes
 from ambjax.text.synonyms import hint, other_words
 from ambjax.text.words import one_line

@@ -15,6 +15,7 @@ from ambjax.cases.plausibility import implausible
 from ambjax.cases.reach import reach, widest
 from ambjax.cases.reader import Case
 from ambjax.cases.table import FILE, require_file, text_of
+from ambjax.simulation.system import reads_velocity
 from ambjax.text.words import one_line
 from ambjax.world.scenario import Scenario
 
@@ -91,7 +92,7 @@ def _noise(case: Case) -> Iterator[str]:
 
 def _velocity(case: Case) -> Iterator[str]:
     sensor, sampled = case.scenario.sensors, case.scenario.sensor or case.cascade.sampled
-    if sensor.velocity and sensor.std_z_dot == 0 and sampled and case.cascade.reads_velocity(case.clock.sample_period):
+    if sensor.velocity and sensor.std_z_dot == 0 and sampled and reads_velocity(case.cascade, case.clock.sample_period):
         yield (
             "sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ERROR, unlike by any real sensor. Set "
             "sensor.std_z_dot, or set sensor.velocity = false and use an observer that estimates the velocity."
@@ -103,7 +104,7 @@ def idealised(case: Case) -> str:
     parts = []
     if case.scenario.plant.one_current:
         parts.append("one current for both coils (plant.kind = 'two-coil' gives each its own)")
-    if case.scenario.sensors.velocity and case.cascade.reads_velocity(case.clock.sample_period):
+    if case.scenario.sensors.velocity and reads_velocity(case.cascade, case.clock.sample_period):
         parts.append("a measured velocity (sensor.velocity = false, and an observer that estimates it)")
     return f"Idealisations of this case, unlike a real bearing: {' and '.join(parts)}." if parts else ""
 

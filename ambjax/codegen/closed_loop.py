@@ -18,10 +18,10 @@ from ambjax.codegen.trace import arguments
 from ambjax.codegen.twins import Horizon, LoopCase, farthest, horizons
 from ambjax.control.cascade_state import Command
 from ambjax.numerics.records import Scalar, canonical, record, static
+from ambjax.simulation.between import SampledState
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import begin, segment
 from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.system import sampled_of
 from ambjax.world.sensor import Errors
 

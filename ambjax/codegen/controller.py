@@ -16,11 +16,11 @@ from ambjax.control.base import memory_of
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
 from ambjax.control.guard import GAPS, Watch
+from ambjax.numerics.linear import choose
 from ambjax.numerics.records import Scalar, leaf, record
-from ambjax.simulation.integrate import choose
+from ambjax.simulation.between import SampledState
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.system import guarded
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement, Sensor

@@ -25,8 +25,8 @@ from ambjax.codegen.interface import (
 )
 from ambjax.codegen.numbering import Number
 from ambjax.codegen.plant_step import PlantMemory, PlantParameters, PlantStep
+from ambjax.numerics.linear import choose
 from ambjax.numerics.records import Scalar
-from ambjax.simulation.integrate import choose
 from ambjax.simulation.trajectory import ALIVE
 
 

@@ -21,13 +21,13 @@ from ambjax.codegen.numbering import Number, earlier, numbers_of
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import Command
 from ambjax.control.processor import MOST_DELAY
+from ambjax.numerics.linear import choose
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.numerics.smooth import limited
-from ambjax.simulation.between import lags, plant_status
-from ambjax.simulation.integrate import FixedSteps, choose
+from ambjax.simulation.between import SampledState, lags, plant_status
+from ambjax.simulation.integrate import Begin, FixedSteps
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED
 from ambjax.world.amplifier import Amplifier, CurrentAmplifier
 from ambjax.world.bearing import Bearing
@@ -166,7 +166,7 @@ class PlantStep(Block):
             u_a=memory.u_a,
         )
         code = jnp.where(memory.lost == TOUCHED, TOUCHED, jnp.where(memory.lost == ALIVE, ALIVE, DIVERGED))
-        after = system.advance(self.method, Errors(zero, zero, zero), 0.0, system.period, state, (), code)
+        after = system.advance(self.method, Errors(zero, zero, zero), Begin(0.0, state, (), code), system.period)
         lost_now = (code == ALIVE) & (after.code != ALIVE)
         new = choose(lost_now, system.rest(after.state, after.code), after.state)
         before, lost = past[:-1], _real(after.code)

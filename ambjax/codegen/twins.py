@@ -7,7 +7,7 @@ While the twins stay close to JAX's loop, a correct program does too.
 """
 
 import dataclasses
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +20,11 @@ from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import Command
 from ambjax.control.guard import Watch
 from ambjax.numerics.records import Scalar, canonical, record, static
+from ambjax.simulation.between import SampledState
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.integrate import Advanced
+from ambjax.simulation.integrate import Advanced, Begin, Integrator
 from ambjax.simulation.rollout import run
 from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.system import sampled_of
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors
@@ -91,16 +91,15 @@ class Twin(Sampled):
         stepped = super().jump(t, state, errors)
         return stepped._replace(command=self._moved(after, stepped.command, self._sizes(stepped).command))
 
-    def advance(self, *now: Any, **named: Any) -> Advanced:
+    def advance(self, method: Integrator, errors: Errors, begin: Begin[SampledState], period: Scalar) -> Advanced:
         if not self.held:
-            return super().advance(*now, **named)
-        method, errors, t, period, *rest = now
-        loop = self.loop
+            return super().advance(method, errors, begin, period)
+        loop, t = self.loop, begin.t
         outside, none = loop.inputs(just_after(t)), loop.scenario.undisturbed()
         scenario = dataclasses.replace(none, q_z=Constant(outside.q_z), q_i=Constant(outside.q_i))
         # the exported plant has no time: t = 0 at the start of each sample
         held = Sampled(dataclasses.replace(loop, scenario=scenario), period, 0)
-        after = held.advance(method, errors, jnp.zeros(()), period, *rest, **named)
+        after = held.advance(method, errors, begin._replace(t=jnp.zeros(())), period)
         return after._replace(t=t + after.t)
 
     def _moved(self, key: Array, state: T, sizes: T) -> T:

@@ -13,7 +13,7 @@ from ambjax.control.cascade import DEFAULT_LAWS
 from ambjax.linear import PLACES, Analysis, analyse, linearise
 from ambjax.results.operating import margin_numbers
 from ambjax.results.outputs import table
-from ambjax.world.coil_limits import difference
+from ambjax.world.amplifier import difference
 
 
 class Fact(NamedTuple):

@@ -10,12 +10,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from ambjax.compiler.barrier import materialised
 from ambjax.control import current, inversion, observer, position
-from ambjax.control.base import default_law, set_valued_signs, with_default_steepness, with_set_valued_signs
+from ambjax.control.base import default_law, with_default_steepness, with_set_valued_signs
 from ambjax.control.cascade_state import CascadeState, Command, Sample
 from ambjax.control.processor import Processor, predicted_over_delay
 from ambjax.control.schedule import extremes, with_gains_at
@@ -27,11 +26,12 @@ from ambjax.control.stages import (
     Observer,
     PositionLaw,
     State,
-    begin_law,
+    rates_along,
     step_law,
 )
 from ambjax.control.synchronous_notch import SynchronousNotch
-from ambjax.numerics.records import Scalar, is_traced, part, record, replaced
+from ambjax.numerics.linear import choose
+from ambjax.numerics.records import Scalar, part, record, replaced
 from ambjax.world.plant import Plant
 from ambjax.world.plant import State as NominalState
 from ambjax.world.rotation import Rotation
@@ -42,7 +42,6 @@ from ambjax.world.waveforms import Reference
 _CONTINUOUS = Processor(delay=0.0, predict=False, guard=None)
 # Marks a law that is not given. `Cascade.__post_init__` replaces it by the default law.
 _LEFT_OUT: Any = None
-# The default law of each stage.
 DEFAULT_LAWS = {
     "observer": observer.Direct,
     "position": position.SlidingMode,
@@ -89,22 +88,23 @@ class Cascade:
         states = [law.init(self.model) for law in rest]
         if reference is not None:
             estimate, _ = self.observed(measured, observed, reference)
-            position = with_gains_at(self.position, estimate.z, reference)
-            states[0] = position.begin(self.model, (estimate, reference))
+            states[0] = self.begun_position(estimate, reference, None)
         return CascadeState(observed, *states)
 
     def begun(self, measured: Measurement, sample: Sample, laws: CascadeState, started: Array) -> CascadeState:
         """Return the states of all laws with which a processor steps at a sample.
 
-        They are `laws` if `started`; otherwise the initial states for these readings. The position law starts from its
-        first estimate (`laws.begin_law`).
+        They are `laws` if `started`; otherwise the initial states for these readings and the first estimate.
         """
-        laws = _chosen(started, laws, self.init(measured))
+        laws = choose(started, laws, self.init(measured))
         estimate, *_ = self.estimate(measured, laws.observer, sample)
-        position = with_gains_at(self.position, estimate.z, sample.reference)
-        inputs, implicit = (estimate, sample.reference), self.timing.implicit
-        begun = begin_law(position, inputs, model=self.model, period=sample.period, implicit=implicit)
-        return laws._replace(position=_chosen(started, laws.position, begun))
+        begun = self.begun_position(estimate, sample.reference, sample.period)
+        return laws._replace(position=choose(started, laws.position, begun))
+
+    def begun_position(self, estimate: Measurement, reference: Reference, period: Scalar | None) -> Any:
+        """Return the first state of the position law, on a processor with this period (s) or in continuous time."""
+        law = with_gains_at(self.position, estimate.z, reference)
+        return law.first_state(self.model, (estimate, reference), period, self.timing.implicit)
 
     def scale(self) -> CascadeState:
         """Return the characteristic size of each state of the laws; integration errors are relative to it."""
@@ -165,68 +165,69 @@ class Cascade:
         return self.current.driven(self.model, u, state)
 
     def demand(
-        self, measured: Measurement, state: CascadeState, reference: Reference
-    ) -> tuple[ForceDemand, Measurement, CascadeState]:
-        """Return the demanded force, the observer's estimate, and the rates of the states of observer and position law.
+        self, measured: Measurement, state: CascadeState, sample: Sample
+    ) -> tuple[ForceDemand, Measurement, CascadeState, Measurement]:
+        """Pass the readings through observer and position law. The arguments are those of `step`.
 
-        `measured`: readings of z (m), z_dot (m/s) and i (A). `state`: states of all laws. `reference`: r and its rates.
+        Returns the demanded force, the estimate, the states of all laws with the next ones (in continuous time: the
+        rates) of observer and position law, and the estimate at the sample itself.
         The rates of z and v_star in the demanded force are total derivatives in time: they include the rates of the
         reference, z_dot, the nominal z_ddot and the rates of the states of the laws. Static inversions and the adaptive
         inversion with feed-forward use them to compute i_ref'; XLA removes them for other laws. If the observer
         estimates the velocity, this estimate is the rate of z, and the rates of the observer's states are not included.
-
-        The returned rates of the inversion and current laws are ().
         """
+        period, estimated = sample.period, self.observer.estimates_velocity
 
         def demanded(
             reference: Reference, z: Array, z_dot: Array, observed: object, positioned: object
-        ) -> tuple[tuple[Array, Array], tuple[Measurement, object, object]]:
-            estimate, observed_rate = self.observed(Measurement(z, z_dot, measured.i), observed, reference)
-            if self.observer.estimates_velocity:
+        ) -> tuple[tuple[Array, Array], tuple[Measurement, Measurement, object, object]]:
+            reading, at = Measurement(z, z_dot, measured.i), sample._replace(reference=reference)
+            estimate, observed, now = self.estimate(reading, observed, at)
+            if period is None and estimated:
                 # XLA aborts when it compiles a one-kernel rollout (`compiler.fast_path`) in which z_dot is unused
                 estimate = estimate._replace(z_dot=estimate.z_dot + 0.0 * z_dot)
-            v_star, positioned_rate = self._demanded(estimate, reference, positioned)
-            return (estimate.z, v_star), (estimate, observed_rate, positioned_rate)
+            v_star, positioned = self.positioned(estimate, reference, positioned, period)
+            return (estimate.z, v_star), (now, estimate, observed, positioned)
 
-        point = (reference, measured.z, measured.z_dot, state.observer, state.position)
-        (z, v_star), (estimate, observed_rate, positioned_rate) = demanded(*point)
-        gaps = self.model.gaps(estimate.z)
-        z_ddot = self.model.z_ddot(estimate.z, estimate.i)
-        if self.observer.estimates_velocity:
-            point = (estimate, z_ddot, reference, state.position, positioned_rate)
-            z_rate, v_star_rate = rates_along(self._demanded, *point)
+        point = (sample.reference, measured.z, measured.z_dot, state.observer, state.position)
+        (z, v_star), (now, estimate, *after) = demanded(*point)
+        z_ddot, rates = self.model.z_ddot(estimate.z, estimate.i), list[Any](after)
+        if period is not None:
+            rates = jax.tree.map(lambda a, b: (b - a) / period, [state.observer, state.position], after)
+        if estimated:
+            law = functools.partial(self.positioned, period=period)
+            z_rate, v_star_rate = rates_along(law, estimate, z_ddot, sample.reference, state.position, rates[1])
         else:
-            along = (reference.rate(), measured.z_dot, z_ddot, self._observer_rate(observed_rate), positioned_rate)
+            if self.notch is not None:  # a notch adds no motion
+                rates[0] = rates[0][0], jax.tree.map(jnp.zeros_like, rates[0][1])
+            along = (sample.reference.rate(), measured.z_dot, z_ddot, *rates)
             z_rate, v_star_rate = jax.jvp(lambda *x: demanded(*x)[0], point, along)[1]
-        rates = CascadeState(observed_rate, positioned_rate, (), ())
-        return ForceDemand(z, z_rate, v_star, v_star_rate, gaps), estimate, rates
+        v_star = v_star if period is None else materialised(v_star)
+        force = ForceDemand(z, z_rate, v_star, v_star_rate, self.model.gaps(z))
+        return force, estimate, state._replace(observer=after[0], position=after[1]), now
 
     def observed(
-        self, measured: Measurement, state: Any, reference: Reference, sample: Sample | None = None
+        self, measured: Measurement, state: Any, reference: Reference, period: Scalar | None = None
     ) -> tuple[Measurement, Any]:
         """Pass the readings through the notch and the observer.
 
-        Returns the estimate, and the next states of both; in continuous time (`sample` is None), their rates.
+        Returns the estimate, and the next states of both; in continuous time (`period` is None), their rates.
         """
         observer = with_gains_at(self.observer, measured.z, reference)
         own, notched = state if self.notch is not None else (state, state)
         if self.notch is not None:
-            through = self.notch if sample is None else functools.partial(self.notch.step, period=sample.period)
+            through = self.notch if period is None else functools.partial(self.notch.step, period=period)
             z, notched = through(measured, notched)
             measured = measured._replace(z=z)
-        if sample is None:
-            estimate, own = observer(self.model, measured, own)
-        else:
-            estimate, own = self._advance(sample)(observer, measured, own)
+        estimate, own = self._acting(period)(observer, measured, own)
         return estimate, own if self.notch is None else (own, notched)
 
-    def _observer_rate(self, rate: Any) -> Any:
-        """Return the rate of the states of observer and notch for the rate of z: a notch adds no motion."""
-        return rate if self.notch is None else (rate[0], jax.tree.map(jnp.zeros_like, rate[1]))
-
-    def _demanded(self, estimate: Measurement, reference: Reference, state: State) -> tuple[Array, State]:
-        """Return v_star (A^2/m^2) and the rate of the state of the position law."""
-        return with_gains_at(self.position, estimate.z, reference)(self.model, (estimate, reference), state)
+    def positioned(
+        self, estimate: Measurement, reference: Reference, state: State, period: Scalar | None = None
+    ) -> tuple[Array, State]:
+        """Return v_star (A^2/m^2), and the next state of the position law, or without a period its rate."""
+        law = with_gains_at(self.position, estimate.z, reference)
+        return self._acting(period)(law, (estimate, reference), state)
 
     def on_processor(self, *delays: Scalar, between: bool = False) -> "Cascade":
         """Fix all choices that determine the compiled program, so that the cascade can be used in jit, grad or vmap.
@@ -238,124 +239,52 @@ class Cascade:
         laws = {stage: with_set_valued_signs(getattr(self, stage)) for stage in DEFAULT_LAWS}
         return dataclasses.replace(self, **laws, processor=self.timing.resolved(*delays, between=between))
 
-    def reads_velocity(self, period: Scalar) -> bool:
-        """Return whether the command or a state of a law depends on the measured velocity.
-
-        `period`: sample period, s. True if a number is traced, because the laws are then not evaluated. Otherwise the
-        laws of the first member are evaluated at three velocities, and the results compared.
-        """
-        if self.observer.estimates_velocity or self.timing.predicts:
-            return not self.observer.estimates_velocity
-        if any(map(is_traced, jax.tree.leaves((self, period)))):
-            return True
-        one = self.on_processor() if self.sampled else self
-        one, period = jax.tree.map(lambda x: np.ravel(np.asarray(x, float))[0], (one, period))
-        z, z_dot, i = (float(x) for x in one.model.sizes())
-        results = [
-            one._response(Measurement(jnp.asarray(z), jnp.asarray(v), jnp.asarray(i)), period)
-            for v in (-1e3 * z_dot, z_dot, 1e3 * z_dot)
-        ]
-        return len({tuple(map(float, jax.tree.leaves(result))) for result in results}) > 1
-
-    def _response(self, measured: Measurement, period: Scalar) -> Any:
-        """Return the command, and the next states or the rates of the states, for the first reading at z = 0."""
-        zero = jnp.zeros(())
-        reference, still = Reference(zero, zero, zero), measured._replace(z_dot=zero)
-        state = self.init(still, reference)
-        if not self.sampled:
-            command, after = self(measured, state, reference, jnp.inf)
-        else:
-            sample = Sample(reference, period, jnp.inf, self.timing.constant_past(zero))
-            command, after, _ = self.step(measured, state, sample)
-        return command.u, after
-
-    def check_smooth(self) -> None:
-        """Raise ValueError for a law with a steepness of inf: in continuous time a sign must be smoothed."""
-        for stage in DEFAULT_LAWS:
-            law = getattr(self, stage)
-            for name in set_valued_signs(law):
-                raise ValueError(
-                    f"controller.{stage}.{name} = inf: in continuous time a sign must be smoothed. Give a finite "
-                    "number, or add [processor], which allows the set-valued sign."
-                )
-
     def in_continuous_time(self) -> "Cascade":
         """Return the cascade without its processor. A steepness of inf becomes the default steepness for the model."""
-        laws = {
-            stage: with_default_steepness(getattr(self, stage), self.model).in_continuous_time()
-            for stage in DEFAULT_LAWS
-        }
+        smooth = {stage: with_default_steepness(getattr(self, stage), self.model) for stage in DEFAULT_LAWS}
+        laws = {stage: law.in_continuous_time() for stage, law in smooth.items()}
         return dataclasses.replace(self, **laws, processor=None)
 
-    def _advance(self, sample: Sample) -> Callable[..., Any]:
-        """Return `laws.step_law` with the model and the discretisation of this cascade, and the period of `sample`."""
-        return functools.partial(step_law, model=self.model, period=sample.period, implicit=self.timing.implicit)
+    def _acting(self, period: Scalar | None) -> Callable[..., Any]:
+        """Return `stages.step_law` with the model and the discretisation of this cascade."""
+        return functools.partial(step_law, model=self.model, period=period, implicit=self.timing.implicit)
 
     def estimate(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State, Measurement]:
-        """Step the observer on a processor.
+        """Pass the readings through the observer, and predict.
 
         Returns the estimate for the other laws (with prediction: at the end of the delay), the next state of the
-        observer, and the estimate at the sample itself.
+        observer (in continuous time: its rate), and the estimate at the sample itself.
         """
-        now, state = self.observed(measured, state, sample.reference, sample)
-        estimate = now
-        if self.timing.predicts:
-            steps = self.timing.prediction_steps(sample.period)
-            estimate = predicted_over_delay(self.model, self.driven, now, sample.past, steps)
-        return estimate, state, now
-
-    def positioned(
-        self, sample: Sample, estimate: Measurement, reference: Reference, state: State
-    ) -> tuple[Array, State]:
-        """Step the position law on a processor. Return v_star (A^2/m^2), and the next state of the law."""
-        law = with_gains_at(self.position, estimate.z, reference)
-        return self._advance(sample)(law, (estimate, reference), state)
+        now, state = self.observed(measured, state, sample.reference, sample.period)
+        if sample.period is None or not self.timing.predicts:
+            return now, state, now
+        steps = self.timing.prediction_steps(sample.period)
+        return predicted_over_delay(self.model, self.driven, now, sample.past, steps), state, now
 
     def step(
         self, measured: Measurement, state: CascadeState, sample: Sample
     ) -> tuple[Command, CascadeState, Measurement]:
         """Step all laws on a processor.
 
-        `measured`: the readings. `state`: states of all laws. `sample`: reference, period, limit of u, past commands.
-        With prediction, all laws except the observer use the estimate at the end of the delay. Returns the command, the
-        next states of the laws, and the observer's estimate at the sample itself.
+        `measured`: readings of z (m), z_dot (m/s) and i (A). `state`: states of all laws. With prediction, all laws
+        except the observer use the estimate at the end of the delay. Returns the command, the next states of the laws
+        (in continuous time: their rates), and the observer's estimate at the sample itself.
         """
-        force_for = functools.partial(self.positioned, sample)
-
-        def demanded(
-            reference: Reference, z: Array, z_dot: Array, observed: object, positioned: object
-        ) -> tuple[tuple[Array, Array], tuple[Measurement, Measurement, object, object]]:
-            reading, at = Measurement(z, z_dot, measured.i), sample._replace(reference=reference)
-            estimate, observed, now = self.estimate(reading, observed, at)
-            v_star, positioned = force_for(estimate, reference, positioned)
-            return (estimate.z, v_star), (now, estimate, observed, positioned)
-
-        point = (sample.reference, measured.z, measured.z_dot, state.observer, state.position)
-        (z, v_star), (now, estimate, observed, positioned) = demanded(*point)
-        # The adaptive inversion with feed-forward needs the rates of z and v_star; XLA removes them for other laws.
-        z_ddot = self.model.z_ddot(estimate.z, estimate.i)
-        rates = jax.tree.map(
-            lambda a, b: (b - a) / sample.period, (state.observer, state.position), (observed, positioned)
-        )
-        if self.observer.estimates_velocity:
-            z_rate, v_star_rate = rates_along(force_for, estimate, z_ddot, sample.reference, state.position, rates[1])
-        else:
-            along = (sample.reference.rate(), measured.z_dot, z_ddot, self._observer_rate(rates[0]), rates[1])
-            z_rate, v_star_rate = jax.jvp(lambda *x: demanded(*x)[0], point, along)[1]
-        v_star = materialised(v_star)
-        force = ForceDemand(z, z_rate, v_star, v_star_rate, self.model.gaps(z))
-        command, after = self.commanded(force, estimate, state, sample)
-        return command, after._replace(observer=observed, position=positioned), now
+        force, estimate, after, now = self.demand(measured, state, sample)
+        return *self.commanded(force, estimate, after, sample), now
 
     def commanded(
         self, force: ForceDemand, estimate: Measurement, state: CascadeState, sample: Sample
     ) -> tuple[Command, CascadeState]:
-        """Step inversion and current law on a processor for a demanded force; the other states do not change."""
-        advance = self._advance(sample)
+        """Pass a demanded force through inversion and current law; the other states do not change.
+
+        Returns the command, and the next states of both laws; in continuous time, their rates.
+        """
+        act = self._acting(sample.period)
         inversion = with_gains_at(self.inversion, force.z, sample.reference)
         current = with_gains_at(self.current, force.z, sample.reference)
-        demand, inverted = advance(inversion, force, state.inversion)
-        u, driven = advance(current, CurrentInputs(estimate, demand, sample.u_max, force.gaps), state.current)
+        demand, inverted = act(inversion, force, state.inversion)
+        u, driven = act(current, CurrentInputs(estimate, demand, sample.u_max, force.gaps), state.current)
         v_tilde = force.v_star - self.model.v_and_dv_di(force.z, demand.i_ref, force.gaps)[0]
         after = state._replace(inversion=inverted, current=driven)
         return Command(force.v_star, v_tilde, demand.i_ref, demand.i_ref_dot, u), after
@@ -363,44 +292,8 @@ class Cascade:
     def __call__(
         self, measured: Measurement, state: CascadeState, reference: Reference, u_max: Scalar
     ) -> tuple[Command, CascadeState]:
-        """Return the command in continuous time and the rates of the states of all laws.
+        """Return the command in continuous time and the rates of the states of all laws, as `step` does.
 
-        `measured`: readings of z (m), z_dot (m/s) and i (A). `state`: states of all laws. `reference`: r and its rates.
         `u_max`: limit of u: of the supply, V, or of the commanded current, A; inf: none.
         """
-        force, estimate, rates = self.demand(measured, state, reference)
-        command, inner = self.command_rates(force, estimate, state, reference, u_max)
-        return command, rates._replace(inversion=inner.inversion, current=inner.current)
-
-    def command_rates(
-        self, force: ForceDemand, estimate: Measurement, state: CascadeState, reference: Reference, u_max: Scalar
-    ) -> tuple[Command, CascadeState]:
-        """Return the command in continuous time for a demanded force, and the rates; those of the others are ()."""
-        inversion = with_gains_at(self.inversion, force.z, reference)
-        current = with_gains_at(self.current, force.z, reference)
-        demand, inversion_rate = inversion(self.model, force, state.inversion)
-        u, current_rate = current(self.model, CurrentInputs(estimate, demand, u_max, force.gaps), state.current)
-        v_tilde = force.v_star - self.model.v_and_dv_di(force.z, demand.i_ref, force.gaps)[0]
-        command = Command(force.v_star, v_tilde, demand.i_ref, demand.i_ref_dot, u)
-        return command, CascadeState((), (), inversion_rate, current_rate)
-
-
-def _chosen(condition: Array, yes: State, no: State) -> State:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
-
-
-def rates_along(
-    law: Callable[..., tuple[Array, State]],
-    estimate: Measurement,
-    z_ddot: Array,
-    reference: Reference,
-    state: State,
-    rate: State,
-) -> tuple[Array, Array]:
-    """Return the rates of z (m/s) and v_star (A^2/m^2/s) if the estimate moves with its own z_dot and with `z_ddot`."""
-
-    def v_star(reference: Reference, z: Array, z_dot: Array, state: State) -> Array:
-        return law(Measurement(z, z_dot, estimate.i), reference, state)[0]
-
-    point = (reference, estimate.z, estimate.z_dot, state)
-    return estimate.z_dot, jax.jvp(v_star, point, (reference.rate(), estimate.z_dot, z_ddot, rate))[1]
+        return self.step(measured, state, Sample(reference, None, u_max))[:2]

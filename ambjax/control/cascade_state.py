@@ -1,5 +1,6 @@
 """The state of a cascade, its outputs, and its inputs at a sample."""
 
+import math
 from typing import Any, NamedTuple
 
 from jax import Array
@@ -34,15 +35,15 @@ class Command(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """Inputs of a cascade on a processor at a sample, apart from the measurement.
+    """Inputs of a cascade at a sample of a processor or, in continuous time, at an instant, apart from the measurement.
 
     - `reference`: at the instant of the sample; with prediction, at the end of the delay.
-    - `period`: sample period, s.
+    - `period`: sample period, s; None: continuous time.
     - `u_max`: limit of u, V or A.
     - `past`: u of the samples before, the most recent first, as many as the delay needs, V or A.
     """
 
     reference: Reference
-    period: Scalar
-    u_max: Scalar
-    past: tuple[Array, ...]
+    period: Scalar | None = None
+    u_max: Scalar = math.inf
+    past: tuple[Array, ...] = ()

@@ -38,7 +38,7 @@ class FilterChain(PositionLaw[ChainState]):
 
     H(s) = (k_p + k_int/s + k_d s/(1 + s/w_f)) (1 + s/w_z)/(1 + s/w_p) N_1(s) N_2(s) w_lp^2/(s^2 + sqrt(2) w_lp s +
     w_lp^2), e = z - r, with the notches N_k(s) = (s^2 + depth_k width_k w_k s + w_k^2)/(s^2 + width_k w_k s + w_k^2).
-    The law does not use the velocity. As in `state_feedback.StateFeedback`, i_star is the demanded current, and i_r
+    The law does not use the velocity. As in `StateFeedback`, i_star is the demanded current, and i_r
     keeps the linearised rotor on the reference. With inversion.Linearised, i_ref is i_star. In the default values, w is
     the pole of the magnets.
     Schweitzer and Maslen, Magnetic Bearings (2009), 8.2. The rate of the integral includes k_aw (i_star - i), which

@@ -10,7 +10,7 @@ from ambjax.control.base import Requirement, scaled_steepness
 from ambjax.control.defaults import current_rate
 from ambjax.control.sampling import Relay, Sampling, non_oscillating
 from ambjax.control.search import Interval, SearchContext, authority, rate, steepness, switch
-from ambjax.control.stages import CurrentInputs, CurrentLaw, OneIntegral, Stateless, unwinding
+from ambjax.control.stages import CurrentInputs, CurrentLaw, OneIntegral, Stateless, no_slope, unwinding
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, limited, smooth_sign
@@ -199,8 +199,7 @@ class OpenLoop(Stateless, CurrentLaw[tuple[()]]):
     analytic = True
     accepts: ClassVar = ("voltage",)
 
-    def slope(self, model: Plant) -> Scalar:
-        return 0.0
+    slope = no_slope
 
     def __call__(self, model: Plant, inputs: CurrentInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
         return model.R * inputs.demand.i_ref, ()
@@ -228,8 +227,7 @@ class AmplifierCurrent(Stateless, CurrentLaw[tuple[()]]):
     commands = "current"
     own_steps = ("implicit", "explicit")
 
-    def slope(self, model: Plant) -> Scalar:
-        return 0.0
+    slope = no_slope
 
     def __call__(self, model: Plant, inputs: CurrentInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
         return inputs.demand.i_ref, ()

@@ -1,6 +1,6 @@
 """The sliding variable, the scaled force for a wanted acceleration, and the scaled force of a linear magnet."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jax import Array
 
@@ -13,6 +13,21 @@ from ambjax.world.waveforms import Reference
 def sliding_variable(c: Scalar, motion: Measurement, reference: Reference) -> Array:
     """Return the sliding variable sigma = e_z_dot + c e_z (m/s), with e_z = z - r (Section 3.2)."""
     return motion.z_dot - reference.r_dot + c * (motion.z - reference.r)
+
+
+def sigma_by_c(self: Any, motion: Measurement, reference: Reference) -> Array:
+    """Return `sigma` of a law with the rate `c` on its sliding manifold: e_dot + c e."""
+    return sliding_variable(self.c, motion, reference)
+
+
+def sigma_by_gains(self: Any, motion: Measurement, reference: Reference) -> Array:
+    """Return `sigma` of a law with the gains k_p and k_d: e_dot + (k_p/k_d) e, the error that the feedback removes."""
+    return sliding_variable(self.k_p / self.k_d, motion, reference)
+
+
+def sigma_size(self: Any, model: Plant) -> Scalar:
+    """Return `size` of a law whose sign has the argument sigma, m/s."""
+    return model.sigma_size
 
 
 def force_for(c: Scalar, model: Plant, motion: Measurement, reference: Reference, robust: Scalar) -> Array:

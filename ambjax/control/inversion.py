@@ -13,7 +13,7 @@ from ambjax.control.base import Requirement, scaled_steepness
 from ambjax.control.defaults import adaptation_gain
 from ambjax.control.sampling import Relay, Sampling
 from ambjax.control.search import Interval, SearchContext, steepness
-from ambjax.control.stages import CurrentDemand, ForceDemand, InversionLaw, Relaxation, Stateless
+from ambjax.control.stages import CurrentDemand, ForceDemand, InversionLaw, Relaxation, Stateless, no_slope
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.numerics.relax import relax, relaxation
 from ambjax.numerics.smooth import TWO_OVER_PI, away_from_zero, smooth_sign
@@ -38,7 +38,6 @@ class AdaptiveReference(InversionLaw[Array]):
     the pole of the magnets: gamma then exceeds Delta_1 of Eq. (7) up to the speed w s_0.
     """
 
-    analytic = True
     gamma: Scalar = gain(
         default=7.5e4, unit="A^2/m^2/s", doc="adaptation gain; above Delta_1 of Eq. (7); left out: 4 w (i_0/s_0)^2"
     )
@@ -195,8 +194,7 @@ class StaticInversion(Stateless, InversionLaw[tuple[()]]):
     def scale_sampled(self, model: Plant) -> StaticInversionState:
         return StaticInversionState(jnp.asarray(model.i_0 / 25), jnp.ones(()))
 
-    def slope(self, model: Plant) -> Scalar:
-        return 0.0
+    slope = no_slope
 
     def __call__(self, model: Plant, inputs: ForceDemand, state: tuple[()]) -> tuple[CurrentDemand, tuple[()]]:
         at, along = (inputs.z, inputs.v_star), (inputs.z_rate, inputs.v_star_rate)
@@ -222,8 +220,6 @@ class ClosedForm(StaticInversion):
     Use it where v_star has little noise: `Cascade(inversion=inversion.ClosedForm())`.
     """
 
-    analytic = True
-
     def inverse(self, model: Plant, z: Array, v_star: Array) -> Array:
         return model.current_for(z, v_star)
 
@@ -239,7 +235,6 @@ class Linearised(StaticInversion):
     Use it for small displacements, or for a linear controller: `Cascade(inversion=inversion.Linearised())`.
     """
 
-    analytic = True
     accepts: ClassVar = ("force", "voltage")
     singular = False
 

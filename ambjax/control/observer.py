@@ -9,7 +9,7 @@ from jax import Array
 from ambjax.control.exact import DERIVATIVES, ExactDifferentiator
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
-from ambjax.control.stages import Observer, Stateless
+from ambjax.control.stages import Observer, Stateless, no_slope
 from ambjax.numerics.records import Scalar, gain, leaf, record
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
@@ -24,8 +24,7 @@ class Direct(Stateless, Observer[tuple[()]]):
 
     analytic = True
 
-    def slope(self, model: Plant) -> Scalar:
-        return 0.0
+    slope = no_slope
 
     def __call__(self, model: Plant, inputs: Measurement, state: tuple[()]) -> tuple[Measurement, tuple[()]]:
         return inputs, ()
@@ -210,7 +209,7 @@ class Kalman(Observer[Predicted]):
 class IRED1(ExactDifferentiator):
     """Robust exact differentiator of order 1: without noise, z_dot is exact after a finite time if |z_ddot| <= L.
 
-    `ambjax.numerics.differentiator` has the equations. z itself is not filtered. In continuous time, the sign is
+    `ambjax.control.exact` has the equations. z itself is not filtered. In continuous time, the sign is
     smoothed. With implicit steps on a processor, it is evaluated at the end of the step.
 
     Use it where the velocity is not measured, and a bound of the acceleration is known:

@@ -8,23 +8,21 @@ from jax import Array
 from ambjax.control.base import Requirement
 from ambjax.control.chain import FilterChain as FilterChain
 from ambjax.control.defaults import switching_gain, switching_steepness
-from ambjax.control.force import force_for, sliding_variable
-from ambjax.control.integral_sliding import IntegralSlidingMode as IntegralSlidingMode
+from ambjax.control.force import force_for, sigma_by_c, sigma_size
 from ambjax.control.linear_controller import LinearController as LinearController
+from ambjax.control.manifolds import IntegralSlidingMode as IntegralSlidingMode
 from ambjax.control.manifolds import TerminalSlidingMode as TerminalSlidingMode
 from ambjax.control.manifolds import UtkinSlidingMode as UtkinSlidingMode
 from ambjax.control.pid import PID as PID
 from ambjax.control.pid import FeedbackLinearisation as FeedbackLinearisation
+from ambjax.control.pid import StateFeedback as StateFeedback
 from ambjax.control.sampling import Relay, Sampling
 from ambjax.control.search import Interval, SearchContext, authority, manifold, position_switch, rate, steepness
 from ambjax.control.stages import OneIntegral, PositionInputs, PositionLaw, Stateless
-from ambjax.control.state_feedback import StateFeedback as StateFeedback
 from ambjax.numerics.records import Scalar, gain, record
 from ambjax.numerics.relax import share, twist
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_root, smooth_sign
 from ambjax.world.plant import Plant
-from ambjax.world.sensor import Measurement
-from ambjax.world.waveforms import Reference
 
 
 @record
@@ -60,11 +58,8 @@ class SlidingMode(Stateless, PositionLaw[tuple[()]]):
     def slope(self, model: Plant) -> Scalar:
         return jnp.maximum(TWO_OVER_PI * self.k * self.p, self.c)
 
-    def size(self, model: Plant) -> Scalar:
-        return model.sigma_size
-
-    def sigma(self, motion: Measurement, reference: Reference) -> Array:
-        return sliding_variable(self.c, motion, reference)
+    size = sigma_size
+    sigma = sigma_by_c
 
     def __call__(self, model: Plant, inputs: PositionInputs, state: tuple[()]) -> tuple[Array, tuple[()]]:
         motion, reference = inputs
@@ -133,11 +128,8 @@ class SuperTwisting(OneIntegral, PositionLaw[Array]):
         pole = (root + jnp.sqrt(jnp.maximum(root**2 - 4 * integral, 0.0))) / 2
         return jnp.maximum(jnp.maximum(pole, jnp.sqrt(integral)), self.c)
 
-    def size(self, model: Plant) -> Scalar:
-        return model.sigma_size
-
-    def sigma(self, motion: Measurement, reference: Reference) -> Array:
-        return sliding_variable(self.c, motion, reference)
+    size = sigma_size
+    sigma = sigma_by_c
 
     def __call__(self, model: Plant, inputs: PositionInputs, state: Array) -> tuple[Array, Array]:
         motion, reference = inputs
@@ -147,18 +139,15 @@ class SuperTwisting(OneIntegral, PositionLaw[Array]):
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         if context.stepped or self.p is None:
-            return {"c": manifold(context), **self._authorities(context)}
+            size = context.w**3 * float(context.model.s_0)
+            root = authority(context, size**0.5, (1e-3, 0.3), "sqrt(w^3 s_0)")
+            return {"c": manifold(context), "k_1": root, "k_2": authority(context, size, (1e-5, 0.1), "w^3 s_0")}
         root, integral = float(self.p) ** 0.5, TWO_OVER_PI * float(self.p)
         return {
             "c": manifold(context),
             "k_1": rate(context, 1 / 3, 100, "slope k_1 sqrt(p) from w/3 to 100 w", root),
             "k_2": rate(context, 1e-2, 10, "corner sqrt(2/pi k_2 p) from w/100 to 10 w", integral, 2),
         }
-
-    def _authorities(self, context: SearchContext) -> dict[str, Interval]:
-        size = float(context.model.s_0)
-        root = authority(context, (context.w**3 * size) ** 0.5, (1e-3, 0.3), "sqrt(w^3 s_0)")
-        return {"k_1": root, "k_2": authority(context, context.w**3 * size, (1e-5, 0.1), "w^3 s_0")}
 
     def step(self, model: Plant, inputs: PositionInputs, state: Array, period: Scalar) -> tuple[Array, Array]:
         """Step with both terms at the end of the step (R. Seeber and B. Andritsch, Automatica 173 (2025) 112027).

@@ -11,9 +11,9 @@ from jax import Array, lax
 
 from ambjax.control.guard import Guard
 from ambjax.control.sampling import Sampling
-from ambjax.numerics.declared import check_number
-from ambjax.numerics.records import Scalar, derived, is_traced, leaf, leaves_of, part, record, replaced, static
-from ambjax.numerics.runge_kutta import rk4_step
+from ambjax.numerics.declared import check_number, leaves_of
+from ambjax.numerics.linear import rk4_step
+from ambjax.numerics.records import Scalar, derived, is_traced, leaf, part, record, replaced, static
 from ambjax.world.plant import Plant, State
 from ambjax.world.sensor import Measurement
 

@@ -1,20 +1,19 @@
 """Control in the coordinates of the rigid rotor: translation and tilt instead of the axes of the bearings."""
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.control.cascade import Cascade, rates_along
+from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Sample
 from ambjax.control.machine_law import Demanded, MachineInputs, MachineLaw
-from ambjax.control.schedule import extremes, with_gains_at
-from ambjax.control.stages import ForceDemand, begin_law
+from ambjax.control.schedule import extremes
+from ambjax.control.stages import ForceDemand, rates_along
+from ambjax.numerics.linear import rk4_step
 from ambjax.numerics.records import leaf, matrix, part, record
-from ambjax.numerics.runge_kutta import rk4_step
 from ambjax.numerics.small_matrices import times
 from ambjax.world.plant import State
 from ambjax.world.sensor import Measurement
@@ -69,29 +68,22 @@ class RigidBody(MachineLaw):
         if not self.laws.sampled:
             states = jax.vmap(lambda law, m, r: law.init(m, r))(self.laws, now, reference)
             return RigidState(states.observer, states.position)
-        implicit, sample = self.laws.timing.implicit, self._sample(inputs)
-        estimate = jax.vmap(lambda law, m, own, r: law.observed(m, own, r, sample(r))[0])(
-            self.laws, now, observed, reference
-        )
+        estimate, _ = self._observed(now, observed, reference, inputs)
         estimate, _ = self._predicted(estimate, measured.i, inputs)
-
-        def one(law: Cascade, estimate: Measurement, reference: Reference) -> Any:
-            position = with_gains_at(law.position, estimate.z, reference)
-            return begin_law(position, (estimate, reference), model=law.model, period=inputs.period, implicit=implicit)
-
-        return RigidState(observed, jax.vmap(one)(self.laws, estimate, reference))
+        begun = jax.vmap(lambda law, m, r: law.begun_position(m, r, inputs.period))
+        return RigidState(observed, begun(self.laws, estimate, reference))
 
     def step(self, measured: Measurement, state: RigidState, inputs: MachineInputs) -> tuple[Demanded, RigidState]:
-        now, reference, sample = self._read(measured, inputs), self._reference(inputs), self._sample(inputs)
-        observe = jax.vmap(lambda law, m, own, r: law.observed(m, own, r, sample(r)))
-        now, observed = observe(self.laws, now, state.observer, reference)
+        reference = self._reference(inputs)
+        now, observed = self._observed(self._read(measured, inputs), state.observer, reference, inputs)
         estimate, i = self._predicted(now, measured.i, inputs)
 
         def one(law: Cascade, estimate: Measurement, r: Reference, before: Any) -> tuple[ForceDemand, Any]:
-            v_star, after = law.positioned(sample(r), estimate, r, before)
+            act = functools.partial(law.positioned, period=inputs.period)
+            v_star, after = act(estimate, r, before)
             rate = jax.tree.map(lambda a, b: (b - a) / inputs.period, before, after)
             z_ddot = law.model.z_ddot(estimate.z, estimate.i)
-            rates = rates_along(functools.partial(law.positioned, sample(r)), estimate, z_ddot, r, before, rate)
+            rates = rates_along(act, estimate, z_ddot, r, before, rate)
             return ForceDemand(estimate.z, rates[0], v_star, rates[1]), after
 
         force, positioned = jax.vmap(one)(self.laws, estimate, reference, state.position)
@@ -101,7 +93,7 @@ class RigidBody(MachineLaw):
         now, reference = self._read(measured, inputs), self._reference(inputs)
 
         def one(law: Cascade, m: Measurement, own: RigidState, r: Reference) -> tuple:
-            return law.demand(m, CascadeState(*own, (), ()), r)
+            return law.demand(m, CascadeState(*own, (), ()), Sample(r))[:3]
 
         force, estimate, rates = jax.vmap(one)(self.laws, now, state, reference)
         return self._demanded(force, estimate, measured.i, estimate, inputs), RigidState(*rates[:2])
@@ -109,8 +101,12 @@ class RigidBody(MachineLaw):
     def _reference(self, inputs: MachineInputs) -> Reference:
         return jax.tree.map(lambda x: times(self.from_sensors, x), inputs.reference)
 
-    def _sample(self, inputs: MachineInputs) -> Callable[[Reference], Sample]:
-        return lambda reference: Sample(reference, inputs.period, jnp.asarray(jnp.inf), ())
+    def _observed(
+        self, now: Measurement, state: Any, reference: Reference, inputs: MachineInputs
+    ) -> tuple[Measurement, Any]:
+        """Step the observers of all coordinates."""
+        observe = jax.vmap(lambda law, m, own, r: law.observed(m, own, r, inputs.period))
+        return observe(self.laws, now, state, reference)
 
     def _read(self, measured: Measurement, inputs: MachineInputs) -> Measurement:
         """Return the readings in coordinates [n]."""

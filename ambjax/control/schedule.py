@@ -7,6 +7,7 @@ and calls the law with the resulting numbers, so laws contain no code for schedu
 import dataclasses
 import functools
 import itertools
+from collections.abc import Callable
 from typing import TypeVar
 
 import jax
@@ -122,16 +123,12 @@ def extremes(law: L) -> tuple[L, ...]:
     found = schedules(law)
     if not found:
         return (law,)
-    ends = (functools.partial(functools.reduce, least) for least in (_lower, _higher))
-    return tuple(_with(law, {name: end(one.values) for name, one in found.items()}) for end in ends)
 
+    def end(values: tuple[Scalar, ...], plain: Callable, other: Callable) -> Scalar:
+        return plain(values) if all(isinstance(x, float) for x in values) else functools.reduce(other, values)
 
-def _lower(a: Scalar, b: Scalar) -> Scalar:
-    return min(a, b) if isinstance(a, float) and isinstance(b, float) else jnp.minimum(a, b)
-
-
-def _higher(a: Scalar, b: Scalar) -> Scalar:
-    return max(a, b) if isinstance(a, float) and isinstance(b, float) else jnp.maximum(a, b)
+    ways = ((min, jnp.minimum), (max, jnp.maximum))
+    return tuple(_with(law, {name: end(one.values, *way) for name, one in found.items()}) for way in ways)
 
 
 def _with(law: L, numbers: dict[str, Scalar]) -> L:

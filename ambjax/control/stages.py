@@ -15,6 +15,7 @@ test in `tests/test_laws.py`.
 """
 
 import abc
+from collections.abc import Callable
 from typing import Any, ClassVar, Generic, NamedTuple, TypeAlias, TypeVar
 
 import jax
@@ -107,6 +108,11 @@ class OneIntegral(Law):
         return jnp.zeros(())
 
 
+def no_slope(self: Law, model: Plant) -> Scalar:
+    """Return `slope` of a law that passes its input on: 0."""
+    return 0.0
+
+
 def unwinding(k_aw: Scalar, k_int: Scalar) -> Array:
     """Return the anti-windup rate k_aw (1/s) of an integral with the gain k_int, or 0 without an integral."""
     return jnp.where(jnp.asarray(k_int) > 0, k_aw, 0.0)
@@ -150,7 +156,17 @@ class PositionLaw(Law, Generic[State]):
 
     def begin_sampled(self, model: Plant, inputs: PositionInputs, period: Scalar) -> object:
         """Return the state before the first call of `step`, from the estimate and the reference of this sample."""
-        return self.init_sampled(model) if has_sampled_state(self) else self.begin(model, inputs)
+        return self.init_sampled(model) if self._has_sampled_state() else self.begin(model, inputs)
+
+    def first_state(self, model: Plant, inputs: PositionInputs, period: Scalar | None, implicit: bool) -> Any:
+        """Return the state before the first step on a processor; without a period, that at t = 0 in continuous time."""
+        if period is not None and (self.has_own_step(implicit) or self._has_sampled_state()):
+            return self.begin_sampled(model, inputs, period)
+        return self.begin(model, inputs)
+
+    def _has_sampled_state(self) -> bool:
+        """Return whether the state on a processor may differ from that in continuous time."""
+        return type(self).init_sampled is not Law.init_sampled
 
     @abc.abstractmethod
     def sigma(self, motion: Measurement, reference: Reference) -> Array: ...
@@ -210,23 +226,33 @@ STAGES: dict[str, type[Law]] = {
 }
 
 
-def has_sampled_state(law: Law) -> bool:
-    """Return whether the state of a law on a processor may differ from its state in continuous time."""
-    return type(law).init_sampled is not Law.init_sampled
-
-
-def begin_law(law: PositionLaw, inputs: PositionInputs, *, model: Plant, period: Scalar, implicit: bool) -> Any:
-    """Return the state of a position law before its first step on a processor (`step_law`)."""
-    if law.has_own_step(implicit) or has_sampled_state(law):
-        return law.begin_sampled(model, inputs, period)
-    return law.begin(model, inputs)
-
-
 def step_law(
-    law: Law, inputs: object, state: State, *, model: Plant, period: Scalar, implicit: bool
+    law: Law, inputs: object, state: State, *, model: Plant, period: Scalar | None, implicit: bool
 ) -> tuple[Any, State]:
-    """Return the output of a law at a sample, by `step` or else by explicit Euler, and its next state."""
+    """Return the output of a law at a sample, by `step` or else by explicit Euler, and its next state.
+
+    Without a period (in continuous time), it is the output now and the rate of the state.
+    """
+    if period is None:
+        return law(model, inputs, state)
     with jax.named_scope(f"law:{type(law).__module__.rpartition('.')[2]}.{type(law).__qualname__}"):
         if law.has_own_step(implicit):
             return law.step(model, inputs, state, period)
         return Law.step(law, model, inputs, state, period)
+
+
+def rates_along(
+    law: Callable[..., tuple[Array, State]],
+    estimate: Measurement,
+    z_ddot: Array,
+    reference: Reference,
+    state: State,
+    rate: State,
+) -> tuple[Array, Array]:
+    """Return the rates of z (m/s) and v_star (A^2/m^2/s) if the estimate moves with its own z_dot and with `z_ddot`."""
+
+    def v_star(reference: Reference, z: Array, z_dot: Array, state: State) -> Array:
+        return law(Measurement(z, z_dot, estimate.i), reference, state)[0]
+
+    point = (reference, estimate.z, estimate.z_dot, state)
+    return estimate.z_dot, jax.jvp(v_star, point, (reference.rate(), estimate.z_dot, z_ddot, rate))[1]

@@ -9,7 +9,7 @@ import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,11 +23,10 @@ from ambjax.control.cascade import Cascade
 from ambjax.numerics.declared import require_number
 from ambjax.numerics.records import canonical, require_concrete
 from ambjax.numerics.shapes import varying
-from ambjax.simulation.clock import Clock
+from ambjax.simulation.clock import Clock, takes_case
 from ambjax.simulation.folds import Fold
 from ambjax.simulation.rollout import Result, System, prepare, run
 from ambjax.simulation.system import check_recording
-from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 
 # Largest number of members in one call of the compiled program, if the argument `call` is None.
@@ -122,10 +121,43 @@ def map_members(
     Raises ValueError if the lengths of two leaves differ, if no leaf is an array, or if one is traced.
     """
     require_concrete("ensemble", tree)
-    compiled = compiled_quickly if plain else one_kernel
     for name, value in (("threads", threads), ("call", call), ("block", block)):
         require_number(name, value, 1, whole=True, optional=True)
-    return _Engine(function, tree, threads, call, block, compiled, vectorised).results()
+    leaves, structure = jax.tree.flatten(tree)
+    members, moves = size(tree), varying(tree)
+    moving = [np.asarray(x) for x, varies in zip(leaves, moves, strict=True) if varies]
+    shared = tuple(x for x, varies in zip(leaves, moves, strict=True) if not varies)
+    workers, call, block = _division(members, threads, call, block)
+    program = _program(len(jax.devices()), compiled_quickly if plain else one_kernel)
+
+    def run_call(start: int) -> Mapped:
+        # The last call may hold fewer members than its length: its last member is repeated.
+        index = np.minimum(np.arange(start, start + call), members - 1)
+        parts = Parts(tuple(x[index] for x in moving), shared)
+        results = program(parts, function=function, moves=moves, tree=structure, block=block, vectorised=vectorised)
+        return jax.tree.map(np.asarray, results)
+
+    starts = range(0, members, call)
+    if min(workers, len(starts)) == 1:  # a thread would cost more than a short run
+        parts = [run_call(start) for start in starts]
+    else:
+        with ThreadPoolExecutor(min(workers, len(starts))) as pool:
+            parts = list(pool.map(run_call, starts))
+    whole = jax.tree.map(lambda *xs: np.concatenate(xs), *parts)
+    return jax.tree.map(lambda x: x[:members], whole)
+
+
+def _division(members: int, threads: int | None, call: int | None, block: int | None) -> tuple[int, int, int]:
+    """Return the number of threads, and of members in a call and in a block. All calls run one compiled program."""
+    devices = jax.devices()
+    single_cpu = len(devices) == 1 and devices[0].platform == "cpu"
+    workers = (threads or cores()) if single_cpu else 1
+    calls = max(-(-members // (MOST_CALL * workers)), 1) * workers
+    share = max(-(-members // calls), LEAST_BYTES // jnp.result_type(float).itemsize)
+    per_call = call or min(share, members)
+    block = block or block_length(per_call)
+    multiple = block * len(devices)
+    return workers, -(-per_call // multiple) * multiple, block
 
 
 def size(tree: object) -> int:
@@ -138,56 +170,6 @@ def size(tree: object) -> int:
             "scenario.member = np.arange(N), and every other leaf that varies as an array with N entries."
         )
     return lengths.pop()
-
-
-class _Engine(Generic[Mapped]):
-    """One ensemble, split into calls of one program. All calls have the same shape, so JAX compiles it once."""
-
-    def __init__(
-        self,
-        function: Callable[..., Mapped],
-        tree: object,
-        threads: int | None,
-        call: int | None,
-        block: int | None,
-        compiled: Callable[..., Callable],
-        vectorised: bool,
-    ) -> None:
-        leaves, self.tree = jax.tree.flatten(tree)
-        self.members, self.moves = size(tree), varying(tree)
-        self.moving = [np.asarray(x) for x, varies in zip(leaves, self.moves, strict=True) if varies]
-        self.shared = tuple(x for x, varies in zip(leaves, self.moves, strict=True) if not varies)
-        self.static = {"function": function, "moves": self.moves, "tree": self.tree, "vectorised": vectorised}
-        self.devices = jax.devices()
-        single_cpu = len(self.devices) == 1 and self.devices[0].platform == "cpu"
-        self.workers = (threads or cores()) if single_cpu else 1
-        # All calls have the same length; the last call may hold fewer members than its length.
-        calls = max(-(-self.members // (MOST_CALL * self.workers)), 1) * self.workers
-        share = max(-(-self.members // calls), LEAST_BYTES // jnp.result_type(float).itemsize)
-        per_call = call or min(share, self.members)
-        self.block = block or block_length(per_call)
-        multiple = self.block * len(self.devices)
-        self.call = -(-per_call // multiple) * multiple
-        self.program = _program(len(self.devices), compiled)
-
-    def results(self) -> Mapped:
-        """Run all calls and concatenate their results in member order."""
-        starts = range(0, self.members, self.call)
-        workers = min(self.workers, len(starts))
-        if workers == 1:  # a thread would cost more than a short run
-            parts = [self._one(start) for start in starts]
-        else:
-            with ThreadPoolExecutor(workers) as pool:
-                parts = list(pool.map(self._one, starts))
-        whole = jax.tree.map(lambda *xs: np.concatenate(xs), *parts)
-        return jax.tree.map(lambda x: x[: self.members], whole)
-
-    def _one(self, start: int) -> Mapped:
-        """Run one call: members from `start` on; the last member is repeated to fill the call."""
-        index = np.minimum(np.arange(start, start + self.call), self.members - 1)
-        parts = Parts(tuple(x[index] for x in self.moving), self.shared)
-        results = self.program(parts, block=self.block, **self.static)
-        return jax.tree.map(np.asarray, results)
 
 
 def cores() -> int:

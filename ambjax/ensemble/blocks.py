@@ -62,14 +62,10 @@ class Blocks:
         block, before = sample // self.every, jnp.maximum(sample - 1, 0) // self.every
         values = {name: getattr(row, name) for name in self.of}
         folded = carry.folded
-        low = {
-            k: _combined(folded.low[k], block, jnp.minimum, jnp.where(row.alive, x, NO_VALUE))
-            for k, x in values.items()
-        }
-        high = {
-            k: _combined(folded.high[k], block, jnp.maximum, jnp.where(row.alive, x, -NO_VALUE))
-            for k, x in values.items()
-        }
+        low, high = (
+            {k: _combined(old[k], block, combine, jnp.where(row.alive, x, none)) for k, x in values.items()}
+            for old, combine, none in ((folded.low, jnp.minimum, NO_VALUE), (folded.high, jnp.maximum, -NO_VALUE))
+        )
         step = jnp.where(row.alive & carry.alive, jnp.abs(row.u_mean - carry.u_mean), 0.0)
         last = {k: jnp.where(row.alive, x, jnp.nan) for k, x in values.items()}
         return Carry(

@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import importlib
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -23,12 +23,11 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import run_ensemble, size
 from ambjax.numerics.records import canonical
 from ambjax.numerics.shapes import varying
-from ambjax.simulation.clock import Clock
+from ambjax.simulation.clock import Clock, takes_case
 from ambjax.simulation.explicit import RK4
 from ambjax.simulation.folds import Fold
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.rollout import Result, prepare, run
-from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 
 # Threads of a warp, and largest number of warps of a program. A thread simulates one member, or block/1024 members in
@@ -86,7 +85,13 @@ def run_on_gpu(
 def _in_one_kernel(
     cascade: Cascade, scenario: Scenario, clock: Clock, fold: Fold | None, *, members: int, block: int, interpret: bool
 ) -> Result:
-    """Build the kernel, run it on all members, and return their outcomes [N]."""
+    """Build the kernel, run it on all members, and return their outcomes [N].
+
+    Each program of the grid reads its block of the members' numbers and all shared numbers.
+    """
+    from jax.experimental import pallas as pl
+    from jax.experimental.pallas import triton
+
     scenario, key = _with_draws(scenario, members)
     whole = ClosedLoop(cascade, scenario, key), clock, fold
     (leaves, tree), axes = jax.tree.flatten(whole), [0 if varies else None for varies in varying(whole)]
@@ -101,8 +106,23 @@ def _in_one_kernel(
         for ref, value in zip(refs[len(axes) :], jaxpr_as_fun(traced)(*numbers), strict=True):
             ref[...] = value
 
-    outputs = _launch(kernel, operands, axes, jax.tree.leaves(results), programs, block, interpret)
-    return jax.tree.unflatten(jax.tree.structure(results), [x[:members] for x in outputs])
+    def own(x: Array | jax.ShapeDtypeStruct) -> pl.BlockSpec:
+        return pl.BlockSpec((block, *x.shape[1:]), lambda n: (n, *(0 for _ in x.shape[1:])))
+
+    def shared(x: Array) -> pl.BlockSpec:
+        return pl.BlockSpec(x.shape, lambda _: (0,) * x.ndim)
+
+    leaves, structure = jax.tree.flatten(results)
+    outputs = pl.pallas_call(
+        kernel,
+        grid=(programs,),
+        in_specs=[shared(x) if axis is None else own(x) for x, axis in zip(operands, axes, strict=True)],
+        out_specs=[own(x) for x in leaves],
+        out_shape=[jax.ShapeDtypeStruct((programs * x.shape[0], *x.shape[1:]), x.dtype) for x in leaves],
+        compiler_params=triton.CompilerParams(num_warps=min(block // WARP, MOST_WARPS)),
+        interpret=interpret,
+    )(*operands)
+    return jax.tree.unflatten(structure, [x[:members] for x in outputs])
 
 
 def _traced(leaves: Sequence[Array], tree: Any, axes: Sequence[int | None], block: int) -> tuple[ClosedJaxpr, Any]:
@@ -116,36 +136,6 @@ def _traced(leaves: Sequence[Array], tree: Any, axes: Sequence[int | None], bloc
     if any(np.ndim(constant) for constant in traced.consts):
         raise ValueError("scenario: run_on_gpu cannot simulate a recorded signal (Recorded). Use run_ensemble.")
     return traced, results
-
-
-def _launch(
-    kernel: Callable[..., None],
-    operands: list[Array],
-    axes: Sequence[int | None],
-    results: Sequence[jax.ShapeDtypeStruct],
-    programs: int,
-    block: int,
-    interpret: bool,
-) -> Any:
-    """Call the kernel on a grid of programs; each reads its block of the members' numbers and all shared numbers."""
-    from jax.experimental import pallas as pl
-    from jax.experimental.pallas import triton
-
-    def own(x: Array | jax.ShapeDtypeStruct) -> pl.BlockSpec:
-        return pl.BlockSpec((block, *x.shape[1:]), lambda n: (n, *(0 for _ in x.shape[1:])))
-
-    def shared(x: Array) -> pl.BlockSpec:
-        return pl.BlockSpec(x.shape, lambda _: (0,) * x.ndim)
-
-    return pl.pallas_call(
-        kernel,
-        grid=(programs,),
-        in_specs=[shared(x) if axis is None else own(x) for x, axis in zip(operands, axes, strict=True)],
-        out_specs=[own(x) for x in results],
-        out_shape=[jax.ShapeDtypeStruct((programs * x.shape[0], *x.shape[1:]), x.dtype) for x in results],
-        compiler_params=triton.CompilerParams(num_warps=min(block // WARP, MOST_WARPS)),
-        interpret=interpret,
-    )(*operands)
 
 
 def _with_draws(scenario: Scenario, members: int) -> tuple[Scenario, tuple[Array, Array]]:

@@ -28,9 +28,8 @@ from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.declared import require_number
 from ambjax.numerics.records import Scalar, canonical, leaf, record, require_concrete
 from ambjax.numerics.shapes import require_one_member
-from ambjax.simulation.clock import Clock
+from ambjax.simulation.clock import Clock, takes_case
 from ambjax.simulation.rollout import prepare
-from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
 
 _matrices = compiled_quickly(loop_matrices, options=QUICKEST)

@@ -18,8 +18,7 @@ from ambjax.linear.member_responses import Responses, member_responses
 from ambjax.linear.multisine import Reading
 from ambjax.numerics.declared import require_number
 from ambjax.numerics.records import Scalar
-from ambjax.simulation.clock import Clock
-from ambjax.simulation.triple import takes_case
+from ambjax.simulation.clock import Clock, takes_case
 from ambjax.world.scenario import Scenario
 
 # LINES: number of logarithmically spaced lines. NEAR: number of lines near a peak. AROUND: their range as multiples of

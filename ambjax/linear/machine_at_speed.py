@@ -118,10 +118,10 @@ class MachineAtSpeed:
         notched: Groups = (None,) * count
 
         def sample(past: tuple) -> Sample:
-            return Sample(reference, self.period, unlimited, past)
+            return Sample(reference, self.period if self.sampled else None, unlimited, past)
 
         def notch(cascade: Cascade, _: object, read: Measurement, state: CascadeState, past: tuple) -> tuple:
-            return cascade.observed(read, state.observer, reference, sample(past) if self.sampled else None)
+            return cascade.observed(read, state.observer, reference, sample(past).period)
 
         whole = self.machine.law
         if whole is not None:
@@ -135,15 +135,10 @@ class MachineAtSpeed:
         ) -> tuple[Array, CascadeState]:
             (force, estimate), own = demand
             if force is not None:
-                if self.sampled:
-                    command, after = cascade.commanded(force, estimate, control, sample(past))
-                else:
-                    command, after = cascade.command_rates(force, estimate, control, reference, unlimited)
+                command, after = cascade.commanded(force, estimate, control, sample(past))
                 after = after._replace(observer=own)
-            elif self.sampled:
-                command, after, _ = cascade.step(measured, control, sample(past))
             else:
-                command, after = cascade(measured, control, reference, unlimited)
+                command, after, _ = cascade.step(measured, control, sample(past))
             return command.u, after
 
         found = self.each(one, measured, control, past, demands, notched)

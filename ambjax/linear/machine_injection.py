@@ -23,10 +23,11 @@ from ambjax.linear.multisine import FourierSums, MultiSine, Response, multisine
 from ambjax.numerics.records import Scalar, canonical, replaced
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop
+from ambjax.simulation.machine_axes import loop_of, with_loop
 from ambjax.simulation.rollout import run
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.trajectory import ALIVE
-from ambjax.simulation.whole_machine import Machine, PlantOnly, loop_of, with_loop
+from ambjax.simulation.whole_machine import Machine, PlantOnly
 from ambjax.world.waveforms import Constant
 
 

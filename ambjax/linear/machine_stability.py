@@ -14,10 +14,12 @@ from ambjax.linear.margins import poles_in_s
 from ambjax.linear.quiet_run import KICK, QuietRun, quiet, quiet_run_of
 from ambjax.linear.stability import GROWN, Stability, Tested, has_set_valued, judged, may_chatter
 from ambjax.linear.state_space import StateSpace
-from ambjax.numerics.shapes import map_varying
+from ambjax.numerics.shapes import map_varying, stack_axes
 from ambjax.simulation.clock import Clock
+from ambjax.simulation.folds import PerAxis
 from ambjax.simulation.loop import ClosedLoop
-from ambjax.simulation.whole_machine import Machine, PerAxis, stack_axes, with_loop
+from ambjax.simulation.machine_axes import with_loop
+from ambjax.simulation.whole_machine import Machine
 from ambjax.world.waveforms import Constant
 
 # Number of the coordinates of a rigid rotor, which the displaced start of a quiet run moves.

@@ -19,7 +19,8 @@ from ambjax.linear.matrices import loop_matrices
 from ambjax.numerics.records import Scalar, canonical
 from ambjax.numerics.smooth import TWO_PI
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.whole_machine import Machine, with_loop
+from ambjax.simulation.machine_axes import with_loop
+from ambjax.simulation.whole_machine import Machine
 from ambjax.world.rotation import PER_MINUTE, Rotation
 from ambjax.world.scenario import Scenario
 

@@ -30,8 +30,7 @@ from ambjax.ensemble.blocks import QUARTERS
 from ambjax.linear.analysis import linearise_members
 from ambjax.linear.quiet_run import KICK, QuietRun, quiet_run
 from ambjax.numerics.shapes import map_varying
-from ambjax.simulation.clock import Clock
-from ambjax.simulation.triple import takes_case
+from ambjax.simulation.clock import Clock, takes_case
 from ambjax.world.scenario import Scenario
 
 if TYPE_CHECKING:  # `ambjax simulate` imports this module, and does not need Theorem 1

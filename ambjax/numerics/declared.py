@@ -114,6 +114,38 @@ def kinds(field: dataclasses.Field) -> tuple[type, ...]:
     return named if known else ()
 
 
+@functools.cache
+def fields_of(kind: type) -> tuple[tuple[dataclasses.Field, bool], ...]:
+    """Return the fields of a record type, and whether each is a leaf; () for a type that is not a record. Cached."""
+    fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
+    return tuple((field, bool(field.metadata.get("leaf"))) for field in fields)
+
+
+@functools.cache
+def leaves_of(kind: type) -> tuple[dataclasses.Field, ...]:
+    """Return the fields of a record type that are leaves. Cached."""
+    return tuple(field for field, is_leaf in fields_of(kind) if is_leaf)
+
+
+@functools.cache
+def limited_parts(kind: type) -> tuple[dataclasses.Field, ...]:
+    """Return the fields of a record type that are no leaves, and whose values are limited. Cached."""
+    fields = [field for field, is_leaf in fields_of(kind) if not is_leaf and field.init]
+    return tuple(field for field in fields if field.metadata.get("choices") or kinds(field))
+
+
+@functools.cache
+def bounded_leaves(kind: type) -> tuple[tuple[dataclasses.Field, float, float], ...]:
+    """Return the leaves of a record type, each with an open interval of allowed floats, empty if `whole`. Cached."""
+    found = []
+    for field in leaves_of(kind):
+        lows = [x for x in (field.metadata["above"], field.metadata["at_least"]) if x is not None]
+        high = field.metadata["at_most"]
+        high = -math.inf if field.metadata["whole"] else math.inf if high is None else high
+        found.append((field, max(lows, default=-math.inf), high))
+    return tuple(found)
+
+
 # What a class also admits: NumPy's booleans, and a list for a tuple.
 ALSO = {bool: (np.bool_,), tuple: (list,)}
 WORDS = {bool: "True or False", tuple: "a tuple", types.NoneType: "None"}

@@ -1,4 +1,4 @@
-"""Linear algebra on states, which are pytrees of a few scalars.
+"""Operations on states, which are pytrees of a few scalars: linear algebra, a choice, and a Runge-Kutta step.
 
 The systems are 3x3 to 8x8 and occur in the innermost loop. Each entry of a matrix is a separate scalar (under vmap, one
 vector lane per member). A library call would take longer than the arithmetic.
@@ -11,10 +11,23 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.compiler.barrier import materialised
 from ambjax.numerics.records import Scalar
 from ambjax.numerics.smooth import away_from_zero
 
 S = TypeVar("S")
+
+
+def axpy(state: S, *terms: tuple[Scalar, S]) -> S:
+    """Return state + sum of factor * direction over the terms, leaf by leaf."""
+    for factor, direction in terms:
+        state = jax.tree.map(lambda x, d, factor=factor: x + factor * d, state, direction)
+    return state
+
+
+def choose(condition: Array | bool, yes: S, no: S) -> S:
+    """Apply jnp.where to every leaf of two states."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
 class Factors(NamedTuple):
@@ -77,3 +90,19 @@ def solve(factors: Factors, right: S) -> S:
             y[i] = y[i] - m[i][j] * y[j]
         y[i] = y[i] * inverses[i]
     return jax.tree.unflatten(tree, list(reversed(y)))
+
+
+def rk4_step(rates: Callable[[S], S], x: S, h: Scalar) -> S:
+    """Return the state after a step of length h (s) from x, with an error of order h^5. `rates(x)`: rates of x."""
+
+    def moved(h: Scalar, k: S) -> S:
+        return jax.tree.map(lambda a, b: a + h * b, x, k)
+
+    def at(y: S) -> S:
+        return materialised(rates(y), y)
+
+    k_1 = at(x)
+    k_2 = at(moved(h / 2, k_1))
+    k_3 = at(moved(h / 2, k_2))
+    k_4 = at(moved(h, k_3))
+    return materialised(moved(h / 6, jax.tree.map(lambda a, b, c, d: a + 2 * (b + c) + d, k_1, k_2, k_3, k_4)))

@@ -7,7 +7,6 @@ part of the tree structure. The case-file reader, the template, the reference pa
 import dataclasses
 import functools
 import inspect
-import math
 import operator
 from collections.abc import Callable, Hashable, Iterable
 from typing import Any, Literal, TypeAlias, TypeVar, dataclass_transform
@@ -20,7 +19,7 @@ from jax import Array
 from jax.core import Tracer
 
 from ambjax.compiler.barrier import in_trace
-from ambjax.numerics.declared import check_fixed, check_number, item, kinds
+from ambjax.numerics import declared
 from ambjax.numerics.shapes import check_shapes
 
 T = TypeVar("T")
@@ -148,7 +147,7 @@ def record(cls: type[T]) -> type[T]:
     _check_at_construction(cls)
     record_type = dataclasses.dataclass(frozen=True)(cls)
     fields = dataclasses.fields(record_type)  # pyright: ignore[reportArgumentType]
-    items = [item(field) for field in fields if field.metadata.get("doc")]
+    items = [declared.item(field) for field in fields if field.metadata.get("doc")]
     record_type.__doc__ = "\n".join([inspect.cleandoc(record_type.__doc__ or ""), "", *items]).rstrip()
     fixed = [f.name for f in fields if f.metadata.get("static")]
     names = [f.name for f in fields if not f.metadata.get("static")]
@@ -187,7 +186,7 @@ def _check_at_construction(cls: type) -> None:
         if type(self) is not cls:  # a subclass that is not a record: JAX may construct it with other values
             return
         given = self.__dict__
-        for field, low, high in _leaves(type(self)):
+        for field, low, high in declared.bounded_leaves(type(self)):
             value = given[field.name]
             fine = value is field.default and not isinstance(value, (list, tuple))
             if fine or (type(value) is float and low < value < high):
@@ -196,9 +195,9 @@ def _check_at_construction(cls: type) -> None:
                 check_leaf(field, f"{type(self).__name__}.{field.name}", value)
             if isinstance(value, (list, tuple)):  # one leaf, not one for each number
                 given[field.name] = np.asarray(value, None if field.metadata["whole"] else float)
-        for field in _fixed(type(self)):
+        for field in declared.limited_parts(type(self)):
             if given[field.name] is not field.default:
-                check_fixed(field, f"{type(self).__name__}.{field.name}", given[field.name])
+                declared.check_fixed(field, f"{type(self).__name__}.{field.name}", given[field.name])
 
     cls.__post_init__ = check  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -243,7 +242,7 @@ def validate(node: object, path: str = "") -> None:
         for index, item in enumerate(node):
             validate(item, f"{path}[{index}]")
         return
-    if not (fields := _fields(type(node))):
+    if not (fields := declared.fields_of(type(node))):
         return
     for field, is_leaf in fields:
         value = getattr(node, field.name)
@@ -251,7 +250,7 @@ def validate(node: object, path: str = "") -> None:
             check_leaf(field, f"{path}.{field.name}".lstrip("."), value)
         else:
             validate(value, f"{path}.{field.name}".lstrip("."))
-    check_shapes(leaves_of(type(node)), vars(node), path)
+    check_shapes(declared.leaves_of(type(node)), vars(node), path)
     if pair := getattr(type(node), "ordered", None):
         low, high = (getattr(node, name) for name in pair)
         if not (is_traced(low) or is_traced(high)) and np.any(np.greater(low, high)):
@@ -263,39 +262,7 @@ def check_leaf(field: dataclasses.Field, name: str, value: object) -> None:
     if isinstance(value, GainFunction):
         value.check(field, name)
     elif not (is_traced(value) or (value is None and (field.metadata["optional"] or field.metadata.get("steepness")))):
-        check_number(field, name, value)
-
-
-@functools.cache
-def _fields(kind: type) -> tuple[tuple[dataclasses.Field, bool], ...]:
-    """Return the fields of a record type, and whether each is a leaf; () for a type that is not a record. Cached."""
-    fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
-    return tuple((field, bool(field.metadata.get("leaf"))) for field in fields)
-
-
-@functools.cache
-def leaves_of(kind: type) -> tuple[dataclasses.Field, ...]:
-    """Return the fields of a record type that are leaves. Cached."""
-    return tuple(field for field, is_leaf in _fields(kind) if is_leaf)
-
-
-@functools.cache
-def _fixed(kind: type) -> tuple[dataclasses.Field, ...]:
-    """Return the fields of a record type that are no leaves, and whose values are limited. Cached."""
-    fields = [field for field, is_leaf in _fields(kind) if not is_leaf and field.init]
-    return tuple(field for field in fields if field.metadata.get("choices") or kinds(field))
-
-
-@functools.cache
-def _leaves(kind: type) -> tuple[tuple[dataclasses.Field, float, float], ...]:
-    """Return the leaves of a record type, each with an open interval of allowed floats, empty if `whole`. Cached."""
-    found = []
-    for field in leaves_of(kind):
-        lows = [x for x in (field.metadata["above"], field.metadata["at_least"]) if x is not None]
-        high = field.metadata["at_most"]
-        high = -math.inf if field.metadata["whole"] else math.inf if high is None else high
-        found.append((field, max(lows, default=-math.inf), high))
-    return tuple(found)
+        declared.check_number(field, name, value)
 
 
 # Names of the leaves that are integers. All other leaves become floating-point numbers, even if given as integers.

@@ -95,3 +95,15 @@ def with_entry(x: Any, index: tuple[Any, ...], value: Any) -> Any:
     at[index] = True
     wide = jax.numpy.asarray(value)[(..., *[None] * len(index))]
     return jax.numpy.where(at, wide, x)
+
+
+def stack_axes(axes: Sequence[T]) -> T:
+    """Return the pytrees of axes as one, each leaf [c, ...]; [N, c, ...] if it varies between members on any axis."""
+    flags = np.any([varying(axis) for axis in axes], 0)
+    parts = [jax.tree.leaves(axis) for axis in axes]
+    leaves = []
+    for k, varies in enumerate(flags):
+        own = [np.asarray(one[k]) for one in parts]
+        most = max((x.shape for x in own), key=len)
+        leaves.append(np.stack([np.broadcast_to(x, most) for x in own], 1) if varies else np.stack(own))
+    return jax.tree.unflatten(jax.tree.structure(axes[0]), leaves)

@@ -14,10 +14,11 @@ from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.ensemble.machines import compiled_for_machines
 from ambjax.ensemble.replay import SEGMENT
 from ambjax.numerics.records import canonical
+from ambjax.numerics.shapes import stack_axes
+from ambjax.simulation.folds import PerAxis
 from ambjax.simulation.metrics import UNITS, Metrics
 from ambjax.simulation.rollout import begin, finish, recorded_segment
 from ambjax.simulation.trajectory import SIGNAL_UNITS, STATUSES, TOUCHED
-from ambjax.simulation.whole_machine import PerAxis, stack_axes
 
 # Metrics of which the smallest value of the axes is the worst.
 SMALLEST = ("singular_at_s", "lost_at_s")

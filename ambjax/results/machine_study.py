@@ -25,11 +25,12 @@ from ambjax.linear.machine_stability import growth_of, machine_stability
 from ambjax.linear.notch_design import speeds_of
 from ambjax.linear.stability import Findings, Stability
 from ambjax.numerics.records import canonical
-from ambjax.numerics.shapes import map_varying
+from ambjax.numerics.shapes import map_varying, stack_axes
 from ambjax.results.machine_run import worst_of
 from ambjax.simulation.clock import Clock
+from ambjax.simulation.folds import PerAxis
 from ambjax.simulation.metrics import Metrics
-from ambjax.simulation.whole_machine import Machine, PerAxis, stack_axes
+from ambjax.simulation.whole_machine import Machine
 from ambjax.world.scenario import Scenario
 
 # Multiple of the clearance by which the rotor of a `lost` call is displaced along x, y and z.

@@ -38,6 +38,7 @@ from ambjax.linear.machine_stability import growth_of, machine_stability
 from ambjax.linear.stability import has_set_valued
 from ambjax.numerics.records import replaced
 from ambjax.simulation.clock import Clock
+from ambjax.simulation.system import reads_velocity
 from ambjax.world.scenario import Initial, Scenario
 from ambjax.world.waveforms import Constant
 
@@ -143,7 +144,7 @@ def points_of(case: MachineCase, turning: Sequence[TurningMachine]) -> list[Mach
 
 def _velocity_sensor(case: Case) -> bool:
     """Return whether the velocity is measured and the laws use this measurement."""
-    return case.scenario.sensors.velocity and case.cascade.reads_velocity(case.clock.sample_period)
+    return case.scenario.sensors.velocity and reads_velocity(case.cascade, case.clock.sample_period)
 
 
 def _analysis(case: Case, system: StateSpace, m: float, velocity: bool, held: bool | None = None) -> Analysis:

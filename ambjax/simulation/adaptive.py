@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from ambjax.numerics.linear import choose
 from ambjax.numerics.records import Scalar, leaf, record, static
 from ambjax.numerics.reversible import while_loop
-from ambjax.simulation.integrate import Advanced, InitialValueProblem, Inputs, State, Times, choose, stage_times
+from ambjax.simulation.integrate import Advanced, Begin, InitialValueProblem, Inputs, State, Times, stage_times
 from ambjax.simulation.span import Instant, Span, blank
 from ambjax.simulation.trajectory import ALIVE, STALLED
 
@@ -76,15 +77,9 @@ class AdaptiveSteps:
         raise NotImplementedError
 
     def advance(
-        self,
-        problem: InitialValueProblem[Inputs, State],
-        t: Scalar,
-        period: Scalar,
-        state: State,
-        memory: object,
-        code: Scalar = ALIVE,
+        self, problem: InitialValueProblem[Inputs, State], begin: Begin[State], period: Scalar
     ) -> Advanced[State]:
-        period = jnp.asarray(period)
+        (t, state, memory, code), period = begin, jnp.asarray(period)
 
         def unfinished(now: _Progress) -> Array:
             return (now.elapsed < period) & (now.code == ALIVE) & (now.trials < self.most_steps)
@@ -117,10 +112,10 @@ class AdaptiveSteps:
 
         zero, code = jnp.zeros_like(period), jnp.asarray(code, jnp.int32)
         h = cast(Array, lax.stop_gradient(memory))
-        begin = _Progress(
+        first = _Progress(
             state, h, h, zero, code, jnp.int32(0), zero, blank(problem.instant_structure), (zero, problem.moving(state))
         )
-        done = while_loop(unfinished, trial, begin)
+        done = while_loop(unfinished, trial, first)
         x = cast(State, done.state)
         end = problem.rates_and_signals(problem.inputs(stage_times(t, done.elapsed)(1.0)), x)[1]
         span = choose(done.elapsed > 0, done.span.with_instant(end, done.before / 2), done.span)

@@ -1,6 +1,7 @@
-"""The plant between two samples of a processor: the voltages that act, and the initial value problems under them."""
+"""The loop on a processor: its state, and the plant between two samples under the voltages that act."""
 
 from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +11,38 @@ from ambjax.control.cascade_state import Command
 from ambjax.numerics.records import Scalar
 from ambjax.simulation.edges import NO_EDGES, Edges
 from ambjax.simulation.integrate import InitialValueProblem
-from ambjax.simulation.loop import INSTANT_TREE, ClosedLoop, Densities, ExternalInputs, Sizes
-from ambjax.simulation.span import Instant
-from ambjax.world.amplifier import Amplifier, CurrentAmplifier
-from ambjax.world.coil_limits import difference
+from ambjax.simulation.loop import ClosedLoop, ExternalInputs
+from ambjax.simulation.span import INSTANT_TREE, Densities, Instant, Sizes
+from ambjax.world.amplifier import Amplifier, CurrentAmplifier, difference
+from ambjax.world.faults import Sensed
+
+
+class SampledState(NamedTuple):
+    """State of the closed loop on a processor. A field is () if the loop has no such part.
+
+    - `plant`, `control`: states of the plant and of the laws.
+    - `command`: last command, with u (V, or A for a current) within `Scenario.command_limit`.
+    - `past`: the commands u before that of `command`, the most recent first, as many as the delay needs.
+    - `finite`: 1 at the start; 0 after a law or, without a guard, the sensor has returned a number that is not finite.
+    - `z_filtered`: output of the low-pass of the position sensor, m.
+    - `u_a`: output voltage of the amplifier, V.
+    - `watch`: state of the guard.
+    - `started`: 0 until the guard has accepted all readings of one sample; then 1. Until then, each sample initialises
+      the laws.
+    - `sensed`: state of a sensor with faults.
+    """
+
+    plant: Any
+    control: Any
+    command: Command
+    past: tuple[Array, ...]
+    finite: Array
+    z_filtered: Array | tuple[()] = ()
+    u_a: Array | tuple[()] = ()
+    watch: Any = ()
+    started: Array | tuple[()] = ()
+    sensed: Sensed | tuple[()] = ()
+
 
 Voltage = Callable[[Scalar], Array]
 
@@ -47,12 +76,13 @@ def amplified(
     t: Array,
     u_a: Array | tuple[()],
     commanded: Sequence[tuple[Array, Scalar]],
+    divided: bool = True,
 ) -> tuple[list[tuple[Voltage, Scalar]], Array | tuple[()]]:
     """Return the amplifier's voltage as functions of time with their durations (s), and its output voltage at the end.
 
     `u_a`: output voltage at t (V). For an amplifier that applies the command at once it is (), also in the result.
-    `commanded`: voltages (V) from t on, each with its duration (s). With a slew-rate limit, each interval is divided at
-    the end of its ramp, where the slope of the voltage jumps.
+    `commanded`: voltages (V) from t on, each with its duration (s). With a slew-rate limit and `divided`, each interval
+    is divided at the end of its ramp, where the slope of the voltage jumps.
     """
     if not isinstance(amplifier, Amplifier) or not amplifier.slow:
         return [(lambda _, u=u: u, time) for u, time in commanded], u_a
@@ -61,7 +91,8 @@ def amplified(
     for u, time in commanded:
         voltage = lambda now, u_a=u_a, u=u, t=t: amplifier.followed(u_a, u, now - t)  # noqa: E731
         ramp = jnp.minimum(amplifier.ramp(u_a, u), time)
-        given += [(voltage, time)] if amplifier.slew is None else [(voltage, ramp), (voltage, time - ramp)]
+        whole = amplifier.slew is None or not divided
+        given += [(voltage, time)] if whole else [(voltage, ramp), (voltage, time - ramp)]
         u_a, t = amplifier.followed(u_a, u, jnp.asarray(time)), t + time
     return given, u_a
 

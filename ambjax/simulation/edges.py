@@ -15,7 +15,6 @@ from jax import Array
 
 from ambjax.numerics.records import Scalar, is_traced
 from ambjax.world.recorded import Knots
-from ambjax.world.scenario import Scenario
 
 
 class Edges(NamedTuple):
@@ -84,22 +83,13 @@ def _rounding() -> float:
     return 4 * float(jnp.finfo(jnp.result_type(float)).eps)
 
 
-def most_inside(scenario: Scenario, period: Scalar, reference: bool = False) -> int | None:
-    """Return the largest number of edges of the disturbances strictly inside one sample; None if an
-    edge or the period is traced.
+def most_inside(edges: tuple[Scalar, ...], period: Scalar, knots: tuple[Knots, ...] = ()) -> int | None:
+    """Return the largest number of `edges` and `knots` strictly inside one sample; None if one or the period is traced.
 
-    `reference`: include the edges of the reference, which a processor reads at the samples only. `period`: one sample
-    period or several, s.
-
-    The number is an upper bound for an ensemble. An edge that differs
+    `period`: one sample period or several, s. The number is an upper bound for an ensemble. An edge that differs
     between members counts as inside a sample. Two edges count as inside the same sample if their distance can be
     shorter than the longest period. The distance can have every value between its extremes over the members.
     """
-    return most_of(scenario.edges(reference), period, scenario.knots(reference))
-
-
-def most_of(edges: tuple[Scalar, ...], period: Scalar, knots: tuple[Knots, ...] = ()) -> int | None:
-    """Return the largest number of `edges` and `knots` strictly inside one sample, as `most_inside`."""
     if any(map(is_traced, (*edges, *(one.start for one in knots), period))):
         return None
     periods = np.asarray(period, float)

@@ -4,14 +4,14 @@
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.law_trial import reason
-from ambjax.numerics.records import Scalar, leaf, record, static
+from ambjax.numerics.records import Scalar, leaf, part, record, static
 from ambjax.numerics.smooth import larger, safe_sqrt, smaller
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import Row, first_time
@@ -41,7 +41,7 @@ class Fold(Protocol[Carry, Result]):
 
     - `init()`: the carry before the first sample: arrays of fixed shapes.
     - `update(carry, row, span)`: the next carry. `row` contains the signals at the start of a sample; `span` contains
-      extremes and integrals of signals from there to the next (`simulation.span`, `loop.Sizes`, `loop.Densities`).
+      extremes and integrals of signals from there to the next (`simulation.span`).
     - `result(carry, ending)`: the numbers, as `Result.metrics`. `ending`: loss and duration of the run.
     """
 
@@ -236,3 +236,22 @@ class Named:
 
     def result(self, carry: dict[str, object], ending: Ending) -> dict[str, Array]:
         return {name: fold.result(carry[name], ending) for name, fold in self.folds.items()}
+
+
+@record
+class PerAxis:
+    """A fold of one axis for each axis. `fold`: the folds of the axes, stacked [c]."""
+
+    fold: Any = part(doc="the folds of the axes", channels=True)
+
+    def init(self) -> object:
+        return jax.vmap(lambda fold: fold.init())(self.fold)
+
+    def update(self, carry: object, row: Any, span: Span) -> object:
+        one = Row(*[0] * len(Row._fields))._replace(t=None, alive=None)  # pyright: ignore[reportArgumentType]
+        axes = 0, 0, one, Span(None, 0, 0, 0)  # pyright: ignore[reportArgumentType]
+        rows = row.axes._replace(t=row.t, alive=row.alive)
+        return jax.vmap(lambda fold, *now: fold.update(*now), in_axes=axes)(self.fold, carry, rows, span)
+
+    def result(self, carry: object, ending: Ending) -> Any:
+        return jax.vmap(lambda fold, own: fold.result(own, ending))(self.fold, carry)

@@ -1,6 +1,6 @@
 """Integrators: methods that advance an initial value problem over one sample period with held measurement errors.
 
-    advance(problem, t, period, state, memory, code=0) -> Advanced(state, code, t, memory, span)
+    advance(problem, Begin(t, state, memory, code=0), period) -> Advanced(state, code, t, memory, span)
 
 The state is any pytree of scalars. An integrator stops at the first state whose status code is not 0, and returns the
 state before it. If the initial code is not 0, the state does not change. `memory` is the data that the method carries
@@ -15,10 +15,10 @@ order there.
 from collections.abc import Callable, Sequence
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
-import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from ambjax.numerics.linear import choose
 from ambjax.numerics.records import Scalar, record, static
 from ambjax.numerics.smooth import away_from_zero
 from ambjax.simulation.edges import NO_EDGES, Edges, inset
@@ -105,6 +105,20 @@ class InitialValueProblem(NamedTuple, Generic[Inputs, State]):
         return (self.rates(inputs, state), NOTHING) if self.observed is None else self.observed(inputs, state)
 
 
+class Begin(NamedTuple, Generic[State]):
+    """Where an integration begins.
+
+    - `t`, `state`: time, s, and the state there.
+    - `memory`: data that the method carries from one sample to the next.
+    - `code`: status code; if it is not 0, the state does not change.
+    """
+
+    t: Scalar
+    state: State
+    memory: object
+    code: Scalar = ALIVE
+
+
 class Advanced(NamedTuple, Generic[State]):
     """Result of `advance`.
 
@@ -137,23 +151,12 @@ class Integrator(Protocol):
     def start(self, period: Scalar) -> object: ...
 
     def advance(
-        self,
-        problem: InitialValueProblem[Inputs, State],
-        t: Scalar,
-        period: Scalar,
-        state: State,
-        memory: object,
-        code: Scalar = ALIVE,
+        self, problem: InitialValueProblem[Inputs, State], begin: Begin[State], period: Scalar
     ) -> Advanced[State]: ...
 
 
 def in_turn(
-    method: Integrator,
-    parts: Sequence[tuple[InitialValueProblem[Inputs, State], Scalar]],
-    t: Scalar,
-    state: State,
-    memory: object,
-    code: Scalar = ALIVE,
+    method: Integrator, parts: Sequence[tuple[InitialValueProblem[Inputs, State], Scalar]], begin: Begin[State]
 ) -> list[Advanced[State]]:
     """Integrate problems one after another, for a sample in which the rates jump at known instants.
 
@@ -161,21 +164,15 @@ def in_turn(
 
     Returns one result for each problem. The span of a result begins at the start of the first problem.
     """
-    (problem, time), *others = parts
-    reached = [method.advance(problem, t, time, state, memory, code)]
-    for problem, following in others:
-        t, time, so_far = t + time, following, reached[-1]
-        after = method.advance(problem, t, time, so_far.state, so_far.memory, so_far.code)
-        end = jnp.where(so_far.code == ALIVE, after.t, so_far.t)
-        reached.append(after._replace(t=end, span=so_far.span.joined(after.span)))
+    reached = list[Advanced[State]]()
+    for problem, time in parts:
+        after = method.advance(problem, begin, time)
+        if reached:
+            end = jnp.where(reached[-1].code == ALIVE, after.t, reached[-1].t)
+            after = after._replace(t=end, span=reached[-1].span.joined(after.span))
+        reached.append(after)
+        begin = Begin(begin.t + time, after.state, after.memory, after.code)
     return reached
-
-
-def axpy(state: State, *terms: tuple[Scalar, State]) -> State:
-    """Return state + sum of factor * direction over the terms, leaf by leaf."""
-    for factor, direction in terms:
-        state = jax.tree.map(lambda x, d, factor=factor: x + factor * d, state, direction)
-    return state
 
 
 class WholeState:
@@ -189,16 +186,9 @@ class WholeState:
         """Return the state: it does not jump at the start of a sample."""
         return state
 
-    def advance(
-        self, method: Integrator, errors: object, t: Scalar, period: Scalar, state: State, memory: object, code: Array
-    ) -> Advanced[State]:
-        """Integrate the system from the sample at t (s) to the next one."""
-        return method.advance(self.problem(errors), t, period, state, memory, code)
-
-
-def choose(condition: Array, yes: State, no: State) -> State:
-    """Apply jnp.where to every leaf of two states."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+    def advance(self, method: Integrator, errors: object, begin: Begin[State], period: Scalar) -> Advanced[State]:
+        """Integrate the system from the beginning of a sample to the next one."""
+        return method.advance(self.problem(errors), begin, period)
 
 
 def stage_times(t: Scalar, h: Scalar) -> Times:
@@ -231,14 +221,9 @@ class FixedSteps:
         raise NotImplementedError
 
     def advance(
-        self,
-        problem: InitialValueProblem[Inputs, State],
-        t: Scalar,
-        period: Scalar,
-        state: State,
-        memory: object,
-        code: Scalar = ALIVE,
+        self, problem: InitialValueProblem[Inputs, State], begin: Begin[State], period: Scalar
     ) -> Advanced[State]:
+        t, state, memory, code = begin
         h = jnp.asarray(period) / self.substeps
         place, steps = problem.edges.steps(t, h, self.substeps)
 
@@ -255,7 +240,7 @@ class FixedSteps:
 
         t = jnp.asarray(t, h.dtype)
         code, last = jnp.asarray(code, jnp.int32), (t, t, problem.moving(state))
-        begin = (state, code, last, blank(problem.instant_structure), place)
-        x, ended, (start, end, motion), span, _ = lax.fori_loop(0, self.substeps + problem.edges.most, body, begin)
+        first = (state, code, last, blank(problem.instant_structure), place)
+        x, ended, (start, end, motion), span, _ = lax.fori_loop(0, self.substeps + problem.edges.most, body, first)
         t_end = problem.ended(x, motion, start, end, ended)
         return Advanced(x, ended, t_end, memory, span.shortened(end - t_end))

@@ -4,19 +4,21 @@ Each axis keeps its guard, its notch and its inner laws; it has no observer.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.cascade import Cascade
-from ambjax.control.machine_law import Demanded, MachineInputs, MachineLaw
+from ambjax.control.machine_law import Demanded, MachineInputs
 from ambjax.control.stages import ForceDemand
+from ambjax.numerics.linear import choose
 from ambjax.numerics.records import Scalar
+from ambjax.simulation.between import SampledState
 from ambjax.simulation.loop import ClosedLoop, LoopState
+from ambjax.simulation.machine_axes import MachineAxes
 from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.sampled_state import SampledState
 from ambjax.world.plant import State
 from ambjax.world.sensor import Measurement
 from ambjax.world.waveforms import Reference
@@ -24,19 +26,8 @@ from ambjax.world.waveforms import Reference
 T = TypeVar("T")
 
 
-class Grouped(Protocol):
-    """A machine whose axes are stacked in groups."""
-
-    @property
-    def law(self) -> MachineLaw | None: ...
-    def split(self, x: T) -> tuple[T, ...]: ...
-    def join(self, parts: Sequence[T]) -> T: ...
-    def each(self, function: Callable[..., T], *groups: Sequence[object]) -> list[T]: ...
-    def loops(self) -> tuple[ClosedLoop, ...]: ...
-
-
 def inputs_of(
-    machine: Grouped, references: Reference, W: Scalar, u_max: Array, past: tuple[Array, ...], period: Scalar
+    machine: MachineAxes, references: Reference, W: Scalar, u_max: Array, past: tuple[Array, ...], period: Scalar
 ) -> MachineInputs:
     """Return the inputs of the law of a machine. All arguments but W and `period` have one number for each axis [c]."""
     cascades = [loop.cascade for loop in machine.loops()]
@@ -57,7 +48,7 @@ def inputs_of(
     return MachineInputs(references, jnp.asarray(W), u_max, start, driven, scaled, past, period)
 
 
-def forces(machine: Grouped, demanded: Demanded) -> tuple[tuple[ForceDemand, Measurement], ...]:
+def forces(machine: MachineAxes, demanded: Demanded) -> tuple[tuple[ForceDemand, Measurement], ...]:
     """Return the demands of the groups, with the gaps of their nominal plants, and the estimates."""
     found = []
     for loop, force, estimate in zip(
@@ -69,7 +60,7 @@ def forces(machine: Grouped, demanded: Demanded) -> tuple[tuple[ForceDemand, Mea
 
 
 def jumped(
-    machine: Grouped, t: Scalar, W: Scalar, axes: Sequence[SampledState], law: Any, errors: Sequence[object]
+    machine: MachineAxes, t: Scalar, W: Scalar, axes: Sequence[SampledState], law: Any, errors: Sequence[object]
 ) -> tuple[list[SampledState], Any]:
     """Step the laws of all axes at time t (s). `axes`: states of the groups. `law`: state of the law of the machine."""
 
@@ -77,7 +68,7 @@ def jumped(
         own, measured = axis.read(own, error)
         measured = axis.injected(measured, t)
         sample, checked, measured, laws = axis.received(measured, axis.reference(t), own)
-        measured, notched = axis.loop.cascade.observed(measured, laws.observer, sample.reference, sample)
+        measured, notched = axis.loop.cascade.observed(measured, laws.observer, sample.reference, sample.period)
         return own, sample, checked, measured, laws._replace(observer=notched)
 
     parts = machine.each(read, axes, errors)
@@ -87,7 +78,7 @@ def jumped(
     flags = [own.started for own, *_ in parts if not isinstance(own.started, tuple)]
     if flags:  # a guard that has not accepted all readings of one sample: the law begins again
         started = jnp.min(jnp.concatenate(flags)) > 0.5
-        law = jax.tree.map(lambda a, b: jnp.where(started, a, b), law, machine.law.begin(measured, inputs))
+        law = choose(started, law, machine.law.begin(measured, inputs))
     demanded, after = machine.law.step(measured, law, inputs)
 
     def finished(
@@ -100,11 +91,11 @@ def jumped(
 
     ended = machine.each(finished, parts, forces(machine, demanded), machine.split(demanded.now))
     keeps = jnp.all(jnp.concatenate([kept for _, kept in ended]))
-    return [own for own, _ in ended], jax.tree.map(lambda a, b: jnp.where(keeps, a, b), after, law)
+    return [own for own, _ in ended], choose(keeps, after, law)
 
 
 def demanded_now(
-    machine: Grouped, W: Scalar, own: Sequence[Any], sensed: Sequence[Any], law: Any, errors: Sequence[object]
+    machine: MachineAxes, W: Scalar, own: Sequence[Any], sensed: Sequence[Any], law: Any, errors: Sequence[object]
 ) -> tuple[tuple[tuple[ForceDemand, Measurement], ...], Any]:
     """Return the demands of the groups in continuous time, and the rates of the state of the law."""
 
@@ -120,7 +111,7 @@ def demanded_now(
     return forces(machine, demanded), rates
 
 
-def begun(machine: Grouped, W: Scalar, axes: Sequence[Any], errors: Sequence[object]) -> Any:
+def begun(machine: MachineAxes, W: Scalar, axes: Sequence[Any], errors: Sequence[object]) -> Any:
     """Return the state of the law at t = 0. `axes`: states of the groups at the places of the sensors."""
     if machine.law is None:
         return ()

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.cascade import Cascade
-from ambjax.control.cascade_state import CascadeState, Command
+from ambjax.control.cascade_state import CascadeState, Command, Sample
 from ambjax.control.stages import ForceDemand
 from ambjax.numerics.records import Scalar, part, record, static
 from ambjax.numerics.smooth import larger, limited
 from ambjax.simulation.edges import Edges
 from ambjax.simulation.integrate import InitialValueProblem, WholeState
 from ambjax.simulation.sliding import slide, slides
-from ambjax.simulation.span import Instant, Span
+from ambjax.simulation.span import INSTANT_TREE, Densities, Instant, Sizes, Span
 from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED, Row
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
@@ -40,31 +40,6 @@ class ExternalInputs(NamedTuple):
     q_i: Array
     runout: Array | tuple[()]
     e: Array | tuple[()] = ()
-
-
-class Sizes(NamedTuple):
-    """Signals whose extremes between samples are recorded. Names and units are those of a `Row`."""
-
-    z: Array
-    e_z: Array
-    sigma: Array
-    u: Array
-    i: Array
-    e: Array
-    v_tilde: Array
-    z_stop: Array | tuple[()] = ()
-
-
-class Densities(NamedTuple):
-    """Signals that are integrated between samples: u (V), u^2 (V^2), and the copper loss in both coils (W)."""
-
-    u: Array
-    u_squared: Array
-    heat: Array
-
-
-# An Instant with the pytree structure of the recorded signals.
-INSTANT_TREE = Instant(Sizes(*[0.0] * 7), Densities(*[0.0] * 3))  # pyright: ignore[reportArgumentType]
 
 
 class LoopState(NamedTuple):
@@ -172,7 +147,7 @@ class ClosedLoop(WholeState):
         if demanded is None:
             command, rates = self.cascade(measured, state.control, inputs.reference, u_max)
         else:
-            command, rates = self.cascade.command_rates(*demanded, state.control, inputs.reference, u_max)
+            command, rates = self.cascade.commanded(*demanded, state.control, Sample(inputs.reference, None, u_max))
             _, notched = self.cascade.observed(measured, state.control.observer, inputs.reference)
             rates = rates._replace(observer=notched)
         return command, rates, self.scenario.coil_voltage(limited(command.u, u_max), state.plant, inputs.q_i)

@@ -9,20 +9,18 @@ from jax import Array
 
 from ambjax.control.machine_law import MachineLaw
 from ambjax.numerics.records import Scalar, record
-from ambjax.simulation.between import acting, lags, under
-from ambjax.simulation.edges import NO_EDGES, most_of
-from ambjax.simulation.integrate import Advanced, InitialValueProblem, Integrator, WholeState, in_turn
+from ambjax.numerics.shapes import stack_axes
+from ambjax.simulation.between import SampledState, acting, amplified, lags, under
+from ambjax.simulation.edges import NO_EDGES, most_inside
+from ambjax.simulation.integrate import Advanced, Begin, InitialValueProblem, Integrator, WholeState, in_turn
 from ambjax.simulation.joint_laws import demanded_now, jumped
 from ambjax.simulation.loop import ClosedLoop, ExternalInputs
-from ambjax.simulation.machine_stops import between_stops
+from ambjax.simulation.machine_axes import loop_of
 from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.span import Instant
 from ambjax.simulation.trajectory import DIVERGED
-from ambjax.simulation.whole_machine import Groups, Machine, MachineState, PlantOnly, loop_of, stack_axes, still
-from ambjax.world.amplifier import Amplifier
+from ambjax.simulation.whole_machine import Groups, Machine, MachineState, PlantOnly, still
 from ambjax.world.rotor import Rotor
-from ambjax.world.sensor import Measurement
 
 # Voltages of the groups as functions of time, or outputs of their amplifiers.
 Voltages = list
@@ -41,25 +39,21 @@ class SampledMachine(Machine):
         axes = self.each(lambda axis, own, error: axis.jump(t, own, error), self.at_sensors(state), errors)
         return state._replace(axes=still(axes))
 
-    def advance(
-        self,
-        method: Integrator,
-        errors: object,
-        t: Scalar,
-        period: Scalar,
-        state: MachineState,
-        memory: object,
-        code: Array,
-    ) -> Advanced:
-        """Integrate rotor and coils from the sample at t (s) to the next one."""
+    def advance(self, method: Integrator, errors: object, begin: Begin[MachineState], period: Scalar) -> Advanced:
+        """Integrate rotor and coils from one sample to the next one."""
+        t, state, memory, code = begin
         finite = jnp.min(self.join([own.finite for own in state.axes]))
         code = jnp.where((code == 0) & (finite == 0), DIVERGED, code)
         pieces, u_a = self._pieces(jnp.asarray(t), period, state.axes)
-        begin = MachineState(state.q, state.q_dot, tuple(PlantOnly(own.plant) for own in state.axes))
+        first = MachineState(state.q, state.q_dot, tuple(PlantOnly(own.plant) for own in state.axes))
         parts = [(self._problem(state, voltages), time) for voltages, time in pieces]
-        reached = in_turn(method, parts, t, begin, memory, code)
-        states, times_of = [begin, *(after.state for after in reached)], [time for _, time in pieces]
-        z_filtered = self._filtered(jnp.asarray(t), state.axes, states, times_of)
+        reached = in_turn(method, parts, Begin(t, first, memory, code))
+        sensed = [self.at_sensors(one) for one in (first, *(after.state for after in reached))]
+
+        def filtered(axis: Sampled, own: SampledState, *states: PlantOnly) -> Array | tuple[()]:
+            return axis.filtered(t, own.z_filtered, [one.plant for one in states], [time for _, time in pieces])
+
+        z_filtered = self.each(filtered, state.axes, *sensed)
         end = reached[-1].state
         ended = zip(state.axes, end.axes, z_filtered, u_a, strict=True)
         axes = tuple(own._replace(plant=at.plant, z_filtered=z, u_a=u) for own, at, z, u in ended)
@@ -73,22 +67,17 @@ class SampledMachine(Machine):
         """
         processor = loop_of(self.axes[0]).cascade.timing
         delay, whole = jnp.asarray(processor.delay)[0], bool(processor.whole)
-        commands = [acting((own.command.u, *own.past), delay, period, whole) for own in axes]
+        groups = []
+        for loop, own in zip(self.loops(), axes, strict=True):
+            commanded = acting((own.command.u, *own.past), delay, period, whole)
+            groups.append(amplified(loop.scenario.amplifier, t, own.u_a, commanded, divided=False))
         low_passed = any(map(lags, self.loops()))
-        edges, u_a, pieces = self.edges(), [own.u_a for own in axes], []
-        for interval in zip(*commands, strict=True):
-            time = interval[0][1]
-            voltages = []
-            for k, (u, _) in enumerate(interval):
-                amplifier = self.loops()[k].scenario.amplifier
-                if isinstance(amplifier, Amplifier) and amplifier.slow:
-                    voltages.append(lambda now, a=amplifier, u=u, u_a=u_a[k], t=t: a.followed(u_a, u, now - t))
-                    u_a[k] = amplifier.followed(u_a[k], u, jnp.asarray(time))
-                else:
-                    voltages.append(lambda now, u=u: u)
+        edges, pieces = self.edges(), []
+        for interval in zip(*(intervals for intervals, _ in groups), strict=True):
+            voltages, time = [voltage for voltage, _ in interval], interval[0][1]
             pieces += [(voltages, length) for length in (edges.pieces(t, time) if low_passed else [time])]
             t = t + time
-        return pieces, u_a
+        return pieces, [u_a for _, u_a in groups]
 
     def _problem(self, first: MachineState, voltages: Sequence[Callable]) -> InitialValueProblem:
         """Return the initial value problem of rotor and coils under the voltages of the groups, functions of time (V).
@@ -107,33 +96,14 @@ class SampledMachine(Machine):
             def one(
                 axis: Sampled, first: SampledState, own: ExternalInputs, u: Array, plant: object
             ) -> tuple[PlantOnly, Instant]:
-                problem = under(between_stops(self, axis.loop), first.plant, first.command, lambda _: u, NO_EDGES)
+                problem = under(self.between_stops(axis.loop), first.plant, first.command, lambda _: u, NO_EDGES)
                 rates, instant = problem.rates_and_signals((own, u), plant)
                 return PlantOnly(rates), instant
 
-            parts = self.each(one, sampled, own, u, at)
-            rates, signals = zip(*parts, strict=True)
-            return self.coupled(self.pushed(outside, state), state, rates), self.with_stops(self.join(signals), state.q)
+            return self.moved(outside, state, self.each(one, sampled, own, u, at))
 
         sizes = self.each(lambda axis: PlantOnly(jax.tree.map(jnp.asarray, axis.loop.scenario.plant.scale())))
         return self.problem_of(inputs, observed, sizes)
-
-    def _filtered(self, t: Array, axes: Groups, states: list[MachineState], durations: list[Scalar]) -> list:
-        """Return the outputs of the sensors' low-passes of the groups at the next sample, m."""
-        found = []
-        sensed = [self.at_sensors(state) for state in states]
-        for k, loop in enumerate(self.loops()):
-            z, sensor, motions = axes[k].z_filtered, loop.scenario.sensors, list[Measurement]()
-            if not lags(loop):
-                found.append(z)
-                continue
-            for own, n in zip(sensed, range(len(durations) + 1), strict=True):
-                motion = Measurement(own[k].plant.z, own[k].plant.z_dot, z)
-                motions.append(sensor.over_surface(motion, jnp.broadcast_to(t + sum(durations[:n]), motion.z.shape)))
-            for before, after, time in zip(motions, motions[1:], durations, strict=False):
-                z = sensor.lagged(z, before, after, time)
-            found.append(z)
-        return found
 
 
 @record
@@ -160,11 +130,9 @@ class ContinuousMachine(WholeState, Machine):
             if self.law is not None:
                 demands, law = demanded_now(self, outside[1], own, sensing, state.law, errors)
             sensed = tuple(one.plant for one in sensing)
-            observe = lambda axis, *now: between_stops(self, axis).observed(*now)  # noqa: E731
+            observe = lambda axis, *now: self.between_stops(axis).observed(*now)  # noqa: E731
             parts = self.each(observe, own, self.at_magnets(state), errors, sensed, demands)
-            rates, signals = zip(*parts, strict=True)
-            moved = self.coupled(self.pushed(outside, state), state, rates, law)
-            return moved, self.with_stops(self.join(signals), state.q)
+            return self.moved(outside, state, parts, law)
 
         return self.problem_of(inputs, observed, self.each(lambda axis: axis.scale()))
 
@@ -184,5 +152,5 @@ def machine_of(
     groups, first = tuple(map(tuple, numbers.values())), axes[0]
     if not isinstance(first, Sampled):
         return ContinuousMachine(rotor, tuple(stacked), start_q, groups, law=law)
-    cuts = most_of(rotor.edges(), first.period)
+    cuts = most_inside(rotor.edges(), first.period)
     return SampledMachine(rotor, tuple(stacked), start_q, groups, law=law, cuts=cuts)

@@ -8,7 +8,7 @@ import numpy as np
 from jax import lax
 
 from ambjax.control.cascade import Cascade
-from ambjax.numerics.records import is_traced, replaced
+from ambjax.numerics.records import Scalar, is_traced, replaced
 from ambjax.simulation.adaptive import AdaptiveSteps
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.edges import most_inside
@@ -154,8 +154,13 @@ def _smooth_inside(cascade: Cascade, scenario: Scenario, sample_period: float) -
         return False
     u_max = scenario.u_max
     limited = is_traced(u_max) or bool(np.any(np.isfinite(np.asarray(u_max))))
-    inside = most_inside(scenario, sample_period, reference=True)
+    inside = _most_inside(scenario, sample_period, True)
     return not limited and scenario.drive == "voltage" and scenario.stop is None and inside == 0
+
+
+def _most_inside(scenario: Scenario, period: Scalar, reference: bool) -> int | None:
+    """Return `most_inside` of the disturbances; with `reference`, also of the reference, which a processor samples."""
+    return most_inside(scenario.edges(reference), period, scenario.knots(reference))
 
 
 def _fixed_only(cascade: Cascade, scenario: Scenario) -> bool:
@@ -199,7 +204,7 @@ def with_method(clock: Clock, cascade: Cascade, scenario: Scenario, *, reverse: 
     elif clock.method.limit is not None:
         _check_limit(clock, clock.method.limit, cascade, scenario)
     fixed = _fixed_only(cascade, scenario)
-    if not (cascade.sampled or fixed) or (cuts := most_inside(scenario, clock.sample_period, fixed)) is None:
+    if not (cascade.sampled or fixed) or (cuts := _most_inside(scenario, clock.sample_period, fixed)) is None:
         return clock
     return replaced(clock, cuts=max(cuts, clock.cuts or 0))
 

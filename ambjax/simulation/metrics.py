@@ -21,34 +21,6 @@ from ambjax.world.plant import Plant
 from ambjax.world.rotation import Rotation
 from ambjax.world.scenario import Scenario
 
-# Unit of each metric by name. Other metrics are shares and counts.
-UNITS = {
-    "max_abs_error_m": "m",
-    "rms_error_m": "m",
-    "settled_max_abs_error_m": "m",
-    "settled_rms_error_m": "m",
-    "settled_max_abs_sigma_m_per_s": "m/s",
-    "settled_max_abs_v_tilde_A2_per_m2": "A^2/m^2",
-    "settled_max_abs_current_error_A": "A",
-    "sigma_reached_s": "s",
-    "v_tilde_reached_s": "s",
-    "current_error_reached_s": "s",
-    "max_abs_u_V": "V",
-    "rms_u_V": "V",
-    "settled_rms_u_V": "V",
-    "chatter_V": "V",
-    "max_abs_i_A": "A",
-    "rms_i_A": "A",
-    "rms_i_1_A": "A",
-    "rms_i_2_A": "A",
-    "copper_loss_W": "W",
-    "max_flux_T": "T",
-    "max_abs_force_N": "N",
-    "lost_at_s": "s",
-    "singular_at_s": "s",
-    "settle_s": "s",
-    **orders.UNITS,
-}
 # Times at which a signal first comes within its band; inf: never.
 REACHED = ("sigma_reached_s", "v_tilde_reached_s", "current_error_reached_s")
 
@@ -198,3 +170,15 @@ class Metrics:
             "singular_at_s": ending.singular_at,
         }
         return numbers | status
+
+
+def _unit(name: str) -> str:
+    """Return the unit with which the name of a metric ends; "" for shares and counts."""
+    compound = {"m_per_s": "m/s", "A2_per_m2": "A^2/m^2"}
+    found = next((end for end in (*compound, *"msVAWTN") if name.endswith(f"_{end}")), "")
+    return compound.get(found, found)
+
+
+_NAMES = (*Metrics()._folds().folds, "lost_at_s", "singular_at_s", "settle_s")
+# Unit of each metric by name. Other metrics are shares and counts.
+UNITS = {name: _unit(name) for name in _NAMES if _unit(name)} | orders.UNITS

@@ -20,19 +20,13 @@ def rolled_in_parts(system: System, clock: Clock, fold: Fold) -> Result:
     result is that of `rollout.run`, up to rounding. `clock` must have fixed steps. The function is not jitted.
     """
     system, clock, fold = canonical((system.realised(), clock, fold))
-    length = part_length(clock.samples)
+    # the number of samples of a part: the largest divisor of `samples` that is at most its square root
+    length = next(one for one in range(math.isqrt(clock.samples), 0, -1) if clock.samples % one == 0)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def part(progress: RolloutState, first: Array, system: Any, clock: Clock, fold: Fold) -> RolloutState:
         return segment(system, clock, fold, progress, first, length, 0)[0]
 
-    def advanced(number: Array, progress: RolloutState) -> RolloutState:
-        return part(progress, number * length, system, clock, fold)
-
+    advanced = lambda number, progress: part(progress, number * length, system, clock, fold)  # noqa: E731
     progress = lax.fori_loop(0, clock.samples // length, advanced, begin(system, clock, fold))
     return finish(progress, None, fold)
-
-
-def part_length(samples: int) -> int:
-    """Return the number of samples of a part: the largest divisor of `samples` that is at most its square root."""
-    return next(length for length in range(math.isqrt(samples), 0, -1) if samples % length == 0)

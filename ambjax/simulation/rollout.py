@@ -1,5 +1,6 @@
 """Rollout: the simulation of a cascade in a scenario. It returns a trajectory, the result of a fold, or both."""
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple, Protocol, Self, TypeVar, cast
 
@@ -9,19 +10,20 @@ from jax import Array, lax
 
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.control.cascade import Cascade
+from ambjax.numerics.linear import choose
 from ambjax.numerics.records import Scalar, canonical
 from ambjax.numerics.shapes import require_one_member
-from ambjax.simulation.clock import Clock
+from ambjax.simulation.clock import Clock, takes_case
 from ambjax.simulation.folds import Ending, Fold, updated
-from ambjax.simulation.integrate import Advanced, Integrator, choose
+from ambjax.simulation.integrate import Advanced, Begin, Integrator
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.method import with_method
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.span import Span
 from ambjax.simulation.system import check_inputs, check_recording, started, system_of
 from ambjax.simulation.trajectory import ALIVE, Row, Trajectory, first_time
-from ambjax.simulation.triple import takes_case
 from ambjax.world.scenario import Scenario
+from ambjax.world.sensor import Errors
 
 # Types of the state of a system, of the errors of its sensors, and of its row.
 S = TypeVar("S")
@@ -54,7 +56,7 @@ class System(Protocol[S, E, R]):
 
     - `jump(t, state, errors)`: the state after the jump at the start of the sample at t (s), such as a step of a
       controller on a processor. The row and the integrator use it. The state of a lost rotor does not jump.
-    - `advance(method, errors, t, period, state, memory, code)`: the result of the method at the end of the sample.
+    - `advance(method, errors, begin, period)`: the result of the method at the end of the sample.
 
     `integrate.WholeState` has the last two for a system that integrates its whole state as one problem per sample.
     """
@@ -68,9 +70,31 @@ class System(Protocol[S, E, R]):
     def completed(self, row: R, span: Span) -> R: ...
     def singularity(self, row: R) -> Array: ...
     def jump(self, t: Scalar, state: S, errors: E) -> S: ...
-    def advance(
-        self, method: Integrator, errors: E, t: Scalar, period: Scalar, state: S, memory: object, code: Array
-    ) -> Advanced: ...
+    def advance(self, method: Integrator, errors: E, begin: Begin[S], period: Scalar) -> Advanced: ...
+
+
+class Extended:
+    """Base class of a system with more states than its `loop`, whose state is the field `loop` of its own state."""
+
+    loop: Any
+
+    def realised(self) -> Self:
+        return dataclasses.replace(self, loop=self.loop.realised())  # pyright: ignore[reportArgumentType]
+
+    def sensor_errors(self, sample: Scalar) -> Errors:
+        return self.loop.sensor_errors(sample)
+
+    def status(self, state: Any) -> Array:
+        return self.loop.status(state.loop)
+
+    def rest(self, state: Any, code: Array) -> Any:
+        return state._replace(loop=self.loop.rest(state.loop, code))
+
+    def completed(self, row: Any, span: Span) -> Any:
+        return row
+
+    def singularity(self, row: Any) -> Array:
+        return self.loop.singularity(row)
 
 
 class RolloutState(NamedTuple):
@@ -228,12 +252,12 @@ def one_sample(
         state = state if jumped is state else choose(alive, jumped, state)
         row = system.row(just_after, state, errors, alive)._replace(t=t)
         method, period = clock.integrator, clock.sample_period
-        after = system.advance(method, errors, t, period, state, memory, ending.lost_code)
+        after = system.advance(method, errors, Begin(t, state, memory, ending.lost_code), period)
         row = system.completed(row, after.span)
         folded = folded if fold is None else updated(fold, folded, row, after.span)
         lost_now = alive & (after.code != ALIVE)
         resting = system.rest(after.state, after.code)
-        state = jax.tree.map(lambda a, b: jnp.where(lost_now, a, b), resting, after.state)
+        state = choose(lost_now, resting, after.state)
         crossed = alive & (system.singularity(row) <= 0)
         ending = Ending(
             after.code,

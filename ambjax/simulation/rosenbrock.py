@@ -6,9 +6,10 @@ from jax import Array
 
 from ambjax.compiler.barrier import materialised
 from ambjax.numerics import linear
+from ambjax.numerics.linear import axpy
 from ambjax.numerics.records import Scalar, record
 from ambjax.simulation.adaptive import AdaptiveSteps, Attempt
-from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, State, Times, axpy
+from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, State, Times
 from ambjax.simulation.span import Instant, Span
 
 

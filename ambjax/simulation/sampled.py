@@ -9,7 +9,8 @@ import dataclasses
 import functools
 import itertools
 import operator
-from typing import Self
+from collections.abc import Sequence
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -19,12 +20,12 @@ from ambjax.compiler.barrier import materialised
 from ambjax.control.cascade_state import CascadeState, Command, Sample
 from ambjax.control.guard import GuardResult, Watch, expected
 from ambjax.control.processor import Processor
+from ambjax.numerics.linear import choose
 from ambjax.numerics.records import Scalar, record, static
 from ambjax.numerics.smooth import limited
-from ambjax.simulation.between import acting, amplified, at_sample, lags, plant_status, subproblems
-from ambjax.simulation.integrate import Advanced, Integrator, in_turn
+from ambjax.simulation.between import SampledState, acting, amplified, at_sample, lags, plant_status, subproblems
+from ambjax.simulation.integrate import Advanced, Begin, Integrator, in_turn
 from ambjax.simulation.loop import AddedSignal, ClosedLoop, LoopState, with_signal
-from ambjax.simulation.sampled_state import SampledState
 from ambjax.simulation.span import Span
 from ambjax.simulation.trajectory import DIVERGED, Row
 from ambjax.world.faults import Sensed
@@ -154,12 +155,12 @@ class Sampled:
         """Return the state with the results of the laws, and whether they are kept."""
         (command, control, estimate), past = stepped, sample.past
         command = command._replace(u=limited(command.u, sample.u_max))
-        new = materialised((control, command, self._next_guard_state(checked, estimate, (command.u, *past))))
+        new: Any = materialised((control, command, self._next_guard_state(checked, estimate, (command.u, *past))))
         # The sum is 0 only if every number is finite: 0 times NaN or infinity is NaN.
         finite = materialised(sum(0.0 * x for x in jax.tree.leaves(new))) == 0
         keeps = finite if checked is None else finite & checked.steps
         old = (state.control, state.command, state.watch)
-        control, command, watch = jax.tree.map(lambda a, b: jnp.where(keeps, a, b), new, old)
+        control, command, watch = choose(keeps, new, old)
         started = state.started
         if not isinstance(started, tuple):
             begins = keeps if checked is None else keeps & ~checked.refused
@@ -201,39 +202,34 @@ class Sampled:
         motion = checked.reading._replace(z_dot=estimate.z_dot)
         return Watch(expected(cascade.driven, cascade.model.start(motion), u, self.period), checked.left)
 
-    def advance(
-        self,
-        method: Integrator,
-        errors: Errors,
-        t: Scalar,
-        period: Scalar,
-        state: SampledState,
-        memory: object,
-        code: Array,
-    ) -> Advanced:
-        """Integrate the plant from the sample at t (s) to the next one, under the voltages that act until then."""
+    def advance(self, method: Integrator, errors: Errors, begin: Begin[SampledState], period: Scalar) -> Advanced:
+        """Integrate the plant from one sample to the next one, under the voltages that act until then."""
+        t, state, memory, code = begin
         code = jnp.where((code == 0) & (state.finite == 0), DIVERGED, code)
         delay, whole = jnp.asarray(self.processor.delay), bool(self.processor.whole)
         commanded = acting((state.command.u, *state.past), delay, period, whole)
         voltages, u_a = amplified(self.loop.scenario.actuator, jnp.asarray(t), state.u_a, commanded)
         parts = subproblems(self.loop, state.plant, state.command, jnp.asarray(t), voltages, self.cuts)
-        reached = in_turn(method, parts, t, state.plant, memory, code)
-        z_filtered = self._lagged(t, state, [after.state for after in reached], [time for _, time in parts])
+        reached = in_turn(method, parts, Begin(t, state.plant, memory, code))
+        states = [state.plant, *(after.state for after in reached)]
+        z_filtered = self.filtered(t, state.z_filtered, states, [time for _, time in parts])
         after = reached[-1]
         return after._replace(state=state._replace(plant=after.state, z_filtered=z_filtered, u_a=u_a))
 
-    def _lagged(self, t: Scalar, state: SampledState, reached: list[object], times: list[Scalar]) -> Array | tuple[()]:
-        """Return the output of the position sensor's low-pass at the next sample, m."""
-        z_filtered = state.z_filtered
-        sensor = self.loop.scenario.sensors
-        if not lags(self.loop) or isinstance(z_filtered, tuple):
-            return z_filtered
+    def filtered(
+        self, t: Scalar, z: Array | tuple[()], plants: Sequence[object], times: Sequence[Scalar]
+    ) -> Array | tuple[()]:
+        """Return the output of the position sensor's low-pass at the next sample, m. `z`: that at t (s).
+
+        `plants`: states of the plant at t, and after each of the `times` (s).
+        """
+        if isinstance(z, tuple):
+            return z
         instants = itertools.accumulate(times, initial=t)
-        states = (state.plant, *reached)
-        motions = [self._sensed(*at) for at in zip(states, instants, strict=True)]
+        motions = [self._sensed(*at) for at in zip(plants, instants, strict=True)]
         for before, after, time in zip(motions, motions[1:], times, strict=False):
-            z_filtered = sensor.lagged(z_filtered, before, after, time)
-        return z_filtered
+            z = self.loop.scenario.sensors.lagged(z, before, after, time)
+        return z
 
     def _sensed(self, plant: object, t: Scalar) -> Measurement:
         """Return the motion of the surface that the position sensor reads at t (s)."""

@@ -23,11 +23,13 @@ from jax import Array
 
 from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.control.cascade import Cascade
+from ambjax.control.cascade_state import Sample
 from ambjax.control.schedule import with_gains_at
 from ambjax.control.stages import CurrentDemand, CurrentInputs
+from ambjax.numerics.linear import axpy
 from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.smooth import limited
-from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, Times, axpy
+from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, Times
 from ambjax.simulation.span import Instant, Span
 from ambjax.world.plant import State
 from ambjax.world.scenario import Scenario
@@ -43,14 +45,16 @@ def slide(loop: Any, errors: Errors, begin: Any, end: Any, h: Scalar, state: Any
     i_ref = control.inversion
     per_h = 1 / jnp.where(h > 0, h, 1.0)
 
-    force_0, estimate_0, rates_0 = cascade.demand(loop.received(begin, state.plant, errors), control, begin.reference)
+    read = loop.received(begin, state.plant, errors)
+    force_0, estimate_0, rates_0, _ = cascade.demand(read, control, Sample(begin.reference))
     z_ddot_0 = scenario.plant.z_ddot(z, i, begin.q_z)
     ahead = State(z + h * z_dot + h * h / 2 * z_ddot_0, z_dot + h * z_ddot_0, i)
     control_1 = control._replace(
         observer=axpy(control.observer, (h, rates_0.observer)), position=axpy(control.position, (h, rates_0.position))
     )
     ahead, control_1, force_0 = materialised((ahead, control_1, force_0))
-    force_1, estimate_1, rates_1 = cascade.demand(loop.received(end, ahead, errors), control_1, end.reference)
+    read = loop.received(end, ahead, errors)
+    force_1, estimate_1, rates_1, _ = cascade.demand(read, control_1, Sample(end.reference))
 
     inversion = with_gains_at(cascade.inversion, estimate_0.z, begin.reference)
     sliding, slaved, tau, (w, w_1, w_2) = inversion.slide(model, force_0, force_1, i_ref, h)

@@ -26,7 +26,30 @@ class Instant(NamedTuple):
     densities: Any
 
 
+class Sizes(NamedTuple):
+    """Signals whose extremes between samples are recorded. Names and units are those of a `Row`."""
+
+    z: Array
+    e_z: Array
+    sigma: Array
+    u: Array
+    i: Array
+    e: Array
+    v_tilde: Array
+    z_stop: Array | tuple[()] = ()
+
+
+class Densities(NamedTuple):
+    """Signals that are integrated between samples: u (V), u^2 (V^2), and the copper loss in both coils (W)."""
+
+    u: Array
+    u_squared: Array
+    heat: Array
+
+
 NOTHING = Instant((), ())
+# An Instant with the pytree structure of the recorded signals.
+INSTANT_TREE = Instant(Sizes(*[0.0] * 7), Densities(*[0.0] * 3))  # pyright: ignore[reportArgumentType]
 
 
 class Span(NamedTuple):

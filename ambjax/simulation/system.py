@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import Cascade
-from ambjax.control.cascade_state import CascadeState
+from ambjax.control.cascade_state import CascadeState, Sample
 from ambjax.control.law_trial import check_own_law
 from ambjax.control.stages import STAGES
 from ambjax.numerics.declared import require_number
@@ -19,6 +20,8 @@ from ambjax.simulation.folds import Named
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.sampled import Sampled
 from ambjax.world.scenario import Scenario
+from ambjax.world.sensor import Measurement
+from ambjax.world.waveforms import Reference
 
 
 def check_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> None:
@@ -87,7 +90,7 @@ def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> 
     _check_stages(cascade)
     _check_laws(cascade, sample_period)
     if not cascade.sampled:
-        cascade.check_smooth()
+        _check_smooth(cascade)
         if (path := scenario.on_processor) is not None:
             raise ValueError(
                 f"{path} is for a controller on a processor, and this one runs in continuous time. Add [processor], or "
@@ -100,12 +103,43 @@ def check_parts(cascade: Cascade, scenario: Scenario, sample_period: Scalar) -> 
             f"{scenario.drive}, or change the mode."
         )
     _check_coils(scenario)
-    if not scenario.sensors.velocity and cascade.reads_velocity(sample_period):
+    if not scenario.sensors.velocity and reads_velocity(cascade, sample_period):
         raise ValueError(
             "sensor.velocity = false: the velocity is not measured, controller.observer does not estimate it, and the "
             'laws or the prediction use it. Choose an observer that estimates it, for example kind = "kalman", or laws '
             "that do not use it, with processor.predict = false."
         )
+
+
+def _check_smooth(cascade: Cascade) -> None:
+    """Raise ValueError for a law with a steepness of inf: in continuous time a sign must be smoothed."""
+    for stage, law in zip(CascadeState._fields, cascade.laws, strict=True):
+        for name in set_valued_signs(law):
+            raise ValueError(
+                f"controller.{stage}.{name} = inf: in continuous time a sign must be smoothed. Give a finite number, "
+                "or add [processor], which allows the set-valued sign."
+            )
+
+
+def reads_velocity(cascade: Cascade, period: Scalar) -> bool:
+    """Return whether the command or a state of a law depends on the measured velocity.
+
+    `period`: sample period, s. True if a number is traced, because the laws are then not evaluated. Otherwise the laws
+    of the first member are evaluated at three velocities, and the results compared.
+    """
+    if cascade.observer.estimates_velocity or cascade.timing.predicts:
+        return not cascade.observer.estimates_velocity
+    if any(map(is_traced, jax.tree.leaves((cascade, period)))):
+        return True
+    one = cascade.on_processor() if cascade.sampled else cascade
+    one, period = jax.tree.map(lambda x: np.ravel(np.asarray(x, float))[0], (one, period))
+    sizes, zero = Measurement(*(jnp.asarray(float(x)) for x in one.model.sizes())), jnp.zeros(())
+    past = one.timing.constant_past(zero)
+    sample = Sample(Reference(zero, zero, zero), period if one.sampled else None, jnp.inf, past)
+    state = one.init(sizes._replace(z_dot=zero), sample.reference)
+    readings = (sizes._replace(z_dot=share * sizes.z_dot) for share in (-1e3, 1.0, 1e3))
+    results = [(command.u, after) for command, after, _ in (one.step(x, state, sample) for x in readings)]
+    return len({tuple(map(float, jax.tree.leaves(result))) for result in results}) > 1
 
 
 def _check_coils(scenario: Scenario) -> None:

@@ -1,39 +1,32 @@
 """A whole machine: one rotor on several magnetic bearing axes, each with its own sensors, amplifier and cascade.
 
-Each axis is the loop of one axis, `Sampled` or `ClosedLoop`. Axes with the same kinds of parts form a group, whose
-leaves are stacked, with a leading axis. The axes are coupled by the rotor alone: its coordinates give the motion at
-each magnet and each sensor, and the forces of the magnets accelerate the coordinates.
+The axes are coupled by the rotor alone: its coordinates give the motion at each magnet and each sensor, and the forces
+of the magnets accelerate the coordinates.
 """
 
 import dataclasses
 import functools
-import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from ambjax.compiler.barrier import materialised
-from ambjax.numerics.records import Scalar, leaf, matrix, part, record, static
-from ambjax.numerics.shapes import varying
+from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.small_matrices import solve, times
 from ambjax.numerics.smooth import away_from_zero
-from ambjax.simulation.between import plant_status
+from ambjax.simulation.between import SampledState, plant_status
 from ambjax.simulation.edges import NO_EDGES, Edges
-from ambjax.simulation.folds import Ending
 from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.joint_laws import begun
-from ambjax.simulation.loop import INSTANT_TREE, ClosedLoop, LoopState
-from ambjax.simulation.machine_stops import limited, stop_forces
+from ambjax.simulation.loop import ClosedLoop, LoopState
+from ambjax.simulation.machine_axes import MachineAxes, loop_of, with_loop
 from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.sampled_state import SampledState
-from ambjax.simulation.span import Instant, Span
+from ambjax.simulation.span import INSTANT_TREE, Instant, Span
 from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED, Row
 from ambjax.world.rotation import Rotation
-from ambjax.world.rotor import Rotor
 from ambjax.world.sensor import Errors
 
 T = TypeVar("T")
@@ -72,67 +65,8 @@ class PlantOnly(NamedTuple):
 
 
 @record
-class PerAxis:
-    """A fold of one axis for each axis. `fold`: the folds of the axes, stacked [c]."""
-
-    fold: Any = part(doc="the folds of the axes", channels=True)
-
-    def init(self) -> object:
-        return jax.vmap(lambda fold: fold.init())(self.fold)
-
-    def update(self, carry: object, row: Any, span: Span) -> object:
-        one = Row(*[0] * len(Row._fields))._replace(t=None, alive=None)  # pyright: ignore[reportArgumentType]
-        axes = 0, 0, one, Span(None, 0, 0, 0)  # pyright: ignore[reportArgumentType]
-        rows = row.axes._replace(t=row.t, alive=row.alive)
-        return jax.vmap(lambda fold, *now: fold.update(*now), in_axes=axes)(self.fold, carry, rows, span)
-
-    def result(self, carry: object, ending: Ending) -> Any:
-        return jax.vmap(lambda fold, own: fold.result(own, ending))(self.fold, carry)
-
-
-@record
-class Machine:
+class Machine(MachineAxes):
     """A rotor on c bearing axes, as a `rollout.System`: base class of both kinds of loop."""
-
-    rotor: Rotor = part(doc="the rotor")
-    axes: tuple[Any, ...] = part(doc="the loops of the groups, `Sampled` or `ClosedLoop`, stacked", channels=True)
-    start_q: Array = leaf(shape="n", unit="m or rad", at_least=-10.0, at_most=10.0, doc="coordinates at t = 0, at rest")
-    groups: tuple[tuple[int, ...], ...] = static(doc="numbers of the axes of each group")
-    inverse: Array | None = matrix("n n", "inverse of the mass matrix", default=None)
-    cuts: int | None = static(
-        default=None, doc="largest number of jumps of the rotor's loads in one sample; None: the number of all jumps"
-    )
-    law: Any = part(default=None, doc="law that demands the forces of all axes; none: each axis has its own laws")
-
-    @property
-    def count(self) -> int:
-        """Number of axes."""
-        return sum(map(len, self.groups))
-
-    def split(self, x: T) -> tuple[T, ...]:
-        """Return the part of each group of arrays [c, ...] of all axes."""
-        if len(self.groups) == 1:
-            return (x,)
-        return tuple(jax.tree.map(operator.itemgetter(np.array(group)), x) for group in self.groups)
-
-    def join(self, parts: Sequence[T]) -> T:
-        """Return arrays [c, ...] of all axes from those of the groups."""
-        if len(parts) == 1:
-            return parts[0]
-        order = np.argsort(np.concatenate([np.array(group) for group in self.groups]))
-        return jax.tree.map(lambda *x: jnp.concatenate(x)[order], *parts)
-
-    def each(self, function: Callable[..., T], *groups: Sequence[object]) -> list[T]:
-        """Return function(loop, ...) of every axis, stacked for each group. `groups`: further arguments."""
-        return [jax.vmap(function)(*own) for own in zip(self.axes, *groups, strict=True)]
-
-    def loops(self) -> tuple[ClosedLoop, ...]:
-        """Return the loops of the groups in continuous time."""
-        return tuple(map(loop_of, self.axes))
-
-    def plants(self, name: str) -> Array:
-        """Return a number of the plant of every axis [c]."""
-        return self.join([getattr(loop.scenario.plant, name) for loop in self.loops()])
 
     def realised(self) -> Self:
         """Return the machine of one member: random signals drawn, a random key for each axis, and M inverted."""
@@ -177,20 +111,10 @@ class Machine:
         """Return the states of the groups with the motion at the sensors."""
         return self.moving(self.rotor.at_sensors, *state[:3])
 
-    @property
-    def near(self) -> str:
-        """The signal of each axis that counts against its clearance."""
-        return "z" if self.rotor.at_stops is None else "z_stop"
-
     def with_stops(self, instant: Instant, q: Array) -> Instant:
         """Return the signals of all axes at one instant, with the displacements at stops at places of their own."""
         rows = self.rotor.at_stops
         return instant if rows is None else instant._replace(sizes=instant.sizes._replace(z_stop=times(rows, q)))
-
-    def pushed(self, outside: tuple[Array, Scalar], state: MachineState) -> tuple[Array, Scalar]:
-        """Return `outside` of `coupled` with the forces of elastic stops at places of their own."""
-        forces = stop_forces(self, state.q, state.q_dot)
-        return outside if forces is None else (outside[0] + forces, outside[1])
 
     def coupled(
         self, outside: tuple[Array, Scalar], state: MachineState, rates: Sequence, law: object = ()
@@ -207,6 +131,18 @@ class Machine:
         forces = forces - times(rotor.D + W * rotor.G, state.q_dot) - times(rotor.K, state.q)
         return MachineState(state.q_dot, times(self.inverse, materialised(forces)), still(rates), law)
 
+    def moved(
+        self, outside: tuple[Array, Scalar], state: MachineState, parts: Sequence[tuple[Any, Instant]], law: object = ()
+    ) -> tuple[MachineState, Instant]:
+        """Return the rates of the machine as `coupled` does, with elastic stops, and the signals of all axes.
+
+        `parts`: rates and signals of the groups.
+        """
+        rates, signals = zip(*parts, strict=True)
+        forces = self.pushed(outside[0], state.q, state.q_dot)
+        moved = self.coupled((forces, outside[1]), state, rates, law)
+        return moved, self.with_stops(self.join(signals), state.q)
+
     def outside(self, t: Scalar) -> tuple[Array, Array]:
         """Return the forces on the coordinates other than the magnets' [n], and the speed (rad/s), at t (s)."""
         return self.rotor.forces(t), self.rotor.speed_at(t)
@@ -219,7 +155,7 @@ class Machine:
     def status(self, state: MachineState) -> Array:
         """Return the status code of the rotor: the largest of its axes; DIVERGED if a coordinate is not finite."""
         finite = 0.0 * (jnp.sum(state.q) + jnp.sum(state.q_dot)) == 0
-        rows, limits = limited(self)
+        rows, limits = self.limited()
         at = self.moving(rows[: self.count], *state[:3])
         codes = self.join(self.each(lambda axis, own: plant_status(loop_of(axis), own.plant), at))
         if len(rows) > self.count:
@@ -229,13 +165,13 @@ class Machine:
 
     def motion(self, state: MachineState) -> tuple[Array, Array]:
         """Return displacements (m) and velocities (m/s) at the places of `limited` [k]."""
-        rows, _ = limited(self)
+        rows, _ = self.limited()
         return times(rows, state.q), times(rows, state.q_dot)
 
     def rest(self, state: MachineState, code: Array) -> MachineState:
         """Return the state in which a lost rotor is frozen: at rest, moved on in proportion to the limit it reached."""
         axes = self.each(lambda axis, own: axis.rest(own, code), self.at_sensors(state))
-        rows, limits = limited(self)
+        rows, limits = self.limited()
         share = jnp.max(jnp.abs(times(rows, state.q)) / limits)
         q = jnp.where((code == TOUCHED) & (share > 0), state.q / away_from_zero(share, 1e-30), state.q)
         return MachineState(q, jnp.zeros_like(state.q_dot), still(axes), state.law)
@@ -290,23 +226,13 @@ class Machine:
             self.with_stops(signals, jnp.asarray(self.start_q)),
             edges=edges if edges.most else NO_EDGES,
             motion=self.motion,
-            limit=limited(self)[1],
+            limit=self.limited()[1],
         )
 
 
 def still(axes: Sequence) -> Groups:
     """Return the states of the groups, or their rates, without displacement and velocity."""
     return tuple(own._replace(plant=own.plant._replace(z=(), z_dot=())) for own in axes)
-
-
-def loop_of(axis: Sampled | ClosedLoop) -> ClosedLoop:
-    """Return the loop of an axis in continuous time."""
-    return axis.loop if isinstance(axis, Sampled) else axis
-
-
-def with_loop(axis: Sampled | ClosedLoop, loop: ClosedLoop) -> Sampled | ClosedLoop:
-    """Return the axis with another loop in continuous time."""
-    return dataclasses.replace(axis, loop=loop) if isinstance(axis, Sampled) else loop
 
 
 def _realised(rotation: Rotation, axis: Sampled | ClosedLoop, number: Array) -> Sampled | ClosedLoop:
@@ -317,15 +243,3 @@ def _realised(rotation: Rotation, axis: Sampled | ClosedLoop, number: Array) -> 
     loop = loop.realised()
     high, low = jax.random.key_data(jax.random.fold_in(loop.scenario.key(), number))
     return with_loop(axis, dataclasses.replace(loop, key=(high, low)))
-
-
-def stack_axes(axes: Sequence[T]) -> T:
-    """Return the pytrees of axes as one, each leaf [c, ...]; [N, c, ...] if it varies between members on any axis."""
-    flags = np.any([varying(axis) for axis in axes], 0)
-    parts = [jax.tree.leaves(axis) for axis in axes]
-    leaves = []
-    for k, varies in enumerate(flags):
-        own = [np.asarray(one[k]) for one in parts]
-        most = max((x.shape for x in own), key=len)
-        leaves.append(np.stack([np.broadcast_to(x, most) for x in own], 1) if varies else np.stack(own))
-    return jax.tree.unflatten(jax.tree.structure(axes[0]), leaves)

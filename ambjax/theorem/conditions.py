@@ -20,13 +20,12 @@ from ambjax.control.schedule import extremes, schedules
 from ambjax.control.stages import PositionLaw
 from ambjax.numerics.records import canonical, require_concrete
 from ambjax.numerics.shapes import require_one_member
-from ambjax.simulation.clock import Clock
+from ambjax.simulation.clock import Clock, takes_case
 from ambjax.simulation.folds import Lowest, Named, Peak
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.rollout import prepare, roll
 from ambjax.simulation.system import check_inputs
 from ambjax.simulation.trajectory import STALLED, STATUSES
-from ambjax.simulation.triple import takes_case
 from ambjax.theorem.causes import Cause
 from ambjax.theorem.proof import Monitored
 from ambjax.world.plant import Plant

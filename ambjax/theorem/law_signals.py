@@ -1,15 +1,15 @@
 """The loop on a processor, with rows of sigma, v_tilde and e as the laws compute them, and of the plant."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
 from ambjax.numerics.records import Scalar, record
-from ambjax.simulation.integrate import Advanced, Integrator
+from ambjax.simulation.between import SampledState
+from ambjax.simulation.integrate import Advanced, Begin, Integrator
+from ambjax.simulation.rollout import Extended
 from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.sampled_state import SampledState
-from ambjax.simulation.span import Span
 from ambjax.world.sensor import Errors
 
 
@@ -44,16 +44,10 @@ class LawSignalsState(NamedTuple):
 
 
 @record
-class LawSignalsRecorder:
+class LawSignalsRecorder(Extended):
     """System of a loop on a processor whose rows record the signals that its laws compute."""
 
     loop: Sampled
-
-    def realised(self) -> "LawSignalsRecorder":
-        return LawSignalsRecorder(self.loop.realised())
-
-    def sensor_errors(self, sample: Scalar) -> Errors:
-        return self.loop.sensor_errors(sample)
 
     def start(self) -> LawSignalsState:
         return LawSignalsState(self.loop.start(), LawSignals(*[jnp.zeros(())] * 3))
@@ -69,25 +63,12 @@ class LawSignalsRecorder:
         sigma, command = cascade.sigma(estimate, reference), after.command
         return LawSignalsState(after, LawSignals(sigma, command.v_tilde, estimate.i - command.i_ref))
 
-    def advance(
-        self, method: Integrator, errors: Errors, t: Scalar, period: Scalar, state: Any, *rest: Any, **named: Any
-    ) -> Advanced:
-        after = self.loop.advance(method, errors, t, period, state.loop, *rest, **named)
-        return after._replace(state=state._replace(loop=after.state))
-
-    def status(self, state: LawSignalsState) -> Array:
-        return self.loop.status(state.loop)
-
-    def rest(self, state: LawSignalsState, code: Array) -> LawSignalsState:
-        return state._replace(loop=self.loop.rest(state.loop, code))
+    def advance(self, method: Integrator, errors: Errors, begin: Begin[LawSignalsState], period: Scalar) -> Advanced:
+        first = Begin(begin.t, begin.state.loop, begin.memory, begin.code)
+        after = self.loop.advance(method, errors, first, period)
+        return after._replace(state=begin.state._replace(loop=after.state))
 
     def row(self, t: Scalar, state: LawSignalsState, errors: Errors, alive: Array) -> LawSignalsRow:
         row = self.loop.row(t, state.loop, errors, alive)
         true = LawSignals(row.sigma, row.v_tilde, row.e)
         return LawSignalsRow(row.t, row.u, row.z, row.i_ref, state.computed, true)
-
-    def completed(self, row: LawSignalsRow, span: Span) -> LawSignalsRow:
-        return row
-
-    def singularity(self, row: LawSignalsRow) -> Array:
-        return self.loop.loop.scenario.plant.singularity(row.z, row.i_ref)

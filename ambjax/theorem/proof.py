@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ambjax.control.cascade_state import Sample
 from ambjax.control.schedule import with_gains_at
-from ambjax.numerics.records import Scalar, record
+from ambjax.numerics.records import record
 from ambjax.simulation.integrate import InitialValueProblem, WholeState
 from ambjax.simulation.loop import ClosedLoop, ExternalInputs, LoopState
-from ambjax.simulation.span import Span
+from ambjax.simulation.rollout import Extended
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.waveforms import Reference
 
@@ -83,16 +84,10 @@ class MonitoredState(NamedTuple):
 
 
 @record
-class Monitored(WholeState):
+class Monitored(Extended, WholeState):
     """System of the closed loop and the integrals of the proof's right-hand sides."""
 
     loop: ClosedLoop
-
-    def realised(self) -> "Monitored":
-        return Monitored(self.loop.realised())
-
-    def sensor_errors(self, sample: Scalar) -> Errors:
-        return self.loop.sensor_errors(sample)
 
     def start(self) -> MonitoredState:
         state = self.loop.start()
@@ -112,18 +107,6 @@ class Monitored(WholeState):
         return InitialValueProblem(
             self.loop.inputs, rates, MonitoredState(self.loop.scale(), sizes), self.status, layer
         )
-
-    def status(self, state: MonitoredState) -> Array:
-        return self.loop.status(state.loop)
-
-    def rest(self, state: MonitoredState, code: Array) -> MonitoredState:
-        return MonitoredState(self.loop.rest(state.loop, code), state.integrals)
-
-    def completed(self, row: TheoremRow, span: Span) -> TheoremRow:
-        return row
-
-    def singularity(self, row: TheoremRow) -> Array:
-        return self.loop.scenario.plant.singularity(row.z, row.i_ref)
 
     def motion(self, state: LoopState) -> Measurement:
         """Return the measurement of ideal sensors."""
@@ -160,7 +143,7 @@ class Monitored(WholeState):
         cascade, reference = self.loop.cascade, inputs.reference
 
         def demanded(reference: Reference, x: LoopState) -> Array:
-            force, _, _ = cascade.demand(self.loop.received(inputs, x.plant, errors), x.control, reference)
+            force, *_ = cascade.demand(self.loop.received(inputs, x.plant, errors), x.control, Sample(reference))
             return force.v_star - cascade.model.v(force.z, i_ref)
 
         return jax.jvp(demanded, (reference, state), (reference.rate(), moving))[1]

@@ -19,12 +19,11 @@ from ambjax.control.cascade import Cascade
 from ambjax.control.sampling import band, disturbance
 from ambjax.control.schedule import schedules
 from ambjax.numerics.records import canonical
-from ambjax.simulation.clock import Clock
+from ambjax.simulation.clock import Clock, takes_case
 from ambjax.simulation.rollout import Result, System, prepare, roll
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
-from ambjax.simulation.triple import takes_case
 from ambjax.theorem.causes import Cause, find_cause
 from ambjax.theorem.law_poles import LawPoles, law_poles, sampling_of
 from ambjax.theorem.law_signals import LawSignalsRecorder

@@ -26,9 +26,9 @@ class Signals(NamedTuple):
 class Bearing(Generic[S]):
     """Parameters of rotor and magnets (Table 1), and the force of given currents. All parameters are in SI units.
 
-    A plant is a subclass of this record, and its state is a NamedTuple of scalars. The subclass implements `start`,
-    `rates`, `rest`, `scale`, `measurement` and `signals`. It overrides `currents` if the coils do not share one
-    current deviation, and `flux_currents` if the flux can lag. It inherits the other methods.
+    A plant is a subclass of this record, and its state is a NamedTuple of scalars with z and z_dot. The subclass
+    implements `start`, `rates`, `scale`, `measurement` and `signals`. It overrides `currents` if the coils do not share
+    one current deviation, and `flux_currents` if the flux can lag. It inherits the other methods.
 
     The paper prints k_z in N m. Here it is a stiffness in N/m; a negative value is restoring.
     """
@@ -81,7 +81,7 @@ class Bearing(Generic[S]):
 
     def rest(self, state: S, z: Array) -> S:
         """Return the state in which a lost rotor is frozen: at z (m), with zero velocity."""
-        raise NotImplementedError
+        return state._replace(z=z, z_dot=jnp.zeros_like(z))  # pyright: ignore[reportAttributeAccessIssue]
 
     def scale(self) -> S:
         """Return the characteristic size of each component of the state; integration errors are relative to it."""

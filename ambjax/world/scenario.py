@@ -9,9 +9,8 @@ import numpy as np
 from jax import Array
 
 from ambjax.numerics.records import Scalar, leaf, part, record
-from ambjax.world.amplifier import Amplifier, CoilResponse, CurrentAmplifier
+from ambjax.world.amplifier import Amplifier, CoilResponse, CoilVoltages, CurrentAmplifier
 from ambjax.world.bearing import Bearing
-from ambjax.world.coil_limits import CoilVoltages
 from ambjax.world.plant import Plant
 from ambjax.world.recorded import Knots
 from ambjax.world.rotation import Rotation, turned

@@ -20,8 +20,7 @@ from ambjax.control.synchronous_notch import SynchronousNotch
 from ambjax.ensemble.distributions import SHAPES
 from ambjax.ensemble.paths import places
 from ambjax.linear import Zones
-from ambjax.world.amplifier import Amplifier
-from ambjax.world.coil_limits import CoilLimits
+from ambjax.world.amplifier import Amplifier, CoilLimits
 from ambjax.world.faults import Dropouts, Outliers
 from ambjax.world.iron import Iron
 from ambjax.world.plant import Plant

@@ -16,8 +16,9 @@ from ambjax.cases.table import Table
 from ambjax.control.lqg import LqgWeights
 from ambjax.extend import canonical
 from ambjax.host.sealed import flat
+from ambjax.simulation.machine_axes import loop_of
 from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.whole_machine import Machine, loop_of
+from ambjax.simulation.whole_machine import Machine
 from tuning.problem.gains_table import chosen
 from tuning.problem.space import Space, read, tunable, with_gain
 
