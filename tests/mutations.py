@@ -256,7 +256,7 @@ MUTATIONS = [
       "with_signal(measured, self.wave, self.wave.at(", "with_signal(measured, self.wave, -self.wave.at(",
       "tests/test_injection.py::test_the_peak_agrees_with_the_independent_simulator[complementary]"),
     M("the response includes members that are lost under the wave", "ambjax/linear/member_responses.py",
-      "code == ALIVE, amplitude", "code >= ALIVE, amplitude",
+      "np.asarray(code) == ALIVE, amplitude", "np.asarray(code) >= ALIVE, amplitude",
       "tests/test_injection.py::test_set_valued_signs_under_noise_and_a_lost_rotor"),
     M("the theorem is checked with the largest value of a schedule instead of the least",
       "ambjax/theorem/conditions.py", "getattr(extremes(law)[0], requirement.gain)",

@@ -23,7 +23,7 @@ from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Trajectory
 from ambjax.theorem import advice, sampled_report
 from ambjax.theorem.conditions import check
 from ambjax.theorem.law_poles import law_poles
-from ambjax.theorem.law_signals import LawSignalsRecorder
+from ambjax.theorem.proof import LawSignalsRecorder
 from ambjax.theorem.sampled_report import Delays, SampledReport, rolled
 from ambjax.world.amplifier import Amplifier
 from ambjax.world.faults import Outliers

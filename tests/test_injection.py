@@ -18,7 +18,7 @@ from ambjax.control import inversion, position
 from ambjax.control.observer import Kalman
 from ambjax.control.processor import Processor
 from ambjax.linear import Zones, frequency_lines, injected, injected_members, linearise, peak
-from ambjax.linear.multisine import multisine
+from ambjax.linear.member_responses import multisine
 from ambjax.sensors import Sensor
 from ambjax.simulation.sliding import Slide
 

@@ -13,7 +13,7 @@ from ambjax.__main__ import main
 from ambjax.cases.forces import forces
 from ambjax.cases.plausibility import implausible
 from ambjax.cases.reader import case_from
-from ambjax.commands.reading import read_with_warnings
+from ambjax.commands.reading import read_any_with_warnings
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_python_and_the_commands_give_the_same_warnings(text, said, tmp_path, ca
         warnings.simplefilter("always")
         ambjax.read_case(case)
     assert {one.filename for one in caught} <= {__file__}  # the line of the caller
-    read_with_warnings(case)
+    read_any_with_warnings(case)
     printed = capsys.readouterr().err.splitlines()
     assert [str(one.message) for one in caught] == printed
     assert any(said in line for line in printed) if said else not printed

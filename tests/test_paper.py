@@ -11,7 +11,7 @@ from matplotlib.image import imread
 
 from ambjax import paper
 from ambjax.__main__ import main
-from ambjax.paper import claims, findings
+from ambjax.paper import claims
 from ambjax.paper.evidence import NOISE_STDS, Evidence, Noise, Run, Survival, Uncertain, survival_of
 from ambjax.paper.ledger import judge_claims, ledger_markdown, noise_table, processor_table
 from ambjax.simulation.trajectory import STALLED, Row, Trajectory
@@ -26,8 +26,8 @@ def noise(survived, radius_at_least=1e-8, stalled=False):
     The others are lost, or stalled; sigma grows with std.
     """
     ended = np.arange(len(NOISE_STDS)) >= survived
-    statuses = ended & (not stalled), ended & stalled
-    return Noise(1e-4, 0.6, *statuses, NOISE_STDS / NOISE_STDS[0] * radius_at_least)
+    found = survival_of(NOISE_STDS, ended & (not stalled), ended & stalled)
+    return Noise(1e-4, 0.6, *found, NOISE_STDS / NOISE_STDS[0] * radius_at_least)
 
 
 def test_verdicts_depend_on_the_evidence():
@@ -41,20 +41,21 @@ def test_verdicts_depend_on_the_evidence():
         return types.SimpleNamespace(tracking=run, check_tracking=types.SimpleNamespace(conditions=[condition]))
 
     judge = judges["Tracking: largest error 2.3e-5 m"]
-    assert judge(tracking(2.3e-5)).verdict == findings.HOLDS
-    assert judge(tracking(2.4e-5)).verdict == findings.FAILS
+    assert judge(tracking(2.3e-5)).verdict == claims.HOLDS
+    assert judge(tracking(2.4e-5)).verdict == claims.FAILS
     lost = judge(tracking(1e-6, lost=True))
-    assert lost.verdict == findings.FAILS
+    assert lost.verdict == claims.FAILS
     assert "gamma = 1000 < Delta_1 = 6e+04" in lost.cause
 
     judge = judges["The rotor is held under sensor noise of variance 1e-7"]
     levels = len(NOISE_STDS)
-    for scans, verdict in (([levels, levels], findings.HOLDS), ([3, 3], findings.FAILS), ([levels, 3], findings.OPEN)):
+    for scans, verdict in (([levels, levels], claims.HOLDS), ([3, 3], claims.FAILS), ([levels, 3], claims.OPEN)):
         assert judge(types.SimpleNamespace(noise=[noise(n) for n in scans])).verdict == verdict
     # the smallest std stalls and a larger one is lost: nothing is known about the smallest
     stalled, lost = np.arange(levels) == 0, np.arange(levels) == 1
-    unknown = noise(levels)._replace(stalled=stalled, lost=lost)
-    assert judge(types.SimpleNamespace(noise=[unknown])).verdict == findings.UNDECIDED
+    upto, undecided = survival_of(NOISE_STDS, lost, stalled)
+    unknown = noise(levels)._replace(survived=upto, undecided=undecided)
+    assert judge(types.SimpleNamespace(noise=[unknown])).verdict == claims.UNDECIDED
     # the radii are compared at the periods at which the smallest std is held
     specified = judges["The noise is specified"]
     scans = [noise(levels), noise(levels), noise(0, radius_at_least=1.0)]
@@ -80,9 +81,9 @@ def test_a_stall_is_neither_held_nor_lost():
         processor_table({"x": evidence}),
     )
     verdicts = {row["says"]: row["findings"]["x"]["verdict"] for row in rows}
-    others = {"The noise is about 20 % of the gap": findings.HOLDS, "The noise is specified": findings.OPEN}
-    assert verdicts == dict.fromkeys(verdicts, findings.UNDECIDED) | others
-    page = ledger_markdown(rows, scans, sampled, [])
+    others = {"The noise is about 20 % of the gap": claims.HOLDS, "The noise is specified": claims.OPEN}
+    assert verdicts == dict.fromkeys(verdicts, claims.UNDECIDED) | others
+    page = ledger_markdown({"claims": rows, "noise": scans, "processor": sampled, "sensitivity": []})
     assert "not decided: stalled at 10 ms" in page
     assert "| none, not decided at 1.0e-08 m |" in page
     assert "rotor lost" not in page
@@ -92,7 +93,7 @@ def test_a_stall_is_neither_held_nor_lost():
     )
     judges = {c.says: c.judge(lost).verdict for c in claims.CLAIMS}
     for says in ("The origin is uniformly asymptotically stable", "Accurate and robust positioning"):
-        assert judges[says] == findings.FAILS
+        assert judges[says] == claims.FAILS
 
 
 def test_the_held_range_ends_before_the_first_loss_or_stall():
@@ -116,18 +117,18 @@ def test_reproduce(tmp_path, monkeypatch):
     found = {c["says"]: c["findings"] for c in written["claims"]}
     assert len(found) == len(claims.CLAIMS)
     verdicts = {f["verdict"] for both in found.values() for f in both.values()}
-    assert verdicts <= {findings.HOLDS, findings.FAILS, findings.OPEN}  # nothing stalls
+    assert verdicts <= {claims.HOLDS, claims.FAILS, claims.OPEN}  # nothing stalls
     error = found["Tracking: largest error 2.3e-5 m"]["repaired"]
-    assert error["verdict"] == findings.HOLDS
+    assert error["verdict"] == claims.HOLDS
     assert 2.2e-5 < error["value"] < 2.4e-5
     assert found["Regulation is insensitive to the pulse"]["repaired"]["value"] == pytest.approx(2.08e-5, rel=0.01)
-    assert found["Theorem 1's conditions hold under Table 2"]["literal"]["verdict"] == findings.FAILS
+    assert found["Theorem 1's conditions hold under Table 2"]["literal"]["verdict"] == claims.FAILS
     assert found["Tracking: largest error 2.3e-5 m"]["literal"]["value"] is None
     # the tuned gains hold the rotor in the paper's noise, at less than half the error that the paper claims
     error = found["Tracking: largest error 2.3e-5 m"]["tuned"]
-    assert error["verdict"] == findings.HOLDS
+    assert error["verdict"] == claims.HOLDS
     assert error["value"] < 1e-5
-    assert found["The rotor is held under sensor noise of variance 1e-7"]["tuned"]["verdict"] == findings.HOLDS
+    assert found["The rotor is held under sensor noise of variance 1e-7"]["tuned"]["verdict"] == claims.HOLDS
     # with each of four numbers of the plant 10 % smaller or larger; the printed gains lose every rotor
     robust = found["Accurate and robust positioning"]
     changes = [f"{name} {sign}10 %" for name in ("m", "k_z", "R", "A") for sign in "-+"]
@@ -141,7 +142,7 @@ def test_reproduce(tmp_path, monkeypatch):
     assert processor["repaired", False]["lost_at_s"] is None
     assert processor["repaired", True]["lost_at_s"] < 0.02
     ours = found["Tracking: largest error 2.3e-5 m"]["sampled"]
-    assert ours["verdict"] == findings.HOLDS
+    assert ours["verdict"] == claims.HOLDS
     assert (
         processor["sampled", True]["settled_max_abs_error_m"]
         == ours["value"]

@@ -252,8 +252,7 @@ def test_softer_signs_are_tried_for_the_loops_that_still_grow():
         return np.where([False, not softest, True, True], 1e6, -1.0)[chosen]
 
     cascade, clock = amb.Cascade(position=law, processor=amb.Processor()), amb.Clock(1000)
-    loops = stability.Tested([cascade], growth, lambda: None, np.array(1e-3), 1.0, clock)
-    least = stability._least_growth(loops, np.array([True, True, True, False]))
+    least = stability._least_growth([cascade], growth, np.array([True, True, True, False]), clock)
     np.testing.assert_array_equal(least, [-1.0, -1.0, 1e6, np.nan])
     assert tried[0][1] == [True, True, True, False]
     assert tried[1][1] == [False, True, True, False]

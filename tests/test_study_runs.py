@@ -15,8 +15,8 @@ from profiles import examples
 from texts import refusal, write
 
 from ambjax.__main__ import main
+from ambjax.commands import ensemble, pace, study_report
 from ambjax.commands import ensemble as studies
-from ambjax.commands import pace, study_report, workers
 
 CASE = """
 [controller.inversion]
@@ -327,7 +327,7 @@ def test_a_missing_package_for_clusters_is_reported_in_one_line(monkeypatch, cap
 def test_a_cluster_that_does_not_answer_is_reported_in_one_line(monkeypatch, capsys):
     pytest.importorskip("distributed")
     write(TINY)
-    monkeypatch.setattr(workers, "PATIENCE", "0.5s")
+    monkeypatch.setattr(ensemble, "PATIENCE", "0.5s")
     assert "--cluster tcp://127.0.0.1:9: no scheduler answers there" in refused(
         [*ON_A_CLUSTER, "tcp://127.0.0.1:9"], capsys
     )

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from ambjax.cases.forces import forces, linear_magnet
 from ambjax.cases.reader import Case
 from ambjax.commands.band_text import band_lines, band_numbers, running_facts, running_speeds
-from ambjax.control.base import set_valued_signs
-from ambjax.control.cascade import DEFAULT_LAWS
+from ambjax.commands.sensitivity_report import set_valued
 from ambjax.linear import PLACES, Analysis, analyse, linearise
 from ambjax.results.operating import margin_numbers
 from ambjax.results.outputs import table
@@ -17,10 +16,7 @@ from ambjax.world.amplifier import difference
 
 
 class Fact(NamedTuple):
-    """A number of the machine: its key in the JSON summary, its meaning, its value (None: not applicable), its unit.
-
-    An empty key: the number is not in the summary.
-    """
+    """A number of the machine. `value`: None: not applicable. Without a `key` it is not in the JSON summary."""
 
     key: str
     words: str
@@ -53,17 +49,13 @@ def acceptance(case: Case) -> tuple[dict[str, object], list[str], str]:
 def _verdict(case: Case, loop: Analysis) -> str:
     if not loop.stable:
         return "Sensitivity: no zone and no margins: the linearised loop is not stable at r = 0."
-    signs = any(set_valued_signs(getattr(case.cascade, stage)) for stage in DEFAULT_LAWS)
-    inside = " (linear loop, valid inside the bands of the set-valued signs)" if signs else ""
+    inside = " (linear loop, valid inside the bands of the set-valued signs)" if set_valued(case) else ""
     word = "largest |S|" if loop.S.at_edge else "peak"
     return f"Sensitivity: zone {loop.zone}, {word} {loop.S.height:.4g} at {loop.S.frequency:.4g} Hz{inside}."
 
 
 def _loop_facts(loop: Analysis, rate: float | None) -> list[Fact]:
-    """Return the peak of a stable loop, and its margins: the smaller one of each kind, and that at the other place.
-
-    `rate`: sampling rate of the processor, Hz; None: continuous time.
-    """
+    """Return the peak and all margins of a stable loop. `rate`: of the processor, Hz; None: continuous time."""
     if not loop.stable:
         return []
     kinds = {
@@ -92,6 +84,7 @@ def machine(case: Case) -> list[Fact]:
     slew = None if u_max is None else u_max / L
     pole = math.sqrt(abs(k_s) / float(plant.m))
     std = float(sensor.std)
+    per_noise = step / std if step and std else None
     return [
         Fact("force_reserve", "largest force / weight", force / weight if weight else None, "1"),
         Fact("load_reserve", "largest force / (weight + largest load)", force / (weight + load) if load else None, "1"),
@@ -103,12 +96,7 @@ def machine(case: Case) -> list[Fact]:
         Fact("current_slew_A_per_s", "slew rate of the current, u_max/L", slew, "A/s"),
         Fact("coil_voltage_reserve_V", "voltage of a coil above the bias, coil.u_max - R i_0", reserve, "V"),
         Fact("converter_step_m", "converter step of z", step, "m"),
-        Fact(
-            "step_per_noise",
-            "converter step / standard deviation of the noise",
-            step / std if step and std else None,
-            "1",
-        ),
+        Fact("step_per_noise", "converter step / standard deviation of the noise", per_noise, "1"),
     ]
 
 

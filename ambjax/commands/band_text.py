@@ -23,10 +23,7 @@ RESPONSES = {
 def band_lines(
     name: str, analysis: Analysis | AxisSensitivity, zones: Zones, fields: Iterable[str] = tuple(RESPONSES)
 ) -> list[str]:
-    """Return one sentence for each maximum of a stable loop that is not a peak, or not the largest value.
-
-    `fields`: of RESPONSES, those that are reported.
-    """
+    """Return a sentence for each maximum that is no peak, or not the largest value. `fields`: of RESPONSES."""
     lines = []
     for field in fields:
         words, unit, _, zoned = RESPONSES[field]

@@ -9,7 +9,7 @@ import numpy as np
 from ambjax.cases.machine_case import MachineCase, with_notches_for
 from ambjax.cases.reader import Case
 from ambjax.cases.rotor_drawing import drawing_of, radial_axes
-from ambjax.commands.reading import read_any_with_warnings
+from ambjax.commands.reading import read_any_with_warnings, results
 from ambjax.host.heartbeat import say
 from ambjax.linear.linear_machine import turning_machines
 from ambjax.linear.machine_stability import growth_of, machine_stability
@@ -22,7 +22,7 @@ from ambjax.linear.unbalance_response import (
     critical_speeds,
     unbalance_response,
 )
-from ambjax.results.outputs import directory, drawn, files, plain, table, write_json, written
+from ambjax.results.outputs import directory, drawn, plain, table, write_json
 from ambjax.text.web_page import escape_markdown, render_page
 from ambjax.text.words import markdown_table
 
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     springs = _on_springs(case) if radial_axes(case) else None
     summary = {
         "speeds_rpm": speeds, "stable": not unstable, "unstable_at_rpm": unstable, "growth_per_s": growth,
-        "poles_per_s": [[[float(p.real), float(p.imag)] for p in own[np.argsort(-np.real(own))]] for own in poles],
+        "poles_per_s": [[[float(p.real), float(p.imag)] for p in own] for own in poles],
         "modes": [[mode.numbers() for mode in own] for own in modes],
         "unbalance": None if found is None else _unbalance(case, found, criticals, operating),
         "undamped_critical_speeds": springs
@@ -83,14 +83,10 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     words = f"unstable at {ranges(speeds, wrong)} rpm" if unstable else "stable"
     text = f"0 to {way * end:g} rpm: {words}; largest real part of a pole {growth.max():.4g} 1/s"
     text += "" if found is None else "\n" + unbalance_text(case, found, criticals, operating)
-    with files(out) as part:
+    with results(args, out, WRITTEN, lambda: text) as part:
         write_json(part / "campbell.json", summary)
         _pictures(case, (speeds, modes, criticals, springs), found, part)
         (part / "campbell.html").write_text(_report(case, text, speeds, modes, part), encoding="utf-8")
-        names = [name for name in WRITTEN if (part / name).exists()]
-    if not args.json:
-        print(text)
-        written(out, ", ".join(names))
     return int(bool(unstable)), plain(summary | {"out": str(out)})
 
 
@@ -181,10 +177,7 @@ def _on_springs(case: MachineCase) -> tuple[np.ndarray, list[np.ndarray], float]
 
 
 def _pictures(case: MachineCase, analysed: tuple, found: UnbalanceResponse | None, part: pathlib.Path) -> None:
-    """Draw Campbell diagram, rotor and response to unbalance.
-
-    `analysed`: speeds, modes, critical speeds, and `_on_springs`, None without radial bearings: then no rotor.
-    """
+    """Draw the pictures. `analysed`: speeds, modes, critical speeds, and `_on_springs` (None: no rotor is drawn)."""
     from ambjax.pictures.machine_pictures import campbell_picture
     from ambjax.pictures.rotor_pictures import rotor_picture, unbalance_picture
 

@@ -13,22 +13,25 @@ from ambjax.cases.forces import forces
 from ambjax.cases.given import of_case
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
-from ambjax.commands import machine_check
+from ambjax.commands import check_text, machine_check
 from ambjax.commands.acceptance import acceptance
 from ambjax.commands.check_text import OnProcessor
 from ambjax.commands.machine_check import CaseCheck
 from ambjax.commands.reading import read_any_with_warnings
 from ambjax.control.cascade import Cascade
+from ambjax.ensemble.delays import DELAYS, at_delays, delay_margin
+from ambjax.ensemble.replay import as_member, record_system
 from ambjax.host.heartbeat import FIRST_RUN, doing, quiet, say
 from ambjax.host.one_thread import one_thread
-from ambjax.linear.stability import Findings, stability_of
+from ambjax.linear.stability import Findings, Stability, stability_of
 from ambjax.results.outputs import plain
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import rollout
-from ambjax.theorem.causes import Cause, find_cause
+from ambjax.theorem import advice
+from ambjax.theorem.causes import find_cause
 from ambjax.theorem.conditions import Condition, Report
 from ambjax.theorem.conditions import check as check_theorem
-from ambjax.theorem.sampled_report import Delays, SampledReport
+from ambjax.theorem.sampled_report import Delays, check_sampled, with_causes
 from ambjax.world.scenario import Scenario
 
 Summary = dict[str, object]
@@ -67,19 +70,21 @@ def check(case: Case | MachineCase, *, full: bool = False) -> CaseCheck:
 
 def _checked(case: Case, path: str, full: bool) -> CaseCheck:
     """Check a case of one axis. `path`: of its file, for the text."""
-    from ambjax.commands import check_text
-
     with doing(f"simulating and analysing the loop; {FIRST_RUN}"):
         report, (loop, sensitivity, machine), on_processor, findings = _results(case, full)
     run = report if on_processor is None else on_processor.sampled
     assert run is not None
-    with doing(f"testing the stability of the loop; {FIRST_RUN}"):
-        findings = (findings or _stability(case)) if math.isinf(run.lost_at) else None
+    if math.isfinite(run.lost_at):
+        findings = None
+    elif findings is None:
+        with doing(f"testing the stability of the loop; {FIRST_RUN}"):
+            say("testing whether the loop is stable: simulating without noise and loads")
+            findings = stability_of(case.cascade, as_member(case.scenario), case.clock).findings()
     summary = {
         "holds": run.holds,
         "lost_at_s": run.lost_at,
         "lost_why": run.lost_why,
-        "cause": _cause(run.cause),
+        "cause": run.cause and run.cause._asdict(),
         "stalled": run.stalled,
         "method": report and report.method,
         "conditions": report and [_condition(c) for c in report.conditions],
@@ -88,14 +93,13 @@ def _checked(case: Case, path: str, full: bool) -> CaseCheck:
         "stability": None if findings is None else findings._asdict(),
     }
     largest, weight, _ = forces(case)
-    differs = None
     if on_processor is not None:
-        differs = _delays_differ(case, on_processor, loop)
-        summary |= _processor_summary(on_processor, differs)
-    summary |= _clearance(case, run.largest_z)
+        summary |= _processor_summary(on_processor)
+    used, zone = check_text.clearance(case, run.largest_z)
+    summary |= {"clearance_used": used, "clearance_zone": zone}
     steady = findings is None or findings.stable
     summary["holds"] = bool(summary["holds"]) and largest >= weight and steady
-    shown = check_text.Checked(case, path, report, findings, on_processor, differs, loop["stable"] is not None)
+    shown = check_text.Checked(case, path, report, findings, on_processor, loop["stable"] is not None)
     verdict = "\n".join(check_text.verdict(shown, sensitivity[0], run.largest_z))
     text = "\n\n".join([verdict, "\n".join([*sensitivity[1:], machine]), *check_text.details(shown, full)])
     return CaseCheck(summary["holds"] and loop["stable"] is not None, plain(summary), text)
@@ -117,9 +121,14 @@ def _results(
         say("linearising the loop")
         loop, on_processor, findings = acceptance(case), None, None
         if case.cascade.sampled:
-            sampled = _sampled(case)
-            margins, findings = _margins(case)
-            on_processor = OnProcessor(sampled, *margins)
+            say("simulating on the processor, with and without noise")
+            parts = (case.cascade, as_member(case.scenario), case.clock, case.settle, record_system)
+            sampled = with_causes(check_sampled(*parts), *parts, say)
+            (margin, unknown), findings = _margins(case)
+            places: Any = loop[0].get("margins") or {"command": {}}
+            linear, delay = places["command"].get("delay_margin_s"), float(case.cascade.timing.delay)
+            differs = advice.delay_difference(linear, unknown or margin, delay, float(case.clock.sample_period))
+            on_processor = OnProcessor(sampled, margin, unknown, differs)
         report = theorem and theorem.result()
     if report is not None and report.lost and not case.cascade.sampled:
         cause = find_cause(_is_lost, case.cascade, case.scenario, case.clock, say)
@@ -131,59 +140,48 @@ def _is_lost(cascade: Cascade, scenario: Scenario, clock: Clock) -> bool:
     return bool(np.isfinite(rollout(cascade, scenario, clock, record_every=0).trajectory.lost_at))
 
 
-def _sampled(case: Case) -> SampledReport:
-    from ambjax.ensemble.replay import as_member, record_system
-    from ambjax.theorem.sampled_report import check_sampled, with_causes
-
-    say("simulating on the processor, with and without noise")
-    parts = (case.cascade, as_member(case.scenario), case.clock, case.settle, record_system)
-    return with_causes(check_sampled(*parts), *parts, say)
-
-
 def _margins(case: Case) -> tuple[tuple[Delays, Delays | None], Findings | None]:
-    """Return two delay margins: with prediction over the delay of each run, and over the delay of the case.
-
-    Also returns the stability of the loop; None if an ensemble of delays does not contain the case.
-    """
-    from ambjax.ensemble.delays import DELAYS, delay_margin
-    from ambjax.linear.stability import with_stability
-
-    loop = (case.cascade, case.scenario, case.clock)
-
-    def found(known: bool) -> tuple[Delays, Findings | None]:
-        margin = delay_margin(*loop, known=known)
-        say("testing whether the loop is stable at these delays")
-        return with_stability(margin, *loop, known=known)
-
+    """Return the delay margins with prediction over each delay, and over that of the case, and the stability."""
     say(f"finding the delay margin: simulating ensembles of {DELAYS} delays, three at most")
-    margin, stability = found(True)
+    margin, stability = _margin_of(case, known=True)
     if (processor := case.cascade.processor) is None or processor.predict is False:
         return (margin, None), stability
     say("finding the delay margin again: the prediction uses the delay of the case")
-    unknown, stability = found(False)
+    unknown, stability = _margin_of(case, known=False)
     return (margin, unknown), stability
 
 
-def _stability(case: Case) -> Findings:
-    """Return whether the loop of the case is stable, from its poles and from a run without noise and loads."""
-    from ambjax.ensemble.replay import as_member
+def _margin_of(case: Case, *, known: bool) -> tuple[Delays, Findings | None]:
+    """Return the result of `delay_margin` with the delays, up to its `held`, up to which the loop is stable.
 
-    say("testing whether the loop is stable: simulating without noise and loads")
-    return stability_of(case.cascade, as_member(case.scenario), case.clock).findings()
+    DELAYS delays are tested; a second pass divides the step after the last one that is stable. Also returns the
+    findings at the case's own delay; None if the rotor is not held there.
+    """
+    margin = delay_margin(case.cascade, case.scenario, case.clock, known=known)
+    say("testing whether the loop is stable at these delays")
+    if margin.held is None:
+        return margin, None
+    own = float(case.cascade.timing.delay)
+    first = own if margin.held >= own else 0.0
+
+    def tried(low: float, high: float) -> tuple[np.ndarray, Stability]:
+        delays = np.linspace(low, high, DELAYS)
+        return delays, stability_of(at_delays(case.cascade, delays, known=known), case.scenario, case.clock)
+
+    delays, found = tried(first, margin.held)
+    at_own = found.of([0]).findings() if first == own else None
+    if found.stable.all():
+        return margin._replace(stable=margin.held, tested=DELAYS), at_own
+    facts, at = found.findings(), int(np.argmin(found.stable))
+    stable = None
+    if at:
+        finer, again = tried(delays[at - 1], delays[at])
+        stable = float(finer[max(int(np.argmin(again.stable)) - 1, 0)])
+    return margin._replace(stable=stable, swing_m=facts.swing_m, current_A=facts.current_A, tested=DELAYS), at_own
 
 
-def _delays_differ(case: Case, results: OnProcessor, loop: Mapping[str, Any]) -> str:
-    """Return why the simulated loop is stable beyond the delay margin of the linearised `loop`; '' if it is not."""
-    from ambjax.theorem import advice
-
-    places = loop.get("margins") or {}
-    linear = places.get("command", {}).get("delay_margin_s")
-    sizes = float(case.cascade.timing.delay), float(case.clock.sample_period)
-    return advice.delay_difference(linear, results.unknown or results.margin, *sizes)
-
-
-def _processor_summary(results: OnProcessor, differs: str) -> Summary:
-    sampled, margin, unknown = results
+def _processor_summary(results: OnProcessor) -> Summary:
+    sampled, margin, unknown, differs = results
     laws = [dataclasses.asdict(law) | {"holds": law.holds} for law in sampled.laws]
     return {
         "processor": {
@@ -192,7 +190,7 @@ def _processor_summary(results: OnProcessor, differs: str) -> Summary:
             "distance_to_C_at_s": sampled.distance[1],
             "alternating": sampled.alternating,
             "alternates": sampled.alternates,
-            "alternation_cause": _cause(sampled.alternation_cause),
+            "alternation_cause": sampled.alternation_cause and sampled.alternation_cause._asdict(),
             "bands": [dataclasses.asdict(band) | {"bound": band.bound} for band in sampled.bands],
             "delay_margin": _margin(margin),
             "delay_margin_unknown": None if unknown is None else _margin(unknown),
@@ -201,20 +199,8 @@ def _processor_summary(results: OnProcessor, differs: str) -> Summary:
     }
 
 
-def _clearance(case: Case, largest: float | None) -> Summary:
-    """Return the clearance zone of the largest |z| after run.settle, m; None: zone D."""
-    if largest is None:
-        return {"clearance_used": None, "clearance_zone": "D"}
-    used = largest / float(np.min(np.asarray(case.scenario.touchdown)))
-    return {"clearance_used": used, "clearance_zone": case.zones.clearance_zone(used)}
-
-
 def _margin(margin: Delays) -> Mapping[str, object]:
     return margin._asdict() | {"resolution": margin.resolution}
-
-
-def _cause(cause: Cause | None) -> Mapping[str, object] | None:
-    return None if cause is None else cause._asdict()
 
 
 def _condition(c: Condition) -> Mapping[str, object]:

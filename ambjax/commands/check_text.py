@@ -30,12 +30,20 @@ BAND = (
 )
 
 
+# Of a condition; one that is only informative has none.
+VERDICTS = {True: "holds", False: "FAILS", None: ""}
+
+
 class OnProcessor(NamedTuple):
-    """Results on the processor. `margin`, `unknown`: delay margins, see `check._margins`."""
+    """Results on the processor. `margin`, `unknown`: delay margins, see `check._margins`.
+
+    `differs`: why simulated and linear delay margins differ, or empty.
+    """
 
     sampled: SampledReport
     margin: Delays
     unknown: Delays | None
+    differs: str
 
 
 class Checked(NamedTuple):
@@ -44,7 +52,6 @@ class Checked(NamedTuple):
     - `path`: name of the case file as given by the user.
     - `report`: on Theorem 1; None: not computed. `findings`: stability of the loop; None: the rotor is lost.
     - `linear`: whether the loop has a linearisation.
-    - `differs`: why simulated and linear delay margins differ, or empty.
     """
 
     case: Case
@@ -52,7 +59,6 @@ class Checked(NamedTuple):
     report: Report | None
     findings: Findings | None
     on_processor: OnProcessor | None
-    differs: str | None
     linear: bool
 
     @property
@@ -64,10 +70,7 @@ class Checked(NamedTuple):
 
 
 def verdict(checked: Checked, sensitivity: str, largest: float | None) -> list[str]:
-    """Return the verdict: what fails, the rotor, its stability, its `sensitivity`, and Theorem 1.
-
-    `largest`: largest |z| after run.settle, m; None: the run ends early.
-    """
+    """Return the lines of the verdict. `largest`: largest |z| after run.settle, m; None: the run ends early."""
     report, findings = checked.report, checked.findings
     failures = list(_failures(checked))
     lines = ["The check passes." if not failures else f"The check FAILS: {'; '.join(failures)}."]
@@ -85,7 +88,6 @@ def verdict(checked: Checked, sensitivity: str, largest: float | None) -> list[s
 
 
 def _failures(checked: Checked) -> list[str]:
-    """Return what makes the check fail, a few words each."""
     run, found = checked.run, []
     if math.isfinite(run.lost_at):
         found.append("the run is not decided" if run.stalled else "the rotor is lost")
@@ -101,13 +103,19 @@ def _failures(checked: Checked) -> list[str]:
     return [*found, *filter(None, [forces(checked.case).too_small])]
 
 
+def clearance(case: Case, largest: float | None) -> tuple[float | None, str]:
+    """Return the share of the clearance of the largest |z| after run.settle, m, and its zone; None: zone D."""
+    used = None if largest is None else largest / float(np.min(np.asarray(case.scenario.touchdown)))
+    return used, "D" if used is None else case.zones.clearance_zone(used)
+
+
 def _clearance(case: Case, largest: float | None) -> str:
-    if largest is None:
+    zones, (used, zone) = case.zones, clearance(case, largest)
+    if used is None:
         return ""
-    zones, used = case.zones, largest / float(np.min(np.asarray(case.scenario.touchdown)))
     return (
         f" After run.settle |z| reaches {largest:.4g} m, {100 * used:.3g} % of the clearance: clearance zone "
-        f"{zones.clearance_zone(used)} (A below {100 * zones.clearance_a:g} %, B below {100 * zones.clearance_b:g} %, "
+        f"{zone} (A below {100 * zones.clearance_a:g} %, B below {100 * zones.clearance_b:g} %, "
         f"C below {100 * zones.clearance_c:g} %)."
     )
 
@@ -118,49 +126,35 @@ def details(checked: Checked, full: bool) -> list[str]:
     if ideal := idealised(case):
         parts.append(ideal)
     if checked.on_processor is not None:
-        sampled, margin, unknown = checked.on_processor
+        sampled, margin, unknown, differs = checked.on_processor
         parts += [f"On the processor: {case.cascade.on_processor().processor}, T = {case.clock.sample_period:g} s."]
         parts += [_laws(sampled), *([_bands(sampled)] if full else [])]
-        differs = [checked.differs] if checked.differs else []
-        parts.append("\n".join([*advice.processor_lines(sampled, margin, unknown), *differs]))
+        parts.append("\n".join([*advice.processor_lines(sampled, margin, unknown), *filter(None, [differs])]))
     if report is not None and (checked.on_processor is None or full):
         shown = [line for line in report.conditions if line.gain is not None and (full or line.holds is not None)]
-        parts += ["Theorem 1:", *([_conditions(shown)] if shown else []), *([_proof(report.proof)] if full else [])]
+        parts += ["Theorem 1:", *([_conditions(shown)] if shown else [])]
+        steps = [(c.name, c.requires, number(c.against, 3), c.unit, number(c.at_s, 5), c.note) for c in report.proof]
+        parts += [table(("proof", "statement", "worst", "unit", "at (s)", "meaning"), steps)] if full else []
         parts.append("\n".join(advice.theorem_lines(report, checked.path)))
         parts += [CONTINUOUS] if checked.on_processor is not None else []
     return parts if full else [*parts, "--full prints every table."]
 
 
 def _conditions(conditions: list[Condition]) -> str:
-    """Return the table of conditions. One that is only informative has no verdict."""
-    verdicts = {True: "holds", False: "FAILS", None: ""}
     rows = []
     for c in conditions:
         sides = [number(x, 5) for x in (c.gain, c.against, c.margin)]
-        rows.append((c.requires, *sides, c.unit, number(c.at_s, 5), verdicts[c.holds], c.note))
+        rows.append((c.requires, *sides, c.unit, number(c.at_s, 5), VERDICTS[c.holds], c.note))
     head = ("condition", "left", "right", "margin", "unit", "at (s)", "verdict", "note")
     columns = len(head) - (not any(row[-1] for row in rows))  # without an empty column of notes
     return table(head[:columns], [row[:columns] for row in rows])
 
 
-def _proof(proof: list[Condition]) -> str:
-    steps = [(c.name, c.requires, f"{c.against:.3g}", c.unit, f"{c.at_s:.5g}", c.note) for c in proof]
-    return table(("proof", "statement", "worst", "unit", "at (s)", "meaning"), steps)
-
-
 def _laws(sampled: SampledReport) -> str:
-    rows = [
-        (
-            law.stage,
-            "implicit" if law.implicit else "explicit",
-            f"{law.radius:.4g}",
-            f"{law.damping:.4g}",
-            "holds" if law.holds else "FAILS",
-        )
-        for law in sampled.laws
-    ]
     head = ("law", "step", "largest |pole|", "least damping ratio", "verdict")
-    return table(head, rows)
+    steps = {True: "implicit", False: "explicit"}
+    numbers = [(number(law.radius), number(law.damping), VERDICTS[law.holds]) for law in sampled.laws]
+    return table(head, [(law.stage, steps[law.implicit], *own) for law, own in zip(sampled.laws, numbers, strict=True)])
 
 
 def _bands(sampled: SampledReport) -> str:
@@ -169,15 +163,9 @@ def _bands(sampled: SampledReport) -> str:
 
     if not sampled.bands:
         return "No bands, because every run ends early."
-    bands = [
-        (
-            b.signal,
-            b.unit,
-            "the case's" if b.noise else "none",
-            *map(limit, (b.gain, b.disturbance, b.band, b.difference, b.bound, b.largest)),
-            b.note,
-        )
-        for b in sampled.bands
-    ]
+    rows = []
+    for b in sampled.bands:
+        values = map(limit, (b.gain, b.disturbance, b.band, b.difference, b.bound, b.largest))
+        rows.append((b.signal, b.unit, "the case's" if b.noise else "none", *values, b.note))
     values = ("gain, per s", "disturbance", "band", "difference", "bound", "largest")
-    return table(("signal", "unit", "noise", *values, "note"), bands) + "\n" + BAND
+    return table(("signal", "unit", "noise", *values, "note"), rows) + "\n" + BAND

@@ -15,7 +15,7 @@ from ambjax.cases.machine_case import AnyCase, MachineCase, first_axis
 from ambjax.cases.reader import Case
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
-from ambjax.commands.comparison_loop import ComparedLoop, loop_of_axis, loop_of_machine, no_loop
+from ambjax.commands.comparison_loop import ComparedLoop, loop_of_axis, loop_of_machine
 from ambjax.commands.comparison_report import (
     BY_AXIS,
     Compared,
@@ -25,7 +25,7 @@ from ambjax.commands.comparison_report import (
 )
 from ambjax.commands.comparison_tuning import check_options, tuned_cases
 from ambjax.commands.machine_commands import refuse
-from ambjax.commands.reading import read_any_with_warnings
+from ambjax.commands.reading import read_any_with_warnings, results
 from ambjax.commands.study_report import findings_of
 from ambjax.ensemble.study import AnyStudy, Study
 from ambjax.ensemble.worker import CALL, chunk
@@ -35,7 +35,7 @@ from ambjax.page.html_page import check_processor, pages
 from ambjax.results.case_export import guarded_for
 from ambjax.results.machine_study import MachineStudy
 from ambjax.results.operating import MEMBERS, operating_point, sensitivity, shown_band, spread_peaks
-from ambjax.results.outputs import described, directory, drawn, files, plain, write_json, written
+from ambjax.results.outputs import described, directory, drawn, plain, write_json
 from ambjax.results.spread_runs import study_of
 from ambjax.text.web_page import render_page
 
@@ -74,16 +74,12 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
         studies = _studies(cases, args.seed, args.members)
     html_pages = pages(of_axis, args.cases) if args.page else {}
     summary, compared = _comparison(cases, studies, notes)
-    with files(out) as part:
+    with results(args, out, (*WRITTEN, *html_pages), lambda: comparison_table(summary)) as part:
         write_json(part / "compare.json", summary)
         drawn(part / "compare.png", lambda: _drawn(compared), 110)
         described("compare.html", lambda: _write_html(summary, part))
         for name, html in html_pages.items():
             (part / name).write_text(html, encoding="utf-8")
-        names = [name for name in WRITTEN if (part / name).exists()]
-    if not args.json:
-        print(described("the table", lambda: comparison_table(summary)) or "")
-        written(out, ", ".join([*names, *html_pages]))
     good = all(one.held.all() and one.findings.stable and one.loop.stable for one in compared)
     return int(not good), plain(summary | {"out": str(out)})
 
@@ -128,13 +124,11 @@ def compare(cases: Sequence[AnyCase], members: int = 1, *, seed: int | None = No
 
 
 def _comparison(cases: Sequence[AnyCase], studies: Sequence[Study | MachineStudy], notes: Sequence[str]) -> Comparison:
-    """Simulate and analyse the cases. `notes`: of `_differences`."""
     compared = [_compared(case, study) for case, study in zip(cases, studies, strict=True)]
     return Comparison(comparison_summary(compared, studies[0], notes), compared)
 
 
 def _write_html(summary: Mapping[str, Any], part: pathlib.Path) -> None:
-    """Write compare.html into the folder `part`, with the picture in it."""
     picture = part / "compare.png"
     drawn = {picture.name: picture.read_bytes()} if picture.exists() else {}
     html = render_page(comparison_markdown(summary), drawn, "Comparison of controllers")
@@ -179,10 +173,7 @@ def _named(cases: Sequence[AnyCase], paths: Sequence[str]) -> list[AnyCase]:
 
 
 def _differences(paths: Sequence[str], cases: Sequence[AnyCase], studies: Sequence[AnyStudy]) -> list[str]:
-    """Return a note for each case that differs from the first in more than the controller and the integration method.
-
-    Raises ValueError if the spreads differ, because the members would then not be the same.
-    """
+    """Note the cases that differ in more than the laws and the method. Raises ValueError if the spreads differ."""
     first, notes = studies[0].fingerprint(), []
     for path, case, study in zip(paths[1:], cases[1:], studies[1:], strict=True):
         other = study.fingerprint()
@@ -206,7 +197,6 @@ def _differences(paths: Sequence[str], cases: Sequence[AnyCase], studies: Sequen
 
 
 def _compared(case: AnyCase, study: Study | MachineStudy) -> Compared:
-    """Simulate the members of a case, analyse its loop, and count the operations of a step."""
     with doing(f"{case.name}: linearising and simulating the loops of the members; {FIRST_RUN}"):
         loop, columns = _linear(case, study), _columns(case, study)
         flops = _flops(case) if isinstance(case, Case) else None
@@ -233,7 +223,7 @@ def _linear(case: AnyCase, study: Study | MachineStudy) -> ComparedLoop:
         point = operating_point(case, "nominal", 0.0)
     except ValueError as error:
         say(f"{case.name}: {error}")
-        return no_loop(None)
+        return ComparedLoop({"stable": None})
     drawn = spread_peaks(case, study, MEMBERS) if isinstance(study, Study) and case.spread.entries else None
     return loop_of_axis(point, drawn)
 
@@ -256,7 +246,7 @@ def _drawn(compared: Sequence[Compared]) -> Any:
     shown = []
     for one in compared:
         errors, volts = (np.asarray(one.columns[name]) for name in ("settled_rms_error_m", "settled_rms_u_V"))
-        loop = one.loop.system, one.loop.channel, one.loop.command, str(one.loop.numbers["worst_at"] or "")
+        loop = one.loop.system, one.loop.channel, one.loop.command, str(one.loop.numbers.get("worst_at") or "")
         shown.append(comparison.Contender(one.case.name, one.held, errors, volts, *loop))
     loops = [(first_axis(one.case), one.loop.system) for one in compared]
     spans = [shown_band(case, [system] if system else []) for case, system in loops]

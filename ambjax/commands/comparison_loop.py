@@ -6,18 +6,14 @@ from typing import NamedTuple
 from ambjax.cases.machine_case import AnyCase, MachineCase
 from ambjax.ensemble.paths import kinds, places
 from ambjax.linear import MachineSensitivity, StateSpace
-from ambjax.results.operating import OperatingPoint, SpreadPeaks
-
-# Numbers of the loop of one axis, without those of the spread.
-KEYS = ("peak", "frequency_hz", "t_peak", "ks_peak", "gain_margin_low", "gain_margin_high", "phase_margin_deg")
-KEYS += ("delay_margin_s", "disk_margin", "stiffness_N_per_m", "outside_peak")
-KEYS += ("delay_margin_reading_s", "delay_margin_command_s", "sigma_max", "worst_at")
+from ambjax.results.operating import OperatingPoint, SpreadPeaks, analysis_summary
 
 
 class ComparedLoop(NamedTuple):
     """The linearised loops of a case.
 
-    - `numbers`: of the nominal loop, or of the worst axis and speed of a machine, by the keys of the summary.
+    - `numbers`: of the nominal loop, or of the worst axis and speed of a machine, by the keys of the summary: "stable"
+      (None: not known), and others.
     - `axes`: peak of |S| and zone of each axis of a machine by its name, at the worst speed; {} for one axis.
     - `system`: the loop that the picture shows; None: not stable, or no equilibrium. `channel`, `command`:
       numbers of the reading and the voltage that the picture shows, among its outputs.
@@ -35,40 +31,38 @@ class ComparedLoop(NamedTuple):
         return bool(self.numbers["stable"])
 
 
-def no_loop(stable: bool | None) -> ComparedLoop:
-    """Return the numbers of a loop that is not stable: its zone is D. None: it has no linearisation, and no zone."""
-    zone = None if stable is None else "D"
-    return ComparedLoop({"stable": stable, "zone": zone, **dict.fromkeys((*KEYS, "unstable", "worst_peak"))})
-
-
 def loop_of_axis(point: OperatingPoint, peaks: SpreadPeaks | None) -> ComparedLoop:
     """Return the loop of a case of one axis. `peaks`: sensitivity peaks of the members; None without a spread."""
-    worst: dict[str, object] = {}
+    numbers: dict[str, object] = {"stable": point.stable, "zone": point.zone}
     if peaks is not None:
-        worst["unstable"] = peaks.members - peaks.stable
-        if not worst["unstable"] and peaks.point is not None and peaks.point.analysis.stable:
-            worst["worst_peak"] = peaks.point.analysis.S.height
+        numbers["unstable"] = peaks.members - peaks.stable
+        if not numbers["unstable"] and peaks.point is not None and peaks.point.analysis.stable:
+            numbers["worst_peak"] = peaks.point.analysis.S.height
     loop = point.analysis
     if not loop.stable:
-        return ComparedLoop({**no_loop(False).numbers, **worst, "stable": point.stable, "zone": point.zone})
-    margins, at, outside = loop.margins, loop.margins_at, loop.S.outside
-    found = (loop.S.height, loop.S.frequency, loop.T.height, loop.KS.height, margins.gm_low, margins.gm_high)
-    found += (margins.pm, margins.delay, margins.dm, loop.stiffness)
-    found += (None if outside is None else outside.height, at.reading.delay, at.command.delay)
-    numbers = {**no_loop(True).numbers, **dict(zip(KEYS, found, strict=False)), **worst, "zone": loop.zone}
+        return ComparedLoop(numbers)
+    at, outside = loop.margins_at, loop.S.outside
+    numbers |= analysis_summary(loop) | {
+        "zone": loop.zone,
+        "stiffness_N_per_m": loop.stiffness,
+        "outside_peak": None if outside is None else outside.height,
+        "delay_margin_reading_s": at.reading.delay,
+        "delay_margin_command_s": at.command.delay,
+    }
     return ComparedLoop(numbers, system=point.system)
 
 
 def loop_of_machine(points: Sequence[MachineSensitivity]) -> ComparedLoop:
     """Return the loops of a machine: the largest peaks and the smallest margins of its axes at its speeds."""
     if not all(point.stable for point in points):
-        return no_loop(False)
+        return ComparedLoop({"stable": False, "zone": "D"})
     if not all(point.linear for point in points):  # stable, but without peaks
-        return ComparedLoop({**no_loop(None).numbers, "stable": True})
+        return ComparedLoop({"stable": True})
     rows = [(axis, point) for point in points for axis in point.axes]
     worst, at = max(rows, key=lambda row: row[0].S.height)
     margins = [axis.margins for axis, _ in rows if axis.margins is not None]
     numbers = {
+        "stable": True,
         "peak": worst.S.height,
         "frequency_hz": worst.S.frequency,
         "zone": worst.zone,
@@ -88,7 +82,7 @@ def loop_of_machine(points: Sequence[MachineSensitivity]) -> ComparedLoop:
         own = max((other for other, _ in rows if other.name == axis.name), key=lambda other: other.S.height)
         axes[axis.name] = {"peak": own.S.height, "frequency_hz": own.S.frequency, "zone": own.zone}
     k = at.axes.index(worst)
-    return ComparedLoop({**no_loop(True).numbers, **numbers}, axes, at.system, k, len(at.axes) + k)
+    return ComparedLoop(numbers, axes, at.system, k, len(at.axes) + k)
 
 
 def laws_of(case: AnyCase) -> dict[str, dict[str, object]]:

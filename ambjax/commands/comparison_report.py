@@ -16,7 +16,7 @@ from ambjax.results.operating import MEMBERS
 from ambjax.results.outputs import table
 from ambjax.simulation import orders
 from ambjax.text import web_page
-from ambjax.text.words import markdown_table
+from ambjax.text.words import markdown_table, number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,15 +46,19 @@ class Compared:
 
 
 class Quantity(NamedTuple):
-    """A row of the table: its key in the summary, its words, its unit, and whether less is better (None: neither).
+    """A row of the table, and a number of each case.
 
-    `axis`: name of an axis of a machine; "" for the whole case.
+    - `key`: in the summary. `less`: whether less is better; None: neither.
+    - `metric`, `reduce`: metric of the members, and how it is reduced; "": the number has another source.
+    - `axis`: name of an axis of a machine; "" for the whole case.
     """
 
     key: str
     words: str
     unit: str
     less: bool | None = True
+    metric: str = ""
+    reduce: Callable[[np.ndarray], Any] = np.max
     axis: str = ""
 
     def value(self, case: Mapping[str, Any]) -> Any:
@@ -62,22 +66,37 @@ class Quantity(NamedTuple):
         return (case.get("axes", {}).get(self.axis, {}) if self.axis else case).get(self.key)
 
 
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _mean_phase(degrees: np.ndarray) -> float:
+    return float(np.degrees(np.angle(np.mean(np.exp(1j * np.radians(degrees))))))
+
+
+def _of_order(name: str, unit: str) -> Quantity:
+    of = name.rpartition("_")[0].replace("_", " at ")
+    if unit == "deg":
+        return Quantity(name, f"mean phase of {of}", unit, None, name, _mean_phase)
+    return Quantity(name, f"median amplitude of {of}", unit, True, name, np.median)
+
+
 QUANTITIES = (
     Quantity("lost", "members lost", "1"),
     Quantity("stalled", "members not decided (the integrator stalled)", "1"),
     Quantity("not_stable", "members held, but not stable, of those tested", "1"),
     Quantity("cycle_m", "the largest amplitude of their own oscillation", "m"),
-    Quantity("rms_error_median_m", "settled rms error, median", "m"),
-    Quantity("rms_error_worst_m", "settled rms error, worst member", "m"),
-    Quantity("max_error_m", "largest settled error", "m"),
+    Quantity("rms_error_median_m", "settled rms error, median", "m", True, "settled_rms_error_m", np.median),
+    Quantity("rms_error_worst_m", "settled rms error, worst member", "m", True, "settled_rms_error_m"),
+    Quantity("max_error_m", "largest settled error", "m", True, "settled_max_abs_error_m"),
     Quantity("better_than_first", "members with a lower rms error than in the first case", "1", less=False),
-    Quantity("rms_u_V", "settled rms voltage, over members", "V"),
-    Quantity("max_u_V", "largest voltage", "V"),
-    Quantity("rms_i_A", "rms current, over members", "A"),
-    Quantity("max_i_A", "largest current", "A"),
-    Quantity("copper_loss_W", "copper loss, mean", "W"),
-    Quantity("chatter_V_per_s", "variation of the voltage, mean", "V/s"),
-    Quantity("clearance_used", "largest settled share of the clearance", "1"),
+    Quantity("rms_u_V", "settled rms voltage, over members", "V", True, "settled_rms_u_V", _rms),
+    Quantity("max_u_V", "largest voltage", "V", True, "max_abs_u_V"),
+    Quantity("rms_i_A", "rms current, over members", "A", True, "rms_i_A", _rms),
+    Quantity("max_i_A", "largest current", "A", True, "max_abs_i_A"),
+    Quantity("copper_loss_W", "copper loss, mean", "W", True, "copper_loss_W", np.mean),
+    Quantity("chatter_V_per_s", "variation of the voltage, mean", "V/s", True, "chatter_V", np.mean),
+    Quantity("clearance_used", "largest settled share of the clearance", "1", True, "settled_clearance_used"),
     Quantity("clearance_zone", "its zone (ISO 14839-2)", "", None),
     Quantity("peak", "peak of |S|", "1"),
     Quantity("frequency_hz", "its frequency", "Hz", None),
@@ -98,21 +117,13 @@ QUANTITIES = (
     Quantity("disk_margin", "disk margin", "1", less=False),
     Quantity("stiffness_N_per_m", "static stiffness", "N/m", less=False),
     Quantity("flops", "cost of a step", "flops"),
-    *(
-        Quantity(name, f"{words} of {name.rpartition('_')[0].replace('_', ' at ')}", unit, None if phase else True)
-        for name, unit in orders.UNITS.items()
-        for phase, words in [(unit == "deg", "mean phase" if unit == "deg" else "median amplitude")]
-    ),
+    *(_of_order(name, unit) for name, unit in orders.UNITS.items()),
 )
 
-# Of each axis of a machine: key in the summary, metric of the members, and how it is reduced.
-AXIS_METRICS = {
-    "rms_error_median_m": ("settled_rms_error_m", np.median),
-    "max_error_m": ("settled_max_abs_error_m", np.max),
-    "max_i_A": ("max_abs_i_A", np.max),
-    "max_u_V": ("max_abs_u_V", np.max),
-}
-BY_AXIS = tuple(metric for metric, _ in AXIS_METRICS.values())
+BY_KEY = {q.key: q for q in QUANTITIES}
+# Those of each axis of a machine, and their metrics.
+OF_AXES = [BY_KEY[key] for key in ("rms_error_median_m", "max_error_m", "max_i_A", "max_u_V")]
+BY_AXIS = tuple(q.metric for q in OF_AXES)
 
 
 def comparison_summary(compared: Sequence[Compared], study: AnyStudy, notes: Sequence[str]) -> dict[str, Any]:
@@ -122,54 +133,35 @@ def comparison_summary(compared: Sequence[Compared], study: AnyStudy, notes: Seq
 
 
 def _values(one: Compared, first: Compared) -> dict[str, object]:
-    """Return the numbers of a case by the keys of QUANTITIES."""
     case, stalled = one.case, np.asarray(one.columns["stalled"], bool)
     settled = max(float(case.clock.duration) - float(case.settle), float(case.clock.sample_period))
-    chatter, used = one.of("chatter_V", np.mean), one.of("settled_clearance_used", np.max)
-    zone = "D" if used is None or not one.held.all() else case.zones.clearance_zone(used)
-    axes = {} if isinstance(case, Case) else {"axes": {axis: _axis(one, axis) for axis in case.axes}}
+    numbers = {q.key: one.of(q.metric, q.reduce) for q in QUANTITIES}
+    chatter, used = numbers["chatter_V_per_s"], numbers["clearance_used"]
+    loop = {key: x for key, x in one.loop.numbers.items() if key in numbers or key == "stable"}
+    axes = {
+        axis: {q.key: one.of(f"{axis}.{q.metric}", q.reduce) for q in OF_AXES} | dict(one.loop.axes.get(axis, {}))
+        for axis in (() if isinstance(case, Case) else case.axes)
+    }
     return {
         "case": case.name,
+        **numbers,
         "lost": int(np.sum(~one.held & ~stalled)),
         "stalled": int(np.sum(stalled)),
         "not_stable": one.findings.unstable,
         "cycle_m": one.findings.swing_m,
-        "rms_error_median_m": one.of("settled_rms_error_m", np.median),
-        "rms_error_worst_m": one.of("settled_rms_error_m", np.max),
-        "max_error_m": one.of("settled_max_abs_error_m", np.max),
         "better_than_first": None if one is first else _better(one, first),
-        "rms_u_V": one.of("settled_rms_u_V", _rms),
-        "max_u_V": one.of("max_abs_u_V", np.max),
-        "rms_i_A": one.of("rms_i_A", _rms),
-        "max_i_A": one.of("max_abs_i_A", np.max),
-        "copper_loss_W": one.of("copper_loss_W", np.mean),
         "chatter_V_per_s": None if chatter is None else chatter / settled,
-        "clearance_used": used,
-        "clearance_zone": zone,
-        **{name: one.of(name, _mean_phase if unit == "deg" else np.median) for name, unit in orders.UNITS.items()},
-        **one.loop.numbers,
+        "clearance_zone": "D" if used is None or not one.held.all() else case.zones.clearance_zone(used),
+        **loop,
         "flops": one.flops,
-        **axes,
+        **({"axes": axes} if axes else {}),
     }
-
-
-def _axis(one: Compared, axis: str) -> dict[str, object]:
-    numbers = {key: one.of(f"{axis}.{metric}", reduce) for key, (metric, reduce) in AXIS_METRICS.items()}
-    return {**numbers, **one.loop.axes.get(axis, {})}
 
 
 def _better(one: Compared, first: Compared) -> int:
     """Return the number of members that this case holds and the first case loses, or holds with a larger rms error."""
     ours, theirs = (np.where(x.held, x.columns["settled_rms_error_m"], math.inf) for x in (one, first))
     return int(np.sum(ours < theirs))
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-def _mean_phase(degrees: np.ndarray) -> float:
-    return float(np.degrees(np.angle(np.mean(np.exp(1j * np.radians(degrees))))))
 
 
 def comparison_table(summary: Mapping[str, Any]) -> str:
@@ -214,12 +206,8 @@ def _shown(summary: Mapping[str, Any]) -> list[Quantity]:
     """Return the quantities that at least one case has. The row of stalled members is left out if there are none."""
     cases = summary["cases"]
     axes = dict.fromkeys(axis for case in cases for axis in case.get("axes", ()))
-    by_key = {q.key: q for q in QUANTITIES}
-    of_axes = [
-        by_key[key]._replace(words=f"{axis}: {by_key[key].words}", axis=axis)
-        for axis in axes
-        for key in (*AXIS_METRICS, "peak", "zone")
-    ]
+    rows = [*OF_AXES, BY_KEY["peak"], BY_KEY["zone"]]
+    of_axes = [q._replace(words=f"{axis}: {q.words}", axis=axis) for axis in axes for q in rows]
     return [
         q
         for q in (*QUANTITIES, *of_axes)
@@ -229,11 +217,7 @@ def _shown(summary: Mapping[str, Any]) -> list[Quantity]:
 
 
 def _cell(value: object) -> str:
-    if value is None:
-        return "-"
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    return str(value)
+    return number(value) if value is None or isinstance(value, float) else str(value)
 
 
 def _marked(quantity: Quantity, summary: Mapping[str, Any]) -> list[str]:

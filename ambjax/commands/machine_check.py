@@ -21,6 +21,7 @@ from ambjax.linear.rotor_modes import LIGHT, Mode, modes_of
 from ambjax.results.machine_run import MachineRun, simulate_machine
 from ambjax.results.operating import points_of
 from ambjax.results.outputs import plain, table
+from ambjax.text.words import number
 from ambjax.world.rotor import Rotor
 
 # Modes that the second analysis adds to those of a shaft. At most MOST lightly damped modes are listed.
@@ -84,7 +85,6 @@ class _Linear(NamedTuple):
 
 
 def _linear(case: MachineCase) -> _Linear:
-    """Analyse the linear machine at its speeds, also with more modes."""
     say(f"linearising at {', '.join(f'{speed:g}' for speed in case.speeds)} rpm")
     try:
         turning = list(turning_machines(case.machine, case.clock.sample_period, case.speeds))
@@ -167,10 +167,7 @@ def _offset(case: MachineCase, points: list[MachineSensitivity]) -> tuple[float 
 
 
 def _spill_over(case: MachineCase) -> tuple[dict[str, float], str, bool]:
-    """Return the largest real part of a pole (1/s) by speed, with MORE modes under the same controller.
-
-    Also return why there are none, and whether this machine is not stable at a speed.
-    """
+    """Return the growth rates (1/s) by speed with MORE modes, why there are none, and whether a speed is not stable."""
     raw = tomllib.loads(case.text) if case.text else {}
     table, known = raw.get("rotor", {}), (len(case.coordinates) - 5) // 2
     more = min(MORE, MODES.metadata["at_most"] - known)
@@ -207,10 +204,7 @@ def _with_modes(raw: dict[str, Any], known: int, count: int, folder: pathlib.Pat
 
 
 def _axis(case: MachineCase, k: int, run: MachineRun, points: list[MachineSensitivity]) -> dict[str, object]:
-    """Return what is checked of one axis: clearance and force as shares, and the largest sensitivity at any speed.
-
-    Without points, the sensitivity is None.
-    """
+    """Return clearance and force of an axis, as shares, and its largest sensitivity at any speed (None: no points)."""
     metrics = run.metrics["axes"][case.axes[k]]
     scenario, share = case.cases[k].scenario, float(metrics["settled_clearance_used"])
     worst = max((point.axes[k] for point in points), key=lambda axis: (axis.S.height, axis.zone or ""), default=None)
@@ -230,11 +224,7 @@ def _zone(case: MachineCase, run: MachineRun, share: float) -> str:
 def _cells(own: dict[str, Any]) -> list[str]:
     """Return the cells of an axis; no peak and no zone if the machine is unstable at a speed or not linearised."""
     shown = own if own["peak"] is not None and np.isfinite(own["peak"]) else own | {"peak": "-", "zone": "-"}
-    return [*map(_short, shown.values())]
-
-
-def _short(value: object) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    return [number(value, 3) if isinstance(value, float) else str(value) for value in shown.values()]
 
 
 def _light(modes: dict[float, list[Mode]]) -> list[tuple[str, ...]]:

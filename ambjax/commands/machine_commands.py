@@ -9,6 +9,7 @@ from tqdm import tqdm
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.rotor_drawing import radial_axes
 from ambjax.commands.band_text import band_lines, running_facts
+from ambjax.commands.reading import results
 from ambjax.commands.sensitivity_report import injected_numbers, injection_text, signs_note
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.linear import Injection, Zones, machine_injected
@@ -17,8 +18,9 @@ from ambjax.linear.margins import Margins
 from ambjax.page.rotor_motion import motion_page
 from ambjax.results import operating
 from ambjax.results.machine_run import simulate_machine
-from ambjax.results.outputs import described, directory, drawn, files, plain, table, write_json, written
+from ambjax.results.outputs import described, directory, drawn, plain, table, write_json
 from ambjax.simulation.machine_kinds import SampledMachine
+from ambjax.text.words import number
 from ambjax.world.rotation import PER_MINUTE
 
 Summary = dict[str, object]
@@ -63,7 +65,12 @@ def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]
     from ambjax.pictures.machine_pictures import machine_figure
     from ambjax.pictures.run_up_picture import run_up_picture
 
-    with files(out) as part:
+    def text() -> str:
+        shown = {name: words for name, words in COLUMNS.items() if name in run.metrics}
+        rows = [(axis, *(number(own[name]) for name in shown)) for axis, own in run.metrics["axes"].items()]
+        return table(("axis", *shown.values()), rows)
+
+    with results(args, out, SIMULATED, text) as part:
         run.save(part / "trajectory.npz")
         write_json(part / "metrics.json", metrics)
         title = f"{case.name}: {case.clock.method}"
@@ -73,12 +80,6 @@ def simulate(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summary]
         page = described("motion.html", lambda: motion_page(case, run.signals)) if radial_axes(case) else None
         if page is not None:
             (part / "motion.html").write_text(page, encoding="utf-8")
-        names = [name for name in SIMULATED if (part / name).exists()]
-    if not args.json:
-        shown = {name: words for name, words in COLUMNS.items() if name in run.metrics}
-        rows = [(axis, *(f"{own[name]:.4g}" for name in shown)) for axis, own in run.metrics["axes"].items()]
-        print(table(("axis", *shown.values()), rows))
-        written(out, ", ".join(names))
     if run.lost:
         lost = run.metrics["lost_at_s"]
         say(f"the rotor is lost at {lost:.6g} s: {run.lost_why}. 'ambjax sensitivity' shows whether it is stable.")
@@ -94,14 +95,11 @@ def sensitivity(args: argparse.Namespace, case: MachineCase) -> tuple[int, Summa
     summary = sensitivity_summary(points, measured)
     from ambjax.pictures.machine_pictures import machine_sensitivity_picture
 
-    with files(out) as part:
+    words = lambda: "\n".join([sensitivity_text(points, measured, case.zones), *signs_note(case.cases)])  # noqa: E731
+    with results(args, out, ANALYSED, words) as part:
         write_json(part / "sensitivity.json", summary)
         limits, path = case.zones.limits, part / "sensitivity.png"
         drawn(path, lambda: machine_sensitivity_picture(points, limits, case.name, measured))
-        names = [name for name in ANALYSED if (part / name).exists()]
-    if not args.json:
-        print("\n".join([sensitivity_text(points, measured, case.zones), *signs_note(case.cases)]))
-        written(out, ", ".join(names))
     return int(not all(point.stable for point in points)), plain(summary | {"out": str(out)})
 
 
@@ -111,10 +109,7 @@ def worst_of_speeds(points: list[MachineSensitivity]) -> MachineSensitivity:
 
 
 def _injections(case: MachineCase, points: list[MachineSensitivity], everywhere: bool) -> Measured:
-    """Measure the sensitivity of each axis by injection into the simulation.
-
-    On a processor at the speed with the largest peak; `everywhere`: at all speeds, also in continuous time.
-    """
+    """Measure the axes, on a processor at the speed with the largest peak; `everywhere`: always, at all speeds."""
     sampled = isinstance(case.machine, SampledMachine)
     at = points if everywhere else [worst_of_speeds(points)] if sampled else []
     at = [point for point in at if point.stable]  # otherwise the rotor swings by itself
@@ -164,7 +159,6 @@ def sensitivity_summary(points: list[MachineSensitivity], measured: Measured) ->
 
 
 def _measured_at(point: MachineSensitivity, measured: Measured) -> tuple[Injection | None, ...]:
-    """Return the measured sensitivity of each axis at the speed of a point; None where there is none."""
     return measured.get(point.speed, (None,) * len(point.axes))
 
 

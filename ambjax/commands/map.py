@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.machine_case import AnyCase
-from ambjax.commands.reading import read_any_with_warnings
+from ambjax.commands.reading import read_any_with_warnings, results
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.maps import CERTAIN, GRIDS, Map
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.results.case_map import computed, labels, panel, study_and_axes
-from ambjax.results.outputs import described, directory, drawn, files, plain, table, write_json, written
+from ambjax.results.outputs import directory, drawn, plain, table, write_json
 
 WRITTEN = ("map.png", "map.json")
 
@@ -28,8 +28,8 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
         except ValueError as error:
             raise ValueError(f"--against {path}: {error}") from None
     out = directory(args.out, f"map-{cases[0].name}", WRITTEN, args.force)
-    with files(out) as part:
-        maps = []
+    maps: list[Map] = []
+    with results(args, out, WRITTEN, lambda: _text(cases, maps)) as part:
         for case, (study, x, y) in zip(cases, ready, strict=True):
             say(f"{case.name}: {len(x.values) * len(y.values)} cells of {args.members}; method: {study.clock.method}")
             if args.members == 1 and case.spread.entries:
@@ -39,10 +39,6 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
         summary = {"cases": [_summary(case, one) for case, one in zip(cases, maps, strict=True)], "out": str(out)}
         write_json(part / "map.json", summary)
         drawn(part / "map.png", lambda: _drawn(cases, maps), 150)
-        names = [name for name in WRITTEN if (part / name).exists()]
-    if not args.json:
-        print(described("the table", lambda: _text(cases, maps)) or "")
-        written(out, ", ".join(names))
     return 0, plain(summary)
 
 
@@ -66,14 +62,10 @@ def _text(cases: Sequence[AnyCase], maps: list[Map]) -> str:
             many, lost = int(one.stalled.sum()), int(one.lost.sum())
             where = f"in {np.count_nonzero(one.stalled)} cells"
             lines += [f"{case.name}: {lost} runs lost, {many} not decided ({where}): the integrator stalled there"]
-    header = [
-        "case",
-        "runs that survive",
-        "cells in which all survive",
-        *[f"cells above {100 * CERTAIN:g} % with confidence"] * sure,
-    ]
-    head = f"{first.x.path} survived, stable, at {first.y.path} = {first.y.values[first.middle]:.3g}"
-    return "\n".join([table([*header, head], rows), *lines])
+    header = ["case", "runs that survive", "cells in which all survive"]
+    header += [f"cells above {100 * CERTAIN:g} % with confidence"] * sure
+    header += [f"{first.x.path} survived, stable, at {first.y.path} = {first.y.values[first.middle]:.3g}"]
+    return "\n".join([table(header, rows), *lines])
 
 
 def _open_ends(one: Map, reach: tuple[float, float]) -> str:

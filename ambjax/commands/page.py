@@ -4,7 +4,7 @@ import argparse
 import pathlib
 
 from ambjax.cases.reader import read_case
-from ambjax.commands.reading import read_with_warnings
+from ambjax.commands.reading import print_warnings
 from ambjax.page.html_page import NAME, page
 from ambjax.results.outputs import directory, files, make, written
 
@@ -13,7 +13,8 @@ Summary = dict[str, object]
 
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """Write the page of a case."""
-    case = read_with_warnings(args.case)
+    case = read_case(args.case)
+    print_warnings(case, args.case)
     given = _target(args.out, args.force)
     text = page(case, [read_case(path) for path in args.also or []], args.case)
     out = given or directory(None, f"page-{case.name}") / NAME

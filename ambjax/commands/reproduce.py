@@ -34,7 +34,6 @@ def _paper_figures(reading: str, evidence: Evidence, out: pathlib.Path) -> None:
 
 
 def _names() -> Iterator[str]:
-    """Yield the paths of all files that the command writes."""
     yield from ("readings.png", "ledger.md", "ledger.json")
     for reading, number in itertools.product(paper.READINGS, figures.PAPER_FIGURES):
         yield f"figure_{number}.png" if reading == "repaired" else f"{reading}/figure_{number}.png"
@@ -42,7 +41,6 @@ def _names() -> Iterator[str]:
 
 @contextlib.contextmanager
 def _alive() -> Iterator[None]:
-    """Raise ValueError if a worker process dies."""
     try:
         yield
     except BrokenExecutor:
@@ -90,9 +88,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         drawn(part / "readings.png", lambda: figures.readings(shown, words, paper.SETTLE))
         claims, noise = ledger.judge_claims(evidence), ledger.noise_table(evidence)
         processor = ledger.processor_table(evidence)
-        page = ledger.ledger_markdown(claims, noise, processor, sensitivity)
-        (part / "ledger.md").write_text(page, encoding="utf-8")
         summary = {"claims": claims, "noise": noise, "processor": processor, "sensitivity": sensitivity}
+        (part / "ledger.md").write_text(ledger.ledger_markdown(summary), encoding="utf-8")
         write_json(part / "ledger.json", plain(summary))
     if not args.json:
         rows = [(c["says"], c["paper"], *(f["verdict"] for f in c["findings"].values())) for c in claims]

@@ -13,6 +13,7 @@ from ambjax.control.cascade import DEFAULT_LAWS
 from ambjax.linear import PLACES, Injection, MemberPeaks, StateSpace, Zones
 from ambjax.results.operating import OperatingPoint, SpreadPeaks, analysis_summary
 from ambjax.results.outputs import table
+from ambjax.text.words import number
 
 UNSTABLE = "The nominal loop is not stable, so it has no peaks, no zone and no margins, and nothing is injected."
 WITHOUT = "The nominal loop is stable, but its linear loop is not, and has no peaks, no zone and no margins."
@@ -94,11 +95,7 @@ def _position_numbers(point: OperatingPoint, measured: Injections | None) -> dic
 
 
 def injected_numbers(system: StateSpace | None, one: Injection | None, channel: int = 0) -> dict[str, object]:
-    """Return the numbers of the measured sensitivity at one sensor.
-
-    Without a measurement, only the peak and the ends of its interval are returned, each as None. `system`: None if it
-    is not stable.
-    """
+    """Return the numbers of a measured sensitivity, None without one. `system`: None if it is not stable."""
     if one is None:
         return {"injected_peak": None, "injected_low": None, "injected_high": None}
     return {
@@ -116,14 +113,13 @@ def injected_numbers(system: StateSpace | None, one: Injection | None, channel: 
 
 
 def _linear_there(system: StateSpace | None, measured: Injection, channel: int) -> float | None:
-    """Return the linear |S| at the frequency of the injected peak. `channel`: number of the sensor's input."""
+    """Return the linear |S| at the frequency of the injected peak."""
     if measured.peak_frequency is None or system is None:
         return None
     return float(np.abs(system.response(np.array([measured.peak_frequency])))[0, channel, channel])
 
 
 def _at_edge(measured: Injection) -> bool | None:
-    """Return whether the largest |S| is that of the first or last line; None if none was measured."""
     return None if measured.peak is None else measured.peak_frequency in measured.frequency[[0, -1]]
 
 
@@ -184,10 +180,10 @@ def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None
             f"Zones of the peak of |S|: A below {zones.zone_a:g}, B below {zones.zone_b:g}, C below {zones.zone_c:g}, "
             "D above."
         ]
-    growth = f"Largest real part of the poles: {_number(one.poles[0].real)} 1/s."
+    growth = f"Largest real part of the poles: {number(one.poles[0].real)} 1/s."
     if one.stable:
-        stiffness = f"{_number(one.stiffness)} N/m" if np.isfinite(one.stiffness) else "infinite"
-        rows += [f"Static stiffness: {stiffness}. Rms of z per rms of position noise: {_number(one.noise)}. {growth}"]
+        stiffness = f"{number(one.stiffness)} N/m" if np.isfinite(one.stiffness) else "infinite"
+        rows += [f"Static stiffness: {stiffness}. Rms of z per rms of position noise: {number(one.noise)}. {growth}"]
     else:
         rows += [f"{WITHOUT if points[0].stable else UNSTABLE} {growth}"]
     if measured is not None:
@@ -214,7 +210,6 @@ def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None
 
 
 def _measured_text(peaks: MemberPeaks, zones: Zones) -> str:
-    """Describe the measured peaks of the members of the spread in one line."""
     numbers, members = _measured_numbers(peaks, zones), len(peaks.peak)
     text = f"Injected into each of the {members} members: {numbers['injected_zone_a']} are in zone A"
     if peaks.lost.any():
@@ -229,8 +224,8 @@ def _row(point: OperatingPoint) -> tuple[str, ...]:
     one = point.analysis
     if not one.stable:
         return (point.name, "no peak" if point.stable else "unstable", *["-"] * 4)
-    S, T, KS = (_number(x.height) + (" (at edge)" if x.at_edge else "") for x in (one.S, one.T, one.KS))
-    return (point.name, S, _number(one.S.frequency), one.zone, T, KS)
+    S, T, KS = (number(x.height) + (" (at edge)" if x.at_edge else "") for x in (one.S, one.T, one.KS))
+    return (point.name, S, number(one.S.frequency), one.zone, T, KS)
 
 
 def _margin_rows(point: OperatingPoint) -> list[tuple[str, ...]]:
@@ -238,16 +233,11 @@ def _margin_rows(point: OperatingPoint) -> list[tuple[str, ...]]:
     at, rows = point.analysis.margins_at, []
     for place in sorted(PLACES, key=lambda place: place != at.place("dm")):
         one = getattr(at, place)
-        gains = f"{_number(one.gm_low)} to {_number(one.gm_high)}"
-        rows.append((point.name, place, gains, *map(_number, (one.pm, one.delay, one.dm))))
+        gains = f"{number(one.gm_low)} to {number(one.gm_high)}"
+        rows.append((point.name, place, gains, *map(number, (one.pm, one.delay, one.dm))))
     return rows
 
 
 def _delay(case: Case, delay: float) -> str:
-    """Return a delay in s, and on a processor in samples too."""
-    samples = f" ({_number(delay / float(case.clock.sample_period))} samples)" if case.cascade.sampled else ""
-    return f"{_number(delay)} s{samples}"
-
-
-def _number(x: float) -> str:
-    return f"{x:.4g}"
+    samples = f" ({number(delay / float(case.clock.sample_period))} samples)" if case.cascade.sampled else ""
+    return f"{number(delay)} s{samples}"

@@ -3,33 +3,27 @@
 import argparse
 import dataclasses
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
 from ambjax.cases.forces import forces
-from ambjax.cases.machine_case import MachineCase
+from ambjax.cases.machine_case import AnyCase, MachineCase
 from ambjax.cases.reader import Case
 from ambjax.cases.warned import reversal
 from ambjax.commands import machine_commands
-from ambjax.commands.reading import read_any_with_warnings
+from ambjax.commands.reading import read_any_with_warnings, results
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.replay import Replay, replay
 from ambjax.ensemble.study import Study
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
-from ambjax.results.outputs import directory, drawn, files, plain, table, write_json, written
+from ambjax.results.outputs import directory, drawn, plain, table, write_json
 from ambjax.results.runs import simulate
 from ambjax.simulation.metrics import UNITS
-from ambjax.simulation.trajectory import Trajectory
 from ambjax.text.words import command
 
-if TYPE_CHECKING:
-    from ambjax.results.machine_study import MachineStudy
-
 Summary = dict[str, object]
-SIMULATING = f"simulating the case; {FIRST_RUN}"
 # runup.png: only if the speed of the rotor changes.
 WRITTEN = ("trajectory.npz", "metrics.json", "overview.png", "runup.png")
 
@@ -37,10 +31,9 @@ WRITTEN = ("trajectory.npz", "metrics.json", "overview.png", "runup.png")
 def run(args: argparse.Namespace) -> tuple[int, Summary]:
     """Simulate a case or one member of its ensemble. Exit code 1 if the rotor is lost or the integrator stalls."""
     case = read_any_with_warnings(args.case)
-    if isinstance(case, MachineCase):
-        members = _study(case, args)
-        return machine_commands.simulate(args, case if members is None else members.member(args.member))
     study = _study(case, args)
+    if isinstance(case, MachineCase):
+        return machine_commands.simulate(args, case if study is None else study.member(args.member))
     if study is not None:
         cascade, scenario = study.member(args.member)
         case = dataclasses.replace(case, name=f"{case.name}-{args.member}", cascade=cascade, scenario=scenario)
@@ -50,8 +43,8 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     say(f"method: {case.clock.method}")
     if case.cascade.sampled:
         say(f"on a processor: {case.cascade.processor}")
-    replayed = None if study is None else _replay(case, study, args.member)
-    trajectory, numbers = _simulated(case) if replayed is None else (replayed.trajectory, replayed.metrics)
+    done = _simulated(case, study, args.member)
+    trajectory, numbers, replayed = done.trajectory, done.metrics, done if isinstance(done, Replay) else None
     _check(numbers, args.case)
     if replayed is not None and replayed.deviation > replayed.rounding:
         say(
@@ -71,7 +64,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
     from ambjax.pictures.run_up_picture import order_picture
 
     rotor = case.scenario.rotor
-    with files(out) as part:
+    with results(args, out, names, lambda: _metrics_text(metrics)) as part:
         trajectory.save(part / "trajectory.npz")
         write_json(part / "metrics.json", metrics)
         title = f"{case.name}: {case.clock.method}"
@@ -80,10 +73,6 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
             drawn(part / "runup.png", lambda: order_picture(trajectory, rotor, title))
         for name, page in html.items():
             (part / name).write_text(page, encoding="utf-8")
-        names = [name for name in names if (part / name).exists()]
-    if not args.json:
-        print(_metrics_text(metrics))
-        written(out, ", ".join(names))
     ended = metrics["lost_at_s"] is not None
     if ended:
         from ambjax.theorem import advice
@@ -134,11 +123,7 @@ def _window(case: Case, args: argparse.Namespace) -> tuple[float, float] | None:
     return begin, end
 
 
-@overload
-def _study(case: Case, args: argparse.Namespace) -> Study | None: ...
-@overload
-def _study(case: MachineCase, args: argparse.Namespace) -> "MachineStudy | None": ...
-def _study(case: Case | MachineCase, args: argparse.Namespace) -> "Study | MachineStudy | None":
+def _study(case: AnyCase, args: argparse.Namespace) -> Any:
     """Return the study that contains member --member, or None without it. Raises ValueError for invalid options."""
     if args.member is None:
         if args.seed is not None or args.members is not None:
@@ -156,32 +141,17 @@ def _study(case: Case | MachineCase, args: argparse.Namespace) -> "Study | Machi
     return study
 
 
-def _simulated(case: Case) -> tuple[Trajectory, dict[str, Any]]:
-    """Simulate a case, with a progress bar if it takes more than two seconds; return trajectory and metrics."""
-    with doing(SIMULATING), _bar(case) as bar:
-        done = simulate(case, _counter(bar))
-        return done.trajectory, done.metrics
+def _simulated(case: Case, study: Study | None, member: int | None) -> Any:
+    """Simulate a case, or a member of a study, with a progress bar if it takes more than two seconds."""
+    shown = {"unit": "sample", "unit_scale": True, "delay": 2, "leave": False, "desc": "simulate"}
+    with doing(f"simulating the case; {FIRST_RUN}"), tqdm(total=case.clock.samples, **shown) as bar:
 
+        def count(samples: int) -> None:
+            if not bar.n:
+                bar.unpause()  # its clock starts with the first samples, after the compilation
+            bar.update(samples)
 
-def _replay(case: Case, study: Study, member: int) -> Replay:
-    """Simulate one member of a study and record every sample, with a progress bar."""
-    with doing(SIMULATING), _bar(case) as bar:
-        return replay(study, member, _counter(bar))
-
-
-def _bar(case: Case) -> tqdm:
-    return tqdm(total=case.clock.samples, unit="sample", unit_scale=True, delay=2, leave=False, desc="simulate")
-
-
-def _counter(bar: tqdm) -> Callable[[int], None]:
-    """Return the function that adds samples to the bar. Its clock starts with the first, after the compilation."""
-
-    def count(samples: int) -> None:
-        if not bar.n:
-            bar.unpause()
-        bar.update(samples)
-
-    return count
+        return simulate(case, count) if study is None or member is None else replay(study, member, count)
 
 
 def _metrics_text(metrics: Summary) -> str:

@@ -98,7 +98,6 @@ def _pictures(
     summary: dict[str, Any] | None,
     out: pathlib.Path,
 ) -> None:
-    """Draw the pictures into the folder `out`. One that cannot be drawn is left out."""
     from ambjax.pictures import histograms
 
     if isinstance(case, Case) and isinstance(study, Study):
@@ -168,15 +167,10 @@ def study_tables(summary: dict[str, Any], stable: str = "") -> str:
         where = f"{statistics.DECIDING} over the {summary['metrics_of']}"
         lines += ["", f"Influence of the spread quantities on {where}: {account['says']}."]
     if account["alone"]:
-        bars = [
-            (
-                d["path"],
-                f"{100 * d['share']:.1f} %",
-                f"{100 * d['low']:.1f} to {100 * d['high']:.1f} %",
-                f"{d['rho']:+.2f}",
-            )
-            for d in drivers
-        ]
+        bars = []
+        for d in drivers:
+            share, low, high = (f"{100 * d[key]:.1f}" for key in ("share", "low", "high"))
+            bars.append((d["path"], f"{share} %", f"{low} to {high} %", f"{d['rho']:+.2f}"))
         lines += [table(("quantity", "share explained alone", sure, "rank correlation"), bars)]
     worst = summary["worst"][0]
     return "\n".join([*lines, "", f"To simulate the worst member: {one_line(worst['replay'])}"])

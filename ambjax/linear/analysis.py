@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -116,6 +117,24 @@ class Zones:
         if not low < high:
             raise ValueError(f"sensitivity.f_low = {low:g}: it must be below f_high, {high:g} Hz. Lower it.")
         return low, high
+
+
+def largest_in(system: StateSpace, zones: Zones) -> Callable[[Callable[[np.ndarray], np.ndarray]], ResponsePeak]:
+    """Return the function that finds the peak of a magnitude in the band of `zones`, and a larger one outside it.
+
+    It takes a function that returns magnitudes [F] of responses [F, outputs, inputs]. All peaks scan the same
+    frequencies. Raises ValueError as `Zones.range` does.
+    """
+    end, responses = whole_end(system), dict[bytes, np.ndarray]()
+    low, high = zones.range(system.period, max(end, 2 * float(zones.f_low)))
+
+    def response(f: np.ndarray) -> np.ndarray:
+        key = f.tobytes()
+        if key not in responses:
+            responses[key] = np.asarray(system.response(f))
+        return responses[key]
+
+    return lambda magnitude: peak(system, lambda f: magnitude(response(f)), low, high, end)
 
 
 def _stiffness(system: StateSpace, m: float, f: float) -> float:
@@ -247,18 +266,13 @@ def analyse(
     Raises ValueError as `Zones.range` does.
     """
     zones = Zones() if zones is None else zones
-    end = whole_end(system)
-    low, high = zones.range(system.period, max(end, 2 * float(zones.f_low)))
-
-    def largest(output: int, source: int, less: float = 0.0) -> ResponsePeak:
-        return peak(system, lambda f: np.abs(system.response(f)[:, output, source] - less), low, high, end)
-
-    poles = poles_in_s(system)
-    poles = poles[np.argsort(-np.real(poles))]
+    largest, poles = largest_in(system, zones), poles_in_s(system)
     if not (held and system.stable):
         none, no, at = Margins(*[0.0] * 6), NO_PEAK, NO_PEAK if velocity else None
         return Analysis(False, no, no, no, "D", at, none, np.nan, np.inf, poles, LoopMargins(none, none))
-    S, T, KS, at = largest(0, 0), largest(0, 0, 1.0), largest(2, 0), largest(1, 1) if velocity else None
-    stiffness, noise = _stiffness(system, float(m), STATIC * low), noise_gain(system, float(period))
+    S, T = largest(lambda H: np.abs(H[:, 0, 0])), largest(lambda H: np.abs(H[:, 0, 0] - 1))
+    KS, at = largest(lambda H: np.abs(H[:, 2, 0])), largest(lambda H: np.abs(H[:, 1, 1])) if velocity else None
+    stiffness = _stiffness(system, float(m), STATIC * float(zones.f_low))
+    noise = noise_gain(system, float(period))
     margins = margins_of(system)
     return Analysis(True, S, T, KS, zones.zone(S.height), at, margins.smaller, stiffness, noise, poles, margins)

@@ -59,27 +59,25 @@ class LoopQuantities(NamedTuple):
 class _Loop(NamedTuple):
     """S and KS of a loop by poles and zeros, without derivatives.
 
+    - `system`: the loop, scaled.
     - `poles`, `zeros` [N]: of S.
-    - `zeros_u` [N]: zeros of 1 + (KS - `through`)/`unit`, whose poles are those of S.
-    - `through`: direct feedthrough of KS, V/m.
+    - `zeros_u` [N]: zeros of 1 + (KS - D)/`unit` with the direct feedthrough D of KS, whose poles are those of S.
     - `unit`: unit of KS, V/m.
-    - `period`: sample period, s; None in continuous time.
     - `poles_in_s` [N]: poles in 1/s.
     """
 
+    system: StateSpace
     poles: Array
     zeros: Array
     zeros_u: Array
-    through: Array
     unit: Array
-    period: Array | None
     poles_in_s: Array
 
     def responses(self, f: Array) -> tuple[Array, Array]:
         """Return S and KS [F], complex, at frequencies [F] in Hz."""
-        at = _point(f, self.period)[:, None]
+        at = self.system.point(f)[:, None]
         S = jnp.prod((at - self.zeros) / (at - self.poles), -1)
-        KS = self.unit * (jnp.prod((at - self.zeros_u) / (at - self.poles), -1) - 1) + self.through
+        KS = self.unit * (jnp.prod((at - self.zeros_u) / (at - self.poles), -1) - 1) + self.system.D[2, 0]
         return S, KS
 
     def transfer(self, f: Array) -> Array:
@@ -133,7 +131,8 @@ def loop_quantities(
     heights = jnp.abs(response[0, 0, 0]), jnp.abs(response[1, 0, 0] - 1), jnp.abs(response[2, 2, 0])
     margin = jnp.asarray(jnp.inf)
     if delay:
-        f = jnp.geomspace(low, _fastest(loop, low), CROSSING_POINTS)
+        end = jnp.maximum(100 * jnp.max(jnp.abs(loop.poles_in_s)) / (2 * jnp.pi), 2 * low)
+        f = jnp.geomspace(low, high if system.period is not None else end, CROSSING_POINTS)
         margin = jnp.minimum(jnp.minimum(_delay_margin(scaled, loop, f), command_delay(scaled, f)), NONE / low)
     running = None if speeds is None else jnp.max(jnp.abs(scaled.response(speeds)[:, 0, 0]))
     fastest = jnp.max(jnp.abs(poles)) if system.period is None else 1 / system.period
@@ -161,12 +160,6 @@ def _without_idle(system: StateSpace) -> Array:
     return jnp.where(idle[:, None], rate * jnp.eye(len(system.A), dtype=system.A.dtype), system.A)
 
 
-def _point(f: Array, period: Array | None) -> Array:
-    """Return s = 2 pi j f, or z = exp(s T) on a processor."""
-    s = 2j * jnp.pi * f
-    return s if period is None else jnp.exp(s * period)
-
-
 def _growth_and_loop(system: StateSpace, unit: Array) -> tuple[Array, _Loop]:
     """Return the largest real part of the poles of a scaled system, 1/s, and its poles and zeros without derivatives.
 
@@ -183,7 +176,7 @@ def _growth_and_loop(system: StateSpace, unit: Array) -> tuple[Array, _Loop]:
     values, left, right = lax.linalg.eig(every, compute_left_eigenvectors=True, compute_right_eigenvectors=True)
     poles, zeros, zeros_u = values
     in_s = poles if system.period is None else jnp.log(jnp.where(jnp.abs(poles) > 1e-9, poles, 1.0)) / system.period
-    loop = _Loop(poles, zeros, zeros_u, fixed.D[2, 0], unit, system.period, in_s)
+    loop = _Loop(fixed, poles, zeros, zeros_u, unit, in_s)
     k = jnp.argmax(jnp.real(poles) if system.period is None else jnp.abs(poles))
     u, v = jnp.conj(left[0, :, k]), right[0, :, k]
     pole = poles[k] + u @ ((system.A - A) @ v) / (u @ v)
@@ -195,16 +188,10 @@ def _growth_and_loop(system: StateSpace, unit: Array) -> tuple[Array, _Loop]:
 
 def _whole_end(loop: _Loop) -> Array:
     """Return `margins.whole_end` (Hz)."""
-    if loop.period is not None:
-        return 0.5 / loop.period
+    if (period := loop.system.period) is not None:
+        return 0.5 / period
     total = jnp.sum(jnp.abs(loop.poles)) + jnp.sum(jnp.abs(loop.zeros))
     return (1 + DECAYED) * total / math.log1p(DECAYED) / (2 * jnp.pi)
-
-
-def _fastest(loop: _Loop, low: Scalar) -> Array:
-    """Return the end of the search for crossings of |L| = 1, Hz."""
-    fastest = 100 * jnp.max(jnp.abs(loop.poles_in_s)) / (2 * jnp.pi)
-    return jnp.maximum(fastest, 2 * low) if loop.period is None else 0.5 / loop.period
 
 
 def _frequencies(loop: _Loop, low: Scalar, high: Scalar) -> Array:
@@ -228,10 +215,7 @@ def _refined(loop: _Loop, f: Array, size: Array, low: Scalar, high: Scalar, whic
 
 
 def _delay_margin(system: StateSpace, loop: _Loop, f: Array) -> Array:
-    """Return the delay margin (s) at the reading: the smallest lag/(2 pi f) over the frequencies f at which |L| = 1.
-
-    Without such a frequency it is inf. `f`: frequencies of the scan.
-    """
+    """Return the delay margin (s) at the reading: the smallest lag/(2 pi f) where |L| = 1, or inf. `f`: of the scan."""
     L = loop.transfer(f)
     size = jnp.log(jnp.abs(L))
     crosses = size[:-1] * size[1:] < 0

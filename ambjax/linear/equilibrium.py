@@ -184,7 +184,6 @@ def newton_of(residual: Callable[[Array], Array], y: Array) -> Newton:
 
 
 def _size(G: Array) -> Array:
-    """Return the largest residual; inf if one is not finite."""
     return jnp.where(jnp.all(jnp.isfinite(G)), jnp.max(jnp.abs(G)), jnp.inf)
 
 

@@ -14,8 +14,7 @@ import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.linear.analysis import Zones
-from ambjax.linear.member_responses import Responses, member_responses
-from ambjax.linear.multisine import Reading
+from ambjax.linear.member_responses import Reading, Responses, member_responses
 from ambjax.numerics.declared import require_number
 from ambjax.numerics.records import Scalar
 from ambjax.simulation.clock import Clock, takes_case

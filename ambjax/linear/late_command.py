@@ -28,7 +28,9 @@ def command_delay(system: StateSpace, f: Any) -> Any:
     function.
     """
     np_ = array_module(system.A)
-    fixed, unit = lax.stop_gradient(system) if np_ is jnp else system, _unit(system, f)
+    fixed = lax.stop_gradient(system) if np_ is jnp else system
+    # of delays, s: a sample, or in continuous time a part of a period of the highest frequency
+    unit = 1 / f[-1] if system.period is None else np_.asarray(system.period)
     steps = STEP * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
 
     def around(x: Any) -> tuple[Any, Any, Any]:
@@ -53,11 +55,6 @@ def command_delay(system: StateSpace, f: Any) -> Any:
     error = np_.log(-system.loop_transfer(np_.exp(x[k, :1]), "command", unit * x[k, 1])[0])
     rate = np_.where(valid[k], _cross(along[k], across[k]), 1.0)
     return np_.where(valid[k], unit * (x[k, 1] - _cross(along[k], np_.where(valid[k], error, 0.0)) / rate), np.inf)
-
-
-def _unit(system: StateSpace, f: Any) -> Any:
-    """Return the unit of delays, s: a sample, or in continuous time a part of a period of the highest frequency."""
-    return 1 / f[-1] if system.period is None else array_module(system.A).asarray(system.period)
 
 
 def _cross(a: Any, b: Any) -> Any:

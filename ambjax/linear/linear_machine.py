@@ -1,25 +1,21 @@
 """Linearisation of a whole machine at rest and constant speed: all loops are closed, each axis has a test signal."""
 
 import functools
-from collections.abc import Callable, Iterable, Iterator
-from typing import NamedTuple, TypeVar
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jax import Array
 
 from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
-from ambjax.linear.analysis import Zones
+from ambjax.linear.analysis import Zones, largest_in
 from ambjax.linear.machine_at_speed import MachineAtSpeed, MachineRest
 from ambjax.linear.machine_matrices import machine_matrices, rests
-from ambjax.linear.margins import NO_PEAK, Margins, ResponsePeak, peak, poles_in_s, reading_margins, whole_end
+from ambjax.linear.margins import NO_PEAK, Margins, ResponsePeak, poles_in_s, reading_margins
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.records import Scalar, canonical
 from ambjax.simulation.whole_machine import Machine
-
-T = TypeVar("T")
-# Parts of a point or of its rates: one stacked pytree for each group.
-Groups = tuple
 
 
 class AxisSensitivity(NamedTuple):
@@ -154,32 +150,13 @@ def sensitivity_of(
     stable: bool | None = None,
     swing: float | None = None,
 ) -> MachineSensitivity:
-    """Return the sensitivity of a linear machine.
-
-    `speed`: rpm. `stable`, `swing`: by runs; None: the linear machine decides.
-
-    The others are those of `machine_sensitivity`.
-    """
+    """Return the sensitivity at a speed (rpm). `stable`, `swing`: by runs; None: the linear machine decides."""
     system, c = point.system.without_idle(), len(names)
-    end = whole_end(system)
-    low, high = zones.range(None if system.period is None else float(system.period), max(end, 2 * float(zones.f_low)))
     linear = system.stable
     stable = linear if stable is None else stable
     linear = linear and stable
-
-    responses: dict[bytes, np.ndarray] = {}
-
-    def response(f: np.ndarray) -> np.ndarray:
-        """Return the response at frequencies f (Hz). All peaks scan the same frequencies."""
-        key = np.asarray(f).tobytes()
-        if key not in responses:
-            responses[key] = np.asarray(system.response(f))
-        return responses[key]
-
-    def largest(magnitude: Callable) -> ResponsePeak:
-        if not linear:
-            return NO_PEAK
-        return peak(system, lambda f: magnitude(response(f)), low, high, end)
+    found = largest_in(system, zones)
+    largest = found if linear else lambda _: NO_PEAK
 
     axes = []
     for k, name in enumerate(names):
@@ -190,6 +167,4 @@ def sensitivity_of(
         margins = reading_margins(own) if linear else None
         axes.append(AxisSensitivity(name, S, T, KS, zones.zone(S.height) if linear or not stable else None, margins))
     sigma = largest(lambda H: np.linalg.norm(H[:, :c], 2, axis=(1, 2)))
-    poles = poles_in_s(system)
-    poles = poles[np.argsort(-np.real(poles))]
-    return MachineSensitivity(speed, stable, linear, tuple(axes), sigma, poles, system, swing)
+    return MachineSensitivity(speed, stable, linear, tuple(axes), sigma, poles_in_s(system), system, swing)

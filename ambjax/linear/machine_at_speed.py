@@ -28,10 +28,7 @@ Groups = tuple
 
 
 class MachineRest(NamedTuple):
-    """A point of the machine at rest: coordinates [n]; plants, laws and commands [c_g] of each group.
-
-    `law`: state of the law of the machine, () without one.
-    """
+    """A machine at rest: coordinates [n]; plants, laws and commands [c_g] of the groups; state of its law, or ()."""
 
     q: Array
     plant: Groups
@@ -173,10 +170,7 @@ class MachineAtSpeed:
         return MachineRest(moved.q_dot / fastest**2, plant, change, jax.tree.map(jnp.subtract, u, point.u), law)
 
     def rest(self, held: "MachineAtSpeed") -> MachineRest:
-        """Return the equilibrium, or the point nearest to it that was found.
-
-        `held`: the same machine, without derivatives.
-        """
+        """Return the equilibrium, or the nearest point found. `held`: the same machine, without derivatives."""
         start, sizes = held.start()
         scale, (flat, restore) = ravel_pytree(sizes)[0], ravel_pytree(start)
         newton = newton_of(lambda y: held.deviation(restore(y * scale), scale), flat / scale)

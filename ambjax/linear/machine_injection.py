@@ -18,15 +18,21 @@ from ambjax.linear.analysis import Zones
 from ambjax.linear.injection import Injection, frequency_lines, injection_of
 from ambjax.linear.linear_machine import machine_rest
 from ambjax.linear.machine_at_speed import MachineRest
-from ambjax.linear.member_responses import AMPLITUDE, Responses, padded
-from ambjax.linear.multisine import FourierSums, MultiSine, Response, multisine
+from ambjax.linear.member_responses import (
+    AMPLITUDE,
+    FourierSums,
+    MultiSine,
+    Response,
+    multisine,
+    padded,
+    responses_of,
+)
 from ambjax.numerics.records import Scalar, canonical, replaced
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.machine_axes import loop_of, with_loop
 from ambjax.simulation.rollout import run
 from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.trajectory import ALIVE
 from ambjax.simulation.whole_machine import Machine, PlantOnly
 from ambjax.world.waveforms import Constant
 
@@ -71,18 +77,13 @@ def machine_injected(
     random = any(np.any(np.asarray(x)) for loop in machine.loops() for x in loop.scenario.sensors.noises)
     found = []
     for n, ((_, k, _), wave) in enumerate(zip(axes, waves, strict=True)):
-        count = len(wave.harmonics)
-        e = float(wave.size) * np.exp(1j * np.asarray(wave.phases))
-        S, KS = ((x[n, 0, :count] + 1j * x[n, 1, :count])[None] / e for x in map(np.asarray, sums[1:3]))
-        frequency, held = np.asarray(wave.harmonics) / float(clock.duration), np.asarray(code[n : n + 1]) == ALIVE
-        saturated = np.asarray(sums.saturated)[n : n + 1]
-        found.append(injection_of(Responses(frequency, S, KS, saturated, held, float(amplitudes[k])), random))
+        own, status = jax.tree.map(lambda x, n=n: np.asarray(x)[n : n + 1], (sums, code))
+        found.append(injection_of(responses_of(own, status, wave, clock, float(amplitudes[k])), random))
     return [tuple(found[n : n + len(gaps)]) for n in range(0, len(found), len(gaps))]
 
 
 @compiled_for_machines
 def _responses(machine: Machine, clock: Clock, point: MachineRest, tests: _Test) -> tuple[FourierSums, Array]:
-    """Return the `FourierSums`, and the status codes, of the members. `point`: the machine at rest."""
     zero = jnp.zeros_like(point.q)
     rest = machine.moving(machine.rotor.at_magnets, point.q, zero, tuple(map(PlantOnly, point.plant)))
     limits = machine.join([jnp.asarray(loop.scenario.voltage_limit) for loop in machine.loops()])

@@ -1,6 +1,7 @@
 """Stability of whole machines at constant speeds, judged as that of one axis is (`stability`)."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import jax
@@ -12,18 +13,15 @@ from ambjax.ensemble.machines import run_machines
 from ambjax.linear.linear_machine import turning_machines
 from ambjax.linear.margins import poles_in_s
 from ambjax.linear.quiet_run import KICK, QuietRun, quiet, quiet_run_of
-from ambjax.linear.stability import GROWN, Stability, Tested, has_set_valued, judged, may_chatter
+from ambjax.linear.rotor_modes import RIGID
+from ambjax.linear.stability import GROWN, Stability, has_set_valued, judged, may_chatter
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.shapes import map_varying, stack_axes
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import PerAxis
-from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.machine_axes import with_loop
 from ambjax.simulation.whole_machine import Machine
 from ambjax.world.waveforms import Constant
-
-# Number of the coordinates of a rigid rotor, which the displaced start of a quiet run moves.
-RIGID = 5
 
 
 def growth_of(system: StateSpace) -> float:
@@ -54,16 +52,9 @@ def machine_stability(
     rotor = dataclasses.replace(one.rotor.without_forces(), speed=speeds, acceleration=0.0, changes=())
     machine = dataclasses.replace(one, rotor=rotor, cuts=None)
     bias = max(float(np.max(np.asarray(loop.scenario.plant.i_0))) for loop in machine.loops())
-    found = judged(
-        Tested(
-            _cascades(machine),
-            lambda own, chosen: _growth(machine, own, chosen, clock),
-            lambda: _quiet_run(machine, bias, clock),
-            _clearance(machine),
-            bias,
-            clock,
-        )
-    )
+    run = _quiet_run(machine, bias, clock)
+    growths = functools.partial(_growth, machine, clock)
+    found = judged(_cascades(machine), growths, run, _clearance(machine), bias, clock)
     return found._replace(stable=found.stable & ~(smooth & np.isinf(growth)))
 
 
@@ -73,7 +64,7 @@ def _cascades(machine: Machine) -> list[Cascade]:
     return [loop.cascade for loop in machine.loops()] + ([whole] if isinstance(whole, Cascade) else [])
 
 
-def _growth(machine: Machine, cascades: Sequence[Cascade], chosen: np.ndarray, clock: Clock) -> np.ndarray:
+def _growth(machine: Machine, clock: Clock, cascades: Sequence[Cascade], chosen: np.ndarray) -> np.ndarray:
     """Return the growth rate of each chosen machine with these cascades, 1/s; NaN without a linearisation."""
     groups, rates = len(machine.axes), []
     loops = [dataclasses.replace(loop, cascade=own) for loop, own in zip(machine.loops(), cascades, strict=False)]
@@ -95,7 +86,11 @@ def _quiet_run(machine: Machine, bias: float, clock: Clock) -> QuietRun:
     moved = np.where(np.sum(rows * q[..., None, :], -1) > 0, -1.0, 1.0) * KICK * _clearance(machine)
     rigid = np.sum(np.linalg.pinv(rows[..., :RIGID]) * moved[..., None, :], -1)
     q = q + np.concatenate([rigid, np.zeros((*rigid.shape[:-1], q.shape[-1] - RIGID))], -1)
-    loops = [_calm(loop, len(group)) for loop, group in zip(machine.loops(), machine.groups, strict=True)]
+    loops = []
+    for loop, group in zip(machine.loops(), machine.groups, strict=True):
+        calm = quiet(dataclasses.replace(loop.scenario, reference=Constant(0.0)))
+        stacked = jax.tree.map(lambda x, c=len(group): np.full(c, x) if np.ndim(x) == 0 else x, calm)
+        loops.append(dataclasses.replace(loop, scenario=stacked))
     machine = dataclasses.replace(machine, axes=tuple(map(with_loop, machine.axes, loops)), start_q=q)
     fold = dataclasses.replace(quarters(clock), of=(near := machine.near, "i"))
     # the fold of the axes has a scatter, which the one-kernel path does not support
@@ -110,10 +105,3 @@ def _clearance(machine: Machine) -> np.ndarray:
     lead = np.broadcast_shapes(*(x.shape[:-1] for x in parts))
     order = np.argsort(np.concatenate(machine.groups))
     return np.concatenate([np.broadcast_to(x, (*lead, x.shape[-1])) for x in parts], -1)[..., order]
-
-
-def _calm(loop: ClosedLoop, count: int) -> ClosedLoop:
-    """Return the loops of a group of `count` axes in a quiet run, at the reference 0."""
-    scenario = quiet(dataclasses.replace(loop.scenario, reference=Constant(0.0)))
-    stacked = jax.tree.map(lambda x: np.full(count, x) if np.ndim(x) == 0 else x, scenario)
-    return dataclasses.replace(loop, scenario=stacked)

@@ -177,11 +177,14 @@ def scan(system: StateSpace, low: float, high: float) -> np.ndarray:
 
 
 def poles_in_s(system: StateSpace) -> np.ndarray:
-    """Return the poles in 1/s. On a processor s = log(z)/T, and poles at z = 0, which are pure delays, are left out."""
+    """Return the poles in 1/s, in the order of decreasing real part.
+
+    On a processor s = log(z)/T, and poles at z = 0, which are pure delays, are left out.
+    """
     poles = system.poles()
-    if system.period is None:
-        return poles
-    return np.log(poles[np.abs(poles) > 1e-9] + 0j) / float(system.period)
+    if system.period is not None:
+        poles = np.log(poles[np.abs(poles) > 1e-9] + 0j) / float(system.period)
+    return poles[np.argsort(-np.real(poles))]
 
 
 def margins_of(system: StateSpace) -> LoopMargins:
@@ -230,7 +233,6 @@ def _margins(system: StateSpace, place: Place, scanned: np.ndarray) -> Margins:
 
 
 def _log(response: np.ndarray) -> np.ndarray:
-    """Return the logarithm of the magnitude, which may be 0."""
     return np.log(np.maximum(np.abs(response), np.finfo(float).tiny))
 
 
@@ -270,11 +272,6 @@ def noise_gain(system: StateSpace, period: float) -> float:
     for _ in range(DOUBLINGS):
         if variance > 0 and variance - before <= SETTLED * variance:
             break
-        covariance, A = _over_twice(covariance, A)
+        covariance, A = covariance + A @ covariance @ A.T, A @ A
         before, variance = variance, float(c @ covariance @ c)
     return math.sqrt(variance)
-
-
-def _over_twice(covariance: np.ndarray, A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the covariance and the transition of twice the number of samples."""
-    return covariance + A @ covariance @ A.T, A @ A

@@ -18,20 +18,6 @@ from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
 
 
-class HeldPlant(NamedTuple):
-    """Linear map of one sample, x_{n+1} = transition x_n + sum over k of driven[k] u_{n-k} + disturbed q_z.
-
-    x [N] is the state of the plant, of the sensor's low-pass (m) and of the amplifier (V). `transition` is [N, N],
-    `driven` [K + 1, N] for K past commands, and `disturbed` [N]. x and u are deviations from the equilibrium. q_z
-    (m/s^2) is constant during the sample. `path`: the rates of x under a command.
-    """
-
-    transition: Array
-    driven: Array
-    disturbed: Array
-    path: CommandPath
-
-
 class LagState(NamedTuple):
     """State of the plant, of the sensor's low-pass (m) and of the amplifier (V); () for a missing lag."""
 
@@ -61,43 +47,6 @@ def with_lags(scenario: Scenario, point: Point) -> LagState:
     """Return the state of plant and lags at rest. `point`: an equilibrium, or the sizes of its components."""
     low_passed, z = scenario.sensors.bandwidth is not None, scenario.plant.measurement(point.plant).z
     return LagState(point.plant, z if low_passed else (), point.u if scenario.actuator.slow else ())
-
-
-class Lagged:
-    """The plant of a scenario with the lags of sensor and amplifier; its state, a `LagState`, is one vector [N]."""
-
-    def __init__(self, scenario: Scenario, point: Point):
-        self.scenario = scenario
-        self.start, self.restore = ravel_pytree(with_lags(scenario, point))
-
-    def rates(self, x: Array, u: Scalar, q_z: Scalar) -> Array:
-        """Return the time derivative of the state under a command u (V or A) and a disturbance q_z (m/s^2)."""
-        state = self.restore(x)
-        rates, u = state.lag_rates(self.scenario, u)
-        u = self.scenario.coil_voltage(jnp.asarray(u), state.plant)
-        return ravel_pytree(rates._replace(plant=self.scenario.plant.rates(state.plant, u, q_z)))[0]
-
-    def voltage(self, x: Array, commands: tuple[Array, ...], delay: Scalar) -> Array:
-        """Return the voltage (V) of a sample: the command u_n, or for current commands the coil voltage at the sample.
-
-        `commands`: u_n, u_{n-1} and so on (V or A). `delay`: in samples.
-        """
-        if self.scenario.drive != "current":
-            return commands[0]
-        return self.scenario.coil_voltage(at_sample(commands, jnp.asarray(delay)), self.restore(x).plant)
-
-    def held(self, point: Point, period: Scalar, delay: Scalar, kept: int) -> HeldPlant:
-        """Return the linear map of one sample at the equilibrium `point`.
-
-        `delay`: samples after which the voltage of a sample begins to act.
-        """
-        A, B = jax.jacfwd(lambda x, w: self.rates(x, w[0], w[1]), (0, 1))(
-            self.start, jnp.stack([point.u, 0.0 * point.u])
-        )
-        path = CommandPath(A, B[:, 0], jnp.asarray(delay))
-        driven = jnp.stack(path.effects(jnp.asarray(period), kept))
-        transition, disturbed = held(A, B[:, 1:], period)
-        return HeldPlant(transition, driven, disturbed[:, 0], path)
 
 
 def loop_matrices(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> tuple[StateSpace, Array]:
@@ -154,27 +103,37 @@ def _continuous(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar,
 
 def _sampled(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, point: Point) -> StateSpace:
     """Return the state space of one sample period, with the state (plant and lags, laws, u_{n-1}, u_{n-2}, ...)."""
-    processor, plant, reference = cascade.timing, Lagged(scenario, point), at_rest(r)
-    past = processor.constant_past(point.u)
-    held = plant.held(point, period, processor.delay, len(past))
-    laws, restore = ravel_pytree(point.control)
-    nx, nl = plant.start.size, laws.size
+    processor, plant, reference = cascade.timing, scenario.plant, at_rest(r)
+    start, lags = ravel_pytree(with_lags(scenario, point))
+    past, delay = processor.constant_past(point.u), jnp.asarray(processor.delay)
+    x, restore = ravel_pytree((start, point.control, past))
+
+    def rates(x: Array, w: Array) -> Array:
+        """Return the rates of plant and lags under a command and a disturbance q_z, w [2]."""
+        state = lags(x)
+        moving, u = state.lag_rates(scenario, w[0])
+        u = scenario.coil_voltage(u, state.plant)
+        return ravel_pytree(moving._replace(plant=plant.rates(state.plant, u, w[1])))[0]
+
+    A, B = jax.jacfwd(rates, (0, 1))(start, jnp.stack([point.u, 0.0 * point.u]))
+    path = CommandPath(A, B[:, 0], delay)
+    driven = jnp.stack(path.effects(jnp.asarray(period), len(past)))
+    transition, disturbed = held(A, B[:, 1:], period)
 
     def step(x: Array, w: Array) -> tuple[Array, Array]:
-        at, laws, past = x[:nx], x[nx : nx + nl], tuple(x[nx + nl :])
-        state = plant.restore(at)
+        at, laws, past = restore(x)
+        state = lags(at)
         measured = state.read(scenario, (w[0], w[1]))
-        sample = Sample(reference, period, jnp.asarray(jnp.inf), past)
-        command, after, _ = cascade.step(measured, restore(laws), sample)
-        commands = jnp.stack([command.u, *past])
-        moved = held.transition @ at + commands @ held.driven + held.disturbed * w[2]
-        after = jnp.concatenate([moved, ravel_pytree(after)[0], commands[: len(past)]])
-        u = plant.voltage(at, (command.u, *past), processor.delay)
-        z = scenario.plant.measurement(state.plant).z
-        return after, jnp.stack([measured.z, measured.z_dot, u, z, command.u, measured.i])
+        command, after, _ = cascade.step(measured, laws, Sample(reference, period, jnp.asarray(jnp.inf), past))
+        commands = command.u, *past
+        moved = transition @ at + jnp.stack(commands) @ driven + disturbed[:, 0] * w[2]
+        u = command.u
+        if scenario.drive == "current":
+            u = scenario.coil_voltage(at_sample(commands, delay), state.plant)
+        outputs = jnp.stack([measured.z, measured.z_dot, u, plant.measurement(state.plant).z, command.u, measured.i])
+        return ravel_pytree((moved, after, commands[: len(past)]))[0], outputs
 
-    x = ravel_pytree((plant.start, laws, past))[0]
     (A, B), (C, D) = jax.jacfwd(step, (0, 1))(x, jnp.zeros(3, x.dtype))
     sizes = sizes_of(cascade, scenario, point)
     scale = ravel_pytree((with_lags(scenario, sizes), sizes.control, processor.constant_past(sizes.u)))[0]
-    return StateSpace(A, B, C, D, scale, jnp.asarray(period), held.path)
+    return StateSpace(A, B, C, D, scale, jnp.asarray(period), path)

@@ -44,10 +44,7 @@ def notch_speeds(notch: SynchronousNotch, speeds: Sequence[float]) -> tuple[floa
 
 
 def with_notch_gains(cascade: Cascade, scenario: Scenario, clock: Clock, rotor: Rotation) -> Cascade:
-    """Return the cascade whose notch has the gains for its loop, at all speeds of `rotor` (`speeds_of`).
-
-    Raises ValueError as `linearise` does.
-    """
+    """Return the cascade with its notch gains at all speeds of `rotor`. Raises ValueError as `linearise` does."""
     assert cascade.notch is not None
     system = linearise(dataclasses.replace(cascade, notch=None), scenario, clock)
     speeds = notch_speeds(cascade.notch, speeds_of(rotor, float(clock.duration)))
@@ -127,7 +124,6 @@ def machine_at_speed(machine: Machine, W: Scalar, period: Scalar) -> Machine:
 
 
 def _with_notches(machine: Machine, notches: Sequence[SynchronousNotch | None]) -> Machine:
-    """Return the machine with these notches, stacked for each group."""
     axes = []
     for axis, loop, notch in zip(machine.axes, machine.loops(), notches, strict=True):
         cascade = dataclasses.replace(loop.cascade, notch=notch)
@@ -138,10 +134,7 @@ def _with_notches(machine: Machine, notches: Sequence[SynchronousNotch | None]) 
 def with_machine_gains(
     machine: Machine, notches: Sequence[SynchronousNotch | None], clock: Clock, speeds: Sequence[float]
 ) -> list[SynchronousNotch | None]:
-    """Return the notches of the axes with the gains for a machine without notches, all loops closed.
-
-    `notches`: of each axis; None: none. `speeds`: see `notch_speeds`.
-    """
+    """Return the notches of the axes (None: none) with the gains for a machine without notches, at `notch_speeds`."""
     c, found, responses = machine.count, list[SynchronousNotch | None](), dict[float, np.ndarray]()
     for k, notch in enumerate(notches):
         if notch is None:

@@ -20,7 +20,7 @@ does not count, nor does the motion of a stable linear loop whose own decay is t
 import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,9 +32,6 @@ from ambjax.linear.quiet_run import KICK, QuietRun, quiet_run
 from ambjax.numerics.shapes import map_varying
 from ambjax.simulation.clock import Clock, takes_case
 from ambjax.world.scenario import Scenario
-
-if TYPE_CHECKING:  # `ambjax simulate` imports this module, and does not need Theorem 1
-    from ambjax.theorem.sampled_report import Delays
 
 # Half peak-to-peak value of z, as a share of the clearance, below which a sustained motion does not count. The chatter
 # of set-valued signs that act a sample late reaches 0.0025.
@@ -152,59 +149,50 @@ def stability_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> Stabilit
     does.
     """
     return judged(
-        Tested(
-            [cascade],
-            lambda own, chosen: _growth(*map_varying(lambda x: np.asarray(x)[chosen], (own[0], scenario)), clock),
-            lambda: quiet_run(cascade, scenario, clock),
-            np.asarray(scenario.touchdown, float)[..., None],
-            float(np.max(np.asarray(scenario.plant.i_0))),
-            clock,
-        )
+        [cascade],
+        lambda own, chosen: _growth(*map_varying(lambda x: np.asarray(x)[chosen], (own[0], scenario)), clock),
+        quiet_run(cascade, scenario, clock),
+        np.asarray(scenario.touchdown, float)[..., None],
+        float(np.max(np.asarray(scenario.plant.i_0))),
+        clock,
     )
 
 
-class Tested(NamedTuple):
-    """N loops whose stability is tested, each with c axes.
+# Largest growth rate of each linear loop that is chosen (bool [N]) with these cascades, 1/s; NaN: no linear verdict.
+Growth = Callable[[Sequence[Cascade], np.ndarray], np.ndarray]
 
-    `cascades`: those with all laws. `growth`: largest growth rate of each linear loop that is chosen (bool [N]) with
-    these cascades, 1/s; NaN without a linear verdict. `quiet`: simulates the quiet runs. `clearance`: of each axis, m,
-    [N, c] or one for all N. `bias`: largest bias current, A.
+
+def judged(
+    cascades: Sequence[Cascade], growth_of: Growth, run: QuietRun, clearance: np.ndarray, bias: float, clock: Clock
+) -> Stability:
+    """Return the stability of N loops, each with c axes, from both verdicts.
+
+    `cascades`: those with all laws. `run`: the quiet runs. `clearance`: of each axis, m, [N, c] or one for all N.
+    `bias`: largest bias current, A.
     """
-
-    cascades: Sequence[Cascade]
-    growth: Callable[[Sequence[Cascade], np.ndarray], np.ndarray]
-    quiet: Callable[[], QuietRun]
-    clearance: np.ndarray
-    bias: float
-    clock: Clock
-
-
-def judged(tested: Tested) -> Stability:
-    """Return the stability of loops from both verdicts."""
-    run, duration = tested.quiet(), float(tested.clock.duration)
+    duration = float(clock.duration)
     growth, everyone = np.full(len(run.lost), np.nan), np.full(len(run.lost), True)
-    if not has_set_valued(tested.cascades):
-        growth = tested.growth(tested.cascades, everyone)
-    clearance = np.broadcast_to(tested.clearance, run.current.shape)
+    if not has_set_valued(cascades):
+        growth = growth_of(cascades, everyone)
+    clearance = np.broadcast_to(clearance, run.current.shape)
     swing = np.where(run.lost[:, None], clearance, run.swings[..., -1])
     slow = (growth < 0) & (-growth * duration / QUARTERS < -np.log1p(-DECAY))
     large = swing > SMALL * clearance
     persists = (large & (swing > (1 - DECAY) * run.swings[..., -2]) & run.returns).any(1) & ~slow
     sustained = run.lost | persists
-    chatters = may_chatter(tested.cascades) & (growth * duration > GROWN) & ~large.any(1)
-    excused = run.busy & ~sustained & (chatters | has_set_valued(tested.cascades))
+    chatters = may_chatter(cascades) & (growth * duration > GROWN) & ~large.any(1)
+    excused = run.busy & ~sustained & (chatters | has_set_valued(cascades))
     if excused.any():
-        least = _least_growth(tested, excused)
+        least = _least_growth(cascades, growth_of, excused, clock)
         other = least * duration > GROWN
         growth, chatters = np.where(other, least, growth), chatters & ~other
     stable = ~(sustained | ((growth * duration > BORDER) & ~chatters))
     widest = np.argmax(swing / clearance, axis=1)[:, None]
     size = np.take_along_axis(swing, widest, axis=1)[:, 0]
-    return Stability(stable, growth, sustained, size, run.current.max(1), run.lost, duration, tested.bias)
+    return Stability(stable, growth, sustained, size, run.current.max(1), run.lost, duration, bias)
 
 
 def _signs(cascade: Cascade) -> list[Law]:
-    """Return the laws with a sign."""
     return [law for law in cascade.laws if law.stiff or law.size(cascade.model) is not None]
 
 
@@ -219,20 +207,20 @@ def may_chatter(cascades: Sequence[Cascade]) -> bool:
     return not all(implicit and law.has_own_step(True) for implicit, law in laws)
 
 
-def _least_growth(tested: Tested, excused: np.ndarray) -> np.ndarray:
+def _least_growth(cascades: Sequence[Cascade], growth_of: Growth, excused: np.ndarray, clock: Clock) -> np.ndarray:
     """Return the least growth rate of each `excused` loop [N] over smoothed signs of the steepnesses SOFTER, 1/s.
 
     It is NaN without a linear verdict, or if a sign has no steepness. A loop that does not grow is done.
     """
-    least, own, grows = np.full(len(excused), np.nan), tested.cascades, excused.copy()
-    if not all(steepnesses(law) for cascade in own for law in _signs(cascade)):
+    least, grows = np.full(len(excused), np.nan), excused.copy()
+    if not all(steepnesses(law) for cascade in cascades for law in _signs(cascade)):
         return least
-    stages = [stage for stage in DEFAULT_LAWS if any(steepnesses(getattr(cascade, stage)) for cascade in own)]
+    stages = [stage for stage in DEFAULT_LAWS if any(steepnesses(getattr(cascade, stage)) for cascade in cascades)]
     for shares in itertools.product(SOFTER, repeat=len(stages)):
         softer = dict(zip(stages, shares, strict=True))
-        cascades = [_softened(cascade, softer, tested.clock.sample_period) for cascade in own]
-        least[grows] = np.fmin(least[grows], tested.growth(cascades, grows))
-        grows &= ~(least * float(tested.clock.duration) <= GROWN)
+        own = [_softened(cascade, softer, clock.sample_period) for cascade in cascades]
+        least[grows] = np.fmin(least[grows], growth_of(own, grows))
+        grows &= ~(least * float(clock.duration) <= GROWN)
         if not grows.any():
             break
     return least
@@ -257,37 +245,6 @@ def suspects(error: np.ndarray, held: np.ndarray) -> np.ndarray:
     """Return the indices of the held members with the largest settled errors, ascending, at most MOST_TESTED."""
     alive = np.flatnonzero(held)
     return np.sort(alive[np.argsort(-np.asarray(error)[alive], kind="stable")[:MOST_TESTED]])
-
-
-def with_stability(
-    margin: "Delays", cascade: Cascade, scenario: Scenario, clock: Clock, *, known: bool
-) -> tuple["Delays", Findings | None]:
-    """Return a result of `delay_margin` with the delays, up to its `held`, up to which the loop is stable.
-
-    `DELAYS` delays are tested; a second pass divides the step after the last one that is stable. `known`: as in
-    `delay_margin`. Also returns the findings at the case's own delay; None if the rotor is not held there.
-    """
-    from ambjax.ensemble.delays import DELAYS, at_delays
-
-    if margin.held is None:
-        return margin, None
-    own = float(cascade.timing.delay)
-    first = own if margin.held >= own else 0.0
-
-    def tried(low: float, high: float) -> tuple[np.ndarray, Stability]:
-        delays = np.linspace(low, high, DELAYS)
-        return delays, stability_of(at_delays(cascade, delays, known=known), scenario, clock)
-
-    delays, found = tried(first, margin.held)
-    at_own = found.of([0]).findings() if first == own else None
-    if found.stable.all():
-        return margin._replace(stable=margin.held, tested=DELAYS), at_own
-    facts, at = found.findings(), int(np.argmin(found.stable))
-    stable = None
-    if at:
-        finer, again = tried(delays[at - 1], delays[at])
-        stable = float(finer[max(int(np.argmin(again.stable)) - 1, 0)])
-    return margin._replace(stable=stable, swing_m=facts.swing_m, current_A=facts.current_A, tested=DELAYS), at_own
 
 
 def _growth(cascade: Cascade, scenario: Scenario, clock: Clock) -> np.ndarray:

@@ -6,25 +6,64 @@ the noise in the gap: its verdict follows from printed numbers.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import numpy as np
 
+from ambjax.numerics.records import Scalar
 from ambjax.paper.evidence import BASIN, NOISE_STDS, UNCERTAIN, Evidence, Run
-from ambjax.paper.findings import FAILS, HOLDS, OPEN, STALLED, UNDECIDED, Finding, finding, finding_if_lost, largest_in
 from ambjax.paper.readings import PULSE, SETTLE, TABLE_2
+from ambjax.simulation.trajectory import Row
 from ambjax.world.plant import Plant
 
 SIGMA_RADIUS, TRACKING_ERROR, INVERSION_TIME = 6e-6, 2.3e-5, 0.01
 GAP = float(Plant().s_0)
 
 
+HOLDS, FAILS, OPEN = "holds", "does not hold", "not determined by the paper"
+# Verdict if a run stalled, so that it is not known whether the rotor survives.
+UNDECIDED = "not decided"
+STALLED = "the integrator could not meet its tolerance, so whether the rotor survives is not known"
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """The result of one claim in one reading: in words, as a number, the verdict, and its cause."""
+
+    ours: str
+    value: float | None
+    verdict: str
+    cause: str
+
+
+def finding(ours: str, value: float, condition: bool, cause: str) -> Finding:
+    """Return the finding of a claim that holds under `condition` and otherwise fails."""
+    return Finding(ours, value, HOLDS if condition else FAILS, cause)
+
+
+def finding_if_lost(run: Run, evidence: Evidence) -> Finding | None:
+    """Return the finding on a claim about a run that is lost or stalled; None if the run reached its end."""
+    if math.isinf(run.metrics["lost_at_s"]):
+        return None
+    if run.metrics["stalled"]:
+        return Finding(f"stalled at {run.metrics['lost_at_s'] * 1e3:.1f} ms", None, UNDECIDED, STALLED)
+    inversion = next(c for c in evidence.check_tracking.conditions if c.name == "inversion, ideal")
+    words = f"rotor lost at {run.metrics['lost_at_s'] * 1e3:.1f} ms"
+    cause = run.trajectory.lost_why
+    if inversion.gain is not None and inversion.gain <= inversion.against:
+        cause = f"gamma = {inversion.gain:g} < Delta_1 = {inversion.against:.3g} A^2/m^2/s, Eq. (7)"
+    return Finding(words, None, FAILS, cause)
+
+
+def largest_in(rows: Row, name: str, begin: Scalar, end: Scalar) -> float:
+    """Return the largest |signal| in begin <= t < end."""
+    return float(np.abs(getattr(rows, name)[(rows.t >= begin) & (rows.t < end)]).max())
+
+
 @dataclasses.dataclass(frozen=True)
 class Claim:
-    """A claim: its statement, its section in the paper, the paper's number, the criterion, and the function `judge`.
-
-    `judge` computes the finding from the evidence of a reading.
-    """
+    """A claim: its statement, its section, the number of the paper, the criterion, and the function of the evidence."""
 
     says: str
     where: str
@@ -34,15 +73,18 @@ class Claim:
 
 
 CLAIMS: list[Claim] = []
+Judge = Callable[[Evidence], Finding]
 
 
-def claim(
-    says: str, where: str, paper: str, criterion: str
-) -> Callable[[Callable[[Evidence], Finding]], Callable[[Evidence], Finding]]:
-    """Decorator that adds a claim to CLAIMS; the decorated function evaluates it."""
+def claim(says: str, where: str, paper: str, criterion: str, *runs: str) -> Callable[[Judge], Judge]:
+    """Decorator that adds a claim to CLAIMS; the decorated function evaluates it, unless one of `runs` ends early."""
 
-    def enter(judge: Callable[[Evidence], Finding]) -> Callable[[Evidence], Finding]:
-        CLAIMS.append(Claim(says, where, paper, criterion, judge))
+    def enter(judge: Judge) -> Judge:
+        def judged(evidence: Evidence) -> Finding:
+            ended = (finding_if_lost(getattr(evidence, run), evidence) for run in runs)
+            return next(filter(None, ended), None) or judge(evidence)
+
+        CLAIMS.append(Claim(says, where, paper, criterion, judged))
         return judge
 
     return enter
@@ -85,45 +127,38 @@ def _stable(evidence: Evidence) -> Finding:
 
 @claim(
     "Regulation: z and i converge to their references", "4", "-",
-    "last 0.1 s: |z| < 1e-6 m and |i - i_ref| < 1e-3 A",
+    "last 0.1 s: |z| < 1e-6 m and |i - i_ref| < 1e-3 A", "regulation",
 )  # fmt: skip
 def _converges(evidence: Evidence) -> Finding:
     rows = evidence.regulation.trajectory.rows
     z, e = largest_in(rows, "e_z", 1.9, 2.0), largest_in(rows, "e", 1.9, 2.0)
     cause = "over the last 0.1 s, 0.6 s after the pulse"
-    return finding_if_lost(evidence.regulation, evidence) or finding(
-        f"{z:.1e} m, {e:.1e} A", z, z < 1e-6 and e < 1e-3, cause
-    )
+    return finding(f"{z:.1e} m, {e:.1e} A", z, z < 1e-6 and e < 1e-3, cause)
 
 
 @claim(
-    "sigma reaches a neighbourhood of 0 in finite time",
-    "4",
-    "finite",
-    "|sigma| <= 6e-6 m/s held from 0.1 s to the pulse",
-)
+    "sigma reaches a neighbourhood of 0 in finite time", "4", "finite",
+    "|sigma| <= 6e-6 m/s held from 0.1 s to the pulse", "regulation",
+)  # fmt: skip
 def _finite_time(evidence: Evidence) -> Finding:
     rows = evidence.regulation.trajectory.rows
     early = rows.t < PULSE.start
     outside = np.flatnonzero(np.abs(rows.sigma[early]) > SIGMA_RADIUS)
     at = float(rows.t[early][outside[-1]]) if outside.size else 0.0
     cause = "last time before the pulse that |sigma| > 6e-6 m/s"
-    return finding_if_lost(evidence.regulation, evidence) or finding(f"{at:.4g} s", at, at < 0.1, cause)
+    return finding(f"{at:.4g} s", at, at < 0.1, cause)
 
 
 @claim(
-    "sigma's neighbourhood has radius 6e-6",
-    "4",
-    "6e-6 m (sic: m/s)",
-    "|sigma| <= 6.3e-6 m/s from 0.5 s to the end of the pulse",
-)
+    "sigma's neighbourhood has radius 6e-6", "4", "6e-6 m (sic: m/s)",
+    "|sigma| <= 6.3e-6 m/s from 0.5 s to the end of the pulse", "regulation",
+)  # fmt: skip
 def _radius(evidence: Evidence) -> Finding:
     rows = evidence.regulation.trajectory.rows
     quiet, pulse = largest_in(rows, "sigma", SETTLE, PULSE.start), largest_in(rows, "sigma", PULSE.start, PULSE.stop)
     worst = max(quiet, pulse)
     cause = f"{quiet:.1e} m/s before the pulse, {pulse:.1e} in it; for no noise, finite p: k 2/pi arctan(p sigma) = q_z"
-    ended = finding_if_lost(evidence.regulation, evidence)
-    return ended or finding(f"{worst:.1e} m/s", worst, worst <= 1.05 * SIGMA_RADIUS, cause)
+    return finding(f"{worst:.1e} m/s", worst, worst <= 1.05 * SIGMA_RADIUS, cause)
 
 
 @claim(
@@ -143,66 +178,68 @@ def _radius_by_noise(evidence: Evidence) -> Finding:
     return finding(words, nearest, 0.8 <= nearest / TABLE_2.noise_std <= 1.25, cause)
 
 
-def _pulse_effect(evidence: Evidence, run: Run) -> Finding:
+@claim(
+    "Regulation is insensitive to the pulse", "4", "-",
+    "pulse changes z by at most 2.3e-5 m, the paper's own accuracy", "regulation",
+)  # fmt: skip
+def _insensitive(evidence: Evidence) -> Finding:
+    return _pulse_effect(evidence.regulation)
+
+
+def _pulse_effect(run: Run) -> Finding:
     change = float(np.abs(run.trajectory.rows.z - run.quiet.rows.z).max())
     cause = f"the pulse moves the rotor by {100 * change / GAP:.2g} % of the gap; with finite p, by q_z pi / (2 c k p)"
-    return finding_if_lost(run, evidence) or finding(f"{change:.3e} m", change, change <= TRACKING_ERROR, cause)
+    return finding(f"{change:.3e} m", change, change <= TRACKING_ERROR, cause)
+
+
+def _inversion(name: str) -> None:
+    says = f"{name.capitalize()}: inversion error zero in less than 0.01 s"
+
+    @claim(says, "4", "< 0.01 s", "|v_tilde| <= 0.1 A^2/m^2 before 0.01 s", name)
+    def judge(evidence: Evidence) -> Finding:
+        metrics = getattr(evidence, name).metrics
+        at, late = metrics["v_tilde_reached_s"], metrics["settled_max_abs_v_tilde_A2_per_m2"]
+        cause = f"first |v_tilde| <= 0.1 A^2/m^2; after {SETTLE} s it stays within {late:.2g}"
+        return finding(f"{at:.4g} s", at, at < INVERSION_TIME, cause)
+
+
+_inversion("regulation")
+_inversion("tracking")
 
 
 @claim(
-    "Regulation is insensitive to the pulse", "4", "-", "pulse changes z by at most 2.3e-5 m, the paper's own accuracy"
+    "The current tracks its reference",
+    "4",
+    "-",
+    "settled |i - i_ref| < 1e-3 A, both scenarios",
+    "regulation",
+    "tracking",
 )
-def _insensitive(evidence: Evidence) -> Finding:
-    return _pulse_effect(evidence, evidence.regulation)
-
-
-def _inversion(evidence: Evidence, run: Run) -> Finding:
-    at = run.metrics["v_tilde_reached_s"]
-    late = run.metrics["settled_max_abs_v_tilde_A2_per_m2"]
-    cause = f"first |v_tilde| <= 0.1 A^2/m^2; after {SETTLE} s it stays within {late:.2g}"
-    return finding_if_lost(run, evidence) or finding(f"{at:.4g} s", at, at < INVERSION_TIME, cause)
-
-
-@claim(
-    "Regulation: inversion error zero in less than 0.01 s", "4", "< 0.01 s", "|v_tilde| <= 0.1 A^2/m^2 before 0.01 s"
-)
-def _inversion_regulation(evidence: Evidence) -> Finding:
-    return _inversion(evidence, evidence.regulation)
-
-
-@claim("Tracking: inversion error zero in less than 0.01 s", "4", "< 0.01 s", "|v_tilde| <= 0.1 A^2/m^2 before 0.01 s")
-def _inversion_tracking(evidence: Evidence) -> Finding:
-    return _inversion(evidence, evidence.tracking)
-
-
-@claim("The current tracks its reference", "4", "-", "settled |i - i_ref| < 1e-3 A, both scenarios")
 def _current(evidence: Evidence) -> Finding:
     worst = max(r.metrics["settled_max_abs_current_error_A"] for r in (evidence.regulation, evidence.tracking))
     cause = f"largest |i - i_ref| after {SETTLE} s, pulse included; q_i = 0, so e decays by Eq. (14) unless u saturates"
-    ended = finding_if_lost(evidence.regulation, evidence) or finding_if_lost(evidence.tracking, evidence)
-    return ended or finding(f"{worst:.1e} A", worst, worst < 1e-3, cause)
+    return finding(f"{worst:.1e} A", worst, worst < 1e-3, cause)
 
 
-@claim("Tracking: largest error 2.3e-5 m", "4", "2.3e-5 m", "rounds to 2.3e-5 m or less")
+@claim("Tracking: largest error 2.3e-5 m", "4", "2.3e-5 m", "rounds to 2.3e-5 m or less", "tracking")
 def _tracking(evidence: Evidence) -> Finding:
     error = evidence.tracking.metrics["settled_max_abs_error_m"]
     cause = f"largest |z - r| after {SETTLE} s, pulse included"
-    return finding_if_lost(evidence.tracking, evidence) or finding(f"{error:.3e} m", error, error < 2.35e-5, cause)
+    return finding(f"{error:.3e} m", error, error < 2.35e-5, cause)
 
 
 @claim(
-    "Tracking: the disturbance is rejected", "4", "-", "pulse changes z by at most 2.3e-5 m, the paper's own accuracy"
-)
+    "Tracking: the disturbance is rejected", "4", "-",
+    "pulse changes z by at most 2.3e-5 m, the paper's own accuracy", "tracking",
+)  # fmt: skip
 def _rejection(evidence: Evidence) -> Finding:
-    return _pulse_effect(evidence, evidence.tracking)
+    return _pulse_effect(evidence.tracking)
 
 
 @claim(
-    "The rotor is held under sensor noise of variance 1e-7",
-    "4",
-    f"std {TABLE_2.noise_std:.2e} m",
+    "The rotor is held under sensor noise of variance 1e-7", "4", f"std {TABLE_2.noise_std:.2e} m",
     "no member lost up to the printed std, at every sample period tried",
-)
+)  # fmt: skip
 def _noise(evidence: Evidence) -> Finding:
     largest = max(n.survived for n in evidence.noise)
     unknown = sum(n.undecided is not None for n in evidence.noise)

@@ -71,25 +71,15 @@ def survival_of(tried: np.ndarray, lost: np.ndarray, stalled: np.ndarray) -> Sur
 class Noise(NamedTuple):
     """The noise scan at one sample period (s).
 
-    Arrays with one entry for each of NOISE_STDS: whether a member is lost, whether a member is stalled, and the mean
-    over the seeds of the largest settled |sigma|, m/s.
+    `survived`, `undecided`: `Survival` over NOISE_STDS, m. `sigma`: for each of these, the mean over the seeds of the
+    largest settled |sigma|, m/s.
     """
 
     sample_period: float
     horizon: float
-    lost: np.ndarray
-    stalled: np.ndarray
+    survived: float
+    undecided: float | None
     sigma: np.ndarray
-
-    @property
-    def survived(self) -> float:
-        """Largest std, in m, up to which every member survives; 0 if a member is lost or stalled at the smallest."""
-        return survival_of(NOISE_STDS, self.lost, self.stalled).upto
-
-    @property
-    def undecided(self) -> float | None:
-        """The next std, in m, if no member is lost there but one stalled; else None."""
-        return survival_of(NOISE_STDS, self.lost, self.stalled).undecided
 
     def std_for(self, radius: float) -> float | None:
         """Return the std, m, at which the largest settled |sigma| equals `radius`, m/s. None: not within the scan.
@@ -144,7 +134,8 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
             check_clock = paper.CLOCK.with_method(AdaptiveRodas3())
             checking = pool.submit(check, cascade, paper.scenario(name, reading), check_clock)
             say(f"{reading}: {name}")
-            runs[name] = _run(cascade, reading, name)
+            quiet = _simulate(reading, cascade, paper.scenario(name, reading, pulse=False)).trajectory
+            runs[name] = _simulate(reading, cascade, paper.scenario(name, reading))._replace(quiet=quiet)
             checks[name] = checking.result()
         noisy = runs["tracking"].trajectory
         if reading not in paper.NOISY:  # the tracking scenario of the others has the noise already
@@ -175,11 +166,6 @@ def _on_processor(reading: str) -> dict[bool, Run]:
     scenario, cascade = paper.scenario("tracking", reading), paper.on_processor(reading)
     quiet = {} if reading in paper.NOISY else {False: _simulate(reading, cascade, scenario)}
     return quiet | {True: _simulate(reading, cascade, paper.noisy(scenario))}
-
-
-def _run(cascade: Cascade, reading: str, name: str) -> Run:
-    run = _simulate(reading, cascade, paper.scenario(name, reading))
-    return run._replace(quiet=_simulate(reading, cascade, paper.scenario(name, reading, pulse=False)).trajectory)
 
 
 def _uncertain(cascade: Cascade, reading: str) -> Uncertain:
@@ -228,7 +214,7 @@ def _noise(cascade: Cascade, reading: str, period: float) -> Noise:
     metrics = _scan(*canonical(_scanned(cascade, scenarios, period)))
     lost, stalled = (np.any(np.reshape(metrics[status], (-1, SEEDS)), axis=1) for status in ("lost", "stalled"))
     sigma = np.asarray(metrics["settled_max_abs_sigma_m_per_s"]).reshape(-1, SEEDS).mean(axis=1)
-    return Noise(period, NOISE_SAMPLES * period, lost, stalled, sigma)
+    return Noise(period, NOISE_SAMPLES * period, *survival_of(NOISE_STDS, lost, stalled), sigma)
 
 
 def _basin(cascade: Cascade, reading: str) -> Survival:

@@ -96,16 +96,9 @@ def sensitivity_table(readings: Iterable[str]) -> list[dict[str, object]]:
     return rows
 
 
-def ledger_markdown(
-    rows: list[dict[str, Any]],
-    noise: list[dict[str, Any]],
-    processor: list[dict[str, Any]],
-    sensitivity: list[dict[str, Any]],
-) -> str:
-    """Return the ledger as a Markdown page.
-
-    Its arguments are the results of `judge_claims`, `noise_table`, `processor_table` and `sensitivity_table`.
-    """
+def ledger_markdown(ledger: dict[str, list[dict[str, Any]]]) -> str:
+    """Return the ledger as Markdown: the claims and the three tables, as ledger.json names them."""
+    rows = ledger["claims"]
     heads = [head for reading in rows[0]["findings"] for head in (f"{reading}: ours", f"{reading}: verdict")]
     lines = ["# Ledger: the paper's claims, per reading", ""]
     lines += [
@@ -120,13 +113,13 @@ def ledger_markdown(
         lines += [f"  - {name}: {f['verdict']}; {f['cause']}" for name, f in row["findings"].items()]
     lines += ["", "## Noise at which the rotor is held (regulation without the pulse, noise on z only, two seeds)", ""]
     head = ("reading", "sample period", "duration", "largest std", "std with max |sigma| = 6e-6 m/s")
-    lines += markdown_table(head, [_noise_cells(n) for n in noise])
+    lines += markdown_table(head, [_noise_cells(n) for n in ledger["noise"]])
     lines += ["", "## All readings on the processor of `sampled` (tracking, pulse included)", ""]
     head = ("reading", "noise and supply", "lost", "largest error after settling", "voltage, rms")
-    lines += markdown_table(head, [_processor_cells(row) for row in processor])
+    lines += markdown_table(head, [_processor_cells(row) for row in ledger["processor"]])
     lines += ["", "## Sensitivity (linear, at rest at r = 0; zones of ISO 14839-3)", ""]
     head = ("reading", "position sensor: peak of |S|, zone", "velocity sensor", "static stiffness")
-    return "\n".join([*lines, *markdown_table(head, [_sensitivity_cells(row) for row in sensitivity])]) + "\n"
+    return "\n".join([*lines, *markdown_table(head, [_sensitivity_cells(row) for row in ledger["sensitivity"]])]) + "\n"
 
 
 def _noise_cells(n: dict[str, Any]) -> tuple[str, ...]:

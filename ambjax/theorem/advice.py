@@ -56,7 +56,8 @@ def advice(report: Report) -> list[str]:
     fall = FALL_SHARE * report.lost_at if report.lost else math.inf
     rows = [line for line in fails if line.path and (line.ideal or line.at_s < fall)]
     paths = dict.fromkeys(row.path for row in rows)
-    lines = [_to_raise(max((row for row in rows if row.path == path), key=_against)) for path in paths]
+    largest = (max((row for row in rows if row.path == path), key=lambda row: row.against) for path in paths)
+    lines = [_to_raise(row) for row in largest]
     if not rows:
         ideal = {line.path: line for line in report.conditions if line.ideal}
         lines = [_during_fall(line, ideal.get(line.path)) for line in fails if line.path]
@@ -118,7 +119,6 @@ def delay_difference(linear: float | None, tested: Delays, delay: float, period:
 
 
 def _curve(distance: float, at: float) -> str:
-    """Describe the condition of Eq. (9) along the run on the processor."""
     question = "Does (z/s_0, i_ref/i_0) stay off the singular curve C at all samples?"
     if distance > 0:
         return f"{question} Yes: the smallest distance is {number(distance)}, at {at:.4g} s."
@@ -140,19 +140,18 @@ def _alternates(share: float, cause: Cause | None) -> str:
 
 def _margin(name: str, margin: Delays) -> str:
     held, lost, undecided = margin.held, margin.lost, margin.undecided
-    tried = f"tested in steps of {margin.step:.2g} samples"
+    if held is None and undecided is None:
+        return f"{name}: none, because the rotor is lost even without a delay."
+    parts = [] if held is None else [f"held up to {_samples(held)} samples"]
     if undecided is not None:
-        parts = [] if held is None else [f"held up to {_samples(held)} samples"]
         parts += [f"not decided at {_samples(undecided)}, where the integrator stalled"]
         parts += [] if lost is None else [f"lost at {_samples(lost)}"]
-        return f"{name}: the rotor is {', '.join(parts)} ({tried}).{_stable(margin)}"
-    if held is None:
-        return f"{name}: none, because the rotor is lost even without a delay."
-    if lost is None:
-        longest = "the longest delay that ambjax simulates"
-        return f"{name}: the rotor is held up to {_samples(held)} samples, {longest} ({tried}).{_stable(margin)}"
-    ends = f"held up to {_samples(held)} samples and lost at {_samples(lost)}"
-    return f"{name}: the rotor is {ends} ({tried}).{_stable(margin)}"
+    elif lost is None:
+        parts += ["the longest delay that ambjax simulates"]
+    else:
+        parts = [f"{parts[0]} and lost at {_samples(lost)}"]
+    tried = f"tested in steps of {margin.step:.2g} samples"
+    return f"{name}: the rotor is {', '.join(parts)} ({tried}).{_stable(margin)}"
 
 
 def _stable(margin: Delays) -> str:
@@ -173,12 +172,7 @@ def _samples(delay: float) -> str:
     return f"{delay:.5f}".rstrip("0").rstrip(".")
 
 
-def _against(line: Condition) -> float:
-    return line.against
-
-
 def _to_raise(line: Condition) -> str:
-    """Return the advice to raise the gain of a condition that fails."""
     if not math.isfinite(line.against):
         return f"{line.requires} cannot be evaluated: its right-hand side is not finite along this run."
     name, key, gain = _sides(line)

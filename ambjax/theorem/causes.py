@@ -74,16 +74,10 @@ def cause_words(cause: Cause, with_part: str, without: str) -> str:
 
 def parts(cascade: Cascade, scenario: Scenario, clock: Clock) -> Iterator[Part]:
     """Yield the parts of a case that can be taken away: errors first, then limits, then what any machine has."""
-    for name, remedy, world in _sensors(scenario):
-        yield Part(name, remedy, cascade, world, clock)
-    for name, remedy, controller in (*_processor(cascade), *_model(cascade, scenario)):
-        yield Part(name, remedy, controller, scenario, clock)
-    for name, remedy, world in _supply(scenario):
-        yield Part(name, remedy, cascade, world, clock)
-    for name, remedy, controller in _delay(cascade):
-        yield Part(name, remedy, controller, scenario, clock)
-    for name, remedy, world in _motion(scenario, clock):
-        yield Part(name, remedy, cascade, world, clock)
+    errors = (*_sensors(scenario), *_processor(cascade), *_model(cascade, scenario))
+    for name, remedy, changed in (*errors, *_supply(scenario), *_delay(cascade), *_motion(scenario, clock)):
+        controller, world = (changed, scenario) if isinstance(changed, Cascade) else (cascade, changed)
+        yield Part(name, remedy, controller, world, clock)
     if cascade.sampled:
         finer = dataclasses.replace(
             clock, samples=FINER * clock.samples, sample_period=float(clock.sample_period) / FINER

@@ -121,12 +121,6 @@ class Required(NamedTuple):
 PEAKS = ("q_z", "q_i", "d", "q_z_plus_h", "sigma_residual", "v_tilde_residual", "e_residual")
 
 
-def _monitors(settle: float) -> Named:
-    """Return the folds of a run: extremes of the monitored signals, and the largest |z| after `settle` (s)."""
-    peaks = {name: Peak(name, timed=True) for name in PEAKS} | {"z": Peak("z", settle, timed=True)}
-    return Named(peaks | {name: Lowest(name) for name in ("distance", "V_margin")})
-
-
 @takes_case
 def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float = 0.0) -> Report:
     """Simulate the loop once in continuous time and evaluate the conditions of Theorem 1 along the run.
@@ -144,7 +138,9 @@ def check(cascade: Cascade, scenario: Scenario, clock: Clock, settle: float = 0.
     loop, clock = prepare(cascade, scenario, clock)
     assert isinstance(loop, ClosedLoop)
     method = str(clock.method)
-    system, clock, fold = canonical((Monitored(loop), clock, _monitors(settle)))
+    peaks = {name: Peak(name, timed=True) for name in PEAKS} | {"z": Peak("z", settle, timed=True)}
+    folds = Named(peaks | {name: Lowest(name) for name in ("distance", "V_margin")})
+    system, clock, fold = canonical((Monitored(loop), clock, folds))
     trajectory, extremes = roll(system, clock, fold, record_every=0)
     worst = {name: (float(value), float(at)) for name, (value, at) in extremes.items()}
     on_reference = delta_1_on_reference(cascade, scenario, clock)

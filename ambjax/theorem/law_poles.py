@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,11 +36,8 @@ ROUNDING = 1e-9
 LEAST_DAMPING = 0.01
 
 
-class Loop(NamedTuple):
-    """A loop: the map of its state over one sample, and its state at rest."""
-
-    step: Callable[[Array], Array]
-    start: Array
+# A loop: the map of its state over one sample, and its state at rest.
+Loop = tuple[Callable[[Array], Array], Array]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,9 +102,8 @@ def _poles(stage: str, law: Law, model: Plant, sampling: Sampling) -> np.ndarray
 
 @functools.partial(compiled_quickly, static_argnames=("stage", "sampling"), options=QUICKEST)
 def _matrix(law: Law, model: Plant, *, stage: str, sampling: Sampling) -> Array:
-    """Return the matrix of the linearised loop of a stage."""
-    loop = LOOPS[stage][0](law, model, sampling)
-    return jax.jacfwd(loop.step)(loop.start)
+    step, start = LOOPS[stage][0](law, model, sampling)
+    return jax.jacfwd(step)(start)
 
 
 def _reached(A: np.ndarray, signals: int) -> np.ndarray:
@@ -140,7 +136,7 @@ def _state(state: Any) -> tuple[Array, Callable[[Array], Any]]:
 def _observer(law: Any, model: Plant, sampling: Sampling) -> Loop:
     rest, _, _ = _rest(model)
     start, restore = _state(law.init(model, rest))
-    return Loop(lambda x: ravel_pytree(_advance(law, model, sampling)(rest, restore(x))[1])[0], start)
+    return lambda x: ravel_pytree(_advance(law, model, sampling)(rest, restore(x))[1])[0], start
 
 
 def _inversion(law: Any, model: Plant, sampling: Sampling) -> Loop:
@@ -148,7 +144,7 @@ def _inversion(law: Any, model: Plant, sampling: Sampling) -> Loop:
     zero = jnp.zeros(())
     start, restore = _state(law.started(rest.i).init_sampled(model))
     demand = ForceDemand(rest.z, zero, v, zero)
-    return Loop(lambda x: ravel_pytree(_advance(law, model, sampling)(demand, restore(x))[1])[0], start)
+    return lambda x: ravel_pytree(_advance(law, model, sampling)(demand, restore(x))[1])[0], start
 
 
 def _position(law: Any, model: Plant, sampling: Sampling) -> Loop:
@@ -167,7 +163,7 @@ def _position(law: Any, model: Plant, sampling: Sampling) -> Loop:
             z, z_dot = z + h * z_dot + h * h / 2 * rate, z_dot + h * rate
         return ravel_pytree((z, z_dot, after, (v_star, *past)[:kept]))[0]
 
-    return Loop(step, jnp.concatenate([jnp.zeros(2), laws, jnp.full(kept, v)]))
+    return step, jnp.concatenate([jnp.zeros(2), laws, jnp.full(kept, v)])
 
 
 def _current(law: Any, model: Plant, sampling: Sampling) -> Loop:
@@ -193,7 +189,7 @@ def _current(law: Any, model: Plant, sampling: Sampling) -> Loop:
             i = i + reach * (rate(rest.i, u) + decay * (i - rest.i) + gain * (voltage - u))
         return ravel_pytree((i, after, (command, *past)[:kept]))[0]
 
-    return Loop(step, jnp.concatenate([rest.i[None], start, jnp.full(kept, u)]))
+    return step, jnp.concatenate([rest.i[None], start, jnp.full(kept, u)])
 
 
 def _kept(late: float) -> int:

@@ -1,4 +1,4 @@
-"""The closed loop together with the steps of the stability proof, Section 3.5.
+"""Loops that record the signals of the theorem: with the steps of its proof, Section 3.5, or on a processor.
 
 The right-hand sides of the proof's identities, Eqs. (12)-(14), are integrated together with the loop. The integrals are
 compared with sigma, v_tilde and e of the loop. If the proof's assumptions hold (exact model, measured state, no limit
@@ -14,16 +14,18 @@ from jax import Array
 
 from ambjax.control.cascade_state import Sample
 from ambjax.control.schedule import with_gains_at
-from ambjax.numerics.records import record
-from ambjax.simulation.integrate import InitialValueProblem, WholeState
+from ambjax.numerics.records import Scalar, record
+from ambjax.simulation.between import SampledState
+from ambjax.simulation.integrate import Advanced, Begin, InitialValueProblem, Integrator, WholeState
 from ambjax.simulation.loop import ClosedLoop, ExternalInputs, LoopState
 from ambjax.simulation.rollout import Extended
+from ambjax.simulation.sampled import Sampled
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.waveforms import Reference
 
 
-class Identities(NamedTuple):
-    """sigma (m/s), v_tilde (A^2/m^2) and e (A): from the loop, or integrated from Eqs. (12)-(14)."""
+class LawSignals(NamedTuple):
+    """sigma (m/s), v_tilde (A^2/m^2) and e = i - i_ref (A)."""
 
     sigma: Array
     v_tilde: Array
@@ -38,8 +40,8 @@ class Terms(NamedTuple):
     """
 
     moving: LoopState
-    values: Identities
-    rates: Identities
+    values: LawSignals
+    rates: LawSignals
     i_ref_dot: Array
     q_z: Array
     q_i: Array
@@ -65,10 +67,10 @@ class TheoremRow(NamedTuple):
     q_i: Array
     d: Array
     q_z_plus_h: Array
-    distance: Array
     sigma_residual: Array
     v_tilde_residual: Array
     e_residual: Array
+    distance: Array
     V_margin: Array
 
 
@@ -80,7 +82,7 @@ class MonitoredState(NamedTuple):
     """
 
     loop: LoopState
-    integrals: Identities
+    integrals: LawSignals
 
 
 @record
@@ -97,13 +99,13 @@ class Monitored(Extended, WholeState):
     def problem(self, errors: Errors) -> InitialValueProblem:
         plant = self.loop.scenario.plant
         _, z_dot, i = map(jnp.asarray, plant.sizes())
-        sizes = Identities(z_dot, plant.dv_di(0.0, 0.0) * i / 100, i)
+        sizes = LawSignals(z_dot, plant.dv_di(0.0, 0.0) * i / 100, i)
 
         def rates(inputs: ExternalInputs, state: MonitoredState) -> MonitoredState:
             terms = self.terms(inputs, state.loop, errors)
             return MonitoredState(terms.moving, terms.rates._replace(e=terms.rates.e + terms.i_ref_dot))
 
-        layer = MonitoredState(self.loop.layer(), Identities(*(jnp.asarray(jnp.inf) for _ in sizes)))
+        layer = MonitoredState(self.loop.layer(), LawSignals(*(jnp.asarray(jnp.inf) for _ in sizes)))
         return InitialValueProblem(
             self.loop.inputs, rates, MonitoredState(self.loop.scale(), sizes), self.status, layer
         )
@@ -125,13 +127,13 @@ class Monitored(Extended, WholeState):
         d = self._drift(inputs, state, errors, command.i_ref, moving)
         h = plant.a * (plant.signals(state.plant).v - v_tilde - plant.v(z, command.i_ref))
         laws = (with_gains_at(law, z, inputs.reference) for law in cascade.laws[1:])
-        robust = Identities(*(law.robust(x) for law, x in zip(laws, (sigma, v_tilde, e), strict=True)))
-        rates = Identities(robust.sigma + q_z + h, robust.v_tilde + d, robust.e + q_i)
+        robust = LawSignals(*(law.robust(x) for law, x in zip(laws, (sigma, v_tilde, e), strict=True)))
+        rates = LawSignals(robust.sigma + q_z + h, robust.v_tilde + d, robust.e + q_i)
         # |v(z, i) - v(z, i_ref)| <= L_v |e|: v is quadratic in i, so dv/di is largest at one end.
         L_v = jnp.maximum(jnp.abs(plant.dv_di(z, i)), jnp.abs(plant.dv_di(z, command.i_ref)))
         room = jnp.abs(robust.sigma) - jnp.abs(q_z)
         bound = 2 * jnp.abs(sigma) * (plant.a * (L_v * jnp.abs(e) + jnp.abs(v_tilde)) - room)
-        return Terms(moving, Identities(sigma, v_tilde, e), rates, command.i_ref_dot, q_z, q_i, d, h, bound)
+        return Terms(moving, LawSignals(sigma, v_tilde, e), rates, command.i_ref_dot, q_z, q_i, d, h, bound)
 
     def _drift(
         self, inputs: ExternalInputs, state: LoopState, errors: Errors, i_ref: Array, moving: LoopState
@@ -154,25 +156,66 @@ class Monitored(Extended, WholeState):
         z, _, i = self.motion(state.loop)
         i_ref = i - terms.values.e
         values = terms.values._replace(e=i)
-        off = Identities(*(a - b for a, b in zip(values, state.integrals, strict=True)))
+        off = LawSignals(*(a - b for a, b in zip(values, state.integrals, strict=True)))
         # V' = 2 sigma sigma', with sigma' from the plant's own acceleration, not from the identity.
-        sigma_dot = self._sigma_dot(inputs.reference, state.loop, terms.moving)
-        return TheoremRow(
-            t=t,
-            z=z,
-            i_ref=i_ref,
-            alive=alive,
-            q_z=jnp.where(alive, terms.q_z, 0.0),
-            q_i=jnp.where(alive, terms.q_i, 0.0),
-            d=jnp.where(alive, terms.d, 0.0),
-            q_z_plus_h=jnp.where(alive, terms.q_z + terms.h, 0.0),
-            distance=self.loop.scenario.plant.signed_distance_to_C(z, i_ref),
-            sigma_residual=jnp.where(alive, off.sigma, 0.0),
-            v_tilde_residual=jnp.where(alive, off.v_tilde, 0.0),
-            e_residual=jnp.where(alive, off.e, 0.0),
-            V_margin=terms.bound - 2 * terms.values.sigma * sigma_dot,
-        )
-
-    def _sigma_dot(self, reference: Reference, state: LoopState, moving: LoopState) -> Array:
         sigma = lambda r, x: self.loop.cascade.sigma(self.motion(x), r)  # noqa: E731
-        return jax.jvp(sigma, (reference, state), (reference.rate(), moving))[1]
+        moving = (inputs.reference.rate(), terms.moving)
+        sigma_dot = jax.jvp(sigma, (inputs.reference, state.loop), moving)[1]
+        signals = (terms.q_z, terms.q_i, terms.d, terms.q_z + terms.h, *off)
+        acting = (jnp.where(alive, x, 0.0) for x in signals)
+        distance = self.loop.scenario.plant.signed_distance_to_C(z, i_ref)
+        V_margin = terms.bound - 2 * terms.values.sigma * sigma_dot
+        return TheoremRow(t, z, i_ref, alive, *acting, distance=distance, V_margin=V_margin)
+
+
+class LawSignalsRow(NamedTuple):
+    """One sample: time (s), limited voltage (V), z (m), i_ref (A), and signals.
+
+    `computed`: signals that the laws compute from the estimate (with prediction: at the end of the delay). `true`:
+    sigma and e of the plant at the sample; v_tilde is the computed one.
+    """
+
+    t: Array
+    u: Array
+    z: Array
+    i_ref: Array
+    computed: LawSignals
+    true: LawSignals
+
+
+class LawSignalsState(NamedTuple):
+    """State of the loop, and the signals that its laws computed at the last sample."""
+
+    loop: SampledState
+    computed: LawSignals
+
+
+@record
+class LawSignalsRecorder(Extended):
+    """System of a loop on a processor whose rows record the signals that its laws compute."""
+
+    loop: Sampled
+
+    def start(self) -> LawSignalsState:
+        return LawSignalsState(self.loop.start(), LawSignals(*[jnp.zeros(())] * 3))
+
+    def jump(self, t: Scalar, state: LawSignalsState, errors: Errors) -> LawSignalsState:
+        """Step the laws and store the signals that they computed."""
+        loop, before = self.loop, state.loop
+        cascade, after = loop.loop.cascade, loop.jump(t, before, errors)
+        reference = loop.reference(t)
+        sample = loop.sample(reference, after.past)
+        _, measured, laws = loop.inputs_of_laws(loop.read(before, errors)[1], sample, before)
+        estimate, *_ = cascade.estimate(measured, laws.observer, sample)
+        sigma, command = cascade.sigma(estimate, reference), after.command
+        return LawSignalsState(after, LawSignals(sigma, command.v_tilde, estimate.i - command.i_ref))
+
+    def advance(self, method: Integrator, errors: Errors, begin: Begin[LawSignalsState], period: Scalar) -> Advanced:
+        first = Begin(begin.t, begin.state.loop, begin.memory, begin.code)
+        after = self.loop.advance(method, errors, first, period)
+        return after._replace(state=begin.state._replace(loop=after.state))
+
+    def row(self, t: Scalar, state: LawSignalsState, errors: Errors, alive: Array) -> LawSignalsRow:
+        row = self.loop.row(t, state.loop, errors, alive)
+        true = LawSignals(row.sigma, row.v_tilde, row.e)
+        return LawSignalsRow(row.t, row.u, row.z, row.i_ref, state.computed, true)

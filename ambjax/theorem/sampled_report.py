@@ -26,7 +26,7 @@ from ambjax.simulation.system import system_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
 from ambjax.theorem.causes import Cause, find_cause
 from ambjax.theorem.law_poles import LawPoles, law_poles, sampling_of
-from ambjax.theorem.law_signals import LawSignalsRecorder
+from ambjax.theorem.proof import LawSignalsRecorder
 from ambjax.world.bearing import Bearing
 from ambjax.world.scenario import Scenario
 
@@ -205,7 +205,6 @@ def with_causes(
 
 
 def _simulated(loop: System, clock: Clock, run: Callable[[System, Clock], Result]) -> Trajectory:
-    """Simulate a loop on a processor and record the rows of `LawSignalsRecorder`."""
     assert isinstance(loop, Sampled)
     return run(LawSignalsRecorder(loop), clock).trajectory
 
@@ -237,7 +236,6 @@ def _without_noise(scenario: Scenario) -> Scenario:
 
 
 def _bands(cascade: Cascade, scenario: Scenario, clock: Clock, settled: int, rows: Any, noise: bool) -> list[Band]:
-    """Return the bands of one run, from sample number `settled` on."""
     sampling, lines = sampling_of(cascade, clock), []
     limited = _peak(rows.u[settled:]) >= float(scenario.voltage_limit)
     for stage, (signal, unit) in SIGNALS.items():
