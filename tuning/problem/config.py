@@ -16,7 +16,6 @@ from ambjax.cases.tune_table import (
     RISKS,
     SETTLING_BAND,
     SURVIVAL,
-    SURVIVING,
     VOLTAGE_SHARE,
     WEIGHTS,
     Budget,
@@ -59,7 +58,7 @@ class LimitSettings:
     """
 
     each: tuple[Limit, ...] = ()
-    survival: float = SURVIVING
+    survival: float = SURVIVAL.default
     band: float = 0.0
     unbreakable: tuple[tuple[Limit, str], ...] = ()
 
@@ -194,7 +193,7 @@ def _limits(table: Table, case: Case) -> LimitSettings:
     bounds = {name: bound for name, bound in bounds_of(case).items() if thresholds.get(name, 0.0) >= bound.most}
     return LimitSettings(
         tuple(limit for limit in each if limit.name not in bounds),
-        table.leaf("survival", SURVIVAL, SURVIVING),
+        table.leaf("survival", SURVIVAL, SURVIVAL.default),
         band,
         tuple((limit, bounds[limit.name].why) for limit in each if limit.name in bounds),
     )
