@@ -1,4 +1,4 @@
-"""Readers of [processor] and of the [controller] tables: the cascade of a case."""
+"""Readers of [processor] and of the [controller] tables: the cascade of a case, and its notch."""
 
 import dataclasses
 import pathlib
@@ -16,9 +16,14 @@ from ambjax.control.linear_controller import OUTPUTS
 from ambjax.control.processor import Processor
 from ambjax.control.sampling import Sampling
 from ambjax.control.schedule import OVER, Schedule
-from ambjax.numerics.records import Scalar
+from ambjax.control.synchronous_notch import NULLED, SynchronousNotch
+from ambjax.ensemble.spread import Spread, ends
+from ambjax.linear.notch_design import with_notch_gains
+from ambjax.numerics.records import Scalar, leaf
+from ambjax.simulation.clock import Clock
 from ambjax.world.bearing import Bearing
 from ambjax.world.plant import Plant
+from ambjax.world.scenario import Scenario
 
 # The laws by stage and kind. The default of a stage is its first law that fits the amplifier and the position law
 # (`_usual`). A new law is one row here.
@@ -59,6 +64,14 @@ KINDS: dict[str, dict[str, type[Law]]] = {
 }
 DISCRETISATIONS = ["implicit", "explicit"]
 (DELAY,) = (field for field in dataclasses.fields(Processor) if field.name == "delay")
+
+# The kind of a notch that switches it off, for example on one bearing.
+OFF = "none"
+NOTCH_NUMBERS = ("rate", "min_speed", "max_speed")
+PHASE = leaf(
+    default=None, unit="degrees", at_least=-360.0, at_most=360.0,
+    doc="phase of the response that the notch inverts; none: that of the linear loop at each speed",
+)  # fmt: skip
 
 
 class Files(NamedTuple):
@@ -192,3 +205,35 @@ def _numbers(table: Table, key: str) -> tuple[float, ...]:
     if key not in table.raw:
         raise ValueError(f"{table.at(key)} is missing: a schedule is a table such as {EXAMPLE}.")
     return tuple(table.column(key, f"a list of numbers, as in {EXAMPLE}"))
+
+
+def notch_from(top: Table, scenario: Scenario) -> SynchronousNotch | None:
+    """Return the notch of [controller.notch] without its gains; None if there is no notch."""
+    controller = top.table("controller")
+    if "notch" not in controller.raw:
+        return None
+    table, rotor = controller.table("notch"), scenario.rotor
+    table.only(["kind", *NOTCH_NUMBERS, "phase"])
+    kind, phase = table.choice("kind", [*NULLED, OFF], next(iter(NULLED))), table.leaf("phase", PHASE)
+    if kind == OFF:
+        return None
+    varying = rotor is not None and (rotor.acceleration != 0 or bool(rotor.changes))
+    if rotor is None or (rotor.speed == 0 and not varying):
+        raise ValueError("[controller.notch]: it follows the speed of the rotor. Give rotor.speed, in rpm.")
+    given = Table({key: table.raw[key] for key in NOTCH_NUMBERS if key in table.raw}, table.path)
+    notch = given.record(SynchronousNotch)
+    return dataclasses.replace(notch, removes=kind, rotor=rotor, varying=varying, phase=phase)
+
+
+def with_gains_of_notch(cascade: Cascade, scenario: Scenario, clock: Clock, spread: Spread) -> Cascade:
+    """Return the cascade with the gains of its notch, if it has one, for all speeds of the spread.
+
+    Raises ValueError if its loop has no linearisation.
+    """
+    rotor = ends(spread, cascade, scenario, ("rotor.",))[1].rotor
+    if cascade.notch is None or rotor is None:
+        return cascade
+    try:
+        return with_notch_gains(cascade, scenario, clock, rotor)
+    except ValueError as error:
+        raise ValueError(f"[controller.notch]: its gain cannot be computed: {error}") from None

@@ -13,17 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.axis_case import MACHINE_TABLES, as_written, axis_tables, check_axis, stop_slope, with_runout_at
-from ambjax.cases.machine_controller import inner, kind_of, law_from, merged
+from ambjax.cases.controller_tables import notch_from
+from ambjax.cases.machine_controller import inner, kind_of, law_from, merged, try_machine
 from ambjax.cases.machine_spread import axis_table, machine_spread, refuse_unused, with_notches
-from ambjax.cases.machine_trial import try_machine
-from ambjax.cases.notch_table import notch_from
 from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
 from ambjax.cases.plausibility import unresolved
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, read_by, safe_name
 from ambjax.cases.rotor_numbers import fastest_rotor, widest_rotation
 from ambjax.cases.rotor_tables import COORDINATES, RIGID, BearingAxis, axes_and_rotor, tables_of, vector
 from ambjax.cases.speed_table import MOST_SPEEDS, listed_speeds
-from ambjax.cases.table import FILE, Table, require_file, show, text_of
+from ambjax.cases.table import Table, show
 from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.synchronous_notch import SynchronousNotch
@@ -92,19 +91,17 @@ def read_machine(path: str | pathlib.Path | Mapping[str, Any]) -> MachineCase:
 
         machine = ambjax.read_machine("machine.toml")
     """
-    other = "it has no [rotor] with a kind, so it is a case of one axis; in Python, read_case reads it."
+
+    def parse(raw: dict[str, Any], *rest: Any) -> MachineCase:
+        if not is_machine(raw):
+            raise ValueError(
+                "it has no [rotor] with a kind, so it is a case of one axis; in Python, read_case reads it."
+            )
+        return machine_from(raw, *rest)
+
     with jax.ensure_compile_time_eval():
-        if isinstance(path, Mapping):
-            if not is_machine(raw := dict(path)):
-                raise ValueError(other)
-            case = dataclasses.replace(machine_from(raw), text=text_of(raw))  # `check` and `map` read the text
-            texts = unresolved(case.cases)
-        else:
-            require_file("path", path, f"{FILE}, or a dict of tables")
-            case = read_any(path)
-            if isinstance(case, Case):
-                raise ValueError(one_line(f"{path}: {other}"))
-            texts = warnings_of_machine(case, path)
+        case = read_by(parse, path)
+        texts = unresolved(case.cases) if isinstance(path, Mapping) else warnings_of_machine(case, path)
     for text in texts:
         warnings.warn(text, stacklevel=2)
     return case

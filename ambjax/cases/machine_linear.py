@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.cases.controller_file import contents_of
+from ambjax.cases.controller_file import controller_file
 from ambjax.cases.reader import Case
 from ambjax.cases.rotor_tables import MODES, RIGID
 from ambjax.cases.speed_table import listed_speeds
@@ -49,7 +49,7 @@ def linear(top: Table, cases: list[Case], folder: pathlib.Path) -> StateSpaceLaw
     if output == OUTPUTS[1] and any(case.scenario.drive == "current" for case in cases):
         raise ValueError(f'{table.at("output")} = "voltage": amplifiers with actuator.mode = "current" take currents.')
     convert = lambda A, B, C, D, dt=0.0: several((A, B, C, D), dt, c)  # noqa: E731
-    matrices, steady, dt = contents_of(table, folder, convert)[2]
+    matrices, steady, dt = controller_file(table, folder, convert).contents
     period = float(cases[0].clock.sample_period) if cases[0].cascade.sampled else None
     if dt and (period is None or not abs(period / dt - 1) < SAME_PERIOD):
         has = "in continuous time" if period is None else f"with a sample period of {period:g} s"

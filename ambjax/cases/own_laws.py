@@ -2,10 +2,9 @@
 
 import dataclasses
 import difflib
-import os
 import pathlib
 import types
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -41,7 +40,7 @@ class OwnLaw(NamedTuple):
 
     def __str__(self) -> str:
         source = self.kind.rpartition(":")[0] if self.file is None else self.file
-        return f"{_key(self.stage)}: imported {self.law.__name__} from {source}"
+        return f"{key_of(self.stage)}: imported {self.law.__name__} from {source}"
 
 
 def is_own(kind: object) -> bool:
@@ -73,10 +72,11 @@ def tried(law: OwnLaw, trial: Callable[[], T]) -> T:
         return trial()
     except Exception as error:
         why = f"{law.law.__name__} {reason(error, law.file)}."
-        raise ValueError(f"{_key(law.stage)} = {show(law.kind)}: {why}") from error
+        raise ValueError(f"{key_of(law.stage)} = {show(law.kind)}: {why}") from error
 
 
-def _key(stage: str) -> str:
+def key_of(stage: str) -> str:
+    """Return the dotted path of the key that names the law of a stage."""
     return f"controller.{stage}.kind" if stage else "controller.kind"
 
 
@@ -86,7 +86,7 @@ def _imported(stage: str, kind: str, folder: pathlib.Path, base: type[Law] | typ
     file = (folder / source).resolve() if source.endswith(".py") else None
 
     def refuse(why: str) -> ValueError:
-        return ValueError(f"{_key(stage)} = {show(kind)}: {why}")
+        return ValueError(f"{key_of(stage)} = {show(kind)}: {why}")
 
     if not source or not name.isidentifier():
         raise refuse(f"write {FORM}.")
@@ -95,27 +95,6 @@ def _imported(stage: str, kind: str, folder: pathlib.Path, base: type[Law] | typ
     if file is not None:
         pickle_with_source(found)
     return OwnLaw(stage, kind, found, file, digest_of(found))
-
-
-def relocated(laws: Iterable[OwnLaw], out: pathlib.Path) -> dict[str, str]:
-    """Return the value of the key `kind` of each law for a case file in the folder `out`, by dotted path."""
-    kinds = {}
-    for law in laws:
-        kind, file = law.kind, law.file
-        if file is not None:
-            kind = f"{path_from(kind.rpartition(':')[0], file, out)}:{law.law.__name__}"
-        kinds[_key(law.stage)] = kind
-    return kinds
-
-
-def path_from(written: str, file: pathlib.Path, folder: pathlib.Path) -> str:
-    """Return the path of `file` for a case file in `folder`: `written` if it leads there, else a new one."""
-    if (folder / written).resolve() == file:
-        return written
-    try:
-        return pathlib.Path(os.path.relpath(file, folder.resolve())).as_posix()
-    except ValueError:  # another drive of Windows
-        return file.as_posix()
 
 
 def _module(source: str, file: pathlib.Path | None, refuse: Refuse) -> types.ModuleType:
@@ -172,4 +151,4 @@ def _check_record(found: type, name: str, stage: str, refuse: Refuse) -> None:
         if not (field.metadata.get("leaf") or field.metadata.get("static")):
             raise refuse(f"{name}.{field.name}: declare it by gain(...), leaf(...) or static(...) of ambjax.extend.")
         if field.name == "kind":
-            raise refuse(f"{name}.kind: the key kind of [{_key(stage)[:-5]}] selects the law. Choose another name.")
+            raise refuse(f"{name}.kind: the key kind of [{key_of(stage)[:-5]}] selects the law. Choose another name.")

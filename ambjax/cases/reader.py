@@ -12,13 +12,19 @@ import numpy as np
 
 from ambjax.cases.case_table import case_table, parts_of
 from ambjax.cases.controller_file import ControllerFile
-from ambjax.cases.controller_tables import KINDS, Files, cascade_from, processor_from
-from ambjax.cases.notch_table import notch_from, with_gains_of_notch
+from ambjax.cases.controller_tables import (
+    KINDS,
+    Files,
+    cascade_from,
+    notch_from,
+    processor_from,
+    with_gains_of_notch,
+)
 from ambjax.cases.own_laws import OwnLaw
 from ambjax.cases.reach import check_reference
 from ambjax.cases.recordings import RecordedFile, Recordings
 from ambjax.cases.scenario_tables import check_start, scenario_from
-from ambjax.cases.table import Table, check_depth, cut, load, put, require_file
+from ambjax.cases.table import FILE, Table, check_depth, cut, load, put, require_file, text_of
 from ambjax.cases.timing import clock_from
 from ambjax.cases.variation import spread_from
 from ambjax.control.cascade import Cascade
@@ -126,17 +132,22 @@ def _unflatten(facts: _Facts, parts: Iterable[object]) -> Case:
 jax.tree_util.register_pytree_with_keys(Case, _flatten, _unflatten)
 
 
-def read_case(path: str | pathlib.Path) -> Case:
-    """Read and check the case file at `path`, and return the case.
+def read_case(path: str | pathlib.Path | Mapping[str, Any]) -> Case:
+    """Read and check the case file at `path`, or a dict of tables, and return the case.
 
-    Raises ValueError, one line, if `path` is not a path, if the file cannot be read, or if any part of it is invalid.
+    Raises ValueError, one line, if `path` is neither, if the file cannot be read, or if any part of it is invalid.
     """
     return read_by(case_from, path)
 
 
-def read_by(parse: Callable[[dict[str, Any], str, str, pathlib.Path], T], path: str | pathlib.Path) -> T:
-    """Return parse(tables, name, text, folder) of the case file at `path`. Raises ValueError as `read_case` does."""
-    require_file("path", path)
+def read_by(parse: Callable[..., T], path: str | pathlib.Path | Mapping[str, Any]) -> T:
+    """Return parse(tables, name, text, folder) of the case file at `path`, or parse(tables) with the text of a dict.
+
+    Raises ValueError as `read_case` does.
+    """
+    if isinstance(path, Mapping):
+        return dataclasses.replace(parse(dict(path)), text=text_of(path))  # pyright: ignore[reportArgumentType]
+    require_file("path", path, f"{FILE}, or a dict of tables")
     path = pathlib.Path(path)
     raw, text = load(path)
     try:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ambjax.cases.own_laws import path_from
 from ambjax.cases.table import Table, quoted, show
 from ambjax.world.recorded import Recorded, Samples
 
@@ -70,11 +69,6 @@ class Recordings:
             raise refuse(f"{why}.") from None
         except ValueError as error:
             raise refuse(f"{error}") from None
-
-
-def relocated_files(files: Iterable[RecordedFile], out: pathlib.Path) -> dict[str, str]:
-    """Return the paths, by dotted key, by which a case file in the folder `out` must name these files."""
-    return {one.key: path_from(one.written, one.file, out) for one in files}
 
 
 def _columns(table: Table) -> tuple[str, str] | None:

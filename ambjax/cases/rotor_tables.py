@@ -18,14 +18,16 @@ from ambjax.cases.rotor_body import (
     MODES,
     PLACE,
     RotorBody,
+    base_from,
     dampings_of,
+    load_from,
     needed,
     row,
     tables_of,
+    unbalance_from,
     vector,
 )
 from ambjax.cases.rotor_file import body_of_file
-from ambjax.cases.rotor_loads import base_from, load_from, unbalance_from
 from ambjax.cases.speed_table import speed_of
 from ambjax.cases.table import Table, show
 from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly, precision

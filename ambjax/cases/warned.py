@@ -14,7 +14,6 @@ from ambjax.cases import reader
 from ambjax.cases.plausibility import implausible
 from ambjax.cases.reach import reach, widest
 from ambjax.cases.reader import Case
-from ambjax.cases.table import FILE, require_file, text_of
 from ambjax.text.words import one_line
 from ambjax.world.scenario import Scenario
 
@@ -35,13 +34,8 @@ def read_case(path: str | pathlib.Path | Mapping[str, Any]) -> Case:
         case = ambjax.read_case("my.toml")
     """
     with jax.ensure_compile_time_eval():
-        if isinstance(path, Mapping):
-            case = dataclasses.replace(reader.case_from(dict(path)), text=text_of(path))
-            texts = warnings_of(case)
-        else:
-            require_file("path", path, f"{FILE}, or a dict of tables")
-            case = reader.read_case(path)
-            texts = warnings_of_file(case, path)
+        case = reader.read_case(path)
+        texts = warnings_of(case) if isinstance(path, Mapping) else warnings_of_file(case, path)
     for text in texts:
         warnings.warn(text, stacklevel=2)
     return case

@@ -5,9 +5,8 @@ import re
 import tomllib
 from collections.abc import Mapping
 
-from ambjax.cases.edited import with_numbers
 from ambjax.cases.reader import Case, case_from
-from ambjax.results.case_file import files_from
+from ambjax.results.case_file import files_from, with_numbers
 
 FIRST = "Tuned by ambjax tune from the case"
 AUTO = "auto"
