@@ -62,12 +62,6 @@ def _shown(value: Any) -> str:
     return f"{float(value):g}" if np.ndim(value) == 0 else f"[{', '.join(map(_shown, value))}]"
 
 
-def case_table(name: str, parts: dict[str, str], spread: tuple[str, ...]) -> str:
-    """Return an HTML table of the parts of a case called `name`. `spread`: paths of the quantities of its spread."""
-    shown = parts | ({"spread": ", ".join(spread)} if spread else {})
-    return notebook_table(name, ("part", "numbers"), shown.items())
-
-
 def notebook_table(caption: str, titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return an HTML table of escaped texts. Without rows, it has its caption only."""
     cells = lambda row, kind: "".join(f"<{kind}>{html.escape(x)}</{kind}>" for x in row)  # noqa: E731

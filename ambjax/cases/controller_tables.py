@@ -5,7 +5,7 @@ import pathlib
 from typing import Any, NamedTuple
 
 from ambjax.cases.controller_file import ControllerFile, controller_file
-from ambjax.cases.own_laws import FORM, OwnLaw, is_own, own_law
+from ambjax.cases.own_laws import FORM, OwnLaw, is_own, own_law_of
 from ambjax.cases.scenario_tables import drive
 from ambjax.cases.table import Table, quoted, show
 from ambjax.control import current, inversion, observer, position
@@ -109,7 +109,7 @@ def cascade_from(
         law = table.table(stage)
         if is_own(law.raw.get("kind")):
             found = [one for one in files.own if one.stage == stage]
-            own += found or [own_law(stage, law.raw["kind"], files.folder, model)]
+            own += found or [own_law_of(stage, law.raw["kind"], files.folder, model)]
             kind = own[-1].law
         else:
             kind = kinds[law.choice("kind", list(kinds), _usual(kinds, laws.get("position"), command), FORM)]

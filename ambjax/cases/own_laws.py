@@ -5,7 +5,7 @@ import difflib
 import pathlib
 import types
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 
@@ -48,22 +48,29 @@ def is_own(kind: object) -> bool:
     return isinstance(kind, str) and ":" in kind
 
 
-def own_law(stage: str, kind: str, folder: pathlib.Path, model: Plant) -> OwnLaw:
-    """Import the law that `kind` names; a path is relative to `folder`, that of the case file.
+def own_law_of(stage: str, kind: str, folder: pathlib.Path, model: Plant | None = None) -> OwnLaw:
+    """Import the law that `kind` names, a subclass of that of its stage which is a record.
 
+    `folder`: that of the case file, to which a path is relative. `model`: with which the law is tried; None: it is not.
     Raises ValueError, with the dotted path, the value and the reason, if there is no such class, if the import fails,
     if the class is not a law of this stage, or if it cannot be called with `model`.
     """
-    found = _imported(stage, kind, folder, STAGES[stage])
-    law = found.law()
-    assert isinstance(law, Law)
-    tried(found, lambda: try_law(law, stage, model))
+    source, _, name = kind.rpartition(":")
+    file = (folder / source).resolve() if source.endswith(".py") else None
+
+    def refuse(why: str) -> ValueError:
+        return ValueError(f"{key_of(stage)} = {show(kind)}: {why}")
+
+    if not source or not name.isidentifier():
+        raise refuse(f"write {FORM}.")
+    kind_of_law = _class(_module(source, file, refuse), name, source, STAGES.get(stage, MachineLaw), refuse)
+    law = _checked(kind_of_law, name, stage, refuse)
+    if file is not None:
+        pickle_with_source(kind_of_law)
+    found = OwnLaw(stage, kind, kind_of_law, file, digest_of(kind_of_law))
+    if model is not None:
+        tried(found, lambda: try_law(law, stage, model))
     return found
-
-
-def own_machine_law(kind: str, folder: pathlib.Path) -> OwnLaw:
-    """Import the law of a whole machine that `kind` names, as `own_law`; its methods are not called."""
-    return _imported("", kind, folder, MachineLaw)
 
 
 def tried(law: OwnLaw, trial: Callable[[], T]) -> T:
@@ -78,23 +85,6 @@ def tried(law: OwnLaw, trial: Callable[[], T]) -> T:
 def key_of(stage: str) -> str:
     """Return the dotted path of the key that names the law of a stage."""
     return f"controller.{stage}.kind" if stage else "controller.kind"
-
-
-def _imported(stage: str, kind: str, folder: pathlib.Path, base: type[Law] | type[MachineLaw]) -> OwnLaw:
-    """Import a subclass of `base` that is a record."""
-    source, _, name = kind.rpartition(":")
-    file = (folder / source).resolve() if source.endswith(".py") else None
-
-    def refuse(why: str) -> ValueError:
-        return ValueError(f"{key_of(stage)} = {show(kind)}: {why}")
-
-    if not source or not name.isidentifier():
-        raise refuse(f"write {FORM}.")
-    found = _class(_module(source, file, refuse), name, source, base, refuse)
-    _check_record(found, name, stage, refuse)
-    if file is not None:
-        pickle_with_source(found)
-    return OwnLaw(stage, kind, found, file, digest_of(found))
 
 
 def _module(source: str, file: pathlib.Path | None, refuse: Refuse) -> types.ModuleType:
@@ -134,8 +124,8 @@ def _named(base: type) -> str:
     return f"ambjax.extend.{base.__name__}"
 
 
-def _check_record(found: type, name: str, stage: str, refuse: Refuse) -> None:
-    """Raise ValueError unless the class is a record that defines every method."""
+def _checked(found: type, name: str, stage: str, refuse: Refuse) -> Any:
+    """Return the law with its defaults. Raises ValueError unless the class is a record that defines every method."""
     try:
         law = found()
     except TypeError as error:  # abstract methods, or fields without a default
@@ -152,3 +142,4 @@ def _check_record(found: type, name: str, stage: str, refuse: Refuse) -> None:
             raise refuse(f"{name}.{field.name}: declare it by gain(...), leaf(...) or static(...) of ambjax.extend.")
         if field.name == "kind":
             raise refuse(f"{name}.kind: the key kind of [{key_of(stage)[:-5]}] selects the law. Choose another name.")
+    return law

@@ -1,6 +1,7 @@
 """Reader of case files: from TOML to a cascade, a scenario and a clock."""
 
 import dataclasses
+import operator
 import pathlib
 import re
 import tomllib
@@ -10,7 +11,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from ambjax.cases.case_table import case_table, parts_of
+from ambjax.cases.case_table import notebook_table, parts_of
 from ambjax.cases.controller_file import ControllerFile
 from ambjax.cases.controller_tables import (
     KINDS,
@@ -102,30 +103,29 @@ class Case:
 
     def _repr_html_(self) -> str:
         """Return the table of the parts of the case and their numbers, for notebooks."""
-        return case_table(self.name, parts_of(self.cascade, self.scenario, self.clock), self.spread.paths)
+        parts = parts_of(self.cascade, self.scenario, self.clock)
+        parts |= {"spread": ", ".join(self.spread.paths)} if self.spread.paths else {}
+        return notebook_table(self.name, ("part", "numbers"), parts.items())
 
 
-class _Facts(tuple[Any, ...]):
+class _Facts(dict[str, Any]):
     """The other fields of a case. Two are equal if each field is the same object: arrays have no hash."""
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Facts) and all(a is b for a, b in zip(self, other, strict=True))
+        return isinstance(other, _Facts) and all(map(operator.is_, self.values(), other.values()))
 
-    def __hash__(self) -> int:
-        return hash(tuple(map(id, self)))
+    def __hash__(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return hash(tuple(map(id, self.values())))
 
 
-def _flatten(case: Case) -> tuple[tuple[tuple[Hashable, object], ...], _Facts]:
-    """Return the parts of a case as a pytree, and its other fields."""
-    fields = [field.name for field in dataclasses.fields(Case)]
-    parts = tuple((jax.tree_util.GetAttrKey(name), getattr(case, name)) for name in PARTS)
-    return parts, _Facts(getattr(case, name) for name in fields if name not in PARTS)
+def _flatten(case: Case) -> tuple[list[tuple[Hashable, object]], _Facts]:
+    facts = _Facts(vars(case))
+    return [(jax.tree_util.GetAttrKey(name), facts.pop(name)) for name in PARTS], facts
 
 
 def _unflatten(facts: _Facts, parts: Iterable[object]) -> Case:
-    """Return a case without the checks of the constructor: JAX puts other things than numbers into a tree."""
-    case, fields = object.__new__(Case), [field.name for field in dataclasses.fields(Case)]
-    case.__dict__.update(zip([*PARTS, *(name for name in fields if name not in PARTS)], (*parts, *facts), strict=True))
+    case = object.__new__(Case)  # without the checks: JAX puts other things than numbers into a tree
+    case.__dict__.update(facts, **dict(zip(PARTS, parts, strict=True)))
     return case
 
 
@@ -245,7 +245,7 @@ def cascade_at(case: Case, period: float, changes: Mapping[str, float]) -> Casca
     """
     raw, known = tomllib.loads(case.text), Files(pathlib.Path(), case.own_laws, case.controller_file)
     for path, value in changes.items():
-        put(raw, path, value)
+        put(raw, path.split("."), value)
     top = Table(raw)
     processor = processor_from(top.table("processor")) if "processor" in raw else None
     return cascade_from(top, _plant(top.table("plant")), processor, period if processor else None, known)[0]

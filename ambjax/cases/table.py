@@ -5,7 +5,7 @@ import difflib
 import pathlib
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -104,12 +104,11 @@ def check_depth(raw: object) -> None:
         raise ValueError(f"tables or lists are nested deeper than {DEEPEST} levels. Use fewer.")
 
 
-def put(raw: dict[str, Any], path: str, value: object) -> None:
-    """Set the value at a dotted path of a parsed TOML document, whose tables are made as needed."""
-    *stems, key = path.split(".")
-    for stem in stems:
-        raw = raw.setdefault(stem, {})
-    raw[key] = value
+def put(raw: Any, words: Sequence[str | int], value: object) -> None:
+    """Set the value at the words of a path of a parsed TOML document, whose tables are made as needed."""
+    for word in words[:-1]:
+        raw = raw[int(word)] if isinstance(raw, list) else raw.setdefault(word, {})
+    raw[words[-1]] = value
 
 
 class Table:

@@ -17,7 +17,7 @@ from ambjax.cases.controller_file import KEY
 from ambjax.cases.machine_case import AnyCase, MachineCase, machine_from
 from ambjax.cases.own_laws import key_of
 from ambjax.cases.reader import Case, is_as_written
-from ambjax.cases.table import file_to_write
+from ambjax.cases.table import file_to_write, put
 from ambjax.ensemble.paths import places
 
 # Numbers of a controller that are no gains, or follow from them.
@@ -85,12 +85,13 @@ def with_numbers(text: str, gains: Mapping[str, float | str]) -> str:
     way.
     """
     try:
-        document = tomlkit.parse(text)
+        document, wanted = tomlkit.parse(text), tomllib.loads(text)
         for path, value in gains.items():
             *tables, name = _words(path)
             _put(_table(document, tables), name, value if isinstance(value, str) else float(value))
+            put(wanted, [*tables, name], value)
         body = tomlkit.dumps(document)
-        if tomllib.loads(body) != _wanted(text, gains):
+        if tomllib.loads(body) != wanted:
             raise ValueError("what is written would be another case")
     except (TOMLKitError, ValueError, TypeError, KeyError) as why:
         raise ValueError(f"gains cannot be written into it ({why}). Give each law a table [controller.STAGE].") from why
@@ -104,18 +105,6 @@ def _words(path: str) -> list[Any]:
     """
     *words, last = path.replace("[", ".").replace("]", "").split(".")
     return [*words, "values", int(last)] if last.isdigit() else [*words, last]
-
-
-def _wanted(text: str, gains: Mapping[str, float | str]) -> dict[str, Any]:
-    """Return the data that the changed text must parse to."""
-    document = tomllib.loads(text)
-    for path, value in gains.items():
-        table: Any = document
-        *tables, name = _words(path)
-        for word in tables:
-            table = table[int(word)] if isinstance(table, list) else table.setdefault(word, {})
-        table[name] = value
-    return document
 
 
 def _table(table: Any, path: list[str]) -> Any:
