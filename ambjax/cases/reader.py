@@ -13,17 +13,10 @@ import numpy as np
 
 from ambjax.cases.case_table import notebook_table, parts_of
 from ambjax.cases.controller_file import ControllerFile
-from ambjax.cases.controller_tables import (
-    KINDS,
-    Files,
-    cascade_from,
-    notch_from,
-    processor_from,
-    with_gains_of_notch,
-)
+from ambjax.cases.controller_tables import KINDS, cascade_from, notch_from, with_gains_of_notch
 from ambjax.cases.own_laws import OwnLaw
 from ambjax.cases.reach import check_reference
-from ambjax.cases.recordings import RecordedFile, Recordings
+from ambjax.cases.recordings import CaseFiles, RecordedFile
 from ambjax.cases.scenario_tables import check_start, scenario_from
 from ambjax.cases.table import FILE, Table, check_depth, cut, load, put, require_file, text_of
 from ambjax.cases.timing import clock_from
@@ -32,6 +25,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import Spread, corners, ends
 from ambjax.linear.analysis import Zones
 from ambjax.numerics.declared import require_number
+from ambjax.numerics.records import leaves_of
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import settled
@@ -188,13 +182,10 @@ def case_from(
         )
     top.only([*TABLES, *OTHERS])
     plant = _plant(top.table("plant"))
-    processor = processor_from(top.table("processor")) if "processor" in top.raw else None
     clock, duration = clock_from(top.table("clock"))
-    period = clock.sample_period if processor else None
-    files = Files(folder, known.own_laws if known else (), known.controller_file if known else None)
-    cascade, own, matrices = cascade_from(top, plant, processor, period, files)
-    recordings = Recordings(folder, known.recorded if known else ())
-    scenario, settle = scenario_from(top, plant, recordings)
+    files = CaseFiles(folder, known)
+    cascade = cascade_from(top, plant, clock.sample_period, files)
+    scenario, settle = scenario_from(top, plant, files)
     check_parts(cascade, scenario, clock.sample_period)
     if isinstance(clock.method, Slide) and scenario.stop is not None:
         raise ValueError('clock.method = "sliding": it does not resolve run.stop_stiffness. Use method = "adaptive".')
@@ -218,8 +209,8 @@ def case_from(
     assumed = _left_out(top.table("plant"), plant)
     zones = top.table("sensitivity").record(Zones)
     zones.check(clock.sample_period if cascade.sampled else None)
-    read = tuple(recordings.read)
-    return Case(safe_name(name), cascade, scenario, clock, settle, spread, text, assumed, own, matrices, zones, read)
+    own, recorded, name = tuple(files.own_laws), tuple(files.recorded), safe_name(name)
+    return Case(name, cascade, scenario, clock, settle, spread, text, assumed, own, files.controller, zones, recorded)
 
 
 def is_as_written(case: Case) -> bool:
@@ -243,12 +234,11 @@ def cascade_at(case: Case, period: float, changes: Mapping[str, float]) -> Casca
 
     `period`: sample period, s. `changes`: numbers of controller and processor by dotted path.
     """
-    raw, known = tomllib.loads(case.text), Files(pathlib.Path(), case.own_laws, case.controller_file)
+    raw = tomllib.loads(case.text)
     for path, value in changes.items():
         put(raw, path.split("."), value)
     top = Table(raw)
-    processor = processor_from(top.table("processor")) if "processor" in raw else None
-    return cascade_from(top, _plant(top.table("plant")), processor, period if processor else None, known)[0]
+    return cascade_from(top, _plant(top.table("plant")), period, CaseFiles(known=case))
 
 
 def _plant(table: Table) -> Bearing:
@@ -261,6 +251,6 @@ def _plant(table: Table) -> Bearing:
 
 def _left_out(table: Table, plant: Bearing) -> tuple[str, ...]:
     """Return the names of the plant's parameters that its table omits; none if the table gives no number at all."""
-    names = [field.name for field in dataclasses.fields(plant) if field.metadata.get("leaf")]
+    names = [field.name for field in leaves_of(type(plant))]
     left = tuple(name for name in names if name not in table.raw)
     return left if len(left) < len(names) else ()

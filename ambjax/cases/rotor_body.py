@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.cases.recordings import Recordings
+from ambjax.cases.recordings import CaseFiles
 from ambjax.cases.scenario_tables import signal_from
 from ambjax.cases.table import Table, show
 from ambjax.numerics.records import leaf
@@ -118,28 +118,28 @@ def unbalance_from(table: Table, body: RotorBody, graded: int) -> RotorUnbalance
     return RotorUnbalance(amount, x, y, table.leaf("phase", PHASE, 0.0), graded="grade" in table.raw)
 
 
-def load_from(table: Table, body: RotorBody, recordings: Recordings) -> RotorLoad:
+def load_from(table: Table, body: RotorBody, files: CaseFiles) -> RotorLoad:
     """Return a load on the rotor."""
     own = ("at", *(["modes"] if body.shapes is None else []))
     at, shapes = body.place(table)
-    signal, direction = _directed(table, "N", recordings, own)
+    signal, direction = _directed(table, "N", files, own)
     return RotorLoad(signal, jnp.asarray(row(at, direction, shapes)))
 
 
-def base_from(table: Table, n: int, recordings: Recordings) -> BaseMotion:
+def base_from(table: Table, n: int, files: CaseFiles) -> BaseMotion:
     """Return a motion of the stator. `n`: number of coordinates of the rotor."""
-    signal, direction = _directed(table, "m/s^2", recordings)
+    signal, direction = _directed(table, "m/s^2", files)
     return BaseMotion(signal, jnp.concatenate([direction, jnp.zeros(n - 3)]))
 
 
-def _directed(table: Table, unit: str, recordings: Recordings, own: tuple[str, ...] = ()) -> tuple[Signal, np.ndarray]:
+def _directed(table: Table, unit: str, files: CaseFiles, own: tuple[str, ...] = ()) -> tuple[Signal, np.ndarray]:
     """Return the signal of a table and the unit vector of its `direction`. `own`: keys that are not the signal's."""
     direction = vector(table, "direction", 3)
     size = float(np.linalg.norm(direction))
     if size == 0:
         raise ValueError(f"{table.at('direction')} = {show(table.raw['direction'])}: it must not be zero.")
     rest = Table({key: value for key, value in table.raw.items() if key not in ("direction", *own)}, table.path)
-    signal = signal_from(rest, unit, recordings)
+    signal = signal_from(rest, unit, files)
     if _turns(signal):
         raise ValueError(f"{table.path}: an unbalance turns with the rotor. Give it as [[unbalance]].")
     return signal, direction / size

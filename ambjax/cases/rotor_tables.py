@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.cases.recordings import Recordings
+from ambjax.cases.recordings import CaseFiles
 from ambjax.cases.rotor_body import (
     DAMPING,
     FREQUENCY,
@@ -295,8 +295,8 @@ def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pat
         acceleration=turning.acceleration,
         changes=turning.changes,
         unbalances=tuple(unbalance_from(one, body, graded) for one in unbalances),
-        loads=tuple(load_from(one, body, Recordings(folder, ())) for one in tables_of(top, "load")),
-        base=tuple(base_from(one, n, Recordings(folder, ())) for one in tables_of(top, "base")),
+        loads=tuple(load_from(one, body, CaseFiles(folder)) for one in tables_of(top, "load")),
+        base=tuple(base_from(one, n, CaseFiles(folder)) for one in tables_of(top, "base")),
     )
 
 

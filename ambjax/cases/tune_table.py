@@ -11,6 +11,8 @@ RISKS = ("mean", "cvar")
 OBJECTIVES = ("knee", "least_error")
 # Default limit of the rms voltage, as a share of actuator.u_max.
 VOLTAGE_SHARE = 0.6
+# Default share of the held-out members that must survive.
+SURVIVING = 1.0
 # Default band of the settling time, as a share of the clearance.
 SETTLING_BAND = 0.01
 # Default margins of limits. MEAN_MARGIN, WORST_MARGIN: for means over members, and for worst members; each is the
@@ -45,7 +47,7 @@ WEIGHTS: dict[str, dataclasses.Field] = {
     "clearance": _weight(1e-3, "closeness to the stop"),
     "survival": _weight(1.0, "loss of the rotor; it counts more if it is earlier"),
 }
-SURVIVAL: dataclasses.Field = leaf(1.0, above=0, at_most=1, doc="share of the held-out members that must survive")
+SURVIVAL: dataclasses.Field = leaf(SURVIVING, above=0, at_most=1, doc="share of the held-out members that must survive")
 # Largest whole numbers. MOST_MEMBERS, for members and starting points, is smaller, because all of them are in memory
 # at once.
 MOST_WHOLE, MOST_MEMBERS = 2**31 - 1, 2**20

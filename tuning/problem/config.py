@@ -16,6 +16,7 @@ from ambjax.cases.tune_table import (
     RISKS,
     SETTLING_BAND,
     SURVIVAL,
+    SURVIVING,
     VOLTAGE_SHARE,
     WEIGHTS,
     Budget,
@@ -58,7 +59,7 @@ class LimitSettings:
     """
 
     each: tuple[Limit, ...] = ()
-    survival: float = SURVIVAL.default
+    survival: float = SURVIVING
     band: float = 0.0
     unbreakable: tuple[tuple[Limit, str], ...] = ()
 
@@ -193,7 +194,7 @@ def _limits(table: Table, case: Case) -> LimitSettings:
     bounds = {name: bound for name, bound in bounds_of(case).items() if thresholds.get(name, 0.0) >= bound.most}
     return LimitSettings(
         tuple(limit for limit in each if limit.name not in bounds),
-        table.leaf("survival", SURVIVAL, SURVIVAL.default),
+        table.leaf("survival", SURVIVAL, SURVIVING),
         band,
         tuple((limit, bounds[limit.name].why) for limit in each if limit.name in bounds),
     )
