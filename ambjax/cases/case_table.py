@@ -38,7 +38,6 @@ def parts_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> dict[str, st
 
 
 def _described(part: object) -> str:
-    """Return the type of a record and its numbers."""
     return ": ".join(filter(None, (type(part).__name__, _numbers_of(part))))
 
 
@@ -58,7 +57,6 @@ def _numbers_of(part: object) -> str:
 
 
 def _shown(value: Any) -> str:
-    """Return a number or an array as a case file writes it."""
     return f"{float(value):g}" if np.ndim(value) == 0 else f"[{', '.join(map(_shown, value))}]"
 
 

@@ -26,36 +26,39 @@ class ControllerFile(NamedTuple):
     contents: Any
 
 
+def contents_of(table: Table, folder: pathlib.Path, convert: Callable[[dict[str, np.ndarray]], Any]) -> ControllerFile:
+    """Read the .npz or .mat file that the key `file` names. Its contents are convert(arrays)."""
+    written = table.raw["file"]
+    if not isinstance(written, str) or not written.endswith(ENDINGS):
+        raise ValueError(f"{table.at('file')} = {show(written)}: it must be the path of an .npz or .mat file.")
+    path = (folder / written).resolve()
+    try:
+        arrays = npz_arrays(path) if path.suffix == ".npz" else _of_mat(path)
+        return ControllerFile(written, path, convert(arrays))
+    except (OSError, ValueError) as error:
+        why = str(error)
+        if isinstance(error, OSError):
+            unread = error.strerror or "is it a file?"
+            why = f"{path} cannot be read ({unread}). A path is relative to the folder of the case file."
+        raise ValueError(f"{table.at('file')} = {show(written)}: {why}") from None
+
+
 def controller_file(table: Table, folder: pathlib.Path, convert: Callable[..., Any] = realisation) -> ControllerFile:
     """Read the controller that the key `file` names. Its contents are convert(A, B, C, D, dt) of its arrays.
 
     A relative path starts at `folder`, that of the case file. Raises ValueError, one line, if the key is missing or the
     file does not contain a controller. The message gives the dotted path and, if known, the file and the array.
     """
-    written = table.raw.get("file")
-    if written is None:
-        raise ValueError(f"{table.at('file')} is missing: give the path of an .npz or .mat file with {NEEDED}.")
-    if not isinstance(written, str) or not written.endswith(ENDINGS):
-        raise ValueError(f"{table.at('file')} = {show(written)}: it must be the path of an .npz or .mat file.")
-    path = (folder / written).resolve()
-    try:
-        arrays = arrays_of(path)
+
+    def matrices(arrays: dict[str, np.ndarray]) -> Any:
         if missing := [name for name in NAMES if name not in arrays]:
             found = ", ".join(name for name in arrays if not name.startswith("_")) or "none"
             raise ValueError(f"the array {missing[0]} is missing. The file must contain {NEEDED}; it has {found}.")
-        contents = convert(**{name: arrays[name] for name in (*NAMES, OPTIONAL) if name in arrays})
-    except ValueError as error:
-        raise ValueError(f"{table.at('file')} = {show(written)}: {error}") from None
-    return ControllerFile(written, path, contents)
+        return convert(**{name: arrays[name] for name in (*NAMES, OPTIONAL) if name in arrays})
 
-
-def arrays_of(path: pathlib.Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an .npz or .mat file. Raises ValueError if it cannot be read."""
-    try:
-        return npz_arrays(path) if path.suffix == ".npz" else _of_mat(path)
-    except OSError as error:
-        why = error.strerror or "is it a file?"
-        raise ValueError(f"{path} cannot be read ({why}). A path is relative to the folder of the case file.") from None
+    if "file" not in table.raw:
+        raise ValueError(f"{table.at('file')} is missing: give the path of an .npz or .mat file with {NEEDED}.")
+    return contents_of(table, folder, matrices)
 
 
 def _of_mat(path: pathlib.Path) -> dict[str, np.ndarray]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.controller_tables import KINDS
-from ambjax.cases.machine_linear import linear, lqg
+from ambjax.cases.machine_linear import linear, lqg, numbers
 from ambjax.cases.own_laws import FORM, OwnLaw, is_own, tried
 from ambjax.cases.reader import Case
 from ambjax.cases.rotor_tables import COORDINATES, RIGID
@@ -133,16 +133,14 @@ def rigid_body(
     B, C, M, G = (np.asarray(x, float) for x in (rotor.at_magnets, rotor.at_sensors, rotor.M, rotor.G))
     held = [k for k in range(RIGID) if np.any(B[:, k])]
     B, C, M = B[:, held], C[:, held], np.diag(M)[held]
-    models = [case.cascade.model for case in cases]
-    kappa, s_0, i_0, m, g = (
-        np.array([float(getattr(model, name)) for model in models]) for name in ("kappa", "s_0", "i_0", "m", "g")
-    )
+    model = cases[0].cascade.model
+    kappa, s_0, i_0, m, g = (numbers(cases, name) for name in ("kappa", "s_0", "i_0", "m", "g"))
     weight = np.asarray(rotor.gravity, float)[held] / M
     parts = []
     for number, k in enumerate(held):
-        plant = nominal(models[0], B[:, number], kappa, s_0, i_0)
-        numbers = {name: float(getattr(models[0], name)) for name in ("mu_0", "n", "R")}
-        given = numbers | plant | {"m": float(M[number]), "k_z": 0.0, "g": float(-weight[number])}
+        plant = nominal(model, B[:, number], kappa, s_0, i_0)
+        same = {name: float(getattr(model, name)) for name in ("mu_0", "n", "R")}
+        given = same | plant | {"m": float(M[number]), "k_z": 0.0, "g": float(-weight[number])}
         parts.append(_coordinate(top, COORDINATES[k], given, read))
     systems = [prepare(part.cascade, part.scenario, part.clock)[0] for part in parts]
     laws = [canonical((one.loop if isinstance(one, Sampled) else one).cascade) for one in systems]

@@ -88,7 +88,6 @@ def key_of(stage: str) -> str:
 
 
 def _module(source: str, file: pathlib.Path | None, refuse: Refuse) -> types.ModuleType:
-    """Import a file or an installed module."""
     try:
         return module_of_name(source) if file is None else module_of_file(file)
     except OSError as error:

@@ -51,8 +51,6 @@ class CaseFiles:
         return Recorded(self.recorded[-1].samples, held, scale, start)
 
     def _opened(self, key: str, written: object, columns: tuple[str, str] | None) -> RecordedFile:
-        """Read the file at the path `written`, the value of `key`. Raises ValueError if that fails."""
-
         def refuse(why: str) -> ValueError:
             return ValueError(f"{key} = {show(written)}: {why}")
 

@@ -139,7 +139,6 @@ def _gyroscopic(table: Table, masses: tuple[float, float, float], modes: int) ->
 
 
 def _places(top: Table) -> list[float]:
-    """Return all places on the shaft that the tables name, m."""
     found = [
         one.leaf(key, PLACE)
         for name in ("bearing", "unbalance", "load")

@@ -244,15 +244,11 @@ class Table:
             check_leaf(field, self.at(field.name), values[field.name])
         check_shapes(fields, values, self.path)
         one = kind(**values)
-        self._check_order(one)
-        return one
-
-    def _check_order(self, record: object) -> None:
-        """Raise ValueError if the two leaves that the record orders, such as start and stop, are not in that order."""
-        if pair := getattr(record, "ordered", None):
-            low, high = (getattr(record, name) for name in pair)
+        if pair := getattr(one, "ordered", None):  # such as start and stop
+            low, high = (getattr(one, name) for name in pair)
             if not low < high:
                 raise ValueError(f"{self.at(pair[1])} = {high:g}: it must be more than {pair[0]} = {low:g}.")
+        return one
 
 
 def _unquoted(value: object) -> str:

@@ -125,7 +125,6 @@ def _currents(case: Case) -> Iterator[str]:
 
 
 def _coil_voltage(scenario: Scenario, least: float) -> Iterator[str]:
-    """Yield warnings about the voltage limit of the coils."""
     coil = scenario.actuator.coil
     if coil is None or coil.u_max is None:
         return

@@ -129,7 +129,6 @@ def _table(table: Any, path: list[str]) -> Any:
 
 
 def _append(document: tomlkit.TOMLDocument, path: list[str]) -> None:
-    """Add an empty table at this path at the end of the document."""
     table = tomlkit.table().add(tomlkit.nl())
     for name in reversed(path[1:]):
         table = tomlkit.table(is_super_table=True).add(name, table)

@@ -138,7 +138,6 @@ def study_and_axes(
 
 
 def _places(case: AnyCase) -> dict[str, Place]:
-    """Return the numbers that an axis may vary, by dotted path."""
     return study_of(case, 0, 1).places()
 
 

@@ -26,7 +26,7 @@ from ambjax.linear.notch_design import speeds_of
 from ambjax.linear.stability import Findings, Stability
 from ambjax.numerics.records import canonical
 from ambjax.numerics.shapes import map_varying
-from ambjax.results.machine_run import worst_of
+from ambjax.results.runs import worst_of
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.whole_machine import Machine, PerAxis, stack_axes

@@ -33,7 +33,12 @@ def directory(out: str | None, name: str, names: Iterable[str] = (), force: bool
     one of `names`, without `force`; `check_places` refuses one of `names`.
     """
     path, names = target(out, name), list(names)
-    while out is None and not _make_new(path):  # another run has made it meanwhile
+    while out is None:
+        with _refusal(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with contextlib.suppress(FileExistsError):  # another run has made it meanwhile
+                path.mkdir()
+                break
         path = target(out, name)
     for file in (MANIFEST, RESULT):
         with _refusal(path):
@@ -100,17 +105,6 @@ def target(out: str | None, name: str) -> pathlib.Path:
         return pathlib.Path(out)
     candidates = (pathlib.Path("out") / (name if n == 1 else f"{name}-{n}") for n in itertools.count(1))
     return next(p for p in candidates if not os.path.lexists(p))
-
-
-def _make_new(path: pathlib.Path) -> bool:
-    """Make a new directory. Return False if it exists already. Raises ValueError if it cannot be made."""
-    with _refusal(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            path.mkdir()
-        except FileExistsError:
-            return False
-        return True
 
 
 def make(path: pathlib.Path) -> None:
