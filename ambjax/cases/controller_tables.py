@@ -110,7 +110,9 @@ def cascade_from(top: Table, plant: Bearing, period: Scalar, files: CaseFiles) -
             # the paper's gains of the inner loops belong to its position law
             printed = type(laws["position"]).printed if "position" in laws else kind.printed
             base = _defaults(law, kind, model, sampling, printed)
-            laws[stage] = law_from(_nominal(law, kind, actuator), kind, base)
+            if getattr(kind, "commands", "") == "current" and "bandwidth" in actuator.raw:  # by default, that bandwidth
+                law = Table({"bandwidth": actuator.raw["bandwidth"], **law.raw}, law.path)
+            laws[stage] = law_from(law, kind, base)
     return Cascade(model=model, processor=processor, **laws)
 
 
@@ -142,13 +144,6 @@ def _usual(kinds: dict[str, type[Law]], demanding: Any, command: str) -> str:
         return fitting[0]
     accepting = [kind for kind in fitting if demanding.demand in getattr(kinds[kind], "accepts", (demanding.demand,))]
     return [*accepting, *fitting][0]
-
-
-def _nominal(law: Table, kind: type[Law], actuator: Table) -> Table:
-    """Return the table of a law. The default bandwidth of a law that commands a current is that of the amplifier."""
-    if getattr(kind, "commands", "") != "current" or "bandwidth" not in actuator.raw:
-        return law
-    return Table({"bandwidth": actuator.raw["bandwidth"], **law.raw}, law.path)
 
 
 def _linear(table: Table, files: CaseFiles) -> Law:

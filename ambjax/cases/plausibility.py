@@ -60,6 +60,8 @@ def _ranges(case: Case) -> Iterator[str]:
         value = float(getattr(case.scenario.plant, name))
         if value and not low <= value <= high:
             yield f"plant.{name} = {value:g} {unit}: {usual}. Is it in {slip}?"
+    if (k_z := float(case.scenario.plant.k_z)) > 0:
+        yield f"plant.k_z = {k_z:g} N/m pushes the rotor away from z = 0; a restoring bearing has k_z < 0."
 
 
 def _forces(case: Case) -> Iterator[str]:

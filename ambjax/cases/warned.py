@@ -47,7 +47,7 @@ def warnings_of_file(case: Case, path: str | pathlib.Path) -> list[str]:
 
 def warnings_of(case: Case) -> list[str]:
     """Return one line for each implausible value of a case: its path, the value, the reason and a possible fix."""
-    own = [*_assumed(case), *_stiffness(case), *_noise(case), *_velocity(case), *_currents(case), *_motion(case)]
+    own = [*_assumed(case), *_noise(case), *_velocity(case), *_currents(case), *_motion(case)]
     return [*own, *implausible(case)]
 
 
@@ -58,11 +58,6 @@ def _assumed(case: Case) -> Iterator[str]:
     left = [f"{name} = {getattr(plant, name):g}{unit}" for name, unit in units.items()]
     if left:
         yield f"[plant] omits numbers, which keep the paper's values: {', '.join(left)}. Give those that differ."
-
-
-def _stiffness(case: Case) -> Iterator[str]:
-    if (plant := case.scenario.plant).k_z > 0:
-        yield f"plant.k_z = {plant.k_z:g} N/m pushes the rotor away from z = 0; a restoring bearing has k_z < 0."
 
 
 def _noise(case: Case) -> Iterator[str]:
