@@ -57,6 +57,7 @@ TABLES = [
     "spread",
     "sensitivity",
 ]
+OTHERS = ["tune"]  # read by the tuner, ignored by the other commands
 # A case name appears in titles, paths, tables and pages. UNSAFE: characters that are replaced in it. LONGEST_NAME: its
 # largest length.
 UNSAFE, LONGEST_NAME = re.compile(r"[^\w.+() -]+"), 80
@@ -179,7 +180,7 @@ def case_from(
             "`sensitivity`, `campbell`, `ensemble`, `map`, `compare` and `tune` take machines; in Python, read_machine "
             "does."
         )
-    top.only([*TABLES, "tune"])  # which the tuner reads
+    top.only([*TABLES, *OTHERS])
     plant = _plant(top.table("plant"))
     clock, duration = clock_from(top.table("clock"))
     files = CaseFiles(folder, known)
