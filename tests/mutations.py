@@ -221,7 +221,7 @@ MUTATIONS = [
       '"not decisive" if self.ok is None else ', "",
       "tests/test_export_verify.py::test_a_short_horizon_is_not_decisive"),
     M("an export overwrites files that it did not write", "ambjax/results/outputs.py",
-      "and not _holds(out / name, mark)", "and False",
+      "lexists(out / name) and not marked", "lexists(out / name) and False",
       "tests/test_export.py::test_only_files_of_an_earlier_export_of_the_same_prefix_are_replaced"),
     M("the constructor of a record does not check the ranges of numbers", "ambjax/numerics/records.py",
       "if isinstance(value, (int, float, str, list, tuple, np.number)) or value is None:", "if value is None:",

@@ -27,8 +27,7 @@ from ambjax.linear.linear_machine import machine_sensitivity
 from ambjax.numerics.records import canonical
 from ambjax.page.rotor_motion import motion_of
 from ambjax.pictures.machine_pictures import machine_figure
-from ambjax.results.machine_run import simulate_machine
-from ambjax.results.runs import simulate
+from ambjax.results.runs import simulate, simulate_machine
 from ambjax.simulation.folds import PerAxis, Rms
 from ambjax.simulation.rollout import run
 from ambjax.world.shaft import Section, shaft_model

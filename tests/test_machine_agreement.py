@@ -14,7 +14,7 @@ from ambjax.__main__ import main
 from ambjax.cases.machine_case import machine_from
 from ambjax.cases.template_text import template
 from ambjax.linear import Zones, machine_injected, machine_sensitivity
-from ambjax.results.machine_run import simulate_machine
+from ambjax.results.runs import simulate_machine
 
 # The fast test takes a machine with many features.
 FAST = "bending"

@@ -13,7 +13,7 @@ from ambjax.cases.template_text import template
 from ambjax.control.lqg import LinearCoils, RotorModel, design, sampled_model
 from ambjax.control.regulator import doubled
 from ambjax.linear.linear_machine import machine_sensitivity
-from ambjax.results.machine_run import simulate_machine
+from ambjax.results.runs import simulate_machine
 
 MACHINE = tomllib.loads(template("machine"))
 # With l^2 = I_t/m at both ends, a force at one end does not move the other. All motions then have the same plant.

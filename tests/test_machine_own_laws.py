@@ -9,7 +9,7 @@ from test_own_laws import LAW
 
 from ambjax.cases.machine_case import machine_from
 from ambjax.linear.linear_machine import machine_sensitivity
-from ambjax.results.machine_run import simulate_machine
+from ambjax.results.runs import simulate_machine
 
 # The law of one axis is that of tests/test_own_laws.py.
 IMPORTS = "from ambjax.extend import MachineLaw, PositionLaw, demand_of, force_for, gain, leaf, record"

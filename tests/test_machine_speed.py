@@ -26,7 +26,7 @@ from ambjax.linear.unbalance_response import UnbalanceResponse, critical_speeds,
 from ambjax.pictures.machine_pictures import machine_sensitivity_picture
 from ambjax.pictures.run_up_picture import last_turn, waterfall
 from ambjax.pictures.style import save
-from ambjax.results.machine_run import simulate_machine
+from ambjax.results.runs import simulate_machine
 
 MASS, I_T, I_P, HALF = 3.0, 0.1, 0.04, 0.25
 K_I, K_S = 50.0, 1e5

@@ -7,7 +7,7 @@ import pytest
 from machine_cases import OFF
 
 from ambjax.cases.machine_case import machine_from
-from ambjax.results.machine_run import simulate_machine
+from ambjax.results.runs import simulate_machine
 from ambjax.results.spread_runs import simulate_members
 from ambjax.world.scenario import POLE
 

@@ -27,7 +27,7 @@ from ambjax.host.extensions import NothingToTuneError
 from ambjax.linear import Stability, machine_sensitivity
 from ambjax.results import machine_study
 from ambjax.results.case_map import study_and_axes, survival_map
-from ambjax.results.machine_run import simulate_machine
+from ambjax.results.runs import simulate_machine
 from ambjax.results.spread_runs import study_of
 
 MACHINE = tomllib.loads(template("machine"))

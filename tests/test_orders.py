@@ -12,7 +12,7 @@ from ambjax.cases.template_text import template
 from ambjax.commands.acceptance import acceptance
 from ambjax.linear import analyse, linearise
 from ambjax.pictures.run_up_picture import once_per_turn
-from ambjax.results.machine_run import simulate_machine
+from ambjax.results.runs import simulate_machine
 from ambjax.signals import Rotation
 from ambjax.simulation.folds import Ending
 from ambjax.simulation.orders import SIGNALS, UNITS, Orders

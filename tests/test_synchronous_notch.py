@@ -23,8 +23,7 @@ from ambjax.linear.margins import poles_in_s
 from ambjax.results.case_map import study_and_axes
 from ambjax.results.cell_gains import notch_gains
 from ambjax.results.gains import with_gains
-from ambjax.results.machine_run import simulate_machine
-from ambjax.results.runs import simulate
+from ambjax.results.runs import simulate, simulate_machine
 from ambjax.world.rotation import Rotation
 from ambjax.world.sensor import Measurement
 from tuning.problem import members as members_of

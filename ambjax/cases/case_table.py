@@ -38,7 +38,6 @@ def parts_of(cascade: Cascade, scenario: Scenario, clock: Clock) -> dict[str, st
 
 
 def _described(part: object) -> str:
-    """Return the type of a record and its numbers."""
     return ": ".join(filter(None, (type(part).__name__, _numbers_of(part))))
 
 
@@ -58,14 +57,7 @@ def _numbers_of(part: object) -> str:
 
 
 def _shown(value: Any) -> str:
-    """Return a number or an array as a case file writes it."""
     return f"{float(value):g}" if np.ndim(value) == 0 else f"[{', '.join(map(_shown, value))}]"
-
-
-def case_table(name: str, parts: dict[str, str], spread: tuple[str, ...]) -> str:
-    """Return an HTML table of the parts of a case called `name`. `spread`: paths of the quantities of its spread."""
-    shown = parts | ({"spread": ", ".join(spread)} if spread else {})
-    return notebook_table(name, ("part", "numbers"), shown.items())
 
 
 def notebook_table(caption: str, titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -3,20 +3,19 @@
 import contextlib
 import pathlib
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ambjax.cases.own_laws import path_from
 from ambjax.cases.recordings import npz_arrays
 from ambjax.cases.table import Table, file_to_write, show
 from ambjax.control.linear_controller import state_space_of
-from ambjax.control.realisation import Realisation, realisation
+from ambjax.control.realisation import realisation
 
 NAMES, OPTIONAL = ("A", "B", "C", "D"), "dt"
+NEEDED = "the arrays A, B, C, D and, for a discrete controller, dt in s"
 ENDINGS = (".npz", ".mat")
 KEY = "controller.position.file"
-T = TypeVar("T")
 
 
 class ControllerFile(NamedTuple):
@@ -24,60 +23,42 @@ class ControllerFile(NamedTuple):
 
     written: str
     path: pathlib.Path
-    contents: Realisation
-
-    def relocated(self, out: pathlib.Path) -> dict[str, str]:
-        """Return the value of the key `file` for a case file in the folder `out`, by dotted path."""
-        return {KEY: path_from(self.written, self.path, out)}
+    contents: Any
 
 
-def controller_file(table: Table, folder: pathlib.Path) -> ControllerFile:
-    """Read the controller that the key `file` names, as `contents_of` does."""
-    written, path, contents = contents_of(table, folder, realisation)
-    return ControllerFile(written, path, contents)
-
-
-def contents_of(table: Table, folder: pathlib.Path, convert: Callable[..., T]) -> tuple[str, pathlib.Path, T]:
-    """Return the path that the key `file` gives, the absolute path, and convert(A, B, C, D, dt) of the file.
-
-    A relative path starts at `folder`, that of the case file. Raises ValueError, one line, if the key is missing or the
-    file does not contain a controller. The message gives the dotted path and, if known, the file and the array.
-    """
-    written = table.raw.get("file")
-    if written is None:
-        raise ValueError(f"{table.at('file')} is missing: give the path of an .npz or .mat file with {_needed()}.")
+def contents_of(table: Table, folder: pathlib.Path, convert: Callable[[dict[str, np.ndarray]], Any]) -> ControllerFile:
+    """Read the .npz or .mat file that the key `file` names. Its contents are convert(arrays)."""
+    written = table.raw["file"]
     if not isinstance(written, str) or not written.endswith(ENDINGS):
         raise ValueError(f"{table.at('file')} = {show(written)}: it must be the path of an .npz or .mat file.")
     path = (folder / written).resolve()
     try:
-        return written, path, convert(**read_controller(path))
-    except ValueError as error:
-        raise ValueError(f"{table.at('file')} = {show(written)}: {error}") from None
+        arrays = npz_arrays(path) if path.suffix == ".npz" else _of_mat(path)
+        return ControllerFile(written, path, convert(arrays))
+    except (OSError, ValueError) as error:
+        why = str(error)
+        if isinstance(error, OSError):
+            unread = error.strerror or "is it a file?"
+            why = f"{path} cannot be read ({unread}). A path is relative to the folder of the case file."
+        raise ValueError(f"{table.at('file')} = {show(written)}: {why}") from None
 
 
-def read_controller(path: pathlib.Path) -> dict[str, np.ndarray]:
-    """Return the arrays A, B, C, D and, if the file has it, dt of an .npz or .mat file.
+def controller_file(table: Table, folder: pathlib.Path, convert: Callable[..., Any] = realisation) -> ControllerFile:
+    """Read the controller that the key `file` names. Its contents are convert(A, B, C, D, dt) of its arrays.
 
-    Raises ValueError if the file cannot be read or lacks an array.
+    A relative path starts at `folder`, that of the case file. Raises ValueError, one line, if the key is missing or the
+    file does not contain a controller. The message gives the dotted path and, if known, the file and the array.
     """
-    arrays = arrays_of(path)
-    if missing := [name for name in NAMES if name not in arrays]:
-        found = ", ".join(name for name in arrays if not name.startswith("_")) or "none"
-        raise ValueError(f"the array {missing[0]} is missing. The file must contain {_needed()}; it has {found}.")
-    return {name: arrays[name] for name in (*NAMES, OPTIONAL) if name in arrays}
 
+    def matrices(arrays: dict[str, np.ndarray]) -> Any:
+        if missing := [name for name in NAMES if name not in arrays]:
+            found = ", ".join(name for name in arrays if not name.startswith("_")) or "none"
+            raise ValueError(f"the array {missing[0]} is missing. The file must contain {NEEDED}; it has {found}.")
+        return convert(**{name: arrays[name] for name in (*NAMES, OPTIONAL) if name in arrays})
 
-def arrays_of(path: pathlib.Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an .npz or .mat file. Raises ValueError if it cannot be read."""
-    try:
-        return npz_arrays(path) if path.suffix == ".npz" else _of_mat(path)
-    except OSError as error:
-        why = error.strerror or "is it a file?"
-        raise ValueError(f"{path} cannot be read ({why}). A path is relative to the folder of the case file.") from None
-
-
-def _needed() -> str:
-    return "the arrays A, B, C, D and, for a discrete controller, dt in s"
+    if "file" not in table.raw:
+        raise ValueError(f"{table.at('file')} is missing: give the path of an .npz or .mat file with {NEEDED}.")
+    return contents_of(table, folder, matrices)
 
 
 def _of_mat(path: pathlib.Path) -> dict[str, np.ndarray]:

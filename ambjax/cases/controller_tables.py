@@ -1,11 +1,11 @@
-"""Readers of [processor] and of the [controller] tables: the cascade of a case."""
+"""Readers of [processor] and of the [controller] tables: the cascade of a case, and its notch."""
 
 import dataclasses
-import pathlib
-from typing import Any, NamedTuple
+from typing import Any
 
-from ambjax.cases.controller_file import ControllerFile, controller_file
-from ambjax.cases.own_laws import FORM, OwnLaw, is_own, own_law
+from ambjax.cases.controller_file import controller_file
+from ambjax.cases.own_laws import FORM, is_own, own_law_of
+from ambjax.cases.recordings import CaseFiles
 from ambjax.cases.scenario_tables import drive
 from ambjax.cases.table import Table, quoted, show
 from ambjax.control import current, inversion, observer, position
@@ -16,9 +16,14 @@ from ambjax.control.linear_controller import OUTPUTS
 from ambjax.control.processor import Processor
 from ambjax.control.sampling import Sampling
 from ambjax.control.schedule import OVER, Schedule
-from ambjax.numerics.records import Scalar
+from ambjax.control.synchronous_notch import NULLED, SynchronousNotch
+from ambjax.ensemble.spread import Spread, ends
+from ambjax.linear.notch_design import with_notch_gains
+from ambjax.numerics.records import Scalar, leaf, leaves_of
+from ambjax.simulation.clock import Clock
 from ambjax.world.bearing import Bearing
 from ambjax.world.plant import Plant
+from ambjax.world.scenario import Scenario
 
 # The laws by stage and kind. The default of a stage is its first law that fits the amplifier and the position law
 # (`_usual`). A new law is one row here.
@@ -60,17 +65,16 @@ KINDS: dict[str, dict[str, type[Law]]] = {
 DISCRETISATIONS = ["implicit", "explicit"]
 (DELAY,) = (field for field in dataclasses.fields(Processor) if field.name == "delay")
 
+# The kind of a notch that switches it off, for example on one bearing.
+OFF = "none"
+NOTCH_NUMBERS = ("rate", "min_speed", "max_speed")
+PHASE = leaf(
+    default=None, unit="degrees", at_least=-360.0, at_most=360.0,
+    doc="phase of the response that the notch inverts; none: that of the linear loop at each speed",
+)  # fmt: skip
 
-class Files(NamedTuple):
-    """The folder of a case file; the custom laws and the linear controller, if they were read earlier."""
 
-    folder: pathlib.Path
-    own: tuple[OwnLaw, ...]
-    controller: ControllerFile | None
-
-
-def processor_from(table: Table) -> Processor:
-    """Return the processor of [processor]. Raises ValueError, one line, for an invalid entry."""
+def _processor(table: Table) -> Processor:
     table.only(["delay", "discretisation", "predict", "guard"])
     delay = table.leaf("delay", DELAY, DELAY.default)
     implicit = table.choice("discretisation", DISCRETISATIONS, DISCRETISATIONS[0]) == DISCRETISATIONS[0]
@@ -78,37 +82,38 @@ def processor_from(table: Table) -> Processor:
     return Processor(delay, implicit, table.switch("predict"), guard=guard)
 
 
-def cascade_from(
-    top: Table, plant: Bearing, processor: Processor | None, period: Scalar | None, files: Files
-) -> tuple[Cascade, tuple[OwnLaw, ...], ControllerFile | None]:
-    """Return the cascade of the [controller] tables, its custom laws, and the file of its linear controller or None.
+def cascade_from(top: Table, plant: Bearing, period: Scalar, files: CaseFiles) -> Cascade:
+    """Return the cascade of [processor] and [controller]. Its custom laws and its linear controller join `files`.
 
-    `top`: the whole case. `plant`: the true plant; its numbers are the defaults of the model. `period`: sample period
-    of the processor, s; None in continuous time. Raises ValueError, one line, for an invalid entry.
+    `top`: the whole case. `plant`: the true plant; its numbers are the defaults of the model. `period`: sample period,
+    s. Raises ValueError, one line, for an invalid entry.
     """
+    processor = _processor(top.table("processor")) if "processor" in top.raw else None
     table, actuator = top.table("controller"), top.table("actuator")
     command = drive(actuator)
     table.only(["model", "notch", *KINDS])
     model = table.table("model").record(Plant, base=plant)  # always lumped, even for a two-coil plant
-    sampling = processor.sampling(period) if processor and period else None
-    laws, own, matrices = {}, [], None
+    sampling = processor.sampling(period) if processor else None
+    laws: dict[str, Any] = {}
     for stage, kinds in KINDS.items():
         law = table.table(stage)
         if is_own(law.raw.get("kind")):
-            found = [one for one in files.own if one.stage == stage]
-            own += found or [own_law(stage, law.raw["kind"], files.folder, model)]
-            kind = own[-1].law
+            known = [one for one in files.known.own_laws if one.stage == stage] if files.known else []
+            files.own_laws += known or [own_law_of(stage, law.raw["kind"], files.folder, model)]
+            kind: Any = files.own_laws[-1].law
         else:
             kind = kinds[law.choice("kind", list(kinds), _usual(kinds, laws.get("position"), command), FORM)]
             _check_default(law, kind, kinds)
         if kind is position.LinearController:
-            laws[stage], matrices = _linear(law, files)
+            laws[stage] = _linear(law, files)
         else:
             # the paper's gains of the inner loops belong to its position law
             printed = type(laws["position"]).printed if "position" in laws else kind.printed
             base = _defaults(law, kind, model, sampling, printed)
-            laws[stage] = law_from(_nominal(law, kind, actuator), kind, base)
-    return Cascade(model=model, processor=processor, **laws), tuple(own), matrices
+            if getattr(kind, "commands", "") == "current" and "bandwidth" in actuator.raw:  # by default, that bandwidth
+                law = Table({"bandwidth": actuator.raw["bandwidth"], **law.raw}, law.path)
+            laws[stage] = law_from(law, kind, base)
+    return Cascade(model=model, processor=processor, **laws)
 
 
 def _check_default(law: Table, kind: type[Law], kinds: dict[str, type[Law]]) -> None:
@@ -124,8 +129,7 @@ def _check_default(law: Table, kind: type[Law], kinds: dict[str, type[Law]]) -> 
 
 
 def _gains(kind: type[Law]) -> set[str]:
-    fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
-    return {field.name for field in fields if field.metadata.get("leaf")}
+    return {field.name for field in leaves_of(kind)}
 
 
 def _usual(kinds: dict[str, type[Law]], demanding: Any, command: str) -> str:
@@ -142,18 +146,11 @@ def _usual(kinds: dict[str, type[Law]], demanding: Any, command: str) -> str:
     return [*accepting, *fitting][0]
 
 
-def _nominal(law: Table, kind: type[Law], actuator: Table) -> Table:
-    """Return the table of a law. The default bandwidth of a law that commands a current is that of the amplifier."""
-    if getattr(kind, "commands", "") != "current" or "bandwidth" not in actuator.raw:
-        return law
-    return Table({"bandwidth": actuator.raw["bandwidth"], **law.raw}, law.path)
-
-
-def _linear(table: Table, files: Files) -> tuple[Law, ControllerFile]:
+def _linear(table: Table, files: CaseFiles) -> Law:
     law = table.record(position.LinearController, extra=("kind", "file", "output"))
     output = table.choice("output", list(OUTPUTS), OUTPUTS[0])
-    found = files.controller or controller_file(table, files.folder)
-    return dataclasses.replace(law, output=output, realisation=found.contents), found
+    files.controller = (files.known and files.known.controller_file) or controller_file(table, files.folder)
+    return dataclasses.replace(law, output=output, realisation=files.controller.contents)
 
 
 def _defaults(table: Table, kind: type[Law], model: Plant, sampling: Sampling | None, printed: bool) -> Law | None:
@@ -172,7 +169,7 @@ EXAMPLE = '{ over = "error", at = [0.0, 1e-5], values = [100.0, 200.0] }'
 
 def law_from(table: Table, kind: type[Law], base: Law | None) -> Any:
     """Return a law of this kind with the gains of this table. `base`: law with the defaults; None: those of `kind`."""
-    names = {field.name: field for field in dataclasses.fields(kind) if field.metadata.get("leaf")}
+    names = {field.name: field for field in leaves_of(kind)}
     given = {name: table.raw[name] for name in names if isinstance(table.raw.get(name), dict)}
     numbers = Table({key: value for key, value in table.raw.items() if key not in given}, table.path)
     law = numbers.record(kind, extra=("kind",), base=base)
@@ -192,3 +189,35 @@ def _numbers(table: Table, key: str) -> tuple[float, ...]:
     if key not in table.raw:
         raise ValueError(f"{table.at(key)} is missing: a schedule is a table such as {EXAMPLE}.")
     return tuple(table.column(key, f"a list of numbers, as in {EXAMPLE}"))
+
+
+def notch_from(top: Table, scenario: Scenario) -> SynchronousNotch | None:
+    """Return the notch of [controller.notch] without its gains; None if there is no notch."""
+    controller = top.table("controller")
+    if "notch" not in controller.raw:
+        return None
+    table, rotor = controller.table("notch"), scenario.rotor
+    table.only(["kind", *NOTCH_NUMBERS, "phase"])
+    kind, phase = table.choice("kind", [*NULLED, OFF], next(iter(NULLED))), table.leaf("phase", PHASE)
+    if kind == OFF:
+        return None
+    varying = rotor is not None and (rotor.acceleration != 0 or bool(rotor.changes))
+    if rotor is None or (rotor.speed == 0 and not varying):
+        raise ValueError("[controller.notch]: it follows the speed of the rotor. Give rotor.speed, in rpm.")
+    given = Table({key: table.raw[key] for key in NOTCH_NUMBERS if key in table.raw}, table.path)
+    notch = given.record(SynchronousNotch)
+    return dataclasses.replace(notch, removes=kind, rotor=rotor, varying=varying, phase=phase)
+
+
+def with_gains_of_notch(cascade: Cascade, scenario: Scenario, clock: Clock, spread: Spread) -> Cascade:
+    """Return the cascade with the gains of its notch, if it has one, for all speeds of the spread.
+
+    Raises ValueError if its loop has no linearisation.
+    """
+    rotor = ends(spread, cascade, scenario, ("rotor.",))[1].rotor
+    if cascade.notch is None or rotor is None:
+        return cascade
+    try:
+        return with_notch_gains(cascade, scenario, clock, rotor)
+    except ValueError as error:
+        raise ValueError(f"[controller.notch]: its gain cannot be computed: {error}") from None

@@ -3,7 +3,7 @@
 import contextlib
 import functools
 from collections.abc import Callable
-from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, cast, overload
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 import jax
 
@@ -13,7 +13,7 @@ from ambjax.cases.table import cut
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import require_concrete
 from ambjax.numerics.shapes import require_one_member
-from ambjax.simulation.clock import Clock, no_case
+from ambjax.simulation.clock import Clock, TakesCase, no_case
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import settled
 from ambjax.simulation.system import check_parts, require_records
@@ -24,27 +24,16 @@ R = TypeVar("R", covariant=True)
 C = TypeVar("C", contravariant=True)
 
 
-class OfCase(Protocol[C, P, R]):
-    """A function of a case, or of a cascade, a scenario and a clock."""
-
-    @overload
-    def __call__(self, case: C, /, *args: P.args, **kwargs: P.kwargs) -> R: ...
-    @overload
-    def __call__(
-        self, cascade: Cascade, scenario: Scenario, clock: Clock, /, *args: P.args, **kwargs: P.kwargs
-    ) -> R: ...
-
-
 def of_case(
     *, machines: bool = False, traced: bool = False
-) -> Callable[[Callable[Concatenate[C, P], R]], OfCase[C, P, R]]:
+) -> Callable[[Callable[Concatenate[C, P], R]], TakesCase[C, P, R]]:
     """Return a decorator for a function of a case, which then also accepts a cascade, a scenario and a clock.
 
     The function raises ValueError for anything else, such as a path. `machines`: whether it takes a `MachineCase`.
     `traced`: whether the numbers of a case may be traced.
     """
 
-    def decorate(function: Callable[Concatenate[C, P], R]) -> OfCase[C, P, R]:
+    def decorate(function: Callable[Concatenate[C, P], R]) -> TakesCase[C, P, R]:
         @functools.wraps(function)
         def called(*args: Any, **named: Any) -> R:
             with contextlib.nullcontext() if traced else jax.ensure_compile_time_eval():  # inside jit, as outside it
@@ -53,7 +42,7 @@ def of_case(
                 require_case(args[0] if args else named.get("case"), machines=machines, traced=traced)
                 return function(*args, **named)
 
-        return cast(OfCase[C, P, R], called)
+        return cast(TakesCase[C, P, R], called)
 
     return decorate
 

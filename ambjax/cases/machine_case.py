@@ -13,17 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.axis_case import MACHINE_TABLES, as_written, axis_tables, check_axis, stop_slope, with_runout_at
-from ambjax.cases.machine_controller import inner, kind_of, law_from, merged
+from ambjax.cases.controller_tables import notch_from
+from ambjax.cases.machine_controller import inner, kind_of, law_from, merged, try_machine
 from ambjax.cases.machine_spread import axis_table, machine_spread, refuse_unused, with_notches
-from ambjax.cases.machine_trial import try_machine
-from ambjax.cases.notch_table import notch_from
-from ambjax.cases.own_laws import OwnLaw, is_own, own_machine_law, tried
+from ambjax.cases.own_laws import OwnLaw, is_own, own_law_of, tried
 from ambjax.cases.plausibility import unresolved
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, read_by, safe_name
 from ambjax.cases.rotor_numbers import fastest_rotor, widest_rotation
 from ambjax.cases.rotor_tables import COORDINATES, RIGID, BearingAxis, axes_and_rotor, tables_of, vector
 from ambjax.cases.speed_table import MOST_SPEEDS, listed_speeds
-from ambjax.cases.table import FILE, Table, require_file, show, text_of
+from ambjax.cases.table import Table, show
 from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.synchronous_notch import SynchronousNotch
@@ -92,19 +91,17 @@ def read_machine(path: str | pathlib.Path | Mapping[str, Any]) -> MachineCase:
 
         machine = ambjax.read_machine("machine.toml")
     """
-    other = "it has no [rotor] with a kind, so it is a case of one axis; in Python, read_case reads it."
+
+    def parse(raw: dict[str, Any], *rest: Any) -> MachineCase:
+        if not is_machine(raw):
+            raise ValueError(
+                "it has no [rotor] with a kind, so it is a case of one axis; in Python, read_case reads it."
+            )
+        return machine_from(raw, *rest)
+
     with jax.ensure_compile_time_eval():
-        if isinstance(path, Mapping):
-            if not is_machine(raw := dict(path)):
-                raise ValueError(other)
-            case = dataclasses.replace(machine_from(raw), text=text_of(raw))  # `check` and `map` read the text
-            texts = unresolved(case.cases)
-        else:
-            require_file("path", path, f"{FILE}, or a dict of tables")
-            case = read_any(path)
-            if isinstance(case, Case):
-                raise ValueError(one_line(f"{path}: {other}"))
-            texts = warnings_of_machine(case, path)
+        case = read_by(parse, path)
+        texts = unresolved(case.cases) if isinstance(path, Mapping) else warnings_of_machine(case, path)
     for text in texts:
         warnings.warn(text, stacklevel=2)
     return case
@@ -157,7 +154,7 @@ def machine_from(
         case = with_runout_at(axis, read(own, f"axis {axis.name}", written))
         check_axis(case, axis, force, q)
         cases.append(case)
-    own_law = own_machine_law(kind, folder) if is_own(kind := kind_of(raw)) else None
+    own_law = own_law_of("", kind, folder) if is_own(kind := kind_of(raw)) else None
     law, parts = law_from(top, rotor, bearings, cases, read, folder, own_law)
     spread = machine_spread(top, rotor, q, axes, names, cases)
     if law is not None:
@@ -168,22 +165,16 @@ def machine_from(
     widest = widest_rotation(rotor, spread)
     notches = [notch_of_axis(controllers[axis.bearing], case, widest) for axis, case in zip(axes, cases, strict=True)]
     speeds = _speeds(top.table("sensitivity"), rotor, float(clock.duration))
-    turning = [*speeds, *speeds_of(widest, float(clock.duration))]
-    cases = notched(cases, notches, machine_of_axes(rotor, parts_of(cases), clock, q, law), clock, turning)
-    spread = with_notches(spread, of_notches, axes, cases)
     modes = range((len(rotor.gravity) - RIGID) // 2)
     coordinates = (*COORDINATES, *(f"mode{k + 1}_{d}" for k in modes for d in "xy"))
     found_laws = [(own_law,) if own_law else (), *(one.own_laws for one in cases)]
-    machine = machine_of_axes(rotor, parts_of(cases), clock, q, law)
-    if own_law is not None:
-        tried(own_law, lambda: try_machine(machine))
-    return MachineCase(
+    case = MachineCase(
         name=safe_name(name),
-        machine=machine,
+        machine=machine_of_axes(rotor, parts_of(cases), clock, q, law),
         clock=clock,
         axes=tuple(axis.name for axis in axes),
         coordinates=coordinates,
-        cases=tuple(cases),
+        cases=notched(cases, notches),
         settle=cases[0].settle,
         zones=cases[0].zones,
         speeds=speeds,
@@ -192,6 +183,11 @@ def machine_from(
         folder=folder,
         own_laws=tuple(dict.fromkeys(law for laws in found_laws for law in laws)),
     )
+    case = with_notches_for(case, [*speeds, *speeds_of(widest, float(clock.duration))])
+    spread = with_notches(spread, of_notches, axes, case.cases)
+    if own_law is not None:
+        tried(own_law, lambda: try_machine(case.machine))
+    return dataclasses.replace(case, spread=spread)
 
 
 def parts_of(cases: Sequence[Case]) -> list[tuple[Cascade, Scenario]]:
@@ -208,17 +204,10 @@ def machine_of_axes(
     return machine_of(rotor, systems, jnp.asarray(q), law)
 
 
-def notched(
-    cases: Sequence[Case],
-    notches: Sequence[SynchronousNotch | None],
-    bare: Machine,
-    clock: Clock,
-    speeds: Sequence[float],
-) -> list[Case]:
-    """Return the cases of the axes with notches whose gains are for these speeds (rpm). `bare`: without notches."""
-    found = with_machine_gains(bare, notches, clock, speeds) if any(notches) else notches
-    laws = [dataclasses.replace(case.cascade, notch=notch) for case, notch in zip(cases, found, strict=True)]
-    return [dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True)]
+def notched(cases: Sequence[Case], notches: Sequence[SynchronousNotch | None]) -> tuple[Case, ...]:
+    """Return the cases of the axes with these notches."""
+    laws = [dataclasses.replace(case.cascade, notch=notch) for case, notch in zip(cases, notches, strict=True)]
+    return tuple(dataclasses.replace(case, cascade=own) for case, own in zip(cases, laws, strict=True))
 
 
 def with_notches_for(case: MachineCase, speeds: Sequence[float]) -> MachineCase:
@@ -230,8 +219,8 @@ def with_notches_for(case: MachineCase, speeds: Sequence[float]) -> MachineCase:
     def made(cases: Sequence[Case]) -> Machine:
         return machine_of_axes(machine.rotor, parts_of(cases), case.clock, machine.start_q, machine.law)
 
-    bare = made(notched(case.cases, [None] * len(notches), machine, case.clock, speeds))
-    cases = tuple(notched(case.cases, notches, bare, case.clock, speeds))
+    bare = made(notched(case.cases, [None] * len(notches)))
+    cases = notched(case.cases, with_machine_gains(bare, notches, case.clock, speeds))
     return dataclasses.replace(case, cases=cases, machine=made(cases))
 
 

@@ -1,29 +1,32 @@
-"""Readers of the controllers of a whole machine: keys of [controller] that one axis does not have."""
+"""Controllers of a whole machine: readers of keys of [controller] that one axis does not have, and a trial."""
 
 import copy
 import dataclasses
 import pathlib
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ambjax.cases.controller_tables import KINDS
-from ambjax.cases.machine_linear import linear, lqg
+from ambjax.cases.machine_linear import linear, lqg, numbers
 from ambjax.cases.own_laws import FORM, OwnLaw, is_own, tried
 from ambjax.cases.reader import Case
 from ambjax.cases.rotor_tables import COORDINATES, RIGID
 from ambjax.cases.table import Table
 from ambjax.control.current import OpenLoop
+from ambjax.control.law_trial import same_shapes
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.observer import Direct
 from ambjax.control.position import FeedbackLinearisation
 from ambjax.control.rigid_body import RigidBody
 from ambjax.numerics.records import canonical
+from ambjax.simulation.machine_kinds import SampledMachine
 from ambjax.simulation.rollout import prepare
 from ambjax.simulation.sampled import Sampled
+from ambjax.simulation.whole_machine import Machine
 from ambjax.world.rotor import Rotor
 
 # Keys of [controller] for a machine. The tables replace keys of the common ones for the tilts and for the axial motion.
@@ -31,14 +34,6 @@ TABLES = {"tilt": ("beta_x", "beta_y"), "axial": ("z",)}
 KEYS = ("kind", "coordinates", "compensate_gyroscopics", *TABLES, "file", "output", "lqg")
 INNER = ("model", "inversion", "current")  # tables beside a custom law
 WAYS, LAWS = ["axes", "rigid-body"], ["cascade", "linear", "lqg"]
-
-
-class NominalPlant(NamedTuple):
-    """One magnet in the place of all magnets that act on a coordinate. `A`: for the given mu_0 and n."""
-
-    A: float
-    s_0: float
-    i_0: float
 
 
 def merged(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
@@ -138,16 +133,14 @@ def rigid_body(
     B, C, M, G = (np.asarray(x, float) for x in (rotor.at_magnets, rotor.at_sensors, rotor.M, rotor.G))
     held = [k for k in range(RIGID) if np.any(B[:, k])]
     B, C, M = B[:, held], C[:, held], np.diag(M)[held]
-    models = [case.cascade.model for case in cases]
-    kappa, s_0, i_0, m, g = (
-        np.array([float(getattr(model, name)) for model in models]) for name in ("kappa", "s_0", "i_0", "m", "g")
-    )
+    model = cases[0].cascade.model
+    kappa, s_0, i_0, m, g = (numbers(cases, name) for name in ("kappa", "s_0", "i_0", "m", "g"))
     weight = np.asarray(rotor.gravity, float)[held] / M
     parts = []
     for number, k in enumerate(held):
-        plant = nominal(models[0], B[:, number], kappa, s_0, i_0)
-        numbers = {name: float(getattr(models[0], name)) for name in ("mu_0", "n", "R")}
-        given = numbers | plant._asdict() | {"m": float(M[number]), "k_z": 0.0, "g": float(-weight[number])}
+        plant = nominal(model, B[:, number], kappa, s_0, i_0)
+        same = {name: float(getattr(model, name)) for name in ("mu_0", "n", "R")}
+        given = same | plant | {"m": float(M[number]), "k_z": 0.0, "g": float(-weight[number])}
         parts.append(_coordinate(top, COORDINATES[k], given, read))
     systems = [prepare(part.cascade, part.scenario, part.clock)[0] for part in parts]
     laws = [canonical((one.loop if isinstance(one, Sampled) else one).cascade) for one in systems]
@@ -166,15 +159,16 @@ def rigid_body(
     return law, parts
 
 
-def nominal(model: Any, b: np.ndarray, kappa: np.ndarray, s_0: np.ndarray, i_0: np.ndarray) -> NominalPlant:
-    """Return the magnet whose stiffness, force per current and largest force are those of all magnets on a coordinate.
+def nominal(model: Any, b: np.ndarray, kappa: np.ndarray, s_0: np.ndarray, i_0: np.ndarray) -> dict[str, float]:
+    """Return A, s_0 and i_0 of the magnet with stiffness, force per current and largest force of all on a coordinate.
 
     `b`: displacements at the magnets [c] per unit of the coordinate. The others: numbers of the magnets [c].
     """
     stiffness, lever = kappa * i_0**2 / s_0**3, np.abs(b)
     force, per_current = lever @ (stiffness * s_0), lever @ (stiffness * s_0 / i_0)
     gap, bias = force / (b**2 @ stiffness), force / per_current
-    return NominalPlant(float(force * gap**2 / bias**2 / (model.mu_0 * model.n**2)), float(gap), float(bias))
+    area = force * gap**2 / bias**2 / (model.mu_0 * model.n**2)
+    return {"A": float(area), "s_0": float(gap), "i_0": float(bias)}
 
 
 def _coordinate(top: Table, name: str, plant: dict[str, float], read: Callable[[dict, str], Case]) -> Case:
@@ -204,3 +198,18 @@ def inner(system: Any, law: MachineLaw) -> Any:
         cascade = dataclasses.replace(cascade, current=OpenLoop())
     loop = dataclasses.replace(loop, cascade=cascade)
     return dataclasses.replace(system, loop=loop) if isinstance(system, Sampled) else loop
+
+
+def try_machine(machine: Machine) -> None:
+    """Trace the law of a whole machine in its loop: `begin`, `scale`, and `step` or the call. Raises as `try_law`."""
+
+    def everything(machine: Machine) -> tuple[Any, Any, Any]:
+        assert machine.law is not None
+        errors = machine.sensor_errors(0)
+        state = machine.start()
+        if isinstance(machine, SampledMachine):
+            return state.law, machine.law.scale(), machine.jump(0.0, state, errors).law
+        return state.law, machine.law.scale(), machine.demands(0.0, state, errors)
+
+    begun, scale, _ = jax.eval_shape(everything, canonical(machine))
+    same_shapes(scale, begun, "scale() must be like the state that begin returns; it is")

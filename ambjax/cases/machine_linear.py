@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.cases.controller_file import contents_of
+from ambjax.cases.controller_file import controller_file
 from ambjax.cases.reader import Case
 from ambjax.cases.rotor_tables import MODES, RIGID
 from ambjax.cases.speed_table import listed_speeds
@@ -49,7 +49,7 @@ def linear(top: Table, cases: list[Case], folder: pathlib.Path) -> StateSpaceLaw
     if output == OUTPUTS[1] and any(case.scenario.drive == "current" for case in cases):
         raise ValueError(f'{table.at("output")} = "voltage": amplifiers with actuator.mode = "current" take currents.')
     convert = lambda A, B, C, D, dt=0.0: several((A, B, C, D), dt, c)  # noqa: E731
-    matrices, steady, dt = contents_of(table, folder, convert)[2]
+    matrices, steady, dt = controller_file(table, folder, convert).contents
     period = float(cases[0].clock.sample_period) if cases[0].cascade.sampled else None
     if dt and (period is None or not abs(period / dt - 1) < SAME_PERIOD):
         has = "in continuous time" if period is None else f"with a sample period of {period:g} s"
@@ -57,13 +57,10 @@ def linear(top: Table, cases: list[Case], folder: pathlib.Path) -> StateSpaceLaw
             f"{table.at('file')} = {show(table.raw['file'])}: the controller is discrete, dt = {dt:g} s, and this case "
             f"runs {has}. Set [processor] and clock.sample_period = {dt:g}, or give a continuous controller."
         )
-    A, B, C, D = matrices if period is None else bilinear(matrices, period)
-    n = len(A)
+    matrices = matrices if period is None else bilinear(matrices, period)
+    n = len(matrices[0])
     return StateSpaceLaw(
-        A=jnp.asarray(A)[None],
-        B=jnp.asarray(B)[None],
-        C=jnp.asarray(C)[None],
-        D=jnp.asarray(D)[None],
+        **{name: jnp.asarray(x)[None] for name, x in zip("ABCD", matrices, strict=True)},
         E=jnp.zeros((1, n, c)),
         a=jnp.zeros((1, n)),
         b=jnp.zeros((1, c)),
@@ -72,7 +69,7 @@ def linear(top: Table, cases: list[Case], folder: pathlib.Path) -> StateSpaceLaw
         sizes=jnp.full(n, float(numbers(cases, "s_0").min()) / 50),
         speeds=jnp.zeros(1),
         **magnets(cases, output == OUTPUTS[1]),
-        inputs=ERROR if B.shape[1] == c else BOTH,
+        inputs=ERROR if matrices[1].shape[1] == c else BOTH,
         output=output,
     )
 
@@ -150,7 +147,6 @@ def lqg(top: Table, cases: list[Case], rotor: Rotor) -> StateSpaceLaw:
 
 
 def _speeds(table: Table, default: float) -> list[float]:
-    """Return the speeds of the designs, rpm."""
     speeds = listed_speeds(table, MOST_DESIGNS) if "speeds" in table.raw else [default]
     if sorted(speeds) != speeds:
         raise ValueError(f"{table.at('speeds')} = {show(speeds)}: the speeds must be in ascending order.")

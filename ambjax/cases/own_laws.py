@@ -2,11 +2,10 @@
 
 import dataclasses
 import difflib
-import os
 import pathlib
 import types
-from collections.abc import Callable, Iterable
-from typing import NamedTuple, TypeVar
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 
@@ -41,7 +40,7 @@ class OwnLaw(NamedTuple):
 
     def __str__(self) -> str:
         source = self.kind.rpartition(":")[0] if self.file is None else self.file
-        return f"{_key(self.stage)}: imported {self.law.__name__} from {source}"
+        return f"{key_of(self.stage)}: imported {self.law.__name__} from {source}"
 
 
 def is_own(kind: object) -> bool:
@@ -49,22 +48,29 @@ def is_own(kind: object) -> bool:
     return isinstance(kind, str) and ":" in kind
 
 
-def own_law(stage: str, kind: str, folder: pathlib.Path, model: Plant) -> OwnLaw:
-    """Import the law that `kind` names; a path is relative to `folder`, that of the case file.
+def own_law_of(stage: str, kind: str, folder: pathlib.Path, model: Plant | None = None) -> OwnLaw:
+    """Import the law that `kind` names, a subclass of that of its stage which is a record.
 
+    `folder`: that of the case file, to which a path is relative. `model`: with which the law is tried; None: it is not.
     Raises ValueError, with the dotted path, the value and the reason, if there is no such class, if the import fails,
     if the class is not a law of this stage, or if it cannot be called with `model`.
     """
-    found = _imported(stage, kind, folder, STAGES[stage])
-    law = found.law()
-    assert isinstance(law, Law)
-    tried(found, lambda: try_law(law, stage, model))
+    source, _, name = kind.rpartition(":")
+    file = (folder / source).resolve() if source.endswith(".py") else None
+
+    def refuse(why: str) -> ValueError:
+        return ValueError(f"{key_of(stage)} = {show(kind)}: {why}")
+
+    if not source or not name.isidentifier():
+        raise refuse(f"write {FORM}.")
+    kind_of_law = _class(_module(source, file, refuse), name, source, STAGES.get(stage, MachineLaw), refuse)
+    law = _checked(kind_of_law, name, stage, refuse)
+    if file is not None:
+        pickle_with_source(kind_of_law)
+    found = OwnLaw(stage, kind, kind_of_law, file, digest_of(kind_of_law))
+    if model is not None:
+        tried(found, lambda: try_law(law, stage, model))
     return found
-
-
-def own_machine_law(kind: str, folder: pathlib.Path) -> OwnLaw:
-    """Import the law of a whole machine that `kind` names, as `own_law`; its methods are not called."""
-    return _imported("", kind, folder, MachineLaw)
 
 
 def tried(law: OwnLaw, trial: Callable[[], T]) -> T:
@@ -73,53 +79,15 @@ def tried(law: OwnLaw, trial: Callable[[], T]) -> T:
         return trial()
     except Exception as error:
         why = f"{law.law.__name__} {reason(error, law.file)}."
-        raise ValueError(f"{_key(law.stage)} = {show(law.kind)}: {why}") from error
+        raise ValueError(f"{key_of(law.stage)} = {show(law.kind)}: {why}") from error
 
 
-def _key(stage: str) -> str:
+def key_of(stage: str) -> str:
+    """Return the dotted path of the key that names the law of a stage."""
     return f"controller.{stage}.kind" if stage else "controller.kind"
 
 
-def _imported(stage: str, kind: str, folder: pathlib.Path, base: type[Law] | type[MachineLaw]) -> OwnLaw:
-    """Import a subclass of `base` that is a record."""
-    source, _, name = kind.rpartition(":")
-    file = (folder / source).resolve() if source.endswith(".py") else None
-
-    def refuse(why: str) -> ValueError:
-        return ValueError(f"{_key(stage)} = {show(kind)}: {why}")
-
-    if not source or not name.isidentifier():
-        raise refuse(f"write {FORM}.")
-    found = _class(_module(source, file, refuse), name, source, base, refuse)
-    _check_record(found, name, stage, refuse)
-    if file is not None:
-        pickle_with_source(found)
-    return OwnLaw(stage, kind, found, file, digest_of(found))
-
-
-def relocated(laws: Iterable[OwnLaw], out: pathlib.Path) -> dict[str, str]:
-    """Return the value of the key `kind` of each law for a case file in the folder `out`, by dotted path."""
-    kinds = {}
-    for law in laws:
-        kind, file = law.kind, law.file
-        if file is not None:
-            kind = f"{path_from(kind.rpartition(':')[0], file, out)}:{law.law.__name__}"
-        kinds[_key(law.stage)] = kind
-    return kinds
-
-
-def path_from(written: str, file: pathlib.Path, folder: pathlib.Path) -> str:
-    """Return the path of `file` for a case file in `folder`: `written` if it leads there, else a new one."""
-    if (folder / written).resolve() == file:
-        return written
-    try:
-        return pathlib.Path(os.path.relpath(file, folder.resolve())).as_posix()
-    except ValueError:  # another drive of Windows
-        return file.as_posix()
-
-
 def _module(source: str, file: pathlib.Path | None, refuse: Refuse) -> types.ModuleType:
-    """Import a file or an installed module."""
     try:
         return module_of_name(source) if file is None else module_of_file(file)
     except OSError as error:
@@ -155,8 +123,8 @@ def _named(base: type) -> str:
     return f"ambjax.extend.{base.__name__}"
 
 
-def _check_record(found: type, name: str, stage: str, refuse: Refuse) -> None:
-    """Raise ValueError unless the class is a record that defines every method."""
+def _checked(found: type, name: str, stage: str, refuse: Refuse) -> Any:
+    """Return the law with its defaults. Raises ValueError unless the class is a record that defines every method."""
     try:
         law = found()
     except TypeError as error:  # abstract methods, or fields without a default
@@ -172,4 +140,5 @@ def _check_record(found: type, name: str, stage: str, refuse: Refuse) -> None:
         if not (field.metadata.get("leaf") or field.metadata.get("static")):
             raise refuse(f"{name}.{field.name}: declare it by gain(...), leaf(...) or static(...) of ambjax.extend.")
         if field.name == "kind":
-            raise refuse(f"{name}.kind: the key kind of [{_key(stage)[:-5]}] selects the law. Choose another name.")
+            raise refuse(f"{name}.kind: the key kind of [{key_of(stage)[:-5]}] selects the law. Choose another name.")
+    return law

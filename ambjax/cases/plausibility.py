@@ -19,11 +19,15 @@ MOST_FLUX = 1.2
 LEAST_SAMPLES, LEAST_BANDWIDTH = 3.0, 2.0
 # Largest ratio of a converter step to the standard deviation of the noise at which the noise dithers the converter.
 MOST_STEP = 4.0
-# Plausible ranges of mass, bias current and resistance, their units, and the unit that a wrong value is probably in.
+# Plausible ranges of numbers of the plant, their units, usual values, and the unit that a wrong one is probably in. The
+# paper's values of s_0, A and mu_0 are 5e-3, 0.121 and 1.25e-6.
 RANGES = {
-    "m": ((1e-3, 1e5), "kg", "grams"),
-    "i_0": ((1e-3, 100.0), "A", "milliamperes"),
-    "R": ((1e-4, 1e4), "ohm", "milliohms"),
+    "s_0": ((2e-5, 2e-2), "m", "gaps are 0.1 mm to some mm, 1e-4 to 5e-3", "millimetres"),
+    "A": ((1e-6, 1.0), "m^2", "poles have some cm^2, 1e-4 and more", "another unit"),
+    "mu_0": ((6e-7, 2.5e-6), "N/A^2", "that of air is 1.257e-6", "another unit"),
+    "m": ((1e-3, 1e5), "kg", "usual values are 0.001 to 100000 kg", "grams"),
+    "i_0": ((1e-3, 100.0), "A", "usual values are 0.001 to 100 A", "milliamperes"),
+    "R": ((1e-4, 1e4), "ohm", "usual values are 0.0001 to 10000 ohm", "milliohms"),
 }
 # Standard gravity, m/s^2, and the largest plausible ratio of a rotor's weight to the largest force of its bearing. The
 # bearings of a vertical axis may be weaker than the weight.
@@ -52,10 +56,12 @@ def unresolved(axes: Iterable[Case]) -> list[str]:
 
 
 def _ranges(case: Case) -> Iterator[str]:
-    for name, ((low, high), unit, slip) in RANGES.items():
+    for name, ((low, high), unit, usual, slip) in RANGES.items():
         value = float(getattr(case.scenario.plant, name))
         if value and not low <= value <= high:
-            yield f"plant.{name} = {value:g} {unit}: usual values are {low:g} to {high:g} {unit}. Is it in {slip}?"
+            yield f"plant.{name} = {value:g} {unit}: {usual}. Is it in {slip}?"
+    if (k_z := float(case.scenario.plant.k_z)) > 0:
+        yield f"plant.k_z = {k_z:g} N/m pushes the rotor away from z = 0; a restoring bearing has k_z < 0."
 
 
 def _forces(case: Case) -> Iterator[str]:

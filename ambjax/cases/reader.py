@@ -1,6 +1,7 @@
 """Reader of case files: from TOML to a cascade, a scenario and a clock."""
 
 import dataclasses
+import operator
 import pathlib
 import re
 import tomllib
@@ -10,21 +11,21 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from ambjax.cases.case_table import case_table, parts_of
+from ambjax.cases.case_table import notebook_table, parts_of
 from ambjax.cases.controller_file import ControllerFile
-from ambjax.cases.controller_tables import KINDS, Files, cascade_from, processor_from
-from ambjax.cases.notch_table import notch_from, with_gains_of_notch
+from ambjax.cases.controller_tables import KINDS, cascade_from, notch_from, with_gains_of_notch
 from ambjax.cases.own_laws import OwnLaw
 from ambjax.cases.reach import check_reference
-from ambjax.cases.recordings import RecordedFile, Recordings
+from ambjax.cases.recordings import CaseFiles, RecordedFile
 from ambjax.cases.scenario_tables import check_start, scenario_from
-from ambjax.cases.table import Table, check_depth, cut, load, put, require_file
+from ambjax.cases.table import FILE, Table, check_depth, cut, load, put, require_file, text_of
 from ambjax.cases.timing import clock_from
 from ambjax.cases.variation import spread_from
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import Spread, corners, ends
 from ambjax.linear.analysis import Zones
 from ambjax.numerics.declared import require_number
+from ambjax.numerics.records import leaves_of
 from ambjax.simulation.clock import PARTS, Clock
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import settled
@@ -94,47 +95,51 @@ class Case:
 
     def _repr_html_(self) -> str:
         """Return the table of the parts of the case and their numbers, for notebooks."""
-        return case_table(self.name, parts_of(self.cascade, self.scenario, self.clock), self.spread.paths)
+        parts = parts_of(self.cascade, self.scenario, self.clock)
+        parts |= {"spread": ", ".join(self.spread.paths)} if self.spread.paths else {}
+        return notebook_table(self.name, ("part", "numbers"), parts.items())
 
 
-class _Facts(tuple[Any, ...]):
+class _Facts(dict[str, Any]):
     """The other fields of a case. Two are equal if each field is the same object: arrays have no hash."""
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Facts) and all(a is b for a, b in zip(self, other, strict=True))
+        return isinstance(other, _Facts) and all(map(operator.is_, self.values(), other.values()))
 
-    def __hash__(self) -> int:
-        return hash(tuple(map(id, self)))
+    def __hash__(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return hash(tuple(map(id, self.values())))
 
 
-def _flatten(case: Case) -> tuple[tuple[tuple[Hashable, object], ...], _Facts]:
-    """Return the parts of a case as a pytree, and its other fields."""
-    fields = [field.name for field in dataclasses.fields(Case)]
-    parts = tuple((jax.tree_util.GetAttrKey(name), getattr(case, name)) for name in PARTS)
-    return parts, _Facts(getattr(case, name) for name in fields if name not in PARTS)
+def _flatten(case: Case) -> tuple[list[tuple[Hashable, object]], _Facts]:
+    facts = _Facts(vars(case))
+    return [(jax.tree_util.GetAttrKey(name), facts.pop(name)) for name in PARTS], facts
 
 
 def _unflatten(facts: _Facts, parts: Iterable[object]) -> Case:
-    """Return a case without the checks of the constructor: JAX puts other things than numbers into a tree."""
-    case, fields = object.__new__(Case), [field.name for field in dataclasses.fields(Case)]
-    case.__dict__.update(zip([*PARTS, *(name for name in fields if name not in PARTS)], (*parts, *facts), strict=True))
+    case = object.__new__(Case)  # without the checks: JAX puts other things than numbers into a tree
+    case.__dict__.update(facts, **dict(zip(PARTS, parts, strict=True)))
     return case
 
 
 jax.tree_util.register_pytree_with_keys(Case, _flatten, _unflatten)
 
 
-def read_case(path: str | pathlib.Path) -> Case:
-    """Read and check the case file at `path`, and return the case.
+def read_case(path: str | pathlib.Path | Mapping[str, Any]) -> Case:
+    """Read and check the case file at `path`, or a dict of tables, and return the case.
 
-    Raises ValueError, one line, if `path` is not a path, if the file cannot be read, or if any part of it is invalid.
+    Raises ValueError, one line, if `path` is neither, if the file cannot be read, or if any part of it is invalid.
     """
     return read_by(case_from, path)
 
 
-def read_by(parse: Callable[[dict[str, Any], str, str, pathlib.Path], T], path: str | pathlib.Path) -> T:
-    """Return parse(tables, name, text, folder) of the case file at `path`. Raises ValueError as `read_case` does."""
-    require_file("path", path)
+def read_by(parse: Callable[..., T], path: str | pathlib.Path | Mapping[str, Any]) -> T:
+    """Return parse(tables, name, text, folder) of the case file at `path`, or parse(tables) with the text of a dict.
+
+    Raises ValueError as `read_case` does.
+    """
+    if isinstance(path, Mapping):
+        return dataclasses.replace(parse(dict(path)), text=text_of(path))  # pyright: ignore[reportArgumentType]
+    require_file("path", path, f"{FILE}, or a dict of tables")
     path = pathlib.Path(path)
     raw, text = load(path)
     try:
@@ -175,13 +180,10 @@ def case_from(
         )
     top.only([*TABLES, *OTHERS])
     plant = _plant(top.table("plant"))
-    processor = processor_from(top.table("processor")) if "processor" in top.raw else None
     clock, duration = clock_from(top.table("clock"))
-    period = clock.sample_period if processor else None
-    files = Files(folder, known.own_laws if known else (), known.controller_file if known else None)
-    cascade, own, matrices = cascade_from(top, plant, processor, period, files)
-    recordings = Recordings(folder, known.recorded if known else ())
-    scenario, settle = scenario_from(top, plant, recordings)
+    files = CaseFiles(folder, known)
+    cascade = cascade_from(top, plant, clock.sample_period, files)
+    scenario, settle = scenario_from(top, plant, files)
     check_parts(cascade, scenario, clock.sample_period)
     if isinstance(clock.method, Slide) and scenario.stop is not None:
         raise ValueError('clock.method = "sliding": it does not resolve run.stop_stiffness. Use method = "adaptive".')
@@ -205,8 +207,8 @@ def case_from(
     assumed = _left_out(top.table("plant"), plant)
     zones = top.table("sensitivity").record(Zones)
     zones.check(clock.sample_period if cascade.sampled else None)
-    read = tuple(recordings.read)
-    return Case(safe_name(name), cascade, scenario, clock, settle, spread, text, assumed, own, matrices, zones, read)
+    own, recorded, name = tuple(files.own_laws), tuple(files.recorded), safe_name(name)
+    return Case(name, cascade, scenario, clock, settle, spread, text, assumed, own, files.controller, zones, recorded)
 
 
 def is_as_written(case: Case) -> bool:
@@ -230,12 +232,11 @@ def cascade_at(case: Case, period: float, changes: Mapping[str, float]) -> Casca
 
     `period`: sample period, s. `changes`: numbers of controller and processor by dotted path.
     """
-    raw, known = tomllib.loads(case.text), Files(pathlib.Path(), case.own_laws, case.controller_file)
+    raw = tomllib.loads(case.text)
     for path, value in changes.items():
-        put(raw, path, value)
+        put(raw, path.split("."), value)
     top = Table(raw)
-    processor = processor_from(top.table("processor")) if "processor" in raw else None
-    return cascade_from(top, _plant(top.table("plant")), processor, period if processor else None, known)[0]
+    return cascade_from(top, _plant(top.table("plant")), period, CaseFiles(known=case))
 
 
 def _plant(table: Table) -> Bearing:
@@ -248,6 +249,6 @@ def _plant(table: Table) -> Bearing:
 
 def _left_out(table: Table, plant: Bearing) -> tuple[str, ...]:
     """Return the names of the plant's parameters that its table omits; none if the table gives no number at all."""
-    names = [field.name for field in dataclasses.fields(plant) if field.metadata.get("leaf")]
+    names = [field.name for field in leaves_of(type(plant))]
     left = tuple(name for name in names if name not in table.raw)
     return left if len(left) < len(names) else ()

@@ -1,16 +1,15 @@
-"""Recorded signals of a case file: `kind = "table"` with a file of times and values (text, npz or Parquet)."""
+"""The files that a case names, and its recorded signals: `kind = "table"` with a file of times and values."""
 
 import csv
 import dataclasses
 import math
 import pathlib
 import zipfile
-from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ambjax.cases.own_laws import path_from
+from ambjax.cases.own_laws import OwnLaw
 from ambjax.cases.table import Table, quoted, show
 from ambjax.world.recorded import Recorded, Samples
 
@@ -28,16 +27,18 @@ class RecordedFile(NamedTuple):
     samples: Samples
 
 
-class Recordings:
-    """Reads the recorded signals of a case. `read` lists the files that its signals use.
+class CaseFiles:
+    """The files that a case names, as they are read: custom laws, a linear controller or None, and recorded signals.
 
     - `folder`: folder of the case file, to which paths are relative.
-    - `known`: files that were read earlier; they are not opened again.
+    - `known`: a `Case` that names the same files; they are not opened again.
     """
 
-    def __init__(self, folder: pathlib.Path = pathlib.Path(), known: Iterable[RecordedFile] = ()) -> None:
-        self.folder, self.known = folder, {one.key: one for one in known}
-        self.read: list[RecordedFile] = []
+    def __init__(self, folder: pathlib.Path = pathlib.Path(), known: Any = None) -> None:
+        self.folder, self.known = folder, known
+        self.own_laws: list[OwnLaw] = []
+        self.controller: Any = None
+        self.recorded: list[RecordedFile] = []
 
     def signal(self, table: Table, extra: tuple[str, ...] = ()) -> Recorded:
         """Return the signal of a table with `kind = "table"`. `extra`: further keys that the table may have."""
@@ -45,13 +46,11 @@ class Recordings:
         held = table.choice("interpolation", INTERPOLATIONS, INTERPOLATIONS[0]) == "held"
         scale, start = (table.leaf(name, FIELDS[name], FIELDS[name].default) for name in ("scale", "start"))
         columns, key = _columns(table), table.at("file")
-        one = self.known.get(key) or self._opened(key, table.raw.get("file"), columns)
-        self.read.append(one)
-        return Recorded(one.samples, held, scale, start)
+        known = [one for one in self.known.recorded if one.key == key] if self.known else []
+        self.recorded += known or [self._opened(key, table.raw.get("file"), columns)]
+        return Recorded(self.recorded[-1].samples, held, scale, start)
 
     def _opened(self, key: str, written: object, columns: tuple[str, str] | None) -> RecordedFile:
-        """Read the file at the path `written`, the value of `key`. Raises ValueError if that fails."""
-
         def refuse(why: str) -> ValueError:
             return ValueError(f"{key} = {show(written)}: {why}")
 
@@ -70,11 +69,6 @@ class Recordings:
             raise refuse(f"{why}.") from None
         except ValueError as error:
             raise refuse(f"{error}") from None
-
-
-def relocated_files(files: Iterable[RecordedFile], out: pathlib.Path) -> dict[str, str]:
-    """Return the paths, by dotted key, by which a case file in the folder `out` must name these files."""
-    return {one.key: path_from(one.written, one.file, out) for one in files}
 
 
 def _columns(table: Table) -> tuple[str, str] | None:

@@ -5,9 +5,9 @@ from functools import partial
 
 import numpy as np
 
-from ambjax.cases.controller_file import ENDINGS, arrays_of
+from ambjax.cases.controller_file import contents_of
 from ambjax.cases.rotor_body import DAMPING, MODES, RotorBody, dampings_of
-from ambjax.cases.table import Table, show
+from ambjax.cases.table import Table
 from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly, precision
 from ambjax.world.shaft import reduced
 
@@ -28,15 +28,9 @@ _reduced = compiled_quickly(reduced, static_argnames=("rows", "modes"), options=
 
 def body_of_file(table: Table, folder: pathlib.Path) -> RotorBody:
     """Return the rotor of the file that the key `file` names. Raises ValueError, one line, if something is wrong."""
-    written = table.raw["file"]
 
-    def refuse(why: object) -> ValueError:
-        return ValueError(f"{table.at('file')} = {show(written)}: {why}")
-
-    if not isinstance(written, str) or not written.endswith(ENDINGS):
-        raise refuse("it must be the path of an .npz or .mat file.")
-    try:
-        arrays = {name: x for name, x in arrays_of((folder / written).resolve()).items() if not name.startswith("_")}
+    def body(found: dict[str, np.ndarray]) -> RotorBody:
+        arrays = {name: x for name, x in found.items() if not name.startswith("_")}
         kind, names = (_of_table, TABLE) if "f_hz" in arrays else (_of_matrices, MATRICES)
         if missing := [name for name in names if name not in arrays]:
             raise ValueError(
@@ -48,8 +42,8 @@ def body_of_file(table: Table, folder: pathlib.Path) -> RotorBody:
             if not (np.issubdtype(x.dtype, np.number) and np.isrealobj(x) and np.all(np.isfinite(x))):
                 raise ValueError(f"{name} must contain finite real numbers.")
         return kind({name: np.asarray(x, float) for name, x in arrays.items()}, table)
-    except ValueError as error:
-        raise refuse(error) from None
+
+    return contents_of(table, folder, body).contents
 
 
 def _shaped(arrays: dict[str, np.ndarray], name: str, *shape: int) -> np.ndarray:

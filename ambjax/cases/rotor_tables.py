@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.cases.recordings import Recordings
+from ambjax.cases.recordings import CaseFiles
 from ambjax.cases.rotor_body import (
     DAMPING,
     FREQUENCY,
@@ -18,14 +18,16 @@ from ambjax.cases.rotor_body import (
     MODES,
     PLACE,
     RotorBody,
+    base_from,
     dampings_of,
+    load_from,
     needed,
     row,
     tables_of,
+    unbalance_from,
     vector,
 )
 from ambjax.cases.rotor_file import body_of_file
-from ambjax.cases.rotor_loads import base_from, load_from, unbalance_from
 from ambjax.cases.speed_table import speed_of
 from ambjax.cases.table import Table, show
 from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly, precision
@@ -137,7 +139,6 @@ def _gyroscopic(table: Table, masses: tuple[float, float, float], modes: int) ->
 
 
 def _places(top: Table) -> list[float]:
-    """Return all places on the shaft that the tables name, m."""
     found = [
         one.leaf(key, PLACE)
         for name in ("bearing", "unbalance", "load")
@@ -293,8 +294,8 @@ def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pat
         acceleration=turning.acceleration,
         changes=turning.changes,
         unbalances=tuple(unbalance_from(one, body, graded) for one in unbalances),
-        loads=tuple(load_from(one, body, Recordings(folder, ())) for one in tables_of(top, "load")),
-        base=tuple(base_from(one, n, Recordings(folder, ())) for one in tables_of(top, "base")),
+        loads=tuple(load_from(one, body, CaseFiles(folder)) for one in tables_of(top, "load")),
+        base=tuple(base_from(one, n, CaseFiles(folder)) for one in tables_of(top, "base")),
     )
 
 

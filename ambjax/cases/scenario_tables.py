@@ -4,7 +4,7 @@ import dataclasses
 import math
 from typing import Any
 
-from ambjax.cases.recordings import Recordings
+from ambjax.cases.recordings import CaseFiles
 from ambjax.cases.speed_table import OWN_SPEED, check_turning, rotation_from, turning_from
 from ambjax.cases.table import Table, show
 from ambjax.numerics.records import leaf
@@ -51,7 +51,7 @@ STOP = {field.name: field for field in dataclasses.fields(Stop)}
 FIELDS = {field.name: field for kind in (Scenario, Clock) for field in dataclasses.fields(kind)}
 
 
-def signal_from(table: Table, unit: str, recordings: Recordings, extra: tuple[str, ...] = ()) -> Any:
+def signal_from(table: Table, unit: str, files: CaseFiles, extra: tuple[str, ...] = ()) -> Any:
     """Return the signal of a table, whose values are in `unit`. `extra`: further keys that the table may have."""
     kind = table.choice("kind", list(SIGNALS))
     if kind == "sum":
@@ -62,9 +62,9 @@ def signal_from(table: Table, unit: str, recordings: Recordings, extra: tuple[st
         if len(terms) > MOST_TERMS:
             raise ValueError(f"{table.at('terms')}: {len(terms)} terms are too many; give at most {MOST_TERMS}.")
         parts = [Table(term, f"{table.at('terms')}[{n}]") for n, term in enumerate(terms)]
-        return waveforms.Sum(tuple(signal_from(part, unit, recordings) for part in parts))
+        return waveforms.Sum(tuple(signal_from(part, unit, files) for part in parts))
     if kind == "table":
-        return recordings.signal(table, extra)
+        return files.signal(table, extra)
     turns = "rotation" in {field.name for field in dataclasses.fields(SIGNALS[kind])}
     made = (turning_from if turns else Table.record)(table, SIGNALS[kind], ("kind", *extra))
     if (own := FIXED_UNITS.get(kind, unit)) != unit:
@@ -73,14 +73,14 @@ def signal_from(table: Table, unit: str, recordings: Recordings, extra: tuple[st
     return made
 
 
-def _disturbances(table: Table, recordings: Recordings) -> dict[str, Any]:
+def _disturbances(table: Table, files: CaseFiles) -> dict[str, Any]:
     """Return the disturbances by field of the scenario. Several signals of the same field become a sum."""
     table.only(list(UNITS))
     found: dict[str, list[Any]] = {}
     for name, slots in UNITS.items():
         for one in _each(table, name) if name in table.raw else ():
             unit = one.choice("unit", list(slots), usual_unit(name, one.raw))
-            found.setdefault(slots[unit], []).append(signal_from(one, unit, recordings, extra=("unit",)))
+            found.setdefault(slots[unit], []).append(signal_from(one, unit, files, extra=("unit",)))
     return {slot: made[0] if len(made) == 1 else waveforms.Sum(tuple(made)) for slot, made in found.items()}
 
 
@@ -100,16 +100,14 @@ def _each(table: Table, name: str) -> list[Table]:
     return [Table(one, f"{table.at(name)}[{n}]") for n, one in enumerate(raw)]
 
 
-def scenario_from(top: Table, plant: Bearing, recordings: Recordings) -> tuple[Scenario, float | None]:
+def scenario_from(top: Table, plant: Bearing, files: CaseFiles) -> tuple[Scenario, float | None]:
     """Return the scenario, and run.settle (s) or None. Raises ValueError for invalid tables."""
     actuator, run = top.table("actuator"), top.table("run")
     run.only(["seed", "settle", "clearance", *(f"stop_{name}" for name in STOP)])
     settle = run.leaf("settle", SETTLE)
     scenario = Scenario(
         plant=plant,
-        reference=signal_from(top.table("reference"), "m", recordings)
-        if "reference" in top.raw
-        else waveforms.Constant(),
+        reference=signal_from(top.table("reference"), "m", files) if "reference" in top.raw else waveforms.Constant(),
         rotor=rotation_from(top.table("rotor")) if "rotor" in top.raw else None,
         sensor=_sensor(top.table("sensor")) if "sensor" in top.raw else None,
         initial=top.table("initial").record(Initial),
@@ -118,7 +116,7 @@ def scenario_from(top: Table, plant: Bearing, recordings: Recordings) -> tuple[S
         clearance=run.leaf("clearance", FIELDS["clearance"]),
         stop=_stop(run),
         seed=_seed(run),
-        **_disturbances(top.table("disturbance"), recordings),
+        **_disturbances(top.table("disturbance"), files),
     )
     check_turning(scenario)
     return scenario, settle

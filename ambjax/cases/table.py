@@ -5,7 +5,7 @@ import difflib
 import pathlib
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -104,12 +104,11 @@ def check_depth(raw: object) -> None:
         raise ValueError(f"tables or lists are nested deeper than {DEEPEST} levels. Use fewer.")
 
 
-def put(raw: dict[str, Any], path: str, value: object) -> None:
-    """Set the value at a dotted path of a parsed TOML document, whose tables are made as needed."""
-    *stems, key = path.split(".")
-    for stem in stems:
-        raw = raw.setdefault(stem, {})
-    raw[key] = value
+def put(raw: Any, words: Sequence[str | int], value: object) -> None:
+    """Set the value at the words of a path of a parsed TOML document, whose tables are made as needed."""
+    for word in words[:-1]:
+        raw = raw[int(word)] if isinstance(raw, list) else raw.setdefault(word, {})
+    raw[words[-1]] = value
 
 
 class Table:
@@ -245,15 +244,11 @@ class Table:
             check_leaf(field, self.at(field.name), values[field.name])
         check_shapes(fields, values, self.path)
         one = kind(**values)
-        self._check_order(one)
-        return one
-
-    def _check_order(self, record: object) -> None:
-        """Raise ValueError if the two leaves that the record orders, such as start and stop, are not in that order."""
-        if pair := getattr(record, "ordered", None):
-            low, high = (getattr(record, name) for name in pair)
+        if pair := getattr(one, "ordered", None):  # such as start and stop
+            low, high = (getattr(one, name) for name in pair)
             if not low < high:
                 raise ValueError(f"{self.at(pair[1])} = {high:g}: it must be more than {pair[0]} = {low:g}.")
+        return one
 
 
 def _unquoted(value: object) -> str:

@@ -45,11 +45,19 @@ def _with_note(text: str, comment: str) -> str:
     return f"{text:<29} # {comment}"
 
 
-def _tune() -> list[str]:
-    """Return the lines of [tune], all of them comments."""
-    head = ("# [tune]", "for 'ambjax tune', which starts at the gains above. Values are defaults unless noted")
-    rows = [(f"# {line.text}" if line.text else "#", line.comment) for line in tune_table.template_lines()]
-    return [_with_note(*row) if len(row[0]) < 30 else f"{row[0]}  # {row[1]}" for row in [head, *rows]]
+def _tune() -> dict[str, str]:
+    """Return the parts of [tune]: the line of each default, a comment, and the numbers of the other comments."""
+    defaults = {f"weights.{name}": field for name, field in tune_table.WEIGHTS.items()}
+    defaults |= tune_table.NUMBERS | tune_table.BUDGET | {"limits.survival": tune_table.SURVIVAL}
+    lines = {name: _with_note(f"# {name} = {x.default!r}", x.metadata["doc"]) for name, x in defaults.items()}
+    shares = {
+        "voltage": 100 * tune_table.VOLTAGE_SHARE,
+        "settling": 100 * tune_table.SETTLING_BAND,
+        "means": tune_table.MEAN_MARGIN,
+        "maxima": tune_table.WORST_MARGIN,
+        "loops": tune_table.LOOP_MARGIN,
+    }
+    return {f"tune.{name}": text for name, text in (lines | {name: f"{x:g}" for name, x in shares.items()}).items()}
 
 
 def _number(value: float) -> str:
@@ -96,5 +104,5 @@ def _generated(tracking: bool) -> dict[str, str]:
         "pulse": "\n".join(_lines(type(PULSE), PULSE)),
         "paper_std": f"{TABLE_2.noise_std:.3e}",
         "designs": " or ".join(f'"{d}"' for d in list(DESIGNS)[1:]),
-        "tune": "\n".join(_tune()),
+        **_tune(),
     }

@@ -68,7 +68,7 @@ def _method(table: Table, period: float, samples: int) -> Integrator | None:
     if dt == "auto":
         if (fixed := table.raw.get("method")) in [name for name in METHODS if name != "sliding"]:
             raise ValueError(f"{table.at('method')} = {show(fixed)} needs a step: give clock.dt in s.")
-        name = table.choice("method", ["auto", "adaptive", "sliding"], "auto") if "method" in table.raw else "auto"
+        name = table.choice("method", ["auto", "adaptive", "sliding"], "auto")
         return {"auto": None, "adaptive": AdaptiveRodas3(), "sliding": Slide(SLIDING_SUBSTEPS)}[name]
     if isinstance(dt, str):
         raise ValueError(f'{table.at("dt")} = {show(dt)}: it must be "auto" or {numbers(DT)}.')

@@ -2,8 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator
-from typing import NamedTuple
 
 from ambjax.numerics.records import leaf
 
@@ -88,92 +86,3 @@ class Budget:
 
 
 BUDGET: dict[str, dataclasses.Field] = {field.name: field for field in dataclasses.fields(Budget)}
-
-
-class Line(NamedTuple):
-    """A line of the template: the key with its value, and a comment."""
-
-    text: str
-    comment: str
-
-
-def template_lines() -> Iterator[Line]:
-    """Yield the lines of [tune] for the template: each key with its default, or with an example and a comment."""
-    yield Line(
-        f'objective = "{OBJECTIVES[0]}"',
-        'least rms voltage within 25 % of the least error; or "least_error"',
-    )
-    yield Line(
-        'gains = ["controller.position.c", "controller.position.k"]',
-        "gains to tune; left out: all that are not 0, but p only on a processor and only if it is finite",
-    )
-    yield Line(
-        "bounds.controller.position.c = [1.0, 500.0]",
-        "bounds of one gain; left out: from plant and theory, see the report; the upper one is",
-    )
-    yield Line("", "then 3 times the end of the range or the gain of the case; for c, a fifth of the sampling rate")
-    yield from _defaults("weights.", WEIGHTS)
-    yield from _limits()
-    yield from _defaults("", {name: NUMBERS[name] for name in ("early",)})
-    yield Line('risk = "cvar"', f'how the members\' losses are combined: "cvar" or "mean"; left out: "{RISKS[0]}"')
-    yield from _defaults("", {"alpha": NUMBERS["alpha"]})
-    yield from _defaults("", {name: BUDGET[name] for name in ("members", "stressed")})
-    yield from _defaults("", {name: NUMBERS[name] for name in ("stress", "gain_margin")})
-    yield from _defaults("", {name: field for name, field in BUDGET.items() if name not in ("members", "stressed")})
-    yield from _defaults("", {"minutes": NUMBERS["minutes"]})
-
-
-def _defaults(prefix: str, fields: dict[str, dataclasses.Field]) -> Iterator[Line]:
-    for name, field in fields.items():
-        yield Line(f"{prefix}{name} = {field.default!r}", field.metadata["doc"])
-
-
-def _limits() -> Iterator[Line]:
-    """Yield the lines of [tune.limits]."""
-    shares = (100 * VOLTAGE_SHARE, MEAN_MARGIN, WORST_MARGIN, LOOP_MARGIN)
-    voltage, means, worst, loops = (f"{x:g}" for x in shares)
-    examples = [
-        (
-            "rms_u_V = 120.0",
-            f"V; root mean square voltage after run.settle, over members (left out: {voltage} % of u_max)",
-        ),
-        ("max_u_V = 150.0", "V; largest voltage of any member; inf, here and below: no limit (left out: none)"),
-        ("max_abs_i_A = 5.0", "A; largest |i|, without the bias, of any member (left out: none)"),
-        (
-            "rms_coil_A = 0.4",
-            "A; root mean square current of a coil after run.settle, bias included, of any member (left out: none)",
-        ),
-        ("chatter_V_per_s = 1e5", "V/s; variation of the voltage after run.settle, mean over members (left out: none)"),
-        ("rms_error_m = 1e-6", "m; root mean square error after run.settle, over members (left out: none)"),
-        ("largest_error_m = 1e-5", "m; largest error after run.settle, of any member (left out: none)"),
-        (
-            "settling_s = 0.2",
-            "s; time of the run after which every error stays within the band (left out: none)",
-        ),
-        (
-            "settling_band_m = 45e-6",
-            f"m; half-width of the settling band (left out: {100 * SETTLING_BAND:g} % of the clearance)",
-        ),
-        (
-            "overshoot_m = 1e-4",
-            "m; largest distance of z beyond its initial value and the range of r so far (left out: none)",
-        ),
-        ("clearance_used = 0.8", "largest |z| of any member as a share of the clearance (left out: none)"),
-        ("z_1x_m = inf", "m; amplitude of z at the speed of [rotor], which it needs, of any member (left out: none)"),
-        ("i_1x_A = inf", "A; amplitude of the current at this speed, of any member (left out: none)"),
-        ("sensitivity_1x = inf", "|S| at this speed, of any member, at r = 0 (left out: none)"),
-        (
-            "sensitivity = 3.0",
-            "peak of |S| of any member, at r = 0; inf: no limit (left out: sensitivity.zone_a)",
-        ),
-        ("complementary = 3.0", "peak of |T| of any member (left out: none)"),
-        ("control_sensitivity = 1e8", "V/m; peak of |KS| of any member (left out: none)"),
-        ("delay_margin_s = 2e-4", "s; least delay margin of any member (left out: none)"),
-        (f"survival = {SURVIVAL.default}", SURVIVAL.metadata["doc"]),
-        (
-            "margin = 0.01",
-            f"distance that the search keeps from a limit, as a share of it; left out: {means} for means, {worst} for "
-            f"maxima, {loops} for loops",
-        ),
-    ]
-    return (Line(f"limits.{text}", comment) for text, comment in examples)

@@ -11,30 +11,24 @@ from ambjax.ensemble.paths import places
 from ambjax.ensemble.spread import Spread, check_spread, require_path
 from ambjax.world.scenario import Scenario
 
+LIST = "a list of numbers, as in [1.0, 2.0]"
+
 
 def _pair(table: Table, key: str) -> list[float]:
-    values = _list(table, key)
+    values = table.column(key, LIST)
     if len(values) != 2:
         raise ValueError(f"{table.at(key)} = {show(table.raw[key])}: it must be [low, high], two numbers.")
     return values
 
 
-def _list(table: Table, key: str) -> list[float]:
-    return table.column(key, "a list of numbers, as in [1.0, 2.0]")
-
-
-def _number(table: Table, key: str) -> float:
-    return table.number(key, None)
-
-
 # Constructors of the distributions, by the key in the case file: `percent` in plant.m = { percent = 10 }. A new
 # distribution needs one row here.
 DISTRIBUTIONS: dict[str, Callable[[Table], Distribution]] = {
-    "percent": lambda t: Percent(_number(t, "percent"), t.choice("shape", list(SHAPES), SHAPES[0])),
-    "normal": lambda t: Normal(_number(t, "normal")),
+    "percent": lambda t: Percent(t.number("percent", None), t.choice("shape", list(SHAPES), SHAPES[0])),
+    "normal": lambda t: Normal(t.number("normal", None)),
     "uniform": lambda t: Uniform(*_pair(t, "uniform")),
     "log-uniform": lambda t: LogUniform(*_pair(t, "log-uniform")),
-    "choices": lambda t: Choice(tuple(_list(t, "choices"))),
+    "choices": lambda t: Choice(tuple(t.column("choices", LIST))),
 }
 
 

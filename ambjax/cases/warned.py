@@ -14,13 +14,10 @@ from ambjax.cases import reader
 from ambjax.cases.plausibility import implausible
 from ambjax.cases.reach import reach, widest
 from ambjax.cases.reader import Case
-from ambjax.cases.table import FILE, require_file, text_of
 from ambjax.simulation.system import reads_velocity
 from ambjax.text.words import one_line
 from ambjax.world.scenario import Scenario
 
-# Plausible ranges of gap (m), pole area (m^2) and permeability (N/A^2); the paper's values are 5e-3, 0.121, 1.25e-6.
-GAPS, AREAS, PERMEABILITIES = (2e-5, 2e-2), (1e-6, 1.0), (6e-7, 2.5e-6)
 # The plant parameter whose default is correct for every machine.
 GRAVITY = "g"
 # Largest plausible standard deviation of the position noise, and largest offset, as shares of the gap.
@@ -36,13 +33,8 @@ def read_case(path: str | pathlib.Path | Mapping[str, Any]) -> Case:
         case = ambjax.read_case("my.toml")
     """
     with jax.ensure_compile_time_eval():
-        if isinstance(path, Mapping):
-            case = dataclasses.replace(reader.case_from(dict(path)), text=text_of(path))
-            texts = warnings_of(case)
-        else:
-            require_file("path", path, f"{FILE}, or a dict of tables")
-            case = reader.read_case(path)
-            texts = warnings_of_file(case, path)
+        case = reader.read_case(path)
+        texts = warnings_of(case) if isinstance(path, Mapping) else warnings_of_file(case, path)
     for text in texts:
         warnings.warn(text, stacklevel=2)
     return case
@@ -56,7 +48,7 @@ def warnings_of_file(case: Case, path: str | pathlib.Path) -> list[str]:
 
 def warnings_of(case: Case) -> list[str]:
     """Return one line for each implausible value of a case: its path, the value, the reason and a possible fix."""
-    own = [*_assumed(case), *_sizes(case), *_noise(case), *_velocity(case), *_currents(case), *_motion(case)]
+    own = [*_assumed(case), *_noise(case), *_velocity(case), *_currents(case), *_motion(case)]
     return [*own, *implausible(case)]
 
 
@@ -67,19 +59,6 @@ def _assumed(case: Case) -> Iterator[str]:
     left = [f"{name} = {getattr(plant, name):g}{unit}" for name, unit in units.items()]
     if left:
         yield f"[plant] omits numbers, which keep the paper's values: {', '.join(left)}. Give those that differ."
-
-
-def _sizes(case: Case) -> Iterator[str]:
-    plant = case.scenario.plant
-    for name, value, (low, high), usual, slip in (
-        ("s_0", plant.s_0, GAPS, "m: gaps are 0.1 mm to some mm, 1e-4 to 5e-3", "millimetres"),
-        ("A", plant.A, AREAS, "m^2: poles have some cm^2, 1e-4 and more", "another unit"),
-        ("mu_0", plant.mu_0, PERMEABILITIES, "N/A^2: that of air is 1.257e-6", "another unit"),
-    ):
-        if not low <= value <= high:
-            yield f"plant.{name} = {value:g} {usual}. Is it in {slip}?"
-    if plant.k_z > 0:
-        yield f"plant.k_z = {plant.k_z:g} N/m pushes the rotor away from z = 0; a restoring bearing has k_z < 0."
 
 
 def _noise(case: Case) -> Iterator[str]:
@@ -142,7 +121,6 @@ def _currents(case: Case) -> Iterator[str]:
 
 
 def _coil_voltage(scenario: Scenario, least: float) -> Iterator[str]:
-    """Yield warnings about the voltage limit of the coils."""
     coil = scenario.actuator.coil
     if coil is None or coil.u_max is None:
         return

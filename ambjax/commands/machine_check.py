@@ -18,9 +18,9 @@ from ambjax.linear.linear_machine import turning_machines
 from ambjax.linear.machine_stability import growth_of, machine_stability
 from ambjax.linear.margins import STATIC
 from ambjax.linear.rotor_modes import LIGHT, Mode, modes_of
-from ambjax.results.machine_run import MachineRun, simulate_machine
 from ambjax.results.operating import points_of
 from ambjax.results.outputs import plain, table
+from ambjax.results.runs import MachineRun, simulate_machine
 from ambjax.text.words import number
 from ambjax.world.rotor import Rotor
 

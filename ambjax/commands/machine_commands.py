@@ -17,8 +17,8 @@ from ambjax.linear.linear_machine import MachineSensitivity
 from ambjax.linear.margins import Margins
 from ambjax.page.rotor_motion import motion_page
 from ambjax.results import operating
-from ambjax.results.machine_run import simulate_machine
 from ambjax.results.outputs import described, directory, drawn, plain, table, write_json
+from ambjax.results.runs import simulate_machine
 from ambjax.simulation.machine_kinds import SampledMachine
 from ambjax.text.words import number
 from ambjax.world.rotation import PER_MINUTE

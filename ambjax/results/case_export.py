@@ -82,7 +82,9 @@ class Plan(NamedTuple):
     @property
     def origin(self) -> Origin:
         """Name and checksum of the case, and the description of the block."""
-        return Origin(self.case.name, _digest(self.case), self.block.described())
+        as_read = self.case.text and is_as_written(self.case)  # a case that was changed has no file
+        digest = hashlib.sha256(self.case.text.encode()).hexdigest() if as_read else ""
+        return Origin(self.case.name, digest, self.block.described())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,11 +181,6 @@ def planned(
     if verified:
         machine.check_compiler()
     return Plan(case, block, format, fmi or 3, precision or "float", name, verified)
-
-
-def _digest(case: Case) -> str:
-    """Return the SHA-256 of the text of a case; '' without a text, or if the case was changed after it was read."""
-    return hashlib.sha256(case.text.encode()).hexdigest() if case.text and is_as_written(case) else ""
 
 
 def _choice(name: str, value: object, allowed: tuple[object, ...]) -> None:

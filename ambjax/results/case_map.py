@@ -138,7 +138,6 @@ def study_and_axes(
 
 
 def _places(case: AnyCase) -> dict[str, Place]:
-    """Return the numbers that an axis may vary, by dotted path."""
     return study_of(case, 0, 1).places()
 
 
@@ -197,7 +196,8 @@ def _axis(flag: str, text: str, case: AnyCase) -> Axis:
     known = _places(case)
     if path != PERIOD and path not in known:
         raise ValueError(f"{flag} {path}: {no_such_number(path, [*known, PERIOD])}")
-    nominal = float(case.clock.sample_period) if path == PERIOD else _nominal(known[path])
+    given = case.clock.sample_period if path == PERIOD else known[path].value
+    nominal = None if given is None else float(given)
     try:
         low, high = (_value(part, nominal) for part in parts[:2])
         count = int(parts[2]) if len(parts) == 3 else COUNT
@@ -242,10 +242,6 @@ def _check_samples(case: AnyCase, x: Axis, y: Axis, members: int) -> None:
                 f"at most {MOST_SAMPLES:,} a run and {MOST_TOTAL:.0e} in all are allowed. Raise LOW, or "
                 "shorten clock.duration."
             )
-
-
-def _nominal(place: Place) -> float | None:
-    return None if place.value is None else float(place.value)
 
 
 def _value(text: str, nominal: float | None) -> float:

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 
+from ambjax.cases.controller_tables import with_gains_of_notch
 from ambjax.cases.machine_case import AnyCase
-from ambjax.cases.notch_table import with_gains_of_notch
 from ambjax.cases.reader import Case, cascade_at
 from ambjax.ensemble.distributions import Uniform
 from ambjax.ensemble.maps import PERIOD

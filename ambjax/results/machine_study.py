@@ -11,7 +11,7 @@ from typing import Any, Self
 import jax
 import numpy as np
 
-from ambjax.cases.machine_case import MachineCase, machine_from, machine_of_axes, parts_of, with_notches_for
+from ambjax.cases.machine_case import MachineCase, machine_from, machine_of_axes, notched, parts_of, with_notches_for
 from ambjax.cases.machine_spread import axis_values, machine_places, shared, varied_start
 from ambjax.cases.rotor_numbers import OF_BEARING, SPEED, varied_rotors
 from ambjax.cases.table import put
@@ -26,7 +26,7 @@ from ambjax.linear.notch_design import speeds_of
 from ambjax.linear.stability import Findings, Stability
 from ambjax.numerics.records import canonical
 from ambjax.numerics.shapes import map_varying, stack_axes
-from ambjax.results.machine_run import worst_of
+from ambjax.results.runs import worst_of
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import PerAxis
 from ambjax.simulation.metrics import Metrics
@@ -106,9 +106,8 @@ class MachineStudy(AnyStudy):
 
     def at(self, path: str, value: float) -> Self:
         case, notches = _reread(self.case, {path: value}), [one.cascade.notch for one in self.case.cases]
-        laws = [dataclasses.replace(one.cascade, notch=own) for one, own in zip(case.cases, notches, strict=True)]
-        cases = [dataclasses.replace(one, cascade=law) for one, law in zip(case.cases, laws, strict=True)]
-        case = with_notches_for(dataclasses.replace(case, cases=tuple(cases)), gain_speeds(self.case))
+        case = dataclasses.replace(case, cases=notched(case.cases, notches))
+        case = with_notches_for(case, gain_speeds(self.case))
         return self._with_clock(case, case.clock.with_method(self.clock.method))
 
     def _with_clock(self, case: MachineCase, clock: Clock) -> Self:
@@ -260,11 +259,11 @@ def _reread(case: MachineCase, changes: Mapping[str, object]) -> MachineCase:
     for path, value in changes.items():
         if path.startswith("controller.model."):  # on all axes
             for one in raw["bearing"]:
-                put(one, path, value)
+                put(one, path.split("."), value)
         elif path.startswith(f"{OF_BEARING}."):
             _, name, own = path.split(".", 2)
             names = [one.get("name", f"bearing{k + 1}") for k, one in enumerate(raw["bearing"])]
-            put(raw["bearing"][names.index(name)], own, value)
+            put(raw["bearing"][names.index(name)], own.split("."), value)
         else:
-            put(raw, path, value)
+            put(raw, path.split("."), value)
     return machine_from(raw, case.name, case.text, case.folder)

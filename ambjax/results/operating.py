@@ -143,7 +143,6 @@ def points_of(case: MachineCase, turning: Sequence[TurningMachine]) -> list[Mach
 
 
 def _velocity_sensor(case: Case) -> bool:
-    """Return whether the velocity is measured and the laws use this measurement."""
     return case.scenario.sensors.velocity and reads_velocity(case.cascade, case.clock.sample_period)
 
 

@@ -33,7 +33,12 @@ def directory(out: str | None, name: str, names: Iterable[str] = (), force: bool
     one of `names`, without `force`; `check_places` refuses one of `names`.
     """
     path, names = target(out, name), list(names)
-    while out is None and not _make_new(path):  # another run has made it meanwhile
+    while out is None:
+        with _refusal(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with contextlib.suppress(FileExistsError):  # another run has made it meanwhile
+                path.mkdir()
+                break
         path = target(out, name)
     for file in (MANIFEST, RESULT):
         with _refusal(path):
@@ -73,18 +78,14 @@ def check_places(out: pathlib.Path, names: Iterable[str | pathlib.PurePath]) -> 
 def spare(out: pathlib.Path, names: Iterable[str], mark: str) -> None:
     """Raise ValueError if a file in `out` has one of these names but lacks `mark`: it is the user's own file."""
     for name in names:
-        if os.path.lexists(out / name) and not _holds(out / name, mark):
+        marked = False
+        with contextlib.suppress(OSError):
+            marked = (out / name).is_file() and mark.encode() in (out / name).read_bytes()
+        if os.path.lexists(out / name) and not marked:
             raise ValueError(
                 f"--out {out}: {name} exists, is not from an export with the same prefix, and would be "
                 "overwritten. Choose another directory, or move the file."
             )
-
-
-def _holds(path: pathlib.Path, mark: str) -> bool:
-    try:
-        return path.is_file() and mark.encode() in path.read_bytes()
-    except OSError:
-        return False
 
 
 def target(out: str | None, name: str) -> pathlib.Path:
@@ -100,17 +101,6 @@ def target(out: str | None, name: str) -> pathlib.Path:
         return pathlib.Path(out)
     candidates = (pathlib.Path("out") / (name if n == 1 else f"{name}-{n}") for n in itertools.count(1))
     return next(p for p in candidates if not os.path.lexists(p))
-
-
-def _make_new(path: pathlib.Path) -> bool:
-    """Make a new directory. Return False if it exists already. Raises ValueError if it cannot be made."""
-    with _refusal(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            path.mkdir()
-        except FileExistsError:
-            return False
-        return True
 
 
 def make(path: pathlib.Path) -> None:
@@ -130,7 +120,8 @@ def files(out: pathlib.Path) -> Iterator[pathlib.Path]:
                 part = pathlib.Path(folder)
                 with removed_by_interrupt(part):
                     yield part
-                names = sorted((p.relative_to(part) for p in part.rglob("*") if p.is_file()), key=_order)
+                names = sorted(p.relative_to(part) for p in part.rglob("*") if p.is_file())
+                names.sort(key=lambda name: name.suffix == ".json")  # report.json last: it ends a search of the tuner
                 check_places(out, names)
                 with uninterrupted():
                     for name in names:
@@ -179,11 +170,6 @@ def fault(error: Exception) -> str:
     at = traceback.extract_tb(error.__traceback__)[-1]
     where = f"{pathlib.Path(at.filename).name}, line {at.lineno}"
     return f"{type(error).__name__}: {words.rstrip('.')} ({where}). This is a defect of ambjax: please report it."
-
-
-def _order(name: pathlib.Path) -> tuple[bool, pathlib.Path]:
-    """Return the key by which files are moved: JSON files last, because report.json ends a search of the tuner."""
-    return name.suffix == ".json", name
 
 
 @contextlib.contextmanager

@@ -43,6 +43,7 @@ class Clock:
 
 P = ParamSpec("P")
 R = TypeVar("R", covariant=True)
+C = TypeVar("C", contravariant=True)
 PARTS = ("cascade", "scenario", "clock")
 
 
@@ -57,11 +58,11 @@ class Triple(Protocol):
     def clock(self) -> Clock: ...
 
 
-class TakesCase(Protocol[P, R]):
-    """A function of a cascade, a scenario and a clock, or of a case."""
+class TakesCase(Protocol[C, P, R]):
+    """A function of a cascade, a scenario and a clock, or of a case of type C."""
 
     @overload
-    def __call__(self, case: Triple, /, *args: P.args, **kwargs: P.kwargs) -> R: ...
+    def __call__(self, case: C, /, *args: P.args, **kwargs: P.kwargs) -> R: ...
     @overload
     def __call__(
         self, cascade: Cascade, scenario: Scenario, clock: Clock, /, *args: P.args, **kwargs: P.kwargs
@@ -76,7 +77,7 @@ def no_case(function: str, *given: object) -> ValueError:
     )
 
 
-def takes_case(function: Callable[Concatenate[Cascade, Scenario, Clock, P], R]) -> TakesCase[P, R]:
+def takes_case(function: Callable[Concatenate[Cascade, Scenario, Clock, P], R]) -> TakesCase[Triple, P, R]:
     """Return the function, which then also accepts a case in place of its first three arguments."""
 
     @functools.wraps(function)
@@ -91,4 +92,4 @@ def takes_case(function: Callable[Concatenate[Cascade, Scenario, Clock, P], R]) 
             raise no_case(function.__name__, *args)
         return function(*args, **named)
 
-    return cast(TakesCase[P, R], called)
+    return cast(TakesCase[Triple, P, R], called)

@@ -36,9 +36,10 @@ def render_page(text: str, pictures: Mapping[str, bytes], title: str, unfolded: 
 
     `unfolded`: headings of level 2 whose sections are open; all other sections are folded. None: all are open.
     """
+    tag = lambda text: '<td class="short">' if len(text) <= SHORT else "<td>"  # noqa: E731
     markdown = MarkdownIt("commonmark", {"html": False}).enable("table")
     markdown.add_render_rule("table_open", lambda *_: '<div class="wide"><table>\n')
-    markdown.add_render_rule("td_open", lambda _, tokens, at, *__: _cell(tokens[at + 1].content))
+    markdown.add_render_rule("td_open", lambda _, tokens, at, *__: tag(tokens[at + 1].content))
     markdown.add_render_rule("table_close", lambda *_: "</table></div>\n")
 
     def image(
@@ -68,7 +69,3 @@ def render_page(text: str, pictures: Mapping[str, bytes], title: str, unfolded: 
                 f"<details><summary>{markdown.render(heading)}</summary>\n{markdown.render(below)}</details>\n"
             )
     return f"{head}\n{''.join(parts)}</html>\n"
-
-
-def _cell(text: str) -> str:
-    return '<td class="short">' if len(text) <= SHORT else "<td>"

@@ -5,8 +5,7 @@ import re
 import tomllib
 from typing import Any
 
-from ambjax.cases.controller_tables import KINDS
-from ambjax.cases.notch_table import PHASE
+from ambjax.cases.controller_tables import KINDS, PHASE
 from ambjax.cases.reader import OTHERS, TABLES, case_from
 from ambjax.cases.scenario_tables import FIELDS, SETTLE, SIGNALS, STOP
 from ambjax.cases.speed_table import OWN_SPEED, RUN_UP
