@@ -25,9 +25,8 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import case_from, read_case
 from ambjax.codegen.c99 import machine
 from ambjax.codegen.c99.machine import Compiled, build
-from ambjax.codegen.c99.package import package_files
-from ambjax.codegen.c99.source import Origin, Writer
-from ambjax.codegen.c99.texts import MARK
+from ambjax.codegen.c99.package import files_of_trace
+from ambjax.codegen.c99.source import MARK, Origin, Writer
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.interface import StepInputs
 from ambjax.codegen.trace import arguments, trace
@@ -292,7 +291,7 @@ def test_a_delay_beyond_the_exported_one_is_refused(tmp_path):
 
 def written(cascade, to, u_max):
     controller = controller_of(cascade, u_max, PERIOD)
-    return package_files(controller, to, "amb", Origin("test", "0" * 64, controller.described()))
+    return files_of_trace(trace(controller, to), "amb", Origin("test", "0" * 64, controller.described()))
 
 
 kept = functools.cache(written)  # many tests read the same text

@@ -14,9 +14,8 @@ from ambjax.__main__ import main
 from ambjax.cases.template_text import template as case_template
 from ambjax.codegen.block import Block
 from ambjax.codegen.javascript.script import HELPERS, script, script_of
-from ambjax.codegen.of_case import block_of
-from ambjax.codegen.points import verification_points
-from ambjax.codegen.reference import results
+from ambjax.codegen.loop_step import block_of
+from ambjax.codegen.points import results, verification_points
 from ambjax.codegen.trace import trace
 
 pytestmark = with_node

@@ -25,7 +25,7 @@ from ambjax.linear.rotor_modes import modes_of, springs_critical
 from ambjax.linear.unbalance_response import UnbalanceResponse, critical_speeds, separation, unbalance_response
 from ambjax.pictures.machine_pictures import machine_sensitivity_picture
 from ambjax.pictures.run_up_picture import last_turn, waterfall
-from ambjax.pictures.style import save
+from ambjax.pictures.scales import save
 from ambjax.results.machine_run import simulate_machine
 
 MASS, I_T, I_P, HALF = 3.0, 0.1, 0.04, 0.25

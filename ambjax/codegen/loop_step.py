@@ -1,4 +1,4 @@
-"""The exported loop: a step of the plant, then a step of the controller, as in the simulator."""
+"""The blocks of a case, and the loop: a step of the plant, then a step of the controller, as in the simulator."""
 
 import dataclasses
 from typing import Any, ClassVar, NamedTuple
@@ -6,8 +6,8 @@ from typing import Any, ClassVar, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.codegen.block import Block, Ports
-from ambjax.codegen.controller import Controller, Memory, Parameters
+from ambjax.codegen.block import Block, Number, Ports
+from ambjax.codegen.controller import Controller, Memory, Parameters, controller_of
 from ambjax.codegen.interface import (
     DISTURBANCES,
     INPUTS,
@@ -23,11 +23,16 @@ from ambjax.codegen.interface import (
     meanings,
     units_of,
 )
-from ambjax.codegen.numbering import Number
-from ambjax.codegen.plant_step import PlantMemory, PlantParameters, PlantStep
+from ambjax.codegen.plant_step import PlantMemory, PlantParameters, PlantStep, plant_of
+from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import Scalar
-from ambjax.simulation.integrate import choose
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.integrate import FixedSteps, choose
+from ambjax.simulation.method import choose_method
 from ambjax.simulation.trajectory import ALIVE
+from ambjax.world.scenario import Scenario
+
+WHAT = ("controller", "plant", "loop")
 
 
 class LoopMemory(NamedTuple):
@@ -108,7 +113,7 @@ class LoopStep(Block):
     def states(self) -> list[Number]:
         own = [x._replace(name=f"controller.{x.name}") for x in self.controller.states()]
         words = "1 after the first accepted readings, which start the laws"
-        begun = Number("controller.started", "", "", words, 0.0, among=(0.0, 1.0, 1.0, 1.0))
+        begun = Number("controller.started", "", words, among=(0.0, 1.0, 1.0, 1.0))
         return [*own, begun, *(x._replace(name=f"plant.{x.name}") for x in self.plant.states())]
 
     def sizes(self) -> tuple[list[float], list[float]]:
@@ -123,6 +128,21 @@ class LoopStep(Block):
         return [*self.controller.described(), *self.plant.described()]
 
 
-def loop_of(controller: Controller, plant: PlantStep) -> LoopStep:
-    """Return the loop of an exported controller and an exported plant, both of one case."""
+def block_of(what: str, cascade: Cascade, scenario: Scenario, clock: Clock) -> Block:
+    """Return a block of a case. `what`: the block, one of WHAT.
+
+    If the clock's method has no fixed number of steps, the plant uses the method that `choose_method` selects instead.
+
+    Raises ValueError for a case that cannot be exported.
+    """
+    period = float(clock.sample_period)
+    controller = controller_of(cascade, scenario.command_limit, period, scenario)
+    if what == "controller":
+        return controller
+    method = clock.method
+    if not isinstance(method, FixedSteps):
+        method = choose_method(cascade, scenario, period, reverse=True)
+    plant = plant_of(cascade, scenario, period, method)
+    if what == "plant":
+        return plant
     return LoopStep(LoopParameters(controller.parameters, plant.parameters), controller.period, controller, plant)

@@ -5,15 +5,8 @@ from typing import Any
 
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
 
-# Primitives that call a jaxpr, by the name of its parameter.
-CALLS = {
-    "checkpoint": "jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-    "remat2": "jaxpr",
-}
+# Primitives that call a jaxpr.
+CALLS = ("checkpoint", "custom_jvp_call", "custom_vjp_call", "jit", "pjit", "remat2")
 
 
 def moved(closed: ClosedJaxpr, moves: Sequence[bool]) -> list[bool]:
@@ -73,6 +66,6 @@ def while_parts(eqn: JaxprEqn) -> tuple[ClosedJaxpr, ClosedJaxpr, int, int]:
 
 
 def called(eqn: JaxprEqn) -> ClosedJaxpr:
-    """Return the jaxpr that an equation of CALLS calls."""
-    inner = eqn.params[CALLS[eqn.primitive.name]]
+    """Return the jaxpr that an equation calls."""
+    inner = next(eqn.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in eqn.params)
     return inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())

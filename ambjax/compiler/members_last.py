@@ -85,7 +85,6 @@ class _Members:
         return [read(x) for x in jaxpr.outvars]
 
     def one(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged:
-        """Return the results of one equation."""
         name, params = eqn.primitive.name, eqn.params
         rule = self.reduced if name in REDUCTIONS else getattr(self, f"rule_{name}", None)
         if name in CALLS and rule is None:

@@ -13,12 +13,11 @@ import jax
 import numpy as np
 
 from ambjax.cases.reader import Case
+from ambjax.codegen.javascript.script import PRELUDE
 from ambjax.ensemble.study import Study
 from ambjax.host.extensions import extra
 from ambjax.page.case_text import TemplateLine, checked, editable_lines
-from ambjax.page.functions import PRELUDE
-from ambjax.page.linear_script import linear_script
-from ambjax.page.loop_functions import COILS, SIGNALS, loop_parameters, loop_script
+from ambjax.page.loop_functions import COILS, SIGNALS, linear_script, loop_parameters, loop_script
 from ambjax.page.sliders import GROUPS, SEED, Slider, changed, parameter_values, parameters, sliders
 from ambjax.simulation.metrics import UNITS
 from ambjax.simulation.trajectory import STATUSES
@@ -96,7 +95,6 @@ def _asset(name: str) -> str:
 
 
 def _library() -> list[str]:
-    """Return Bokeh's JavaScript. Raises ValueError if Bokeh is not installed."""
     folder = pathlib.Path(extra("bokeh", "page").__file__).parent / "server" / "static" / "js"
     return [(folder / name).read_text(encoding="utf-8") for name in BOKEH]
 
@@ -119,7 +117,6 @@ def _check_contents(case: Case, path: str) -> None:
 
 
 def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str, Any]]:
-    """Return the script of the worker, and the data of the page for JSON."""
     check_processor(case, path)
     _check_contents(case, path)
     for other in others:
@@ -127,7 +124,7 @@ def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str,
     case = _finest(case, others)
     try:
         loop, moving = loop_script(case), loop_script(case, any_delay=True)
-        linear = linear_script(case)
+        linear, facts = linear_script(case)
     except ValueError as why:
         raise ValueError(f"{path}: the page cannot compute this case: {why}") from None
     given, lines = _written(case, others)
@@ -151,11 +148,11 @@ def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str,
         "settle": float(case.settle),
         "period": float(case.clock.sample_period),
         "members": _members(case),
-        "linear": linear.facts,
+        "linear": facts,
         "lost": loop.lost,
         "places": parameters(case, ["plant.s_0", "plant.i_0", *clearance]),
     }
-    generated = [PRELUDE, loop.source, moving.source.replace("function ", "function any_"), linear.source]
+    generated = [PRELUDE, loop.source, moving.source.replace("function ", "function any_"), linear]
     return "\n".join([*generated, *map(_asset, WORKER)]), data
 
 
@@ -176,19 +173,16 @@ def _written(case: Case, others: list[Case]) -> tuple[list[Slider], list[list[Te
 
 
 def _in_file(slider: Slider, case: Case) -> bool:
-    """Return whether the case file contains the number of a slider."""
     lines, _ = editable_lines(case.text, [slider])
     return any(not line.only and len(line.parts) > 1 for line in lines)
 
 
 def _own(given: list[Slider], case: Case) -> list[Slider]:
-    """Return the sliders `given` with the values of a case."""
     values = parameter_values(case)
     return [one._replace(value=float(values[one.parameter])) for one in given]
 
 
 def _preset(case: Case, lines: list[TemplateLine]) -> dict[str, Any]:
-    """Return a preset for JSON: name, parameters and template of a case."""
     values = [float(x) for x in parameter_values(case)]
     return {"name": case.name, "P": [x if np.isfinite(x) else "Infinity" for x in values], "lines": lines}
 
@@ -203,7 +197,6 @@ def _check_structure(case: Case, other: Case, path: str) -> None:
 
 
 def _alike(case: Case, other: Case) -> bool:
-    """Return whether two cases differ in numbers only."""
     same = other.cascade.sampled and other.clock.samples == case.clock.samples
     return same and jax.tree.structure(loop_parameters(other)) == jax.tree.structure(loop_parameters(case))
 

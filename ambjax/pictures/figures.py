@@ -8,8 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from ambjax.pictures.scales import prefix_of
-from ambjax.pictures.style import own_style
+from ambjax.pictures.scales import own_style, prefix_of
 from ambjax.pictures.thinning import envelope, smoothed, stretch_of, thin
 from ambjax.simulation.trajectory import STALLED, Row, Trajectory
 

@@ -24,8 +24,7 @@ from ambjax.pictures.figures import (
     draw_panel,
     signal_of,
 )
-from ambjax.pictures.scales import prefix_of
-from ambjax.pictures.style import own_style
+from ambjax.pictures.scales import own_style, prefix_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
 
 # Largest number of reversals of a chattering voltage in the enlarged end of a run.
@@ -139,9 +138,8 @@ def _status(trajectory: Trajectory) -> str:
     lost_at = float(trajectory.lost_at)
     if not np.isfinite(lost_at):
         return ""
-    return (
-        f"{'not decided from' if trajectory.lost_code == STALLED else 'lost at'} {lost_at:.4g} s: {trajectory.lost_why}"
-    )
+    status = "not decided from" if trajectory.lost_code == STALLED else "lost at"
+    return f"{status} {lost_at:.4g} s: {trajectory.lost_why}"
 
 
 def _short(seconds: float) -> str:

@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from ambjax.pictures.machine_pictures import orbits_of
-from ambjax.pictures.style import own_style
+from ambjax.pictures.machine_pictures import orbit_axes, orbits_of
+from ambjax.pictures.scales import own_style
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.world.rotation import Rotation
 
@@ -75,10 +75,8 @@ def run_up_picture(case: Any, signals: dict[str, np.ndarray]) -> Figure:
                               shading="nearest", rasterized=True)  # fmt: skip
         ax.plot(found.speeds[order], np.abs(found.speeds[order]) / 60, "c--", linewidth=0.8)
         ax.annotate("1x", (found.speeds[order][-1], np.abs(found.speeds[order][-1]) / 60), color="c")
-        ax.set_ylim(0, end)
-        ax.set_title(f"reading of {signals['axes'][x]}")
-        ax.set_xlabel("speed, rpm")
-        ax.set_ylabel("frequency, Hz")
+        title = f"reading of {signals['axes'][x]}"
+        ax.set(ylim=(0, end), title=title, xlabel="speed, rpm", ylabel="frequency, Hz")
         figure.colorbar(image, ax=ax, pad=0.01, label="amplitude, µm")
         orbits = figure.add_subplot(grid[row, 1])
         for place in np.linspace(0.02, 1.0, ORBITS):
@@ -86,11 +84,7 @@ def run_up_picture(case: Any, signals: dict[str, np.ndarray]) -> Figure:
             part = last_turn(turns, end_of)
             u, v = (1e6 * (signals["z"][alive, k][part]) for k in (x, y))
             orbits.plot(u, v, linewidth=0.9, label=f"{speed[end_of]:.0f} rpm")
-        orbits.set_aspect("equal", adjustable="datalim")
-        orbits.set_title(f"orbits of {name}: one turn each")
-        orbits.set_xlabel("x axis, µm")
-        orbits.set_ylabel("y axis, µm")
-        orbits.grid(True, alpha=0.3)
+        orbit_axes(orbits, f"orbits of {name}: one turn each")
         orbits.legend(fontsize="xx-small", loc="upper right")
     _limits(figure.add_subplot(grid[-1, :]), case, signals, alive)
     figure.suptitle(f"{case.name}: {speed[0]:.0f} to {speed[-1]:.0f} rpm")
@@ -110,9 +104,8 @@ def _limits(ax: Any, case: Any, signals: dict[str, np.ndarray], alive: np.ndarra
             ax.plot(middle, [float(np.max(part)) for part in parts], style, color=f"C{k}", linewidth=1.1, label=label)
     ax.axhline(1.0, color="r", linewidth=0.9, linestyle="--")
     ax.set_ylim(bottom=0)
-    ax.set_xlabel("speed, rpm")
-    ax.set_ylabel("share of the limit")
-    ax.set_title("largest |i| as a share of the bias, largest |u| as a share of the supply")
+    title = "largest |i| as a share of the bias, largest |u| as a share of the supply"
+    ax.set(title=title, xlabel="speed, rpm", ylabel="share of the limit")
     ax.grid(True, alpha=0.3)
     ax.legend(fontsize="small", ncols=4, loc="upper right")
 

@@ -1,11 +1,15 @@
-"""Axes of pictures: units, SI prefixes, ticks of logarithmic axes, and edges of cells."""
+"""The style of every picture, and its axes: units, SI prefixes, ticks of logarithmic axes, edges of cells."""
 
 import math
+import pathlib
 import re
+from typing import Any
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.figure import Figure
 from matplotlib.ticker import (
     EngFormatter,
     FixedLocator,
@@ -19,6 +23,10 @@ from matplotlib.ticker import (
 from ambjax.simulation import orders
 from ambjax.simulation.metrics import UNITS
 
+# Matplotlib's default without offsets of axes, independent of any matplotlibrc file.
+_STYLE: Any = {k: v for k, v in matplotlib.rcParamsDefault.items() if k != "backend"}
+# Decorator of every function that draws.
+own_style = matplotlib.rc_context(_STYLE | {"axes.formatter.useoffset": False})
 # Labels of metrics without their units.
 LABELS = {
     "max_abs_error_m": "max |error|",
@@ -157,3 +165,9 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
     powers = LogFormatterSciNotation(labelOnlyBase=False)
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}" if 1e-3 <= value < 1e5 else powers(value)))
     axis.set_minor_formatter(NullFormatter())
+
+
+@own_style
+def save(figure: Figure, path: pathlib.Path, dpi: int = 130) -> None:
+    """Write a picture to a file."""
+    figure.savefig(path, dpi=dpi)

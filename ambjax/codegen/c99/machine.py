@@ -11,9 +11,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ambjax.codegen.points import Points
+from ambjax.codegen.points import Points, Results
 from ambjax.codegen.program import PRECISIONS
-from ambjax.codegen.reference import Results
 from ambjax.codegen.trace import Trace
 
 STRICT = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic", "-Werror"]

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ambjax.codegen.block import UNREAD
 from ambjax.codegen.c99.statements import word
 from ambjax.codegen.interface import INPUTS
-from ambjax.codegen.numbering import UNREAD
 from ambjax.codegen.trace import Trace
 
 
@@ -53,11 +53,6 @@ def notes_of(trace: Trace) -> list[str]:
     """Return lines on the order of operations in a sample, on what the export fixes, and on what a step checks."""
     if trace.block.noun == "controller":
         return [*order_of_work(trace), "", *fixed(trace)]
-    return _of_plant(trace)
-
-
-def _of_plant(trace: Trace) -> list[str]:
-    """Return the lines of `notes_of` for a plant or a loop."""
     block = trace.block
     lines = [
         f"Step n ends at t = n T, T = {block.period:g} s. It advances the plant by T under the voltages that act, with",

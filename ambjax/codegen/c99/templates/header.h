@@ -40,13 +40,13 @@ typedef {real} {p}_real;
 extern const {p}_params {p}_default;
 
 /* {about.init} */
-{init};
+void {p}_init({p}_state *state);
 
 /* {about.step} */
-{step};
+uint32_t {p}_step(const {p}_params *params, {p}_state *state, const {p}_input *input, {p}_output *output);
 
 /* {about.reset} */
-{reset};
+void {p}_reset({p}_state *state);
 
 #ifdef __cplusplus
 }}
