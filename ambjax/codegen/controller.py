@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.codegen.block import Block, Number, Ports, earlier, numbers_of, scales
-from ambjax.codegen.interface import INPUTS, Status, StepInputs, StepOutputs, meanings, outputs_of
+from ambjax.codegen.interface import INPUTS, OUTPUTS, Status, StepInputs, StepOutputs, meanings
 from ambjax.control.base import memory_of
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
@@ -97,7 +97,8 @@ class Controller(Block):
 
     @property
     def outputs(self) -> Ports:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return outputs_of(self.commands)
+        current = {"u": ("A", "current to command to the amplifier, within its limit")}
+        return OUTPUTS | (current if self.commands == "current" else {})
 
     def step(
         self, parameters: Parameters, memory: Memory, inputs: StepInputs, period: Scalar, read: frozenset[str]

@@ -13,7 +13,7 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn
 
 from ambjax.codegen.primitives import CALLS, OPS, SAME, dtype_of, split_scan, walked
 from ambjax.codegen.program import Operand, Program, Ref, of
-from ambjax.compiler.member_flags import called
+from ambjax.compiler.members_last import called
 
 LOOPS = ("scan", "while")
 COMPOSED = ("rsqrt", "exp2", "logistic", "one_minus_square")

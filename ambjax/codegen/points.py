@@ -20,7 +20,7 @@ from ambjax.codegen.block import UNREAD
 from ambjax.codegen.primitives import CALLS, OPS, SAME, dtype_of, split_scan, walked
 from ambjax.codegen.program import PRECISIONS, Ref
 from ambjax.codegen.trace import Trace, arguments
-from ambjax.compiler.member_flags import called
+from ambjax.compiler.members_last import called
 from ambjax.compiler.short_compilation import precision
 
 # DECADES: range of the random numbers, in decades around the scale of each. EDGY: probability that a number is zero,
@@ -113,7 +113,8 @@ def _seen(trace: Trace, x: np.ndarray, started: np.ndarray) -> tuple[np.ndarray,
 
 def _drawn(trace: Trace, random: np.random.Generator, parameters: np.ndarray) -> np.ndarray:
     """Return random states and inputs of either sign, over decades, with zeros, limits and some non-finite inputs."""
-    sizes, count = np.array(_sizes(trace)), parameters.shape[1]
+    states, inputs = trace.block.sizes()
+    sizes, count = np.array([*(states[k] for k in trace.keep), *inputs]), parameters.shape[1]
     limits = np.ones((sizes.size, count))  # 1 for numbers without a limit: states, and readings without a guard
     bounds = trace.block.bounds()
     for k, x in enumerate(trace.parameters):
@@ -130,13 +131,8 @@ def _drawn(trace: Trace, random: np.random.Generator, parameters: np.ndarray) ->
         if state.among:
             row[:] = random.choice(state.among, count)
     wild = random.choice([np.nan, np.inf, -np.inf], shape)
-    inputs = np.arange(sizes.size)[:, None] >= len(trace.state)
-    return np.where(inputs & (random.random(shape) < EDGY / 10), wild, x)
-
-
-def _sizes(trace: Trace) -> list[float]:
-    states, inputs = trace.block.sizes()
-    return [states[k] for k in trace.keep] + inputs
+    given = np.arange(sizes.size)[:, None] >= len(trace.state)
+    return np.where(given & (random.random(shape) < EDGY / 10), wild, x)
 
 
 def _borders(trace: Trace, x: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ import dataclasses
 import html
 import importlib.resources
 import json
+import math
 import pathlib
 import shlex
 from collections.abc import Sequence
@@ -99,8 +100,8 @@ def _library() -> list[str]:
     return [(folder / name).read_text(encoding="utf-8") for name in BOKEH]
 
 
-def _check_contents(case: Case, path: str) -> None:
-    """Raise ValueError for what a page cannot contain: a signal from a file, and a notch."""
+def _check_contents(case: Case, others: list[Case], path: str) -> None:
+    """Raise ValueError for a signal from a file, a notch, and other cases that differ in more than numbers."""
     if case.cascade.notch is not None:
         raise ValueError(
             f"{path}: [controller.notch]: a page cannot contain a notch, whose gain depends on all numbers of the "
@@ -114,16 +115,20 @@ def _check_contents(case: Case, path: str) -> None:
                 f'{path}: {where}: kind = "table": a page cannot contain a signal from a file. Remove it, or '
                 "replace it by another signal."
             )
+    for other in others:
+        if not _alike(case, other):
+            raise ValueError(
+                f"--also {other.name}: it differs from {path} in more than numbers. Give a case with the same laws, "
+                "plant, signals, sensors and number of samples, such as tuned.toml."
+            )
 
 
 def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str, Any]]:
     check_processor(case, path)
-    _check_contents(case, path)
-    for other in others:
-        _check_structure(case, other, path)
+    _check_contents(case, others, path)
     case = _finest(case, others)
     try:
-        loop, moving = loop_script(case), loop_script(case, any_delay=True)
+        (loop, states), (moving, _) = loop_script(case), loop_script(case, any_delay=True)
         linear, facts = linear_script(case)
     except ValueError as why:
         raise ValueError(f"{path}: the page cannot compute this case: {why}") from None
@@ -135,13 +140,11 @@ def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str,
         "from": pathlib.Path(path).name,
         "command": shlex.join(["ambjax", "tune", pathlib.Path(path).name, "--out", "tuned"]),
         "presets": presets,
-        "sliders": [_finite(one._asdict()) for one in given],
+        "sliders": [{k: None if x in (math.inf, -math.inf) else x for k, x in one._asdict().items()} for one in given],
         "groups": list(GROUPS.items()),
-        "metrics": loop.metrics,
         "units": UNITS,
         "statuses": STATUSES,
         "signals": [*SIGNALS, *COILS],
-        "states": loop.states,
         "samples": case.clock.samples,
         "delay": parameters(case, ["processor.delay"])["processor.delay"],
         "seed": parameters(case, [SEED])[SEED],
@@ -149,10 +152,10 @@ def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str,
         "period": float(case.clock.sample_period),
         "members": _members(case),
         "linear": facts,
-        "lost": loop.lost,
+        **states,
         "places": parameters(case, ["plant.s_0", "plant.i_0", *clearance]),
     }
-    generated = [PRELUDE, loop.source, moving.source.replace("function ", "function any_"), linear]
+    generated = [PRELUDE, loop, moving.replace("function ", "function any_"), linear]
     return "\n".join([*generated, *map(_asset, WORKER)]), data
 
 
@@ -187,15 +190,6 @@ def _preset(case: Case, lines: list[TemplateLine]) -> dict[str, Any]:
     return {"name": case.name, "P": [x if np.isfinite(x) else "Infinity" for x in values], "lines": lines}
 
 
-def _check_structure(case: Case, other: Case, path: str) -> None:
-    """Raise ValueError if two cases differ in more than numbers. `path`: case file of the first."""
-    if not _alike(case, other):
-        raise ValueError(
-            f"--also {other.name}: it differs from {path} in more than numbers. Give a case with the same laws, plant, "
-            "signals, sensors and number of samples, such as tuned.toml."
-        )
-
-
 def _alike(case: Case, other: Case) -> bool:
     same = other.cascade.sampled and other.clock.samples == case.clock.samples
     return same and jax.tree.structure(loop_parameters(other)) == jax.tree.structure(loop_parameters(case))
@@ -211,8 +205,8 @@ def _finest(case: Case, others: list[Case]) -> Case:
 
 def _members(case: Case) -> dict[str, Any]:
     """Return the members of the ensemble for JSON: their number, and rows for the parameters that vary."""
-    study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, MEMBERS)
-    study = dataclasses.replace(study, seed=int(case.scenario.seed))
+    seed = int(case.scenario.seed)
+    study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, seed, MEMBERS)
     own, drawn = parameter_values(case), study.drawn(np.arange(MEMBERS))
     relative = {path for path, kind in case.spread.entries if kind.relative}
     rows = []
@@ -222,8 +216,3 @@ def _members(case: Case) -> dict[str, Any]:
             factor = path in relative and own[k] != 0
             rows.append([int(k), bool(factor), [float(one[k] / own[k] if factor else one[k]) for one in moved]])
     return {"count": MEMBERS, "rows": rows}
-
-
-def _finite(entries: dict[str, Any]) -> dict[str, Any]:
-    """Return the entries with None instead of an infinite number, which JSON lacks."""
-    return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in entries.items()}

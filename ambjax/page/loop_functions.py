@@ -93,28 +93,16 @@ SIGNALS = ("z", "alive", "r", "u", "u_mean", "i_ref", "q_z", "z_measured", "sigm
 COILS = ("i_1", "i_2")
 
 
-class LoopScript(NamedTuple):
-    """The loop as JavaScript.
+def loop_script(case: Case, any_delay: bool = False) -> tuple[str, dict[str, Any]]:
+    """Return the loop of a case on a processor as JavaScript, and facts for the page.
 
-    - `source`: the functions `startLoop(P, W, out)`, `makeLoop(P)`, `makeMember(P)` and `loopMetrics(P, S, out)`.
-      W: normal random numbers. `out`: array of the result. See `functions.loop_source` for the functions that
-      `makeLoop` and `makeMember` return. That of a member does not update the metrics in S.
-    - `metrics`: names of the metrics, in the order of `out` of `loopMetrics`.
-    - `states`: number of states S.
-    - `lost`: index of the state that contains the status code of the rotor.
-    """
+    The JavaScript defines `startLoop(P, W, out)`, `makeLoop(P)`, `makeMember(P)` and `loopMetrics(P, S, out)`. W:
+    normal random numbers. `out`: array of the result. See `loop_source` for the functions that `makeLoop` and
+    `makeMember` return. That of a member does not update the metrics in S. The facts: names of the metrics in the order
+    of `out` of `loopMetrics`, number of states S, index of the state that contains the status code of the rotor.
 
-    source: str
-    metrics: list[str]
-    states: int
-    lost: int
-
-
-def loop_script(case: Case, any_delay: bool = False) -> LoopScript:
-    """Return the loop of a case on a processor as JavaScript. `any_delay`: for every delay that the page
-    admits, not only that of the case.
-
-    Raises ValueError for a part of the case that scalar code cannot express.
+    `any_delay`: for every delay that the page admits, not only that of the case. Raises ValueError for a part of the
+    case that scalar code cannot express.
     """
     with precision("double"):
         numbers = canonical(loop_parameters(case, any_delay))
@@ -129,16 +117,14 @@ def loop_script(case: Case, any_delay: bool = False) -> LoopScript:
     _, row, coils = step.results
     shown = [getattr(row, name) for name in SIGNALS] + list(coils)
     every = operands_of(step.results[0])
-    source = "\n".join(
-        [
-            function_source(start, "startLoop", "PW", start.results),
-            loop_source(step, "makeLoop", shown, every),
-            loop_source(step, "makeMember", shown[:3], []),
-            function_source(result, "loopMetrics", "PS", result.results),
-        ]
-    )
+    sources = [
+        function_source(start, "startLoop", "PW", start.results),
+        loop_source(step, "makeLoop", shown, every),
+        loop_source(step, "makeMember", shown[:3], []),
+        function_source(result, "loopMetrics", "PS", result.results),
+    ]
     lost = jax.tree.leaves(jax.tree.map(lambda x: x is shapes.ending.lost_code, shapes)).index(True)
-    return LoopScript(source, list(result.results), len(every), lost)
+    return "\n".join(sources), {"metrics": list(result.results), "states": len(every), "lost": lost}
 
 
 class LoopPoint(NamedTuple):

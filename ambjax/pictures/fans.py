@@ -9,9 +9,8 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ambjax.pictures.figures import BLUE, INK, RED
+from ambjax.pictures.figures import BLUE, INK, RED, envelope, thin
 from ambjax.pictures.scales import digits, own_style, prefix_of, style_axes
-from ambjax.pictures.thinning import envelope, thin
 
 # Quantities of a fan chart: label and SI unit.
 QUANTITIES = {

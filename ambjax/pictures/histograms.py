@@ -50,7 +50,8 @@ def histogram_figure(columns: Mapping[str, np.ndarray], metrics: Sequence[str] =
     names = [name for name in metrics if name in columns]
     if not names:
         raise ValueError(f"histograms: none of {', '.join(metrics)} is a column. The columns are {', '.join(columns)}.")
-    lost = _lost(columns, len(columns[names[0]]))
+    none = np.full(len(columns[names[0]]), math.inf)
+    lost = np.isfinite(np.asarray(columns.get("lost_at", columns.get("lost_at_s", none)), float))
     open_ = int(np.sum(lost & np.asarray(columns.get("stalled", False), bool)))
     across = min(3, len(names))
     down = -(-len(names) // across)
@@ -66,13 +67,6 @@ def histogram_figure(columns: Mapping[str, np.ndarray], metrics: Sequence[str] =
     figure.suptitle(f"{lost.size} members, {statuses(int(lost.sum()) - open_, open_)}", fontsize=11)
     figure.legend(handles=keys, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     return figure
-
-
-def _lost(columns: Mapping[str, object], members: int) -> np.ndarray:
-    for name in ("lost_at", "lost_at_s"):
-        if name in columns:
-            return np.isfinite(np.asarray(columns[name], float))
-    return np.zeros(members, bool)
 
 
 def _histogram(ax: Axes, name: str, values: np.ndarray, lost: np.ndarray) -> None:
@@ -96,19 +90,10 @@ def _histogram(ax: Axes, name: str, values: np.ndarray, lost: np.ndarray) -> Non
         value = factor * order[math.ceil(share * order.size) - 1] if order.size else math.nan
         if math.isfinite(value) and (value > 0 or not log):
             ax.axvline(value, color=INK, linestyle=style, linewidth=1.2)
-        text = (
-            f"{digits(value)} {unit}".rstrip()
-            if math.isfinite(value)
-            else "never"
-            if reached and order.size
-            else "none"
-        )
-        notes.append(f"{words}: {text}")
-    for count, words in (
-        (np.sum(~np.isfinite(values)), "never" if reached else "not finite"),
-        (np.sum(finite == 0) * log, "at zero"),
-    ):
-        notes += [f"{count} {words}"] if count else []
+        missing = "never" if reached and order.size else "none"
+        notes.append(f"{words}: {f'{digits(value)} {unit}'.rstrip() if math.isfinite(value) else missing}")
+    counts = {"never" if reached else "not finite": np.sum(~np.isfinite(values)), "at zero": np.sum(finite == 0) * log}
+    notes += [f"{count} {words}" for words, count in counts.items() if count]
     ax.set_title(", ".join(notes), fontsize=8, pad=3)
     ax.set_xlabel(f"{label} ({unit})" if unit else label, fontsize=9)
     ax.set_ylim(0, 1.08 * max((alive + dead).max(), 1))

@@ -22,7 +22,7 @@ from ambjax.codegen.c99 import machine, package
 from ambjax.codegen.c99.source import MARK, Origin
 from ambjax.codegen.c99.statements import RESERVED
 from ambjax.codegen.fmi import archive
-from ambjax.codegen.javascript.script import script_of
+from ambjax.codegen.javascript.script import script
 from ambjax.codegen.loop_step import WHAT, block_of
 from ambjax.codegen.program import PRECISIONS
 from ambjax.codegen.trace import trace
@@ -211,7 +211,8 @@ def generated(plan: Plan) -> ExportedCase:
 def _built(plan: Plan) -> dict[str, str | bytes]:
     """Return the content of each file by name, without verification."""
     if plan.format == "js":
-        return {f"{plan.prefix}.js": f"// {plan.mark}\n{script_of(plan.block, plan.prefix)}"}
+        text = script(trace(plan.block, "double"), plan.prefix)
+        return {f"{plan.prefix}.js": f"// {plan.mark}\n{text}"}
     if plan.format == "c":
         return {**package.files_of_trace(trace(plan.block, plan.precision), plan.prefix, plan.origin)}
     case, traced = plan.case, trace(plan.block, "double")

@@ -94,8 +94,8 @@ def _refusal(writer: Writer) -> dict[str, object]:
 def _readme(writer: Writer) -> str:
     t, p = writer.trace, writer.prefix
     controller = t.block.noun == "controller"
-    read = [name for name in t.block.inputs if name in t.read]
-    source = _source if controller else "input_{}".format
+    given = {name: "reference_" if name in Reference._fields else "read_" for name in t.block.inputs if name in t.read}
+    read = {name: f"{start if controller else 'input_'}{name}" for name, start in given.items()}
     command = getattr(t.block, "commands", "voltage")
     written_ = {command: "u"} if controller else {name: name for name in t.block.outputs}
     bits = ("SAFE", "FAILED", "INVALID") if controller else ("INVALID", "TOUCHED", "DIVERGED")
@@ -108,8 +108,8 @@ def _readme(writer: Writer) -> str:
         cascade="\n".join(f"- {line}" for line in writer.origin.parts),
         notes="\n".join(order_of_work(t) if controller else notes_of(t)),
         fixed="\n".join([*fixed(t), "", ""]) if controller else "",
-        yours="\n".join(f"{p}_real {source(name)}(void);" for name in read),
-        reads="\n".join(f"    input.{name} = {source(name)}();" for name in read),
+        yours="\n".join(f"{p}_real {source}(void);" for source in read.values()),
+        reads="\n".join(f"    input.{name} = {source}();" for name, source in read.items()),
         writers="\n".join(f"void write_{name}({p}_real {port});" for name, port in written_.items()),
         writes="\n".join(f"    write_{name}(output.{port});" for name, port in written_.items()),
         faults=" | ".join(f"{p}_{bit}" for bit in bits),
@@ -121,8 +121,3 @@ def _readme(writer: Writer) -> str:
         period=f"{t.block.period:g}",
         ulps="a relative difference of 1e-5" if t.precision == "float" else f"{ULPS} units in the last place",
     )
-
-
-def _source(name: str) -> str:
-    """Return the name of the function that reads an input in the README's example: read_z, reference_r_dot."""
-    return f"{'reference' if name in Reference._fields else 'read'}_{name}"

@@ -34,8 +34,6 @@ class Writer:
         self.trace, self.prefix, self.origin = trace, prefix, origin
         self.text = CStatements(trace.program, trace.order(), trace.precision, prefix)
 
-    # --- numbers in structs ---
-
     def struct(self, kind: str, numbers: Iterable[Number], more: Sequence[str] = ()) -> str:
         """Return the definition of a struct of numbers; a dotted name becomes a struct within it."""
 
@@ -64,8 +62,6 @@ class Writer:
             yield "}"
 
         return " \\\n".join(lines(_nested(numbers), 1))
-
-    # --- the step ---
 
     def body(self) -> list[str]:
         p, trace, text = self.prefix, self.trace, self.text
@@ -105,8 +101,6 @@ class Writer:
         lines += [f"SHA-256 of the case: {self.origin.digest}"] if self.origin.digest else []
         return "/* " + "\n * ".join(lines) + " */"
 
-    # --- the header ---
-
     def header(self) -> str:
         p, t = self.prefix, self.trace
         inputs = [x._replace(allowed="" if x.name in t.read else UNREAD) for x in t.inputs]
@@ -121,7 +115,7 @@ class Writer:
             bits="\n".join(bits),
             params=self.struct("params", t.parameters),
             state=self.struct(
-                "state", [x for x, _ in t.state], [f"uint32_t started; /* {ABOUT[t.block.noun].started} */"]
+                "state", [x for x, _ in t.state], [f"uint32_t started; /* {ABOUT[t.block.noun]['started']} */"]
             ),
             input=self.struct("input", inputs),
             output=self.struct("output", [x for x, _ in t.outputs]),

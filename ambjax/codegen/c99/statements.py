@@ -20,7 +20,11 @@ RESERVED = {
     *("noexcept", "nullptr", "reinterpret_cast", "requires", "static_assert", "static_cast", "thread_local", "true"),
     *("false", "typeid", "wchar_t", "asm", "compl", "bitand", "bitor", "and_eq", "or_eq", "xor_eq", "not_eq", "xor"),
 }
-HELPERS = {"max": "a > b || a != a ? a : b", "min": "a < b || a != a ? a : b", "sign": "a > 0 ? 1 : a < 0 ? -1 : a"}
+HELPERS = {
+    "max": "a > b || a != a ? a : b",
+    "min": "a < b || a != a ? a : b",
+    "sign": "a > {zero} ? {one} : a < {zero} ? -{one} : a",
+}
 
 
 def word(name: str) -> str:
@@ -81,11 +85,11 @@ class CStatements(Statements):
         """Return the functions that the step uses and C lacks. They treat NaN as JAX does."""
         used = {self.program.nodes[n].op for n in self.order}
         real, lines = f"{self.prefix}_real", []
+        zero, one = (c_constant(x, self.precision) for x in (0, 1))
         for name, text in HELPERS.items():
             if name in used:
                 taken = f"{real} a" if name == "sign" else f"{real} a, {real} b"
-                for digit in ("0", "1"):
-                    text = re.sub(rf"(?<![\w.]){digit}(?![\w.])", c_constant(float(digit), self.precision), text)
+                text = text.format(zero=zero, one=one)
                 lines += [f"static {real} {self.prefix}_{name}({taken})", "{", f"    return {text};", "}", ""]
         return lines
 

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple, SupportsFloat
 import jax
 import numpy as np
 
-from ambjax.codegen.block import Block, Number
+from ambjax.codegen.block import Number
 from ambjax.codegen.emitter import traced as traced_into
 from ambjax.codegen.primitives import OPS
 from ambjax.codegen.program import PERIOD, STARTED, Location, Operand, Program, Ref, Statements
-from ambjax.codegen.trace import Trace, trace
+from ambjax.codegen.trace import Trace
 
 # Functions that the rows of OPS use, and that `Math` lacks or defines differently. They treat NaN and the sign of 0 as
 # JAX does.
@@ -39,13 +39,11 @@ NEEDS = {"erf": ("erfc",), "erfc": ("erf",)}
 PRELUDE = "\n".join(f"const {name} = {text};" for name, text in HELPERS.items())
 
 
-def script_of(block: Block, name: str) -> str:
-    """Return JavaScript that defines the constant `name`, an object with the step of a block in double precision."""
-    return script(trace(block, "double"), name)
-
-
 def script(traced: Trace, name: str) -> str:
-    """Return JavaScript that defines the constant `name` as in `script_of`. `traced`: a trace in double precision."""
+    """Return JavaScript that defines the constant `name`, an object with the step of a block.
+
+    `traced`: its trace in double precision.
+    """
     block = traced.block
     lists = {
         "parameters": traced.parameters,

@@ -27,7 +27,7 @@ typedef {real} {p}_real;
 /* state that one step passes to the next */
 {state}
 
-/* {about.inputs} */
+/* {about[inputs]} */
 {input}
 
 /* outputs of a step */
@@ -39,13 +39,13 @@ typedef {real} {p}_real;
 
 extern const {p}_params {p}_default;
 
-/* {about.init} */
+/* {about[init]} */
 void {p}_init({p}_state *state);
 
-/* {about.step} */
+/* {about[step]} */
 uint32_t {p}_step(const {p}_params *params, {p}_state *state, const {p}_input *input, {p}_output *output);
 
-/* {about.reset} */
+/* {about[reset]} */
 void {p}_reset({p}_state *state);
 
 #ifdef __cplusplus
