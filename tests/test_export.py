@@ -560,6 +560,14 @@ def test_a_failing_compiler_is_reported(case, tmp_path, capsys, monkeypatch, doe
     assert not (tmp_path / "c").exists()
 
 
+def test_a_compiler_that_cannot_run_is_reported_with_the_option_that_needs_it(tmp_path, monkeypatch):
+    (cc := tmp_path / "mycc").write_text("\0")
+    cc.chmod(0o755)
+    monkeypatch.setenv("CC", str(cc))
+    with pytest.raises(ValueError, match=r"^--format fmu: the C compiler .* cannot be run .*, or use --format c\.$"):
+        build([tmp_path / "a.c"], tmp_path / "a", asked=machine.FMU)
+
+
 @compiled
 def test_programs_that_do_not_end_or_have_no_temporary_folder_are_not_judged(case, tmp_path, capsys, monkeypatch):
     out = ("--out", tmp_path / "c", "--verify")

@@ -107,9 +107,8 @@ class Controller(Block):
         measured = Measurement(*inputs[:3])
         if not self.velocity:  # the simulator reads 0
             measured = measured._replace(z_dot=jnp.zeros_like(inputs.z_dot))
-        fine = [
-            jnp.abs(getattr(inputs, name)) <= getattr(limits, name) for name in StepInputs._fields[3:] if name in read
-        ]
+        checked = [name for name in StepInputs._fields[3:] if name in read]
+        fine = [jnp.abs(getattr(inputs, name)) <= getattr(limits, name) for name in checked]
         processor = cascade.timing
         if processor.predicts or processor.guard is not None:  # the number of prediction steps is fixed at export
             fine += [processor.delay >= 0, processor.delay <= (processor.most or 0)]

@@ -1,6 +1,7 @@
 """The blocks of a case, and the loop: a step of the plant, then a step of the controller, as in the simulator."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
@@ -8,21 +9,7 @@ from jax import Array
 
 from ambjax.codegen.block import Block, Number, Ports
 from ambjax.codegen.controller import Controller, Memory, Parameters, controller_of
-from ambjax.codegen.interface import (
-    DISTURBANCES,
-    INPUTS,
-    OUTPUTS,
-    REFERENCES,
-    LoopInputs,
-    PlantInputs,
-    PlantOutputs,
-    PlantStatus,
-    Status,
-    StepInputs,
-    StepOutputs,
-    meanings,
-    units_of,
-)
+from ambjax.codegen.interface import DISTURBANCES, OUTPUTS, REFERENCES, LoopInputs, PlantOutputs, Status, StepOutputs
 from ambjax.codegen.plant_step import PlantMemory, PlantParameters, PlantStep, plant_of
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import Scalar
@@ -74,16 +61,14 @@ class LoopStep(Block):
 
     noun: ClassVar[str] = "loop"
     ports: ClassVar[Any] = LoopInputs
-    inputs: ClassVar[Ports] = {name: (INPUTS | units_of(PlantInputs))[name] for name in LoopInputs._fields}
-    outputs: ClassVar[Ports] = OUTPUTS | units_of(PlantOutputs)
-    bits = (
-        meanings(Status)
-        | meanings(PlantStatus)
-        | {
-            "invalid": "the reference or a parameter of the controller is NaN or out of range: u is held; or an input "
-            "of the plant is not finite: 0 replaces it; or the plant's delay is out of range"
-        }
-    )
+    inputs: ClassVar[Ports] = {name: (Controller.inputs | PlantStep.inputs)[name] for name in LoopInputs._fields}
+    outputs: ClassVar[Ports] = OUTPUTS | PlantStep.outputs
+    bits: ClassVar[Mapping[str, str]] = {
+        **Controller.bits,
+        **PlantStep.bits,
+        "invalid": "the reference or a parameter of the controller is NaN or out of range: u is held; or an input "
+        "of the plant is not finite: 0 replaces it; or the plant's delay is out of range",
+    }
     crowded = ("saturated", "refused", "touched", "diverged")
 
     def step(
@@ -91,9 +76,9 @@ class LoopStep(Block):
     ) -> tuple[LoopMemory, LoopOutputs, LoopStatus]:
         """Advance the plant under the commanded voltages, read its sensors, and step the controller."""
         before = choose(memory.plant.started, memory.control, self.start().control)
-        given = PlantInputs._make([before.last.u, *inputs[: len(DISTURBANCES)]])
+        given = self.plant.ports._make([before.last.u, *inputs[: len(DISTURBANCES)]])
         plant, motion, lost = self.plant.step(parameters.machine, memory.plant, given, period, read)
-        readings = StepInputs._make([*motion[:3], *inputs[len(DISTURBANCES) :]])
+        readings = self.controller.ports._make([*motion[:3], *inputs[len(DISTURBANCES) :]])
         control, command, status = self.controller.step(parameters.controller, before, readings, period, read)
         alive, off = plant.lost == ALIVE, jnp.zeros(())
         frozen = before._replace(last=before.last._replace(u=off), before=(off,) * len(before.before))

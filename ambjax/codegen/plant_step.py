@@ -177,9 +177,8 @@ class PlantStep(Block):
         z_filtered = scenario.plant.measurement(motion).z if lags(system.loop) else ()
         lost = _real(plant_status(system.loop, motion))
         last, *before = system.processor.constant_past(zero)
-        return PlantMemory(
-            motion, last, tuple(before), z_filtered, zero if scenario.actuator.slow else (), lost, jnp.asarray(True)
-        )
+        u_a = zero if scenario.actuator.slow else ()
+        return PlantMemory(motion, last, tuple(before), z_filtered, u_a, lost, jnp.asarray(True))
 
     def start(self) -> PlantMemory:
         begun = self._begun(self.system(self.parameters, self.period))

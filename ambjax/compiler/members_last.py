@@ -84,9 +84,7 @@ class _Members:
     def evaluated(self, closed: ClosedJaxpr, values: Sequence[Any], moves: Sequence[bool]) -> Flagged:
         """Return the results of a jaxpr. `moves`: the flags of `values`."""
         jaxpr = closed.jaxpr
-        known: dict[Any, tuple[Any, bool]] = dict(
-            zip(jaxpr.constvars, [(x, False) for x in closed.consts], strict=True)
-        )
+        known: dict[Any, Any] = {v: (x, False) for v, x in zip(jaxpr.constvars, closed.consts, strict=True)}
         known |= dict(zip(jaxpr.invars, zip(values, moves, strict=True), strict=True))
         read = lambda x: (x.val, False) if isinstance(x, Literal) else known[x]  # noqa: E731
         for eqn in jaxpr.eqns:
@@ -140,9 +138,8 @@ class _Members:
     def rule_dynamic_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         if any(moves[1:]):
             return None
-        return [
-            (lax.dynamic_slice(values[0], (*values[1:], _first(eqn)), (*eqn.params["slice_sizes"], self.size)), True)
-        ]
+        sizes = (*eqn.params["slice_sizes"], self.size)
+        return [(lax.dynamic_slice(values[0], (*values[1:], _first(eqn)), sizes), True)]
 
     def rule_dynamic_update_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         if any(moves[2:]):

@@ -197,13 +197,11 @@ def phase_plane(trajectory: Trajectory, title: str, settle: float = 0.0) -> Figu
     figure = Figure(figsize=(5.2 * len(parts) + 1.2, 4.6), layout="constrained")
     axes = figure.subplots(1, len(parts), squeeze=False)[0]
     for ax, (words, part) in zip(axes, parts, strict=True):
-        (by_z, unit), (by_rate, rate) = (
-            prefix_of(one, float(np.abs(x[part]).max(initial=0.0))) for one, x in (("m", z), ("m/s", z_dot))
-        )
+        largest = [float(np.abs(x[part]).max(initial=0.0)) for x in (z, z_dot)]
+        (by_z, unit), (by_rate, rate) = map(prefix_of, ("m", "m/s"), largest)
         points = np.column_stack([by_z * z[part], by_rate * z_dot[part]])
-        lines = LineCollection(
-            list(np.stack([points[:-1], points[1:]], 1)), cmap="viridis", array=t[part][:-1], linewidth=1
-        )
+        segments = list(np.stack([points[:-1], points[1:]], 1))
+        lines = LineCollection(segments, cmap="viridis", array=t[part][:-1], linewidth=1)
         ax.add_collection(lines)
         ax.plot(points[0, 0], points[0, 1], "o", color=INK, markersize=5)
         if np.isfinite(lost_at):

@@ -136,9 +136,8 @@ def _nyquist(ax: Axes, loops: Sequence[NamedLoop]) -> None:
         far, near = (2 + d) / (2 - d), (2 - d) / (2 + d)
         ax.add_patch(Circle((-(far + near) / 2, 0), (far - near) / 2, color="#f6d5d5", zorder=0, linewidth=0))
     ax.plot([-1], [0], marker="+", color=INK, markersize=10)
-    ax.set(
-        xlim=(-1 - WINDOW, -1 + WINDOW), ylim=(-WINDOW, WINDOW), xlabel="real part of L", ylabel="imaginary part of L"
-    )
+    ax.set(xlim=(-1 - WINDOW, -1 + WINDOW), ylim=(-WINDOW, WINDOW))
+    ax.set(xlabel="real part of L", ylabel="imaginary part of L")
     ax.set_aspect("equal", adjustable="box")
     ax.grid(True, color="#dddddd", linewidth=0.6)
     ax.set_title("Nyquist curve; shaded: disk margin of the first loop", fontsize=9)

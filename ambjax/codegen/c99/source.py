@@ -94,15 +94,14 @@ class Writer:
 
     def banner(self, file: str) -> str:
         """Return the first comment of a file: its contents and its origin."""
-        lines = [
-            f"{file}: the {self.trace.block.noun} of case '{self.origin.case}' as C99, written by ambjax {__version__}."
-        ]
-        lines += [MARK.format(p=self.prefix)]
+        what = f"the {self.trace.block.noun} of case '{self.origin.case}'"
+        lines = [f"{file}: {what} as C99, written by ambjax {__version__}.", MARK.format(p=self.prefix)]
         lines += [f"SHA-256 of the case: {self.origin.digest}"] if self.origin.digest else []
         return "/* " + "\n * ".join(lines) + " */"
 
     def header(self) -> str:
         p, t = self.prefix, self.trace
+        about = ABOUT[t.block.noun]
         inputs = [x._replace(allowed="" if x.name in t.read else UNREAD) for x in t.inputs]
         bits = [f"#define {p}_{x.upper()} {1 << k}u /* {t.block.bits[x]} */" for k, (x, _) in enumerate(t.bits)]
         return self.filled(
@@ -114,13 +113,11 @@ class Writer:
             period=c_constant(t.block.period, t.precision),
             bits="\n".join(bits),
             params=self.struct("params", t.parameters),
-            state=self.struct(
-                "state", [x for x, _ in t.state], [f"uint32_t started; /* {ABOUT[t.block.noun]['started']} */"]
-            ),
+            state=self.struct("state", [x for x, _ in t.state], [f"uint32_t started; /* {about['started']} */"]),
             input=self.struct("input", inputs),
             output=self.struct("output", [x for x, _ in t.outputs]),
             gains=self.values(t.parameters),
-            about=ABOUT[t.block.noun],
+            about=about,
         )
 
     def notes(self) -> list[str]:

@@ -86,13 +86,12 @@ def binary_name(identifier: str, version: int) -> str:
 
 def compiled(files: dict[str, str], identifier: str) -> bytes:
     """Return the library that the C compiler of this machine makes of an FMU's sources."""
-    machine.compiler("--format fmu", "Install one, set CC, or use --format c")
     with machine.scratch() as folder:
         for name, text in files.items():
             (folder / name).write_text(text, encoding="utf-8")
         library = folder / f"{identifier}.so"
         units = [folder / name for name in files if name.endswith(".c")]
-        if messages := machine.build(units, library, *machine.SHARED, "-fvisibility=hidden"):
+        if messages := machine.build(units, library, *machine.SHARED, "-fvisibility=hidden", asked=machine.FMU):
             raise ValueError(f"--format fmu: {machine.compiler()} cannot compile the FMU ({machine.short(messages)}).")
         return library.read_bytes()
 
