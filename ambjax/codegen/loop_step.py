@@ -61,8 +61,8 @@ class LoopStep(Block):
 
     noun: ClassVar[str] = "loop"
     ports: ClassVar[Any] = LoopInputs
-    inputs: ClassVar[Ports] = {name: (Controller.inputs | PlantStep.inputs)[name] for name in LoopInputs._fields}
-    outputs: ClassVar[Ports] = OUTPUTS | PlantStep.outputs
+    inputs: ClassVar[Ports] = {name: {**Controller.inputs, **PlantStep.inputs}[name] for name in LoopInputs._fields}
+    outputs: ClassVar[Ports] = {**OUTPUTS, **PlantStep.outputs}
     bits: ClassVar[Mapping[str, str]] = {
         **Controller.bits,
         **PlantStep.bits,
