@@ -5,10 +5,9 @@ import importlib
 import sys
 
 from ambjax._version import __version__
-from ambjax.host.command_line import Parser, complain, run_command
+from ambjax.host.command_line import Parser, complain, open_streams, run_command
 from ambjax.host.heartbeat import FIRST_RUN, Heartbeat, doing
 from ambjax.host.interrupts import exit_on_interrupt
-from ambjax.host.streams import open_streams
 
 FIRST_DAY = """\
 ambjax simulates, checks, tunes and exports the controller of a rotor in an active magnetic bearing.

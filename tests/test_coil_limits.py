@@ -15,7 +15,7 @@ from ambjax.actuators import Amplifier
 from ambjax.cases.forces import forces
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
-from ambjax.codegen.numbering import numbers_of
+from ambjax.codegen.block import numbers_of
 from ambjax.commands.acceptance import machine
 from ambjax.simulation.integrate import Begin, InitialValueProblem
 from ambjax.solvers import RK4

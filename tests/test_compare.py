@@ -15,7 +15,7 @@ from ambjax.commands.comparison_report import Quantity, _marked
 from ambjax.ensemble.study import Study
 from ambjax.host import extensions
 from ambjax.linear import analyse, linearise
-from ambjax.pictures.comparison import Contender, comparison_figure
+from ambjax.pictures.frequency import Contender, comparison_figure
 from ambjax.results.case_export import guarded_for
 
 # A smooth loop on a processor, 0.2 s of it.

@@ -51,7 +51,7 @@ FAILING = {
     "ensemble": {
         "ambjax.pictures.fans.fan": "fan.png",
         "ambjax.pictures.histograms.histogram_figure": "histograms.png",
-        "ambjax.pictures.tornado.tornado": "tornado.png",
+        "ambjax.pictures.histograms.tornado": "tornado.png",
         "ambjax.commands.study_report.study_tables": "",
     },
     "ensemble, summary": {"ambjax.commands.study_report._summary": "summary.json"},
@@ -62,7 +62,7 @@ FAILING = {
         "ambjax.commands.sensitivity.text_of": "",
     },
     "compare": {
-        "ambjax.pictures.comparison.comparison_figure": "compare.png",
+        "ambjax.pictures.frequency.comparison_figure": "compare.png",
         "ambjax.commands.compare.render_page": "compare.html",
         "ambjax.commands.compare.comparison_table": "",
     },

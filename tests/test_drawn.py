@@ -16,9 +16,9 @@ import tuning.report.pictures as tuned
 from ambjax.commands import map as map_command
 from ambjax.ensemble.maps import PERIOD, Axis, Map
 from ambjax.pictures import fans, figures, heatmaps, histograms
+from ambjax.pictures.figures import BINS, thin
+from ambjax.pictures.histograms import Bar, tornado
 from ambjax.pictures.overview import overview_figure
-from ambjax.pictures.thinning import BINS, thin
-from ambjax.pictures.tornado import Bar, tornado
 from ambjax.results import case_map
 from ambjax.simulation.trajectory import ALIVE, TOUCHED, Row, Trajectory
 

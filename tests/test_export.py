@@ -25,9 +25,8 @@ from ambjax.__main__ import main
 from ambjax.cases.reader import case_from, read_case
 from ambjax.codegen.c99 import machine
 from ambjax.codegen.c99.machine import Compiled, build
-from ambjax.codegen.c99.package import package_files
-from ambjax.codegen.c99.source import Origin, Writer
-from ambjax.codegen.c99.texts import MARK
+from ambjax.codegen.c99.package import files_of_trace
+from ambjax.codegen.c99.source import MARK, Origin, Writer
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.interface import StepInputs
 from ambjax.codegen.trace import arguments, trace
@@ -292,7 +291,7 @@ def test_a_delay_beyond_the_exported_one_is_refused(tmp_path):
 
 def written(cascade, to, u_max):
     controller = controller_of(cascade, u_max, PERIOD)
-    return package_files(controller, to, "amb", Origin("test", "0" * 64, controller.described()))
+    return files_of_trace(trace(controller, to), "amb", Origin("test", "0" * 64, controller.described()))
 
 
 kept = functools.cache(written)  # many tests read the same text
@@ -559,6 +558,14 @@ def test_a_failing_compiler_is_reported(case, tmp_path, capsys, monkeypatch, doe
     monkeypatch.setenv("CC", str(cc))
     assert f"--verify: {message.format(cc=cc)}" in refusal(capsys, "export", case, "--out", tmp_path / "c", "--verify")
     assert not (tmp_path / "c").exists()
+
+
+def test_a_compiler_that_cannot_run_is_reported_with_the_option_that_needs_it(tmp_path, monkeypatch):
+    (cc := tmp_path / "mycc").write_text("\0")
+    cc.chmod(0o755)
+    monkeypatch.setenv("CC", str(cc))
+    with pytest.raises(ValueError, match=r"^--format fmu: the C compiler .* cannot be run .*, or use --format c\.$"):
+        build([tmp_path / "a.c"], tmp_path / "a", asked=machine.FMU)
 
 
 @compiled

@@ -14,12 +14,11 @@ from ambjax import Clock, rollout
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.codegen.c99.source import Origin
-from ambjax.codegen.fmi.cross_check import run_block
-from ambjax.codegen.of_case import WHAT, block_of
+from ambjax.codegen.fmi.archive import run_block
+from ambjax.codegen.loop_step import WHAT, block_of
 from ambjax.codegen.plant_step import plant_of
-from ambjax.codegen.series import series
 from ambjax.codegen.trace import arguments
-from ambjax.codegen.twins import LoopCase
+from ambjax.codegen.twins import LoopCase, series
 from ambjax.codegen.verify import draft, verify
 from ambjax.control.processor import Processor
 from ambjax.sensors import Sensor

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from ambjax.codegen.c99.statements import Statements
+from ambjax.codegen.c99.statements import CStatements
 from ambjax.codegen.emitter import traced
 from ambjax.codegen.primitives import OPS
 from ambjax.codegen.program import PRECISIONS, Location, Program
@@ -59,9 +59,9 @@ def compiled(function, to, folder, count):
     with precision(to):
         refs = [program.input(Location("input", name), dtype) for name in "ab"]
         results = traced(program, function, (jnp.ones((), dtype), jnp.ones((), dtype)), refs)
-    text = Statements(program, program.order(results), to, "amb")
+    text = CStatements(program, program.order(results), to, "amb")
     lines = ["#include <math.h>", f"typedef {to} amb_real;", "typedef struct { amb_real a, b; } amb_input;"]
-    lines += [*text.helpers(), "void amb(const amb_input *input, amb_real *y) {", *text.body()]
+    lines += [*text.helpers(), "void amb(const amb_input *input, amb_real *y) {", *text.body("")]
     lines += [f"    y[{k}] = {text.operand(x)};" for k, x in enumerate(results)] + ["}"]
     (folder / "amb.c").write_text("\n".join(lines))
     flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic", "-Werror"]

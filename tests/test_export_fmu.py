@@ -14,13 +14,11 @@ from texts import refusal, write
 from ambjax import rollout
 from ambjax.cases.reader import read_case
 from ambjax.codegen.c99.source import Origin
-from ambjax.codegen.fmi.archive import packed, sources
-from ambjax.codegen.fmi.cross_check import files_of
+from ambjax.codegen.fmi.archive import files_of, packed, sources
 from ambjax.codegen.fmi.description import description, exponents, variables
-from ambjax.codegen.of_case import WHAT, block_of
-from ambjax.codegen.series import series
+from ambjax.codegen.loop_step import WHAT, block_of
 from ambjax.codegen.trace import trace
-from ambjax.codegen.twins import LoopCase, horizons
+from ambjax.codegen.twins import LoopCase, horizons, series
 
 ORIGIN = Origin("test", "0" * 64, [])
 F20 = pathlib.Path(__file__).parents[1] / "benchmarks" / "tasks" / "sampled" / "F20.toml"

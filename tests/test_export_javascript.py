@@ -13,10 +13,9 @@ from texts import refusal, write
 from ambjax.__main__ import main
 from ambjax.cases.template_text import template as case_template
 from ambjax.codegen.block import Block
-from ambjax.codegen.javascript.script import HELPERS, script, script_of
-from ambjax.codegen.of_case import block_of
-from ambjax.codegen.points import verification_points
-from ambjax.codegen.reference import results
+from ambjax.codegen.javascript.script import HELPERS, script
+from ambjax.codegen.loop_step import block_of
+from ambjax.codegen.points import results, verification_points
 from ambjax.codegen.trace import trace
 
 pytestmark = with_node
@@ -51,7 +50,7 @@ LOOSER = {"erf": 32, "erfc": 512, "sinh": 64, "cosh": 64, "arctanh": 256, "logis
 
 @pytest.mark.slow
 def test_every_primitive_equals_jax(tmp_path):
-    text = script_of(Functions((), 1.0), "all")
+    text = script(trace(Functions((), 1.0), "double"), "all")
     run = "const s = all.start(), y = new Float64Array(all.outputs.length);\n"
     run += "const run = x => { all.step([], s, x, y); return y; };\n"
     check_functions(lambda x: run_rows(text + run, x, tmp_path), "double", LOOSE | LOOSER)

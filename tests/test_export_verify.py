@@ -8,7 +8,7 @@ from test_export import PERIOD, compiled, drafts, failed, hard
 
 from ambjax import Clock, Scenario
 from ambjax.codegen import closed_loop
-from ambjax.codegen.numbering import UNREAD
+from ambjax.codegen.block import UNREAD
 from ambjax.codegen.points import evaluated
 from ambjax.codegen.twins import LEAST, SIGNALS, Horizon, LoopCase
 from ambjax.codegen.verify import Check, _looped, checks_page, checks_verdict, holds, verify

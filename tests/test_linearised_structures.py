@@ -17,15 +17,14 @@ from profiles import THOROUGH
 from ambjax import Cascade, Clock, Scenario, rollout
 from ambjax.cases.controller_tables import KINDS
 from ambjax.cases.reader import case_from
+from ambjax.codegen.javascript.script import PRELUDE
 from ambjax.control import current, inversion
 from ambjax.control.base import default_law
 from ambjax.control.processor import Processor
 from ambjax.control.sampling import Sampling
 from ambjax.linear import StateSpace, linearise
 from ambjax.numerics.records import canonical
-from ambjax.page.functions import PRELUDE
-from ambjax.page.linear_script import linear_script
-from ambjax.page.loop_functions import loop_parameters
+from ambjax.page.loop_functions import linear_script, loop_parameters
 from ambjax.plants import Plant
 from ambjax.world.scenario import Initial
 
@@ -111,13 +110,13 @@ def test_the_page_linearises_a_loop_with_a_state_that_never_changes(tmp_path):
     plant = {field.name: getattr(RIG, field.name) for field in dataclasses.fields(RIG) if field.name != "iron"}
     given = {"plant": plant, "controller": laws, "processor": {"delay": 1.0, "discretisation": "explicit"}}
     case = case_from(given | {"clock": {"sample_period": T, "duration": 0.01}})
-    script, asset = linear_script(case), importlib.resources.files("ambjax.page") / "assets" / "sensitivity.js"
-    run = f"""const facts = {json.dumps(script.facts)};
+    (source, facts), asset = linear_script(case), importlib.resources.files("ambjax.page") / "assets" / "sensitivity.js"
+    run = f"""const facts = {json.dumps(facts)};
     function run(P) {{ const S = sensitivity(P, facts, {T}, 1.0); return [S.peak, S.frequency, Number(S.stable)]; }}"""
     numbers = np.array([jax.tree.leaves(canonical(loop_parameters(case, any_delay=True)))], float)
-    peak, f, stable = run_rows(
-        "\n".join([PRELUDE, script.source, asset.read_text(encoding="utf-8"), run]), numbers, tmp_path
-    )[0]
+    peak, f, stable = run_rows("\n".join([PRELUDE, source, asset.read_text(encoding="utf-8"), run]), numbers, tmp_path)[
+        0
+    ]
     system = linearise(case.cascade, case.scenario, case.clock)
     # both equilibria are exact to 1e-9 of the sizes of the states
     assert peak == pytest.approx(np.abs(system.sensitivity(np.array([f])))[0], rel=1e-7)

@@ -25,7 +25,7 @@ from ambjax.linear.rotor_modes import modes_of, springs_critical
 from ambjax.linear.unbalance_response import UnbalanceResponse, critical_speeds, separation, unbalance_response
 from ambjax.pictures.machine_pictures import machine_sensitivity_picture
 from ambjax.pictures.run_up_picture import last_turn, waterfall
-from ambjax.pictures.style import save
+from ambjax.pictures.scales import save
 from ambjax.results.runs import simulate_machine
 
 MASS, I_T, I_P, HALF = 3.0, 0.1, 0.04, 0.25
@@ -185,11 +185,11 @@ def test_modes_have_the_names_and_directions_of_the_motion(rigid, way):
 def test_the_waterfall_of_a_sweep_follows_its_frequency():
     t = np.arange(0, 2.0, 1e-3)
     speed = 60 * (10 + 40 * t)  # rpm: 10 to 90 Hz
-    found = waterfall(2e-6 * np.sin(2 * np.pi * (10 * t + 20 * t**2)), speed, 1e-3)
-    highest = found.frequency[np.argmax(found.amplitude, 1)]
+    speeds, frequency, amplitude = waterfall(2e-6 * np.sin(2 * np.pi * (10 * t + 20 * t**2)), speed, 1e-3)
+    highest = frequency[np.argmax(amplitude, 1)]
     # a window covers 1/12 of the sweep, 7 Hz, and lowers the peak of the spectrum
-    np.testing.assert_allclose(highest, found.speeds / 60, atol=2.0)
-    assert 0.6e-6 < found.amplitude.max() < 2e-6
+    np.testing.assert_allclose(highest, speeds / 60, atol=2.0)
+    assert 0.6e-6 < amplitude.max() < 2e-6
 
 
 def test_the_text_of_an_injection_gives_the_zone_of_its_peak(rigid):

@@ -15,10 +15,9 @@ from texts import refusal
 
 from ambjax.__main__ import main
 from ambjax.pictures import fans, figures, heatmaps, histograms
+from ambjax.pictures.histograms import Bar, tornado
 from ambjax.pictures.overview import overview_figure
-from ambjax.pictures.scales import AXIS_UNITS, LABELS, axis_of, label_of, prefix_of
-from ambjax.pictures.style import save
-from ambjax.pictures.tornado import Bar, tornado
+from ambjax.pictures.scales import AXIS_UNITS, LABELS, axis_of, label_of, prefix_of, save
 from ambjax.simulation import orders
 from ambjax.simulation.metrics import UNITS, Metrics
 from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Row, Trajectory

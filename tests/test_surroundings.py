@@ -17,11 +17,11 @@ from tqdm import tqdm
 from ambjax.__main__ import main, parser, run_command
 from ambjax.commands import simulate
 from ambjax.ensemble import worker
+from ambjax.host.command_line import open_streams
 from ambjax.host.lock import LOCK, locked
 from ambjax.host.sealed import write_whole
-from ambjax.host.streams import open_streams
-from ambjax.pictures import tornado
-from ambjax.pictures.style import save
+from ambjax.pictures import histograms
+from ambjax.pictures.scales import save
 from ambjax.results import outputs
 from tuning.__main__ import main as tune
 
@@ -169,8 +169,8 @@ def test_a_missing_device_is_reported_in_one_line(error, monkeypatch, capsys):
 
 
 def test_pictures_do_not_depend_on_a_matplotlibrc():
-    bars = [tornado.Bar(**dict.fromkeys(tornado.Bar._fields, 0.5) | {"path": "plant.m"})]
+    bars = [histograms.Bar(**dict.fromkeys(histograms.Bar._fields, 0.5) | {"path": "plant.m"})]
     with matplotlib.rc_context({"text.usetex": True, "font.size": 30, "axes.facecolor": "red"}):
-        save(tornado.tornado(bars, "rms_u_V", "all"), pathlib.Path("theirs.png"))
-    save(tornado.tornado(bars, "rms_u_V", "all"), pathlib.Path("ours.png"))
+        save(histograms.tornado(bars, "rms_u_V", "all"), pathlib.Path("theirs.png"))
+    save(histograms.tornado(bars, "rms_u_V", "all"), pathlib.Path("ours.png"))
     assert pathlib.Path("theirs.png").read_bytes() == pathlib.Path("ours.png").read_bytes()

@@ -13,7 +13,7 @@ from ambjax.cases.reader import case_from
 from ambjax.cases.table import Table
 from ambjax.cases.template_text import template
 from ambjax.codegen.c99.source import Origin
-from ambjax.codegen.of_case import block_of
+from ambjax.codegen.loop_step import block_of
 from ambjax.codegen.verify import draft, holds, verify
 from ambjax.control.synchronous_notch import NotchGain, NotchState, SynchronousNotch
 from ambjax.ensemble.maps import PERIOD

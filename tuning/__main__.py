@@ -5,9 +5,8 @@ import sys
 from typing import TYPE_CHECKING
 
 from ambjax import __version__
-from ambjax.host.command_line import Parser, run_command
+from ambjax.host.command_line import Parser, open_streams, run_command
 from ambjax.host.interrupts import exit_on_interrupt
-from ambjax.host.streams import open_streams
 
 if TYPE_CHECKING:
     from tuning.command import TunedCase

@@ -14,7 +14,7 @@ from ambjax.control.base import Law
 from ambjax.control.law_trial import reason, try_law
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.stages import STAGES
-from ambjax.host.imports import digest_of, module_of_file, module_of_name, pickle_with_source
+from ambjax.host.extensions import digest_of, module_of_file, module_of_name, pickle_with_source
 from ambjax.world.plant import Plant
 
 T = TypeVar("T")

@@ -1,16 +1,99 @@
-"""A block: an exported part of the loop. Its step is traced, written in another language, and compared with JAX."""
+"""A block, an exported part of the loop: its step, which is traced and written in another language, and its numbers."""
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any, ClassVar
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from ambjax.codegen.numbering import Number
-from ambjax.control.cascade import Cascade
-from ambjax.control.schedule import schedules
+from ambjax.control.schedule import OVER, Schedule, finite
+from ambjax.numerics.declared import allowed
 from ambjax.numerics.records import Scalar
+
+# The verification also sets each parameter to its value divided by this factor, and to its value times this factor.
+SPAN = 100.0
+# Text in place of the allowed values of a number that the step does not use.
+UNREAD = "not read"
+
+
+class Number(NamedTuple):
+    """A parameter, a state, an input or an output: dotted name, unit, meaning, value, allowed values.
+
+    - `ends`: further values of a parameter at which exported code is compared with JAX: the lowest and the highest
+      first, then values that are not finite or that a step must reject.
+    - `among`: values of a state that is a flag or a code, from which the comparison draws; a value that occurs twice is
+      drawn twice as often. () for a real number.
+    - `least`, `most`: smallest and largest value of a parameter. `infinite`: whether inf is allowed, too. `whole`:
+      whether only whole numbers are allowed.
+    """
+
+    name: str
+    unit: str
+    doc: str
+    value: float = 0.0
+    allowed: str = ""
+    ends: tuple[float, ...] = ()
+    among: tuple[float, ...] = ()
+    least: float = -math.inf
+    most: float = math.inf
+    infinite: bool = False
+    whole: bool = False
+
+
+def numbers_of(node: Any, path: str = "", home: str = "") -> Iterator[Number]:
+    """Yield every number of a record, in the order of its leaves.
+
+    - `path`: beginning of each dotted name, such as "position."; the name of a field follows.
+    - `home`: text before the name in an error message.
+
+    Raises ValueError for an array.
+    """
+    for field in dataclasses.fields(node):
+        value, name = getattr(node, field.name), f"{path}{field.name}"
+        if field.metadata.get("static") or value is None:
+            continue
+        if isinstance(value, Schedule):
+            unit, signal = OVER[value.over]
+            for knot, (at, x) in enumerate(zip(value.at, value.values, strict=True)):
+                number = _number(f"{name}.knot_{knot}", finite(field), float(x))
+                yield number._replace(doc=f"{number.doc}; at {signal} = {at:g} {unit}")
+        elif isinstance(value, tuple):
+            for k, one in enumerate(value):
+                yield from numbers_of(one, f"{name}_{k}.", home)
+        elif dataclasses.is_dataclass(value):
+            yield from numbers_of(value, f"{name}.", home)
+        elif jnp.shape(value) == ():
+            yield _number(name, field, float(value))
+        else:
+            raise ValueError(f"{home}{name} has the shape {jnp.shape(value)}: only scalars can be exported.")
+
+
+def earlier(before: tuple[Any, ...], unit: str, what: str) -> list[Number]:
+    """Return the states `before` of a block: commands of the samples before the last. `what`: name of a command."""
+    names = ["before.u"] if len(before) == 1 else [f"before_{k + 1}.u" for k in range(len(before))]
+    words = [f"{what}, {k + 1} sample{'s' * (k > 0)} before last.u" for k in range(len(before))]
+    return [Number(name, unit, doc) for name, doc in zip(names, words, strict=True)]
+
+
+def _number(name: str, field: dataclasses.Field, value: float) -> Number:
+    """Return the number of a field, with the unit, range and meaning that the field declares."""
+    meta = field.metadata
+    unit, doc = meta.get("unit", ""), meta.get("doc", "")
+    infinity = "finite: set p = inf in the case and export again" if meta.get("steepness") else "or inf"
+    least = -math.inf if meta.get("at_least") is None else float(meta["at_least"])
+    if meta.get("above") is not None:
+        least = max(least, math.nextafter(float(meta["above"]), math.inf))
+    most = math.inf if meta.get("at_most") is None else float(meta["at_most"])
+    low, high = sorted((value / SPAN, value * SPAN)) if value else (-1.0, 1.0)
+    if math.isinf(value):
+        low, high = 1.0, SPAN
+    ends = max(low, least), min(high, most), *([math.inf] if meta.get("infinite") else []), math.nan
+    unbounded = bool(meta.get("infinite")) and not meta.get("steepness")  # an infinite steepness is another program
+    text, whole = allowed(field, infinity), bool(meta.get("whole"))
+    return Number(name, unit, doc, value, text, ends, (), least, most, unbounded, whole)
+
 
 # Inputs or outputs: unit and meaning by name.
 Ports = Mapping[str, tuple[str, str]]
@@ -78,15 +161,3 @@ class Block:
 def scales(tree: Any) -> list[float]:
     """Return the leaves of a pytree of characteristic sizes as floats, in the units of the leaves."""
     return [float(jnp.asarray(x)) for x in jax.tree.leaves(tree)]
-
-
-def law_lines(cascade: Cascade) -> list[str]:
-    """Return one line per stage, with its law, set-valued signs and schedules, then a line on the processor."""
-    laws: tuple[Any, ...] = cascade.laws
-    lines = []
-    for stage, law in zip(("observer", "position", "inversion", "current"), laws, strict=True):
-        hard = [f.name for f in dataclasses.fields(law) if f.metadata.get("steepness") and getattr(law, f.name) is None]
-        ends = "".join(f", {name} = inf (a set-valued sign)" for name in hard)
-        over = "".join(f", {name} as a function of the {one.over}" for name, one in schedules(law).items())
-        lines.append(f"{stage}: {type(law).__name__}{ends}{over}")
-    return [*lines, f"processor: {cascade.processor}"]

@@ -1,21 +1,19 @@
 """Loops with compiled parts (the controller, the plant or both) compared with JAX's own closed loop."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from ambjax.codegen.c99.machine import Compiled
 from ambjax.codegen.controller import Controller, controller_of
 from ambjax.codegen.interface import OUTPUTS, Status
 from ambjax.codegen.loop_step import LoopStep
 from ambjax.codegen.plant_step import PlantStep
-from ambjax.codegen.series import series
-from ambjax.codegen.trace import arguments
-from ambjax.codegen.twins import Horizon, LoopCase, farthest, horizons
+from ambjax.codegen.trace import in_jax
+from ambjax.codegen.twins import Horizon, LoopCase, farthest, horizons, series
 from ambjax.control.cascade_state import Command
 from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.between import SampledState
@@ -29,33 +27,24 @@ FAULTS = [1 << k for k, name in enumerate(Status._fields) if name in ("invalid",
 (REFUSED,) = (1 << k for k, name in enumerate(Status._fields) if name == "refused")
 
 
-class ControllerState(NamedTuple):
-    """State of the compiled controller: its numbers, whether it has started, and its faulty samples so far."""
-
-    numbers: Array
-    started: Array
-    faults: Array
-
-
 class Machines:
-    """Compiled controllers with one function `step`, which takes the controller's index, its state and its inputs."""
+    """Compiled controllers with one function `step`, which takes the controller's index, its memory and its inputs.
+
+    A memory is an array: the state, padded with zeros to `room` numbers, and the flag `started`.
+    """
 
     def __init__(self, *machines: Compiled) -> None:
         self.machines = machines
         self.room = max(len(machine.trace.state) for machine in machines)
 
-    def step(
-        self, which: np.ndarray, numbers: np.ndarray, started: np.ndarray, inputs: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Step controller `which`. Return its state, padded with zeros to `room`, and [started, bits, *outputs]."""
-        machine = self.machines[int(which)]
+    def step(self, which: np.ndarray, memory: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        """Step controller `which`. Return [*memory, bits, *outputs]."""
+        machine, memory = self.machines[int(which)], np.asarray(memory)
         count = len(machine.trace.state)
-        machine.state["numbers"], machine.state["started"] = np.asarray(numbers)[:count], int(started)
+        machine.state["numbers"], machine.state["started"] = memory[:count], int(memory[-1])
         machine.inputs[:] = np.asarray(inputs)
-        bits = machine.step()
-        state = np.zeros(self.room)
-        state[:count] = machine.state["numbers"]
-        return state, np.array([float(machine.state["started"]), float(bits), *machine.outputs], float)
+        bits, rest = machine.step(), [0.0] * (self.room - count)
+        return np.array([*machine.state["numbers"], *rest, machine.state["started"], bits, *machine.outputs], float)
 
 
 @record
@@ -66,26 +55,22 @@ class CompiledLoop(Sampled):
     machines: Machines = static(default=None)
 
     def start(self) -> SampledState:
-        zero = jnp.zeros(())
-        return super().start()._replace(control=ControllerState(jnp.zeros(self.machines.room), zero, zero))
+        return super().start()._replace(control=jnp.zeros(self.machines.room + 1))
 
     def jump(self, t: Scalar, state: SampledState, errors: Errors) -> SampledState:
         state, measured = self.read(state, errors)
-        memory, processor = state.control, self.processor
-        inputs = jnp.stack([*measured, *self.reference(t)])
-        shapes = jax.ShapeDtypeStruct((self.machines.room,), float), jax.ShapeDtypeStruct((2 + len(OUTPUTS),), float)
-        numbers, rest = jax.pure_callback(
-            self.machines.step, shapes, self.which, memory.numbers, memory.started, inputs, vmap_method="sequential"
-        )
-        answer = dict(zip(OUTPUTS, rest[2:], strict=True))
-        command = Command(**answer, i_ref_dot=jnp.zeros(()))
-        faulty = rest[1].astype(int) & sum(FAULTS) != 0
-        after = ControllerState(numbers, rest[0], memory.faults + faulty)
+        processor, size = self.processor, self.machines.room + 1
+        shape = jax.ShapeDtypeStruct((size + 1 + len(OUTPUTS),), float)
+        given = self.which, state.control, jnp.stack([*measured, *self.reference(t)])
+        found = jax.pure_callback(self.machines.step, shape, *given, vmap_method="sequential")
+        bits = found[size].astype(int)
+        command = Command(**dict(zip(OUTPUTS, found[size + 1 :], strict=True)), i_ref_dot=jnp.zeros(()))
+        faulty = bits & sum(FAULTS) != 0
         past, finite = processor.remembered(state.command.u, *state.past), jnp.where(faulty, 0.0, state.finite)
         watch, guard = state.watch, processor.guard
         if watch and guard:  # from `left`, `Sampled.row` finds whether a reading was refused
-            watch = watch._replace(left=jnp.where(rest[1].astype(int) & REFUSED, 0.0, jnp.asarray(guard.samples)))
-        return state._replace(control=after, command=command, past=past, finite=finite, watch=watch)
+            watch = watch._replace(left=jnp.where(bits & REFUSED, 0.0, jnp.asarray(guard.samples)))
+        return state._replace(control=found[:size], command=command, past=past, finite=finite, watch=watch)
 
 
 class LoopComparison(NamedTuple):
@@ -113,9 +98,8 @@ def compare_loops(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, Lo
     host, found = Machines(*machines.values()), {}
     for which, (precision, horizon) in enumerate(horizons(case, list(machines)).items()):
         looped = CompiledLoop(**vars(given), which=which, machines=host)
-        found[precision] = LoopComparison(
-            horizon, times_of(_displacement(looped, case.clock, horizon.samples), horizon)
-        )
+        z = _displacement(looped, case.clock, horizon.samples)
+        found[precision] = LoopComparison(horizon, times_of(z, horizon))
     return found
 
 
@@ -182,17 +166,12 @@ def looped(machine: Compiled, inputs: dict[str, np.ndarray], law: Law | None) ->
 
 def law_of(controller: Controller) -> Law:
     """Return JAX's step of a controller as a function with a state."""
-    parameters, memory, _, period = arguments(controller)
-    read = frozenset(controller.inputs)
-
-    @jax.jit
-    def step(memory: Any, x: jax.Array) -> tuple[Any, jax.Array]:
-        memory, outputs, _ = controller.step(parameters, memory, controller.ports(*x), period, read)
-        return memory, outputs.u
+    memory, step = in_jax(controller)
+    step = jax.jit(step)
 
     def law(x: np.ndarray) -> float:
         nonlocal memory
-        memory, u = step(memory, jnp.asarray(x, float))
-        return float(u)
+        memory, outputs, _ = step(memory, jnp.asarray(x, float))
+        return float(outputs.u)
 
     return law

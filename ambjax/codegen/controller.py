@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.codegen.block import Block, Ports, law_lines, scales
-from ambjax.codegen.interface import INPUTS, Status, StepInputs, StepOutputs, meanings, outputs_of
-from ambjax.codegen.numbering import Number, earlier, numbers_of
+from ambjax.codegen.block import Block, Number, Ports, earlier, numbers_of, scales
+from ambjax.codegen.interface import INPUTS, OUTPUTS, Status, StepInputs, StepOutputs, meanings
 from ambjax.control.base import memory_of
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
 from ambjax.control.guard import GAPS, Watch
+from ambjax.control.schedule import schedules
 from ambjax.numerics.linear import choose
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.simulation.between import SampledState
@@ -97,19 +97,18 @@ class Controller(Block):
 
     @property
     def outputs(self) -> Ports:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return outputs_of(self.commands)
+        current = {"u": ("A", "current to command to the amplifier, within its limit")}
+        return OUTPUTS | (current if self.commands == "current" else {})
 
     def step(
         self, parameters: Parameters, memory: Memory, inputs: StepInputs, period: Scalar, read: frozenset[str]
     ) -> tuple[Memory, StepOutputs, Status]:
-        """Compute one sample. Return the memory for the next one, the outputs and the status."""
         cascade, limits = parameters
         measured = Measurement(*inputs[:3])
         if not self.velocity:  # the simulator reads 0
             measured = measured._replace(z_dot=jnp.zeros_like(inputs.z_dot))
-        fine = [
-            jnp.abs(getattr(inputs, name)) <= getattr(limits, name) for name in StepInputs._fields[3:] if name in read
-        ]
+        checked = [name for name in StepInputs._fields[3:] if name in read]
+        fine = [jnp.abs(getattr(inputs, name)) <= getattr(limits, name) for name in checked]
         processor = cascade.timing
         if processor.predicts or processor.guard is not None:  # the number of prediction steps is fixed at export
             fine += [processor.delay >= 0, processor.delay <= (processor.most or 0)]
@@ -184,15 +183,15 @@ class Controller(Block):
                     f"controller.{stage}: a state of {type(law).__name__} is an array; only scalars can be exported."
                 )
             words = f"state of {type(law).__name__}"
-            found += [Number(f"{stage}.{name}", unit, "", doc or words, 0.0) for name, unit, doc in entries]
+            found += [Number(f"{stage}.{name}", unit, doc or words) for name, unit, doc in entries]
         commands = {**self.outputs, "i_ref_dot": ("A/s", "rate of i_ref")}
         for name in memory.last._fields:
-            found.append(Number(f"last.{name}", commands[name][0], "", f"last {commands[name][1]}", 0.0))
+            found.append(Number(f"last.{name}", commands[name][0], f"last {commands[name][1]}"))
         found += earlier(memory.before, commands["u"][0], "u")
         if memory.watch:
             names = {f"watch.{name}": (INPUTS[name][0], "predicted reading") for name in memory.watch.expected._fields}
             names["watch.left"] = ("samples", "number of samples for which a reading may still be replaced")
-            found += [Number(name, unit, "", doc, 0.0) for name, (unit, doc) in names.items()]
+            found += [Number(name, unit, doc) for name, (unit, doc) in names.items()]
         return found
 
     def sizes(self) -> tuple[list[float], list[float]]:
@@ -213,7 +212,14 @@ class Controller(Block):
         return {f"{of}.{name}": k for k, name in enumerate(INPUTS) for of in ("limits", "processor.guard")}
 
     def described(self) -> list[str]:
-        return law_lines(self.parameters.controller)
+        cascade, lines = self.parameters.controller, []
+        for stage, law in zip(CascadeState._fields, cascade.laws, strict=True):
+            fields = dataclasses.fields(law)
+            hard = [f.name for f in fields if f.metadata.get("steepness") and getattr(law, f.name) is None]
+            ends = "".join(f", {name} = inf (a set-valued sign)" for name in hard)
+            over = "".join(f", {name} as a function of the {one.over}" for name, one in schedules(law).items())
+            lines.append(f"{stage}: {type(law).__name__}{ends}{over}")
+        return [*lines, f"processor: {cascade.processor}"]
 
 
 def controller_of(cascade: Cascade, u_max: Scalar, period: float, scenario: Scenario | None = None) -> Controller:
@@ -238,7 +244,6 @@ def controller_of(cascade: Cascade, u_max: Scalar, period: float, scenario: Scen
 
 
 def _steepnesses(cascade: Cascade) -> list[Scalar]:
-    """Return the steepnesses of the smoothed signs of all laws."""
     laws: tuple[Any, ...] = cascade.laws
     fields = [(law, field) for law in laws for field in dataclasses.fields(law)]
     found = [getattr(law, field.name) for law, field in fields if field.metadata.get("steepness")]

@@ -9,10 +9,11 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+from jax.extend.core import ClosedJaxpr, JaxprEqn
 
-from ambjax.codegen.primitives import CALLS, OPS, SAME, Atom, dtype_of, live, split_scan
+from ambjax.codegen.primitives import CALLS, OPS, SAME, dtype_of, split_scan, walked
 from ambjax.codegen.program import Operand, Program, Ref, of
+from ambjax.compiler.members_last import called
 
 LOOPS = ("scan", "while")
 COMPOSED = ("rsqrt", "exp2", "logistic", "one_minus_square")
@@ -36,26 +37,20 @@ class _Reader:
         for const in closed.consts:
             if np.shape(const) != ():
                 raise ValueError(f"{of(law)}a constant of shape {np.shape(const)}: only scalars can be exported.")
-        return self.jaxpr(closed.jaxpr, [np.asarray(x)[()] for x in closed.consts], operands, law)
 
-    def jaxpr(self, jaxpr: Jaxpr, consts: list[Operand], operands: list[Operand], law: str) -> list[Operand]:
-        known: dict[Any, Operand] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *operands], strict=True))
-
-        def value(x: Atom) -> Operand:
-            return np.asarray(x.val, dtype_of(x))[()] if isinstance(x, Literal) else known[x]
-
-        for eqn in live(jaxpr):
-            inner = _law(str(eqn.source_info.name_stack)) or law
+        def one(eqn: JaxprEqn, args: list[Operand]) -> list[Operand]:
+            name = eqn.primitive.name
+            # the innermost law in JAX's name scopes; jvp(...), for example, may wrap a scope
+            inner = [law, *re.findall(r"law:([^/()]+)", str(eqn.source_info.name_stack))][-1]
             if any(getattr(x.aval, "shape", None) != () for x in [*eqn.invars, *eqn.outvars]):
-                raise ValueError(refusal(eqn.primitive.name, inner, "on arrays"))
-            results = self.equation(eqn.primitive.name, eqn, [value(x) for x in eqn.invars], inner)
-            known.update(zip(eqn.outvars, results, strict=True))
-        return [value(x) for x in jaxpr.outvars]
+                raise ValueError(refusal(name, inner, "on arrays"))
+            return self.equation(name, eqn, args, inner)
+
+        return walked(closed, operands, one)
 
     def equation(self, name: str, eqn: JaxprEqn, args: list[Operand], law: str) -> list[Operand]:
         if name in CALLS:
-            inner = next(eqn.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in eqn.params)
-            return self.closed(inner, args, law) if isinstance(inner, ClosedJaxpr) else self.jaxpr(inner, [], args, law)
+            return self.closed(called(eqn), args, law)
         if name in SAME:
             return args
         if name in LOOPS or name == "cond":
@@ -102,7 +97,6 @@ class _Reader:
         return apply("div", (one, apply("add", (one, grown), dtype, law)), dtype, law)
 
     def _power(self, x: Operand, y: int, dtype: np.dtype, law: str) -> Operand:
-        """Compute an integer power by repeated squaring, as JAX does."""
         total, left = None, abs(y)
         while left > 0:
             if left & 1:
@@ -164,9 +158,3 @@ def refusal(name: str, law: str, how: str = "") -> str:
     """Return the error message for a primitive that cannot be exported, and the fix."""
     reason = f"the primitive {name!r}{f' {how}' if how else ''} cannot be written as scalar code"
     return f"{law or 'the step'}: {reason}. Write the law with real scalars and loops of a fixed length."
-
-
-def _law(stack: str) -> str:
-    """Return the innermost law in a stack of JAX's name scopes; '' if none. jvp(...), for example, may wrap a scope."""
-    found = re.findall(r"law:([^/()]+)", stack)
-    return found[-1] if found else ""

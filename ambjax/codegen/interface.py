@@ -56,18 +56,12 @@ class Status(NamedTuple):
 
 
 class StepOutputs(NamedTuple):
-    """Outputs of a step of the controller. `outputs_of` replaces u if it is a current."""
+    """Outputs of a step of the controller. A controller that commands a current replaces u."""
 
     u: Annotated[Array, "V", "voltage to apply, within the supply's limit"]
     i_ref: Annotated[Array, "A", "current reference"]
     v_star: Annotated[Array, "A^2/m^2", "demanded scaled force"]
     v_tilde: Annotated[Array, "A^2/m^2", "inversion error v_star - v(z, i_ref)"]
-
-
-def outputs_of(commands: str) -> dict[str, tuple[str, str]]:
-    """Return unit and meaning of each output of a controller that commands a "voltage" or a "current"."""
-    current = {"u": ("A", "current to command to the amplifier, within its limit")}
-    return OUTPUTS | (current if commands == "current" else {})
 
 
 class PlantInputs(NamedTuple):

@@ -1,33 +1,26 @@
-"""The exported loop: a step of the plant, then a step of the controller, as in the simulator."""
+"""The blocks of a case, and the loop: a step of the plant, then a step of the controller, as in the simulator."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.codegen.block import Block, Ports
-from ambjax.codegen.controller import Controller, Memory, Parameters
-from ambjax.codegen.interface import (
-    DISTURBANCES,
-    INPUTS,
-    OUTPUTS,
-    REFERENCES,
-    LoopInputs,
-    PlantInputs,
-    PlantOutputs,
-    PlantStatus,
-    Status,
-    StepInputs,
-    StepOutputs,
-    meanings,
-    units_of,
-)
-from ambjax.codegen.numbering import Number
-from ambjax.codegen.plant_step import PlantMemory, PlantParameters, PlantStep
+from ambjax.codegen.block import Block, Number, Ports
+from ambjax.codegen.controller import Controller, Memory, Parameters, controller_of
+from ambjax.codegen.interface import DISTURBANCES, OUTPUTS, REFERENCES, LoopInputs, PlantOutputs, Status, StepOutputs
+from ambjax.codegen.plant_step import PlantMemory, PlantParameters, PlantStep, plant_of
+from ambjax.control.cascade import Cascade
 from ambjax.numerics.linear import choose
 from ambjax.numerics.records import Scalar
+from ambjax.simulation.clock import Clock
+from ambjax.simulation.integrate import FixedSteps
+from ambjax.simulation.method import choose_method
 from ambjax.simulation.trajectory import ALIVE
+from ambjax.world.scenario import Scenario
+
+WHAT = ("controller", "plant", "loop")
 
 
 class LoopMemory(NamedTuple):
@@ -69,16 +62,14 @@ class LoopStep(Block):
 
     noun: ClassVar[str] = "loop"
     ports: ClassVar[Any] = LoopInputs
-    inputs: ClassVar[Ports] = {name: (INPUTS | units_of(PlantInputs))[name] for name in LoopInputs._fields}
-    outputs: ClassVar[Ports] = OUTPUTS | units_of(PlantOutputs)
-    bits = (
-        meanings(Status)
-        | meanings(PlantStatus)
-        | {
-            "invalid": "the reference or a parameter of the controller is NaN or out of range: u is held; or an input "
-            "of the plant is not finite: 0 replaces it; or the plant's delay is out of range"
-        }
-    )
+    inputs: ClassVar[Ports] = {name: {**Controller.inputs, **PlantStep.inputs}[name] for name in LoopInputs._fields}
+    outputs: ClassVar[Ports] = {**OUTPUTS, **PlantStep.outputs}
+    bits: ClassVar[Mapping[str, str]] = {
+        **Controller.bits,
+        **PlantStep.bits,
+        "invalid": "the reference or a parameter of the controller is NaN or out of range: u is held; or an input "
+        "of the plant is not finite: 0 replaces it; or the plant's delay is out of range",
+    }
     crowded = ("saturated", "refused", "touched", "diverged")
 
     def step(
@@ -86,9 +77,9 @@ class LoopStep(Block):
     ) -> tuple[LoopMemory, LoopOutputs, LoopStatus]:
         """Advance the plant under the commanded voltages, read its sensors, and step the controller."""
         before = choose(memory.plant.started, memory.control, self.start().control)
-        given = PlantInputs._make([before.last.u, *inputs[: len(DISTURBANCES)]])
+        given = self.plant.ports._make([before.last.u, *inputs[: len(DISTURBANCES)]])
         plant, motion, lost = self.plant.step(parameters.machine, memory.plant, given, period, read)
-        readings = StepInputs._make([*motion[:3], *inputs[len(DISTURBANCES) :]])
+        readings = self.controller.ports._make([*motion[:3], *inputs[len(DISTURBANCES) :]])
         control, command, status = self.controller.step(parameters.controller, before, readings, period, read)
         alive, off = plant.lost == ALIVE, jnp.zeros(())
         frozen = before._replace(last=before.last._replace(u=off), before=(off,) * len(before.before))
@@ -108,7 +99,7 @@ class LoopStep(Block):
     def states(self) -> list[Number]:
         own = [x._replace(name=f"controller.{x.name}") for x in self.controller.states()]
         words = "1 after the first accepted readings, which start the laws"
-        begun = Number("controller.started", "", "", words, 0.0, among=(0.0, 1.0, 1.0, 1.0))
+        begun = Number("controller.started", "", words, among=(0.0, 1.0, 1.0, 1.0))
         return [*own, begun, *(x._replace(name=f"plant.{x.name}") for x in self.plant.states())]
 
     def sizes(self) -> tuple[list[float], list[float]]:
@@ -123,6 +114,21 @@ class LoopStep(Block):
         return [*self.controller.described(), *self.plant.described()]
 
 
-def loop_of(controller: Controller, plant: PlantStep) -> LoopStep:
-    """Return the loop of an exported controller and an exported plant, both of one case."""
+def block_of(what: str, cascade: Cascade, scenario: Scenario, clock: Clock) -> Block:
+    """Return a block of a case. `what`: the block, one of WHAT.
+
+    If the clock's method has no fixed number of steps, the plant uses the method that `choose_method` selects instead.
+
+    Raises ValueError for a case that cannot be exported.
+    """
+    period = float(clock.sample_period)
+    controller = controller_of(cascade, scenario.command_limit, period, scenario)
+    if what == "controller":
+        return controller
+    method = clock.method
+    if not isinstance(method, FixedSteps):
+        method = choose_method(cascade, scenario, period, reverse=True)
+    plant = plant_of(cascade, scenario, period, method)
+    if what == "plant":
+        return plant
     return LoopStep(LoopParameters(controller.parameters, plant.parameters), controller.period, controller, plant)

@@ -15,9 +15,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.codegen.block import Block, Ports, scales
+from ambjax.codegen.block import Block, Number, Ports, earlier, numbers_of, scales
 from ambjax.codegen.interface import PlantInputs, PlantOutputs, PlantStatus, meanings, units_of
-from ambjax.codegen.numbering import Number, earlier, numbers_of
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import Command
 from ambjax.control.processor import MOST_DELAY
@@ -173,15 +172,13 @@ class PlantStep(Block):
         return PlantMemory(new.plant, u, before, new.z_filtered, new.u_a, lost, jnp.asarray(True))
 
     def _begun(self, system: Sampled) -> PlantMemory:
-        """Return the memory at the first sample."""
         scenario, zero = system.loop.scenario, jnp.zeros(())
         motion = scenario.plant.start(scenario.initial.measurement())
         z_filtered = scenario.plant.measurement(motion).z if lags(system.loop) else ()
         lost = _real(plant_status(system.loop, motion))
         last, *before = system.processor.constant_past(zero)
-        return PlantMemory(
-            motion, last, tuple(before), z_filtered, zero if scenario.actuator.slow else (), lost, jnp.asarray(True)
-        )
+        u_a = zero if scenario.actuator.slow else ()
+        return PlantMemory(motion, last, tuple(before), z_filtered, u_a, lost, jnp.asarray(True))
 
     def start(self) -> PlantMemory:
         begun = self._begun(self.system(self.parameters, self.period))
@@ -200,15 +197,15 @@ class PlantStep(Block):
         for field, value in memory.motion._asdict().items():
             count = len(jax.tree.leaves(value))  # `delayed` of a plant with eddy currents: none, one or two
             names = [field] if count == 1 else [f"{field}_{k + 1}" for k in range(count)]
-            found += [Number(name, COORDINATES[name][0], "", COORDINATES[name][1], 0.0) for name in names]
-        found.append(Number("last.u", "V", "", "voltage of the sample before the last", 0.0))
+            found += [Number(name, *COORDINATES[name]) for name in names]
+        found.append(Number("last.u", "V", "voltage of the sample before the last"))
         found += earlier(memory.before, "V", "voltage")
         if not isinstance(memory.z_filtered, tuple):
-            found.append(Number("z_filtered", "m", "", "output of the position sensor's low-pass", 0.0))
+            found.append(Number("z_filtered", "m", "output of the position sensor's low-pass"))
         if not isinstance(memory.u_a, tuple):
-            found.append(Number("u_a", "V", "", "output voltage of the amplifier", 0.0))
+            found.append(Number("u_a", "V", "output voltage of the amplifier"))
         codes = f"0, {TOUCHED} after touch-down, {DIVERGED} after divergence"
-        lost = Number("lost", "", "", codes, 0.0, among=(*[float(ALIVE)] * 8, float(TOUCHED), float(DIVERGED)))
+        lost = Number("lost", "", codes, among=(*[float(ALIVE)] * 8, float(TOUCHED), float(DIVERGED)))
         return [*found, lost]
 
     def sizes(self) -> tuple[list[float], list[float]]:

@@ -1,15 +1,27 @@
-"""The points at which the exported step is compared with JAX: parameters, states and inputs.
+"""The points at which the exported step is compared with JAX, and its results there, computed operation by operation.
 
 `verification_points` keeps the case's parameters; `varied` sets each of them to its `Number.ends`.
+
+If XLA compiles a whole step, it may round a product and a sum only once. If it compiles one operation at a time, it
+rounds each result, so two programs with the same operations in the same order agree to the last bits. Functions of
+<math.h> come from the C library, because XLA's own functions differ: its log1p is off by 1e2 units in the last place.
 """
 
+import ctypes
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr, JaxprEqn
+from jax.typing import ArrayLike
 
-from ambjax.codegen.numbering import UNREAD
+from ambjax.codegen.block import UNREAD
+from ambjax.codegen.primitives import CALLS, OPS, SAME, dtype_of, split_scan, walked
 from ambjax.codegen.program import PRECISIONS, Ref
-from ambjax.codegen.trace import Trace
+from ambjax.codegen.trace import Trace, arguments
+from ambjax.compiler.members_last import called
+from ambjax.compiler.short_compilation import precision
 
 # DECADES: range of the random numbers, in decades around the scale of each. EDGY: probability that a number is zero,
 # tiny, or at or near a limit. FIRST: probability that a point is a first step.
@@ -55,13 +67,13 @@ def verification_points(trace: Trace, count: int, seed: int = 0) -> Points:
     return _split(trace, x, np.concatenate([started[chosen], np.ones(borders.shape[1], bool)]))
 
 
-def varied(trace: Trace, count: int, seed: int = 2) -> Points:
+def varied(trace: Trace, count: int) -> Points:
     """Return points with other parameters: first each alone at each of its `Number.ends`, then all drawn at random.
 
     The ends include values that a step must reject. A random parameter has its value in the case, or one of its first
     two ends.
     """
-    random, dtype = np.random.default_rng(seed), PRECISIONS[trace.precision]
+    random, dtype = np.random.default_rng(2), PRECISIONS[trace.precision]
     cases = [(k, end) for k, x in enumerate(trace.parameters) if x.allowed != UNREAD for end in x.ends]
     alone = np.arange(int(ALONE * count)) % len(cases)
     parameters = np.array([[x.value] * count for x in trace.parameters])
@@ -101,7 +113,8 @@ def _seen(trace: Trace, x: np.ndarray, started: np.ndarray) -> tuple[np.ndarray,
 
 def _drawn(trace: Trace, random: np.random.Generator, parameters: np.ndarray) -> np.ndarray:
     """Return random states and inputs of either sign, over decades, with zeros, limits and some non-finite inputs."""
-    sizes, count = np.array(_sizes(trace)), parameters.shape[1]
+    states, inputs = trace.block.sizes()
+    sizes, count = np.array([*(states[k] for k in trace.keep), *inputs]), parameters.shape[1]
     limits = np.ones((sizes.size, count))  # 1 for numbers without a limit: states, and readings without a guard
     bounds = trace.block.bounds()
     for k, x in enumerate(trace.parameters):
@@ -118,13 +131,8 @@ def _drawn(trace: Trace, random: np.random.Generator, parameters: np.ndarray) ->
         if state.among:
             row[:] = random.choice(state.among, count)
     wild = random.choice([np.nan, np.inf, -np.inf], shape)
-    inputs = np.arange(sizes.size)[:, None] >= len(trace.state)
-    return np.where(inputs & (random.random(shape) < EDGY / 10), wild, x)
-
-
-def _sizes(trace: Trace) -> list[float]:
-    states, inputs = trace.block.sizes()
-    return [states[k] for k in trace.keep] + inputs
+    given = np.arange(sizes.size)[:, None] >= len(trace.state)
+    return np.where(given & (random.random(shape) < EDGY / 10), wild, x)
 
 
 def _borders(trace: Trace, x: np.ndarray) -> np.ndarray:
@@ -158,3 +166,70 @@ def evaluated(trace: Trace, x: np.ndarray, started: np.ndarray) -> list[np.ndarr
     values += [*memory, started, *rows, np.full(count, trace.block.period, dtype)]
     given = {ref.node: value for ref, value in zip(trace.refs, values, strict=True)}
     return [np.broadcast_to(v, count) for v in program.evaluate(given)]
+
+
+class Results(NamedTuple):
+    """Results of a step at some points: next states and flag `started`, outputs, and status bits."""
+
+    state: np.ndarray
+    started: np.ndarray
+    outputs: np.ndarray
+    bits: np.ndarray
+
+
+def results(trace: Trace, at: Points) -> Results:
+    """Return the results of the step at these points, computed with JAX operation by operation."""
+    count = at.started.size
+    with precision(trace.precision):
+        given = arguments(trace.block)
+        closed = jax.make_jaxpr(lambda p, m, x, t: trace.block.step(p, m, x, t, trace.read))(*given)
+        rows: list[Any] = [np.zeros(count, at.state.dtype)] * (len(jax.tree.leaves(given[1])) - 1) + [at.started]
+        for row, k in zip(at.state, trace.keep, strict=True):
+            rows[k] = row
+        found = one_by_one(closed, [*at.parameters, *rows, *at.inputs, given[3]], count)
+    spread = [np.broadcast_to(x, count) for x in found]
+    begun, bits = len(rows), sum(np.where(x, 1 << k, 0) for k, x in enumerate(spread[-len(trace.bits) :]))
+    kept = np.array([spread[k] for k in trace.keep]).reshape(len(trace.keep), count)
+    return Results(kept, spread[begun - 1], np.array(spread[begun : -len(trace.bits)]), np.asarray(bits))
+
+
+def one_by_one(closed: ClosedJaxpr, args: list[ArrayLike], count: int) -> list[ArrayLike]:
+    """Evaluate a trace for scalars or rows of `count`, one primitive at a time."""
+    return walked(closed, args, lambda eqn, values: _one(eqn, values, count))
+
+
+def _one(eqn: JaxprEqn, args: list[ArrayLike], count: int) -> list[ArrayLike]:
+    name, params = eqn.primitive.name, eqn.params
+    if name in SAME:
+        return args
+    if name in CALLS:
+        return one_by_one(called(eqn), args, count)
+    if name == "cond":
+        sides = [one_by_one(branch, args[1:], count) for branch in params["branches"]]
+        at = np.asarray(args[0], int)
+        return [np.choose(at, [np.broadcast_to(x, count) for x in xs]) for xs in zip(*sides, strict=True)]
+    if name == "scan":
+        fixed, carry = split_scan(params, args)
+        for _ in range(params["length"]):
+            carry = one_by_one(params["jaxpr"], fixed + carry, count)
+        return carry
+    if name == "while":
+        at, to = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
+        asked, fixed, carry = args[:at], args[at:to], args[to:]
+        while np.any(more := one_by_one(params["cond_jaxpr"], asked + carry, count)[0]):
+            after = one_by_one(params["body_jaxpr"], fixed + carry, count)
+            carry = list[ArrayLike](jnp.where(more, a, b) for a, b in zip(after, carry, strict=True))
+        return carry
+    if name in OPS and OPS[name].cost == "call":
+        return [_of_library(OPS[name].c99.partition("{f}")[0], args, dtype_of(eqn.outvars[0]), count)]
+    rows = [jnp.broadcast_to(jnp.asarray(x, dtype_of(v)), (count,)) for x, v in zip(args, eqn.invars, strict=True)]
+    return [eqn.primitive.bind(*rows, **params)]
+
+
+def _of_library(name: str, args: list[ArrayLike], dtype: np.dtype, count: int) -> np.ndarray:
+    """Evaluate a function of this machine's <math.h> on rows."""
+    single = dtype == np.float32
+    function, kind = getattr(ctypes.CDLL(None), name + "f" * single), ctypes.c_float if single else ctypes.c_double
+    function.restype, function.argtypes = kind, [kind] * len(args)
+    rows = [np.broadcast_to(np.asarray(x, dtype), count).tolist() for x in args]
+    return np.array([function(*point) for point in zip(*rows, strict=True)], dtype)

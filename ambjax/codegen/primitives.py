@@ -4,11 +4,11 @@ The NumPy functions are used to fold constants and to choose the points of the v
 the exported code with JAX, not with NumPy.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
-from jax.extend.core import Jaxpr, JaxprEqn, Literal, Var
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 
 
 class Op(NamedTuple):
@@ -105,14 +105,26 @@ def dtype_of(x: Atom) -> np.dtype:
     return np.dtype(aval.dtype)
 
 
-def live(jaxpr: Jaxpr) -> list[JaxprEqn]:
-    """Return the equations on which the results of a jaxpr depend, in their order."""
-    needed, found = {x for x in jaxpr.outvars if not isinstance(x, Literal)}, list[JaxprEqn]()
+def walked(closed: ClosedJaxpr, args: Sequence[Any], one: Callable[[JaxprEqn, list[Any]], Sequence[Any]]) -> list[Any]:
+    """Return the results of a trace. `one`: returns the results of an equation from its operands.
+
+    Equations on which no result depends are left out.
+    """
+    jaxpr, live = closed.jaxpr, list[JaxprEqn]()
+    needed = {x for x in jaxpr.outvars if not isinstance(x, Literal)}
     for eqn in reversed(jaxpr.eqns):
         if not needed.isdisjoint(eqn.outvars):
             needed.update(x for x in eqn.invars if not isinstance(x, Literal))
-            found.append(eqn)
-    return found[::-1]
+            live.append(eqn)
+    known = dict[Any, Any](zip(jaxpr.constvars, (np.asarray(x)[()] for x in closed.consts), strict=True))
+    known.update(zip(jaxpr.invars, args, strict=True))
+
+    def value(x: Atom) -> Any:
+        return np.asarray(x.val, dtype_of(x))[()] if isinstance(x, Literal) else known[x]
+
+    for eqn in reversed(live):
+        known.update(zip(eqn.outvars, one(eqn, [value(x) for x in eqn.invars]), strict=True))
+    return [value(x) for x in jaxpr.outvars]
 
 
 def split_scan(params: dict[str, Any], args: list[Argument]) -> tuple[list[Argument], list[Argument]]:

@@ -1,10 +1,11 @@
-"""Straight-line scalar code: one node per operation, with equal expressions shared and constants folded.
+"""Straight-line scalar code, and its statements: a node per operation, equal expressions shared, constants folded.
 
 A node that no other node or result uses is not written. A constant is a NumPy scalar, and so is any expression of
 constants.
 """
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -63,7 +64,6 @@ class Program:
         return Ref(len(self.nodes) - 1)
 
     def dtype(self, x: Operand) -> np.dtype:
-        """Return the dtype of an operand."""
         return self.nodes[x.node].dtype if isinstance(x, Ref) else x.dtype
 
     def apply(self, op: str, args: Sequence[Operand], dtype: npt.DTypeLike, law: str) -> Operand:
@@ -100,6 +100,14 @@ class Program:
         """Return the numbers of the nodes on which these operands depend, without inputs, in order of computation."""
         return sorted(n for n in self.needed(outputs) if self.nodes[n].op != "input")
 
+    def fixed(self, order: Sequence[int], inputs: Iterable[int]) -> set[int]:
+        """Return the nodes of `order` that depend only on these input nodes and on constants."""
+        known = set(inputs)
+        for n in order:
+            if all(x.node in known for x in self.nodes[n].args if isinstance(x, Ref)):
+                known.add(n)
+        return known.intersection(order)
+
     def used(self, before: Sequence[Ref], after: Sequence[Operand], outputs: Sequence[Operand]) -> list[int]:
         """Return the indices of the states on which `outputs` depend, in this step or in a later one."""
         used: list[int] = []
@@ -119,6 +127,50 @@ class Program:
                 value = inputs[number] if node.op == "input" else OPS[node.op].numpy(*args)
                 values.append(np.asarray(value).astype(node.dtype))
         return values
+
+
+class Statements:
+    """The nodes `order` of a program as statements, one per node, in the language of a subclass.
+
+    `read`: a function that returns the text that reads an input.
+    """
+
+    def __init__(self, program: Program, order: Sequence[int], read: Callable[[Location], str]) -> None:
+        self.program, self.order, self.read = program, order, read
+        self.names = {n: f"v{k}" for k, n in enumerate(order)}
+
+    def constant(self, x: Any) -> str:
+        raise NotImplementedError
+
+    def statement(self, n: int) -> str:
+        raise NotImplementedError
+
+    def operand(self, x: Operand) -> str:
+        if isinstance(x, Ref):
+            location = self.program.nodes[x.node].location
+            return self.names[x.node] if location is None else self.read(location)
+        text = self.constant(x)
+        return f"({text})" if text.startswith("-") else text
+
+    def body(self, comment: str) -> list[str]:
+        """Return all statements. `comment`: the line before the statements of a law, with its name for {law}."""
+        lines, law = [], ""
+        for n in self.order:
+            if (node := self.program.nodes[n]).law != law:
+                law = node.law
+                lines.append(comment.format(law=re.sub(r"[^ -~]", "?", law) or "the cascade"))
+            lines.append(self.statement(n))
+        return lines
+
+    def assigned(self, results: Sequence[tuple[str, Operand]], state: str) -> tuple[dict[str, str], dict[str, str]]:
+        """Return names for the states that a step copies, by their texts, and the new value of each place.
+
+        A state is copied before any is written. Its text begins with `state`.
+        """
+        given = {place: self.operand(value) for place, value in results}
+        copied = dict.fromkeys(text for text in given.values() if text.startswith(state))
+        old = {text: f"old{k}" for k, text in enumerate(copied)}
+        return old, {place: old.get(text, text) for place, text in given.items()}
 
 
 def _key(x: Operand) -> tuple[str, str]:

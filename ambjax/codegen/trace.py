@@ -2,19 +2,26 @@
 
 import dataclasses
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.codegen.block import Block
+from ambjax.codegen.block import UNREAD, Block, Number
 from ambjax.codegen.emitter import traced
-from ambjax.codegen.numbering import UNREAD, Number
 from ambjax.codegen.primitives import COUNTED, OPS
 from ambjax.codegen.program import PERIOD, PRECISIONS, STARTED, Location, Operand, Program, Ref
 from ambjax.compiler.short_compilation import precision
 from ambjax.numerics.records import canonical
+
+
+def in_jax(block: Block) -> tuple[Any, Callable[[Any, Array], tuple[Any, Any, Any]]]:
+    """Return the first memory of a block, and its step as a function of a memory and an array of inputs."""
+    parameters, memory, _, period = arguments(block)
+    read = frozenset(block.inputs)
+    return memory, lambda memory, x: block.step(parameters, memory, block.ports(*x), period, read)
 
 
 def arguments(block: Block) -> tuple[Any, Any, Any, Array]:
@@ -52,7 +59,6 @@ class Trace:
     refs: list[Ref]
 
     def roots(self) -> list[Operand]:
-        """Return the operands of all results of the step."""
         return [x for _, x in [*self.state, *self.outputs, *self.bits]] + [self.started]
 
     def order(self) -> list[int]:
@@ -61,16 +67,9 @@ class Trace:
 
     def counts(self) -> Counter:
         """Return the number of operations of each kind in a step."""
-        nodes = self.program.nodes
-        fixed = {n for n, node in enumerate(nodes) if node.location == PERIOD}
-        found: Counter = Counter()
-        for n in self.order():
-            refs = [x.node for x in nodes[n].args if isinstance(x, Ref)]
-            if set(refs) <= fixed:
-                fixed.add(n)
-            else:
-                found[OPS[nodes[n].op].cost] += 1
-        return found
+        order, nodes = self.order(), self.program.nodes
+        fixed = self.program.fixed(order, [self.refs[-1].node])
+        return Counter(OPS[nodes[n].op].cost for n in order if n not in fixed)
 
     def state_bytes(self) -> int:
         """Return the size of the C struct of states in bytes, with the flag `started` and the padding after it."""
@@ -100,12 +99,8 @@ def _traced(block: Block, to: str, read: frozenset[str]) -> Trace:
     """Trace the step of a block that checks the inputs `read`, and drop states on which no result depends."""
     given, program, real = arguments(block), Program(), np.dtype(PRECISIONS[to])
     parameters, states, step = block.numbers(), block.states(), block.step
-    locations = [
-        *(Location("params", x.name) for x in parameters),
-        *(Location("state", x.name) for x in states),
-        STARTED,
-    ]
-    locations += [*(Location("input", name) for name in block.inputs), PERIOD]
+    locations = [Location(group, x.name) for group, xs in (("params", parameters), ("state", states)) for x in xs]
+    locations += [STARTED, *(Location("input", name) for name in block.inputs), PERIOD]
     refs = [program.input(location, bool if location == STARTED else real) for location in locations]
     results = traced(program, lambda p, s, x, t: step(p, s, x, t, read), given, refs)
     for x in results:
@@ -124,13 +119,10 @@ def _traced(block: Block, to: str, read: frozenset[str]) -> Trace:
         to,
         program,
         [x if ref.node in seen else x._replace(allowed=UNREAD) for x, ref in zip(parameters, refs, strict=False)],
-        [Number(name, unit, "", doc, 0.0) for name, (unit, doc) in block.inputs.items()],
+        [Number(name, *port) for name, port in block.inputs.items()],
         [(states[k], after[k]) for k in keep],
         started,
-        [
-            (Number(name, u, "", doc, 0.0), x)
-            for (name, (u, doc)), x in zip(block.outputs.items(), outputs, strict=True)
-        ],
+        [(Number(name, *port), x) for (name, port), x in zip(block.outputs.items(), outputs, strict=True)],
         list(zip(block.bits, bits, strict=True)),
         frozenset(name for name, ref in zip(block.inputs, input_refs, strict=True) if ref.node in seen),
         keep,

@@ -1,4 +1,4 @@
-"""The horizon within which two closed loops can be compared despite rounding errors.
+"""The inputs of a case's loop, and the horizon within which two such loops can be compared despite rounding errors.
 
 A closed loop with set-valued signs or converters amplifies rounding errors until two correct programs agree only in
 their statistics. Twins of JAX's loop measure this growth. A twin is the loop that JAX simulates, with every state of
@@ -14,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.codegen.interface import LoopInputs
 from ambjax.codegen.program import PRECISIONS
-from ambjax.codegen.series import just_after
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import Command
 from ambjax.control.guard import Watch
+from ambjax.numerics.gaussian import normals
 from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.between import SampledState
 from ambjax.simulation.clock import Clock
@@ -37,6 +38,34 @@ T = TypeVar("T")
 TWINS, PARTED, LEAST = 8, 1e-2, 20
 # Signals that are compared. A large difference of a twin in any of them ends the horizon.
 SIGNALS = ("z", "u")
+
+
+def just_after(t: Scalar) -> Scalar:
+    """Return the instant (s) at which the simulator evaluates signals for the sample at t: a jump at t has happened."""
+    return t * (1 + 4 * float(jnp.finfo(jnp.result_type(float)).eps))
+
+
+def series(cascade: Cascade, scenario: Scenario, clock: Clock, samples: int) -> dict[str, np.ndarray]:
+    """Return the inputs of the loop at samples 0 to `samples` - 1, by name.
+
+    The disturbances for sample n are those of the sample before, because these act until sample n.
+    """
+    given = sampled_of(cascade, scenario, clock)
+    found = _series(canonical(given), jnp.arange(samples))
+    return {name: np.asarray(x) for name, x in found._asdict().items()}
+
+
+@jax.jit
+def _series(system: Sampled, samples: Array) -> LoopInputs:
+    loop = system.loop.realised()
+
+    def one(n: Array) -> LoopInputs:
+        t = just_after(n * system.period)
+        before = just_after(jnp.maximum(n - 1, 0) * system.period)
+        outside, w = loop.inputs(before), normals(loop.words(), n)
+        return LoopInputs._make([outside.q_z, outside.q_i, *(w[k] for k in range(3)), *system.reference(t)])
+
+    return jax.vmap(one)(samples)
 
 
 class LoopCase(NamedTuple):
@@ -64,7 +93,6 @@ class Horizon(NamedTuple):
 
     @property
     def decisive(self) -> bool:
-        """Whether the horizon is long enough for a verdict."""
         return self.samples >= LEAST
 
 

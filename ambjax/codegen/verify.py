@@ -8,14 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ambjax.codegen import closed_loop
-from ambjax.codegen.block import Block
+from ambjax.codegen.block import SPAN, Block
 from ambjax.codegen.c99.machine import EXACT, SANITIZED, SHARED, STRICT, Compiled, build, execute, scratch, short
 from ambjax.codegen.c99.package import SHARE, ULPS, files_of_trace, tolerance
 from ambjax.codegen.c99.source import Origin
-from ambjax.codegen.numbering import SPAN
-from ambjax.codegen.points import Points, varied, verification_points
+from ambjax.codegen.points import Points, Results, results, varied, verification_points
 from ambjax.codegen.program import PRECISIONS
-from ambjax.codegen.reference import Results, results
 from ambjax.codegen.trace import Trace, trace
 from ambjax.codegen.twins import LEAST, PARTED, TWINS, LoopCase
 from ambjax.text.words import markdown_table
@@ -38,7 +36,6 @@ class Check(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """`ok` in words."""
         return "not decisive" if self.ok is None else "holds" if self.ok else "FAILS"
 
 
@@ -105,7 +102,6 @@ def _built(one: Draft, precision: str, at: pathlib.Path) -> Iterator[Check]:
 
 
 def _stepped(name: str, one: Draft, precision: str, machine: Compiled) -> Iterator[Check]:
-    """Compare one step from each point."""
     at, should = one.steps[name]
     found, kind = machine.results(at), np.finfo(PRECISIONS[precision])
     is_, as_ = (np.concatenate([x.state, x.outputs]) for x in (found, should))

@@ -16,7 +16,7 @@ from ambjax.host.heartbeat import say
 from ambjax.paper import ledger
 from ambjax.paper.evidence import Evidence, gather
 from ambjax.pictures import figures
-from ambjax.pictures.style import save
+from ambjax.pictures.scales import save
 from ambjax.results.outputs import described, directory, drawn, files, plain, table, write_json, written
 
 Summary = dict[str, object]

@@ -108,11 +108,11 @@ def _pictures(
 
 
 def _tornado(summary: dict[str, Any]) -> Any:
-    from ambjax.pictures import tornado
+    from ambjax.pictures import histograms
 
     deciding = statistics.DECIDING
-    bars = [tornado.Bar(*(d[k] for k in tornado.Bar._fields)) for d in summary["drivers"][deciding]]
-    return tornado.tornado(bars, deciding, summary["explained"][deciding]["says"])
+    bars = [histograms.Bar(*(d[k] for k in histograms.Bar._fields)) for d in summary["drivers"][deciding]]
+    return histograms.tornado(bars, deciding, summary["explained"][deciding]["says"])
 
 
 def _fan(case: Case, study: Study, columns: dict[str, np.ndarray]) -> Any:

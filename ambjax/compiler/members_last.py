@@ -14,8 +14,8 @@ import numpy as np
 from jax import Array, lax
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
 
-from ambjax.compiler.member_flags import CALLS, called, carried_flags, moved, scan_parts, shape_of, while_parts
-
+# Primitives that call a jaxpr.
+CALLS = ("checkpoint", "custom_jvp_call", "custom_vjp_call", "jit", "pjit", "remat2")
 # Primitives whose operands have one shape, or no axes.
 NAMES = (
     "abs acos add add_any and asin atan atan2 bitcast_convert_type cbrt ceil clamp complex convert_element_type copy "
@@ -27,6 +27,17 @@ NAMES = (
 ELEMENTWISE = frozenset(NAMES.split())
 # Primitives of one operand whose parameters name axes: a further last axis does not change them.
 SAME_AXES = frozenset(("argmax", "argmin", "cumsum", "reduce_prod", "rev", "split", "squeeze"))
+# Primitives of one operand whose parameters contain shapes: functions of the operand, the parameters and the members.
+SHAPED: dict[str, Callable[[Any, dict[str, Any], int], Array]] = {
+    "broadcast_in_dim": lambda x, p, size: lax.broadcast_in_dim(
+        x, (*p["shape"], size), (*p["broadcast_dimensions"], len(p["shape"]))
+    ),
+    "reshape": lambda x, p, size: lax.reshape(x, (*p["new_sizes"], size)),
+    "slice": lambda x, p, size: lax.slice(
+        x, (*p["start_indices"], 0), (*p["limit_indices"], size), p["strides"] and (*p["strides"], 1)
+    ),
+    "transpose": lambda x, p, size: lax.transpose(x, (*p["permutation"], len(p["permutation"]))),
+}
 # Reductions, as functions of two terms. XLA compiles a reduction into a loop that is not vectorised.
 REDUCTIONS = {
     "reduce_and": lax.bitwise_and,
@@ -73,9 +84,7 @@ class _Members:
     def evaluated(self, closed: ClosedJaxpr, values: Sequence[Any], moves: Sequence[bool]) -> Flagged:
         """Return the results of a jaxpr. `moves`: the flags of `values`."""
         jaxpr = closed.jaxpr
-        known: dict[Any, tuple[Any, bool]] = dict(
-            zip(jaxpr.constvars, [(x, False) for x in closed.consts], strict=True)
-        )
+        known: dict[Any, Any] = {v: (x, False) for v, x in zip(jaxpr.constvars, closed.consts, strict=True)}
         known |= dict(zip(jaxpr.invars, zip(values, moves, strict=True), strict=True))
         read = lambda x: (x.val, False) if isinstance(x, Literal) else known[x]  # noqa: E731
         for eqn in jaxpr.eqns:
@@ -85,7 +94,6 @@ class _Members:
         return [read(x) for x in jaxpr.outvars]
 
     def one(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged:
-        """Return the results of one equation."""
         name, params = eqn.primitive.name, eqn.params
         rule = self.reduced if name in REDUCTIONS else getattr(self, f"rule_{name}", None)
         if name in CALLS and rule is None:
@@ -96,6 +104,8 @@ class _Members:
             return _flagged(eqn, eqn.primitive.bind(*self.together(eqn, values, moves), **params), True)
         if name in SAME_AXES:
             return _flagged(eqn, eqn.primitive.bind(*values, **params), True)
+        if name in SHAPED:
+            return [(SHAPED[name](values[0], params, self.size), True)]
         if rule is not None and (found := rule(eqn, values, moves)) is not None:  # None: the rule does not apply
             return found
         axes = [-1 if moving else None for moving in moves]
@@ -121,21 +131,6 @@ class _Members:
 
     rule_pjit = rule_jit
 
-    def rule_broadcast_in_dim(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
-        shape, dims = eqn.params["shape"], eqn.params["broadcast_dimensions"]
-        return [(lax.broadcast_in_dim(values[0], (*shape, self.size), (*dims, len(shape))), True)]
-
-    def rule_reshape(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
-        return [(lax.reshape(values[0], (*eqn.params["new_sizes"], self.size)), True)]
-
-    def rule_transpose(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
-        order = eqn.params["permutation"]
-        return [(lax.transpose(values[0], (*order, len(order))), True)]
-
-    def rule_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
-        begin, end, strides = (eqn.params[x] for x in ("start_indices", "limit_indices", "strides"))
-        return [(lax.slice(values[0], (*begin, 0), (*end, self.size), strides and (*strides, 1)), True)]
-
     def rule_concatenate(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         parts = [self.wide(x, m, shape_of(v)) for x, m, v in zip(values, moves, eqn.invars, strict=True)]
         return [(lax.concatenate(parts, eqn.params["dimension"]), True)]
@@ -143,9 +138,8 @@ class _Members:
     def rule_dynamic_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         if any(moves[1:]):
             return None
-        return [
-            (lax.dynamic_slice(values[0], (*values[1:], _first(eqn)), (*eqn.params["slice_sizes"], self.size)), True)
-        ]
+        sizes = (*eqn.params["slice_sizes"], self.size)
+        return [(lax.dynamic_slice(values[0], (*values[1:], _first(eqn)), sizes), True)]
 
     def rule_dynamic_update_slice(self, eqn: JaxprEqn, values: list, moves: list[bool]) -> Flagged | None:
         if any(moves[2:]):
@@ -215,3 +209,68 @@ def _first(eqn: JaxprEqn) -> Array:
 
 def _flagged(eqn: JaxprEqn, results: Any, moves: bool) -> Flagged:
     return [(x, moves) for x in (results if eqn.primitive.multiple_results else [results])]
+
+
+# Flags of the values of a jaxpr: whether a value differs between members, so that it has an axis of members.
+
+
+def moved(closed: ClosedJaxpr, moves: Sequence[bool]) -> list[bool]:
+    """Return the flags of the results of a jaxpr."""
+    jaxpr = closed.jaxpr
+    known: dict[Any, bool] = dict(zip(jaxpr.invars, moves, strict=True))
+    read = lambda x: not isinstance(x, Literal) and known.get(x, False)  # noqa: E731
+    for eqn in jaxpr.eqns:
+        own, name = [read(x) for x in eqn.invars], eqn.primitive.name
+        flags = [any(own)] * len(eqn.outvars)
+        if any(own) and name in CALLS:
+            flags = moved(called(eqn), own)
+        elif any(own) and name == "scan":
+            body, (fixed, both) = eqn.params["jaxpr"], scan_parts(eqn)
+            flags = moved(body, [*own[:fixed], *carried_flags(body, own[:both], fixed, own[both:]), *own[both:]])
+        elif any(own) and name == "while":
+            goes, body, consts, fixed = while_parts(eqn)
+            carried = carried_flags(body, own[consts:], fixed, ())
+            flags = [True] * len(carried) if moved(goes, [*own[:consts], *carried])[0] else carried
+        known |= dict(zip(eqn.outvars, flags, strict=True))
+    return [read(x) for x in jaxpr.outvars]
+
+
+def carried_flags(body: ClosedJaxpr, moves: Sequence[bool], fixed: int, each: Sequence[bool]) -> list[bool]:
+    """Return which values that a loop carries differ between members after any turn."""
+    carried = list(moves[fixed:])
+    while True:
+        after = moved(body, [*moves[:fixed], *carried, *each])
+        joined = [a or b for a, b in zip(carried, after, strict=False)]
+        if joined == carried:
+            return carried
+        carried = joined
+
+
+def scan_parts(eqn: JaxprEqn) -> tuple[int, int]:
+    """Return the number of constants of a scan, and that of constants and carried values together.
+
+    The shapes show them: only inputs and results of a single turn have one axis more outside than inside.
+    """
+    body = eqn.params["jaxpr"].jaxpr
+    both, carried = (
+        sum(len(shape_of(outer)) == len(shape_of(inner)) for outer, inner in zip(outside, inside, strict=True))
+        for outside, inside in ((eqn.invars, body.invars), (eqn.outvars, body.outvars))
+    )
+    return both - carried, both
+
+
+def shape_of(x: Any) -> tuple[int, ...]:
+    """Return the shape of a variable of a jaxpr."""
+    return x.aval.shape
+
+
+def while_parts(eqn: JaxprEqn) -> tuple[ClosedJaxpr, ClosedJaxpr, int, int]:
+    """Return condition and body of a loop, and the numbers of their constants."""
+    p = eqn.params
+    return p["cond_jaxpr"], p["body_jaxpr"], p["cond_nconsts"], p["body_nconsts"]
+
+
+def called(eqn: JaxprEqn) -> ClosedJaxpr:
+    """Return the jaxpr that an equation calls."""
+    inner = next(eqn.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in eqn.params)
+    return inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())

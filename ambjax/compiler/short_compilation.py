@@ -53,7 +53,6 @@ def supported(options: Mapping[str, bool | int]) -> dict[str, bool | int]:
 
 @functools.cache
 def _supports(name: str, value: bool | int) -> bool:
-    """Return whether a small program can be compiled with an option."""
     try:
         jax.jit(lambda x: x, compiler_options={name: value}).lower(0.0).compile()
     except jax.errors.JaxRuntimeError:

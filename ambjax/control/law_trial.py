@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from ambjax.control.base import Law
 from ambjax.control.stages import CurrentDemand, CurrentInputs, ForceDemand, PositionLaw
-from ambjax.host.imports import line_of
+from ambjax.host.extensions import line_of
 from ambjax.numerics.records import GainFunction
 from ambjax.numerics.shapes import map_varying
 from ambjax.world.plant import Plant

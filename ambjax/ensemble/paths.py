@@ -8,7 +8,7 @@ import numpy as np
 
 from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import Schedule
-from ambjax.host.imports import digest_of
+from ambjax.host.extensions import digest_of
 from ambjax.numerics.records import is_traced, leaf, replaced
 from ambjax.numerics.shapes import axes_of, with_entry
 from ambjax.world.scenario import Scenario

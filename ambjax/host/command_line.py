@@ -1,4 +1,4 @@
-"""Command lines: arguments, errors on one line, a summary as JSON, and exit codes."""
+"""Command lines: arguments, errors on one line, a summary as JSON, exit codes, streams whose failure stops no run."""
 
 import argparse
 import atexit
@@ -11,11 +11,10 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, NoReturn
 
-from ambjax.host.streams import lenient
 from ambjax.text.words import one_line
 
 # Errors of a file system that another folder or free space may resolve.
@@ -99,7 +98,6 @@ def run_command(parser: argparse.ArgumentParser, words: list[str] | None, run: R
 
 
 def _code(run: Callable[[], tuple[int, object]], as_json: bool, program: str) -> int:
-    """Call `run` and return its exit code."""
     try:
         code, summary = run()
         if as_json:
@@ -127,3 +125,61 @@ def message(error: Exception) -> str:
             # JAX: a device is missing, or its memory is full
             return str(error).strip().partition("\n")[0] or type(error).__name__
     raise error
+
+
+class Lenient:
+    """A wrapper of a text stream that records the first failure and discards all text after it."""
+
+    def __init__(self, stream: Any) -> None:
+        self.stream, self.failed = stream, None
+
+    def write(self, text: str) -> int:
+        self._try(lambda: self.stream.write(text))
+        return len(text)
+
+    def flush(self) -> None:
+        self._try(self.stream.flush)
+
+    def failure(self) -> Exception | None:
+        """Flush, and return the first failure; None if all text was written."""
+        self.flush()
+        return self.failed
+
+    def _try(self, act: Callable[[], object]) -> None:
+        if self.failed is None:
+            try:
+                act()
+            except (OSError, ValueError) as why:  # ValueError: the stream is closed
+                self.failed = why
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+
+def open_streams() -> None:
+    """Open the null device for each standard stream that was closed when the process started.
+
+    Streams are opened in the order of their file numbers, so that no later file takes the number of a standard stream.
+    Characters that the encoding of stdout or stderr lacks are written as escapes.
+    """
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))  # noqa: SIM115, PTH123
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@contextlib.contextmanager
+def lenient() -> Iterator[Lenient]:
+    """Wrap stdout and stderr in `Lenient` for this block, and yield the wrapper of stdout."""
+    before = {name: getattr(sys, name) for name in ("stdout", "stderr")}
+    now = {name: Lenient(stream) for name, stream in before.items()}
+    for name, stream in now.items():
+        setattr(sys, name, stream)
+    try:
+        yield now["stdout"]
+    finally:
+        for name, stream in now.items():
+            if stream.failure() is None:
+                setattr(sys, name, before[name])

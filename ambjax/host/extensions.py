@@ -1,12 +1,26 @@
-"""Optional packages, and commands that other packages declare, such as that of the tuner."""
+"""Import of optional packages, of commands that other packages declare (that of the tuner), and of custom classes.
 
+Other processes cannot import a file with a custom class by name. An instance of such a class is therefore pickled with
+the text of the file. A worker process, or a machine of a cluster without that file, then executes the same text.
+"""
+
+import contextlib
+import copyreg
+import hashlib
 import importlib
 import importlib.metadata
+import inspect
+import pathlib
+import re
+import sys
+import types
 from collections.abc import Callable
 from typing import Any
 
 # Entry-point group in which a package that depends on ambjax declares its command.
 GROUP = "ambjax.commands"
+# SHA-256 of the source of each module that was imported here, by the module's name.
+_DIGESTS: dict[str, str] = {}
 
 
 def extra(name: str, group: str = "tables") -> Any:
@@ -34,3 +48,72 @@ def extension(name: str) -> Callable[..., int]:
     if not found:
         raise ValueError(f"{name}: this command is not installed. Reinstall ambjax with pip.")
     return found[0].load()
+
+
+def module_of_file(path: pathlib.Path) -> types.ModuleType:
+    """Execute a Python file and return its module. The same text at the same path is executed only once per process.
+
+    Output of the file goes to stderr. Raises OSError if the file cannot be read, and whatever its execution raises.
+    """
+    return _executed(str(path.resolve()), path.read_bytes())
+
+
+def module_of_name(name: str) -> types.ModuleType:
+    """Import an installed module by its dotted name. Raises whatever its import raises."""
+    with contextlib.redirect_stdout(sys.stderr):
+        module = importlib.import_module(name)
+    with contextlib.suppress(OSError, TypeError):  # a module without source, such as a compiled one
+        _DIGESTS[module.__name__] = hashlib.sha256(inspect.getsource(module).encode()).hexdigest()
+    return module
+
+
+def digest_of(kind: type) -> str:
+    """Return the SHA-256 of the source of the module of a class, if it was imported here; otherwise ''."""
+    return _DIGESTS.get(kind.__module__, "")
+
+
+def pickle_with_source(kind: type) -> None:
+    """Make pickles of instances of this class, which a file defines, carry the text of the file."""
+    copyreg.pickle(kind, _reduced)  # pyright: ignore[reportArgumentType]
+
+
+def line_of(error: BaseException, path: pathlib.Path) -> int | None:
+    """Return the last line of the file at `path` that an exception passed through, or None."""
+    name, line, tail = str(path.resolve()), None, error.__traceback__
+    while tail is not None:
+        line = tail.tb_lineno if tail.tb_frame.f_code.co_filename == name else line
+        tail = tail.tb_next
+    return error.lineno if isinstance(error, SyntaxError) and error.filename == name else line
+
+
+def _executed(path: str, text: bytes) -> types.ModuleType:
+    """Return the module of this text, which stands at `path`; execute it unless this process has done so."""
+    digest = hashlib.sha256(path.encode() + b"\0" + text).hexdigest()
+    package = f"own_{digest[:16]}"
+    name = f"{package}.{re.sub(r'[^A-Za-z0-9_]', '_', pathlib.Path(path).stem)}"
+    if name in sys.modules:
+        return sys.modules[name]
+    module = types.ModuleType(name)
+    module.__file__, module.__dict__["_TEXT"] = path, text
+    sys.modules[package], sys.modules[name] = types.ModuleType(package), module  # dataclasses and pickle look it up
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            exec(compile(text, path, "exec"), module.__dict__)
+    except BaseException:
+        del sys.modules[package], sys.modules[name]
+        raise
+    _DIGESTS[name] = hashlib.sha256(text).hexdigest()
+    return module
+
+
+def _reduced(instance: Any) -> tuple[Any, ...]:
+    kind = type(instance)
+    module = sys.modules[kind.__module__]
+    return _blank, (module.__file__, module.__dict__["_TEXT"], kind.__qualname__), dict(vars(instance))
+
+
+def _blank(path: str, text: bytes, name: str) -> Any:
+    """Return an instance of the class `name` of this text. It has no attributes; unpickling sets them."""
+    kind = getattr(_executed(path, text), name)
+    pickle_with_source(kind)
+    return object.__new__(kind)

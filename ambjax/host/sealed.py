@@ -13,6 +13,7 @@ import pathlib
 import secrets
 import zipfile
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import IO, Any
 
 import numpy as np
@@ -57,7 +58,7 @@ def seal(path: pathlib.Path, arrays: Mapping[str, np.ndarray], facts: Mapping[st
     """
     arrays = {name: np.asarray(array) for name, array in arrays.items()}
     content = dict(facts) | {ARRAYS: shapes(arrays)}
-    mark = np.array(json.dumps(content | {CHECKSUM: _checksum(content, arrays)}).encode())
+    mark = np.array(json.dumps(content | {CHECKSUM: checksum_of(content, arrays)}).encode())
     write_whole(path, lambda file: np.savez(file, **arrays, **{SEAL: mark}))  # pyright: ignore[reportArgumentType]
 
 
@@ -74,7 +75,7 @@ def unseal(path: pathlib.Path) -> tuple[Arrays, dict[str, Any]]:
         raise
     except Exception as error:  # the type of error depends on where the archive is damaged
         raise DamagedError(f"a part of it cannot be read ({type(error).__name__})") from None
-    if checksum != _checksum(content, arrays):
+    if checksum != checksum_of(content, arrays):
         raise DamagedError("its checksum is wrong")
     if content.pop(ARRAYS) != shapes(arrays):
         raise DamagedError("its arrays are not those that its record lists")
@@ -111,12 +112,8 @@ def provenance() -> dict[str, str]:
     return {"version": __version__, "jax": jax.__version__, "precision": str(jnp.result_type(float))}
 
 
-def checksum_of(facts: Mapping[str, object]) -> str:
-    """Return the SHA-256 of facts, written as JSON, in hexadecimal."""
-    return _checksum(facts, {})
-
-
-def _checksum(facts: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> str:
+def checksum_of(facts: Mapping[str, object], arrays: Mapping[str, np.ndarray] = MappingProxyType({})) -> str:
+    """Return the SHA-256 of facts, written as JSON, and of arrays, in hexadecimal."""
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     for name in sorted(arrays):
         digest.update(name.encode() + b"\0" + np.ascontiguousarray(arrays[name]).tobytes())

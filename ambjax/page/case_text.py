@@ -46,12 +46,10 @@ class Spot(NamedTuple):
 
     @property
     def header(self) -> str:
-        """The header of the table."""
         return f"[{self.table}]" if self.element is None else f"[[{self.table}]]"
 
     @property
     def written(self) -> bool:
-        """Whether the file contains the number."""
         if isinstance(self.holder, list):
             return int(self.key) < len(self.holder)
         return self.holder is not None and self.key in self.holder
@@ -132,7 +130,6 @@ def _spot(document: Any, path: str) -> Spot | None:
 
 
 def _entry(holder: Any, word: str | int) -> Any:
-    """Return an entry of a table or of a list; None if there is none."""
     if isinstance(word, int):
         return holder[word] if isinstance(holder, list) and word < len(holder) else None
     return holder.get(word) if isinstance(holder, dict) else None

@@ -4,6 +4,7 @@ import dataclasses
 import html
 import importlib.resources
 import json
+import math
 import pathlib
 import shlex
 from collections.abc import Sequence
@@ -13,12 +14,11 @@ import jax
 import numpy as np
 
 from ambjax.cases.reader import Case
+from ambjax.codegen.javascript.script import PRELUDE
 from ambjax.ensemble.study import Study
 from ambjax.host.extensions import extra
 from ambjax.page.case_text import TemplateLine, checked, editable_lines
-from ambjax.page.functions import PRELUDE
-from ambjax.page.linear_script import linear_script
-from ambjax.page.loop_functions import COILS, SIGNALS, loop_parameters, loop_script
+from ambjax.page.loop_functions import COILS, SIGNALS, linear_script, loop_parameters, loop_script
 from ambjax.page.sliders import GROUPS, SEED, Slider, changed, parameter_values, parameters, sliders
 from ambjax.simulation.metrics import UNITS
 from ambjax.simulation.trajectory import STATUSES
@@ -96,13 +96,12 @@ def _asset(name: str) -> str:
 
 
 def _library() -> list[str]:
-    """Return Bokeh's JavaScript. Raises ValueError if Bokeh is not installed."""
     folder = pathlib.Path(extra("bokeh", "page").__file__).parent / "server" / "static" / "js"
     return [(folder / name).read_text(encoding="utf-8") for name in BOKEH]
 
 
-def _check_contents(case: Case, path: str) -> None:
-    """Raise ValueError for what a page cannot contain: a signal from a file, and a notch."""
+def _check_contents(case: Case, others: list[Case], path: str) -> None:
+    """Raise ValueError for a signal from a file, a notch, and other cases that differ in more than numbers."""
     if case.cascade.notch is not None:
         raise ValueError(
             f"{path}: [controller.notch]: a page cannot contain a notch, whose gain depends on all numbers of the "
@@ -116,18 +115,21 @@ def _check_contents(case: Case, path: str) -> None:
                 f'{path}: {where}: kind = "table": a page cannot contain a signal from a file. Remove it, or '
                 "replace it by another signal."
             )
+    for other in others:
+        if not _alike(case, other):
+            raise ValueError(
+                f"--also {other.name}: it differs from {path} in more than numbers. Give a case with the same laws, "
+                "plant, signals, sensors and number of samples, such as tuned.toml."
+            )
 
 
 def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str, Any]]:
-    """Return the script of the worker, and the data of the page for JSON."""
     check_processor(case, path)
-    _check_contents(case, path)
-    for other in others:
-        _check_structure(case, other, path)
+    _check_contents(case, others, path)
     case = _finest(case, others)
     try:
-        loop, moving = loop_script(case), loop_script(case, any_delay=True)
-        linear = linear_script(case)
+        (loop, states), (moving, _) = loop_script(case), loop_script(case, any_delay=True)
+        linear, facts = linear_script(case)
     except ValueError as why:
         raise ValueError(f"{path}: the page cannot compute this case: {why}") from None
     given, lines = _written(case, others)
@@ -138,24 +140,22 @@ def _computed(case: Case, others: list[Case], path: str) -> tuple[str, dict[str,
         "from": pathlib.Path(path).name,
         "command": shlex.join(["ambjax", "tune", pathlib.Path(path).name, "--out", "tuned"]),
         "presets": presets,
-        "sliders": [_finite(one._asdict()) for one in given],
+        "sliders": [{k: None if x in (math.inf, -math.inf) else x for k, x in one._asdict().items()} for one in given],
         "groups": list(GROUPS.items()),
-        "metrics": loop.metrics,
         "units": UNITS,
         "statuses": STATUSES,
         "signals": [*SIGNALS, *COILS],
-        "states": loop.states,
         "samples": case.clock.samples,
         "delay": parameters(case, ["processor.delay"])["processor.delay"],
         "seed": parameters(case, [SEED])[SEED],
         "settle": float(case.settle),
         "period": float(case.clock.sample_period),
         "members": _members(case),
-        "linear": linear.facts,
-        "lost": loop.lost,
+        "linear": facts,
+        **states,
         "places": parameters(case, ["plant.s_0", "plant.i_0", *clearance]),
     }
-    generated = [PRELUDE, loop.source, moving.source.replace("function ", "function any_"), linear.source]
+    generated = [PRELUDE, loop, moving.replace("function ", "function any_"), linear]
     return "\n".join([*generated, *map(_asset, WORKER)]), data
 
 
@@ -176,34 +176,21 @@ def _written(case: Case, others: list[Case]) -> tuple[list[Slider], list[list[Te
 
 
 def _in_file(slider: Slider, case: Case) -> bool:
-    """Return whether the case file contains the number of a slider."""
     lines, _ = editable_lines(case.text, [slider])
     return any(not line.only and len(line.parts) > 1 for line in lines)
 
 
 def _own(given: list[Slider], case: Case) -> list[Slider]:
-    """Return the sliders `given` with the values of a case."""
     values = parameter_values(case)
     return [one._replace(value=float(values[one.parameter])) for one in given]
 
 
 def _preset(case: Case, lines: list[TemplateLine]) -> dict[str, Any]:
-    """Return a preset for JSON: name, parameters and template of a case."""
     values = [float(x) for x in parameter_values(case)]
     return {"name": case.name, "P": [x if np.isfinite(x) else "Infinity" for x in values], "lines": lines}
 
 
-def _check_structure(case: Case, other: Case, path: str) -> None:
-    """Raise ValueError if two cases differ in more than numbers. `path`: case file of the first."""
-    if not _alike(case, other):
-        raise ValueError(
-            f"--also {other.name}: it differs from {path} in more than numbers. Give a case with the same laws, plant, "
-            "signals, sensors and number of samples, such as tuned.toml."
-        )
-
-
 def _alike(case: Case, other: Case) -> bool:
-    """Return whether two cases differ in numbers only."""
     same = other.cascade.sampled and other.clock.samples == case.clock.samples
     return same and jax.tree.structure(loop_parameters(other)) == jax.tree.structure(loop_parameters(case))
 
@@ -218,8 +205,8 @@ def _finest(case: Case, others: list[Case]) -> Case:
 
 def _members(case: Case) -> dict[str, Any]:
     """Return the members of the ensemble for JSON: their number, and rows for the parameters that vary."""
-    study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, 0, MEMBERS)
-    study = dataclasses.replace(study, seed=int(case.scenario.seed))
+    seed = int(case.scenario.seed)
+    study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, seed, MEMBERS)
     own, drawn = parameter_values(case), study.drawn(np.arange(MEMBERS))
     relative = {path for path, kind in case.spread.entries if kind.relative}
     rows = []
@@ -229,8 +216,3 @@ def _members(case: Case) -> dict[str, Any]:
             factor = path in relative and own[k] != 0
             rows.append([int(k), bool(factor), [float(one[k] / own[k] if factor else one[k]) for one in moved]])
     return {"count": MEMBERS, "rows": rows}
-
-
-def _finite(entries: dict[str, Any]) -> dict[str, Any]:
-    """Return the entries with None instead of an infinite number, which JSON lacks."""
-    return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in entries.items()}

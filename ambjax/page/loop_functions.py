@@ -1,17 +1,20 @@
-"""The sampled loop that JAX traces for the page, as JavaScript. Every number of the case is a parameter."""
+"""The sampled loop and the linearised loop that JAX traces for the page, as JavaScript. The numbers are parameters."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from ambjax.cases.reader import Case
+from ambjax.codegen.javascript.script import function_source, loop_source, operands_of, piece_of
 from ambjax.compiler.short_compilation import precision
 from ambjax.control.cascade import Cascade
+from ambjax.control.cascade_state import CascadeState, Sample
+from ambjax.linear.equilibrium import at_rest, ideal, sizes_of, start_of
+from ambjax.linear.matrices import LagState, with_lags
 from ambjax.numerics.records import Scalar, canonical, replaced
-from ambjax.page.functions import function_source, loop_source, operands_of, piece_of
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.metrics import Metrics
@@ -57,7 +60,6 @@ class LoopFunctions:
         return Metrics.of(numbers.settle, dataclasses.replace(numbers.scenario, rotor=None))
 
     def start(self, numbers: Numbers, normals: Any) -> RolloutState:
-        """Return the state of the run before the first sample."""
         return begin(*self._system(numbers, normals))
 
     def step(
@@ -69,7 +71,6 @@ class LoopFunctions:
         return after, row, numbers.scenario.plant.currents(progress.state.plant)
 
     def result(self, numbers: Numbers, progress: RolloutState) -> dict[str, Array]:
-        """Return the metrics of a run that ended in this state."""
         fold = self._fold(numbers)
         return fold.result(progress.fold, progress.ending)
 
@@ -92,30 +93,16 @@ SIGNALS = ("z", "alive", "r", "u", "u_mean", "i_ref", "q_z", "z_measured", "sigm
 COILS = ("i_1", "i_2")
 
 
-class LoopScript(NamedTuple):
-    """The loop as JavaScript.
+def loop_script(case: Case, any_delay: bool = False) -> tuple[str, dict[str, Any]]:
+    """Return the loop of a case on a processor as JavaScript, and facts for the page.
 
-    - `source`: the functions `startLoop(P, W, out)`, `makeLoop(P)`, `makeMember(P)` and `loopMetrics(P, S, out)`.
-      W: normal random numbers. `out`: array of the result. See `functions.loop_source` for the functions that
-      `makeLoop` and `makeMember` return. That of a member does not update the metrics in S.
-    - `parameters`: the case's values of the parameters P.
-    - `metrics`: names of the metrics, in the order of `out` of `loopMetrics`.
-    - `states`: number of states S.
-    - `lost`: index of the state that contains the status code of the rotor.
-    """
+    The JavaScript defines `startLoop(P, W, out)`, `makeLoop(P)`, `makeMember(P)` and `loopMetrics(P, S, out)`. W:
+    normal random numbers. `out`: array of the result. See `loop_source` for the functions that `makeLoop` and
+    `makeMember` return. That of a member does not update the metrics in S. The facts: names of the metrics in the order
+    of `out` of `loopMetrics`, number of states S, index of the state that contains the status code of the rotor.
 
-    source: str
-    parameters: list[float]
-    metrics: list[str]
-    states: int
-    lost: int
-
-
-def loop_script(case: Case, any_delay: bool = False) -> LoopScript:
-    """Return the loop of a case on a processor as JavaScript. `any_delay`: for every delay that the page
-    admits, not only that of the case.
-
-    Raises ValueError for a part of the case that scalar code cannot express.
+    `any_delay`: for every delay that the page admits, not only that of the case. Raises ValueError for a part of the
+    case that scalar code cannot express.
     """
     with precision("double"):
         numbers = canonical(loop_parameters(case, any_delay))
@@ -130,14 +117,108 @@ def loop_script(case: Case, any_delay: bool = False) -> LoopScript:
     _, row, coils = step.results
     shown = [getattr(row, name) for name in SIGNALS] + list(coils)
     every = operands_of(step.results[0])
-    source = "\n".join(
-        [
-            function_source(start, "startLoop", "PW", start.results),
-            loop_source(step, "makeLoop", shown, every),
-            loop_source(step, "makeMember", shown[:3], []),
-            function_source(result, "loopMetrics", "PS", result.results),
-        ]
-    )
-    values = [float(x) for x in jax.tree.leaves(numbers)]
+    sources = [
+        function_source(start, "startLoop", "PW", start.results),
+        loop_source(step, "makeLoop", shown, every),
+        loop_source(step, "makeMember", shown[:3], []),
+        function_source(result, "loopMetrics", "PS", result.results),
+    ]
     lost = jax.tree.leaves(jax.tree.map(lambda x: x is shapes.ending.lost_code, shapes)).index(True)
-    return LoopScript(source, values, list(result.results), len(every), lost)
+    return "\n".join(sources), {"metrics": list(result.results), "states": len(every), "lost": lost}
+
+
+class LoopPoint(NamedTuple):
+    """A point at which the loop is linearised.
+
+    - `lagged`: state of the plant and its lags.
+    - `acting`: the voltage that acts, V.
+    - `control`: states of the laws.
+    - `past`: the voltages commanded before, the most recent first, V.
+    - `e`: test signal that is added to the reading of z, m.
+    """
+
+    lagged: LagState
+    acting: Array
+    control: CascadeState
+    past: tuple[Array, ...]
+    e: Array
+
+
+class PointValues(NamedTuple):
+    """Rates of the plant and its lags, next states of the laws, commanded voltage u (V), and reading of z (m)."""
+
+    rates: LagState
+    control: CascadeState
+    u: Array
+    z: Array
+
+
+# An equilibrium: state of the plant and its lags, voltage (V), states of the laws.
+EquilibriumPoint: TypeAlias = tuple[LagState, Array, CascadeState]
+
+
+def _start(numbers: Numbers) -> tuple[EquilibriumPoint, EquilibriumPoint]:
+    """Return the initial guess of the equilibrium, and the characteristic sizes of its components."""
+    numbers = _ideal(numbers)
+    point = start_of(numbers.cascade, numbers.scenario, numbers.period, 0.0)
+    sizes = sizes_of(numbers.cascade, numbers.scenario, point)
+    state, size = (with_lags(numbers.scenario, one) for one in (point, sizes))
+    return (state, point.u, point.control), (size, sizes.u, sizes.control)
+
+
+def _columns(numbers: Numbers, x: LoopPoint) -> tuple[PointValues, list[PointValues]]:
+    """Return the values at a point, and a list of their derivatives with respect to each component of the point."""
+    leaves, tree = jax.tree.flatten(x)
+
+    def values(x: LoopPoint) -> PointValues:
+        return _values(_ideal(numbers), x)
+
+    found = []
+    for k in range(len(leaves)):
+        unit = jax.tree.unflatten(tree, [jnp.ones(()) if j == k else jnp.zeros(()) for j in range(len(leaves))])
+        found.append(jax.jvp(values, (x,), (unit,))[1])
+    return values(x), found
+
+
+def _values(numbers: Numbers, x: LoopPoint) -> PointValues:
+    """Return the values at a point. `numbers`: those of `_ideal`."""
+    scenario = numbers.scenario
+    rates, u = x.lagged.lag_rates(scenario, x.acting)
+    measured = x.lagged.read(scenario, (x.e, jnp.zeros(())))
+    sample = Sample(at_rest(0.0), jnp.asarray(numbers.period), jnp.asarray(jnp.inf), x.past)
+    command, control, _ = numbers.cascade.step(measured, x.control, sample)
+    return PointValues(rates._replace(plant=scenario.plant.rates(x.lagged.plant, u)), control, command.u, measured.z)
+
+
+def _ideal(numbers: Numbers) -> Numbers:
+    """Return the numbers without parts that cannot be linearised: limits, noise, converters, guard."""
+    return numbers._replace(cascade=numbers.cascade.with_processor(guard=None), scenario=ideal(numbers.scenario))
+
+
+def linear_script(case: Case) -> tuple[str, dict[str, Any]]:
+    """Return the linear loop of a case as JavaScript, for any delay, and facts.
+
+    The JavaScript defines `linearStart(P, out)` and `linearPoint(P, X, out)`. The first writes the initial guess of the
+    equilibrium and the characteristic sizes of its components. The second writes the values at the point X and their
+    derivatives. The facts: number of components of the parts of a point, limits of the ISO zones, range of frequencies
+    (Hz).
+
+    Raises ValueError for a part of the case that scalar code cannot express.
+    """
+    with precision("double"):
+        numbers = canonical(loop_parameters(case, any_delay=True))
+        (lagged, u, control), _ = jax.eval_shape(_start, numbers)
+        zero = jnp.zeros(())
+        x = LoopPoint(lagged, u, control, numbers.cascade.timing.constant_past(zero), zero)
+        x = jax.tree.map(lambda _: zero, x)
+        start = piece_of(_start, "p", (numbers,))
+        point = piece_of(_columns, "px", (numbers, x))
+    low, high = dataclasses.replace(case.zones, f_high=None).range(case.clock.sample_period)
+    zones = case.zones.limits
+    sizes = {name: len(jax.tree.leaves(getattr(x, name))) for name in ("lagged", "control", "past")}
+    facts = {**sizes, "zones": zones, "low": low, "high": high}
+    sources = [
+        function_source(start, "linearStart", "P", start.results),
+        function_source(point, "linearPoint", "PX", point.results),
+    ]
+    return "\n".join(sources), facts

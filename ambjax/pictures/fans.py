@@ -9,10 +9,8 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ambjax.pictures.figures import BLUE, INK, RED
-from ambjax.pictures.scales import digits, prefix_of, style_axes
-from ambjax.pictures.style import own_style
-from ambjax.pictures.thinning import envelope, thin
+from ambjax.pictures.figures import BLUE, INK, RED, envelope, thin
+from ambjax.pictures.scales import digits, own_style, prefix_of, style_axes
 
 # Quantities of a fan chart: label and SI unit.
 QUANTITIES = {
@@ -86,10 +84,8 @@ def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float,
         ax.axhline(factor * value, color=RED, linestyle="--", linewidth=1.1, label="limit")
     ax.set_ylim(factor * low, factor * high)
     if beyond > 0:
-        words = (
-            f"the {percents[0]:g} to {percents[-1]:g} % band reaches {digits(factor * beyond)} {unit}, beyond this axis"
-        )
-        ax.set_title(words, fontsize=7, loc="right", pad=2, color=INK)
+        words = f"the {percents[0]:g} to {percents[-1]:g} % band reaches {digits(factor * beyond)} {unit}"
+        ax.set_title(f"{words}, beyond this axis", fontsize=7, loc="right", pad=2, color=INK)
     style_axes(ax, f"{label}\n({unit})")
 
 
@@ -127,16 +123,8 @@ def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray
     ax.set_ylim(floor - 0.12 * (100 - floor), top)
     if len(at):
         ticks, _ = thin(at, at)
-        where = ax.get_xaxis_transform()
-        ax.plot(
-            ticks,
-            np.full(len(ticks), 0.08),
-            "|",
-            color=RED,
-            markersize=7,
-            label="a member is lost or stalls",
-            transform=where,
-        )
+        look = {"color": RED, "markersize": 7, "label": "a member is lost or stalls"}
+        ax.plot(ticks, np.full(len(ticks), 0.08), "|", transform=ax.get_xaxis_transform(), **look)
     lost, open_ = int(ended.sum()), 0 if stalled is None else int(np.sum(np.asarray(stalled, bool) & ended))
     words = f"{len(lost_at) - lost} of {len(lost_at)} survive ({share[-1]:.4g} %)"
     words += f", {statuses(lost - open_, open_)}" * bool(lost)

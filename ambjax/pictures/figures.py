@@ -1,4 +1,4 @@
-"""Pictures of trajectories: panels of signals, the paper's Figures 3 to 6, the comparison of readings, phase plane."""
+"""Pictures of trajectories: panels of signals, the paper's Figures 3 to 6, readings, phase plane; thinned curves."""
 
 import textwrap
 from typing import NamedTuple
@@ -8,13 +8,13 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from ambjax.pictures.scales import prefix_of
-from ambjax.pictures.style import own_style
-from ambjax.pictures.thinning import envelope, smoothed, stretch_of, thin
+from ambjax.pictures.scales import own_style, prefix_of
 from ambjax.simulation.trajectory import STALLED, Row, Trajectory
 
 # Okabe and Ito's colours: distinct in print and to colour-blind readers.
 INK, BLUE, ORANGE, GREEN, RED = "#222222", "#0072B2", "#E69F00", "#009E73", "#D55E00"
+# Bins of a thinned curve: more than the width of a picture in pixels.
+BINS = 2000
 # A panel of a part of the run (a stretch) with more than 4 PIXELS samples is divided into PIXELS columns.
 PIXELS = 500
 # Smallest vertical range of a panel of a stretch, as a share of the range over the whole run.
@@ -197,13 +197,11 @@ def phase_plane(trajectory: Trajectory, title: str, settle: float = 0.0) -> Figu
     figure = Figure(figsize=(5.2 * len(parts) + 1.2, 4.6), layout="constrained")
     axes = figure.subplots(1, len(parts), squeeze=False)[0]
     for ax, (words, part) in zip(axes, parts, strict=True):
-        (by_z, unit), (by_rate, rate) = (
-            prefix_of(one, float(np.abs(x[part]).max(initial=0.0))) for one, x in (("m", z), ("m/s", z_dot))
-        )
+        largest = [float(np.abs(x[part]).max(initial=0.0)) for x in (z, z_dot)]
+        (by_z, unit), (by_rate, rate) = map(prefix_of, ("m", "m/s"), largest)
         points = np.column_stack([by_z * z[part], by_rate * z_dot[part]])
-        lines = LineCollection(
-            list(np.stack([points[:-1], points[1:]], 1)), cmap="viridis", array=t[part][:-1], linewidth=1
-        )
+        segments = list(np.stack([points[:-1], points[1:]], 1))
+        lines = LineCollection(segments, cmap="viridis", array=t[part][:-1], linewidth=1)
         ax.add_collection(lines)
         ax.plot(points[0, 0], points[0, 1], "o", color=INK, markersize=5)
         if np.isfinite(lost_at):
@@ -215,3 +213,47 @@ def phase_plane(trajectory: Trajectory, title: str, settle: float = 0.0) -> Figu
         figure.colorbar(lines, ax=ax, label="time (s)")
     figure.suptitle(title, fontsize=12)
     return figure
+
+
+def thin(t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return K of the T samples of the curve y(t), enough to draw it; up to 4 BINS samples are returned unchanged."""
+    n = len(t)
+    if n <= 4 * BINS:
+        return t, y
+    width = -(-n // BINS)
+    finite, rows = np.isfinite(y), -(-n // width)
+    padded = np.full((2, rows * width), np.inf)
+    padded[:, :n] = np.where(finite, [y, -y], np.inf)
+    extremes = padded.reshape(2, rows, width).argmin(2) + width * np.arange(rows)
+    border = np.flatnonzero(np.diff(finite))
+    at = np.unique(np.concatenate([extremes.ravel(), border, border + 1, [0, n - 1]]))
+    return t[at], y[at]
+
+
+def _bin_starts(samples: int, bins: int) -> np.ndarray:
+    """Return the index of the first sample of each bin, [bins]. The sizes of the bins differ by at most one sample."""
+    return np.arange(bins) * samples // bins
+
+
+def smoothed(t: np.ndarray, y: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean times and means of y over `bins` bins of samples, [bins + 2]."""
+    starts = _bin_starts(len(t), bins)
+    centres, means = (np.add.reduceat(values, starts) / np.diff(starts, append=len(t)) for values in (t, y))
+    return np.concatenate([t[:1], centres, t[-1:]]), np.concatenate([means[:1], means, means[-1:]])
+
+
+def envelope(
+    t: np.ndarray, low: np.ndarray, high: np.ndarray, bins: int = BINS
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times, lower and upper border of a band; up to 4 `bins` samples are returned unchanged."""
+    if len(t) <= 4 * bins:
+        return t, low, high
+    starts = _bin_starts(len(t), bins)
+    edges = np.append(t[starts], t[-1])
+    x = np.stack([edges[:-1], edges[1:]], 1).ravel()
+    return x, np.fmin.reduceat(low, starts).repeat(2), np.fmax.reduceat(high, starts).repeat(2)
+
+
+def stretch_of(t: np.ndarray, low: float, high: float) -> slice:
+    """Return the samples from `low` to `high`, s, with the outer neighbour of a bound that lies between two samples."""
+    return slice(max(int(np.searchsorted(t, low, "right")) - 1, 0), int(np.searchsorted(t, high, "left")) + 1)

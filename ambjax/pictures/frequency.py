@@ -1,5 +1,6 @@
-"""Pictures over frequency: sensitivity functions with zones, Nyquist curve with the disk, Bode plot, stiffness."""
+"""Pictures over frequency: sensitivity functions, Nyquist curve, Bode plot, stiffness, and a comparison of cases."""
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,10 +11,12 @@ from matplotlib.patches import Circle
 
 from ambjax.linear.state_space import StateSpace
 from ambjax.pictures.figures import BLUE, GREEN, INK, ORANGE, RED
-from ambjax.pictures.style import own_style
+from ambjax.pictures.scales import own_style, prefix_of
 
 # Colour and style of each loop; later ones are dashed, so that equal curves stay visible.
 LINES = ((BLUE, "-"), (ORANGE, "--"), (GREEN, ":"), (RED, "-."))
+# Styles of the cases of a comparison, each with four colours.
+STYLES = ("-", "--")
 ZONES = (("A", "#e5f2ea"), ("B", "#f6f3d8"), ("C", "#fae3cf"), ("D", "#f6d5d5"))
 POINTS = 1200
 # Lowest |S| shown.
@@ -78,9 +81,8 @@ def frequency_figure(
         for ax, x in ((S_axes, measured.S), (T_axes, measured.T), (KS_axes, measured.KS), (gain_axes, L)):
             ax.loglog(measured.frequency, np.abs(x), **points)
         nyquist_axes.plot(L.real, L.imag, **points)
-        phase_axes.semilogx(
-            measured.frequency, _near(np.degrees(np.angle(L)), measured.frequency, phase_axes), **points
-        )
+        phase = _near(np.degrees(np.angle(L)), measured.frequency, phase_axes)
+        phase_axes.semilogx(measured.frequency, phase, **points)
     if loops:
         shade_zones(S_axes, limits)
     else:
@@ -96,8 +98,7 @@ def frequency_figure(
         phase_axes: "phase of L, degrees",
     }
     for ax, label in labels.items():
-        ax.set_ylabel(label)
-        ax.set_xlim(span)
+        ax.set(xlim=span, ylabel=label)
         ax.grid(True, which="major", color="#dddddd", linewidth=0.6)
     for ax in (stiffness_axes, phase_axes):
         ax.set_xlabel("frequency, Hz")
@@ -135,10 +136,75 @@ def _nyquist(ax: Axes, loops: Sequence[NamedLoop]) -> None:
         far, near = (2 + d) / (2 - d), (2 - d) / (2 + d)
         ax.add_patch(Circle((-(far + near) / 2, 0), (far - near) / 2, color="#f6d5d5", zorder=0, linewidth=0))
     ax.plot([-1], [0], marker="+", color=INK, markersize=10)
-    ax.set_xlim(-1 - WINDOW, -1 + WINDOW)
-    ax.set_ylim(-WINDOW, WINDOW)
+    ax.set(xlim=(-1 - WINDOW, -1 + WINDOW), ylim=(-WINDOW, WINDOW))
+    ax.set(xlabel="real part of L", ylabel="imaginary part of L")
     ax.set_aspect("equal", adjustable="box")
     ax.grid(True, color="#dddddd", linewidth=0.6)
-    ax.set_xlabel("real part of L")
-    ax.set_ylabel("imaginary part of L")
     ax.set_title("Nyquist curve; shaded: disk margin of the first loop", fontsize=9)
+
+
+class Contender(NamedTuple):
+    """A case of a comparison.
+
+    - `held`: whether each member keeps its rotor [N].
+    - `error`, `voltage`: settled rms error (m) and settled rms voltage (V) of each member [N].
+    - `system`: the linearised loop; None: not stable, or no equilibrium. Then |S| and |KS| are not drawn.
+    - `channel`, `command`: numbers of the drawn reading and voltage among the outputs of `system`; the reading has the
+      number of its test signal. `where`: axis and speed of a machine in the legend.
+    """
+
+    name: str
+    held: np.ndarray
+    error: np.ndarray
+    voltage: np.ndarray
+    system: StateSpace | None
+    channel: int = 0
+    command: int = 2
+    where: str = ""
+
+
+@own_style
+def comparison_figure(cases: Sequence[Contender], limits: Sequence[float], span: tuple[float, float]) -> Figure:
+    """Return a picture: |S| with zones, |KS|, share of members below an rms error, rms error against rms voltage.
+
+    `limits`: upper limits of the zones A, B and C. `span`: lowest and highest frequency, Hz; a curve ends at half the
+    sampling rate of its case. A member that is lost has
+    no error: the curve of a case that loses members ends below 1. At most 8 cases are drawn.
+    """
+    figure = Figure(figsize=(12, 8.5), layout="constrained")
+    (S_axes, error_axes), (KS_axes, effort_axes) = figure.subplots(2, 2)
+    grid = np.geomspace(*span, POINTS)
+    finite = [case.error[case.held] for case in cases if case.held.any()]
+    factor, unit = prefix_of("m", float(max((x.max() for x in finite), default=1e-6)))
+    looks = [(colour, style) for style, colour in itertools.product(STYLES, (BLUE, ORANGE, GREEN, RED))]
+    for case, (colour, style) in zip(cases, looks, strict=False):
+        look = {"color": colour, "linestyle": style, "linewidth": 1.5, "label": case.name}
+        if case.system is not None:
+            period = case.system.period
+            f = grid if period is None else grid[grid <= 0.5 / float(period)]
+            H, k = np.asarray(case.system.response(f)), case.channel
+            S_axes.loglog(f, np.abs(H[:, k, k]), **look | {"label": f"{case.name}: {case.where}"})
+            KS_axes.loglog(f, np.abs(H[:, case.command, k]), **look)
+        errors, lost = factor * np.sort(case.error[case.held]), int(np.sum(~case.held))
+        label = f"{case.name} ({lost} lost)" if lost else case.name
+        error_axes.step(errors, np.arange(1, errors.size + 1) / case.held.size, where="post", **look | {"label": label})
+        mark = {"color": colour, "marker": "o" if style == "-" else "x", "linestyle": "", "markersize": 3, "alpha": 0.4}
+        effort_axes.plot(case.voltage[case.held], factor * case.error[case.held], **mark)
+    shade_zones(S_axes, limits)
+    labels = {
+        S_axes: ("frequency, Hz", "|S|", "sensitivity at the position sensor, with zones"),
+        KS_axes: ("frequency, Hz", "|KS|, V/m", "voltage per error of the position sensor"),
+        error_axes: (f"settled rms error, {unit}", "share of all members", "members with at most this error"),
+        effort_axes: ("settled rms voltage, V", f"settled rms error, {unit}", "one point per member"),
+    }
+    for ax, (x, y, title) in labels.items():
+        ax.set(xlabel=x, ylabel=y)
+        ax.set_title(title, fontsize=10, color=INK)
+        ax.grid(True, which="major", color="#dddddd", linewidth=0.6)
+    error_axes.set_ylim(0, 1.02)
+    error_axes.legend(fontsize=8, loc="lower right")
+    if any(case.system is not None and case.where for case in cases):
+        S_axes.legend(fontsize=8, loc="lower right")
+    for ax in (S_axes, KS_axes):
+        ax.set_xlim(span)
+    return figure

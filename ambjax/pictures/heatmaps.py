@@ -13,8 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from ambjax.pictures.figures import INK
-from ambjax.pictures.scales import axis_of, edges, label_of, log_ticks, size_of
-from ambjax.pictures.style import own_style
+from ambjax.pictures.scales import axis_of, edges, label_of, log_ticks, own_style, size_of
 
 CONTOUR = 0.95
 # Widths of the contours of survival and of the bounds of its interval; the last is drawn on top.
@@ -92,7 +91,6 @@ Labels: TypeAlias = tuple[str, str, bool, bool]
 
 
 def _errors(figure: Figure, axes: Sequence[Axes], panels: Sequence[MapPanel], metric: str, labels: Labels) -> None:
-    """Draw the lower row: the errors, on one logarithmic scale."""
     errors = [panel.error for panel in panels if panel.error is not None]
     values = np.concatenate([np.ravel(np.asarray(error, float)) for error in errors])
     values = values[np.isfinite(values) & (values > 0)]
@@ -121,8 +119,7 @@ def _cells(ax: Axes, panel: MapPanel, values: np.ndarray, norm: Normalize, colou
     y_factor, y_label = label_of(y_label, size_of(y, y_log))
     x_edges, y_edges = edges(x_factor * x, x_log), edges(y_factor * y, y_log)
     ax.patch.set(**EMPTY_CELL)
-    ax.set_xscale("log" if x_log else "linear")
-    ax.set_yscale("log" if y_log else "linear")
+    ax.set(xscale="log" if x_log else "linear", yscale="log" if y_log else "linear")
     ax.pcolormesh(x_edges, y_edges, np.ma.masked_invalid(values), norm=norm, cmap=colours)
     if panel.unstable is not None:
         for row, column in np.argwhere(panel.unstable):
@@ -134,8 +131,7 @@ def _cells(ax: Axes, panel: MapPanel, values: np.ndarray, norm: Normalize, colou
             continue
         level = 1.0 if panel.low is None else CONTOUR
         _outline(ax, x_edges, y_edges, np.asarray(values, float) >= level, width)
-    ax.set_xlim(x_edges[0], x_edges[-1])
-    ax.set_ylim(y_edges[0], y_edges[-1])
+    ax.set(xlim=x_edges[[0, -1]], ylim=y_edges[[0, -1]])
     for axis, ends, log in ((ax.xaxis, x_edges, x_log), (ax.yaxis, y_edges, y_log)):
         if log:
             log_ticks(axis, ends[0], ends[-1])

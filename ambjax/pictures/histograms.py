@@ -1,8 +1,9 @@
-"""Histograms of the metrics of an ensemble, from columns in SI units."""
+"""Histograms of the metrics of an ensemble, from columns in SI units, and the tornado chart of a metric's drivers."""
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,9 +13,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from ambjax.pictures.fans import statuses
-from ambjax.pictures.figures import BLUE, INK, RED
-from ambjax.pictures.scales import axis_of, digits, log_ticks, size_of, style_axes
-from ambjax.pictures.style import own_style
+from ambjax.pictures.figures import BLUE, INK, ORANGE, RED
+from ambjax.pictures.scales import axis_of, digits, log_ticks, own_style, size_of, style_axes
 from ambjax.simulation.metrics import REACHED
 
 # Metrics that are drawn by default.
@@ -32,6 +32,9 @@ CHIEF = (
     "chatter_V",
     "copper_loss_W",
 )
+# Largest number of bars of a tornado chart, and their colours.
+MOST_DRIVERS = 12
+TRENDS = {"grows with it": BLUE, "falls with it": ORANGE, "no steady trend": "#8a8a8a"}
 LOST = {"facecolor": RED, "edgecolor": "white", "hatch": "////", "linewidth": 0.0}
 MARKS: dict[float, tuple[Any, str, str]] = {0.5: ("-", "median", "median"), 0.95: ("--", "95 %", "95 % quantile")}
 
@@ -47,7 +50,8 @@ def histogram_figure(columns: Mapping[str, np.ndarray], metrics: Sequence[str] =
     names = [name for name in metrics if name in columns]
     if not names:
         raise ValueError(f"histograms: none of {', '.join(metrics)} is a column. The columns are {', '.join(columns)}.")
-    lost = _lost(columns, len(columns[names[0]]))
+    none = np.full(len(columns[names[0]]), math.inf)
+    lost = np.isfinite(np.asarray(columns.get("lost_at", columns.get("lost_at_s", none)), float))
     open_ = int(np.sum(lost & np.asarray(columns.get("stalled", False), bool)))
     across = min(3, len(names))
     down = -(-len(names) // across)
@@ -63,13 +67,6 @@ def histogram_figure(columns: Mapping[str, np.ndarray], metrics: Sequence[str] =
     figure.suptitle(f"{lost.size} members, {statuses(int(lost.sum()) - open_, open_)}", fontsize=11)
     figure.legend(handles=keys, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     return figure
-
-
-def _lost(columns: Mapping[str, object], members: int) -> np.ndarray:
-    for name in ("lost_at", "lost_at_s"):
-        if name in columns:
-            return np.isfinite(np.asarray(columns[name], float))
-    return np.zeros(members, bool)
 
 
 def _histogram(ax: Axes, name: str, values: np.ndarray, lost: np.ndarray) -> None:
@@ -93,19 +90,10 @@ def _histogram(ax: Axes, name: str, values: np.ndarray, lost: np.ndarray) -> Non
         value = factor * order[math.ceil(share * order.size) - 1] if order.size else math.nan
         if math.isfinite(value) and (value > 0 or not log):
             ax.axvline(value, color=INK, linestyle=style, linewidth=1.2)
-        text = (
-            f"{digits(value)} {unit}".rstrip()
-            if math.isfinite(value)
-            else "never"
-            if reached and order.size
-            else "none"
-        )
-        notes.append(f"{words}: {text}")
-    for count, words in (
-        (np.sum(~np.isfinite(values)), "never" if reached else "not finite"),
-        (np.sum(finite == 0) * log, "at zero"),
-    ):
-        notes += [f"{count} {words}"] if count else []
+        missing = "never" if reached and order.size else "none"
+        notes.append(f"{words}: {f'{digits(value)} {unit}'.rstrip() if math.isfinite(value) else missing}")
+    counts = {"never" if reached else "not finite": np.sum(~np.isfinite(values)), "at zero": np.sum(finite == 0) * log}
+    notes += [f"{count} {words}" for words, count in counts.items() if count]
     ax.set_title(", ".join(notes), fontsize=8, pad=3)
     ax.set_xlabel(f"{label} ({unit})" if unit else label, fontsize=9)
     ax.set_ylim(0, 1.08 * max((alive + dead).max(), 1))
@@ -122,3 +110,55 @@ def _bins(values: np.ndarray, log: bool) -> np.ndarray:
         room = 0.1 * abs(high) or 1.0
         return np.linspace(low - room, high + room, 42)  # an odd number of bins: the constant is inside one
     return np.linspace(low, high, 41)
+
+
+class Bar(NamedTuple):
+    """A driver: its dotted path, the share it explains with its interval, and its rank correlation with the metric."""
+
+    path: str
+    share: float
+    low: float
+    high: float
+    rho: float
+
+
+@own_style
+def tornado(drivers: Sequence[Bar], metric: str, says: str) -> Figure:
+    """Return a chart with the share of a metric's variation that each driver explains, the largest on top.
+
+    The chart has at most MOST_DRIVERS bars, coloured by the trend, with whiskers from low to high. `says`: the text
+    below the title. Raises ValueError without drivers.
+    """
+    if not drivers:
+        raise ValueError("tornado: there are no drivers. Only an ensemble with [spread] has drivers.")
+    ranking = sorted(drivers, key=lambda driver: -driver.share)
+    bars = ranking[:MOST_DRIVERS]
+    figure = Figure(figsize=(7.5, 0.36 * len(bars) + 2.2), layout="constrained")
+    ax = figure.subplots()
+    for row, one in enumerate(bars):
+        ax.barh(row, 100 * one.share, height=0.62, color=TRENDS[_trend(one)])
+        ax.plot([100 * one.low, 100 * one.high], [row, row], color=INK, linewidth=1.2, marker="|", markersize=7)
+        words = f"{100 * one.share:.0f} %"
+        ax.text(100 * max(one.share, one.high) + 1.5, row, words, fontsize=8, va="center", color=INK)
+    ax.set_yticks(range(len(bars)), [one.path for one in bars])
+    ax.set_ylim(len(bars) - 0.4, -0.6)
+    ax.set_xlim(0, 112)
+    ax.set_xticks(np.linspace(0, 100, 6))
+    more = len(ranking) - len(bars)
+    words = "share of the variation of the rank explained alone, %; whiskers: 95 % interval"
+    ax.set_xlabel(words + (f"; {more} weaker not shown" if more else ""), fontsize=9)
+    figure.suptitle(f"Drivers of {axis_of(metric, 0.0)[1]}", fontsize=11)
+    ax.set_title(textwrap.fill(says, 95), fontsize=8)
+    style_axes(ax, "")
+    trends = dict.fromkeys(_trend(one) for one in bars)
+    keys = [Patch(color=TRENDS[trend], label=trend) for trend in TRENDS if trend in trends]
+    figure.legend(handles=keys, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    return figure
+
+
+def _trend(one: Bar) -> str:
+    """Return the trend of the metric. A monotonic trend must explain at least half of the share."""
+    rising, falling, neither = TRENDS
+    if one.share <= 0 or one.rho**2 < 0.5 * one.share:
+        return neither
+    return rising if one.rho > 0 else falling

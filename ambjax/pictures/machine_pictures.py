@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ambjax.linear.margins import BAND
 from ambjax.linear.rotor_modes import LIGHT
-from ambjax.pictures.style import own_style
+from ambjax.pictures.scales import own_style
 
 # Largest number of points of a drawn curve.
 MOST_POINTS = 4000
@@ -42,10 +42,9 @@ def machine_figure(case: Any, signals: dict[str, np.ndarray], title: str) -> Fig
             ax = figure.add_subplot(grid[row, column])
             for k, axis in enumerate(axes):
                 ax.plot(t[shown], scale * signals[name][shown, k], label=axis, linewidth=0.9)
-            ax.set_ylabel(words if column == 0 else "")
             _limit_lines(ax, case, name, scale)
-            ax.set_title(("whole run", "start of the run")[column] if row == 0 else "")
-            ax.set_xlabel("time, s" if row == 2 else "")
+            title = ("whole run", "start of the run")[column] if row == 0 else ""
+            ax.set(xlabel="time, s" if row == 2 else "", ylabel=words if column == 0 else "", title=title)
             ax.xaxis.set_major_locator(MaxNLocator(5))
             ax.grid(True, alpha=0.3)
     handles, labels = figure.axes[0].get_legend_handles_labels()
@@ -54,12 +53,11 @@ def machine_figure(case: Any, signals: dict[str, np.ndarray], title: str) -> Fig
         ax = figure.add_subplot(grid[row, 2])
         orbit = 1e6 * signals["z"][settled][:, [x, y]]
         ax.plot(*orbit.T, linewidth=0.7)
-        _stop_circle(ax, 1e6 * float(case.cases[x].scenario.touchdown), float(np.max(np.abs(orbit))))
-        ax.set_aspect("equal", adjustable="datalim")
-        ax.set_title(f"orbit of {name}, from {begin:g} s on")
-        ax.set_xlabel("x axis, µm")
-        ax.set_ylabel("y axis, µm")
-        ax.grid(True, alpha=0.3)
+        radius = 1e6 * float(case.cases[x].scenario.touchdown)
+        if np.max(np.abs(orbit)) >= NEAR * radius:  # the stop around an orbit that is near it
+            angle = np.linspace(0, 2 * np.pi, 181)
+            ax.plot(radius * np.cos(angle), radius * np.sin(angle), "r--", linewidth=0.8)
+        orbit_axes(ax, f"orbit of {name}, from {begin:g} s on")
     ended = str(signals["lost_why"])
     figure.suptitle(f"{title}: {ended}" if ended else title)
     return figure
@@ -77,11 +75,11 @@ def _limit_lines(ax: Any, case: Any, name: str, scale: float) -> None:
                 ax.annotate(words, (0.01, bound), xycoords=("axes fraction", "data"), color="r", fontsize="x-small")
 
 
-def _stop_circle(ax: Any, radius: float, reached: float) -> None:
-    """Draw the stop around an orbit if a displacement of it is near, `reached`."""
-    if reached >= NEAR * radius:
-        angle = np.linspace(0, 2 * np.pi, 181)
-        ax.plot(radius * np.cos(angle), radius * np.sin(angle), "r--", linewidth=0.8)
+def orbit_axes(ax: Any, title: str) -> None:
+    """Set scale, title and labels of a panel with orbits in µm."""
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set(title=title, xlabel="x axis, µm", ylabel="y axis, µm")
+    ax.grid(True, alpha=0.3)
 
 
 def orbits_of(axes: Sequence[str]) -> list[tuple[str, int, int]]:
@@ -119,9 +117,8 @@ def machine_sensitivity_picture(
             if one is not None and one.S is not None:
                 label = "injected" if k == len(point.axes) - 1 else None
                 ax.loglog(one.frequency, np.abs(one.S), ".", color=line.get_color(), markersize=4, label=label)
-        ax.loglog(
-            f, np.linalg.norm(S, 2, axis=(1, 2)), "k--", label=f"largest singular value: {point.sigma.height:.3g}"
-        )
+        label = f"largest singular value: {point.sigma.height:.3g}"
+        ax.loglog(f, np.linalg.norm(S, 2, axis=(1, 2)), "k--", label=label)
         top = max(2 * limits[-1], 1.3 * point.sigma.height)
         bounds = [1e-2, *limits, top]
         zones = zip(bounds[:-1], bounds[1:], ("g", "y", "orange", "r"), "ABCD", (0.96, 0.985) * 2, strict=True)
@@ -129,9 +126,7 @@ def machine_sensitivity_picture(
             ax.axhspan(low, high, color=colour, alpha=0.08)
             at = x, np.sqrt(max(low, 0.5) * high)
             ax.text(*at, name, transform=ax.get_yaxis_transform(), ha="center", va="center", fontsize="small")
-        ax.set_ylim(1e-2, top)
-        ax.set_xlabel("frequency, Hz")
-        ax.set_ylabel("|S|")
+        ax.set(ylim=(1e-2, top), xlabel="frequency, Hz", ylabel="|S|")
         ax.grid(True, alpha=0.3)
         ax.legend(fontsize="small", loc="lower right")
     figure.suptitle(title)
@@ -163,16 +158,13 @@ def campbell_picture(title: str, speeds: np.ndarray, modes: Sequence[Sequence[An
     below = -np.inf
     for mode in light:  # the names of close modes are moved apart
         below = max(mode.frequency, below + top / 45)
-        ax.annotate(
-            mode.label, (speeds[-1], mode.frequency), (1.02 * speeds[-1], below), fontsize="x-small", va="center"
-        )
+        at, beside = (speeds[-1], mode.frequency), (1.02 * speeds[-1], below)
+        ax.annotate(mode.label, at, beside, fontsize="x-small", va="center")
     ax.set_xlim(right=1.2 * speeds[-1])
-    ax.set_xlabel("speed, rpm")
-    ax.set_ylabel("frequency of the mode, Hz")
+    ax.set(xlabel="speed, rpm", ylabel="frequency of the mode, Hz", title=f"{title}: modes of the closed loops")
     bar = figure.colorbar(shown, ticks=[-3, -2, -1, 0])
     bar.ax.set_yticklabels(["0.001", "0.01", "0.1", "1"])
     bar.set_label("damping ratio")
     ax.grid(True, alpha=0.3)
     figure.legend(fontsize="small", loc="outside lower center", ncols=5)
-    ax.set_title(f"{title}: modes of the closed loops")
     return figure

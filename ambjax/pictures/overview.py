@@ -8,24 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ambjax.pictures.figures import (
-    AVERAGED,
-    COILS,
-    CURRENT,
-    CURRENT_DISTURBANCE,
-    DISTURBANCE,
-    ERROR,
-    FORCE_ERROR,
-    MAGNETIC,
-    MEASUREMENT,
-    POSITION,
-    SLIDING,
-    Panel,
-    draw_panel,
-    signal_of,
-)
-from ambjax.pictures.scales import prefix_of
-from ambjax.pictures.style import own_style
+from ambjax.pictures import figures
+from ambjax.pictures.scales import own_style, prefix_of
 from ambjax.simulation.trajectory import STALLED, Trajectory
 
 # Largest number of reversals of a chattering voltage in the enlarged end of a run.
@@ -65,7 +49,7 @@ def overview_figure(
             if panel is None:
                 ax.set_axis_off()
                 continue
-            draw_panel(ax, panel, trajectory, stretch=(stretch[0], stretch[1]))
+            figures.draw_panel(ax, panel, trajectory, stretch=(stretch[0], stretch[1]))
             if window is None and n == 0 and _scales_late(trajectory, settle):
                 _fit(ax, panel, trajectory, settle)
             if window is None and n:
@@ -83,21 +67,22 @@ def overview_figure(
     return figure
 
 
-def _panels(trajectory: Trajectory) -> tuple[Panel, ...]:
+def _panels(trajectory: Trajectory) -> tuple[figures.Panel, ...]:
     """Return the panels of a run; those of q_i and of the measured position only if they differ from 0 and from z."""
     rows = trajectory.rows
-    panels = (_prefixed(POSITION, trajectory), _prefixed(ERROR, trajectory), SLIDING, DISTURBANCE)
-    panels = (*panels, CURRENT, COILS, MAGNETIC, FORCE_ERROR, AVERAGED)
+    panels = (_prefixed(figures.POSITION, trajectory), _prefixed(figures.ERROR, trajectory))
+    panels = (*panels, figures.SLIDING, figures.DISTURBANCE, figures.CURRENT, figures.COILS, figures.MAGNETIC)
+    panels = (*panels, figures.FORCE_ERROR, figures.AVERAGED)
     if np.any(np.asarray(rows.q_i)):
-        panels = (*panels, CURRENT_DISTURBANCE)
-    measured = _prefixed(MEASUREMENT, trajectory)
+        panels = (*panels, figures.CURRENT_DISTURBANCE)
+    measured = _prefixed(figures.MEASUREMENT, trajectory)
     return (*panels, measured) if np.any(np.asarray(rows.z_measured) != np.asarray(rows.z)) else panels
 
 
-def _prefixed(panel: Panel, trajectory: Trajectory) -> Panel:
+def _prefixed(panel: figures.Panel, trajectory: Trajectory) -> figures.Panel:
     """Return a panel of lengths in the prefix of metres that suits its first signal."""
     held = np.asarray(trajectory.rows.t) < float(trajectory.lost_at)
-    values = np.abs(signal_of(trajectory.rows, panel.curves[0].signal)[held])
+    values = np.abs(figures.signal_of(trajectory.rows, panel.curves[0].signal)[held])
     factor, unit = prefix_of("m", float(values.max(initial=0.0)))
     return panel._replace(unit=unit, factor=factor)
 
@@ -108,10 +93,10 @@ def _scales_late(trajectory: Trajectory, settle: float) -> bool:
     return not np.isfinite(float(trajectory.lost_at)) and t[0] < settle < t[-1]
 
 
-def _fit(ax: Axes, panel: Panel, trajectory: Trajectory, settle: float) -> None:
+def _fit(ax: Axes, panel: figures.Panel, trajectory: Trajectory, settle: float) -> None:
     """Set the vertical scale of a panel to its signals from `settle` (s) on, with a margin of 12 %."""
     late = np.asarray(trajectory.rows.t) >= settle
-    values = [panel.factor * signal_of(trajectory.rows, curve.signal)[late] for curve in panel.curves]
+    values = [panel.factor * figures.signal_of(trajectory.rows, curve.signal)[late] for curve in panel.curves]
     low, high = float(np.min(values)), float(np.max(values))
     if high > low:
         margin = 0.12 * (high - low)
@@ -139,9 +124,8 @@ def _status(trajectory: Trajectory) -> str:
     lost_at = float(trajectory.lost_at)
     if not np.isfinite(lost_at):
         return ""
-    return (
-        f"{'not decided from' if trajectory.lost_code == STALLED else 'lost at'} {lost_at:.4g} s: {trajectory.lost_why}"
-    )
+    status = "not decided from" if trajectory.lost_code == STALLED else "lost at"
+    return f"{status} {lost_at:.4g} s: {trajectory.lost_why}"
 
 
 def _short(seconds: float) -> str:
@@ -153,7 +137,7 @@ def _last_moments(trajectory: Trajectory, end: float) -> float:
     t = np.asarray(trajectory.rows.t, float)
     longest = min(0.02, (end - t[0]) / 5)
     late = (t >= end - longest) & (t < end)
-    turning = np.flatnonzero(np.diff(np.sign(np.diff(signal_of(trajectory.rows, "u_mean")[late]))))
+    turning = np.flatnonzero(np.diff(np.sign(np.diff(figures.signal_of(trajectory.rows, "u_mean")[late]))))
     return longest if turning.size <= TURNS else float(end - t[late][turning[-TURNS]])
 
 
@@ -164,7 +148,7 @@ def _transient(trajectory: Trajectory, end: float, loss: bool) -> float:
     t, most = t[alive] - t[0], (end - t[0]) / (3 if loss else 20)
     slowest = 0.0
     for name in ("e_z", "sigma", "v_tilde", "e"):
-        size = np.abs(signal_of(trajectory.rows, name)[alive])
+        size = np.abs(figures.signal_of(trajectory.rows, name)[alive])
         down = size <= max(0.02 * size.max(), 1.5 * size[len(size) // 2 :].max())
         slowest = max(slowest, t[np.argmax(down)])
     return min(max(3 * slowest, 20 * (t[1] - t[0]) if len(t) > 1 else 0.0, most / 10), most)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from ambjax.linear.rotor_modes import planes_of
 from ambjax.linear.unbalance_response import a1_limit
-from ambjax.pictures.style import own_style
+from ambjax.pictures.scales import own_style
 
 # Marks of the planes: letter, colour, and side of the rotor (1: above).
 PLANES = {
@@ -85,7 +85,6 @@ def rotor_picture(
 
 
 def _rotor(ax: Axes, drawing: Any) -> None:
-    """Draw the rotor from the side, with letters at the planes."""
     size = max((d for _, _, d in drawing.sections), default=0.02 * float(np.ptp(drawing.at)))
     reach = 4 * size
     for begin, end, d in drawing.sections:
@@ -97,17 +96,10 @@ def _rotor(ax: Axes, drawing: Any) -> None:
     for kind, at in drawing.planes:
         letter, colour, way = PLANES[kind]
         ax.plot([at, at], [0, way * reach], color=colour, linewidth=1.0, linestyle="--")
-        ax.text(
-            at,
-            way * reach * (1.25 if kind in ("magnet", "sensor") else 1.6),
-            letter,
-            color=colour,
-            ha="center",
-            va="center",
-        )
+        height = way * reach * (1.25 if kind in ("magnet", "sensor") else 1.6)
+        ax.text(at, height, letter, color=colour, ha="center", va="center")
     ax.plot(0.0, 0.0, "k+", markersize=10)
-    ax.set_ylim(-2 * reach, 2 * reach)
-    ax.set_yticks([])
+    ax.set(ylim=(-2 * reach, 2 * reach), yticks=[])
     ax.set_title("M magnet, S sensor, T stop, U unbalance, + centre of mass, dark: disc", fontsize="medium")
 
 
@@ -135,7 +127,6 @@ def _shape(ax: Axes, drawing: Any, mode: Any, way: int) -> None:
 
 
 def _critical_map(ax: Axes, stiffness: np.ndarray, speeds: list[np.ndarray], k_s: float, speed: float) -> None:
-    """Draw the undamped critical speeds against the stiffness of the bearings."""
     count = max(map(len, speeds))
     for number in range(count):
         line = [own[number] if number < len(own) else np.nan for own in speeds]
@@ -147,8 +138,7 @@ def _critical_map(ax: Axes, stiffness: np.ndarray, speeds: list[np.ndarray], k_s
         ax.axhline(speed, color="k", linewidth=0.9, linestyle="--")
         ax.annotate("1x", (stiffness[-1], speed), fontsize="small", va="bottom", ha="right")
     ax.set_ylim(top=max(20 * speed, 3 * float(np.nanmax([own[0] for own in speeds]))))
-    ax.set_xlabel("stiffness of each radial bearing, N/m")
-    ax.set_ylabel("undamped critical speed, rpm")
+    ax.set(xlabel="stiffness of each radial bearing, N/m", ylabel="undamped critical speed, rpm")
     ax.set_title("critical speeds on springs (forward)", fontsize="medium")
     ax.legend(fontsize="small", title="mode")
     ax.grid(True, alpha=0.3, which="both")

@@ -1,14 +1,14 @@
 """Pictures of a run-up or run-down, of a machine and of one axis."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from ambjax.pictures.machine_pictures import orbits_of
-from ambjax.pictures.style import own_style
+from ambjax.pictures.machine_pictures import orbit_axes, orbits_of
+from ambjax.pictures.scales import own_style
 from ambjax.simulation.trajectory import Trajectory
 from ambjax.world.rotation import Rotation
 
@@ -22,26 +22,18 @@ RANGE, ORBITS = 3e-4, 7
 PADDED = 4
 
 
-class Waterfall(NamedTuple):
-    """Spectra of a signal against speed.
+def waterfall(x: np.ndarray, speed: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the spectra of a signal `x` [N] in W windows of a run. `speed` [N]: rpm. `period`: between samples, s.
 
-    - `speeds` [N]: rpm, at the middle of each window. `frequency` [F]: Hz.
-    - `amplitude` [N, F]: of a sine with this frequency, in the unit of the signal.
+    Results: speed at the middle of each window [W], rpm; frequency [F], Hz; amplitude of a sine [W, F], in the unit of
+    the signal.
     """
-
-    speeds: np.ndarray
-    frequency: np.ndarray
-    amplitude: np.ndarray
-
-
-def waterfall(x: np.ndarray, speed: np.ndarray, period: float) -> Waterfall:
-    """Return the spectra of a signal `x` [N] in windows of a run. `speed` [N]: rpm. `period`: between samples, s."""
     length = max(int(SHARE * len(x)), 16)
     window = np.hanning(length)
     starts = np.unique(np.linspace(0, len(x) - length, WINDOWS).astype(int))
     parts = np.stack([x[k : k + length] - np.mean(x[k : k + length]) for k in starts])
     amplitude = 2 * np.abs(np.fft.rfft(parts * window, PADDED * length)) / window.sum()
-    return Waterfall(speed[starts + length // 2], np.fft.rfftfreq(PADDED * length, period), amplitude)
+    return speed[starts + length // 2], np.fft.rfftfreq(PADDED * length, period), amplitude
 
 
 def last_turn(turns: np.ndarray, end: int) -> slice:
@@ -63,22 +55,20 @@ def run_up_picture(case: Any, signals: dict[str, np.ndarray]) -> Figure:
     figure = Figure(figsize=(13.0, 3.6 * (len(pairs) + 1)), layout="constrained")
     grid = figure.add_gridspec(len(pairs) + 1, 2, width_ratios=[2.2, 1])
     for row, (name, x, y) in enumerate(pairs):
-        found = waterfall(signals["z_measured"][alive, x], speed, period)
-        end = min(max(HARMONICS * np.abs(speed).max() / 60, LOWEST_END), found.frequency[-1])
-        shown = found.frequency <= end
-        size = 1e6 * found.amplitude[:, shown].T
+        speeds, frequency, amplitude = waterfall(signals["z_measured"][alive, x], speed, period)
+        end = min(max(HARMONICS * np.abs(speed).max() / 60, LOWEST_END), frequency[-1])
+        shown = frequency <= end
+        size = 1e6 * amplitude[:, shown].T
         ax = figure.add_subplot(grid[row, 0])
         norm = LogNorm(RANGE * size.max(), size.max())
-        order = np.argsort(found.speeds)
-        clipped = np.maximum(size[:, order], RANGE * size.max())
-        image = ax.pcolormesh(found.speeds[order], found.frequency[shown], clipped, norm=norm, cmap="magma",
-                              shading="nearest", rasterized=True)  # fmt: skip
-        ax.plot(found.speeds[order], np.abs(found.speeds[order]) / 60, "c--", linewidth=0.8)
-        ax.annotate("1x", (found.speeds[order][-1], np.abs(found.speeds[order][-1]) / 60), color="c")
-        ax.set_ylim(0, end)
-        ax.set_title(f"reading of {signals['axes'][x]}")
-        ax.set_xlabel("speed, rpm")
-        ax.set_ylabel("frequency, Hz")
+        order = np.argsort(speeds)
+        speeds, clipped = speeds[order], np.maximum(size[:, order], RANGE * size.max())
+        look = {"norm": norm, "cmap": "magma", "shading": "nearest", "rasterized": True}
+        image = ax.pcolormesh(speeds, frequency[shown], clipped, **look)
+        ax.plot(speeds, np.abs(speeds) / 60, "c--", linewidth=0.8)
+        ax.annotate("1x", (speeds[-1], np.abs(speeds[-1]) / 60), color="c")
+        title = f"reading of {signals['axes'][x]}"
+        ax.set(ylim=(0, end), title=title, xlabel="speed, rpm", ylabel="frequency, Hz")
         figure.colorbar(image, ax=ax, pad=0.01, label="amplitude, µm")
         orbits = figure.add_subplot(grid[row, 1])
         for place in np.linspace(0.02, 1.0, ORBITS):
@@ -86,11 +76,7 @@ def run_up_picture(case: Any, signals: dict[str, np.ndarray]) -> Figure:
             part = last_turn(turns, end_of)
             u, v = (1e6 * (signals["z"][alive, k][part]) for k in (x, y))
             orbits.plot(u, v, linewidth=0.9, label=f"{speed[end_of]:.0f} rpm")
-        orbits.set_aspect("equal", adjustable="datalim")
-        orbits.set_title(f"orbits of {name}: one turn each")
-        orbits.set_xlabel("x axis, µm")
-        orbits.set_ylabel("y axis, µm")
-        orbits.grid(True, alpha=0.3)
+        orbit_axes(orbits, f"orbits of {name}: one turn each")
         orbits.legend(fontsize="xx-small", loc="upper right")
     _limits(figure.add_subplot(grid[-1, :]), case, signals, alive)
     figure.suptitle(f"{case.name}: {speed[0]:.0f} to {speed[-1]:.0f} rpm")
@@ -98,7 +84,7 @@ def run_up_picture(case: Any, signals: dict[str, np.ndarray]) -> Figure:
 
 
 def _limits(ax: Any, case: Any, signals: dict[str, np.ndarray], alive: np.ndarray) -> None:
-    """Draw the largest current, voltage and displacement of each part of the run, as shares of their limits."""
+    """Draw the largest current and voltage of each part of the run, as shares of their limits."""
     speed = signals["speed_rpm"][alive]
     for k, (axis, one) in enumerate(zip(case.axes, case.cases, strict=True)):
         scenario = one.scenario
@@ -110,9 +96,8 @@ def _limits(ax: Any, case: Any, signals: dict[str, np.ndarray], alive: np.ndarra
             ax.plot(middle, [float(np.max(part)) for part in parts], style, color=f"C{k}", linewidth=1.1, label=label)
     ax.axhline(1.0, color="r", linewidth=0.9, linestyle="--")
     ax.set_ylim(bottom=0)
-    ax.set_xlabel("speed, rpm")
-    ax.set_ylabel("share of the limit")
-    ax.set_title("largest |i| as a share of the bias, largest |u| as a share of the supply")
+    title = "largest |i| as a share of the bias, largest |u| as a share of the supply"
+    ax.set(title=title, xlabel="speed, rpm", ylabel="share of the limit")
     ax.grid(True, alpha=0.3)
     ax.legend(fontsize="small", ncols=4, loc="upper right")
 

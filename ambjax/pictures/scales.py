@@ -1,24 +1,24 @@
-"""Axes of pictures: units, SI prefixes, ticks of logarithmic axes, and edges of cells."""
+"""The style of every picture, and its axes: units, SI prefixes, ticks of logarithmic axes, edges of cells."""
 
 import math
+import pathlib
 import re
+from typing import Any
 
+import matplotlib
 import numpy as np
+from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.ticker import (
-    EngFormatter,
-    FixedLocator,
-    FuncFormatter,
-    LogFormatterSciNotation,
-    LogLocator,
-    MaxNLocator,
-    NullFormatter,
-)
+from matplotlib.figure import Figure
 
 from ambjax.simulation import orders
 from ambjax.simulation.metrics import UNITS
 
+# Matplotlib's default without offsets of axes, independent of any matplotlibrc file.
+_STYLE: Any = {k: v for k, v in matplotlib.rcParamsDefault.items() if k != "backend"}
+# Decorator of every function that draws.
+own_style = matplotlib.rc_context(_STYLE | {"axes.formatter.useoffset": False})
 # Labels of metrics without their units.
 LABELS = {
     "max_abs_error_m": "max |error|",
@@ -76,7 +76,7 @@ def prefix_of(unit: str, size: float) -> tuple[float, str]:
     # 0.9995 prints as 1 with three digits
     power = 3 * math.floor(math.log10(size / 0.9995) / 3)
     power = max(LEAST_POWER, min(power, 0 if match["length"] else MOST_POWER))
-    return 1 / float(f"1e{power}"), EngFormatter.ENG_PREFIXES[power] + unit
+    return 1 / float(f"1e{power}"), ticker.EngFormatter.ENG_PREFIXES[power] + unit
 
 
 def size_of(values: np.ndarray, log: bool = False) -> float:
@@ -149,11 +149,17 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
     """Set ticks in plain numbers on a logarithmic axis; fewer decades have more ticks each."""
     decades = math.log10(high / low)
     if decades < 0.8:
-        at = MaxNLocator(5).tick_values(low, high)
+        at = ticker.MaxNLocator(5).tick_values(low, high)
     else:
         subs = (1, 2, 5) if decades < 2.2 else (1, 3) if decades < 4 else (1,)
-        at = LogLocator(subs=subs, numticks=8).tick_values(low, high)
-    axis.set_major_locator(FixedLocator([value for value in np.asarray(at) if low <= value <= high]))
-    powers = LogFormatterSciNotation(labelOnlyBase=False)
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}" if 1e-3 <= value < 1e5 else powers(value)))
-    axis.set_minor_formatter(NullFormatter())
+        at = ticker.LogLocator(subs=subs, numticks=8).tick_values(low, high)
+    axis.set_major_locator(ticker.FixedLocator([value for value in np.asarray(at) if low <= value <= high]))
+    powers = ticker.LogFormatterSciNotation(labelOnlyBase=False)
+    axis.set_major_formatter(lambda value, _: f"{value:g}" if 1e-3 <= value < 1e5 else powers(value))
+    axis.set_minor_formatter(ticker.NullFormatter())
+
+
+@own_style
+def save(figure: Figure, path: pathlib.Path, dpi: int = 130) -> None:
+    """Write a picture to a file."""
+    figure.savefig(path, dpi=dpi)

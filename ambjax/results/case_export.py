@@ -18,12 +18,12 @@ from ambjax.cases.reader import Case, is_as_written
 from ambjax.cases.table import require_file
 from ambjax.codegen import verify
 from ambjax.codegen.block import Block
-from ambjax.codegen.c99 import machine, package, texts
-from ambjax.codegen.c99.source import Origin
+from ambjax.codegen.c99 import machine, package
+from ambjax.codegen.c99.source import MARK, Origin
 from ambjax.codegen.c99.statements import RESERVED
-from ambjax.codegen.fmi import archive, cross_check
-from ambjax.codegen.javascript.script import script_of
-from ambjax.codegen.of_case import WHAT, block_of
+from ambjax.codegen.fmi import archive
+from ambjax.codegen.javascript.script import script
+from ambjax.codegen.loop_step import WHAT, block_of
 from ambjax.codegen.program import PRECISIONS
 from ambjax.codegen.trace import trace
 from ambjax.codegen.twins import LoopCase
@@ -77,7 +77,7 @@ class Plan(NamedTuple):
     @property
     def mark(self) -> str:
         """Line by which a later export recognises the files."""
-        return texts.MARK.format(p=self.prefix)
+        return MARK.format(p=self.prefix)
 
     @property
     def origin(self) -> Origin:
@@ -208,14 +208,15 @@ def generated(plan: Plan) -> ExportedCase:
 def _built(plan: Plan) -> dict[str, str | bytes]:
     """Return the content of each file by name, without verification."""
     if plan.format == "js":
-        return {f"{plan.prefix}.js": f"// {plan.mark}\n{script_of(plan.block, plan.prefix)}"}
+        text = script(trace(plan.block, "double"), plan.prefix)
+        return {f"{plan.prefix}.js": f"// {plan.mark}\n{text}"}
     if plan.format == "c":
-        return {**package.package_files(plan.block, plan.precision, plan.prefix, plan.origin)}
+        return {**package.files_of_trace(trace(plan.block, plan.precision), plan.prefix, plan.origin)}
     case, traced = plan.case, trace(plan.block, "double")
     fmu = {f"{plan.prefix}.fmu": archive.packed(traced, plan.prefix, plan.origin, plan.fmi)}
     cascade = guarded_for(case)
     block = plan.block, plan.prefix, traced.read, cascade, case.scenario, case.clock
-    return fmu | (described("the reference data", lambda: cross_check.files_of(*block)) or {})
+    return fmu | (described("the reference data", lambda: archive.files_of(*block)) or {})
 
 
 @contextlib.contextmanager

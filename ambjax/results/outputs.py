@@ -155,7 +155,7 @@ def drawn(path: pathlib.Path, draw: Callable[[], Any], dpi: int = 130) -> None:
     """Write the Figure that `draw` returns to a file. An error costs this picture only, as in `described`."""
 
     def write() -> None:
-        from ambjax.pictures.style import save
+        from ambjax.pictures.scales import save
 
         save(draw(), path, dpi)
 

@@ -7,8 +7,7 @@ from matplotlib.figure import Figure
 
 from ambjax.pictures.figures import AVERAGED, BLUE, ERROR, ORANGE
 from ambjax.pictures.overview import overview_figure
-from ambjax.pictures.scales import digits, log_ticks, prefix_of
-from ambjax.pictures.style import own_style
+from ambjax.pictures.scales import digits, log_ticks, own_style, prefix_of
 from ambjax.simulation.trajectory import ALIVE, STALLED, Trajectory
 from tuning.problem.goal import shown
 from tuning.report.front_table import letter

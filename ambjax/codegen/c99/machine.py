@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import functools
 import os
 import pathlib
 import shutil
@@ -11,50 +12,49 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ambjax.codegen.points import Points
+from ambjax.codegen.points import Points, Results
 from ambjax.codegen.program import PRECISIONS
-from ambjax.codegen.reference import Results
 from ambjax.codegen.trace import Trace
 
 STRICT = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic", "-Werror"]
 EXACT = "-ffp-contract=off"
 SANITIZED = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 SHARED = ["-shared", "-fPIC"]
+# For messages: the option that needs a compiler, and what to do without one.
+VERIFY, FMU = ("--verify", "omit --verify"), ("--format fmu", "use --format c")
 # Time limit of a compiled program, s.
 TIME_LIMIT = 60
+_run = functools.partial(subprocess.run, capture_output=True, text=True, errors="replace", check=False)
 
 
-def compiler(option: str = "--verify", fix: str = "Install one, set CC, or omit --verify") -> str:
+def compiler(asked: tuple[str, str] = VERIFY) -> str:
     """Return the C compiler: $CC if it is set, else the first of cc, gcc and clang that exists.
 
-    Raises ValueError if there is none. The message names the `option` that needs a compiler, and the `fix`.
+    Raises ValueError if there is none. `asked`: the option that needs a compiler and another fix, for the message.
     """
     requested = os.environ.get("CC")
     for name in [requested] if requested else ["cc", "gcc", "clang"]:
         if found := shutil.which(name):
             return found
-    raise ValueError(f"{option}: there is no C compiler ({requested or 'cc, gcc or clang'}). {fix}.")
+    missing = f"there is no C compiler ({requested or 'cc, gcc or clang'})"
+    raise ValueError(f"{asked[0]}: {missing}. Install one, set CC, or {asked[1]}.")
 
 
-def build(sources: list[pathlib.Path], target: pathlib.Path, *flags: str) -> str:
-    """Compile `sources` to `target` with STRICT, EXACT and `flags`."""
-    command = [compiler(), *STRICT, EXACT, *flags, *map(str, sources), "-o", str(target), "-lm"]
+def build(sources: list[pathlib.Path], target: pathlib.Path, *flags: str, asked: tuple[str, str] = VERIFY) -> str:
+    """Compile `sources` to `target` with STRICT, EXACT and `flags`. `asked`: as for `compiler`."""
+    command = [compiler(asked), *STRICT, EXACT, *flags, *map(str, sources), "-o", str(target), "-lm"]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+        done = _run(command)
     except OSError as error:
-        raise ValueError(
-            f"--verify: the C compiler {command[0]} cannot be run ({error.strerror}). Set CC to another, or omit "
-            "--verify."
-        ) from None
+        why = f"the C compiler {command[0]} cannot be run ({error.strerror})"
+        raise ValueError(f"{asked[0]}: {why}. Set CC to another, or {asked[1]}.") from None
     return "" if done.returncode == 0 else done.stderr.strip() or f"exit code {done.returncode}"
 
 
 def execute(program: pathlib.Path) -> tuple[int, str]:
     """Run a compiled program, and return its exit code and its output."""
     try:
-        done = subprocess.run(
-            [program], capture_output=True, text=True, errors="replace", check=False, timeout=TIME_LIMIT
-        )
+        done = _run([program], timeout=TIME_LIMIT)
     except subprocess.TimeoutExpired:
         raise ValueError(
             f"--verify: the program {program.name} did not end within {TIME_LIMIT:g} s, so the check is not decided. "

@@ -1,51 +1,40 @@
 """Texts about a block for the header and the README: order of operations, what the export fixes, what a step checks."""
 
-from typing import NamedTuple
-
 import numpy as np
 
+from ambjax.codegen.block import UNREAD
 from ambjax.codegen.c99.statements import word
 from ambjax.codegen.interface import INPUTS
-from ambjax.codegen.numbering import UNREAD
 from ambjax.codegen.trace import Trace
 
-
-class About(NamedTuple):
-    """Comments of a header on the flag `started`, the inputs, and the functions `init`, `step` and `reset`."""
-
-    started: str
-    inputs: str
-    init: str
-    step: str
-    reset: str
-
-
+# Comments of a header on the flag `started`, the inputs, and the functions `init`, `step` and `reset`.
 ABOUT = {
-    "controller": About(
-        "0: the laws start at the next accepted readings",
-        "inputs of a step: the readings, checked against params->processor.guard if there is a guard, and the "
-        "reference,\n * checked against params->limits",
-        "Initialise the state before the first step: u is 0; the first accepted readings will start the laws.",
-        "Compute one sample. Returns the status bits above.",
-        "Restart the laws at the next accepted readings. The delayed commands are kept.",
-    ),
-    "plant": About(
-        "0: the next step reads the sensors in the initial state",
-        "inputs of a step: u, commanded at the last sample; the disturbances, constant over the sample that ends with\n"
-        " * the step; and the noise of its readings",
-        "Initialise the state before the first step.",
-        "Advance the plant to the next sample, then read the sensors; the first step reads them in the initial state.\n"
-        " * Returns the status bits above.",
-        "Begin again: the next step reads the sensors in the initial state, params->initial.",
-    ),
-    "loop": About(
-        "0: the next step begins with the plant in the initial state",
-        "inputs of a step: disturbances, constant over the sample that ends with the step, then noise and reference",
-        "Initialise the state before the first step.",
-        "Advance the plant to the next sample under the voltages that act, read the sensors, and step the\n"
-        " * controller; the first step reads the sensors in the initial state. Returns the status bits above.",
-        "Begin again: the next step reads the sensors in the initial state, params->initial.",
-    ),
+    "controller": {
+        "started": "0: the laws start at the next accepted readings",
+        "inputs": "inputs of a step: the readings, checked against params->processor.guard if there is a guard, "
+        "and the reference,\n * checked against params->limits",
+        "init": "Initialise the state before the first step: u is 0; the first accepted readings will start the laws.",
+        "step": "Compute one sample. Returns the status bits above.",
+        "reset": "Restart the laws at the next accepted readings. The delayed commands are kept.",
+    },
+    "plant": {
+        "started": "0: the next step reads the sensors in the initial state",
+        "inputs": "inputs of a step: u, commanded at the last sample; the disturbances, constant over the sample "
+        "that ends with\n * the step; and the noise of its readings",
+        "init": "Initialise the state before the first step.",
+        "step": "Advance the plant to the next sample, then read the sensors; the first step reads them in the "
+        "initial state.\n * Returns the status bits above.",
+        "reset": "Begin again: the next step reads the sensors in the initial state, params->initial.",
+    },
+    "loop": {
+        "started": "0: the next step begins with the plant in the initial state",
+        "inputs": "inputs of a step: disturbances, constant over the sample that ends with the step, then noise "
+        "and reference",
+        "init": "Initialise the state before the first step.",
+        "step": "Advance the plant to the next sample under the voltages that act, read the sensors, and step "
+        "the\n * controller; the first step reads the sensors in the initial state. Returns the status bits above.",
+        "reset": "Begin again: the next step reads the sensors in the initial state, params->initial.",
+    },
 }
 
 
@@ -53,11 +42,6 @@ def notes_of(trace: Trace) -> list[str]:
     """Return lines on the order of operations in a sample, on what the export fixes, and on what a step checks."""
     if trace.block.noun == "controller":
         return [*order_of_work(trace), "", *fixed(trace)]
-    return _of_plant(trace)
-
-
-def _of_plant(trace: Trace) -> list[str]:
-    """Return the lines of `notes_of` for a plant or a loop."""
     block = trace.block
     lines = [
         f"Step n ends at t = n T, T = {block.period:g} s. It advances the plant by T under the voltages that act, with",

@@ -3,13 +3,14 @@
 import hashlib
 import math
 import re
+import uuid
 from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 from ambjax._version import __version__
-from ambjax.codegen.numbering import UNREAD, Number
+from ambjax.codegen.block import UNREAD, Number
 from ambjax.codegen.trace import Trace
 
 STATUS = "status"
@@ -64,7 +65,7 @@ def token(traced: Trace, identifier: str, files: dict[str, str]) -> str:
     """Return the GUID of an FMU, a digest of its identifier, block and sources. `files`: their texts by name."""
     text = "\n".join([identifier, traced.block.noun, *(files[name] for name in sorted(files))])
     digest = hashlib.sha256(text.encode()).hexdigest()
-    return "{" + "-".join([digest[:8], digest[8:12], digest[12:16], digest[16:20], digest[20:32]]) + "}"
+    return f"{{{uuid.UUID(digest[:32])}}}"
 
 
 class Form(NamedTuple):
@@ -148,7 +149,6 @@ def _variable(x: Variable, form: Form) -> str:
 
 
 def _units(found: list[Variable]) -> list[str]:
-    """Return the lines that define the units in base units of SI."""
     rows = []
     for unit in sorted({x.unit for x in found if x.unit}):
         powers = exponents(unit) or {}

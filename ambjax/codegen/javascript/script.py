@@ -1,17 +1,18 @@
-"""Write a traced step as JavaScript: an object with the function `step` and with names, units and values."""
+"""Write traced code as JavaScript: the step of a block, a function of arrays, a step inside a loop over samples."""
 
 import json
 import re
-from collections.abc import Mapping
-from typing import SupportsFloat
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, NamedTuple, SupportsFloat
 
+import jax
 import numpy as np
 
-from ambjax.codegen.block import Block
-from ambjax.codegen.numbering import Number
+from ambjax.codegen.block import Number
+from ambjax.codegen.emitter import traced as traced_into
 from ambjax.codegen.primitives import OPS
-from ambjax.codegen.program import PERIOD, STARTED, Location, Operand, Program, Ref
-from ambjax.codegen.trace import Trace, trace
+from ambjax.codegen.program import PERIOD, STARTED, Location, Operand, Program, Ref, Statements
+from ambjax.codegen.trace import Trace
 
 # Functions that the rows of OPS use, and that `Math` lacks or defines differently. They treat NaN and the sign of 0 as
 # JAX does.
@@ -34,16 +35,16 @@ HELPERS = {
 }
 # For each helper, the other helpers that it calls.
 NEEDS = {"erf": ("erfc",), "erfc": ("erf",)}
-
-
-def script_of(block: Block, name: str) -> str:
-    """Return JavaScript that defines the constant `name`, an object with the step of a block in double precision."""
-    return script(trace(block, "double"), name)
+# All of them.
+PRELUDE = "\n".join(f"const {name} = {text};" for name, text in HELPERS.items())
 
 
 def script(traced: Trace, name: str) -> str:
-    """Return JavaScript that defines the constant `name` as in `script_of`. `traced`: a trace in double precision."""
-    body, block = Body(traced), traced.block
+    """Return JavaScript that defines the constant `name`, an object with the step of a block.
+
+    `traced`: its trace in double precision.
+    """
+    block = traced.block
     lists = {
         "parameters": traced.parameters,
         "states": [x for x, _ in traced.state],
@@ -56,8 +57,8 @@ def script(traced: Trace, name: str) -> str:
             f"const {name} = (() => {{",
             '"use strict";',
             f"const period = {js_constant(block.period)};",
-            *body.helpers(),
-            *body.step(),
+            *_helpers(traced),
+            *_step(traced),
             "return {",
             f"  noun: {_json(block.noun)}, period, step,",
             *(f"  {kind}: [\n{_entries(xs, kind, traced.read)}\n  ]," for kind, xs in lists.items()),
@@ -94,79 +95,151 @@ def _entries(numbers: list[Number], kind: str, read: frozenset[str]) -> str:
     return "\n".join(rows)
 
 
-class Statements:
-    """Nodes of a program as JavaScript. `names`: names of nodes by number. `inputs`: texts that read the inputs."""
+class ScriptStatements(Statements):
+    """Nodes of a program as JavaScript."""
 
-    def __init__(self, program: Program, names: Mapping[int, str], inputs: Mapping[Location, str]) -> None:
-        self.program, self.names, self.inputs = program, names, inputs
-
-    def operand(self, x: Operand) -> str:
-        """Return an operand as a JavaScript expression."""
-        if isinstance(x, Ref):
-            location = self.program.nodes[x.node].location
-            return self.names[x.node] if location is None else self.inputs[location]
-        if x.dtype.kind == "b":
-            return "true" if x else "false"
-        text = js_constant(x)
-        return f"({text})" if text.startswith("-") else text
+    def constant(self, x: Any) -> str:
+        return ("true" if x else "false") if x.dtype.kind == "b" else js_constant(x)
 
     def statement(self, n: int) -> str:
-        """Return the declaration of the value of node `n`."""
         node = self.program.nodes[n]
         text = OPS[node.op].javascript.format(*map(self.operand, node.args))
-        rounded = f"Math.fround({text})" if node.dtype == np.float32 else text
-        return f"const {self.names[n]} = {rounded};"
+        return f"const {self.names[n]} = {f'Math.fround({text})' if node.dtype == np.float32 else text};"
 
 
-class Body(Statements):
-    """The step of a trace as JavaScript statements.
+def _step(traced: Trace) -> list[str]:
+    """Return the lines of the function `step`.
 
-    The step reads the parameters from the array `p` and the inputs from `x`, updates the states and the flag `started`
-    in `s`, and writes the outputs into `y`.
+    It reads the parameters from the array `p` and the inputs from `x`, updates the states and the flag `started` in
+    `s`, and writes the outputs into `y`.
     """
+    count = len(traced.state)
+    groups = [("params", "p", traced.parameters), ("input", "x", traced.inputs)]
+    groups += [("state", "s", [x for x, _ in traced.state])]
+    inputs = {Location(group, x.name): f"{array}[{k}]" for group, array, xs in groups for k, x in enumerate(xs)}
+    inputs |= {PERIOD: "period", STARTED: f"(s[{count}] !== 0)"}
+    text = ScriptStatements(traced.program, traced.order(), inputs.__getitem__)
+    results = [(f"s[{k}]", after) for k, (_, after) in enumerate(traced.state)]
+    old, given = text.assigned([*results, *((f"y[{k}]", x) for k, (_, x) in enumerate(traced.outputs))], "s[")
+    bits = [f"({text.operand(bit)} ? {1 << k} : 0)" for k, (_, bit) in enumerate(traced.bits)]
+    lines = [
+        *text.body("// {law}"),
+        *(f"const {name} = {value};" for value, name in old.items()),
+        f"const started = {text.operand(traced.started)} ? 1 : 0;",
+        f"const status = {' | '.join(bits)};",
+        *(f"{place} = {value};" for place, value in given.items()),
+        f"s[{count}] = started;",
+        "return status;",
+    ]
+    comment = "// Computes one sample: updates s, writes y, returns the status bits."
+    return [comment, "function step(p, s, x, y) {", *(f"  {line}" for line in lines), "}"]
 
-    def __init__(self, traced: Trace) -> None:
-        self.trace, self.order = traced, traced.order()
-        groups = [("params", "p", traced.parameters), ("input", "x", traced.inputs)]
-        groups += [("state", "s", [x for x, _ in traced.state])]
-        inputs = {Location(group, x.name): f"{array}[{k}]" for group, array, xs in groups for k, x in enumerate(xs)}
-        inputs |= {PERIOD: "period", STARTED: f"(s[{len(traced.state)}] !== 0)"}
-        super().__init__(traced.program, {n: f"v{k}" for k, n in enumerate(self.order)}, inputs)
 
-    def statements(self) -> list[str]:
-        """Return all statements. A comment with the name of a law precedes the statements of that law."""
-        lines, law = [], ""
-        for n in self.order:
-            if (node := self.program.nodes[n]).law != law:
-                law = node.law
-                lines.append(f"  // {re.sub(r'[^ -~]', '?', law) or 'the cascade'}")
-            lines.append(f"  {self.statement(n)}")
-        return lines
+def _helpers(traced: Trace) -> list[str]:
+    """Return the definitions of the functions in HELPERS that the step uses, and of those that they call."""
+    texts = {OPS[traced.program.nodes[n].op].javascript for n in traced.order()}
+    used = [name for name in HELPERS if any(re.search(rf"(?<![.\w]){name}\(", text) for text in texts)]
+    used += [more for name in used for more in NEEDS.get(name, ()) if more not in used]
+    return [f"const {name} = {HELPERS[name]};" for name in used]
 
-    def step(self) -> list[str]:
-        """Return the lines of the function `step`."""
-        given = [(f"s[{k}]", self.operand(after)) for k, (_, after) in enumerate(self.trace.state)]
-        given += [(f"y[{k}]", self.operand(value)) for k, (_, value) in enumerate(self.trace.outputs)]
-        # a state that is copied to another location is read before any state is written
-        old = {value: f"old{k}" for k, value in enumerate(dict.fromkeys(v for _, v in given if v.startswith("s[")))}
-        bits = [f"({self.operand(bit)} ? {1 << k} : 0)" for k, (_, bit) in enumerate(self.trace.bits)]
-        started = f"const started = {self.operand(self.trace.started)} ? 1 : 0;"
-        return [
-            "// Computes one sample: updates s, writes y, returns the status bits.",
-            "function step(p, s, x, y) {",
-            *self.statements(),
-            *(f"  const {name} = {value};" for value, name in old.items()),
-            f"  {started}",
-            f"  const status = {' | '.join(bits)};",
-            *(f"  {place} = {old.get(value, value)};" for place, value in given),
-            f"  s[{len(self.trace.state)}] = started;",
-            "  return status;",
-            "}",
-        ]
 
-    def helpers(self) -> list[str]:
-        """Return the definitions of the functions in HELPERS that the step uses, and of those that they call."""
-        texts = {OPS[self.program.nodes[n].op].javascript for n in self.order}
-        used = [name for name in HELPERS if any(re.search(rf"(?<![.\w]){name}\(", text) for text in texts)]
-        used += [more for name in used for more in NEEDS.get(name, ()) if more not in used]
-        return [f"const {name} = {HELPERS[name]};" for name in used]
+class Piece(NamedTuple):
+    """A traced function: its program, and its arguments and results as pytrees whose leaves are operands."""
+
+    program: Program
+    arguments: Any
+    results: Any
+
+
+def piece_of(function: Callable[..., object], names: Sequence[str], arguments: Sequence[Any]) -> Piece:
+    """Trace a function of pytrees of scalars.
+
+    `names`: for each argument, the prefix of the JavaScript names of its leaves; "p" gives p0, p1, ...
+
+    Raises ValueError for a primitive that is not scalar arithmetic.
+    """
+    program = Program()
+    operands = []
+    for name, argument in zip(names, arguments, strict=True):
+        leaves, tree = jax.tree.flatten(argument)
+        refs = [program.input(Location("page", f"{name}{n}"), np.asarray(x).dtype) for n, x in enumerate(leaves)]
+        operands.append(jax.tree.unflatten(tree, refs))
+    flat = traced_into(program, function, arguments, jax.tree.leaves(operands, is_leaf=_is_ref))
+    tree = jax.tree.structure(jax.eval_shape(function, *arguments))
+    return Piece(program, operands, jax.tree.unflatten(tree, flat))
+
+
+def _is_ref(x: object) -> bool:
+    return isinstance(x, Ref)
+
+
+def operands_of(tree: object) -> list[Any]:
+    """Return the operands in a pytree. A Ref is a pytree itself, but counts as one operand."""
+    return jax.tree.leaves(tree, is_leaf=_is_ref)
+
+
+def _statements(program: Program) -> ScriptStatements:
+    """Return the nodes of a program as JavaScript. An input has the name of its location; node 7 is `v7` otherwise."""
+    return ScriptStatements(program, range(len(program.nodes)), lambda location: location.name)
+
+
+def function_source(piece: Piece, name: str, arrays: Sequence[str], results: object) -> str:
+    """Return a JavaScript function `name(ARRAYS..., out)` that writes results into the array `out` and returns it.
+
+    - `arrays`: for each argument of the traced function, the name of the JavaScript array that holds its leaves.
+    - `results`: pytree of the operands to write.
+    """
+    script, roots = _statements(piece.program), operands_of(results)
+    needed = piece.program.needed(roots)
+    lines = [f"function {name}({', '.join(arrays)}, out) {{"]
+    for array, argument in zip(arrays, piece.arguments, strict=True):
+        lines += [f"const {line}" for line in _loads(script, array, operands_of(argument), needed)]
+    lines += map(script.statement, piece.program.order(roots))
+    lines += [f"out[{k}] = {script.operand(x)};" for k, x in enumerate(roots)]
+    return "\n".join([*lines, "return out;", "}"])
+
+
+def _loads(script: ScriptStatements, array: str, refs: Sequence[Ref], needed: Collection[int]) -> list[str]:
+    """Return texts that read inputs from a JavaScript array: those of `refs` whose nodes are in `needed`."""
+    lines = []
+    for k, ref in enumerate(refs):
+        if ref.node in needed:
+            truth = " !== 0" if script.program.dtype(ref).kind == "b" else ""
+            lines.append(f"{script.operand(ref)} = {array}[{k}]{truth};")
+    return lines
+
+
+def loop_source(piece: Piece, name: str, shown: Sequence[Operand], always: Sequence[Operand]) -> str:
+    """Return a JavaScript function `name(P)` that returns `run(S, from, to, W, rows)`.
+
+    - `piece`: the traced `LoopFunctions.step`.
+    - `shown`: the operands that a row contains.
+    - `always`: further results of the step, which no row contains. `run` updates a state only if an operand in `shown`
+      or `always` depends on it, in the same sample or in a later one.
+
+    `run` computes the samples `from` <= n < `to`. P: parameters. S: the state, which `run` updates. W: three standard
+    normal random numbers per sample. `run` writes one row per sample into `rows`, unless `rows` is null. `name(P)`
+    computes the values that depend only on parameters, once.
+    """
+    program, script = piece.program, _statements(piece.program)
+    parameters, before = operands_of(piece.arguments[0]), operands_of(piece.arguments[1])
+    after = operands_of(piece.results[0])
+    kept = program.used(before, after, [*shown, *always])
+    roots = [*shown, *(after[k] for k in kept)]
+    order, needed = program.order(roots), program.needed(roots)
+    fixed = program.fixed(order, [x.node for x in parameters])
+    state = {k: script.operand(before[k]) for k in kept}
+    lines = [f"function {name}(P) {{", *(f"const {line}" for line in _loads(script, "P", parameters, needed))]
+    lines += [script.statement(n) for n in order if n in fixed]
+    lines += ["return function run(S, from, to, W, rows) {"]
+    lines += [f"let {line}" for line in _loads(script, "S", before, {before[k].node for k in kept})]
+    lines += ["for (let n0 = from; n0 < to; n0++) {"]
+    lines += [f"const {script.operand(x)} = W[3 * n0 + {k}];" for k, x in enumerate(piece.arguments[2])]
+    lines += [script.statement(n) for n in order if n not in fixed]
+    if shown:
+        writes = [f"rows[at + {k}] = {script.operand(x)};" for k, x in enumerate(shown)]
+        lines += ["if (rows !== null) {", f"const at = {len(shown)} * n0;", *writes, "}"]
+    lines += [f"const t{k} = {script.operand(after[k])};" for k in kept]
+    lines += [f"{text} = t{k};" for k, text in state.items()]
+    lines += ["}", *(f"S[{k}] = {text};" for k, text in state.items()), "};", "}"]
+    return "\n".join(lines)

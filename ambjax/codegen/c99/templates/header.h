@@ -27,7 +27,7 @@ typedef {real} {p}_real;
 /* state that one step passes to the next */
 {state}
 
-/* {about.inputs} */
+/* {about[inputs]} */
 {input}
 
 /* outputs of a step */
@@ -39,14 +39,14 @@ typedef {real} {p}_real;
 
 extern const {p}_params {p}_default;
 
-/* {about.init} */
-{init};
+/* {about[init]} */
+void {p}_init({p}_state *state);
 
-/* {about.step} */
-{step};
+/* {about[step]} */
+uint32_t {p}_step(const {p}_params *params, {p}_state *state, const {p}_input *input, {p}_output *output);
 
-/* {about.reset} */
-{reset};
+/* {about[reset]} */
+void {p}_reset({p}_state *state);
 
 #ifdef __cplusplus
 }}

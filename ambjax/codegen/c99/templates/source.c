@@ -10,14 +10,18 @@
 
 {helpers}const {p}_params {p}_default = {P}_DEFAULT;
 
-{init}
+void {p}_init({p}_state *state)
 {{
 {zeros}    state->started = 0u;
 }}
 
-{reset}
+void {p}_reset({p}_state *state)
 {{
 {forgotten}    state->started = 0u;
 }}
 
-{body}
+uint32_t {p}_step(const {p}_params *params, {p}_state *state, const {p}_input *input, {p}_output *output)
+{{
+    uint32_t status = 0u;
+{body}    return status;
+}}
