@@ -19,7 +19,8 @@ from ambjax.control.schedule import OVER, Schedule
 from ambjax.control.synchronous_notch import NULLED, SynchronousNotch
 from ambjax.ensemble.spread import Spread, ends
 from ambjax.linear.notch_design import with_notch_gains
-from ambjax.numerics.records import Scalar, leaf, leaves_of
+from ambjax.numerics.declared import leaves_of
+from ambjax.numerics.records import Scalar, leaf
 from ambjax.simulation.clock import Clock
 from ambjax.world.bearing import Bearing
 from ambjax.world.plant import Plant

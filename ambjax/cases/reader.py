@@ -24,8 +24,7 @@ from ambjax.cases.variation import spread_from
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import Spread, corners, ends
 from ambjax.linear.analysis import Zones
-from ambjax.numerics.declared import require_number
-from ambjax.numerics.records import leaves_of
+from ambjax.numerics.declared import leaves_of, require_number
 from ambjax.simulation.clock import PARTS, Clock
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import settled
