@@ -1,5 +1,6 @@
 """Configuration of the site, built by `sphinx-build -W docs docs/_build/html` without network access."""
 
+import gc
 import os
 import pathlib
 import sys
@@ -23,6 +24,10 @@ import quick  # noqa: E402
 from execution import source_checksum  # noqa: E402
 
 from ambjax import __version__  # noqa: E402
+from ambjax.host.command_line import GC_THRESHOLDS  # noqa: E402
+
+# As in the commands. The collector would scan the trees of all pages again and again.
+gc.set_threshold(*GC_THRESHOLDS)
 
 # Compilation takes most of a build's time.
 os.environ.setdefault("XLA_FLAGS", quick.flags())
