@@ -1,5 +1,6 @@
 """Configuration of the site, built by `sphinx-build -W docs docs/_build/html` without network access."""
 
+import gc
 import os
 import pathlib
 import sys
@@ -16,12 +17,17 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ |= {"JAX_COMPILATION_CACHE_MAX_SIZE": str(2**30)}
 os.environ |= {"OPENBLAS_NUM_THREADS": "1"}  # as in the commands
 os.environ |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
+os.environ |= {"JAX_TRACEBACK_IN_LOCATIONS_LIMIT": "0"}  # as in the tests
 os.environ |= {"PYTHONWARNINGS": "ignore:Error reading persistent,ignore:Error writing persistent"}
 
 import quick  # noqa: E402
 from execution import source_checksum  # noqa: E402
 
 from ambjax import __version__  # noqa: E402
+from ambjax.host.command_line import GC_THRESHOLDS  # noqa: E402
+
+# As in the commands. The collector would scan the trees of all pages again and again.
+gc.set_threshold(*GC_THRESHOLDS)
 
 # Compilation takes most of a build's time.
 os.environ.setdefault("XLA_FLAGS", quick.flags())

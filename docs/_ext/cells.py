@@ -1,14 +1,27 @@
-"""Cells of shell commands: `%%shell` runs them, and the page shows the commands. `table` prints rows for the pages."""
+"""Cells of shell commands: `%%shell` runs them, and the page shows the commands. `table` prints rows for the pages.
 
+A kernel loads this module. It imports neither Sphinx nor JAX, because many pages need neither of them.
+"""
+
+import gc
 import subprocess
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
-from docutils import nodes
-from sphinx.application import Sphinx
+from ambjax.host.command_line import GC_THRESHOLDS
 
-from ambjax.results.outputs import table as table
+if TYPE_CHECKING:
+    from docutils import nodes
+    from sphinx.application import Sphinx
 
 MAGIC = "%%shell"
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a text table as the commands print it."""
+    from ambjax.results.outputs import table as printed
+
+    return printed(header, rows)
 
 
 def shell(line: str, cell: str) -> None:
@@ -21,18 +34,21 @@ def shell(line: str, cell: str) -> None:
 
 def load_ipython_extension(ipython: Any) -> None:
     """Register the magic command; called by `%load_ext cells`."""
+    gc.set_threshold(*GC_THRESHOLDS)  # as in the commands
     ipython.register_magic_function(shell, "cell", "shell")
 
 
-def shown(app: Sphinx, tree: nodes.document) -> None:
+def shown(app: "Sphinx", tree: "nodes.document") -> None:
     """Remove the `%%shell` line of every cell that begins with it."""
+    from docutils import nodes
+
     for block in list(tree.findall(nodes.literal_block)):
         if (text := block.astext()).startswith(MAGIC):
             text = text.partition("\n")[2]
             block.replace_self(nodes.literal_block(text, text, language="bash"))
 
 
-def setup(app: Sphinx) -> dict[str, bool]:
+def setup(app: "Sphinx") -> dict[str, bool]:
     """Register the extension."""
     app.connect("doctree-read", shown)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
