@@ -95,7 +95,9 @@ def test_the_sensitivity_of_a_machine_with_an_axial_bearing_alone_is_that_of_one
 
 def test_the_orbits_of_a_rotor_that_is_lost_before_it_settles_end_at_the_loss(machine, held):
     lost = held.signals | {"lost_at": np.asarray(0.004), "lost_why": np.asarray("touched down")}
-    (orbit,) = machine_figure(dataclasses.replace(machine, settle=0.005), lost, "m").axes[-1].lines
+    figure = machine_figure(dataclasses.replace(machine, settle=0.005), lost, "m")
+    (orbit,) = figure.axes[-1].lines
+    assert figure.get_suptitle() == f"m: {lost['lost_why']}"
     np.testing.assert_allclose(orbit.get_xdata(), 1e6 * held.signals["z"][:81, 2])  # 5e-5 s a sample
 
 

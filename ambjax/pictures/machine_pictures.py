@@ -43,8 +43,8 @@ def machine_figure(case: Any, signals: dict[str, np.ndarray], title: str) -> Fig
             for k, axis in enumerate(axes):
                 ax.plot(t[shown], scale * signals[name][shown, k], label=axis, linewidth=0.9)
             _limit_lines(ax, case, name, scale)
-            title = ("whole run", "start of the run")[column] if row == 0 else ""
-            ax.set(xlabel="time, s" if row == 2 else "", ylabel=words if column == 0 else "", title=title)
+            part = ("whole run", "start of the run")[column] if row == 0 else ""
+            ax.set(xlabel="time, s" if row == 2 else "", ylabel=words if column == 0 else "", title=part)
             ax.xaxis.set_major_locator(MaxNLocator(5))
             ax.grid(True, alpha=0.3)
     handles, labels = figure.axes[0].get_legend_handles_labels()
