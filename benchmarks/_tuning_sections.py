@@ -93,7 +93,9 @@ def search() -> list[str]:
         "Nelder-Mead and CMA-ES have deterministic starting points. Reached: number of rollouts until a method",
         "reaches the final median loss of the gradient search, median over seeds; a dash: not within the budget.",
         "A call always simulates a full batch, but only the members that a method needs count as rollouts. The number",
-        "of rollouts is therefore no measure of the cost. Time: processor time of one search on one core.",
+        "of rollouts is therefore no measure of the cost. Time: processor time of one search on one core, while other",
+        "programs ran. The rows `CMA-ES, 10 times` are older: ten times the rollouts of the search before its screen",
+        "and race began on two members.",
         "",
     ]
     rows = []
