@@ -89,9 +89,10 @@ def test_hostile_files_are_refused_in_one_line(wrong):
 
 @pytest.mark.slow
 def test_a_metric_that_is_not_a_number_is_refused(capsys, monkeypatch):
-    trajectory, metrics = simulate._simulated(read_case(write(SHORT)))
+    done = simulate._simulated(read_case(write(SHORT)), None, None)
     for name, value in (("rms_error_m", math.nan), ("lost_at_s", math.nan), ("rms_u_V", math.inf)):
-        monkeypatch.setattr(simulate, "_simulated", lambda _, own=metrics | {name: value}: (trajectory, own))
+        broken = dataclasses.replace(done, metrics=done.metrics | {name: value})
+        monkeypatch.setattr(simulate, "_simulated", lambda *_, run=broken: run)
         assert main(["simulate", "case.toml", "--out", "broken"]) == 2
         assert f"case.toml: {name}: not finite in this run" in capsys.readouterr().err
         assert not pathlib.Path("broken/metrics.json").exists()

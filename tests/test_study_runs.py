@@ -237,7 +237,7 @@ def test_a_finished_study_is_not_run_again(no_pictures, monkeypatch, capsys):
     assert main(argv) == 0
     first, members = capsys.readouterr().out, result("out")
     pathlib.Path("out", "chunks").mkdir()  # as a kill in the last moment leaves it
-    monkeypatch.setattr(studies, "compute", None)
+    monkeypatch.setattr(studies, "_compute", None)
     assert main([*argv, "--resume"]) == 0
     assert json.loads(capsys.readouterr().out) == json.loads(first)
     assert result("out") == members

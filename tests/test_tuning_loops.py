@@ -174,7 +174,7 @@ def test_injections_find_the_members_with_the_largest_injected_peak():
     expected = sorted(range(count), key=lambda k: -each[k].peak)[:FEW]
     assert [one.member for one in found.peaks] == expected
     # the same signal, amplitude and plant, in another program
-    assert [one.peak for one in found.peaks] == pytest.approx([each[k].peak for k in expected], rel=1e-6)
+    assert [one.injected.peak for one in found.peaks] == pytest.approx([each[k].peak for k in expected], rel=1e-6)
     # the order of the peaks of |KS| is another one
     columns = {"loss.limit.control_sensitivity": np.ones(count), "lost_at_s": columns["lost_at_s"]}
     by_KS = sorted(range(count), key=lambda k: -np.abs(each[k].KS).max())[:FEW]

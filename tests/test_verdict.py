@@ -133,11 +133,12 @@ def test_every_command_reports_the_same_status_of_a_rotor(kind, capsys, monkeypa
     }
     genuine = simulate._simulated
 
-    def ended(case):
-        trajectory, measured = genuine(case)
+    def ended(*given):
+        run = genuine(*given)
         code = STALLED if stalled else TOUCHED if kind == "lost" else 0
-        trajectory = dataclasses.replace(trajectory, lost_at=lost_at, lost_code=code)
-        return trajectory, {**measured, "lost": kind == "lost", "stalled": stalled, "lost_at_s": lost_at}
+        metrics = run.metrics | {"lost": kind == "lost", "stalled": stalled, "lost_at_s": lost_at}
+        trajectory = dataclasses.replace(run.trajectory, lost_at=lost_at, lost_code=code)
+        return dataclasses.replace(run, trajectory=trajectory, metrics=metrics)
 
     monkeypatch.setattr(simulate, "_simulated", ended)
     assert main(["simulate", write(SHORT.replace("0.05", "0.002")), "--out", "out"]) == int(kind != "held")
