@@ -50,10 +50,15 @@ def test_a_command_says_what_takes_long_and_only_that(monkeypatch, capsys):
             pass
         with heartbeat.doing("compiling"):
             time.sleep(0.4)
+        with heartbeat.doing("outer"), Log() as log:  # only the inner one writes
+            log(Event("inner"))
+            time.sleep(0.3)
         said = capsys.readouterr().err
         time.sleep(0.3)
     assert said.count("compiling") > 1
+    assert said.count("inner") > 1
     assert "short" not in said
+    assert "outer" not in said
     with heartbeat.doing("called from Python"):
         time.sleep(0.3)
     assert capsys.readouterr().err == ""

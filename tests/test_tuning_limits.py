@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bowl import World, answer_of, study
+from bowl import Bowl, World, answer_of, study
 from texts import case_and_tune, problem_from
 
 from ambjax import rollout
@@ -23,7 +23,8 @@ from tuning.problem.quantities import KINDS, LimitContext, largest
 from tuning.report import limit_table
 from tuning.report.limit_table import MORE
 from tuning.rounds import rounds
-from tuning.solve.course import Course, training
+from tuning.solve import multipliers
+from tuning.solve.course import Course, first_search, training
 from tuning.solve.multipliers import breaking, optima, search_within_limits
 
 # The voltage of a Bowl is proportional to k: 20 V at the best k, 60, and 10 V at k = 30.
@@ -269,14 +270,45 @@ def test_members_that_break_a_limit_on_the_worst_member_join(monkeypatch):
     values = np.full(count, 0.5)
     values[[1, 4, 7]] = 2.0, 3.0, 9.0
     columns = {"lost_at_s": np.where(np.arange(count) == 7, 0.01, np.inf), f"loss.limit.{limit.name}": values}
-    more = breaking(course, [(0.6, 3.0)], columns)
+    beyond, inside = ({limit.name: (0.6, judged)} for judged in (3.0, 0.5))
+    more = breaking(course, beyond, columns)
     assert more.member.tolist() == [1, 4]
     assert set(more.seed) == {config.seeds(problem.tune.budget)[1]}
     course.members = course.members.joined(more, stressed=False)
     assert course.members.searched.member[:2].tolist() == [1, 4]
     assert course.members.part.member[:2].tolist() == [1, 4]
-    assert breaking(course, [(0.6, 3.0)], columns) is None
-    assert breaking(course, [(0.6, 0.5)], columns) is None  # it is held
+    assert breaking(course, beyond, columns) is None
+    assert breaking(course, inside, columns) is None  # it is held
+
+
+def test_after_saturated_injections_the_search_limits_the_voltage(monkeypatch):
+    """The linear peak is 8/V at a voltage of V volts. Injections saturate above 12 V and then measure more.
+
+    The least error is at 20 V. A smaller linear peak needs more volts, a smaller injected one fewer.
+    """
+    terms, peak = Bowl._terms, "settling_s"
+
+    def with_peak(self, x, members, along=None):
+        found = terms(self, x, members, along)
+        return found | {f"limit.{peak}": 8.0 / found["limit.rms_u_V"]}
+
+    def reached_of(limit, columns, injected):
+        more = max(8.0 / limit.reached(columns) / 12.0, 1.0) ** 4 if limit.name == peak else 1.0
+        return more * limit.reached(columns)
+
+    monkeypatch.setattr(Bowl, "_terms", with_peak)
+    saturating = SimpleNamespace(decides=False, saturates=True)
+    for name, one in (("injects", lambda problem: True), ("injections", lambda of: saturating)):
+        monkeypatch.setattr(multipliers, name, one)
+    monkeypatch.setattr(multipliers, "reached_of", reached_of)
+    problem = study(monkeypatch, World(), limits={peak: 1.0, "rms_u_V": 50.0})
+    course = Course(problem, training(problem), 1)
+    x, within = search_within_limits(course, first_search(course, np.array(World.best)))
+    assert within
+    # 20 V and 16 V are lowered to 80 %; one search of the method of multipliers leaves an excess of 2 %
+    assert problem.objective.space.gains_at(x)[1] == pytest.approx(60 * 0.8**2, rel=0.03)
+    (row,) = (row for row in limit_table._asked(course.problem) if row.name == "rms_u_V")
+    assert row.threshold == 50.0  # the report states the limit of the case
 
 
 @pytest.mark.parametrize(

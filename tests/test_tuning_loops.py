@@ -144,14 +144,16 @@ def test_a_lower_limit_holds_for_larger_values():
 
 
 @pytest.mark.slow
-def test_injections_find_the_members_with_the_largest_injected_peak():
-    """Set-valued signs without noise: one measurement of each plant.
+@pytest.mark.parametrize("signs", [True, False])
+def test_injections_find_the_members_with_the_largest_injected_peak(signs):
+    """Set-valued signs, or a voltage that saturates, without noise: one measurement of each plant.
 
     The order of the linear peaks differs from that of the injected ones.
     """
-    signs = {"position": {"c": 200.0, "k": 30.0}, "inversion": {"gamma": 1e7}, "current": {"k_i": 2000.0}}
-    document = DOCUMENT | {
-        "controller": {stage: law | {"p": math.inf} for stage, law in signs.items()},
+    laws = {"position": {"c": 200.0, "k": 30.0}, "inversion": {"gamma": 1e7}, "current": {"k_i": 2000.0}}
+    chattering = {"controller": {stage: law | {"p": math.inf} for stage, law in laws.items()}}
+    document = DOCUMENT | (chattering if signs else {"actuator": {"u_max": 75.0}})
+    document |= {
         "processor": {"delay": 1.0},
         "sensor": {"std": 0.0},
         "sensitivity": {"f_low": 20.0, "amplitude": 5e-5},
@@ -163,7 +165,7 @@ def test_injections_find_the_members_with_the_largest_injected_peak():
     count = 6
     columns = {"loss.limit.sensitivity": np.arange(count)[::-1] + 1.0, "lost_at_s": np.full(count, np.inf)}
     found = injections(JudgedMembers(problem, x, 1, columns))
-    assert found.decides
+    assert (found.decides, found.saturates) == (signs, not signs)
     case, masses = problem.case, problem.objective.chosen(1, np.arange(count), count).values["plant.m"]
     plants = [dataclasses.replace(case.scenario.plant, m=m) for m in masses]
     worlds, clock = [dataclasses.replace(case.scenario, plant=plant) for plant in plants], one_period(case)
@@ -175,10 +177,10 @@ def test_injections_find_the_members_with_the_largest_injected_peak():
     assert [one.member for one in found.peaks] == expected
     # the same signal, amplitude and plant, in another program
     assert [one.injected.peak for one in found.peaks] == pytest.approx([each[k].peak for k in expected], rel=1e-6)
-    # the order of the peaks of |KS| is another one
     columns = {"loss.limit.control_sensitivity": np.ones(count), "lost_at_s": columns["lost_at_s"]}
     by_KS = sorted(range(count), key=lambda k: -np.abs(each[k].KS).max())[:FEW]
-    assert [one.member for one in injections(JudgedMembers(problem, x, 1, columns)).peaks] == by_KS != expected
+    assert [one.member for one in injections(JudgedMembers(problem, x, 1, columns)).peaks] == by_KS
+    assert signs == (by_KS != expected)
 
 
 @pytest.mark.parametrize(

@@ -158,8 +158,8 @@ def _point(course: Course, one: Judged) -> FrontPoint:
     error, volts = (
         rms(columns[name][alive]) if alive.any() else math.nan for name in ("settled_rms_error_m", "settled_rms_u_V")
     )
-    values = {limit.name: judged for limit, (_, judged) in zip(limits, one.numbers, strict=True)}
-    others = [limit for limit in limits if limit.source != FRONT]
+    values = {name: judged for name, (_, judged) in one.numbers.items()}
+    others = [limit for limit in limits if limit.asked]
     within = all(limit.holds(values[limit.name]) for limit in others)
     reserve = all(limit.has_reserve(values[limit.name]) for limit in others)
     lost, stalled = (int(columns[name].sum()) for name in ("lost", "stalled"))

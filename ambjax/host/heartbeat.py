@@ -24,7 +24,8 @@ _quiet: list[bool] = []
 class Heartbeat:
     """Context manager that writes its text to stderr again and again while nothing else is written there.
 
-    Each line begins with the time since the beginning. On a terminal, such repetitions overwrite each other.
+    Each line begins with the time since the beginning. On a terminal, such repetitions overwrite each other. Of several
+    that run, only the last one entered writes.
     """
 
     lock = threading.RLock()  # of all heartbeats, because each line closes those of the others
@@ -41,13 +42,15 @@ class Heartbeat:
 
     def __exit__(self, *_: object) -> None:
         self.ended.set()
-        self.close()
+        for heartbeat in _running:
+            heartbeat.close()
         _running.remove(self)
 
     def _repeat(self) -> None:
         while not self.ended.wait(SILENCE / 9):
             with self.lock:
-                if self.text and time.monotonic() - self.written >= SILENCE and not bar_is_open():
+                inner = _running[-1:] == [self]  # the line of a command inside this one tells more
+                if inner and self.text and time.monotonic() - self.written >= SILENCE and not bar_is_open():
                     self.line(f"... {self.text}", passing=True)
 
     def line(self, text: str, *, passing: bool = False) -> None:

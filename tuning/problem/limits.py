@@ -38,6 +38,8 @@ MOST_STEPS = 5.0
 PREFIX = "limit."
 # Value of `Limit.source` for the limit on the rms error that traces the front of error against voltage.
 FRONT = "the front"
+# The same for a limit on the rms voltage that the search sets itself.
+SATURATION = "saturated injections"
 # Prefixes of the paths on which the bounds of quantities depend.
 PATHS = ("actuator.u_max", "actuator.coil.u_max", "reference.", "plant.s_0", "run.clearance")
 
@@ -75,9 +77,9 @@ class Limit:
     """A limit, and the state of its augmented Lagrangian.
 
     `name`: key of the quantity in KINDS. `threshold`: the limit, in the unit of the quantity. `source`: origin of the
-    limit (case file, default or FRONT), for the report. `margin`: relative distance that the search keeps from the
-    limit, on the allowed side. `multiplier`: of the augmented Lagrangian. `ratio`: the judge's
-    value divided by the search's value. `history`: (judge's value, multiplier) of every update.
+    limit (case file, default, FRONT or SATURATION), for the report. `margin`: relative distance that the search keeps
+    from the limit, on the allowed side. `multiplier`: of the augmented Lagrangian. `ratio`: the judge's value divided
+    by the search's value. `history`: (judge's value, multiplier) of every update.
     """
 
     name: str
@@ -87,6 +89,11 @@ class Limit:
     multiplier: float = 0.0
     ratio: float = 1.0
     history: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def asked(self) -> bool:
+        """Whether the limit is a requirement of [tune.limits], and not a means of the search."""
+        return self.source not in (FRONT, SATURATION)
 
     @property
     def kind(self) -> Kind:

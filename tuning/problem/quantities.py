@@ -26,6 +26,8 @@ LOOPS = 16
 NORM = 16
 # Differences of logarithms, of a goal or of a limited quantity, that are negligible: 1 %.
 NEGLIGIBLE = 0.01
+# Limited quantities that an injection measures.
+BY_INJECTION = {"sensitivity": "S", "complementary": "T", "control_sensitivity": "KS"}
 # Lower bound of the argument of a logarithm.
 TINY = 1e-30
 

@@ -17,7 +17,7 @@ from tuning.problem.lanes import Engine
 from tuning.problem.limits import FRONT, Limit, measures
 from tuning.problem.loss import HELD, TERMS, loss_for
 from tuning.problem.members import FEW, LoopRange, Members, Objective
-from tuning.problem.quantities import KINDS, LimitContext
+from tuning.problem.quantities import BY_INJECTION, KINDS, LimitContext
 from tuning.problem.ranges import Range, bounded
 
 # Ratio of the number of steps of the judge to that of the search, in continuous time. On a processor, it is the ratio
@@ -192,7 +192,9 @@ def problem_of(case: Case, tune: Tune, *, threads: int | None = None, front: boo
     limits = tune.limits
     front = front or tune.objective == "knee"
     loop = _loop_range(case, limits.each)
-    names = sorted({limit.name for limit in limits.each} | set(TRACED if front else ()))
+    asked = {limit.name for limit in limits.each}
+    # after saturated injections, the search limits the voltage
+    names = sorted(asked | set(TRACED if front else ("rms_u_V",) if asked & set(BY_INJECTION) else ()))
     names = [*(name for name in names if KINDS[name].fold), *(loop.names if loop else ())]
     context = LimitContext(
         case.settle, float(clock.duration), float(case.scenario.touchdown), limits.band, case.scenario.rotor

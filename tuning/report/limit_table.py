@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from tuning.judge.peaks import BY_INJECTION, DELAY_MARGIN, DelayTest, Sensitivity, not_simulated, reached_of
-from tuning.problem.limits import FRONT, Limit
-from tuning.problem.quantities import Kind
+from tuning.judge.peaks import DELAY_MARGIN, DelayTest, Sensitivity, not_simulated, reached_of
+from tuning.problem.limits import Limit
+from tuning.problem.quantities import BY_INJECTION, Kind
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.report.facts import Column, Row, table
 
@@ -115,8 +115,8 @@ def _tested(row: Row, delayed: DelayTest | None, refuted: str, reason: str = "")
 
 
 def _asked(problem: TuningProblem) -> list[Limit]:
-    """Return the limits of [tune.limits], without the limit that traces the front of error against voltage."""
-    found = {limit.name: limit for limit in problem.limits if limit.source != FRONT}
+    """Return the limits of [tune.limits], in the state of the last search."""
+    found = {limit.name: limit for limit in problem.limits if limit.asked}
     return [found.get(limit.name, limit) for limit in problem.tune.limits.each]
 
 

@@ -2,6 +2,9 @@
 
 The judge evaluates the limited quantities at each optimum, on members that the search does not use. At an optimum, the
 excess g of a limit is about (required multiplier - multiplier) / penalty. An update of the multiplier reduces it.
+
+An injection that saturates the voltage measures a larger peak than that of the linear loop, which the search evaluates.
+A lower linear peak then may need a higher voltage, which saturates more. So the search limits the voltage instead.
 """
 
 import dataclasses
@@ -11,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tuning.judge.evaluate import RESOLVED, JudgedMembers, held, judge
+from tuning.judge.evaluate import RESOLVED, JudgedMembers, held, judge, rms
 from tuning.judge.peaks import injections, injects, reached_of
 from tuning.problem.config import seeds
-from tuning.problem.limits import PREFIX, Limit
+from tuning.problem.limits import PREFIX, SATURATION, Limit
 from tuning.problem.members import Members
 from tuning.problem.quantities import NEGLIGIBLE
 from tuning.solve.course import Course
@@ -26,22 +29,29 @@ MOST_UPDATES = 6
 AVERAGING_MEMBERS = 256
 # Largest number of members that join at once for each reason.
 MOST_JOINING = 8
+# Bound of the rms voltage in the next search, relative to a voltage at which injections saturate it.
+LOWER = 0.8
 
 
 class Judged(NamedTuple):
     """An optimum, judged on members of the validation ensemble, or of the training ensemble if tune.validation is 0.
 
-    `x` [m]: coordinates. `numbers`: (the search's value, the judge's value) of each limit. `columns` [N]: metrics of
-    the judged members.
+    `x` [m]: coordinates. `numbers`: (the search's value, the judge's value) of each limit by name. `columns` [N]:
+    metrics of the judged members. `saturated`: linear values of the limits that only saturated injections break.
     """
 
     x: np.ndarray
-    numbers: list[tuple[float, float]]
+    numbers: Mapping[str, tuple[float, float]]
     columns: Mapping[str, np.ndarray]
+    saturated: Mapping[str, float] = {}
 
     def holds(self, limits: Sequence[Limit]) -> bool:
         """Return whether the judge's values are within all limits, without margins."""
-        return all(limit.holds(judged) for limit, (_, judged) in zip(limits, self.numbers, strict=True))
+        return all(limit.holds(self.numbers[limit.name][1]) for limit in limits if limit.source != SATURATION)
+
+    def linear(self, limit: Limit) -> float:
+        """Return the judge's value of a limit, or the linear one if only saturated injections break the limit."""
+        return self.saturated.get(limit.name, self.numbers[limit.name][1])
 
 
 def search_within_limits(course: Course, x: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -90,18 +100,34 @@ def _updated(course: Course, one: Judged, moved: bool) -> bool:
     """Update the multipliers at a judged optimum. Return whether all limits are met there.
 
     A limit is met if the judge's value is close to the bound, or within it if its multiplier was and stays 0. If the
-    search has not `moved`, it suffices that no limit is broken. Tells each limit that is active or not met.
+    search has not `moved`, it suffices that no limit is broken. Tells each limit that is active or not met. If only
+    saturated injections break a limit, its multiplier follows the linear value, and the voltage is limited.
     """
-    before = course.problem.limits
-    after = tuple(limit.updated(*found) for limit, found in zip(before, one.numbers, strict=True))
-    course.problem, done = course.problem.limited(after), []
-    for old, new, (_, judged) in zip(before, after, one.numbers, strict=True):
-        idle = old.multiplier == new.multiplier == 0
+    before, numbers = course.problem.limits, one.numbers
+    after = tuple(limit.updated(numbers[limit.name][0], one.linear(limit)) for limit in before)
+    done = []
+    for old, new in zip(before, after, strict=True):
+        judged, idle = numbers[new.name][1], old.multiplier == new.multiplier == 0
         close = new.log_excess(judged) >= -NEGLIGIBLE and new.has_reserve(judged)
-        done.append(close or (idle and new.log_excess(judged) <= 0))
+        done.append(close or (idle and new.log_excess(judged) <= 0) or new.source == SATURATION)
         if not (idle and done[-1]):
             _tell(course, new, judged)
+    if one.saturated:
+        after = _lower(course, one, after)
+    course.problem = course.problem.limited(after)
     return all(done) or (not moved and one.holds(after))
+
+
+def _lower(course: Course, one: Judged, limits: Sequence[Limit]) -> tuple[Limit, ...]:
+    """Return the limits with a limit on the rms voltage that is LOWER times the voltage of the judged members."""
+    alive = held(one.columns)
+    volts = LOWER * rms(one.columns["settled_rms_u_V"][alive]) if alive.any() else 0.0
+    if not volts > 0:
+        return tuple(limits)
+    own = next((limit for limit in limits if limit.name == "rms_u_V"), Limit("rms_u_V", volts))
+    own = dataclasses.replace(own, threshold=min(volts, own.threshold), source=SATURATION, history=())
+    course.tell(f"injections saturate the voltage; the search continues with at most {own.threshold:.3g} V rms")
+    return tuple(sorted([*(one for one in limits if one.name != own.name), own], key=lambda limit: limit.name))
 
 
 def _tell(course: Course, limit: Limit, judged: float) -> None:
@@ -117,7 +143,8 @@ def join_breaking(course: Course, one: Judged) -> bool:
     if more is None:
         return False
     limits = course.problem.limits
-    for limit, (_, judged) in zip(limits, one.numbers, strict=True):
+    for limit in limits:
+        judged = one.numbers[limit.name][1]
         if limit.kind.worst and not limit.has_reserve(judged):
             _tell(course, limit, judged)
     course.tell(f"{len(more.member)} validation members that break a limit join the training ensemble")
@@ -140,7 +167,7 @@ def largest_unseen(course: Course, values: np.ndarray) -> np.ndarray:
 
 
 def breaking(
-    course: Course, numbers: Sequence[tuple[float, float]], columns: Mapping[str, np.ndarray]
+    course: Course, numbers: Mapping[str, tuple[float, float]], columns: Mapping[str, np.ndarray]
 ) -> Members | None:
     """Return the validation members that explain a broken limit and are not in the training ensemble, or None.
 
@@ -148,13 +175,14 @@ def breaking(
     reserve. For a limit on a mean, they are the members with the largest values, if the judged value breaks the limit
     and exceeds its expected value, the search's value times `Limit.ratio`, by more than RESOLVED.
 
-    `numbers`: the values of the search and of the judge for each limit. `columns` [N]: metrics of the judged members.
+    `numbers`: the values of the search and of the judge by limit. `columns` [N]: metrics of the judged members.
     """
     problem, budget = course.problem, course.problem.tune.budget
     if not budget.validation:
         return None
     found = np.zeros(0, int)
-    for limit, (tuned, judged) in zip(problem.limits, numbers, strict=True):
+    for limit in problem.limits:
+        tuned, judged = numbers[limit.name]
         excess = np.where(held(columns), limit.log_excess(limit.values(columns)), -math.inf)
         if limit.kind.worst and not limit.has_reserve(judged):
             found = np.append(found, largest_unseen(course, np.where(excess > 0, excess, -math.inf)))
@@ -176,7 +204,13 @@ def judged_at(course: Course, x: np.ndarray) -> Judged:
     course.tell(f"judging the limits on {count} members")
     of = JudgedMembers(problem, x, seed, judge(problem, x, seed, count))
     terms, n = problem.engine.terms(x[None], course.members), course.members.ordinary
-    tuned = [float(limit.kind.tuned(terms[PREFIX + limit.name][0, :n])) for limit in problem.limits]
     injected = injections(of) if injects(problem) else None
-    judged = [reached_of(limit, of.columns, injected) for limit in problem.limits]
-    return Judged(x, list(zip(tuned, judged, strict=True)), of.columns)
+    numbers, saturated = dict[str, tuple[float, float]](), dict[str, float]()
+    for limit in problem.limits:
+        tuned = float(limit.kind.tuned(terms[PREFIX + limit.name][0, :n]))
+        judged, linear = reached_of(limit, of.columns, injected), limit.reached(of.columns)
+        numbers[limit.name] = tuned, judged
+        nonlinear = injected is not None and not injected.decides and injected.saturates
+        if nonlinear and judged > (1 + RESOLVED) * linear and not limit.has_reserve(judged):
+            saturated[limit.name] = linear
+    return Judged(x, numbers, of.columns, saturated)
