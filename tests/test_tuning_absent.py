@@ -72,7 +72,13 @@ def sensitivities():
         one, continuous = peak_of(linear, injected), injected == "none"
         beside = known | INJECTED["none"] if continuous else known
         for members in ([one], [one, beside], [beside, one]):
-            yield {"members": members, "injected": not continuous, "decides": decides, "zones": [3.0, 4.0, 5.0]}
+            yield {
+                "members": members,
+                "injected": not continuous,
+                "decides": decides,
+                "tried": decides,
+                "zones": [3.0, 4.0, 5.0],
+            }
 
 
 @pytest.mark.parametrize("kind", SAID)

@@ -12,9 +12,9 @@ NO_PEAK = {"D": "unstable", None: "not computed"}
 
 
 def facts(zones: Zones, found: Sensitivity) -> Row:
-    """Return plain data: a row for each member, and the limits of the zones.
+    """Return plain data: a row for each member, the limits of the zones, and how the members were chosen.
 
-    Fields of a row:
+    `tried`: by one injection into each of many members, not by linear peaks. Fields of a row:
 
     - `linear`, `frequency_hz`, `zone`: peak of |S| of the linearised loop. If it is not stable, they are None, None and
       "D"; if it could not be computed, all are None. `why`: which of the two, with the cause; '' otherwise.
@@ -25,7 +25,8 @@ def facts(zones: Zones, found: Sensitivity) -> Row:
     """
     injected = any(one.injected for one in found.peaks)
     rows = [_row(one, zones) for one in found.peaks]
-    return {"members": rows, "injected": injected, "decides": found.decides, "zones": zones.limits}
+    tried = found.decides or found.saturates
+    return {"members": rows, "injected": injected, "decides": found.decides, "tried": tried, "zones": zones.limits}
 
 
 def _row(one: MemberPeak, zones: Zones) -> Row:
@@ -98,13 +99,11 @@ def section(found: Row | None) -> list[str]:
     }
     a, b, c = found["zones"]
     words = [f"Zone A is below {a:g}, B below {b:g}, C below {c:g}."]
+    chosen = f"peaks by one injection into each of up to {MOST_TESTED} members" if found["tried"] else "linear peaks"
+    words.append(f"The members are those with the largest {chosen}.")
     if found["decides"]:
-        words.append(
-            f"The members are those with the largest peaks by one injection into each of up to {MOST_TESTED} members. "
-            "A sign is set-valued: the injected peak decides, because no linear loop describes chattering."
-        )
+        words.append("A sign is set-valued: the injected peak decides, because no linear loop describes chattering.")
     else:
-        words.append("The members are those with the largest linear peaks.")
         words.append(f"The {'larger of the linear and the injected' if found['injected'] else 'linear'} peak decides.")
     if any(row["saturated"] for row in found["members"]):
         words.append(
