@@ -330,6 +330,8 @@ def test_the_best_answer_within_the_limits_is_taken_if_the_multipliers_do_not_co
     monkeypatch.setattr(course, "search", lambda points, earlier, evolve: at[next(found)])
     x, within = search_within_limits(course, at[ends[0]])
     np.testing.assert_array_equal(x, at[25.0])
+    (limit,) = course.problem.limits  # that of the search which ended there
+    assert len(limit.history) == ends.index(25.0)
     assert within
     assert next(found, None) is None
 

@@ -37,12 +37,14 @@ class Judged(NamedTuple):
     """An optimum, judged on members of the validation ensemble, or of the training ensemble if tune.validation is 0.
 
     `x` [m]: coordinates. `numbers`: (the search's value, the judge's value) of each limit by name. `columns` [N]:
-    metrics of the judged members. `saturated`: linear values of the limits that only saturated injections break.
+    metrics of the judged members. `limits`: those of the search that ended here. `saturated`: linear values of the
+    limits that only saturated injections break.
     """
 
     x: np.ndarray
     numbers: Mapping[str, tuple[float, float]]
     columns: Mapping[str, np.ndarray]
+    limits: tuple[Limit, ...] = ()
     saturated: Mapping[str, float] = {}
 
     def holds(self, limits: Sequence[Limit]) -> bool:
@@ -59,19 +61,21 @@ def search_within_limits(course: Course, x: np.ndarray) -> tuple[np.ndarray, boo
 
     The result is the last optimum. If the searches do not converge, it is the optimum of least goal within all limits,
     if there is one: the judge may measure very different values on either side of a limit, and the searches then
-    alternate between the sides.
+    alternate between the sides. Later searches begin with the multipliers of this optimum.
     """
     limits = course.problem.limits
     if not limits:
         return x, True
     seen, converged = optima(course, x)
-    within = [one.x for one in seen if one.holds(limits)]
+    within = [one for one in seen if one.holds(limits)]
     if converged or not within:
-        return seen[-1].x, bool(within) and within[-1] is seen[-1].x
+        return seen[-1].x, bool(within) and within[-1] is seen[-1]
     course.tell("the multipliers of the limits do not converge; the best answer within the limits is taken")
     goal = dataclasses.replace(course.problem.goal, limits=())
-    terms = course.problem.engine.terms(np.array(within), course.members)
-    return within[int(np.argmin(goal.score(terms, course.members)))], True
+    terms = course.problem.engine.terms(np.array([one.x for one in within]), course.members)
+    best = within[int(np.argmin(goal.score(terms, course.members)))]
+    course.problem = course.problem.limited(best.limits)
+    return best.x, True
 
 
 def optima(course: Course, x: np.ndarray, updates: int = MOST_UPDATES) -> tuple[list[Judged], bool]:
@@ -213,4 +217,4 @@ def judged_at(course: Course, x: np.ndarray) -> Judged:
         nonlinear = injected is not None and not injected.decides and injected.saturates
         if nonlinear and judged > (1 + RESOLVED) * linear and not limit.has_reserve(judged):
             saturated[limit.name] = linear
-    return Judged(x, numbers, of.columns, saturated)
+    return Judged(x, numbers, of.columns, problem.limits, saturated)
