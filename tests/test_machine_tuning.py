@@ -233,7 +233,6 @@ def test_refused_options(tmp_path, capsys, options):
 @pytest.mark.slow  # compiles no other peaks than the tests above
 def test_command(tmp_path, capsys):
     text = template("machine").replace("duration = 0.2", "duration = 2e-3").replace("settle = 0.05", "settle = 0.0")
-    text = text.replace("speed = 6000.0 ", "speed = 60000.0 ")  # two turns in the run
     parts = '[controller.inversion]\nkind = "linearised"\n[controller.current]\nkind = "pi"\n'
     budget = "starts = 1\niterations = 1\nheld_out = 2\nlimits.sensitivity = 2.5\n"
     tune = f"[tune]\ngains = {json.dumps(SLIDING)}\n{budget}"
@@ -271,8 +270,9 @@ def test_command(tmp_path, capsys):
     facts = judged(pushed, pushed, {"max_u_V": 1e6}, 0, 2)
     assert (facts["outcome"]["held"], facts["limits"][0]["holds"]) == (0, False)
     assert "all limits met" not in facts["verdict"]
-    # each limit at the speed holds or breaks by itself
-    turning = machine_from(raw | {"sensitivity": {"speeds": [12000.0]}})
+    # two turns in the run: each limit at the speed holds or breaks by itself
+    fast = {"rotor": raw["rotor"] | {"speed": 60000.0}, "sensitivity": {"speeds": [12000.0]}}
+    turning = machine_from(raw | fast)
     one = {"z_1x_m": 1.0, "i_1x_A": 9.0, "sensitivity_1x": 99.0}
     values = judged(turning, turning, one, 0, 2)["metrics"]
     (point,) = turning_machines(turning.machine, 5e-5, turning.speeds)
