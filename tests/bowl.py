@@ -7,6 +7,7 @@ limit of its own. The search's own step reports an error that is too large by a 
 
 import dataclasses
 import functools
+import json
 import math
 from collections.abc import Callable
 
@@ -157,16 +158,8 @@ BUDGET = {
 def document(tables=None, **tune):
     """A case file whose two gains are tuned, as read from TOML; `tables` replace those of CASE."""
     limits = {"sensitivity": math.inf} | tune.pop("limits", {})
-    settings = {
-        "objective": "least_error",
-        "gains": PATHS,
-        "bounds": BOUNDS,
-        "weights": {"effort": 0.0},
-        "limits": limits,
-        **BUDGET,
-        **tune,
-    }
-    return CASE | (tables or {}) | {"tune": settings}
+    settings = {"objective": "least_error", "gains": PATHS, "bounds": BOUNDS, "weights": {"effort": 0.0}} | BUDGET
+    return CASE | (tables or {}) | {"tune": settings | {"limits": limits} | tune}
 
 
 def instead_of_engines(monkeypatch, world):
@@ -201,3 +194,15 @@ def case_file(folder, **tune):
     path = folder / "case.toml"
     path.write_text(dumps(document(**tune)))
     return path, folder / "out"
+
+
+def command(monkeypatch, folder, capsys, world, *flags, **tune):
+    """Run `ambjax tune` without pictures in a world: exit code, facts, stdout, stderr and output folder."""
+    import tuning.report.folder
+    from tuning.__main__ import main
+
+    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: None)
+    study(monkeypatch, world, **tune)
+    path, out = case_file(folder, **tune)
+    code = main([str(path), "--out", str(out), *flags])
+    return code, json.loads((out / "report.json").read_text()), *capsys.readouterr(), out

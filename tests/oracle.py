@@ -26,10 +26,11 @@ class World:
 
     plant: dict = field(default_factory=dict)  # what differs from Table 1
     model: dict = field(default_factory=dict)  # what the controller believes to differ from the true plant
-    observer: tuple = ("direct", {})
+    observer: tuple = ("direct", {})  # ("complementary", {"l"[, "z_hat"]})
+    # or ("super-twisting", {"c", "k_1", "k_2", "p"})
     position: tuple = ("sliding-mode", {"c": 17.0, "k": 25.0, "p": 25.0})
-    inversion: tuple = ("adaptive", {"gamma": 7.5e4, "p": 25.0, "i_ref": 0.0})
-    current: tuple = ("sliding-mode", {"k_i": 152.0, "p": 25.0})
+    inversion: tuple = ("adaptive", {"gamma": 7.5e4, "p": 25.0, "i_ref": 0.0})  # ("closed-form", {"i_ref"})
+    current: tuple = ("sliding-mode", {"k_i": 152.0, "p": 25.0})  # ("pi", {"k_p", "k_int", "k_aw"})
     reference: tuple = REST
     q_z: tuple = QUIET  # m/s^2
     q_v: tuple = QUIET  # A^2/m^2, times the true plant's kappa / (4 m)

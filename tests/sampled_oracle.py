@@ -28,7 +28,8 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from oracle import QUIET, REST, TABLE_1, Body, _edges, _pulse, _reference
+import oracle
+from oracle import TABLE_1, Body, _edges, _pulse, _reference
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
@@ -37,28 +38,14 @@ SLIVER = 1e-9  # of a period: a piece shorter than this is rounding, not a piece
 
 
 @dataclass(frozen=True)
-class World:
-    """Numbers only, SI units. A law, a reference or a disturbance is (kind, its parameters)."""
+class World(oracle.World):
+    """More observers: ("difference", {"w"}), ("kalman", {"w"}), ("ired-1", {"L"}), ("ired-2", {"L"})."""
 
     kind: str = "lumped"  # or "two-coil": of the true plant; the controller's model is always lumped
-    plant: dict = field(default_factory=dict)  # what differs from Table 1
-    model: dict = field(default_factory=dict)  # what the controller believes to differ from the true plant
     period: float = 1e-4
     delay: float = 1.0  # samples
     discretisation: str = "implicit"  # or "explicit"
     predict: bool = True
-    observer: tuple = ("direct", {})  # ("complementary", {"l"[, "z_hat"]})
-    # ("difference", {"w"}), ("kalman", {"w"}), ("ired-1", {"L"}), ("ired-2", {"L"})
-    # or ("super-twisting", {"c", "k_1", "k_2", "p"})
-    position: tuple = ("sliding-mode", {"c": 17.0, "k": 25.0, "p": 25.0})
-    inversion: tuple = ("adaptive", {"gamma": 7.5e4, "p": 25.0, "i_ref": 0.0})  # ("closed-form", {"i_ref"})
-    current: tuple = ("sliding-mode", {"k_i": 152.0, "p": 25.0})  # ("pi", {"k_p", "k_int", "k_aw"})
-    reference: tuple = REST
-    q_z: tuple = QUIET  # m/s^2
-    q_v: tuple = QUIET  # A^2/m^2, times the true plant's kappa / (4 m)
-    q_i: tuple = QUIET  # A/s
-    initial: tuple = (0.0, 0.0, 0.0)  # z, z_dot, i
-    u_max: float = math.inf
     bits: int | None = None
     range_z: float = 5e-3
     range_i: float = 0.5

@@ -339,11 +339,8 @@ def uncommented(name):
 def test_the_template_lists_every_key_of_tune_with_its_default(name):
     document = uncommented(name)
     table, nothing = document["tune"], {"nothing": 1}
-    for keys, wrong in (
-        (table, nothing),
-        (table["weights"], {"weights": nothing}),
-        (table["limits"], {"limits": nothing}),
-    ):
+    within = {name: {name: nothing} for name in ("weights", "limits")}
+    for keys, wrong in ((table, nothing), *((table[name], one) for name, one in within.items())):
         with pytest.raises(ValueError, match="Keys allowed here") as refused:
             read_tune(write(dumps({"tune": wrong})))
         assert set(keys) == set(str(refused.value).partition("Keys allowed here: ")[2].rstrip(".").split(", "))

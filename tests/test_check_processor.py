@@ -6,6 +6,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from test_sampled import loop_with
 
 import ambjax as amb
 from ambjax.cases.reader import case_from
@@ -86,15 +87,6 @@ def test_a_sign_law_stays_in_its_band_and_reaches_its_ends(implicit, p):
     assert max(np.abs(x[200:]).max() for x in runs) >= (0.999 if implicit else 0.3) * limit
 
 
-def cascade_of(c, k, gamma, k_i, p, **how):
-    return amb.Cascade(
-        position=amb.laws.position.SlidingMode(c, k, p),
-        inversion=amb.laws.inversion.Adaptive(gamma, p),
-        current=amb.laws.current.SlidingMode(k_i, p),
-        processor=Processor(**how),
-    )
-
-
 HARD, SOFT = (200.0, 25.0, 2e6, 2000.0, INF), (17.0, 25.0, 2e5, 152.0, 25.0)
 WORLD = amb.Scenario(reference=amb.signals.Sine(2.5e-3, 2.0))
 CLOCK, LONG = (amb.Clock(samples, 1e-4, amb.solvers.RK4(4)) for samples in (600, 3000))
@@ -109,16 +101,16 @@ def random_loop(name, draw):
     gamma, p = 10 ** draw.uniform(5.0, 7.0), 10 ** draw.uniform(0.5, 2.0)
     world = {"reference": amb.signals.Sine(draw.uniform(0.5e-3, 2.5e-3), 2.0), "u_max": draw.uniform(100.0, 2e3)}
     if name == "estimated, two coils":
-        cascade = cascade_of(c, k, gamma, k_i, INF, delay=draw.uniform(0.1, 0.9))
+        cascade = loop_with(c, k, gamma, k_i, INF, delay=draw.uniform(0.1, 0.9))
         cascade = dataclasses.replace(cascade, observer=amb.laws.observer.Kalman(draw.uniform(300.0, 1500.0)))
         sensor = amb.sensors.Sensor(10 ** draw.uniform(-8, -6), 0.0, 1e-5, bits=16, velocity=False)
         return cascade, amb.Scenario(plant=TwoCoil(m=draw.uniform(0.5, 0.7)), sensor=sensor, **world)
     if name == "late, amplifier":
-        cascade = cascade_of(c, k, gamma, k_i, p, delay=draw.uniform(0.1, 0.9), predict=False)
+        cascade = loop_with(c, k, gamma, k_i, p, delay=draw.uniform(0.1, 0.9), predict=False)
         cascade = dataclasses.replace(cascade, observer=amb.laws.observer.Complementary(draw.uniform(1.0, 50.0)))
         amplifier = Amplifier(bandwidth=draw.uniform(1e3, 5e3))
         return cascade, amb.Scenario(sensor=amb.sensors.Sensor(1e-6, 1e-4, 1e-4), amplifier=amplifier, **world)
-    return cascade_of(c, k, gamma, k_i, p, implicit=False, delay=draw.uniform(0.1, 0.9), predict=True), amb.Scenario(
+    return loop_with(c, k, gamma, k_i, p, implicit=False, delay=draw.uniform(0.1, 0.9), predict=True), amb.Scenario(
         initial=amb.Initial(draw.uniform(-1e-4, 1e-4)), **world
     )
 
@@ -144,7 +136,7 @@ def test_measured_signals_do_not_exceed_their_bounds(name):
 def test_bounds_are_tight_without_an_estimate():
     """An implicit set-valued sign reaches its bound. With smoothed signs, the signal reaches at least half of it."""
     for gains, share in ((HARD, 0.999), (SOFT, 0.5)):
-        lines = sampled_report.check_sampled(cascade_of(*gains, delay=0.0), WORLD, LONG, 0.1).bands
+        lines = sampled_report.check_sampled(loop_with(*gains, delay=0.0), WORLD, LONG, 0.1).bands
         assert [line.signal for line in lines] == ["sigma", "v_tilde", "e"]
         for line in lines:
             # u is 0 before the first sample, so the sensors' signals are the plant's: nothing is off but i_ref's sample
@@ -217,13 +209,13 @@ def test_the_poles_of_a_law_are_those_of_its_theory(law, implicit, radius):
 
 
 def test_a_sign_one_sample_late_is_unstable():
-    hard, soft = cascade_of(*HARD, delay=1.0), cascade_of(*SOFT, delay=1.0, predict=False)
+    hard, soft = loop_with(*HARD, delay=1.0), loop_with(*SOFT, delay=1.0, predict=False)
     late = dataclasses.replace(hard, processor=Processor(1.0, predict=False))
     assert [one.holds for one in law_poles(hard, CLOCK)] == [True, True, True]
     assert [one.holds for one in law_poles(late, CLOCK)] == [False, True, False]
     assert [one.holds for one in law_poles(soft, CLOCK)] == [True, True, True]
     # the term c e_dot of the position law acts at the start of a sample: 1 - c T = -2 beside the sign
-    (position, *_) = law_poles(cascade_of(3e4, 25.0, 2e6, 2000.0, 25.0), CLOCK)
+    (position, *_) = law_poles(loop_with(3e4, 25.0, 2e6, 2000.0, 25.0), CLOCK)
     assert position.radius > 1.9
     assert not position.holds
 
@@ -245,7 +237,7 @@ BEYOND = amb.Scenario(
 
 def test_the_distance_to_the_singular_curve_is_that_of_the_sampled_run():
     clock, world = amb.Clock(300, 1e-4), dataclasses.replace(BEYOND, u_max=500.0)
-    crossing = cascade_of(200.0, 1000.0, 1e8, 2000.0, INF, delay=0.0)
+    crossing = loop_with(200.0, 1000.0, 1e8, 2000.0, INF, delay=0.0)
     sampled = sampled_report.check_sampled(crossing, world, clock, 0.005)
     trajectory = amb.rollout(crossing, world, clock).trajectory
     assert np.isfinite(trajectory.singular_at)
@@ -274,23 +266,23 @@ def test_a_linear_inversion_may_cross_the_singular_curve():
 
 
 def test_the_margin_is_between_a_delay_that_holds_and_one_that_does_not():
-    cascade, clock = cascade_of(*HARD, delay=0.0, predict=False), amb.Clock(600, 1e-4, amb.solvers.RK4(1))
+    cascade, clock = loop_with(*HARD, delay=0.0, predict=False), amb.Clock(600, 1e-4, amb.solvers.RK4(1))
     margin = delay_margin(cascade, WORLD, clock)
     # the sign itself, one sample late: an oscillation that does not decay, and the steps of the position law on top
     assert 0.5 < margin.held < margin.lost <= 1.0
     assert margin.step == pytest.approx(2 / (DELAYS - 1))
     assert margin.resolution == pytest.approx(margin.step / (DELAYS - 1))
     for delay, lost in zip(margin[:2], (False, True), strict=True):
-        late = cascade_of(*HARD, delay=delay, predict=False)
+        late = loop_with(*HARD, delay=delay, predict=False)
         assert np.isfinite(amb.rollout(late, WORLD, clock, record_every=0).trajectory.lost_at) == lost
     # if the rotor is lost at the delay of the case, the answer names the delays at which it is held
-    beyond = delay_margin(cascade_of(*HARD, delay=1.5, predict=False), WORLD, clock)
+    beyond = delay_margin(loop_with(*HARD, delay=1.5, predict=False), WORLD, clock)
     assert 0.5 < beyond.held < beyond.lost < 1.1
 
 
 @pytest.mark.slow
 def test_the_delay_margin_without_a_known_delay_is_smaller():
-    cascade, clock = cascade_of(*HARD, delay=1.0), amb.Clock(600, 1e-4, amb.solvers.RK4(1))
+    cascade, clock = loop_with(*HARD, delay=1.0), amb.Clock(600, 1e-4, amb.solvers.RK4(1))
     margin = delay_margin(cascade, WORLD, clock, known=False)
     # a prediction that knows it holds the rotor up to 2 samples and more
     assert 1.0 < margin.held < margin.lost < 1.9
@@ -302,7 +294,7 @@ def test_a_loss_in_a_narrow_interval_of_delays_is_found(monkeypatch):
     """The loop is replaced by one that is lost from 0.704 to 0.716 samples only, and stalls at one delay."""
     monkeypatch.setattr(searched, "run_ensemble", delays)
     delays.stalled, delays.lost = (-1.0, -1.0), (0.704, 0.716)
-    cascade, clock = cascade_of(*HARD, delay=0.0), amb.Clock(300, 1e-4, amb.solvers.RK4(1))
+    cascade, clock = loop_with(*HARD, delay=0.0), amb.Clock(300, 1e-4, amb.solvers.RK4(1))
     margin = delay_margin(cascade, WORLD, clock)
     assert 0.704 - 2 / 256**2 <= margin.held < 0.704 <= margin.lost < 0.704 + 2 / 256**2
     # beyond two samples the steps are longer, and the result says so
@@ -320,7 +312,7 @@ def test_a_delay_whose_run_stalls_is_neither_held_nor_lost(monkeypatch):
     delays.stalled, delays.lost = (0.6, 0.9), (1.5, INF)
 
     def margin(own):
-        return delay_margin(cascade_of(*HARD, delay=own), WORLD, amb.Clock(300, 1e-4, amb.solvers.RK4(1)))
+        return delay_margin(loop_with(*HARD, delay=own), WORLD, amb.Clock(300, 1e-4, amb.solvers.RK4(1)))
 
     near = 2 / 256**2
     stall, loss = pytest.approx(0.6, abs=near), pytest.approx(1.5, abs=near)
@@ -353,7 +345,7 @@ def test_a_stalled_run_on_a_processor_is_reported_as_undecided():
     assert "gamma" not in said  # laws that are stepped stall no integrator
     # one trial step a sample, where the tolerance takes more
     stalling = amb.Clock(10, 1e-4, amb.solvers.AdaptiveRodas3(1e-12, most_steps=1))
-    found = sampled_report.check_sampled(cascade_of(*HARD, delay=1.0), WORLD, stalling, 0.0)
+    found = sampled_report.check_sampled(loop_with(*HARD, delay=1.0), WORLD, stalling, 0.0)
     assert found.stalled
     assert not found.bands
 

@@ -219,7 +219,7 @@ def test_files_of_an_earlier_run_are_overwritten_only_with_force(capsys):
 
 @pytest.mark.slow
 def test_check_exits_with_0_if_the_conditions_hold_and_1_otherwise(capsys):
-    sine = SHORT + '[reference]\nkind = "sine"\namplitude = 2.5e-3\nfrequency = 2.0\n'
+    sine = SHORT.replace("0.05", "0.02") + '[reference]\nkind = "sine"\namplitude = 2.5e-3\nfrequency = 2.0\n'
     assert main(["check", write(sine), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["holds"] is True
     no = write(sine + "[controller.inversion]\ngamma = 1000.0\n[initial]\ni = 0.3\n")

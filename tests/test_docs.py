@@ -171,7 +171,7 @@ def numbers_of(raw):
 
 @pytest.mark.slow
 def test_metrics_and_arrays_are_those_of_the_files(tmp_path):
-    case = write("[clock]\nduration = 0.01\n[rotor]\nspeed = 30000.0\n", str(tmp_path / "short.toml"))
+    case = write("[clock]\nduration = 0.01\n[rotor]\nspeed = 30000.0\n[processor]\n", str(tmp_path / "short.toml"))
     assert main(["simulate", case, "--out", str(tmp_path / "run")]) == 0
     written = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert {row[0].strip("`") for row in metrics.rows()} == {*written, "trajectory_deviation"}  # the last with --member

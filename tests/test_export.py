@@ -122,13 +122,13 @@ CASCADES = {
         processor=Processor(0.5),
     ),
     "integral sliding mode, Kalman": hard(observer=observer.Kalman(), position=position.IntegralSlidingMode(p=INF)),
-    "Utkin's sliding mode, a difference": hard(
+    "Utkin's sliding mode, a difference, feed-forward, dead-beat": hard(
         observer=observer.Difference(),
         position=position.UtkinSlidingMode(k=2.3, p=INF),
-        inversion=inversion.ClosedForm(),
+        inversion=inversion.FeedForwardAdaptive(8e5, INF),
+        current=current.DeadBeat(),
     ),
     "terminal sliding mode": hard(position=position.TerminalSlidingMode()),
-    "feed-forward, dead-beat": hard(inversion=inversion.FeedForwardAdaptive(8e5, INF), current=current.DeadBeat()),
     "a differentiator, explicit": hard(observer=observer.IRED2(), processor=Processor(2.0, implicit=False)),
     "Kalman": hard(observer=observer.Kalman()),
 }

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from sampled_oracle import simulate
-from test_sampled import DIFFERENCE, KALMAN, NOISE, TRACKING, World, hard, loop_of, noise_of, soft
+from test_oracle import noise_of
+from test_sampled import DIFFERENCE, KALMAN, NOISE, TRACKING, World, hard, loop_of, soft
 
 import ambjax as amb
 from ambjax.cases.reader import case_from

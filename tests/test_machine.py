@@ -236,9 +236,11 @@ def test_runout_turns_with_the_rotor():
 
 
 @pytest.mark.slow
-def test_a_machine_is_differentiable_and_an_ensemble_has_one_entry_per_member(machine):
+def test_a_machine_is_differentiable_and_an_ensemble_has_one_entry_per_member():
+    processor = MACHINE["processor"] | {"predict": False, "guard": False}  # compiles faster
+    machine = machine_from(short(MACHINE, 20, sensor={"velocity": False}, processor=processor), "machine")
     fold = PerAxis(jax.tree.map(lambda *x: np.stack(x), *[canonical(Rms("z"))] * 5))
-    whole, clock, fold = canonical((machine.machine, dataclasses.replace(machine.clock, samples=20), fold))
+    whole, clock, fold = canonical((machine.machine, machine.clock, fold))
     whole, clock, fold = jax.tree.map(jnp.asarray, (whole, clock, fold))
 
     @jax.jit

@@ -42,11 +42,8 @@ def test_a_lost_rotor_without_an_equilibrium_has_a_verdict(tmp_path, capsys):
 
 
 def test_the_check_says_why_there_is_no_test_with_more_modes():
-    assert machine_check._spill_over(with_rotor(modes=20)) == (
-        {},
-        "the rotor has 20 already, the largest number",
-        False,
-    )
+    full = machine_check._spill_over(with_rotor(modes=20))
+    assert full == ({}, "the rotor has 20 already, the largest number", False)
     rigid = read_machine(tomllib.loads(template("machine")))
     assert machine_check._spill_over(rigid)[1] == "only a rotor of the kind shaft or of a file has further modes"
 

@@ -64,7 +64,7 @@ def made(world, std, samples):
     cascade, scenario, _ = in_ambjax(case)
     if any(std):
         scenario = dataclasses.replace(scenario, sensor=Sensor(*std))
-    return cascade, scenario, noise_of(case, scenario)
+    return cascade, scenario, noise_of(scenario, samples)
 
 
 def measured(cascade, scenario, samples, method, fold):

@@ -144,11 +144,11 @@ def in_ambjax(case):
     return cascade, scenario, amb.Clock(case.samples, 1e-4)
 
 
-def noise_of(case, scenario):
+def noise_of(scenario, samples):
     """Return the errors that ambjax draws, as data for the independent solution."""
     if scenario.sensor is None:
         return None
-    errors = jax.vmap(lambda k: scenario.sensor.noise(scenario.words(), k))(np.arange(case.samples))
+    errors = jax.jit(jax.vmap(lambda k: scenario.sensor.noise(scenario.words(), k)))(np.arange(samples))
     return np.stack(errors, axis=1)
 
 
@@ -162,7 +162,7 @@ def test_the_rotor_moves_as_in_the_independent_solution(case, record_property):
         return trajectory.rows
 
     rows = run(clock)
-    z = solve(case.world, np.asarray(rows.t), noise_of(case, scenario), method=case.solver)
+    z = solve(case.world, np.asarray(rows.t), noise_of(scenario, case.samples), method=case.solver)
     by_itself = np.abs(rows.z - z).max()
     tight = np.abs(run(clock.with_method(case.tight)).z - z).max()
     record_property("error_m", (float(by_itself), float(tight)))

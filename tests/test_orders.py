@@ -81,11 +81,9 @@ def test_without_a_whole_revolution_nothing_is_known():
 
 @pytest.mark.slow
 def test_every_axis_of_a_machine_has_them():
-    raw = tomllib.loads(template("machine"))
-    turning = {"rotor": raw["rotor"] | {"speed": 6000.0}, "clock": raw["clock"] | {"duration": 0.05}}
-    case = machine_from(raw | turning | {"run": {"settle": 0.02}}, "m")
+    case = machine_from(tomllib.loads(template("machine")), "m")
     run = simulate_machine(case)
-    settled = run.signals["t"] >= 0.02  # three revolutions
+    settled = run.signals["t"] >= case.settle  # fifteen revolutions
     turn = 2 * np.pi * 100.0 * run.signals["t"][settled]
     basis = np.stack([np.ones_like(turn), *(f(k * turn) for k in (1, 2) for f in (np.cos, np.sin))], 1)
     fits = np.linalg.lstsq(basis, run.signals["z"][settled], rcond=None)[0]

@@ -209,18 +209,14 @@ def typed(tab, path, text):
 
 
 @in_browser
-def test_the_trajectory_with_noise_equals_the_simulator(fresh, case):
-    rows = simulate(case).trajectory.rows
+def test_the_trajectory_with_noise_and_the_metrics_equal_the_simulator(fresh, case):
+    run = simulate(case)
+    rows, metrics = run.trajectory.rows, run.metrics
     # equal to the order of rounding; an error would be at least the noise, 5e-7 m
     for name, tolerance in (("z", 1e-13), ("z_measured", 1e-13), ("u", 1e-6), ("i", 1e-9), ("r", 0)):
         np.testing.assert_allclose(signal(fresh, name), getattr(rows, name), rtol=0, atol=tolerance, err_msg=name)
     upper = float(case.scenario.plant.i_0) + np.asarray(rows.i)
     np.testing.assert_allclose(signal(fresh, "i_1"), upper, rtol=0, atol=1e-9)
-
-
-@in_browser
-def test_the_metrics_equal_the_simulator(fresh, case):
-    metrics = simulate(case).metrics
     found = fresh.run("ambjax.state.metrics")
     assert set(found) == set(metrics)
     for name, value in metrics.items():

@@ -140,7 +140,7 @@ def test_results_of_a_chaotic_loop_do_not_depend_on_the_division_of_the_ensemble
 
 LOST = """
 [clock]
-duration = 0.05
+duration = 0.02
 [controller.inversion]
 gamma = 1000.0
 [reference]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from sampled_oracle import World, simulate
-from test_oracle import adaptive, current, pulse, sine, smc, smoothstep, twisting
+from test_oracle import adaptive, current, noise_of, pulse, sine, smc, smoothstep, twisting
 
 import ambjax as amb
 from ambjax.cases.controller_tables import KINDS
@@ -126,13 +126,6 @@ def loop_of(world, samples, std):
     return amb.Cascade(**laws, model=model, processor=processor), scenario, amb.Clock(samples, world.period)
 
 
-def noise_of(scenario, samples):
-    if scenario.sensor is None:
-        return None
-    drawn = jax.jit(jax.vmap(lambda n: scenario.sensor.noise(scenario.words(), n)))(np.arange(samples))
-    return np.stack(drawn, axis=-1)
-
-
 def how_slow(name):
     return () if name in FAST else pytest.mark.slow
 
@@ -151,15 +144,18 @@ def test_sampled_loops_agree_with_the_independent_simulator(case):
     np.testing.assert_allclose(rows.u, run.u, rtol=0, atol=1e-6 * largest)
 
 
-def cascade_of(p=INF, **processor):
-    """Gains that hold the rotor at 10 kHz with a sample of delay, under noise and on 200 V."""
-    c, k, gamma, k_i = 1440.0, 2.3, 8e5, 870.0
+def loop_with(c, k, gamma, k_i, p, **processor):
     return amb.Cascade(
         position=amb.laws.position.SlidingMode(c, k, p),
         inversion=amb.laws.inversion.Adaptive(gamma, p),
         current=amb.laws.current.SlidingMode(k_i, p),
         processor=Processor(**processor),
     )
+
+
+def cascade_of(p=INF, **processor):
+    """Gains that hold the rotor at 10 kHz with a sample of delay, under noise and on 200 V."""
+    return loop_with(1440.0, 2.3, 8e5, 870.0, p, **processor)
 
 
 @pytest.mark.parametrize("wrong", [{}, pytest.param({"predict": False, "model": WRONG}, marks=pytest.mark.slow)])

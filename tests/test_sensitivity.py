@@ -141,7 +141,9 @@ def test_bad_input_is_refused_in_one_line(tmp_path, capsys, text, flags, message
     assert not (tmp_path / "out").exists()
 
 
-CHECKED = "[controller]\n[clock]\nduration = 0.02\n[actuator]\nu_max = 200.0\n"
+# The reference and the duration are those of the other tests of `check`, which share a compiled program.
+CHECKED = "[reference]\nkind = 'sine'\namplitude = 1e-3\nfrequency = 2.0\n[clock]\nduration = 0.02\n"
+CHECKED += "[actuator]\nu_max = 200.0\n"
 
 
 @pytest.mark.thorough

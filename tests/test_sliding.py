@@ -27,13 +27,10 @@ def cascade(c, k, gamma, k_i, p=25.0, **more):
     )
 
 
+OBSERVED = cascade(551.0, 108.0, 2.9e5, 367.0, observer=observer.Complementary(1.0, 0.0))
 NOISY = {
     "direct": (cascade(2190.0, 37.0, 1.66e6, 238.0), Sensor(1e-6, 1e-4, 1e-4), 200.0),
-    "behind an observer": (
-        cascade(551.0, 108.0, 2.9e5, 367.0, observer=observer.Complementary(1.0, 0.0)),
-        Sensor(3.1623e-4),
-        200.0,
-    ),
+    "behind an observer": (OBSERVED, Sensor(3.1623e-4), 200.0),
     "fast current loop": (cascade(181.0, 202.0, 1.3e6, 3800.0), Sensor(1e-5, 1e-4, 1e-4), 500.0),
 }
 

@@ -205,54 +205,35 @@ BAD = {
     "start after stop": ("disturbance.q_z.start = { uniform = [0.5, 1.4] }", ["q_z.start", "1.4", "1.3", "q_z.shift"]),
     "unknown design": ('design = "halton"', ["spread.design", '"halton"', "'sobol'"]),
 }  # fmt: skip
+BITS = "processor = {}\nsensor.bits = 12\nspread.sensor.bits = "
+# Whole files.
+UNFIT = {
+    "number": ("spread = 3", ["spread = 3", "table"]),
+    "no sensor": ("spread.sensor.std = { uniform = [0, 1e-6] }", ["spread.sensor.std", "add the table [sensor]"]),
+    "unit": ('disturbance.q_z = { kind = "constant", unit = "A^2/m^2" }\nspread.disturbance.q_z.value.normal = 1',
+             ["spread.disturbance.q_z.value", "m/s^2"]),
+    "band": ('disturbance.q_z = { kind = "band-noise", std = 1, f_low = 5, f_high = 9 }\n'
+             "spread.disturbance.q_z.f_low.uniform = [1, 9]", ["spread.disturbance.q_z.f_low", "Narrow the range."]),
+    # the nominal 7.5e4 allows this step, 1.5 times it does not
+    "step": ('clock = { dt = 2e-6, method = "rk4" }\nspread.controller.inversion.gamma.percent = 50',
+             ["clock.dt = 2e-06", "stable only up to 1.56e-06"]),
+    "range of bits": (BITS + "{ uniform = [8.0, 14.0] }",
+                      ["spread.sensor.bits = { uniform = [8, 14] }", "a whole number from 2 to 32. Use choices"]),
+    "half a bit": (BITS + "{ choices = [8, 8.5, 14] }",
+                   ["spread.sensor.bits = { choices = [8, 8.5, 14] }", "a whole number from 2 to 32. Use choices"]),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("wrong", BAD)
+@pytest.mark.parametrize("wrong", [*BAD, *UNFIT])
 def test_a_bad_spread_is_refused_in_one_line(wrong):
-    lines, wanted = BAD[wrong]
+    lines, wanted = (BAD | UNFIT)[wrong]
     with pytest.raises(ValueError) as refused:  # noqa: PT011 (the words are in the table)
-        case_from(tomllib.loads(f"{CASE}[spread]\n{lines}\n"))
+        case_from(tomllib.loads(f"{CASE}[spread]\n{lines}\n" if wrong in BAD else lines))
     message = str(refused.value)
     assert "\n" not in message
-    assert message.startswith("spread.")
+    assert message.startswith("spread.") or wrong in UNFIT
     for part in wanted:
         assert part in message
-
-
-@pytest.mark.parametrize(
-    ("text", "wanted"),
-    [
-        ("spread = 3", ["spread = 3", "table"]),
-        ("spread.sensor.std = { uniform = [0, 1e-6] }", ["spread.sensor.std", "add the table [sensor]"]),
-        (
-            'disturbance.q_z = { kind = "constant", unit = "A^2/m^2" }\nspread.disturbance.q_z.value = { normal = 1 }',
-            ["spread.disturbance.q_z.value", "m/s^2"],
-        ),
-        (
-            'disturbance.q_z = { kind = "band-noise", std = 1, f_low = 5, f_high = 9 }\n'
-            "spread.disturbance.q_z.f_low = { uniform = [1, 9] }",
-            ["spread.disturbance.q_z.f_low", "Narrow the range."],
-        ),
-        (
-            # the nominal 7.5e4 allows this step, 1.5 times it does not
-            'clock = { dt = 2e-6, method = "rk4" }\nspread.controller.inversion.gamma = { percent = 50 }',
-            ["clock.dt = 2e-06", "stable only up to 1.56e-06"],
-        ),
-        (
-            "processor = {}\nsensor.bits = 12\nspread.sensor.bits = { uniform = [8.0, 14.0] }",
-            ["spread.sensor.bits = { uniform = [8, 14] }", "a whole number from 2 to 32. Use choices"],
-        ),
-        (
-            "processor = {}\nsensor.bits = 12\nspread.sensor.bits = { choices = [8, 8.5, 14] }",
-            ["spread.sensor.bits = { choices = [8, 8.5, 14] }", "a whole number from 2 to 32. Use choices"],
-        ),
-    ],
-)
-def test_spreads_that_do_not_fit_the_case_are_refused(text, wanted):
-    with pytest.raises(ValueError) as refused:  # noqa: PT011
-        case_from(tomllib.loads(text))
-    for part in wanted:
-        assert part in str(refused.value)
 
 
 def test_whole_numbers_are_spread_by_choices():

@@ -37,7 +37,8 @@ def test_help_and_version_import_no_numerical_package(program, option):
                  marks=pytest.mark.thorough),
 ])  # fmt: skip
 def test_a_command_imports_only_the_packages_that_it_needs(tmp_path, command, unneeded):
-    case = write("[clock]\nduration = 0.01\n", tmp_path / "short.toml")
+    sine = "kind = 'sine'\namplitude = 1e-3\nfrequency = 2.0\n"
+    case = write(f"[clock]\nduration = 0.02\n[reference]\n{sine}", tmp_path / "short.toml")
     found = loaded("ambjax", command, case, *(("--out", tmp_path) if command == "simulate" else ()))
     assert "jax" in found
     assert not found & unneeded

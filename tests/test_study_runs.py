@@ -42,9 +42,10 @@ plant.m = {{ percent = 10 }}
 initial.z = {{ normal = 1e-6 }}
 """
 TINY = CASE.format(duration="2e-3")
-# Some 50 ms for each chunk, so that something can happen in the middle of a run.
-LONGER, MEMBERS, CHUNKS = CASE.format(duration="0.05"), 1536, 48
-RUN = ["ensemble", "case.toml", "--members", str(MEMBERS), "--chunk", "32", "--seed", "3"]
+# A tenth of a second and two calls of the compiled program for each chunk, so that something can happen in the middle
+# of a run. The last one is no whole chunk.
+LONGER, MEMBERS, CHUNK, CHUNKS = CASE.format(duration="0.05"), 1500, 96, 16
+RUN = ["ensemble", "case.toml", "--members", str(MEMBERS), "--chunk", str(CHUNK), "--seed", "3"]
 
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -101,26 +102,6 @@ def result(out):
     return pathlib.Path(out, "members.npz").read_bytes()
 
 
-# --- where it runs ---
-
-
-@pytest.mark.slow
-def test_several_processes_give_the_same_file(capsys, monkeypatch):
-    write(TINY)
-    # a chunk is several calls of the compiled program, and the last one is no whole chunk
-    argv = ["ensemble", "case.toml", "--members", "200", "--chunk", "128", "--seed", "3"]
-    with monkeypatch.context() as hasty:
-        hasty.setattr(study_report, "_pictures", lambda *_: None)
-        assert main([*argv, "--out", "here"]) == 0
-    assert main([*argv, "--out", "there", "--processes", "2"]) == 0
-    assert result("here") == result("there")
-    written = capsys.readouterr().out.splitlines()[-1]
-    assert written == "written: there/members.npz, summary.json, fan.png, histograms.png, tornado.png"
-    for path in written.removeprefix("written: there/").split(", "):
-        assert pathlib.Path("there", path).stat().st_size > 0
-    assert not list(pathlib.Path("there").glob("chunks"))
-
-
 @pytest.mark.thorough
 def test_a_cluster_gives_the_same_file_if_a_worker_is_killed(no_pictures):
     distributed = pytest.importorskip("distributed")
@@ -155,10 +136,10 @@ def test_ctrl_c_keeps_the_finished_chunks_and_prints_the_command_to_resume(flags
     assert running.returncode == 130
     assert group_ends(running.pid)
     kept = finished_chunks("out")
-    assert 2 <= kept < many // 32
+    assert 2 <= kept < many // CHUNK
     said = [line for line in err.splitlines() if line.startswith("ambjax: ")]
     again = "To continue, repeat the command with --out out --resume."
-    assert said == [f"ambjax: interrupted: {32 * kept} of {many} members are kept. {again}"]
+    assert said == [f"ambjax: interrupted: {CHUNK * kept} of {many} members are kept. {again}"]
     assert "Traceback" not in err
     for path in pathlib.Path("out", "chunks").glob("*.npz"):
         with np.load(path) as chunk:
@@ -204,14 +185,16 @@ sys.exit(main())
 
 
 @pytest.mark.slow
-def test_a_study_killed_at_any_instant_and_resumed_gives_the_same_file(no_pictures):
+def test_a_study_killed_at_any_instant_and_resumed_on_other_processes_gives_the_same_file(capsys, monkeypatch):
     write(LONGER)
-    assert main([*RUN, "--out", "whole"]) == 0
+    with monkeypatch.context() as hasty:
+        hasty.setattr(study_report, "_pictures", lambda *_: None)
+        assert main([*RUN, "--out", "whole"]) == 0
     dice, early = random.Random(11), 0
     count = examples(1, 10)
     for n in range(count):
-        out, flags = f"cut-{n}", [[], ["--processes", "2"]][n % 2]
-        running = begin(out, *flags)
+        out, places = f"cut-{n}", [[], ["--processes", "2"]]
+        running = begin(out, *places[n % 2])
         after = dice.randrange(CHUNKS)
         wait_for(lambda out=out, after=after: finished_chunks(out) >= after or done(out), running)
         time.sleep(dice.uniform(0, 0.2))
@@ -220,9 +203,13 @@ def test_a_study_killed_at_any_instant_and_resumed_gives_the_same_file(no_pictur
         assert group_ends(running.pid), "a worker process outlives its parent"
         early += not done(out)
         resume = ["--resume"] if pathlib.Path(out, "study.json").exists() else []
-        assert main([*RUN, "--out", out, *resume]) == 0
+        assert main([*RUN, "--out", out, *places[1 - n % 2], *resume]) == 0
         assert result(out) == result("whole")
         assert not pathlib.Path(out, "chunks").exists()
+        written = capsys.readouterr().out.splitlines()[-1]
+        assert written == f"written: {out}/members.npz, summary.json, fan.png, histograms.png, tornado.png"
+        for path in written.removeprefix(f"written: {out}/").split(", "):
+            assert pathlib.Path(out, path).stat().st_size > 0
     assert early >= count / 2, "the runs were over before they could be killed"
 
 

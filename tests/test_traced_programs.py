@@ -8,7 +8,6 @@ import jax
 import numpy as np
 import pytest
 
-from ambjax.cases.template_text import template
 from ambjax.compiler import traced_programs
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.compiler.short_compilation import compiled_quickly
@@ -44,7 +43,7 @@ def stored(folder):
 
 @pytest.mark.slow
 def test_a_process_traces_nothing_that_another_one_has_traced(tmp_path):
-    (tmp_path / "case.toml").write_text(template("rig"))
+    (tmp_path / "case.toml").write_text("processor = {}\nclock.duration = 0.01\ncontroller.position.kind = 'pid'\n")
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
     del environment["JAX_COMPILATION_CACHE_DIR"]
     shown = []

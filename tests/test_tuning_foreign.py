@@ -174,15 +174,8 @@ def test_the_tuned_file_gives_the_tuned_cascade(laws):
 
 def write(path, text, **tune):
     document = tomllib.loads(text)
-    document["tune"] = {
-        "objective": "least_error",
-        "members": 8,
-        "held_out": 100,
-        "validation": 100,
-        "screen": 32,
-        "iterations": 8,
-        "limits": {"sensitivity": math.inf},
-    } | tune
+    budget = {"members": 8, "held_out": 100, "validation": 100, "screen": 32, "iterations": 8}
+    document["tune"] = {"objective": "least_error", "limits": {"sensitivity": math.inf}} | budget | tune
     document["clock"] = {"duration": 0.2}
     document["run"] = {"settle": 0.05}
     if pulse := document.get("disturbance", {}).get("q_z"):

@@ -1,17 +1,13 @@
 """The front of error against voltage, and its knee: on formulas with a known answer, in report and case files."""
 
-import json
 import math
 
 import numpy as np
 import pytest
-from bowl import FLOOR, RARE_FROM, S_0, World, case_file, document, study
+from bowl import FLOOR, RARE_FROM, S_0, World, command, document, study
 from texts import case_and_tune
 
-import tuning.command
-import tuning.report.folder
 from ambjax.cases.reader import read_case
-from tuning.__main__ import main
 from tuning.front import KNEE, FrontPoint, chosen, least_of
 from tuning.problem.config import seeds
 from tuning.problem.limits import FRONT
@@ -24,16 +20,7 @@ BOUNDLESS = {"controller": {"position": {"c": [1.0, 1000.0], "k": [0.1, 1000.0]}
 
 @pytest.fixture
 def ran(monkeypatch, tmp_path, capsys):
-    """Run the command on a Bowl without pictures: exit code, facts, the verdict printed, folder."""
-    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: None)
-
-    def run(pareto=True, **tune):
-        study(monkeypatch, World(), **tune)
-        path, out = case_file(tmp_path, **tune)
-        code = main([str(path), "--out", str(out), *["--pareto"] * pareto])
-        return code, json.loads((out / "report.json").read_text()), capsys.readouterr().out, out
-
-    return run
+    return lambda *flags, **tune: command(monkeypatch, tmp_path, capsys, World(), *flags, **tune)
 
 
 def least_voltage(factor):
@@ -46,7 +33,7 @@ def least_voltage(factor):
 
 @pytest.mark.slow
 def test_the_knee_is_the_least_voltage_within_25_percent_of_the_least_error(ran):
-    code, facts, out, folder = ran(objective="knee", front=3, bounds=BOUNDLESS)
+    code, facts, out, _, folder = ran("--pareto", objective="knee", front=3, bounds=BOUNDLESS)
     rows = {row["factor"]: row for row in facts["front"]}
     least = S_0 * math.sqrt(FLOOR)
     assert code == 0
@@ -94,7 +81,7 @@ def test_members_of_rare_large_errors_join_the_search(monkeypatch, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("pareto", [False, True])
 def test_least_error_is_the_answer_with_and_without_its_front(pareto, ran):
-    code, facts, out, folder = ran(pareto=pareto, front=1, bounds=BOUNDLESS)
+    code, facts, out, _, folder = ran(*["--pareto"] * pareto, front=1, bounds=BOUNDLESS)
     assert code == 0
     rows = facts.get("front", [])
     assert [(row["factor"], row["taken"]) for row in rows] == ([(1, True), (1.25, False)] if pareto else [])

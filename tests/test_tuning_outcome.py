@@ -1,13 +1,12 @@
 """Exit code, log, report, JSON and tuned.toml agree for each kind of outcome."""
 
-import json
 import math
 import re
 import types
 
 import numpy as np
 import pytest
-from bowl import World, case_file, study
+from bowl import World, command
 
 import tuning.command
 import tuning.report.folder
@@ -16,7 +15,6 @@ from ambjax.cases.tune_table import Budget
 from ambjax.control.cascade import Cascade
 from ambjax.linear import Findings
 from ambjax.text.web_page import escape_markdown
-from tuning.__main__ import main
 from tuning.judge.evaluate import summarise
 from tuning.problem.config import seeds
 from tuning.problem.limits import Limit
@@ -62,18 +60,8 @@ OUTCOMES = {
 
 @pytest.fixture
 def ran(monkeypatch, tmp_path, capsys):
-    """Run the command on a Bowl without pictures. Return exit code, facts, stdout, stderr and folder."""
-    monkeypatch.setattr(tuning.report.folder, "_pictures", lambda *_: None)
     monkeypatch.setattr(tuning.rounds, "MOST_ROUNDS", 1)
-
-    def run(world, tune):
-        study(monkeypatch, world, **tune)
-        path, out = case_file(tmp_path, **tune)
-        code = main([str(path), "--out", str(out), "--force"])
-        said = capsys.readouterr()
-        return code, json.loads((out / "report.json").read_text()), said.out, said.err, out
-
-    return run
+    return lambda world, tune: command(monkeypatch, tmp_path, capsys, world, "--force", **tune)
 
 
 @pytest.mark.parametrize("kind", OUTCOMES)

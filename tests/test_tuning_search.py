@@ -267,6 +267,13 @@ def test_a_resumed_search_is_the_uninterrupted_one(small, tmp_path):
 # --- [tune] ---
 
 
+C = "controller.position.c"
+
+
+def bounds(**ends):
+    return {"bounds": {"controller": {"position": ends}}}
+
+
 def parsed(tune, **tables):
     document = {"sensor": {"std": 1e-6}, **tables, "tune": tune}
     return case_and_tune(document)[1]
@@ -275,7 +282,7 @@ def parsed(tune, **tables):
 def test_everything_in_tune_has_a_default():
     tune = parsed({})
     assert tune.space.paths == [f"controller.{path}" for path in PATHS]
-    cvar = parsed({"risk": "cvar", "alpha": 0.8, "bounds": {"controller": {"position": {"c": [1, 100]}}}})
+    cvar = parsed({"risk": "cvar", "alpha": 0.8} | bounds(c=[1, 100]))
     assert cvar.risk == CVaR(0.8)
     assert (cvar.space.gains[0].low, cvar.space.gains[0].high) == (1.0, 100.0)
 
@@ -284,24 +291,15 @@ def test_everything_in_tune_has_a_default():
     ("tune", "says"),
     [
         ({"gains": []}, "tune.gains is empty"),
-        ({"gains": ["controller.position.cc"]}, "Did you mean 'controller.position.c'"),
-        (
-            {"gains": ["controller.position.c", "plant.m"]},
-            "tune.gains: 'plant.m': there is no such number to tune in this case. There are: ",
-        ),
-        (
-            {"bounds": {"controller": {"position": {"cc": [1, 2]}}}},
-            "tune.bounds: 'controller.position.cc': there is no such number to tune in this case. Did you mean 'c",
-        ),
+        ({"gains": [f"{C}c"]}, f"Did you mean '{C}'"),
+        ({"gains": [C, "plant.m"]}, "tune.gains: 'plant.m': there is no such number to tune in this case. There are: "),
+        (bounds(cc=[1, 2]), f"tune.bounds: '{C}c': there is no such number to tune in this case. Did you mean 'c"),
         ({"gains": "c"}, "give a list of paths"),
         ({"objective": "knees"}, "Did you mean 'knee'"),
         ({"weights": {"tracking": 0.0}}, "no term of the loss depends on the error"),
         ({"weights": {"survival": 0.0}}, "losing the rotor would cost nothing"),
-        ({"bounds": {"controller": {"position": {"c": [5, 2]}}}}, "low < high"),
-        (
-            {"gains": ["controller.position.c"], "bounds": {"controller": {"position": {"k": [5, 9]}}}},
-            "not in tune.gains",
-        ),
+        (bounds(c=[5, 2]), "low < high"),
+        ({"gains": [C]} | bounds(k=[5, 9]), "not in tune.gains"),
         ({"alpha": 0.5}, "applies to risk"),
         ({"memebrs": 3}, "Did you mean 'members'"),
     ],

@@ -56,22 +56,11 @@ def test_the_judge_evaluates_every_held_out_member_once(monkeypatch):
 
 def test_a_summary_is_pooled_and_counts_the_lost_and_the_stalled():
     errors, lost_at = np.array([1.0, 2.0, 3.0, 6.0]) * 1e-6, np.array([np.inf, np.inf, 0.01, 0.02])
-    found = {
-        "settled_rms_error_m": errors,
-        "settled_max_abs_error_m": 2 * errors,
-        "lost_at_s": lost_at,
-        "lost": lost_at == 0.01,
-        "stalled": lost_at == 0.02,
-    }
+    found = {"settled_rms_error_m": errors, "settled_max_abs_error_m": 2 * errors}
+    found |= {"lost_at_s": lost_at, "lost": lost_at == 0.01, "stalled": lost_at == 0.02}
     pooled = summarise(found)
     # the status of a stalled member is not known: it counts neither as lost nor as a survivor
-    assert (pooled["members"], pooled["lost"], pooled["stalled"], pooled["held"], pooled["survival"]) == (
-        4,
-        1,
-        1,
-        2,
-        0.5,
-    )
+    assert [pooled[one] for one in ("members", "lost", "stalled", "held", "survival")] == [4, 1, 1, 2, 0.5]
     theirs = stats.binomtest(2, 4).proportion_ci(0.95, method="wilson")
     assert (pooled["survival_low"], pooled["survival_high"]) == pytest.approx((theirs.low, theirs.high))
     assert pooled["settled_rms_error_m"] == pytest.approx(math.sqrt(2.5) * 1e-6)  # of the two that are held
@@ -198,12 +187,11 @@ def test_an_unfinished_search_is_kept_and_only_resumed_with_resume(monkeypatch, 
         command(monkeypatch, tmp_path, World())
     assert {path.name for path in (out / "checkpoints").glob("*.npz")} == left | {mine.name}
     command(monkeypatch, tmp_path, World(), force=True)  # it has ended: its checkpoints go
-    os.utime(out / "report.json", (0, 0))  # of the search before the one whose checkpoints these are
-    with pytest.raises(ValueError, match=r"not ended. Continue it with resume=True, discard it with force=True"):
-        command(monkeypatch, tmp_path, World())
-    (out / "report.json").unlink()
-    with pytest.raises(ValueError, match=r"not ended. Continue it with resume=True, discard it with force=True"):
-        command(monkeypatch, tmp_path, World())
+    report = out / "report.json"
+    for spoil in (lambda: os.utime(report, (0, 0)), report.unlink):  # of the search before that of these checkpoints
+        spoil()
+        with pytest.raises(ValueError, match=r"not ended. Continue it with resume=True, discard it with force=True"):
+            command(monkeypatch, tmp_path, World())
     assert {path.name for path in (out / "checkpoints").glob("*.npz")} == left | {mine.name}
     (out / "checkpoints" / "round-99.npz").touch()
     command(monkeypatch, tmp_path, World(), force=True)

@@ -112,11 +112,8 @@ def test_the_report_lists_a_limit_that_cannot_be_broken(monkeypatch):
     problem = study(monkeypatch, World(), limits={"max_u_V": 250.0, "rms_u_V": 150.0})
     assert [limit.name for limit in problem.limits] == ["rms_u_V"]
     rows = limit_table.facts(problem, {}, {"members": 0, "held": 0})
-    assert [(row["name"], row["verdict"]) for row in rows] == [
-        ("rms_u_V", "not judged"),
-        ("max_u_V", "cannot be broken"),
-        ("survival", "not judged"),
-    ]
+    verdicts = [("rms_u_V", "not judged"), ("max_u_V", "cannot be broken"), ("survival", "not judged")]
+    assert [(row["name"], row["verdict"]) for row in rows] == verdicts
     text = "\n".join(limit_table.section(rows))
     assert "| `max_u_V` | at most 250 V | - | - | cannot be broken |" in text
     assert "cannot be broken: |u| is at most 200 V (actuator.u_max)" in text

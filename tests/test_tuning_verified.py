@@ -89,10 +89,8 @@ def test_steps_are_compared_without_the_converter(small):
     converted = problem_from(
         SMALL.replace("std = 2e-7", "std = 2e-7\nbits = 12").replace("ity = inf", "ity = 3.0") + "[processor]\n"
     )
-    compared = [one.objective for one in converted.steps]
-    assert [(one.scenario.sensor.bits, one.loop) for one in compared] == [
-        (None, None)
-    ] * 2  # linear loops have no steps
+    compared = [(one.objective.scenario.sensor.bits, one.objective.loop) for one in converted.steps]
+    assert compared == [(None, None)] * 2  # linear loops have no steps
     assert converted.engine.objective.scenario.sensor.bits == 12
     assert converted.engine.objective.loop is not None
     ours, accurate = (engine.objective.clock.method for engine in converted.steps)
