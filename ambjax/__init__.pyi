@@ -12,9 +12,9 @@ from ambjax import signals as signals
 from ambjax import solvers as solvers
 from ambjax import theorem as theorem
 from ambjax._version import __version__ as __version__
-from ambjax.cases.controller_file import save_controller as save_controller
 from ambjax.cases.machine_case import MachineCase as MachineCase
 from ambjax.cases.machine_case import read_machine as read_machine
+from ambjax.cases.named_files import save_controller as save_controller
 from ambjax.cases.reader import Case as Case
 from ambjax.cases.template_text import template as template
 from ambjax.cases.warned import read_case as read_case

@@ -80,7 +80,7 @@ def fan_of(name, force, every):
     study = study_of(found, 3, 16)
     data = study.bands(16, found.clock.samples // every)
     shown = {name: _quantiles(x, data.extremes.get(name)) for name, x in data.signals.items()}
-    panels = fans.fan(data.t, shown, {}, "", data.trajectory.lost_at).axes[: len(shown)]
+    panels = fans.fan(data.t, shown, {}, "", data.trajectory.lost_at, np.zeros(16)).axes[: len(shown)]
     return data, {name: (ax.lines[0], ax.collections) for name, ax in zip(shown, panels, strict=True)}
 
 

@@ -72,9 +72,7 @@ def test_a_stall_is_neither_held_nor_lost():
     report = Report([Condition("x", "", 2.0, 1.0, 0.0, "", True)], [], 0.01, "stalled", "", True)
     nothing = noise(0, stalled=True)
     uncertain = Uncertain([], ["m -10 %"], 0.0)
-    evidence = Evidence(
-        run, run, trajectory, {True: run}, report, report, [nothing] * 3, Survival(0.0, 1e-7), uncertain
-    )
+    evidence = Evidence(run, run, {True: run}, report, report, [nothing] * 3, Survival(0.0, 1e-7), uncertain)
     (rows, scans, sampled) = (
         judge_claims({"x": evidence}),
         noise_table({"x": evidence}),

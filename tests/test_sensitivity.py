@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+import types
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from ambjax.commands.comparison_loop import loop_of_axis
 from ambjax.commands.sensitivity_report import UNSTABLE, WITHOUT, _measured_numbers, text_of
 from ambjax.linear import MemberPeaks, Stability, StateSpace, Zones, analyse, linearise
 from ambjax.linear.state_space import CommandPath
-from ambjax.pictures.frequency import MeasuredPoints, NamedLoop, frequency_figure
+from ambjax.pictures.frequency import frequency_figure
 from ambjax.results import operating
 from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import rollout
@@ -256,8 +257,8 @@ def test_the_picture_shows_the_response_and_the_injected_points(tmp_path):
     system = linearise(case.cascade, case.scenario, case.clock)
     f = np.array([10.0, 50.0, 200.0])
     H = system.response(f)
-    measured = MeasuredPoints(f, H[:, 0, 0], H[:, 0, 0] - 1, H[:, 2, 0])
-    loop = NamedLoop("nominal", system, 0.588, 0.02)
+    measured = types.SimpleNamespace(frequency=f, S=H[:, 0, 0], T=H[:, 0, 0] - 1, KS=H[:, 2, 0])
+    loop = operating.operating_point(case, "nominal", 0.0)
     axes = frequency_figure("x", [loop], [3.0, 4.0, 5.0], (1.0, 500.0), measured).axes
     lines = [(ax.get_ylabel(), line) for ax in axes for line in ax.get_lines()]
     curves = {ax.get_ylabel(): ax.get_lines()[0].get_xydata() for ax in axes}

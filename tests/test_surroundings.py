@@ -169,7 +169,7 @@ def test_a_missing_device_is_reported_in_one_line(error, monkeypatch, capsys):
 
 
 def test_pictures_do_not_depend_on_a_matplotlibrc():
-    bars = [histograms.Bar(**dict.fromkeys(histograms.Bar._fields, 0.5) | {"path": "plant.m"})]
+    bars = [{"path": "plant.m", "share": 0.5, "low": 0.5, "high": 0.5, "rho": 0.5}]
     with matplotlib.rc_context({"text.usetex": True, "font.size": 30, "axes.facecolor": "red"}):
         save(histograms.tornado(bars, "rms_u_V", "all"), pathlib.Path("theirs.png"))
     save(histograms.tornado(bars, "rms_u_V", "all"), pathlib.Path("ours.png"))

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.cases.controller_file import controller_file
+from ambjax.cases.named_files import controller_file
 from ambjax.cases.reader import Case
 from ambjax.cases.rotor_tables import MODES, RIGID
 from ambjax.cases.speed_table import listed_speeds

@@ -12,11 +12,10 @@ import jax
 import numpy as np
 
 from ambjax.cases.case_table import notebook_table, parts_of
-from ambjax.cases.controller_file import ControllerFile
 from ambjax.cases.controller_tables import KINDS, cascade_from, notch_from, with_gains_of_notch
+from ambjax.cases.named_files import CaseFiles, NamedFile
 from ambjax.cases.own_laws import OwnLaw
 from ambjax.cases.reach import check_reference
-from ambjax.cases.recordings import CaseFiles, RecordedFile
 from ambjax.cases.scenario_tables import check_start, scenario_from
 from ambjax.cases.table import FILE, Table, check_depth, cut, load, put, require_file, text_of
 from ambjax.cases.timing import clock_from
@@ -67,8 +66,8 @@ class Case:
     `clock`: its integration method is valid for all values of the spread. `settle`: time from which
     "settled" metrics count, s. `text`: the file as it was read. `assumed`: names of the plant's parameters that the
     file omits while it gives others; they keep the paper's values. Empty if the file gives all or none. `own_laws`: the
-    custom laws that the file names. `controller_file`: the linear controller that the file names, or None. `zones`:
-    range and limits of the sensitivity. `recorded`: the files of recorded signals.
+    custom laws that the file names. `zones`: range and limits of the sensitivity. `files`: the linear controller and
+    the recorded signals that the file names.
 
     A case is a pytree of its cascade, scenario and clock, so it is an argument of functions under jit and vmap.
     """
@@ -82,9 +81,8 @@ class Case:
     text: str = ""
     assumed: tuple[str, ...] = ()
     own_laws: tuple[OwnLaw, ...] = ()
-    controller_file: ControllerFile | None = None
     zones: Zones = Zones()
-    recorded: tuple[RecordedFile, ...] = ()
+    files: tuple[NamedFile, ...] = ()
 
     def __post_init__(self) -> None:
         for name, kind in {"name": str, "cascade": Cascade, "scenario": Scenario, "clock": Clock}.items():
@@ -206,8 +204,8 @@ def case_from(
     assumed = _left_out(top.table("plant"), plant)
     zones = top.table("sensitivity").record(Zones)
     zones.check(clock.sample_period if cascade.sampled else None)
-    own, recorded, name = tuple(files.own_laws), tuple(files.recorded), safe_name(name)
-    return Case(name, cascade, scenario, clock, settle, spread, text, assumed, own, files.controller, zones, recorded)
+    own, read, name = tuple(files.own_laws), tuple(files.files), safe_name(name)
+    return Case(name, cascade, scenario, clock, settle, spread, text, assumed, own, zones, read)
 
 
 def is_as_written(case: Case) -> bool:

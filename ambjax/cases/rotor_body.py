@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.cases.recordings import CaseFiles
+from ambjax.cases.named_files import CaseFiles
 from ambjax.cases.scenario_tables import signal_from
 from ambjax.cases.table import Table, show
 from ambjax.numerics.records import leaf

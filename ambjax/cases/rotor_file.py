@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from ambjax.cases.controller_file import contents_of
+from ambjax.cases.named_files import contents_of
 from ambjax.cases.rotor_body import DAMPING, MODES, RotorBody, dampings_of
 from ambjax.cases.table import Table
 from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly, precision

@@ -4,7 +4,7 @@ import dataclasses
 import math
 from typing import Any
 
-from ambjax.cases.recordings import CaseFiles
+from ambjax.cases.named_files import CaseFiles
 from ambjax.cases.speed_table import OWN_SPEED, check_turning, rotation_from, turning_from
 from ambjax.cases.table import Table, show
 from ambjax.numerics.records import leaf

@@ -243,12 +243,7 @@ def _flops(case: Case) -> int | None:
 def _drawn(compared: Sequence[Compared]) -> Any:
     from ambjax.pictures import frequency
 
-    shown = []
-    for one in compared:
-        errors, volts = (np.asarray(one.columns[name]) for name in ("settled_rms_error_m", "settled_rms_u_V"))
-        loop = one.loop.system, one.loop.channel, one.loop.command, str(one.loop.numbers.get("worst_at") or "")
-        shown.append(frequency.Contender(one.case.name, one.held, errors, volts, *loop))
     loops = [(first_axis(one.case), one.loop.system) for one in compared]
     spans = [shown_band(case, [system] if system else []) for case, system in loops]
     span = min(low for low, _ in spans), max(high for _, high in spans)
-    return frequency.comparison_figure(shown, compared[0].case.zones.limits, span)
+    return frequency.comparison_figure(compared, compared[0].case.zones.limits, span)

@@ -12,8 +12,8 @@ from collections.abc import Callable
 import numpy as np
 
 from ambjax.numerics.records import Scalar
+from ambjax.paper import PULSE, SETTLE, TABLE_2
 from ambjax.paper.evidence import BASIN, NOISE_STDS, UNCERTAIN, Evidence, Run
-from ambjax.paper.readings import PULSE, SETTLE, TABLE_2
 from ambjax.simulation.trajectory import Row
 from ambjax.world.plant import Plant
 
@@ -208,13 +208,9 @@ _inversion("tracking")
 
 
 @claim(
-    "The current tracks its reference",
-    "4",
-    "-",
-    "settled |i - i_ref| < 1e-3 A, both scenarios",
-    "regulation",
-    "tracking",
-)
+    "The current tracks its reference", "4", "-", "settled |i - i_ref| < 1e-3 A, both scenarios",
+    "regulation", "tracking",
+)  # fmt: skip
 def _current(evidence: Evidence) -> Finding:
     worst = max(r.metrics["settled_max_abs_current_error_A"] for r in (evidence.regulation, evidence.tracking))
     cause = f"largest |i - i_ref| after {SETTLE} s, pulse included; q_i = 0, so e decays by Eq. (14) unless u saturates"

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from typing import Any
 
 from ambjax.linear import Zones, analyse, linearise
+from ambjax.paper import CLOCK, PROCESSOR, SAMPLED, SUPPLY, TABLE_2, TUNED, Tuned, cascade, scenario
 from ambjax.paper.claims import CLAIMS, SIGMA_RADIUS
 from ambjax.paper.evidence import Evidence
-from ambjax.paper.readings import CLOCK, PROCESSOR, SAMPLED, SUPPLY, TABLE_2, TUNED, Tuned, cascade, scenario
 from ambjax.text.words import markdown_table
 
 

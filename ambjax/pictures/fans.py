@@ -30,26 +30,22 @@ def fan(
     bands: Mapping[str, Mapping[float, np.ndarray]],
     limits: Mapping[str, float],
     title: str,
-    lost_at: np.ndarray | None = None,
-    stalled: np.ndarray | None = None,
+    lost_at: np.ndarray,
+    stalled: np.ndarray,
 ) -> Figure:
     """Return quantile bands over time, one panel per quantity (keys of QUANTITIES), all in SI units.
 
     `bands[quantity][percent]`: the quantile [T] at the times t [T] (s) over the members not yet lost; NaN if all are
     lost. `limits[quantity]` (> 0): drawn at plus and minus its value if the data come near it. `lost_at` [N] (s, +inf:
-    never): adds a panel with the share of survivors. `stalled` [N] (bool): members at which the integrator stalled.
+    never): for the last panel, the share of survivors. `stalled` [N] (bool): members at which the integrator stalled.
     """
-    t = np.asarray(t, float)
-    end = t[-1]
-    extra = [0.55] if lost_at is not None else []
-    heights = [1.0] * len(bands) + extra
+    heights = [1.0] * len(bands) + [0.55]
     figure = Figure(figsize=(8.0, 2.1 * sum(heights) + 0.9), layout="constrained")
     axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     for ax, (quantity, quantiles) in zip(axes, bands.items(), strict=False):
         _fan_panel(ax, t, quantity, quantiles, limits.get(quantity, math.inf))
-    if lost_at is not None:
-        _survivors(axes[-1], t, np.asarray(lost_at, float), stalled)
-        end = max(t[-1], np.max(lost_at, initial=t[-1], where=np.isfinite(lost_at)))
+    _survivors(axes[-1], t, lost_at, stalled)
+    end = np.max(lost_at, initial=t[-1], where=np.isfinite(lost_at))
     if t[-1] > t[0]:
         axes[-1].set_xlim(t[0], end)
     axes[-1].set_xlabel("time (s)", fontsize=9)
@@ -61,11 +57,9 @@ def fan(
 
 
 def _fan_panel(ax: Axes, t: np.ndarray, quantity: str, quantiles: Mapping[float, np.ndarray], limit: float) -> None:
-    if quantity not in QUANTITIES:
-        raise ValueError(f"fan: cannot draw {quantity!r}. Use one of {', '.join(QUANTITIES)}.")
     label, unit = QUANTITIES[quantity]
     percents = sorted(quantiles)
-    curves = [np.asarray(quantiles[percent], float) for percent in percents]
+    curves = [quantiles[percent] for percent in percents]
     low, high, beyond = _reach(curves)
     factor, unit = prefix_of(unit, max(abs(low), abs(high)))
     pairs = len(percents) // 2
@@ -110,7 +104,7 @@ def _reach(curves: Sequence[np.ndarray]) -> tuple[float, float, float]:
     return low, high, 0.0
 
 
-def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray | None) -> None:
+def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray) -> None:
     """Draw the share of survivors over time, with a tick at each time at which a member is lost or stalls."""
     ended = np.isfinite(lost_at)
     at, many = np.unique(lost_at[ended], return_counts=True)
@@ -125,7 +119,7 @@ def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray
         ticks, _ = thin(at, at)
         look = {"color": RED, "markersize": 7, "label": "a member is lost or stalls"}
         ax.plot(ticks, np.full(len(ticks), 0.08), "|", transform=ax.get_xaxis_transform(), **look)
-    lost, open_ = int(ended.sum()), 0 if stalled is None else int(np.sum(np.asarray(stalled, bool) & ended))
+    lost, open_ = int(ended.sum()), int(np.sum(np.asarray(stalled, bool) & ended))
     words = f"{len(lost_at) - lost} of {len(lost_at)} survive ({share[-1]:.4g} %)"
     words += f", {statuses(lost - open_, open_)}" * bool(lost)
     ax.set_title(words, fontsize=8, loc="right", pad=2, color=INK)

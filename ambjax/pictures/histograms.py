@@ -3,7 +3,7 @@
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -112,35 +112,24 @@ def _bins(values: np.ndarray, log: bool) -> np.ndarray:
     return np.linspace(low, high, 41)
 
 
-class Bar(NamedTuple):
-    """A driver: its dotted path, the share it explains with its interval, and its rank correlation with the metric."""
-
-    path: str
-    share: float
-    low: float
-    high: float
-    rho: float
-
-
 @own_style
-def tornado(drivers: Sequence[Bar], metric: str, says: str) -> Figure:
+def tornado(drivers: Sequence[Mapping[str, Any]], metric: str, says: str) -> Figure:
     """Return a chart with the share of a metric's variation that each driver explains, the largest on top.
 
-    The chart has at most MOST_DRIVERS bars, coloured by the trend, with whiskers from low to high. `says`: the text
-    below the title. Raises ValueError without drivers.
+    `drivers`: at least one row of `drivers` in summary.json: the `path`, the `share` with its interval `low` to `high`,
+    and the rank correlation `rho`. The chart has at most MOST_DRIVERS bars, coloured by the trend, with whiskers from
+    low to high. `says`: the text below the title.
     """
-    if not drivers:
-        raise ValueError("tornado: there are no drivers. Only an ensemble with [spread] has drivers.")
-    ranking = sorted(drivers, key=lambda driver: -driver.share)
+    ranking = sorted(drivers, key=lambda driver: -driver["share"])
     bars = ranking[:MOST_DRIVERS]
     figure = Figure(figsize=(7.5, 0.36 * len(bars) + 2.2), layout="constrained")
     ax = figure.subplots()
     for row, one in enumerate(bars):
-        ax.barh(row, 100 * one.share, height=0.62, color=TRENDS[_trend(one)])
-        ax.plot([100 * one.low, 100 * one.high], [row, row], color=INK, linewidth=1.2, marker="|", markersize=7)
-        words = f"{100 * one.share:.0f} %"
-        ax.text(100 * max(one.share, one.high) + 1.5, row, words, fontsize=8, va="center", color=INK)
-    ax.set_yticks(range(len(bars)), [one.path for one in bars])
+        share, low, high = (100 * one[key] for key in ("share", "low", "high"))
+        ax.barh(row, share, height=0.62, color=TRENDS[_trend(one)])
+        ax.plot([low, high], [row, row], color=INK, linewidth=1.2, marker="|", markersize=7)
+        ax.text(max(share, high) + 1.5, row, f"{share:.0f} %", fontsize=8, va="center", color=INK)
+    ax.set_yticks(range(len(bars)), [one["path"] for one in bars])
     ax.set_ylim(len(bars) - 0.4, -0.6)
     ax.set_xlim(0, 112)
     ax.set_xticks(np.linspace(0, 100, 6))
@@ -156,9 +145,9 @@ def tornado(drivers: Sequence[Bar], metric: str, says: str) -> Figure:
     return figure
 
 
-def _trend(one: Bar) -> str:
+def _trend(one: Mapping[str, Any]) -> str:
     """Return the trend of the metric. A monotonic trend must explain at least half of the share."""
     rising, falling, neither = TRENDS
-    if one.share <= 0 or one.rho**2 < 0.5 * one.share:
+    if one["share"] <= 0 or one["rho"] ** 2 < 0.5 * one["share"]:
         return neither
-    return rising if one.rho > 0 else falling
+    return rising if one["rho"] > 0 else falling

@@ -13,7 +13,6 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import InlineTable, Table
 
-from ambjax.cases.controller_file import KEY
 from ambjax.cases.machine_case import AnyCase, MachineCase, machine_from
 from ambjax.cases.own_laws import key_of
 from ambjax.cases.reader import Case, is_as_written
@@ -40,12 +39,10 @@ def save_case(path: str | pathlib.Path, case: Case) -> None:
 
 def files_from(case: Case, out: pathlib.Path) -> dict[str, str]:
     """Return the names of the files of a case for a case file in the folder `out`, by dotted path."""
-    found = {one.key: _path_from(one.written, one.file, out) for one in case.recorded}
+    found = {one.key: _path_from(one.written, one.file, out) for one in case.files}
     for law in case.own_laws:
         source, name = law.kind.rpartition(":")[0], law.law.__name__
         found[key_of(law.stage)] = law.kind if law.file is None else f"{_path_from(source, law.file, out)}:{name}"
-    if one := case.controller_file:
-        found[KEY] = _path_from(one.written, one.path, out)
     return found
 
 
