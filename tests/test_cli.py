@@ -19,7 +19,7 @@ from ambjax.cases.reader import case_from, read_case
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.cases.template_text import template
 from ambjax.host.command_line import run_command
-from ambjax.paper import CLOCK, SETTLE, cascade, scenario
+from ambjax.paper.readings import CLOCK, SETTLE, cascade, scenario
 
 SHORT = "[clock]\nduration = 0.05\n"
 

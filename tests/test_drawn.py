@@ -15,9 +15,9 @@ from matplotlib.collections import LineCollection, PolyQuadMesh, QuadMesh
 import tuning.report.pictures as tuned
 from ambjax.commands import map as map_command
 from ambjax.ensemble.maps import PERIOD, Axis, Map
-from ambjax.pictures import fans, figures, heatmaps, histograms
+from ambjax.pictures import ensembles, figures, heatmaps
+from ambjax.pictures.ensembles import tornado
 from ambjax.pictures.figures import BINS, thin
-from ambjax.pictures.histograms import tornado
 from ambjax.pictures.overview import overview_figure
 from ambjax.results import case_map
 from ambjax.simulation.trajectory import ALIVE, TOUCHED, Row, Trajectory
@@ -170,7 +170,7 @@ def bands_of(n, seed=0):
 @pytest.mark.parametrize("n", [2, 500, 9601])
 def test_a_fan_shows_the_quantiles_of_the_members(n):
     t, bands = np.linspace(0, 0.9, n), bands_of(n)
-    figure = fans.fan(t, {"z - r": bands}, {}, "", np.array([np.inf]), np.array([False]))
+    figure = ensembles.fan(t, {"z - r": bands}, {}, "", np.array([np.inf]), np.array([False]))
     ax = figure.axes[0]
     factor = factor_of(ax.get_ylabel())
     for k, (low, high) in enumerate(((0, 100), (5, 95), (25, 75))):
@@ -196,7 +196,7 @@ def test_the_number_of_survivors_excludes_the_lost_members(members):
     lost_at[-1] = 0.9999  # between the last sample and the end of the run
     stalled = np.arange(members) == members - 1
     bands = {"u": {50: np.zeros(100)}}
-    figure = fans.fan(t, bands, {}, "", lost_at=lost_at, stalled=stalled)
+    figure = ensembles.fan(t, bands, {}, "", lost_at=lost_at, stalled=stalled)
     ax = figure.axes[-1]
     step, rug = ax.lines
     x, share = step.get_data()
@@ -221,7 +221,7 @@ def test_a_histogram_counts_all_members(log):
     lost = rng.uniform(size=500) < 0.3
     if log:
         values[7] = 0.0
-    figure = histograms.histogram_figure({"rms_error_m": values, "lost_at": np.where(lost, 0.1, np.inf)})
+    figure = ensembles.histogram_figure({"rms_error_m": values, "lost_at": np.where(lost, 0.1, np.inf)})
     ax = figure.axes[0]
     assert ax.get_xscale() == ("log" if log else "linear")
     alive, dead = (patch.get_data() for patch in ax.patches)

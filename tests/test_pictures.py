@@ -15,8 +15,8 @@ from texts import refusal
 
 from ambjax.__main__ import main
 from ambjax.ensemble.maps import Axis, Map
-from ambjax.pictures import fans, figures, heatmaps, histograms
-from ambjax.pictures.histograms import tornado
+from ambjax.pictures import ensembles, figures, heatmaps
+from ambjax.pictures.ensembles import tornado
 from ambjax.pictures.overview import overview_figure
 from ambjax.pictures.scales import AXIS_UNITS, LABELS, axis_of, label_of, prefix_of, save
 from ambjax.simulation import orders
@@ -75,7 +75,7 @@ def test_every_metric_has_its_unit():
         assert "_" not in re.sub(r"\$[^$]*\$", "", words), name
     assert axis_of("settled_max_abs_sigma_m_per_s", 2e-3)[1:] == (r"settled max |$\sigma$|", "mm/s")
     assert axis_of("clearance_used", 0.5) == (100.0, "clearance used", "%")
-    assert set(histograms.CHIEF) <= set(names)
+    assert set(ensembles.CHIEF) <= set(names)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_labels_keep_text_that_is_not_a_unit(label, size, factor, shown):
 def test_fan_charts_of_special_cases(tmp_path, values, lost_at):
     # one member: all bands alike; NaN: no member left
     bands = {"u": dict.fromkeys(PERCENTS, values)}
-    save(fans.fan(np.linspace(0, 1, 9), bands, {"u": 2.0}, "hard", lost_at, lost_at == 1), tmp_path / "fan.png")
+    save(ensembles.fan(np.linspace(0, 1, 9), bands, {"u": 2.0}, "hard", lost_at, lost_at == 1), tmp_path / "fan.png")
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_fan_charts_of_special_cases(tmp_path, values, lost_at):
 @pytest.mark.parametrize("all_lost", [False, True])
 def test_histograms_of_special_cases(tmp_path, drawn, values, all_lost):
     columns = {"lost_at": np.full(len(values), 0.1 if all_lost else np.inf), "rms_error_m": values}
-    save(histograms.histogram_figure(columns), tmp_path / "h.png")
+    save(ensembles.histogram_figure(columns), tmp_path / "h.png")
     shown = drawn[0].axes[0].patches[-1].get_data().values.sum()
     in_range = np.isfinite(values) & ((values > 0) | (drawn[0].axes[0].get_xscale() == "linear"))
     assert shown == in_range.sum()  # no value falls out of the last bin

@@ -11,7 +11,7 @@ from texts import refusal
 from ambjax.__main__ import main
 from ambjax.cases.reader import case_from, read_case
 from ambjax.cases.template_text import template
-from ambjax.commands import acceptance
+from ambjax.commands import check_text
 from ambjax.commands.comparison_loop import loop_of_axis
 from ambjax.commands.sensitivity_report import UNSTABLE, WITHOUT, _measured_numbers, text_of
 from ambjax.linear import MemberPeaks, Stability, StateSpace, Zones, analyse, linearise
@@ -119,7 +119,7 @@ def test_an_unstable_loop_has_no_peaks_and_no_zone(tmp_path, capsys):
     assert written["running_speed"] == []
     axes = frequency_figure("x", [], [3.0, 4.0, 5.0], (1.0, 500.0)).axes
     assert not any(ax.patches for ax in axes)  # no zones
-    summary, lines, _ = acceptance.acceptance(read_case(path))
+    summary, lines, _ = check_text.acceptance(read_case(path))
     assert lines == ["Sensitivity: no zone and no margins: the linearised loop is not stable at r = 0."]
     assert not {"peak", "running_speed", "delay_margin_s"} & set(summary)
 
@@ -152,7 +152,7 @@ def test_check_does_not_succeed_without_a_linearisation(tmp_path, capsys, monkey
     def fails(*args):
         raise ValueError("the cause")
 
-    monkeypatch.setattr(acceptance, "linearise", fails)
+    monkeypatch.setattr(check_text, "linearise", fails)
     code, summary = checked(tmp_path, capsys, CHECKED)
     loop = summary["loop"]
     assert code == 1
@@ -166,7 +166,7 @@ def test_the_numbers_of_the_machine_contain_its_iron(kind):
     rig = tomllib.loads(template("rig"))
     rig["plant"] |= {"kind": kind, "iron": {"saturation": 0.7, "leakage": 1.1}}
     case = case_from(rig)
-    plant, facts = case.scenario.plant, {fact.key: fact.value for fact in acceptance.machine(case)}
+    plant, facts = case.scenario.plant, {fact.key: fact.value for fact in check_text.machine(case)}
 
     def rates(z=0.0, i=0.0, u=0.0):
         return plant.measurement(plant.rates(plant.start(Measurement(z, 0.0, i)), u))

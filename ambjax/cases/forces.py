@@ -66,9 +66,3 @@ def linear_magnet(plant: Bearing) -> LinearMagnet:
 
     k_s, k_i = jax.grad(force, (0, 1))(zero, zero)
     return LinearMagnet(k_s, k_i, 1 / jax.grad(rate)(zero), plant.flux_density(rest))
-
-
-def bias_flux(case: Case) -> float:
-    """Return the flux density of the bias current without saturation and leakage, mu_0 n i_0/(2 s_0), T."""
-    plant = case.scenario.plant
-    return float(plant.mu_0) * float(plant.n) * float(plant.i_0) / (2 * float(plant.s_0))

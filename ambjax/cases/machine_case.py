@@ -94,9 +94,8 @@ def read_machine(path: str | pathlib.Path | Mapping[str, Any]) -> MachineCase:
 
     def parse(raw: dict[str, Any], *rest: Any) -> MachineCase:
         if not is_machine(raw):
-            raise ValueError(
-                "it has no [rotor] with a kind, so it is a case of one axis; in Python, read_case reads it."
-            )
+            why = "it has no [rotor] with a kind, so it is a case of one axis"
+            raise ValueError(f"{why}; in Python, read_case reads it.")
         return machine_from(raw, *rest)
 
     with jax.ensure_compile_time_eval():

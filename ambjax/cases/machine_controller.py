@@ -76,9 +76,8 @@ def axis_controller(raw: dict[str, Any]) -> None:
         raw["controller"] = controller | outer | inner
     if isinstance(raw.get("processor"), dict):
         if Table(raw).table("processor").switch("predict"):
-            raise ValueError(
-                f'processor.predict = true: controller.kind = "{kind}" predicts nothing. Leave predict out.'
-            )
+            law = f'controller.kind = "{kind}"'
+            raise ValueError(f"processor.predict = true: {law} predicts nothing. Leave predict out.")
         raw["processor"]["predict"] = False
 
 

@@ -53,10 +53,8 @@ def linear(top: Table, cases: list[Case], folder: pathlib.Path) -> StateSpaceLaw
     period = float(cases[0].clock.sample_period) if cases[0].cascade.sampled else None
     if dt and (period is None or not abs(period / dt - 1) < SAME_PERIOD):
         has = "in continuous time" if period is None else f"with a sample period of {period:g} s"
-        raise ValueError(
-            f"{table.at('file')} = {show(table.raw['file'])}: the controller is discrete, dt = {dt:g} s, and this case "
-            f"runs {has}. Set [processor] and clock.sample_period = {dt:g}, or give a continuous controller."
-        )
+        why = f"the controller is discrete, dt = {dt:g} s, and this case runs {has}. Set [processor] and clock."
+        raise table.refuse("file", f"{why}sample_period = {dt:g}, or give a continuous controller.")
     matrices = matrices if period is None else bilinear(matrices, period)
     n = len(matrices[0])
     return StateSpaceLaw(
@@ -158,10 +156,9 @@ def _coils(cases: Sequence[Case], voltage: bool) -> LinearCoils:
     m, a, R, L, s_0 = (numbers(cases, name) for name in ("m", "a", "R", "L", "s_0"))
     models = [case.cascade.model for case in cases]
     i = np.array([float(model.equilibrium()[0]) for model in models])
-    slopes = [
-        (float(model.dv_dz(0.0, one)), float(model.dv_di(0.0, one))) for model, one in zip(models, i, strict=True)
-    ]
-    dv_dz, dv_di = np.array(slopes).T
+    each = list(zip(models, i, strict=True))
+    dv_dz = np.array([float(model.dv_dz(0.0, one)) for model, one in each])
+    dv_di = np.array([float(model.dv_di(0.0, one)) for model, one in each])
     if voltage:
         return LinearCoils(m * a * dv_dz, m * a * dv_di, R, L, 2 * i / s_0)
     laws = [case.cascade.current for case in cases]

@@ -93,7 +93,7 @@ def _columns(table: Table) -> tuple[str, str] | None:
     if names is None:
         return None
     if not isinstance(names, list) or len(names) != 2 or not all(isinstance(one, str) for one in names):
-        raise ValueError(f'{table.at("columns")} = {show(names)}: it must be two names, ["t", "force"] for example.')
+        raise table.refuse("columns", 'it must be two names, ["t", "force"] for example.')
     return names[0], names[1]
 
 
@@ -187,7 +187,7 @@ def contents_of(table: Table, folder: pathlib.Path, convert: Callable[[dict[str,
     """Read the .npz or .mat file that the key `file` names. Its contents are convert(arrays)."""
     written, key = table.raw["file"], table.at("file")
     if not isinstance(written, str) or not written.endswith(ENDINGS):
-        raise ValueError(f"{key} = {show(written)}: it must be the path of an .npz or .mat file.")
+        raise table.refuse("file", "it must be the path of an .npz or .mat file.")
     return _opened(key, written, folder, lambda file: convert((npz_arrays if file.suffix == ".npz" else _of_mat)(file)))
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from ambjax.cases.forces import bias_flux, forces
+from ambjax.cases.forces import forces
 from ambjax.cases.reader import Case
 from ambjax.simulation.orders import ORDERS, ROUNDED
 from ambjax.world.recorded import Recorded
@@ -81,8 +81,9 @@ def _forces(case: Case) -> Iterator[str]:
 
 
 def _flux(case: Case) -> Iterator[str]:
-    iron = case.scenario.plant.iron
-    if (flux := bias_flux(case)) > MOST_FLUX and (iron is None or iron.saturation is None):
+    plant, iron = case.scenario.plant, case.scenario.plant.iron
+    flux = float(plant.mu_0) * float(plant.n) * float(plant.i_0) / (2 * float(plant.s_0))  # of the bias current
+    if flux > MOST_FLUX and (iron is None or iron.saturation is None):
         yield (
             f"plant: the bias flux density mu_0 n i_0/(2 s_0) is {flux:.3g} T; iron saturates above about "
             f"{MOST_FLUX:g} T. Check n, i_0 and s_0, or give plant.iron.saturation."

@@ -137,7 +137,7 @@ def _directed(table: Table, unit: str, files: CaseFiles, own: tuple[str, ...] = 
     direction = vector(table, "direction", 3)
     size = float(np.linalg.norm(direction))
     if size == 0:
-        raise ValueError(f"{table.at('direction')} = {show(table.raw['direction'])}: it must not be zero.")
+        raise table.refuse("direction", "it must not be zero.")
     rest = Table({key: value for key, value in table.raw.items() if key not in ("direction", *own)}, table.path)
     signal = signal_from(rest, unit, files)
     if _turns(signal):

@@ -77,7 +77,7 @@ def body_from(top: Table, folder: pathlib.Path = pathlib.Path()) -> RotorBody:
     known = next((key for key in ("m", "I_t", "I_p") if key in table.raw), None)
     if known and (kind == "shaft" or "file" in table.raw):
         source = "geometry" if kind == "shaft" else "file"
-        raise ValueError(f"{table.at(known)} = {show(table.raw[known])}: it follows from the {source}. Leave it out.")
+        raise table.refuse(known, f"it follows from the {source}. Leave it out.")
     if kind == "shaft":
         table.only([*common, "elements", "discs", "sleeves", "modes", "damping", *MATERIAL])
         return _shaft(table, _places(top))
@@ -120,10 +120,8 @@ def _gyroscopic(table: Table, masses: tuple[float, float, float], modes: int) ->
     given = table.array("Gm", None, "a list of rows")
     Gm = np.asarray(given, float) if np.shape(given) in ((modes, modes), whole.shape) else np.full((1, 1), np.nan)
     if not np.all(np.isfinite(Gm)):
-        raise ValueError(
-            f"{table.at('Gm')} = {show(table.raw['Gm'])}: it must be {modes} rows of {modes} numbers, for the modes, "
-            f"or {2 + modes} rows of {2 + modes}, for translation, tilt and modes."
-        )
+        whole_size = f"{2 + modes} rows of {2 + modes}, for translation, tilt and modes"
+        raise table.refuse("Gm", f"it must be {modes} rows of {modes} numbers, for the modes, or {whole_size}.")
     if not np.allclose(Gm, Gm.T, rtol=1e-6, atol=1e-9 * np.abs(Gm).max()):
         raise ValueError(f"{table.at('Gm')}: it must be symmetric.")
     if len(Gm) == modes:
@@ -178,9 +176,8 @@ def _shaft(table: Table, places: list[float]) -> RotorBody:
     ends = [x for one in sections for x in (one.begin, one.begin + one.length)]
     for place in (*places, *ends, *(disc.at for disc in discs)):
         if not -1e-9 <= place <= end * (1 + 1e-9):
-            raise ValueError(
-                f"rotor: the place {place:g} m is not on the shaft, which is {end:g} m long from its left end."
-            )
+            where = f"is not on the shaft, which is {end:g} m long from its left end."
+            raise ValueError(f"rotor: the place {place:g} m {where}")
     points = _distinct([*places, *ends, *(disc.at for disc in discs)], 1e-6 * end)
     nodes = _distinct(
         [x for a, b in itertools.pairwise(points)
@@ -237,11 +234,8 @@ def axes_from(bearings: list[Table], body: RotorBody) -> list[BearingAxis]:
         at = needed(table, "at", PLACE)
         if body.shapes is None and len(body.frequencies):
             vector(table, "modes", len(body.frequencies))  # a radial bearing gives the shapes at its magnet
-        magnet = body.place(table)
-        places = (
-            magnet,
-            *(body.place(table, *keys, (at, magnet[1])) for keys in zip(PLACE_KEYS[1:], SHAPE_KEYS[1:], strict=True)),
-        )
+        magnet, others = body.place(table), zip(PLACE_KEYS[1:], SHAPE_KEYS[1:], strict=True)
+        places = [magnet, *(body.place(table, *keys, (at, magnet[1])) for keys in others)]
         angle = math.radians(table.leaf("angle", ANGLE, 0.0))
         cos, sin = _exact(math.cos(angle)), _exact(math.sin(angle))
         for label, d in (("x", (cos, sin, 0.0)), ("y", (-sin, cos, 0.0))):

@@ -58,7 +58,7 @@ def signal_from(table: Table, unit: str, files: CaseFiles, extra: tuple[str, ...
         table.only(["kind", "terms", *extra])
         terms = table.raw.get("terms")
         if not isinstance(terms, list) or not terms:
-            raise ValueError(f"{table.at('terms')} = {show(terms)}: it must be a list of at least one signal table.")
+            raise table.refuse("terms", "it must be a list of at least one signal table.")
         if len(terms) > MOST_TERMS:
             raise ValueError(f"{table.at('terms')}: {len(terms)} terms are too many; give at most {MOST_TERMS}.")
         parts = [Table(term, f"{table.at('terms')}[{n}]") for n, term in enumerate(terms)]
@@ -144,23 +144,19 @@ def _amplifier(actuator: Table) -> Amplifier | CurrentAmplifier | None:
             f'{actuator.at("mode")} = "current": {actuator.at("bandwidth")} is missing. Give the bandwidth of the '
             "amplifier's current loop, Hz: bandwidth = 1e3, for example."
         )
-    given = any(name in actuator.raw for name in names)
-    if not given:
+    if not any(name in actuator.raw for name in names):
         return None
-    amplifier = actuator.record(kind, extra=("mode", "u_max", "coil"))
-    return dataclasses.replace(amplifier, coil=_coil(actuator.table("coil"))) if "coil" in actuator.raw else amplifier
-
-
-def _coil(table: Table) -> CoilLimits:
-    limits, one_way = table.record(CoilLimits, extra=("unidirectional",)), table.switch("unidirectional")
-    return dataclasses.replace(limits, unidirectional=one_way is True)
+    amplifier, coil = actuator.record(kind, extra=("mode", "u_max", "coil")), actuator.table("coil")
+    if "coil" not in actuator.raw:
+        return amplifier
+    limits = coil.record(CoilLimits, extra=("unidirectional",))
+    limits = dataclasses.replace(limits, unidirectional=coil.switch("unidirectional") is True)
+    return dataclasses.replace(amplifier, coil=limits)
 
 
 def _sensor(table: Table) -> Sensor:
-    sensor, velocity = (
-        table.record(Sensor, extra=("velocity", "outliers", "dropouts", "runout")),
-        table.switch("velocity"),
-    )
+    sensor = table.record(Sensor, extra=("velocity", "outliers", "dropouts", "runout"))
+    velocity = table.switch("velocity")
     parts = {
         "outliers": table.table("outliers").record(Outliers) if "outliers" in table.raw else None,
         "dropouts": _dropouts(table.table("dropouts")) if "dropouts" in table.raw else None,
@@ -193,17 +189,14 @@ def _stop(run: Table) -> Stop | None:
     if not given:
         return None
     if "stiffness" not in given:
-        raise ValueError(
-            f"{run.at('stop_damping')} = {show(run.raw['stop_damping'])}: there is no stop to damp. Give "
-            "run.stop_stiffness (N/m) too."
-        )
+        raise run.refuse("stop_damping", "there is no stop to damp. Give run.stop_stiffness (N/m) too.")
     return Stop(*(run.leaf(f"stop_{name}", field, field.default) for name, field in STOP.items()))
 
 
 def _seed(run: Table) -> int:
     seed = run.raw.get("seed", 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
-        raise ValueError(f"{run.at('seed')} = {show(seed)}: it must be a whole number from 0 to 4294967295.")
+        raise run.refuse("seed", "it must be a whole number from 0 to 4294967295.")
     return seed
 
 

@@ -9,7 +9,7 @@ from ambjax.cases.controller_tables import KINDS
 from ambjax.cases.reader import PLANTS
 from ambjax.cases.scenario_tables import SIGNALS
 from ambjax.ensemble.design import DESIGNS
-from ambjax.paper import PULSE, REFERENCE, TABLE_2
+from ambjax.paper.readings import PULSE, REFERENCE, TABLE_2
 from ambjax.world.plant import Plant
 
 # Templates of bearings other than the paper's, and of whole machines, by name.

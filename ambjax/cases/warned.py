@@ -1,8 +1,8 @@
 """Warnings about values of a case that are valid but probably unintended, such as millimetres given as metres."""
 
-import dataclasses
 import math
 import pathlib
+import tomllib
 import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -14,6 +14,7 @@ from ambjax.cases import reader
 from ambjax.cases.plausibility import implausible
 from ambjax.cases.reach import reach, widest
 from ambjax.cases.reader import Case
+from ambjax.numerics.declared import leaves_of
 from ambjax.simulation.system import reads_velocity
 from ambjax.text.words import one_line
 from ambjax.world.scenario import Scenario
@@ -53,11 +54,11 @@ def warnings_of(case: Case) -> list[str]:
 
 
 def _assumed(case: Case) -> Iterator[str]:
-    plant = case.scenario.plant
-    fields = [field for field in dataclasses.fields(plant) if field.name in case.assumed and field.name != GRAVITY]
-    units = {field.name: "" if field.metadata["unit"] == "1" else f" {field.metadata['unit']}" for field in fields}
-    left = [f"{name} = {getattr(plant, name):g}{unit}" for name, unit in units.items()]
-    if left:
+    plant, given = case.scenario.plant, tomllib.loads(case.text).get("plant", {})
+    units = {field.name: field.metadata["unit"] for field in leaves_of(type(plant))}
+    left = [name for name in units if name not in given and name != GRAVITY]
+    left = [f"{name} = {getattr(plant, name):g}{f' {units[name]}' * (units[name] != '1')}" for name in left]
+    if left and units.keys() & given.keys():
         yield f"[plant] omits numbers, which keep the paper's values: {', '.join(left)}. Give those that differ."
 
 

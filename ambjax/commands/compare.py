@@ -139,9 +139,7 @@ def _studies(cases: Sequence[AnyCase], seed: int | None, members: int) -> list[S
     """Return the studies of the cases, with the same seed: by default the first case's."""
     seed = study_of(cases[0], seed, members).seed
     studies = [study_of(case, seed, members) for case in cases]
-    return [
-        dataclasses.replace(study, by_axis=BY_AXIS) if isinstance(study, MachineStudy) else study for study in studies
-    ]
+    return [dataclasses.replace(one, by_axis=BY_AXIS) if isinstance(one, MachineStudy) else one for one in studies]
 
 
 def _read(paths: Sequence[str]) -> list[AnyCase]:

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from ambjax.cases.machine_case import AnyCase, MachineCase, machine_from
 from ambjax.cases.reader import read_case
 from ambjax.cases.table import load
-from ambjax.commands.pace import duration
 from ambjax.host.command_line import message
 from ambjax.host.extensions import NothingToTuneError, extension
 from ambjax.host.heartbeat import say
 from ambjax.host.interrupts import raise_if_interrupted, reporting
+from ambjax.text.words import duration
 
 # In the folder of a case: the file by which the tuner marks a search that has begun, and the case with the tuned gains.
 BEGUN, TUNED = "checkpoints/search.json", "tuned.toml"

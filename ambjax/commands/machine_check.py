@@ -177,9 +177,8 @@ def _spill_over(case: MachineCase) -> tuple[dict[str, float], str, bool]:
         return {}, f"the rotor has {known} already, the largest number", False
     try:
         rotor = _with_modes(raw, known, known + more, case.folder)
-        machine = machine_of_axes(
-            rotor, parts_of(case.cases), case.clock, np.zeros(len(rotor.gravity)), case.machine.law
-        )
+        q = np.zeros(len(rotor.gravity))
+        machine = machine_of_axes(rotor, parts_of(case.cases), case.clock, q, case.machine.law)
         points = list(turning_machines(machine, case.clock.sample_period, case.speeds))
     except ValueError as error:
         return {}, str(error), False
@@ -217,7 +216,6 @@ def _axis(case: MachineCase, k: int, run: MachineRun, points: list[MachineSensit
 
 
 def _zone(case: MachineCase, run: MachineRun, share: float) -> str:
-    """Return the zone of a share of the clearance; D if the rotor is lost."""
     return "D" if run.lost else case.zones.clearance_zone(share)
 
 

@@ -204,9 +204,8 @@ def sensitivity_text(points: list[MachineSensitivity], measured: Measured, zones
         parts.append(f"{point.speed:g} rpm: stable; {slow}")
         single = f"{point.sigma.height:.4g}", f"{point.sigma.frequency:.4g}"
         rows.append(("largest singular value", *single, "", "", "", ""))
-        parts.append(
-            table(("axis", "peak of |S|", "Hz", "zone", "peak of |T|", "gain margin", "phase margin, deg"), rows)
-        )
+        head = ("axis", "peak of |S|", "Hz", "zone", "peak of |T|", "gain margin", "phase margin, deg")
+        parts.append(table(head, rows))
         parts += outside_lines(point, zones)
         for _, lines in once_per_revolution(point):
             parts += lines

@@ -114,7 +114,7 @@ def _drawn(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None,
     shown = [point for point in points if point.analysis.stable]
     if spread is not None and spread.point is not None and spread.point.analysis.stable:
         shown.append(spread.point)
-    held = measured is not None and measured.position.S is not None
+    one = None if measured is None else measured.position
     span = operating.shown_band(case, [point.system for point in shown])
-    injected_points = measured.position if held else None
+    injected_points = None if one is None or one.S is None else one
     return frequency.frequency_figure(case.name, shown, case.zones.limits, span, injected_points)

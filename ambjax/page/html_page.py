@@ -30,10 +30,8 @@ NAME = "page.html"
 # Number of members of the envelope.
 MEMBERS = 64
 # Script files of the web worker and of the page, in the order of execution.
-WORKER, PAGE = (
-    ("noise.js", "spectrum.js", "sensitivity.js", "worker.js"),
-    ("controls.js", "plots.js", "machine.js", "app.js"),
-)
+WORKER = ("noise.js", "spectrum.js", "sensitivity.js", "worker.js")
+PAGE = ("controls.js", "plots.js", "machine.js", "app.js")
 BOKEH = "bokeh.min.js", "bokeh-api.min.js"
 
 
@@ -46,7 +44,8 @@ def page(case: Case, others: Sequence[Case] = (), path: str = "case.toml") -> st
     Raises ValueError with a message of one line if the case has no processor or has a part that the page cannot
     compute, if one of `others` differs in structure, or if Bokeh is missing.
     """
-    library = _library()
+    folder = pathlib.Path(extra("bokeh", "page").__file__).parent / "server" / "static" / "js"
+    library = [(folder / name).read_text(encoding="utf-8") for name in BOKEH]
     worker, data = _computed(case, list(others), path)
     title = f"{case.name}: ambjax"
     scripts = "".join(f"<script>{text}</script>\n" for text in (*library, *map(_asset, PAGE)))
@@ -93,11 +92,6 @@ def _block(name: str, text: str) -> str:
 
 def _asset(name: str) -> str:
     return (importlib.resources.files("ambjax.page") / "assets" / name).read_text(encoding="utf-8")
-
-
-def _library() -> list[str]:
-    folder = pathlib.Path(extra("bokeh", "page").__file__).parent / "server" / "static" / "js"
-    return [(folder / name).read_text(encoding="utf-8") for name in BOKEH]
 
 
 def _check_contents(case: Case, others: list[Case], path: str) -> None:

@@ -86,7 +86,6 @@ def sliders(case: Case, others: list[Case]) -> list[Slider]:
 
 
 def _places(case: Case) -> dict[str, Place]:
-    """Return every number of a case and the seed, by path."""
     (field,) = (field for field in dataclasses.fields(case.scenario) if field.name == "seed")
     return {**places(case.cascade, case.scenario), SEED: Place((1, "seed"), field, case.scenario.seed)}
 

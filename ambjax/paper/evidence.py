@@ -170,9 +170,8 @@ def _uncertain(cascade: Cascade, reading: str) -> Uncertain:
     def one(case: tuple[str, float]) -> dict[str, float]:
         name, factor = case
         plant = dataclasses.replace(Plant(), **{name: getattr(Plant(), name) * factor})
-        return _simulate(
-            reading, cascade, dataclasses.replace(paper.scenario("tracking", reading), plant=plant)
-        ).metrics
+        scenario = dataclasses.replace(paper.scenario("tracking", reading), plant=plant)
+        return _simulate(reading, cascade, scenario).metrics
 
     with ThreadPoolExecutor() as pool:
         metrics = list(pool.map(one, cases))

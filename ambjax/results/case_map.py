@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.case_table import notebook_table
-from ambjax.cases.given import of_case
+from ambjax.cases.given import names_arguments, of_case
 from ambjax.cases.machine_case import AnyCase
 from ambjax.cases.timing import FEWEST_SAMPLES, MOST_SAMPLES, SAMPLE_PERIOD
 from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, with_method_for_axes
 from ambjax.ensemble.paths import Place
 from ambjax.ensemble.spread import no_such_number
 from ambjax.ensemble.study import AnyStudy, Study
-from ambjax.host.arguments import names_arguments
 from ambjax.host.extensions import extra
 from ambjax.host.one_thread import one_thread
 from ambjax.linear import stability_of

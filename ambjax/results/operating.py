@@ -99,7 +99,7 @@ def operating_point(case: Case, name: str, r: float) -> OperatingPoint:
             start = Initial(r, 0.0, float(scenario.plant.equilibrium(r)[0]))
             scenario = dataclasses.replace(scenario, reference=Constant(r), initial=start)
         held = bool(stability_of(case.cascade, scenario, case.clock).stable[0])
-    return OperatingPoint(name, r, m, system, _analysis(case, system, m, _velocity_sensor(case), held), held)
+    return OperatingPoint(name, r, m, system, _analysis(case, system, m, held), held)
 
 
 # Modules in these types: the documentation would find two classes of each name, one of them in `ambjax.linear`.
@@ -127,7 +127,7 @@ def sensitivity(case: Case | MachineCase, r: float = 0.0) -> Analysis | list[Mac
     if isinstance(case, MachineCase):
         return points_of(case, list(turning_machines(case.machine, case.clock.sample_period, case.speeds)))
     system = linearise(case.cascade, case.scenario, case.clock, r)
-    return _analysis(case, system, float(case.scenario.plant.m), _velocity_sensor(case))
+    return _analysis(case, system, float(case.scenario.plant.m))
 
 
 def points_of(case: MachineCase, turning: Sequence[TurningMachine]) -> list[MachineSensitivity]:
@@ -142,11 +142,8 @@ def points_of(case: MachineCase, turning: Sequence[TurningMachine]) -> list[Mach
     return [sensitivity_of(point, case.axes, speed, case.zones, *found) for point, speed, found in each]
 
 
-def _velocity_sensor(case: Case) -> bool:
-    return case.scenario.sensors.velocity and reads_velocity(case.cascade, case.clock.sample_period)
-
-
-def _analysis(case: Case, system: StateSpace, m: float, velocity: bool, held: bool | None = None) -> Analysis:
+def _analysis(case: Case, system: StateSpace, m: float, held: bool | None = None) -> Analysis:
+    velocity = case.scenario.sensors.velocity and reads_velocity(case.cascade, case.clock.sample_period)
     return analyse(system, m, case.clock.sample_period, case.zones, velocity, held is not False)
 
 
@@ -158,7 +155,7 @@ def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPea
     held: list[bool | None] = [None] * members
     if has_set_valued([case.cascade]):
         held = stability_of(cascade, scenario, study.clock).stable.tolist()
-    peaks, good, velocity = np.full(members, math.inf), np.zeros(members, bool), _velocity_sensor(case)
+    peaks, good = np.full(members, math.inf), np.zeros(members, bool)
     masses = np.broadcast_to(np.asarray(scenario.plant.m, float), (members,))
     analyses: list[Analysis | None] = []
     loops: list[StateSpace] = []
@@ -166,7 +163,7 @@ def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPea
         one, loop = None, jax.tree.map(lambda x, k=k: np.asarray(x)[k], systems)
         with contextlib.suppress(ValueError):  # the member has no linearisation
             loop = checked(loop, found[k], 0.0)
-            one = _analysis(case, loop, float(masses[k]), velocity, held[k])
+            one = _analysis(case, loop, float(masses[k]), held[k])
         loops.append(loop)
         analyses.append(one)
         if one is not None:

@@ -57,9 +57,8 @@ class CaseRun:
 
         `attrs["units"]` contains the unit of each column. Raises ValueError if pandas is not installed.
         """
-        frame = extra("pandas").DataFrame(
-            self._signals(), index=extra("pandas").Index(np.asarray(self.trajectory.rows.t), name="t")
-        )
+        index = extra("pandas").Index(np.asarray(self.trajectory.rows.t), name="t")
+        frame = extra("pandas").DataFrame(self._signals(), index=index)
         frame.attrs["units"] = {name: SIGNAL_UNITS[name] for name in frame.columns}
         return frame
 
@@ -114,7 +113,6 @@ class CaseRun:
         return {name: x for name, x in self.trajectory.arrays().items() if name in SIGNAL_UNITS and name != "t"}
 
     def _repr_html_(self) -> str:
-        """Return the table of the metrics, with the status of the rotor as its caption."""
         why = self.trajectory.lost_why
         ended = f"the rotor is lost: {why}" if self.lost else f"not decided, {why}" if why else "the rotor is held"
         rows = [(name, f"{value:.6g}", UNITS.get(name, "")) for name, value in self.metrics.items()]
@@ -158,9 +156,8 @@ _finished = compiled_quickly(finish, options=QUICKEST)
 
 def simulate_machine(case: MachineCase, progress: Progress = lambda samples: None) -> MachineRun:
     """Simulate a machine, as `simulate` does."""
-    fold = PerAxis(
-        stack_axes([canonical(Metrics.of(case.settle, one.scenario, case.machine.near)) for one in case.cases])
-    )
+    folds = [canonical(Metrics.of(case.settle, one.scenario, case.machine.near)) for one in case.cases]
+    fold = PerAxis(stack_axes(folds))
     machine, clock, fold = canonical((case.machine, case.clock, fold))
     state, parts, count = _begun(machine, clock, fold), [], min(SEGMENT, clock.samples)
     for first in range(0, clock.samples, count):
