@@ -192,8 +192,8 @@ def test_a_run_decides_on_a_loop_with_set_valued_signs(monkeypatch, pole, held, 
         pole * one, 0.1 * np.ones((1, 3)), np.ones((6, 1)), np.eye(6)[:, :3], np.ones(1), np.array(1e-3), path
     )
     found = Stability(*(np.array([x]) for x in (held, np.nan, not held, 0.0, 0.0, False)), 1.0, 1.0)
-    monkeypatch.setattr(operating, "linearise", lambda *_: system)
-    monkeypatch.setattr(operating, "stability_of", lambda *_: found)
+    monkeypatch.setattr(operating.linear, "linearise", lambda *_: system)
+    monkeypatch.setattr(operating.linear, "stability_of", lambda *_: found)
     point = operating.operating_point(case, "nominal", 0.0)
     assert (point.stable, point.zone) == (held, zone)
     assert np.isfinite(point.analysis.S.height) == (zone == "A")
