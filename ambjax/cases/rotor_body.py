@@ -57,14 +57,6 @@ class RotorBody(NamedTuple):
         return found - self.centre, vector(table, modes, count, None if needed else default)
 
 
-def tables_of(top: Table, name: str) -> list[Table]:
-    """Return the tables of a list, written as [[name]]."""
-    raw = top.raw.get(name, [])
-    if not isinstance(raw, list):
-        raise ValueError(f"{top.at(name)} = {show(raw)}: write [[{top.at(name)}]] above each.")
-    return [Table(one, f"{top.at(name)}[{k}]") for k, one in enumerate(raw)]
-
-
 def needed(table: Table, key: str, field: Any) -> float:
     """Return a number that the table must give."""
     if key not in table.raw:

@@ -23,7 +23,6 @@ from ambjax.cases.rotor_body import (
     load_from,
     needed,
     row,
-    tables_of,
     unbalance_from,
     vector,
 )
@@ -94,7 +93,7 @@ def body_from(top: Table, folder: pathlib.Path = pathlib.Path()) -> RotorBody:
             f"{table.at('modes')} is missing: give [[rotor.modes]] with the frequency of each bending mode, or "
             'a file; kind = "rigid" has no modes.'
         )
-    modes = tables_of(table, "modes")
+    modes = table.tables("modes")
     for one in modes:
         one.only(["frequency", "damping"])
     frequencies = np.array([needed(one, "frequency", FREQUENCY) for one in modes])
@@ -140,7 +139,7 @@ def _places(top: Table) -> list[float]:
     found = [
         one.leaf(key, PLACE)
         for name in ("bearing", "unbalance", "load")
-        for one in tables_of(top, name)
+        for one in top.tables(name)
         for key in PLACE_KEYS
         if key in one.raw
     ]
@@ -159,17 +158,17 @@ def _section(table: Table, begin: float, common: Table, sleeve: bool = False) ->
 
 def _shaft(table: Table, places: list[float]) -> RotorBody:
     """Return the body of a shaft from its geometry. Places are measured from the left end of the shaft."""
-    elements, begin, sections = tables_of(table, "elements"), 0.0, list[Section]()
+    elements, begin, sections = table.tables("elements"), 0.0, list[Section]()
     if not elements:
         raise ValueError(f"{table.at('elements')} is missing: give [[rotor.elements]] with length and diameter.")
     for one in elements:
         sections.append(_section(one, begin, table))
         begin += float(sections[-1].length)
     end, shaft = begin, len(sections)
-    for one in tables_of(table, "sleeves"):
+    for one in table.tables("sleeves"):
         sections.append(_section(one, needed(one, "at", PLACE), table, sleeve=True))
     discs = []
-    for one in tables_of(table, "discs"):
+    for one in table.tables("discs"):
         one.only(["at", "m", "I_t", "I_p"])
         discs.append(Disc(*(needed(one, k, f) for k, f in (("at", PLACE), ("m", MASS), ("I_t", I_T), ("I_p", I_P)))))
         _check_inertias(one, float(discs[-1].I_t), float(discs[-1].I_p))
@@ -261,7 +260,7 @@ def _exact(x: float) -> float:
 def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pathlib.Path) -> Rotor:
     """Return the rotor of the tables [rotor], [[unbalance]], [[load]] and [[base]]."""
     table, k = top.table("rotor"), len(body.frequencies)
-    unbalances = tables_of(top, "unbalance")
+    unbalances = top.tables("unbalance")
     graded = sum("grade" in one.raw for one in unbalances)
     n, w = RIGID + 2 * k, 2 * np.pi * np.repeat(body.frequencies, 2)
     mass = np.concatenate([[body.m, body.m, body.m, body.I_t, body.I_t], np.ones(2 * k)])
@@ -288,13 +287,13 @@ def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pat
         acceleration=turning.acceleration,
         changes=turning.changes,
         unbalances=tuple(unbalance_from(one, body, graded) for one in unbalances),
-        loads=tuple(load_from(one, body, CaseFiles(folder)) for one in tables_of(top, "load")),
-        base=tuple(base_from(one, n, CaseFiles(folder)) for one in tables_of(top, "base")),
+        loads=tuple(load_from(one, body, CaseFiles(folder)) for one in top.tables("load")),
+        base=tuple(base_from(one, n, CaseFiles(folder)) for one in top.tables("base")),
     )
 
 
 def axes_and_rotor(top: Table, folder: pathlib.Path) -> tuple[list[BearingAxis], Rotor]:
     """Return the axes and the rotor of a case file."""
     body = body_from(top, folder)
-    axes = axes_from(tables_of(top, "bearing"), body)
+    axes = axes_from(top.tables("bearing"), body)
     return axes, rotor_from(top, body, axes, folder)

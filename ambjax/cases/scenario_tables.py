@@ -61,8 +61,7 @@ def signal_from(table: Table, unit: str, files: CaseFiles, extra: tuple[str, ...
             raise table.refuse("terms", "it must be a list of at least one signal table.")
         if len(terms) > MOST_TERMS:
             raise ValueError(f"{table.at('terms')}: {len(terms)} terms are too many; give at most {MOST_TERMS}.")
-        parts = [Table(term, f"{table.at('terms')}[{n}]") for n, term in enumerate(terms)]
-        return waveforms.Sum(tuple(signal_from(part, unit, files) for part in parts))
+        return waveforms.Sum(tuple(signal_from(part, unit, files) for part in table.tables("terms")))
     if kind == "table":
         return files.signal(table, extra)
     turns = "rotation" in {field.name for field in dataclasses.fields(SIGNALS[kind])}
@@ -97,7 +96,7 @@ def _each(table: Table, name: str) -> list[Table]:
         return [table.table(name)]
     if not 0 < len(raw) <= MOST_TERMS:
         raise ValueError(f"{table.at(name)}: {len(raw)} signals; give 1 to {MOST_TERMS}.")
-    return [Table(one, f"{table.at(name)}[{n}]") for n, one in enumerate(raw)]
+    return table.tables(name)
 
 
 def scenario_from(top: Table, plant: Bearing, files: CaseFiles) -> tuple[Scenario, float | None]:
@@ -174,7 +173,7 @@ def _runout(table: Table) -> Runout:
             f"{table.at('harmonics')} {given}: it must be a list of 1 to {MOST_TERMS} tables, "
             "[{ number = 1, amplitude = 1e-6, phase = 0.0 }] for example."
         )
-    waves = tuple(Table(one, f"{table.at('harmonics')}[{n}]").record(Harmonic) for n, one in enumerate(raw))
+    waves = tuple(one.record(Harmonic) for one in table.tables("harmonics"))
     return dataclasses.replace(turning_from(table, Runout, ("harmonics",)), harmonics=waves)
 
 

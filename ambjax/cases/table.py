@@ -139,6 +139,13 @@ class Table:
         """Return a table within this one; empty if left out."""
         return Table(self.raw.get(key, {}), self.at(key))
 
+    def tables(self, key: str) -> list["Table"]:
+        """Return the tables of a list, written as [[key]]; none if left out."""
+        raw = self.raw.get(key, [])
+        if not isinstance(raw, list):
+            raise self.refuse(key, f"write [[{self.at(key)}]] above each.")
+        return [Table(one, f"{self.at(key)}[{n}]") for n, one in enumerate(raw)]
+
     def number(self, key: str, default: object, allowed: str = "a number") -> Any:
         """Return a number, or the default if left out. Raises ValueError for anything else."""
         value = self.raw.get(key, default)
