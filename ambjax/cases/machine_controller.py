@@ -118,10 +118,8 @@ def law_from(
         own = bearing.table("controller")
         for key in ("observer", "position"):
             if key in own.raw:
-                raise ValueError(
-                    f"{own.at(key)}: in rigid-body coordinates no bearing has its own {key}. Use [controller.tilt."
-                    f"{key}] or [controller.axial.{key}]."
-                )
+                advice = f"Use [controller.tilt.{key}] or [controller.axial.{key}]."
+                raise ValueError(f"{own.at(key)}: in rigid-body coordinates no bearing has its own {key}. {advice}")
     return rigid_body(top, rotor, cases, read, bool(compensated))
 
 

@@ -126,9 +126,8 @@ def _gyroscopic(table: Table, masses: tuple[float, float, float], modes: int) ->
     if len(Gm) == modes:
         whole[2:, 2:] = Gm
     elif np.abs(Gm[0]).max() > 1e-9 * np.abs(Gm).max() or not np.isclose(Gm[1, 1], I_p / I_t, rtol=1e-2):
-        raise ValueError(
-            f"{table.at('Gm')}: its first row must be 0, and Gm[1][1] = {Gm[1, 1]:g} must be I_p/I_t = {I_p / I_t:g}."
-        )
+        why = f"its first row must be 0, and Gm[1][1] = {Gm[1, 1]:g} must be I_p/I_t = {I_p / I_t:g}."
+        raise ValueError(f"{table.at('Gm')}: {why}")
     else:
         size = np.sqrt([m, I_t, *np.ones(modes)])
         whole = Gm * np.outer(size, size)
@@ -219,10 +218,8 @@ def axes_from(bearings: list[Table], body: RotorBody) -> list[BearingAxis]:
         kind = table.choice("kind", ["radial", "axial"])
         name = table.raw.get("name", f"bearing{number + 1}")
         if not isinstance(name, str) or not name or "." in name or name in seen:
-            raise ValueError(
-                f"{table.at('name')} = {show(name)}: each bearing needs a name of its own, as text without dots, which "
-                "separate the words of paths."
-            )
+            why = "each bearing needs a name of its own, as text without dots, which separate the words of paths."
+            raise ValueError(f"{table.at('name')} = {show(name)}: {why}")
         seen.add(name)
         if kind == "axial":
             _check_axial(table)

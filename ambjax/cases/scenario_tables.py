@@ -213,16 +213,12 @@ def check_start(scenario: Scenario) -> None:
         if not stop < scenario.limit:
             raise ValueError(f"run.clearance = {stop:g} m: with a stop it must be below {scenario.limit:g} m.")
         if not abs(z) < scenario.limit:
-            raise ValueError(
-                f"initial.z = {z:g} m: the rotor would touch a magnet; |z| must be below {scenario.limit:g} m. Its "
-                f"stop begins at {math.copysign(stop, z):g} m."
-            )
+            why = f"|z| must be below {scenario.limit:g} m. Its stop begins at {math.copysign(stop, z):g} m."
+            raise ValueError(f"initial.z = {z:g} m: the rotor would touch a magnet; {why}")
         return
     if not abs(z) < stop:
-        raise ValueError(
-            f"initial.z = {z:g} m: the rotor would touch its stop at the start; |z| must be less than {stop:g} m "
-            "(run.clearance, by default 0.9 of plant.s_0)."
-        )
+        why = f"|z| must be less than {stop:g} m (run.clearance, by default 0.9 of plant.s_0)."
+        raise ValueError(f"initial.z = {z:g} m: the rotor would touch its stop at the start; {why}")
 
 
 def _check_coils(scenario: Scenario) -> None:
@@ -232,14 +228,11 @@ def _check_coils(scenario: Scenario) -> None:
         return
     i_0, bias, i = scenario.plant.i_0, scenario.plant.R * scenario.plant.i_0, scenario.initial.i
     if coil.i_max is not None and not coil.i_max > i_0:
-        raise ValueError(
-            f"actuator.coil.i_max = {coil.i_max:g} A: it must be more than the bias current of each coil, "
-            f"plant.i_0 = {i_0:g} A."
-        )
+        why = f"it must be more than the bias current of each coil, plant.i_0 = {i_0:g} A."
+        raise ValueError(f"actuator.coil.i_max = {coil.i_max:g} A: {why}")
     if coil.u_max is not None and not coil.u_max > bias:
-        raise ValueError(
-            f"actuator.coil.u_max = {coil.u_max:g} V: it must be more than the {bias:g} V of the bias current, R i_0."
-        )
+        why = f"it must be more than the {bias:g} V of the bias current, R i_0."
+        raise ValueError(f"actuator.coil.u_max = {coil.u_max:g} V: {why}")
     most = min(math.inf if coil.i_max is None else coil.i_max - i_0, i_0 if coil.unidirectional else math.inf)
     if abs(i) > most:
         raise ValueError(

@@ -152,10 +152,8 @@ class Table:
         if value is default:
             return default
         if is_traced(value):
-            raise ValueError(
-                f"{self.at(key)}: the number is traced. Read the case outside jit, vmap and grad; inside, change its "
-                "numbers by ambjax.with_gains or dataclasses.replace."
-            )
+            why = "inside, change its numbers by ambjax.with_gains or dataclasses.replace."
+            raise ValueError(f"{self.at(key)}: the number is traced. Read the case outside jit, vmap and grad; {why}")
         if getattr(value, "ndim", None) == 0:  # a number of NumPy or JAX, in a dict
             value = value.item()
         if isinstance(value, bool) or not isinstance(value, (int, float)):

@@ -160,9 +160,8 @@ def _named(cases: Sequence[AnyCase], paths: Sequence[str]) -> list[AnyCase]:
     """Append a number to a name that occurs more than once. Raises ValueError for machines beside cases of one axis."""
     for path, case in zip(paths, cases, strict=True):
         if type(case) is not type(cases[0]):
-            raise ValueError(
-                f"{path}, {paths[0]}: one has one axis, the other is a machine with [rotor]. Compare cases of one kind."
-            )
+            advice = "Compare cases of one kind."
+            raise ValueError(f"{path}, {paths[0]}: one has one axis, the other is a machine with [rotor]. {advice}")
     names = [case.name for case in cases]
     return [
         case if names.count(case.name) == 1 else dataclasses.replace(case, name=f"{case.name} ({n})")
@@ -183,10 +182,8 @@ def _differences(paths: Sequence[str], cases: Sequence[AnyCase], studies: Sequen
                 dict(one.spread.entries).get(spread[0].removeprefix("spread."), facts.get(spread[0], "none"))
                 for one, facts in ((study, other), (studies[0], first))
             )
-            raise ValueError(
-                f"{path}: {spread[0]} = {own}, and {paths[0]} has {its}: the members would not be the same. Give both "
-                "cases the same [spread]."
-            )
+            why = "the members would not be the same. Give both cases the same [spread]."
+            raise ValueError(f"{path}: {spread[0]} = {own}, and {paths[0]} has {its}: {why}")
         if names:
             shown = [f"{name} ({first.get(name, 'none')} and {other.get(name, 'none')})" for name in names[:6]]
             shown += [f"{len(names) - 6} more"] * (len(names) > 6)

@@ -44,10 +44,8 @@ def tuned_cases(cases: Sequence[AnyCase], out: pathlib.Path, args: argparse.Name
     folders = [_folder(out, case) for case in cases]
     old = [folder.name for folder in folders if (folder / BEGUN).exists()]
     if old and not (args.resume or args.force):
-        raise ValueError(
-            f"--out {out}: it has tunings of an earlier run ({', '.join(old)}). Continue them with --resume, discard "
-            "them with --force, or choose another directory."
-        )
+        advice = "Continue them with --resume, discard them with --force, or choose another directory."
+        raise ValueError(f"--out {out}: it has tunings of an earlier run ({', '.join(old)}). {advice}")
     found, failed, times = list[AnyCase](), list[str](), list[float]()
     kept = f"the tunings so far are saved. To continue, repeat the command with --out {out} --resume"
     with reporting(lambda: kept):

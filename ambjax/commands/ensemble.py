@@ -132,16 +132,14 @@ def _executor(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | None]
         try:
             client = Client(args.cluster, timeout=PATIENCE)
         except (OSError, ValueError) as error:
-            raise ValueError(
-                f"--cluster {args.cluster}: no scheduler answers there ({error}). Check the address."
-            ) from None
+            advice = "Check the address."
+            raise ValueError(f"--cluster {args.cluster}: no scheduler answers there ({error}). {advice}") from None
         try:
             with client:
                 yield client.get_executor(), AHEAD * max(len(client.scheduler_info()["workers"]), 1)
         except (KilledWorker, CancelledError):
-            raise ValueError(
-                f"--cluster {args.cluster}: the cluster died, or its workers died repeatedly. {CONTINUE}"
-            ) from None
+            why = f"the cluster died, or its workers died repeatedly. {CONTINUE}"
+            raise ValueError(f"--cluster {args.cluster}: {why}") from None
     elif args.processes is not None:
         try:
             with processes(args.processes) as pool:

@@ -101,9 +101,8 @@ def _study(case: Case, args: argparse.Namespace) -> Study | None:
     """Return the study of the case's spread; None without one. Raises ValueError for --members without [spread]."""
     if not case.spread.entries:
         if args.members is not None:
-            raise ValueError(
-                "--members: all members of this case are the same. Add [spread] to the case, or omit --members."
-            )
+            advice = "Add [spread] to the case, or omit --members."
+            raise ValueError(f"--members: all members of this case are the same. {advice}")
         return None
     return study_of(case, args.seed, operating.MEMBERS if args.members is None else args.members)
 

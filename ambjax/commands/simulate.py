@@ -104,10 +104,8 @@ def _check(numbers: dict[str, Any], path: str) -> None:
     """Raise ValueError if a metric is not finite, which is a bug. A time may be inf: the event did not occur."""
     wrong = [name for name, x in numbers.items() if not (np.isfinite(x) or (UNITS.get(name) == "s" and x == math.inf))]
     if wrong:
-        raise ValueError(
-            f"{path}: {', '.join(wrong)}: not finite in this run, so nothing is written. This is a defect of "
-            "ambjax, not of the case: please report it with the case file."
-        )
+        advice = "This is a defect of ambjax, not of the case: please report it with the case file."
+        raise ValueError(f"{path}: {', '.join(wrong)}: not finite in this run, so nothing is written. {advice}")
 
 
 def _window(case: Case, args: argparse.Namespace) -> tuple[float, float] | None:

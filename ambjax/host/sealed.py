@@ -43,9 +43,8 @@ def write_whole(path: pathlib.Path, write: Callable[[IO[bytes]], object]) -> Non
             os.fsync(file.fileno())
         part.replace(path)
     except OSError as error:
-        raise ValueError(
-            f"{path}: cannot be written ({error.strerror}). Free disk space, or choose another --out."
-        ) from None
+        advice = "Free disk space, or choose another --out."
+        raise ValueError(f"{path}: cannot be written ({error.strerror}). {advice}") from None
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)

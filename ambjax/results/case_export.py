@@ -166,9 +166,8 @@ def planned(
     if fmi is not None and format != "fmu":
         raise ValueError(f"--fmi {fmi}: it is the version of an FMU. Omit --fmi, or set --format to fmu.")
     if precision == "float" and format != "c":
-        raise ValueError(
-            f"--precision float: --format {format} computes in double. Omit --precision, or set --format to c."
-        )
+        advice = "Omit --precision, or set --format to c."
+        raise ValueError(f"--precision float: --format {format} computes in double. {advice}")
     if verified and format == "js":
         raise ValueError("--verify: it compares C with JAX. Omit it, or set --format to c.")
     if verified:

@@ -55,10 +55,8 @@ def directory(out: str | None, name: str, names: Iterable[str] = (), force: bool
 def check_new(out: pathlib.Path, names: Iterable[str]) -> None:
     """Raise ValueError if `out` has a file with one of these names."""
     if old := [name for name in names if (out / name).exists()]:
-        raise ValueError(
-            f"--out {out}: it has {', '.join(old)} of an earlier run. Choose another directory, or overwrite them "
-            "with --force."
-        )
+        advice = "Choose another directory, or overwrite them with --force."
+        raise ValueError(f"--out {out}: it has {', '.join(old)} of an earlier run. {advice}")
 
 
 def check_places(out: pathlib.Path, names: Iterable[str | pathlib.PurePath]) -> None:
