@@ -80,11 +80,10 @@ def bilinear(matrices: tuple[np.ndarray, ...], period: float) -> tuple[np.ndarra
 
 
 class LqgProblem(NamedTuple):
-    """The design of an LQG.
+    """The design of an LQG: models of the rotor at `speeds` (rpm), and linear magnets and coils.
 
-    - `weights`: the numbers of `LqgWeights`, none left out. `speeds`: those of the designs, rpm.
-    - `models`: of the rotor at these speeds. `coils`: linear magnets and coils. `pole`: of the magnets, 1/s.
-    - `period`: sample period, s. `delay`: samples. `magnets`, `output`: fields of `StateSpaceLaw`.
+    `weights`: the numbers of `LqgWeights`, none left out. `pole`: of the magnets, 1/s. `period`: sample period, s.
+    `delay`: samples. `magnets`, `output`: fields of `StateSpaceLaw`.
     """
 
     weights: dict[str, float]

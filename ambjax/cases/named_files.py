@@ -40,8 +40,7 @@ class NamedFile(NamedTuple):
 class CaseFiles:
     """The files that a case names, as they are read: custom laws; a linear controller and recorded signals.
 
-    - `folder`: folder of the case file, to which paths are relative.
-    - `known`: a `Case` that names the same files; they are not opened again.
+    `folder`: that of the case file. `known`: a `Case` that names the same files; they are not opened again.
     """
 
     def __init__(self, folder: pathlib.Path = pathlib.Path(), known: Any = None) -> None:

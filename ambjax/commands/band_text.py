@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.linear import Analysis, ResponsePeak, Zones
+from ambjax.linear import Analysis, ResponsePeak, StateSpace, Zones
 from ambjax.linear.linear_machine import AxisSensitivity
 from ambjax.linear.margins import NO_PEAK
-from ambjax.linear.state_space import StateSpace
 from ambjax.world.rotation import PER_MINUTE, Rotation
 
 # The responses whose maxima are reported: words, unit, the name in JSON, and whether the response has zones.

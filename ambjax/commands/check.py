@@ -24,10 +24,9 @@ from ambjax.host.one_thread import one_thread
 from ambjax.linear.stability import Findings, Stability, stability_of
 from ambjax.results.outputs import plain
 from ambjax.simulation.rollout import rollout
-from ambjax.theorem import advice
+from ambjax.theorem import Condition, Report, advice
+from ambjax.theorem import check as check_theorem
 from ambjax.theorem.causes import find_cause
-from ambjax.theorem.conditions import Condition, Report
-from ambjax.theorem.conditions import check as check_theorem
 from ambjax.theorem.sampled_report import Delays, check_sampled, with_causes
 
 Summary = dict[str, object]

@@ -11,13 +11,11 @@ from ambjax.cases.reader import Case
 from ambjax.cases.warned import idealised
 from ambjax.commands.band_text import band_lines, band_numbers, running_facts, running_speeds
 from ambjax.commands.sensitivity_report import set_valued
-from ambjax.linear import PLACES, Analysis, analyse, linearise
-from ambjax.linear.stability import Findings
+from ambjax.linear import PLACES, Analysis, Findings, analyse, linearise
 from ambjax.results.operating import margin_numbers
 from ambjax.results.outputs import table
 from ambjax.text.words import number
-from ambjax.theorem import advice
-from ambjax.theorem.conditions import Condition, Report
+from ambjax.theorem import Condition, Report, advice
 from ambjax.theorem.sampled_report import Delays, SampledReport
 from ambjax.world.amplifier import difference
 
@@ -156,11 +154,10 @@ class OnProcessor(NamedTuple):
 
 
 class Checked(NamedTuple):
-    """Results of a check.
+    """Results of a check. `path`: name of the case file as given by the user.
 
-    - `path`: name of the case file as given by the user.
-    - `report`: on Theorem 1; None: not computed. `findings`: stability of the loop; None: the rotor is lost.
-    - `linear`: whether the loop has a linearisation.
+    `report`: on Theorem 1; None: not computed. `findings`: stability of the loop; None: the rotor is lost. `linear`:
+    whether the loop has a linearisation.
     """
 
     case: Case

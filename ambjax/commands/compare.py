@@ -87,8 +87,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
 class Comparison(NamedTuple):
     """The result of `compare`.
 
-    - `summary`: the content of compare.json: members, seed, and the numbers of each case.
-    - `compared`: each case with the columns of its members, its nominal loop and its peaks.
+    `summary`: the content of compare.json. `compared`: each case with the columns of its members and its nominal loop.
     """
 
     summary: dict[str, Any]

@@ -33,11 +33,9 @@ AXIS_COLUMNS = ("axis", "|z|/clearance", "zone", "weight/force", "force reserve"
 
 
 class CaseCheck(NamedTuple):
-    """The result of a check.
+    """The result of a check: whether it passes, and its numbers, as `ambjax check --json` prints them.
 
-    - `holds`: whether the check passes.
-    - `summary`: its numbers, as `ambjax check --json` prints them.
-    - `text`: the verdict in the first lines, then the tables that apply.
+    `text`: the verdict in the first lines, then the tables that apply.
     """
 
     holds: bool

@@ -12,9 +12,7 @@ from ambjax.commands.band_text import band_lines, running_facts
 from ambjax.commands.reading import results
 from ambjax.commands.sensitivity_report import injected_numbers, injection_text, signs_note
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
-from ambjax.linear import Injection, Zones, machine_injected
-from ambjax.linear.linear_machine import MachineSensitivity
-from ambjax.linear.margins import Margins
+from ambjax.linear import Injection, MachineSensitivity, Margins, Zones, machine_injected
 from ambjax.page.rotor_motion import motion_page
 from ambjax.results import operating
 from ambjax.results.outputs import described, directory, drawn, plain, table, write_json

@@ -112,13 +112,10 @@ def loop_script(case: Case, any_delay: bool = False) -> tuple[str, dict[str, Any
 
 
 class LoopPoint(NamedTuple):
-    """A point at which the loop is linearised.
+    """A point at which the loop is linearised: the state of the plant and its lags, and the states of the laws.
 
-    - `lagged`: state of the plant and its lags.
-    - `acting`: the voltage that acts, V.
-    - `control`: states of the laws.
-    - `past`: the voltages commanded before, the most recent first, V.
-    - `e`: test signal that is added to the reading of z, m.
+    `acting`: the voltage that acts, V. `past`: the voltages commanded before, the most recent first, V. `e`: test
+    signal that is added to the reading of z, m.
     """
 
     lagged: LagState

@@ -34,13 +34,10 @@ SMALLEST = ("singular_at_s", "lost_at_s")
 
 @dataclasses.dataclass(frozen=True)
 class CaseRun:
-    """The result of `simulate`.
+    """The result of `simulate`. A notebook shows it as the table of its metrics.
 
-    - `case`: the case that was simulated.
-    - `trajectory`: its signals at every sample, and the status of the rotor.
-    - `metrics`: each metric by name, in the SI unit of `UNITS`.
-
-    A notebook shows it as the table of its metrics.
+    `trajectory`: the signals of the case at every sample, and the status of the rotor. `metrics`: each metric by name,
+    in the SI unit of `UNITS`.
     """
 
     case: Case
@@ -123,9 +120,9 @@ class CaseRun:
 class MachineRun:
     """The result of a simulation of a machine.
 
-    - `signals`: t (s) [N], q [N, coordinates] (m or rad), speed_rpm [N], and by name each signal of the axes [N, axes].
-    - `metrics`: each metric by name, of the worst axis; under "axes", the metrics of each axis by its name.
-    - `lost_why`: why the rotor was lost; empty if it is held.
+    `signals`: t (s) [N], q [N, coordinates] (m or rad), speed_rpm [N], and by name each signal of the axes [N, axes].
+    `metrics`: each metric by name, of the worst axis; under "axes", the metrics of each axis by its name. `lost_why`:
+    why the rotor was lost; empty if it is held.
     """
 
     case: MachineCase

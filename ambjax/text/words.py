@@ -45,32 +45,28 @@ def _table(name: str) -> dict[str, str]:
     return tomllib.loads(text)[name]
 
 
-def meant(word: str, allowed: Iterable[str], elsewhere: Iterable[str] = ()) -> str | None:
-    """Return the name that `word` probably means: one of `allowed`, or a name of another table; None if unknown."""
+def hint(word: str, allowed: Iterable[str], elsewhere: Iterable[str]) -> str:
+    """Return " Did you mean 'name'?" for the name that `word` probably means; "" if unknown.
+
+    It is one of `allowed`, or the path of a number in another table, among them the paths `elsewhere`.
+    """
     names, plain = list(allowed), _plain(word)
+    if "mu_0" in names and (source := _table("derived").get(plain)):
+        return f" It follows from {source}."
     for name in names:
         if _plain(name) == plain or plain in other_words(name):
-            return name
+            return f" Did you mean '{name}'?"
     lasts = {path: path.rpartition(".")[2] for path in elsewhere}
     paths = [path for path, last in lasts.items() if plain in (_plain(last), *other_words(last))]
     paths += [name for name, words in _table("words").items() if "." in name and plain in words.split()]
     path = next(iter(paths or difflib.get_close_matches(word, names, n=1)), None)
     last = path.rpartition(".")[2] if path else ""
-    return last if last in names else path
+    return f" Did you mean '{last if last in names else path}'?" if path else ""
 
 
 def other_words(name: str) -> list[str]:
     """Return the other words for a name; none if the table has no row for it."""
     return _table("words").get(name, "").split()
-
-
-def hint(word: str, allowed: Iterable[str], elsewhere: Iterable[str] = ()) -> str:
-    """Return " Did you mean 'name'?" for the name that `word` probably means (`meant`); "" if unknown."""
-    allowed = list(allowed)
-    if "mu_0" in allowed and (source := _table("derived").get(_plain(word))):
-        return f" It follows from {source}."
-    name = meant(word, allowed, elsewhere)
-    return f" Did you mean '{name}'?" if name else ""
 
 
 def hint_of_path(path: str, known: Iterable[str]) -> str:
