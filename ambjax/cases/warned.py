@@ -73,10 +73,8 @@ def _noise(case: Case) -> Iterator[str]:
 def _velocity(case: Case) -> Iterator[str]:
     sensor, sampled = case.scenario.sensors, case.scenario.sensor or case.cascade.sampled
     if sensor.velocity and sensor.std_z_dot == 0 and sampled and reads_velocity(case.cascade, case.clock.sample_period):
-        yield (
-            "sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ERROR, unlike by any real sensor. Set "
-            "sensor.std_z_dot, or set sensor.velocity = false and use an observer that estimates the velocity."
-        )
+        advice = "Set sensor.std_z_dot, or set sensor.velocity = false and use an observer that estimates the velocity."
+        yield f"sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ERROR, unlike by any real sensor. {advice}"
 
 
 def idealised(case: Case) -> str:
