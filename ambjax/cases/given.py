@@ -24,6 +24,8 @@ from ambjax.world.scenario import Scenario
 P = ParamSpec("P")
 R = TypeVar("R", covariant=True)
 C = TypeVar("C", contravariant=True)
+# An option of the command line, such as --settings-of.
+OPTION = re.compile(r"--([a-z][a-z-]*)")
 
 
 def of_case(
@@ -82,10 +84,6 @@ def require_case(case: object, *, machines: bool = False, traced: bool = False) 
         require_records("scenario", case.scenario)
         require_one_member({"controller": case.cascade, "scenario": case.scenario, "clock": case.clock})
     settled(case.settle, case.clock)
-
-
-# An option of the command line, such as --settings-of.
-OPTION = re.compile(r"--([a-z][a-z-]*)")
 
 
 def names_arguments(**others: str) -> Callable[[Callable[P, R]], Callable[P, R]]:

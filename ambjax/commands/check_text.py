@@ -19,6 +19,24 @@ from ambjax.theorem import Condition, Report, advice
 from ambjax.theorem.sampled_report import Delays, SampledReport
 from ambjax.world.amplifier import difference
 
+CONTINUOUS = (
+    "The tables of Theorem 1 are computed in continuous time, without the case's [processor] and without the low-pass, "
+    "the converters and the faults of the sensor. An amplifier is included only if it controls the current. A "
+    "set-valued sign is replaced by a sign with a boundary layer. These tables do not affect the verdict on this case."
+)
+
+BAND = (
+    "Evaluated at the samples after run.settle. Signal: the quantity that the law drives to zero. Disturbance: largest "
+    "difference between the rate of the computed signal and the rate that the sign function of the law commands. Band: "
+    "largest |computed signal| that such disturbances can cause. Difference: largest difference between the computed "
+    "signal and that of the plant. Bound: band plus difference; it bounds the signal of the plant. Largest: largest "
+    "|signal| of the plant."
+)
+
+
+# Of a condition; one that is only informative has none.
+VERDICTS = {True: "holds", False: "FAILS", None: ""}
+
 
 class Fact(NamedTuple):
     """A number of the machine. `value`: None: not applicable. Without a `key` it is not in the JSON summary."""
@@ -120,25 +138,6 @@ def _voltages(case: Case) -> tuple[float | None, float | None]:
 def _facts_table(facts: list[Fact]) -> str:
     rows = [(fact.words, f"{fact.value:.4g}", fact.unit) for fact in facts if fact.value is not None]
     return table(("loop and machine", "value", "unit"), rows)
-
-
-CONTINUOUS = (
-    "The tables of Theorem 1 are computed in continuous time, without the case's [processor] and without the low-pass, "
-    "the converters and the faults of the sensor. An amplifier is included only if it controls the current. A "
-    "set-valued sign is replaced by a sign with a boundary layer. These tables do not affect the verdict on this case."
-)
-
-BAND = (
-    "Evaluated at the samples after run.settle. Signal: the quantity that the law drives to zero. Disturbance: largest "
-    "difference between the rate of the computed signal and the rate that the sign function of the law commands. Band: "
-    "largest |computed signal| that such disturbances can cause. Difference: largest difference between the computed "
-    "signal and that of the plant. Bound: band plus difference; it bounds the signal of the plant. Largest: largest "
-    "|signal| of the plant."
-)
-
-
-# Of a condition; one that is only informative has none.
-VERDICTS = {True: "holds", False: "FAILS", None: ""}
 
 
 class OnProcessor(NamedTuple):

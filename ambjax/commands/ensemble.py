@@ -41,6 +41,17 @@ AHEAD = 2
 PATIENCE = "10s"
 CONTINUE = "Finished chunks are kept: repeat the command with --out and --resume to continue."
 
+# Target duration of a chunk, s. It is the largest time lost by an interruption, and the interval of the progress bar.
+CHUNK_SECONDS = 2.0
+# Largest number of members per chunk.
+MOST_CHUNK = 65_536
+# Members per chunk, and members that `_pilot` times, on an accelerator.
+ACCELERATOR_CHUNK = 1024
+# The expected duration is printed above SHORT, and a faster method suggested above LONG, both in s.
+SHORT, LONG = 3.0, 60.0
+# Number of members, and metrics, in the comparison of the sliding step with adaptive steps.
+COMPARISON, COMPARED = 16, ("settled_rms_error_m", "rms_u_V", "chatter_V")
+
 # Chunks by their spans.
 Results = Iterator[tuple[tuple[int, int], dict[str, Any]]]
 
@@ -175,18 +186,6 @@ def _run_on(study: AnyStudy, store: Store, missing: list[tuple[int, int]], pool:
                 running[pool.submit(work, sent, *span, store.chunk)] = span
         for future in wait(running, return_when=FIRST_COMPLETED).done:
             yield running.pop(future), future.result()
-
-
-# Target duration of a chunk, s. It is the largest time lost by an interruption, and the interval of the progress bar.
-CHUNK_SECONDS = 2.0
-# Largest number of members per chunk.
-MOST_CHUNK = 65_536
-# Members per chunk, and members that `pilot` times, on an accelerator.
-ACCELERATOR_CHUNK = 1024
-# The expected duration is printed above SHORT, and a faster method suggested above LONG, both in s.
-SHORT, LONG = 3.0, 60.0
-# Number of members, and metrics, in the comparison of the sliding step with adaptive steps.
-COMPARISON, COMPARED = 16, ("settled_rms_error_m", "rms_u_V", "chatter_V")
 
 
 class Pace(NamedTuple):

@@ -27,6 +27,26 @@ QUANTITIES = {
     "variation of u": ("variation of $u$", "V/s"),
     "v_tilde": (r"force error $\tilde v$", "A²/m²"),
 }
+# Metrics that are drawn by default.
+CHIEF = (
+    "settled_max_abs_error_m",
+    "settled_rms_error_m",
+    "max_abs_error_m",
+    "rms_error_m",
+    "clearance_used",
+    "settled_max_abs_sigma_m_per_s",
+    "v_tilde_reached_s",
+    "max_abs_i_A",
+    "max_abs_u_V",
+    "rms_u_V",
+    "chatter_V",
+    "copper_loss_W",
+)
+# Largest number of bars of a tornado chart, and their colours.
+MOST_DRIVERS = 12
+TRENDS = {"grows with it": BLUE, "falls with it": ORANGE, "no steady trend": "#8a8a8a"}
+LOST = {"facecolor": RED, "edgecolor": "white", "hatch": "////", "linewidth": 0.0}
+MARKS: dict[float, tuple[Any, str, str]] = {0.5: ("-", "median", "median"), 0.95: ("--", "95 %", "95 % quantile")}
 
 
 @own_style
@@ -135,28 +155,6 @@ def _survivors(ax: Axes, t: np.ndarray, lost_at: np.ndarray, stalled: np.ndarray
 def statuses(lost: int, stalled: int) -> str:
     """Return in words the numbers of lost and of stalled members."""
     return f"{lost} lost" + f", {stalled} not decided" * bool(stalled)
-
-
-# Metrics that are drawn by default.
-CHIEF = (
-    "settled_max_abs_error_m",
-    "settled_rms_error_m",
-    "max_abs_error_m",
-    "rms_error_m",
-    "clearance_used",
-    "settled_max_abs_sigma_m_per_s",
-    "v_tilde_reached_s",
-    "max_abs_i_A",
-    "max_abs_u_V",
-    "rms_u_V",
-    "chatter_V",
-    "copper_loss_W",
-)
-# Largest number of bars of a tornado chart, and their colours.
-MOST_DRIVERS = 12
-TRENDS = {"grows with it": BLUE, "falls with it": ORANGE, "no steady trend": "#8a8a8a"}
-LOST = {"facecolor": RED, "edgecolor": "white", "hatch": "////", "linewidth": 0.0}
-MARKS: dict[float, tuple[Any, str, str]] = {0.5: ("-", "median", "median"), 0.95: ("--", "95 %", "95 % quantile")}
 
 
 @own_style

@@ -27,6 +27,8 @@ from ambjax.linear.notch_design import redesigned_at_once
 from ambjax.world.scenario import Scenario
 
 Loop = TypeVar("Loop", Cascade, Case)
+# Numbers of a controller that are no gains, or follow from them.
+NO_GAINS = ("controller.model.", "controller.notch.gains.")
 
 
 def gains_of(loop: Cascade | Case, paths: Iterable[str] | None = None) -> dict[str, Array]:
@@ -83,10 +85,6 @@ def with_gains(loop: Loop, gains: Mapping[str, Any]) -> Loop:
             cascade = dataclasses.replace(cascade, notch=dataclasses.replace(cascade.notch, gains=anew))
         return dataclasses.replace(loop, cascade=cascade)
     return with_values(loop, Scenario(), gains)[0]
-
-
-# Numbers of a controller that are no gains, or follow from them.
-NO_GAINS = ("controller.model.", "controller.notch.gains.")
 
 
 def save_case(path: str | pathlib.Path, case: Case) -> None:
