@@ -12,7 +12,7 @@ from ambjax.commands.band_text import band_lines, running_facts
 from ambjax.commands.reading import results
 from ambjax.commands.sensitivity_report import injected_numbers, injection_text, signs_note
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
-from ambjax.linear import Injection, MachineSensitivity, Margins, Zones, machine_injected
+from ambjax.linear import Injection, MachineSensitivity, Zones, machine_injected
 from ambjax.page.rotor_motion import motion_page
 from ambjax.results import operating
 from ambjax.results.outputs import described, directory, drawn, plain, table, write_json
@@ -39,6 +39,8 @@ COLUMNS = {
     "z_1x_m": "z at 1x, m",
     "i_1x_A": "i at 1x, A",
 }
+# Margins of an axis in sensitivity.json, and their names in `Margins`.
+MARGINS = {"gain_low": "gm_low", "gain_high": "gm_high", "phase_deg": "pm", "delay_s": "delay", "disk": "dm"}
 
 
 def refuse(args: argparse.Namespace, names: tuple[str, ...]) -> None:
@@ -132,7 +134,7 @@ def sensitivity_summary(points: list[MachineSensitivity], measured: Measured) ->
                     "name": axis.name, "peak": axis.S.height, "frequency_hz": axis.S.frequency, "zone": axis.zone,
                     "outside_peak": None if axis.S.outside is None else axis.S.outside.height,
                     "peak_T": axis.T.height, "peak_KS": axis.KS.height,
-                    "margins": None if axis.margins is None else _margins(axis.margins),
+                    "margins": axis.margins and {key: getattr(axis.margins, name) for key, name in MARGINS.items()},
                     "running_speed": facts,
                     **injected_numbers(point.system if point.linear else None, one, k),
                 }
@@ -164,13 +166,6 @@ def once_per_revolution(point: MachineSensitivity) -> list[tuple[list[Summary], 
     """Return |S| of each axis at the speed, as `running_facts` does."""
     speeds = (abs(point.speed) * PER_MINUTE,) if point.speed else ()
     return [running_facts(speeds, point.system, axis.S, k, f"|S| of {axis.name}") for k, axis in enumerate(point.axes)]
-
-
-def _margins(margins: Margins) -> dict[str, float]:
-    return {
-        "gain_low": margins.gm_low, "gain_high": margins.gm_high, "phase_deg": margins.pm,
-        "delay_s": margins.delay, "disk": margins.dm,
-    }  # fmt: skip
 
 
 def outside_lines(point: MachineSensitivity, zones: Zones) -> list[str]:

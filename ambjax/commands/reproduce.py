@@ -1,10 +1,8 @@
 """`ambjax reproduce`: simulate the paper's scenarios, draw its figures and judge its claims."""
 
 import argparse
-import itertools
 import pathlib
 import time
-from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 
 from tqdm import tqdm
@@ -31,12 +29,6 @@ def _paper_figures(reading: str, evidence: Evidence, out: pathlib.Path) -> None:
         save(figure, folder / f"figure_{number}.png", 150)
 
 
-def _names() -> Iterator[str]:
-    yield from ("readings.png", "ledger.md", "ledger.json")
-    for reading, number in itertools.product(paper.READINGS, figures.PAPER_FIGURES):
-        yield f"figure_{number}.png" if reading == "repaired" else f"{reading}/figure_{number}.png"
-
-
 def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     """Reproduce the paper and write its figures and the ledger of claims."""
     try:
@@ -47,7 +39,10 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
 
 
 def _reproduced(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
-    out = directory(args.out, "reproduce", _names(), args.force)
+    folders = ["" if reading == "repaired" else f"{reading}/" for reading in paper.READINGS]
+    drawings = [f"{folder}figure_{number}.png" for folder in folders for number in figures.PAPER_FIGURES]
+    names = ["readings.png", "ledger.md", "ledger.json", *drawings]
+    out = directory(args.out, "reproduce", names, args.force)
     began = time.perf_counter()
     stages = 2 * 8 + 2
     with (
