@@ -13,7 +13,7 @@ from texts import write
 from ambjax import Cascade, Clock, Scenario
 from ambjax.__main__ import main
 from ambjax.cases.reader import read_case
-from ambjax.commands.acceptance import acceptance
+from ambjax.commands.check_text import acceptance
 from ambjax.control import current, inversion, position
 from ambjax.linear import StateSpace, Zones, frequency_lines, linearise, loop_quantities, peak
 from ambjax.linear.margins import DECAYED, decayed_end, whole_end

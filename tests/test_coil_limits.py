@@ -16,7 +16,7 @@ from ambjax.cases.forces import forces
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.codegen.block import numbers_of
-from ambjax.commands.acceptance import machine
+from ambjax.commands.check_text import machine
 from ambjax.simulation.integrate import Begin, InitialValueProblem
 from ambjax.solvers import RK4
 from ambjax.world.amplifier import CoilLimits, difference

@@ -1,5 +1,6 @@
 """`ambjax compare`: its numbers are those of the study and of the linear analysis, of the same members in all cases."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -11,11 +12,12 @@ from ambjax.cases.reader import read_case
 from ambjax.codegen.controller import controller_of
 from ambjax.codegen.trace import trace
 from ambjax.commands import compare
-from ambjax.commands.comparison_report import Quantity, _marked
+from ambjax.commands.comparison_loop import ComparedLoop
+from ambjax.commands.comparison_report import Compared, Quantity, _marked
 from ambjax.ensemble.study import Study
 from ambjax.host import extensions
 from ambjax.linear import analyse, linearise
-from ambjax.pictures.frequency import Contender, comparison_figure
+from ambjax.pictures.frequency import comparison_figure
 from ambjax.results.case_export import guarded_for
 
 # A smooth loop on a processor, 0.2 s of it.
@@ -172,7 +174,9 @@ def test_the_picture_counts_every_member(cases):
     case = read_case(cases / "soft.toml")
     system = linearise(case.cascade, case.scenario, case.clock)
     error, held = np.array([3e-6, 1e-6, 9.0, 2e-6]), np.array([True, True, False, True])
-    axes = comparison_figure([Contender("x", held, error, np.arange(4.0), system)], [3.0, 4.0, 5.0], (1.0, 2e3)).axes
+    columns = {"settled_rms_error_m": error, "settled_rms_u_V": np.arange(4.0), "lost_at": np.where(held, np.inf, 0.1)}
+    one = Compared(dataclasses.replace(case, name="x"), columns, ComparedLoop({"stable": True}, system=system), None)
+    axes = comparison_figure([one], [3.0, 4.0, 5.0], (1.0, 2e3)).axes
     S, shares, KS, points = (ax.get_lines()[0].get_xydata() for ax in axes)
     np.testing.assert_allclose(S[:, 1], np.abs(system.sensitivity(S[:, 0])))
     np.testing.assert_allclose(KS[:, 1], np.abs(system.response(KS[:, 0])[:, 2, 0]))

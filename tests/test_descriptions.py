@@ -49,9 +49,9 @@ def broken(*_, **__):
 # For each command: the functions that make its descriptions, with the file that is then missing ('': printed text).
 FAILING = {
     "ensemble": {
-        "ambjax.pictures.fans.fan": "fan.png",
-        "ambjax.pictures.histograms.histogram_figure": "histograms.png",
-        "ambjax.pictures.histograms.tornado": "tornado.png",
+        "ambjax.pictures.ensembles.fan": "fan.png",
+        "ambjax.pictures.ensembles.histogram_figure": "histograms.png",
+        "ambjax.pictures.ensembles.tornado": "tornado.png",
         "ambjax.commands.study_report.study_tables": "",
     },
     "ensemble, summary": {"ambjax.commands.study_report._summary": "summary.json"},

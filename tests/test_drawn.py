@@ -15,9 +15,9 @@ from matplotlib.collections import LineCollection, PolyQuadMesh, QuadMesh
 import tuning.report.pictures as tuned
 from ambjax.commands import map as map_command
 from ambjax.ensemble.maps import PERIOD, Axis, Map
-from ambjax.pictures import fans, figures, heatmaps, histograms
+from ambjax.pictures import ensembles, figures, heatmaps
+from ambjax.pictures.ensembles import tornado
 from ambjax.pictures.figures import BINS, thin
-from ambjax.pictures.histograms import Bar, tornado
 from ambjax.pictures.overview import overview_figure
 from ambjax.results import case_map
 from ambjax.simulation.trajectory import ALIVE, TOUCHED, Row, Trajectory
@@ -170,8 +170,8 @@ def bands_of(n, seed=0):
 @pytest.mark.parametrize("n", [2, 500, 9601])
 def test_a_fan_shows_the_quantiles_of_the_members(n):
     t, bands = np.linspace(0, 0.9, n), bands_of(n)
-    figure = fans.fan(t, {"z - r": bands}, {}, "")
-    (ax,) = figure.axes
+    figure = ensembles.fan(t, {"z - r": bands}, {}, "", np.array([np.inf]), np.array([False]))
+    ax = figure.axes[0]
     factor = factor_of(ax.get_ylabel())
     for k, (low, high) in enumerate(((0, 100), (5, 95), (25, 75))):
         assert ax.collections[k].get_label() == f"{low} to {high} %"
@@ -196,7 +196,7 @@ def test_the_number_of_survivors_excludes_the_lost_members(members):
     lost_at[-1] = 0.9999  # between the last sample and the end of the run
     stalled = np.arange(members) == members - 1
     bands = {"u": {50: np.zeros(100)}}
-    figure = fans.fan(t, bands, {}, "", lost_at=lost_at, stalled=stalled)
+    figure = ensembles.fan(t, bands, {}, "", lost_at=lost_at, stalled=stalled)
     ax = figure.axes[-1]
     step, rug = ax.lines
     x, share = step.get_data()
@@ -221,7 +221,7 @@ def test_a_histogram_counts_all_members(log):
     lost = rng.uniform(size=500) < 0.3
     if log:
         values[7] = 0.0
-    figure = histograms.histogram_figure({"rms_error_m": values, "lost_at": np.where(lost, 0.1, np.inf)})
+    figure = ensembles.histogram_figure({"rms_error_m": values, "lost_at": np.where(lost, 0.1, np.inf)})
     ax = figure.axes[0]
     assert ax.get_xscale() == ("log" if log else "linear")
     alive, dead = (patch.get_data() for patch in ax.patches)
@@ -243,16 +243,17 @@ def test_a_histogram_counts_all_members(log):
 
 
 def test_a_tornado_shows_the_shares_and_their_intervals():
-    bars = [Bar(f"plant.{k}", share, share / 2, min(1.3 * share, 1), 0.0) for k, share in enumerate((0.2, 1.0, 0.05))]
+    shares = enumerate((0.2, 1.0, 0.05))
+    bars = [{"path": f"plant.{k}", "share": x, "low": x / 2, "high": min(1.3 * x, 1), "rho": 0.0} for k, x in shares]
     figure = tornado(bars, "rms_u_V", "")
     (ax,) = figure.axes
     names = [label.get_text() for label in ax.get_yticklabels()]
     for row, (name, patch, line) in enumerate(zip(names, ax.patches, ax.lines, strict=True)):
         one = bars[int(name[-1])]
-        assert (patch.get_x(), patch.get_width()) == (0, 100 * one.share)
+        assert (patch.get_x(), patch.get_width()) == (0, 100 * one["share"])
         assert patch.get_y() + patch.get_height() / 2 == pytest.approx(row, abs=ROUNDING)
         assert ax.get_yticks()[row] == row
-        np.testing.assert_array_equal(line.get_data(), ([100 * one.low, 100 * one.high], [row, row]))
+        np.testing.assert_array_equal(line.get_data(), ([100 * one["low"], 100 * one["high"]], [row, row]))
     assert names == ["plant.1", "plant.0", "plant.2"]
     assert ax.get_xlim()[0] <= 0
     assert ax.get_xlim()[1] >= 100
@@ -265,7 +266,7 @@ def test_the_cells_of_a_map_lie_at_their_coordinates(path, monkeypatch):
     survival = np.arange(12.0).reshape(4, 3) / 11
     error = np.where(survival > 0, 1e-6 * (1 + np.arange(12.0).reshape(4, 3)), np.nan)
     one = Map(x, y, survival, survival - 0.05, survival + 0.05, error, 0 * error, 0 * survival, 0 * survival, 100)
-    other = one._replace(survival=survival[::-1], low=survival[::-1] - 0.05, high=survival[::-1], error=None)
+    other = one._replace(survival=survival[::-1], low=survival[::-1] - 0.05, high=survival[::-1])
     case = types.SimpleNamespace(name="the case", cascade=None, scenario=None)
     figure = map_command._drawn([case, case], [one, other])
     axes = figure.axes[:3]
@@ -289,10 +290,10 @@ def test_the_cells_of_a_map_lie_at_their_coordinates(path, monkeypatch):
 
 
 def test_the_outlines_of_a_map_follow_the_confidence_bounds():
-    x, y = np.arange(4.0), np.arange(3.0)
+    x, y = Axis("x", np.arange(4.0)), Axis("y", np.arange(3.0))
     survival, low, high = (np.tile(np.arange(4) >= k, (3, 1)).astype(float) for k in (2, 3, 1))
-    panel = heatmaps.MapPanel("", x, y, survival, low, high, None)
-    figure = heatmaps.map_figure([panel], "x", "y", False, False)
+    one = Map(x, y, survival, low, high, *[0 * survival] * 4, members=100)
+    figure = heatmaps.map_figure([one], [""], "x", "y")
     outlines = [c for c in figure.axes[0].collections if isinstance(c, LineCollection)]
     places = [{float(segment[0, 0]) for segment in one.get_segments()} for one in outlines]
     assert places == [{2.5}, {2.5}, {0.5}, {0.5}, {1.5}, {1.5}]  # each a line on its white seam

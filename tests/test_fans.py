@@ -7,7 +7,7 @@ import pytest
 
 from ambjax.cases.reader import case_from
 from ambjax.commands.study_report import _quantiles
-from ambjax.pictures import fans
+from ambjax.pictures import ensembles
 from ambjax.results.spread_runs import study_of
 
 # A step in the force at 10 ms, under a once-per-revolution motion of 540 Hz that the members share.
@@ -80,7 +80,7 @@ def fan_of(name, force, every):
     study = study_of(found, 3, 16)
     data = study.bands(16, found.clock.samples // every)
     shown = {name: _quantiles(x, data.extremes.get(name)) for name, x in data.signals.items()}
-    panels = fans.fan(data.t, shown, {}, "", data.trajectory.lost_at).axes[: len(shown)]
+    panels = ensembles.fan(data.t, shown, {}, "", data.trajectory.lost_at, np.zeros(16)).axes[: len(shown)]
     return data, {name: (ax.lines[0], ax.collections) for name, ax in zip(shown, panels, strict=True)}
 
 

@@ -82,7 +82,7 @@ def test_imports_have_no_cycles():
 
 # Ensembles, linear analysis, the design of default gains, controllers in files, and the number of threads.
 SCIPY = ("ambjax.ensemble", "ambjax.linear", "ambjax.control.regulator", "ambjax.results.runs")
-SCIPY += ("ambjax.control.realisation", "ambjax.control.lqg", "ambjax.cases.controller_file", "ambjax.host.one_thread")
+SCIPY += ("ambjax.control.realisation", "ambjax.control.lqg", "ambjax.cases.named_files", "ambjax.host.one_thread")
 
 
 @pytest.mark.parametrize("module", [m for m in MODULES if m.startswith("ambjax")])

@@ -185,8 +185,8 @@ def test_a_written_case_finds_its_tables(tmp_path):
     written, again = tuned_case(case, {"controller.position.c": 20.0}, "", out)
     (out / "tuned.toml").write_text(written)
     found = read_case(out / "tuned.toml")
-    assert {one.written for one in found.recorded} == {"../../load.csv"}
-    assert [one.file for one in found.recorded] == [one.file for one in case.recorded]
+    assert {one.written for one in found.files} == {"../../load.csv"}
+    assert [one.file for one in found.files] == [one.file for one in case.files]
     assert found.scenario == again.scenario == case.scenario
 
 

@@ -9,7 +9,7 @@ import pytest
 from ambjax.cases.machine_case import machine_from
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
-from ambjax.commands.acceptance import acceptance
+from ambjax.commands.check_text import acceptance
 from ambjax.linear import analyse, linearise
 from ambjax.pictures.run_up_picture import once_per_turn
 from ambjax.results.runs import simulate_machine

@@ -72,8 +72,7 @@ def test_a_stall_is_neither_held_nor_lost():
     report = Report([Condition("x", "", 2.0, 1.0, 0.0, "", True)], [], 0.01, "stalled", "", True)
     nothing = noise(0, stalled=True)
     uncertain = Uncertain([], ["m -10 %"], 0.0)
-    scans, basin = [nothing] * 3, Survival(0.0, 1e-7)
-    evidence = Evidence(run, run, trajectory, {True: run}, report, report, scans, basin, uncertain)
+    evidence = Evidence(run, run, {True: run}, report, report, [nothing] * 3, Survival(0.0, 1e-7), uncertain)
     rows, scans, sampled = (of({"x": evidence}) for of in (judge_claims, noise_table, processor_table))
     verdicts = {row["says"]: row["findings"]["x"]["verdict"] for row in rows}
     others = {"The noise is about 20 % of the gap": claims.HOLDS, "The noise is specified": claims.OPEN}

@@ -14,8 +14,9 @@ from matplotlib.text import Text
 from texts import refusal
 
 from ambjax.__main__ import main
-from ambjax.pictures import fans, figures, heatmaps, histograms
-from ambjax.pictures.histograms import Bar, tornado
+from ambjax.ensemble.maps import Axis, Map
+from ambjax.pictures import ensembles, figures, heatmaps
+from ambjax.pictures.ensembles import tornado
 from ambjax.pictures.overview import overview_figure
 from ambjax.pictures.scales import AXIS_UNITS, LABELS, axis_of, label_of, prefix_of, save
 from ambjax.simulation import orders
@@ -74,7 +75,7 @@ def test_every_metric_has_its_unit():
         assert "_" not in re.sub(r"\$[^$]*\$", "", words), name
     assert axis_of("settled_max_abs_sigma_m_per_s", 2e-3)[1:] == (r"settled max |$\sigma$|", "mm/s")
     assert axis_of("clearance_used", 0.5) == (100.0, "clearance used", "%")
-    assert set(histograms.CHIEF) <= set(names)
+    assert set(ensembles.CHIEF) <= set(names)
 
 
 @pytest.mark.parametrize(
@@ -95,12 +96,12 @@ def test_labels_keep_text_that_is_not_a_unit(label, size, factor, shown):
 # ---------------------------------------------------------------- special cases
 
 
-@pytest.mark.parametrize("lost_at", [None, np.array([np.inf]), np.zeros(3)])
+@pytest.mark.parametrize("lost_at", [np.array([np.inf]), np.zeros(3)])
 @pytest.mark.parametrize("values", [np.zeros(9), np.full(9, -2.0), np.full(9, np.nan), np.r_[1.0, 2.0, [np.nan] * 7]])
 def test_fan_charts_of_special_cases(tmp_path, values, lost_at):
     # one member: all bands alike; NaN: no member left
     bands = {"u": dict.fromkeys(PERCENTS, values)}
-    save(fans.fan(np.linspace(0, 1, 9), bands, {"u": 2.0}, "hard", lost_at), tmp_path / "fan.png")
+    save(ensembles.fan(np.linspace(0, 1, 9), bands, {"u": 2.0}, "hard", lost_at, lost_at == 1), tmp_path / "fan.png")
 
 
 @pytest.mark.parametrize(
@@ -119,25 +120,26 @@ def test_fan_charts_of_special_cases(tmp_path, values, lost_at):
 @pytest.mark.parametrize("all_lost", [False, True])
 def test_histograms_of_special_cases(tmp_path, drawn, values, all_lost):
     columns = {"lost_at": np.full(len(values), 0.1 if all_lost else np.inf), "rms_error_m": values}
-    save(histograms.histogram_figure(columns), tmp_path / "h.png")
+    save(ensembles.histogram_figure(columns), tmp_path / "h.png")
     shown = drawn[0].axes[0].patches[-1].get_data().values.sum()
     in_range = np.isfinite(values) & ((values > 0) | (drawn[0].axes[0].get_xscale() == "linear"))
     assert shown == in_range.sum()  # no value falls out of the last bin
 
 
 def test_tornado_charts_of_special_cases(tmp_path, drawn):
-    save(tornado([Bar("plant.m", 0.0, 0.0, 1.0, 0.0)], "rms_u_V", "nothing explains it"), tmp_path / "a.png")
-    save(tornado([Bar("plant.m", 1.0, 1.0, 1.0, -1.0)], "lost_at_s", "all"), tmp_path / "b.png")
+    keys = ("path", "share", "low", "high", "rho")
+    nothing, alone = (dict(zip(keys, row, strict=True)) for row in (("m", 0.0, 0.0, 1.0, 0.0), ("m", *[1.0] * 3, -1.0)))
+    save(tornado([nothing], "rms_u_V", "nothing explains it"), tmp_path / "a.png")
+    save(tornado([alone], "lost_at_s", "all"), tmp_path / "b.png")
     assert any("falls with it" in words.get_text() for words in drawn[1].findobj(Text))
-    with pytest.raises(ValueError, match="no drivers"):
-        tornado([], "rms_u_V", "")
 
 
-def a_panel(survival, error=None, x=None):
+def a_map(survival, error, x=None):
     ny, nx = survival.shape
-    x = np.geomspace(1e-6, 1e-3, nx) if x is None else x
+    x = Axis("x", np.geomspace(1e-6, 1e-3, nx) if x is None else x, True)
+    y = Axis("y", np.geomspace(1e-5, 1e-3, ny))
     low, high = np.clip(survival - 0.02, 0, 1), np.clip(survival + 0.02, 0, 1)
-    return heatmaps.MapPanel("repaired", x, np.geomspace(1e-5, 1e-3, ny), survival, low, high, error)
+    return Map(x, y, survival, low, high, error, *[0 * survival] * 2, np.nan_to_num(0 * survival), members=100)
 
 
 ALL = np.ones((3, 4))
@@ -150,22 +152,20 @@ ALL = np.ones((3, 4))
         (0 * ALL, np.nan * ALL),
         (0.95 * ALL, 0 * ALL),
         (np.nan * ALL, np.inf * ALL),
-        (np.where(np.eye(3, 4), np.nan, 0.97), None),
+        (np.where(np.eye(3, 4), np.nan, 0.97), np.nan * ALL),
         (np.ones((1, 1)), np.ones((1, 1))),
         (np.array([[0.0, 0.5, 1.0]]), np.array([[np.nan, 1e-3, 1e-6]])),
         (np.eye(2), np.array([[1e-9, 1e3], [1.0, np.nan]])),
     ],
 )
 def test_maps_of_special_cases(tmp_path, survival, error):
-    panels = [a_panel(survival, error), a_panel(0.5 * survival, None)]
-    save(heatmaps.map_figure(panels, "std (m)", "period (s)", True, False, "rms_error_m"), tmp_path / "m.png")
+    found = [a_map(survival, error), a_map(0.5 * survival, error)._replace(members=1)]
+    save(heatmaps.map_figure(found, ["decisive", "one member"], "std (m)", "period (s)"), tmp_path / "m.png")
 
 
-def test_maps_refuse_empty_panels_and_zeros_on_a_log_axis():
-    with pytest.raises(ValueError, match="no panels"):
-        heatmaps.map_figure([], "", "", False, False)
+def test_maps_refuse_zeros_on_a_log_axis():
     with pytest.raises(ValueError, match="log axis cannot show"):
-        heatmaps.map_figure([a_panel(ALL, x=np.arange(4.0))], "x", "y", True, False)
+        heatmaps.map_figure([a_map(ALL, ALL, x=np.arange(4.0))], [""], "x", "y")
 
 
 # ---------------------------------------------------------------- runs

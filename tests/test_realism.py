@@ -16,7 +16,7 @@ import ambjax as amb
 from ambjax.cases.reader import case_from
 from ambjax.cases.template_text import template
 from ambjax.cases.warned import warnings_of
-from ambjax.commands.acceptance import machine
+from ambjax.commands.check_text import machine
 from ambjax.control.processor import Processor
 from ambjax.ensemble import run_ensemble
 from ambjax.ensemble.maps import Axis, with_method_for_axes

@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+import types
 
 import numpy as np
 import pytest
@@ -10,12 +11,12 @@ from texts import refusal
 from ambjax.__main__ import main
 from ambjax.cases.reader import case_from, read_case
 from ambjax.cases.template_text import template
-from ambjax.commands import acceptance
+from ambjax.commands import check_text
 from ambjax.commands.comparison_loop import loop_of_axis
 from ambjax.commands.sensitivity_report import UNSTABLE, WITHOUT, _measured_numbers, text_of
 from ambjax.linear import MemberPeaks, Stability, StateSpace, Zones, analyse, linearise
 from ambjax.linear.state_space import CommandPath
-from ambjax.pictures.frequency import MeasuredPoints, NamedLoop, frequency_figure
+from ambjax.pictures.frequency import frequency_figure
 from ambjax.results import operating
 from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import rollout
@@ -118,7 +119,7 @@ def test_an_unstable_loop_has_no_peaks_and_no_zone(tmp_path, capsys):
     assert written["running_speed"] == []
     axes = frequency_figure("x", [], [3.0, 4.0, 5.0], (1.0, 500.0)).axes
     assert not any(ax.patches for ax in axes)  # no zones
-    summary, lines, _ = acceptance.acceptance(read_case(path))
+    summary, lines, _ = check_text.acceptance(read_case(path))
     assert lines == ["Sensitivity: no zone and no margins: the linearised loop is not stable at r = 0."]
     assert not {"peak", "running_speed", "delay_margin_s"} & set(summary)
 
@@ -153,7 +154,7 @@ def test_check_does_not_succeed_without_a_linearisation(tmp_path, capsys, monkey
     def fails(*args):
         raise ValueError("the cause")
 
-    monkeypatch.setattr(acceptance, "linearise", fails)
+    monkeypatch.setattr(check_text, "linearise", fails)
     code, summary = checked(tmp_path, capsys, CHECKED)
     loop = summary["loop"]
     assert code == 1
@@ -167,7 +168,7 @@ def test_the_numbers_of_the_machine_contain_its_iron(kind):
     rig = tomllib.loads(template("rig"))
     rig["plant"] |= {"kind": kind, "iron": {"saturation": 0.7, "leakage": 1.1}}
     case = case_from(rig)
-    plant, facts = case.scenario.plant, {fact.key: fact.value for fact in acceptance.machine(case)}
+    plant, facts = case.scenario.plant, {fact.key: fact.value for fact in check_text.machine(case)}
 
     def rates(z=0.0, i=0.0, u=0.0):
         return plant.measurement(plant.rates(plant.start(Measurement(z, 0.0, i)), u))
@@ -193,8 +194,8 @@ def test_a_run_decides_on_a_loop_with_set_valued_signs(monkeypatch, pole, held, 
         pole * one, 0.1 * np.ones((1, 3)), np.ones((6, 1)), np.eye(6)[:, :3], np.ones(1), np.array(1e-3), path
     )
     found = Stability(*(np.array([x]) for x in (held, np.nan, not held, 0.0, 0.0, False)), 1.0, 1.0)
-    monkeypatch.setattr(operating, "linearise", lambda *_: system)
-    monkeypatch.setattr(operating, "stability_of", lambda *_: found)
+    monkeypatch.setattr(operating.linear, "linearise", lambda *_: system)
+    monkeypatch.setattr(operating.linear, "stability_of", lambda *_: found)
     point = operating.operating_point(case, "nominal", 0.0)
     assert (point.stable, point.zone) == (held, zone)
     assert np.isfinite(point.analysis.S.height) == (zone == "A")
@@ -258,8 +259,8 @@ def test_the_picture_shows_the_response_and_the_injected_points(tmp_path):
     system = linearise(case.cascade, case.scenario, case.clock)
     f = np.array([10.0, 50.0, 200.0])
     H = system.response(f)
-    measured = MeasuredPoints(f, H[:, 0, 0], H[:, 0, 0] - 1, H[:, 2, 0])
-    loop = NamedLoop("nominal", system, 0.588, 0.02)
+    measured = types.SimpleNamespace(frequency=f, S=H[:, 0, 0], T=H[:, 0, 0] - 1, KS=H[:, 2, 0])
+    loop = operating.operating_point(case, "nominal", 0.0)
     axes = frequency_figure("x", [loop], [3.0, 4.0, 5.0], (1.0, 500.0), measured).axes
     lines = [(ax.get_ylabel(), line) for ax in axes for line in ax.get_lines()]
     curves = {ax.get_ylabel(): ax.get_lines()[0].get_xydata() for ax in axes}

@@ -15,7 +15,7 @@ from profiles import examples
 from texts import refusal, write
 
 from ambjax.__main__ import main
-from ambjax.commands import ensemble, pace, study_report
+from ambjax.commands import ensemble, study_report
 from ambjax.commands import ensemble as studies
 
 CASE = """
@@ -248,7 +248,7 @@ def test_the_error_of_the_sliding_step_is_measured_and_printed(no_pictures, caps
     write(HARD.replace("dt = 5e-5", 'method = "adaptive"'))
     assert main(["ensemble", "case.toml", "--members", "20", "--seed", "3", "--out", "accurate"]) == 0
     with np.load("out/members.npz") as ours, np.load("accurate/members.npz") as theirs:
-        for name in pace.COMPARED:
+        for name in ensemble.COMPARED:
             off = np.abs(ours[name] / theirs[name] - 1)[:16].max()
             assert error[name] == pytest.approx(off, rel=1e-9)  # the same numbers, divided otherwise
             assert f"{name} off by {100 * off:.2g} %" in err

@@ -20,7 +20,7 @@ from ambjax.ensemble import worker
 from ambjax.host.command_line import open_streams
 from ambjax.host.lock import LOCK, locked
 from ambjax.host.sealed import write_whole
-from ambjax.pictures import histograms
+from ambjax.pictures import ensembles
 from ambjax.pictures.scales import save
 from ambjax.results import outputs
 from tuning.__main__ import main as tune
@@ -169,8 +169,8 @@ def test_a_missing_device_is_reported_in_one_line(error, monkeypatch, capsys):
 
 
 def test_pictures_do_not_depend_on_a_matplotlibrc():
-    bars = [histograms.Bar(**dict.fromkeys(histograms.Bar._fields, 0.5) | {"path": "plant.m"})]
+    bars = [{"path": "plant.m", "share": 0.5, "low": 0.5, "high": 0.5, "rho": 0.5}]
     with matplotlib.rc_context({"text.usetex": True, "font.size": 30, "axes.facecolor": "red"}):
-        save(histograms.tornado(bars, "rms_u_V", "all"), pathlib.Path("theirs.png"))
-    save(histograms.tornado(bars, "rms_u_V", "all"), pathlib.Path("ours.png"))
+        save(ensembles.tornado(bars, "rms_u_V", "all"), pathlib.Path("theirs.png"))
+    save(ensembles.tornado(bars, "rms_u_V", "all"), pathlib.Path("ours.png"))
     assert pathlib.Path("theirs.png").read_bytes() == pathlib.Path("ours.png").read_bytes()

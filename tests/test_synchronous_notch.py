@@ -20,9 +20,9 @@ from ambjax.ensemble.maps import PERIOD
 from ambjax.linear import linearise
 from ambjax.linear.linear_machine import linearise_machine
 from ambjax.linear.margins import poles_in_s
+from ambjax.results.case_gains import with_gains
 from ambjax.results.case_map import study_and_axes
 from ambjax.results.cell_gains import notch_gains
-from ambjax.results.gains import with_gains
 from ambjax.results.runs import simulate, simulate_machine
 from ambjax.world.rotation import Rotation
 from ambjax.world.sensor import Measurement

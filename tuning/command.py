@@ -9,18 +9,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ambjax.cases.given import names_arguments
 from ambjax.cases.machine_case import AnyCase, MachineCase
 from ambjax.cases.reader import Case, is_machine, read_case
 from ambjax.cases.table import FILE, load, one_line, require_file, text_of
 from ambjax.commands.reading import print_warnings
-from ambjax.host.arguments import names_arguments
 from ambjax.host.heartbeat import say
 from ambjax.host.interrupts import reporting
 from ambjax.host.lock import locked
 from ambjax.host.one_thread import one_thread
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
-from ambjax.results.case_file import text_with_gains
+from ambjax.results.case_gains import text_with_gains
 from ambjax.results.outputs import check_new, described, directory, files, plain, write_json
 from tuning.events import Listener, Log, teller
 from tuning.machines.machine_tuning import machine_plan, tune_machine

@@ -9,8 +9,8 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-from ambjax.commands.pace import duration
 from ambjax.host.heartbeat import SILENCE, Heartbeat
+from ambjax.text.words import duration
 
 
 class Reached(NamedTuple):

@@ -105,10 +105,8 @@ def check_axis(case: Case, axis: BearingAxis, force: float, q: np.ndarray) -> No
             "centre. Increase plant.n, plant.A, plant.i_0 or the limits of [actuator], or reduce plant.s_0."
         )
     if abs(z := float(axis.magnet @ q)) >= gap:
-        raise ValueError(
-            f"axis {axis.name}: initial.q: at the magnet z = {z:g} m: the rotor would touch it; |z| must be below "
-            f"{gap:g} m."
-        )
+        why = f"the rotor would touch it; |z| must be below {gap:g} m."
+        raise ValueError(f"axis {axis.name}: initial.q: at the magnet z = {z:g} m: {why}")
 
 
 def stop_slope(rotor: Rotor, cases: list[Case]) -> float:

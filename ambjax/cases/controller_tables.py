@@ -3,9 +3,8 @@
 import dataclasses
 from typing import Any
 
-from ambjax.cases.controller_file import controller_file
+from ambjax.cases.named_files import CaseFiles, controller_file
 from ambjax.cases.own_laws import FORM, is_own, own_law_of
-from ambjax.cases.recordings import CaseFiles
 from ambjax.cases.scenario_tables import drive
 from ambjax.cases.table import Table, quoted, show
 from ambjax.control import current, inversion, observer, position
@@ -150,8 +149,8 @@ def _usual(kinds: dict[str, type[Law]], demanding: Any, command: str) -> str:
 def _linear(table: Table, files: CaseFiles) -> Law:
     law = table.record(position.LinearController, extra=("kind", "file", "output"))
     output = table.choice("output", list(OUTPUTS), OUTPUTS[0])
-    files.controller = (files.known and files.known.controller_file) or controller_file(table, files.folder)
-    return dataclasses.replace(law, output=output, realisation=files.controller.contents)
+    contents = files.contents(table.at("file"), lambda: controller_file(table, files.folder))
+    return dataclasses.replace(law, output=output, realisation=contents)
 
 
 def _defaults(table: Table, kind: type[Law], model: Plant, sampling: Sampling | None, printed: bool) -> Law | None:

@@ -39,22 +39,13 @@ def forces(case: Case) -> Forces:
     return Forces(largest, m * abs(float(plant.g)), load)
 
 
-class LinearMagnet(NamedTuple):
-    """The true magnets at z = i = 0, with the saturation and the leakage of their iron.
-
-    `k_s`: negative stiffness, N/m. `k_i`: force per current, N/A. `L`: voltage per rate of the current, H. `flux`: flux
-    density of the cores, T.
-    """
-
-    k_s: Array
-    k_i: Array
-    L: Array
-    flux: Array
-
-
 @jax.jit
-def linear_magnet(plant: Bearing) -> LinearMagnet:
-    """Return the derivatives of the force and of the current's rate at z = i = 0."""
+def linear_magnet(plant: Bearing) -> tuple[Array, Array, Array, Array]:
+    """Return numbers of the true magnets at z = i = 0, with the saturation and the leakage of their iron.
+
+    They are k_s, the negative stiffness, N/m; k_i, the force per current, N/A; L, the voltage per rate of the current,
+    H; and the flux density of the cores, T.
+    """
     zero = jnp.zeros(())
     rest = plant.start(Measurement(zero, zero, zero))
 
@@ -65,10 +56,4 @@ def linear_magnet(plant: Bearing) -> LinearMagnet:
         return plant.measurement(plant.rates(rest, u)).i
 
     k_s, k_i = jax.grad(force, (0, 1))(zero, zero)
-    return LinearMagnet(k_s, k_i, 1 / jax.grad(rate)(zero), plant.flux_density(rest))
-
-
-def bias_flux(case: Case) -> float:
-    """Return the flux density of the bias current without saturation and leakage, mu_0 n i_0/(2 s_0), T."""
-    plant = case.scenario.plant
-    return float(plant.mu_0) * float(plant.n) * float(plant.i_0) / (2 * float(plant.s_0))
+    return k_s, k_i, 1 / jax.grad(rate)(zero), plant.flux_density(rest)

@@ -20,7 +20,7 @@ from ambjax.cases.own_laws import OwnLaw, is_own, own_law_of, tried
 from ambjax.cases.plausibility import unresolved
 from ambjax.cases.reader import TABLES, Case, case_from, is_machine, read_by, safe_name
 from ambjax.cases.rotor_numbers import fastest_rotor, widest_rotation
-from ambjax.cases.rotor_tables import COORDINATES, RIGID, BearingAxis, axes_and_rotor, tables_of, vector
+from ambjax.cases.rotor_tables import COORDINATES, RIGID, BearingAxis, axes_and_rotor, vector
 from ambjax.cases.speed_table import MOST_SPEEDS, listed_speeds
 from ambjax.cases.table import Table, show
 from ambjax.control.cascade import Cascade
@@ -94,9 +94,8 @@ def read_machine(path: str | pathlib.Path | Mapping[str, Any]) -> MachineCase:
 
     def parse(raw: dict[str, Any], *rest: Any) -> MachineCase:
         if not is_machine(raw):
-            raise ValueError(
-                "it has no [rotor] with a kind, so it is a case of one axis; in Python, read_case reads it."
-            )
+            why = "it has no [rotor] with a kind, so it is a case of one axis"
+            raise ValueError(f"{why}; in Python, read_case reads it.")
         return machine_from(raw, *rest)
 
     with jax.ensure_compile_time_eval():
@@ -128,7 +127,7 @@ def machine_from(
     if (method := top.table("clock").raw.get("method", "auto")) not in ("auto", "rk4", "dop853", "euler"):
         words = "'rk4', 'dop853' or 'euler' with a number for clock.dt, or leave it out"
         raise ValueError(f"clock.method = {show(method)}: a machine takes equal explicit steps. Give {words}.")
-    bearings = tables_of(top, "bearing")
+    bearings = top.tables("bearing")
     if not bearings:
         raise ValueError("[[bearing]] is missing: give one for each bearing, with kind and at.")
     axes, rotor = axes_and_rotor(top, folder)

@@ -76,9 +76,8 @@ def axis_controller(raw: dict[str, Any]) -> None:
         raw["controller"] = controller | outer | inner
     if isinstance(raw.get("processor"), dict):
         if Table(raw).table("processor").switch("predict"):
-            raise ValueError(
-                f'processor.predict = true: controller.kind = "{kind}" predicts nothing. Leave predict out.'
-            )
+            law = f'controller.kind = "{kind}"'
+            raise ValueError(f"processor.predict = true: {law} predicts nothing. Leave predict out.")
         raw["processor"]["predict"] = False
 
 
@@ -119,10 +118,8 @@ def law_from(
         own = bearing.table("controller")
         for key in ("observer", "position"):
             if key in own.raw:
-                raise ValueError(
-                    f"{own.at(key)}: in rigid-body coordinates no bearing has its own {key}. Use [controller.tilt."
-                    f"{key}] or [controller.axial.{key}]."
-                )
+                advice = f"Use [controller.tilt.{key}] or [controller.axial.{key}]."
+                raise ValueError(f"{own.at(key)}: in rigid-body coordinates no bearing has its own {key}. {advice}")
     return rigid_body(top, rotor, cases, read, bool(compensated))
 
 

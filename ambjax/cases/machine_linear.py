@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.cases.controller_file import controller_file
+from ambjax.cases.named_files import controller_file
 from ambjax.cases.reader import Case
 from ambjax.cases.rotor_tables import MODES, RIGID
 from ambjax.cases.speed_table import listed_speeds
@@ -53,10 +53,8 @@ def linear(top: Table, cases: list[Case], folder: pathlib.Path) -> StateSpaceLaw
     period = float(cases[0].clock.sample_period) if cases[0].cascade.sampled else None
     if dt and (period is None or not abs(period / dt - 1) < SAME_PERIOD):
         has = "in continuous time" if period is None else f"with a sample period of {period:g} s"
-        raise ValueError(
-            f"{table.at('file')} = {show(table.raw['file'])}: the controller is discrete, dt = {dt:g} s, and this case "
-            f"runs {has}. Set [processor] and clock.sample_period = {dt:g}, or give a continuous controller."
-        )
+        why = f"the controller is discrete, dt = {dt:g} s, and this case runs {has}. Set [processor] and clock."
+        raise table.refuse("file", f"{why}sample_period = {dt:g}, or give a continuous controller.")
     matrices = matrices if period is None else bilinear(matrices, period)
     n = len(matrices[0])
     return StateSpaceLaw(
@@ -82,11 +80,10 @@ def bilinear(matrices: tuple[np.ndarray, ...], period: float) -> tuple[np.ndarra
 
 
 class LqgProblem(NamedTuple):
-    """The design of an LQG.
+    """The design of an LQG: models of the rotor at `speeds` (rpm), and linear magnets and coils.
 
-    - `weights`: the numbers of `LqgWeights`, none left out. `speeds`: those of the designs, rpm.
-    - `models`: of the rotor at these speeds. `coils`: linear magnets and coils. `pole`: of the magnets, 1/s.
-    - `period`: sample period, s. `delay`: samples. `magnets`, `output`: fields of `StateSpaceLaw`.
+    `weights`: the numbers of `LqgWeights`, none left out. `pole`: of the magnets, 1/s. `period`: sample period, s.
+    `delay`: samples. `magnets`, `output`: fields of `StateSpaceLaw`.
     """
 
     weights: dict[str, float]
@@ -158,10 +155,9 @@ def _coils(cases: Sequence[Case], voltage: bool) -> LinearCoils:
     m, a, R, L, s_0 = (numbers(cases, name) for name in ("m", "a", "R", "L", "s_0"))
     models = [case.cascade.model for case in cases]
     i = np.array([float(model.equilibrium()[0]) for model in models])
-    slopes = [
-        (float(model.dv_dz(0.0, one)), float(model.dv_di(0.0, one))) for model, one in zip(models, i, strict=True)
-    ]
-    dv_dz, dv_di = np.array(slopes).T
+    each = list(zip(models, i, strict=True))
+    dv_dz = np.array([float(model.dv_dz(0.0, one)) for model, one in each])
+    dv_di = np.array([float(model.dv_di(0.0, one)) for model, one in each])
     if voltage:
         return LinearCoils(m * a * dv_dz, m * a * dv_di, R, L, 2 * i / s_0)
     laws = [case.cascade.current for case in cases]

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from ambjax.cases.forces import bias_flux, forces
+from ambjax.cases.forces import forces
 from ambjax.cases.reader import Case
 from ambjax.simulation.orders import ORDERS, ROUNDED
 from ambjax.world.recorded import Recorded
@@ -81,12 +81,11 @@ def _forces(case: Case) -> Iterator[str]:
 
 
 def _flux(case: Case) -> Iterator[str]:
-    iron = case.scenario.plant.iron
-    if (flux := bias_flux(case)) > MOST_FLUX and (iron is None or iron.saturation is None):
-        yield (
-            f"plant: the bias flux density mu_0 n i_0/(2 s_0) is {flux:.3g} T; iron saturates above about "
-            f"{MOST_FLUX:g} T. Check n, i_0 and s_0, or give plant.iron.saturation."
-        )
+    plant, iron = case.scenario.plant, case.scenario.plant.iron
+    flux = float(plant.mu_0) * float(plant.n) * float(plant.i_0) / (2 * float(plant.s_0))  # of the bias current
+    if flux > MOST_FLUX and (iron is None or iron.saturation is None):
+        why = f"iron saturates above about {MOST_FLUX:g} T. Check n, i_0 and s_0, or give plant.iron.saturation."
+        yield f"plant: the bias flux density mu_0 n i_0/(2 s_0) is {flux:.3g} T; {why}"
     if iron is not None and iron.saturation is not None and flux > float(iron.saturation):
         yield (
             f"plant.iron.saturation = {float(iron.saturation):g} T is less than the bias flux density "
@@ -153,10 +152,8 @@ def _runout(case: Case) -> Iterator[str]:
         return
     most = max(abs(float(one)) for one in runout.span(float(case.clock.duration)))
     if most > MOST_RUNOUT * stop:
-        yield (
-            f"sensor.runout: the harmonics reach {most:.3g} m, {100 * most / stop:.3g} % of run.clearance. Are the "
-            "amplitudes in another unit?"
-        )
+        advice = "Are the amplitudes in another unit?"
+        yield f"sensor.runout: the harmonics reach {most:.3g} m, {100 * most / stop:.3g} % of run.clearance. {advice}"
 
 
 def _signals(case: Case) -> dict[str, object]:
@@ -204,10 +201,8 @@ def _aliases(case: Case) -> Iterator[str]:
     for path, signal in parts.items():
         for name, high in frequencies_of(signal):
             if high >= half:
-                yield (
-                    f"{path}: {name} gives {high:.4g} Hz, not below half the sampling rate, {half:.4g} Hz: samples "
-                    "cannot resolve it. Reduce clock.sample_period."
-                )
+                why = "samples cannot resolve it. Reduce clock.sample_period."
+                yield f"{path}: {name} gives {high:.4g} Hz, not below half the sampling rate, {half:.4g} Hz: {why}"
 
 
 def _orders(case: Case) -> Iterator[str]:

@@ -12,11 +12,10 @@ import jax
 import numpy as np
 
 from ambjax.cases.case_table import notebook_table, parts_of
-from ambjax.cases.controller_file import ControllerFile
 from ambjax.cases.controller_tables import KINDS, cascade_from, notch_from, with_gains_of_notch
+from ambjax.cases.named_files import CaseFiles, NamedFile
 from ambjax.cases.own_laws import OwnLaw
 from ambjax.cases.reach import check_reference
-from ambjax.cases.recordings import CaseFiles, RecordedFile
 from ambjax.cases.scenario_tables import check_start, scenario_from
 from ambjax.cases.table import FILE, Table, check_depth, cut, load, put, require_file, text_of
 from ambjax.cases.timing import clock_from
@@ -24,7 +23,7 @@ from ambjax.cases.variation import spread_from
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import Spread, corners, ends
 from ambjax.linear.analysis import Zones
-from ambjax.numerics.declared import leaves_of, require_number
+from ambjax.numerics.declared import require_number
 from ambjax.simulation.clock import PARTS, Clock
 from ambjax.simulation.method import with_method
 from ambjax.simulation.metrics import settled
@@ -65,10 +64,8 @@ class Case:
     """The contents of a case file.
 
     `clock`: its integration method is valid for all values of the spread. `settle`: time from which
-    "settled" metrics count, s. `text`: the file as it was read. `assumed`: names of the plant's parameters that the
-    file omits while it gives others; they keep the paper's values. Empty if the file gives all or none. `own_laws`: the
-    custom laws that the file names. `controller_file`: the linear controller that the file names, or None. `zones`:
-    range and limits of the sensitivity. `recorded`: the files of recorded signals.
+    "settled" metrics count, s. `text`: the file as it was read. `own_laws`: the custom laws that the file names.
+    `zones`: range and limits of the sensitivity. `files`: the linear controller and the recorded signals that it names.
 
     A case is a pytree of its cascade, scenario and clock, so it is an argument of functions under jit and vmap.
     """
@@ -80,11 +77,9 @@ class Case:
     settle: float
     spread: Spread = Spread()
     text: str = ""
-    assumed: tuple[str, ...] = ()
     own_laws: tuple[OwnLaw, ...] = ()
-    controller_file: ControllerFile | None = None
     zones: Zones = Zones()
-    recorded: tuple[RecordedFile, ...] = ()
+    files: tuple[NamedFile, ...] = ()
 
     def __post_init__(self) -> None:
         for name, kind in {"name": str, "cascade": Cascade, "scenario": Scenario, "clock": Clock}.items():
@@ -93,7 +88,6 @@ class Case:
         require_number("Case.settle", self.settle, 0)
 
     def _repr_html_(self) -> str:
-        """Return the table of the parts of the case and their numbers, for notebooks."""
         parts = parts_of(self.cascade, self.scenario, self.clock)
         parts |= {"spread": ", ".join(self.spread.paths)} if self.spread.paths else {}
         return notebook_table(self.name, ("part", "numbers"), parts.items())
@@ -203,11 +197,10 @@ def case_from(
     if cascade.sampled:
         latest = ends(spread, cascade, scenario, ("processor.",))[0].timing.delay
         cascade = cascade.on_processor(latest, between="processor.delay" in spread.paths)
-    assumed = _left_out(top.table("plant"), plant)
     zones = top.table("sensitivity").record(Zones)
     zones.check(clock.sample_period if cascade.sampled else None)
-    own, recorded, name = tuple(files.own_laws), tuple(files.recorded), safe_name(name)
-    return Case(name, cascade, scenario, clock, settle, spread, text, assumed, own, files.controller, zones, recorded)
+    own, read, name = tuple(files.own_laws), tuple(files.files), safe_name(name)
+    return Case(name, cascade, scenario, clock, settle, spread, text, own, zones, read)
 
 
 def is_as_written(case: Case) -> bool:
@@ -216,14 +209,11 @@ def is_as_written(case: Case) -> bool:
     The gains of a notch are not compared: they follow from the other numbers.
     """
     read = case_from(tomllib.loads(case.text), case.name, known=case)
-    (a, known), (b, given) = (
-        jax.tree_util.tree_flatten_with_path([getattr(one, name) for name in PARTS]) for one in (read, case)
-    )
+    parts = ([getattr(one, name) for name in PARTS] for one in (read, case))
+    (a, known), (b, given) = map(jax.tree_util.tree_flatten_with_path, parts)
     same = all(getattr(read, name) == getattr(case, name) for name in ("settle", "spread", "zones"))
-    pairs = [
-        (x, y) for (path, x), (_, y) in zip(a, b, strict=False) if ".notch.gains" not in jax.tree_util.keystr(path)
-    ]
-    return same and known == given and all(np.array_equal(*pair) for pair in pairs)
+    both = [(jax.tree_util.keystr(path), x, y) for (path, x), (_, y) in zip(a, b, strict=False)]
+    return same and known == given and all(np.array_equal(x, y) for path, x, y in both if ".notch.gains" not in path)
 
 
 def cascade_at(case: Case, period: float, changes: Mapping[str, float]) -> Cascade:
@@ -244,10 +234,3 @@ def _plant(table: Table) -> Bearing:
     if "iron" not in table.raw:
         return plant
     return dataclasses.replace(plant, iron=table.table("iron").record(Iron))
-
-
-def _left_out(table: Table, plant: Bearing) -> tuple[str, ...]:
-    """Return the names of the plant's parameters that its table omits; none if the table gives no number at all."""
-    names = [field.name for field in leaves_of(type(plant))]
-    left = tuple(name for name in names if name not in table.raw)
-    return left if len(left) < len(names) else ()

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.cases.recordings import CaseFiles
+from ambjax.cases.named_files import CaseFiles
 from ambjax.cases.scenario_tables import signal_from
 from ambjax.cases.table import Table, show
 from ambjax.numerics.records import leaf
@@ -55,14 +55,6 @@ class RotorBody(NamedTuple):
             return found - self.centre, self.shapes(found)
         needed = count and other is not None and found != at
         return found - self.centre, vector(table, modes, count, None if needed else default)
-
-
-def tables_of(top: Table, name: str) -> list[Table]:
-    """Return the tables of a list, written as [[name]]."""
-    raw = top.raw.get(name, [])
-    if not isinstance(raw, list):
-        raise ValueError(f"{top.at(name)} = {show(raw)}: write [[{top.at(name)}]] above each.")
-    return [Table(one, f"{top.at(name)}[{k}]") for k, one in enumerate(raw)]
 
 
 def needed(table: Table, key: str, field: Any) -> float:
@@ -137,7 +129,7 @@ def _directed(table: Table, unit: str, files: CaseFiles, own: tuple[str, ...] = 
     direction = vector(table, "direction", 3)
     size = float(np.linalg.norm(direction))
     if size == 0:
-        raise ValueError(f"{table.at('direction')} = {show(table.raw['direction'])}: it must not be zero.")
+        raise table.refuse("direction", "it must not be zero.")
     rest = Table({key: value for key, value in table.raw.items() if key not in ("direction", *own)}, table.path)
     signal = signal_from(rest, unit, files)
     if _turns(signal):

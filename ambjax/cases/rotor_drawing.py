@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ambjax.cases.machine_case import MachineCase
-from ambjax.cases.rotor_tables import RIGID, body_from, tables_of
+from ambjax.cases.rotor_tables import RIGID, body_from
 from ambjax.cases.table import Table
 from ambjax.world.rotor import Rotor
 
@@ -41,10 +41,10 @@ def drawing_of(case: MachineCase) -> RotorDrawing:
     at = np.linspace(0.0, ends[-1], PLACES)
     top = Table(raw | {"load": [{"at": float(x)} for x in at]})  # so that each place is a node
     body, table = body_from(top), top.table("rotor")
-    shape_at, diameters = body.shapes, [one.raw["diameter"] for one in tables_of(table, "elements")]
+    shape_at, diameters = body.shapes, [one.raw["diameter"] for one in table.tables("elements")]
     assert shape_at is not None
     sections = tuple(zip(ends[:-1] - body.centre, ends[1:] - body.centre, diameters, strict=True))
-    discs = tuple(one.raw["at"] - body.centre for one in tables_of(table, "discs"))
+    discs = tuple(one.raw["at"] - body.centre for one in table.tables("discs"))
     return RotorDrawing(planes, at - body.centre, np.stack([shape_at(x) for x in at]), sections, discs)
 
 

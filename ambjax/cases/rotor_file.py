@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from ambjax.cases.controller_file import contents_of
+from ambjax.cases.named_files import contents_of
 from ambjax.cases.rotor_body import DAMPING, MODES, RotorBody, dampings_of
 from ambjax.cases.table import Table
 from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly, precision
@@ -87,9 +87,8 @@ def _of_matrices(arrays: dict[str, np.ndarray], table: Table) -> RotorBody:
     K, slopes = own["K"], np.stack([nodes - nodes.mean(), np.ones(count)], 1).ravel()
     for motion in (np.tile([1.0, 0.0], count), slopes):
         if np.abs(K @ motion).max() > FREE * np.abs(K).max() * np.abs(motion).max():
-            raise ValueError(
-                "K holds the rotor: it must be free. Save the rotor without bearings and seals, with nodes in m."
-            )
+            advice = "Save the rotor without bearings and seals, with nodes in m."
+            raise ValueError(f"K holds the rotor: it must be free. {advice}")
     if np.linalg.eigvalsh(own["M"])[0] <= 0:
         raise ValueError("M must be positive definite.")
     modes = table.leaf("modes", MODES, MODES.default)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.cases.recordings import CaseFiles
+from ambjax.cases.named_files import CaseFiles
 from ambjax.cases.rotor_body import (
     DAMPING,
     FREQUENCY,
@@ -23,7 +23,6 @@ from ambjax.cases.rotor_body import (
     load_from,
     needed,
     row,
-    tables_of,
     unbalance_from,
     vector,
 )
@@ -77,7 +76,7 @@ def body_from(top: Table, folder: pathlib.Path = pathlib.Path()) -> RotorBody:
     known = next((key for key in ("m", "I_t", "I_p") if key in table.raw), None)
     if known and (kind == "shaft" or "file" in table.raw):
         source = "geometry" if kind == "shaft" else "file"
-        raise ValueError(f"{table.at(known)} = {show(table.raw[known])}: it follows from the {source}. Leave it out.")
+        raise table.refuse(known, f"it follows from the {source}. Leave it out.")
     if kind == "shaft":
         table.only([*common, "elements", "discs", "sleeves", "modes", "damping", *MATERIAL])
         return _shaft(table, _places(top))
@@ -94,7 +93,7 @@ def body_from(top: Table, folder: pathlib.Path = pathlib.Path()) -> RotorBody:
             f"{table.at('modes')} is missing: give [[rotor.modes]] with the frequency of each bending mode, or "
             'a file; kind = "rigid" has no modes.'
         )
-    modes = tables_of(table, "modes")
+    modes = table.tables("modes")
     for one in modes:
         one.only(["frequency", "damping"])
     frequencies = np.array([needed(one, "frequency", FREQUENCY) for one in modes])
@@ -120,18 +119,15 @@ def _gyroscopic(table: Table, masses: tuple[float, float, float], modes: int) ->
     given = table.array("Gm", None, "a list of rows")
     Gm = np.asarray(given, float) if np.shape(given) in ((modes, modes), whole.shape) else np.full((1, 1), np.nan)
     if not np.all(np.isfinite(Gm)):
-        raise ValueError(
-            f"{table.at('Gm')} = {show(table.raw['Gm'])}: it must be {modes} rows of {modes} numbers, for the modes, "
-            f"or {2 + modes} rows of {2 + modes}, for translation, tilt and modes."
-        )
+        whole_size = f"{2 + modes} rows of {2 + modes}, for translation, tilt and modes"
+        raise table.refuse("Gm", f"it must be {modes} rows of {modes} numbers, for the modes, or {whole_size}.")
     if not np.allclose(Gm, Gm.T, rtol=1e-6, atol=1e-9 * np.abs(Gm).max()):
         raise ValueError(f"{table.at('Gm')}: it must be symmetric.")
     if len(Gm) == modes:
         whole[2:, 2:] = Gm
     elif np.abs(Gm[0]).max() > 1e-9 * np.abs(Gm).max() or not np.isclose(Gm[1, 1], I_p / I_t, rtol=1e-2):
-        raise ValueError(
-            f"{table.at('Gm')}: its first row must be 0, and Gm[1][1] = {Gm[1, 1]:g} must be I_p/I_t = {I_p / I_t:g}."
-        )
+        why = f"its first row must be 0, and Gm[1][1] = {Gm[1, 1]:g} must be I_p/I_t = {I_p / I_t:g}."
+        raise ValueError(f"{table.at('Gm')}: {why}")
     else:
         size = np.sqrt([m, I_t, *np.ones(modes)])
         whole = Gm * np.outer(size, size)
@@ -142,7 +138,7 @@ def _places(top: Table) -> list[float]:
     found = [
         one.leaf(key, PLACE)
         for name in ("bearing", "unbalance", "load")
-        for one in tables_of(top, name)
+        for one in top.tables(name)
         for key in PLACE_KEYS
         if key in one.raw
     ]
@@ -161,26 +157,25 @@ def _section(table: Table, begin: float, common: Table, sleeve: bool = False) ->
 
 def _shaft(table: Table, places: list[float]) -> RotorBody:
     """Return the body of a shaft from its geometry. Places are measured from the left end of the shaft."""
-    elements, begin, sections = tables_of(table, "elements"), 0.0, list[Section]()
+    elements, begin, sections = table.tables("elements"), 0.0, list[Section]()
     if not elements:
         raise ValueError(f"{table.at('elements')} is missing: give [[rotor.elements]] with length and diameter.")
     for one in elements:
         sections.append(_section(one, begin, table))
         begin += float(sections[-1].length)
     end, shaft = begin, len(sections)
-    for one in tables_of(table, "sleeves"):
+    for one in table.tables("sleeves"):
         sections.append(_section(one, needed(one, "at", PLACE), table, sleeve=True))
     discs = []
-    for one in tables_of(table, "discs"):
+    for one in table.tables("discs"):
         one.only(["at", "m", "I_t", "I_p"])
         discs.append(Disc(*(needed(one, k, f) for k, f in (("at", PLACE), ("m", MASS), ("I_t", I_T), ("I_p", I_P)))))
         _check_inertias(one, float(discs[-1].I_t), float(discs[-1].I_p))
     ends = [x for one in sections for x in (one.begin, one.begin + one.length)]
     for place in (*places, *ends, *(disc.at for disc in discs)):
         if not -1e-9 <= place <= end * (1 + 1e-9):
-            raise ValueError(
-                f"rotor: the place {place:g} m is not on the shaft, which is {end:g} m long from its left end."
-            )
+            where = f"is not on the shaft, which is {end:g} m long from its left end."
+            raise ValueError(f"rotor: the place {place:g} m {where}")
     points = _distinct([*places, *ends, *(disc.at for disc in discs)], 1e-6 * end)
     nodes = _distinct(
         [x for a, b in itertools.pairwise(points)
@@ -223,10 +218,8 @@ def axes_from(bearings: list[Table], body: RotorBody) -> list[BearingAxis]:
         kind = table.choice("kind", ["radial", "axial"])
         name = table.raw.get("name", f"bearing{number + 1}")
         if not isinstance(name, str) or not name or "." in name or name in seen:
-            raise ValueError(
-                f"{table.at('name')} = {show(name)}: each bearing needs a name of its own, as text without dots, which "
-                "separate the words of paths."
-            )
+            why = "each bearing needs a name of its own, as text without dots, which separate the words of paths."
+            raise ValueError(f"{table.at('name')} = {show(name)}: {why}")
         seen.add(name)
         if kind == "axial":
             _check_axial(table)
@@ -237,11 +230,8 @@ def axes_from(bearings: list[Table], body: RotorBody) -> list[BearingAxis]:
         at = needed(table, "at", PLACE)
         if body.shapes is None and len(body.frequencies):
             vector(table, "modes", len(body.frequencies))  # a radial bearing gives the shapes at its magnet
-        magnet = body.place(table)
-        places = (
-            magnet,
-            *(body.place(table, *keys, (at, magnet[1])) for keys in zip(PLACE_KEYS[1:], SHAPE_KEYS[1:], strict=True)),
-        )
+        magnet, others = body.place(table), zip(PLACE_KEYS[1:], SHAPE_KEYS[1:], strict=True)
+        places = [magnet, *(body.place(table, *keys, (at, magnet[1])) for keys in others)]
         angle = math.radians(table.leaf("angle", ANGLE, 0.0))
         cos, sin = _exact(math.cos(angle)), _exact(math.sin(angle))
         for label, d in (("x", (cos, sin, 0.0)), ("y", (-sin, cos, 0.0))):
@@ -267,7 +257,7 @@ def _exact(x: float) -> float:
 def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pathlib.Path) -> Rotor:
     """Return the rotor of the tables [rotor], [[unbalance]], [[load]] and [[base]]."""
     table, k = top.table("rotor"), len(body.frequencies)
-    unbalances = tables_of(top, "unbalance")
+    unbalances = top.tables("unbalance")
     graded = sum("grade" in one.raw for one in unbalances)
     n, w = RIGID + 2 * k, 2 * np.pi * np.repeat(body.frequencies, 2)
     mass = np.concatenate([[body.m, body.m, body.m, body.I_t, body.I_t], np.ones(2 * k)])
@@ -294,13 +284,13 @@ def rotor_from(top: Table, body: RotorBody, axes: list[BearingAxis], folder: pat
         acceleration=turning.acceleration,
         changes=turning.changes,
         unbalances=tuple(unbalance_from(one, body, graded) for one in unbalances),
-        loads=tuple(load_from(one, body, CaseFiles(folder)) for one in tables_of(top, "load")),
-        base=tuple(base_from(one, n, CaseFiles(folder)) for one in tables_of(top, "base")),
+        loads=tuple(load_from(one, body, CaseFiles(folder)) for one in top.tables("load")),
+        base=tuple(base_from(one, n, CaseFiles(folder)) for one in top.tables("base")),
     )
 
 
 def axes_and_rotor(top: Table, folder: pathlib.Path) -> tuple[list[BearingAxis], Rotor]:
     """Return the axes and the rotor of a case file."""
     body = body_from(top, folder)
-    axes = axes_from(tables_of(top, "bearing"), body)
+    axes = axes_from(top.tables("bearing"), body)
     return axes, rotor_from(top, body, axes, folder)

@@ -4,7 +4,7 @@ import dataclasses
 import math
 from typing import Any
 
-from ambjax.cases.recordings import CaseFiles
+from ambjax.cases.named_files import CaseFiles
 from ambjax.cases.speed_table import OWN_SPEED, check_turning, rotation_from, turning_from
 from ambjax.cases.table import Table, show
 from ambjax.numerics.records import leaf
@@ -58,11 +58,10 @@ def signal_from(table: Table, unit: str, files: CaseFiles, extra: tuple[str, ...
         table.only(["kind", "terms", *extra])
         terms = table.raw.get("terms")
         if not isinstance(terms, list) or not terms:
-            raise ValueError(f"{table.at('terms')} = {show(terms)}: it must be a list of at least one signal table.")
+            raise table.refuse("terms", "it must be a list of at least one signal table.")
         if len(terms) > MOST_TERMS:
             raise ValueError(f"{table.at('terms')}: {len(terms)} terms are too many; give at most {MOST_TERMS}.")
-        parts = [Table(term, f"{table.at('terms')}[{n}]") for n, term in enumerate(terms)]
-        return waveforms.Sum(tuple(signal_from(part, unit, files) for part in parts))
+        return waveforms.Sum(tuple(signal_from(part, unit, files) for part in table.tables("terms")))
     if kind == "table":
         return files.signal(table, extra)
     turns = "rotation" in {field.name for field in dataclasses.fields(SIGNALS[kind])}
@@ -97,7 +96,7 @@ def _each(table: Table, name: str) -> list[Table]:
         return [table.table(name)]
     if not 0 < len(raw) <= MOST_TERMS:
         raise ValueError(f"{table.at(name)}: {len(raw)} signals; give 1 to {MOST_TERMS}.")
-    return [Table(one, f"{table.at(name)}[{n}]") for n, one in enumerate(raw)]
+    return table.tables(name)
 
 
 def scenario_from(top: Table, plant: Bearing, files: CaseFiles) -> tuple[Scenario, float | None]:
@@ -144,23 +143,19 @@ def _amplifier(actuator: Table) -> Amplifier | CurrentAmplifier | None:
             f'{actuator.at("mode")} = "current": {actuator.at("bandwidth")} is missing. Give the bandwidth of the '
             "amplifier's current loop, Hz: bandwidth = 1e3, for example."
         )
-    given = any(name in actuator.raw for name in names)
-    if not given:
+    if not any(name in actuator.raw for name in names):
         return None
-    amplifier = actuator.record(kind, extra=("mode", "u_max", "coil"))
-    return dataclasses.replace(amplifier, coil=_coil(actuator.table("coil"))) if "coil" in actuator.raw else amplifier
-
-
-def _coil(table: Table) -> CoilLimits:
-    limits, one_way = table.record(CoilLimits, extra=("unidirectional",)), table.switch("unidirectional")
-    return dataclasses.replace(limits, unidirectional=one_way is True)
+    amplifier, coil = actuator.record(kind, extra=("mode", "u_max", "coil")), actuator.table("coil")
+    if "coil" not in actuator.raw:
+        return amplifier
+    limits = coil.record(CoilLimits, extra=("unidirectional",))
+    limits = dataclasses.replace(limits, unidirectional=coil.switch("unidirectional") is True)
+    return dataclasses.replace(amplifier, coil=limits)
 
 
 def _sensor(table: Table) -> Sensor:
-    sensor, velocity = (
-        table.record(Sensor, extra=("velocity", "outliers", "dropouts", "runout")),
-        table.switch("velocity"),
-    )
+    sensor = table.record(Sensor, extra=("velocity", "outliers", "dropouts", "runout"))
+    velocity = table.switch("velocity")
     parts = {
         "outliers": table.table("outliers").record(Outliers) if "outliers" in table.raw else None,
         "dropouts": _dropouts(table.table("dropouts")) if "dropouts" in table.raw else None,
@@ -178,7 +173,7 @@ def _runout(table: Table) -> Runout:
             f"{table.at('harmonics')} {given}: it must be a list of 1 to {MOST_TERMS} tables, "
             "[{ number = 1, amplitude = 1e-6, phase = 0.0 }] for example."
         )
-    waves = tuple(Table(one, f"{table.at('harmonics')}[{n}]").record(Harmonic) for n, one in enumerate(raw))
+    waves = tuple(one.record(Harmonic) for one in table.tables("harmonics"))
     return dataclasses.replace(turning_from(table, Runout, ("harmonics",)), harmonics=waves)
 
 
@@ -193,17 +188,14 @@ def _stop(run: Table) -> Stop | None:
     if not given:
         return None
     if "stiffness" not in given:
-        raise ValueError(
-            f"{run.at('stop_damping')} = {show(run.raw['stop_damping'])}: there is no stop to damp. Give "
-            "run.stop_stiffness (N/m) too."
-        )
+        raise run.refuse("stop_damping", "there is no stop to damp. Give run.stop_stiffness (N/m) too.")
     return Stop(*(run.leaf(f"stop_{name}", field, field.default) for name, field in STOP.items()))
 
 
 def _seed(run: Table) -> int:
     seed = run.raw.get("seed", 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
-        raise ValueError(f"{run.at('seed')} = {show(seed)}: it must be a whole number from 0 to 4294967295.")
+        raise run.refuse("seed", "it must be a whole number from 0 to 4294967295.")
     return seed
 
 
@@ -221,16 +213,12 @@ def check_start(scenario: Scenario) -> None:
         if not stop < scenario.limit:
             raise ValueError(f"run.clearance = {stop:g} m: with a stop it must be below {scenario.limit:g} m.")
         if not abs(z) < scenario.limit:
-            raise ValueError(
-                f"initial.z = {z:g} m: the rotor would touch a magnet; |z| must be below {scenario.limit:g} m. Its "
-                f"stop begins at {math.copysign(stop, z):g} m."
-            )
+            why = f"|z| must be below {scenario.limit:g} m. Its stop begins at {math.copysign(stop, z):g} m."
+            raise ValueError(f"initial.z = {z:g} m: the rotor would touch a magnet; {why}")
         return
     if not abs(z) < stop:
-        raise ValueError(
-            f"initial.z = {z:g} m: the rotor would touch its stop at the start; |z| must be less than {stop:g} m "
-            "(run.clearance, by default 0.9 of plant.s_0)."
-        )
+        why = f"|z| must be less than {stop:g} m (run.clearance, by default 0.9 of plant.s_0)."
+        raise ValueError(f"initial.z = {z:g} m: the rotor would touch its stop at the start; {why}")
 
 
 def _check_coils(scenario: Scenario) -> None:
@@ -240,14 +228,11 @@ def _check_coils(scenario: Scenario) -> None:
         return
     i_0, bias, i = scenario.plant.i_0, scenario.plant.R * scenario.plant.i_0, scenario.initial.i
     if coil.i_max is not None and not coil.i_max > i_0:
-        raise ValueError(
-            f"actuator.coil.i_max = {coil.i_max:g} A: it must be more than the bias current of each coil, "
-            f"plant.i_0 = {i_0:g} A."
-        )
+        why = f"it must be more than the bias current of each coil, plant.i_0 = {i_0:g} A."
+        raise ValueError(f"actuator.coil.i_max = {coil.i_max:g} A: {why}")
     if coil.u_max is not None and not coil.u_max > bias:
-        raise ValueError(
-            f"actuator.coil.u_max = {coil.u_max:g} V: it must be more than the {bias:g} V of the bias current, R i_0."
-        )
+        why = f"it must be more than the {bias:g} V of the bias current, R i_0."
+        raise ValueError(f"actuator.coil.u_max = {coil.u_max:g} V: {why}")
     most = min(math.inf if coil.i_max is None else coil.i_max - i_0, i_0 if coil.unidirectional else math.inf)
     if abs(i) > most:
         raise ValueError(

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.cases.table import Table, show
+from ambjax.cases.table import Table
 from ambjax.numerics.records import leaf
 from ambjax.world.rotation import Rotation, SpeedChange
 from ambjax.world.scenario import SLOTS, Scenario
@@ -28,9 +28,7 @@ def table_of_speeds(table: Table) -> Rotation | None:
     own.only(["times", "rpm"])
     times, rpm = own.column("times", field=AT), own.column("rpm", field=SPEED)
     if len(times) < 2 or len(times) != len(rpm) or np.any(np.diff(times) <= 0):
-        raise ValueError(
-            f"{own.path} = {show(own.raw)}: it must have two or more times (s), ascending, and one rpm for each."
-        )
+        raise table.refuse("speed", "it must have two or more times (s), ascending, and one rpm for each.")
     rates = [0.0, *(np.diff(rpm) / np.diff(times)).tolist(), 0.0]
     changes = [SpeedChange(t, by) for t, by in zip(times, np.diff(rates).tolist(), strict=True)]
     if times[0] > 0:
@@ -41,23 +39,17 @@ def table_of_speeds(table: Table) -> Rotation | None:
 def listed_speeds(table: Table, most: int) -> list[float]:
     """Return the key `speeds`, rpm: a list, or a range of equal steps, as in `ambjax map`. `most`: of them."""
     value = table.raw["speeds"]
-
-    def refuse(why: str) -> ValueError:
-        return ValueError(f"{table.at('speeds')} = {show(value)}: {why}.")
-
     values = _range(value) if isinstance(value, str) else value
     if not isinstance(values, list) or not 0 < len(values) <= most:
-        raise refuse(
-            f'it must be a list of 1 to {most} speeds (rpm), or a range "LOW:HIGH:COUNT" of 2 to {most}, as "0:6000:7"'
-        )
+        ranges = f'a range "LOW:HIGH:COUNT" of 2 to {most}, as "0:6000:7"'
+        raise table.refuse("speeds", f"it must be a list of 1 to {most} speeds (rpm), or {ranges}.")
     speeds = [Table({f"speeds[{k}]": x}, table.path).leaf(f"speeds[{k}]", SPEED) for k, x in enumerate(values)]
     if (twice := next((x for x in speeds if speeds.count(x) > 1), None)) is not None:
-        raise refuse(f"{twice:g} rpm is given more than once. Give it once")
+        raise table.refuse("speeds", f"{twice:g} rpm is given more than once. Give it once.")
     return speeds
 
 
 def _range(text: str) -> list[float] | None:
-    """Return the speeds of a range, or None if it is not one."""
     try:
         first, last, number = text.split(":")
         low, high, count = float(first), float(last), int(number)
@@ -69,9 +61,9 @@ def _range(text: str) -> list[float] | None:
 
 def speed_of(table: Table) -> Rotation:
     """Return the speed of the table [rotor] of a machine."""
-    return table_of_speeds(table) or Rotation(
-        table.leaf("speed", SPEED, 0.0), table.leaf("acceleration", ACCELERATION, 0.0)
-    )
+    if turning := table_of_speeds(table):
+        return turning
+    return Rotation(table.leaf("speed", SPEED, 0.0), table.leaf("acceleration", ACCELERATION, 0.0))
 
 
 RUN_UP = leaf(default=1.0, unit="s", at_least=1e-9, at_most=1e9, doc="duration of the run-up")
@@ -104,13 +96,8 @@ def turning_from(table: Table, kind: type, extra: tuple[str, ...]) -> Any:
 
 def check_turning(scenario: Scenario) -> None:
     """Raise ValueError if a load or the runout has no speed, or has its own beside [rotor]."""
-    parts = {
-        f"disturbance.{slot if slot == 'base' else 'q_z'}": getattr(scenario, slot)
-        for slot in SLOTS
-        if slot != "reference"
-    }
-    parts["sensor.runout"] = scenario.sensor and scenario.sensor.runout
-    for path, part in parts.items():
+    parts = [(f"disturbance.{'base' if slot == 'base' else 'q_z'}", getattr(scenario, slot)) for slot in SLOTS[1:]]
+    for path, part in [*parts, ("sensor.runout", scenario.sensor and scenario.sensor.runout)]:
         for one in getattr(part, "terms", (part,)):
             if not hasattr(one, "rotation"):
                 continue

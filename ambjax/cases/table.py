@@ -13,8 +13,7 @@ import numpy as np
 from ambjax.numerics.declared import check_number, leaves_of, numbers
 from ambjax.numerics.records import check_leaf, is_traced
 from ambjax.numerics.shapes import axes_of, check_shapes
-from ambjax.text.synonyms import hint, other_words
-from ambjax.text.words import one_line
+from ambjax.text.words import hint, one_line, other_words
 
 # Largest number of characters of a key or a value in a message.
 LONGEST = 60
@@ -125,18 +124,27 @@ class Table:
         """Return the dotted path of a key."""
         return f"{self.path}.{cut(key)}" if self.path else cut(key)
 
+    def refuse(self, key: str, why: str) -> ValueError:
+        """Return the error that the value of a key is wrong."""
+        return ValueError(f"{self.at(key)} = {show(self.raw.get(key))}: {why}")
+
     def only(self, allowed: list[str], elsewhere: Iterable[str] = ()) -> None:
         """Raise ValueError for a key that is not in `allowed`, and suggest the one that is meant."""
         for key in self.raw:
             if key not in allowed:
                 names, other = ", ".join(allowed) if allowed else "none", hint(key[:LONGEST], allowed, elsewhere)
-                raise ValueError(
-                    f"{self.at(key)} = {show(self.raw[key])}: unknown key.{other} Keys allowed here: {names}."
-                )
+                raise self.refuse(key, f"unknown key.{other} Keys allowed here: {names}.")
 
     def table(self, key: str) -> "Table":
         """Return a table within this one; empty if left out."""
         return Table(self.raw.get(key, {}), self.at(key))
+
+    def tables(self, key: str) -> list["Table"]:
+        """Return the tables of a list, written as [[key]]; none if left out."""
+        raw = self.raw.get(key, [])
+        if not isinstance(raw, list):
+            raise self.refuse(key, f"write [[{self.at(key)}]] above each.")
+        return [Table(one, f"{self.at(key)}[{n}]") for n, one in enumerate(raw)]
 
     def number(self, key: str, default: object, allowed: str = "a number") -> Any:
         """Return a number, or the default if left out. Raises ValueError for anything else."""
@@ -144,10 +152,8 @@ class Table:
         if value is default:
             return default
         if is_traced(value):
-            raise ValueError(
-                f"{self.at(key)}: the number is traced. Read the case outside jit, vmap and grad; inside, change its "
-                "numbers by ambjax.with_gains or dataclasses.replace."
-            )
+            why = "inside, change its numbers by ambjax.with_gains or dataclasses.replace."
+            raise ValueError(f"{self.at(key)}: the number is traced. Read the case outside jit, vmap and grad; {why}")
         if getattr(value, "ndim", None) == 0:  # a number of NumPy or JAX, in a dict
             value = value.item()
         if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -172,7 +178,7 @@ class Table:
         try:
             return np.asarray(rows)
         except ValueError:
-            raise ValueError(f"{self.at(key)} = {show(value)}: its rows have different lengths.") from None
+            raise self.refuse(key, "its rows have different lengths.") from None
 
     def column(
         self, key: str, allowed: str = "a list of numbers", field: dataclasses.Field | None = None
@@ -180,7 +186,7 @@ class Table:
         """Return a list of numbers, within the bounds of `field` if given. Raises ValueError otherwise."""
         values = self.raw.get(key)
         if not isinstance(values, list):
-            raise ValueError(f"{self.at(key)} = {show(values)}: it must be {allowed}.")
+            raise self.refuse(key, f"it must be {allowed}.")
         each = Table({str(n): x for n, x in enumerate(values)}, self.at(key))
         return [each.number(n, None) if field is None else each.leaf(n, field) for n in each.raw]
 
@@ -209,7 +215,7 @@ class Table:
         """Return a Boolean; None if left out."""
         value = self.raw.get(key)
         if value is not None and not isinstance(value, bool):
-            raise ValueError(f"{self.at(key)} = {show(value)}: it must be true or false{_unquoted(value)}.")
+            raise self.refuse(key, f"it must be true or false{_unquoted(value)}.")
         return value
 
     def choice(self, key: str, allowed: list[str], default: str | None = None, other: str = "") -> str:

@@ -45,15 +45,11 @@ def clock_from(table: Table) -> tuple[Clock, float]:
             f"The nearest duration that it divides is {nearest:.12g} s."
         )
     if samples > MOST_SAMPLES:
-        raise ValueError(
-            f"{table.at('duration')} = {duration:g} s makes {samples:,} samples of {period:g} s; at most "
-            f"{MOST_SAMPLES:,} can be recorded. Shorten the run or lengthen clock.sample_period."
-        )
+        why = f"at most {MOST_SAMPLES:,} can be recorded. Shorten the run or lengthen clock.sample_period."
+        raise ValueError(f"{table.at('duration')} = {duration:g} s makes {samples:,} samples of {period:g} s; {why}")
     if samples < FEWEST_SAMPLES:
-        raise ValueError(
-            f"{table.at('duration')} = {duration:g} s is one sample of {period:g} s; at least {FEWEST_SAMPLES} are "
-            "needed. Lengthen the run or shorten clock.sample_period."
-        )
+        why = f"at least {FEWEST_SAMPLES} are needed. Lengthen the run or shorten clock.sample_period."
+        raise ValueError(f"{table.at('duration')} = {duration:g} s is one sample of {period:g} s; {why}")
     return Clock(samples, period, _method(table, period, samples)), duration
 
 

@@ -53,12 +53,12 @@ SURVIVAL: dataclasses.Field = leaf(SURVIVING, above=0, at_most=1, doc="share of 
 MOST_WHOLE, MOST_MEMBERS = 2**31 - 1, 2**20
 
 
+def _whole(default: int, at_least: int, doc: str, at_most: int = MOST_WHOLE) -> int:
+    return leaf(default, at_least=at_least, at_most=at_most, whole=True, doc=doc)
+
+
 def _members(default: int, at_least: int, doc: str) -> int:
-    return leaf(default, at_least=at_least, at_most=MOST_MEMBERS, whole=True, doc=doc)
-
-
-def _whole(default: int, at_least: int, doc: str) -> int:
-    return leaf(default, at_least=at_least, at_most=MOST_WHOLE, whole=True, doc=doc)
+    return _whole(default, at_least, doc, MOST_MEMBERS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,13 +76,7 @@ class Budget:
     starts: int = _whole(16, 1, "number of the best of these points that are refined")
     iterations: int = _whole(40, 1, "largest number of iterations of a search")
     substeps: int = _whole(3, 1, "integration steps per sample")
-    front: int = leaf(
-        3,
-        at_least=1,
-        at_most=6,
-        whole=True,
-        doc="number of points of the front of error against voltage, without that of least error",
-    )
+    front: int = _whole(3, 1, "number of points of the front of error against voltage, without that of least error", 6)
 
 
 BUDGET: dict[str, dataclasses.Field] = {field.name: field for field in dataclasses.fields(Budget)}

@@ -17,7 +17,7 @@ LIST = "a list of numbers, as in [1.0, 2.0]"
 def _pair(table: Table, key: str) -> list[float]:
     values = table.column(key, LIST)
     if len(values) != 2:
-        raise ValueError(f"{table.at(key)} = {show(table.raw[key])}: it must be [low, high], two numbers.")
+        raise table.refuse(key, "it must be [low, high], two numbers.")
     return values
 
 

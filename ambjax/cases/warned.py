@@ -1,8 +1,8 @@
 """Warnings about values of a case that are valid but probably unintended, such as millimetres given as metres."""
 
-import dataclasses
 import math
 import pathlib
+import tomllib
 import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -14,6 +14,7 @@ from ambjax.cases import reader
 from ambjax.cases.plausibility import implausible
 from ambjax.cases.reach import reach, widest
 from ambjax.cases.reader import Case
+from ambjax.numerics.declared import leaves_of
 from ambjax.simulation.system import reads_velocity
 from ambjax.text.words import one_line
 from ambjax.world.scenario import Scenario
@@ -53,11 +54,11 @@ def warnings_of(case: Case) -> list[str]:
 
 
 def _assumed(case: Case) -> Iterator[str]:
-    plant = case.scenario.plant
-    fields = [field for field in dataclasses.fields(plant) if field.name in case.assumed and field.name != GRAVITY]
-    units = {field.name: "" if field.metadata["unit"] == "1" else f" {field.metadata['unit']}" for field in fields}
-    left = [f"{name} = {getattr(plant, name):g}{unit}" for name, unit in units.items()]
-    if left:
+    plant, given = case.scenario.plant, tomllib.loads(case.text).get("plant", {})
+    units = {field.name: field.metadata["unit"] for field in leaves_of(type(plant))}
+    left = [name for name in units if name not in given and name != GRAVITY]
+    left = [f"{name} = {getattr(plant, name):g}{f' {units[name]}' * (units[name] != '1')}" for name in left]
+    if left and units.keys() & given.keys():
         yield f"[plant] omits numbers, which keep the paper's values: {', '.join(left)}. Give those that differ."
 
 
@@ -72,10 +73,8 @@ def _noise(case: Case) -> Iterator[str]:
 def _velocity(case: Case) -> Iterator[str]:
     sensor, sampled = case.scenario.sensors, case.scenario.sensor or case.cascade.sampled
     if sensor.velocity and sensor.std_z_dot == 0 and sampled and reads_velocity(case.cascade, case.clock.sample_period):
-        yield (
-            "sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ERROR, unlike by any real sensor. Set "
-            "sensor.std_z_dot, or set sensor.velocity = false and use an observer that estimates the velocity."
-        )
+        advice = "Set sensor.std_z_dot, or set sensor.velocity = false and use an observer that estimates the velocity."
+        yield f"sensor.std_z_dot = 0 m/s: THE VELOCITY IS MEASURED WITHOUT ERROR, unlike by any real sensor. {advice}"
 
 
 def idealised(case: Case) -> str:

@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.linear import Analysis, ResponsePeak, Zones
+from ambjax.linear import Analysis, ResponsePeak, StateSpace, Zones
 from ambjax.linear.linear_machine import AxisSensitivity
 from ambjax.linear.margins import NO_PEAK
-from ambjax.linear.state_space import StateSpace
 from ambjax.world.rotation import PER_MINUTE, Rotation
 
 # The responses whose maxima are reported: words, unit, the name in JSON, and whether the response has zones.
@@ -30,17 +29,15 @@ def band_lines(
         one: ResponsePeak | None = getattr(analysis, field)
         if one is None:
             continue
-        text = ""
+        text = [f"{name}:"]
         if one.at_edge:
-            text = f"{one.frequency:.4g} Hz, where {words} is largest, is an end of the band: this value is not a peak."
+            where = f"{one.frequency:.4g} Hz, where {words} is largest"
+            text.append(f"{where}, is an end of the band: this value is not a peak.")
         if one.outside is not None:
             zone = f" (zone {zones.zone(one.outside.height)})" if zoned else ""
-            text += " " if text else ""
-            text += (
-                f"Outside the band of [sensitivity], {words} is larger: {one.outside.height:.4g}{unit} at "
-                f"{one.outside.frequency:.4g} Hz{zone}."
-            )
-        lines += [f"{name}: {text}"] if text else []
+            size = f"{one.outside.height:.4g}{unit} at {one.outside.frequency:.4g} Hz{zone}"
+            text.append(f"Outside the band of [sensitivity], {words} is larger: {size}.")
+        lines += [" ".join(text)] if len(text) > 1 else []
     return lines
 
 

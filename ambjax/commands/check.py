@@ -14,25 +14,20 @@ from ambjax.cases.given import of_case
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
 from ambjax.commands import check_text, machine_check
-from ambjax.commands.acceptance import acceptance
-from ambjax.commands.check_text import OnProcessor
+from ambjax.commands.check_text import OnProcessor, acceptance
 from ambjax.commands.machine_check import CaseCheck
 from ambjax.commands.reading import read_any_with_warnings
-from ambjax.control.cascade import Cascade
 from ambjax.ensemble.delays import DELAYS, at_delays, delay_margin
 from ambjax.ensemble.replay import as_member, record_system
 from ambjax.host.heartbeat import FIRST_RUN, doing, quiet, say
 from ambjax.host.one_thread import one_thread
 from ambjax.linear.stability import Findings, Stability, stability_of
 from ambjax.results.outputs import plain
-from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import rollout
-from ambjax.theorem import advice
+from ambjax.theorem import Condition, Report, advice
+from ambjax.theorem import check as check_theorem
 from ambjax.theorem.causes import find_cause
-from ambjax.theorem.conditions import Condition, Report
-from ambjax.theorem.conditions import check as check_theorem
 from ambjax.theorem.sampled_report import Delays, check_sampled, with_causes
-from ambjax.world.scenario import Scenario
 
 Summary = dict[str, object]
 
@@ -131,13 +126,10 @@ def _results(
             on_processor = OnProcessor(sampled, margin, unknown, differs)
         report = theorem and theorem.result()
     if report is not None and report.lost and not case.cascade.sampled:
-        cause = find_cause(_is_lost, case.cascade, case.scenario, case.clock, say)
+        lost = lambda *loop: bool(np.isfinite(rollout(*loop, record_every=0).trajectory.lost_at))  # noqa: E731
+        cause = find_cause(lost, case.cascade, case.scenario, case.clock, say)
         report = dataclasses.replace(report, cause=cause)
     return report, loop, on_processor, findings
-
-
-def _is_lost(cascade: Cascade, scenario: Scenario, clock: Clock) -> bool:
-    return bool(np.isfinite(rollout(cascade, scenario, clock, record_every=0).trajectory.lost_at))
 
 
 def _margins(case: Case) -> tuple[tuple[Delays, Delays | None], Findings | None]:

@@ -87,8 +87,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
 class Comparison(NamedTuple):
     """The result of `compare`.
 
-    - `summary`: the content of compare.json: members, seed, and the numbers of each case.
-    - `compared`: each case with the columns of its members, its nominal loop and its peaks.
+    `summary`: the content of compare.json. `compared`: each case with the columns of its members and its nominal loop.
     """
 
     summary: dict[str, Any]
@@ -139,9 +138,7 @@ def _studies(cases: Sequence[AnyCase], seed: int | None, members: int) -> list[S
     """Return the studies of the cases, with the same seed: by default the first case's."""
     seed = study_of(cases[0], seed, members).seed
     studies = [study_of(case, seed, members) for case in cases]
-    return [
-        dataclasses.replace(study, by_axis=BY_AXIS) if isinstance(study, MachineStudy) else study for study in studies
-    ]
+    return [dataclasses.replace(one, by_axis=BY_AXIS) if isinstance(one, MachineStudy) else one for one in studies]
 
 
 def _read(paths: Sequence[str]) -> list[AnyCase]:
@@ -162,9 +159,8 @@ def _named(cases: Sequence[AnyCase], paths: Sequence[str]) -> list[AnyCase]:
     """Append a number to a name that occurs more than once. Raises ValueError for machines beside cases of one axis."""
     for path, case in zip(paths, cases, strict=True):
         if type(case) is not type(cases[0]):
-            raise ValueError(
-                f"{path}, {paths[0]}: one has one axis, the other is a machine with [rotor]. Compare cases of one kind."
-            )
+            advice = "Compare cases of one kind."
+            raise ValueError(f"{path}, {paths[0]}: one has one axis, the other is a machine with [rotor]. {advice}")
     names = [case.name for case in cases]
     return [
         case if names.count(case.name) == 1 else dataclasses.replace(case, name=f"{case.name} ({n})")
@@ -185,10 +181,8 @@ def _differences(paths: Sequence[str], cases: Sequence[AnyCase], studies: Sequen
                 dict(one.spread.entries).get(spread[0].removeprefix("spread."), facts.get(spread[0], "none"))
                 for one, facts in ((study, other), (studies[0], first))
             )
-            raise ValueError(
-                f"{path}: {spread[0]} = {own}, and {paths[0]} has {its}: the members would not be the same. Give both "
-                "cases the same [spread]."
-            )
+            why = "the members would not be the same. Give both cases the same [spread]."
+            raise ValueError(f"{path}: {spread[0]} = {own}, and {paths[0]} has {its}: {why}")
         if names:
             shown = [f"{name} ({first.get(name, 'none')} and {other.get(name, 'none')})" for name in names[:6]]
             shown += [f"{len(names) - 6} more"] * (len(names) > 6)
@@ -243,12 +237,7 @@ def _flops(case: Case) -> int | None:
 def _drawn(compared: Sequence[Compared]) -> Any:
     from ambjax.pictures import frequency
 
-    shown = []
-    for one in compared:
-        errors, volts = (np.asarray(one.columns[name]) for name in ("settled_rms_error_m", "settled_rms_u_V"))
-        loop = one.loop.system, one.loop.channel, one.loop.command, str(one.loop.numbers.get("worst_at") or "")
-        shown.append(frequency.Contender(one.case.name, one.held, errors, volts, *loop))
     loops = [(first_axis(one.case), one.loop.system) for one in compared]
     spans = [shown_band(case, [system] if system else []) for case, system in loops]
     span = min(low for low, _ in spans), max(high for _, high in spans)
-    return frequency.comparison_figure(shown, compared[0].case.zones.limits, span)
+    return frequency.comparison_figure(compared, compared[0].case.zones.limits, span)

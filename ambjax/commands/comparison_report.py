@@ -46,11 +46,10 @@ class Compared:
 
 
 class Quantity(NamedTuple):
-    """A row of the table, and a number of each case.
+    """A row of the table, and a number of each case by its key in the summary.
 
-    - `key`: in the summary. `less`: whether less is better; None: neither.
-    - `metric`, `reduce`: metric of the members, and how it is reduced; "": the number has another source.
-    - `axis`: name of an axis of a machine; "" for the whole case.
+    `less`: whether less is better; None: neither. `metric`, `reduce`: metric of the members, and how it is reduced; "":
+    the number has another source. `axis`: name of an axis of a machine; "" for the whole case.
     """
 
     key: str

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from ambjax.cases.machine_case import AnyCase, MachineCase, machine_from
 from ambjax.cases.reader import read_case
 from ambjax.cases.table import load
-from ambjax.commands.pace import duration
 from ambjax.host.command_line import message
 from ambjax.host.extensions import NothingToTuneError, extension
 from ambjax.host.heartbeat import say
 from ambjax.host.interrupts import raise_if_interrupted, reporting
+from ambjax.text.words import duration
 
 # In the folder of a case: the file by which the tuner marks a search that has begun, and the case with the tuned gains.
 BEGUN, TUNED = "checkpoints/search.json", "tuned.toml"
@@ -44,10 +44,8 @@ def tuned_cases(cases: Sequence[AnyCase], out: pathlib.Path, args: argparse.Name
     folders = [_folder(out, case) for case in cases]
     old = [folder.name for folder in folders if (folder / BEGUN).exists()]
     if old and not (args.resume or args.force):
-        raise ValueError(
-            f"--out {out}: it has tunings of an earlier run ({', '.join(old)}). Continue them with --resume, discard "
-            "them with --force, or choose another directory."
-        )
+        advice = "Continue them with --resume, discard them with --force, or choose another directory."
+        raise ValueError(f"--out {out}: it has tunings of an earlier run ({', '.join(old)}). {advice}")
     found, failed, times = list[AnyCase](), list[str](), list[float]()
     kept = f"the tunings so far are saved. To continue, repeat the command with --out {out} --resume"
     with reporting(lambda: kept):

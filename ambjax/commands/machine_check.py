@@ -33,11 +33,9 @@ AXIS_COLUMNS = ("axis", "|z|/clearance", "zone", "weight/force", "force reserve"
 
 
 class CaseCheck(NamedTuple):
-    """The result of a check.
+    """The result of a check: whether it passes, and its numbers, as `ambjax check --json` prints them.
 
-    - `holds`: whether the check passes.
-    - `summary`: its numbers, as `ambjax check --json` prints them.
-    - `text`: the verdict in the first lines, then the tables that apply.
+    `text`: the verdict in the first lines, then the tables that apply.
     """
 
     holds: bool
@@ -177,9 +175,8 @@ def _spill_over(case: MachineCase) -> tuple[dict[str, float], str, bool]:
         return {}, f"the rotor has {known} already, the largest number", False
     try:
         rotor = _with_modes(raw, known, known + more, case.folder)
-        machine = machine_of_axes(
-            rotor, parts_of(case.cases), case.clock, np.zeros(len(rotor.gravity)), case.machine.law
-        )
+        q = np.zeros(len(rotor.gravity))
+        machine = machine_of_axes(rotor, parts_of(case.cases), case.clock, q, case.machine.law)
         points = list(turning_machines(machine, case.clock.sample_period, case.speeds))
     except ValueError as error:
         return {}, str(error), False
@@ -217,7 +214,6 @@ def _axis(case: MachineCase, k: int, run: MachineRun, points: list[MachineSensit
 
 
 def _zone(case: MachineCase, run: MachineRun, share: float) -> str:
-    """Return the zone of a share of the clearance; D if the rotor is lost."""
     return "D" if run.lost else case.zones.clearance_zone(share)
 
 

@@ -12,9 +12,7 @@ from ambjax.commands.band_text import band_lines, running_facts
 from ambjax.commands.reading import results
 from ambjax.commands.sensitivity_report import injected_numbers, injection_text, signs_note
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
-from ambjax.linear import Injection, Zones, machine_injected
-from ambjax.linear.linear_machine import MachineSensitivity
-from ambjax.linear.margins import Margins
+from ambjax.linear import Injection, MachineSensitivity, Zones, machine_injected
 from ambjax.page.rotor_motion import motion_page
 from ambjax.results import operating
 from ambjax.results.outputs import described, directory, drawn, plain, table, write_json
@@ -41,6 +39,8 @@ COLUMNS = {
     "z_1x_m": "z at 1x, m",
     "i_1x_A": "i at 1x, A",
 }
+# Margins of an axis in sensitivity.json, and their names in `Margins`.
+MARGINS = {"gain_low": "gm_low", "gain_high": "gm_high", "phase_deg": "pm", "delay_s": "delay", "disk": "dm"}
 
 
 def refuse(args: argparse.Namespace, names: tuple[str, ...]) -> None:
@@ -134,7 +134,7 @@ def sensitivity_summary(points: list[MachineSensitivity], measured: Measured) ->
                     "name": axis.name, "peak": axis.S.height, "frequency_hz": axis.S.frequency, "zone": axis.zone,
                     "outside_peak": None if axis.S.outside is None else axis.S.outside.height,
                     "peak_T": axis.T.height, "peak_KS": axis.KS.height,
-                    "margins": None if axis.margins is None else _margins(axis.margins),
+                    "margins": axis.margins and {key: getattr(axis.margins, name) for key, name in MARGINS.items()},
                     "running_speed": facts,
                     **injected_numbers(point.system if point.linear else None, one, k),
                 }
@@ -168,13 +168,6 @@ def once_per_revolution(point: MachineSensitivity) -> list[tuple[list[Summary], 
     return [running_facts(speeds, point.system, axis.S, k, f"|S| of {axis.name}") for k, axis in enumerate(point.axes)]
 
 
-def _margins(margins: Margins) -> dict[str, float]:
-    return {
-        "gain_low": margins.gm_low, "gain_high": margins.gm_high, "phase_deg": margins.pm,
-        "delay_s": margins.delay, "disk": margins.dm,
-    }  # fmt: skip
-
-
 def outside_lines(point: MachineSensitivity, zones: Zones) -> list[str]:
     """Return `band_lines` of |S| of each axis at a speed at which the machine is stable."""
     name = f"{{}} at {point.speed:g} rpm"
@@ -204,9 +197,8 @@ def sensitivity_text(points: list[MachineSensitivity], measured: Measured, zones
         parts.append(f"{point.speed:g} rpm: stable; {slow}")
         single = f"{point.sigma.height:.4g}", f"{point.sigma.frequency:.4g}"
         rows.append(("largest singular value", *single, "", "", "", ""))
-        parts.append(
-            table(("axis", "peak of |S|", "Hz", "zone", "peak of |T|", "gain margin", "phase margin, deg"), rows)
-        )
+        head = ("axis", "peak of |S|", "Hz", "zone", "peak of |T|", "gain margin", "phase margin, deg")
+        parts.append(table(head, rows))
         parts += outside_lines(point, zones)
         for _, lines in once_per_revolution(point):
             parts += lines

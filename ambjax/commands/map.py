@@ -12,7 +12,7 @@ from ambjax.commands.reading import read_any_with_warnings, results
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.maps import CERTAIN, GRIDS, Map
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
-from ambjax.results.case_map import computed, labels, panel, study_and_axes
+from ambjax.results.case_map import computed, labels, study_and_axes, title
 from ambjax.results.outputs import directory, drawn, plain, table, write_json
 
 WRITTEN = ("map.png", "map.json")
@@ -87,8 +87,7 @@ def _confidence_note(one: Map) -> str:
 def _drawn(cases: Sequence[AnyCase], maps: list[Map]) -> Any:
     from ambjax.pictures import heatmaps
 
-    panels = [panel(case, one) for case, one in zip(cases, maps, strict=True)]
-    return heatmaps.map_figure(panels, *labels(cases[0], maps[0]))
+    return heatmaps.map_figure(maps, list(map(title, cases, maps)), *labels(cases[0], maps[0]))
 
 
 def _summary(case: AnyCase, one: Map) -> Mapping[str, object]:

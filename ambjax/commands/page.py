@@ -8,10 +8,8 @@ from ambjax.commands.reading import print_warnings
 from ambjax.page.html_page import NAME, page
 from ambjax.results.outputs import directory, files, make, written
 
-Summary = dict[str, object]
 
-
-def run(args: argparse.Namespace) -> tuple[int, Summary]:
+def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     """Write the page of a case."""
     case = read_case(args.case)
     print_warnings(case, args.case)

@@ -1,11 +1,8 @@
 """`ambjax reproduce`: simulate the paper's scenarios, draw its figures and judge its claims."""
 
 import argparse
-import contextlib
-import itertools
 import pathlib
 import time
-from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 
 from tqdm import tqdm
@@ -19,7 +16,6 @@ from ambjax.pictures import figures
 from ambjax.pictures.scales import save
 from ambjax.results.outputs import described, directory, drawn, files, plain, table, write_json, written
 
-Summary = dict[str, object]
 # Labels of the tuned readings in readings.png.
 SHOWN_AS: dict[str, str] = {"tuned": "tuned in continuous time", "sampled": "tuned for the processor"}
 
@@ -33,25 +29,20 @@ def _paper_figures(reading: str, evidence: Evidence, out: pathlib.Path) -> None:
         save(figure, folder / f"figure_{number}.png", 150)
 
 
-def _names() -> Iterator[str]:
-    yield from ("readings.png", "ledger.md", "ledger.json")
-    for reading, number in itertools.product(paper.READINGS, figures.PAPER_FIGURES):
-        yield f"figure_{number}.png" if reading == "repaired" else f"{reading}/figure_{number}.png"
-
-
-@contextlib.contextmanager
-def _alive() -> Iterator[None]:
-    try:
-        yield
-    except BrokenExecutor:
-        raise ValueError(
-            "a worker process died, perhaps because memory ran out. Nothing is kept: start again."
-        ) from None
-
-
-def run(args: argparse.Namespace) -> tuple[int, Summary]:
+def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     """Reproduce the paper and write its figures and the ledger of claims."""
-    out = directory(args.out, "reproduce", _names(), args.force)
+    try:
+        return _reproduced(args)
+    except BrokenExecutor:
+        why = "a worker process died, perhaps because memory ran out. Nothing is kept: start again."
+        raise ValueError(why) from None
+
+
+def _reproduced(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
+    folders = ["" if reading == "repaired" else f"{reading}/" for reading in paper.READINGS]
+    drawings = [f"{folder}figure_{number}.png" for folder in folders for number in figures.PAPER_FIGURES]
+    names = ["readings.png", "ledger.md", "ledger.json", *drawings]
+    out = directory(args.out, "reproduce", names, args.force)
     began = time.perf_counter()
     stages = 2 * 8 + 2
     with (
@@ -68,7 +59,7 @@ def run(args: argparse.Namespace) -> tuple[int, Summary]:
         # JAX holds the GIL while it traces. The readings that need other programs therefore run in a second process.
         # The figures are drawn in a thread.
         evidence, jobs = {}, []
-        with _alive(), ThreadPoolExecutor(1) as artist, processes(1) as other:
+        with ThreadPoolExecutor(1) as artist, processes(1) as other:
             theirs = {reading: other.submit(gather, reading) for reading in paper.NOISY}
             for reading in (reading for reading in paper.READINGS if reading not in theirs):
                 evidence[reading] = gather(reading, stage)

@@ -101,30 +101,19 @@ def _study(case: Case, args: argparse.Namespace) -> Study | None:
     """Return the study of the case's spread; None without one. Raises ValueError for --members without [spread]."""
     if not case.spread.entries:
         if args.members is not None:
-            raise ValueError(
-                "--members: all members of this case are the same. Add [spread] to the case, or omit --members."
-            )
+            advice = "Add [spread] to the case, or omit --members."
+            raise ValueError(f"--members: all members of this case are the same. {advice}")
         return None
     return study_of(case, args.seed, operating.MEMBERS if args.members is None else args.members)
 
 
-def _drawn(
-    case: Case,
-    points: list[OperatingPoint],
-    spread: SpreadPeaks | None,
-    measured: Injections | None,
-) -> Any:
+def _drawn(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None, measured: Injections | None) -> Any:
     from ambjax.pictures import frequency
 
     shown = [point for point in points if point.analysis.stable]
     if spread is not None and spread.point is not None and spread.point.analysis.stable:
         shown.append(spread.point)
-    loops = [
-        frequency.NamedLoop(point.name, point.system, point.m, point.analysis.margins_at.reading.dm) for point in shown
-    ]
-    injected_points = None
     one = None if measured is None else measured.position
-    if one is not None and one.S is not None and one.T is not None and one.KS is not None:
-        injected_points = frequency.MeasuredPoints(one.frequency, one.S, one.T, one.KS)
     span = operating.shown_band(case, [point.system for point in shown])
-    return frequency.frequency_figure(case.name, loops, case.zones.limits, span, injected_points)
+    injected_points = None if one is None or one.S is None else one
+    return frequency.frequency_figure(case.name, shown, case.zones.limits, span, injected_points)

@@ -56,9 +56,7 @@ def sensitivity_summary(
         own = {"stable": point.stable, "zone": point.zone}
         return analysis_summary(point.analysis) | own | band_numbers(point.analysis, zones)
 
-    rows: list[dict[str, object]] = [
-        {"point": point.name, "reference_m": point.r, **numbers(point)} for point in points
-    ]
+    rows: list[dict[str, object]] = [{"point": one.name, "reference_m": one.r, **numbers(one)} for one in points]
     rows += [{"point": name, "stable": None, "zone": None, "why": why} for name, why in missing.items()]
     summary: dict[str, object] = {**numbers(points[0]), **_position_numbers(points[0], measured), "points": rows}
     if spread is not None:
@@ -154,10 +152,8 @@ def injection_text(
     if measured.lost:
         text += f" {measured.lost} of {measured.members} members lose the rotor and are left out."
     if measured.saturated:
-        text += (
-            f" The supply limits u in {100 * measured.saturated:.2g} % of the samples, where the linear values do not"
-        )
-        text += " apply. A smaller sensitivity.amplitude measures the loop without this limit."
+        text += f" The supply limits u in {100 * measured.saturated:.2g} % of the samples, where the linear values do "
+        text += "not apply. A smaller sensitivity.amplitude measures the loop without this limit."
     return text
 
 

@@ -23,12 +23,11 @@ from ambjax.results.runs import simulate
 from ambjax.simulation.metrics import UNITS
 from ambjax.text.words import command
 
-Summary = dict[str, object]
 # runup.png: only if the speed of the rotor changes.
 WRITTEN = ("trajectory.npz", "metrics.json", "overview.png", "runup.png")
 
 
-def run(args: argparse.Namespace) -> tuple[int, Summary]:
+def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     """Simulate a case or one member of its ensemble. Exit code 1 if the rotor is lost or the integrator stalls."""
     case = read_any_with_warnings(args.case)
     study = _study(case, args)
@@ -105,10 +104,8 @@ def _check(numbers: dict[str, Any], path: str) -> None:
     """Raise ValueError if a metric is not finite, which is a bug. A time may be inf: the event did not occur."""
     wrong = [name for name, x in numbers.items() if not (np.isfinite(x) or (UNITS.get(name) == "s" and x == math.inf))]
     if wrong:
-        raise ValueError(
-            f"{path}: {', '.join(wrong)}: not finite in this run, so nothing is written. This is a defect of "
-            "ambjax, not of the case: please report it with the case file."
-        )
+        advice = "This is a defect of ambjax, not of the case: please report it with the case file."
+        raise ValueError(f"{path}: {', '.join(wrong)}: not finite in this run, so nothing is written. {advice}")
 
 
 def _window(case: Case, args: argparse.Namespace) -> tuple[float, float] | None:
@@ -154,9 +151,7 @@ def _simulated(case: Case, study: Study | None, member: int | None) -> Any:
         return simulate(case, count) if study is None or member is None else replay(study, member, count)
 
 
-def _metrics_text(metrics: Summary) -> str:
+def _metrics_text(metrics: dict[str, object]) -> str:
     given = {name: value for name, value in metrics.items() if value != ""}
-    rows = [
-        (name, "never" if v is None else f"{v:.6g}" if isinstance(v, float) else str(v)) for name, v in given.items()
-    ]
-    return table(("metric", "value"), rows)
+    words = ("never" if x is None else f"{x:.6g}" if isinstance(x, float) else str(x) for x in given.values())
+    return table(("metric", "value"), zip(given, words, strict=True))

@@ -98,26 +98,19 @@ def _pictures(
     summary: dict[str, Any] | None,
     out: pathlib.Path,
 ) -> None:
-    from ambjax.pictures import histograms
+    from ambjax.pictures import ensembles
 
     if isinstance(case, Case) and isinstance(study, Study):
-        drawn(out / "fan.png", lambda: _fan(case, study, columns), 150)
-    drawn(out / "histograms.png", lambda: histograms.histogram_figure(columns))
+        drawn(out / "fan.png", lambda: ensembles.fan(*_bands(case, study, columns)), 150)
+    drawn(out / "histograms.png", lambda: ensembles.histogram_figure(columns))
     if summary is not None and summary["drivers"][statistics.DECIDING]:  # there are none if no member survives
-        drawn(out / "tornado.png", lambda: _tornado(summary), 150)
+        of = statistics.DECIDING
+        told = summary["drivers"][of], of, summary["explained"][of]["says"]
+        drawn(out / "tornado.png", lambda: ensembles.tornado(*told), 150)
 
 
-def _tornado(summary: dict[str, Any]) -> Any:
-    from ambjax.pictures import histograms
-
-    deciding = statistics.DECIDING
-    bars = [histograms.Bar(*(d[k] for k in histograms.Bar._fields)) for d in summary["drivers"][deciding]]
-    return histograms.tornado(bars, deciding, summary["explained"][deciding]["says"])
-
-
-def _fan(case: Case, study: Study, columns: dict[str, np.ndarray]) -> Any:
-    from ambjax.pictures import fans
-
+def _bands(case: Case, study: Study, columns: dict[str, np.ndarray]) -> tuple[Any, ...]:
+    """Return the arguments of the fan chart."""
     lost_at = columns["lost_at"]
     # End the fan chart soon after the last loss if every member is lost.
     bands = study.bands(FAN_MEMBERS, FAN_TIMES, BEYOND * float(np.max(lost_at)))
@@ -125,7 +118,7 @@ def _fan(case: Case, study: Study, columns: dict[str, np.ndarray]) -> Any:
     few = np.size(bands.trajectory.lost_at)
     title = case.name if few == study.members else f"{case.name}: bands of {few} of {study.members} members"
     limits = {"z - r": float(np.min(study.scenario.touchdown)), "u": float(np.min(study.scenario.u_max))}
-    return fans.fan(bands.t, shown, limits, title, lost_at=lost_at, stalled=columns["stalled"])
+    return bands.t, shown, limits, title, lost_at, columns["stalled"]
 
 
 def _quantiles(x: np.ndarray, extremes: tuple[np.ndarray, np.ndarray] | None) -> dict[float, np.ndarray]:

@@ -16,7 +16,7 @@ from ambjax.ensemble.design import DESIGNS, design_points
 from ambjax.ensemble.distributions import Choice, Distribution, Percent
 from ambjax.ensemble.paths import Place, order_pairs, places, with_values
 from ambjax.numerics.declared import numbers, within
-from ambjax.text.synonyms import hint_of_path
+from ambjax.text.words import hint_of_path
 from ambjax.world.scenario import POLE, Scenario
 
 # Prefixes of the paths whose values affect the choice of the integration step. Disturbances are among them because

@@ -117,3 +117,19 @@ def _blank(path: str, text: bytes, name: str) -> Any:
     kind = getattr(_executed(path, text), name)
     pickle_with_source(kind)
     return object.__new__(kind)
+
+
+def tune(case: str | pathlib.Path, out: str | pathlib.Path | None = None, **options: Any) -> Any:
+    """Tune the gains of a case file, as `ambjax tune` does. Return the result of `tuning.tune`, a `TunedCase`.
+
+    - `case`: path of the case file; its table [tune] sets what is tuned.
+    - `out`: directory of the results; None: a new one under ./out.
+    - `options`: `minutes`, `listen`, `resume`, `force`, `pareto`, `page`, `settings_of`: see `tuning.tune`.
+
+    Raises ValueError for bad input, or if the tuner is not installed.
+
+        tuned = ambjax.tune("my.toml", "tuned", minutes=10)
+        tuned.good, tuned.case  # whether the gains meet all requirements, and the case with them
+    """
+    package = importlib.import_module(extension("tune").__module__.partition(".")[0])
+    return package.tune(case, out, **options)

@@ -93,47 +93,40 @@ def exit_on_interrupt(program: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def reporting(words: Callable[[], str]) -> Iterator[None]:
+def _during(name: str, value: object) -> Iterator[None]:
+    """Give an attribute of the handler another value in this block."""
+    before = getattr(_handler, name)
+    setattr(_handler, name, value)
+    try:
+        yield
+    finally:
+        setattr(_handler, name, before)
+
+
+def reporting(words: Callable[[], str]) -> contextlib.AbstractContextManager[None]:
     """Add the text that `words` returns to the message of a Ctrl-C in this block. Another thread calls `words`.
 
     In a nested block, the words of the outer one apply.
     """
-    before = _handler.report
-    _handler.report = before or words
-    try:
-        yield
-    finally:
-        _handler.report = before
+    return _during("report", _handler.report or words)
 
 
-@contextlib.contextmanager
-def deferred(words: str) -> Iterator[None]:
+def deferred(words: str) -> contextlib.AbstractContextManager[None]:
     """Print `words`, a sentence, on the first Ctrl-C in this block, and leave the exit to `raise_if_interrupted`.
 
     Has no effect if `words` is empty. A second Ctrl-C ends the process.
     """
-    before, _handler.deferral = _handler.deferral, words
-    try:
-        yield
-    finally:
-        _handler.deferral = before
+    return _during("deferral", words)
 
 
-@contextlib.contextmanager
-def uninterrupted() -> Iterator[None]:
+def uninterrupted() -> contextlib.AbstractContextManager[object]:
     """Delay Ctrl-C until the end of this short block, so that the report includes the files written in it."""
-    with _handler.busy:
-        yield
+    return _handler.busy
 
 
-@contextlib.contextmanager
-def removed_by_interrupt(folder: pathlib.Path) -> Iterator[None]:
+def removed_by_interrupt(folder: pathlib.Path) -> contextlib.AbstractContextManager[None]:
     """Remove `folder`, and its parent if that is then empty, if a Ctrl-C ends the process in this block."""
-    _handler.unfinished = folder
-    try:
-        yield
-    finally:
-        _handler.unfinished = None
+    return _during("unfinished", folder)
 
 
 def raise_if_interrupted() -> None:

@@ -23,9 +23,8 @@ def locked(directory: pathlib.Path) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout:
-        raise ValueError(
-            f"--out {directory}: another run is using this directory. Wait for it, or choose another directory."
-        ) from None
+        advice = "Wait for it, or choose another directory."
+        raise ValueError(f"--out {directory}: another run is using this directory. {advice}") from None
     except OSError as error:
         if error.errno not in NO_LOCKS:
             raise

@@ -43,9 +43,8 @@ def write_whole(path: pathlib.Path, write: Callable[[IO[bytes]], object]) -> Non
             os.fsync(file.fileno())
         part.replace(path)
     except OSError as error:
-        raise ValueError(
-            f"{path}: cannot be written ({error.strerror}). Free disk space, or choose another --out."
-        ) from None
+        advice = "Free disk space, or choose another --out."
+        raise ValueError(f"{path}: cannot be written ({error.strerror}). {advice}") from None
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
@@ -99,8 +98,10 @@ def flat(tree: Mapping[str, object], prefix: str = "") -> dict[str, Any]:
     """Flatten nested tables into one with dotted keys and JSON values, so that `difference` can name a key."""
     entries: dict[str, Any] = {}
     for key, value in tree.items():
-        name = f"{prefix}{key}"
-        entries |= flat(value, f"{name}.") if isinstance(value, Mapping) else {name: _plain(value)}
+        if isinstance(value, Mapping):
+            entries |= flat(value, f"{prefix}{key}.")
+        else:
+            entries[f"{prefix}{key}"] = json.loads(json.dumps(value, default=str))
     return entries
 
 
@@ -118,7 +119,3 @@ def checksum_of(facts: Mapping[str, object], arrays: Mapping[str, np.ndarray] = 
     for name in sorted(arrays):
         digest.update(name.encode() + b"\0" + np.ascontiguousarray(arrays[name]).tobytes())
     return digest.hexdigest()
-
-
-def _plain(value: object) -> Any:
-    return json.loads(json.dumps(value, default=str))

@@ -20,10 +20,9 @@ SIGNALS = "reference", "disturbance"
 class TemplateLine(NamedTuple):
     """A line of the case file.
 
-    - `parts`: texts and places of sliders, which alternate. A place is the index of the slider, and the text of its
-      value in the case file.
-    - `only`: indices of sliders. The line is present if one of them differs from the case's value; if `only` is empty,
-      the line is always present.
+    `parts`: texts and places of sliders, which alternate. A place is the index of the slider, and the text of its value
+    in the case file. `only`: the line is present if one of the sliders with these indices differs from the case's
+    value, or always if there are none.
     """
 
     parts: list[str | tuple[int, str]]
@@ -31,12 +30,10 @@ class TemplateLine(NamedTuple):
 
 
 class Spot(NamedTuple):
-    """The place of a number in a case file.
+    """The place of a number in a case file: its key in a table, or its index in a list.
 
-    - `holder`: the table or list that contains it; None if the file has no such table.
-    - `key`: its key in the table, or its index in the list.
-    - `table`: dotted name of the table.
-    - `element`: number of the table in a list of tables of this name; None for a table outside a list.
+    `holder`: the table or list; None if the file has no such table. `table`: dotted name of the table. `element`: its
+    number in a list of tables of this name; None for a table outside a list.
     """
 
     holder: Any
@@ -56,10 +53,7 @@ class Spot(NamedTuple):
 
 
 def editable_lines(text: str, given: Sequence[Slider]) -> tuple[list[TemplateLine], list[int]]:
-    """Return the lines of a case file, and the indices of the sliders that have a place in it.
-
-    - `text`: the case file.
-    - `given`: the sliders, with the values of this case.
+    """Return the lines of a case file, and the indices of the sliders `given` that have a place in it.
 
     For a number that the file does not contain, a line is added that is present only if its slider has moved. For a
     number of the plant that [controller.model] does not give, a further line, present under the same condition, keeps

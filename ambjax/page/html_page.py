@@ -15,11 +15,11 @@ import numpy as np
 
 from ambjax.cases.reader import Case
 from ambjax.codegen.javascript.script import PRELUDE
-from ambjax.ensemble.study import Study
 from ambjax.host.extensions import extra
 from ambjax.page.case_text import TemplateLine, checked, editable_lines
 from ambjax.page.loop_functions import COILS, SIGNALS, linear_script, loop_parameters, loop_script
 from ambjax.page.sliders import GROUPS, SEED, Slider, changed, parameter_values, parameters, sliders
+from ambjax.results.spread_runs import study_of
 from ambjax.simulation.metrics import UNITS
 from ambjax.simulation.trajectory import STATUSES
 from ambjax.world.recorded import Recorded
@@ -30,10 +30,8 @@ NAME = "page.html"
 # Number of members of the envelope.
 MEMBERS = 64
 # Script files of the web worker and of the page, in the order of execution.
-WORKER, PAGE = (
-    ("noise.js", "spectrum.js", "sensitivity.js", "worker.js"),
-    ("controls.js", "plots.js", "machine.js", "app.js"),
-)
+WORKER = ("noise.js", "spectrum.js", "sensitivity.js", "worker.js")
+PAGE = ("controls.js", "plots.js", "machine.js", "app.js")
 BOKEH = "bokeh.min.js", "bokeh-api.min.js"
 
 
@@ -46,7 +44,8 @@ def page(case: Case, others: Sequence[Case] = (), path: str = "case.toml") -> st
     Raises ValueError with a message of one line if the case has no processor or has a part that the page cannot
     compute, if one of `others` differs in structure, or if Bokeh is missing.
     """
-    library = _library()
+    folder = pathlib.Path(extra("bokeh", "page").__file__).parent / "server" / "static" / "js"
+    library = [(folder / name).read_text(encoding="utf-8") for name in BOKEH]
     worker, data = _computed(case, list(others), path)
     title = f"{case.name}: ambjax"
     scripts = "".join(f"<script>{text}</script>\n" for text in (*library, *map(_asset, PAGE)))
@@ -80,9 +79,8 @@ def pages(cases: Sequence[Case], paths: Sequence[str]) -> dict[str, str]:
 def check_processor(case: Case, path: str) -> None:
     """Raise ValueError if the case has no processor. `path`: name of the case file, for the message."""
     if not case.cascade.sampled:
-        raise ValueError(
-            f"{path}: the page runs a controller on a processor, and this case has none. Add the table [processor]."
-        )
+        advice = "Add the table [processor]."
+        raise ValueError(f"{path}: the page runs a controller on a processor, and this case has none. {advice}")
 
 
 def _block(name: str, text: str) -> str:
@@ -95,18 +93,11 @@ def _asset(name: str) -> str:
     return (importlib.resources.files("ambjax.page") / "assets" / name).read_text(encoding="utf-8")
 
 
-def _library() -> list[str]:
-    folder = pathlib.Path(extra("bokeh", "page").__file__).parent / "server" / "static" / "js"
-    return [(folder / name).read_text(encoding="utf-8") for name in BOKEH]
-
-
 def _check_contents(case: Case, others: list[Case], path: str) -> None:
     """Raise ValueError for a signal from a file, a notch, and other cases that differ in more than numbers."""
     if case.cascade.notch is not None:
-        raise ValueError(
-            f"{path}: [controller.notch]: a page cannot contain a notch, whose gain depends on all numbers of the "
-            "loop. Remove it."
-        )
+        why = "a page cannot contain a notch, whose gain depends on all numbers of the loop. Remove it."
+        raise ValueError(f"{path}: [controller.notch]: {why}")
     for slot in SLOTS:
         signal = getattr(case.scenario, slot)
         if any(isinstance(one, Recorded) for one in getattr(signal, "terms", (signal,))):
@@ -205,9 +196,7 @@ def _finest(case: Case, others: list[Case]) -> Case:
 
 def _members(case: Case) -> dict[str, Any]:
     """Return the members of the ensemble for JSON: their number, and rows for the parameters that vary."""
-    seed = int(case.scenario.seed)
-    study = Study(case.cascade, case.scenario, case.clock, case.settle, case.spread, seed, MEMBERS)
-    own, drawn = parameter_values(case), study.drawn(np.arange(MEMBERS))
+    own, drawn = parameter_values(case), study_of(case, None, MEMBERS).drawn(np.arange(MEMBERS))
     relative = {path for path, kind in case.spread.entries if kind.relative}
     rows = []
     for path, values in drawn.items():

@@ -21,7 +21,6 @@ from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.rollout import RolloutState, begin, one_sample
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import sampled_of
-from ambjax.simulation.trajectory import Row
 from ambjax.world.scenario import Scenario
 
 
@@ -37,42 +36,19 @@ class Numbers(NamedTuple):
     period: Scalar
 
 
-@dataclasses.dataclass(frozen=True)
-class LoopFunctions:
-    """The functions of the loop, which JAX traces.
+def _system(clock: Clock, numbers: Numbers, normals: Any) -> tuple[Sampled, Clock, Metrics]:
+    """Return the loop of a sample. `clock`: number of samples and integrator. `normals`: three normal numbers."""
+    clock = replaced(clock, sample_period=numbers.period)
+    built = sampled_of(numbers.cascade, numbers.scenario, clock)
+    word = jnp.zeros((), jnp.uint32)
+    cascade = built.loop.cascade.turning(numbers.scenario.rotor)
+    loop = ClosedLoop(cascade, numbers.scenario.turning(), (word, word), normals)
+    return dataclasses.replace(built, loop=loop), clock, _fold(numbers)
 
-    `clock`: number of samples and integrator. The argument `normals` of the methods is a tuple of three scalars, the
-    normal numbers of the sample.
-    """
 
-    clock: Clock
-
-    def _system(self, numbers: Numbers, normals: Any) -> tuple[Sampled, Clock, Metrics]:
-        clock = replaced(self.clock, sample_period=numbers.period)
-        built = sampled_of(numbers.cascade, numbers.scenario, clock)
-        word = jnp.zeros((), jnp.uint32)
-        cascade = built.loop.cascade.turning(numbers.scenario.rotor)
-        loop = ClosedLoop(cascade, numbers.scenario.turning(), (word, word), normals)
-        return dataclasses.replace(built, loop=loop), clock, self._fold(numbers)
-
-    def _fold(self, numbers: Numbers) -> Metrics:
-        """Return the metrics without those once per revolution, which compute with arrays."""
-        return Metrics.of(numbers.settle, dataclasses.replace(numbers.scenario, rotor=None))
-
-    def start(self, numbers: Numbers, normals: Any) -> RolloutState:
-        return begin(*self._system(numbers, normals))
-
-    def step(
-        self, numbers: Numbers, progress: RolloutState, normals: Any, k: Array
-    ) -> tuple[RolloutState, Row, tuple[Array, Array]]:
-        """Return the state after sample k, the row of this sample, and the currents of both coils at its start, A."""
-        system, clock, fold = self._system(numbers, normals)
-        after, row = one_sample(system, clock, fold, progress, k)
-        return after, row, numbers.scenario.plant.currents(progress.state.plant)
-
-    def result(self, numbers: Numbers, progress: RolloutState) -> dict[str, Array]:
-        fold = self._fold(numbers)
-        return fold.result(progress.fold, progress.ending)
+def _fold(numbers: Numbers) -> Metrics:
+    """Return the metrics without those once per revolution, which compute with arrays."""
+    return Metrics.of(numbers.settle, dataclasses.replace(numbers.scenario, rotor=None))
 
 
 def loop_parameters(case: Case, any_delay: bool = False) -> Numbers:
@@ -106,14 +82,22 @@ def loop_script(case: Case, any_delay: bool = False) -> tuple[str, dict[str, Any
     """
     with precision("double"):
         numbers = canonical(loop_parameters(case, any_delay))
-        functions = LoopFunctions(case.clock)
         zero = jnp.zeros(())
         normals = (zero, zero, zero)
-        start = piece_of(functions.start, "pw", (numbers, normals))
-        shapes = jax.eval_shape(functions.start, numbers, normals)
+
+        def begun(numbers: Numbers, normals: Any) -> RolloutState:
+            return begin(*_system(case.clock, numbers, normals))
+
+        def stepped(numbers: Numbers, progress: RolloutState, normals: Any, k: Array) -> tuple[Any, ...]:
+            """Return the state after sample k, the row of this sample, and the currents of both coils at its start."""
+            after, row = one_sample(*_system(case.clock, numbers, normals), progress, k)
+            return after, row, numbers.scenario.plant.currents(progress.state.plant)
+
+        start = piece_of(begun, "pw", (numbers, normals))
+        shapes = jax.eval_shape(begun, numbers, normals)
         progress = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        step = piece_of(functions.step, "pswn", (numbers, progress, normals, zero))
-        result = piece_of(functions.result, "ps", (numbers, progress))
+        step = piece_of(stepped, "pswn", (numbers, progress, normals, zero))
+        result = piece_of(lambda n, state: _fold(n).result(state.fold, state.ending), "ps", (numbers, progress))
     _, row, coils = step.results
     shown = [getattr(row, name) for name in SIGNALS] + list(coils)
     every = operands_of(step.results[0])
@@ -128,13 +112,10 @@ def loop_script(case: Case, any_delay: bool = False) -> tuple[str, dict[str, Any
 
 
 class LoopPoint(NamedTuple):
-    """A point at which the loop is linearised.
+    """A point at which the loop is linearised: the state of the plant and its lags, and the states of the laws.
 
-    - `lagged`: state of the plant and its lags.
-    - `acting`: the voltage that acts, V.
-    - `control`: states of the laws.
-    - `past`: the voltages commanded before, the most recent first, V.
-    - `e`: test signal that is added to the reading of z, m.
+    `acting`: the voltage that acts, V. `past`: the voltages commanded before, the most recent first, V. `e`: test
+    signal that is added to the reading of z, m.
     """
 
     lagged: LagState

@@ -35,16 +35,11 @@ GROUPS = {
 
 
 class Slider(NamedTuple):
-    """A slider of the page: a number of the case.
+    """A slider of the page: a number of the case, by its dotted path, with its unit and meaning.
 
-    - `path`, `unit`, `doc`: dotted path in the case file, unit and meaning.
-    - `parameter`: its index among the parameters P of the JavaScript.
-    - `value`: the case's value.
-    - `low`, `high`: ends of the slider.
-    - `log`: whether the slider is logarithmic.
-    - `least`, `most`: smallest and largest allowed value; `open`: whether `least` itself is excluded.
-    - `whole`: whether only whole numbers are allowed.
-    - `grid`: whether the number is a time at which a disturbance jumps. The page rounds such a time to a whole sample.
+    `parameter`: its index among the parameters P of the JavaScript. `value`: the case's value. `low`, `high`: ends of
+    the slider. `least`, `most`: smallest and largest allowed value; `open`: whether `least` itself is excluded.
+    `grid`: whether the number is a time at which a disturbance jumps. The page rounds such a time to a whole sample.
     """
 
     path: str
@@ -86,7 +81,6 @@ def sliders(case: Case, others: list[Case]) -> list[Slider]:
 
 
 def _places(case: Case) -> dict[str, Place]:
-    """Return every number of a case and the seed, by path."""
     (field,) = (field for field in dataclasses.fields(case.scenario) if field.name == "seed")
     return {**places(case.cascade, case.scenario), SEED: Place((1, "seed"), field, case.scenario.seed)}
 

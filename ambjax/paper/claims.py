@@ -20,7 +20,6 @@ from ambjax.world.plant import Plant
 SIGMA_RADIUS, TRACKING_ERROR, INVERSION_TIME = 6e-6, 2.3e-5, 0.01
 GAP = float(Plant().s_0)
 
-
 HOLDS, FAILS, OPEN = "holds", "does not hold", "not determined by the paper"
 # Verdict if a run stalled, so that it is not known whether the rotor survives.
 UNDECIDED = "not decided"
@@ -93,9 +92,8 @@ def claim(says: str, where: str, paper: str, criterion: str, *runs: str) -> Call
 @claim("Theorem 1's conditions hold under Table 2", "3.5", "assumed", "every margin positive, both scenarios")
 def _theorem(evidence: Evidence) -> Finding:
     lines = [c for report in (evidence.check_regulation, evidence.check_tracking) for c in report.conditions]
-    tightest = min(
-        (c for c in lines if c.holds is not None and c.gain), key=lambda c: (c.margin or 0.0) / (c.gain or 1.0)
-    )
+    given = [c for c in lines if c.holds is not None and c.gain]
+    tightest = min(given, key=lambda c: (c.margin or 0.0) / (c.gain or 1.0))
     share = 100 * (tightest.margin or 0.0) / (tightest.gain or 1.0)
     failing = [c for c in lines if c.holds is False]
     ideal = [c for c in failing if c.name == "inversion, ideal"]
@@ -178,18 +176,16 @@ def _radius_by_noise(evidence: Evidence) -> Finding:
     return finding(words, nearest, 0.8 <= nearest / TABLE_2.noise_std <= 1.25, cause)
 
 
-@claim(
-    "Regulation is insensitive to the pulse", "4", "-",
-    "pulse changes z by at most 2.3e-5 m, the paper's own accuracy", "regulation",
-)  # fmt: skip
-def _insensitive(evidence: Evidence) -> Finding:
-    return _pulse_effect(evidence.regulation)
+def _pulse(says: str, name: str) -> None:
+    @claim(says, "4", "-", "pulse changes z by at most 2.3e-5 m, the paper's own accuracy", name)
+    def judge(evidence: Evidence) -> Finding:
+        run, formula = getattr(evidence, name), "with finite p, by q_z pi / (2 c k p)"
+        change = float(np.abs(run.trajectory.rows.z - run.quiet.rows.z).max())
+        cause = f"the pulse moves the rotor by {100 * change / GAP:.2g} % of the gap; {formula}"
+        return finding(f"{change:.3e} m", change, change <= TRACKING_ERROR, cause)
 
 
-def _pulse_effect(run: Run) -> Finding:
-    change = float(np.abs(run.trajectory.rows.z - run.quiet.rows.z).max())
-    cause = f"the pulse moves the rotor by {100 * change / GAP:.2g} % of the gap; with finite p, by q_z pi / (2 c k p)"
-    return finding(f"{change:.3e} m", change, change <= TRACKING_ERROR, cause)
+_pulse("Regulation is insensitive to the pulse", "regulation")
 
 
 def _inversion(name: str) -> None:
@@ -208,13 +204,9 @@ _inversion("tracking")
 
 
 @claim(
-    "The current tracks its reference",
-    "4",
-    "-",
-    "settled |i - i_ref| < 1e-3 A, both scenarios",
-    "regulation",
-    "tracking",
-)
+    "The current tracks its reference", "4", "-", "settled |i - i_ref| < 1e-3 A, both scenarios",
+    "regulation", "tracking",
+)  # fmt: skip
 def _current(evidence: Evidence) -> Finding:
     worst = max(r.metrics["settled_max_abs_current_error_A"] for r in (evidence.regulation, evidence.tracking))
     cause = f"largest |i - i_ref| after {SETTLE} s, pulse included; q_i = 0, so e decays by Eq. (14) unless u saturates"
@@ -228,12 +220,7 @@ def _tracking(evidence: Evidence) -> Finding:
     return finding(f"{error:.3e} m", error, error < 2.35e-5, cause)
 
 
-@claim(
-    "Tracking: the disturbance is rejected", "4", "-",
-    "pulse changes z by at most 2.3e-5 m, the paper's own accuracy", "tracking",
-)  # fmt: skip
-def _rejection(evidence: Evidence) -> Finding:
-    return _pulse_effect(evidence.tracking)
+_pulse("Tracking: the disturbance is rejected", "tracking")
 
 
 @claim(
@@ -259,9 +246,8 @@ def _noise(evidence: Evidence) -> Finding:
 def _specification(evidence: Evidence) -> Finding:
     held = [n for n in evidence.noise if n.survived]
     if not held:
-        return Finding(
-            "never held", None, OPEN, "the rotor is not held at the smallest noise, so the radii cannot be compared"
-        )
+        cause = "the rotor is not held at the smallest noise, so the radii cannot be compared"
+        return Finding("never held", None, OPEN, cause)
     if len(evidence.noise) == 1:
         words = f"period {evidence.noise[0].sample_period:g} s"
         return Finding(words, None, OPEN, "only the period of the processor was simulated; the paper gives no period")

@@ -109,8 +109,6 @@ class Evidence(NamedTuple):
 
     regulation: Run
     tracking: Run
-    noisy: Trajectory
-    """tracking under the paper's noise and supply"""
     on_processor: dict[bool, Run]
     """tracking on the processor of `sampled`, under noise (True); for readings without noise also without it (False)"""
     check_regulation: Report
@@ -137,9 +135,6 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
             quiet = _simulate(reading, cascade, paper.scenario(name, reading, pulse=False)).trajectory
             runs[name] = _simulate(reading, cascade, paper.scenario(name, reading))._replace(quiet=quiet)
             checks[name] = checking.result()
-        noisy = runs["tracking"].trajectory
-        if reading not in paper.NOISY:  # the tracking scenario of the others has the noise already
-            noisy = _simulate(reading, cascade, paper.noisy(paper.scenario("tracking", reading))).trajectory
         say(f"{reading}: on a processor")
         on_processor = {True: runs["tracking"]} if cascade.sampled else _on_processor(reading)
         # The first scan compiled the program that these reuse.
@@ -149,7 +144,7 @@ def gather(reading: str, say: Callable[[str], None] = lambda text: None) -> Evid
     say(f"{reading}: uncertain plant")
     uncertain = _uncertain(cascade, reading)
     reports = checks["regulation"], checks["tracking"]
-    return Evidence(runs["regulation"], runs["tracking"], noisy, on_processor, *reports, noise, basin, uncertain)
+    return Evidence(runs["regulation"], runs["tracking"], on_processor, *reports, noise, basin, uncertain)
 
 
 def _simulate(reading: str, cascade: Cascade, scenario: Scenario) -> Run:
@@ -175,9 +170,8 @@ def _uncertain(cascade: Cascade, reading: str) -> Uncertain:
     def one(case: tuple[str, float]) -> dict[str, float]:
         name, factor = case
         plant = dataclasses.replace(Plant(), **{name: getattr(Plant(), name) * factor})
-        return _simulate(
-            reading, cascade, dataclasses.replace(paper.scenario("tracking", reading), plant=plant)
-        ).metrics
+        scenario = dataclasses.replace(paper.scenario("tracking", reading), plant=plant)
+        return _simulate(reading, cascade, scenario).metrics
 
     with ThreadPoolExecutor() as pool:
         metrics = list(pool.map(one, cases))

@@ -101,9 +101,8 @@ def ledger_markdown(ledger: dict[str, list[dict[str, Any]]]) -> str:
     rows = ledger["claims"]
     heads = [head for reading in rows[0]["findings"] for head in (f"{reading}: ours", f"{reading}: verdict")]
     lines = ["# Ledger: the paper's claims, per reading", ""]
-    lines += [
-        "`literal`: Table 2 as printed. `repaired`: gamma = 7.5e4, disturbance as scaled force. Both without noise."
-    ]
+    quiet = "`repaired`: gamma = 7.5e4, disturbance as scaled force. Both without noise."
+    lines += [f"`literal`: Table 2 as printed. {quiet}"]
     lines += [f"`tuned`: {TUNED_WORDS}.", f"`sampled`: {SAMPLED_WORDS}.", ""]
     verdicts = [[cell for f in row["findings"].values() for cell in (f["ours"], f"**{f['verdict']}**")] for row in rows]
     claims = [(row["says"], row["where"], row["paper"], *own) for row, own in zip(rows, verdicts, strict=True)]
@@ -123,9 +122,8 @@ def ledger_markdown(ledger: dict[str, list[dict[str, Any]]]) -> str:
 
 
 def _noise_cells(n: dict[str, Any]) -> tuple[str, ...]:
-    survived, gives = (
-        f"{n[name]:.1e} m" if n[name] else "none" for name in ("largest_std_survived_m", "std_for_sigma_6e-6_m")
-    )
+    names = ("largest_std_survived_m", "std_for_sigma_6e-6_m")
+    survived, gives = (f"{n[name]:.1e} m" if n[name] else "none" for name in names)
     if n["undecided_std_m"]:
         survived += f", not decided at {n['undecided_std_m']:.1e} m"
     return n["reading"], f"{n['sample_period_s']:g} s", f"{n['horizon_s']:g} s", survived, gives

@@ -109,7 +109,8 @@ def draw_panel(
     rows, lost_at = trajectory.rows, float(trajectory.lost_at)
     t = np.asarray(rows.t)
     low, high = (t[0], t[-1]) if stretch is None else stretch
-    part = stretch_of(t, low, high)
+    # with the outer neighbour of a bound that lies between two samples
+    part = slice(max(int(np.searchsorted(t, low, "right")) - 1, 0), int(np.searchsorted(t, high, "left")) + 1)
     held = t[part] < lost_at
     for curve in panel.curves:
         x, y = t[part][held], panel.factor * signal_of(rows, curve.signal)[part][held]
@@ -252,8 +253,3 @@ def envelope(
     edges = np.append(t[starts], t[-1])
     x = np.stack([edges[:-1], edges[1:]], 1).ravel()
     return x, np.fmin.reduceat(low, starts).repeat(2), np.fmax.reduceat(high, starts).repeat(2)
-
-
-def stretch_of(t: np.ndarray, low: float, high: float) -> slice:
-    """Return the samples from `low` to `high`, s, with the outer neighbour of a bound that lies between two samples."""
-    return slice(max(int(np.searchsorted(t, low, "right")) - 1, 0), int(np.searchsorted(t, high, "left")) + 1)

@@ -2,14 +2,13 @@
 
 import itertools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from ambjax.linear.state_space import StateSpace
 from ambjax.pictures.figures import BLUE, GREEN, INK, ORANGE, RED
 from ambjax.pictures.scales import own_style, prefix_of
 
@@ -25,37 +24,15 @@ LOWEST = 0.01
 WINDOW = 3.0
 
 
-class MeasuredPoints(NamedTuple):
-    """Responses measured at some frequencies [L] (Hz): S, T (1) and KS (V/m), complex [L]."""
-
-    frequency: np.ndarray
-    S: np.ndarray
-    T: np.ndarray
-    KS: np.ndarray
-
-
-class NamedLoop(NamedTuple):
-    """A linearised loop with its name, its mass (kg) and its disk margin."""
-
-    name: str
-    system: StateSpace
-    m: float
-    disk: float
-
-
 @own_style
 def frequency_figure(
-    title: str,
-    loops: Sequence[NamedLoop],
-    limits: Sequence[float],
-    span: tuple[float, float],
-    measured: MeasuredPoints | None = None,
+    title: str, loops: Sequence[Any], limits: Sequence[float], span: tuple[float, float], measured: Any = None
 ) -> Figure:
     """Return a picture: |S| with zones, |T|, |KS|, dynamic stiffness, Nyquist curve with the disk, Bode plot of L.
 
-    `limits`: upper limits of the zones A, B and C. `span`: lowest and highest frequency, Hz. `measured`: points
-    measured on the nominal loop, which are drawn with the curves. Only the first len(LINES) loops are drawn. Without a
-    loop, because none is stable, there are no zones.
+    `loops`: stable loops, as `OperatingPoint`. `limits`: upper limits of the zones A, B and C. `span`: lowest and
+    highest frequency, Hz. `measured`: an `Injection` into the nominal loop with S, T and KS; its points are drawn with
+    the curves. Only the first len(LINES) loops are drawn. Without a loop, because none is stable, there are no zones.
     """
     figure = Figure(figsize=(12, 11), layout="constrained")
     left = figure.add_gridspec(4, 2)
@@ -128,11 +105,11 @@ def shade_zones(ax: Axes, limits: Sequence[float]) -> None:
     ax.set_ylim(low, high)
 
 
-def _nyquist(ax: Axes, loops: Sequence[NamedLoop]) -> None:
+def _nyquist(ax: Axes, loops: Sequence[Any]) -> None:
     """Mark -1, and shade the disk of the disk margin of the first loop, which its Nyquist curve touches."""
     if loops:
         # the disk with the diameter from -(2 + d)/(2 - d) to its inverse
-        d = min(loops[0].disk, 1.999)
+        d = min(loops[0].analysis.margins_at.reading.dm, 1.999)
         far, near = (2 + d) / (2 - d), (2 - d) / (2 + d)
         ax.add_patch(Circle((-(far + near) / 2, 0), (far - near) / 2, color="#f6d5d5", zorder=0, linewidth=0))
     ax.plot([-1], [0], marker="+", color=INK, markersize=10)
@@ -143,53 +120,35 @@ def _nyquist(ax: Axes, loops: Sequence[NamedLoop]) -> None:
     ax.set_title("Nyquist curve; shaded: disk margin of the first loop", fontsize=9)
 
 
-class Contender(NamedTuple):
-    """A case of a comparison.
-
-    - `held`: whether each member keeps its rotor [N].
-    - `error`, `voltage`: settled rms error (m) and settled rms voltage (V) of each member [N].
-    - `system`: the linearised loop; None: not stable, or no equilibrium. Then |S| and |KS| are not drawn.
-    - `channel`, `command`: numbers of the drawn reading and voltage among the outputs of `system`; the reading has the
-      number of its test signal. `where`: axis and speed of a machine in the legend.
-    """
-
-    name: str
-    held: np.ndarray
-    error: np.ndarray
-    voltage: np.ndarray
-    system: StateSpace | None
-    channel: int = 0
-    command: int = 2
-    where: str = ""
-
-
 @own_style
-def comparison_figure(cases: Sequence[Contender], limits: Sequence[float], span: tuple[float, float]) -> Figure:
+def comparison_figure(cases: Sequence[Any], limits: Sequence[float], span: tuple[float, float]) -> Figure:
     """Return a picture: |S| with zones, |KS|, share of members below an rms error, rms error against rms voltage.
 
-    `limits`: upper limits of the zones A, B and C. `span`: lowest and highest frequency, Hz; a curve ends at half the
-    sampling rate of its case. A member that is lost has
-    no error: the curve of a case that loses members ends below 1. At most 8 cases are drawn.
+    `cases`: results of cases, as `Compared`; |S| and |KS| of a loop that is not stable are not drawn. `limits`: upper
+    limits of the zones A, B and C. `span`: lowest and highest frequency, Hz; a curve ends at half the sampling rate of
+    its case. A member that is lost has no error: the curve of a case that loses members ends below 1. At most 8 cases
+    are drawn.
     """
     figure = Figure(figsize=(12, 8.5), layout="constrained")
     (S_axes, error_axes), (KS_axes, effort_axes) = figure.subplots(2, 2)
     grid = np.geomspace(*span, POINTS)
-    finite = [case.error[case.held] for case in cases if case.held.any()]
-    factor, unit = prefix_of("m", float(max((x.max() for x in finite), default=1e-6)))
+    errors = [one.columns["settled_rms_error_m"][one.held] for one in cases]
+    factor, unit = prefix_of("m", float(max((x.max() for x in errors if x.size), default=1e-6)))
     looks = [(colour, style) for style, colour in itertools.product(STYLES, (BLUE, ORANGE, GREEN, RED))]
-    for case, (colour, style) in zip(cases, looks, strict=False):
-        look = {"color": colour, "linestyle": style, "linewidth": 1.5, "label": case.name}
-        if case.system is not None:
-            period = case.system.period
+    for one, error, (colour, style) in zip(cases, errors, looks, strict=False):
+        name, loop = one.case.name, one.loop
+        look = {"color": colour, "linestyle": style, "linewidth": 1.5, "label": name}
+        if loop.system is not None:
+            period = loop.system.period
             f = grid if period is None else grid[grid <= 0.5 / float(period)]
-            H, k = np.asarray(case.system.response(f)), case.channel
-            S_axes.loglog(f, np.abs(H[:, k, k]), **look | {"label": f"{case.name}: {case.where}"})
-            KS_axes.loglog(f, np.abs(H[:, case.command, k]), **look)
-        errors, lost = factor * np.sort(case.error[case.held]), int(np.sum(~case.held))
-        label = f"{case.name} ({lost} lost)" if lost else case.name
-        error_axes.step(errors, np.arange(1, errors.size + 1) / case.held.size, where="post", **look | {"label": label})
+            H, k = np.asarray(loop.system.response(f)), loop.channel
+            S_axes.loglog(f, np.abs(H[:, k, k]), **look | {"label": f"{name}: {loop.numbers.get('worst_at', '')}"})
+            KS_axes.loglog(f, np.abs(H[:, loop.command, k]), **look)
+        lost, share = int(np.sum(~one.held)), np.arange(1, error.size + 1) / one.held.size
+        label = f"{name} ({lost} lost)" if lost else name
+        error_axes.step(factor * np.sort(error), share, where="post", **look | {"label": label})
         mark = {"color": colour, "marker": "o" if style == "-" else "x", "linestyle": "", "markersize": 3, "alpha": 0.4}
-        effort_axes.plot(case.voltage[case.held], factor * case.error[case.held], **mark)
+        effort_axes.plot(one.columns["settled_rms_u_V"][one.held], factor * error, **mark)
     shade_zones(S_axes, limits)
     labels = {
         S_axes: ("frequency, Hz", "|S|", "sensitivity at the position sensor, with zones"),
@@ -203,7 +162,7 @@ def comparison_figure(cases: Sequence[Contender], limits: Sequence[float], span:
         ax.grid(True, which="major", color="#dddddd", linewidth=0.6)
     error_axes.set_ylim(0, 1.02)
     error_axes.legend(fontsize=8, loc="lower right")
-    if any(case.system is not None and case.where for case in cases):
+    if any(one.loop.system is not None and one.loop.numbers.get("worst_at") for one in cases):
         S_axes.legend(fontsize=8, loc="lower right")
     for ax in (S_axes, KS_axes):
         ax.set_xlim(span)

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from ambjax.cases.case_table import notebook_table
-from ambjax.cases.given import of_case
+from ambjax.cases.given import names_arguments, of_case
 from ambjax.cases.reader import Case, is_as_written
 from ambjax.cases.table import require_file
 from ambjax.codegen import verify
@@ -29,7 +29,6 @@ from ambjax.codegen.trace import trace
 from ambjax.codegen.twins import LoopCase
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.spread import ends
-from ambjax.host.arguments import names_arguments
 from ambjax.results.outputs import described, directory, files, plain, spare
 from ambjax.simulation.system import guarded
 
@@ -55,15 +54,9 @@ KEYWORDS = {
 
 
 class Plan(NamedTuple):
-    """A checked export.
+    """A checked export of a `block`, with the options of `export`.
 
-    - `case`: the case.
-    - `block`: what is exported.
-    - `format`: one of FORMATS.
-    - `fmi`: version of FMI of an FMU, 2 or 3.
-    - `precision`: C type of a C package, "float" or "double".
-    - `prefix`: prefix of all C names.
-    - `verified`: whether the C is compared with JAX.
+    `prefix`: of all C names. `verified`: whether the C is compared with JAX.
     """
 
     case: Case
@@ -173,9 +166,8 @@ def planned(
     if fmi is not None and format != "fmu":
         raise ValueError(f"--fmi {fmi}: it is the version of an FMU. Omit --fmi, or set --format to fmu.")
     if precision == "float" and format != "c":
-        raise ValueError(
-            f"--precision float: --format {format} computes in double. Omit --precision, or set --format to c."
-        )
+        advice = "Omit --precision, or set --format to c."
+        raise ValueError(f"--precision float: --format {format} computes in double. {advice}")
     if verified and format == "js":
         raise ValueError("--verify: it compares C with JAX. Omit it, or set --format to c.")
     if verified:
@@ -226,21 +218,15 @@ def destination(out: str | None, name: str, plan: Plan) -> Iterator[tuple[pathli
     Without verification, the verification of an earlier export is removed, because it does not apply to the new files.
     """
     path = directory(out, name)
-    names = {"fmu": FMU_NAMES[: 1 if _holds_fmu(path, plan) else None], "js": ("{p}.js",), "c": package.NAMES}[
-        plan.format
-    ]
+    fmu = path / f"{plan.prefix}.fmu"
+    old = fmu.is_file() and fmu.read_bytes().endswith(plan.mark.encode())  # then its reference data may be overwritten
+    names = {"fmu": FMU_NAMES[: 1 if old else None], "js": ("{p}.js",), "c": package.NAMES}[plan.format]
     spare(path, [*(name.format(p=plan.prefix) for name in names), *VERIFIED], plan.mark)
     with files(path) as part:
         yield path, part
     if not plan.verified:
         for name in VERIFIED:
             (path / name).unlink(missing_ok=True)
-
-
-def _holds_fmu(out: pathlib.Path, plan: Plan) -> bool:
-    """Return whether `out` contains an FMU of an earlier export. Its reference data may then be overwritten."""
-    path = out / f"{plan.prefix}.fmu"
-    return path.is_file() and path.read_bytes().endswith(plan.mark.encode())
 
 
 def guarded_for(case: Case) -> Cascade:

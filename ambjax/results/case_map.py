@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.case_table import notebook_table
-from ambjax.cases.given import of_case
+from ambjax.cases.given import names_arguments, of_case
 from ambjax.cases.machine_case import AnyCase
 from ambjax.cases.timing import FEWEST_SAMPLES, MOST_SAMPLES, SAMPLE_PERIOD
 from ambjax.ensemble.maps import GRIDS, PERIOD, Axis, Map, grid, with_method_for_axes
 from ambjax.ensemble.paths import Place
 from ambjax.ensemble.spread import no_such_number
 from ambjax.ensemble.study import AnyStudy, Study
-from ambjax.host.arguments import names_arguments
 from ambjax.host.extensions import extra
 from ambjax.host.one_thread import one_thread
 from ambjax.linear import stability_of
@@ -66,7 +65,7 @@ class CaseMap:
         """Return a matplotlib Figure with heat maps of the survival and of the error, as map.png shows them."""
         from ambjax.pictures.heatmaps import map_figure
 
-        return map_figure([panel(self.case, self.map)], *labels(self.case, self.map))
+        return map_figure([self.map], [title(self.case, self.map)], *labels(self.case, self.map))
 
     def _repr_html_(self) -> str:
         one = self.map
@@ -147,38 +146,22 @@ def unit_of(case: AnyCase, axis: Axis) -> str:
     return "s" if place is None else place.field.metadata["unit"]
 
 
-def panel(case: AnyCase, one: Map) -> Any:
-    """Return the panel of a map, a `heatmaps.MapPanel`."""
-    from ambjax.pictures.heatmaps import MapPanel
-
-    return MapPanel(
-        title=f"{case.name}\n{_subtitle(one)}",
-        x=one.x.values,
-        y=one.y.values,
-        survival=one.survival,
-        low=one.low if one.decisive else None,
-        high=one.high if one.decisive else None,
-        error=one.error,
-        unstable=one.unstable > 0,
-    )
-
-
-def _subtitle(one: Map) -> str:
-    """Return the subtitle of a panel: the spread quantities, or their number if there are more than three."""
+def title(case: AnyCase, one: Map) -> str:
+    """Return the title of a map: the case, and the spread quantities, or their number if there are more than three."""
     few = len(one.drawn) <= 3
     what = ", ".join(one.drawn) if few else f"{len(one.drawn)} quantities"
-    words = f"spread: {what}" if what else "nominal"
+    words = f"{case.name}\nspread: {what}" if what else f"{case.name}\nnominal"
     return words + f"; {int(one.stalled.sum())} runs not decided" * bool(one.stalled.any())
 
 
-def labels(case: AnyCase, one: Map) -> tuple[str, str, bool, bool]:
-    """Return the labels of x and y with their units, and whether each axis is logarithmic."""
+def labels(case: AnyCase, one: Map) -> tuple[str, str]:
+    """Return the labels of x and y with their units."""
 
     def label(axis: Axis) -> str:
         unit = unit_of(case, axis)
         return f"{axis.path} ({unit})" if unit else axis.path
 
-    return label(one.x), label(one.y), one.x.log, one.y.log
+    return label(one.x), label(one.y)
 
 
 def _axis(flag: str, text: str, case: AnyCase) -> Axis:

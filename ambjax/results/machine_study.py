@@ -31,6 +31,7 @@ from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import PerAxis
 from ambjax.simulation.metrics import Metrics
 from ambjax.simulation.whole_machine import Machine
+from ambjax.world.rotor import Rotor
 from ambjax.world.scenario import Scenario
 
 # Multiple of the clearance by which the rotor of a `lost` call is displaced along x, y and z.
@@ -52,10 +53,7 @@ class LinearFindings(Findings):
 class MachineStudy(AnyStudy):
     """The definition of an ensemble of a machine. Member k depends on (seed, k), as in `Study`.
 
-    - `case`: the machine, with its spread.
-    - `seed`: seed of the spread and of the noise.
-    - `members`: number of members.
-    - `by_axis`: metrics of each axis among the columns, as AXIS.METRIC.
+    `by_axis`: metrics of each axis among the columns, as AXIS.METRIC.
     """
 
     case: MachineCase
@@ -83,7 +81,6 @@ class MachineStudy(AnyStudy):
         return drawn(self.spread, self._numbers(), self.seed, members, self.members)
 
     def _numbers(self) -> dict[str, Place]:
-        """Return every number of the rotor and of each axis by dotted path."""
         machine = self.case.machine
         return machine_places(machine.rotor, machine.start_q, self.case.axes, self.case.cases)
 
@@ -146,9 +143,8 @@ class MachineStudy(AnyStudy):
 
         What varies has an axis [n].
         """
-        machine = self.case.machine
+        machine, (rotor, start) = self.case.machine, self._rotor(values)
         parts = [self._axis(values, k, members) for k in range(len(self.case.axes))]
-        rotor, start = varied_rotors(machine.rotor, values, self.case.axes), varied_start(machine.start_q, values)
         folds = [canonical(Metrics.of(self.settle, scenario, machine.near)) for _, scenario in parts]
         return machine_of_axes(rotor, parts, self.clock, start, machine.law), PerAxis(stack_axes(folds))
 
@@ -166,6 +162,10 @@ class MachineStudy(AnyStudy):
             columns |= {f"{axis}.{name}": outcome.metrics[name][:, k] for name in self.by_axis}
         return columns
 
+    def _rotor(self, values: dict[str, np.ndarray]) -> tuple[Rotor, np.ndarray]:
+        machine = self.case.machine
+        return varied_rotors(machine.rotor, values, self.case.axes), varied_start(machine.start_q, values)
+
     def _axis(self, values: dict[str, Any], k: int, member: Any) -> tuple[Cascade, Scenario]:
         one = self.case.cases[k]
         own = axis_values(values, self.case.axes[k], places(one.cascade, one.scenario))
@@ -179,8 +179,7 @@ class MachineStudy(AnyStudy):
         for k, one in enumerate(self.case.cases):
             cascade, scenario = self._axis(numbers, k, index)
             cases.append(dataclasses.replace(one, cascade=cascade, scenario=scenario))
-        machine = self.case.machine
-        rotor, start = varied_rotors(machine.rotor, values, self.case.axes), varied_start(machine.start_q, values)
+        machine, (rotor, start) = self.case.machine, self._rotor(values)
         if rotor is not machine.rotor:
             rotor = jax.tree.map(lambda x: x[0], rotor)
         start = start.reshape(-1, start.shape[-1])[0]

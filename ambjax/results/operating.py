@@ -9,6 +9,7 @@ from typing import NamedTuple, overload
 import jax
 import numpy as np
 
+from ambjax import linear
 from ambjax.cases.given import of_case
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
@@ -16,23 +17,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.replay import as_member
 from ambjax.ensemble.study import Study
 from ambjax.host.one_thread import one_thread
-from ambjax.linear import (
-    PLACES,
-    Analysis,
-    Margins,
-    MemberPeaks,
-    StateSpace,
-    analyse,
-    analysis,
-    checked,
-    decayed_end,
-    frequency_lines,
-    injected_members,
-    linear_machine,
-    linearise,
-    linearise_members,
-    stability_of,
-)
+from ambjax.linear import analysis, linear_machine
 from ambjax.linear.linear_machine import MachineSensitivity, TurningMachine, sensitivity_of, turning_machines
 from ambjax.linear.machine_stability import growth_of, machine_stability
 from ambjax.linear.stability import has_set_valued
@@ -55,8 +40,8 @@ class OperatingPoint(NamedTuple):
     name: str
     r: float
     m: float
-    system: StateSpace
-    analysis: Analysis
+    system: linear.StateSpace
+    analysis: linear.Analysis
     held: bool | None = None
 
     @property
@@ -85,21 +70,21 @@ class SpreadPeaks(NamedTuple):
     zone_a: int
     worst: int
     point: OperatingPoint | None
-    measured: MemberPeaks | None = None
+    measured: linear.MemberPeaks | None = None
     failed: int = 0
 
 
 def operating_point(case: Case, name: str, r: float) -> OperatingPoint:
     """Linearise and analyse the loop of a case at a constant reference r (m). Raises ValueError as `linearise` does."""
-    system = linearise(case.cascade, case.scenario, case.clock, r)
+    system = linear.linearise(case.cascade, case.scenario, case.clock, r)
     m, held = float(case.scenario.plant.m), None
     if has_set_valued([case.cascade]):
         scenario = as_member(case.scenario)
         if r:
             start = Initial(r, 0.0, float(scenario.plant.equilibrium(r)[0]))
             scenario = dataclasses.replace(scenario, reference=Constant(r), initial=start)
-        held = bool(stability_of(case.cascade, scenario, case.clock).stable[0])
-    return OperatingPoint(name, r, m, system, _analysis(case, system, m, _velocity_sensor(case), held), held)
+        held = bool(linear.stability_of(case.cascade, scenario, case.clock).stable[0])
+    return OperatingPoint(name, r, m, system, _analysis(case, system, m, held), held)
 
 
 # Modules in these types: the documentation would find two classes of each name, one of them in `ambjax.linear`.
@@ -111,7 +96,7 @@ def sensitivity(case: Case, r: float = 0.0) -> analysis.Analysis: ...
 def sensitivity(case: Cascade, scenario: Scenario, clock: Clock, /, r: float = 0.0) -> analysis.Analysis: ...
 @of_case(machines=True)
 @one_thread()
-def sensitivity(case: Case | MachineCase, r: float = 0.0) -> Analysis | list[MachineSensitivity]:
+def sensitivity(case: Case | MachineCase, r: float = 0.0) -> linear.Analysis | list[MachineSensitivity]:
     """Linearise the loop of a case, and return its peaks of |S|, |T| and |KS|, zone, margins and stiffness.
 
     - `case`: from `read_case` or `read_machine`; or a cascade, a scenario and a clock.
@@ -126,8 +111,8 @@ def sensitivity(case: Case | MachineCase, r: float = 0.0) -> Analysis | list[Mac
     """
     if isinstance(case, MachineCase):
         return points_of(case, list(turning_machines(case.machine, case.clock.sample_period, case.speeds)))
-    system = linearise(case.cascade, case.scenario, case.clock, r)
-    return _analysis(case, system, float(case.scenario.plant.m), _velocity_sensor(case))
+    system = linear.linearise(case.cascade, case.scenario, case.clock, r)
+    return _analysis(case, system, float(case.scenario.plant.m))
 
 
 def points_of(case: MachineCase, turning: Sequence[TurningMachine]) -> list[MachineSensitivity]:
@@ -142,31 +127,28 @@ def points_of(case: MachineCase, turning: Sequence[TurningMachine]) -> list[Mach
     return [sensitivity_of(point, case.axes, speed, case.zones, *found) for point, speed, found in each]
 
 
-def _velocity_sensor(case: Case) -> bool:
-    return case.scenario.sensors.velocity and reads_velocity(case.cascade, case.clock.sample_period)
-
-
-def _analysis(case: Case, system: StateSpace, m: float, velocity: bool, held: bool | None = None) -> Analysis:
-    return analyse(system, m, case.clock.sample_period, case.zones, velocity, held is not False)
+def _analysis(case: Case, system: linear.StateSpace, m: float, held: bool | None = None) -> linear.Analysis:
+    velocity = case.scenario.sensors.velocity and reads_velocity(case.cascade, case.clock.sample_period)
+    return linear.analyse(system, m, case.clock.sample_period, case.zones, velocity, held is not False)
 
 
 def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPeaks:
     """Analyse the members of the study at r = 0, and return the counts and the member with the largest peak."""
     members = study.members if most is None else min(study.members, most)
     cascade, scenario = study.batch(np.arange(members))
-    systems, found = linearise_members(cascade, scenario, study.clock)
+    systems, found = linear.linearise_members(cascade, scenario, study.clock)
     held: list[bool | None] = [None] * members
     if has_set_valued([case.cascade]):
-        held = stability_of(cascade, scenario, study.clock).stable.tolist()
-    peaks, good, velocity = np.full(members, math.inf), np.zeros(members, bool), _velocity_sensor(case)
+        held = linear.stability_of(cascade, scenario, study.clock).stable.tolist()
+    peaks, good = np.full(members, math.inf), np.zeros(members, bool)
     masses = np.broadcast_to(np.asarray(scenario.plant.m, float), (members,))
-    analyses: list[Analysis | None] = []
-    loops: list[StateSpace] = []
+    analyses: list[linear.Analysis | None] = []
+    loops: list[linear.StateSpace] = []
     for k in range(members):
         one, loop = None, jax.tree.map(lambda x, k=k: np.asarray(x)[k], systems)
         with contextlib.suppress(ValueError):  # the member has no linearisation
-            loop = checked(loop, found[k], 0.0)
-            one = _analysis(case, loop, float(masses[k]), velocity, held[k])
+            loop = linear.checked(loop, found[k], 0.0)
+            one = _analysis(case, loop, float(masses[k]), held[k])
         loops.append(loop)
         analyses.append(one)
         if one is not None:
@@ -180,12 +162,12 @@ def spread_peaks(case: Case, study: Study, most: int | None = None) -> SpreadPea
     return SpreadPeaks(members, int(good.sum()), int(zone_a), worst, point, failed=failed)
 
 
-def measured_peaks(case: Case, study: Study, peak: float) -> MemberPeaks:
+def measured_peaks(case: Case, study: Study, peak: float) -> linear.MemberPeaks:
     """Measure the peak of |S| of each member of the study by injection of a multi-sine."""
     cascade, scenario = study.batch(np.arange(study.members))
     clock = one_period(case)
-    lines = frequency_lines(case.zones, clock, peak)
-    return injected_members(cascade, scenario, clock, lines, amplitude=case.zones.amplitude)
+    lines = linear.frequency_lines(case.zones, clock, peak)
+    return linear.injected_members(cascade, scenario, clock, lines, amplitude=case.zones.amplitude)
 
 
 def one_period(case: Case | MachineCase) -> Clock:
@@ -194,15 +176,15 @@ def one_period(case: Case | MachineCase) -> Clock:
     return replaced(case.clock, samples=math.ceil(1 / (float(case.zones.f_low) * period)))
 
 
-def shown_band(case: Case, systems: list[StateSpace]) -> tuple[float, float]:
+def shown_band(case: Case, systems: list[linear.StateSpace]) -> tuple[float, float]:
     """Return the band (Hz) of a picture of these loops: that of the case, by default until |S - 1| has decayed."""
     if case.cascade.sampled:
         return case.zones.range(case.clock.sample_period)
     low = float(case.zones.f_low)
-    return case.zones.range(None, max([decayed_end(system, low) for system in systems], default=1e3 * low))
+    return case.zones.range(None, max([linear.decayed_end(system, low) for system in systems], default=1e3 * low))
 
 
-def analysis_summary(one: Analysis) -> dict[str, object]:
+def analysis_summary(one: linear.Analysis) -> dict[str, object]:
     """Return the numbers of an analysis by their names in the JSON summary."""
     margins = one.margins
     return {
@@ -224,13 +206,13 @@ def analysis_summary(one: Analysis) -> dict[str, object]:
     }
 
 
-def margin_numbers(one: Analysis) -> dict[str, object]:
+def margin_numbers(one: linear.Analysis) -> dict[str, object]:
     """Return the margins of a loop by place, and the place of the smaller delay margin, for a JSON summary."""
-    numbers: dict[str, object] = {place: _margin_numbers(getattr(one.margins_at, place)) for place in PLACES}
+    numbers: dict[str, object] = {place: _margin_numbers(getattr(one.margins_at, place)) for place in linear.PLACES}
     return numbers | {"delay_at": one.margins_at.place("delay")}
 
 
-def _margin_numbers(margins: Margins) -> dict[str, float]:
+def _margin_numbers(margins: linear.Margins) -> dict[str, float]:
     return {
         "gain_margin": margins.gm,
         "gain_margin_low": margins.gm_low,

@@ -55,22 +55,16 @@ def directory(out: str | None, name: str, names: Iterable[str] = (), force: bool
 def check_new(out: pathlib.Path, names: Iterable[str]) -> None:
     """Raise ValueError if `out` has a file with one of these names."""
     if old := [name for name in names if (out / name).exists()]:
-        raise ValueError(
-            f"--out {out}: it has {', '.join(old)} of an earlier run. Choose another directory, or overwrite them "
-            "with --force."
-        )
+        advice = "Choose another directory, or overwrite them with --force."
+        raise ValueError(f"--out {out}: it has {', '.join(old)} of an earlier run. {advice}")
 
 
 def check_places(out: pathlib.Path, names: Iterable[str | pathlib.PurePath]) -> None:
     """Raise ValueError if a folder in `out` has one of these file names, or a file has the name of a needed folder."""
     for name in map(pathlib.PurePath, names):
-        blocking = [
-            parent for parent in name.parents[:-1] if os.path.lexists(out / parent) and not (out / parent).is_dir()
-        ]
-        if blocking:
-            raise ValueError(
-                f"--out {out}: {blocking[0]} exists and is not a folder. Move it, or choose another directory."
-            )
+        if blocking := [x for x in name.parents[:-1] if os.path.lexists(out / x) and not (out / x).is_dir()]:
+            why = f"{blocking[0]} exists and is not a folder. Move it, or choose another directory."
+            raise ValueError(f"--out {out}: {why}")
         if (out / name).is_dir() and not (out / name).is_symlink():
             raise ValueError(f"--out {out}: {name} exists and is a folder. Move it, or choose another directory.")
 
@@ -95,9 +89,8 @@ def target(out: str | None, name: str) -> pathlib.Path:
     """
     if out is not None:
         if not out.strip():
-            raise ValueError(
-                "--out: the name of the directory is empty. Give a name, '.' for this directory, or omit --out."
-            )
+            advice = "Give a name, '.' for this directory, or omit --out."
+            raise ValueError(f"--out: the name of the directory is empty. {advice}")
         return pathlib.Path(out)
     candidates = (pathlib.Path("out") / (name if n == 1 else f"{name}-{n}") for n in itertools.count(1))
     return next(p for p in candidates if not os.path.lexists(p))
@@ -180,9 +173,8 @@ def _refusal(out: pathlib.Path) -> Iterator[None]:
     except OSError as error:
         for above in (out, *out.parents):
             if os.path.isfile(above):  # noqa: PTH113 - it never raises an error
-                raise ValueError(
-                    f"--out {out}: cannot write there, because {above} is a file. Choose a directory."
-                ) from None
+                why = f"because {above} is a file. Choose a directory."
+                raise ValueError(f"--out {out}: cannot write there, {why}") from None
         why = error.strerror or str(error)
         raise ValueError(f"--out {out}: cannot write there ({why}). Free space, or choose another directory.") from None
 

@@ -34,13 +34,10 @@ SMALLEST = ("singular_at_s", "lost_at_s")
 
 @dataclasses.dataclass(frozen=True)
 class CaseRun:
-    """The result of `simulate`.
+    """The result of `simulate`. A notebook shows it as the table of its metrics.
 
-    - `case`: the case that was simulated.
-    - `trajectory`: its signals at every sample, and the status of the rotor.
-    - `metrics`: each metric by name, in the SI unit of `UNITS`.
-
-    A notebook shows it as the table of its metrics.
+    `trajectory`: the signals of the case at every sample, and the status of the rotor. `metrics`: each metric by name,
+    in the SI unit of `UNITS`.
     """
 
     case: Case
@@ -57,9 +54,8 @@ class CaseRun:
 
         `attrs["units"]` contains the unit of each column. Raises ValueError if pandas is not installed.
         """
-        frame = extra("pandas").DataFrame(
-            self._signals(), index=extra("pandas").Index(np.asarray(self.trajectory.rows.t), name="t")
-        )
+        index = extra("pandas").Index(np.asarray(self.trajectory.rows.t), name="t")
+        frame = extra("pandas").DataFrame(self._signals(), index=index)
         frame.attrs["units"] = {name: SIGNAL_UNITS[name] for name in frame.columns}
         return frame
 
@@ -114,7 +110,6 @@ class CaseRun:
         return {name: x for name, x in self.trajectory.arrays().items() if name in SIGNAL_UNITS and name != "t"}
 
     def _repr_html_(self) -> str:
-        """Return the table of the metrics, with the status of the rotor as its caption."""
         why = self.trajectory.lost_why
         ended = f"the rotor is lost: {why}" if self.lost else f"not decided, {why}" if why else "the rotor is held"
         rows = [(name, f"{value:.6g}", UNITS.get(name, "")) for name, value in self.metrics.items()]
@@ -125,9 +120,9 @@ class CaseRun:
 class MachineRun:
     """The result of a simulation of a machine.
 
-    - `signals`: t (s) [N], q [N, coordinates] (m or rad), speed_rpm [N], and by name each signal of the axes [N, axes].
-    - `metrics`: each metric by name, of the worst axis; under "axes", the metrics of each axis by its name.
-    - `lost_why`: why the rotor was lost; empty if it is held.
+    `signals`: t (s) [N], q [N, coordinates] (m or rad), speed_rpm [N], and by name each signal of the axes [N, axes].
+    `metrics`: each metric by name, of the worst axis; under "axes", the metrics of each axis by its name. `lost_why`:
+    why the rotor was lost; empty if it is held.
     """
 
     case: MachineCase
@@ -158,9 +153,8 @@ _finished = compiled_quickly(finish, options=QUICKEST)
 
 def simulate_machine(case: MachineCase, progress: Progress = lambda samples: None) -> MachineRun:
     """Simulate a machine, as `simulate` does."""
-    fold = PerAxis(
-        stack_axes([canonical(Metrics.of(case.settle, one.scenario, case.machine.near)) for one in case.cases])
-    )
+    folds = [canonical(Metrics.of(case.settle, one.scenario, case.machine.near)) for one in case.cases]
+    fold = PerAxis(stack_axes(folds))
     machine, clock, fold = canonical((case.machine, case.clock, fold))
     state, parts, count = _begun(machine, clock, fold), [], min(SEGMENT, clock.samples)
     for first in range(0, clock.samples, count):

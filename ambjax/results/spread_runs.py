@@ -7,13 +7,12 @@ from typing import Any, overload
 import numpy as np
 
 from ambjax.cases.case_table import notebook_table
-from ambjax.cases.given import of_case
+from ambjax.cases.given import names_arguments, of_case
 from ambjax.cases.machine_case import MachineCase, first_axis
 from ambjax.cases.reader import Case
 from ambjax.ensemble import statistics
 from ambjax.ensemble.design import MOST_MEMBERS
 from ambjax.ensemble.study import AnyStudy, Study
-from ambjax.host.arguments import names_arguments
 from ambjax.host.extensions import extra
 from ambjax.results.machine_study import MachineStudy
 from ambjax.simulation.metrics import UNITS
@@ -50,7 +49,6 @@ class MembersRun:
         return frame
 
     def _repr_html_(self) -> str:
-        """Return the table of the metrics that have a unit and are finite for all held members, for notebooks."""
         held = np.isposinf(self.columns["lost_at"])
         head = f"{self.survivors} of {held.size} members are held (seed {self.study.seed})"
         rows = [
@@ -65,7 +63,7 @@ class MembersRun:
 
         Raises ValueError if none of these names is a column.
         """
-        from ambjax.pictures.histograms import CHIEF, histogram_figure
+        from ambjax.pictures.ensembles import CHIEF, histogram_figure
 
         return histogram_figure(self.columns, metrics or CHIEF)
 

@@ -15,12 +15,11 @@ from ambjax.simulation.loop import ClosedLoop, LoopState
 
 
 class VectorField(NamedTuple):
-    """The equations y' = f(t, y) of a closed loop in continuous time.
+    """The equations y' = f(t, y) of a closed loop in continuous time. `y_0`: state at t = 0 [N].
 
-    - `f`: returns the rate [N] of the state at time t (s) in the state y [N]. It ignores a third argument, which
-      diffrax passes. It is compiled, and can be differentiated.
-    - `y_0`: state at t = 0 [N].
-    - `named`: returns the state as a tree: `plant` with z (m), z_dot (m/s) and the currents (A), and `control`.
+    `f`: returns the rate [N] of the state at time t (s) in the state y [N]. It ignores a third argument, which diffrax
+    passes. It is compiled, and can be differentiated. `named`: returns the state as a tree: `plant` with z (m), z_dot
+    (m/s) and the currents (A), and `control`.
     """
 
     f: Callable[..., Array]

@@ -65,7 +65,6 @@ def render_page(text: str, pictures: Mapping[str, bytes], title: str, unfolded: 
         if heading.removeprefix("## ") in (unfolded or ()):
             parts.append(markdown.render(section))
         else:
-            parts.append(
-                f"<details><summary>{markdown.render(heading)}</summary>\n{markdown.render(below)}</details>\n"
-            )
+            summary = f"<summary>{markdown.render(heading)}</summary>"
+            parts.append(f"<details>{summary}\n{markdown.render(below)}</details>\n")
     return f"{head}\n{''.join(parts)}</html>\n"

@@ -11,7 +11,6 @@ from jax import Array
 
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.machine_linear import LqgProblem, lqg_problem
-from ambjax.cases.rotor_tables import tables_of
 from ambjax.cases.table import Table
 from ambjax.control.lqg import LqgWeights
 from ambjax.extend import canonical
@@ -97,7 +96,7 @@ def machine_space(table: Table, case: MachineCase, raw: dict[str, Any]) -> Machi
 
 def _known(case: MachineCase, raw: dict[str, Any]) -> dict[str, MachineGain]:
     """Return every gain by path. A common gain belongs to the axes whose bearing does not give it itself."""
-    bearings = tables_of(Table(raw), "bearing")
+    bearings = Table(raw).tables("bearing")
     names = [table.raw.get("name", f"bearing{k + 1}") for k, table in enumerate(bearings)]
     each = [tunable(one.cascade, steepness=False) for one in case.cases]
     found: dict[str, MachineGain] = {}

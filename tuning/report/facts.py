@@ -99,9 +99,8 @@ def search_facts(raw: dict[str, Any], case: Case, tune: Tune) -> Row:
     `raw`: content of the case file.
     """
     laws = {law.stage: law.digest for law in case.own_laws}
-    if case.controller_file:
-        laws["position"] = case.controller_file.contents.digest
-    laws |= {one.key: one.samples.digest for one in case.recorded}
+    names = {"controller.position.file": "position"}
+    laws |= {names.get(one.key, one.key): one.contents.digest for one in case.files}
     return {"case": raw, "tune": settings(tune), "laws": laws}
 
 

@@ -14,7 +14,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.replay import record_member
 from ambjax.page.html_page import NAME
 from ambjax.page.html_page import page as sliders_page
-from ambjax.results.case_file import files_from, with_numbers
+from ambjax.results.case_gains import files_from, with_numbers
 from ambjax.results.outputs import described, drawn
 from ambjax.simulation.rollout import rollout
 from ambjax.simulation.trajectory import Trajectory
