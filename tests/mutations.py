@@ -105,7 +105,7 @@ MUTATIONS = [
       "else total - self.base(t)", "else total + self.base(t)",
       "tests/test_loads.py::test_disturbances_of_several_units_act_together"),
     M("the force of an unbalance is proportional to the speed instead of its square", "ambjax/world/rotation.py",
-      "GRAM_MM * self.unbalance * omega**2", "GRAM_MM * self.unbalance * omega",
+      "self.size * omega**2", "self.size * omega",
       "tests/test_loads.py::test_the_force_of_an_unbalance_by_hand"),
     M("the damping force of the stop has the wrong sign on one side", "ambjax/world/touchdown.py",
       "self.damping * share * (side * motion.z_dot)", "self.damping * share * motion.z_dot",

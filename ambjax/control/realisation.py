@@ -59,7 +59,6 @@ class Realisation:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the numbers."""
         return hashlib.sha256(repr((self.A, self.B, self.C, self.D, self.dt)).encode()).hexdigest()
 
     @property
@@ -108,7 +107,6 @@ class Realisation:
         return self.output(p, w), tuple(2 * q - y for q, y in zip(p, x, strict=True))
 
     def _blocks(self) -> list[tuple[int, ...]]:
-        """Return the row indices of each diagonal block of A."""
         blocks, k = [], 0
         while k < len(self.A):
             size = 2 if k + 1 < len(self.A) and self.A[k + 1][k] else 1

@@ -9,8 +9,7 @@ from jax import Array, lax
 from ambjax.numerics.records import Scalar, leaf, record, static
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Ending
-from ambjax.simulation.span import Span
-from ambjax.simulation.trajectory import Row
+from ambjax.simulation.trajectory import Row, Span
 
 # Initial minimum of a block (its negative: initial maximum), before any value is included.
 NO_VALUE = jnp.inf

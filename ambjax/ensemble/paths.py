@@ -9,13 +9,13 @@ import numpy as np
 from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import Schedule
 from ambjax.host.extensions import digest_of
-from ambjax.numerics.records import is_traced, leaf, replaced
+from ambjax.numerics.records import bounded, is_traced, replaced
 from ambjax.numerics.shapes import axes_of, with_entry
 from ambjax.world.scenario import Scenario
 from ambjax.world.waveforms import Constant
 
 SHIFT = "shift"
-TIME = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="time by which start and stop are shifted together")
+TIME = bounded(0.0, "s", -1e9, 1e9, "time by which start and stop are shifted together")
 
 
 class Place(NamedTuple):

@@ -49,9 +49,8 @@ def summary(
     drivers of lost_at_s and in `worst`.
 
     A metric that is infinite for some survivors (a time never reached) has quantiles, but no mean, standard deviation
-    or CVaR; `finite` counts its finite values. Without survivors all its statistics are None. `drivers` and
-    `explained` are
-    the results of `ensemble.drivers.drivers`. `worst` lists lost and stalled members by time, then survivors by
+    or CVaR; `finite` counts its finite values. Without survivors all its statistics are None. `drivers` and `explained`
+    are the results of `ensemble.drivers.drivers`. `worst` lists lost and stalled members by time, then survivors by
     `deciding` in descending order. `notes` names the statistics whose intervals are not reliable.
 
     Raises ValueError if there is no column `deciding`, and as `column_of` does: for a column that is empty, contains

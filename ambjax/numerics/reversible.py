@@ -66,7 +66,6 @@ class _WhileLoop(NamedTuple):
         return loop(*map(jnp.asarray, constants), *begin)
 
     def with_tangents(self, constants: Values, begin: Values, tangents: Values) -> tuple[list[Array], list[Any]]:
-        """Return the carry after the loop, and its tangents."""
         moving = [n for n, x in enumerate(tangents[: len(constants)]) if type(x) is not SymbolicZero]
         moving = [n for n in moving if jnp.issubdtype(constants[n].dtype, jnp.inexact)]
         real = [n for n, x in enumerate(begin) if jnp.issubdtype(x.dtype, jnp.inexact)]

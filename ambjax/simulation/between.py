@@ -12,7 +12,7 @@ from ambjax.numerics.records import Scalar
 from ambjax.simulation.edges import NO_EDGES, Edges
 from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.loop import ClosedLoop, ExternalInputs
-from ambjax.simulation.span import INSTANT_TREE, Densities, Instant, Sizes
+from ambjax.simulation.trajectory import INSTANT_TREE, Densities, Instant, Sizes
 from ambjax.world.amplifier import Amplifier, CurrentAmplifier, difference
 from ambjax.world.faults import Sensed
 

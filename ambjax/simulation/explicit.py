@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,8 @@ from jax import Array
 from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.numerics.records import Scalar, record
 from ambjax.simulation.adaptive import AdaptiveSteps, Attempt
-from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, State, Times
-from ambjax.simulation.span import Instant, Span
+from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Times
+from ambjax.simulation.trajectory import Instant, Span
 
 
 @functools.cache
@@ -53,8 +53,8 @@ class _Tableau:
     ROWS: ClassVar[tuple[tuple[float, ...], ...]]
 
     def _stages(
-        self, problem: InitialValueProblem[Inputs, State], at: Times, h: Array, state: State
-    ) -> tuple[State, list[State], list[Instant]]:
+        self, problem: InitialValueProblem, at: Times, h: Array, state: Any
+    ) -> tuple[Any, list[Any], list[Instant]]:
         """Return the new state, and the rates and the signals of all stages."""
         inputs = {share: problem.inputs(at(share)) for share in self.TIMES}
         x, rates, instants = state, [], []
@@ -70,9 +70,7 @@ class _Tableau:
 class _Explicit(_Tableau, FixedSteps):
     """Base class of explicit Runge-Kutta methods with equal substeps."""
 
-    def _step(
-        self, problem: InitialValueProblem[Inputs, State], at: Times, h: Scalar, state: State, span: Span
-    ) -> tuple[State, Span]:
+    def _step(self, problem: InitialValueProblem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
         h = jnp.asarray(h)
         x, _, (first, *others) = self._stages(problem, at, h, state)
         # Integrals use the weights of the method. Only the first stage counts for extremes; the others are trial
@@ -180,8 +178,8 @@ class AdaptiveCashKarp(_Tableau, AdaptiveSteps):
     )
     ERROR = (-277 / 64512, 0.0, 6925 / 370944, -6925 / 202752, -277 / 14336, 277 / 7084)
 
-    def _attempt(self, problem: InitialValueProblem[Inputs, State], at: Times, h: Array, state: State) -> Attempt:
-        def total(weights: tuple[float, ...], trees: list[State]) -> State:
+    def _attempt(self, problem: InitialValueProblem, at: Times, h: Array, state: Any) -> Attempt:
+        def total(weights: tuple[float, ...], trees: list[Any]) -> Any:
             return jax.tree.map(lambda *ks: h * sum(w * k for w, k in zip(weights, ks, strict=True) if w), *trees)
 
         new, rates, instants = self._stages(problem, at, h, state)

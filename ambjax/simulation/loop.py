@@ -17,8 +17,7 @@ from ambjax.numerics.smooth import larger, limited
 from ambjax.simulation.edges import Edges
 from ambjax.simulation.integrate import InitialValueProblem, WholeState
 from ambjax.simulation.sliding import slide, slides
-from ambjax.simulation.span import INSTANT_TREE, Densities, Instant, Sizes, Span
-from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED, Row
+from ambjax.simulation.trajectory import ALIVE, DIVERGED, INSTANT_TREE, TOUCHED, Densities, Instant, Row, Sizes, Span
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.waveforms import Reference, reference_at
@@ -94,14 +93,12 @@ class ClosedLoop(WholeState):
         return self.scenario.words() if self.key is None else self.key
 
     def sensor_errors(self, sample: Scalar) -> Errors:
-        """Return the errors of all sensors in sample number `sample`; zeros for ideal sensors."""
         sensors = self.scenario.sensors
         if self.normals is not None:
             return Errors(*sensors.scaled(self.normals))
         return Errors(*sensors.noise(self.words(), sample))
 
     def start(self) -> LoopState:
-        """Return the state at t = 0."""
         plant = self.scenario.plant.start(self.scenario.initial.measurement())
         inputs = self.inputs(0.0)._replace(e=())
         measured = self.received(inputs, plant, self.sensor_errors(0))
@@ -184,7 +181,6 @@ class ClosedLoop(WholeState):
         return LoopState(plant.rates(state.plant, u, q_z, inputs.q_i), control)
 
     def status(self, state: LoopState) -> Array:
-        """Return the status code of the rotor, an index of `trajectory.STATUSES`: 0 while it is levitated."""
         return self.status_of(state, self.scale(), state.plant)
 
     def status_of(self, state: object, scale: object, plant: object) -> Array:
@@ -207,7 +203,6 @@ class ClosedLoop(WholeState):
         return state._replace(plant=plant.rest(state.plant, jnp.where(code == TOUCHED, stop, z)))
 
     def problem(self, errors: Errors) -> InitialValueProblem:
-        """Return the initial value problem of one sample."""
         step = functools.partial(slide, self, errors) if slides(self.cascade, self.scenario) else None
         rates = lambda inputs, x: self.rates(inputs, x, errors)  # noqa: E731
         observed = lambda inputs, x: self.observed(inputs, x, errors)  # noqa: E731
@@ -245,7 +240,6 @@ class ClosedLoop(WholeState):
     def signals(
         self, t: Scalar, inputs: ExternalInputs, state: object, command: Command, measured: Measurement, alive: Array
     ) -> Row:
-        """Return all signals at time t (s)."""
         plant = self.scenario.plant
         motion, signals, (i_1, i_2) = plant.measurement(state), plant.signals(state), plant.currents(state)
         return Row(

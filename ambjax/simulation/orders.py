@@ -5,12 +5,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, part, record
+from ambjax.numerics.records import Scalar, bounded, part, record
 from ambjax.numerics.small_matrices import solve
 from ambjax.numerics.smooth import TWO_PI, safe_sqrt, sine
 from ambjax.simulation.folds import Ending
-from ambjax.simulation.span import Span
-from ambjax.simulation.trajectory import Row
+from ambjax.simulation.trajectory import Row, Span
 from ambjax.world.rotation import Rotation
 
 # Signals and their units, and orders: multiples of the speed.
@@ -51,7 +50,7 @@ class Orders:
     """
 
     rotor: Rotation = part(doc="speed of the rotor")
-    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6, doc="start of the evaluation")
+    after: Scalar = bounded(0.0, "s", 0, 1e6, "start of the evaluation")
 
     def init(self) -> OrderCarry:
         zero, size = jnp.zeros((), jnp.result_type(float)), 1 + 2 * len(ORDERS)

@@ -12,8 +12,7 @@ from jax import Array
 from ambjax.numerics.records import Scalar, leaf, record
 from ambjax.numerics.smooth import larger, smaller
 from ambjax.simulation.folds import Ending
-from ambjax.simulation.span import Span
-from ambjax.simulation.trajectory import Row
+from ambjax.simulation.trajectory import Row, Span
 
 # Smallest slope of a crossing, in bands per sample, which bounds the derivative of the settling time.
 SLOWEST = 1e-3

@@ -29,8 +29,8 @@ from ambjax.control.stages import CurrentDemand, CurrentInputs
 from ambjax.numerics.linear import axpy
 from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.smooth import limited
-from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, Times
-from ambjax.simulation.span import Instant, Span
+from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Times
+from ambjax.simulation.trajectory import Instant, Span
 from ambjax.world.plant import State
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
@@ -175,9 +175,7 @@ class Slide(FixedSteps):
 
     limit = None
 
-    def _step(
-        self, problem: InitialValueProblem[Inputs, S], at: Times, h: Scalar, state: S, span: Span
-    ) -> tuple[S, Span]:
+    def _step(self, problem: InitialValueProblem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
         if problem.slide is None:
             raise ValueError(
                 "clock.method = Slide(...): it requires continuous time, a lumped plant without iron, the 'adaptive' "

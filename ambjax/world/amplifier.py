@@ -6,7 +6,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, part, record, static
+from ambjax.numerics.records import Scalar, bounded, part, record, static
 from ambjax.numerics.smooth import limited
 
 
@@ -33,12 +33,8 @@ class CoilLimits:
     Use it where each coil has its own limit: `actuators.Amplifier(coil=actuators.CoilLimits(i_max=5.0))`.
     """
 
-    u_max: Scalar | None = leaf(
-        default=None, unit="V", at_least=1e-9, at_most=1e12, doc="limit of |R i_0 +- u| at a coil; none: no limit"
-    )
-    i_max: Scalar | None = leaf(
-        default=None, unit="A", at_least=1e-9, at_most=1e6, doc="limit of a coil's |current|, with i_0; none: no limit"
-    )
+    u_max: Scalar | None = bounded(None, "V", 1e-9, 1e12, "limit of |R i_0 +- u| at a coil; none: no limit")
+    i_max: Scalar | None = bounded(None, "A", 1e-9, 1e6, "limit of a coil's |current|, with i_0; none: no limit")
     unidirectional: bool = static(default=False, doc="whether the current of a coil cannot become negative")
 
     def differential(self, i_0: Scalar) -> Scalar | None:
@@ -114,16 +110,10 @@ class Amplifier:
     `Scenario(u_max=48.0, amplifier=actuators.Amplifier(bandwidth=2e3))`.
     """
 
-    bandwidth: Scalar | None = leaf(
-        default=None, unit="Hz", at_least=1, at_most=1e6, doc="bandwidth of the voltage, first order; none: no lag"
-    )
-    slew: Scalar | None = leaf(
-        default=None, unit="V/s", at_least=1e-3, at_most=1e15, doc="largest rate of u; none: no limit"
-    )
-    dead_band: Scalar | None = leaf(
-        default=None, unit="V", at_least=0, at_most=1e12, doc="subtracted from |u|; none: 0"
-    )
-    i_max: Scalar | None = leaf(default=None, unit="A", at_least=1e-9, at_most=1e6, doc="limit of |i|; none: no limit")
+    bandwidth: Scalar | None = bounded(None, "Hz", 1, 1e6, "bandwidth of the voltage, first order; none: no lag")
+    slew: Scalar | None = bounded(None, "V/s", 1e-3, 1e15, "largest rate of u; none: no limit")
+    dead_band: Scalar | None = bounded(None, "V", 0, 1e12, "subtracted from |u|; none: 0")
+    i_max: Scalar | None = bounded(None, "A", 1e-9, 1e6, "limit of |i|; none: no limit")
     coil: CoilLimits | None = part(default=None, doc="limits of each coil of a `TwoCoil`; None: no limits")
 
     mode: ClassVar[str] = "voltage"
@@ -190,30 +180,22 @@ class CurrentAmplifier:
     Use it with `current.AmplifierCurrent`: `Scenario(u_max=48.0, amplifier=actuators.CurrentAmplifier(bandwidth=1e3))`.
     """
 
-    bandwidth: Scalar = leaf(
-        default=1e3, unit="Hz", at_least=1, at_most=1e6, doc="bandwidth of the current loop, first order"
-    )
-    i_max: Scalar | None = leaf(
-        default=None, unit="A", at_least=1e-9, at_most=1e6, doc="limit of the command; none: no limit"
-    )
+    bandwidth: Scalar = bounded(1e3, "Hz", 1, 1e6, "bandwidth of the current loop, first order")
+    i_max: Scalar | None = bounded(None, "A", 1e-9, 1e6, "limit of the command; none: no limit")
     mode: ClassVar[str] = "current"
     slow: ClassVar[bool] = False
     coil: ClassVar[None] = None
 
     def linear(self) -> "CurrentAmplifier":
-        """Return the amplifier without its limit."""
         return CurrentAmplifier(self.bandwidth)
 
     def slope(self) -> Scalar:
-        """Return the rate w of the current, 1/s."""
         return 2 * jnp.pi * self.bandwidth
 
     def command_limit(self, u_max: Scalar) -> Scalar:
-        """Return the limit of the commanded current (A)."""
         return jnp.inf if self.i_max is None else self.i_max
 
     def current_limit(self, i_0: Scalar) -> Scalar | None:
-        """Return the limit of |i| (A); None: no limit."""
         return self.i_max
 
     def at_coil(self, command: Array, i: Array, u_max: Scalar, response: Callable[[], CoilResponse]) -> Array:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.compiler.barrier import compiled_alone, materialised
-from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.records import Scalar, bounded, record
 
 # Smallest slope of the saturation curve: at large currents only the flux through the air still increases.
 AIR = 0.02
@@ -33,15 +33,9 @@ class Iron:
     Use it where the core saturates or its eddy currents matter: `plants.TwoCoil(iron=plants.Iron(saturation=1.4))`.
     """
 
-    saturation: Scalar | None = leaf(
-        default=None, unit="T", at_least=1e-3, at_most=1e3, doc="flux density limit of the core"
-    )
-    leakage: Scalar | None = leaf(
-        default=None, unit="1", at_least=1, at_most=10, doc="flux of a coil over flux of its gap, z = 0"
-    )
-    eddy: Scalar | None = leaf(
-        default=None, unit="s", at_least=1e-7, at_most=1.0, doc="lag of the flux behind the current"
-    )
+    saturation: Scalar | None = bounded(None, "T", 1e-3, 1e3, "flux density limit of the core")
+    leakage: Scalar | None = bounded(None, "1", 1, 10, "flux of a coil over flux of its gap, z = 0")
+    eddy: Scalar | None = bounded(None, "s", 1e-7, 1.0, "lag of the flux behind the current")
 
     def core(self, plant: Any, i: Scalar, inverse: Scalar) -> Array:
         """Return the flux density of a core without saturation, T: mu_0 n i/2 (1/gap + (leakage - 1)/s_0).

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, part, record
+from ambjax.numerics.records import Scalar, bounded, part, record
 from ambjax.world.amplifier import Amplifier, CoilResponse, CoilVoltages, CurrentAmplifier
 from ambjax.world.bearing import Bearing
 from ambjax.world.plant import Plant
@@ -36,12 +36,11 @@ _IDEAL_SENSOR, _IDEAL_AMPLIFIER = IdealSensor(), Amplifier()
 class Initial:
     """State of the plant at t = 0."""
 
-    z: Scalar = leaf(default=0.0, unit="m", at_least=-1.0, at_most=1.0, doc="displacement, within the clearance")
-    z_dot: Scalar = leaf(default=0.0, unit="m/s", at_least=-1e6, at_most=1e6, doc="velocity")
-    i: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="current deviation")
+    z: Scalar = bounded(0.0, "m", -1.0, 1.0, "displacement, within the clearance")
+    z_dot: Scalar = bounded(0.0, "m/s", -1e6, 1e6, "velocity")
+    i: Scalar = bounded(0.0, "A", -1e6, 1e6, "current deviation")
 
     def measurement(self) -> Measurement:
-        """The initial state as a measurement."""
         return Measurement(*(jnp.asarray(x) for x in (self.z, self.z_dot, self.i)))
 
 
@@ -68,20 +67,16 @@ class Scenario:
     )
     sensor: Sensor | None = part(default=None, doc="errors of the sensors; None: no errors")
     initial: Initial = part(default=Initial(), doc="state of the plant at t = 0")
-    u_max: Scalar = leaf(
-        default=jnp.inf, unit="V", at_least=1e-9, at_most=1e12, infinite=True, doc="limit of the supply; inf: no limit"
-    )
+    u_max: Scalar = bounded(jnp.inf, "V", 1e-9, 1e12, "limit of the supply; inf: no limit", infinite=True)
     amplifier: Amplifier | CurrentAmplifier | None = part(
         default=None, doc="amplifier; None: the coils receive the commanded voltage"
     )
-    clearance: Scalar | None = leaf(
-        default=None, unit="m", at_least=1e-9, at_most=1.0, doc="|z| at which the rotor touches down; none: 0.9 s_0"
-    )
+    clearance: Scalar | None = bounded(None, "m", 1e-9, 1.0, "|z| at which the rotor touches down; none: 0.9 s_0")
     stop: Stop | None = part(
         default=None, doc="the touchdown bearing at the clearance; None: a rotor that reaches the clearance is lost"
     )
-    seed: Scalar = leaf(default=0, at_least=0, at_most=2**32 - 1, whole=True, doc="seed of the noise")
-    member: Scalar = leaf(default=0, at_least=0, at_most=2**32 - 1, whole=True, doc="member of an ensemble")
+    seed: Scalar = bounded(0, "", 0, 2**32 - 1, "seed of the noise", whole=True)
+    member: Scalar = bounded(0, "", 0, 2**32 - 1, "member of an ensemble", whole=True)
 
     @property
     def touchdown(self) -> Scalar:
@@ -95,12 +90,10 @@ class Scenario:
 
     @property
     def sensors(self) -> Sensor:
-        """The field `sensor`, or ideal sensors."""
         return self.sensor or _IDEAL_SENSOR
 
     @property
     def actuator(self) -> Amplifier | CurrentAmplifier:
-        """The field `amplifier`, or an ideal amplifier."""
         return self.amplifier or _IDEAL_AMPLIFIER
 
     @property
@@ -196,7 +189,6 @@ class Scenario:
         return dataclasses.replace(self, sensor=self.sensor and dataclasses.replace(self.sensor, **fields))
 
     def louder(self, factor: Scalar) -> "Scenario":
-        """Return the scenario with `factor` times the noise of its sensor."""
         return dataclasses.replace(self, sensor=self.sensor and self.sensor.louder(factor))
 
     def acceleration(self, t: Scalar) -> Array:

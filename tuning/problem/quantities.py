@@ -15,8 +15,7 @@ from ambjax.extend import Scalar, leaf, record, static
 from ambjax.simulation.folds import Driven, Ending, Fold, Named, Peak, Rms, Variation
 from ambjax.simulation.orders import Orders
 from ambjax.simulation.response import Overshoot, Settling
-from ambjax.simulation.span import Span
-from ambjax.simulation.trajectory import Row
+from ambjax.simulation.trajectory import Row, Span
 from ambjax.world.rotation import Rotation
 
 # Largest number of members whose loops the search linearises. The judge linearises the loops of all its members, and
