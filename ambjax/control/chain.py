@@ -81,7 +81,6 @@ class FilterChain(PositionLaw[ChainState]):
         return _begun(self.k_d * self.w_f * e, self.k_p * e, [part.steady for part in self._parts()])
 
     def begin_sampled(self, model: Plant, inputs: PositionInputs, period: Scalar) -> ChainState:
-        """Return the filters in the steady state for the error of the first sample, and an integral of 0."""
         e = jnp.asarray(inputs[0].z - inputs[1].r)
         parts = [functools.partial(part.steady_sampled, period=period) for part in self._parts()]
         derivative = -self.k_d * self.w_f / (1 + self.w_f * period / 2) * e

@@ -84,7 +84,6 @@ class Guard:
 
     @property
     def derived(self) -> bool:
-        """Whether every number is left out."""
         return all(getattr(self, field.name) is None for field in dataclasses.fields(type(self)))
 
     def with_limits(self, model: Plant, scenario: Scenario, period: Scalar, velocity: bool) -> "Guard":
@@ -109,7 +108,6 @@ class Guard:
         return Guard(**{name: value if own[name] is None else own[name] for name, value in values.items()})
 
     def start(self) -> Watch:
-        """Return the state before the first reading."""
         zero = jnp.zeros(())
         return Watch(Measurement(zero, zero, zero), zero)
 

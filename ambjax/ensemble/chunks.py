@@ -48,7 +48,6 @@ class Chunks:
         return self.directory / f"{span[0]:012d}-{span[1]:012d}.npz"
 
     def put(self, span: Span, columns: Arrays) -> None:
-        """Write a finished chunk. Raises ValueError if it cannot be written."""
         seal(self.path(span), columns, self._facts(span))
 
     def _facts(self, span: Span) -> dict[str, object]:

@@ -65,9 +65,8 @@ def summary(
     stalled = ended & np.asarray(columns["stalled"], bool)
     survivors = int(np.sum(~ended))
     held = {name: x[~ended] for name, x in metrics.items()}
-    ranking, accounts = _drivers(
-        {path: column_of(columns[SPREAD + path]) for path in spread_names}, held, lost_at, confidence
-    )
+    spread = {path: column_of(columns[SPREAD + path]) for path in spread_names}
+    ranking, accounts = _drivers(spread, held, lost_at, confidence)
     return {
         "members": len(lost_at),
         "survivors": survivors,

@@ -109,7 +109,6 @@ class Store:
         return Chunks(self.chunks, self.members, self.chunk, checksum_of(self.facts))
 
     def spans(self) -> list[Span]:
-        """Return all chunks in order as (first member, last member + 1); an empty list before `cut`."""
         return self.parts.spans()
 
     def count(self) -> int:

@@ -46,7 +46,12 @@ class Biquad(NamedTuple):
 
     def _bilinear(self, period: Scalar) -> Scalar:
         """Return K of the bilinear transform s = K (1 - q)/(1 + q), q the backward shift."""
-        return 2 / period if self.centre is None else _prewarped(jnp.asarray(self.centre), period)
+        if self.centre is None:
+            return 2 / period
+        # w/tan(w T/2) for w = centre, at most NYQUIST_SHARE of the Nyquist frequency
+        half = jnp.minimum(jnp.asarray(self.centre) * period / 2, NYQUIST_SHARE * HALF_PI)
+        turns = half / (4 * HALF_PI)
+        return 2 * half / period * cosine(turns) / sine(turns)
 
     def step(self, u: Array, x: tuple[Array, Array], period: Scalar) -> tuple[Array, tuple[Array, Array]]:
         """Return the output and the next state of the sampled filter, in transposed direct form II.
@@ -60,13 +65,6 @@ class Biquad(NamedTuple):
         first = 2 * self.c_0 * over * u - 2 * (self.a_0 - square) * over * y
         second = (self.c_0 - K * self.c_1) * over * u - (square - K * self.a_1 + self.a_0) * over * y
         return self.d * u + y, (first + x[1], second)
-
-
-def _prewarped(centre: Array, period: Scalar) -> Array:
-    """Return w/tan(w T/2) for w = centre, at most NYQUIST_SHARE of the Nyquist frequency."""
-    half = jnp.minimum(centre * period / 2, NYQUIST_SHARE * HALF_PI)
-    turns = half / (4 * HALF_PI)
-    return 2 * half / period * cosine(turns) / sine(turns)
 
 
 def low_pass(w: Scalar) -> Biquad:

@@ -98,9 +98,7 @@ def gain(
     the gain off. Returns the dataclass field.
     """
     above, at_least = (None, 0.0) if zero else (GAINS[0], None)
-    plain = leaf(
-        default=default, unit=unit, doc=doc, above=above, at_least=at_least, at_most=GAINS[1], infinite=steepness
-    )
+    plain = leaf(default, unit=unit, doc=doc, above=above, at_least=at_least, at_most=GAINS[1], infinite=steepness)
     metadata = {**plain.metadata, "steepness": steepness, "optional": optional}
     return dataclasses.field(default=default, metadata=metadata)
 

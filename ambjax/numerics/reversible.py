@@ -93,10 +93,7 @@ class _Varied(NamedTuple):
     moving: list[int]
     real: list[int]
 
-    def step(
-        self, constants: Values, carry: Values, moving: list[Array], real: list[Array]
-    ) -> tuple[list[Array], list[Array]]:
-        """Return the varied components of the carry after one step, and the whole carry."""
+    def step(self, constants: Values, carry: Values, moving: Values, real: Values) -> tuple[list[Array], list[Array]]:
         constants, carry = _replaced(constants, self.moving, moving), _replaced(carry, self.real, real)
         after = self.loop.step(constants, carry)
         return [after[n] for n in self.real], after
@@ -177,9 +174,7 @@ def _jvp(primals: Values, tangents: Values, **how: Any) -> tuple[list[Any], list
     return jax.jvp(lambda *x: _forwards(*x, **how), tuple(primals), tuple(ad.instantiate_zeros(x) for x in tangents))
 
 
-def _transpose(
-    cotangents: Values, *args: Any, forwards: Any, backwards: Any, sizes: tuple[int, int, int]
-) -> list[Array | None]:
+def _transpose(cotangents: Values, *args: Any, forwards: Any, backwards: Any, sizes: Any) -> list[Array | None]:
     constants, begin, _, _ = _grouped(args, sizes)
     d_constants, d_begin = backwards(list(constants), list(begin), [ad.instantiate_zeros(x) for x in cotangents])
     return [*[None] * (len(constants) + len(begin)), *d_constants, *d_begin]

@@ -64,7 +64,11 @@ class AdaptiveSteps:
     most_steps: int = static(default=10_000, doc="trial steps per sample period after which the run stalls")
 
     limit = None
+    title: ClassVar[str]
     ORDER: ClassVar[int]
+
+    def __str__(self) -> str:
+        return f"{self.title}, adaptive, tolerance {float(self.tolerance):g}"
 
     def step_size(self, period: float) -> float | None:
         return None

@@ -52,10 +52,7 @@ class _Tableau:
     TIMES: ClassVar[tuple[float, ...]]
     ROWS: ClassVar[tuple[tuple[float, ...], ...]]
 
-    def _stages(
-        self, problem: InitialValueProblem, at: Times, h: Array, state: Any
-    ) -> tuple[Any, list[Any], list[Instant]]:
-        """Return the new state, and the rates and the signals of all stages."""
+    def _stages(self, problem: InitialValueProblem, at: Times, h: Array, state: Any) -> tuple[Any, list, list[Instant]]:
         inputs = {share: problem.inputs(at(share)) for share in self.TIMES}
         x, rates, instants = state, [], []
         for share, row in zip(self.TIMES, self.ROWS, strict=True):
@@ -88,12 +85,10 @@ class Euler(_Explicit):
     Use it only for comparisons, with many substeps: `Clock(1000, 1e-4, solvers.Euler(100))`.
     """
 
+    title = "explicit Euler"
     limit = 2.0
     TIMES = (0.0,)
     ROWS = ((1.0,),)
-
-    def __str__(self) -> str:
-        return f"explicit Euler, {self.steps}"
 
 
 @record
@@ -103,12 +98,10 @@ class RK4(_Explicit):
     Use it where a fixed number of steps is wanted and the loop is not stiff: `Clock(1000, 1e-4, solvers.RK4(4))`.
     """
 
+    title = "RK4"
     limit = 2.785
     TIMES = (0.0, 1 / 2, 1 / 2, 1.0)
     ROWS = ((1 / 2,), (0.0, 1 / 2), (0.0, 0.0, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6))
-
-    def __str__(self) -> str:
-        return f"RK4, {self.steps}"
 
 
 @record
@@ -123,6 +116,7 @@ class DOP853(_Explicit):
     `Clock(1000, 1e-4, solvers.DOP853(1))` takes one step per sample.
     """
 
+    title = "DOP853"
     limit = 6.39
     # fmt: off
     TIMES = (0.0, 0.05260015195876773, 0.0789002279381516, 0.1183503419072274, 0.2816496580927726, 1 / 3, 1 / 4,
@@ -149,9 +143,6 @@ class DOP853(_Explicit):
     )
     # fmt: on
 
-    def __str__(self) -> str:
-        return f"DOP853, {self.steps}"
-
 
 @record
 class AdaptiveCashKarp(_Tableau, AdaptiveSteps):
@@ -166,6 +157,7 @@ class AdaptiveCashKarp(_Tableau, AdaptiveSteps):
     `Clock(1000, 1e-4, solvers.AdaptiveCashKarp(1e-8))` sets the allowed error.
     """
 
+    title = "Cash-Karp 5(4)"
     ORDER = 5
     TIMES = (0.0, 1 / 5, 3 / 10, 3 / 5, 1.0, 7 / 8)
     ROWS = (
@@ -185,6 +177,3 @@ class AdaptiveCashKarp(_Tableau, AdaptiveSteps):
         new, rates, instants = self._stages(problem, at, h, state)
         integrals = total(self.ROWS[-1], [x.densities for x in instants])
         return Attempt(new, total(self.ERROR, rates), instants[0], integrals)
-
-    def __str__(self) -> str:
-        return f"Cash-Karp 5(4), adaptive, tolerance {float(self.tolerance):g}"

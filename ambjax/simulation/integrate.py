@@ -3,9 +3,7 @@
     advance(problem, Begin(t, state, memory, code=0), period) -> Advanced(state, code, t, memory, span)
 
 The state is any pytree of scalars. An integrator stops at the first state whose status code is not 0, and returns the
-state before it. If the initial code is not 0, the state does not change. `memory` is the data that the method carries
-from one sample to the next; `start(period)` returns the initial memory. `span` holds the extremes and integrals of
-signals over the sample (`trajectory.Span`).
+state before it. `start(period)` returns the initial memory of the method.
 
 Stage times are moved into the step by a few units in the last place. A jump at the boundary of two steps then belongs
 to the second step. Otherwise the last stage of the first step would include the jump, and the method would be of first
@@ -13,7 +11,7 @@ order there.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -97,7 +95,6 @@ class InitialValueProblem(NamedTuple):
         return lax.while_loop(lambda now: now[0], crossing, (touched, end))[1]
 
     def rates_and_signals(self, inputs: Any, state: Any) -> tuple[Any, Instant]:
-        """Return the rates, and the signals to record."""
         return (self.rates(inputs, state), NOTHING) if self.observed is None else self.observed(inputs, state)
 
 
@@ -178,7 +175,6 @@ class WholeState:
         return state
 
     def advance(self, method: Integrator, errors: object, begin: Begin, period: Scalar) -> Advanced:
-        """Integrate the system from the beginning of a sample to the next one."""
         return method.advance(self.problem(errors), begin, period)
 
 
@@ -194,10 +190,10 @@ class FixedSteps:
 
     substeps: int = static(default=1, doc="steps per sample period")
     limit = None
+    title: ClassVar[str]
 
-    @property
-    def steps(self) -> str:
-        return f"{self.substeps} substep{'s' * (self.substeps != 1)}"
+    def __str__(self) -> str:
+        return f"{self.title}, {self.substeps} substep{'s' * (self.substeps != 1)}"
 
     def step_size(self, period: float) -> float | None:
         return period / self.substeps

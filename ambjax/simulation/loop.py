@@ -41,6 +41,10 @@ class ExternalInputs(NamedTuple):
     e: Array | tuple[()] = ()
 
 
+# The demanded force and the estimate, if another law computes them; None: observer and position law of the cascade do.
+Demand = tuple[ForceDemand, Measurement] | None
+
+
 class LoopState(NamedTuple):
     """State of the plant, then of the cascade. `numerics.linear.factor` relies on this order."""
 
@@ -127,17 +131,11 @@ class ClosedLoop(WholeState):
         return with_signal(measured, self.wave, inputs.e)
 
     def command(
-        self,
-        inputs: ExternalInputs,
-        state: LoopState,
-        errors: Errors,
-        sensed: object = None,
-        demanded: tuple[ForceDemand, Measurement] | None = None,
+        self, inputs: ExternalInputs, state: LoopState, errors: Errors, sensed: object = None, demanded: Demand = None
     ) -> tuple[Command, CascadeState, Array]:
         """Return the command of the cascade, the rates of its states, and the voltage at the coils, V.
 
-        `sensed`: state of the plant at the place of the sensor; None: that of `state`. `demanded`: the demanded force
-        and the estimate, if another law computes them; None: observer and position law of the cascade do.
+        `sensed`: state of the plant at the place of the sensor; None: that of `state`.
         """
         u_max = jnp.asarray(self.scenario.command_limit)
         measured = self.received(inputs, state.plant if sensed is None else sensed, errors)
@@ -155,14 +153,9 @@ class ClosedLoop(WholeState):
         return self.derivative(inputs, state, control, u)
 
     def observed(
-        self,
-        inputs: ExternalInputs,
-        state: LoopState,
-        errors: Errors,
-        sensed: object = None,
-        demanded: tuple[ForceDemand, Measurement] | None = None,
+        self, inputs: ExternalInputs, state: LoopState, errors: Errors, sensed: object = None, demanded: Demand = None
     ) -> tuple[LoopState, Instant]:
-        """Return the rates of the state, and the signals to record now. `sensed`, `demanded`: as in `command`."""
+        """Return the rates of the state, and the signals to record now. `sensed`: as in `command`."""
         command, control, u = self.command(inputs, state, errors, sensed, demanded)
         signals = self.instant(inputs.reference, state.plant, command.i_ref, command.v_tilde, u)
         return self.derivative(inputs, state, control, u), signals
@@ -223,14 +216,7 @@ class ClosedLoop(WholeState):
             self.scenario.limit,
         )
 
-    def row(
-        self,
-        t: Scalar,
-        state: LoopState,
-        errors: Errors,
-        alive: Array,
-        demanded: tuple[ForceDemand, Measurement] | None = None,
-    ) -> Row:
+    def row(self, t: Scalar, state: LoopState, errors: Errors, alive: Array, demanded: Demand = None) -> Row:
         """Return the signals at time t (s), with u_mean = u_peak = 0. The drive of a lost rotor is off: u = 0."""
         inputs = self.inputs(t)
         command, _, u = self.command(inputs, state, errors, None, demanded)

@@ -49,7 +49,6 @@ class MachineAxes:
 
     @property
     def count(self) -> int:
-        """Number of axes."""
         return sum(map(len, self.groups))
 
     def split(self, x: T) -> tuple[T, ...]:
@@ -70,7 +69,6 @@ class MachineAxes:
         return [jax.vmap(function)(*own) for own in zip(self.axes, *groups, strict=True)]
 
     def loops(self) -> tuple[ClosedLoop, ...]:
-        """Return the loops of the groups in continuous time."""
         return tuple(map(loop_of, self.axes))
 
     def plants(self, name: str) -> Array:

@@ -12,8 +12,8 @@ import numpy as np
 from jax import Array
 
 from ambjax.numerics.records import Scalar, bounded, is_traced, leaf, part, record, static
-from ambjax.simulation import orders
-from ambjax.simulation.clock import Clock
+from ambjax.simulation import response
+from ambjax.simulation.clock import Clock, Triple
 from ambjax.simulation.folds import Count, Driven, Ending, Fold, Named, Peak, Reaching, Rms, Variation
 from ambjax.simulation.trajectory import ALIVE, STALLED, Row, Span
 from ambjax.world.plant import Plant
@@ -28,15 +28,11 @@ REACHED = ("sigma_reached_s", "v_tilde_reached_s", "current_error_reached_s")
 ROUNDING = 1e-9
 
 
-class SettledCase(Protocol):
-    """A case with a scenario, a clock and a settling time (s), such as that of `read_case`."""
+class SettledCase(Triple, Protocol):
+    """A case with a settling time (s), such as that of `read_case`."""
 
     @property
     def settle(self) -> float: ...
-    @property
-    def scenario(self) -> Scenario: ...
-    @property
-    def clock(self) -> Clock: ...
 
 
 def settled(settle: float, clock: Clock) -> float:
@@ -113,7 +109,7 @@ class Metrics:
 
     def _folds(self) -> Named:
         late = self.settle
-        turning: dict[str, Fold] = {} if self.rotor is None else {"orders": orders.Orders(self.rotor, late)}
+        turning: dict[str, Fold] = {} if self.rotor is None else {"orders": response.Orders(self.rotor, late)}
         return Named(
             turning
             | {
@@ -175,4 +171,4 @@ def _unit(name: str) -> str:
 
 _NAMES = (*Metrics()._folds().folds, "lost_at_s", "singular_at_s", "settle_s")
 # Unit of each metric by name. Other metrics are shares and counts.
-UNITS = {name: _unit(name) for name in _NAMES if _unit(name)} | orders.UNITS
+UNITS = {name: _unit(name) for name in _NAMES if _unit(name)} | response.UNITS

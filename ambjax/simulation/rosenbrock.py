@@ -49,15 +49,12 @@ class Rodas3(FixedSteps):
     `Clock(1000, 1e-4, solvers.Rodas3(10))` takes ten substeps per sample.
     """
 
-    limit = None
+    title = "RODAS3 (L-stable Rosenbrock)"
 
     def _step(self, problem: InitialValueProblem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
         new, _, here = rodas3_step(problem, at, h, state)
         there = problem.rates_and_signals(problem.inputs(at(1.0)), new)[1]
         return new, span.with_instant(here, h / 2, h).with_instant(there, h / 2)
-
-    def __str__(self) -> str:
-        return f"RODAS3 (L-stable Rosenbrock), {self.steps}"
 
 
 @record
@@ -74,10 +71,8 @@ class AdaptiveRodas3(AdaptiveSteps):
     Use it for stiff gains, and wherever the stiffness is not known: `Clock(1000, 1e-4, solvers.AdaptiveRodas3())`.
     """
 
+    title = "RODAS3 (L-stable Rosenbrock)"
     ORDER = 3
 
     def _attempt(self, problem: InitialValueProblem, at: Times, h: Array, state: Any) -> Attempt:
         return Attempt(*rodas3_step(problem, at, h, state))
-
-    def __str__(self) -> str:
-        return f"RODAS3 (L-stable Rosenbrock), adaptive, tolerance {float(self.tolerance):g}"

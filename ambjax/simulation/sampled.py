@@ -102,17 +102,7 @@ class Sampled:
 
     def read(self, state: SampledState, errors: Errors) -> tuple[SampledState, Measurement]:
         """Return the state with the new state of the faulty sensor, and the readings of the sensors, with faults."""
-        return self._with_faults(self.measured(state.plant, state.z_filtered, errors), state, errors)
-
-    def reference(self, t: Scalar) -> Reference:
-        """Return the reference of the laws in the sample at t (s); with prediction, that at the end of the delay."""
-        late = self.processor.ahead * self.period if self.processor.predicts else 0.0
-        return reference_at(self.loop.scenario.reference, t + late)
-
-    def _with_faults(
-        self, measured: Measurement, state: SampledState, errors: Errors
-    ) -> tuple[SampledState, Measurement]:
-        """Apply the faults of the position sensor. Return the new state and the readings."""
+        measured = self.measured(state.plant, state.z_filtered, errors)
         sensor, sensed = self.loop.scenario.sensors, state.sensed
         if not sensed or not errors.onsets:
             return state, measured
@@ -123,6 +113,11 @@ class Sampled:
             state = state._replace(finite=jnp.where(jnp.isnan(sensed.z), 0.0, state.finite))
             return state, measured._replace(z=z)
         return state, measured._replace(z=sensed.z)
+
+    def reference(self, t: Scalar) -> Reference:
+        """Return the reference of the laws in the sample at t (s); with prediction, that at the end of the delay."""
+        late = self.processor.ahead * self.period if self.processor.predicts else 0.0
+        return reference_at(self.loop.scenario.reference, t + late)
 
     def with_command(self, measured: Measurement, reference: Reference, state: SampledState) -> SampledState:
         """Compute the command from the readings, and return the state with it. The plant does not change.
@@ -198,7 +193,6 @@ class Sampled:
         return Watch(expected(cascade.driven, cascade.model.start(motion), u, self.period), checked.left)
 
     def advance(self, method: Integrator, errors: Errors, begin: Begin, period: Scalar) -> Advanced:
-        """Integrate the plant from one sample to the next one, under the voltages that act until then."""
         t, state, memory, code = begin
         code = jnp.where((code == 0) & (state.finite == 0), DIVERGED, code)
         delay, whole = jnp.asarray(self.processor.delay), bool(self.processor.whole)
@@ -235,7 +229,6 @@ class Sampled:
         return plant_status(self.loop, state.plant)
 
     def rest(self, state: SampledState, code: Array) -> SampledState:
-        """Return the state in which a lost rotor is frozen, with the drive off."""
         zero = jnp.zeros_like(state.command.u)
         plant = self.loop.rest(LoopState(state.plant, state.control), code).plant
         z_filtered = self.loop.scenario.plant.measurement(plant).z if lags(self.loop) else ()

@@ -173,7 +173,7 @@ class Slide(FixedSteps):
     Use it for long studies with stiff adaptive inversion: `Clock(1000, 1e-4, solvers.Slide(4))`.
     """
 
-    limit = None
+    title = "sliding step"
 
     def _step(self, problem: InitialValueProblem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
         if problem.slide is None:
@@ -183,6 +183,3 @@ class Slide(FixedSteps):
                 "Rodas3."
             )
         return problem.slide(problem.inputs(at(0.0)), problem.inputs(at(1.0)), h, state, span)
-
-    def __str__(self) -> str:
-        return f"sliding step, {self.steps}"

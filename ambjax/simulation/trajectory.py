@@ -218,9 +218,7 @@ class Span(NamedTuple):
     def shortened(self, by: Scalar) -> "Span":
         """Return the interval without its last `by` seconds, which have no derivatives. Means of densities are kept."""
         share = 1 - lax.stop_gradient(by) / jnp.where(self.time > 0, self.time, 1.0)
-        return self._replace(
-            time=share * self.time, densities=jax.tree.map(lambda total: share * total, self.densities)
-        )
+        return self._replace(time=share * self.time, densities=jax.tree.map(lambda x: share * x, self.densities))
 
     def joined(self, after: "Span") -> "Span":
         """Return the union of this interval and the next one."""

@@ -99,16 +99,14 @@ class Monitored(Extended, WholeState):
     def problem(self, errors: Errors) -> InitialValueProblem:
         plant = self.loop.scenario.plant
         _, z_dot, i = map(jnp.asarray, plant.sizes())
-        sizes = LawSignals(z_dot, plant.dv_di(0.0, 0.0) * i / 100, i)
+        sizes = MonitoredState(self.loop.scale(), LawSignals(z_dot, plant.dv_di(0.0, 0.0) * i / 100, i))
 
         def rates(inputs: ExternalInputs, state: MonitoredState) -> MonitoredState:
             terms = self.terms(inputs, state.loop, errors)
             return MonitoredState(terms.moving, terms.rates._replace(e=terms.rates.e + terms.i_ref_dot))
 
-        layer = MonitoredState(self.loop.layer(), LawSignals(*(jnp.asarray(jnp.inf) for _ in sizes)))
-        return InitialValueProblem(
-            self.loop.inputs, rates, MonitoredState(self.loop.scale(), sizes), self.status, layer
-        )
+        layer = MonitoredState(self.loop.layer(), LawSignals(*[jnp.asarray(jnp.inf)] * 3))
+        return InitialValueProblem(self.loop.inputs, rates, sizes, self.status, layer)
 
     def motion(self, state: LoopState) -> Measurement:
         return self.loop.scenario.plant.measurement(state.plant)

@@ -54,9 +54,7 @@ class CoilLimits:
         voltages = self._limited(u, bias), self._limited(-u, bias)
         if self.i_max is not None or self.unidirectional:
             # the rate of each current is an affine function of its own voltage, and independent of the other voltage
-            still, driven = (
-                plant.currents(plant.rates(state, CoilVoltages(volt, -volt), 0.0, q_i)) for volt in (0.0, 1.0)
-            )
+            still, driven = (plant.currents(plant.rates(state, CoilVoltages(v, -v), 0.0, q_i)) for v in (0.0, 1.0))
             kept = (self._limited(-a / (b - a), bias) for a, b in zip(still, driven, strict=True))
             coils = zip(voltages, kept, plant.currents(state), strict=True)
             voltages = tuple(self._current_limited(*coil) for coil in coils)

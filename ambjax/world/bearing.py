@@ -7,8 +7,7 @@ from jax import Array
 
 from ambjax.numerics.records import Scalar, bounded, part, record
 from ambjax.numerics.smooth import safe_sqrt
-from ambjax.world.gaps import Gaps, distance_to_C, gaps
-from ambjax.world.iron import Iron
+from ambjax.world.magnet import Gaps, Iron, distance_to_C, gaps
 from ambjax.world.sensor import Measurement
 
 # State of a plant, or its rates: a NamedTuple of scalars.
@@ -186,7 +185,7 @@ class Bearing(Generic[S]):
         return (self.i_0 / self.s_0) * (self.i_0 / self.s_0)
 
     def gaps(self, z: Scalar) -> Gaps:
-        """Return the gaps s_0 - z and s_0 + z (m). Only their inverses are bounded (`world.gaps.GAP_FLOOR`)."""
+        """Return the gaps s_0 - z and s_0 + z (m). Only their inverses are bounded (`world.magnet.GAP_FLOOR`)."""
         return gaps(z, self.s_0)
 
     def v(self, z: Scalar, i: Scalar) -> Array:

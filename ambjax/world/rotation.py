@@ -64,7 +64,6 @@ class Rotation:
         return (jnp.maximum((self.speed_end - self.speed) / jnp.where(still, 1.0, self.acceleration), 0.0),)
 
     def edges(self) -> tuple[Scalar, ...]:
-        """Return the instants (s) at which the rate of the speed jumps."""
         return (*self._end(), *(change.at for change in self.changes))
 
     def _sweep(self, t: Array) -> Array:

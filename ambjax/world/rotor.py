@@ -76,7 +76,6 @@ class Rotor:
 
     @property
     def rotation(self) -> Rotation:
-        """Speed and angle over time."""
         return Rotation(self.speed, self.acceleration, changes=self.changes)
 
     def speed_at(self, t: Scalar) -> Array:
@@ -102,7 +101,6 @@ class Rotor:
         return dataclasses.replace(self, unbalances=(), loads=(), base=())
 
     def edges(self) -> tuple[Scalar, ...]:
-        """Return the instants (s) at which a load, the base motion or the rate of the speed jumps."""
         signals = [one.signal for one in (*self.loads, *self.base)]
         return (*self.rotation.edges(), *(edge for signal in signals for edge in edges_of(signal)))
 

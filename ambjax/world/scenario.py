@@ -219,7 +219,6 @@ class Scenario:
         return dataclasses.replace(self, sensor=sensor, **signals)
 
     def undisturbed(self) -> "Scenario":
-        """Return the scenario without disturbances and runout."""
         none = Constant()
         calm = dataclasses.replace(self, q_z=none, q_v=none, q_i=none, q_f=None, base=None)
         return calm.with_sensor(runout=None)

@@ -116,7 +116,6 @@ class Pulse:
         return (self.start, self.stop)
 
     def shifted(self, by: Scalar) -> "Pulse":
-        """Return the pulse, `by` seconds later. Both jumps shift together, so the pulse keeps its length."""
         return dataclasses.replace(self, start=self.start + by, stop=self.stop + by)
 
 
@@ -180,7 +179,8 @@ class SmoothStep(Rise):
 
     def __call__(self, t: Scalar) -> Array:
         s = (jnp.asarray(t) - self.start) / self.duration
-        return self.amplitude * jnp.where(s <= 0, 0.0, jnp.where(s >= 1, 1.0, self.curve(s)))
+        rising = self.curve(s)
+        return self.amplitude * jnp.where(s <= 0, 0.0, jnp.where(s >= 1, 1.0, rising))
 
 
 @record
