@@ -97,16 +97,8 @@ class Orders:
         return numbers
 
 
-class Crossing(NamedTuple):
-    """State of `Settling`.
-
-    - `at`: time at which |z - r| last came within the band, s.
-    - `t`, `size`: time of the previous sample, s, and |z - r| there, m.
-    """
-
-    at: Array
-    t: Array
-    size: Array
+# Three numbers that a fold carries.
+Three = tuple[Array, Array, Array]
 
 
 @record
@@ -115,32 +107,26 @@ class Settling:
 
     It is 0 if |z - r| never leaves the band. If |z - r| is outside the band at the end of the run, the settling time is
     the duration of the run times the final |z - r|/band, so it is longer than the run.
+
+    Carried: the time at which |z - r| last came within the band, s; the time of the last sample, s; |z - r| there, m.
     """
 
     band: Scalar = leaf(unit="m", above=0, at_most=1.0, doc="the band")
 
-    def init(self) -> Crossing:
-        zero = jnp.zeros((), jnp.result_type(float))
-        return Crossing(zero, zero, zero)
+    def init(self) -> Three:
+        return (jnp.zeros((), jnp.result_type(float)),) * 3
 
-    def update(self, carry: Crossing, row: Row, span: Span) -> Crossing:
+    def update(self, carry: Three, row: Row, span: Span) -> Three:
+        at, before, last = carry
         size = jnp.abs(row.z - row.r)
-        fall = jnp.maximum(carry.size - size, SLOWEST * self.band)
-        share = jnp.minimum((carry.size - self.band) / fall, 1.0)
-        entered = (carry.size > self.band) & (size <= self.band)
-        at = jnp.where(entered, carry.t + (row.t - carry.t) * share, carry.at)
-        return Crossing(at, row.t, size)
+        fall = jnp.maximum(last - size, SLOWEST * self.band)
+        share = jnp.minimum((last - self.band) / fall, 1.0)
+        entered = (last > self.band) & (size <= self.band)
+        return jnp.where(entered, before + (row.t - before) * share, at), row.t, size
 
-    def result(self, carry: Crossing, ending: Ending) -> Array:
-        return jnp.where(carry.size > self.band, ending.duration * carry.size / self.band, carry.at)
-
-
-class Reach(NamedTuple):
-    """State of `Overshoot`: extremes of the initial z and of r so far, and the largest excursion of z beyond, m."""
-
-    low: Array
-    high: Array
-    beyond: Array
+    def result(self, carry: Three, ending: Ending) -> Array:
+        at, _, last = carry
+        return jnp.where(last > self.band, ending.duration * last / self.band, at)
 
 
 @record
@@ -148,17 +134,20 @@ class Overshoot:
     """Overshoot, m: the largest excursion of z beyond the range of its initial value and of all earlier references.
 
     For a step of r it is the usual overshoot; for a rotor that is lifted to r = 0, the excursion beyond 0.
+
+    Carried: the extremes of the initial z and of r so far, and the largest excursion of z beyond them, m.
     """
 
-    def init(self) -> Reach:
+    def init(self) -> Three:
         zero = jnp.zeros((), jnp.result_type(float))
-        return Reach(zero + jnp.inf, zero - jnp.inf, zero)
+        return zero + jnp.inf, zero - jnp.inf, zero
 
-    def update(self, carry: Reach, row: Row, span: Span) -> Reach:
+    def update(self, carry: Three, row: Row, span: Span) -> Three:
+        low, high, beyond = carry
         began = jnp.where(row.t <= 0, row.z, row.r)
-        low = smaller(carry.low, smaller(began, row.r))
-        high = larger(carry.high, larger(began, row.r))
-        return Reach(low, high, larger(carry.beyond, larger(row.z - high, low - row.z)))
+        low = smaller(low, smaller(began, row.r))
+        high = larger(high, larger(began, row.r))
+        return low, high, larger(beyond, larger(row.z - high, low - row.z))
 
-    def result(self, carry: Reach, ending: Ending) -> Array:
-        return carry.beyond
+    def result(self, carry: Three, ending: Ending) -> Array:
+        return carry[2]

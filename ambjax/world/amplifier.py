@@ -81,18 +81,8 @@ class CoilLimits:
         return jnp.where((i <= least) & (volt < kept), kept, volt)
 
 
-class CoilResponse(NamedTuple):
-    """Rate of the current i at an instant, as a function of the voltage u (V): i' = still + per_volt u.
-
-    `still`: A/s. `per_volt`: A/(V s).
-    """
-
-    still: Array
-    per_volt: Array
-
-    def voltage(self, rate: Scalar) -> Array:
-        """Return the voltage (V) for which the current has this rate (A/s)."""
-        return (rate - self.still) / self.per_volt
+# Gives `still` (A/s) and `per_volt` (A/(V s)) of the rate of the current i at an instant: i' = still + per_volt u.
+CoilResponse = Callable[[], tuple[Array, Array]]
 
 
 @record
@@ -154,14 +144,15 @@ class Amplifier:
         decay = jnp.where(later > 0, 0.0, 1.0) if self.bandwidth is None else jnp.exp(-self.slope() * later)
         return u + jnp.where(u_a > u, left, -left) * decay
 
-    def at_coil(self, u_a: Array, i: Array, u_max: Scalar, response: Callable[[], CoilResponse]) -> Array:
+    def at_coil(self, u_a: Array, i: Array, u_max: Scalar, response: CoilResponse) -> Array:
         """Return the voltage (V) at the coils for the output u_a (V) and a current i (A), within u_max (V)."""
         if self.dead_band is not None:
             size = jnp.maximum(jnp.abs(u_a) - self.dead_band, 0.0)
             u_a = jnp.where(u_a < 0, -size, size)
         if self.i_max is None:
             return u_a
-        kept = limited(response().voltage(0.0), u_max)
+        still, per_volt = response()
+        kept = limited((0.0 - still) / per_volt, u_max)
         u_a = jnp.where((i >= self.i_max) & (u_a > kept), kept, u_a)
         return jnp.where((i <= -self.i_max) & (u_a < kept), kept, u_a)
 
@@ -196,6 +187,7 @@ class CurrentAmplifier:
     def current_limit(self, i_0: Scalar) -> Scalar | None:
         return self.i_max
 
-    def at_coil(self, command: Array, i: Array, u_max: Scalar, response: Callable[[], CoilResponse]) -> Array:
+    def at_coil(self, command: Array, i: Array, u_max: Scalar, response: CoilResponse) -> Array:
         """Return the voltage (V) at the coils for a commanded current (A) and a current i (A), within u_max (V)."""
-        return limited(response().voltage(self.slope() * (command - i)), u_max)
+        still, per_volt = response()
+        return limited((self.slope() * (command - i) - still) / per_volt, u_max)

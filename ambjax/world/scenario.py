@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.numerics.records import Scalar, bounded, part, record
-from ambjax.world.amplifier import Amplifier, CoilResponse, CoilVoltages, CurrentAmplifier
+from ambjax.world.amplifier import Amplifier, CoilVoltages, CurrentAmplifier
 from ambjax.world.bearing import Bearing
 from ambjax.world.plant import Plant
 from ambjax.world.recorded import Knots
@@ -114,9 +114,9 @@ class Scenario:
         """
         plant = self.plant
 
-        def response() -> CoilResponse:
+        def response() -> tuple[Array, Array]:
             still, driven = (plant.measurement(plant.rates(state, volt, 0.0, q_i)).i for volt in (0.0, 1.0))
-            return CoilResponse(still, driven - still)  # i' is linear in u
+            return still, driven - still  # i' is linear in u
 
         return self.actuator.at_coil(command, plant.measurement(state).i, self.u_max, response)
 
