@@ -22,7 +22,6 @@ MOST_OF_MACHINE = 300
 FREQUENCIES, DAMPED = np.geomspace(10.0, 1e5, 81), 0.05
 # Largest condition number of A + I of a discrete controller. Above it, a pole is too close to z = -1.
 MOST_CONDITION = 1e8
-
 # Modes of a controller below this rate (1/s) count as integrals, which start at 0.
 SLOWEST = 10.0
 

@@ -79,8 +79,6 @@ class Map(NamedTuple):
 
 # Returns whether each system of a study is stable, [N]. The other arguments are those of `AnyStudy.metrics`.
 StabilityTest = Callable[[AnyStudy, Arrays, np.ndarray], np.ndarray]
-
-
 # Returns the numbers that the controllers of cells are designed with, [N] by dotted path, from the values of the axes.
 Design = Callable[[AnyStudy, Arrays], Arrays]
 

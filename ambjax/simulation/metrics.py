@@ -22,8 +22,6 @@ from ambjax.world.scenario import Scenario
 
 # Times at which a signal first comes within its band; inf: never.
 REACHED = ("sigma_reached_s", "v_tilde_reached_s", "current_error_reached_s")
-
-
 # Relative difference of two times that are taken as equal.
 ROUNDING = 1e-9
 

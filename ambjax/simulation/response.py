@@ -114,7 +114,8 @@ class Settling:
     band: Scalar = leaf(unit="m", above=0, at_most=1.0, doc="the band")
 
     def init(self) -> Three:
-        return (jnp.zeros((), jnp.result_type(float)),) * 3
+        zero = jnp.zeros((), jnp.result_type(float))
+        return zero, zero, zero
 
     def update(self, carry: Three, row: Row, span: Span) -> Three:
         at, before, last = carry

@@ -23,11 +23,9 @@ from ambjax.world.waveforms import Constant, Signal, edges_of, frequencies_of, i
 DESIGN_STREAM, SIGNAL_STREAM = np.uint32(2**32 - 1), np.uint32(2**32 - 2)
 # Fields that are signals. The position in this list selects the random key of a signal, so add new fields at the end.
 SLOTS = ("reference", "q_z", "q_v", "q_i", "q_f", "base")
-
 # |z| at which a rotor with an elastic stop is lost, as a share of s_0. The lower bound of the gaps (GAP_FLOOR) acts
 # only at a larger |z|.
 POLE = 0.99
-
 # An amplifier without any of its fields applies the command at once, and without a limit of its own.
 _IDEAL_SENSOR, _IDEAL_AMPLIFIER = IdealSensor(), Amplifier()
 
