@@ -201,19 +201,10 @@ class ClosedLoop(WholeState):
         observed = lambda inputs, x: self.observed(inputs, x, errors)  # noqa: E731
         jumps = sum(map(jnp.abs, self.scenario.sensors.noises)) > 0
         edges = Edges(self.scenario.edges(reference=True), self.cuts, self.scenario.knots(reference=True))
+        motion = lambda state: self.motion(state.plant)  # noqa: E731
+        scale, layer, limit = self.scale(), self.layer(), self.scenario.limit
         return InitialValueProblem(
-            self.inputs,
-            rates,
-            self.scale(),
-            self.status,
-            self.layer(),
-            observed,
-            INSTANT_TREE,
-            jumps,
-            step,
-            edges,
-            lambda state: self.motion(state.plant),
-            self.scenario.limit,
+            self.inputs, rates, scale, self.status, layer, observed, INSTANT_TREE, jumps, step, edges, motion, limit
         )
 
     def row(self, t: Scalar, state: LoopState, errors: Errors, alive: Array, demanded: Demand = None) -> Row:

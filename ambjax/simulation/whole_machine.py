@@ -211,17 +211,11 @@ class Machine(MachineAxes):
         """Return the initial value problem with these inputs, rates with signals, and sizes of the groups' states."""
         edges = self.edges()
         signals = jax.tree.map(lambda _: jnp.zeros(self.count), INSTANT_TREE)
+        rates = lambda inputs, state: observed(inputs, state)[0]  # noqa: E731
+        sizes, edges = self.scale(scale), edges if edges.most else NO_EDGES
+        signals, limit = self.with_stops(signals, jnp.asarray(self.start_q)), self.limited()[1]
         return InitialValueProblem(
-            inputs,
-            lambda inputs, state: observed(inputs, state)[0],
-            self.scale(scale),
-            self.status,
-            None,
-            observed,
-            self.with_stops(signals, jnp.asarray(self.start_q)),
-            edges=edges if edges.most else NO_EDGES,
-            motion=self.motion,
-            limit=self.limited()[1],
+            inputs, rates, sizes, self.status, None, observed, signals, edges=edges, motion=self.motion, limit=limit
         )
 
 
