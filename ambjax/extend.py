@@ -25,8 +25,7 @@ from ambjax.numerics.records import GAINS, Scalar, canonical, gain, leaf, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, smooth_sign
 from ambjax.simulation.folds import Fold, Lowest, Named, Peak, Rms
-from ambjax.simulation.span import Span
-from ambjax.simulation.trajectory import Row, Trajectory
+from ambjax.simulation.trajectory import Row, Span, Trajectory
 from ambjax.world.bearing import Bearing, Signals
 from ambjax.world.rotor import Rotor
 from ambjax.world.waveforms import Reference, Signal, reference_at

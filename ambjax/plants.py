@@ -7,7 +7,7 @@ For example:
     Scenario(plant=plants.TwoCoil(m=1.64, iron=plants.Iron(saturation=1.4)), stop=plants.Stop(stiffness=1e7))
 """
 
-from ambjax.world.iron import Iron
+from ambjax.world.magnet import Iron
 from ambjax.world.plant import Plant, TwoCoil
 from ambjax.world.touchdown import Stop
 

@@ -27,8 +27,7 @@ from ambjax import Cascade, Initial, rollout
 from ambjax.compiler.fast_path import one_kernel
 from ambjax.laws import current, inversion, position
 from ambjax.simulation.folds import Rms
-from ambjax.simulation.parts import rolled_in_parts
-from ambjax.simulation.rollout import prepare
+from ambjax.simulation.rollout import prepare, rolled_in_parts
 from tuning.problem.config import read_tune
 from tuning.problem.loss import weigh
 from tuning.problem.tuning_problem import problem_of

@@ -20,7 +20,7 @@ from ambjax.commands.check_text import machine
 from ambjax.simulation.integrate import Begin, InitialValueProblem
 from ambjax.solvers import RK4
 from ambjax.world.amplifier import CoilLimits, difference
-from ambjax.world.iron import Iron
+from ambjax.world.magnet import Iron
 from ambjax.world.plant import TwoCoil
 from ambjax.world.sensor import Measurement
 

@@ -15,7 +15,7 @@ from ambjax.cases.template_text import template
 from ambjax.plants import Plant
 from ambjax.solvers import RK4
 from ambjax.world.amplifier import Amplifier
-from ambjax.world.iron import Iron
+from ambjax.world.magnet import Iron
 from ambjax.world.plant import TwoCoil
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement

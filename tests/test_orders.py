@@ -15,7 +15,7 @@ from ambjax.pictures.run_up_picture import once_per_turn
 from ambjax.results.runs import simulate_machine
 from ambjax.signals import Rotation
 from ambjax.simulation.folds import Ending
-from ambjax.simulation.orders import SIGNALS, UNITS, Orders
+from ambjax.simulation.response import SIGNALS, UNITS, Orders
 from ambjax.simulation.trajectory import Row
 
 T, NEVER = 1e-4, np.inf

@@ -9,8 +9,7 @@ from ambjax.laws import current, inversion, position
 from ambjax.sensors import Sensor
 from ambjax.signals import Sine
 from ambjax.simulation.folds import Rms
-from ambjax.simulation.parts import rolled_in_parts
-from ambjax.simulation.rollout import prepare
+from ambjax.simulation.rollout import prepare, rolled_in_parts
 from ambjax.solvers import RK4
 
 

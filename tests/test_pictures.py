@@ -19,7 +19,7 @@ from ambjax.pictures import ensembles, figures, heatmaps
 from ambjax.pictures.ensembles import tornado
 from ambjax.pictures.overview import overview_figure
 from ambjax.pictures.scales import AXIS_UNITS, LABELS, axis_of, label_of, prefix_of, save
-from ambjax.simulation import orders
+from ambjax.simulation import response
 from ambjax.simulation.metrics import UNITS, Metrics
 from ambjax.simulation.trajectory import ALIVE, STALLED, TOUCHED, Row, Trajectory
 
@@ -64,7 +64,7 @@ def test_the_prefix_of_a_unit(unit, size, expected):
 
 
 def test_every_metric_has_its_unit():
-    names = [*Metrics()._folds().folds, *orders.UNITS, "force_used", "lost_at_s", "singular_at_s"]
+    names = [*Metrics()._folds().folds, *response.UNITS, "force_used", "lost_at_s", "singular_at_s"]
     assert set(names) == set(LABELS)
     assert set(UNITS) | set(AXIS_UNITS) == {*names, "settle_s"}
     for name, unit in UNITS.items():  # the name of a metric ends in its unit

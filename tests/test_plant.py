@@ -9,7 +9,7 @@ import pytest
 from ambjax import Scenario
 from ambjax.plants import Plant
 from ambjax.simulation.metrics import Metrics
-from ambjax.world.iron import Iron
+from ambjax.world.magnet import Iron
 from ambjax.world.plant import Currents, TwoCoil
 from ambjax.world.sensor import Measurement
 

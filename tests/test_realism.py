@@ -22,7 +22,7 @@ from ambjax.ensemble import run_ensemble
 from ambjax.ensemble.maps import Axis, with_method_for_axes
 from ambjax.results.spread_runs import study_of
 from ambjax.simulation.folds import Named
-from ambjax.world.amplifier import Amplifier, CoilResponse
+from ambjax.world.amplifier import Amplifier
 from ambjax.world.sensor import Errors, Measurement, Sensor, converted
 from tuning.problem.quantities import Typical
 
@@ -126,7 +126,7 @@ def test_dead_band_and_current_limit():
     def at(u, i, hold=None):
         u, i = jnp.asarray(u), jnp.asarray(i)
         held = 50.0 * i if hold is None else jnp.asarray(hold)
-        return float(drive.at_coil(u, i, 60.0, lambda: CoilResponse(-held, jnp.ones(()))))
+        return float(drive.at_coil(u, i, 60.0, lambda: (-held, jnp.ones(()))))
 
     assert [at(u, 0.1) for u in (5.0, 1.0, -1.5, -9.0)] == [3.0, 0.0, 0.0, -7.0]
     assert [at(30.0, 0.4), at(30.0, -0.5), at(-30.0, -0.5), at(10.0, 0.4)] == [20.0, 28.0, -25.0, 8.0]

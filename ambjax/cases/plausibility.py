@@ -7,7 +7,7 @@ import numpy as np
 
 from ambjax.cases.forces import forces
 from ambjax.cases.reader import Case
-from ambjax.simulation.orders import ORDERS, ROUNDED
+from ambjax.simulation.response import ORDERS, ROUNDED
 from ambjax.world.recorded import Recorded
 from ambjax.world.scenario import SLOTS
 from ambjax.world.waveforms import frequencies_of

@@ -31,7 +31,7 @@ from ambjax.simulation.sliding import Slide, slides
 from ambjax.simulation.system import check_parts
 from ambjax.text.words import one_line
 from ambjax.world.bearing import Bearing
-from ambjax.world.iron import Iron
+from ambjax.world.magnet import Iron
 from ambjax.world.plant import Plant, TwoCoil
 from ambjax.world.scenario import Scenario
 

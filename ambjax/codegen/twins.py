@@ -119,7 +119,7 @@ class Twin(Sampled):
         stepped = super().jump(t, state, errors)
         return stepped._replace(command=self._moved(after, stepped.command, self._sizes(stepped).command))
 
-    def advance(self, method: Integrator, errors: Errors, begin: Begin[SampledState], period: Scalar) -> Advanced:
+    def advance(self, method: Integrator, errors: Errors, begin: Begin, period: Scalar) -> Advanced:
         if not self.held:
             return super().advance(method, errors, begin, period)
         loop, t = self.loop, begin.t

@@ -14,7 +14,7 @@ from ambjax.ensemble.study import AnyStudy
 from ambjax.linear import Findings
 from ambjax.results.operating import MEMBERS
 from ambjax.results.outputs import table
-from ambjax.simulation import orders
+from ambjax.simulation import response
 from ambjax.text import web_page
 from ambjax.text.words import markdown_table, number
 
@@ -116,7 +116,7 @@ QUANTITIES = (
     Quantity("disk_margin", "disk margin", "1", less=False),
     Quantity("stiffness_N_per_m", "static stiffness", "N/m", less=False),
     Quantity("flops", "cost of a step", "flops"),
-    *(_of_order(name, unit) for name, unit in orders.UNITS.items()),
+    *(_of_order(name, unit) for name, unit in response.UNITS.items()),
 )
 
 BY_KEY = {q.key: q for q in QUANTITIES}

@@ -123,7 +123,6 @@ class Law(abc.ABC):
         return self.init(model)
 
     def scale_sampled(self, model: Plant) -> object:
-        """Return the characteristic size of each component of the state on a processor."""
         return self.scale(model)
 
     def designed(self: L, model: Plant, sampling: Sampling | None) -> L:

@@ -133,7 +133,6 @@ class Cascade:
 
     @property
     def laws(self) -> tuple[Observer, PositionLaw, InversionLaw, CurrentLaw]:
-        """The four laws in order."""
         return self.observer, self.position, self.inversion, self.current
 
     def turning(self, rotor: Rotation | None) -> "Cascade":
@@ -148,7 +147,6 @@ class Cascade:
 
     @property
     def sampled(self) -> bool:
-        """Whether the laws run on a processor."""
         return self.processor is not None
 
     @property
@@ -161,7 +159,6 @@ class Cascade:
         return dataclasses.replace(self, processor=self.processor and replaced(self.processor, **fields))
 
     def driven(self, u: Array, state: NominalState) -> NominalState:
-        """Return the rates of the nominal plant under the command u, V or A."""
         return self.current.driven(self.model, u, state)
 
     def demand(
@@ -246,7 +243,6 @@ class Cascade:
         return dataclasses.replace(self, **laws, processor=None)
 
     def _acting(self, period: Scalar | None) -> Callable[..., Any]:
-        """Return `stages.step_law` with the model and the discretisation of this cascade."""
         return functools.partial(step_law, model=self.model, period=period, implicit=self.timing.implicit)
 
     def estimate(self, measured: Measurement, state: State, sample: Sample) -> tuple[Measurement, State, Measurement]:

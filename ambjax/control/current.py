@@ -7,11 +7,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.base import Requirement, scaled_steepness
-from ambjax.control.defaults import current_rate
+from ambjax.control.defaults import current_rate, sign_steepness
 from ambjax.control.sampling import Relay, Sampling, non_oscillating
 from ambjax.control.search import Interval, SearchContext, authority, rate, steepness, switch
 from ambjax.control.stages import CurrentInputs, CurrentLaw, OneIntegral, Stateless, no_slope, unwinding
-from ambjax.numerics.records import Scalar, gain, leaf, record
+from ambjax.numerics.records import Scalar, bounded, gain, record
 from ambjax.numerics.relax import share
 from ambjax.numerics.smooth import TWO_OVER_PI, limited, smooth_sign
 from ambjax.world.plant import Plant, State
@@ -28,15 +28,8 @@ class SlidingMode(Stateless, CurrentLaw[tuple[()]]):
     """
 
     analytic = True
-    k_i: Scalar = gain(
-        default=152.0, unit="A/s", doc="switching gain; above the disturbance bound Q_i; left out: w_c i_0/4"
-    )
-    p: Scalar = gain(
-        default=25.0,
-        unit="1/A",
-        doc="steepness of the smoothed sign of the current error; left out: scaled to the nominal plant",
-        steepness=True,
-    )
+    k_i: Scalar = gain(152.0, "A/s", "switching gain; above the disturbance bound Q_i; left out: w_c i_0/4")
+    p: Scalar = sign_steepness("sign of the current error", unit="1/A")
     requirement: ClassVar = Requirement("k_i", "Q_i")
     printed: ClassVar = True
 
@@ -54,7 +47,6 @@ class SlidingMode(Stateless, CurrentLaw[tuple[()]]):
         return self._voltage(model, inputs, self.robust(inputs.measured.i - inputs.demand.i_ref)), ()
 
     def step(self, model: Plant, inputs: CurrentInputs, state: tuple[()], period: Scalar) -> tuple[Array, tuple[()]]:
-        """Return the voltage of an implicit step, with the sign of i - i_ref at the end of the sample."""
         e = inputs.measured.i - inputs.demand.i_ref
         return self._voltage(model, inputs, -self.k_i * share(e, period * self.k_i, self.p)), ()
 
@@ -93,9 +85,9 @@ class ProportionalIntegral(OneIntegral, CurrentLaw[Array]):
     """
 
     analytic = True
-    k_p: Scalar = gain(default=1.76e5, unit="V/A", doc="proportional gain; left out: w_c L")
-    k_int: Scalar = gain(default=2.33e8, unit="V/A/s", doc="integral gain, 0: none; left out: w_c^2 L/4", zero=True)
-    k_aw: Scalar = gain(default=1330.0, unit="1/s", doc="anti-windup rate, 0: none; left out: w_c/4", zero=True)
+    k_p: Scalar = gain(1.76e5, "V/A", "proportional gain; left out: w_c L")
+    k_int: Scalar = gain(2.33e8, "V/A/s", "integral gain, 0: none; left out: w_c^2 L/4", zero=True)
+    k_aw: Scalar = gain(1330.0, "1/s", "anti-windup rate, 0: none; left out: w_c/4", zero=True)
     memory = (("x", "V", "integral of the current error"),)
 
     def scale(self, model: Plant) -> Scalar:
@@ -138,14 +130,12 @@ class DeadBeat(Stateless, CurrentLaw[tuple[()]]):
     """
 
     analytic = True
-    w: Scalar = gain(
-        default=5310.0, unit="1/s", doc="decay rate of the current error in continuous time; left out: w_c"
-    )
+    w: Scalar = gain(5310.0, "1/s", "decay rate of the current error in continuous time; left out: w_c")
     share: Scalar = gain(
-        default=1.0,
-        unit="1",
-        doc="share of the current error that each sample removes; 1: dead-beat; left out: 1 with prediction; without "
-        "it, the largest share that does not oscillate (1/4 for a delay of one sample)",
+        1.0,
+        "1",
+        "share of the current error that each sample removes; 1: dead-beat; left out: 1 with prediction; without it, "
+        "the largest share that does not oscillate (1/4 for a delay of one sample)",
     )
 
     def designed(self, model: Plant, sampling: Sampling | None) -> "DeadBeat":
@@ -205,7 +195,6 @@ class OpenLoop(Stateless, CurrentLaw[tuple[()]]):
         return model.R * inputs.demand.i_ref, ()
 
     def step(self, model: Plant, inputs: CurrentInputs, state: tuple[()], period: Scalar) -> tuple[Array, tuple[()]]:
-        """Return the voltage for the reference that the inversion has computed at this sample."""
         return model.R * (inputs.demand.i_ref + period * inputs.demand.i_ref_dot), ()
 
     own_steps = ("implicit", "explicit")
@@ -221,9 +210,7 @@ class AmplifierCurrent(Stateless, CurrentLaw[tuple[()]]):
     Use it with an amplifier that closes the current loop: `Cascade(current=current.AmplifierCurrent())`.
     """
 
-    bandwidth: Scalar = leaf(
-        default=1e3, unit="Hz", at_least=1, at_most=1e6, doc="nominal bandwidth; left out: actuator.bandwidth"
-    )
+    bandwidth: Scalar = bounded(1e3, "Hz", 1, 1e6, "nominal bandwidth; left out: actuator.bandwidth")
     commands = "current"
     own_steps = ("implicit", "explicit")
 

@@ -13,13 +13,23 @@ of |S| of that plant is about 40, and they lose a plant of another size.
 """
 
 import math
+from typing import Any
 
 from ambjax.control.sampling import Sampling
-from ambjax.numerics.records import Scalar
+from ambjax.numerics.records import Scalar, gain
 from ambjax.world.plant import Plant
 
 # Bandwidth of the current loop as a multiple of w, and its largest product with the sample period.
 FASTER, MOST = 10.0, 1 / 4
+# Default steepness of the sign of a position law, in words.
+SLOPE_W = "pi/(w s_0), or scaled to the nominal plant if k is given"
+
+
+def sign_steepness(
+    sign: str, left_out: str = "scaled to the nominal plant", unit: str = "s/m", default: float = 25.0
+) -> Any:
+    """Declare the steepness p of a smoothed sign. `sign`, `left_out`: the sign and the default, in words."""
+    return gain(default, unit, f"steepness of the smoothed {sign}; left out: {left_out}", steepness=True)
 
 
 def switching_gain(model: Plant) -> Scalar:

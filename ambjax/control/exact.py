@@ -41,18 +41,14 @@ def smooth_rates(x: tuple[Array, ...], f: Array, L: Scalar, width: Scalar) -> tu
     return tuple(a + b for a, b in zip(pushes, (*x[1:], jnp.zeros_like(e)), strict=True))
 
 
-def slope(m: int, L: Scalar, width: Scalar) -> Scalar:
-    """Return the largest slope of x_0' of `smooth_rates` with respect to e, for order m, 1/s."""
-    return LAM[m][0] * (L / width) ** (1 / (m + 1))
-
-
 def implicit_step(x: tuple[Array, ...], f: Array, L: Scalar, T: Scalar) -> tuple[Array, ...]:
     """Return x at this sample from x at the previous one, by backward Euler with period T (s)."""
     m = len(x) - 1
     lam, b = LAM[m], f - sum(T**k * one for k, one in enumerate(x))
     ratio = b / (L * T ** (m + 1))
-    # r^(m+1) + lam_0 r^m + .. + lam_m = |ratio|; r = 0 if the set-valued sign balances b
-    r = _root(jnp.maximum(jnp.abs(ratio) - lam[m], 0.0), m)
+    # r^(m+1) + lam_0 r^m + .. + lam_{m-1} r = c = |ratio| - lam_m; r = 0 if the set-valued sign balances b
+    c = jnp.maximum(jnp.abs(ratio) - lam[m], 0.0)
+    r = 2 * c / (lam[0] + jnp.sqrt(lam[0] ** 2 + 4 * c)) if m == 1 else _cubic_root(c)
     after = [x[m] + L * T * jnp.clip(ratio, -lam[m], lam[m])]
     for k in reversed(range(m)):
         push = lam[k] * L * T ** (m - k + 1) * r ** (m - k) * jnp.sign(b)
@@ -60,22 +56,10 @@ def implicit_step(x: tuple[Array, ...], f: Array, L: Scalar, T: Scalar) -> tuple
     return tuple(after)
 
 
-def velocity(x: tuple[Array, ...], T: Scalar) -> Array:
-    """Return f' at this sample, exact for polynomials of degree m. For m = 2, the state x_1 lags by half a sample."""
-    return x[1] + T / 2 * x[2] if len(x) == 3 else x[1]
-
-
-def _root(c: Array, m: int) -> Array:
-    """Return the r >= 0 with r^(m+1) + lam_0 r^m + .. + lam_{m-1} r = c, c >= 0."""
-    if m == 1:
-        return 2 * c / (LAM[1][0] + jnp.sqrt(LAM[1][0] ** 2 + 4 * c))
-    return _cubic_root(c)
-
-
 @jax.custom_jvp
 @compiled_alone
 def _cubic_root(c: Array) -> Array:
-    """Return the root of `_root` for m = 2."""
+    """Return the root r of `implicit_step` for m = 2."""
     square, linear, _ = LAM[2]
     # The root of each term alone is an upper bound. The left side is convex, so Newton's steps decrease to the root.
     r = jnp.minimum(jnp.minimum(c / linear, jnp.sqrt(c / square)), jnp.cbrt(c))
@@ -119,28 +103,26 @@ class ExactDifferentiator(Observer[tuple[Array, ...]]):
         return (z, z_dot, jnp.abs(model.g) / 50 + 1e-3)[: self.order + 1]
 
     def slope(self, model: Plant) -> Scalar:
-        return slope(self.order, self.L, _width(model))
+        """Return the largest slope of x_0' of `smooth_rates` with respect to e, 1/s."""
+        return LAM[self.order][0] * (self.L / (WIDTH * model.s_0)) ** (1 / (self.order + 1))
 
     def layer(self, model: Plant) -> tuple[Scalar, ...]:
-        return (0.3 * _width(model), *[jnp.inf] * self.order)
+        return (0.3 * (WIDTH * model.s_0), *[jnp.inf] * self.order)
 
     def __call__(
         self, model: Plant, inputs: Measurement, state: tuple[Array, ...]
     ) -> tuple[Measurement, tuple[Array, ...]]:
-        return inputs._replace(z_dot=state[1]), smooth_rates(state, inputs.z, self.L, _width(model))
+        return inputs._replace(z_dot=state[1]), smooth_rates(state, inputs.z, self.L, WIDTH * model.s_0)
 
     def step(
         self, model: Plant, inputs: Measurement, state: tuple[Array, ...], period: Scalar
     ) -> tuple[Measurement, tuple[Array, ...]]:
-        """Update the estimate with this sample."""
         after = implicit_step(state, inputs.z, self.L, period)
-        return inputs._replace(z_dot=velocity(after, period)), after
+        # exact for polynomials of degree `order`: for order 2, the state x_1 lags by half a sample
+        z_dot = after[1] + period / 2 * after[2] if self.order == 2 else after[1]
+        return inputs._replace(z_dot=z_dot), after
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         power = self.order + 1
         words = f"(x w)^{power} s_0, x from 1/10 to 1"
         return {"L": rate(context, 0.1, 1, words, 1 / float(context.model.s_0), power)}
-
-
-def _width(model: Plant) -> Scalar:
-    return WIDTH * model.s_0

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.numerics.gaussian import LARGEST_NORMAL
-from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.records import Scalar, bounded, record
 from ambjax.world.plant import Plant, State
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Measurement
@@ -21,7 +21,7 @@ GAPS, CURRENTS, BEYOND = 2.0, 100.0, 1.1
 
 
 def _limit(unit: str, doc: str, least: float = 1e-30) -> Any:
-    return leaf(default=None, unit=unit, at_least=least, at_most=1e30, doc=doc)
+    return bounded(None, unit, least, 1e30, doc)
 
 
 class Watch(NamedTuple):
@@ -73,18 +73,17 @@ class Guard:
         "not measured or the sensor has a low-pass, else plus pole times clearance times |sensor.gain - 1|",
         0,
     )
-    samples: Scalar | None = leaf(
-        default=None,
-        unit="samples",
-        at_least=1,
-        at_most=1_000_000,
+    samples: Scalar | None = bounded(
+        None,
+        "samples",
+        1,
+        1_000_000,
+        "largest number of successive predictions; none: 1/(pole T); in this time, an error grows by the factor e",
         whole=True,
-        doc="largest number of successive predictions; none: 1/(pole T); in this time, an error grows by the factor e",
     )
 
     @property
     def derived(self) -> bool:
-        """Whether every number is left out."""
         return all(getattr(self, field.name) is None for field in dataclasses.fields(type(self)))
 
     def with_limits(self, model: Plant, scenario: Scenario, period: Scalar, velocity: bool) -> "Guard":
@@ -109,7 +108,6 @@ class Guard:
         return Guard(**{name: value if own[name] is None else own[name] for name, value in values.items()})
 
     def start(self) -> Watch:
-        """Return the state before the first reading."""
         zero = jnp.zeros(())
         return Watch(Measurement(zero, zero, zero), zero)
 

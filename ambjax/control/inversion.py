@@ -10,11 +10,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.base import Requirement, scaled_steepness
-from ambjax.control.defaults import adaptation_gain
+from ambjax.control.defaults import adaptation_gain, sign_steepness
 from ambjax.control.sampling import Relay, Sampling
 from ambjax.control.search import Interval, SearchContext, steepness
 from ambjax.control.stages import CurrentDemand, ForceDemand, InversionLaw, Relaxation, Stateless, no_slope
-from ambjax.numerics.records import Scalar, gain, leaf, record
+from ambjax.numerics.records import Scalar, bounded, gain, record
 from ambjax.numerics.relax import relax, relaxation
 from ambjax.numerics.smooth import TWO_OVER_PI, away_from_zero, smooth_sign
 from ambjax.world.plant import Plant
@@ -38,17 +38,10 @@ class AdaptiveReference(InversionLaw[Array]):
     the pole of the magnets: gamma then exceeds Delta_1 of Eq. (7) up to the speed w s_0.
     """
 
-    gamma: Scalar = gain(
-        default=7.5e4, unit="A^2/m^2/s", doc="adaptation gain; above Delta_1 of Eq. (7); left out: 4 w (i_0/s_0)^2"
-    )
-    p: Scalar = gain(
-        default=25.0,
-        unit="m^2/A^2",
-        doc="steepness of the smoothed sign of v_tilde; left out: scaled to the nominal plant",
-        steepness=True,
-    )
+    gamma: Scalar = gain(7.5e4, "A^2/m^2/s", "adaptation gain; above Delta_1 of Eq. (7); left out: 4 w (i_0/s_0)^2")
+    p: Scalar = sign_steepness("sign of v_tilde", unit="m^2/A^2")
     printed: ClassVar = True
-    i_ref: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="initial current reference")
+    i_ref: Scalar = bounded(0.0, "A", -1e6, 1e6, "initial current reference")
     memory = (("i_ref", "A", "current reference of the next sample"),)
 
     def designed(self, model: Plant, sampling: Sampling | None) -> Self:
@@ -139,9 +132,7 @@ class FeedForwardAdaptive(AdaptiveReference):
     """
 
     analytic = True
-    gamma: Scalar = gain(
-        default=7.5e4, unit="A^2/m^2/s", doc="adaptation gain; above the error of the rates; left out: 4 w (i_0/s_0)^2"
-    )
+    gamma: Scalar = gain(7.5e4, "A^2/m^2/s", "adaptation gain; above the error of the rates; left out: 4 w (i_0/s_0)^2")
 
     def __call__(self, model: Plant, inputs: ForceDemand, state: Array) -> tuple[CurrentDemand, Array]:
         v, gradient = v_and_gradient(model, inputs, state)

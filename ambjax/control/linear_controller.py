@@ -67,7 +67,7 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
     """
 
     analytic = True
-    gain: Scalar = records.gain(default=1.0, unit="1", doc="factor of the controller's output")
+    gain: Scalar = records.gain(1.0, "1", "factor of the controller's output")
     output: str = static(
         default=OUTPUTS[0], choices=OUTPUTS, doc="quantity that the controller returns: a current (A) or a voltage (V)"
     )
@@ -94,7 +94,6 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
 
     @property
     def memory(self) -> tuple[tuple[str, str, str], ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Name, unit and meaning of each state."""
         return tuple((f"x_{k + 1}", "m", "state of the controller") for k in range(len(self.realisation.A)))
 
     def check_use(self, model: Plant, period: float | None) -> None:
@@ -161,7 +160,6 @@ class LinearController(PositionLaw[tuple[Array, ...]]):
     def step(
         self, model: Plant, inputs: PositionInputs, state: tuple[Array, ...], period: Scalar
     ) -> tuple[Array, tuple[Array, ...]]:
-        """Step by the bilinear transform."""
         y, after = self.realisation.step(state, self._inputs(inputs), period)
         return self._force(model, inputs[0].z, y), after
 

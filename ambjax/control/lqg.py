@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ambjax.control.regulator import riccati_gain
-from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.records import Scalar, bounded, leaf, record
 from ambjax.numerics.small_matrices import held
 
 
@@ -37,9 +37,9 @@ class LqgWeights:
     drift: Scalar | None = _size(
         "N/s", 1e12, "change of the constant force at each magnet in a second; none: 0.03 w times `force`"
     )
-    bending: Scalar = leaf(
-        default=0.3, unit="1", at_least=0, at_most=1e3,
-        doc="force on each bending mode of its own, as a share of `force` at the magnet where its shape is largest",
+    bending: Scalar = bounded(
+        0.3, "1", 0, 1e3,
+        "force on each bending mode of its own, as a share of `force` at the magnet where its shape is largest",
     )  # fmt: skip
 
 

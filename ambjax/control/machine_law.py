@@ -76,7 +76,6 @@ class MachineLaw(abc.ABC):
     output: str = "force"
 
     def designed(self: L, rotor: Rotor) -> L:
-        """Return the law for a nominal rotor; by default the law itself."""
         return self
 
     @abc.abstractmethod

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.base import scaled_steepness
-from ambjax.control.defaults import switching_gain, switching_steepness
+from ambjax.control.defaults import SLOPE_W, sign_steepness, switching_gain, switching_steepness
 from ambjax.control.force import force_for, sigma_by_c, sigma_by_gains, sigma_size, sliding_variable
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, manifold, position_switch, rate, steepness
@@ -35,19 +35,10 @@ class IntegralSlidingMode(OneIntegral, PositionLaw[Array]):
     """
 
     analytic = True
-    c: Scalar = gain(default=17.0, unit="1/s", doc="coefficient of the error in the sliding variable; left out: w")
-    c_int: Scalar = gain(
-        default=70.0, unit="1/s^2", doc="gain of the integral of the error, 0: none; left out: w^2/4", zero=True
-    )
-    k: Scalar = gain(
-        default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z; left out: w^2 s_0/2"
-    )
-    p: Scalar = gain(
-        default=25.0,
-        unit="s/m",
-        doc="steepness of the smoothed sign; left out: pi/(w s_0), or scaled to the nominal plant if k is given",
-        steepness=True,
-    )
+    c: Scalar = gain(17.0, "1/s", "coefficient of the error in the sliding variable; left out: w")
+    c_int: Scalar = gain(70.0, "1/s^2", "gain of the integral of the error, 0: none; left out: w^2/4", zero=True)
+    k: Scalar = gain(25.0, "m/s^2", "switching gain; above the disturbance bound Q_z; left out: w^2 s_0/2")
+    p: Scalar = sign_steepness("sign", SLOPE_W)
     switching: ClassVar = ("k",)
     printed: ClassVar = True
     memory = (("x", "m s", "integral of the error"),)
@@ -102,26 +93,18 @@ class UtkinSlidingMode(OneIntegral, PositionLaw[Array]):
     Integral sliding mode: feedback linearisation, and a sign that cancels the disturbance (V. Utkin and J. Shi, Proc.
     35th IEEE Conf. Decision and Control, 1996, 4591-4596). x starts at -(e_dot + k_d e), so that s = 0 from the
     beginning: there is no reaching phase, and for |q_z| < k the error follows e_ddot = -k_p e - k_d e_dot at all times,
-    up to the smoothing of the sign.
-    `IntegralSlidingMode` starts its integral at 0 instead. A trajectory does not contain s; it reports
-    e_dot + (k_p/k_d) e as sigma. The default k_p and k_d for a model place a double pole at -w/3, where w is
-    the unstable pole of the magnets.
+    up to the smoothing of the sign. `IntegralSlidingMode` starts its integral at 0 instead. A trajectory does not
+    contain s; it reports e_dot + (k_p/k_d) e as sigma. The default k_p and k_d for a model place a double pole at -w/3,
+    where w is the unstable pole of the magnets.
 
     Use it where the motion must be that of a PD controller from the start:
     `Cascade(position=position.UtkinSlidingMode())`.
     """
 
-    k_p: Scalar = gain(default=3.1e4, unit="1/s^2", doc="proportional gain; left out: (w/3)^2")
-    k_d: Scalar = gain(default=354.0, unit="1/s", doc="derivative gain; left out: 2 w/3")
-    k: Scalar = gain(
-        default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z; left out: w^2 s_0/2"
-    )
-    p: Scalar = gain(
-        default=25.0,
-        unit="s/m",
-        doc="steepness of the smoothed sign of s; left out: pi/(w s_0), or scaled to the nominal plant if k is given",
-        steepness=True,
-    )
+    k_p: Scalar = gain(3.1e4, "1/s^2", "proportional gain; left out: (w/3)^2")
+    k_d: Scalar = gain(354.0, "1/s", "derivative gain; left out: 2 w/3")
+    k: Scalar = gain(25.0, "m/s^2", "switching gain; above the disturbance bound Q_z; left out: w^2 s_0/2")
+    p: Scalar = sign_steepness("sign of s", SLOPE_W)
     switching: ClassVar = ("k",)
     memory = (("integral", "m/s", "integral of k_p e"),)
     own_steps = ("implicit", "explicit")
@@ -161,7 +144,6 @@ class UtkinSlidingMode(OneIntegral, PositionLaw[Array]):
         }
 
     def step(self, model: Plant, inputs: PositionInputs, state: Array, period: Scalar) -> tuple[Array, Array]:
-        """Step with the sign of s at the end of the step."""
         motion, reference = inputs
         sign = share(sliding_variable(self.k_d, *inputs) + state, period * self.k, self.p)
         return self._force(model, inputs, sign), state + period * self.k_p * (motion.z - reference.r)
@@ -180,15 +162,10 @@ class TerminalSlidingMode(Stateless, PositionLaw[tuple[()]]):
     Use it where an error must vanish in a finite time: `Cascade(position=position.TerminalSlidingMode())`.
     """
 
-    c: Scalar = gain(default=530.0, unit="1/s", doc="decay rate on the manifold where |e| = l; left out: w")
-    l: Scalar = gain(default=1e-4, unit="m", doc="error at which the decay rate is c; left out: s_0/50")
-    k: Scalar = gain(
-        default=280.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z; left out: w^2 s_0/5"
-    )
-    p: Scalar = gain(
-        default=25.0, unit="s/m", doc="steepness of the smoothed sign of sigma; left out: scaled to the nominal plant",
-        steepness=True,
-    )  # fmt: skip
+    c: Scalar = gain(530.0, "1/s", "decay rate on the manifold where |e| = l; left out: w")
+    l: Scalar = gain(1e-4, "m", "error at which the decay rate is c; left out: s_0/50")
+    k: Scalar = gain(280.0, "m/s^2", "switching gain; above the disturbance bound Q_z; left out: w^2 s_0/5")
+    p: Scalar = sign_steepness("sign of sigma")
 
     def designed(self, model: Plant, sampling: Sampling | None) -> "TerminalSlidingMode":
         scaled = scaled_steepness(self, model)

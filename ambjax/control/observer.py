@@ -10,7 +10,7 @@ from ambjax.control.exact import DERIVATIVES, ExactDifferentiator
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
 from ambjax.control.stages import Observer, Stateless, no_slope
-from ambjax.numerics.records import Scalar, gain, leaf, record
+from ambjax.numerics.records import Scalar, bounded, gain, record
 from ambjax.world.plant import Plant
 from ambjax.world.sensor import Measurement
 
@@ -37,15 +37,12 @@ class Complementary(Observer[Array]):
     The estimate z_hat (m) integrates the velocity, and converges to the measured position at the rate l (1/s). Noise of
     the position sensor passes through a low-pass of corner l, noise of the velocity through a low-pass of gain 1/l.
 
-    Use it where both the position and the velocity are measured:
-    `Cascade(observer=observer.Complementary(l=10.0))`.
+    Use it where both the position and the velocity are measured: `Cascade(observer=observer.Complementary(l=10.0))`.
     """
 
     analytic = True
-    l: Scalar = gain(default=10.6, unit="1/s", doc="corner between velocity and position sensor; left out: w/50")
-    z_hat: Scalar | None = leaf(
-        default=None, unit="m", at_least=-1.0, at_most=1.0, doc="initial estimate; none: the first measurement"
-    )
+    l: Scalar = gain(10.6, "1/s", "corner between velocity and position sensor; left out: w/50")
+    z_hat: Scalar | None = bounded(None, "m", -1.0, 1.0, "initial estimate; none: the first measurement")
     memory = (("z_hat", "m", "estimate of the displacement"),)
 
     def init(self, model: Plant, measured: Measurement) -> Array:
@@ -82,9 +79,7 @@ class Difference(Observer[Array]):
     """
 
     w: Scalar = gain(
-        default=5310.0,
-        unit="1/s",
-        doc="corner of the low-pass on the differenced position; left out: ten times the pole of the magnets",
+        5310.0, "1/s", "corner of the low-pass on the differenced position; left out: ten times the pole of the magnets"
     )
     estimates_velocity: ClassVar[bool] = True
     memory = (("z_f", "m", "position through the low-pass"),)
@@ -147,9 +142,9 @@ class Kalman(Observer[Predicted]):
 
     analytic = True
     w: Scalar = gain(
-        default=1590.0,
-        unit="1/s",
-        doc="decay rate of the estimation error, which has three poles at -w; left out: three times the pole of the "
+        1590.0,
+        "1/s",
+        "decay rate of the estimation error, which has three poles at -w; left out: three times the pole of the "
         "magnets",
     )
     estimates_velocity: ClassVar[bool] = True
@@ -216,7 +211,7 @@ class IRED1(ExactDifferentiator):
     `Cascade(observer=observer.IRED1())`.
     """
 
-    L: Scalar = gain(default=56.3, unit="m/s^2", doc="bound on the acceleration; left out: w^2 s_0/25")
+    L: Scalar = gain(56.3, "m/s^2", "bound on the acceleration; left out: w^2 s_0/25")
     order: ClassVar[int] = 1
     memory = DERIVATIVES[:2]
 
@@ -228,6 +223,6 @@ class IRED2(ExactDifferentiator):
     Use it where a bound of the rate of the acceleration is known: `Cascade(observer=observer.IRED2())`.
     """
 
-    L: Scalar = gain(default=2.99e4, unit="m/s^3", doc="bound on the rate of the acceleration; left out: w^3 s_0/25")
+    L: Scalar = gain(2.99e4, "m/s^3", "bound on the rate of the acceleration; left out: w^3 s_0/25")
     order: ClassVar[int] = 2
     memory = DERIVATIVES

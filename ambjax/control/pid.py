@@ -43,11 +43,11 @@ class PID(PositionLaw[PIDState]):
     """
 
     analytic = True
-    k_p: Scalar = gain(default=3.52e5, unit="1/s^2", doc="proportional gain; left out: 5/4 w^2")
-    k_int: Scalar = gain(default=3.74e7, unit="1/s^3", doc="integral gain, 0: none; left out: w^3/4", zero=True)
-    k_d: Scalar = gain(default=1062.0, unit="1/s", doc="derivative gain; left out: 2 w")
-    w_f: Scalar = gain(default=1.06e4, unit="1/s", doc="bandwidth of the filter of the derivative; left out: 20 w")
-    k_aw: Scalar = gain(default=26.5, unit="1/s", doc="anti-windup rate, 0: none; left out: w/20", zero=True)
+    k_p: Scalar = gain(3.52e5, "1/s^2", "proportional gain; left out: 5/4 w^2")
+    k_int: Scalar = gain(3.74e7, "1/s^3", "integral gain, 0: none; left out: w^3/4", zero=True)
+    k_d: Scalar = gain(1062.0, "1/s", "derivative gain; left out: 2 w")
+    w_f: Scalar = gain(1.06e4, "1/s", "bandwidth of the filter of the derivative; left out: 20 w")
+    k_aw: Scalar = gain(26.5, "1/s", "anti-windup rate, 0: none; left out: w/20", zero=True)
     memory = (("rate", "m/s", "filtered rate of the error"), ("integral", "m/s^2", "integral term"))
 
     def init(self, model: Plant) -> PIDState:
@@ -122,8 +122,8 @@ class FeedbackLinearisation(Stateless, PositionLaw[tuple[()]]):
     """
 
     analytic = True
-    k_p: Scalar = gain(default=2.82e5, unit="1/s^2", doc="proportional gain; left out: w^2")
-    k_d: Scalar = gain(default=1062.0, unit="1/s", doc="derivative gain; left out: 2 w")
+    k_p: Scalar = gain(2.82e5, "1/s^2", "proportional gain; left out: w^2")
+    k_d: Scalar = gain(1062.0, "1/s", "derivative gain; left out: 2 w")
 
     def designed(self, model: Plant, sampling: Sampling | None) -> "FeedbackLinearisation":
         return FeedbackLinearisation(model.pole**2, 2 * model.pole)
@@ -161,10 +161,10 @@ class StateFeedback(OneIntegral, PositionLaw[Array]):
     """
 
     analytic = True
-    k_p: Scalar = gain(default=135.0, unit="A/m", doc="proportional gain; left out: LQR")
-    k_d: Scalar = gain(default=0.219, unit="A s/m", doc="derivative gain; left out: LQR")
-    k_int: Scalar = gain(default=5310.0, unit="A/m/s", doc="integral gain, 0: none; left out: LQR", zero=True)
-    k_aw: Scalar = gain(default=10.6, unit="1/s", doc="anti-windup rate, 0: none; left out: w/50", zero=True)
+    k_p: Scalar = gain(135.0, "A/m", "proportional gain; left out: LQR")
+    k_d: Scalar = gain(0.219, "A s/m", "derivative gain; left out: LQR")
+    k_int: Scalar = gain(5310.0, "A/m/s", "integral gain, 0: none; left out: LQR", zero=True)
+    k_aw: Scalar = gain(10.6, "1/s", "anti-windup rate, 0: none; left out: w/50", zero=True)
     memory = (("integral", "A", "integral term"),)
 
     def scale(self, model: Plant) -> Scalar:

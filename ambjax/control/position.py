@@ -7,7 +7,7 @@ from jax import Array
 
 from ambjax.control.base import Requirement
 from ambjax.control.chain import FilterChain as FilterChain
-from ambjax.control.defaults import switching_gain, switching_steepness
+from ambjax.control.defaults import SLOPE_W, sign_steepness, switching_gain, switching_steepness
 from ambjax.control.force import force_for, sigma_by_c, sigma_size
 from ambjax.control.linear_controller import LinearController as LinearController
 from ambjax.control.manifolds import IntegralSlidingMode as IntegralSlidingMode
@@ -37,17 +37,9 @@ class SlidingMode(Stateless, PositionLaw[tuple[()]]):
     """
 
     analytic = True
-    c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold; left out: w")
-    k: Scalar = gain(
-        default=25.0, unit="m/s^2", doc="switching gain; above the disturbance bound Q_z; left out: w^2 s_0/2"
-    )
-    p: Scalar = gain(
-        default=25.0,
-        unit="s/m",
-        doc="steepness of the smoothed sign of sigma; left out: pi/(w s_0), or scaled to the nominal plant if k is "
-        "given",
-        steepness=True,
-    )
+    c: Scalar = gain(17.0, "1/s", "decay rate on the sliding manifold; left out: w")
+    k: Scalar = gain(25.0, "m/s^2", "switching gain; above the disturbance bound Q_z; left out: w^2 s_0/2")
+    p: Scalar = sign_steepness("sign of sigma", SLOPE_W)
     requirement: ClassVar = Requirement("k", "Q_z")
     switching: ClassVar = ("k",)
     printed: ClassVar = True
@@ -96,20 +88,13 @@ class SuperTwisting(OneIntegral, PositionLaw[Array]):
     Use it where a constant or slowly varying force acts: `Cascade(position=position.SuperTwisting())`.
     """
 
-    c: Scalar = gain(default=17.0, unit="1/s", doc="decay rate on the sliding manifold; left out: W")
-    k_1: Scalar = gain(default=40.0, unit="m^0.5/s^1.5", doc="gain of the root term; left out: sqrt(W^3 s_0/pi)")
+    c: Scalar = gain(17.0, "1/s", "decay rate on the sliding manifold; left out: W")
+    k_1: Scalar = gain(40.0, "m^0.5/s^1.5", "gain of the root term; left out: sqrt(W^3 s_0/pi)")
     k_2: Scalar = gain(
-        default=50.0,
-        unit="m/s^3",
-        doc="gain of the integral, 0: none; above the bound on dq_z/dt; left out: W^3 s_0/8",
-        zero=True,
+        50.0, "m/s^3", "gain of the integral, 0: none; above the bound on dq_z/dt; left out: W^3 s_0/8", zero=True
     )
-    p: Scalar = gain(
-        default=100.0,
-        unit="s/m",
-        doc="steepness of the smoothed root and sign of sigma; left out: pi/(W s_0), or scaled to the nominal plant if "
-        "k_1 or k_2 is given",
-        steepness=True,
+    p: Scalar = sign_steepness(
+        "root and sign of sigma", "pi/(W s_0), or scaled to the nominal plant if k_1 or k_2 is given", default=100.0
     )
     switching: ClassVar = ("k_1", "k_2")
     printed: ClassVar = True

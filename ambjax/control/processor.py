@@ -13,7 +13,7 @@ from ambjax.control.guard import Guard
 from ambjax.control.sampling import Sampling
 from ambjax.numerics.declared import check_number, leaves_of
 from ambjax.numerics.linear import rk4_step
-from ambjax.numerics.records import Scalar, derived, is_traced, leaf, part, record, replaced, static
+from ambjax.numerics.records import Scalar, bounded, derived, is_traced, part, record, replaced, static
 from ambjax.world.plant import Plant, State
 from ambjax.world.sensor import Measurement
 
@@ -33,21 +33,15 @@ class Processor:
     which the model predicts, if it differs from the true delay.
     """
 
-    delay: Scalar = leaf(
-        default=1.0, unit="samples", at_least=0, at_most=MOST_DELAY, doc="time from the reading until the voltage acts"
-    )
+    delay: Scalar = bounded(1.0, "samples", 0, MOST_DELAY, "time from the reading until the voltage acts")
     implicit: bool = static(
         default=True, doc="implicit steps, which evaluate signs at the end of the step; otherwise explicit Euler steps"
     )
     predict: bool | None = static(
         default=None, doc="whether the laws use the estimate predicted over the delay; None: True if there is a delay"
     )
-    assumed: Scalar | None = leaf(
-        default=None,
-        unit="samples",
-        at_least=0,
-        at_most=MOST_DELAY,
-        doc="delay that the prediction assumes; none: the true delay",
+    assumed: Scalar | None = bounded(
+        None, "samples", 0, MOST_DELAY, "delay that the prediction assumes; none: the true delay"
     )
     guard: Guard | None = part(default=Guard(), doc="guard of the readings; None: every reading is accepted")
     # Of `resolved`: whether every delay is a whole number of samples, the samples over which the longest prediction

@@ -22,7 +22,6 @@ MOST_OF_MACHINE = 300
 FREQUENCIES, DAMPED = np.geomspace(10.0, 1e5, 81), 0.05
 # Largest condition number of A + I of a discrete controller. Above it, a pole is too close to z = -1.
 MOST_CONDITION = 1e8
-
 # Modes of a controller below this rate (1/s) count as integrals, which start at 0.
 SLOWEST = 10.0
 
@@ -59,7 +58,6 @@ class Realisation:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the numbers."""
         return hashlib.sha256(repr((self.A, self.B, self.C, self.D, self.dt)).encode()).hexdigest()
 
     @property
@@ -108,7 +106,6 @@ class Realisation:
         return self.output(p, w), tuple(2 * q - y for q, y in zip(p, x, strict=True))
 
     def _blocks(self) -> list[tuple[int, ...]]:
-        """Return the row indices of each diagonal block of A."""
         blocks, k = [], 0
         while k < len(self.A):
             size = 2 if k + 1 < len(self.A) and self.A[k + 1][k] else 1

@@ -63,20 +63,15 @@ def doubled(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.nd
     E. K.-W. Chu, H.-Y. Fan, W.-W. Lin and C.-S. Wang, Int. J. Control 77 (2004) 767-788. Unlike SciPy's solver, it does
     not reorder eigenvalues, which fails for lightly damped modes. Raises ValueError if it does not converge.
     """
-    G, P = B @ np.linalg.solve(R, B.T), Q
+    G, P, n = B @ np.linalg.solve(R, B.T), Q, len(A)
     for _ in range(MOST_DOUBLINGS):
         before = P
-        A, G, P = _over_twice(A, G, P)
+        W = np.linalg.solve(np.eye(n) + G @ P, np.hstack([A, G]))
+        G, P, A = G + A @ W[:, n:] @ A.T, P + A.T @ P @ W[:, :n], A @ W[:, :n]
+        G, P = (G + G.T) / 2, (P + P.T) / 2
         if np.linalg.norm(P - before) <= np.finfo(float).eps * np.linalg.norm(P):
             return P
     raise ValueError("no convergence")
-
-
-def _over_twice(A: np.ndarray, G: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the matrices of `doubled` for twice the horizon."""
-    W = np.linalg.solve(np.eye(len(A)) + G @ P, np.hstack([A, G]))
-    G, P, A = G + A @ W[:, len(A) :] @ A.T, P + A.T @ P @ W[:, : len(A)], A @ W[:, : len(A)]
-    return A, (G + G.T) / 2, (P + P.T) / 2
 
 
 def optimal_gains(model: Plant, period: float | None = None) -> np.ndarray:

@@ -104,7 +104,6 @@ class RigidBody(MachineLaw):
     def _observed(
         self, now: Measurement, state: Any, reference: Reference, inputs: MachineInputs
     ) -> tuple[Measurement, Any]:
-        """Step the observers of all coordinates."""
         observe = jax.vmap(lambda law, m, own, r: law.observed(m, own, r, inputs.period))
         return observe(self.laws, now, state, reference)
 

@@ -53,7 +53,6 @@ class Schedule(GainFunction):
         return total
 
     def with_knot(self, knot: int, value: Scalar) -> "Schedule":
-        """Return the schedule with another value at one knot."""
         return dataclasses.replace(self, values=(*self.values[:knot], value, *self.values[knot + 1 :]))
 
     def check(self, field: dataclasses.Field, path: str) -> None:

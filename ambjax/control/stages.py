@@ -24,7 +24,7 @@ from jax import Array
 
 from ambjax.control.base import Law
 from ambjax.numerics.records import Scalar
-from ambjax.world.gaps import Gaps
+from ambjax.world.magnet import Gaps
 from ambjax.world.plant import Plant
 from ambjax.world.plant import State as NominalState
 from ambjax.world.sensor import Measurement

@@ -11,7 +11,7 @@ from typing import ClassVar, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, part, record, static
+from ambjax.numerics.records import Scalar, bounded, leaf, part, record, static
 from ambjax.numerics.smooth import TWO_PI
 from ambjax.world.plant import Plant
 from ambjax.world.rotation import PER_MINUTE, Rotation, known
@@ -60,11 +60,9 @@ class SynchronousNotch:
     """
 
     removes: str = static(default="force-free", choices=tuple(NULLED), doc='"force-free" or "displacement-free"')
-    rate: Scalar = leaf(default=10.0, unit="1/s", at_least=1e-6, at_most=1e6, doc="rate at which the notch converges")
-    min_speed: Scalar = leaf(default=0.0, unit="rpm", at_least=0, at_most=1e7, doc="speed from which the notch is on")
-    max_speed: Scalar = leaf(
-        default=1e7, unit="rpm", at_least=0, at_most=1e7, doc="speed above which the notch is off again"
-    )
+    rate: Scalar = bounded(10.0, "1/s", 1e-6, 1e6, "rate at which the notch converges")
+    min_speed: Scalar = bounded(0.0, "rpm", 0, 1e7, "speed from which the notch is on")
+    max_speed: Scalar = bounded(1e7, "rpm", 0, 1e7, "speed above which the notch is off again")
     ordered: ClassVar = ("min_speed", "max_speed")
     gains: tuple[NotchGain, ...] = part(default=(), doc="gain at each speed, in between linear")
     rotor: Rotation | None = part(default=None, doc="speed of the rotor; that of a scenario replaces it")

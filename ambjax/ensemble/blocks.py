@@ -9,8 +9,7 @@ from jax import Array, lax
 from ambjax.numerics.records import Scalar, leaf, record, static
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Ending
-from ambjax.simulation.span import Span
-from ambjax.simulation.trajectory import Row
+from ambjax.simulation.trajectory import Row, Span
 
 # Initial minimum of a block (its negative: initial maximum), before any value is included.
 NO_VALUE = jnp.inf
@@ -33,12 +32,8 @@ class BlockValues(NamedTuple):
     last: dict[str, Array]
 
 
-class Carry(NamedTuple):
-    """State of the fold: the blocks so far, and u_mean (V) and `alive` at the previous sample."""
-
-    folded: BlockValues
-    u_mean: Array
-    alive: Array
+# State of the fold: the blocks so far, and u_mean (V) and `alive` at the previous sample.
+Carry = tuple[BlockValues, Array, Array]
 
 
 @record
@@ -55,27 +50,24 @@ class Blocks:
         low, high = ({name: jnp.full(self.count, x, dtype) for name in self.of} for x in (NO_VALUE, -NO_VALUE))
         last = {name: jnp.asarray(jnp.nan, dtype) for name in self.of}
         folded = BlockValues(low, high, jnp.zeros(self.count, dtype), last)
-        return Carry(folded, jnp.zeros((), dtype), jnp.asarray(False))
+        return folded, jnp.zeros((), dtype), jnp.asarray(False)
 
     def update(self, carry: Carry, row: Row, span: Span) -> Carry:
         sample = jnp.floor(row.t / self.period + 0.5).astype(int)
         block, before = sample // self.every, jnp.maximum(sample - 1, 0) // self.every
         values = {name: getattr(row, name) for name in self.of}
-        folded = carry.folded
+        folded, u_mean, alive = carry
         low, high = (
             {k: _combined(old[k], block, combine, jnp.where(row.alive, x, none)) for k, x in values.items()}
             for old, combine, none in ((folded.low, jnp.minimum, NO_VALUE), (folded.high, jnp.maximum, -NO_VALUE))
         )
-        step = jnp.where(row.alive & carry.alive, jnp.abs(row.u_mean - carry.u_mean), 0.0)
+        step = jnp.where(row.alive & alive, jnp.abs(row.u_mean - u_mean), 0.0)
         last = {k: jnp.where(row.alive, x, jnp.nan) for k, x in values.items()}
-        return Carry(
-            BlockValues(low, high, _combined(folded.variation, before, jnp.add, step), last),
-            row.u_mean,
-            jnp.asarray(row.alive),
-        )
+        variation = _combined(folded.variation, before, jnp.add, step)
+        return BlockValues(low, high, variation, last), row.u_mean, jnp.asarray(row.alive)
 
     def result(self, carry: Carry, ending: Ending) -> BlockValues:
-        return carry.folded
+        return carry[0]
 
 
 def quarters(clock: Clock) -> Blocks:

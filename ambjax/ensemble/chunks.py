@@ -45,11 +45,9 @@ class Chunks:
         return [(n, min(n + self.size, self.members)) for n in range(0, self.members, self.size)]
 
     def path(self, span: Span) -> pathlib.Path:
-        """Return the file of a chunk."""
         return self.directory / f"{span[0]:012d}-{span[1]:012d}.npz"
 
     def put(self, span: Span, columns: Arrays) -> None:
-        """Write a finished chunk. Raises ValueError if it cannot be written."""
         seal(self.path(span), columns, self._facts(span))
 
     def _facts(self, span: Span) -> dict[str, object]:

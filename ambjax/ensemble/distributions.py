@@ -52,11 +52,8 @@ class Normal:
         return f"{{ normal = {self.std:g} }}"
 
     def fault(self) -> str | None:
-        return (
-            None
-            if 0 <= self.std < math.inf
-            else "normal, the standard deviation, must be a finite number of at least 0"
-        )
+        fine = 0 <= self.std < math.inf
+        return None if fine else "normal, the standard deviation, must be a finite number of at least 0"
 
     def support(self, nominal: float) -> tuple[float, float]:
         return nominal - CUT * self.std, nominal + CUT * self.std

@@ -10,6 +10,7 @@ from ambjax.ensemble.distributions import Choice, Distribution, Uniform
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.spread import STEP_PATHS, Spread, SpreadError, check_spread, corners, drawn, ends, no_such_number
 from ambjax.ensemble.study import PERIOD, AnyStudy, Study
+from ambjax.host.sealed import Arrays
 from ambjax.simulation.method import choose_method
 
 # Survival of a cell is certain if the lower end of its interval is at least this share.
@@ -77,11 +78,9 @@ class Map(NamedTuple):
 
 
 # Returns whether each system of a study is stable, [N]. The other arguments are those of `AnyStudy.metrics`.
-StabilityTest = Callable[[AnyStudy, dict[str, np.ndarray], np.ndarray], np.ndarray]
-
-
+StabilityTest = Callable[[AnyStudy, Arrays, np.ndarray], np.ndarray]
 # Returns the numbers that the controllers of cells are designed with, [N] by dotted path, from the values of the axes.
-Design = Callable[[AnyStudy, dict[str, np.ndarray]], dict[str, np.ndarray]]
+Design = Callable[[AnyStudy, Arrays], Arrays]
 
 
 def grid(study: AnyStudy, x: Axis, y: Axis, stable: StabilityTest | None = None, design: Design | None = None) -> Map:

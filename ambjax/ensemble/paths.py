@@ -9,13 +9,13 @@ import numpy as np
 from ambjax.control.cascade import Cascade
 from ambjax.control.schedule import Schedule
 from ambjax.host.extensions import digest_of
-from ambjax.numerics.records import is_traced, leaf, replaced
+from ambjax.numerics.records import bounded, is_traced, replaced
 from ambjax.numerics.shapes import axes_of, with_entry
 from ambjax.world.scenario import Scenario
 from ambjax.world.waveforms import Constant
 
 SHIFT = "shift"
-TIME = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="time by which start and stop are shifted together")
+TIME = bounded(0.0, "s", -1e9, 1e9, "time by which start and stop are shifted together")
 
 
 class Place(NamedTuple):
@@ -46,15 +46,8 @@ def places(cascade: Cascade, scenario: Scenario) -> dict[str, Place]:
     table |= numbers_in(cascade.processor, "processor", (0, "processor"))
     notch = numbers_in(cascade.notch, "controller.notch", (0, "notch"))
     table |= {path: place for path, place in notch if "rotor" not in place.route}  # that of the scenario replaces it
-    names = {
-        "plant": "plant",
-        "reference": "reference",
-        "rotor": "rotor",
-        "disturbance.q_i": "q_i",
-        "sensor": "sensor",
-        "actuator": "amplifier",
-    }
-    names |= {"initial": "initial", "disturbance.base": "base"}
+    names = {name: name for name in ("plant", "reference", "rotor")} | {"disturbance.q_i": "q_i"}
+    names |= {"sensor": "sensor", "actuator": "amplifier", "initial": "initial", "disturbance.base": "base"}
     acting = [slot for slot in ("q_z", "q_v", "q_f") if not _absent(getattr(scenario, slot))] or ["q_z"]
     names |= {f"disturbance.{slot if len(acting) > 1 else 'q_z'}": slot for slot in acting}
     for path, name in names.items():

@@ -15,6 +15,7 @@ from ambjax.control.cascade import Cascade
 from ambjax.ensemble.design import DESIGNS, design_points
 from ambjax.ensemble.distributions import Choice, Distribution, Percent
 from ambjax.ensemble.paths import Place, order_pairs, places, with_values
+from ambjax.host.sealed import Arrays
 from ambjax.numerics.declared import numbers, within
 from ambjax.text.words import hint_of_path
 from ambjax.world.scenario import POLE, Scenario
@@ -38,13 +39,10 @@ class Spread:
 
     @property
     def paths(self) -> tuple[str, ...]:
-        """The dotted paths in order."""
         return tuple(path for path, _ in self.entries)
 
 
-def draw(
-    spread: Spread, cascade: Cascade, scenario: Scenario, seed: int, members: np.ndarray, total: int
-) -> dict[str, np.ndarray]:
+def draw(spread: Spread, cascade: Cascade, scenario: Scenario, seed: int, members: np.ndarray, total: int) -> Arrays:
     """Draw the values of `members` (integers [n]) of an ensemble of `total` members.
 
     Returns the values by dotted path, float64 [n]. The values of member k depend only on (seed, k), and for a Latin
@@ -53,9 +51,7 @@ def draw(
     return drawn(spread, check_spread(spread, cascade, scenario), seed, members, total)
 
 
-def drawn(
-    spread: Spread, known: Mapping[str, Place], seed: int, members: np.ndarray, total: int
-) -> dict[str, np.ndarray]:
+def drawn(spread: Spread, known: Mapping[str, Place], seed: int, members: np.ndarray, total: int) -> Arrays:
     """Draw the values as `draw` does. `known`: the numbers of a checked spread by dotted path."""
     u = design_points(spread.design, seed, len(spread.entries), members, total)
     return {path: kind.quantile(u[:, n], _nominal(known[path])) for n, (path, kind) in enumerate(spread.entries)}

@@ -49,9 +49,8 @@ def summary(
     drivers of lost_at_s and in `worst`.
 
     A metric that is infinite for some survivors (a time never reached) has quantiles, but no mean, standard deviation
-    or CVaR; `finite` counts its finite values. Without survivors all its statistics are None. `drivers` and
-    `explained` are
-    the results of `ensemble.drivers.drivers`. `worst` lists lost and stalled members by time, then survivors by
+    or CVaR; `finite` counts its finite values. Without survivors all its statistics are None. `drivers` and `explained`
+    are the results of `ensemble.drivers.drivers`. `worst` lists lost and stalled members by time, then survivors by
     `deciding` in descending order. `notes` names the statistics whose intervals are not reliable.
 
     Raises ValueError if there is no column `deciding`, and as `column_of` does: for a column that is empty, contains
@@ -66,9 +65,8 @@ def summary(
     stalled = ended & np.asarray(columns["stalled"], bool)
     survivors = int(np.sum(~ended))
     held = {name: x[~ended] for name, x in metrics.items()}
-    ranking, accounts = _drivers(
-        {path: column_of(columns[SPREAD + path]) for path in spread_names}, held, lost_at, confidence
-    )
+    spread = {path: column_of(columns[SPREAD + path]) for path in spread_names}
+    ranking, accounts = _drivers(spread, held, lost_at, confidence)
     return {
         "members": len(lost_at),
         "survivors": survivors,

@@ -106,22 +106,18 @@ class Store:
 
     @property
     def parts(self) -> Chunks:
-        """The chunks on disk."""
         return Chunks(self.chunks, self.members, self.chunk, checksum_of(self.facts))
 
     def spans(self) -> list[Span]:
-        """Return all chunks in order as (first member, last member + 1); an empty list before `cut`."""
         return self.parts.spans()
 
     def count(self) -> int:
-        """Return the number of members on disk."""
         if self.path.exists() and not self.chunks.exists():
             return self.members
         parts = self.parts
         return sum(stop - start for start, stop in parts.spans() if parts.path((start, stop)).exists())
 
     def put(self, span: Span, columns: Arrays) -> None:
-        """Write a finished chunk. Raises ValueError if it cannot be written."""
         self.parts.put(span, columns)
 
     def finish(self) -> pathlib.Path:
@@ -147,7 +143,6 @@ class Store:
         return self.path
 
     def begun(self) -> bool:
-        """Return whether the directory holds a study."""
         return self.manifest.exists()
 
     def finished(self) -> bool:

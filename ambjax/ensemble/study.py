@@ -14,7 +14,7 @@ from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.blocks import Blocks
 from ambjax.ensemble.paths import Place, kinds, places
 from ambjax.ensemble.spread import Spread, apply, draw
-from ambjax.host.sealed import provenance
+from ambjax.host.sealed import Arrays, provenance
 from ambjax.numerics.records import replaced
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.metrics import Metrics
@@ -47,7 +47,7 @@ class Bands(NamedTuple):
 
     t: np.ndarray
     trajectory: Trajectory
-    signals: dict[str, np.ndarray]
+    signals: Arrays
     extremes: dict[str, tuple[np.ndarray, np.ndarray]]
 
 
@@ -67,11 +67,10 @@ class AnyStudy(abc.ABC):
 
     @property
     def varies(self) -> bool:
-        """Whether the members differ."""
         return bool(self.spread.entries) or self.random
 
     @abc.abstractmethod
-    def drawn(self, members: np.ndarray) -> dict[str, np.ndarray]:
+    def drawn(self, members: np.ndarray) -> Arrays:
         """Draw the spread quantities of these members (integers [n]); arrays [n] by dotted path."""
 
     @abc.abstractmethod
@@ -91,9 +90,7 @@ class AnyStudy(abc.ABC):
         """Return the study with another value of a number for which `rereads` is true; runs have the same duration."""
 
     @abc.abstractmethod
-    def metrics(
-        self, values: dict[str, np.ndarray], members: np.ndarray, *, lost: bool = False, **how: Any
-    ) -> dict[str, np.ndarray]:
+    def metrics(self, values: Arrays, members: np.ndarray, *, lost: bool = False, **how: Any) -> Arrays:
         """Simulate systems with these values [n] by dotted path, and return lost_at (s) and their metrics, [n] by name.
 
         `members` [n]: numbers of the members whose random signals they have. `lost` and, in `how`, `call`
@@ -158,14 +155,14 @@ class Study(AnyStudy):
     def random(self) -> bool:
         return self.scenario.random
 
-    def drawn(self, members: np.ndarray) -> dict[str, np.ndarray]:
+    def drawn(self, members: np.ndarray) -> Arrays:
         return draw(self.spread, self.cascade, self.scenario, self.seed, members, self.members)
 
     def batch(self, members: np.ndarray) -> tuple[Cascade, Scenario]:
         """Return the cascade and scenario of these members (integers [n]); leaves that vary are arrays [n]."""
         return self.varied(self.drawn(members), members)
 
-    def varied(self, values: dict[str, np.ndarray], members: np.ndarray) -> tuple[Cascade, Scenario]:
+    def varied(self, values: Arrays, members: np.ndarray) -> tuple[Cascade, Scenario]:
         """Return the cascade and scenario with these values [n], and with the random signals of these members [n]."""
         cascade, scenario = apply(self.cascade, self.scenario, values)
         return cascade, dataclasses.replace(scenario, seed=self.seed, member=members)
@@ -178,9 +175,7 @@ class Study(AnyStudy):
         samples = max(round(float(self.clock.duration) / value), 1)
         return dataclasses.replace(self, clock=replaced(self.clock, samples=samples, sample_period=value))
 
-    def metrics(
-        self, values: dict[str, np.ndarray], members: np.ndarray, *, lost: bool = False, **how: Any
-    ) -> dict[str, np.ndarray]:
+    def metrics(self, values: Arrays, members: np.ndarray, *, lost: bool = False, **how: Any) -> Arrays:
         cascade, scenario = self.varied(values, members)
         if lost:
             far = np.full(np.shape(scenario.initial.z), 2 * np.max(np.asarray(scenario.limit)))

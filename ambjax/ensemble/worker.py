@@ -11,10 +11,9 @@ import warnings
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 
-import numpy as np
-
 from ambjax.compiler.traced_programs import store_in
 from ambjax.ensemble.study import AnyStudy
+from ambjax.host.sealed import Arrays
 
 # Members in one call of the compiled program on a CPU. The last digit of a result may depend on it. It is fixed, so
 # that no result depends on the number of cores or on the process that computes a chunk.
@@ -56,7 +55,7 @@ def configure_jax() -> None:
 
 def chunk(
     study: AnyStudy, start: int, stop: int, size: int, threads: int | None = None, *, lost: bool = False
-) -> dict[str, np.ndarray]:
+) -> Arrays:
     """Simulate members start <= k < stop of a study, and return their columns.
 
     `size`: members in one call of the program on an accelerator; on a CPU, a call has CALL members. `threads`: CPU
@@ -68,7 +67,7 @@ def chunk(
     return study.columns(start, stop, call=call, threads=threads, lost=lost)
 
 
-def work(study: bytes, start: int, stop: int, size: int) -> dict[str, np.ndarray]:
+def work(study: bytes, start: int, stop: int, size: int) -> Arrays:
     """Simulate a chunk of a study in a worker process, on one core, and return its columns.
 
     `study`: pickled. Before JAX is configured, the arrays of JAX in it would be read as float32.

@@ -15,7 +15,7 @@ from ambjax.linear.equilibrium import TOLERANCE, at_rest, ideal, inverse, newton
 from ambjax.numerics.records import Scalar
 from ambjax.numerics.small_matrices import times
 from ambjax.numerics.smooth import TWO_PI
-from ambjax.simulation.joint_laws import forces, inputs_of
+from ambjax.simulation.machine_axes import forces, inputs_of
 from ambjax.simulation.machine_kinds import SampledMachine
 from ambjax.simulation.whole_machine import Machine, MachineState, PlantOnly, still
 from ambjax.world.rotation import PER_MINUTE

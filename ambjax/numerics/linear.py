@@ -5,7 +5,7 @@ vector lane per member). A library call would take longer than the arithmetic.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -30,11 +30,8 @@ def choose(condition: Array | bool, yes: S, no: S) -> S:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
-class Factors(NamedTuple):
-    """The factors L and U of I - g J in one table. Elimination goes from the last component to the first."""
-
-    table: list[list[Array]]
-    inverse_pivots: list[Array]
+# The factors L and U of I - g J in one table, and the inverse pivots. Elimination goes from the last component on.
+Factors = tuple[list[list[Array]], list[Array]]
 
 
 def jacobian(function: Callable[[S], object], state: S) -> list[list[Array]]:
@@ -73,7 +70,7 @@ def factor(jac: list[list[Array]], g: Scalar) -> Factors:
             m[i][k] = m[i][k] * inverses[k]
             for j in range(k + 1, n):
                 m[i][j] = m[i][j] - m[i][k] * m[k][j]
-    return Factors(m, inverses)
+    return m, inverses
 
 
 def solve(factors: Factors, right: S) -> S:

@@ -72,6 +72,11 @@ def leaf(
     return dataclasses.field(default=default, metadata=metadata)
 
 
+def bounded(default: object, unit: str, at_least: float, at_most: float, doc: str, **more: Any) -> Any:
+    """Declare a numeric field with a default and inclusive bounds. The arguments are those of `leaf`."""
+    return leaf(default, unit=unit, at_least=at_least, at_most=at_most, doc=doc, **more)
+
+
 def matrix(shape: str, doc: str, **more: Any) -> Any:
     """Declare a field with a matrix or a vector of any size. The arguments are those of `leaf`."""
     return leaf(shape=shape, at_least=-1e30, at_most=1e30, doc=doc, **more)
@@ -83,7 +88,7 @@ GAINS = 1e-30, 1e30
 
 
 def gain(
-    *, default: object, unit: str, doc: str, steepness: bool = False, zero: bool = False, optional: bool = False
+    default: object, unit: str, doc: str, *, steepness: bool = False, zero: bool = False, optional: bool = False
 ) -> Any:
     """Declare a gain: a positive numeric field of a law, which the tuner varies on a logarithmic scale.
 
@@ -93,9 +98,7 @@ def gain(
     the gain off. Returns the dataclass field.
     """
     above, at_least = (None, 0.0) if zero else (GAINS[0], None)
-    plain = leaf(
-        default=default, unit=unit, doc=doc, above=above, at_least=at_least, at_most=GAINS[1], infinite=steepness
-    )
+    plain = leaf(default, unit=unit, doc=doc, above=above, at_least=at_least, at_most=GAINS[1], infinite=steepness)
     metadata = {**plain.metadata, "steepness": steepness, "optional": optional}
     return dataclasses.field(default=default, metadata=metadata)
 
@@ -133,7 +136,7 @@ def part(*, default: object = dataclasses.MISSING, doc: str, channels: bool = Fa
     return dataclasses.field(default=default, metadata={"doc": doc, "channels": channels})
 
 
-@dataclass_transform(frozen_default=True, field_specifiers=(leaf, gain, static, derived, part, dataclasses.field))
+@dataclass_transform(frozen_default=True, field_specifiers=(leaf, static, derived, part, dataclasses.field))
 def record(cls: type[T]) -> type[T]:
     """Make `cls` a frozen dataclass and register it as a pytree.
 

@@ -66,7 +66,6 @@ class _WhileLoop(NamedTuple):
         return loop(*map(jnp.asarray, constants), *begin)
 
     def with_tangents(self, constants: Values, begin: Values, tangents: Values) -> tuple[list[Array], list[Any]]:
-        """Return the carry after the loop, and its tangents."""
         moving = [n for n, x in enumerate(tangents[: len(constants)]) if type(x) is not SymbolicZero]
         moving = [n for n in moving if jnp.issubdtype(constants[n].dtype, jnp.inexact)]
         real = [n for n, x in enumerate(begin) if jnp.issubdtype(x.dtype, jnp.inexact)]
@@ -94,10 +93,7 @@ class _Varied(NamedTuple):
     moving: list[int]
     real: list[int]
 
-    def step(
-        self, constants: Values, carry: Values, moving: list[Array], real: list[Array]
-    ) -> tuple[list[Array], list[Array]]:
-        """Return the varied components of the carry after one step, and the whole carry."""
+    def step(self, constants: Values, carry: Values, moving: Values, real: Values) -> tuple[list[Array], list[Array]]:
         constants, carry = _replaced(constants, self.moving, moving), _replaced(carry, self.real, real)
         after = self.loop.step(constants, carry)
         return [after[n] for n in self.real], after
@@ -178,9 +174,7 @@ def _jvp(primals: Values, tangents: Values, **how: Any) -> tuple[list[Any], list
     return jax.jvp(lambda *x: _forwards(*x, **how), tuple(primals), tuple(ad.instantiate_zeros(x) for x in tangents))
 
 
-def _transpose(
-    cotangents: Values, *args: Any, forwards: Any, backwards: Any, sizes: tuple[int, int, int]
-) -> list[Array | None]:
+def _transpose(cotangents: Values, *args: Any, forwards: Any, backwards: Any, sizes: Any) -> list[Array | None]:
     constants, begin, _, _ = _grouped(args, sizes)
     d_constants, d_begin = backwards(list(constants), list(begin), [ad.instantiate_zeros(x) for x in cotangents])
     return [*[None] * (len(constants) + len(begin)), *d_constants, *d_begin]

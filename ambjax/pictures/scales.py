@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 
-from ambjax.simulation import orders
+from ambjax.simulation import response
 from ambjax.simulation.metrics import UNITS
 
 # Matplotlib's default without offsets of axes, independent of any matplotlibrc file.
@@ -49,7 +49,7 @@ LABELS = {
     "lost_at_s": "lost at",
     "singular_at_s": "singular at",
 }
-for _name, _unit in orders.UNITS.items():
+for _name, _unit in response.UNITS.items():
     _signal, _order, _ = _name.split("_")
     LABELS[_name] = f"{'phase' if _unit == 'deg' else 'amplitude'} of {_signal} at {_order}"
 # Metrics that are shown in another unit than that of `UNITS`: the factor to this unit, and the unit.

@@ -9,9 +9,8 @@ from jax import Array, lax
 from ambjax.numerics.linear import choose
 from ambjax.numerics.records import Scalar, leaf, record, static
 from ambjax.numerics.reversible import while_loop
-from ambjax.simulation.integrate import Advanced, Begin, InitialValueProblem, Inputs, State, Times, stage_times
-from ambjax.simulation.span import Instant, Span, blank
-from ambjax.simulation.trajectory import ALIVE, STALLED
+from ambjax.simulation.integrate import Advanced, Begin, InitialValueProblem, Times, stage_times
+from ambjax.simulation.trajectory import ALIVE, STALLED, Instant, Span, blank
 
 
 class Attempt(NamedTuple):
@@ -65,7 +64,11 @@ class AdaptiveSteps:
     most_steps: int = static(default=10_000, doc="trial steps per sample period after which the run stalls")
 
     limit = None
+    title: ClassVar[str]
     ORDER: ClassVar[int]
+
+    def __str__(self) -> str:
+        return f"{self.title}, adaptive, tolerance {float(self.tolerance):g}"
 
     def step_size(self, period: float) -> float | None:
         return None
@@ -73,12 +76,10 @@ class AdaptiveSteps:
     def start(self, period: Scalar) -> Array:
         return jnp.asarray(period) * 1e-3
 
-    def _attempt(self, problem: InitialValueProblem[Inputs, State], at: Times, h: Array, state: State) -> Attempt:
+    def _attempt(self, problem: InitialValueProblem, at: Times, h: Array, state: Any) -> Attempt:
         raise NotImplementedError
 
-    def advance(
-        self, problem: InitialValueProblem[Inputs, State], begin: Begin[State], period: Scalar
-    ) -> Advanced[State]:
+    def advance(self, problem: InitialValueProblem, begin: Begin, period: Scalar) -> Advanced:
         (t, state, memory, code), period = begin, jnp.asarray(period)
 
         def unfinished(now: _Progress) -> Array:
@@ -89,13 +90,13 @@ class AdaptiveSteps:
             goal = problem.edges.until(t + now.elapsed, left)
             last = now.h * 1.0001 >= goal
             step = jnp.where(last, goal, now.h)
-            tried = self._attempt(problem, stage_times(t + now.elapsed, step), step, cast(State, now.state))
+            tried = self._attempt(problem, stage_times(t + now.elapsed, step), step, now.state)
             size = self._size(tried.error, now.state, tried.state, problem)
             accept = size <= 1
             suggestion = step * jnp.clip(0.9 * jnp.maximum(size, 1e-9) ** (-1 / self.ORDER), 0.2, 5.0)
             # A step that an edge or the end of the sample shortened must not reduce the next step.
             h = jnp.where(last & accept, jnp.maximum(now.h, suggestion), suggestion)
-            verdict = jnp.where(accept, problem.status(cast(State, tried.state)), ALIVE)
+            verdict = jnp.where(accept, problem.status(tried.state), ALIVE)
             span, before = self._recorded(now, tried, step, problem.jumps & (now.elapsed == 0))
             end = jnp.where(last & (goal >= left), period, now.elapsed + step)
             return _Progress(
@@ -107,7 +108,7 @@ class AdaptiveSteps:
                 now.trials + 1,
                 jnp.where(accept, before, now.before),
                 choose(accept, span, now.span),
-                choose(accept, (now.elapsed, problem.moving(cast(State, tried.state))), now.last),
+                choose(accept, (now.elapsed, problem.moving(tried.state)), now.last),
             )
 
         zero, code = jnp.zeros_like(period), jnp.asarray(code, jnp.int32)
@@ -116,7 +117,7 @@ class AdaptiveSteps:
             state, h, h, zero, code, jnp.int32(0), zero, blank(problem.instant_structure), (zero, problem.moving(state))
         )
         done = while_loop(unfinished, trial, first)
-        x = cast(State, done.state)
+        x = done.state
         end = problem.rates_and_signals(problem.inputs(stage_times(t, done.elapsed)(1.0)), x)[1]
         span = choose(done.elapsed > 0, done.span.with_instant(end, done.before / 2), done.span)
         stalled = (done.code == ALIVE) & (done.elapsed < period)

@@ -12,7 +12,7 @@ from ambjax.numerics.records import Scalar
 from ambjax.simulation.edges import NO_EDGES, Edges
 from ambjax.simulation.integrate import InitialValueProblem
 from ambjax.simulation.loop import ClosedLoop, ExternalInputs
-from ambjax.simulation.span import INSTANT_TREE, Densities, Instant, Sizes
+from ambjax.simulation.trajectory import INSTANT_TREE, Densities, Instant, Sizes
 from ambjax.world.amplifier import Amplifier, CurrentAmplifier, difference
 from ambjax.world.faults import Sensed
 
@@ -44,7 +44,9 @@ class SampledState(NamedTuple):
     sensed: Sensed | tuple[()] = ()
 
 
+# A voltage (V) as a function of time; such functions with the durations (s) for which they act.
 Voltage = Callable[[Scalar], Array]
+Acting = list[tuple[Voltage, Scalar]]
 
 
 def acting(voltages: tuple[Array, ...], delay: Array, period: Scalar, whole: bool) -> list[tuple[Array, Scalar]]:
@@ -77,7 +79,7 @@ def amplified(
     u_a: Array | tuple[()],
     commanded: Sequence[tuple[Array, Scalar]],
     divided: bool = True,
-) -> tuple[list[tuple[Voltage, Scalar]], Array | tuple[()]]:
+) -> tuple[Acting, Array | tuple[()]]:
     """Return the amplifier's voltage as functions of time with their durations (s), and its output voltage at the end.
 
     `u_a`: output voltage at t (V). For an amplifier that applies the command at once it is (), also in the result.
@@ -98,12 +100,7 @@ def amplified(
 
 
 def subproblems(
-    loop: ClosedLoop,
-    state: object,
-    command: Command,
-    t: Array,
-    voltages: list[tuple[Voltage, Scalar]],
-    cuts: int | None,
+    loop: ClosedLoop, state: object, command: Command, t: Array, voltages: Acting, cuts: int | None
 ) -> list[tuple[InitialValueProblem, Scalar]]:
     """Return the initial value problems from t (s) on, with their durations (s), for the voltages that act.
 
@@ -159,16 +156,7 @@ def under(loop: ClosedLoop, state: object, command: Command, voltage: Voltage, e
     def status(x: object) -> Array:
         return plant_status(loop, x)
 
-    scale = jax.tree.map(jnp.asarray, plant.scale())
+    scale, limit = jax.tree.map(jnp.asarray, plant.scale()), loop.scenario.limit
     return InitialValueProblem(
-        inputs,
-        rates,
-        scale,
-        status,
-        None,
-        observed,
-        INSTANT_TREE,
-        edges=edges,
-        motion=loop.motion,
-        limit=loop.scenario.limit,
+        inputs, rates, scale, status, None, observed, INSTANT_TREE, edges=edges, motion=loop.motion, limit=limit
     )

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, cast, overload
 
 from ambjax.control.cascade import Cascade
-from ambjax.numerics.records import Scalar, derived, leaf, part, record, replaced, static
+from ambjax.numerics.records import Scalar, bounded, derived, part, record, replaced, static
 from ambjax.simulation.integrate import Integrator
 from ambjax.world.scenario import Scenario
 
@@ -15,9 +15,7 @@ class Clock:
     """Number of samples, sample period, and the integrator between samples."""
 
     samples: int = static(default=20_000, doc="number of sample periods")
-    sample_period: Scalar = leaf(
-        default=1e-4, unit="s", at_least=1e-9, at_most=1e6, doc="sample period; each measurement error is held for it"
-    )
+    sample_period: Scalar = bounded(1e-4, "s", 1e-9, 1e6, "sample period; each measurement error is held for it")
     method: Integrator | None = part(default=None, doc="the integrator; None: `ambjax.solvers.with_method` chooses it")
     # Largest number of edges inside one sample, from `with_method`. None: of all edges on a processor, otherwise 0.
     cuts: int | None = derived()
@@ -37,7 +35,6 @@ class Clock:
         return self.method
 
     def with_method(self, method: Integrator | None) -> "Clock":
-        """Return this clock with another integrator."""
         return replaced(self, method=method)
 
 

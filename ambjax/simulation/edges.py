@@ -46,9 +46,7 @@ class Edges(NamedTuple):
             t, left = t + lengths[-1], left - lengths[-1]
         return [*lengths, left]
 
-    def steps(
-        self, t: Scalar, h: Scalar, count: int
-    ) -> tuple[Any, Callable[[Array, Any], tuple[Array, Array, Array, Any]]]:
+    def steps(self, t: Scalar, h: Scalar, count: int) -> tuple[Any, Callable[[Array, Any], tuple]]:
         """Divide `count` equal steps of length h, from t on, at the edges inside them.
 
         Returns the position before the first step, and a function from the number of a step, 0 to `count` + `most` - 1,

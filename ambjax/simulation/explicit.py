@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,8 @@ from jax import Array
 from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.numerics.records import Scalar, record
 from ambjax.simulation.adaptive import AdaptiveSteps, Attempt
-from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, State, Times
-from ambjax.simulation.span import Instant, Span
+from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Times
+from ambjax.simulation.trajectory import Instant, Span
 
 
 @functools.cache
@@ -52,10 +52,7 @@ class _Tableau:
     TIMES: ClassVar[tuple[float, ...]]
     ROWS: ClassVar[tuple[tuple[float, ...], ...]]
 
-    def _stages(
-        self, problem: InitialValueProblem[Inputs, State], at: Times, h: Array, state: State
-    ) -> tuple[State, list[State], list[Instant]]:
-        """Return the new state, and the rates and the signals of all stages."""
+    def _stages(self, problem: InitialValueProblem, at: Times, h: Array, state: Any) -> tuple[Any, list, list[Instant]]:
         inputs = {share: problem.inputs(at(share)) for share in self.TIMES}
         x, rates, instants = state, [], []
         for share, row in zip(self.TIMES, self.ROWS, strict=True):
@@ -70,9 +67,7 @@ class _Tableau:
 class _Explicit(_Tableau, FixedSteps):
     """Base class of explicit Runge-Kutta methods with equal substeps."""
 
-    def _step(
-        self, problem: InitialValueProblem[Inputs, State], at: Times, h: Scalar, state: State, span: Span
-    ) -> tuple[State, Span]:
+    def _step(self, problem: InitialValueProblem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
         h = jnp.asarray(h)
         x, _, (first, *others) = self._stages(problem, at, h, state)
         # Integrals use the weights of the method. Only the first stage counts for extremes; the others are trial
@@ -90,12 +85,10 @@ class Euler(_Explicit):
     Use it only for comparisons, with many substeps: `Clock(1000, 1e-4, solvers.Euler(100))`.
     """
 
+    title = "explicit Euler"
     limit = 2.0
     TIMES = (0.0,)
     ROWS = ((1.0,),)
-
-    def __str__(self) -> str:
-        return f"explicit Euler, {self.steps}"
 
 
 @record
@@ -105,12 +98,10 @@ class RK4(_Explicit):
     Use it where a fixed number of steps is wanted and the loop is not stiff: `Clock(1000, 1e-4, solvers.RK4(4))`.
     """
 
+    title = "RK4"
     limit = 2.785
     TIMES = (0.0, 1 / 2, 1 / 2, 1.0)
     ROWS = ((1 / 2,), (0.0, 1 / 2), (0.0, 0.0, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6))
-
-    def __str__(self) -> str:
-        return f"RK4, {self.steps}"
 
 
 @record
@@ -125,6 +116,7 @@ class DOP853(_Explicit):
     `Clock(1000, 1e-4, solvers.DOP853(1))` takes one step per sample.
     """
 
+    title = "DOP853"
     limit = 6.39
     # fmt: off
     TIMES = (0.0, 0.05260015195876773, 0.0789002279381516, 0.1183503419072274, 0.2816496580927726, 1 / 3, 1 / 4,
@@ -151,9 +143,6 @@ class DOP853(_Explicit):
     )
     # fmt: on
 
-    def __str__(self) -> str:
-        return f"DOP853, {self.steps}"
-
 
 @record
 class AdaptiveCashKarp(_Tableau, AdaptiveSteps):
@@ -168,6 +157,7 @@ class AdaptiveCashKarp(_Tableau, AdaptiveSteps):
     `Clock(1000, 1e-4, solvers.AdaptiveCashKarp(1e-8))` sets the allowed error.
     """
 
+    title = "Cash-Karp 5(4)"
     ORDER = 5
     TIMES = (0.0, 1 / 5, 3 / 10, 3 / 5, 1.0, 7 / 8)
     ROWS = (
@@ -180,13 +170,10 @@ class AdaptiveCashKarp(_Tableau, AdaptiveSteps):
     )
     ERROR = (-277 / 64512, 0.0, 6925 / 370944, -6925 / 202752, -277 / 14336, 277 / 7084)
 
-    def _attempt(self, problem: InitialValueProblem[Inputs, State], at: Times, h: Array, state: State) -> Attempt:
-        def total(weights: tuple[float, ...], trees: list[State]) -> State:
+    def _attempt(self, problem: InitialValueProblem, at: Times, h: Array, state: Any) -> Attempt:
+        def total(weights: tuple[float, ...], trees: list[Any]) -> Any:
             return jax.tree.map(lambda *ks: h * sum(w * k for w, k in zip(weights, ks, strict=True) if w), *trees)
 
         new, rates, instants = self._stages(problem, at, h, state)
         integrals = total(self.ROWS[-1], [x.densities for x in instants])
         return Attempt(new, total(self.ERROR, rates), instants[0], integrals)
-
-    def __str__(self) -> str:
-        return f"Cash-Karp 5(4), adaptive, tolerance {float(self.tolerance):g}"

@@ -11,10 +11,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.law_trial import reason
-from ambjax.numerics.records import Scalar, leaf, part, record, static
+from ambjax.numerics.records import Scalar, bounded, leaf, part, record, static
 from ambjax.numerics.smooth import larger, safe_sqrt, smaller
-from ambjax.simulation.span import Span
-from ambjax.simulation.trajectory import Row, first_time
+from ambjax.simulation.trajectory import Row, Span, first_time
 
 # Types of the numbers that a fold carries from one sample to the next, and of its result: pytrees.
 Carry = TypeVar("Carry")
@@ -41,7 +40,7 @@ class Fold(Protocol[Carry, Result]):
 
     - `init()`: the carry before the first sample: arrays of fixed shapes.
     - `update(carry, row, span)`: the next carry. `row` contains the signals at the start of a sample; `span` contains
-      extremes and integrals of signals from there to the next (`simulation.span`).
+      extremes and integrals of signals from there to the next (`simulation.trajectory.Span`).
     - `result(carry, ending)`: the numbers, as `Result.metrics`. `ending`: loss and duration of the run.
     """
 
@@ -77,15 +76,24 @@ def _signal(row: Row, name: str) -> Array:
 
 
 @record
-class Peak:
-    """Largest absolute value of a signal, also between samples if the span contains its extremes."""
+class OfSignal:
+    """Base class of the folds of one signal. By default, two numbers are carried, which are the result."""
 
     of: str = static(doc="name of the signal, a field of a Row")
-    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6, doc="start of the evaluation")
-    timed: bool = static(default=False, doc="return (value, time): the start (s) of the sample with the maximum")
 
-    def init(self) -> tuple[Array, Array]:
+    def init(self) -> Any:
         return _zero(), _zero()
+
+    def result(self, carry: Any, ending: Ending) -> Any:
+        return carry
+
+
+@record
+class Peak(OfSignal):
+    """Largest absolute value of a signal, also between samples if the span contains its extremes."""
+
+    after: Scalar = bounded(0.0, "s", 0, 1e6, "start of the evaluation")
+    timed: bool = static(default=False, doc="return (value, time): the start (s) of the sample with the maximum")
 
     def update(self, carry: tuple[Array, Array], row: Row, span: Span) -> tuple[Array, Array]:
         peak, when = carry
@@ -100,10 +108,8 @@ class Peak:
 
 
 @record
-class Lowest:
+class Lowest(OfSignal):
     """Smallest value of the signal `of` over the samples at which the rotor is held. Result: (value, time in s)."""
-
-    of: str = static(doc="name of the signal, a field of a Row")
 
     def init(self) -> tuple[Array, Array]:
         return _zero() + jnp.inf, _zero()
@@ -114,23 +120,16 @@ class Lowest:
         new = (value < least) & row.alive
         return jnp.where(new, value, least), jnp.where(new, row.t, when)
 
-    def result(self, carry: tuple[Array, Array], ending: Ending) -> tuple[Array, Array]:
-        return carry
-
 
 @record
-class Rms:
+class Rms(OfSignal):
     """Root mean square of the signal `of` over the samples from `after` (s) on.
 
     `driven`: only over the samples before the rotor is lost, while the drive is on.
     """
 
-    of: str = static(doc="name of the signal, a field of a Row")
-    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6, doc="start of the evaluation")
+    after: Scalar = bounded(0.0, "s", 0, 1e6, "start of the evaluation")
     driven: bool = static(default=False)
-
-    def init(self) -> tuple[Array, Array]:
-        return _zero(), _zero()
 
     def update(self, carry: tuple[Array, Array], row: Row, span: Span) -> tuple[Array, Array]:
         total, count = carry
@@ -142,15 +141,11 @@ class Rms:
 
 
 @record
-class Driven:
+class Driven(OfSignal):
     """Mean over time of the density `of`, from `after` (s) until the rotor is lost; its square root if `root`."""
 
-    of: str = static(doc="name of the signal, a field of a Row")
-    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6, doc="start of the evaluation")
+    after: Scalar = bounded(0.0, "s", 0, 1e6, "start of the evaluation")
     root: bool = static(default=False)
-
-    def init(self) -> tuple[Array, Array]:
-        return _zero(), _zero()
 
     def update(self, carry: tuple[Array, Array], row: Row, span: Span) -> tuple[Array, Array]:
         counts = row.t >= self.after
@@ -172,7 +167,7 @@ class Variation:
     the rise time of any drive.
     """
 
-    after: Scalar = leaf(default=0.0, unit="s", at_least=0, at_most=1e6, doc="start of the evaluation")
+    after: Scalar = bounded(0.0, "s", 0, 1e6, "start of the evaluation")
 
     def init(self) -> tuple[Array, Array, Array]:
         return _zero(), _zero(), jnp.asarray(False)
@@ -187,10 +182,8 @@ class Variation:
 
 
 @record
-class Count:
+class Count(OfSignal):
     """Number of samples at which the boolean signal `of` is true."""
-
-    of: str = static(doc="name of the signal, a field of a Row")
 
     def init(self) -> Array:
         return _zero()
@@ -198,15 +191,11 @@ class Count:
     def update(self, carry: Array, row: Row, span: Span) -> Array:
         return carry + _signal(row, self.of)
 
-    def result(self, carry: Array, ending: Ending) -> Array:
-        return carry
-
 
 @record
-class Reaching:
+class Reaching(OfSignal):
     """Start of the first sample in which the absolute value of the signal `of` is at most `band`, s; +inf: never."""
 
-    of: str = static(doc="name of the signal, a field of a Row")
     band: Scalar = leaf(above=0, at_most=1e30, doc="the band, in the unit of the signal")
 
     def init(self) -> Array:
@@ -217,9 +206,6 @@ class Reaching:
         if self.of in getattr(span.least, "_fields", ()):
             value = smaller(value, getattr(span.least, self.of))
         return first_time((value <= self.band) & row.alive, row.t, carry)
-
-    def result(self, carry: Array, ending: Ending) -> Array:
-        return carry
 
 
 @record

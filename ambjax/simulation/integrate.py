@@ -3,9 +3,7 @@
     advance(problem, Begin(t, state, memory, code=0), period) -> Advanced(state, code, t, memory, span)
 
 The state is any pytree of scalars. An integrator stops at the first state whose status code is not 0, and returns the
-state before it. If the initial code is not 0, the state does not change. `memory` is the data that the method carries
-from one sample to the next; `start(period)` returns the initial memory. `span` holds the extremes and integrals of
-signals over the sample (`ambjax.simulation.span`).
+state before it. `start(period)` returns the initial memory of the method.
 
 Stage times are moved into the step by a few units in the last place. A jump at the boundary of two steps then belongs
 to the second step. Otherwise the last stage of the first step would include the jump, and the method would be of first
@@ -13,7 +11,7 @@ order there.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -22,17 +20,13 @@ from ambjax.numerics.linear import choose
 from ambjax.numerics.records import Scalar, record, static
 from ambjax.numerics.smooth import away_from_zero
 from ambjax.simulation.edges import NO_EDGES, Edges, inset
-from ambjax.simulation.span import NOTHING, Instant, Span, blank
-from ambjax.simulation.trajectory import ALIVE, TOUCHED
+from ambjax.simulation.trajectory import ALIVE, NOTHING, TOUCHED, Instant, Span, blank
 
-State = TypeVar("State")
-# External inputs of a problem at one instant.
-Inputs = TypeVar("Inputs")
 # Time of a stage as a function of its fraction of the step, 0 to 1.
 Times = Callable[[float], Scalar]
 
 
-class InitialValueProblem(NamedTuple, Generic[Inputs, State]):
+class InitialValueProblem(NamedTuple):
     """An initial value problem, whose time derivative is rates(inputs(t), state).
 
     - `inputs`: external inputs as a function of time.
@@ -51,25 +45,25 @@ class InitialValueProblem(NamedTuple, Generic[Inputs, State]):
     - `limit`: |displacement| at which the status becomes TOUCHED; of each axis, if there are several.
     """
 
-    inputs: Callable[[Scalar], Inputs]
-    rates: Callable[[Inputs, State], State]
-    scale: State
-    status: Callable[[State], Array]
-    layer: State | None = None
-    observed: Callable[[Inputs, State], tuple[State, Instant]] | None = None
+    inputs: Callable[[Scalar], Any]
+    rates: Callable[[Any, Any], Any]
+    scale: Any
+    status: Callable[[Any], Array]
+    layer: Any = None
+    observed: Callable[[Any, Any], tuple[Any, Instant]] | None = None
     instant_structure: Instant = NOTHING
     jumps: Array | bool = False
-    slide: Callable[[Inputs, Inputs, Scalar, State, Span], tuple[State, Span]] | None = None
+    slide: Callable[[Any, Any, Scalar, Any, Span], tuple[Any, Span]] | None = None
     edges: Edges = NO_EDGES
-    motion: Callable[[State], tuple[Array, Array]] | None = None
+    motion: Callable[[Any], tuple[Array, Array]] | None = None
     limit: Scalar = jnp.inf
 
-    def moving(self, state: State) -> tuple[Array, Array] | tuple[()]:
+    def moving(self, state: Any) -> tuple[Array, Array] | tuple[()]:
         """Return the displacement and the velocity of the rotor; empty without a rotor."""
         return () if self.motion is None else self.motion(state)
 
     def ended(
-        self, before: State, after: tuple[Array, Array] | tuple[()], begin: Array, end: Array, code: Array
+        self, before: Any, after: tuple[Array, Array] | tuple[()], begin: Array, end: Array, code: Array
     ) -> Array:
         """Return the time of the end, s; if the last step reaches the limit, that at which |displacement| equals it.
 
@@ -100,12 +94,11 @@ class InitialValueProblem(NamedTuple, Generic[Inputs, State]):
         # The loop makes one turn, and none in an ensemble of which no member reaches the limit in this step.
         return lax.while_loop(lambda now: now[0], crossing, (touched, end))[1]
 
-    def rates_and_signals(self, inputs: Inputs, state: State) -> tuple[State, Instant]:
-        """Return the rates, and the signals to record."""
+    def rates_and_signals(self, inputs: Any, state: Any) -> tuple[Any, Instant]:
         return (self.rates(inputs, state), NOTHING) if self.observed is None else self.observed(inputs, state)
 
 
-class Begin(NamedTuple, Generic[State]):
+class Begin(NamedTuple):
     """Where an integration begins.
 
     - `t`, `state`: time, s, and the state there.
@@ -114,12 +107,12 @@ class Begin(NamedTuple, Generic[State]):
     """
 
     t: Scalar
-    state: State
+    state: Any
     memory: object
     code: Scalar = ALIVE
 
 
-class Advanced(NamedTuple, Generic[State]):
+class Advanced(NamedTuple):
     """Result of `advance`.
 
     - `state`: last state with status code 0.
@@ -129,7 +122,7 @@ class Advanced(NamedTuple, Generic[State]):
     - `span`: extremes and integrals of the signals.
     """
 
-    state: State
+    state: Any
     code: Array
     t: Array
     memory: object
@@ -150,21 +143,17 @@ class Integrator(Protocol):
 
     def start(self, period: Scalar) -> object: ...
 
-    def advance(
-        self, problem: InitialValueProblem[Inputs, State], begin: Begin[State], period: Scalar
-    ) -> Advanced[State]: ...
+    def advance(self, problem: InitialValueProblem, begin: Begin, period: Scalar) -> Advanced: ...
 
 
-def in_turn(
-    method: Integrator, parts: Sequence[tuple[InitialValueProblem[Inputs, State], Scalar]], begin: Begin[State]
-) -> list[Advanced[State]]:
+def in_turn(method: Integrator, parts: Sequence[tuple[InitialValueProblem, Scalar]], begin: Begin) -> list[Advanced]:
     """Integrate problems one after another, for a sample in which the rates jump at known instants.
 
     `parts`: pairs of a problem and its duration, s; the duration may be 0.
 
     Returns one result for each problem. The span of a result begins at the start of the first problem.
     """
-    reached = list[Advanced[State]]()
+    reached = list[Advanced]()
     for problem, time in parts:
         after = method.advance(problem, begin, time)
         if reached:
@@ -179,15 +168,13 @@ class WholeState:
     """Base class of a system (`rollout.System`) whose whole state is integrated, as one problem per sample."""
 
     def problem(self, errors: Any) -> InitialValueProblem:
-        """Return the initial value problem of one sample, with the measurement errors held."""
         raise NotImplementedError
 
-    def jump(self, t: Scalar, state: State, errors: object) -> State:
+    def jump(self, t: Scalar, state: Any, errors: object) -> Any:
         """Return the state: it does not jump at the start of a sample."""
         return state
 
-    def advance(self, method: Integrator, errors: object, begin: Begin[State], period: Scalar) -> Advanced[State]:
-        """Integrate the system from the beginning of a sample to the next one."""
+    def advance(self, method: Integrator, errors: object, begin: Begin, period: Scalar) -> Advanced:
         return method.advance(self.problem(errors), begin, period)
 
 
@@ -203,11 +190,10 @@ class FixedSteps:
 
     substeps: int = static(default=1, doc="steps per sample period")
     limit = None
+    title: ClassVar[str]
 
-    @property
-    def steps(self) -> str:
-        """The number of substeps in words."""
-        return f"{self.substeps} substep{'s' * (self.substeps != 1)}"
+    def __str__(self) -> str:
+        return f"{self.title}, {self.substeps} substep{'s' * (self.substeps != 1)}"
 
     def step_size(self, period: float) -> float | None:
         return period / self.substeps
@@ -215,19 +201,15 @@ class FixedSteps:
     def start(self, period: Scalar) -> tuple[()]:
         return ()
 
-    def _step(
-        self, problem: InitialValueProblem[Inputs, State], at: Times, h: Scalar, state: State, span: Span
-    ) -> tuple[State, Span]:
+    def _step(self, problem: InitialValueProblem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
         raise NotImplementedError
 
-    def advance(
-        self, problem: InitialValueProblem[Inputs, State], begin: Begin[State], period: Scalar
-    ) -> Advanced[State]:
+    def advance(self, problem: InitialValueProblem, begin: Begin, period: Scalar) -> Advanced:
         t, state, memory, code = begin
         h = jnp.asarray(period) / self.substeps
         place, steps = problem.edges.steps(t, h, self.substeps)
 
-        def body(number: Array, carry: tuple[State, Array, Any, Span, Any]) -> tuple[State, Array, Any, Span, Any]:
+        def body(number: Array, carry: tuple[Any, Array, Any, Span, Any]) -> tuple[Any, Array, Any, Span, Any]:
             x, code, last, span, place = carry
             alive = code == ALIVE
             # Times do not depend on the status, so that members share the times and the inputs at these times.

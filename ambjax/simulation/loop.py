@@ -17,8 +17,7 @@ from ambjax.numerics.smooth import larger, limited
 from ambjax.simulation.edges import Edges
 from ambjax.simulation.integrate import InitialValueProblem, WholeState
 from ambjax.simulation.sliding import slide, slides
-from ambjax.simulation.span import INSTANT_TREE, Densities, Instant, Sizes, Span
-from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED, Row
+from ambjax.simulation.trajectory import ALIVE, DIVERGED, INSTANT_TREE, TOUCHED, Densities, Instant, Row, Sizes, Span
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.waveforms import Reference, reference_at
@@ -40,6 +39,10 @@ class ExternalInputs(NamedTuple):
     q_i: Array
     runout: Array | tuple[()]
     e: Array | tuple[()] = ()
+
+
+# The demanded force and the estimate, if another law computes them; None: observer and position law of the cascade do.
+Demand = tuple[ForceDemand, Measurement] | None
 
 
 class LoopState(NamedTuple):
@@ -94,14 +97,12 @@ class ClosedLoop(WholeState):
         return self.scenario.words() if self.key is None else self.key
 
     def sensor_errors(self, sample: Scalar) -> Errors:
-        """Return the errors of all sensors in sample number `sample`; zeros for ideal sensors."""
         sensors = self.scenario.sensors
         if self.normals is not None:
             return Errors(*sensors.scaled(self.normals))
         return Errors(*sensors.noise(self.words(), sample))
 
     def start(self) -> LoopState:
-        """Return the state at t = 0."""
         plant = self.scenario.plant.start(self.scenario.initial.measurement())
         inputs = self.inputs(0.0)._replace(e=())
         measured = self.received(inputs, plant, self.sensor_errors(0))
@@ -130,17 +131,11 @@ class ClosedLoop(WholeState):
         return with_signal(measured, self.wave, inputs.e)
 
     def command(
-        self,
-        inputs: ExternalInputs,
-        state: LoopState,
-        errors: Errors,
-        sensed: object = None,
-        demanded: tuple[ForceDemand, Measurement] | None = None,
+        self, inputs: ExternalInputs, state: LoopState, errors: Errors, sensed: object = None, demanded: Demand = None
     ) -> tuple[Command, CascadeState, Array]:
         """Return the command of the cascade, the rates of its states, and the voltage at the coils, V.
 
-        `sensed`: state of the plant at the place of the sensor; None: that of `state`. `demanded`: the demanded force
-        and the estimate, if another law computes them; None: observer and position law of the cascade do.
+        `sensed`: state of the plant at the place of the sensor; None: that of `state`.
         """
         u_max = jnp.asarray(self.scenario.command_limit)
         measured = self.received(inputs, state.plant if sensed is None else sensed, errors)
@@ -158,14 +153,9 @@ class ClosedLoop(WholeState):
         return self.derivative(inputs, state, control, u)
 
     def observed(
-        self,
-        inputs: ExternalInputs,
-        state: LoopState,
-        errors: Errors,
-        sensed: object = None,
-        demanded: tuple[ForceDemand, Measurement] | None = None,
+        self, inputs: ExternalInputs, state: LoopState, errors: Errors, sensed: object = None, demanded: Demand = None
     ) -> tuple[LoopState, Instant]:
-        """Return the rates of the state, and the signals to record now. `sensed`, `demanded`: as in `command`."""
+        """Return the rates of the state, and the signals to record now. `sensed`: as in `command`."""
         command, control, u = self.command(inputs, state, errors, sensed, demanded)
         signals = self.instant(inputs.reference, state.plant, command.i_ref, command.v_tilde, u)
         return self.derivative(inputs, state, control, u), signals
@@ -184,7 +174,6 @@ class ClosedLoop(WholeState):
         return LoopState(plant.rates(state.plant, u, q_z, inputs.q_i), control)
 
     def status(self, state: LoopState) -> Array:
-        """Return the status code of the rotor, an index of `trajectory.STATUSES`: 0 while it is levitated."""
         return self.status_of(state, self.scale(), state.plant)
 
     def status_of(self, state: object, scale: object, plant: object) -> Array:
@@ -207,35 +196,18 @@ class ClosedLoop(WholeState):
         return state._replace(plant=plant.rest(state.plant, jnp.where(code == TOUCHED, stop, z)))
 
     def problem(self, errors: Errors) -> InitialValueProblem:
-        """Return the initial value problem of one sample."""
         step = functools.partial(slide, self, errors) if slides(self.cascade, self.scenario) else None
         rates = lambda inputs, x: self.rates(inputs, x, errors)  # noqa: E731
         observed = lambda inputs, x: self.observed(inputs, x, errors)  # noqa: E731
         jumps = sum(map(jnp.abs, self.scenario.sensors.noises)) > 0
         edges = Edges(self.scenario.edges(reference=True), self.cuts, self.scenario.knots(reference=True))
+        motion = lambda state: self.motion(state.plant)  # noqa: E731
+        scale, layer, limit = self.scale(), self.layer(), self.scenario.limit
         return InitialValueProblem(
-            self.inputs,
-            rates,
-            self.scale(),
-            self.status,
-            self.layer(),
-            observed,
-            INSTANT_TREE,
-            jumps,
-            step,
-            edges,
-            lambda state: self.motion(state.plant),
-            self.scenario.limit,
+            self.inputs, rates, scale, self.status, layer, observed, INSTANT_TREE, jumps, step, edges, motion, limit
         )
 
-    def row(
-        self,
-        t: Scalar,
-        state: LoopState,
-        errors: Errors,
-        alive: Array,
-        demanded: tuple[ForceDemand, Measurement] | None = None,
-    ) -> Row:
+    def row(self, t: Scalar, state: LoopState, errors: Errors, alive: Array, demanded: Demand = None) -> Row:
         """Return the signals at time t (s), with u_mean = u_peak = 0. The drive of a lost rotor is off: u = 0."""
         inputs = self.inputs(t)
         command, _, u = self.command(inputs, state, errors, None, demanded)
@@ -245,7 +217,6 @@ class ClosedLoop(WholeState):
     def signals(
         self, t: Scalar, inputs: ExternalInputs, state: object, command: Command, measured: Measurement, alive: Array
     ) -> Row:
-        """Return all signals at time t (s)."""
         plant = self.scenario.plant
         motion, signals, (i_1, i_2) = plant.measurement(state), plant.signals(state), plant.currents(state)
         return Row(

@@ -13,12 +13,10 @@ from ambjax.numerics.shapes import stack_axes
 from ambjax.simulation.between import SampledState, acting, amplified, lags, under
 from ambjax.simulation.edges import NO_EDGES, most_inside
 from ambjax.simulation.integrate import Advanced, Begin, InitialValueProblem, Integrator, WholeState, in_turn
-from ambjax.simulation.joint_laws import demanded_now, jumped
 from ambjax.simulation.loop import ClosedLoop, ExternalInputs
-from ambjax.simulation.machine_axes import loop_of
+from ambjax.simulation.machine_axes import demanded_now, jumped, loop_of
 from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.span import Instant
-from ambjax.simulation.trajectory import DIVERGED
+from ambjax.simulation.trajectory import DIVERGED, Instant
 from ambjax.simulation.whole_machine import Groups, Machine, MachineState, PlantOnly, still
 from ambjax.world.rotor import Rotor
 
@@ -31,7 +29,6 @@ class SampledMachine(Machine):
     """A machine whose cascades run on a processor, one step of all axes per sample."""
 
     def jump(self, t: Scalar, state: MachineState, errors: Sequence[object]) -> MachineState:
-        """Step the laws of all axes at time t (s)."""
         if self.law is not None:
             W, at = self.rotor.speed_at(t), self.at_sensors(state)
             axes, law = jumped(self, t, W, at, state.law, errors)
@@ -39,8 +36,7 @@ class SampledMachine(Machine):
         axes = self.each(lambda axis, own, error: axis.jump(t, own, error), self.at_sensors(state), errors)
         return state._replace(axes=still(axes))
 
-    def advance(self, method: Integrator, errors: object, begin: Begin[MachineState], period: Scalar) -> Advanced:
-        """Integrate rotor and coils from one sample to the next one."""
+    def advance(self, method: Integrator, errors: object, begin: Begin, period: Scalar) -> Advanced:
         t, state, memory, code = begin
         finite = jnp.min(self.join([own.finite for own in state.axes]))
         code = jnp.where((code == 0) & (finite == 0), DIVERGED, code)
@@ -118,7 +114,6 @@ class ContinuousMachine(WholeState, Machine):
         return tuple((one,) for one in found)
 
     def problem(self, errors: Sequence[object]) -> InitialValueProblem:
-        """Return the initial value problem of one sample, with the measurement errors held."""
 
         def inputs(t: Scalar) -> tuple[object, ...]:
             return self.outside(t), tuple(self.each(lambda axis: axis.inputs(t)))

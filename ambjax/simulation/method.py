@@ -48,11 +48,9 @@ NOISY = 2.0
 # proportional to slope h^2. At this value the gradient in gamma under held noise is correct to 1e-3; with twice the
 # step its error is 12 %.
 CORNER = 7.5e-6
-# Relative error per step of adaptive RODAS3 with and without noise. The error of z is proportional to the response of
-# the loop to an impulse: the largest later change of z, m, after a velocity change of 1 m/s. At QUIET_TOLERANCE, z is
-# within 1e-8 m if that response is at most 0.1 m. The response is unbounded for a loop that nearly loses its rotor, so
-# that no bound in metres holds for every loop (tests/test_oracle.py). Under noise every sample begins with a jump,
-# and QUIET_TOLERANCE would take up to twice the steps.
+# Relative error per step of adaptive RODAS3 with and without noise; `AdaptiveRodas3` states the error of z that follows
+# (tests/test_oracle.py). Under noise every sample begins with a jump, and QUIET_TOLERANCE would take up to twice the
+# steps.
 TOLERANCE, QUIET_TOLERANCE = 1e-6, 1e-7
 # The same for the Cash-Karp method, whose number of steps grows only as the fifth root of the tolerance. Kinks at the
 # limit of the supply require TIGHT; a drop onto a fast transient requires QUIET_TIGHT (tests/test_oracle.py).

@@ -11,33 +11,26 @@ from typing import Protocol
 import numpy as np
 from jax import Array
 
-from ambjax.numerics.records import Scalar, is_traced, leaf, part, record, static
-from ambjax.simulation import orders
-from ambjax.simulation.clock import Clock
+from ambjax.numerics.records import Scalar, bounded, is_traced, leaf, part, record, static
+from ambjax.simulation import response
+from ambjax.simulation.clock import Clock, Triple
 from ambjax.simulation.folds import Count, Driven, Ending, Fold, Named, Peak, Reaching, Rms, Variation
-from ambjax.simulation.span import Span
-from ambjax.simulation.trajectory import ALIVE, STALLED, Row
+from ambjax.simulation.trajectory import ALIVE, STALLED, Row, Span
 from ambjax.world.plant import Plant
 from ambjax.world.rotation import Rotation
 from ambjax.world.scenario import Scenario
 
 # Times at which a signal first comes within its band; inf: never.
 REACHED = ("sigma_reached_s", "v_tilde_reached_s", "current_error_reached_s")
-
-
 # Relative difference of two times that are taken as equal.
 ROUNDING = 1e-9
 
 
-class SettledCase(Protocol):
-    """A case with a scenario, a clock and a settling time (s), such as that of `read_case`."""
+class SettledCase(Triple, Protocol):
+    """A case with a settling time (s), such as that of `read_case`."""
 
     @property
     def settle(self) -> float: ...
-    @property
-    def scenario(self) -> Scenario: ...
-    @property
-    def clock(self) -> Clock: ...
 
 
 def settled(settle: float, clock: Clock) -> float:
@@ -61,9 +54,7 @@ class Metrics:
     The defaults are for the plant of Table 1; `Metrics.of` scales them to another plant.
     """
 
-    settle: Scalar = leaf(
-        default=0.5, unit="s", at_least=0, at_most=1e6, doc="time from which metrics count as settled"
-    )
+    settle: Scalar = bounded(0.5, "s", 0, 1e6, "time from which metrics count as settled")
     touchdown: Scalar = leaf(
         default=4.5e-3, unit="m", above=0, at_most=1.0, doc="clearance; `clearance_used` is |z| as a share of it"
     )
@@ -115,9 +106,8 @@ class Metrics:
         return Metrics.of(settled(case.settle, case.clock), case.scenario)
 
     def _folds(self) -> Named:
-        """Return the fold of each metric by name."""
         late = self.settle
-        turning: dict[str, Fold] = {} if self.rotor is None else {"orders": orders.Orders(self.rotor, late)}
+        turning: dict[str, Fold] = {} if self.rotor is None else {"orders": response.Orders(self.rotor, late)}
         return Named(
             turning
             | {
@@ -149,11 +139,9 @@ class Metrics:
         )
 
     def init(self) -> dict[str, object]:
-        """Return the initial value of the fold of each metric."""
         return self._folds().init()
 
     def update(self, carry: dict[str, object], row: Row, span: Span) -> dict[str, object]:
-        """Return the folds after one more sample: its row, and the span up to the next sample."""
         return self._folds().update(carry, row, span)
 
     def result(self, carry: dict[str, object], ending: Ending) -> dict[str, Array]:
@@ -181,4 +169,4 @@ def _unit(name: str) -> str:
 
 _NAMES = (*Metrics()._folds().folds, "lost_at_s", "singular_at_s", "settle_s")
 # Unit of each metric by name. Other metrics are shares and counts.
-UNITS = {name: _unit(name) for name in _NAMES if _unit(name)} | orders.UNITS
+UNITS = {name: _unit(name) for name in _NAMES if _unit(name)} | response.UNITS

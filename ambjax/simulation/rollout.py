@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from typing import Any, NamedTuple, Protocol, Self, TypeVar, cast
 
 import jax
@@ -19,9 +20,8 @@ from ambjax.simulation.integrate import Advanced, Begin, Integrator
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.method import with_method
 from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.span import Span
 from ambjax.simulation.system import check_inputs, check_recording, started, system_of
-from ambjax.simulation.trajectory import ALIVE, Row, Trajectory, first_time
+from ambjax.simulation.trajectory import ALIVE, Row, Span, Trajectory, first_time
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors
 
@@ -70,7 +70,7 @@ class System(Protocol[S, E, R]):
     def completed(self, row: R, span: Span) -> R: ...
     def singularity(self, row: R) -> Array: ...
     def jump(self, t: Scalar, state: S, errors: E) -> S: ...
-    def advance(self, method: Integrator, errors: E, begin: Begin[S], period: Scalar) -> Advanced: ...
+    def advance(self, method: Integrator, errors: E, begin: Begin, period: Scalar) -> Advanced: ...
 
 
 class Extended:
@@ -268,3 +268,23 @@ def one_sample(
         return RolloutState(state, ending, after.memory, folded), row
 
     return run(system, clock, fold, progress)
+
+
+def rolled_in_parts(system: System, clock: Clock, fold: Fold) -> Result:
+    """Simulate a rollout without rows, in parts that reverse mode recomputes (`jax.checkpoint`).
+
+    Reverse mode stores the state at the start of each part and, for one part at a time, the state at each sample: if N
+    samples have a divisor near sqrt(N), its memory grows with sqrt(N). The result is that of `run`, up to rounding.
+    `clock` must have fixed steps. The function is not jitted.
+    """
+    system, clock, fold = canonical((system.realised(), clock, fold))
+    # the number of samples of a part: the largest divisor of `samples` that is at most its square root
+    length = next(one for one in range(math.isqrt(clock.samples), 0, -1) if clock.samples % one == 0)
+
+    @functools.partial(jax.checkpoint, prevent_cse=False)
+    def part(progress: RolloutState, first: Array, system: Any, clock: Clock, fold: Fold) -> RolloutState:
+        return segment(system, clock, fold, progress, first, length, 0)[0]
+
+    advanced = lambda number, progress: part(progress, number * length, system, clock, fold)  # noqa: E731
+    progress = lax.fori_loop(0, clock.samples // length, advanced, begin(system, clock, fold))
+    return finish(progress, None, fold)

@@ -1,5 +1,7 @@
 """RODAS3, an L-stable Rosenbrock method, with equal and with adaptive steps."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -9,13 +11,11 @@ from ambjax.numerics import linear
 from ambjax.numerics.linear import axpy
 from ambjax.numerics.records import Scalar, record
 from ambjax.simulation.adaptive import AdaptiveSteps, Attempt
-from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, State, Times
-from ambjax.simulation.span import Instant, Span
+from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Times
+from ambjax.simulation.trajectory import Instant, Span
 
 
-def rodas3_step(
-    problem: InitialValueProblem[Inputs, State], at: Times, h: Scalar, state: State
-) -> tuple[State, State, Instant]:
+def rodas3_step(problem: InitialValueProblem, at: Times, h: Scalar, state: Any) -> tuple[Any, Any, Instant]:
     """Compute one step of RODAS3, its error estimate, and the signals at its start.
 
     RODAS3 is a Rosenbrock method of order 3(2), L-stable and stiffly accurate (Sandu et al., Atmospheric Environment 31
@@ -29,7 +29,7 @@ def rodas3_step(
     f_0, f_t, here = jax.jvp(lambda s: problem.rates_and_signals(s, state), (inputs,), (inputs_t,), has_aux=True)
     inputs = problem.inputs(at(1.0))
 
-    def stage(f: State, *couplings: tuple[Scalar, State]) -> State:
+    def stage(f: Any, *couplings: tuple[Scalar, Any]) -> Any:
         increment = jax.tree.map(lambda q: h / 2 * q, f)
         return materialised(linear.solve(factors, axpy(increment, *((c / 2, u) for c, u in couplings))))
 
@@ -49,17 +49,12 @@ class Rodas3(FixedSteps):
     `Clock(1000, 1e-4, solvers.Rodas3(10))` takes ten substeps per sample.
     """
 
-    limit = None
+    title = "RODAS3 (L-stable Rosenbrock)"
 
-    def _step(
-        self, problem: InitialValueProblem[Inputs, State], at: Times, h: Scalar, state: State, span: Span
-    ) -> tuple[State, Span]:
+    def _step(self, problem: InitialValueProblem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
         new, _, here = rodas3_step(problem, at, h, state)
         there = problem.rates_and_signals(problem.inputs(at(1.0)), new)[1]
         return new, span.with_instant(here, h / 2, h).with_instant(there, h / 2)
-
-    def __str__(self) -> str:
-        return f"RODAS3 (L-stable Rosenbrock), {self.steps}"
 
 
 @record
@@ -76,10 +71,8 @@ class AdaptiveRodas3(AdaptiveSteps):
     Use it for stiff gains, and wherever the stiffness is not known: `Clock(1000, 1e-4, solvers.AdaptiveRodas3())`.
     """
 
+    title = "RODAS3 (L-stable Rosenbrock)"
     ORDER = 3
 
-    def _attempt(self, problem: InitialValueProblem[Inputs, State], at: Times, h: Array, state: State) -> Attempt:
+    def _attempt(self, problem: InitialValueProblem, at: Times, h: Array, state: Any) -> Attempt:
         return Attempt(*rodas3_step(problem, at, h, state))
-
-    def __str__(self) -> str:
-        return f"RODAS3 (L-stable Rosenbrock), adaptive, tolerance {float(self.tolerance):g}"

@@ -26,8 +26,7 @@ from ambjax.numerics.smooth import limited
 from ambjax.simulation.between import SampledState, acting, amplified, at_sample, lags, plant_status, subproblems
 from ambjax.simulation.integrate import Advanced, Begin, Integrator, in_turn
 from ambjax.simulation.loop import AddedSignal, ClosedLoop, LoopState, with_signal
-from ambjax.simulation.span import Span
-from ambjax.simulation.trajectory import DIVERGED, Row
+from ambjax.simulation.trajectory import DIVERGED, Row, Span
 from ambjax.world.faults import Sensed
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.waveforms import Reference, reference_at
@@ -51,11 +50,9 @@ class Sampled:
 
     @property
     def processor(self) -> Processor:
-        """The processor of the cascade."""
         return self.loop.cascade.timing
 
     def realised(self) -> Self:
-        """Return the loop of one member, with its random signals drawn."""
         return dataclasses.replace(self, loop=self.loop.realised())
 
     def sensor_errors(self, sample: Scalar) -> Errors:
@@ -64,7 +61,6 @@ class Sampled:
         return self.loop.scenario.sensors.on_processor(drawn, self.loop.words(), sample, self.period)
 
     def start(self) -> SampledState:
-        """Return the state at t = 0."""
         scenario, zero = self.loop.scenario, jnp.zeros(())
         plant = scenario.plant.start(scenario.initial.measurement())
         z_filtered = self._sensed(plant, zero).z if lags(self.loop) else ()
@@ -95,7 +91,6 @@ class Sampled:
         return sensor.converted(sensor.reading(motion, errors), true.s_0, true.i_0)
 
     def jump(self, t: Scalar, state: SampledState, errors: Errors) -> SampledState:
-        """Step the laws at time t (s): return the state with the new command and the next states of the laws."""
         state, measured = self.read(state, errors)
         return self.with_command(self.injected(measured, t), self.reference(t), state)
 
@@ -107,17 +102,7 @@ class Sampled:
 
     def read(self, state: SampledState, errors: Errors) -> tuple[SampledState, Measurement]:
         """Return the state with the new state of the faulty sensor, and the readings of the sensors, with faults."""
-        return self._with_faults(self.measured(state.plant, state.z_filtered, errors), state, errors)
-
-    def reference(self, t: Scalar) -> Reference:
-        """Return the reference of the laws in the sample at t (s); with prediction, that at the end of the delay."""
-        late = self.processor.ahead * self.period if self.processor.predicts else 0.0
-        return reference_at(self.loop.scenario.reference, t + late)
-
-    def _with_faults(
-        self, measured: Measurement, state: SampledState, errors: Errors
-    ) -> tuple[SampledState, Measurement]:
-        """Apply the faults of the position sensor. Return the new state and the readings."""
+        measured = self.measured(state.plant, state.z_filtered, errors)
         sensor, sensed = self.loop.scenario.sensors, state.sensed
         if not sensed or not errors.onsets:
             return state, measured
@@ -128,6 +113,11 @@ class Sampled:
             state = state._replace(finite=jnp.where(jnp.isnan(sensed.z), 0.0, state.finite))
             return state, measured._replace(z=z)
         return state, measured._replace(z=sensed.z)
+
+    def reference(self, t: Scalar) -> Reference:
+        """Return the reference of the laws in the sample at t (s); with prediction, that at the end of the delay."""
+        late = self.processor.ahead * self.period if self.processor.predicts else 0.0
+        return reference_at(self.loop.scenario.reference, t + late)
 
     def with_command(self, measured: Measurement, reference: Reference, state: SampledState) -> SampledState:
         """Compute the command from the readings, and return the state with it. The plant does not change.
@@ -202,8 +192,7 @@ class Sampled:
         motion = checked.reading._replace(z_dot=estimate.z_dot)
         return Watch(expected(cascade.driven, cascade.model.start(motion), u, self.period), checked.left)
 
-    def advance(self, method: Integrator, errors: Errors, begin: Begin[SampledState], period: Scalar) -> Advanced:
-        """Integrate the plant from one sample to the next one, under the voltages that act until then."""
+    def advance(self, method: Integrator, errors: Errors, begin: Begin, period: Scalar) -> Advanced:
         t, state, memory, code = begin
         code = jnp.where((code == 0) & (state.finite == 0), DIVERGED, code)
         delay, whole = jnp.asarray(self.processor.delay), bool(self.processor.whole)
@@ -237,11 +226,9 @@ class Sampled:
         return scenario.sensors.over_surface(scenario.plant.measurement(plant), t)
 
     def status(self, state: SampledState) -> Array:
-        """Return the status code of the rotor, an index of `trajectory.STATUSES`."""
         return plant_status(self.loop, state.plant)
 
     def rest(self, state: SampledState, code: Array) -> SampledState:
-        """Return the state in which a lost rotor is frozen, with the drive off."""
         zero = jnp.zeros_like(state.command.u)
         plant = self.loop.rest(LoopState(state.plant, state.control), code).plant
         z_filtered = self.loop.scenario.plant.measurement(plant).z if lags(self.loop) else ()
@@ -274,5 +261,4 @@ class Sampled:
         return completed if self.loop.scenario.amplifier is None else completed._replace(u_peak=span.most.u)
 
     def singularity(self, row: Row) -> Array:
-        """Return `ClosedLoop.singularity`: 0 on the singular curve C. Eq. (9)."""
         return self.loop.singularity(row)

@@ -29,8 +29,8 @@ from ambjax.control.stages import CurrentDemand, CurrentInputs
 from ambjax.numerics.linear import axpy
 from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.smooth import limited
-from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Inputs, Times
-from ambjax.simulation.span import Instant, Span
+from ambjax.simulation.integrate import FixedSteps, InitialValueProblem, Times
+from ambjax.simulation.trajectory import Instant, Span
 from ambjax.world.plant import State
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
@@ -173,11 +173,9 @@ class Slide(FixedSteps):
     Use it for long studies with stiff adaptive inversion: `Clock(1000, 1e-4, solvers.Slide(4))`.
     """
 
-    limit = None
+    title = "sliding step"
 
-    def _step(
-        self, problem: InitialValueProblem[Inputs, S], at: Times, h: Scalar, state: S, span: Span
-    ) -> tuple[S, Span]:
+    def _step(self, problem: InitialValueProblem, at: Times, h: Scalar, state: Any, span: Span) -> tuple[Any, Span]:
         if problem.slide is None:
             raise ValueError(
                 "clock.method = Slide(...): it requires continuous time, a lumped plant without iron, the 'adaptive' "
@@ -185,6 +183,3 @@ class Slide(FixedSteps):
                 "Rodas3."
             )
         return problem.slide(problem.inputs(at(0.0)), problem.inputs(at(1.0)), h, state, span)
-
-    def __str__(self) -> str:
-        return f"sliding step, {self.steps}"

@@ -20,12 +20,10 @@ from ambjax.numerics.smooth import away_from_zero
 from ambjax.simulation.between import SampledState, plant_status
 from ambjax.simulation.edges import NO_EDGES, Edges
 from ambjax.simulation.integrate import InitialValueProblem
-from ambjax.simulation.joint_laws import begun
 from ambjax.simulation.loop import ClosedLoop, LoopState
-from ambjax.simulation.machine_axes import MachineAxes, loop_of, with_loop
+from ambjax.simulation.machine_axes import MachineAxes, begun, loop_of, with_loop
 from ambjax.simulation.sampled import Sampled
-from ambjax.simulation.span import INSTANT_TREE, Instant, Span
-from ambjax.simulation.trajectory import ALIVE, DIVERGED, TOUCHED, Row
+from ambjax.simulation.trajectory import ALIVE, DIVERGED, INSTANT_TREE, TOUCHED, Instant, Row, Span
 from ambjax.world.rotation import Rotation
 from ambjax.world.sensor import Errors
 
@@ -104,11 +102,9 @@ class Machine(MachineAxes):
         )
 
     def at_magnets(self, state: MachineState) -> Groups:
-        """Return the states of the groups with the motion at the magnets."""
         return self.moving(self.rotor.at_magnets, *state[:3])
 
     def at_sensors(self, state: MachineState) -> Groups:
-        """Return the states of the groups with the motion at the sensors."""
         return self.moving(self.rotor.at_sensors, *state[:3])
 
     def with_stops(self, instant: Instant, q: Array) -> Instant:
@@ -148,7 +144,6 @@ class Machine(MachineAxes):
         return self.rotor.forces(t), self.rotor.speed_at(t)
 
     def edges(self) -> Edges:
-        """Return the instants at which the forces on the rotor jump."""
         at = self.rotor.edges()
         return Edges(at, len(at) if self.cuts is None else self.cuts)
 
@@ -216,17 +211,11 @@ class Machine(MachineAxes):
         """Return the initial value problem with these inputs, rates with signals, and sizes of the groups' states."""
         edges = self.edges()
         signals = jax.tree.map(lambda _: jnp.zeros(self.count), INSTANT_TREE)
+        rates = lambda inputs, state: observed(inputs, state)[0]  # noqa: E731
+        sizes, edges = self.scale(scale), edges if edges.most else NO_EDGES
+        signals, limit = self.with_stops(signals, jnp.asarray(self.start_q)), self.limited()[1]
         return InitialValueProblem(
-            inputs,
-            lambda inputs, state: observed(inputs, state)[0],
-            self.scale(scale),
-            self.status,
-            None,
-            observed,
-            self.with_stops(signals, jnp.asarray(self.start_q)),
-            edges=edges if edges.most else NO_EDGES,
-            motion=self.motion,
-            limit=self.limited()[1],
+            inputs, rates, sizes, self.status, None, observed, signals, edges=edges, motion=self.motion, limit=limit
         )
 
 

@@ -79,10 +79,9 @@ def parts(cascade: Cascade, scenario: Scenario, clock: Clock) -> Iterator[Part]:
         controller, world = (changed, scenario) if isinstance(changed, Cascade) else (cascade, changed)
         yield Part(name, remedy, controller, world, clock)
     if cascade.sampled:
-        finer = dataclasses.replace(
-            clock, samples=FINER * clock.samples, sample_period=float(clock.sample_period) / FINER
-        )
-        name = f"the sample period of {float(clock.sample_period):g} s (with {float(finer.sample_period):g} s instead)"
+        period = float(clock.sample_period)
+        finer = dataclasses.replace(clock, samples=FINER * clock.samples, sample_period=period / FINER)
+        name = f"the sample period of {period:g} s (with {period / FINER:g} s instead)"
         yield Part(name, "Shorten clock.sample_period, or lower the gains or p of the laws.", cascade, scenario, finer)
 
 

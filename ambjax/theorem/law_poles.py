@@ -34,8 +34,6 @@ ROUNDING = 1e-9
 # Smallest damping ratio of a stable law. A law below it is at its limit: dead-beat control whose output acts one sample
 # late, for example, oscillates with a period of six samples, and only the resistance of the coil damps it.
 LEAST_DAMPING = 0.01
-
-
 # A loop: the map of its state over one sample, and its state at rest.
 Loop = tuple[Callable[[Array], Array], Array]
 

@@ -99,19 +99,16 @@ class Monitored(Extended, WholeState):
     def problem(self, errors: Errors) -> InitialValueProblem:
         plant = self.loop.scenario.plant
         _, z_dot, i = map(jnp.asarray, plant.sizes())
-        sizes = LawSignals(z_dot, plant.dv_di(0.0, 0.0) * i / 100, i)
+        sizes = MonitoredState(self.loop.scale(), LawSignals(z_dot, plant.dv_di(0.0, 0.0) * i / 100, i))
 
         def rates(inputs: ExternalInputs, state: MonitoredState) -> MonitoredState:
             terms = self.terms(inputs, state.loop, errors)
             return MonitoredState(terms.moving, terms.rates._replace(e=terms.rates.e + terms.i_ref_dot))
 
-        layer = MonitoredState(self.loop.layer(), LawSignals(*(jnp.asarray(jnp.inf) for _ in sizes)))
-        return InitialValueProblem(
-            self.loop.inputs, rates, MonitoredState(self.loop.scale(), sizes), self.status, layer
-        )
+        layer = MonitoredState(self.loop.layer(), LawSignals(*[jnp.asarray(jnp.inf)] * 3))
+        return InitialValueProblem(self.loop.inputs, rates, sizes, self.status, layer)
 
     def motion(self, state: LoopState) -> Measurement:
-        """Return the measurement of ideal sensors."""
         return self.loop.scenario.plant.measurement(state.plant)
 
     def terms(self, inputs: ExternalInputs, state: LoopState, errors: Errors) -> Terms:
@@ -200,7 +197,6 @@ class LawSignalsRecorder(Extended):
         return LawSignalsState(self.loop.start(), LawSignals(*[jnp.zeros(())] * 3))
 
     def jump(self, t: Scalar, state: LawSignalsState, errors: Errors) -> LawSignalsState:
-        """Step the laws and store the signals that they computed."""
         loop, before = self.loop, state.loop
         cascade, after = loop.loop.cascade, loop.jump(t, before, errors)
         reference = loop.reference(t)
@@ -210,7 +206,7 @@ class LawSignalsRecorder(Extended):
         sigma, command = cascade.sigma(estimate, reference), after.command
         return LawSignalsState(after, LawSignals(sigma, command.v_tilde, estimate.i - command.i_ref))
 
-    def advance(self, method: Integrator, errors: Errors, begin: Begin[LawSignalsState], period: Scalar) -> Advanced:
+    def advance(self, method: Integrator, errors: Errors, begin: Begin, period: Scalar) -> Advanced:
         first = Begin(begin.t, begin.state.loop, begin.memory, begin.code)
         after = self.loop.advance(method, errors, first, period)
         return after._replace(state=begin.state._replace(loop=after.state))

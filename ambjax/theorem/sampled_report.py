@@ -138,6 +138,10 @@ class Delays(NamedTuple):
         return None if self.held is None or self.lost is None else self.lost - self.held
 
 
+# A function that simulates a system.
+Run = Callable[[System, Clock], Result]
+
+
 def rolled(system: System, clock: Clock) -> Result:
     """Roll out a system and record every sample."""
     return roll(*canonical((system, clock)), None, record_every=1)
@@ -145,7 +149,7 @@ def rolled(system: System, clock: Clock) -> Result:
 
 @takes_case
 def check_sampled(
-    cascade: Cascade, scenario: Scenario, clock: Clock, settle: float, run: Callable[[System, Clock], Result] = rolled
+    cascade: Cascade, scenario: Scenario, clock: Clock, settle: float, run: Run = rolled
 ) -> SampledReport:
     """Return the report on a cascade with a processor. It is computed from a run without sensor noise and, if the case
     has noise, from a run with it.
@@ -175,7 +179,7 @@ def with_causes(
     scenario: Scenario,
     clock: Clock,
     settle: float,
-    run: Callable[[System, Clock], Result] = rolled,
+    run: Run = rolled,
     tell: Callable[[str], object] = lambda _: None,
 ) -> SampledReport:
     """Return the report with the causes of a lost rotor and of an alternating voltage (`causes.find_cause`).
@@ -204,7 +208,7 @@ def with_causes(
     return report
 
 
-def _simulated(loop: System, clock: Clock, run: Callable[[System, Clock], Result]) -> Trajectory:
+def _simulated(loop: System, clock: Clock, run: Run) -> Trajectory:
     assert isinstance(loop, Sampled)
     return run(LawSignalsRecorder(loop), clock).trajectory
 

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, part, record, static
+from ambjax.numerics.records import Scalar, bounded, part, record, static
 from ambjax.numerics.smooth import limited
 
 
@@ -33,12 +33,8 @@ class CoilLimits:
     Use it where each coil has its own limit: `actuators.Amplifier(coil=actuators.CoilLimits(i_max=5.0))`.
     """
 
-    u_max: Scalar | None = leaf(
-        default=None, unit="V", at_least=1e-9, at_most=1e12, doc="limit of |R i_0 +- u| at a coil; none: no limit"
-    )
-    i_max: Scalar | None = leaf(
-        default=None, unit="A", at_least=1e-9, at_most=1e6, doc="limit of a coil's |current|, with i_0; none: no limit"
-    )
+    u_max: Scalar | None = bounded(None, "V", 1e-9, 1e12, "limit of |R i_0 +- u| at a coil; none: no limit")
+    i_max: Scalar | None = bounded(None, "A", 1e-9, 1e6, "limit of a coil's |current|, with i_0; none: no limit")
     unidirectional: bool = static(default=False, doc="whether the current of a coil cannot become negative")
 
     def differential(self, i_0: Scalar) -> Scalar | None:
@@ -58,9 +54,7 @@ class CoilLimits:
         voltages = self._limited(u, bias), self._limited(-u, bias)
         if self.i_max is not None or self.unidirectional:
             # the rate of each current is an affine function of its own voltage, and independent of the other voltage
-            still, driven = (
-                plant.currents(plant.rates(state, CoilVoltages(volt, -volt), 0.0, q_i)) for volt in (0.0, 1.0)
-            )
+            still, driven = (plant.currents(plant.rates(state, CoilVoltages(v, -v), 0.0, q_i)) for v in (0.0, 1.0))
             kept = (self._limited(-a / (b - a), bias) for a, b in zip(still, driven, strict=True))
             coils = zip(voltages, kept, plant.currents(state), strict=True)
             voltages = tuple(self._current_limited(*coil) for coil in coils)
@@ -87,18 +81,8 @@ class CoilLimits:
         return jnp.where((i <= least) & (volt < kept), kept, volt)
 
 
-class CoilResponse(NamedTuple):
-    """Rate of the current i at an instant, as a function of the voltage u (V): i' = still + per_volt u.
-
-    `still`: A/s. `per_volt`: A/(V s).
-    """
-
-    still: Array
-    per_volt: Array
-
-    def voltage(self, rate: Scalar) -> Array:
-        """Return the voltage (V) for which the current has this rate (A/s)."""
-        return (rate - self.still) / self.per_volt
+# Gives `still` (A/s) and `per_volt` (A/(V s)) of the rate of the current i at an instant: i' = still + per_volt u.
+CoilResponse = Callable[[], tuple[Array, Array]]
 
 
 @record
@@ -114,16 +98,10 @@ class Amplifier:
     `Scenario(u_max=48.0, amplifier=actuators.Amplifier(bandwidth=2e3))`.
     """
 
-    bandwidth: Scalar | None = leaf(
-        default=None, unit="Hz", at_least=1, at_most=1e6, doc="bandwidth of the voltage, first order; none: no lag"
-    )
-    slew: Scalar | None = leaf(
-        default=None, unit="V/s", at_least=1e-3, at_most=1e15, doc="largest rate of u; none: no limit"
-    )
-    dead_band: Scalar | None = leaf(
-        default=None, unit="V", at_least=0, at_most=1e12, doc="subtracted from |u|; none: 0"
-    )
-    i_max: Scalar | None = leaf(default=None, unit="A", at_least=1e-9, at_most=1e6, doc="limit of |i|; none: no limit")
+    bandwidth: Scalar | None = bounded(None, "Hz", 1, 1e6, "bandwidth of the voltage, first order; none: no lag")
+    slew: Scalar | None = bounded(None, "V/s", 1e-3, 1e15, "largest rate of u; none: no limit")
+    dead_band: Scalar | None = bounded(None, "V", 0, 1e12, "subtracted from |u|; none: 0")
+    i_max: Scalar | None = bounded(None, "A", 1e-9, 1e6, "limit of |i|; none: no limit")
     coil: CoilLimits | None = part(default=None, doc="limits of each coil of a `TwoCoil`; None: no limits")
 
     mode: ClassVar[str] = "voltage"
@@ -166,14 +144,15 @@ class Amplifier:
         decay = jnp.where(later > 0, 0.0, 1.0) if self.bandwidth is None else jnp.exp(-self.slope() * later)
         return u + jnp.where(u_a > u, left, -left) * decay
 
-    def at_coil(self, u_a: Array, i: Array, u_max: Scalar, response: Callable[[], CoilResponse]) -> Array:
+    def at_coil(self, u_a: Array, i: Array, u_max: Scalar, response: CoilResponse) -> Array:
         """Return the voltage (V) at the coils for the output u_a (V) and a current i (A), within u_max (V)."""
         if self.dead_band is not None:
             size = jnp.maximum(jnp.abs(u_a) - self.dead_band, 0.0)
             u_a = jnp.where(u_a < 0, -size, size)
         if self.i_max is None:
             return u_a
-        kept = limited(response().voltage(0.0), u_max)
+        still, per_volt = response()
+        kept = limited((0.0 - still) / per_volt, u_max)
         u_a = jnp.where((i >= self.i_max) & (u_a > kept), kept, u_a)
         return jnp.where((i <= -self.i_max) & (u_a < kept), kept, u_a)
 
@@ -190,32 +169,25 @@ class CurrentAmplifier:
     Use it with `current.AmplifierCurrent`: `Scenario(u_max=48.0, amplifier=actuators.CurrentAmplifier(bandwidth=1e3))`.
     """
 
-    bandwidth: Scalar = leaf(
-        default=1e3, unit="Hz", at_least=1, at_most=1e6, doc="bandwidth of the current loop, first order"
-    )
-    i_max: Scalar | None = leaf(
-        default=None, unit="A", at_least=1e-9, at_most=1e6, doc="limit of the command; none: no limit"
-    )
+    bandwidth: Scalar = bounded(1e3, "Hz", 1, 1e6, "bandwidth of the current loop, first order")
+    i_max: Scalar | None = bounded(None, "A", 1e-9, 1e6, "limit of the command; none: no limit")
     mode: ClassVar[str] = "current"
     slow: ClassVar[bool] = False
     coil: ClassVar[None] = None
 
     def linear(self) -> "CurrentAmplifier":
-        """Return the amplifier without its limit."""
         return CurrentAmplifier(self.bandwidth)
 
     def slope(self) -> Scalar:
-        """Return the rate w of the current, 1/s."""
         return 2 * jnp.pi * self.bandwidth
 
     def command_limit(self, u_max: Scalar) -> Scalar:
-        """Return the limit of the commanded current (A)."""
         return jnp.inf if self.i_max is None else self.i_max
 
     def current_limit(self, i_0: Scalar) -> Scalar | None:
-        """Return the limit of |i| (A); None: no limit."""
         return self.i_max
 
-    def at_coil(self, command: Array, i: Array, u_max: Scalar, response: Callable[[], CoilResponse]) -> Array:
+    def at_coil(self, command: Array, i: Array, u_max: Scalar, response: CoilResponse) -> Array:
         """Return the voltage (V) at the coils for a commanded current (A) and a current i (A), within u_max (V)."""
-        return limited(response().voltage(self.slope() * (command - i)), u_max)
+        still, per_volt = response()
+        return limited((self.slope() * (command - i) - still) / per_volt, u_max)

@@ -5,10 +5,9 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, part, record
+from ambjax.numerics.records import Scalar, bounded, part, record
 from ambjax.numerics.smooth import safe_sqrt
-from ambjax.world.gaps import Gaps, distance_to_C, gaps
-from ambjax.world.iron import Iron
+from ambjax.world.magnet import Gaps, Iron, distance_to_C, gaps
 from ambjax.world.sensor import Measurement
 
 # State of a plant, or its rates: a NamedTuple of scalars.
@@ -33,21 +32,15 @@ class Bearing(Generic[S]):
     The paper prints k_z in N m. Here it is a stiffness in N/m; a negative value is restoring.
     """
 
-    m: Scalar = leaf(default=0.588, unit="kg", at_least=1e-6, at_most=1e6, doc="mass of rotor and axle")
-    k_z: Scalar = leaf(
-        default=-754.0,
-        unit="N/m",
-        at_least=-1e12,
-        at_most=1e12,
-        doc="axial stiffness of one passive bearing; negative: restoring",
-    )
-    mu_0: Scalar = leaf(default=1.25e-6, unit="N/A^2", at_least=1e-8, at_most=1e-4, doc="permeability of the air gap")
-    n: Scalar = leaf(default=1480.0, unit="1", at_least=1, at_most=1e6, doc="turns of each coil")
-    A: Scalar = leaf(default=0.121, unit="m^2", at_least=1e-9, at_most=100.0, doc="area of a pole")
-    s_0: Scalar = leaf(default=5e-3, unit="m", at_least=1e-6, at_most=1.0, doc="air gap at z = 0")
-    i_0: Scalar = leaf(default=0.25, unit="A", at_least=1e-6, at_most=1e5, doc="bias current")
-    R: Scalar = leaf(default=41.44, unit="ohm", at_least=0, at_most=1e6, doc="coil resistance")
-    g: Scalar = leaf(default=9.81, unit="m/s^2", at_least=-1e4, at_most=1e4, doc="gravitational acceleration")
+    m: Scalar = bounded(0.588, "kg", 1e-6, 1e6, "mass of rotor and axle")
+    k_z: Scalar = bounded(-754.0, "N/m", -1e12, 1e12, "axial stiffness of one passive bearing; negative: restoring")
+    mu_0: Scalar = bounded(1.25e-6, "N/A^2", 1e-8, 1e-4, "permeability of the air gap")
+    n: Scalar = bounded(1480.0, "1", 1, 1e6, "turns of each coil")
+    A: Scalar = bounded(0.121, "m^2", 1e-9, 100.0, "area of a pole")
+    s_0: Scalar = bounded(5e-3, "m", 1e-6, 1.0, "air gap at z = 0")
+    i_0: Scalar = bounded(0.25, "A", 1e-6, 1e5, "bias current")
+    R: Scalar = bounded(41.44, "ohm", 0, 1e6, "coil resistance")
+    g: Scalar = bounded(9.81, "m/s^2", -1e4, 1e4, "gravitational acceleration")
 
     iron: Iron | None = part(
         default=None,
@@ -88,7 +81,6 @@ class Bearing(Generic[S]):
         raise NotImplementedError
 
     def measurement(self, state: S) -> Measurement:
-        """Return the measurement of ideal sensors."""
         raise NotImplementedError
 
     def signals(self, state: S) -> Signals:
@@ -193,7 +185,7 @@ class Bearing(Generic[S]):
         return (self.i_0 / self.s_0) * (self.i_0 / self.s_0)
 
     def gaps(self, z: Scalar) -> Gaps:
-        """Return the gaps s_0 - z and s_0 + z (m). Only their inverses are bounded (`world.gaps.GAP_FLOOR`)."""
+        """Return the gaps s_0 - z and s_0 + z (m). Only their inverses are bounded (`world.magnet.GAP_FLOOR`)."""
         return gaps(z, self.s_0)
 
     def v(self, z: Scalar, i: Scalar) -> Array:

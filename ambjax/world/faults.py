@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.numerics.gaussian import threefry
-from ambjax.numerics.records import Scalar, leaf, record, static
+from ambjax.numerics.records import Scalar, bounded, record, static
 
 # Random streams of a member's key, in addition to those of `numerics.gaussian`.
 OUTLIERS, DROPOUTS = 3, 4
@@ -28,19 +28,11 @@ class Sensed(NamedTuple):
 
 
 def _rate() -> Any:
-    return leaf(
-        default=0.0, unit="1/s", at_least=0, at_most=1e9, doc="mean number per second, equally likely at every sample"
-    )
+    return bounded(0.0, "1/s", 0, 1e9, "mean number per second, equally likely at every sample")
 
 
 def _at() -> Any:
-    return leaf(
-        default=None,
-        unit="s",
-        at_least=0,
-        at_most=1e6,
-        doc="time of one more fault, rounded to the nearest sample; none: no other fault",
-    )
+    return bounded(None, "s", 0, 1e6, "time of one more fault, rounded to the nearest sample; none: no other fault")
 
 
 @record
@@ -51,7 +43,7 @@ class Outliers:
     """
 
     rate: Scalar = _rate()
-    size: Scalar = leaf(default=1e-3, unit="m", at_least=0, at_most=1.0, doc="error of a reading")
+    size: Scalar = bounded(1e-3, "m", 0, 1.0, "error of a reading")
     at: Scalar | None = _at()
 
     def onset(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Array:
@@ -70,18 +62,14 @@ class Dropouts:
     """
 
     rate: Scalar = _rate()
-    duration: Scalar = leaf(
-        default=5e-4, unit="s", at_least=0, at_most=1e6, doc="duration, rounded to whole samples, at least one"
-    )
+    duration: Scalar = bounded(5e-4, "s", 0, 1e6, "duration, rounded to whole samples, at least one")
     at: Scalar | None = _at()
     value: str = static(default=VALUES[0], choices=VALUES, doc="reading during a dropout")
 
     def onset(self, key: tuple[Scalar, Scalar], sample: Scalar, period: Scalar) -> Array:
-        """Return whether a dropout begins at a sample."""
         return _begins(self, DROPOUTS, key, sample, period)[0]
 
     def samples(self, period: Scalar) -> Array:
-        """Return the number of samples of a dropout."""
         return jnp.maximum(jnp.round(self.duration / period), 1.0)
 
     def read(self, last: Array, end: Scalar) -> Array:

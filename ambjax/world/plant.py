@@ -9,7 +9,7 @@ from ambjax.numerics.records import Scalar, record
 from ambjax.numerics.smooth import reciprocal
 from ambjax.world.amplifier import CoilVoltages
 from ambjax.world.bearing import Bearing, Signals
-from ambjax.world.iron import Iron
+from ambjax.world.magnet import Iron
 from ambjax.world.sensor import Measurement
 
 

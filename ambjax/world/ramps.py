@@ -1,11 +1,12 @@
 """Signals that consist of straight lines: ramp and trapezoid."""
 
+from typing import Any
+
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, record
-from ambjax.world.waveforms import hull, later
+from ambjax.numerics.records import Scalar, bounded, leaf, record
+from ambjax.world.waveforms import Rise, hull, later
 
 
 def _share(t: Scalar, start: Scalar, duration: Scalar) -> Array:
@@ -14,28 +15,18 @@ def _share(t: Scalar, start: Scalar, duration: Scalar) -> Array:
 
 
 @record
-class Ramp:
+class Ramp(Rise):
     """0 until `start`, then a straight line to `amplitude` over `duration`, then `amplitude`.
 
     Use it for a load that grows slowly: `Scenario(q_f=signals.Ramp(50.0, start=0.1, duration=0.5))`.
     """
 
-    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="final value")
-    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="start of the rise")
-    duration: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="duration of the rise")
+    @staticmethod
+    def curve(s: Any) -> Any:
+        return s
 
     def __call__(self, t: Scalar) -> Array:
         return self.amplitude * _share(t, self.start, self.duration)
-
-    def span(self, end: float) -> tuple[float, float]:
-        ends = (np.clip((t - np.asarray(self.start)) / self.duration, 0.0, 1.0) for t in (0.0, end))
-        return hull(*(self.amplitude * share for share in ends))
-
-    def edges(self) -> tuple[Scalar, ...]:
-        """Return the times of the two kinks, s."""
-        return (self.start, self.start + self.duration)
-
-    shifted = later
 
 
 @record
@@ -47,10 +38,10 @@ class Trapezoid:
     """
 
     amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="largest value")
-    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="start of the rise")
-    rise: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="duration of the rise")
-    hold: Scalar = leaf(default=0.1, unit="s", at_least=0, at_most=1e9, doc="time at the largest value")
-    fall: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="duration of the fall")
+    start: Scalar = bounded(0.0, "s", -1e9, 1e9, "start of the rise")
+    rise: Scalar = bounded(0.1, "s", 1e-9, 1e9, "duration of the rise")
+    hold: Scalar = bounded(0.1, "s", 0, 1e9, "time at the largest value")
+    fall: Scalar = bounded(0.1, "s", 1e-9, 1e9, "duration of the fall")
 
     def __call__(self, t: Scalar) -> Array:
         down = self.start + self.rise + self.hold
@@ -60,7 +51,6 @@ class Trapezoid:
         return hull(0.0, self.amplitude)
 
     def edges(self) -> tuple[Scalar, ...]:
-        """Return the times of the four kinks, s."""
         top, down = self.start + self.rise, self.start + self.rise + self.hold
         return (self.start, top, down, down + self.fall)
 

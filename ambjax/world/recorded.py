@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, record, static
+from ambjax.numerics.records import Scalar, bounded, leaf, record, static
 from ambjax.numerics.smooth import TWO_PI, sine
 from ambjax.world.waveforms import later
 
@@ -63,7 +63,6 @@ class Samples:
 
     @functools.cached_property
     def digest(self) -> str:
-        """SHA-256 of the numbers."""
         return hashlib.sha256(np.stack([self.times, self.values]).tobytes()).hexdigest()
 
     def __eq__(self, other: object) -> bool:
@@ -98,10 +97,8 @@ class Recorded:
 
     samples: Samples = static(doc="times and values")
     held: bool = static(default=False, doc="whether a value is held until the next time")
-    scale: Scalar = leaf(default=1.0, unit="1", at_least=-1e20, at_most=1e20, doc="factor of the values")
-    start: Scalar = leaf(
-        default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="time of the run at which the time of the file is 0"
-    )
+    scale: Scalar = bounded(1.0, "1", -1e20, 1e20, "factor of the values")
+    start: Scalar = bounded(0.0, "s", -1e9, 1e9, "time of the run at which the time of the file is 0")
 
     def __call__(self, t: Scalar) -> Array:
         dtype = jnp.result_type(float)
@@ -167,7 +164,6 @@ class BandNoise:
     ordered: ClassVar = ("f_low", "f_high")
 
     def realised(self, key: Array) -> Lines:
-        """Draw the signal of one member."""
         place, turn = jax.random.uniform(key, (2, LINES))
         share = (jnp.arange(LINES) + place) / LINES
         return Lines(self.std, self.f_low + (self.f_high - self.f_low) * share, 2 * jnp.pi * turn)

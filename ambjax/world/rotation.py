@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, part, record
+from ambjax.numerics.records import Scalar, bounded, leaf, part, record
 from ambjax.numerics.smooth import TWO_PI, sine
 from ambjax.world.waveforms import Sum, hull
 
@@ -20,7 +20,7 @@ def _rpm(at_least: float, doc: str, **more: Any) -> Any:
 
 
 def _phase() -> Any:
-    return leaf(default=0.0, unit="rad", at_least=-1e9, at_most=1e9, doc="phase of the sine at t = 0")
+    return bounded(0.0, "rad", -1e9, 1e9, "phase of the sine at t = 0")
 
 
 @record
@@ -41,7 +41,7 @@ class Rotation:
     """
 
     speed: Scalar = _rpm(-1e7, "speed at t = 0")
-    acceleration: Scalar = leaf(default=0.0, unit="rpm/s", at_least=-1e9, at_most=1e9, doc="rate of the speed")
+    acceleration: Scalar = bounded(0.0, "rpm/s", -1e9, 1e9, "rate of the speed")
     speed_end: Scalar | None = _rpm(
         -1e7, "speed at which the run-up or run-down ends; none: it never ends", default=None
     )
@@ -64,7 +64,6 @@ class Rotation:
         return (jnp.maximum((self.speed_end - self.speed) / jnp.where(still, 1.0, self.acceleration), 0.0),)
 
     def edges(self) -> tuple[Scalar, ...]:
-        """Return the instants (s) at which the rate of the speed jumps."""
         return (*self._end(), *(change.at for change in self.changes))
 
     def _sweep(self, t: Array) -> Array:
@@ -109,12 +108,6 @@ def known(rotation: Rotation | None) -> Rotation:
     return rotation
 
 
-def _bound(rotation: Rotation | None, size: Scalar, end: float) -> tuple[float, float]:
-    """Return bounds of `size` omega^2 sin(...) from 0 to `end` (s). `size`: at least 0, in kg m or m."""
-    peak = np.asarray(size) * known(rotation).fastest(end) ** 2
-    return hull(-peak, peak)
-
-
 def turned(node: Any, rotation: Rotation) -> Any:
     """Return a signal or a runout in which each part without a speed of its own has this one."""
     if isinstance(node, Sum):
@@ -122,8 +115,29 @@ def turned(node: Any, rotation: Rotation) -> Any:
     return dataclasses.replace(node, rotation=rotation) if getattr(node, "rotation", rotation) is None else node
 
 
+class Turning:
+    """Base class of the loads `size` omega^2 sin(angle + phase) of a turning rotor. `size`: at least 0, kg m or m."""
+
+    size: Any
+    phase: Scalar
+    rotation: Rotation | None
+
+    def __call__(self, t: Scalar) -> Array:
+        rotation = known(self.rotation)
+        omega = rotation.omega(t)
+        return self.size * omega**2 * sine(rotation.turns(t) + self.phase / TWO_PI)
+
+    def span(self, end: float) -> tuple[float, float]:
+        peak = np.asarray(self.size) * known(self.rotation).fastest(end) ** 2
+        return hull(-peak, peak)
+
+    def edges(self) -> tuple[Scalar, ...]:
+        """Return the end of the run-up, s, where the slope of the speed jumps; empty without such an end."""
+        return known(self.rotation).edges()
+
+
 @record
-class Unbalance:
+class Unbalance(Turning):
     """Force of an unbalance U, in N: U omega^2 sin(angle + phase).
 
     U is the unbalance mass times its distance from the axis. omega is the speed in rad/s; the angle is its integral.
@@ -140,21 +154,13 @@ class Unbalance:
     rotation: Rotation | None = _rotation()
     unit: ClassVar = "N"
 
-    def __call__(self, t: Scalar) -> Array:
-        rotation = known(self.rotation)
-        omega = rotation.omega(t)
-        return GRAM_MM * self.unbalance * omega**2 * sine(rotation.turns(t) + self.phase / TWO_PI)
-
-    def span(self, end: float) -> tuple[float, float]:
-        return _bound(self.rotation, GRAM_MM * self.unbalance, end)
-
-    def edges(self) -> tuple[Scalar, ...]:
-        """Return the end of the run-up, s, where the slope of the speed jumps; empty without such an end."""
-        return known(self.rotation).edges()
+    @property
+    def size(self) -> Scalar:
+        return GRAM_MM * self.unbalance
 
 
 @record
-class UnbalanceGrade:
+class UnbalanceGrade(Turning):
     """Acceleration of a rotor with the unbalance of a balance quality grade, in m/s^2: e omega^2 sin(angle + phase).
 
     The grade G is the product of the eccentricity e and the service speed, so e = G / (2 pi `service_speed` / 60); the
@@ -176,17 +182,7 @@ class UnbalanceGrade:
         """Eccentricity e of the rotor, m."""
         return MM * self.grade / (TWO_PI * PER_MINUTE * self.service_speed)
 
-    def __call__(self, t: Scalar) -> Array:
-        rotation = known(self.rotation)
-        omega = rotation.omega(t)
-        return self.eccentricity * omega**2 * sine(rotation.turns(t) + self.phase / TWO_PI)
-
-    def span(self, end: float) -> tuple[float, float]:
-        return _bound(self.rotation, self.eccentricity, end)
-
-    def edges(self) -> tuple[Scalar, ...]:
-        """Return the end of the run-up, s, where the slope of the speed jumps; empty without such an end."""
-        return known(self.rotation).edges()
+    size = eccentricity
 
 
 @record
@@ -197,7 +193,7 @@ class Harmonic:
     """
 
     amplitude: Scalar = leaf(unit="m", at_least=-1.0, at_most=1.0, doc="amplitude, half of the peak-to-peak value")
-    number: Scalar = leaf(default=1.0, at_least=1, at_most=1000, whole=True, doc="waves in one turn")
+    number: Scalar = bounded(1.0, "", 1, 1000, "waves in one turn", whole=True)
     phase: Scalar = _phase()
 
 
@@ -207,8 +203,7 @@ class Runout:
 
     The sensor reads the position plus the runout; low-pass and gain follow. The true position does not contain it.
 
-    Use it where the sensor reads a turned surface:
-    `sensors.Sensor(runout=sensors.Runout((sensors.Harmonic(2e-6),)))`.
+    Use it where the sensor reads a turned surface: `sensors.Sensor(runout=sensors.Runout((sensors.Harmonic(2e-6),)))`.
     """
 
     harmonics: tuple[Harmonic, ...] = part(default=(), doc="the harmonics")

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, matrix, part, record, static
+from ambjax.numerics.records import Scalar, bounded, leaf, matrix, part, record, static
 from ambjax.numerics.small_matrices import times
 from ambjax.numerics.smooth import TWO_PI, sine
 from ambjax.world.rotation import GRAM_MM, PER_MINUTE, Rotation, SpeedChange
@@ -21,9 +21,7 @@ class RotorUnbalance:
     amount: Scalar = leaf(unit="g mm", at_least=0, at_most=1e9, doc="unbalance mass times its distance from the axis")
     along_x: Array = matrix("n", "forces on the coordinates per force along x at the place", unit="1")
     along_y: Array = matrix("n", "the same for y", unit="1")
-    phase: Scalar = leaf(
-        default=0.0, unit="degrees", at_least=-1e6, at_most=1e6, doc="angle from the x axis at rotor angle 0"
-    )
+    phase: Scalar = bounded(0.0, "degrees", -1e6, 1e6, "angle from the x axis at rotor angle 0")
     graded: bool = static(default=False, doc="whether the amount is that of a balance quality grade, per mass")
 
     def force(self, turns: Array, W: Array, W_dot: Array) -> Array:
@@ -66,8 +64,8 @@ class Rotor:
     at_magnets: Array = matrix("c n", "rows b_k: z_k = b_k q is the displacement at the magnet of axis k")
     at_sensors: Array = matrix("c n", "rows c_k: c_k q is what the sensor of axis k sees")
     gravity: Array = matrix("n", "weight, as forces on the coordinates")
-    speed: Scalar = leaf(default=0.0, unit="rpm", at_least=-1e7, at_most=1e7, doc="speed at t = 0")
-    acceleration: Scalar = leaf(default=0.0, unit="rpm/s", at_least=-1e9, at_most=1e9, doc="rate of the speed")
+    speed: Scalar = bounded(0.0, "rpm", -1e7, 1e7, "speed at t = 0")
+    acceleration: Scalar = bounded(0.0, "rpm/s", -1e9, 1e9, "rate of the speed")
     changes: tuple[SpeedChange, ...] = part(default=(), doc="later changes of the rate, of a table of speeds")
     unbalances: tuple[RotorUnbalance, ...] = part(default=(), doc="unbalances")
     loads: tuple[RotorLoad, ...] = part(default=(), doc="loads")
@@ -78,7 +76,6 @@ class Rotor:
 
     @property
     def rotation(self) -> Rotation:
-        """Speed and angle over time."""
         return Rotation(self.speed, self.acceleration, changes=self.changes)
 
     def speed_at(self, t: Scalar) -> Array:
@@ -104,7 +101,6 @@ class Rotor:
         return dataclasses.replace(self, unbalances=(), loads=(), base=())
 
     def edges(self) -> tuple[Scalar, ...]:
-        """Return the instants (s) at which a load, the base motion or the rate of the speed jumps."""
         signals = [one.signal for one in (*self.loads, *self.base)]
         return (*self.rotation.edges(), *(edge for signal in signals for edge in edges_of(signal)))
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, part, record
-from ambjax.world.amplifier import Amplifier, CoilResponse, CoilVoltages, CurrentAmplifier
+from ambjax.numerics.records import Scalar, bounded, part, record
+from ambjax.world.amplifier import Amplifier, CoilVoltages, CurrentAmplifier
 from ambjax.world.bearing import Bearing
 from ambjax.world.plant import Plant
 from ambjax.world.recorded import Knots
@@ -23,11 +23,9 @@ from ambjax.world.waveforms import Constant, Signal, edges_of, frequencies_of, i
 DESIGN_STREAM, SIGNAL_STREAM = np.uint32(2**32 - 1), np.uint32(2**32 - 2)
 # Fields that are signals. The position in this list selects the random key of a signal, so add new fields at the end.
 SLOTS = ("reference", "q_z", "q_v", "q_i", "q_f", "base")
-
 # |z| at which a rotor with an elastic stop is lost, as a share of s_0. The lower bound of the gaps (GAP_FLOOR) acts
 # only at a larger |z|.
 POLE = 0.99
-
 # An amplifier without any of its fields applies the command at once, and without a limit of its own.
 _IDEAL_SENSOR, _IDEAL_AMPLIFIER = IdealSensor(), Amplifier()
 
@@ -36,12 +34,11 @@ _IDEAL_SENSOR, _IDEAL_AMPLIFIER = IdealSensor(), Amplifier()
 class Initial:
     """State of the plant at t = 0."""
 
-    z: Scalar = leaf(default=0.0, unit="m", at_least=-1.0, at_most=1.0, doc="displacement, within the clearance")
-    z_dot: Scalar = leaf(default=0.0, unit="m/s", at_least=-1e6, at_most=1e6, doc="velocity")
-    i: Scalar = leaf(default=0.0, unit="A", at_least=-1e6, at_most=1e6, doc="current deviation")
+    z: Scalar = bounded(0.0, "m", -1.0, 1.0, "displacement, within the clearance")
+    z_dot: Scalar = bounded(0.0, "m/s", -1e6, 1e6, "velocity")
+    i: Scalar = bounded(0.0, "A", -1e6, 1e6, "current deviation")
 
     def measurement(self) -> Measurement:
-        """The initial state as a measurement."""
         return Measurement(*(jnp.asarray(x) for x in (self.z, self.z_dot, self.i)))
 
 
@@ -68,20 +65,16 @@ class Scenario:
     )
     sensor: Sensor | None = part(default=None, doc="errors of the sensors; None: no errors")
     initial: Initial = part(default=Initial(), doc="state of the plant at t = 0")
-    u_max: Scalar = leaf(
-        default=jnp.inf, unit="V", at_least=1e-9, at_most=1e12, infinite=True, doc="limit of the supply; inf: no limit"
-    )
+    u_max: Scalar = bounded(jnp.inf, "V", 1e-9, 1e12, "limit of the supply; inf: no limit", infinite=True)
     amplifier: Amplifier | CurrentAmplifier | None = part(
         default=None, doc="amplifier; None: the coils receive the commanded voltage"
     )
-    clearance: Scalar | None = leaf(
-        default=None, unit="m", at_least=1e-9, at_most=1.0, doc="|z| at which the rotor touches down; none: 0.9 s_0"
-    )
+    clearance: Scalar | None = bounded(None, "m", 1e-9, 1.0, "|z| at which the rotor touches down; none: 0.9 s_0")
     stop: Stop | None = part(
         default=None, doc="the touchdown bearing at the clearance; None: a rotor that reaches the clearance is lost"
     )
-    seed: Scalar = leaf(default=0, at_least=0, at_most=2**32 - 1, whole=True, doc="seed of the noise")
-    member: Scalar = leaf(default=0, at_least=0, at_most=2**32 - 1, whole=True, doc="member of an ensemble")
+    seed: Scalar = bounded(0, "", 0, 2**32 - 1, "seed of the noise", whole=True)
+    member: Scalar = bounded(0, "", 0, 2**32 - 1, "member of an ensemble", whole=True)
 
     @property
     def touchdown(self) -> Scalar:
@@ -95,12 +88,10 @@ class Scenario:
 
     @property
     def sensors(self) -> Sensor:
-        """The field `sensor`, or ideal sensors."""
         return self.sensor or _IDEAL_SENSOR
 
     @property
     def actuator(self) -> Amplifier | CurrentAmplifier:
-        """The field `amplifier`, or an ideal amplifier."""
         return self.amplifier or _IDEAL_AMPLIFIER
 
     @property
@@ -121,9 +112,9 @@ class Scenario:
         """
         plant = self.plant
 
-        def response() -> CoilResponse:
+        def response() -> tuple[Array, Array]:
             still, driven = (plant.measurement(plant.rates(state, volt, 0.0, q_i)).i for volt in (0.0, 1.0))
-            return CoilResponse(still, driven - still)  # i' is linear in u
+            return still, driven - still  # i' is linear in u
 
         return self.actuator.at_coil(command, plant.measurement(state).i, self.u_max, response)
 
@@ -196,7 +187,6 @@ class Scenario:
         return dataclasses.replace(self, sensor=self.sensor and dataclasses.replace(self.sensor, **fields))
 
     def louder(self, factor: Scalar) -> "Scenario":
-        """Return the scenario with `factor` times the noise of its sensor."""
         return dataclasses.replace(self, sensor=self.sensor and self.sensor.louder(factor))
 
     def acceleration(self, t: Scalar) -> Array:
@@ -227,7 +217,6 @@ class Scenario:
         return dataclasses.replace(self, sensor=sensor, **signals)
 
     def undisturbed(self) -> "Scenario":
-        """Return the scenario without disturbances and runout."""
         none = Constant()
         calm = dataclasses.replace(self, q_z=none, q_v=none, q_i=none, q_f=None, base=None)
         return calm.with_sensor(runout=None)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from ambjax.numerics.gaussian import LARGEST_NORMAL, normals
-from ambjax.numerics.records import Scalar, leaf, part, record, static
+from ambjax.numerics.records import Scalar, bounded, part, record, static
 from ambjax.numerics.smooth import polynomial
 from ambjax.world.faults import Dropouts, FaultOnsets, Outliers, Sensed
 from ambjax.world.rotation import Runout
@@ -54,32 +54,18 @@ class Sensor:
     Use it in every case that a real bearing must follow: `Scenario(sensor=sensors.Sensor(std=1e-7, velocity=False))`.
     """
 
-    std: Scalar = leaf(default=0.0, unit="m", at_least=0, at_most=1.0, doc="standard deviation of the noise of z")
-    std_z_dot: Scalar = leaf(
-        default=0.0, unit="m/s", at_least=0, at_most=1e6, doc="standard deviation of the noise of z_dot"
+    std: Scalar = bounded(0.0, "m", 0, 1.0, "standard deviation of the noise of z")
+    std_z_dot: Scalar = bounded(0.0, "m/s", 0, 1e6, "standard deviation of the noise of z_dot")
+    std_i: Scalar = bounded(0.0, "A", 0, 1e6, "standard deviation of the noise of i")
+    offset: Scalar = bounded(0.0, "m", -1.0, 1.0, "offset of the position sensor")
+    gain: Scalar = bounded(1.0, "1", 0.01, 100, "gain of the position sensor, ideally 1")
+    bandwidth: Scalar | None = bounded(None, "Hz", 1, 1e9, "bandwidth of the position sensor, order 1; none: no lag")
+    bits: Scalar | None = bounded(None, "", 2, 32, "bits of the converter of z and i; none: not rounded", whole=True)
+    bits_i: Scalar | None = bounded(
+        None, "", 2, 32, "resolution of the converter of i, if it is another one; none: that of z", whole=True
     )
-    std_i: Scalar = leaf(default=0.0, unit="A", at_least=0, at_most=1e6, doc="standard deviation of the noise of i")
-    offset: Scalar = leaf(default=0.0, unit="m", at_least=-1.0, at_most=1.0, doc="offset of the position sensor")
-    gain: Scalar = leaf(default=1.0, unit="1", at_least=0.01, at_most=100, doc="gain of the position sensor, ideally 1")
-    bandwidth: Scalar | None = leaf(
-        default=None, unit="Hz", at_least=1, at_most=1e9, doc="bandwidth of the position sensor, order 1; none: no lag"
-    )
-    bits: Scalar | None = leaf(
-        default=None, at_least=2, at_most=32, whole=True, doc="bits of the converter of z and i; none: not rounded"
-    )
-    bits_i: Scalar | None = leaf(
-        default=None,
-        at_least=2,
-        at_most=32,
-        whole=True,
-        doc="resolution of the converter of i, if it is another one; none: that of z",
-    )
-    range_z: Scalar | None = leaf(
-        default=None, unit="m", at_least=1e-9, at_most=1.0, doc="the converter reads z within +-range_z; none: s_0"
-    )
-    range_i: Scalar | None = leaf(
-        default=None, unit="A", at_least=1e-9, at_most=1e6, doc="the converter reads i within +-range_i; none: 2 i_0"
-    )
+    range_z: Scalar | None = bounded(None, "m", 1e-9, 1.0, "the converter reads z within +-range_z; none: s_0")
+    range_i: Scalar | None = bounded(None, "A", 1e-9, 1e6, "the converter reads i within +-range_i; none: 2 i_0")
     velocity: bool = static(default=True, doc="whether z_dot is measured; if not, an observer must estimate it")
     outliers: Outliers | None = part(default=None, doc="single wrong readings of the position; None: no such fault")
     dropouts: Dropouts | None = part(
@@ -99,7 +85,6 @@ class Sensor:
 
     @property
     def faulty(self) -> bool:
-        """Whether the position sensor has faults."""
         return self.outliers is not None or self.dropouts is not None
 
     def noise(self, key: tuple[Scalar, Scalar], sample: Scalar) -> Measurement:
@@ -167,7 +152,6 @@ class Sensor:
         return 2 * i_0 if self.range_i is None else self.range_i
 
     def louder(self, factor: Scalar) -> "Sensor":
-        """Return the sensor with `factor` times the noise."""
         stds = {"std": self.std, "std_z_dot": self.std_z_dot, "std_i": self.std_i}
         return dataclasses.replace(self, **{name: std * factor for name, std in stds.items()})
 

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jax import Array
 
-from ambjax.numerics.records import Scalar, leaf, record
+from ambjax.numerics.records import Scalar, bounded, leaf, record
 from ambjax.world.sensor import Measurement
 
 # Penetration over which the damping rises to its full value, as a share of the clearance.
@@ -22,7 +22,7 @@ class Stop:
     """
 
     stiffness: Scalar = leaf(unit="N/m", at_least=1.0, at_most=1e12, doc="stiffness of the touchdown bearing")
-    damping: Scalar = leaf(default=0.0, unit="N s/m", at_least=0, at_most=1e9, doc="damping of the touchdown bearing")
+    damping: Scalar = bounded(0.0, "N s/m", 0, 1e9, "damping of the touchdown bearing")
 
     def force(self, motion: Measurement, gap: Scalar) -> Array:
         """Return the force on the rotor, N. `motion`: true motion. `gap`: |z| at which the stop begins, m."""

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.numerics.records import Scalar, is_traced, leaf, part, record
+from ambjax.numerics.records import Scalar, bounded, is_traced, leaf, part, record
 from ambjax.numerics.smooth import TWO_PI, sine
 
 T = TypeVar("T")
@@ -58,7 +58,7 @@ class Constant:
     `Scenario(reference=signals.Constant(1e-4))`.
     """
 
-    value: Scalar = leaf(default=0.0, at_least=-1e20, at_most=1e20, doc="the value")
+    value: Scalar = bounded(0.0, "", -1e20, 1e20, "the value")
 
     def __call__(self, t: Scalar) -> Array:
         return jnp.broadcast_to(jnp.asarray(self.value, jnp.result_type(float)), jnp.shape(t))
@@ -76,7 +76,7 @@ class Step:
     """
 
     amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="value after the jump")
-    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="time of the jump to `amplitude`")
+    start: Scalar = bounded(0.0, "s", -1e9, 1e9, "time of the jump to `amplitude`")
 
     def __call__(self, t: Scalar) -> Array:
         return jnp.where(jnp.asarray(t) >= self.start, self.amplitude, 0.0)
@@ -86,7 +86,6 @@ class Step:
         return hull(np.where(start > 0, 0.0, self.amplitude), np.where(start <= end, self.amplitude, 0.0))
 
     def edges(self) -> tuple[Scalar, ...]:
-        """Return the time of the jump, s."""
         return (self.start,)
 
     shifted = later
@@ -114,11 +113,9 @@ class Pulse:
         return hull(np.where(on, self.amplitude, 0.0), np.where(off, 0.0, self.amplitude))
 
     def edges(self) -> tuple[Scalar, ...]:
-        """Return the times of the two jumps, s."""
         return (self.start, self.stop)
 
     def shifted(self, by: Scalar) -> "Pulse":
-        """Return the pulse, `by` seconds later. Both jumps shift together, so the pulse keeps its length."""
         return dataclasses.replace(self, start=self.start + by, stop=self.stop + by)
 
 
@@ -132,7 +129,7 @@ class Sine:
 
     amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="amplitude, half of the peak-to-peak value")
     frequency: Scalar = leaf(unit="Hz", at_least=0, at_most=1e9, doc="frequency")
-    phase: Scalar = leaf(default=0.0, unit="rad", at_least=-1e9, at_most=1e9, doc="phase at t = 0")
+    phase: Scalar = bounded(0.0, "rad", -1e9, 1e9, "phase at t = 0")
 
     def __call__(self, t: Scalar) -> Array:
         return self.amplitude * sine(self.frequency * jnp.asarray(t) + self.phase / TWO_PI)
@@ -143,7 +140,31 @@ class Sine:
 
 
 @record
-class SmoothStep:
+class Rise:
+    """Base class of the signals that rise from 0 to `amplitude`."""
+
+    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="final value")
+    start: Scalar = bounded(0.0, "s", -1e9, 1e9, "start of the rise")
+    duration: Scalar = bounded(0.1, "s", 1e-9, 1e9, "duration of the rise")
+
+    @staticmethod
+    def curve(s: Any) -> Any:
+        """Return the share of the amplitude at the share s of the duration, 0 to 1."""
+        raise NotImplementedError
+
+    def span(self, end: float) -> tuple[float, float]:
+        shares = [np.clip((t - np.asarray(self.start)) / self.duration, 0.0, 1.0) for t in (0.0, end)]
+        return hull(*(self.amplitude * self.curve(s) for s in shares))
+
+    def edges(self) -> tuple[Scalar, ...]:
+        """Return the times at which the rise begins and ends, s."""
+        return (self.start, self.start + self.duration)
+
+    shifted = later
+
+
+@record
+class SmoothStep(Rise):
     """0 until `start`, a smooth rise over `duration`, then `amplitude`.
 
     During the rise, the value is amplitude (10 s^3 - 15 s^4 + 6 s^5) with s = (t - start)/duration. The signal has
@@ -152,24 +173,14 @@ class SmoothStep:
     Use it to move the rotor: `Scenario(reference=signals.SmoothStep(1e-4, start=0.1, duration=0.02))`.
     """
 
-    amplitude: Scalar = leaf(at_least=-1e20, at_most=1e20, doc="final value")
-    start: Scalar = leaf(default=0.0, unit="s", at_least=-1e9, at_most=1e9, doc="start of the rise")
-    duration: Scalar = leaf(default=0.1, unit="s", at_least=1e-9, at_most=1e9, doc="duration of the rise")
+    @staticmethod
+    def curve(s: Any) -> Any:
+        return s**3 * (10 - 15 * s + 6 * s**2)
 
     def __call__(self, t: Scalar) -> Array:
         s = (jnp.asarray(t) - self.start) / self.duration
-        rising = s**3 * (10 - 15 * s + 6 * s**2)
+        rising = self.curve(s)
         return self.amplitude * jnp.where(s <= 0, 0.0, jnp.where(s >= 1, 1.0, rising))
-
-    def span(self, end: float) -> tuple[float, float]:
-        shares = [np.clip((t - np.asarray(self.start)) / self.duration, 0.0, 1.0) for t in (0.0, end)]
-        return hull(*(self.amplitude * s**3 * (10 - 15 * s + 6 * s**2) for s in shares))
-
-    def edges(self) -> tuple[Scalar, ...]:
-        """Return the times at which the third derivative jumps, s."""
-        return (self.start, self.start + self.duration)
-
-    shifted = later
 
 
 @record
@@ -223,11 +234,9 @@ class Sum:
         return sum(low for low, _ in ends), sum(high for _, high in ends)
 
     def edges(self) -> tuple[Scalar, ...]:
-        """Return the edges of all terms, s."""
         return tuple(edge for term in self.terms for edge in edges_of(term))
 
     def knots(self) -> tuple[Any, ...]:
-        """Return the knots of all recorded terms."""
         return tuple(one for term in self.terms for one in knots_of(term))
 
     def realised(self, key: Array) -> "Sum":

@@ -21,7 +21,7 @@ from ambjax.ensemble.paths import places
 from ambjax.linear import Zones
 from ambjax.world.amplifier import Amplifier, CoilLimits
 from ambjax.world.faults import Dropouts, Outliers
-from ambjax.world.iron import Iron
+from ambjax.world.magnet import Iron
 from ambjax.world.plant import Plant
 from ambjax.world.rotation import Rotation, Runout
 from ambjax.world.scenario import Initial

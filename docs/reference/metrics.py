@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from ambjax.simulation import orders
+from ambjax.simulation import response
 from ambjax.simulation.folds import Count, Driven, Peak, Reaching, Rms, Variation
 from ambjax.simulation.metrics import UNITS, Metrics
 from ambjax.simulation.trajectory import NOT_SAVED, Row
@@ -42,7 +42,7 @@ OTHERS = {
     "trajectory.npz",
 }
 # Metrics of a case with [rotor].
-for _name in orders.UNITS:
+for _name in response.UNITS:
     _signal, _order, _kind = _name.split("_")
     OTHERS[_name] = f"with `[rotor]`: {'phase' if _kind == 'deg' else 'amplitude'} of {_signal} at {_order[0]} " + (
         "times the speed, from the fit A cos(k angle + phase) over the whole revolutions from `run.settle` on"

@@ -11,8 +11,7 @@ from jax import Array
 
 from ambjax.extend import Scalar, leaf, record
 from ambjax.simulation.folds import Ending, Fold, Named
-from ambjax.simulation.span import Span
-from ambjax.simulation.trajectory import ALIVE, Row
+from ambjax.simulation.trajectory import ALIVE, Row, Span
 from ambjax.world.scenario import Scenario
 from tuning.problem.limits import PREFIX
 from tuning.problem.quantities import NORM

@@ -17,8 +17,7 @@ from ambjax.extend import Scalar, canonical
 from ambjax.linear import linearisation_inputs
 from ambjax.linear.notch_design import redesigned
 from ambjax.simulation.clock import Clock
-from ambjax.simulation.parts import rolled_in_parts
-from ambjax.simulation.rollout import prepare, rollout
+from ambjax.simulation.rollout import prepare, rolled_in_parts, rollout
 from ambjax.world.scenario import Scenario
 from tuning.problem.loss import Loss
 from tuning.problem.quantities import LOOPS

@@ -13,10 +13,8 @@ from jax import Array
 from ambjax.cases.tune_table import LOOP_MARGIN, MEAN_MARGIN, WORST_MARGIN
 from ambjax.extend import Scalar, leaf, record, static
 from ambjax.simulation.folds import Driven, Ending, Fold, Named, Peak, Rms, Variation
-from ambjax.simulation.orders import Orders
-from ambjax.simulation.response import Overshoot, Settling
-from ambjax.simulation.span import Span
-from ambjax.simulation.trajectory import Row
+from ambjax.simulation.response import Orders, Overshoot, Settling
+from ambjax.simulation.trajectory import Row, Span
 from ambjax.world.rotation import Rotation
 
 # Largest number of members whose loops the search linearises. The judge linearises the loops of all its members, and
