@@ -7,36 +7,6 @@ from ambjax.codegen.c99.statements import word
 from ambjax.codegen.interface import INPUTS
 from ambjax.codegen.trace import Trace
 
-# Comments of a header on the flag `started`, the inputs, and the functions `init`, `step` and `reset`.
-ABOUT = {
-    "controller": {
-        "started": "0: the laws start at the next accepted readings",
-        "inputs": "inputs of a step: the readings, checked against params->processor.guard if there is a guard, "
-        "and the reference,\n * checked against params->limits",
-        "init": "Initialise the state before the first step: u is 0; the first accepted readings will start the laws.",
-        "step": "Compute one sample. Returns the status bits above.",
-        "reset": "Restart the laws at the next accepted readings. The delayed commands are kept.",
-    },
-    "plant": {
-        "started": "0: the next step reads the sensors in the initial state",
-        "inputs": "inputs of a step: u, commanded at the last sample; the disturbances, constant over the sample "
-        "that ends with\n * the step; and the noise of its readings",
-        "init": "Initialise the state before the first step.",
-        "step": "Advance the plant to the next sample, then read the sensors; the first step reads them in the "
-        "initial state.\n * Returns the status bits above.",
-        "reset": "Begin again: the next step reads the sensors in the initial state, params->initial.",
-    },
-    "loop": {
-        "started": "0: the next step begins with the plant in the initial state",
-        "inputs": "inputs of a step: disturbances, constant over the sample that ends with the step, then noise "
-        "and reference",
-        "init": "Initialise the state before the first step.",
-        "step": "Advance the plant to the next sample under the voltages that act, read the sensors, and step "
-        "the\n * controller; the first step reads the sensors in the initial state. Returns the status bits above.",
-        "reset": "Begin again: the next step reads the sensors in the initial state, params->initial.",
-    },
-}
-
 
 def notes_of(trace: Trace) -> list[str]:
     """Return lines on the order of operations in a sample, on what the export fixes, and on what a step checks."""

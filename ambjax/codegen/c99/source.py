@@ -2,6 +2,7 @@
 
 import functools
 import importlib.resources
+import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from ambjax._version import __version__
 from ambjax.codegen.block import UNREAD, Number
-from ambjax.codegen.c99.notes import ABOUT, notes_of
+from ambjax.codegen.c99.notes import notes_of
 from ambjax.codegen.c99.statements import CStatements, c_constant, word
 from ambjax.codegen.trace import Trace
 
@@ -25,6 +26,11 @@ class Origin(NamedTuple):
     case: str
     digest: str
     parts: Sequence[str]
+
+
+def template(name: str) -> str:
+    """Return a file of the folder `templates`."""
+    return (importlib.resources.files("ambjax.codegen.c99") / "templates" / name).read_text(encoding="utf-8")
 
 
 class Writer:
@@ -86,11 +92,11 @@ class Writer:
         texts = {name: "".join(f"{line}\n" for line in lines) for name, lines in groups.items()}
         return self.filled("source.c", f"{self.prefix}.c", **texts)
 
-    def filled(self, template: str, file: str, **values: object) -> str:
-        """Return a file of the folder `templates` with its names in braces replaced. `file`: name of the result."""
-        path, p = importlib.resources.files("ambjax.codegen.c99") / "templates" / template, self.prefix
+    def filled(self, name: str, file: str, **values: object) -> str:
+        """Return a `template` with its names in braces replaced. `file`: name of the result."""
+        p = self.prefix
         names = {"p": p, "P": p.upper(), "mark": MARK.format(p=p), "banner": self.banner(file)}
-        return path.read_text(encoding="utf-8").format(**names, **values)
+        return template(name).format(**names, **values)
 
     def banner(self, file: str) -> str:
         """Return the first comment of a file: its contents and its origin."""
@@ -101,7 +107,7 @@ class Writer:
 
     def header(self) -> str:
         p, t = self.prefix, self.trace
-        about = ABOUT[t.block.noun]
+        about = tomllib.loads(template("about.toml"))[t.block.noun]
         inputs = [x._replace(allowed="" if x.name in t.read else UNREAD) for x in t.inputs]
         bits = [f"#define {p}_{x.upper()} {1 << k}u /* {t.block.bits[x]} */" for k, (x, _) in enumerate(t.bits)]
         return self.filled(
