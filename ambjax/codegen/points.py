@@ -17,10 +17,10 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn
 from jax.typing import ArrayLike
 
 from ambjax.codegen.block import UNREAD
-from ambjax.codegen.primitives import CALLS, OPS, SAME, dtype_of, split_scan, walked
+from ambjax.codegen.primitives import OPS, SAME, dtype_of, split_scan, walked
 from ambjax.codegen.program import PRECISIONS, Ref
 from ambjax.codegen.trace import Trace, arguments
-from ambjax.compiler.members_last import called
+from ambjax.compiler.members_last import CALLS, called
 from ambjax.compiler.short_compilation import precision
 
 # DECADES: range of the random numbers, in decades around the scale of each. EDGY: probability that a number is zero,

@@ -81,9 +81,6 @@ OPS: dict[str, Op] = {
 # Primitives that return a scalar operand unchanged.
 SAME = ("broadcast_in_dim", "copy", "copy_p", "optimization_barrier", "reshape", "squeeze", "stop_gradient")
 SAME += ("xla_metadata_value", "pvary")
-# Primitives that call another trace, which is inlined. Custom derivatives do not change a value.
-CALLS = ("jit", "pjit", "closed_call", "core_call", "eval_jaxpr", "custom_jvp_call", "custom_vjp_call")
-CALLS += ("checkpoint", "remat2")
 
 COUNTED = ("add", "multiply", "divide", "root", "call")
 

@@ -1,5 +1,8 @@
 """Texts about a block for the header and the README: order of operations, what the export fixes, what a step checks."""
 
+import importlib.resources
+import tomllib
+
 import numpy as np
 
 from ambjax.codegen.block import UNREAD
@@ -8,30 +11,18 @@ from ambjax.codegen.interface import INPUTS
 from ambjax.codegen.trace import Trace
 
 
+def template(name: str) -> str:
+    """Return a file of the folder `templates`."""
+    return (importlib.resources.files("ambjax.codegen.c99") / "templates" / name).read_text(encoding="utf-8")
+
+
 def notes_of(trace: Trace) -> list[str]:
     """Return lines on the order of operations in a sample, on what the export fixes, and on what a step checks."""
     if trace.block.noun == "controller":
         return [*order_of_work(trace), "", *fixed(trace)]
-    block = trace.block
-    lines = [
-        f"Step n ends at t = n T, T = {block.period:g} s. It advances the plant by T under the voltages that act, with",
-        "the simulator's own steps, and reads the sensors. Step 0 only reads them, in the initial state.",
-    ]
-    if block.noun == "plant":
-        lines += [
-            "input->u of step n is the voltage that the controller computed from the readings of step n - 1;",
-            "params->delay delays it further.",
-        ]
-    else:
-        lines += ["Then the controller computes output->u from these readings; it acts params->delay samples later."]
-    return [
-        *lines,
-        "",
-        f"Fixed at export: T = {block.period:g} s, the parts of the plant, the integration steps in a sample. Export",
-        "again to change one. An input that is not finite, or a delay out of range, sets the bit INVALID. A lost",
-        "rotor is frozen until the next reset.",
-        "No other parameter of the plant is checked: with a value beyond its range, the rotor may be lost at once.",
-    ]
+    texts = tomllib.loads(template("about.toml"))
+    command = texts[trace.block.noun]["command"]
+    return texts["motion"]["notes"].format(period=f"{trace.block.period:g}", command=command).splitlines()
 
 
 def order_of_work(trace: Trace) -> list[str]:

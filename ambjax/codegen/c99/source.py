@@ -1,7 +1,6 @@
 """Write the header and the source of a traced step as C."""
 
 import functools
-import importlib.resources
 import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -10,7 +9,7 @@ import numpy as np
 
 from ambjax._version import __version__
 from ambjax.codegen.block import UNREAD, Number
-from ambjax.codegen.c99.notes import notes_of
+from ambjax.codegen.c99.notes import notes_of, template
 from ambjax.codegen.c99.statements import CStatements, c_constant, word
 from ambjax.codegen.trace import Trace
 
@@ -26,11 +25,6 @@ class Origin(NamedTuple):
     case: str
     digest: str
     parts: Sequence[str]
-
-
-def template(name: str) -> str:
-    """Return a file of the folder `templates`."""
-    return (importlib.resources.files("ambjax.codegen.c99") / "templates" / name).read_text(encoding="utf-8")
 
 
 class Writer:
