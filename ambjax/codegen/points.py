@@ -227,7 +227,6 @@ def _one(eqn: JaxprEqn, args: list[ArrayLike], count: int) -> list[ArrayLike]:
 
 
 def _of_library(name: str, args: list[ArrayLike], dtype: np.dtype, count: int) -> np.ndarray:
-    """Evaluate a function of this machine's <math.h> on rows."""
     single = dtype == np.float32
     function, kind = getattr(ctypes.CDLL(None), name + "f" * single), ctypes.c_float if single else ctypes.c_double
     function.restype, function.argtypes = kind, [kind] * len(args)

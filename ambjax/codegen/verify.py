@@ -10,9 +10,8 @@ import numpy as np
 from ambjax.codegen import closed_loop
 from ambjax.codegen.block import SPAN, Block
 from ambjax.codegen.c99.machine import EXACT, SANITIZED, SHARED, STRICT, Compiled, build, execute, scratch, short
-from ambjax.codegen.c99.notes import template
 from ambjax.codegen.c99.package import SHARE, ULPS, files_of_trace, tolerance
-from ambjax.codegen.c99.source import Origin
+from ambjax.codegen.c99.source import Origin, template
 from ambjax.codegen.points import Points, Results, results, varied, verification_points
 from ambjax.codegen.program import PRECISIONS
 from ambjax.codegen.trace import Trace, trace

@@ -244,8 +244,10 @@ def _residual(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, p
     u = scenario.coil_voltage(point.u, point.plant) if scenario.drive == "current" else point.u
     moved = jax.tree.map(lambda x: x / plant.pole, plant.rates(point.plant, u))
     measured, reference = reading(scenario, plant.measurement(point.plant), (0.0, 0.0)), at_rest(r)
-    timing = (period, u_max, cascade.timing.constant_past(point.u)) if cascade.sampled else (None, u_max)
-    command, after, _ = cascade.step(measured, point.control, Sample(reference, *timing))
+    sample = Sample(reference, None, u_max)
+    if cascade.sampled:
+        sample = Sample(reference, period, u_max, cascade.timing.constant_past(point.u))
+    command, after, _ = cascade.step(measured, point.control, sample)
     control = jax.tree.map(lambda a, b: b - a if cascade.sampled else b / plant.pole, point.control, after)
     change = Point(moved, control, command.u - point.u)
     return ravel_pytree(jax.tree.map(lambda x, size: x / size, change, sizes))[0]

@@ -176,6 +176,5 @@ def files_of(
 
 
 def _csv(names: list[str], rows: np.ndarray) -> str:
-    """Return the text of a CSV file: a line of quoted names, then the rows."""
     head = ",".join(f'"{name}"' for name in names)
     return "\n".join([head, *(",".join(map(repr, map(float, row))) for row in rows), ""])
