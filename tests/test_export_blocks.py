@@ -16,7 +16,6 @@ from ambjax.cases.template_text import template
 from ambjax.codegen.c99.source import Origin
 from ambjax.codegen.fmi.archive import run_block
 from ambjax.codegen.loop_step import WHAT, block_of
-from ambjax.codegen.plant_step import plant_of
 from ambjax.codegen.trace import arguments
 from ambjax.codegen.twins import LoopCase, series
 from ambjax.codegen.verify import draft, verify
@@ -129,10 +128,8 @@ def test_parts_that_an_exported_plant_lacks_are_refused_in_one_line(part):
 
 def test_a_plant_needs_a_processor_and_fixed_steps():
     cascade, scenario, clock = RIG
-    with pytest.raises(ValueError, match=r"\[processor\] is missing: the exported plant takes a voltage"):
-        plant_of(dataclasses.replace(cascade, processor=None), scenario, 5e-5, RK4(1))
-    with pytest.raises(ValueError, match=r"has no fixed number of steps.*Set clock\.dt"):
-        plant_of(cascade, scenario, 5e-5, AdaptiveRodas3(1e-6))
+    with pytest.raises(ValueError, match=r"\[processor\] is missing"):
+        block_of("plant", dataclasses.replace(cascade, processor=None), scenario, clock.with_method(RK4(1)))
     # a case whose method is adaptive gets the simulator's choice among those with fixed steps
     assert isinstance(block_of("plant", cascade, scenario, clock.with_method(AdaptiveRodas3(1e-6))).method, FixedSteps)
 

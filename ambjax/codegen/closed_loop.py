@@ -1,6 +1,5 @@
 """Loops with compiled parts (the controller, the plant or both) compared with JAX's own closed loop."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -8,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.codegen.c99.machine import Compiled
-from ambjax.codegen.controller import Controller, controller_of
-from ambjax.codegen.interface import OUTPUTS, Status
+from ambjax.codegen.controller import controller_of
+from ambjax.codegen.interface import OUTPUTS, REFERENCES, STATUS
 from ambjax.codegen.loop_step import LoopStep
 from ambjax.codegen.plant_step import PlantStep
 from ambjax.codegen.trace import in_jax
@@ -23,8 +22,7 @@ from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import sampled_of
 from ambjax.world.sensor import Errors
 
-FAULTS = [1 << k for k, name in enumerate(Status._fields) if name in ("invalid", "failed")]
-(REFUSED,) = (1 << k for k, name in enumerate(Status._fields) if name == "refused")
+BITS = {name: 1 << k for k, name in enumerate(STATUS)}
 
 
 class Machines:
@@ -65,11 +63,11 @@ class CompiledLoop(Sampled):
         found = jax.pure_callback(self.machines.step, shape, *given, vmap_method="sequential")
         bits = found[size].astype(int)
         command = Command(**dict(zip(OUTPUTS, found[size + 1 :], strict=True)), i_ref_dot=jnp.zeros(()))
-        faulty = bits & sum(FAULTS) != 0
+        faulty = bits & (BITS["invalid"] | BITS["failed"]) != 0
         past, finite = processor.remembered(state.command.u, *state.past), jnp.where(faulty, 0.0, state.finite)
         watch, guard = state.watch, processor.guard
         if watch and guard:  # from `left`, `Sampled.row` finds whether a reading was refused
-            watch = watch._replace(left=jnp.where(bits & REFUSED, 0.0, jnp.asarray(guard.samples)))
+            watch = watch._replace(left=jnp.where(bits & BITS["refused"], 0.0, jnp.asarray(guard.samples)))
         return state._replace(control=found[:size], command=command, past=past, finite=finite, watch=watch)
 
 
@@ -92,13 +90,19 @@ BLOCK = 1000
 begin_jit, segment_jit = jax.jit(begin), jax.jit(segment, static_argnames=("count", "record_every"))
 
 
-def compare_loops(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, LoopComparison]:
-    """Compare the loop of each compiled controller to JAX's loop. Returns one comparison for each precision."""
+def compare(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, LoopComparison]:
+    """Compare the loop of a block, compiled in each precision, to JAX's loop. Keys: the precisions."""
+    block = next(iter(machines.values())).trace.block
+    plant = block.plant if isinstance(block, LoopStep) else block
+    held, found, host = isinstance(plant, PlantStep), {}, Machines(*machines.values())
+    if isinstance(plant, PlantStep):
+        case = case._replace(clock=case.clock.with_method(plant.method))
     given = sampled_of(case.cascade, case.scenario, case.clock)
-    host, found = Machines(*machines.values()), {}
-    for which, (precision, horizon) in enumerate(horizons(case, list(machines)).items()):
-        looped = CompiledLoop(**vars(given), which=which, machines=host)
-        z = _displacement(looped, case.clock, horizon.samples)
+    for which, (precision, horizon) in enumerate(horizons(case, list(machines), held=held).items()):
+        if held:
+            z = _plant_motion(machines[precision], case, max(horizon.samples, 1))
+        else:
+            z = _displacement(CompiledLoop(**vars(given), which=which, machines=host), case.clock, horizon.samples)
         found[precision] = LoopComparison(horizon, times_of(z, horizon))
     return found
 
@@ -124,54 +128,20 @@ def _displacement(system: CompiledLoop, clock: Clock, count: int) -> np.ndarray:
     return np.concatenate(rows)
 
 
-# Function that returns the controller's voltage (V) for readings and reference, [7], and stores the controller's state.
-Law = Callable[[np.ndarray], float]
-
-
-def compare_blocks(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, LoopComparison]:
-    """Compare the loop of each compiled plant, or each compiled loop, to JAX's loop. Keys: the precisions."""
-    block = next(iter(machines.values())).trace.block
-    plant = block.plant if isinstance(block, LoopStep) else block
-    assert isinstance(plant, PlantStep)
-    case = case._replace(clock=case.clock.with_method(plant.method))
-    controller = controller_of(case.cascade, case.scenario.u_max, plant.period, case.scenario)
-    found = {}
-    for precision, horizon in horizons(case, list(machines), held=True).items():
-        inputs = series(case.cascade, case.scenario, case.clock, max(horizon.samples, 1))
-        machine = machines[precision]
-        z = looped(machine, inputs, None if block.noun == "loop" else law_of(controller))
-        found[precision] = LoopComparison(horizon, times_of(z, horizon))
-    return found
-
-
-def looped(machine: Compiled, inputs: dict[str, np.ndarray], law: Law | None) -> np.ndarray:
-    """Return the true z (m) of a loop at every sample of `inputs`. `law`: the controller of a compiled plant."""
-    names, u = [x.name for x in machine.trace.inputs], 0.0
-    count = len(inputs["r"])
-    rows = np.array([inputs.get(name, np.zeros(count)) for name in names]).T
-    references = np.array([inputs[name] for name in ("r", "r_dot", "r_ddot", "r_dddot")]).T
-    at = [x.name for x, _ in machine.trace.outputs].index("z_true")
+def _plant_motion(machine: Compiled, case: LoopCase, count: int) -> np.ndarray:
+    """Return the true z (m) of the loop of a compiled plant, with JAX's controller, or of a compiled loop."""
+    inputs, trace = series(case.cascade, case.scenario, case.clock, count), machine.trace
+    rows = {x.name: inputs.get(x.name, np.zeros(count)) for x in trace.inputs}
+    references = np.array([inputs[name] for name in REFERENCES]).T
+    z, at = np.empty(count), [x.name for x, _ in trace.outputs].index("z_true")
+    memory, step = in_jax(controller_of(case.cascade, case.scenario.u_max, trace.block.period, case.scenario))
+    step = jax.jit(step)
     machine.state[()] = np.zeros((), machine.memory)
-    z = np.empty(count)
     for n in range(count):
-        machine.inputs[:] = rows[n]
-        if law is not None:
-            machine.inputs[names.index("u")] = u
+        machine.inputs[:] = [row[n] for row in rows.values()]
         machine.step()
         z[n] = machine.outputs[at]
-        if law is not None:
-            u = law(np.concatenate([machine.outputs[:3], references[n]]))
+        if "u" in rows and n + 1 < count:
+            memory, outputs, _ = step(memory, jnp.asarray([*machine.outputs[:3], *references[n]], float))
+            rows["u"][n + 1] = outputs.u
     return z
-
-
-def law_of(controller: Controller) -> Law:
-    """Return JAX's step of a controller as a function with a state."""
-    memory, step = in_jax(controller)
-    step = jax.jit(step)
-
-    def law(x: np.ndarray) -> float:
-        nonlocal memory
-        memory, outputs, _ = step(memory, jnp.asarray(x, float))
-        return float(outputs.u)
-
-    return law

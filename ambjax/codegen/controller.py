@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.codegen.block import Block, Number, Ports, earlier, numbers_of, scales
-from ambjax.codegen.interface import INPUTS, OUTPUTS, Status, StepInputs, StepOutputs, meanings
+from ambjax.codegen.interface import INPUTS, OUTPUTS, STATUS, Status, StepInputs, StepOutputs
 from ambjax.control.base import memory_of
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
@@ -87,7 +87,7 @@ class Controller(Block):
     noun: ClassVar[str] = "controller"
     ports: ClassVar[Any] = StepInputs
     inputs: ClassVar[Ports] = INPUTS
-    bits = meanings(Status)
+    bits = STATUS
     crowded = ("saturated", "refused")
 
     @property

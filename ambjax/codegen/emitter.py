@@ -11,9 +11,9 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn
 
-from ambjax.codegen.primitives import CALLS, OPS, SAME, dtype_of, split_scan, walked
+from ambjax.codegen.primitives import OPS, SAME, dtype_of, split_scan, walked
 from ambjax.codegen.program import Operand, Program, Ref, of
-from ambjax.compiler.members_last import called
+from ambjax.compiler.members_last import CALLS, called
 
 LOOPS = ("scan", "while")
 COMPOSED = ("rsqrt", "exp2", "logistic", "one_minus_square")

@@ -2,14 +2,13 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
-from jax import Array
 
 from ambjax.codegen.block import Block, Number, Ports
 from ambjax.codegen.controller import Controller, Memory, Parameters, controller_of
-from ambjax.codegen.interface import DISTURBANCES, OUTPUTS, REFERENCES, LoopInputs, PlantOutputs, Status, StepOutputs
+from ambjax.codegen.interface import DISTURBANCES, OUTPUTS, REFERENCES, LoopInputs, Status
 from ambjax.codegen.plant_step import PlantMemory, PlantParameters, PlantStep, plant_of
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.linear import choose
@@ -23,38 +22,18 @@ from ambjax.world.scenario import Scenario
 WHAT = ("controller", "plant", "loop")
 
 
-class LoopMemory(NamedTuple):
-    """State of the controller and of the plant; here `control.started` is a real number, 0 or 1, not a flag."""
-
-    control: Memory
-    plant: PlantMemory
-
-
-class LoopParameters(NamedTuple):
-    """Parameters of the controller and of the plant."""
-
-    controller: Parameters
-    machine: PlantParameters
-
-
-class LoopOutputs(NamedTuple):
-    """Outputs of a step of the loop: those of the controller, then those of the plant."""
-
-    command: StepOutputs
-    motion: PlantOutputs
-
-
-class LoopStatus(NamedTuple):
-    """Status bits of the controller, and two bits of the plant that report a lost rotor."""
-
-    controller: Status
-    touched: Array
-    diverged: Array
+# Parameters, and state, of the controller and of the plant. In this state, `Memory.started` is a real number, 0 or 1.
+LoopParameters = tuple[Parameters, PlantParameters]
+LoopMemory = tuple[Memory, PlantMemory]
 
 
 @dataclasses.dataclass(frozen=True)
 class LoopStep(Block):
-    """The controller and the plant of a case as one block."""
+    """The controller and the plant of a case as one block.
+
+    The outputs are those of the controller, then those of the plant; the status bits are those of the controller, then
+    two of the plant that report a lost rotor.
+    """
 
     parameters: LoopParameters
     controller: Controller
@@ -62,7 +41,7 @@ class LoopStep(Block):
 
     noun: ClassVar[str] = "loop"
     ports: ClassVar[Any] = LoopInputs
-    inputs: ClassVar[Ports] = {name: {**Controller.inputs, **PlantStep.inputs}[name] for name in LoopInputs._fields}
+    inputs: ClassVar[Ports] = DISTURBANCES | REFERENCES
     outputs: ClassVar[Ports] = {**OUTPUTS, **PlantStep.outputs}
     bits: ClassVar[Mapping[str, str]] = {
         **Controller.bits,
@@ -74,23 +53,24 @@ class LoopStep(Block):
 
     def step(
         self, parameters: LoopParameters, memory: LoopMemory, inputs: LoopInputs, period: Scalar, read: frozenset[str]
-    ) -> tuple[LoopMemory, LoopOutputs, LoopStatus]:
+    ) -> tuple[LoopMemory, tuple, tuple]:
         """Advance the plant under the commanded voltages, read its sensors, and step the controller."""
-        before = choose(memory.plant.started, memory.control, self.start().control)
+        laws, machine = memory
+        before = choose(machine.started, laws, self.start()[0])
         given = self.plant.ports._make([before.last.u, *inputs[: len(DISTURBANCES)]])
-        plant, motion, lost = self.plant.step(parameters.machine, memory.plant, given, period, read)
+        plant, motion, lost = self.plant.step(parameters[1], machine, given, period, read)
         readings = self.controller.ports._make([*motion[:3], *inputs[len(DISTURBANCES) :]])
-        control, command, status = self.controller.step(parameters.controller, before, readings, period, read)
+        control, command, status = self.controller.step(parameters[0], before, readings, period, read)
         alive, off = plant.lost == ALIVE, jnp.zeros(())
         frozen = before._replace(last=before.last._replace(u=off), before=(off,) * len(before.before))
         control = choose(alive, control, frozen)
-        outputs = LoopOutputs(command._replace(u=control.last.u), motion)
         status = Status._make([*(alive & bit for bit in status[:-1]), (alive & status.invalid) | lost.invalid])
-        return LoopMemory(control, plant), outputs, LoopStatus(status, lost.touched, lost.diverged)
+        outputs = command._replace(u=control.last.u), motion
+        return (control, plant), outputs, (status, lost.touched, lost.diverged)
 
     def start(self) -> LoopMemory:
         control = self.controller.start()
-        return LoopMemory(control._replace(started=jnp.zeros(())), self.plant.start())
+        return control._replace(started=jnp.zeros(())), self.plant.start()
 
     def numbers(self) -> list[Number]:
         own = [x._replace(name=f"controller.{x.name}") for x in self.controller.numbers()]
@@ -128,7 +108,8 @@ def block_of(what: str, cascade: Cascade, scenario: Scenario, clock: Clock) -> B
     method = clock.method
     if not isinstance(method, FixedSteps):
         method = choose_method(cascade, scenario, period, reverse=True)
+        assert isinstance(method, FixedSteps)
     plant = plant_of(cascade, scenario, period, method)
     if what == "plant":
         return plant
-    return LoopStep(LoopParameters(controller.parameters, plant.parameters), controller.period, controller, plant)
+    return LoopStep((controller.parameters, plant.parameters), controller.period, controller, plant)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.codegen.block import Block, Number, Ports, earlier, numbers_of, scales
-from ambjax.codegen.interface import PlantInputs, PlantOutputs, PlantStatus, meanings, units_of
+from ambjax.codegen.interface import PLANT_INPUTS, PLANT_OUTPUTS, PLANT_STATUS, PlantInputs, PlantOutputs, PlantStatus
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import Command
 from ambjax.control.processor import MOST_DELAY
@@ -88,20 +88,6 @@ class PlantParameters:
         unit="samples", at_least=0, at_most=MOST_DELAY, doc="time from the readings until the voltage acts"
     )
 
-    def scenario(self, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Scenario:
-        """Return the scenario with these parameters and constant disturbances, m/s^2 and A/s."""
-        return Scenario(
-            plant=self.plant,
-            q_z=Constant(q_z),
-            q_i=Constant(q_i),
-            sensor=self.sensor,
-            initial=self.initial,
-            u_max=self.u_max,
-            amplifier=self.actuator,
-            clearance=self.clearance,
-            stop=self.stop,
-        )
-
 
 @dataclasses.dataclass(frozen=True)
 class PlantStep(Block):
@@ -117,9 +103,9 @@ class PlantStep(Block):
 
     noun: ClassVar[str] = "plant"
     ports: ClassVar[Any] = PlantInputs
-    inputs: ClassVar[Ports] = units_of(PlantInputs)
-    outputs: ClassVar[Ports] = units_of(PlantOutputs)
-    bits = meanings(PlantStatus)
+    inputs: ClassVar[Ports] = PLANT_INPUTS
+    outputs: ClassVar[Ports] = PLANT_OUTPUTS
+    bits = PLANT_STATUS
     crowded = ("touched", "diverged")
 
     @property
@@ -130,7 +116,18 @@ class PlantStep(Block):
     def system(self, machine: PlantParameters, period: Scalar, q_z: Scalar = 0.0, q_i: Scalar = 0.0) -> Sampled:
         """Return the simulator's loop with the parameters `machine` and constant disturbances (m/s^2, A/s)."""
         cascade = self.cascade.with_processor(delay=machine.delay, assumed=None, predict=False, guard=None)
-        return Sampled(ClosedLoop(cascade, machine.scenario(q_z, q_i)), period, 0)
+        scenario = Scenario(
+            plant=machine.plant,
+            q_z=Constant(q_z),
+            q_i=Constant(q_i),
+            sensor=machine.sensor,
+            initial=machine.initial,
+            u_max=machine.u_max,
+            amplifier=machine.actuator,
+            clearance=machine.clearance,
+            stop=machine.stop,
+        )
+        return Sampled(ClosedLoop(cascade, scenario), period, 0)
 
     def step(
         self,
@@ -237,20 +234,12 @@ def _real(code: Array) -> Array:
     return jnp.where(code == ALIVE, 0 * one, jnp.where(code == TOUCHED, TOUCHED * one, DIVERGED * one))
 
 
-def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object) -> PlantStep:
-    """Return the plant of a case as it is exported.
+def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: FixedSteps) -> PlantStep:
+    """Return the plant of a case as it is exported. `period`: sample period, s. `method`: integrator between samples.
 
-    - `period`: sample period, s.
-    - `method`: integrator between samples; it must have a fixed number of steps.
-
-    Raises ValueError for a cascade in continuous time, an amplifier that controls the current, faults or a runout of
-    the sensor, and an adaptive method.
+    `cascade`: on a processor. Raises ValueError for an amplifier that controls the current, and for faults or a runout
+    of the sensor.
     """
-    if not cascade.sampled:
-        raise ValueError(
-            "[processor] is missing: the exported plant takes a voltage that is held over a sample, and this case "
-            "is in continuous time. Add [processor], tune the gains for it, and export the tuned case."
-        )
     if isinstance(scenario.amplifier, CurrentAmplifier):
         raise ValueError(
             'actuator.mode = "current": the exported plant takes a voltage. Export the controller, or use '
@@ -261,11 +250,6 @@ def plant_of(cascade: Cascade, scenario: Scenario, period: float, method: object
             raise ValueError(
                 f"sensor.{part}: the exported plant does not model this error. Remove it, and add it to the output z."
             )
-    if not isinstance(method, FixedSteps):
-        raise ValueError(
-            f"clock: {method} has no fixed number of steps, and exported code needs one. Set clock.dt; the "
-            "method is then RK4, unless clock.method names another."
-        )
     resolved = cascade.on_processor()
     parts = scenario.plant, scenario.sensor, scenario.amplifier, scenario.stop, scenario.initial
     machine = PlantParameters(*parts, scenario.u_max, scenario.clearance, resolved.timing.delay)

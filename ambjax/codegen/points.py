@@ -17,10 +17,10 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn
 from jax.typing import ArrayLike
 
 from ambjax.codegen.block import UNREAD
-from ambjax.codegen.primitives import CALLS, OPS, SAME, dtype_of, split_scan, walked
+from ambjax.codegen.primitives import OPS, SAME, dtype_of, split_scan, walked
 from ambjax.codegen.program import PRECISIONS, Ref
 from ambjax.codegen.trace import Trace, arguments
-from ambjax.compiler.members_last import called
+from ambjax.compiler.members_last import CALLS, called
 from ambjax.compiler.short_compilation import precision
 
 # DECADES: range of the random numbers, in decades around the scale of each. EDGY: probability that a number is zero,
@@ -227,7 +227,6 @@ def _one(eqn: JaxprEqn, args: list[ArrayLike], count: int) -> list[ArrayLike]:
 
 
 def _of_library(name: str, args: list[ArrayLike], dtype: np.dtype, count: int) -> np.ndarray:
-    """Evaluate a function of this machine's <math.h> on rows."""
     single = dtype == np.float32
     function, kind = getattr(ctypes.CDLL(None), name + "f" * single), ctypes.c_float if single else ctypes.c_double
     function.restype, function.argtypes = kind, [kind] * len(args)

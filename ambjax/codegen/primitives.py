@@ -12,7 +12,7 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 
 
 class Op(NamedTuple):
-    """Texts in C and JavaScript; NumPy function; kind of cost; whether operands commute, whether the result is a bool.
+    """Texts in C and JavaScript; NumPy function; kind of cost; whether operands commute.
 
     In both texts `{0}`, `{1}`, `{2}` are the operands. In C, `{f}` is the suffix of float functions, `{name}` the
     prefix of all names, `{to}` the type of the result, `{one}` and `{zero}` are numbers of that type. A function of
@@ -24,7 +24,6 @@ class Op(NamedTuple):
     numpy: Callable[..., Any]
     cost: str = "call"
     commutes: bool = False
-    boolean: bool = False
 
 
 def _erf(name: str) -> Callable[..., Any]:
@@ -33,13 +32,13 @@ def _erf(name: str) -> Callable[..., Any]:
     return np.vectorize(getattr(math, name), otypes=[float])
 
 
-def _function(name: str, numpy: Callable[..., object] | None = None) -> Op:
-    return Op(f"{name}{{f}}({{0}})", f"Math.{name}({{0}})", numpy or getattr(np, name))
+def _function(name: str, numpy: str) -> Op:
+    return Op(f"{name}{{f}}({{0}})", f"Math.{name}({{0}})", getattr(np, numpy))
 
 
 def _compare(sign: str, numpy: Callable[..., object]) -> Op:
     strict = f"{sign}=" if sign in ("==", "!=") else sign
-    return Op(f"{{0}} {sign} {{1}}", f"{{0}} {strict} {{1}}", numpy, "comparison", sign in ("==", "!="), True)
+    return Op(f"{{0}} {sign} {{1}}", f"{{0}} {strict} {{1}}", numpy, "comparison", sign in ("==", "!="))
 
 
 # JAX's `&` and `|` on bools become `&&` and `||`. The result is the same, because both operands are computed already.
@@ -60,14 +59,9 @@ OPS: dict[str, Op] = {
     "rem": Op("fmod{f}({0}, {1})", "{0} % {1}", np.fmod),
     "round_away": Op("round{f}({0})", "roundAway({0})", lambda x: np.copysign(np.floor(np.abs(x) + 0.5), x)),
     "round_even": Op("rint{f}({0})", "roundEven({0})", np.rint),
-    "asin": _function("asin", np.arcsin),
-    "acos": _function("acos", np.arccos),
-    "atan": _function("atan", np.arctan),
-    "asinh": _function("asinh", np.arcsinh),
-    "acosh": _function("acosh", np.arccosh),
-    "atanh": _function("atanh", np.arctanh),
-    **{name: _function(name) for name in ("exp", "expm1", "log", "log1p", "cbrt", "floor", "ceil")},
-    **{name: _function(name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
+    **{f"a{name}": _function(f"a{name}", f"arc{name}") for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
+    **{name: _function(name, name) for name in ("exp", "expm1", "log", "log1p", "cbrt", "floor", "ceil")},
+    **{name: _function(name, name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
     "erf": Op("erf{f}({0})", "erf({0})", _erf("erf")),
     "erfc": Op("erfc{f}({0})", "erfc({0})", _erf("erfc")),
     "eq": _compare("==", np.equal),
@@ -76,20 +70,17 @@ OPS: dict[str, Op] = {
     "le": _compare("<=", np.less_equal),
     "gt": _compare(">", np.greater),
     "ge": _compare(">=", np.greater_equal),
-    "is_finite": Op("isfinite({0})", "Number.isFinite({0})", np.isfinite, "comparison", False, True),
-    "and": Op("{0} && {1}", "{0} && {1}", np.logical_and, "logic", True, True),
-    "or": Op("{0} || {1}", "{0} || {1}", np.logical_or, "logic", True, True),
-    "xor": Op("{0} != {1}", "{0} !== {1}", np.logical_xor, "logic", True, True),
-    "not": Op("!{0}", "!{0}", np.logical_not, "logic", False, True),
+    "is_finite": Op("isfinite({0})", "Number.isFinite({0})", np.isfinite, "comparison"),
+    "and": Op("{0} && {1}", "{0} && {1}", np.logical_and, "logic", True),
+    "or": Op("{0} || {1}", "{0} || {1}", np.logical_or, "logic", True),
+    "xor": Op("{0} != {1}", "{0} !== {1}", np.logical_xor, "logic", True),
+    "not": Op("!{0}", "!{0}", np.logical_not, "logic"),
     "real": Op("({to}){0}", "{0}", lambda x: x, "conversion"),
     "flag": Op("{0} ? {one} : {zero}", "{0} ? 1 : 0", lambda x: np.where(x, 1.0, 0.0), "conversion"),
 }
 # Primitives that return a scalar operand unchanged.
 SAME = ("broadcast_in_dim", "copy", "copy_p", "optimization_barrier", "reshape", "squeeze", "stop_gradient")
 SAME += ("xla_metadata_value", "pvary")
-# Primitives that call another trace, which is inlined. Custom derivatives do not change a value.
-CALLS = ("jit", "pjit", "closed_call", "core_call", "eval_jaxpr", "custom_jvp_call", "custom_vjp_call")
-CALLS += ("checkpoint", "remat2")
 
 COUNTED = ("add", "multiply", "divide", "root", "call")
 

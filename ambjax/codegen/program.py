@@ -4,6 +4,7 @@ A node that no other node or result uses is not written. A constant is a NumPy s
 constants.
 """
 
+import dataclasses
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
@@ -18,7 +19,8 @@ MOST = 40_000
 PRECISIONS = {"float": "float32", "double": "float64"}
 
 
-class Ref(NamedTuple):
+@dataclasses.dataclass(frozen=True, slots=True)
+class Ref:
     """Operand: the node with this number."""
 
     node: int

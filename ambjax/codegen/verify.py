@@ -11,7 +11,7 @@ from ambjax.codegen import closed_loop
 from ambjax.codegen.block import SPAN, Block
 from ambjax.codegen.c99.machine import EXACT, SANITIZED, SHARED, STRICT, Compiled, build, execute, scratch, short
 from ambjax.codegen.c99.package import SHARE, ULPS, files_of_trace, tolerance
-from ambjax.codegen.c99.source import Origin
+from ambjax.codegen.c99.source import Origin, template
 from ambjax.codegen.points import Points, Results, results, varied, verification_points
 from ambjax.codegen.program import PRECISIONS
 from ambjax.codegen.trace import Trace, trace
@@ -80,9 +80,7 @@ def verify(drafts: Mapping[str, Draft], case: LoopCase | None) -> list[Check]:
                 for name in one.steps:
                     checks += _stepped(name, one, precision, machines[precision])
         if case is not None and len(machines) == len(drafts):
-            whole = any(one.trace.block.noun != "controller" for one in drafts.values())
-            compare = closed_loop.compare_blocks if whole else closed_loop.compare_loops
-            checks += [_looped(precision, found) for precision, found in compare(case, machines).items()]
+            checks += [_looped(*found) for found in closed_loop.compare(case, machines).items()]
     return checks
 
 
@@ -142,9 +140,20 @@ def _looped(precision: str, found: closed_loop.LoopComparison) -> Check:
 def checks_page(checks: list[Check], case: str, mark: str, noun: str = "controller") -> str:
     """Return the checks as a Markdown page that ends with the line `mark`."""
     rows = [(*x[:4], x.verdict) for x in checks]
-    lines = [f"# The {noun} of case '{case}' as C, compared with JAX", "", checks_verdict(checks), ""]
-    lines += markdown_table(("check", "precision", "found", "allowed", "verdict"), rows)
-    return "\n".join([*lines, "", NOTES, mark, ""])
+    return template("verify.md").format(
+        noun=noun,
+        case=case,
+        verdict=checks_verdict(checks),
+        table="\n".join(markdown_table(("check", "precision", "found", "allowed", "verdict"), rows)),
+        exact=EXACT,
+        least=1 / SPAN,
+        span=SPAN,
+        twins=TWINS,
+        parted=PARTED,
+        times=closed_loop.TIMES,
+        samples=LEAST,
+        mark=mark,
+    )
 
 
 def holds(checks: list[Check]) -> bool:
@@ -158,27 +167,3 @@ def checks_verdict(checks: list[Check]) -> str:
     if not holds(checks):
         return "Some checks FAIL."
     return f"No check fails; {open_} of {len(checks)} are not decisive." if open_ else "All checks hold."
-
-
-NOTES = f"""One step: the points are random states and inputs over decades, zeros, limits, NaN and infinities, and
-points on both sides of the threshold of each comparison in the step. The reference is JAX in the same
-precision, one primitive at a time, with the functions of math.h: if XLA compiles the whole step, it rounds
-a product and a sum once where the C ({EXACT}) rounds twice. The tolerance of a number is relative. Points
-at which an intermediate number is subnormal are omitted, because XLA replaces it by 0.
-
-Parameters: one step with other parameters. This check finds a gain or a limit that the C has as a constant. Every
-parameter that the step reads is set to {1 / SPAN:g} and {SPAN:g} times the case's value (0: to -1 and 1; inf: to 1
-and {SPAN:g}), within the range in the header. First it is changed alone, then all are drawn at random from the case's
-value and these two. When changed alone, a parameter is also set to NaN; u_max and a steepness p are also set to inf,
-and a delay to values outside its range. The C must reject what JAX rejects.
-
-Closed loop: the compiled C with the rest of the loop in JAX (a controller with JAX's plant and sensors, a plant with
-JAX's controller), compared with the same loop in JAX in double precision. An exported plant or loop has disturbances
-that are constant over each sample, and so has JAX's loop in this comparison. Signs and converters amplify rounding
-errors, so the loops are compared only while these errors are small. {TWINS} twins of JAX's loop measure them: in
-each, every state of plant and laws and the voltage is changed by one unit in the last place of the precision, up or
-down at random, at every sample. The horizon ends before the first sample at which a twin differs by more than
-{PARTED:g} of the rms of z - r, or of the rms of u, or at which the rotor is lost. Within the horizon, z of the C's
-loop may differ by at most {closed_loop.TIMES:g} times the difference of the farthest twin, at every sample. With a
-horizon of fewer than {LEAST} samples the row is not decisive.
-"""

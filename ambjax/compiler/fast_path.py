@@ -133,7 +133,6 @@ def options() -> dict[str, Any] | None:
 
 
 def _step(y: Any, lib: Any) -> Any:
-    """Compute one iteration of the probe's loop with the functions of `lib` (numpy or jax.numpy)."""
     turn = y - lib.round(y)
     rational = turn * (1 + 0.7 * turn * turn) / (1 + turn * turn * (0.9 + 0.1 * turn * turn))
     return y + rational + lib.where(y > 1, 1 / y, y) / lib.sqrt(lib.sqrt(y * y + 0.25))

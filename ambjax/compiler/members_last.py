@@ -14,8 +14,9 @@ import numpy as np
 from jax import Array, lax
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
 
-# Primitives that call a jaxpr.
-CALLS = ("checkpoint", "custom_jvp_call", "custom_vjp_call", "jit", "pjit", "remat2")
+# Primitives that call a jaxpr. Custom derivatives do not change a value.
+CALLS = ("checkpoint", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "eval_jaxpr", "jit", "pjit")
+CALLS += ("remat2",)
 # Primitives whose operands have one shape, or no axes.
 NAMES = (
     "abs acos add add_any and asin atan atan2 bitcast_convert_type cbrt ceil clamp complex convert_element_type copy "

@@ -17,6 +17,7 @@ from jax.flatten_util import ravel_pytree
 
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Sample
+from ambjax.numerics.linear import choose
 from ambjax.numerics.records import Scalar
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors, Measurement
@@ -160,7 +161,7 @@ def newton_of(residual: Callable[[Array], Array], y: Array) -> Newton:
         first = jnp.where(newton.number == 0, G, newton.first)
         G = G - newton.target * first
         better = _size(G) < newton.error
-        y, J, error = where(better, (newton.trial, J, _size(G)), (newton.y, newton.J, newton.error))
+        y, J, error = choose(better, (newton.trial, J, _size(G)), (newton.y, newton.J, newton.error))
         direction = jnp.where(better, inverse(J) @ G, newton.direction)
         fraction = jnp.where(better, 1.0, 0.5 * newton.fraction)
         trial, number = y - fraction * direction, newton.number + 1
@@ -169,10 +170,7 @@ def newton_of(residual: Callable[[Array], Array], y: Array) -> Newton:
         onward = after.begun(y, after.target, jnp.maximum(after.target - 2 * step, 0.0))
         back = after.begun(after.base, after.reached, after.target + step / 2)
         failed = ~solved & (fraction < LEAVING) & (step > SHORTEST)
-        return where(solved & (after.target > 0), onward, where(failed, back._replace(fraction=one), after))
-
-    def where(which: Array, a: Any, b: Any) -> Any:
-        return jax.tree.map(lambda x, y: jnp.where(which, x, y), a, b)
+        return choose(solved & (after.target > 0), onward, choose(failed, back._replace(fraction=one), after))
 
     def unfinished(newton: Newton) -> Array:
         return (newton.number < STEPS) & (newton.fraction > SMALLEST) & (newton.error > 0)
@@ -246,12 +244,10 @@ def _residual(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, p
     u = scenario.coil_voltage(point.u, point.plant) if scenario.drive == "current" else point.u
     moved = jax.tree.map(lambda x: x / plant.pole, plant.rates(point.plant, u))
     measured, reference = reading(scenario, plant.measurement(point.plant), (0.0, 0.0)), at_rest(r)
-    if not cascade.sampled:
-        command, rates = cascade(measured, point.control, reference, u_max)
-        control = jax.tree.map(lambda x: x / plant.pole, rates)
-    else:
+    sample = Sample(reference, None, u_max)
+    if cascade.sampled:
         sample = Sample(reference, period, u_max, cascade.timing.constant_past(point.u))
-        command, after, _ = cascade.step(measured, point.control, sample)
-        control = jax.tree.map(lambda a, b: b - a, point.control, after)
+    command, after, _ = cascade.step(measured, point.control, sample)
+    control = jax.tree.map(lambda a, b: b - a if cascade.sampled else b / plant.pole, point.control, after)
     change = Point(moved, control, command.u - point.u)
     return ravel_pytree(jax.tree.map(lambda x, size: x / size, change, sizes))[0]

@@ -2,20 +2,25 @@
 
 import functools
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.flatten_util import ravel_pytree
 
 from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
 from ambjax.linear.analysis import Zones, largest_in
-from ambjax.linear.machine_at_speed import MachineAtSpeed, MachineRest
-from ambjax.linear.machine_matrices import machine_matrices, rests
-from ambjax.linear.margins import NO_PEAK, Margins, ResponsePeak, poles_in_s, reading_margins
-from ambjax.linear.state_space import StateSpace
+from ambjax.linear.equilibrium import TOLERANCE
+from ambjax.linear.machine_at_speed import Groups, MachineAtSpeed, MachineRest, plants_of
+from ambjax.linear.margins import NO_PEAK, Margins, ResponsePeak, margins_at, poles_in_s
+from ambjax.linear.matrices import LagState
+from ambjax.linear.state_space import CommandPath, StateSpace
 from ambjax.numerics.records import Scalar, canonical
-from ambjax.simulation.whole_machine import Machine
+from ambjax.numerics.small_matrices import exponential, times
+from ambjax.simulation.whole_machine import Machine, PlantOnly
+from ambjax.world.scenario import Scenario
 
 
 class AxisSensitivity(NamedTuple):
@@ -71,7 +76,9 @@ def _at_rest(machine: Machine, W: Scalar, period: Scalar) -> MachineRest:
 @functools.partial(compiled_quickly, options=QUICKEST)
 def _matrices(machine: Machine, W: Scalar, period: Scalar, point: MachineRest) -> tuple[StateSpace, Array, Array]:
     own = MachineAtSpeed(machine, W, period)
-    return *machine_matrices(own, point), rests(own, point)
+    deviation = own.deviation(point, ravel_pytree(own.start()[1])[0])
+    rests = jnp.max(jnp.abs(deviation)) <= TOLERANCE * jnp.finfo(deviation.dtype).eps
+    return *machine_matrices(own, point), rests
 
 
 def machine_rest(machine: Machine, period: Scalar) -> MachineRest:
@@ -164,7 +171,62 @@ def sensitivity_of(
         T = largest(lambda H, k=k: np.abs(H[:, k, k] - 1))
         KS = largest(lambda H, k=k: np.abs(H[:, c + k, k]))
         own = system._replace(B=system.B[:, [k]], C=system.C[[k]], D=system.D[[k]][:, [k]])
-        margins = reading_margins(own) if linear else None
+        margins = margins_at(own, "reading") if linear else None
         axes.append(AxisSensitivity(name, S, T, KS, zones.zone(S.height) if linear or not stable else None, margins))
     sigma = largest(lambda H: np.linalg.norm(H[:, :c], 2, axis=(1, 2)))
     return MachineSensitivity(speed, stable, linear, tuple(axes), sigma, poles_in_s(system), system, swing)
+
+
+def machine_matrices(own: MachineAtSpeed, point: MachineRest) -> tuple[StateSpace, Array]:
+    """Return the state space at a point, and its A under constant commands."""
+
+    def lagging(u: Groups) -> Groups:
+        return tuple(one if slow else () for one, slow in zip(u, own.lagged, strict=True))
+
+    sizes, past = own.start()[1], own.past(point.u)
+    start = point.q, jnp.zeros_like(point.q), point.plant, own.sensed(point.q), lagging(point.u)
+    body, parts = ravel_pytree(start)
+    fastest = jnp.max(own.machine.join([scenario.plant.pole for scenario in own.scenario]))
+    low = own.machine.split(times(jnp.abs(own.rotor.at_sensors), sizes.q))
+    low = tuple(one if on else () for one, on in zip(low, own.low_passed, strict=True))
+    body_sizes = sizes.q, sizes.q * fastest, sizes.plant, low, lagging(sizes.u)
+    x, restore = ravel_pytree((body, point.control, point.law, past))
+    free = jax.jacfwd(lambda x, u: _body_rates(own, parts(x), own.machine.split(u)), (0, 1))
+    A, B = free(body, own.machine.join(point.u))
+    kept, transition, driven = len(past[0]), A, list[Array]()
+    if own.sampled:
+        delay = jnp.asarray(own.cascade[0].timing.delay)[0]
+        transition, driven = exponential(A * own.period), CommandPath(A, B, delay).effects(own.period, kept)
+
+    def step(x: Array, e: Array) -> tuple[Array, Array]:
+        at, control, law, past = restore(x)
+        q, q_dot, plant, filtered, _ = parts(at)
+        measured = own.read(q, q_dot, plant, filtered, own.machine.split(e))
+        u, after, law = own.laws(measured, control, law, past)
+        commands = [(new, *old) for new, old in zip(u, past, strict=True)]
+        if own.sampled:
+            late = [own.machine.join([one[lag] for one in commands]) for lag in range(kept + 1)]
+            moved = transition @ at + sum(effect @ one for effect, one in zip(driven, late, strict=True))
+        else:
+            moved = _body_rates(own, parts(at), u)
+        z, i = (own.machine.join([getattr(one, name) for one in measured]) for name in ("z", "i"))
+        outputs = jnp.concatenate([z, own.machine.join(u), i, q])
+        return ravel_pytree((moved, after, law, [one[:kept] for one in commands]))[0], outputs
+
+    scale = ravel_pytree((body_sizes, sizes.control, sizes.law, own.past(sizes.u)))[0]
+    (F, G), (C, D) = jax.jacfwd(step, (0, 1))(x, jnp.zeros(own.machine.count, x.dtype))
+    return StateSpace(F, G, C, D, scale, jnp.asarray(own.period) if own.sampled else None), A
+
+
+def _body_rates(own: MachineAtSpeed, parts: tuple, u: Groups) -> Array:
+    """Return the rates of rotor, plants, low-passes and amplifiers, `parts`, under commands u."""
+
+    def lags(_: object, scenario: Scenario, seen: PlantOnly, z: Any, u_a: Any, u: Array) -> tuple[LagState, Array]:
+        return LagState(seen.plant, z, u_a).lag_rates(scenario, u)
+
+    q, q_dot, plant, filtered, voltage = parts
+    seen = own.machine.moving(own.rotor.at_sensors, q, q_dot, tuple(map(PlantOnly, plant)))
+    lagged = own.each(lags, seen, filtered, voltage, u)
+    after = own.rates(q, q_dot, plant, tuple(applied for _, applied in lagged))
+    z_rates, u_rates = (tuple(getattr(one, name) for one, _ in lagged) for name in ("z_filtered", "u_a"))
+    return ravel_pytree((after.q, after.q_dot, plants_of(after.axes), z_rates, u_rates))[0]

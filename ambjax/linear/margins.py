@@ -189,24 +189,14 @@ def poles_in_s(system: StateSpace) -> np.ndarray:
 
 def margins_of(system: StateSpace) -> LoopMargins:
     """Return the margins of a stable loop, broken at the reading and at the command."""
-    f = _scanned(system)
-    return LoopMargins(_margins(system, "reading", f), _margins(system, "command", f))
+    return LoopMargins(margins_at(system, "reading"), margins_at(system, "command"))
 
 
-def reading_margins(system: StateSpace) -> Margins:
-    """Return the margins of a stable loop, broken at the reading: output 0, to which input 0 is added."""
-    return _margins(system, "reading", _scanned(system))
-
-
-def _scanned(system: StateSpace) -> np.ndarray:
-    """Return the frequencies (Hz) at which crossings are searched."""
+def margins_at(system: StateSpace, place: Place) -> Margins:
+    """Return the margins of a stable loop, broken at the command, or at the reading: output 0, of input 0."""
     fastest = float(np.max(np.abs(poles_in_s(system)), initial=1.0)) / (2 * math.pi)
     high = 100 * fastest if system.period is None else 0.5 / float(system.period)
-    return scan(system, min(1e-3, 1e-6 * high), high)
-
-
-def _margins(system: StateSpace, place: Place, scanned: np.ndarray) -> Margins:
-    """Return the margins at one place. `scanned`: frequencies, Hz, of which the first stands for 0."""
+    scanned = scan(system, min(1e-3, 1e-6 * high), high)  # the first frequency stands for 0
 
     def L(f: np.ndarray) -> np.ndarray:
         return np.asarray(system.loop_transfer(f, place))

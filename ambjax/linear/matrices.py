@@ -62,8 +62,7 @@ def loop_matrices(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scala
     """
     cascade, scenario = _linear_parts(cascade, scenario)
     point, found, _ = equilibrium(cascade, scenario, period, r)
-    build = _sampled if cascade.sampled else _continuous
-    return build(cascade, scenario, period, r, point), found & cascade.timing.supported()
+    return _state_space(cascade, scenario, period, r, point), found & cascade.timing.supported()
 
 
 def rest(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar) -> Equilibrium:
@@ -77,35 +76,12 @@ def _linear_parts(cascade: Cascade, scenario: Scenario) -> tuple[Cascade, Scenar
     return cascade.with_processor(guard=None), ideal(scenario)
 
 
-def _continuous(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, point: Point) -> StateSpace:
-    """Return the state space in continuous time, with the state (plant, laws)."""
-    plant, reference = scenario.plant, at_rest(r)
-    x, restore = ravel_pytree((point.plant, point.control))
-
-    def system(x: Array, w: Array) -> tuple[Array, Array]:
-        state, control = restore(x)
-        measured = reading(scenario, plant.measurement(state), (w[0], w[1]))
-        command, rates = cascade(measured, control, reference, jnp.asarray(jnp.inf))
-        u = scenario.coil_voltage(command.u, state)
-        outputs = jnp.stack([measured.z, measured.z_dot, u, plant.measurement(state).z, command.u, measured.i])
-        moved = plant.rates(state, u, w[2])
-        return ravel_pytree((moved, rates))[0], outputs
-
-    def driven(u: Array) -> Array:
-        return ravel_pytree(plant.rates(point.plant, scenario.coil_voltage(u, point.plant)))[0]
-
-    (A, B), (C, D) = jax.jacfwd(system, (0, 1))(x, jnp.zeros(3, x.dtype))
-    sizes, b = sizes_of(cascade, scenario, point), jax.jacfwd(driven)(point.u)
-    # in continuous time, the path does not use its A
-    path = CommandPath(jnp.zeros((len(b), len(b)), b.dtype), b, jnp.zeros_like(point.u))
-    return StateSpace(A, B, C, D, ravel_pytree((sizes.plant, sizes.control))[0], None, path)
-
-
-def _sampled(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, point: Point) -> StateSpace:
-    """Return the state space of one sample period, with the state (plant and lags, laws, u_{n-1}, u_{n-2}, ...)."""
+def _state_space(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, point: Point) -> StateSpace:
+    """Return the state space, with the state (plant and lags, laws, u_{n-1}, u_{n-2}, ...)."""
     processor, plant, reference = cascade.timing, scenario.plant, at_rest(r)
     start, lags = ravel_pytree(with_lags(scenario, point))
-    past, delay = processor.constant_past(point.u), jnp.asarray(processor.delay)
+    tick, delay = jnp.asarray(period) if cascade.sampled else None, jnp.asarray(processor.delay)
+    past = () if tick is None else processor.constant_past(point.u)
     x, restore = ravel_pytree((start, point.control, past))
 
     def rates(x: Array, w: Array) -> Array:
@@ -115,18 +91,26 @@ def _sampled(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, po
         u = scenario.coil_voltage(u, state.plant)
         return ravel_pytree(moving._replace(plant=plant.rates(state.plant, u, w[1])))[0]
 
-    A, B = jax.jacfwd(rates, (0, 1))(start, jnp.stack([point.u, 0.0 * point.u]))
-    path = CommandPath(A, B[:, 0], delay)
-    driven = jnp.stack(path.effects(jnp.asarray(period), len(past)))
-    transition, disturbed = held(A, B[:, 1:], period)
+    inputs = jnp.stack([point.u, 0.0 * point.u])
+    if tick is None:  # then the path does not use its A
+        A, B = jnp.zeros((start.size, start.size), start.dtype), jax.jacfwd(rates, 1)(start, inputs)
+    else:
+        A, B = jax.jacfwd(rates, (0, 1))(start, inputs)
+    path, transition, driven, disturbed = CommandPath(A, B[:, 0], delay), A, B, B
+    if tick is not None:
+        driven = jnp.stack(path.effects(tick, len(past)))
+        transition, disturbed = held(A, B[:, 1:], tick)
 
     def step(x: Array, w: Array) -> tuple[Array, Array]:
         at, laws, past = restore(x)
         state = lags(at)
         measured = state.read(scenario, (w[0], w[1]))
-        command, after, _ = cascade.step(measured, laws, Sample(reference, period, jnp.asarray(jnp.inf), past))
+        command, after, _ = cascade.step(measured, laws, Sample(reference, tick, jnp.asarray(jnp.inf), past))
         commands = command.u, *past
-        moved = transition @ at + jnp.stack(commands) @ driven + disturbed[:, 0] * w[2]
+        if tick is None:
+            moved = rates(at, jnp.stack([command.u, w[2]]))
+        else:
+            moved = transition @ at + jnp.stack(commands) @ driven + disturbed[:, 0] * w[2]
         u = command.u
         if scenario.drive == "current":
             u = scenario.coil_voltage(at_sample(commands, delay), state.plant)
@@ -135,5 +119,5 @@ def _sampled(cascade: Cascade, scenario: Scenario, period: Scalar, r: Scalar, po
 
     (A, B), (C, D) = jax.jacfwd(step, (0, 1))(x, jnp.zeros(3, x.dtype))
     sizes = sizes_of(cascade, scenario, point)
-    scale = ravel_pytree((with_lags(scenario, sizes), sizes.control, processor.constant_past(sizes.u)))[0]
-    return StateSpace(A, B, C, D, scale, jnp.asarray(period), path)
+    scale = ravel_pytree((with_lags(scenario, sizes), sizes.control, (sizes.u,) * len(past)))[0]
+    return StateSpace(A, B, C, D, scale, tick, path)

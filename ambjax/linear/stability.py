@@ -89,7 +89,6 @@ class Stability(NamedTuple):
         return Findings(len(self.stable), int(bad.sum()), self.bias, swing, current, reason)
 
     def _reason(self, k: int) -> str:
-        """Return why the linear and the simulated verdict on member k differ."""
         rate = float(self.growth[k])
         if rate <= 0:
             decays = f"the linear loop is stable (its slowest mode decays at {-rate:.3g} 1/s)"

@@ -8,6 +8,7 @@ import numpy as np
 from ambjax.linear.linear_machine import TurningMachine, turning_machines
 from ambjax.linear.margins import poles_in_s
 from ambjax.numerics.records import Scalar
+from ambjax.numerics.small_matrices import held
 from ambjax.simulation.whole_machine import Machine
 from ambjax.world.rotation import GRAM_MM
 from ambjax.world.rotor import Rotor
@@ -104,6 +105,8 @@ def _near_crossings(speeds: np.ndarray, points: Sequence[TurningMachine]) -> np.
 
 def _amplitudes(point: TurningMachine, rotor: Rotor) -> np.ndarray:
     """Return the complex amplitudes of the outputs at one speed, NaN if the machine is not stable there."""
+    from scipy.linalg import expm
+
     system, W = point.system, point.W
     if not system.without_idle().stable:
         return np.full(len(system.C), np.nan, complex)
@@ -116,24 +119,15 @@ def _amplitudes(point: TurningMachine, rotor: Rotor) -> np.ndarray:
     b[n : 2 * n] = np.linalg.solve(np.asarray(rotor.M), force)
     s: complex = 1j * W
     if system.period is not None:
-        period = float(system.period)
-        b[: len(point.free)] = _over_a_sample(point.free, b[: len(point.free)], W, period)
+        # the effect of the force b exp(s t) over one sample on x' = A x + b exp(s t), with x = y exp(s t)
+        A, period = point.free - s * np.eye(len(point.free)), float(system.period)
         s = np.exp(s * period)
+        b[: len(A)] = s * held(A, b[: len(A), None], period, expm)[1][:, 0]
     scale = np.asarray(system.sizes)
     A = np.asarray(system.A) * scale / scale[:, None]
     # the rotor is free along axes without a magnet: their poles are at W = 0
     x = np.linalg.solve(s * np.eye(len(b)) - A, b / scale) if W else 0 * b
     return np.asarray(system.C) * scale @ x
-
-
-def _over_a_sample(A: np.ndarray, b: np.ndarray, W: float, period: float) -> np.ndarray:
-    """Return the effect of the force b exp(j W t) on the state x' = A x + b exp(j W t) over one sample."""
-    from scipy.linalg import expm
-
-    n = len(b)
-    table = np.zeros((n + 1, n + 1), complex)
-    table[:n, :n], table[:n, n], table[n, n] = A, b, 1j * W
-    return expm(table * period)[:n, n]
 
 
 def critical_speeds(found: UnbalanceResponse, operating: tuple[float, float]) -> list[CriticalSpeed]:

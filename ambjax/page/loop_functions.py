@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.cases.reader import Case
-from ambjax.codegen.javascript.script import function_source, loop_source, operands_of, piece_of
+from ambjax.codegen.javascript.script import function_source, loop_source, piece_of
 from ambjax.compiler.short_compilation import precision
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Sample
@@ -100,7 +100,7 @@ def loop_script(case: Case, any_delay: bool = False) -> tuple[str, dict[str, Any
         result = piece_of(lambda n, state: _fold(n).result(state.fold, state.ending), "ps", (numbers, progress))
     _, row, coils = step.results
     shown = [getattr(row, name) for name in SIGNALS] + list(coils)
-    every = operands_of(step.results[0])
+    every = jax.tree.leaves(step.results[0])
     sources = [
         function_source(start, "startLoop", "PW", start.results),
         loop_source(step, "makeLoop", shown, every),

@@ -74,7 +74,6 @@ def load_library(library: pathlib.Path) -> ctypes.CDLL:
 
 
 def _unusable(verb: str, what: pathlib.Path, why: str) -> str:
-    """Return the error message for a compiled file that cannot be run or loaded."""
     return (
         f"--verify: the output of {compiler()} cannot be {verb} in {what.parent} ({why}). Set TMPDIR to a folder that "
         "allows it, set CC to a compiler for this machine, or omit --verify."

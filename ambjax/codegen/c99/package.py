@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from ambjax.codegen.c99.notes import fixed, notes_of, order_of_work
-from ambjax.codegen.c99.source import Origin, Writer
+from ambjax.codegen.c99.source import Origin, Writer, fixed, notes_of, order_of_work
 from ambjax.codegen.c99.statements import c_constant, word
 from ambjax.codegen.points import Points, Results, results, verification_points
 from ambjax.codegen.program import PRECISIONS

@@ -16,7 +16,7 @@ from jax import Array
 from ambjax.codegen.block import Block
 from ambjax.codegen.c99 import machine
 from ambjax.codegen.c99.source import MARK, Origin, Writer
-from ambjax.codegen.fmi.description import build_description, description, token
+from ambjax.codegen.fmi.description import build_description, description, filled, token
 from ambjax.codegen.loop_step import block_of
 from ambjax.codegen.trace import Trace, in_jax
 from ambjax.codegen.twins import series
@@ -53,8 +53,8 @@ def sources(traced: Trace, identifier: str, origin: Origin, version: int) -> tup
     found = {f"{identifier}.h": writer.header(), f"{identifier}.c": writer.source()}
     found |= {name: (home / name).read_text(encoding="utf-8") for name in names}
     guid = token(traced, identifier, found)
-    model = (home / "model.h").read_text(encoding="utf-8")
-    found["model.h"] = model.format(
+    found["model.h"] = filled(
+        "model.h",
         p=identifier,
         token=guid,
         inputs=len(traced.inputs),
@@ -176,6 +176,5 @@ def files_of(
 
 
 def _csv(names: list[str], rows: np.ndarray) -> str:
-    """Return the text of a CSV file: a line of quoted names, then the rows."""
     head = ",".join(f'"{name}"' for name in names)
     return "\n".join([head, *(",".join(map(repr, map(float, row))) for row in rows), ""])

@@ -1,6 +1,7 @@
 """The model description of an FMU: names, units, start values and value references, as XML of FMI 2.0 or 3.0."""
 
 import hashlib
+import importlib.resources
 import math
 import re
 import uuid
@@ -68,84 +69,54 @@ def token(traced: Trace, identifier: str, files: dict[str, str]) -> str:
     return f"{{{uuid.UUID(digest[:32])}}}"
 
 
-class Form(NamedTuple):
-    """What differs between the model descriptions of FMI 2.0 and FMI 3.0, with fields for str.format.
-
-    - `root`: attributes of the root; `co_simulation`: the element of that name; `variable`: an element of a variable.
-    - `kinds`: names of the elements of a real number and of an integer.
-    - `unknowns`: the outputs and the initial unknowns, each from a template of the list and one of an output.
-    - `infinity`: FMI 2.0 has no infinity; 1e300 stands for it.
-    """
-
-    root: str
-    co_simulation: str
-    variable: str
-    kinds: tuple[str, str]
-    unknowns: tuple[tuple[str, str], ...]
-    infinity: str
-
-
-FORMS = {
-    2: Form(
-        'fmiVersion="2.0" guid={guid} {head} variableNamingConvention="structured" numberOfEventIndicators="0"',
-        '<CoSimulation modelIdentifier="{identifier}" canHandleVariableCommunicationStepSize="false" '
-        'canInterpolateInputs="false" maxOutputDerivativeOrder="0" canGetAndSetFMUstate="true" '
-        'canSerializeFMUstate="false">\n    <SourceFiles>{files}</SourceFiles>\n  </CoSimulation>',
-        "<ScalarVariable {common}><{kind}{numbers}/></ScalarVariable>",
-        ("Real", "Integer"),
-        tuple((f"<{tag}>{{}}</{tag}>", '<Unknown index="{index}"/>') for tag in ("Outputs", "InitialUnknowns")),
-        "1e300",
-    ),
-    3: Form(
-        'fmiVersion="3.0" instantiationToken={guid} {head}',
-        '<CoSimulation modelIdentifier="{identifier}" canHandleVariableCommunicationStepSize="false" '
-        'fixedInternalStepSize="{period!r}" canGetAndSetFMUState="true" canSerializeFMUState="false"/>',
-        "<{kind} {common}{numbers}/>",
-        ("Float64", "UInt32"),
-        tuple(("{}", f'<{tag} valueReference="{{reference}}"/>') for tag in ("Output", "InitialUnknown")),
-        "INF",
-    ),
-}
+def filled(name: str, **values: object) -> str:
+    """Return a file of this folder with its names in braces replaced."""
+    path = importlib.resources.files("ambjax.codegen.fmi") / name
+    return path.read_text(encoding="utf-8").format(**values)
 
 
 def description(traced: Trace, identifier: str, case: str, guid: str, sources: list[str], version: int) -> str:
     """Return the text of modelDescription.xml. `case`: name of the case. `sources`: names of the C files."""
-    form, period = FORMS[version], traced.block.period
+    old, period = version == 2, traced.block.period
     words = f"{traced.block.noun} of case {case}: one sample per communication step"
     head = f"modelName={quoteattr(f'{identifier} ({traced.block.noun})')} description={quoteattr(words)}"
     head += f" generationTool={quoteattr(f'ambjax {__version__}')}"
-    files = "".join(f"<File name={quoteattr(name)}/>" for name in sources)
-    found = variables(traced)[1 if version == 2 else 0 :]  # time is no variable of FMI 2.0
+    found = variables(traced)[int(old) :]  # time is no variable of FMI 2.0
     outputs = [(index, x.reference) for index, x in enumerate(found, 1) if x.causality == "output"]
-    lines = [
-        '<?xml version="1.0" encoding="UTF-8"?>',
-        f"<fmiModelDescription {form.root.format(guid=quoteattr(guid), head=head)}>",
-        f"  {form.co_simulation.format(identifier=identifier, period=period, files=files)}",
-        *_units(found),
-        '  <LogCategories><Category name="logStatusError"/></LogCategories>',
-        f'  <DefaultExperiment startTime="0" stopTime="{1000 * period!r}" stepSize="{period!r}"/>',
-        "  <ModelVariables>",
-        *(f"    {_variable(x, form)}" for x in found),
-        "  </ModelVariables>",
-        "  <ModelStructure>",
-    ]
-    for listed, one in form.unknowns:
-        rows = "".join(one.format(index=index, reference=reference) for index, reference in outputs)
-        lines.append(f"    {listed.format(rows)}")
-    return "\n".join([*lines, "  </ModelStructure>", "</fmiModelDescription>", ""])
+
+    def unknowns(tag: str) -> str:
+        rows = (f'Unknown index="{index}"' if old else f'{tag} valueReference="{ref}"' for index, ref in outputs)
+        return "".join(f"<{row}/>" for row in rows)
+
+    return filled(
+        f"modelDescription{version}.xml",
+        guid=quoteattr(guid),
+        head=head,
+        identifier=identifier,
+        period=period,
+        end=1000 * period,
+        files="".join(f"<File name={quoteattr(name)}/>" for name in sources),
+        units="\n".join(_units(found)),
+        variables="\n".join(f"    {_variable(x, old)}" for x in found),
+        outputs=unknowns("Output"),
+        unknowns=unknowns("InitialUnknown"),
+    )
 
 
-def _variable(x: Variable, form: Form) -> str:
+def _variable(x: Variable, old: bool) -> str:
+    """Return the element of a variable. `old`: of FMI 2.0, which has no infinity; 1e300 stands for it."""
     numbers = f" unit={quoteattr(x.unit)}" if x.unit else ""
     for name, value in (("min", x.least), ("max", x.most), ("start", x.start)):
         if value is not None:
-            text = repr(float(value)) if math.isfinite(value) else "-" * (value < 0) + form.infinity
+            text = repr(float(value)) if math.isfinite(value) else "-" * (value < 0) + ("1e300" if old else "INF")
             numbers += f' {name}="{text}"'
     common = (
         f'name={quoteattr(x.name)} valueReference="{x.reference}" causality="{x.causality}" '
         f'variability="{x.variability}" description={quoteattr(x.description)}'
     )
-    return form.variable.format(kind=form.kinds[x.whole], common=common, numbers=numbers)
+    if old:
+        return f"<ScalarVariable {common}><{'Integer' if x.whole else 'Real'}{numbers}/></ScalarVariable>"
+    return f"<{'UInt32' if x.whole else 'Float64'} {common}{numbers}/>"
 
 
 def _units(found: list[Variable]) -> list[str]:
@@ -159,12 +130,8 @@ def _units(found: list[Variable]) -> list[str]:
 
 def build_description(identifier: str, sources: list[str]) -> str:
     """Return the text of buildDescription.xml of FMI 3.0, which tells a tool how to compile the sources."""
-    files = "".join(f'\n      <SourceFile name="{name}"/>' for name in sources)
-    return (
-        '<?xml version="1.0" encoding="UTF-8"?>\n<fmiBuildDescription fmiVersion="3.0">\n'
-        f'  <BuildConfiguration modelIdentifier="{identifier}">\n    <SourceFileSet language="C99">{files}\n'
-        "    </SourceFileSet>\n  </BuildConfiguration>\n</fmiBuildDescription>\n"
-    )
+    files = "\n      ".join(f'<SourceFile name="{name}"/>' for name in sources)
+    return filled("buildDescription.xml", identifier=identifier, files=files)
 
 
 # Exponents of the base units in each derived unit.

@@ -1,5 +1,6 @@
 """Write traced code as JavaScript: the step of a block, a function of arrays, a step inside a loop over samples."""
 
+import importlib.resources
 import json
 import re
 from collections.abc import Callable, Collection, Sequence
@@ -15,28 +16,12 @@ from ambjax.codegen.program import PERIOD, STARTED, Location, Operand, Program, 
 from ambjax.codegen.trace import Trace
 
 # Functions that the rows of OPS use, and that `Math` lacks or defines differently. They treat NaN and the sign of 0 as
-# JAX does.
-HELPERS = {
-    "max": "(a, b) => a > b || a !== a ? a : b",
-    "min": "(a, b) => a < b || a !== a ? a : b",
-    "pow": "(a, b) => a === 1 || (a === -1 && (b === Infinity || b === -Infinity)) ? 1 : Math.pow(a, b)",
-    "roundAway": "x => {\n  const a = Math.abs(x), f = Math.floor(a), r = a - f >= 0.5 ? f + 1 : f;\n"
-    "  return x > 0 ? r : x < 0 ? -r : x;\n}",
-    "roundEven": "x => {\n  const big = 4503599627370496, a = Math.abs(x);\n"
-    "  return x === 0 || !(a < big) ? x : x > 0 ? a + big - big : -(a + big - big);\n}",
-    # erf: a series whose terms have one sign, for |x| < 3; erfc: a continued fraction, for x >= 1
-    "erf": "x => {\n  const a = Math.abs(x);\n  if (!(a < 3)) return x !== x ? x : Math.sign(x) * (1 - erfc(a));\n"
-    "  let term = x, sum = x;\n"
-    "  for (let n = 1; n < 200; n++) { term *= 2 * x * x / (2 * n + 1); sum += term; }\n"
-    "  return 2 / Math.sqrt(Math.PI) * Math.exp(-x * x) * sum;\n}",
-    "erfc": "x => {\n  if (x !== x) return x;\n  if (x < 1) return 1 - erf(x);\n  if (x > 27) return 0;\n  let f = 0;\n"
-    "  for (let n = 300; n > 0; n--) f = n / 2 / (x + f);\n"
-    "  return Math.exp(-x * x) / Math.sqrt(Math.PI) / (x + f);\n}",
-}
+# JAX does. erf is a series whose terms have one sign, for |x| < 3; erfc a continued fraction, for x >= 1.
+PRELUDE = (importlib.resources.files("ambjax.codegen.javascript") / "helpers.js").read_text(encoding="utf-8").strip()
+# The definition of each by its name.
+HELPERS = {text.split()[1]: text for text in re.split(r"\n(?=const )", PRELUDE)}
 # For each helper, the other helpers that it calls.
 NEEDS = {"erf": ("erfc",), "erfc": ("erf",)}
-# All of them.
-PRELUDE = "\n".join(f"const {name} = {text};" for name, text in HELPERS.items())
 
 
 def script(traced: Trace, name: str) -> str:
@@ -140,7 +125,7 @@ def _helpers(traced: Trace) -> list[str]:
     texts = {OPS[traced.program.nodes[n].op].javascript for n in traced.order()}
     used = [name for name in HELPERS if any(re.search(rf"(?<![.\w]){name}\(", text) for text in texts)]
     used += [more for name in used for more in NEEDS.get(name, ()) if more not in used]
-    return [f"const {name} = {HELPERS[name]};" for name in used]
+    return [HELPERS[name] for name in used]
 
 
 class Piece(NamedTuple):
@@ -164,18 +149,9 @@ def piece_of(function: Callable[..., object], names: Sequence[str], arguments: S
         leaves, tree = jax.tree.flatten(argument)
         refs = [program.input(Location("page", f"{name}{n}"), np.asarray(x).dtype) for n, x in enumerate(leaves)]
         operands.append(jax.tree.unflatten(tree, refs))
-    flat = traced_into(program, function, arguments, jax.tree.leaves(operands, is_leaf=_is_ref))
+    flat = traced_into(program, function, arguments, jax.tree.leaves(operands))
     tree = jax.tree.structure(jax.eval_shape(function, *arguments))
     return Piece(program, operands, jax.tree.unflatten(tree, flat))
-
-
-def _is_ref(x: object) -> bool:
-    return isinstance(x, Ref)
-
-
-def operands_of(tree: object) -> list[Any]:
-    """Return the operands in a pytree. A Ref is a pytree itself, but counts as one operand."""
-    return jax.tree.leaves(tree, is_leaf=_is_ref)
 
 
 def _statements(program: Program) -> ScriptStatements:
@@ -189,11 +165,11 @@ def function_source(piece: Piece, name: str, arrays: Sequence[str], results: obj
     - `arrays`: for each argument of the traced function, the name of the JavaScript array that holds its leaves.
     - `results`: pytree of the operands to write.
     """
-    script, roots = _statements(piece.program), operands_of(results)
+    script, roots = _statements(piece.program), jax.tree.leaves(results)
     needed = piece.program.needed(roots)
     lines = [f"function {name}({', '.join(arrays)}, out) {{"]
     for array, argument in zip(arrays, piece.arguments, strict=True):
-        lines += [f"const {line}" for line in _loads(script, array, operands_of(argument), needed)]
+        lines += [f"const {line}" for line in _loads(script, array, jax.tree.leaves(argument), needed)]
     lines += map(script.statement, piece.program.order(roots))
     lines += [f"out[{k}] = {script.operand(x)};" for k, x in enumerate(roots)]
     return "\n".join([*lines, "return out;", "}"])
@@ -222,8 +198,8 @@ def loop_source(piece: Piece, name: str, shown: Sequence[Operand], always: Seque
     computes the values that depend only on parameters, once.
     """
     program, script = piece.program, _statements(piece.program)
-    parameters, before = operands_of(piece.arguments[0]), operands_of(piece.arguments[1])
-    after = operands_of(piece.results[0])
+    parameters, before = (jax.tree.leaves(x) for x in piece.arguments[:2])
+    after = jax.tree.leaves(piece.results[0])
     kept = program.used(before, after, [*shown, *always])
     roots = [*shown, *(after[k] for k in kept)]
     order, needed = program.order(roots), program.needed(roots)
