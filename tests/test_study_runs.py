@@ -17,7 +17,7 @@ from texts import refusal, write
 
 from ambjax.__main__ import main
 from ambjax.commands import ensemble, study_report
-from ambjax.commands import ensemble as studies
+from ambjax.pictures import ensembles
 
 CASE = """
 [controller.inversion]
@@ -54,7 +54,7 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 
 @pytest.fixture
 def no_pictures(monkeypatch):
-    """Drawing takes longer than these studies."""
+    """Drawing takes longer than these ensemble."""
     monkeypatch.setattr(study_report, "_pictures", lambda *_: None)
 
 
@@ -192,7 +192,8 @@ def test_a_study_killed_at_any_instant_and_resumed_on_other_processes_gives_the_
         hasty.setattr(study_report, "_pictures", lambda *_: None)
         assert main([*RUN, "--out", "whole"]) == 0
     # a fan is another program; tests/test_descriptions.py draws one
-    monkeypatch.setattr(study_report, "_fan", lambda *_: Figure())
+    monkeypatch.setattr(study_report, "_bands", lambda *_: ())
+    monkeypatch.setattr(ensembles, "fan", Figure)
     dice, early = random.Random(3), 0
     count = examples(1, 10)
     for n in range(count):
@@ -227,7 +228,7 @@ def test_a_finished_study_is_not_run_again(no_pictures, monkeypatch, capsys):
     assert main(argv) == 0
     first, members = capsys.readouterr().out, result("out")
     pathlib.Path("out", "chunks").mkdir()  # as a kill in the last moment leaves it
-    monkeypatch.setattr(studies, "_compute", None)
+    monkeypatch.setattr(ensemble, "_compute", None)
     assert main([*argv, "--resume"]) == 0
     assert json.loads(capsys.readouterr().out) == json.loads(first)
     assert result("out") == members

@@ -118,6 +118,7 @@ class Store:
         return sum(stop - start for start, stop in parts.spans() if parts.path((start, stop)).exists())
 
     def put(self, span: Span, columns: Arrays) -> None:
+        """Write a finished chunk. Raises ValueError if it cannot be written."""
         self.parts.put(span, columns)
 
     def finish(self) -> pathlib.Path:

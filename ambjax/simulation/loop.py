@@ -174,6 +174,7 @@ class ClosedLoop(WholeState):
         return LoopState(plant.rates(state.plant, u, q_z, inputs.q_i), control)
 
     def status(self, state: LoopState) -> Array:
+        """Return the status code of the rotor, an index of `trajectory.STATUSES`: 0 while it is levitated."""
         return self.status_of(state, self.scale(), state.plant)
 
     def status_of(self, state: object, scale: object, plant: object) -> Array:
