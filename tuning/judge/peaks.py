@@ -26,9 +26,7 @@ from tuning.problem.tuning_problem import TuningProblem
 
 DELAY_MARGIN = "delay_margin_s"
 
-# Share of samples at the limit of the voltage above which an injection differs from the linear loop. With 3 % of the
-# samples at the limit, the injected peak of the blower's state feedback exceeds the linear one by 10 %, with 20 % four
-# times.
+# Share of samples at the limit of the voltage above which an injection does not measure the linear loop.
 SATURATED = 0.01
 
 
