@@ -11,7 +11,7 @@ from tuning.judge.evaluate import JudgedMembers
 from tuning.judge.peaks import DELAY_MARGIN, DelayTest, delay_test, not_simulated
 from tuning.problem.limits import PREFIX
 from tuning.problem.tuning_problem import problem_of
-from tuning.report import limit_table
+from tuning.report import judging, limit_table
 
 PERIOD = 6e-4
 # a current amplifier on a slow processor: the linear delay margin is 0.68 of a sample
@@ -32,6 +32,13 @@ CASE = {
 
 def problem(limit, **more):
     return problem_of(*case_and_tune(CASE | more | {"tune": {"limits": {DELAY_MARGIN: limit}, "members": 4}}))
+
+
+def test_laws_without_a_condition_of_theorem_1_have_no_table_of_conditions():
+    made = problem(1e-4)
+    assert judging._conditions(made, made.tune.space.encode(made.tune.space.values(made.case.cascade))) == {
+        "conditions": [], "advice_on_conditions": [],
+    }  # fmt: skip
 
 
 @pytest.mark.thorough

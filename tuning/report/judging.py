@@ -10,7 +10,7 @@ from ambjax.linear import Findings, stability_of, suspects
 from ambjax.results.outputs import described
 from ambjax.theorem.advice import advice as on_conditions
 from ambjax.theorem.conditions import Report as Check
-from ambjax.theorem.conditions import check
+from ambjax.theorem.conditions import check, required
 from tuning.events import Tell
 from tuning.judge.evaluate import JudgedMembers, describe, held, judge, step_error, summarise, worst_of
 from tuning.judge.peaks import delay_test, injections
@@ -21,7 +21,7 @@ from tuning.report import front_table, limit_table, outcome, sensitivity_table
 from tuning.report.facts import Row, TuningFacts
 from tuning.solve.course import SearchResult
 
-# The summary of no members, and the fields on the conditions of Theorem 1 if they cannot be computed.
+# The summary of no members, and the fields on the conditions of Theorem 1 if no law has one, or they are not computed.
 NO_MEMBERS: Row = {"members": 0, "held": 0, "lost": 0, "stalled": 0}
 NO_CONDITIONS: Row = {"conditions": [], "advice_on_conditions": []}
 
@@ -128,8 +128,10 @@ def _steps(answer: SearchResult, of: JudgedMembers, tell: Tell) -> Row:
 def _conditions(problem: TuningProblem, x: np.ndarray) -> Row:
     case, objective = problem.case, problem.objective
     cascade = objective.notched(x, objective.space.decode(jnp.asarray(x), case.cascade))
+    if not cascade.inversion.singular and all(one.value is None for one in required(cascade)):
+        return NO_CONDITIONS
     line: Check = check(cascade, case.scenario, case.clock.with_method(None))
-    rows = [dataclasses.asdict(one) | {"margin": one.margin} for one in line.conditions]
+    rows = [dataclasses.asdict(one) | {"margin": one.margin} for one in line.conditions if one.gain is not None]
     return {"conditions": rows, "advice_on_conditions": on_conditions(line)}
 
 
