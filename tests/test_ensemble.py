@@ -13,6 +13,8 @@ import pytest
 
 from ambjax import Cascade, Clock, Initial, Metrics, Scenario, rollout
 from ambjax.compiler import fast_path
+from ambjax.compiler.fast_path import one_kernel
+from ambjax.compiler.short_compilation import compiled_quickest, compiled_quickly
 from ambjax.ensemble import Normal, Percent, Spread, map_members, run_ensemble
 from ambjax.ensemble.batching import size
 from ambjax.ensemble.store import Store
@@ -148,11 +150,11 @@ class Scaled:
         return {"sum": tree["scale"] * jnp.sum(tree["x"]) ** self.power, "x": tree["x"]}
 
 
-@pytest.mark.parametrize("plain", [False, True])
-def test_any_function_of_a_member_is_mapped_over_all_and_compiled_once(plain):
+@pytest.mark.parametrize("compiled", [one_kernel, compiled_quickly, compiled_quickest])
+def test_any_function_of_a_member_is_mapped_over_all_and_compiled_once(compiled):
     x = np.arange(70.0 * 3).reshape(70, 3)
     for threads, call, block in ((1, None, None), (2, 32, 32), (3, 10, 4)):
-        cut, seen = {"threads": threads, "call": call, "block": block, "plain": plain}, []
+        cut, seen = {"threads": threads, "call": call, "block": block, "compiled": compiled}, []
         for scale in (2.0, 3.0):
             found = map_members(Scaled(2), {"x": x, "scale": np.asarray(scale)}, **cut)
             np.testing.assert_array_equal(found["x"], x)

@@ -11,6 +11,7 @@ import pytest
 
 from ambjax import Cascade, Scenario, rollout
 from ambjax.cases.table import Table
+from ambjax.compiler.short_compilation import compiled_quickly
 from ambjax.ensemble import run_ensemble
 from ambjax.ensemble.batching import map_members, size
 from ambjax.ensemble.distributions import Choice
@@ -76,7 +77,7 @@ def test_members_that_differ_in_one_entry_are_each_solved_alone(case):
     spread = Spread(((path, Choice((-0.5, 0.0, 0.7))), ("plant.rotor.speed", Choice((1.0, 2.0)))))
     values = draw(spread, *case, 3, np.arange(20), 20)
     cascade, scenario = apply(*case, values)
-    found = map_members(accelerations, canonical(scenario), plain=True)
+    found = map_members(accelerations, canonical(scenario), compiled=compiled_quickly)
     assert len(set(values[path])) == 3
     for k, b in enumerate(found):
         changed = M.copy()

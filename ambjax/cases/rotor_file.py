@@ -8,7 +8,7 @@ import numpy as np
 from ambjax.cases.named_files import contents_of
 from ambjax.cases.rotor_body import DAMPING, MODES, RotorBody, dampings_of
 from ambjax.cases.table import Table
-from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly, precision
+from ambjax.compiler.short_compilation import compiled_quickest, precision
 from ambjax.world.shaft import reduced
 
 MATRICES, TABLE, SHAPES = ("M", "K", "G", "nodes"), ("f_hz", "m", "It", "Ip", "zc"), "phi_"
@@ -23,7 +23,7 @@ CLOSE = 0.1
 # Largest distance between a place and the one at which a modal table has shapes, as a share of its length.
 SAME = 1e-3
 
-_reduced = compiled_quickly(reduced, static_argnames=("rows", "modes"), options=QUICKEST)
+_reduced = compiled_quickest(reduced, static_argnames=("rows", "modes"))
 
 
 def body_of_file(table: Table, folder: pathlib.Path) -> RotorBody:

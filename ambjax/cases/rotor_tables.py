@@ -29,7 +29,7 @@ from ambjax.cases.rotor_body import (
 from ambjax.cases.rotor_file import body_of_file
 from ambjax.cases.speed_table import speed_of
 from ambjax.cases.table import Table, show
-from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly, precision
+from ambjax.compiler.short_compilation import compiled_quickest, precision
 from ambjax.numerics.records import leaf
 from ambjax.world.rotor import Rotor
 from ambjax.world.shaft import Disc, Section, shaft_model
@@ -55,7 +55,7 @@ MATERIAL = {
     "nu": leaf(default=0.3, unit="1", at_least=0.0, at_most=0.5, doc="Poisson's ratio"),
 }
 # One program: operation by operation, about 90 would be compiled.
-_shaft_model = compiled_quickly(shaft_model, static_argnames=("sizes", "places", "modes"), options=QUICKEST)
+_shaft_model = compiled_quickest(shaft_model, static_argnames=("sizes", "places", "modes"))
 
 
 class BearingAxis(NamedTuple):

@@ -38,6 +38,11 @@ def compiled_quickly(
     return call
 
 
+def compiled_quickest(function: Callable[..., Result], static_argnames: tuple[str, ...] = ()) -> Callable[..., Result]:
+    """Return `compiled_quickly` with QUICKEST."""
+    return compiled_quickly(function, static_argnames, QUICKEST)
+
+
 def precision(name: str) -> AbstractContextManager[object]:
     """Return a context manager in which JAX computes in single ("float") or double ("double") precision."""
     import jax.experimental

@@ -18,7 +18,6 @@ from jax import Array, lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from ambjax.compiler.fast_path import block_length, one_kernel
-from ambjax.compiler.short_compilation import compiled_quickly
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.declared import require_number
 from ambjax.numerics.records import canonical, require_concrete
@@ -93,7 +92,7 @@ def map_members(
     threads: int | None = None,
     call: int | None = None,
     block: int | None = None,
-    plain: bool = False,
+    compiled: Callable[..., Callable] = one_kernel,
     vectorised: bool = False,
 ) -> Mapped:
     """Return function(member) for every member of an ensemble.
@@ -112,7 +111,8 @@ def map_members(
       idle.
     - `block`: members that run together in vector instructions (None: as many as fit the first-level cache,
       fewer in a small ensemble).
-    - `plain`: compile without the fast path, which does not support the functions of LAPACK, such as eigenvalues.
+    - `compiled`: how the program is compiled: `one_kernel`, the fast path; `compiled_quickly` without it, for functions
+      of LAPACK, such as eigenvalues, which it does not support; `compiled_quickest` also for programs that run briefly.
     - `vectorised`: whether the function is vectorised already. It then receives the tree of a block of members, and the
       tree `in_axes` of `jax.vmap` (0 or None for each leaf). Each leaf of its result has a leading axis of the block.
 
@@ -128,7 +128,7 @@ def map_members(
     moving = [np.asarray(x) for x, varies in zip(leaves, moves, strict=True) if varies]
     shared = tuple(x for x, varies in zip(leaves, moves, strict=True) if not varies)
     workers, call, block = _division(members, threads, call, block)
-    program = _program(len(jax.devices()), compiled_quickly if plain else one_kernel)
+    program = _program(len(jax.devices()), compiled)
 
     def run_call(start: int) -> Mapped:
         # The last call may hold fewer members than its length: its last member is repeated.

@@ -20,10 +20,11 @@ from ambjax.simulation.whole_machine import Machine
 def run_machines(machine: Machine, clock: Clock, fold: Fold, **how: Any) -> Result:
     """Simulate every member of an ensemble of machines. What varies has a leading axis [N]. No rows are recorded.
 
-    `how`: `threads`, `call` and `plain` of `map_members`.
+    `how`: `threads`, `call` and `compiled` of `map_members`.
     """
     tree = canonical((machine, clock, fold))
-    return map_members(_simulated, tree, vectorised=True, **({"plain": _has_long_sums(machine)} | how))
+    how.setdefault("compiled", compiled_quickly if _has_long_sums(machine) else one_kernel)
+    return map_members(_simulated, tree, vectorised=True, **how)
 
 
 def compiled_for_machines(

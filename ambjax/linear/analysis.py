@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
+from ambjax.compiler.short_compilation import compiled_quickest
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members
 from ambjax.linear.margins import (
@@ -33,8 +33,8 @@ from ambjax.simulation.clock import Clock, takes_case
 from ambjax.simulation.rollout import prepare
 from ambjax.world.scenario import Scenario
 
-_matrices = compiled_quickly(loop_matrices, options=QUICKEST)
-_rest = compiled_quickly(rest, options=QUICKEST)
+_matrices = compiled_quickest(loop_matrices)
+_rest = compiled_quickest(rest)
 # Members that one call linearises: ensembles of all sizes share one compiled program.
 CALL = 64
 
@@ -228,7 +228,7 @@ def linearise_members(
     """
     inputs = canonical((*linearisation_inputs(cascade, scenario, clock), r))
     # one call at a time: XLA runs LAPACK on its own threads, and two calls may deadlock
-    return map_members(_member, inputs, threads=1, call=CALL, plain=True)
+    return map_members(_member, inputs, threads=1, call=CALL, compiled=compiled_quickest)
 
 
 def _member(tree: Any) -> tuple[StateSpace, Any]:

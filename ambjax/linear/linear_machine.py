@@ -1,6 +1,5 @@
 """Linearisation of a whole machine at rest and constant speed: all loops are closed, each axis has a test signal."""
 
-import functools
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
@@ -10,7 +9,7 @@ import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
+from ambjax.compiler.short_compilation import compiled_quickest
 from ambjax.linear.analysis import Zones, largest_in
 from ambjax.linear.equilibrium import TOLERANCE
 from ambjax.linear.machine_at_speed import Groups, MachineAtSpeed, MachineRest, plants_of
@@ -68,12 +67,12 @@ class MachineSensitivity(NamedTuple):
         return max(self.axes, key=lambda axis: axis.S.height)
 
 
-@functools.partial(compiled_quickly, options=QUICKEST)
+@compiled_quickest
 def _at_rest(machine: Machine, W: Scalar, period: Scalar) -> MachineRest:
     return MachineAtSpeed(machine, W, period).rest(MachineAtSpeed(jax.lax.stop_gradient(machine), W, period))
 
 
-@functools.partial(compiled_quickly, options=QUICKEST)
+@compiled_quickest
 def _matrices(machine: Machine, W: Scalar, period: Scalar, point: MachineRest) -> tuple[StateSpace, Array, Array]:
     own = MachineAtSpeed(machine, W, period)
     deviation = own.deviation(point, ravel_pytree(own.start()[1])[0])

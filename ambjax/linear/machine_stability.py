@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
+from ambjax.compiler.short_compilation import compiled_quickly
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.blocks import quarters
 from ambjax.ensemble.machines import run_machines
@@ -94,7 +95,7 @@ def _quiet_run(machine: Machine, bias: float, clock: Clock) -> QuietRun:
     machine = dataclasses.replace(machine, axes=tuple(map(with_loop, machine.axes, loops)), start_q=q)
     fold = dataclasses.replace(quarters(clock), of=(near := machine.near, "i"))
     # the fold of the axes has a scatter, which the one-kernel path does not support
-    run = run_machines(machine, clock, PerAxis(stack_axes([fold] * machine.count)), plain=True)
+    run = run_machines(machine, clock, PerAxis(stack_axes([fold] * machine.count)), compiled=compiled_quickly)
     low, high = ({"z": part[near], "i": part["i"]} for part in (run.metrics.low, run.metrics.high))
     return quiet_run_of(low, high, np.asarray(run.trajectory.lost_at), np.array(bias))
 

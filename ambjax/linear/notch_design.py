@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
+from ambjax.compiler.short_compilation import compiled_quickest
 from ambjax.control.cascade import Cascade
 from ambjax.control.synchronous_notch import NULLED, NotchGain, SynchronousNotch
 from ambjax.ensemble.batching import map_members
@@ -73,13 +73,14 @@ def redesigned(cascade: Cascade, scenario: Scenario, period: Scalar) -> tuple[No
 
 
 # For one cascade with concrete numbers.
-redesigned_at_once = compiled_quickly(redesigned, options=QUICKEST)
+redesigned_at_once = compiled_quickest(redesigned)
 
 
 def redesigned_members(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[NotchGain, ...]:
     """Return the gains of `redesigned` of every member of an ensemble, whose varying leaves are arrays [N]."""
     # threads: see `linearise_members`
-    return map_members(_redesigned, canonical(linearisation_inputs(cascade, scenario, clock)), threads=1, plain=True)
+    inputs = canonical(linearisation_inputs(cascade, scenario, clock))
+    return map_members(_redesigned, inputs, threads=1, compiled=compiled_quickest)
 
 
 def _redesigned(tree: tuple[Cascade, Scenario, Scalar]) -> tuple[NotchGain, ...]:

@@ -13,7 +13,7 @@ from ambjax.cases.given import of_case
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
 from ambjax.cases.table import file_to_write
-from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
+from ambjax.compiler.short_compilation import compiled_quickest
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.machines import compiled_for_machines
 from ambjax.ensemble.replay import SEGMENT, record_member
@@ -146,9 +146,9 @@ class MachineRun:
         return machine_figure(self.case, self.signals, self.case.name)
 
 
-_begun = compiled_quickly(begin, options=QUICKEST)
+_begun = compiled_quickest(begin)
 _segment = compiled_for_machines(recorded_segment, static_argnames=("count",))
-_finished = compiled_quickly(finish, options=QUICKEST)
+_finished = compiled_quickest(finish)
 
 
 def simulate_machine(case: MachineCase, progress: Progress = lambda samples: None) -> MachineRun:

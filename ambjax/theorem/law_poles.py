@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
+from ambjax.compiler.short_compilation import compiled_quickest
 from ambjax.control.base import Law, set_valued_signs, steepnesses
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState
@@ -98,7 +98,7 @@ def _poles(stage: str, law: Law, model: Plant, sampling: Sampling) -> np.ndarray
     return np.linalg.eigvals(A[used][:, used])
 
 
-@functools.partial(compiled_quickly, static_argnames=("stage", "sampling"), options=QUICKEST)
+@functools.partial(compiled_quickest, static_argnames=("stage", "sampling"))
 def _matrix(law: Law, model: Plant, *, stage: str, sampling: Sampling) -> Array:
     step, start = LOOPS[stage][0](law, model, sampling)
     return jax.jacfwd(step)(start)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.compiler.short_compilation import compiled_quickly
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble import apply, map_members
 from ambjax.extend import Scalar, canonical
@@ -71,7 +72,7 @@ def loops(
     lane = lane._replace(x=at, cascade=objective.notched(at, lane.cascade))
     function = LaneLoop(objective.space, objective.loop, float(objective.clock.duration))
     # one call at a time: XLA runs LAPACK on its own threads, and two calls wait for each other for ever
-    values, slopes = map_members(function, lane, threads=1, call=LOOPS, block=LOOPS, plain=True)
+    values, slopes = map_members(function, lane, threads=1, call=LOOPS, block=LOOPS, compiled=compiled_quickly)
     names = (*objective.loop.names, *also)
     return (
         {name: getattr(values, name).reshape(count, n) for name in names},

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ambjax.compiler.short_compilation import QUICKEST, compiled_quickly
+from ambjax.compiler.short_compilation import compiled_quickest
 from ambjax.control.cascade import Cascade
 from ambjax.control.synchronous_notch import NotchGain
 from ambjax.ensemble import Spread, apply, draw
@@ -174,7 +174,7 @@ class Objective:
         return rollout(cascade, scenario, self.clock, fold=fold, record_every=0).metrics
 
 
-@partial(compiled_quickly, static_argnames=("space",), options=QUICKEST)
+@partial(compiled_quickest, static_argnames=("space",))
 def _designs(x: Array, cascade: Cascade, scenario: Scenario, period: Scalar, *, space: Space) -> tuple[NotchGain, ...]:
     """Return the gains of the notch at each x [S, m]; the leaves are arrays [S]."""
     return jax.vmap(lambda x: redesigned(space.decode(x, cascade), scenario, period))(x)
