@@ -13,22 +13,17 @@ from ambjax.theorem.causes import NO_PART, Cause, cause_words, find_cause, parts
 from ambjax.theorem.sampled_report import Delays
 
 EVERYTHING = """
-plant = { kind = "two-coil" }
+plant = { kind = "two-coil", iron.leakage = 1.2 }
+rotor.speed = 6000.0
 controller.model = { m = 0.7 }
 controller.observer = { kind = "kalman" }
+controller.notch.rate = 5.0
 disturbance.q_z = { kind = "step", amplitude = 1.0, start = 0.1 }
 processor = { delay = 1.0, discretisation = "explicit" }
 actuator = { u_max = 100.0, bandwidth = 5e3 }
 initial = { z = 1e-4 }
 clock = { sample_period = 1e-4, duration = 0.2 }
-[sensor]
-std = 1e-7
-bits = 12
-bandwidth = 1e4
-velocity = false
-[sensor.outliers]
-rate = 1.0
-size = 1e-5
+sensor = { std = 1e-7, bits = 12, bandwidth = 1e4, offset = 1e-6, velocity = false, outliers = { rate = 1.0 } }
 """
 # Part, and whether a case still has it.
 PARTS = {
@@ -36,12 +31,15 @@ PARTS = {
     "the converter": lambda c, s, k: s.sensor.bits < 32,
     "the faults of the position sensor": lambda c, s, k: s.sensor.faulty,
     "the low-pass": lambda c, s, k: s.sensor.bandwidth is not None,
+    "the calibration": lambda c, s, k: bool(s.sensor.offset),
     "the explicit steps": lambda c, s, k: not c.processor.implicit,
     "the guard": lambda c, s, k: c.processor.guard is not None,
+    "the notch": lambda c, s, k: c.notch is not None,
     "the difference of controller.model": lambda c, s, k: c.model.m != s.plant.m,
     "the limit of the voltage": lambda c, s, k: np.isfinite(s.u_max),
     "the amplifier": lambda c, s, k: s.amplifier is not None,
     "the delay": lambda c, s, k: bool(c.processor.delay),
+    "the iron": lambda c, s, k: s.plant.iron is not None,
     "the disturbances": lambda c, s, k: s.q_z.span(1.0) != (0.0, 0.0),
     "the start": lambda c, s, k: bool(s.initial.z),
     "the sample period": lambda c, s, k: k.sample_period > 5e-5,
@@ -86,6 +84,8 @@ LOSSES = {
     "the noise of the sensors": ({"sensor": {"std": 1e-4, "bits": None}}, {"sensor": {"std": 0.0, "std_i": 0.0}}),
     "the limit of the voltage": ({"initial": {"z": 2e-4}, "actuator": {"u_max": 4.0}}, {"actuator": {"u_max": None}}),
     "the disturbances": ({"disturbance": {"q_z": {"amplitude": 400.0}}}, {"disturbance": None}),
+    # a rate above 2/T = 4e4 1/s: the notch is not stable
+    "the notch": ({"rotor": {"speed": 6e3}, "controller": {"notch": {"rate": 1e5}}}, {"controller": {"notch": None}}),
 }
 
 

@@ -75,7 +75,8 @@ def cause_words(cause: Cause, with_part: str, without: str) -> str:
 def parts(cascade: Cascade, scenario: Scenario, clock: Clock) -> Iterator[Part]:
     """Yield the parts of a case that can be taken away: errors first, then limits, then what any machine has."""
     errors = (*_sensors(scenario), *_processor(cascade), *_model(cascade, scenario))
-    for name, remedy, changed in (*errors, *_supply(scenario), *_delay(cascade), *_motion(scenario, clock)):
+    limits = (*_supply(scenario), *_delay(cascade), *_iron(scenario))
+    for name, remedy, changed in (*errors, *limits, *_motion(scenario, clock)):
         controller, world = (changed, scenario) if isinstance(changed, Cascade) else (cascade, changed)
         yield Part(name, remedy, controller, world, clock)
     if cascade.sampled:
@@ -87,7 +88,6 @@ def parts(cascade: Cascade, scenario: Scenario, clock: Clock) -> Iterator[Part]:
 
 def _sensors(scenario: Scenario) -> Iterator[tuple[str, str, Scenario]]:
     sensor = scenario.sensors
-
     if (quiet := scenario.louder(0.0)).sensor != scenario.sensor:
         yield "the noise of the sensors", "Lower it, or choose an observer that attenuates it more.", quiet
     for name in ("bits", "bits_i"):
@@ -98,6 +98,9 @@ def _sensors(scenario: Scenario) -> Iterator[tuple[str, str, Scenario]]:
         yield "the faults of the position sensor", "", scenario.with_sensor(outliers=None, dropouts=None)
     if sensor.bandwidth is not None:
         yield "the low-pass of the position sensor", "Raise sensor.bandwidth.", scenario.with_sensor(bandwidth=None)
+    if np.any(np.asarray(sensor.gain) != 1) or np.any(np.asarray(sensor.offset) != 0):
+        exact = scenario.with_sensor(gain=1.0, offset=0.0)
+        yield "the calibration of the position sensor (sensor.gain, sensor.offset)", "Correct it.", exact
 
 
 def _supply(scenario: Scenario) -> Iterator[tuple[str, str, Scenario]]:
@@ -119,13 +122,17 @@ def _processor(cascade: Cascade) -> Iterator[tuple[str, str, Cascade]]:
         yield "the explicit steps", 'Set discretisation = "implicit".', cascade.with_processor(implicit=True)
     if cascade.timing.guard is not None:
         yield "the guard of the readings", "Change [processor.guard].", cascade.with_processor(guard=None)
+    if cascade.notch is not None:
+        remedy = "Lower its rate, raise its min_speed, or correct its phase."
+        yield "the notch (controller.notch)", remedy, dataclasses.replace(cascade, notch=None)
 
 
 def _delay(cascade: Cascade) -> Iterator[tuple[str, str, Cascade]]:
     timing = cascade.timing
     if (delay := float(np.max(timing.delay))) > 0:
         remedy = "Reduce the delay or the gains." if timing.predicts else "Set predict = true, or reduce the delay."
-        yield f"the delay of {delay:g} samples", remedy, cascade.with_processor(delay=0.0, assumed=None)
+        name = f"the delay of {delay:g} sample{'s' * (delay != 1)}"
+        yield name, remedy, cascade.with_processor(delay=0.0, assumed=None)
 
 
 def _model(cascade: Cascade, scenario: Scenario) -> Iterator[tuple[str, str, Cascade]]:
@@ -135,6 +142,12 @@ def _model(cascade: Cascade, scenario: Scenario) -> Iterator[tuple[str, str, Cas
     if any(np.any(np.asarray(getattr(cascade.model, name)) != np.asarray(x)) for name, x in true.items()):
         exact = dataclasses.replace(cascade, model=dataclasses.replace(cascade.model, **true))
         yield "the difference of controller.model from the plant", "Correct [controller.model].", exact
+
+
+def _iron(scenario: Scenario) -> Iterator[tuple[str, str, Scenario]]:
+    if scenario.plant.iron is not None:
+        ideal = dataclasses.replace(scenario, plant=dataclasses.replace(scenario.plant, iron=None))
+        yield "the iron of the magnets (plant.iron)", "Reduce the bias or the loads.", ideal
 
 
 def _motion(scenario: Scenario, clock: Clock) -> Iterator[tuple[str, str, Scenario]]:
