@@ -150,7 +150,7 @@ def test_bad_input_is_refused_by_name(path, run, monkeypatch):
     A_CASE = r"give a case, .* a Cascade, a Scenario and a Clock"
     refused = [
         (lambda: ambjax.simulate_members(case, 0), "members = 0: it must be a whole number from 1 to"),
-        (lambda: ambjax.simulate_members(case, 1, seed=-1), "seed = -1: it must be a whole number from 0 to"),
+        (lambda: ambjax.compare([case, case], 1, seed=-1), "seed = -1: it must be a whole number from 0 to"),
         (lambda: ambjax.read_case(3), "path = 3: it must be the path of a file.* or a dict"),
         (lambda: run.save("nowhere/run.npz"), "nowhere/run.npz: the directory nowhere does not exist"),
         (lambda: run.save(3), "path = 3: it must be the path of a file"),

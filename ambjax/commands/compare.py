@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from ambjax.cases.given import require_case
+from ambjax.cases.given import names_arguments, require_case
 from ambjax.cases.machine_case import AnyCase, MachineCase, first_axis
 from ambjax.cases.reader import Case
 from ambjax.codegen.controller import controller_of
@@ -99,6 +99,7 @@ class Comparison(NamedTuple):
 
 
 @one_thread()
+@names_arguments()
 def compare(cases: Sequence[AnyCase], members: int = 1, *, seed: int | None = None) -> Comparison:
     """Compare cases, or machines, on the same members of their spread, as `ambjax compare` does.
 
