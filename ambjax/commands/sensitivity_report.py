@@ -166,9 +166,10 @@ def text_of(case: Case, points: list[OperatingPoint], spread: SpreadPeaks | None
     rows = [table(head, [_row(point) for point in shown]), ""]
     one, zones = points[0].analysis, case.zones
     stable = [point for point in shown if point.analysis.stable]
-    rows += [line for point in stable for line in band_lines(point.name, point.analysis, zones)]
+    bands = [line for point in stable for line in band_lines(point.name, point.analysis, zones)]
+    rows += [*bands, ""] if bands else []
     if stable:
-        rows += ["", table(margins, [row for point in stable for row in _margin_rows(point)]), ""]
+        rows += [table(margins, [row for point in stable for row in _margin_rows(point)]), ""]
         first = stable[0].analysis
         where = first.margins_at.place("delay")
         rows += [f"The delay margin is the smaller one, {_delay(case, first.margins.delay)}, at the {where}."]
