@@ -120,6 +120,11 @@ def _rates(case: Case) -> Iterator[str]:
                 f"{name}.bandwidth = {float(bandwidth):g} Hz is less than twice the unstable pole, {pole:.4g} 1/s = "
                 f"{pole / (2 * math.pi):.4g} Hz: a loop with usable margins needs more. Is it in kHz?"
             )
+    if (notch := case.cascade.notch) is not None and float(notch.rate) > pole:
+        yield (
+            f"controller.notch.rate = {float(notch.rate):g} 1/s exceeds the unstable pole, {pole:.4g} 1/s. A notch "
+            "converge slowly against the loop. Lower the rate."
+        )
 
 
 def _converter(case: Case) -> Iterator[str]:
