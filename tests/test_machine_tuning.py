@@ -1,7 +1,6 @@
 """Tuning of whole machines: derivatives, gains of one bearing, and the command."""
 
 import dataclasses
-import json
 import re
 import tomllib
 from typing import Any
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from texts import refusal
+from tomlkit import dumps
 
 import tuning
 from ambjax.cases.machine_case import machine_from, read_any
@@ -40,6 +40,14 @@ def raw_case(**tune):
     return raw | {"tune": tune}
 
 
+def quick_case(**tune):
+    """The case without observer and prediction, which compiles faster; its sensors measure the velocity."""
+    raw = raw_case(**tune) | {"sensor": {}}
+    raw["processor"] |= {"predict": False}
+    del raw["controller"]["observer"]
+    return raw
+
+
 def space_of(raw):
     case = machine_from(raw)
     return case, machine_space(Table(raw).table("tune"), case, raw)
@@ -47,7 +55,7 @@ def space_of(raw):
 
 @pytest.fixture(scope="module")
 def peaks():
-    raw = raw_case(gains=SLIDING)
+    raw = quick_case(gains=SLIDING)
     raw["controller"]["position"] = {"kind": "integral-sliding-mode"}
     case, space = space_of(raw)
     return case, space, Peaks(case, space)
@@ -141,6 +149,7 @@ def test_bfgs_finds_the_minimum_of_a_function_that_is_not_smooth():
 def lqg_case(**tune):
     raw = tomllib.loads(template("machine"))
     raw |= {"controller": {"kind": "lqg"}, "tune": tune, "bearing": raw["bearing"][:2]}
+    raw["sensitivity"] = {"speeds": [6000.0]}
     case = machine_from(raw)
     return case, lqg_space(Table(raw).table("tune"), case, raw)
 
@@ -232,12 +241,12 @@ def test_refused_options(tmp_path, capsys, options):
 
 @pytest.mark.slow  # compiles no other peaks than the tests above
 def test_command(tmp_path, capsys):
-    text = template("machine").replace("duration = 0.2", "duration = 2e-3").replace("settle = 0.05", "settle = 0.0")
-    parts = '[controller.inversion]\nkind = "linearised"\n[controller.current]\nkind = "pi"\n'
-    budget = "starts = 1\niterations = 1\nheld_out = 2\nlimits.sensitivity = 2.5\n"
-    tune = f"[tune]\ngains = {json.dumps(SLIDING)}\n{budget}"
+    budget = {"starts": 1, "iterations": 1, "held_out": 2, "limits": {"sensitivity": 2.5}}
+    raw = quick_case(gains=SLIDING, **budget) | {"run": {"settle": 0.0}}
+    raw["controller"]["position"] = {"kind": "integral-sliding-mode"}
+    raw["clock"]["duration"] = 2e-3
     path = tmp_path / "m.toml"
-    path.write_text(f"{text}\n{parts}\n{tune}")
+    path.write_text(dumps(raw))
 
     heard = []
 
@@ -287,10 +296,9 @@ def test_command(tmp_path, capsys):
 @pytest.mark.slow
 def test_members_that_are_held_but_not_stable_refute_the_answer():
     """Delays of up to 8 samples without prediction: the motion grows, too slowly to reach a stop within 2 ms."""
-    raw = raw_case() | {"run": {"settle": 1e-3}, "spread": {"processor": {"delay": {"uniform": [0.5, 8.0]}}}}
-    raw = {name: table for name, table in raw.items() if name != "load"}
+    raw = quick_case() | {"run": {"settle": 1e-3}, "spread": {"processor": {"delay": {"uniform": [0.5, 8.0]}}}}
+    raw = {name: table for name, table in raw.items() if name != "load"} | {"sensitivity": {"speeds": [6000.0]}}
     raw["clock"] |= {"duration": 2e-3}
-    raw["processor"] |= {"predict": False}
     case = machine_from(raw)
     facts = judged(case, case, {"sensitivity": 3.0}, 0, 6)
     stable = MachineStudy(case, 0, 6).stable(MachineStudy(case, 0, 6).drawn(np.arange(6)), np.arange(6))
