@@ -148,8 +148,8 @@ def test_bfgs_finds_the_minimum_of_a_function_that_is_not_smooth():
 
 def lqg_case(**tune):
     raw = tomllib.loads(template("machine"))
-    raw |= {"controller": {"kind": "lqg"}, "tune": tune, "bearing": raw["bearing"][:2]}
-    raw["sensitivity"] = {"speeds": [6000.0]}
+    raw |= {"controller": {"kind": "lqg"}, "tune": tune, "sensitivity": {"speeds": [6e3]}}
+    del raw["bearing"][2]
     case = machine_from(raw)
     return case, lqg_space(Table(raw).table("tune"), case, raw)
 

@@ -157,14 +157,12 @@ def test_the_exported_notch_equals_the_simulated_one(tmp_path, rotor):
     assert holds(verify({"double": made}, None))
 
 
+# compiles faster than the laws of the template, as does a processor without prediction
 QUICK = {"position": {"kind": "pid"}, "inversion": {"kind": "linearised"}}
 
 
 def of_machine(bearings=(), **controller):
-    """The template of a machine at RPM under an unbalance; `bearings`: the notch of each of the first ones.
-
-    Without `controller`, a PID without observer and prediction, which compiles faster.
-    """
+    """A machine at RPM under an unbalance; `bearings`: the notch of each of the first ones; `controller`: or QUICK."""
     raw = tomllib.loads(template("machine"))
     raw["rotor"] |= {"speed": RPM}
     raw["controller"] = (raw["controller"] if "coordinates" in controller else {}) | (controller or QUICK)
