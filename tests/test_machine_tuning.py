@@ -79,10 +79,9 @@ def test_the_peak_is_that_of_the_sensitivity(peaks, integral):
 @pytest.mark.slow  # compiles the loop and its derivatives
 def test_the_search_designs_the_notches_for_its_gains():
     """Poles and peak are those of the machine that is read with the gains, and so are the derivatives."""
-    raw: dict[str, Any] = raw_case(gains=["controller.position.k_d"]) | {"sensitivity": {"speeds": [6000.0]}}
+    raw: dict[str, Any] = quick_case(gains=["controller.position.k_d"]) | {"sensitivity": {"speeds": [6000.0]}}
     raw["controller"] |= {"notch": {"kind": "displacement-free", "rate": 20.0}}
     raw["bearing"][2]["controller"] = {"notch": {"kind": "none"}}
-    raw["processor"] |= {"predict": False}  # compiles faster
     case, space = space_of(raw)
     found, k_d = Peaks(case, space), 1.6 * space.values(case)[0]
     pid = {"position": PARTS["position"] | {"k_d": float(k_d)}}

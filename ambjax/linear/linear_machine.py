@@ -80,9 +80,12 @@ def _matrices(machine: Machine, W: Scalar, period: Scalar, point: MachineRest) -
     return *machine_matrices(own, point), rests
 
 
-def machine_rest(machine: Machine, period: Scalar) -> MachineRest:
-    """Return the equilibrium of a machine at speed 0, or the point nearest to it that was found."""
-    return _at_rest(machine, 0.0, period)
+def machine_rest(machine: Machine, period: Scalar, W: Scalar = 0.0) -> MachineRest:
+    """Return the equilibrium of a machine at the speed W (rad/s), or the point nearest to it that was found.
+
+    It depends on the speed if gains do. At speed 0, a notch may keep a constant signal.
+    """
+    return _at_rest(machine, W, period)
 
 
 def machine_loop(machine: Machine, W: Scalar, period: Scalar, point: MachineRest) -> StateSpace:

@@ -54,23 +54,25 @@ class Peaks:
         self.speeds = 2 * np.pi * PER_MINUTE * np.array(case.speeds)
         speeds = jnp.asarray(self.speeds)
 
-        def systems(machine: Machine, rest: MachineRest) -> StateSpace:
-            def one(W: Array) -> StateSpace:
-                found = machine_loop(machine_at_speed(machine, W, self.period), W, self.period, rest).scaled()
+        def systems(machine: Machine, rests: MachineRest) -> StateSpace:
+            def one(at: tuple[Array, MachineRest]) -> StateSpace:
+                found = machine_loop(machine_at_speed(machine, at[0], self.period), at[0], self.period, at[1]).scaled()
                 return found._replace(C=found.C[: self.count], D=found.D[: self.count], period=None)
 
-            return jax.lax.map(one, speeds)
+            return jax.lax.map(one, (speeds, rests))
 
         self._both: Callable[[np.ndarray], tuple[StateSpace, StateSpace]]
         quick = supported(QUICK)
         if isinstance(space, LqgSpace):  # the weights do not move the rotor
-            rest, compiled = machine_rest(machine, self.period), jax.jit(systems, compiler_options=quick)
-            self._both = lambda x: _differences(lambda x: compiled(space.decode(x, machine), rest), x)
+            each = [machine_rest(machine, self.period, W) for W in speeds]
+            rests = jax.tree.map(lambda *own: jnp.stack(own), *each)
+            compiled = jax.jit(systems, compiler_options=quick)
+            self._both = lambda x: _differences(lambda x: compiled(space.decode(x, machine), rests), x)
         else:  # the machine is an argument, because constants are not arrays of JAX
 
             def at(x: Array, machine: Machine) -> tuple[StateSpace, StateSpace]:
                 own = space.decode(x, machine)
-                found = systems(own, machine_rest(own, self.period))
+                found = systems(own, jax.lax.map(lambda W: machine_rest(own, self.period, W), speeds))
                 return found, found
 
             both = jax.jit(jax.jacfwd(at, has_aux=True), compiler_options=quick)
