@@ -25,6 +25,7 @@ GAINS = {
     "position": {"c": 200.0, "k": 63.0, "p": 5.0},
     "inversion": {"gamma": 2e6, "p": 1e-3},
     "current": {"k_i": 600.0, "p": 20.0},
+    "model": {"m": 0.588},  # that of the rotor; in every document, so that all share one program
 }
 DOCUMENT = {
     "controller": GAINS,
