@@ -45,7 +45,7 @@ initial.z = {{ normal = 1e-6 }}
 TINY = CASE.format(duration="2e-3")
 # A tenth of a second and two calls of the compiled program for each chunk, so that something can happen in the middle
 # of a run. The last one is no whole chunk.
-LONGER, MEMBERS, CHUNK, CHUNKS = CASE.format(duration="0.05"), 1500, 96, 16
+LONGER, MEMBERS, CHUNK, CHUNKS = CASE.format(duration="0.05"), 1000, 96, 11
 RUN = ["ensemble", "case.toml", "--members", str(MEMBERS), "--chunk", str(CHUNK), "--seed", "3"]
 
 
