@@ -222,7 +222,7 @@ def _one(eqn: JaxprEqn, args: list[ArrayLike], count: int) -> list[ArrayLike]:
         return carry
     if name in OPS and OPS[name].cost == "call":
         return [_of_library(OPS[name].c99.partition("{f}")[0], args, dtype_of(eqn.outvars[0]), count)]
-    rows = [jnp.broadcast_to(jnp.asarray(x, dtype_of(v)), (count,)) for x, v in zip(args, eqn.invars, strict=True)]
+    rows = [np.broadcast_to(np.asarray(x, dtype_of(v)), count) for x, v in zip(args, eqn.invars, strict=True)]
     return [eqn.primitive.bind(*rows, **params)]
 
 
