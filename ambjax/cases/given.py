@@ -7,11 +7,10 @@ import re
 from collections.abc import Callable
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
-import jax
-
 from ambjax.cases.machine_case import MachineCase
 from ambjax.cases.reader import Case
 from ambjax.cases.table import cut
+from ambjax.compiler.barrier import as_outside_jit
 from ambjax.control.cascade import Cascade
 from ambjax.numerics.records import require_concrete
 from ambjax.numerics.shapes import require_one_member
@@ -40,7 +39,7 @@ def of_case(
     def decorate(function: Callable[Concatenate[C, P], R]) -> TakesCase[C, P, R]:
         @functools.wraps(function)
         def called(*args: Any, **named: Any) -> R:
-            with contextlib.nullcontext() if traced else jax.ensure_compile_time_eval():  # inside jit, as outside it
+            with contextlib.nullcontext() if traced else as_outside_jit():
                 if args and isinstance(args[0], Cascade):
                     args = (case_of(function.__name__, *args[:3]), *args[3:])
                 require_case(args[0] if args else named.get("case"), machines=machines, traced=traced)

@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -23,6 +22,7 @@ from ambjax.cases.rotor_numbers import fastest_rotor, widest_rotation
 from ambjax.cases.rotor_tables import COORDINATES, RIGID, BearingAxis, axes_and_rotor, vector
 from ambjax.cases.speed_table import MOST_SPEEDS, listed_speeds
 from ambjax.cases.table import Table, show
+from ambjax.compiler.barrier import as_outside_jit
 from ambjax.control.cascade import Cascade
 from ambjax.control.machine_law import MachineLaw
 from ambjax.control.synchronous_notch import SynchronousNotch
@@ -98,7 +98,7 @@ def read_machine(path: str | pathlib.Path | Mapping[str, Any]) -> MachineCase:
             raise ValueError(f"{why}; in Python, read_case reads it.")
         return machine_from(raw, *rest)
 
-    with jax.ensure_compile_time_eval():
+    with as_outside_jit():
         case = read_by(parse, path)
         texts = unresolved(case.cases) if isinstance(path, Mapping) else warnings_of_machine(case, path)
     for text in texts:

@@ -7,13 +7,13 @@ import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-import jax
 import numpy as np
 
 from ambjax.cases import reader
 from ambjax.cases.plausibility import implausible
 from ambjax.cases.reach import reach, widest
 from ambjax.cases.reader import Case
+from ambjax.compiler.barrier import as_outside_jit
 from ambjax.numerics.declared import leaves_of
 from ambjax.simulation.system import reads_velocity
 from ambjax.text.words import one_line
@@ -33,7 +33,7 @@ def read_case(path: str | pathlib.Path | Mapping[str, Any]) -> Case:
 
         case = ambjax.read_case("my.toml")
     """
-    with jax.ensure_compile_time_eval():
+    with as_outside_jit():
         case = reader.read_case(path)
         texts = warnings_of(case) if isinstance(path, Mapping) else warnings_of_file(case, path)
     for text in texts:

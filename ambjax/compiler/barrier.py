@@ -6,8 +6,10 @@ Iterations of shorter loops overlap better. XLA removes JAX's optimisation barri
 it must not inline.
 """
 
+import contextlib
 import functools
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any, TypeVar
 
 import jax
@@ -21,6 +23,15 @@ Result = TypeVar("Result")
 def in_trace(node: object) -> bool:
     """Return whether a number of the pytree is traced, or jit traces the caller: then it traces every result."""
     return any(isinstance(x, Tracer) for x in (jnp.zeros(()), *jax.tree.leaves(node)))
+
+
+def as_outside_jit() -> AbstractContextManager[object]:
+    """Return a context manager in which a function computes with numbers, also if jit traces its caller.
+
+    Outside jit it changes nothing: evaluation at compile time would execute the constant operations of each program one
+    by one, and the program would differ from that of the same case in a command.
+    """
+    return jax.ensure_compile_time_eval() if in_trace(()) else contextlib.nullcontext()
 
 
 def compiled_alone(function: Callable[..., Result]) -> Callable[..., Result]:

@@ -85,7 +85,7 @@ def machine_rest(machine: Machine, period: Scalar, W: Scalar = 0.0) -> MachineRe
 
     It depends on the speed if gains do. At speed 0, a notch may keep a constant signal.
     """
-    return _at_rest(machine, W, period)
+    return _at_rest(machine, *canonical((W, period)))
 
 
 def machine_loop(machine: Machine, W: Scalar, period: Scalar, point: MachineRest) -> StateSpace:
