@@ -268,7 +268,7 @@ def hold(text, path, tally, run):
 
 
 @pytest.mark.parametrize(
-    ("count", "run"), [(100, False), pytest.param(examples(150, 8_000), True, marks=pytest.mark.slow)]
+    ("count", "run"), [(100, False), pytest.param(examples(100, 8_000), True, marks=pytest.mark.slow)]
 )
 def test_changed_files_are_read_or_refused_in_one_line(count, run, tmp_path):
     """The slow test also simulates files that are read."""
