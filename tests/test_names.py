@@ -118,7 +118,7 @@ def test_python_and_the_commands_give_the_same_warnings(text, said, tmp_path, ca
         ({}, {"disturbance": {"q_z": UNBALANCE}}, "disturbance.q_f: speed gives 6667 Hz"),
         ({}, {"processor": {}, "clock": {"duration": 0.1, "sample_period": 1e-3}}, "has only 1.5 samples. Give"),
         ({}, {"processor": {}, "sensor": {"bandwidth": 50.0}}, "sensor.bandwidth = 50 Hz is less than twice the"),
-        ({}, {"rotor": {"speed": 6e4}, "controller": {"notch": {"rate": 700.0}}}, "notch.rate = 700 1/s exceeds the"),
+        ({}, {"rotor": {"speed": 6e4}, "controller": {"notch": {"rate": 700.0}}}, "exceeds .* A notch must converge"),
         ({}, {"processor": {}, "sensor": {"bits": 8, "std": 1e-7}}, "a step of 3.91e-06 m is 39.1 times the noise"),
         ({}, step(0.09) | {"processor": {"delay": 0.0}, "sensor": {"bits": 14, "std": 1e-7}}, None),
         ({}, {"processor": {"delay": 5e-5}}, "processor.delay = 5e-05 samples is close to 0. Is it in seconds"),

@@ -123,7 +123,7 @@ def _rates(case: Case) -> Iterator[str]:
     if (notch := case.cascade.notch) is not None and float(notch.rate) > pole:
         yield (
             f"controller.notch.rate = {float(notch.rate):g} 1/s exceeds the unstable pole, {pole:.4g} 1/s. A notch "
-            "converge slowly against the loop. Lower the rate."
+            "must converge slowly against the loop. Lower the rate."
         )
 
 
