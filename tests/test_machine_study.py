@@ -153,6 +153,8 @@ def test_shapes_of_modes():
     [
         ({"plant": {"m": {"percent": 1}}}, "rotor.m"),
         ({"initial": {"z": {"percent": 1}}}, "spread.initial"),
+        ({"initial": {"q": {"0": {"uniform": [-2e-3, 2e-3]}}}}, r"axis left.x, \|z\| reaches"),
+        ({"initial": {"q": {"3": {"normal": 1e-3}}}}, r"axis left.y, \|z\| reaches"),
         ({"bearing": {"top": {"plant": {"A": {"percent": 1}}}}}, "left, right, thrust"),
         ({"bearing": {"thrust": {"x": {"plant": {"A": {"percent": 1}}}}}}, "bearing.thrust.x"),
         ({"rotor": {"kind": {"percent": 1}}}, "spread.rotor.kind"),

@@ -12,8 +12,9 @@ from ambjax.cases.rotor_numbers import OF_BEARING, SHAPES, rotor_places
 from ambjax.cases.rotor_tables import COORDINATES, BearingAxis
 from ambjax.cases.table import Table
 from ambjax.cases.variation import entries_of, is_distribution
+from ambjax.ensemble.distributions import Distribution, Uniform
 from ambjax.ensemble.paths import Place, places
-from ambjax.ensemble.spread import Spread, check_entries
+from ambjax.ensemble.spread import Spread, SpreadError, check_entries, check_spread
 from ambjax.numerics.records import leaf
 from ambjax.world.rotor import Rotor
 
@@ -98,7 +99,7 @@ def machine_spread(
     """Return the spread of a machine. Each axis varies independently, except for the numbers of the processor.
 
     `q`: coordinates at t = 0. `names`: of the bearings. `cases`: those of the axes, with their own spreads. Raises
-    ValueError for an invalid entry of the rotor or its start, or for an unknown bearing.
+    ValueError for an invalid entry of the rotor or its start, for a start beyond a stop, or for an unknown bearing.
     """
     raw = top.table("spread").raw
     bearings, shapes = Table(raw, "spread").table(OF_BEARING), {}
@@ -115,6 +116,7 @@ def machine_spread(
     entries = entries_of(given, "", list(known))
     entries += entries_of({name: own for name, own in shapes.items() if own}, f"{OF_BEARING}.", list(known))
     check_entries(Spread(tuple(entries)), known)
+    _check_start(entries, q, axes, cases)
     for k, (axis, case) in enumerate(zip(axes, cases, strict=True)):
         for path, kind in case.spread.entries:
             if not path.startswith(COMMON):
@@ -122,6 +124,27 @@ def machine_spread(
             elif k == 0:
                 entries.append((path, kind))
     return Spread(tuple(entries), cases[0].spread.design)
+
+
+def _check_start(
+    entries: Iterable[tuple[str, Distribution]], q: np.ndarray, axes: Sequence[BearingAxis], cases: Sequence[Case]
+) -> None:
+    """Raise ValueError if a member may start beyond the stop of an axis. `q`: coordinates of the nominal start."""
+    ends = np.stack([q, q])
+    for path, kind in entries:
+        if path.startswith(START):
+            k = int(path.removeprefix(START))
+            ends[:, k] = kind.support(float(q[k]))
+    for axis, case in zip(axes, cases, strict=True):
+        reach = (axis.stop if case.scenario.stop is None else axis.magnet) * ends
+        low, high = float(reach.min(0).sum()), float(reach.max(0).sum())
+        if low < high:
+            own = Spread((*case.spread.entries, ("initial.z", Uniform(low, high))))
+            try:
+                check_spread(own, case.cascade, case.scenario)
+            except SpreadError as error:
+                reason = error.reason.replace("initial.z", "z")
+                raise ValueError(f"spread.initial.q: at axis {axis.name}, {reason}") from None
 
 
 def machine_places(rotor: Rotor, q: Any, names: Sequence[str], cases: Sequence[Case]) -> dict[str, Place]:
