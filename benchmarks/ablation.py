@@ -52,7 +52,7 @@ def constant(module: Any, **values: Any) -> Callable[[dict[str, Any]], None]:
 
 def by_values(raw: dict[str, Any]) -> None:
     """Refine each start with CMA-ES from its first point on."""
-    constant(refine, _slope=lambda starts: math.inf)(raw)
+    constant(refine, _slopes=lambda starts: np.full(len(starts.value), math.inf))(raw)
 
 
 def patient(raw: dict[str, Any]) -> None:
@@ -70,7 +70,7 @@ MECHANISMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "starting points: only the case's gains": setting(screen=0),
     "several starts: only the best of the screen": setting(starts=1),
     "halvings: after five steps the best continues alone": constant(refine, FEW=NEVER),
-    "CMA-ES": constant(refine, _slope=lambda starts: 0.0),
+    "CMA-ES": constant(refine, _slopes=lambda starts: np.zeros(len(starts.value))),
     "large populations of CMA-ES": constant(evolution, POPULATION=1),
     "descent: CMA-ES only": by_values,
     "patience: six iterations instead of five": patient,

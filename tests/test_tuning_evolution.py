@@ -10,7 +10,7 @@ from tuning.problem.quantities import NEGLIGIBLE
 from tuning.rounds import rounds
 from tuning.solve.course import Course, training
 from tuning.solve.evolution import PATIENCE, Evolution
-from tuning.solve.refine import early
+from tuning.solve.refine import early, search
 
 # Derivatives of a loop that is chaotic; those of a Bowl's loss are about 1e-4.
 CHAOS = {"chaotic": 1e30, "of moderate size": 1e-2, "not finite": math.nan}
@@ -83,6 +83,15 @@ def test_a_descent_that_ends_early_is_continued_by_cma_es_if_asked_and_a_steep_o
     course.search(np.asarray(start)[None], evolve=evolve)
     assert (populations(world) > 0) == draws
     assert early(course.past[-1]) != draws
+
+
+@pytest.mark.parametrize(("chaos", "raced"), [(0.0, 2 * PATIENCE), (1e30, 2)])
+def test_a_race_halves_at_once_if_all_gradients_are_steep(monkeypatch, chaos, raced):
+    """Eight starts race, then four."""
+    problem = study(monkeypatch, World(chaos=chaos), starts=8)
+    points = np.random.default_rng(1).normal(size=(8, 2))
+    found = search(problem.engine, problem.goal, training(problem), points, keep=8, iterations=1)
+    assert (found.raced, found.iteration) == (raced, raced + 1)
 
 
 def test_cma_es_has_converged_if_whole_populations_do_not_improve():

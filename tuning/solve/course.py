@@ -13,7 +13,7 @@ from tuning.events import Event, Listener, Reached, Standing
 from tuning.judge.evaluate import StepError
 from tuning.problem.loops import check_loops
 from tuning.problem.loss import TERMS
-from tuning.problem.members import Members
+from tuning.problem.members import FEW, Members
 from tuning.problem.quantities import NEGLIGIBLE
 from tuning.problem.ranges import around, initial_points
 from tuning.problem.tuning_problem import TuningProblem
@@ -196,14 +196,12 @@ def first_search(course: Course, start: np.ndarray) -> np.ndarray:
     while budget.screen and not course.over:
         course.tell("comparing this optimum with points at which some gains are changed")
         points = around(x, AROUND * budget.screen, course.seed + len(course.past))
-        near, goals = screen(problem.engine, course.members, points, problem.goal)
-        if goals[0] > goals[np.flatnonzero((near == x).all(1))[0]] - NEGLIGIBLE:
+        near, _ = screen(problem.engine, course.members, points, problem.goal)
+        goals = problem.goal.score(problem.engine.terms(near[:FEW], course.members), course.members)
+        if not goals.min() < best_of(course.past[-1])[1] - NEGLIGIBLE:
             break
         course.tell("with some gains changed, the loss is lower than at this optimum")
-        (_, least), other = best_of(course.past[-1]), course.search(near[:1])
-        if not best_of(course.past[-1])[1] < least:
-            break
-        x = other
+        x = course.search(near[[goals.argmin()]])
     return x
 
 

@@ -164,18 +164,19 @@ def _evolved(
 
 
 def _race(engine: Engine, goal: Goal, members: Members, progress: SearchState) -> None:
-    """After each PATIENCE iterations, select the starts that continue.
+    """After each PATIENCE iterations, or if no gradient leads to a minimum, select the starts that continue.
 
     On other members, a start begins again at its best point, with its inverse Hessian.
     """
-    if progress.iteration % PATIENCE:
-        return
     starts, keep = progress.starts, (len(progress.starts.value) + 1) // 2
+    if progress.iteration % PATIENCE and not _steep(starts).all():
+        return
     values = np.asarray(starts.value)
     if len(values) <= FEW:
         values, keep = goal.score(engine.terms(np.asarray(starts.best), members), members), 1
     best = np.argsort(values, kind="stable")[:keep]
     progress.starts = Starts(*(leaf[best] for leaf in starts))
+    progress.raced = progress.raced if progress.racing else progress.iteration
     if len(_heat(members, progress.starts).member) != len(_heat(members, starts).member):
         progress.starts = progress.starts._replace(trial=progress.starts.best, value=jnp.full(keep, jnp.inf))
 
@@ -201,18 +202,23 @@ def _advance(progress: SearchState, seed: int, evolve: bool) -> None:
     stalled = len(values) > PATIENCE and values[-1] > values[-1 - PATIENCE] - SHORTEST
     ended = stalled or float(jnp.linalg.norm(starts.trial - starts.best)) <= SHORTEST
     progress.converged = ended
-    if not SHORTEST * _slope(starts) < 1 or (evolve and early(progress)):
+    if _steep(starts)[0] or (evolve and early(progress)):
         progress.evolution, progress.converged = Evolution(progress.history["x"][-1], seed), False
 
 
 def early(progress: SearchState) -> bool:
     """Return whether a descent has ended with a gradient of CONVERGED or more, and CMA-ES has not continued it."""
-    return progress.converged and progress.evolution is None and not _slope(progress.starts) < CONVERGED
+    return progress.converged and progress.evolution is None and not _slopes(progress.starts)[0] < CONVERGED
 
 
-def _slope(starts: Starts) -> float:
-    """Return the norm of the gradient of the first start; inf before its first trial."""
-    return float(jnp.linalg.norm(starts.gradient[0])) if np.isfinite(starts.value[0]) else math.inf
+def _steep(starts: Starts) -> np.ndarray:
+    """Return whether each gradient predicts a change of the goal by 1 within a step of SHORTEST [S]."""
+    return ~(SHORTEST * _slopes(starts) < 1)
+
+
+def _slopes(starts: Starts) -> np.ndarray:
+    """Return the norm of each gradient [S]; inf before the first trial."""
+    return np.where(np.isfinite(starts.value), np.linalg.norm(starts.gradient, axis=1), math.inf)
 
 
 def best_of(progress: SearchState) -> tuple[np.ndarray, float]:
