@@ -336,6 +336,23 @@ def test_the_best_answer_within_the_limits_is_taken_if_the_multipliers_do_not_co
     assert next(found, None) is None
 
 
+def test_a_search_begins_at_the_optimum_of_least_goal(monkeypatch):
+    """A search ends at 200 V, far from the limit of 10 V; the next one begins at 15 V."""
+    problem = study(monkeypatch, World(), **TEN)
+    course = Course(problem, training(problem), 1)
+    course.past.append(SimpleNamespace(interrupted=False, starts=None, converged=False))
+    at = [np.asarray(problem.objective.space.encode(np.array([World.best[0], k]))) for k in (60.0, 45.0, 600.0, 29.9)]
+    starts, found = [], iter(at[1:])
+
+    def searched(points, earlier, evolve):
+        starts.append(points[0])
+        return next(found)
+
+    monkeypatch.setattr(course, "search", searched)
+    optima(course, at[0], 3)
+    np.testing.assert_allclose(starts, [at[0], at[1], at[1]])
+
+
 @pytest.mark.parametrize(
     ("limits", "ends", "joining"),
     [({"rms_u_V": 10.0}, (29.9, 29.9), 0), ({"settling_s": 10.0}, (60.0, 29.0), 8)],

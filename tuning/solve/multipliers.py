@@ -17,6 +17,7 @@ import numpy as np
 from tuning.judge.evaluate import RESOLVED, JudgedMembers, held, judge, rms
 from tuning.judge.peaks import injections, injects, reached_of
 from tuning.problem.config import seeds
+from tuning.problem.goal import Goal
 from tuning.problem.limits import PREFIX, SATURATION, Limit
 from tuning.problem.members import Members
 from tuning.problem.quantities import NEGLIGIBLE
@@ -71,15 +72,15 @@ def search_within_limits(course: Course, x: np.ndarray) -> tuple[np.ndarray, boo
     if converged or not within:
         return seen[-1].x, bool(within) and within[-1] is seen[-1]
     course.tell("the multipliers of the limits do not converge; the best answer within the limits is taken")
-    goal = dataclasses.replace(course.problem.goal, limits=())
-    terms = course.problem.engine.terms(np.array([one.x for one in within]), course.members)
-    best = within[int(np.argmin(goal.score(terms, course.members)))]
+    best = _lowest(course, within, dataclasses.replace(course.problem.goal, limits=()))
     course.problem = course.problem.limited(best.limits)
     return best.x, True
 
 
 def optima(course: Course, x: np.ndarray, updates: int = MOST_UPDATES) -> tuple[list[Judged], bool]:
     """Judge the optimum x [m], let the members that break a limit join, or update the multipliers, and search again.
+
+    Each search begins at the optimum so far of least goal, with the new members and multipliers.
 
     Returns the judged optima, the first at x, and whether the last one meets all limits. There are at most `updates`
     searches after updates, and as many after members have joined. After a search that ends where it began, the
@@ -97,7 +98,14 @@ def optima(course: Course, x: np.ndarray, updates: int = MOST_UPDATES) -> tuple[
         met = not joined and _updated(course, one, moved)
         if last or (met and not early(course.past[-1])):
             return seen, met
-        x, moved = course.again(x, evolve=met or not moved)
+        x, moved = course.again(_lowest(course, seen).x, evolve=met or not moved)
+
+
+def _lowest(course: Course, seen: Sequence[Judged], goal: Goal | None = None) -> Judged:
+    """Return the optimum of least goal. `goal`: None: that of the next search."""
+    problem, members = course.problem, course.members
+    terms = problem.engine.terms(np.array([one.x for one in seen]), members)
+    return seen[int(np.argmin((goal or problem.goal).score(terms, members)))]
 
 
 def _updated(course: Course, one: Judged, moved: bool) -> bool:
