@@ -7,6 +7,7 @@ import json
 import math
 import os
 import tomllib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -149,6 +150,22 @@ def test_a_change_of_one_gain_leads_to_a_lower_optimum(monkeypatch, valley, lose
     lower = World.best * np.array([np.exp(valley), 1.0])
     np.testing.assert_allclose(gains, World.best if loses else lower, rtol=0.02)
     assert len(found.past) == 2 - loses
+
+
+def test_a_further_search_that_does_not_lower_the_loss_is_the_last(monkeypatch):
+    """The comparison finds lower losses than the searches, whose best one is always 1."""
+    made = study(monkeypatch, World(), screen=8)
+    found = course.Course(made, course.training(made), 1)
+    ends = [at(made, 90.0, 50.0), at(made, 80.0, 40.0)]
+
+    def searched(points):
+        x = ends[len(found.past)]  # a third search would raise IndexError
+        found.past.append(SimpleNamespace(history={"value": [0.0], "x": [x]}, interrupted=False))
+        return x
+
+    monkeypatch.setattr(found, "search", searched)
+    np.testing.assert_array_equal(course.first_search(found, np.array([90.0, 50.0])), ends[0])
+    assert len(found.past) == 2
 
 
 # --- the command ---
