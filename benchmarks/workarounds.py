@@ -76,6 +76,15 @@ def without_sine() -> None:
     smooth.cosine = lambda x: jnp.cos(smooth.TWO_PI * x)
 
 
+def without_refined() -> None:
+    """Float64 divisions are not approximated."""
+    from ambjax.numerics import relax, smooth
+    from ambjax.world import magnet
+
+    for module in (relax, smooth, magnet):
+        module.refined_reciprocal = lambda x: 1 / x
+
+
 def without_blocks() -> None:
     """A call simulates all its members at once."""
     from ambjax.compiler import fast_path
@@ -93,6 +102,7 @@ WITHOUT: dict[str, Callable[[], None]] = {
     "stored": without_stored,
     "arctan": without_arctan,
     "sine": without_sine,
+    "refined": without_refined,
     "blocks": without_blocks,
 }
 

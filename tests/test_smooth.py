@@ -10,6 +10,7 @@ from ambjax.numerics.smooth import (
     arctan_per,
     away_from_zero,
     cosine,
+    refined_reciprocal,
     safe_sqrt,
     sine,
     smooth_root,
@@ -76,6 +77,18 @@ def test_arctan_per_agrees_with_numpy(dtype):
     expected = np.arctan(x.astype(np.longdouble)) / per.astype(np.longdouble)
     # the approximation's own 2e-15 (9 eps) in float64, a few roundings in float32
     np.testing.assert_allclose(wide(arctan_per)(x, per), expected, rtol=10 * np.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_refined_reciprocal_is_one_over_x_to_the_last_bit_but_one(dtype):
+    """Over the whole range, and near 1, where rounding of either operand has the largest effect."""
+    eps = np.finfo(dtype).eps
+    near = 1 + np.linspace(-50, 50, 101) * eps
+    x = np.concatenate([np.geomspace(1e-37, 1e37, 9973), near]).astype(dtype)
+    x = np.concatenate([x, -x])
+    np.testing.assert_allclose(wide(refined_reciprocal)(x), 1 / x.astype(np.longdouble), rtol=2 * eps)
+    # far beyond it, what is as good as 0: a trial state on its way out of the model's range
+    np.testing.assert_array_equal(wide(refined_reciprocal)(np.array([np.sqrt(np.finfo(dtype).max)] * 8)) < 1e-18, True)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

@@ -11,9 +11,9 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn
 
-from ambjax.codegen.primitives import OPS, SAME, dtype_of, split_scan, walked
+from ambjax.codegen.primitives import OPS, SAME, called_by, dtype_of, split_scan, walked
 from ambjax.codegen.program import Operand, Program, Ref, of
-from ambjax.compiler.members_last import CALLS, called
+from ambjax.compiler.members_last import CALLS
 
 LOOPS = ("scan", "while")
 COMPOSED = ("rsqrt", "exp2", "logistic", "one_minus_square")
@@ -50,7 +50,7 @@ class _Reader:
 
     def equation(self, name: str, eqn: JaxprEqn, args: list[Operand], law: str) -> list[Operand]:
         if name in CALLS:
-            return self.closed(called(eqn), args, law)
+            return self.closed(called_by(eqn), args, law)
         if name in SAME:
             return args
         if name in LOOPS or name == "cond":

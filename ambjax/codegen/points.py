@@ -17,10 +17,10 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn
 from jax.typing import ArrayLike
 
 from ambjax.codegen.block import UNREAD
-from ambjax.codegen.primitives import OPS, SAME, dtype_of, split_scan, walked
+from ambjax.codegen.primitives import OPS, SAME, called_by, dtype_of, split_scan, walked
 from ambjax.codegen.program import PRECISIONS, Ref
 from ambjax.codegen.trace import Trace, arguments
-from ambjax.compiler.members_last import CALLS, called
+from ambjax.compiler.members_last import CALLS
 from ambjax.compiler.short_compilation import precision
 
 # DECADES: range of the random numbers, in decades around the scale of each. EDGY: probability that a number is zero,
@@ -203,7 +203,7 @@ def _one(eqn: JaxprEqn, args: list[ArrayLike], count: int) -> list[ArrayLike]:
     if name in SAME:
         return args
     if name in CALLS:
-        return one_by_one(called(eqn), args, count)
+        return one_by_one(called_by(eqn), args, count)
     if name == "cond":
         sides = [one_by_one(branch, args[1:], count) for branch in params["branches"]]
         at = np.asarray(args[0], int)

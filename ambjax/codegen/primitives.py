@@ -7,8 +7,12 @@ the exported code with JAX, not with NumPy.
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
+import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
+
+from ambjax.compiler.members_last import called
+from ambjax.numerics.smooth import REFINED
 
 
 class Op(NamedTuple):
@@ -94,6 +98,13 @@ def dtype_of(x: Atom) -> np.dtype:
     """Return the dtype of a variable or constant of a trace."""
     aval: Any = x.aval
     return np.dtype(aval.dtype)
+
+
+def called_by(eqn: JaxprEqn) -> ClosedJaxpr:
+    """Return the jaxpr that an equation calls. That of `refined_reciprocal` is one division."""
+    if eqn.params.get("name") == REFINED:
+        return jax.make_jaxpr(lambda x: 1 / x)(eqn.invars[0].aval)
+    return called(eqn)
 
 
 def walked(closed: ClosedJaxpr, args: Sequence[Any], one: Callable[[JaxprEqn, list[Any]], Sequence[Any]]) -> list[Any]:

@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from ambjax.compiler.fast_path import SHORTEST
+from ambjax.compiler.short_compilation import compiled_quickest
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import map_members, size
 from ambjax.linear.equilibrium import ideal, reading
@@ -20,7 +21,9 @@ from ambjax.simulation.folds import Ending
 from ambjax.simulation.rollout import prepare, run
 from ambjax.simulation.sliding import Slide
 from ambjax.simulation.trajectory import ALIVE
+from ambjax.world.plant import Plant
 from ambjax.world.scenario import Initial, Scenario
+from ambjax.world.sensor import Measurement
 from ambjax.world.waveforms import Constant
 
 # Default amplitude of e, as a share of the gap s_0; at the velocity sensor, of s_0 times the plant's pole.
@@ -209,15 +212,23 @@ def padded(wave: MultiSine, lines: int) -> MultiSine:
 
 def _at_rest(cascade: Cascade, scenario: Scenario, r: float) -> tuple[Cascade, Scenario]:
     """Return cascade and scenario that start at rest at the constant reference r (m), without disturbances."""
-    i = scenario.plant.equilibrium(r)[0]
-    initial = Initial(r, 0.0, float(i) if np.ndim(i) == 0 else i)
-    scenario = dataclasses.replace(scenario.undisturbed(), reference=Constant(r), initial=initial)
-    inversion = cascade.inversion.started(cascade.model.equilibrium(r)[0])
+    scenario = dataclasses.replace(scenario.undisturbed(), reference=Constant(r))
+    i, i_model, z = _rest(*canonical((scenario, cascade.model, r)))
+    scenario = dataclasses.replace(scenario, initial=Initial(r, 0.0, float(i) if np.ndim(i) == 0 else i))
     # The observer does not start at the first measurement: a slow observer would keep the noise of this measurement as
     # an initial error.
-    rest = initial.measurement()
-    z = reading(ideal(scenario), rest, (0.0, 0.0)).z
-    return dataclasses.replace(cascade, inversion=inversion, observer=cascade.observer.started(z)), scenario
+    laws = {"inversion": cascade.inversion.started(i_model), "observer": cascade.observer.started(z)}
+    return dataclasses.replace(cascade, **laws), scenario
+
+
+def _values_at_rest(scenario: Scenario, model: Plant, r: Scalar) -> tuple[Array, Array, Array]:
+    """Return the currents of plant and model at rest at r (m), in A, and the reading of the position there, m."""
+    i = scenario.plant.equilibrium(r)[0]
+    z = reading(ideal(scenario), Measurement(jnp.asarray(r), 0.0 * i, i), (0.0, 0.0)).z
+    return i, model.equilibrium(r)[0], z
+
+
+_rest = compiled_quickest(_values_at_rest)  # a command would compile each operation alone
 
 
 def _harmonics(frequencies: Sequence[float] | np.ndarray, clock: Clock) -> np.ndarray:

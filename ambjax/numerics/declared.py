@@ -96,7 +96,7 @@ def check_number(field: dataclasses.Field, name: str, value: object) -> None:
     with contextlib.suppress(TypeError, ValueError):
         if not plain and np.asarray(value).dtype.kind not in "bUS":
             number = np.asarray(value, dtype=float)
-    if not (np.size(number) and within(field.metadata, number)):
+    if not ((plain or np.size(number)) and within(field.metadata, number)):
         form = ".10g" if field.metadata["whole"] else "g"
         shown = f"{value:{form}}" if plain else _shown(value, number)
         raise ValueError(f"{name} = {shown}: it must be {numbers(field)}.")

@@ -13,7 +13,15 @@ from jax import Array
 
 from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.numerics.records import Scalar
-from ambjax.numerics.smooth import TWO_OVER_PI, arctan_per, limited, safe_sqrt, smooth_root, smooth_sign
+from ambjax.numerics.smooth import (
+    TWO_OVER_PI,
+    arctan_per,
+    limited,
+    refined_reciprocal,
+    safe_sqrt,
+    smooth_root,
+    smooth_sign,
+)
 
 # Steps of Halley's method. They start from the solution for a rational sign with the same tail and 2.5 times the slope
 # at 0. This solution is 0.4 to 1 times the exact one. The relative residual is 3e-8 after 2 steps, and at the level of
@@ -57,12 +65,12 @@ def _relaxed(x: Array, h: Array) -> Array:
     reach, eps = h / TWO_OVER_PI, TWO_OVER_PI
     b = eps + reach - size
     root = jnp.sqrt(b * b + 4 * eps * size)
-    y = jnp.where(b > 0, 2 * eps * size / (jnp.abs(b) + root), (root - b) / 2)
+    y = jnp.where(b > 0, 2 * eps * size * refined_reciprocal(jnp.abs(b) + root), (root - b) / 2)
     for _ in range(HALLEY):
         flat = 1 + y * y
-        steep = 1 / (flat + h)  # reciprocal first: y^4 would overflow in float32
+        steep = refined_reciprocal(flat + h)  # reciprocal first: y^4 would overflow in float32
         newton = (y + h * arctan_per(y, jnp.ones_like(y)) - size) * steep
-        y = y - newton * flat / (1 + (y * steep) * (h * newton))
+        y = y - newton * flat * refined_reciprocal(1 + (y * steep) * (h * newton))
     return jnp.where(x < 0, -y, y)
 
 

@@ -25,7 +25,7 @@ def check_shapes(fields: Sequence[dataclasses.Field], values: Mapping[str, Any],
     lengths: dict[str, tuple[int, str]] = {}
     for field in fields:
         value, axes = values[field.name], axes_of(field)
-        if value is None or dataclasses.is_dataclass(value) or (not axes and np.ndim(value) < 2):
+        if (not axes and getattr(value, "ndim", 0) < 2) or value is None or dataclasses.is_dataclass(value):
             continue
         shape = np.shape(value)
         own = shape[len(shape) - len(axes) :] if len(axes) <= len(shape) <= len(axes) + 1 else ()
@@ -45,7 +45,7 @@ def varying(tree: object) -> tuple[bool, ...]:
     It is if the leaf has one axis more than its field declares. Outside of a record every array has this axis.
     """
     leaves, structure = jax.tree.flatten(tree)
-    return tuple(np.ndim(x) > rank for x, rank in zip(leaves, _ranks(structure), strict=True))
+    return tuple(getattr(x, "ndim", 0) > rank for x, rank in zip(leaves, _ranks(structure), strict=True))
 
 
 def require_one_member(parts: dict[str, object]) -> None:

@@ -31,11 +31,29 @@ SINE_S = {
 # fmt: on
 
 
+@jax.jit
+def refined_reciprocal(x: Array) -> Array:
+    """Return 1/x for |x| between 1e-37 and 1e37.
+
+    Many CPUs divide vectors of float32 faster than vectors of float64. In float64 on a CPU, the function therefore
+    refines a float32 quotient by one step of third order. The error is at most about one unit in the last place. In a
+    JAX trace it is a call of this name (REFINED), which the exporter writes as a quotient.
+    """
+    if x.dtype != jnp.float64 or jax.default_backend() != "cpu":
+        return 1 / x
+    rough = (1 / x.astype(jnp.float32)).astype(jnp.float64)
+    error = 1 - x * rough
+    return rough + rough * (error + error * error)
+
+
+REFINED = "refined_reciprocal"
+
+
 @jax.custom_jvp
 @compiled_alone
 def reciprocal(x: Array) -> Array:
-    """Return 1/x. Its derivative does not divide, because divisions would dominate the cost of a gradient."""
-    return 1 / x
+    """Return 1/x, with a derivative that does not divide: divisions would dominate the cost of a gradient."""
+    return refined_reciprocal(x)
 
 
 @reciprocal.defjvp

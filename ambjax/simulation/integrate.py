@@ -73,12 +73,13 @@ class InitialValueProblem(NamedTuple):
         """
         if self.motion is None or not after:
             return end
-        z, z_dot, z_after, z_dot_after = lax.stop_gradient((*self.motion(before), *after))
-        begin, end, limit = lax.stop_gradient((begin, end, self.limit))
-        touched = (code == TOUCHED) & (end > begin)
+        touched, end = (code == TOUCHED) & (end > begin), lax.stop_gradient(end)
+        given = lax.stop_gradient((begin, jnp.asarray(self.limit), *self.motion(before), *after))
 
         def crossing(now: tuple[Array, Array]) -> tuple[Array, Array]:
-            h = now[1] - begin  # not `end`: XLA moves what is constant in a loop out of it
+            # XLA moves what is constant in a loop out of it, and would compute it in every sample.
+            end, (begin, limit, z, z_dot, z_after, z_dot_after) = lax.optimization_barrier((now[1], given))
+            h = end - begin
             sign = jnp.where(z_after < 0, -1.0, 1.0)
             a, slope_a, b, slope_b = sign * z, sign * h * z_dot, sign * z_after, sign * h * z_dot_after
             curve, twist = 3 * (b - a) - 2 * slope_a - slope_b, 2 * (a - b) + slope_a + slope_b

@@ -79,7 +79,8 @@ def slopes(cascade: Cascade, scenario: Scenario) -> dict[str, float]:
     plant = scenario.plant
     named = laws | {PLANT: plant.slope(), COILS: scenario.current_slope, FLUX: plant.flux_slope()}
     named |= {} if scenario.stop is None else {STOP: scenario.stop.slope(plant.m)}
-    named = {name: lax.stop_gradient(slope) for name, slope in named.items()}
+    if any(map(is_traced, named.values())):
+        named = lax.stop_gradient(named)
     if traced := [name for name, slope in named.items() if is_traced(slope)]:
         raise UnknownSlopeError(f"slope of the {traced[0]}")
     return {name: float(np.max(np.asarray(x))) for name, x in named.items()}

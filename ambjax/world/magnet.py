@@ -8,7 +8,7 @@ from jax import Array
 
 from ambjax.compiler.barrier import compiled_alone, materialised
 from ambjax.numerics.records import Scalar, bounded, record
-from ambjax.numerics.smooth import safe_sqrt
+from ambjax.numerics.smooth import refined_reciprocal, safe_sqrt
 
 # Lower bound of a gap in the divisions, as a share of s_0. The rotor is lost at a larger gap, so the bound acts only on
 # trial stages of an integrator. It keeps the quotients and their derivatives finite.
@@ -46,7 +46,7 @@ def gaps(z: Scalar, s_0: Scalar) -> Gaps:
 @compiled_alone
 def _inverse(z: Array, s_0: Array) -> Array:
     """Return 1 / (upper lower), 1/m^2, with the lower bound of `_product`."""
-    return 1 / _product(z, s_0)
+    return refined_reciprocal(_product(z, s_0))
 
 
 @_inverse.defjvp
@@ -135,7 +135,7 @@ class Iron:
 def _inverse_root(x: Array) -> Array:
     """Return (1 + x^4)^(-1/4)."""
     square = x * x
-    return 1 / jnp.sqrt(jnp.sqrt(1 + square * square))
+    return refined_reciprocal(jnp.sqrt(jnp.sqrt(1 + square * square)))
 
 
 @_inverse_root.defjvp
