@@ -74,12 +74,12 @@ class InitialValueProblem(NamedTuple):
         if self.motion is None or not after:
             return end
         touched, end = (code == TOUCHED) & (end > begin), lax.stop_gradient(end)
-        given = lax.stop_gradient((begin, jnp.asarray(self.limit), *self.motion(before), *after))
+        given = lax.stop_gradient((begin, self.limit, *self.motion(before), *after))
 
         def crossing(now: tuple[Array, Array]) -> tuple[Array, Array]:
             # XLA moves what is constant in a loop out of it, and would compute it in every sample.
-            end, (begin, limit, z, z_dot, z_after, z_dot_after) = lax.optimization_barrier((now[1], given))
-            h = end - begin
+            begin, limit, z, z_dot, z_after, z_dot_after = (jnp.where(now[0], x, 0.0) for x in given)
+            h = now[1] - begin
             sign = jnp.where(z_after < 0, -1.0, 1.0)
             a, slope_a, b, slope_b = sign * z, sign * h * z_dot, sign * z_after, sign * h * z_dot_after
             curve, twist = 3 * (b - a) - 2 * slope_a - slope_b, 2 * (a - b) + slope_a + slope_b
