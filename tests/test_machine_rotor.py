@@ -136,6 +136,21 @@ def test_modes_with_a_gyroscopic_matrix_are_the_shaft(shaft):
     assert own[3, 4] == I_p
 
 
+def test_a_step_beyond_the_stability_limit_of_the_fastest_mode_is_refused():
+    """The limit of RK4 is 2.785 divided by the natural frequency."""
+    raw = FLEXIBLE | {"rotor": FLEXIBLE["rotor"] | {"modes": 20}}
+    rotor = machine_from(raw).machine.rotor
+    fastest = np.sqrt(np.linalg.eigvals(np.linalg.solve(rotor.M, rotor.K)).real.max())
+
+    def with_step(dt):
+        clock = {"sample_period": dt, "dt": dt, "duration": 100 * dt, "method": "rk4"}
+        return machine_from(raw | {"clock": clock, "run": {"settle": 0.0}})
+
+    assert with_step(0.99 * 2.785 / fastest).clock.method.substeps == 1
+    with pytest.raises(ValueError, match=rf"^clock\.dt = .* up to {2.785 / fastest:.3g} s, because the fastest mode"):
+        with_step(1.01 * 2.785 / fastest)
+
+
 BAD = [
     ({"K": None}, {}, "the array K is missing"),
     ({"nodes": np.zeros(3)}, {}, "in ascending order"),

@@ -33,7 +33,7 @@ from ambjax.numerics.records import canonical
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.explicit import DOP853, RK4, Euler
 from ambjax.simulation.machine_kinds import machine_of
-from ambjax.simulation.method import ACCURATE, DRIVEN, TOUCHED, slopes
+from ambjax.simulation.method import ACCURATE, DRIVEN, STOP, TOUCHED, require_stable, slopes
 from ambjax.simulation.rollout import prepare
 from ambjax.simulation.whole_machine import Machine
 from ambjax.text.words import one_line
@@ -310,8 +310,12 @@ def _clock(cases: list[Case], rotor: Rotor, fixed: bool) -> Clock:
     fastest = max(math.sqrt(float(np.max(np.diag(K) / np.diag(M)))), float(W * np.max(np.abs(G) / np.diag(M)[:, None])))
     signals = tuple(one.signal for one in (*rotor.loads, *rotor.base))
     load = 2 * math.pi * max((high for _, high in frequencies_of(signals)), default=0.0)
-    needed = period * max(fastest / MODE, stop_slope(rotor, cases) / TOUCHED, max(load, float(W)) / DRIVEN)
-    substeps = most.substeps if fixed else max(most.substeps, math.ceil(needed))
+    on_stop = stop_slope(rotor, cases)
+    if fixed:
+        require_stable(most, period / most.substeps, most.limit, {"fastest mode of the rotor": fastest, STOP: on_stop})
+        return clock.with_method(most)
+    needed = period * max(fastest / MODE, on_stop / TOUCHED, max(load, float(W)) / DRIVEN)
+    substeps = max(most.substeps, math.ceil(needed))
     if substeps > MOST_SUBSTEPS:
         raise ValueError(
             f"clock: this machine needs {substeps} steps in a sample of {period:g} s; at most {MOST_SUBSTEPS} are "

@@ -215,10 +215,18 @@ def _check_limit(clock: Clock, limit: float, cascade: Cascade, scenario: Scenari
         step = clock.integrator.step_size(float(np.max(np.asarray(clock.sample_period))))
     except (ValueError, jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):
         return  # traced values cannot be checked
-    law = max(named, key=lambda name: named[name])
-    limit /= named[law]
-    if step is not None and step > limit:
+    if step is not None:
+        require_stable(clock.method, step, limit, named)
+
+
+def require_stable(method: object, step: float, limit: float, named: dict[str, float]) -> None:
+    """Raise ValueError if a step (s) times the largest of the slopes (1/s) exceeds the stability limit of the method.
+
+    `named`: the slopes by what has them.
+    """
+    what = max(named, key=lambda name: named[name])
+    if step * named[what] > limit:
         raise ValueError(
-            f"clock.dt = {step:g} s: {clock.method} is stable only up to {limit:.3g} s, because the "
-            f"{law} has slope {named[law]:.3g} 1/s. Use dt = 'auto', method = 'rodas3', or a smaller dt."
+            f"clock.dt = {step:g} s: {method} is stable only up to {limit / named[what]:.3g} s, because the "
+            f"{what} has slope {named[what]:.3g} 1/s. Use dt = 'auto' or a smaller dt."
         )
