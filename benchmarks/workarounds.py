@@ -81,8 +81,7 @@ def without_refined() -> None:
     from ambjax.numerics import relax, smooth
     from ambjax.world import magnet
 
-    for module in (relax, smooth, magnet):
-        module.refined_reciprocal = lambda x: 1 / x
+    relax.refined_reciprocal = smooth.refined_reciprocal = magnet.refined_reciprocal = lambda x: 1 / x
 
 
 def without_blocks() -> None:
