@@ -24,7 +24,7 @@ from ambjax.numerics.records import canonical, require_concrete
 from ambjax.numerics.shapes import varying
 from ambjax.simulation.clock import Clock, takes_case
 from ambjax.simulation.folds import Fold
-from ambjax.simulation.rollout import Result, System, prepare, run
+from ambjax.simulation.rollout import Result, RolloutState, System, begin, finish, prepare, segment
 from ambjax.simulation.system import check_recording
 from ambjax.world.scenario import Scenario
 
@@ -72,17 +72,26 @@ def run_ensemble(
     """
     check_recording(fold, record_every)
     tree = canonical((*prepare(cascade, scenario, clock), fold))
-    return map_members(_Rollout(record_every), tree, threads=threads, call=call)
+    return map_members(Rollouts(record_every), tree, threads=threads, call=call, vectorised=True)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Rollout:
-    """The function that simulates one member."""
+class Rollouts:
+    """The function that simulates a block of members, for `map_members` with `vectorised`."""
 
-    record_every: int
+    record_every: int = 0
 
-    def __call__(self, tree: tuple[System, Clock, Fold | None]) -> Result:
-        return run(*tree, self.record_every)
+    def __call__(self, tree: tuple[System, Clock, Fold | None], axes: Any) -> Result:
+        # The state has an axis of members from the first sample on. Otherwise JAX maps a sample again and again, until
+        # it knows which parts of the state vary. A fold may have parts that do not, such as the number of the sample.
+        start = jax.vmap(functools.partial(begin, fold=None), axes[:2], axis_size=size(tree))(*tree[:2])
+
+        def rest(system: System, clock: Clock, fold: Fold | None, start: RolloutState) -> Result:
+            progress = start if fold is None else start._replace(fold=fold.init())
+            progress, rows = segment(system, clock, fold, progress, 0, clock.samples, self.record_every)
+            return finish(progress, rows, fold)
+
+        return jax.vmap(rest, (*axes, 0))(*tree, start)
 
 
 def map_members(

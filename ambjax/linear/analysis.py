@@ -1,6 +1,7 @@
 """Linearisation of a case, and its analysis: sensitivity with its zone, margins, stiffness, noise, poles."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,7 +11,7 @@ import numpy as np
 
 from ambjax.compiler.short_compilation import compiled_quickest
 from ambjax.control.cascade import Cascade
-from ambjax.ensemble.batching import map_members
+from ambjax.ensemble.batching import size
 from ambjax.linear.margins import (
     BAND,
     NO_PEAK,
@@ -28,15 +29,13 @@ from ambjax.linear.matrices import loop_matrices, rest
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.declared import require_number
 from ambjax.numerics.records import Scalar, canonical, leaf, record, require_concrete
-from ambjax.numerics.shapes import require_one_member
+from ambjax.numerics.shapes import require_one_member, varying
 from ambjax.simulation.clock import Clock, takes_case
 from ambjax.simulation.rollout import prepare
 from ambjax.world.scenario import Scenario
 
 _matrices = compiled_quickest(loop_matrices)
 _rest = compiled_quickest(rest)
-# Members that one call linearises: ensembles of all sizes share one compiled program.
-CALL = 64
 
 
 @record
@@ -187,7 +186,7 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
     not contain noise, runout, disturbances, converters, faults, the guard, the limits of supply and amplifier, or the
     dead band. On a processor it is the exact map of one sample period.
 
-    Returns the state space with NumPy arrays. States that no input reaches are left out. Raises ValueError as `rollout`
+    Returns the state space with NumPy arrays, without states that no input reaches. Raises ValueError as `rollout`
     does, if no equilibrium is found at r, and if a law has no derivative there.
     """
     require_number("r", r)
@@ -199,7 +198,7 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
 
 
 def checked(system: StateSpace, found: Any, r: Scalar, moving: str = "") -> StateSpace:
-    """Return a result of `loop_matrices` with NumPy arrays, without the states that no input reaches.
+    """Return a result of `loop_matrices` with NumPy arrays, without states that are not reached or have no effect.
 
     `moving`: path of the state that changes most where the search for an equilibrium ended, for the message. Raises
     ValueError if the result has no meaning: no equilibrium at r (m), or a matrix that is not finite.
@@ -214,7 +213,8 @@ def checked(system: StateSpace, found: Any, r: Scalar, moving: str = "") -> Stat
             f"the loop has no linearisation at the equilibrium of r = {float(r):g} m: the derivative of a law or of "
             "the plant is not finite there."
         )
-    return system.without_idle()
+    system = system.without_idle()
+    return system if system.period is None else system.without_old_commands()
 
 
 @takes_case
@@ -227,23 +227,24 @@ def linearise_members(
     not, the matrices of the member have no meaning. `checked` examines one member. Raises ValueError as `rollout` does.
     """
     inputs = canonical((*linearisation_inputs(cascade, scenario, clock), r))
-    # one call at a time: XLA runs LAPACK on its own threads, and two calls may deadlock
-    return map_members(_member, inputs, threads=1, call=CALL, compiled=compiled_quickest)
-
-
-def _member(tree: Any) -> tuple[StateSpace, Any]:
-    return loop_matrices(*tree)
+    # in turn, with the program of one loop: a call takes about 1 ms, the compilation of another program seconds
+    leaves, structure = jax.tree.flatten(inputs)
+    columns = [x if varies else itertools.repeat(x) for x, varies in zip(leaves, varying(inputs), strict=True)]
+    members = itertools.islice(zip(*columns, strict=False), size(inputs))
+    each = [_matrices(*jax.tree.unflatten(structure, member)) for member in members]
+    return jax.tree.map(lambda *xs: np.stack(xs), *each)
 
 
 def linearisation_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Cascade, Scenario, Scalar]:
     """Check a case, and return the first three arguments of `loop_matrices`: cascade, scenario and sample period (s).
 
-    If the cascade has a processor, the returned cascade is that of `Cascade.on_processor`. The integration method of
+    If the cascade has a processor, the program of the returned one serves every delay. The integration method of
     `clock` has no effect: it may be too coarse for this cascade. Raises ValueError as `rollout` does otherwise.
     """
     system, clock = prepare(cascade, scenario, clock.with_method(None))
     if cascade.sampled:
-        cascade = system.loop.cascade  # pyright: ignore[reportAttributeAccessIssue]
+        own: Cascade = system.loop.cascade  # pyright: ignore[reportAttributeAccessIssue]
+        cascade = dataclasses.replace(own, processor=cascade.timing.for_every_delay())
     return dataclasses.replace(cascade), scenario, clock.sample_period
 
 

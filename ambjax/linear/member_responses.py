@@ -12,13 +12,13 @@ from jax import Array
 from ambjax.compiler.fast_path import SHORTEST
 from ambjax.compiler.short_compilation import compiled_quickest
 from ambjax.control.cascade import Cascade
-from ambjax.ensemble.batching import map_members, size
+from ambjax.ensemble.batching import Rollouts, map_members, size
 from ambjax.linear.equilibrium import ideal, reading
 from ambjax.numerics.declared import require_number
 from ambjax.numerics.records import Scalar, canonical, leaf, record, replaced, static
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Ending
-from ambjax.simulation.rollout import prepare, run
+from ambjax.simulation.rollout import Result, prepare
 from ambjax.simulation.sliding import Slide
 from ambjax.simulation.trajectory import ALIVE
 from ambjax.world.plant import Plant
@@ -184,8 +184,8 @@ def member_responses(
     system, longer = prepare(*_at_rest(cascade, scenario, r), longer)
     response = Response(padded(wave, PADDED * math.ceil(len(wave.harmonics) / PADDED)), scenario.voltage_limit, skip)
     tree = canonical((system, longer, response))
-    sums, code = map_members(_member, tree, call=SHORTEST if size(tree) <= FEW else None)
-    return responses_of(sums, code, wave, clock, amplitude)
+    found = map_members(_responses, tree, call=SHORTEST if size(tree) <= FEW else None, vectorised=True)
+    return responses_of(found.metrics, found.trajectory.lost_code, wave, clock, amplitude)
 
 
 def responses_of(sums: FourierSums, code: Any, wave: MultiSine, clock: Clock, amplitude: float) -> Responses:
@@ -197,10 +197,10 @@ def responses_of(sums: FourierSums, code: Any, wave: MultiSine, clock: Clock, am
     return Responses(frequency, S, KS, np.asarray(sums.saturated), np.asarray(code) == ALIVE, amplitude)
 
 
-def _member(tree: Any) -> tuple[Any, Any]:
-    system, clock, response = tree
-    outcome = run(dataclasses.replace(system, wave=response.wave), clock, response, 0)
-    return outcome.metrics, outcome.trajectory.lost_code
+def _responses(tree: Any, axes: Any) -> Result:
+    """Simulate a block of members, with the wave of the fold (`Response`) added to the readings."""
+    waved = [(dataclasses.replace(system, wave=fold.wave), clock, fold) for system, clock, fold in (tree, axes)]
+    return Rollouts()(*waved)
 
 
 def padded(wave: MultiSine, lines: int) -> MultiSine:

@@ -223,7 +223,10 @@ class FixedSteps:
 
         t = jnp.asarray(t, h.dtype)
         code, last = jnp.asarray(code, jnp.int32), (t, t, problem.moving(state))
-        first = (state, code, last, blank(problem.instant_structure), place)
+        # what a step changes varies over members if the status does: so from the start, JAX maps the step only once
+        alive = code == ALIVE
+        last, span = (choose(alive, x, x) for x in (last, blank(problem.instant_structure)))
+        first = (state, code, last, span, place)
         x, ended, (start, end, motion), span, _ = lax.fori_loop(0, self.substeps + problem.edges.most, body, first)
         t_end = problem.ended(x, motion, start, end, ended)
         return Advanced(x, ended, t_end, memory, span.shortened(end - t_end))
