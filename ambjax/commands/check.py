@@ -73,8 +73,7 @@ def _checked(case: Case, path: str, full: bool) -> CaseCheck:
         findings = None
     elif findings is None:
         with doing(f"testing the stability of the loop; {FIRST_RUN}"):
-            say("testing whether the loop is stable: simulating without noise and loads")
-            findings = stability_of(case.cascade, as_member(case.scenario), case.clock).findings()
+            findings = _stability(case)
     summary = {
         "holds": run.holds,
         "lost_at_s": run.lost_at,
@@ -105,31 +104,38 @@ def _results(
 ) -> tuple[Report | None, tuple[Summary, list[str], str], OnProcessor | None, Findings | None]:
     """Return the report of Theorem 1, the linear loop, the results on the processor, and the stability of the loop.
 
-    The report is None for a case on a processor, unless `full`. The stability is None unless the search of the delay
-    margin has computed it.
+    The report is None for a case on a processor, unless `full`. The stability is None if, on a processor, the search of
+    the delay margin has not computed it. It has no meaning if the rotor is lost.
     """
-    with ThreadPoolExecutor(1) as pool:
-        theorem = None
+    with ThreadPoolExecutor(2) as pool:  # compilations use one core each
+        theorem = on_processor = findings = None
         if full or not case.cascade.sampled:
             say(f"checking Theorem 1: simulating {float(case.clock.duration):g} s in continuous time")
             theorem = pool.submit(check_theorem, case.cascade, case.scenario, case.clock, case.settle)
         say("linearising the loop")
-        loop, on_processor, findings = acceptance(case), None, None
+        linear = pool.submit(acceptance, case)
         if case.cascade.sampled:
             say("simulating on the processor, with and without noise")
             parts = (case.cascade, as_member(case.scenario), case.clock, case.settle, record_system)
-            sampled = with_causes(check_sampled(*parts), *parts, say)
+            run = pool.submit(lambda: with_causes(check_sampled(*parts), *parts, say))
             (margin, unknown), findings = _margins(case)
-            places: Any = loop[0].get("margins") or {"command": {}}
-            linear, delay = places["command"].get("delay_margin_s"), float(case.cascade.timing.delay)
-            differs = advice.delay_difference(linear, unknown or margin, delay, float(case.clock.sample_period))
-            on_processor = OnProcessor(sampled, margin, unknown, differs)
-        report = theorem and theorem.result()
+            places: Any = linear.result()[0].get("margins") or {"command": {}}
+            own, delay = places["command"].get("delay_margin_s"), float(case.cascade.timing.delay)
+            differs = advice.delay_difference(own, unknown or margin, delay, float(case.clock.sample_period))
+            on_processor = OnProcessor(run.result(), margin, unknown, differs)
+        else:
+            findings = _stability(case)
+        loop, report = linear.result(), theorem and theorem.result()
     if report is not None and report.lost and not case.cascade.sampled:
         lost = lambda *loop: bool(np.isfinite(rollout(*loop, record_every=0).trajectory.lost_at))  # noqa: E731
         cause = find_cause(lost, case.cascade, case.scenario, case.clock, say)
         report = dataclasses.replace(report, cause=cause)
     return report, loop, on_processor, findings
+
+
+def _stability(case: Case) -> Findings:
+    say("testing whether the loop is stable: simulating without noise and loads")
+    return stability_of(case.cascade, as_member(case.scenario), case.clock).findings()
 
 
 def _margins(case: Case) -> tuple[tuple[Delays, Delays | None], Findings | None]:

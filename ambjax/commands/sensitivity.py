@@ -1,6 +1,7 @@
 """`ambjax sensitivity`: sensitivity peaks, ISO 14839-3 zones, margins and stiffness of a case's loop."""
 
 import argparse
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from ambjax.cases.machine_case import MachineCase
@@ -33,15 +34,18 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     if isinstance(case, MachineCase):
         return machine_commands.sensitivity(args, case)
     study = _study(case, args)
-    with doing(f"linearising the loop at the equilibria; {FIRST_RUN}"):
-        points, missing = _points(case)
-    spread = None if study is None else _spread(case, study, points[0])
-    measured = None
-    if points[0].stable and (args.inject or case.cascade.sampled):
+    with ThreadPoolExecutor(1) as pool:  # the nominal loop on one core, the members on the other one
+        with doing(f"linearising the loop at the equilibria, and those of the members; {FIRST_RUN}"):
+            nominal = pool.submit(_points, case)
+            spread = None if study is None else operating.spread_peaks(case, study)
+            points, missing = nominal.result()
+        injects = points[0].stable and (args.inject or case.cascade.sampled)
         with doing(f"measuring the sensitivity by injection into the simulation; {FIRST_RUN}"):
-            one = points[0].analysis
-            velocity = None if one.S_velocity is None else _injected(case, one.S_velocity.frequency, "z_dot")
-            measured = Injections(_injected(case, one.S.frequency, "z"), velocity)
+            injection = pool.submit(_injections, case, points[0]) if injects else None
+            if spread is not None and study is not None and set_valued(case) and points[0].stable:
+                peaks = operating.measured_peaks(case, study, points[0].analysis.S.frequency)
+                spread = spread._replace(measured=peaks)
+            measured = injection and injection.result()
     out = directory(args.out, f"sensitivity-{case.name}", WRITTEN, args.force)
     summary = sensitivity_summary(points, spread, measured, case.zones, missing)
     speeds, first = running_speeds(case.scenario.rotor, float(case.clock.duration)), points[0]
@@ -58,14 +62,11 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     return int(bool(missing) or not stable), plain(summary | {"out": str(out)})
 
 
-def _spread(case: Case, study: Study, point: OperatingPoint) -> SpreadPeaks:
-    """Return the peaks of the members; with set-valued signs and a stable `point`, also those of an injection."""
-    with doing(f"linearising the loops of the members; {FIRST_RUN}"):
-        spread = operating.spread_peaks(case, study)
-    if not set_valued(case) or not point.stable:
-        return spread
-    with doing(f"measuring the sensitivity of the members by injection into the simulation; {FIRST_RUN}"):
-        return spread._replace(measured=operating.measured_peaks(case, study, point.analysis.S.frequency))
+def _injections(case: Case, point: OperatingPoint) -> Injections:
+    """Measure the sensitivity of the nominal loop, `point`, by injection."""
+    one = point.analysis
+    velocity = None if one.S_velocity is None else _injected(case, one.S_velocity.frequency, "z_dot")
+    return Injections(_injected(case, one.S.frequency, "z"), velocity)
 
 
 def _points(case: Case) -> tuple[list[OperatingPoint], dict[str, str]]:

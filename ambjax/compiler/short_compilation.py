@@ -1,6 +1,7 @@
 """Faster compilation, for functions that run only a few times or that the fast path refuses; precision of JAX."""
 
 import functools
+import threading
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from typing import Any, TypeVar
@@ -39,8 +40,19 @@ def compiled_quickly(
 
 
 def compiled_quickest(function: Callable[..., Result], static_argnames: tuple[str, ...] = ()) -> Callable[..., Result]:
-    """Return `compiled_quickly` with QUICKEST."""
-    return compiled_quickly(function, static_argnames, QUICKEST)
+    """Return `compiled_quickly` with QUICKEST. Such programs run one at a time."""
+    compiled = compiled_quickly(function, static_argnames, QUICKEST)
+
+    @functools.wraps(function)
+    def call(*args: object, **static: object) -> Result:
+        with _ONE_AT_A_TIME:
+            return jax.block_until_ready(compiled(*args, **static))
+
+    return call
+
+
+# XLA runs LAPACK on its own threads, and two programs with it may deadlock.
+_ONE_AT_A_TIME = threading.RLock()
 
 
 def precision(name: str) -> AbstractContextManager[object]:

@@ -95,11 +95,6 @@ class Processor:
         kept = max(self.kept or 0, most, longest, math.ceil(USUAL_DELAY))
         return replaced(self, whole=whole, most=most, kept=kept)
 
-    def for_every_delay(self) -> "Processor":
-        """Return this processor, resolved for one program that serves every delay and horizon of the prediction."""
-        own = replaced(self, predict=self.predict is not False, assumed=self.ahead, most=math.ceil(MOST_DELAY))
-        return own.resolved(MOST_DELAY, between=True)
-
     def supported(self, whole: bool = False) -> Array:
         """Return whether the program of `resolved` has room for this delay and this horizon of the prediction.
 

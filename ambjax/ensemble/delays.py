@@ -1,6 +1,5 @@
 """The delay margin of a cascade on a processor: the largest delay up to which the rotor survives."""
 
-import dataclasses
 import itertools
 
 import numpy as np
@@ -65,10 +64,10 @@ def delay_margin(cascade: Cascade, scenario: Scenario, clock: Clock, *, known: b
 
 def at_delays(cascade: Cascade, delays: np.ndarray, *, known: bool) -> Cascade:
     """Return the cascade with these delays [N] (samples) of its processor. `known`: as in `delay_margin`."""
-    cascade = dataclasses.replace(cascade.on_processor(), processor=cascade.timing.for_every_delay())
+    cascade = cascade.on_processor(0.0, MOST_DELAY, between=True)
     # an array in both cases, so that both use the same compiled program
     assumed = delays if known else np.full(len(delays), float(cascade.timing.ahead))
-    return cascade.with_processor(delay=delays, assumed=assumed)
+    return cascade.with_processor(predict=cascade.timing.predict is not False, delay=delays, assumed=assumed)
 
 
 def _read(delays: np.ndarray, lost_at: np.ndarray, code: np.ndarray) -> Delays:

@@ -186,7 +186,7 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
     not contain noise, runout, disturbances, converters, faults, the guard, the limits of supply and amplifier, or the
     dead band. On a processor it is the exact map of one sample period.
 
-    Returns the state space with NumPy arrays, without states that no input reaches. Raises ValueError as `rollout`
+    Returns the state space with NumPy arrays. States that no input reaches are left out. Raises ValueError as `rollout`
     does, if no equilibrium is found at r, and if a law has no derivative there.
     """
     require_number("r", r)
@@ -198,7 +198,7 @@ def linearise(cascade: Cascade, scenario: Scenario, clock: Clock, r: Scalar = 0.
 
 
 def checked(system: StateSpace, found: Any, r: Scalar, moving: str = "") -> StateSpace:
-    """Return a result of `loop_matrices` with NumPy arrays, without states that are not reached or have no effect.
+    """Return a result of `loop_matrices` with NumPy arrays, without the states that no input reaches.
 
     `moving`: path of the state that changes most where the search for an equilibrium ended, for the message. Raises
     ValueError if the result has no meaning: no equilibrium at r (m), or a matrix that is not finite.
@@ -213,8 +213,7 @@ def checked(system: StateSpace, found: Any, r: Scalar, moving: str = "") -> Stat
             f"the loop has no linearisation at the equilibrium of r = {float(r):g} m: the derivative of a law or of "
             "the plant is not finite there."
         )
-    system = system.without_idle()
-    return system if system.period is None else system.without_old_commands()
+    return system.without_idle()
 
 
 @takes_case
@@ -238,13 +237,12 @@ def linearise_members(
 def linearisation_inputs(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[Cascade, Scenario, Scalar]:
     """Check a case, and return the first three arguments of `loop_matrices`: cascade, scenario and sample period (s).
 
-    If the cascade has a processor, the program of the returned one serves every delay. The integration method of
+    If the cascade has a processor, the returned cascade is that of `Cascade.on_processor`. The integration method of
     `clock` has no effect: it may be too coarse for this cascade. Raises ValueError as `rollout` does otherwise.
     """
     system, clock = prepare(cascade, scenario, clock.with_method(None))
     if cascade.sampled:
-        own: Cascade = system.loop.cascade  # pyright: ignore[reportAttributeAccessIssue]
-        cascade = dataclasses.replace(own, processor=cascade.timing.for_every_delay())
+        cascade = system.loop.cascade  # pyright: ignore[reportAttributeAccessIssue]
     return dataclasses.replace(cascade), scenario, clock.sample_period
 
 

@@ -4,8 +4,11 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
+from ambjax.compiler.short_compilation import compiled_quickest
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.blocks import QUARTERS, quarters
@@ -105,5 +108,9 @@ def _at_start(reference: Signal) -> Any:
         return 0.0
     varies = varying(reference)
     axes = jax.tree.unflatten(jax.tree.structure(reference), [0 if own else None for own in varies])
-    at_start = lambda one: one(0.0)  # noqa: E731
-    return np.asarray((jax.vmap(at_start, (axes,)) if any(varies) else at_start)(reference))
+    return np.asarray((jax.vmap(_first, (axes,)) if any(varies) else _first)(reference))
+
+
+@compiled_quickest
+def _first(signal: Signal) -> Array:
+    return jnp.asarray(signal(0.0))

@@ -107,16 +107,6 @@ class StateSpace(NamedTuple):
         A, B, C, sizes = one.A[kept][:, kept], one.B[kept], one.C[:, kept], one.sizes[kept]
         return one._replace(A=A, B=B, C=C, sizes=sizes)
 
-    def without_old_commands(self) -> "StateSpace":
-        """Return the system with NumPy arrays, without the last states if they have no effect.
-
-        On a processor these are commands that ceased to act: the program keeps those of the longest delay it serves.
-        """
-        last = len(self.A)
-        while last and not (np.any(self.A[:last, last - 1]) or np.any(self.C[:, last - 1])):
-            last -= 1
-        return self._replace(A=self.A[:last, :last], B=self.B[:last], C=self.C[:, :last], sizes=self.sizes[:last])
-
     def response(self, frequency: Array | np.ndarray) -> Array:
         """Return the complex frequency response at frequencies [F] in Hz, as an array [F, 6 outputs, 3 inputs].
 

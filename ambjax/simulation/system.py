@@ -7,20 +7,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
+from ambjax.compiler.short_compilation import compiled_quickest
 from ambjax.control.base import set_valued_signs
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Sample
 from ambjax.control.law_trial import check_own_law
 from ambjax.control.stages import STAGES
 from ambjax.numerics.declared import require_number
-from ambjax.numerics.records import Scalar, is_traced, validate
+from ambjax.numerics.records import Scalar, canonical, is_traced, validate
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.folds import Named
 from ambjax.simulation.loop import ClosedLoop
 from ambjax.simulation.sampled import Sampled
 from ambjax.world.scenario import Scenario
-from ambjax.world.sensor import Measurement
 from ambjax.world.waveforms import Reference
 
 
@@ -133,13 +134,19 @@ def reads_velocity(cascade: Cascade, period: Scalar) -> bool:
         return True
     one = cascade.on_processor() if cascade.sampled else cascade
     one, period = jax.tree.map(lambda x: np.ravel(np.asarray(x, float))[0], (one, period))
-    sizes, zero = Measurement(*(jnp.asarray(float(x)) for x in one.model.sizes())), jnp.zeros(())
-    past = one.timing.constant_past(zero)
-    sample = Sample(Reference(zero, zero, zero), period if one.sampled else None, jnp.inf, past)
-    state = one.init(sizes._replace(z_dot=zero), sample.reference)
-    readings = (sizes._replace(z_dot=share * sizes.z_dot) for share in (-1e3, 1.0, 1e3))
-    results = [(command.u, after) for command, after, _ in (one.step(x, state, sample) for x in readings)]
+    results = (_stepped(*canonical((one, period, size))) for size in (-1e3, 1.0, 1e3))
     return len({tuple(map(float, jax.tree.leaves(result))) for result in results}) > 1
+
+
+@compiled_quickest
+def _stepped(cascade: Cascade, period: Array, size: Array) -> tuple[Array, CascadeState]:
+    """Return the command and the states of the laws after one step. `size`: reading of the velocity, as a multiple."""
+    sizes, zero = cascade.model.sizes(), jnp.zeros(())
+    past = cascade.timing.constant_past(zero)
+    sample = Sample(Reference(zero, zero, zero), period if cascade.sampled else None, jnp.inf, past)
+    state = cascade.init(sizes._replace(z_dot=zero), sample.reference)
+    command, after, _ = cascade.step(sizes._replace(z_dot=size * sizes.z_dot), state, sample)
+    return command.u, after
 
 
 def _check_coils(scenario: Scenario) -> None:
