@@ -31,12 +31,8 @@ def test_a_limit_on_the_delay_margin_does_not_stop_two_cores(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(tomlkit.dumps(raw))
     # XLA's pool has as many threads as NPROC; a program that waits for ever is ended after 4 minutes
-    subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(path)],
-        check=True,
-        timeout=240,
-        env={**os.environ, "NPROC": "2", "JAX_ENABLE_X64": "1"},
-    )
+    env = os.environ | {"NPROC": "2", "JAX_ENABLE_X64": "1"}
+    subprocess.run([sys.executable, "-c", PROGRAM, str(path)], check=True, timeout=240, env=env)
 
 
 def test_elimination_solves_systems_that_need_pivoting():

@@ -119,7 +119,6 @@ from jax._src import xla_bridge
 assert not xla_bridge._backends, "importing ambjax started a backend"
 """
     # with JAX's own defaults: -I drops PYTHON* variables only, so the environment is given by hand
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, env={"PATH": "/usr/bin:/bin"}, capture_output=True, text=True
-    )
+    command, env = [sys.executable, "-c", code], {"PATH": "/usr/bin:/bin"}
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -106,7 +106,7 @@ def with_notch():
     return read_machine(FLEXIBLE | {"rotor": FLEXIBLE["rotor"] | {"modes": 1}, "controller": laws})
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_notch_at_rest_grows_by_rounding_errors_only(monkeypatch):
     """At 0 rpm, one of the two states of a notch has a pole at 0."""
     found = machine_check._linear(with_notch())

@@ -123,7 +123,7 @@ def test_bad_keys_are_refused_in_one_line(change, said):
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_diagonal_controller_of_a_file_equals_one_controller_on_each_axis(tmp_path):
     """K = 2e4 (1 + s/500)/(1 + s/5e3) A/m, continuous; the states start at the reading."""
     raw = UNCOUPLED | {"processor": {"delay": 1.0, "predict": False}, "sensor": {}}

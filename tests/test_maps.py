@@ -41,7 +41,7 @@ def basin(reading):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("reading", ["literal", "repaired"])
+@pytest.mark.parametrize("reading", [pytest.param("literal", marks=pytest.mark.thorough), "repaired"])
 def test_the_basin_of_attraction_is_a_strip_of_known_width(reading):
     """While v_tilde is saturated, z + z_dot/pole diverges unless gamma exceeds dv/dz pole |z + z_dot/pole|."""
     study = basin(reading)
@@ -100,7 +100,9 @@ TURNING = with_notch(ON_PROCESSOR, "displacement-free") | {"clock": CLOCK, "run"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("y", ["rotor.speed=3000:9000:2", "clock.sample_period=1e-4:2e-4:2"])
+@pytest.mark.parametrize(
+    "y", [pytest.param("rotor.speed=3000:9000:2", marks=pytest.mark.thorough), "clock.sample_period=1e-4:2e-4:2"]
+)
 def test_each_cell_has_the_default_gains_and_a_notch_for_its_controller_and_its_speed(y):
     """A cell equals the case whose file has its numbers."""
     found = survival_map(case_from(TURNING, text=dumps(TURNING)), "controller.position.k_p=6e4:2e5:2", y).map

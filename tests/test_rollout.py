@@ -284,9 +284,8 @@ np.savez(sys.argv[1], **out)
 @pytest.mark.slow
 def test_float32_is_within_20_nm_of_float64(tracking, tmp_path):
     path = tmp_path / "single.npz"
-    subprocess.run(
-        [sys.executable, "-c", IN_FLOAT32, str(path)], cwd=ROOT, env=os.environ | {"JAX_ENABLE_X64": "0"}, check=True
-    )
+    env = os.environ | {"JAX_ENABLE_X64": "0"}
+    subprocess.run([sys.executable, "-c", IN_FLOAT32, str(path)], cwd=ROOT, env=env, check=True)
     smooth = rollout(SMOOTH, TRACKING, Clock(20_000, 1e-4, RK4(4)), record_every=10).trajectory
     # measured: 0.96e-8 m repaired, 1.04e-8 m smooth, of 2.5e-3 m: t = 2 s is rounded to 6e-8 s, and r moves at 31 mm/s
     with np.load(path) as single:

@@ -66,7 +66,10 @@ def test_the_slow_motion_is_of_second_order():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "mode"),
-    [(Slide(2), jax.jacfwd), (Rodas3(12), jax.jacfwd), pytest.param(Rodas3(12), jax.grad, marks=pytest.mark.thorough)],
+    [
+        (Slide(2), jax.jacfwd),
+        *(pytest.param(Rodas3(12), f, marks=pytest.mark.thorough) for f in (jax.jacfwd, jax.grad)),
+    ],
 )
 def test_values_and_derivatives_are_finite_over_six_decades_of_gains(method, mode):
     """From 1 mm off the origin, most of these gains lose the rotor.

@@ -72,7 +72,7 @@ def test_the_margin_and_the_stability_at_its_delays_share_a_compiled_program(cap
     finally:
         jax.config.update("jax_log_compiles", False)
     compiled = [message.split()[1] for message in caplog.messages if message.startswith("Compiling ")]
-    assert "jit(_blocks)" in compiled  # the linear loops
+    assert "jit(loop_matrices)" in compiled  # the linear loops
     assert "jit(marked)" not in compiled
 
 

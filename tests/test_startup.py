@@ -14,9 +14,8 @@ ROOT = pathlib.Path(__file__).parent.parent
 
 def loaded(*words):
     """Modules that a command imports, and those of them that are packages of their own."""
-    done = subprocess.run(
-        [sys.executable, "-X", "importtime", "-m", *words], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-X", "importtime", "-m", *words]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode in (0, 1), done.stderr
     lines = [line for line in done.stderr.splitlines() if line.startswith("import time:")]
     assert len(lines) > 50

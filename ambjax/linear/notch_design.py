@@ -78,9 +78,8 @@ redesigned_at_once = compiled_quickest(redesigned)
 
 def redesigned_members(cascade: Cascade, scenario: Scenario, clock: Clock) -> tuple[NotchGain, ...]:
     """Return the gains of `redesigned` of every member of an ensemble, whose varying leaves are arrays [N]."""
-    # threads: see `linearise_members`
     inputs = canonical(linearisation_inputs(cascade, scenario, clock))
-    return map_members(_redesigned, inputs, threads=1, compiled=compiled_quickest)
+    return map_members(_redesigned, inputs, compiled=compiled_quickest)
 
 
 def _redesigned(tree: tuple[Cascade, Scenario, Scalar]) -> tuple[NotchGain, ...]:
