@@ -16,7 +16,7 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": str(HERE / "_build" / "programs")}
     os.environ |= {"JAX_COMPILATION_CACHE_MAX_SIZE": str(2**30)}
 os.environ |= {"OPENBLAS_NUM_THREADS": "1"}  # as in the commands
-os.environ |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
+os.environ |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
 os.environ |= {"JAX_TRACEBACK_IN_LOCATIONS_LIMIT": "0"}  # as in the tests
 os.environ |= {"PYTHONWARNINGS": "ignore:Error reading persistent,ignore:Error writing persistent"}
 
@@ -46,7 +46,6 @@ extensions = [
     "pages",
     "execution",
     "printed_tables",
-    "gallery",
 ]
 exclude_patterns = ["_build", "_ext", "reference"]
 

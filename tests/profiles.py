@@ -5,6 +5,8 @@ By default the slow tests cover each law and each structure at least once, with 
 
 import os
 
+import pytest
+
 PROFILES = ("usual", "thorough")
 PROFILE = os.environ.get("AMBJAX_TESTS", "usual")
 if PROFILE not in PROFILES:
@@ -15,3 +17,8 @@ THOROUGH = PROFILE == "thorough"
 def examples(usual: int, thorough: int) -> int:
     """Return the number of examples of this profile."""
     return thorough if THOROUGH else usual
+
+
+def thorough(*values: object, id: str | None = None):
+    """Return values of parameters for the thorough profile only: other values test the same."""
+    return pytest.param(*values, id=id, marks=pytest.mark.thorough)

@@ -6,6 +6,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from profiles import thorough
 from test_sampled import loop_with
 
 import ambjax as amb
@@ -116,7 +117,7 @@ def random_loop(name, draw):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["estimated, two coils", "late, amplifier", "explicit"])
+@pytest.mark.parametrize("name", ["estimated, two coils", thorough("late, amplifier"), "explicit"])
 def test_measured_signals_do_not_exceed_their_bounds(name):
     """The text and the verdict also agree. The tolerance 1e-12 is for rounding."""
     draw, bounds = np.random.default_rng(7), 0
@@ -140,7 +141,7 @@ def test_bounds_are_tight_without_an_estimate():
         assert [line.signal for line in lines] == ["sigma", "v_tilde", "e"]
         for line in lines:
             # u is 0 before the first sample, so the sensors' signals are the plant's: nothing is off but i_ref's sample
-            assert line.difference == 0.0
+            assert line.difference <= 1e-12 * line.bound
             assert share * line.bound <= line.largest <= line.bound * (1 + 1e-12), line
         # the theorem's own Delta_1 on this reference is 6.231e4, at 0.25 s
         assert lines[1].disturbance == pytest.approx(6.231e4, rel=0.05)

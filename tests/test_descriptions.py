@@ -67,9 +67,10 @@ FAILING = {
         "ambjax.commands.compare.comparison_table": "",
     },
 }
+MARKS = {"simulate": (), "ensemble": pytest.mark.thorough, "map": pytest.mark.thorough}
 
 
-@pytest.mark.parametrize("name", [x if x == "simulate" else pytest.param(x, marks=pytest.mark.slow) for x in FAILING])
+@pytest.mark.parametrize("name", [pytest.param(x, marks=MARKS.get(x, pytest.mark.slow)) for x in FAILING])
 def test_an_error_in_a_description_costs_only_that_description(name, monkeypatch, capsys):
     command, missing = name.partition(",")[0], {file for file in FAILING[name].values() if file}
     monkeypatch.setattr(outputs, "STRICT", False)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from profiles import thorough
 from structures import METHODS
 
 import ambjax as amb
@@ -128,7 +129,7 @@ def test_derivatives_in_the_time_of_an_edge():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("held", "sensor"), [(True, amb.sensors.Sensor(bandwidth=5e3)), (False, None)])
+@pytest.mark.parametrize(("held", "sensor"), [(True, amb.sensors.Sensor(bandwidth=5e3)), thorough(False, None)])
 def test_a_record_inside_samples_costs_no_accuracy(held, sensor):
     """Against 20 times as many steps. Without edges at the times of the record, the errors are 1e-9 to 1e-8 m."""
     rng = np.random.default_rng(3)

@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
+from profiles import thorough
 from test_export import compiled
 from test_export_blocks import rig
 from texts import refusal, write
@@ -228,9 +229,7 @@ def test_a_changed_gain_a_reset_a_nan_and_a_second_instance(version, tmp_path):
 
 
 @compiled
-@pytest.mark.parametrize(
-    "version", [pytest.param(2, marks=pytest.mark.thorough), pytest.param(3, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("version", [thorough(2), pytest.param(3, marks=pytest.mark.slow)])
 def test_an_fmu_compiled_again_from_its_sources_gives_the_reference(version, tmp_path):
     """As a real-time target does, the test compiles the sources alone, with another build system."""
     fmpy = pytest.importorskip("fmpy")

@@ -4,6 +4,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from profiles import thorough
 
 from ambjax.cases.reader import case_from
 from ambjax.commands.study_report import _quantiles
@@ -71,6 +72,7 @@ FANS = {
     "some lost": ('kind = "two-coil"', PID + PROCESSOR, "velocity = false", 3.5e-4),
     "continuous": ("", PID.replace("kalman", "direct"), "", 5e-5),
 }
+DRAWN = [thorough("pid", 1), thorough("chattering", 4), ("some lost", 4), ("continuous", 1)]
 
 
 def fan_of(name, force, every):
@@ -85,7 +87,7 @@ def fan_of(name, force, every):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "every"), [("pid", 1), ("chattering", 4), ("some lost", 4), ("continuous", 1)])
+@pytest.mark.parametrize(("name", "every"), DRAWN)
 def test_every_median_lies_in_its_bands_and_moves_after_its_cause(name, every):
     _, before = fan_of(name, 0.0, every)
     data, panels = fan_of(name, 30.0, every)

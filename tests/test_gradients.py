@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from profiles import thorough
 
 from ambjax import Cascade, Clock, Initial, Metrics, Processor, Scenario, rollout, with_gains
 from ambjax.actuators import Amplifier
@@ -56,7 +57,7 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=["smooth", pytest.param("repaired", marks=pytest.mark.thorough)])
+@pytest.fixture(scope="module", params=["smooth", thorough("repaired")])
 def three_ways(request):
     """Reverse, forward and Richardson-extrapolated central differences, without and with noise: arrays [2, 4]."""
     nominal, p, method, steps = CASES[request.param]

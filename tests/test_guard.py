@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from profiles import thorough
 from sampled_oracle import simulate
 from test_oracle import noise_of
 from test_sampled import DIFFERENCE, KALMAN, NOISE, TRACKING, World, hard, loop_of, soft
@@ -37,7 +38,7 @@ def struck(guard=Guard(), observer=None, **faults):
     return cascade, amb.Scenario(reference=amb.signals.Sine(2.5e-3, 2.0), sensor=sensor, u_max=200.0, seed=3)
 
 
-KALMAN_OBSERVER = pytest.param(amb.laws.observer.Kalman(500.0), id="Kalman", marks=pytest.mark.thorough)
+KALMAN_OBSERVER = thorough(amb.laws.observer.Kalman(500.0), id="Kalman")
 
 
 @pytest.mark.slow
@@ -65,8 +66,8 @@ WORLDS = {
     "Kalman, half a sample": World(**TRACKING, observer=KALMAN, delay=0.5, **soft()),
     "difference, no delay": World(**TRACKING, observer=DIFFERENCE, delay=0.0, **soft()),
 }
-MARKS = {"delay 1": (), "difference, no delay": pytest.mark.thorough}
-EACH_WORLD = [pytest.param(x, marks=MARKS.get(x, pytest.mark.slow)) for x in WORLDS]
+REPEATED = ("the sign itself, one and a half, noise", "difference, no delay")
+EACH_WORLD = [pytest.param(x, marks=pytest.mark.thorough if x in REPEATED else ()) for x in WORLDS]
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracle import TABLE_1, Body
+from profiles import thorough
 from sampled_oracle import World, simulate
 from structures import SMOOTH
 from test_oracle import adaptive, current, smc
@@ -115,9 +116,7 @@ def test_the_measured_peak_in_continuous_time_is_the_linear_peak(cascade, amplit
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("processor", "period"),
-    [(Processor(0.0), T), pytest.param(None, 1e-3, marks=pytest.mark.thorough)],
-    ids=["processor", "continuous"],
+    ("processor", "period"), [(Processor(0.0), T), thorough(None, 1e-3)], ids=["processor", "continuous"]
 )
 def test_the_sensitivity_at_the_velocity_sensor(processor, period):
     """At 1 mm. The tolerances are those of continuous time above: 1e-3 for S, 1e-2 for u."""

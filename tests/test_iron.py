@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from profiles import thorough
 from structures import RIG
 
 from ambjax import simulate
@@ -86,8 +87,7 @@ def test_the_flux_follows_a_held_current_exponentially(kind):
 
 
 @pytest.mark.parametrize(
-    ("eddy", "most"),
-    [pytest.param(2e-4, 2, marks=pytest.mark.slow), (5e-5, 2), pytest.param(1e-5, 10, marks=pytest.mark.thorough)],
+    ("eddy", "most"), [pytest.param(2e-4, 2, marks=pytest.mark.slow), (5e-5, 2), thorough(1e-5, 10)]
 )
 def test_the_chosen_step_resolves_the_lag_of_the_flux(eddy, most):
     """Against 25 times as many steps: z in the first 30 samples, as the rotor leaves the centre and the voltage limits.

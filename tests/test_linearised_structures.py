@@ -52,7 +52,7 @@ ALL = [
         moving,
         id=f"{mode}-{watching}-{moving}",
         marks=() if (mode, watching, moving) in FAST
-        else pytest.mark.slow if watching == "kalman" and mode != "implicit" and moving in ("pid", "sliding-mode")
+        else pytest.mark.slow if watching == "kalman" and mode != "implicit" and moving == "sliding-mode"
         else pytest.mark.thorough,
     )
     for mode in MODES for watching in KINDS["observer"] for moving in KINDS["position"]

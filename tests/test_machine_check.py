@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from profiles import thorough
 
 from ambjax.__main__ import main
 from ambjax.cases.machine_case import read_machine
@@ -50,11 +51,7 @@ def test_the_check_says_why_there_is_no_test_with_more_modes():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "growth", "held"),
-    [
-        ("integral-sliding-mode", -125.0, False),
-        pytest.param("super-twisting", 2519.0, True, marks=pytest.mark.thorough),
-    ],
+    ("kind", "growth", "held"), [("integral-sliding-mode", -125.0, False), thorough("super-twisting", 2519.0, True)]
 )
 def test_a_run_decides_on_the_stability_of_a_machine_with_set_valued_signs(kind, growth, held):
     """The verdict of the linear machine inside the bands of the signs is wrong in both cases."""
@@ -134,7 +131,7 @@ def test_the_larger_rotor_has_the_notches_of_the_case(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("third", [True, False])
+@pytest.mark.parametrize("third", [True, thorough(False)])
 def test_integral_actions_on_three_bearings_of_a_rigid_rotor_drift_apart(third, monkeypatch):
     """The least offset is the static gain of the discrete map, which is nearly singular with three bearings."""
     raw: dict[str, Any] = tomllib.loads(template("machine")) | {"sensitivity": {"speeds": [6000.0]}}

@@ -76,7 +76,7 @@ def test_the_peak_is_that_of_the_sensitivity(peaks, integral):
     assert found.turning(x) == pytest.approx(np.max(np.abs(S)), rel=1e-9)
 
 
-@pytest.mark.slow  # compiles the loop and its derivatives
+@pytest.mark.thorough  # compiles the loop and its derivatives
 def test_the_search_designs_the_notches_for_its_gains():
     """Poles and peak are those of the machine that is read with the gains, and so are the derivatives."""
     raw: dict[str, Any] = quick_case(gains=["controller.position.k_d"]) | {"sensitivity": {"speeds": [6000.0]}}

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from profiles import thorough
 
 from ambjax import Cascade, Initial, Scenario
 from ambjax.cases.reader import case_from
@@ -100,7 +101,7 @@ def test_a_terminal_sliding_mode_ends_in_the_finite_time_of_its_manifold():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["bearing", "rig"])
+@pytest.mark.parametrize("name", [thorough("bearing"), "rig"])
 def test_the_default_gains_of_a_terminal_manifold_reach_zone_a(name):
     raw = tomllib.loads(template(name))
     raw["controller"]["position"] = {"kind": "terminal-sliding-mode"}

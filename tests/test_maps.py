@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from profiles import thorough
 from test_synchronous_notch import ON_PROCESSOR, with_notch
 from texts import refusal
 from tomlkit import dumps
@@ -41,7 +42,7 @@ def basin(reading):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("reading", [pytest.param("literal", marks=pytest.mark.thorough), "repaired"])
+@pytest.mark.parametrize("reading", [thorough("literal"), "repaired"])
 def test_the_basin_of_attraction_is_a_strip_of_known_width(reading):
     """While v_tilde is saturated, z + z_dot/pole diverges unless gamma exceeds dv/dz pole |z + z_dot/pole|."""
     study = basin(reading)
@@ -99,10 +100,8 @@ CLOCK = {"duration": 0.1, "sample_period": 1e-4}
 TURNING = with_notch(ON_PROCESSOR, "displacement-free") | {"clock": CLOCK, "run": {"settle": 0.08}}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "y", [pytest.param("rotor.speed=3000:9000:2", marks=pytest.mark.thorough), "clock.sample_period=1e-4:2e-4:2"]
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("y", ["rotor.speed=3000:9000:2", "clock.sample_period=1e-4:2e-4:2"])
 def test_each_cell_has_the_default_gains_and_a_notch_for_its_controller_and_its_speed(y):
     """A cell equals the case whose file has its numbers."""
     found = survival_map(case_from(TURNING, text=dumps(TURNING)), "controller.position.k_p=6e4:2e5:2", y).map

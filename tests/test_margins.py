@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from margin_oracle import Change, parts_of
+from profiles import thorough
 from structures import RIG
 
 from ambjax.cases.reader import case_from
@@ -90,7 +91,9 @@ LOOPS = {
                     "inversion": {"kind": "adaptive"}, "current": {"kind": "dead-beat"}}),
 }  # fmt: skip
 # Loops whose parts the others have.
-REPEATED = ("cascade, explicit", "cascade, continuous", "PID, dead-beat", "state feedback, dead-beat")
+REPEATED = ("cascade, explicit", "cascade, continuous", "PID, dead-beat", "state feedback, dead-beat",
+            "super-twisting, 2.5 samples late")  # fmt: skip
+SEARCHED = ["LQG, dead-beat", thorough("PID, dead-beat"), "state feedback, continuous"]
 
 
 def agrees(parts, margin, changed, most):
@@ -139,7 +142,7 @@ def test_a_delay_margin_of_several_samples_is_that_of_the_simulation(own):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["LQG, dead-beat", "PID, dead-beat", "state feedback, continuous"])
+@pytest.mark.parametrize("name", SEARCHED)
 def test_the_search_of_the_tuner_finds_the_delay_margin_of_the_analysis(name):
     """The derivative is compared with differences of the analysis, along a change of the gain of the drive.
 

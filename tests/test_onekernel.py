@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from profiles import thorough
 
 from ambjax import Cascade, Clock, Initial, Metrics, Scenario
 from ambjax.compiler.fast_path import block_length
@@ -52,14 +53,11 @@ OTHERS = Cascade(
 )
 # Without random signals, members share the reference, so the kernel computes its sine with scalars.
 SHARED = dataclasses.replace(SCENARIO, q_z=Constant(0.0), q_v=Pulse(1.0, 1e-4, 2e-4), sensor=None)
+KERNELS = [(CASCADE, True, SCENARIO), thorough(OTHERS, False, SCENARIO), (CASCADE, False, SHARED)]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("laws", "x64", "scenario"),
-    [(CASCADE, True, SCENARIO), (OTHERS, False, SCENARIO), (CASCADE, False, SHARED)],
-    ids=("paper", "others", "shared"),
-)
+@pytest.mark.parametrize(("laws", "x64", "scenario"), KERNELS, ids=("paper", "others", "shared"))
 def test_the_kernel_compiles_for_a_gpu(laws, x64, scenario, monkeypatch):
     # Lowering for CUDA needs no GPU. A primitive that Triton lacks raises here.
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")

@@ -9,6 +9,7 @@ import tomllib
 
 import jax
 import pytest
+from profiles import thorough
 from texts import refusal, write
 
 from ambjax.__main__ import main
@@ -73,10 +74,10 @@ def case(elsewhere):
     "command",
     [
         pytest.param("simulate --out there", marks=pytest.mark.slow),
-        pytest.param("ensemble --members 3 --out there", marks=pytest.mark.thorough),
-        pytest.param("check", marks=pytest.mark.thorough),
-        pytest.param("sensitivity --out there", marks=pytest.mark.thorough),
-        pytest.param("map --x controller.position.stiff=8e3:1e4:2 --y plant.m=-1%:1%:2", marks=pytest.mark.thorough),
+        thorough("ensemble --members 3 --out there"),
+        thorough("check"),
+        thorough("sensitivity --out there"),
+        thorough("map --x controller.position.stiff=8e3:1e4:2 --y plant.m=-1%:1%:2"),
         "export --out there",
     ],
 )

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from profiles import thorough
 from sampled_oracle import World, simulate
 from test_oracle import adaptive, current, noise_of, pulse, sine, smc, smoothstep, twisting
 
@@ -186,7 +187,7 @@ def test_the_voltage_of_a_sample_acts_after_the_delay(delay):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "inversion",
-    [amb.laws.inversion.Adaptive(8e5, INF), pytest.param(amb.laws.inversion.ClosedForm(), marks=pytest.mark.thorough)],
+    [amb.laws.inversion.Adaptive(8e5, INF), thorough(amb.laws.inversion.ClosedForm())],
     ids=lambda law: type(law).__name__,
 )
 def test_a_member_equals_its_rollout_for_any_delays_of_the_others(inversion):

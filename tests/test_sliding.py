@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from profiles import thorough
 
 from ambjax import Cascade, Clock, Initial, Scenario, rollout
 from ambjax.ensemble import run_ensemble
@@ -65,11 +66,7 @@ def test_the_slow_motion_is_of_second_order():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("method", "mode"),
-    [
-        (Slide(2), jax.jacfwd),
-        *(pytest.param(Rodas3(12), f, marks=pytest.mark.thorough) for f in (jax.jacfwd, jax.grad)),
-    ],
+    ("method", "mode"), [(Slide(2), jax.jacfwd), *(thorough(Rodas3(12), f) for f in (jax.jacfwd, jax.grad))]
 )
 def test_values_and_derivatives_are_finite_over_six_decades_of_gains(method, mode):
     """From 1 mm off the origin, most of these gains lose the rotor.

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 import test_check_processor as sampled
+from profiles import thorough
 from test_tuning_delay import CASE
 from texts import write
 from tomlkit import dumps
@@ -161,10 +162,7 @@ def test_only_an_oscillation_that_the_linear_loop_does_not_explain_is_sustained(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "position",
-    [pytest.param({"kind": "pid"}, marks=pytest.mark.thorough), {"kind": "sliding-mode", "p": math.inf}],
-)
+@pytest.mark.parametrize("position", [thorough({"kind": "pid"}), {"kind": "sliding-mode", "p": math.inf}])
 def test_a_current_loop_that_alternates_between_the_limits_of_the_supply_is_not_stable(position):
     """Its gain is far too high. The rotor hardly moves, but no sign of a law causes that, also if the loop has one."""
     laws = {"position": position, "inversion": {"kind": "closed-form"}, "current": {"kind": "pi", "k_p": 2000.0}}

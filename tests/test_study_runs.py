@@ -12,7 +12,7 @@ import time
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from profiles import examples
+from profiles import examples, thorough
 from texts import refusal, write
 
 from ambjax.__main__ import main
@@ -123,10 +123,7 @@ def test_a_cluster_gives_the_same_file_if_a_worker_is_killed(no_pictures):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "flags",
-    [pytest.param([], id="here"), pytest.param(["--processes", "2"], id="processes", marks=pytest.mark.thorough)],
-)
+@pytest.mark.parametrize("flags", [pytest.param([], id="here"), thorough(["--processes", "2"], id="processes")])
 def test_ctrl_c_keeps_the_finished_chunks_and_prints_the_command_to_resume(flags):
     write(LONGER)
     many = 100_000  # so that no machine is done before it is interrupted
@@ -185,7 +182,7 @@ sys.exit(main())
 """
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_study_killed_at_any_instant_and_resumed_on_other_processes_gives_the_same_file(capsys, monkeypatch):
     write(LONGER)
     with monkeypatch.context() as hasty:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from profiles import thorough
 
 from ambjax.cases.machine_case import machine_from, read_machine
 from ambjax.cases.reader import case_from
@@ -55,7 +56,7 @@ def with_notch(raw, kind, **more):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("raw", "kind", "nulled", "other"),
-    [(TURNING, "force-free", "i_1x_A", "z_1x_m"), (ON_PROCESSOR, "displacement-free", "z_1x_m", "i_1x_A")],
+    [(TURNING, "force-free", "i_1x_A", "z_1x_m"), thorough(ON_PROCESSOR, "displacement-free", "z_1x_m", "i_1x_A")],
 )
 def test_the_notch_removes_the_speed_from_one_signal(raw, kind, nulled, other):
     # the second one is off: the same compiled program
@@ -147,7 +148,7 @@ def test_a_notch_in_float32_turns_with_the_rotor_for_hours():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rotor", [{"speed": RPM}, {"speed": 3000.0, "acceleration": 1e4}])
+@pytest.mark.parametrize("rotor", [thorough({"speed": RPM}), {"speed": 3000.0, "acceleration": 1e4}])
 def test_the_exported_notch_equals_the_simulated_one(tmp_path, rotor):
     case = case_from(with_notch(ON_PROCESSOR | {"rotor": rotor}, "force-free"))
     controller = block_of("controller", case.cascade, case.scenario, case.clock)
@@ -173,10 +174,8 @@ def of_machine(bearings=(), **controller):
                   "sensor": {"velocity": not controller}, "unbalance": [{"at": 0.05, "amount": 0.1}]}  # fmt: skip
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "controller", [pytest.param({"coordinates": "rigid-body"}, marks=pytest.mark.thorough), {"kind": "lqg"}]
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("controller", [{"coordinates": "rigid-body"}, {"kind": "lqg"}])
 def test_each_bearing_of_a_machine_has_its_own_notch(controller):
     """One law of all axes: no current at the speed on the left, no displacement on the right, no notch along z."""
     notches = {"rate": 40.0}, {"kind": "displacement-free", "rate": 40.0}, {"kind": "none"}

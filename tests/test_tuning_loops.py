@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from profiles import thorough
 from texts import case_and_tune
 
 from ambjax.linear import analyse, frequency_lines, injected, linearise
@@ -145,7 +146,7 @@ def test_a_lower_limit_holds_for_larger_values():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("signs", [True, False])
+@pytest.mark.parametrize("signs", [True, thorough(False)])
 def test_injections_find_the_members_with_the_largest_injected_peak(signs):
     """Set-valued signs, or a voltage that saturates, without noise: one measurement of each plant.
 

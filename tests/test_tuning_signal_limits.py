@@ -5,6 +5,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from profiles import thorough
 from texts import SMALL_SEARCH, case_and_tune, problem_from
 
 from ambjax import rollout
@@ -107,7 +108,7 @@ def test_a_limit_at_the_speed_needs_a_speed(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("case", "names", "gain"), [(MOVED, ["rms_coil_A"], 2000.0), (TURNING, ["i_1x_A", "z_1x_m"], 800.0)]
+    ("case", "names", "gain"), [(MOVED, ["rms_coil_A"], 2000.0), thorough(TURNING, ["i_1x_A", "z_1x_m"], 800.0)]
 )
 def test_the_derivatives_of_limited_values_agree_with_differences(case, names, gain):
     problem = problem_from(case, limits={"sensitivity": math.inf, "rms_u_V": math.inf} | dict.fromkeys(names, 1e3))
@@ -125,7 +126,7 @@ def test_the_derivatives_of_limited_values_agree_with_differences(case, names, g
     ("case", "name", "most", "excess", "cost"),
     [
         pytest.param(MOVED, "rms_coil_A", 1.66, 1.01, 1.1, marks=pytest.mark.slow),
-        pytest.param(TURNING, "i_1x_A", 6e-5, 1.1, math.inf, marks=pytest.mark.thorough),
+        thorough(TURNING, "i_1x_A", 6e-5, 1.1, math.inf),
     ],
 )
 def test_a_search_keeps_a_current_within_its_limit(tmp_path, case, name, most, excess, cost):

@@ -23,6 +23,7 @@ from myst_nb.core.config import NbParserConfig
 from myst_nb.core.read import create_nb_reader
 from myst_parser.config.main import MdParserConfig
 from quick import take_core
+from reference.page_outputs import PAGES
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 from sphinx.util import logging as sphinx_logging
@@ -45,13 +46,16 @@ def source_checksum() -> str:
 
 
 def execute(app: Sphinx, env: Any, docnames: list[str]) -> None:
-    """Execute the pages that are about to be read, except those in the cache. Raises ExtensionError if a cell fails."""
+    """Execute the pages that are about to be read, except those in the cache and those with committed outputs.
+
+    Raises ExtensionError if a cell fails.
+    """
     if app.config.nb_execution_mode != "cache":
         return
     folder = pathlib.Path(app.config.nb_execution_cache_path)
     for old in set(folder.parent.glob("*")) - {folder}:
         shutil.rmtree(old)
-    paths = [pathlib.Path(env.doc2path(name)) for name in docnames]
+    paths = [pathlib.Path(env.doc2path(name)) for name in docnames if name not in PAGES]
     notebooks(paths, str(folder), app.config.nb_execution_timeout)
 
 

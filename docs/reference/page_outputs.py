@@ -2,7 +2,7 @@
 
 `python docs/reference/page_outputs.py [PAGE ...]` executes the cells of these pages, or of all, and writes the outputs.
 A block of outputs follows its cell, between two comments. The first has a checksum of all code of the page; the name of
-a picture has one of the cell that draws it. The build of the site removes the blocks, because it executes the cells.
+a picture has one of the cell that draws it. The site shows these blocks too, and its build executes the other pages.
 """
 
 import base64
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 DOCS = pathlib.Path(__file__).parent.parent
 PICTURES = DOCS / "pictures"
-# Pages with outputs. The gallery has the pictures of all pages.
+# Pages with outputs: long searches and studies. The gallery has the pictures of all pages.
 PAGES, GALLERY = ("start", "compare"), "gallery"
 BEGIN, END = "<!-- output {}: written by docs/reference/page_outputs.py -->", "<!-- end of output -->"
 BLOCK = re.compile(rf"\n<!-- output (\w+):.*?\n{END}\n", re.DOTALL)
@@ -40,6 +40,14 @@ class Cell(NamedTuple):
 def stripped(text: str) -> str:
     """Return the text of a page without outputs."""
     return BLOCK.sub("", text)
+
+
+def committed(text: str) -> str:
+    """Return the text of a page with outputs for the site: its cells are code that is not executed."""
+    code = lambda cell: "" if "remove" in cell[1] else f"```python\n{cell[2]}```\n"  # noqa: E731
+    outputs = lambda block: block[0].replace("```text", "```{code-block} none\n:class: output\n")  # noqa: E731
+    in_boxes = BLOCK.sub(lambda block: f"\n::::{{container}} cell-output\n{outputs(block)}\n::::\n", text)
+    return CELL.sub(code, re.sub(r"\A---\n.*?\n---\n", "", in_boxes, flags=re.DOTALL))
 
 
 def read(name: str) -> str:
