@@ -134,16 +134,10 @@ def test_a_plant_needs_a_processor_and_fixed_steps():
     assert isinstance(block_of("plant", cascade, scenario, clock.with_method(AdaptiveRodas3(1e-6))).method, FixedSteps)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @compiled
-@pytest.mark.parametrize(
-    ("what", "name"),
-    [
-        pytest.param(what, name, marks=() if (what, name) == ("loop", "two coils") else pytest.mark.thorough)
-        for what in ("plant", "loop")
-        for name in CASES
-    ],
-)
+@pytest.mark.parametrize("what", ["plant", "loop"])
+@pytest.mark.parametrize("name", CASES)
 def test_the_c_of_each_block_passes_all_checks(what, name):
     cascade, scenario, clock = CASES[name]
     block = blocks(name)[what]

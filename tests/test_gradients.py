@@ -149,9 +149,8 @@ LENGTHS = {
 LAG, SLEW, BETWEEN = Sensor(bandwidth=2e3), Amplifier(slew=3e5), SAMPLED.on_processor(1.0, 2.0, between=True)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=pytest.mark.slow if x == "ramp" else pytest.mark.thorough) for x in LENGTHS]
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", LENGTHS)
 def test_the_derivatives_of_integrals_contain_the_lengths_of_the_steps(name):
     x, world = LENGTHS[name]
 

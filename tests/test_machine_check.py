@@ -28,7 +28,7 @@ def with_rotor(**changes):
     return read_machine(FLEXIBLE | {"rotor": FLEXIBLE["rotor"] | changes})
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_lost_rotor_without_an_equilibrium_has_a_verdict(tmp_path, capsys):
     """Each sensor is at an end of the shaft, behind a node of the first bending mode."""
     text = template("machine-flexible").replace("duration = 0.4", "duration = 0.05").replace("settle = 0.2", "")
@@ -115,7 +115,7 @@ def test_a_notch_at_rest_grows_by_rounding_errors_only(monkeypatch):
     assert "stability: stable at 0 rpm; with up to 4 more bending modes NOT STABLE" in found.verdict[1]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_larger_rotor_has_the_notches_of_the_case(monkeypatch):
     """The gain of a notch is that of the designed rotor: the machine in service has no other."""
     case = with_notch()

@@ -284,7 +284,7 @@ def test_the_picture_shows_the_response_and_the_injected_points(tmp_path):
     assert points["phase of L, degrees"][:, 1] == pytest.approx(phase, abs=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_check_gives_the_zone_of_the_clearance(tmp_path, capsys):
     """The reference moves the rotor by 1 mm of 4.5 mm, which is 22 %: above clearance_b, below clearance_c."""
     limits = "clearance_a = 0.1\nclearance_b = 0.2\n"

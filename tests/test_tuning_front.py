@@ -31,7 +31,7 @@ def least_voltage(factor):
     return 20 * math.exp(-math.sqrt(factor**2 - 1))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_knee_is_the_least_voltage_within_25_percent_of_the_least_error(ran):
     code, facts, out, _, folder = ran("--pareto", objective="knee", front=3, bounds=BOUNDLESS)
     rows = {row["factor"]: row for row in facts["front"]}

@@ -11,19 +11,26 @@ import io
 import pathlib
 import re
 import sys
+import tempfile
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 DOCS = pathlib.Path(__file__).parent.parent
 PICTURES = DOCS / "pictures"
-# Pages with outputs: long searches and studies. The gallery has the pictures of all pages.
-PAGES, GALLERY = ("start", "compare"), "gallery"
+# Pages with outputs: those whose cells take long. The gallery has the pictures of all pages.
+PAGES = ("start", "study", "compare", "own-laws", "machine", "loads", "sensors", "observers", "structures", "export")
+PAGES += ("fmu", "processor", "sensitivity", "magnet")
+GALLERY = "gallery"
 BEGIN, END = "<!-- output {}: written by docs/reference/page_outputs.py -->", "<!-- end of output -->"
 BLOCK = re.compile(rf"\n<!-- output (\w+):.*?\n{END}\n", re.DOTALL)
 PICTURE = re.compile(r"\(pictures/(([\w-]+)-(\w+)\.\w+)\)")
 LINK = re.compile(r"\[!\[[^\]]*\]\(pictures/[^\]]*\]\(([\w-]+)\.md#[^)]*\)")
 CELL = re.compile(r"^```\{code-cell\}[^\n]*\n((?::[^\n]*\n)*)(.*?)^```\n", re.DOTALL | re.MULTILINE)
 HEADING = re.compile(r"^```.*?^```$|^#+ ([^\n]+)$", re.DOTALL | re.MULTILINE)
+# Removed from outputs: lines of progress, and the temporary folder of the cells.
+WITHOUT = re.compile(
+    rf"^(\x1b\[K)?\d+:\d\d .*\n|\x1b\[K\n?|{re.escape(tempfile.gettempdir())}/\w+/", flags=re.MULTILINE
+)
 # Width (pixels) and number of colours of a picture.
 WIDTH, COLOURS = 720, 32
 
@@ -44,10 +51,21 @@ def stripped(text: str) -> str:
 
 def committed(text: str) -> str:
     """Return the text of a page with outputs for the site: its cells are code that is not executed."""
-    code = lambda cell: "" if "remove" in cell[1] else f"```python\n{cell[2]}```\n"  # noqa: E731
-    outputs = lambda block: block[0].replace("```text", "```{code-block} none\n:class: output\n")  # noqa: E731
-    in_boxes = BLOCK.sub(lambda block: f"\n::::{{container}} cell-output\n{outputs(block)}\n::::\n", text)
-    return CELL.sub(code, re.sub(r"\A---\n.*?\n---\n", "", in_boxes, flags=re.DOTALL))
+    text = BLOCK.sub(_box, re.sub(r"\A---\n.*?\n---\n", "", text, flags=re.DOTALL))
+    return CELL.sub(_code, text)
+
+
+def _box(block: re.Match[str]) -> str:
+    """Return a block of outputs as Sphinx shows those of a cell."""
+    outputs = block[0].replace("```text", "```{code-block} none\n:class: output\n")
+    return f"\n::::{{container}} cell-output\n{outputs}\n::::\n"
+
+
+def _code(cell: re.Match[str]) -> str:
+    """Return the code of a cell, or nothing, or a line that a click unfolds, as its tags say."""
+    code = f"```python\n{cell[2]}```\n"
+    hidden = f"<details><summary>Code</summary>\n\n{code}\n</details>\n"
+    return "" if "remove" in cell[1] else hidden if "hide-input" in cell[1] else code
 
 
 def read(name: str) -> str:
@@ -68,13 +86,15 @@ def checksum(*codes: str) -> str:
 
 
 def outdated(name: str) -> list[str]:
-    """Return what in a page no longer fits the code of the cells: checksums of blocks, and pictures."""
+    """Return what in a page no longer fits: checksums of blocks, pictures, and the code of cells (`cell_code`)."""
+    from reference.cell_code import faults
+
     text, found = (DOCS / f"{name}.md").read_text(encoding="utf-8"), cells(read(name))
     now = checksum(*(cell.code for cell in found))
     old = [] if name == GALLERY else [one[1] for one in BLOCK.finditer(text) if one[1] != now]
     drawn = {(page, checksum(cell.code)) for page in (*_order(), name) for cell in cells(read(page))}
     missing = [one[1] for one in PICTURE.finditer(text) if one.group(2, 3) not in drawn or not _path(one[1]).exists()]
-    return old + missing + ([] if BLOCK.search(text) else ["no outputs"])
+    return old + missing + ([] if BLOCK.search(text) else ["no outputs"]) + faults([cell.code for cell in found])
 
 
 def _path(name: str) -> pathlib.Path:
@@ -89,13 +109,14 @@ def _order() -> list[str]:
 
 def _shown(name: str, cell: Cell, outputs: list[Any]) -> Iterator[str]:
     """Yield the outputs of a cell as Markdown, and write its pictures."""
+    outputs = [one for one in outputs if one.get("name") != "stderr"]
     for one in outputs if "remove" not in cell.tags.replace("remove-input", "") else []:
         data = one.get("data", {})
         if picture := next((kind for kind in ("image/png", "image/svg+xml") if kind in data), None):
             target = _path(f"{name}-{checksum(cell.code)}.{picture[6:9]}")
             target.write_bytes(_small(data[picture]))
             yield f"![{cell.section}](pictures/{target.name})"
-        elif text := (one.get("text") or data.get("text/plain") or "").strip("\n"):
+        elif text := WITHOUT.sub("", one.get("text") or data.get("text/plain") or "").strip("\n"):
             yield f"```text\n{text}\n```"
 
 
