@@ -1,4 +1,4 @@
-"""Seven machines as case dictionaries, all held: what `machine_oracle` and another program are compared on."""
+"""Eight machines as case dictionaries, all held: what `machine_oracle` and another program are compared on."""
 
 import numpy as np
 
@@ -19,10 +19,7 @@ def processor(**keys):
 MACHINES = {
     # the paper's cascade on four axes, default gains, a delay of one sample with prediction; off centre and tilted
     "rigid": {
-        "plant": RIG,
-        "rotor": SHORT,
-        "bearing": [LEFT, RIGHT],
-        "processor": processor(delay=1.0),
+        "plant": RIG, "rotor": SHORT, "bearing": [LEFT, RIGHT], "processor": processor(delay=1.0),
         "initial": {"q": [3e-5, -4e-5, 0.0, 1e-4, -5e-5]},
         "clock": CLOCK,
     },
@@ -33,11 +30,8 @@ MACHINES = {
         "rotor": {"kind": "rigid", "m": 4.0, "I_t": 0.03, "I_p": 0.045, "speed": 12000.0},
         "bearing": [
             LEFT | {"at": -0.12, "sensor_at": -0.135},
-            RIGHT
-            | {
-                "at": 0.15,
-                "sensor_at": 0.16,
-                "plant": {"A": 3.2e-4, "s_0": 6e-4},
+            RIGHT | {
+                "at": 0.15, "sensor_at": 0.16, "plant": {"A": 3.2e-4, "s_0": 6e-4},
                 "controller": {"position": {"k_d": 2000.0, "k_int": 1e7}},
             },
         ],
@@ -95,10 +89,8 @@ MACHINES = {
     # a pulse of force that act on the modes; the base shakes, at a slant and with a pulse
     "bending": {
         "plant": RIG,
-        "rotor": SHORT
-        | {
-            "kind": "modal",
-            "speed": 4000.0,
+        "rotor": SHORT | {
+            "kind": "modal", "speed": 4000.0,
             "modes": [{"frequency": 105.0, "damping": 0.005}, {"frequency": 420.0, "damping": 0.005}],
             "Gm": [[0.0] * 4, [0.0, SPIN, 0.2, 0.1], [0.0, 0.2, 0.3, -0.1], [0.0, 0.1, -0.1, 0.2]],
         },
@@ -121,6 +113,12 @@ MACHINES = {
         ],
         "initial": {"q": [1e-5, 1e-5, 0.0, 2e-5, 2e-5]},
         "clock": CLOCK,
+    },
+    # one axis across the shaft, with a bending mode; the sensor apart
+    "one": {
+        "plant": RIG, "processor": processor(delay=1.0), "clock": CLOCK, "initial": {"q": [0.0, 3e-5, 0.0, 0.0, 0.0]},
+        "rotor": SHORT | {"kind": "modal", "m": 1.64, "modes": [{"frequency": 900.0, "damping": 0.01}]},
+        "bearing": [{"name": "mid", "kind": "radial", "at": 0.0, "axes": ["y"], "modes": [0.4], "sensor_modes": [0.3]}],
     },
     # rigid-body coordinates: PID on translation, tilt and axial motion, with other gains for each; Kalman observers;
     # a disc at 9,000 rpm, of which the gyroscopic terms are compensated; three kinds of magnets; one axis at an angle

@@ -67,7 +67,8 @@ def machine(case):
         ways = {"x": (math.cos(angle), math.sin(angle), 0.0), "y": (-math.sin(angle), math.cos(angle), 0.0)}
         if bearing["kind"] == "axial":
             ways, shapes = {"z": (0.0, 0.0, 1.0)}, []
-        for letter, way in ways.items():
+        for letter in bearing.get("axes", ways):
+            way = ways[letter]
             names.append(f"{bearing['name']}.{letter}")
             b.append(row(way, at, shapes, len(modes)))
             c.append(row(way, bearing.get("sensor_at", at), bearing.get("sensor_modes", shapes), len(modes)))

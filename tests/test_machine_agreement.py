@@ -36,7 +36,7 @@ def test_every_axis_agrees_with_the_independent_program(name):
 
 @pytest.mark.slow
 # the laws of "five", in another arrangement, are those of the others
-@pytest.mark.parametrize("name", ["gyroscopic", "run-up", "bending", thorough("coordinates")])
+@pytest.mark.parametrize("name", ["gyroscopic", "run-up", "bending", "one", thorough("coordinates")])
 def test_the_sensitivity_agrees_with_the_independent_program(name):
     case = machine_from(tomllib.loads(tomlkit.dumps(MACHINES[name])), name)
     ours = machine_sensitivity(case.machine, case.axes, case.clock.sample_period, case.speeds[0], case.zones)

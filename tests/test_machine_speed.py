@@ -7,13 +7,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from machine_cases import MUNICH, Pid
+from machine_cases import MACHINES, MUNICH, Pid
 from scipy.linalg import block_diag
 from texts import refusal
 
 from ambjax import save_controller
 from ambjax.__main__ import main
 from ambjax.cases.machine_case import machine_from, read_machine
+from ambjax.cases.rotor_drawing import in_pairs
 from ambjax.cases.template_text import template
 from ambjax.commands import campbell
 from ambjax.commands.machine_commands import once_per_revolution
@@ -158,6 +159,9 @@ def test_critical_speeds_of_a_rigid_rotor_on_springs(rigid):
     found = np.array(springs_critical(rigid.machine.rotor, k))
     expected = np.sort([np.sqrt(2 * k / MASS), np.sqrt(2 * k * HALF**2 / (I_T - I_P))], 0).T * 30 / np.pi
     np.testing.assert_allclose(found, expected, rtol=1e-12)
+    centre = dataclasses.replace(rigid.machine.rotor, at_magnets=np.eye(2, 5))  # it does not hold the tilt
+    np.testing.assert_allclose(springs_critical(centre, k)[0], np.sqrt(k[0] / MASS) * 30 / np.pi, rtol=1e-12)
+    assert (in_pairs(rigid), in_pairs(machine_from(MACHINES["one"]))) == (True, False)
 
 
 @pytest.mark.parametrize("way", [1, -1])

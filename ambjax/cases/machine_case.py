@@ -263,26 +263,30 @@ def _start(table: Table, rotor: Rotor, count: int) -> tuple[np.ndarray, list[flo
 
 
 def _check_rank(rotor: Rotor, axes: list[BearingAxis]) -> None:
-    """Raise ValueError if magnets or sensors leave a coordinate free that any of them, a weight or a load acts on.
+    """Raise ValueError if magnets or sensors leave a coordinate free that moves, directly or through others.
 
-    An axial bearing alone leaves the coordinates across the shaft out; radial bearings must hold all four.
+    A rigid coordinate without magnet, sensor and force stays at rest, such as the tilt of a rotor with one bearing at
+    its centre of mass.
     """
-    forces = [np.asarray(rotor.gravity), *(np.asarray(load.along) for load in rotor.loads)]
-    pushed, across = np.any(forces, 0), [k for k in range(RIGID) if k != 2]
-    for rows, what in ((rotor.at_magnets, "magnets"), (rotor.at_sensors, "sensors")):
-        rigid = np.asarray(rows)[:, :RIGID]
-        used = [k for k in range(RIGID) if np.any(rigid[:, k])]
-        needed = [k for k in range(RIGID) if pushed[k] or (k in across and set(used) & set(across))]
-        if free := [k for k in needed if k not in used]:
-            other = ", or a rotor.gravity and loads that do not" if np.any(pushed[free]) else ""
+    M, D, G, K = (np.asarray(x) for x in (rotor.M, rotor.D, rotor.G, rotor.K))
+    every = [np.asarray(rows)[:, :RIGID] for rows in (rotor.at_magnets, rotor.at_sensors)]
+    turning = [np.asarray(x) for one in rotor.unbalances for x in (one.along_x, one.along_y)]
+    loads = [np.asarray(one.along) for one in rotor.loads]
+    pushed = np.any([np.asarray(rotor.gravity), *loads, *turning], 0)
+    moved = pushed | np.any([*rotor.at_magnets, *rotor.at_sensors], 0)
+    linked = np.linalg.matrix_power(np.any([M, D, G, K], 0).astype(float), len(M)) > 0  # directly or through others
+    needed = np.flatnonzero((linked @ moved)[:RIGID])
+    for rigid, what in zip(every, ("magnets", "sensors"), strict=True):
+        if free := [k for k in needed if not np.any(rigid[:, k])]:
+            other = ", or leave out the weight, load or unbalance that acts on it" if np.any(pushed[free]) else ""
             names = ", ".join(COORDINATES[k] for k in free)
             raise ValueError(f"bearing: no axis holds {names}. Give a bearing whose {what} act on it{other}.")
-        scale = np.abs(rigid[:, used]).max(0)
-        rank = int(np.linalg.matrix_rank(rigid[:, used] / scale, tol=1e-9))
-        if rank < len(used):
+        scale = np.abs(rigid[:, needed]).max(0)
+        rank = int(np.linalg.matrix_rank(rigid[:, needed] / scale, tol=1e-9))
+        if rank < len(needed):
             raise ValueError(
-                f"bearing: the {what} of the {len(axes)} axes determine {rank} of the {len(used)} rigid motions "
-                f"({', '.join(COORDINATES[k] for k in used)}). Place radial bearings at two different places."
+                f"bearing: the {what} of the {len(axes)} axes determine {rank} of the {len(needed)} rigid motions "
+                f"({', '.join(COORDINATES[k] for k in needed)}). Place radial bearings at two different places."
             )
 
 

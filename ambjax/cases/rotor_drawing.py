@@ -65,8 +65,14 @@ def _planes(rotor: Rotor) -> list[tuple[tuple[str, float], np.ndarray]]:
 
 
 def radial_axes(case: MachineCase) -> list[int]:
-    """Return the numbers of the axes across the shaft, two of each radial bearing."""
+    """Return the numbers of the axes across the shaft."""
     return [k for k, name in enumerate(case.axes) if not name.endswith(".z")]
+
+
+def in_pairs(case: MachineCase) -> bool:
+    """Return whether there are radial bearings, and each has two axes."""
+    names = [case.axes[k].rpartition(".")[0] for k in radial_axes(case)]
+    return len(names) == 2 * len(set(names)) > 0
 
 
 def place_of(row: np.ndarray) -> float:

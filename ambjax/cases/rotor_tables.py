@@ -210,11 +210,11 @@ def _distinct(x: Any, close: float) -> np.ndarray:
 
 
 def axes_from(bearings: list[Table], body: RotorBody) -> list[BearingAxis]:
-    """Return the axes of all bearings: two of a radial one, at `angle` and 90 degrees further; one of an axial one."""
+    """Return the axes of all bearings: of a radial one those of `axes`, at `angle` and 90 degrees further; or z."""
     axes, seen = [], set()
     for number, table in enumerate(bearings):
         own = [] if body.shapes is not None else SHAPE_KEYS
-        table.only(["name", "kind", *PLACE_KEYS, "angle", "clearance", *own, *OWN])
+        table.only(["name", "kind", *PLACE_KEYS, "axes", "angle", "clearance", *own, *OWN])
         kind = table.choice("kind", ["radial", "axial"])
         name = table.raw.get("name", f"bearing{number + 1}")
         if not isinstance(name, str) or not name or "." in name or name in seen:
@@ -234,19 +234,28 @@ def axes_from(bearings: list[Table], body: RotorBody) -> list[BearingAxis]:
         places = [magnet, *(body.place(table, *keys, (at, magnet[1])) for keys in others)]
         angle = math.radians(table.leaf("angle", ANGLE, 0.0))
         cos, sin = _exact(math.cos(angle)), _exact(math.sin(angle))
-        for label, d in (("x", (cos, sin, 0.0)), ("y", (-sin, cos, 0.0))):
-            rows = [row(place, d, shapes) for place, shapes in places]
+        directions = {"x": (cos, sin, 0.0), "y": (-sin, cos, 0.0)}
+        for label in _labels(table, list(directions)):
+            rows = [row(place, directions[label], shapes) for place, shapes in places]
             axes.append(BearingAxis(f"{name}.{label}", number, *rows))
     return axes
 
 
 def _check_axial(table: Table) -> None:
     """Raise ValueError for a key that an axial bearing cannot use. Its places are checked, but have no effect."""
-    for key in ("angle", *SHAPE_KEYS):
+    for key in ("axes", "angle", *SHAPE_KEYS):
         if key in table.raw:
             raise ValueError(f"{table.at(key)}: an axial bearing acts along the shaft, without bending. Omit {key}.")
     for key in PLACE_KEYS:
         table.leaf(key, PLACE, 0.0)
+
+
+def _labels(table: Table, known: list[str]) -> list[str]:
+    """Return the labels of the axes of a radial bearing."""
+    found = table.raw.get("axes", known)
+    if found not in (known, *([one] for one in known)):
+        raise table.refuse("axes", f"it must be {', '.join(show([one]) for one in known)} or {show(known)}.")
+    return list(found)
 
 
 def _exact(x: float) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ambjax.cases.machine_case import MachineCase, with_notches_for
 from ambjax.cases.reader import Case
-from ambjax.cases.rotor_drawing import drawing_of, radial_axes
+from ambjax.cases.rotor_drawing import drawing_of, in_pairs, radial_axes
 from ambjax.commands.reading import read_any_with_warnings, results
 from ambjax.host.heartbeat import say
 from ambjax.linear.linear_machine import turning_machines
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> tuple[int, dict[str, object]]:
     turned = case.machine.rotor.unbalances and radial_axes(case)
     found = unbalance_response(case.machine, case.clock.sample_period, way * end) if turned else None
     criticals = [] if found is None else critical_speeds(found, operating)
-    springs = _on_springs(case) if radial_axes(case) else None
+    springs = _on_springs(case) if in_pairs(case) else None
     summary = {
         "speeds_rpm": speeds, "stable": not unstable, "unstable_at_rpm": unstable, "growth_per_s": growth,
         "poles_per_s": [[[float(p.real), float(p.imag)] for p in own] for own in poles],
@@ -185,6 +185,8 @@ def _pictures(case: MachineCase, analysed: tuple, found: UnbalanceResponse | Non
     way, operating = direction(case), operating_range(case)
     case = dataclasses.replace(case, name=case.name + ", negative speeds" * (way < 0))
     drawn(part / "campbell.png", lambda: campbell_picture(case.name, abs(speeds), modes))
+    if found is not None and np.isfinite(found.sensors).any():  # stable at a speed
+        drawn(part / "unbalance.png", lambda: unbalance_picture(case, found, criticals, operating))
     if springs is None:
         return
     speed = way * operating[1]
@@ -194,8 +196,6 @@ def _pictures(case: MachineCase, analysed: tuple, found: UnbalanceResponse | Non
     light = [mode for mode in bent if mode.damping < LIGHT]
     shown = light or bent
     drawn(part / "rotor.png", lambda: rotor_picture(case.name, drawing_of(case), shown, springs, speed))
-    if found is not None and np.isfinite(found.sensors).any():  # stable at a speed
-        drawn(part / "unbalance.png", lambda: unbalance_picture(case, found, criticals, operating))
 
 
 def unbalance_text(

@@ -123,7 +123,8 @@ def springs_critical(rotor: Rotor, stiffness: np.ndarray) -> list[np.ndarray]:
         np.real(basis.conj().T @ x @ basis) / 2
         for x in (np.asarray(rotor.M), np.asarray(rotor.K), 1j * np.asarray(rotor.G), radial.T @ radial)
     )
-    found = []
+    found, held = [], np.any(K + B, 1)
+    M, K, G, B = (x[np.ix_(held, held)] for x in (M, K, G, B))
     for k in stiffness:
         # K + k B - W^2 (M - G) is singular; without G it is positive definite
         inverse = np.linalg.eigvals(np.linalg.solve(K + k * B, M - G)).real

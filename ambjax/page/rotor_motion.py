@@ -42,10 +42,10 @@ def motion_of(case: MachineCase, signals: dict[str, Any]) -> dict[str, Any]:
     y = np.column_stack([q[:, 1], -q[:, 3], modes[:, :, 1]])
     rotor = case.machine.rotor
     rows = np.asarray(rotor.at_magnets if rotor.at_stops is None else rotor.at_stops)
-    stops = [[round(place_of(rows[k]), 6), float(case.cases[k].scenario.touchdown)] for k in radial_axes(case)[::2]]
+    stops = {round(place_of(rows[k]), 6): float(case.cases[k].scenario.touchdown) for k in radial_axes(case)}
     return {
         "t": _rounded(t[kept]), "rpm": _rounded(speed[kept]), "x": _rounded(x), "y": _rounded(y),
-        "at": _rounded(drawing.at), "stops": stops,
+        "at": _rounded(drawing.at), "stops": list(map(list, stops.items())),
         "along": _rounded(np.column_stack([np.ones_like(drawing.at), drawing.at, drawing.shapes])),
         "planes": [[kind, round(place, 6)] for kind, place in drawing.planes],
     }  # fmt: skip

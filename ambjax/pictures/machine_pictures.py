@@ -83,8 +83,8 @@ def orbit_axes(ax: Any, title: str) -> None:
 
 
 def orbits_of(axes: Sequence[str]) -> list[tuple[str, int, int]]:
-    """Return the radial bearings with the positions of their two axes in the list of axes."""
-    names = [name.rpartition(".")[0] for name in axes if name.endswith(".x")]
+    """Return the radial bearings with two axes, and the positions of these in the list of axes."""
+    names = [name.removesuffix(".x") for name in axes if name.endswith(".x") and f"{name[:-1]}y" in axes]
     return [(name, list(axes).index(f"{name}.x"), list(axes).index(f"{name}.y")) for name in names]
 
 

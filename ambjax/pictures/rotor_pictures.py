@@ -85,7 +85,7 @@ def rotor_picture(
 
 
 def _rotor(ax: Axes, drawing: Any) -> None:
-    size = max((d for _, _, d in drawing.sections), default=0.02 * float(np.ptp(drawing.at)))
+    size = max((d for _, _, d in drawing.sections), default=0.02 * (float(np.ptp(drawing.at)) or 1.0))
     reach = 4 * size
     for begin, end, d in drawing.sections:
         ax.fill_between([begin, end], -d / 2, d / 2, color="0.6", step="mid", linewidth=0)
