@@ -48,7 +48,7 @@ def without_level() -> None:
     """XLA compiles at its default level of optimisation."""
     from ambjax.compiler import fast_path
 
-    fast_path.LEVEL = {}
+    fast_path.LEVEL = fast_path.SHORT
 
 
 def without_apart() -> None:

@@ -6,11 +6,10 @@ Runs take longer with these options, and results differ in roundings only.
 import importlib.metadata
 import os
 
-# XLA aborts on a flag that it does not know, so each version of jaxlib has its own. Passes over loops take longest.
+# XLA aborts on a flag that it does not know, so each version of jaxlib has its own.
 FLAGS = {
     "0.10": "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
-    "--xla_cpu_parallel_codegen_split_count=1 --xla_disable_hlo_passes="
-    "simplify-while-loops,while-loop-invariant-code-motion,while-loop-constant-sinking"
+    "--xla_cpu_parallel_codegen_split_count=1 --xla_disable_hlo_passes=while-loop-invariant-code-motion"
 }
 
 

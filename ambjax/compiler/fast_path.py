@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ambjax.compiler.barrier import in_trace
+from ambjax.compiler.short_compilation import SHORT, supported
 from ambjax.compiler.traced_programs import traced_once
 
 log = logging.getLogger(__name__)
@@ -29,8 +30,8 @@ log = logging.getLogger(__name__)
 MARK = {"inlineable": "false", "xla_cpu_small_call": "true"}
 WIDE = {"xla_cpu_prefer_vector_width": 512}
 # XLA's default, level 3, unrolls loops over the members of short blocks, which makes them slower; see
-# benchmarks/workarounds.py. A level in XLA_FLAGS has priority.
-LEVEL = {"xla_backend_optimization_level": 2}
+# benchmarks/workarounds.py. Options in XLA_FLAGS have priority.
+LEVEL = SHORT | {"xla_backend_optimization_level": 2}
 # Members of the shortest block.
 SHORTEST = 16
 
@@ -122,7 +123,8 @@ def options() -> dict[str, Any] | None:
         log.warning("one-kernel path is off: AMBJAX_PLAIN is set. Results are the same, runs are several times slower.")
         return None
     given, faults = os.environ.get("XLA_FLAGS", ""), []
-    wide, level = WIDE if has_avx512() else {}, {} if any(name in given for name in LEVEL) else LEVEL
+    wide = WIDE if has_avx512() else {}
+    level = {name: value for name, value in supported(LEVEL).items() if name not in given}
     for trial in (wide | level, wide, {}):
         fault = _probe(trial)
         if not fault:

@@ -12,15 +12,22 @@ from ambjax.compiler.barrier import in_trace
 from ambjax.compiler.traced_programs import traced_once
 
 Result = TypeVar("Result")
+Option = bool | int | str
 
-# Options of XLA. On a CPU, the older emitters of fused operations compile faster. The programs are as fast.
-QUICK = {"xla_cpu_use_fusion_emitters": False}
+# Options of XLA that shorten compilation for a CPU. The programs are as fast. One thread compiles all parts of a
+# program, and no operations are moved out of loops, which takes many passes.
+SHORT = {
+    "xla_cpu_parallel_codegen_split_count": 1,
+    "xla_disable_hlo_passes": "while-loop-invariant-code-motion",
+}
+# The older emitters of fused operations compile faster.
+QUICK = SHORT | {"xla_cpu_use_fusion_emitters": False}
 # For programs that run only a few times: most optimisations would cost more time than they save.
 QUICKEST = QUICK | {"xla_backend_optimization_level": 0}
 
 
 def compiled_quickly(
-    function: Callable[..., Result], static_argnames: tuple[str, ...] = (), options: Mapping[str, bool | int] = QUICK
+    function: Callable[..., Result], static_argnames: tuple[str, ...] = (), options: Mapping[str, Option] = QUICK
 ) -> Callable[..., Result]:
     """Return jit(`function`), compiled with those of `options` that this version of XLA supports.
 
@@ -63,13 +70,13 @@ def precision(name: str) -> AbstractContextManager[object]:
     return home.enable_x64(name == "double")
 
 
-def supported(options: Mapping[str, bool | int]) -> dict[str, bool | int]:
+def supported(options: Mapping[str, Option]) -> dict[str, Option]:
     """Return those of `options` that this version of XLA supports."""
     return {name: value for name, value in options.items() if _supports(name, value)}
 
 
 @functools.cache
-def _supports(name: str, value: bool | int) -> bool:
+def _supports(name: str, value: Option) -> bool:
     try:
         jax.jit(lambda x: x, compiler_options={name: value}).lower(0.0).compile()
     except jax.errors.JaxRuntimeError:
