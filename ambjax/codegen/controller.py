@@ -11,7 +11,7 @@ from jax import Array
 
 from ambjax.codegen.block import Block, Number, Ports, earlier, numbers_of, scales
 from ambjax.codegen.interface import INPUTS, OUTPUTS, STATUS, Status, StepInputs, StepOutputs
-from ambjax.control.base import memory_of
+from ambjax.control.base import memory_of, steepnesses
 from ambjax.control.cascade import Cascade
 from ambjax.control.cascade_state import CascadeState, Command
 from ambjax.control.guard import GAPS, Watch
@@ -112,7 +112,8 @@ class Controller(Block):
         processor = cascade.timing
         if processor.predicts or processor.guard is not None:  # the number of prediction steps is fixed at export
             fine += [processor.delay >= 0, processor.delay <= (processor.most or 0)]
-        fine += [jnp.isfinite(p) for p in _steepnesses(cascade)]  # p = inf needs another program
+        signs = [getattr(law, name) for law in cascade.laws for name in steepnesses(law)]
+        fine += [jnp.isfinite(p) for p in jax.tree.leaves(signs)]  # p = inf needs another program
         valid = functools.reduce(jnp.logical_and, fine, jnp.asarray(True))
         sensor = Sensor(velocity=self.velocity)
         system = Sampled(ClosedLoop(cascade, Scenario(u_max=limits.u_max, sensor=sensor)), period, 0)
@@ -214,8 +215,7 @@ class Controller(Block):
     def described(self) -> list[str]:
         cascade, lines = self.parameters.controller, []
         for stage, law in zip(CascadeState._fields, cascade.laws, strict=True):
-            fields = dataclasses.fields(law)
-            hard = [f.name for f in fields if f.metadata.get("steepness") and getattr(law, f.name) is None]
+            hard = [name for name in steepnesses(law) if getattr(law, name) is None]
             ends = "".join(f", {name} = inf (a set-valued sign)" for name in hard)
             over = "".join(f", {name} as a function of the {one.over}" for name, one in schedules(law).items())
             lines.append(f"{stage}: {type(law).__name__}{ends}{over}")
@@ -241,10 +241,3 @@ def controller_of(cascade: Cascade, u_max: Scalar, period: float, scenario: Scen
     limits = StepLimits(u_max, NEAR, *(GAPS * float(model.s_0) / period**n for n in range(4)))
     plain = jax.tree.map(lambda x: float(x) if jnp.shape(x) == () else x, Parameters(cascade, limits))
     return Controller(plain, period, scenario.sensors.velocity)
-
-
-def _steepnesses(cascade: Cascade) -> list[Scalar]:
-    laws: tuple[Any, ...] = cascade.laws
-    fields = [(law, field) for law in laws for field in dataclasses.fields(law)]
-    found = [getattr(law, field.name) for law, field in fields if field.metadata.get("steepness")]
-    return jax.tree.leaves(found)

@@ -16,6 +16,7 @@ from jax import Array
 from ambjax.control.sampling import Relay, Sampling
 from ambjax.control.search import Interval, SearchContext
 from ambjax.numerics.records import GainFunction, Scalar, is_traced
+from ambjax.numerics.smooth import smooth_sign
 from ambjax.world.plant import Plant
 
 L = TypeVar("L", bound="Law")
@@ -95,10 +96,10 @@ class Law(abc.ABC):
     def robust(self, error: Array, /) -> Array:
         """Return the term that the sign adds to the rate of the stage's error: -k sgn(sigma) in Eq. (12), for example.
 
-        `error`: sigma (m/s), v_tilde (A^2/m^2) or e (A). The default is 0, also for
-        a law that has a sign but does not define this method.
+        `error`: sigma (m/s), v_tilde (A^2/m^2) or e (A). By default it is the sign of `relay`, or 0 without one.
         """
-        return 0.0 * error
+        relay = self.relay()
+        return 0.0 * error if relay is None else -relay.gain * smooth_sign(error, relay.steepness)
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
         """Return the range of the initial values of each gain in the tuner's search, by the name of the gain."""

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ambjax.control.force import force_of_current, linear_mechanics, resting_current, sliding_variable
+from ambjax.control.pid import StateFeedback
 from ambjax.control.regulator import optimal_gains
 from ambjax.control.sampling import Sampling
 from ambjax.control.search import Interval, SearchContext, rate
@@ -226,21 +227,13 @@ class FilterChain(PositionLaw[ChainState]):
         return force_of_current(model, motion.z, i_star), ChainState(derivative, integral, tuple(after))
 
     def ranges(self, context: SearchContext) -> dict[str, Interval]:
-        b = linear_mechanics(context.model).b
         names = ["w_f", *["w_lp"] * (self.w_lp is not None)]
         corners = {name: rate(context, 2, 100, "corner from 2 w to 100 w") for name in names}
         corners |= {name: rate(context, 1, 50, "corner from w to 50 w") for name in ("w_z", "w_p")}
         corners |= {name: rate(context, 2, 50, "centre from 2 w to 50 w") for name in ("w_1", "w_2")}
         shares = {f"width_{k}": Interval(0.1, 2.0, "a tenth to twice the centre") for k in (1, 2)}
         shares |= {f"depth_{k}": Interval(0.03, 1.0, "a depth of 30 dB to no notch", True) for k in (1, 2)}
-        return {
-            "k_p": rate(context, 1, 5, "corner sqrt(b k_p) from w to 5 w", b, 2),
-            "k_d": rate(context, 1 / 3, 10, "rate b k_d from w/3 to 10 w", b),
-            "k_int": rate(context, 1 / 30, 2, "corner cbrt(b k_int) from w/30 to 2 w", b, 3),
-            "k_aw": rate(context, 1e-3, 1, "rate from w/1000 to w"),
-            **corners,
-            **shares,
-        }
+        return StateFeedback().ranges(context) | corners | shares
 
 
 def _begun(derivative: Array, y: Array, parts: Sequence[Callable[..., Any]]) -> ChainState:

@@ -13,7 +13,7 @@ from ambjax.control.search import Interval, SearchContext, authority, rate, stee
 from ambjax.control.stages import CurrentInputs, CurrentLaw, OneIntegral, Stateless, no_slope, unwinding
 from ambjax.numerics.records import Scalar, bounded, gain, record
 from ambjax.numerics.relax import share
-from ambjax.numerics.smooth import TWO_OVER_PI, limited, smooth_sign
+from ambjax.numerics.smooth import TWO_OVER_PI, limited
 from ambjax.world.plant import Plant, State
 
 
@@ -55,9 +55,6 @@ class SlidingMode(Stateless, CurrentLaw[tuple[()]]):
         inverse = (inputs.gaps or model.gaps(measured.z)).inverses[1]
         wanted = -2 * measured.z_dot * inverse * measured.i + demand.i_ref_dot + robust
         return (model.kappa / 2) * inverse * wanted + model.R * measured.i
-
-    def robust(self, e: Array) -> Array:
-        return -self.k_i * smooth_sign(e, self.p)
 
     def relay(self) -> Relay:
         return Relay(self.k_i, self.p)

@@ -88,9 +88,6 @@ class Adaptive(AdaptiveReference):
         rate = self.gamma * smooth_sign(inputs.v_star - v, self.p, per=gradient)
         return CurrentDemand(state, rate), rate
 
-    def robust(self, v_tilde: Array) -> Array:
-        return -self.gamma * smooth_sign(v_tilde, self.p)
-
     def relay(self) -> Relay:
         return Relay(self.gamma, self.p)
 

@@ -30,13 +30,14 @@ def try_law(law: Law, stage: str, model: Plant) -> None:
 
     Raises TypeError if an output, a rate, a scale, a slope or a state has a wrong structure or shape.
     """
-    motion, reference = Measurement(*_zeros(3)), Reference(*_zeros(3))
-    demand, force = CurrentDemand(*_zeros(2)), ForceDemand(_zero(), _zero(), _zero(), _zero())
+    zero = jnp.zeros(())
+    motion, reference = Measurement(zero, zero, zero), Reference(zero, zero, zero)
+    demand, force = CurrentDemand(zero, zero), ForceDemand(zero, zero, zero, zero)
     inputs, wanted = {
         "observer": (motion, motion),
-        "position": ((motion, reference), _zero()),
+        "position": ((motion, reference), zero),
         "inversion": (force, demand),
-        "current": (CurrentInputs(motion, demand, jnp.ones(())), _zero()),
+        "current": (CurrentInputs(motion, demand, jnp.ones(())), zero),
     }[stage]
     first = (model, motion) if stage == "observer" else (model,)
 
@@ -62,7 +63,7 @@ def try_law(law: Law, stage: str, model: Plant) -> None:
     same_shapes(after, (wanted, kept), "on a processor, a step must return the output and the next state; they are")
     same_shapes(begun, state, "begin(model, inputs) must be like init(model); it is")
     same_shapes(sampled, kept, "begin_sampled(model, inputs, period) must be like init_sampled(model); it is")
-    same_shapes(slope, _zero(), "slope(model) must be a number; it is")
+    same_shapes(slope, zero, "slope(model) must be a number; it is")
 
 
 # Classes of custom laws that have passed a trial.
@@ -94,14 +95,6 @@ def reason(error: BaseException, file: pathlib.Path | None = None) -> str:
     if isinstance(error, (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)):
         fix = ". Compute with jax.numpy without float(), and use jnp.where in place of `if`, `and` and `or`"
     return f"raised {type(error).__name__}: {words.rstrip('.')}{'' if line is None else f' (line {line})'}{fix}"
-
-
-def _zero() -> jax.Array:
-    return jnp.zeros(())
-
-
-def _zeros(count: int) -> list[jax.Array]:
-    return [_zero()] * count
 
 
 def same_shapes(found: Any, wanted: Any, words: str) -> None:

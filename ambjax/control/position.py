@@ -58,9 +58,6 @@ class SlidingMode(Stateless, PositionLaw[tuple[()]]):
         robust = self.robust(self.sigma(motion, reference))
         return force_for(self.c, model, motion, reference, robust), ()
 
-    def robust(self, sigma: Array) -> Array:
-        return -self.k * smooth_sign(sigma, self.p)
-
     def relay(self) -> Relay:
         return Relay(self.k, self.p)
 

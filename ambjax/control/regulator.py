@@ -16,21 +16,6 @@ LONGEST = 0.5
 MOST_DOUBLINGS = 60
 
 
-def state_space(model: Plant) -> tuple[np.ndarray, np.ndarray]:
-    """Return A [3, 3] and B [3, 1] of x' = A x + B i for x = (integral of the error, error, its rate), SI units."""
-    s, b = map(float, linear_mechanics(model))
-    return np.array([[0, 1, 0], [0, 0, 1], [0, s, 0.0]]), np.array([[0], [0], [b]])
-
-
-def weights(model: Plant) -> tuple[np.ndarray, float]:
-    """Return Q [3, 3] and R of the cost x'Q x + R i^2 by Bryson's rule, with x as in `state_space`.
-
-    A. E. Bryson and Y.-C. Ho, Applied Optimal Control (1975), 5.2.
-    """
-    error, current, w = ERROR * float(model.s_0), CURRENT * float(model.i_0), float(model.pole)
-    return np.diag([(INTEGRAL * w / error) ** 2, 1 / error**2, 0.0]), 1 / current**2
-
-
 def discretised(A: np.ndarray, B: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the map of one period (s) with the input held; the integral takes a step of explicit Euler."""
     from scipy.linalg import expm
@@ -75,24 +60,25 @@ def doubled(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.nd
 
 
 def optimal_gains(model: Plant, period: float | None = None) -> np.ndarray:
-    """Return the gains K [3] of the feedback i = -K x that minimises the cost of `weights`.
+    """Return the gains K [3] of the feedback i = -K x, x = (integral of the error, error, its rate), in SI units.
+
+    It minimises the integral, or sum, of a cost by Bryson's rule (A. E. Bryson and Y.-C. Ho, Applied Optimal Control,
+    1975, 5.2), with the weights ERROR, CURRENT and INTEGRAL.
 
     `model`: its parameters are concrete numbers. `period`: sample period, s, replaced by LONGEST over the fastest rate
     if it is longer; None: continuous time. Raises ValueError if the Riccati equation has no solution in floating-point
     numbers, or if a gain is not positive, as for a rotor on springs much stiffer than the magnets.
     """
-    A, B = state_space(model)
-    Q, _ = weights(model)
-    # unit of time 1/w and units of error and current from the weights: R is 1, all numbers are of order one
-    w = float(model.pole)
-    units = np.array([1 / w, 1.0, w]) * ERROR * float(model.s_0)
-    scaled_A, scaled_B = A * units / units[:, None] / w, B / units[:, None] / w * CURRENT * float(model.i_0)
-    cost = Q * units * units[:, None]
+    # x' = A x + B i in the unit of time 1/w and the units of error and current that cost the same: numbers of order one
+    (s, b), w = map(float, linear_mechanics(model)), float(model.pole)
+    error, current = ERROR * float(model.s_0), CURRENT * float(model.i_0)
+    A = np.array([[0, 1, 0], [0, 0, 1], [0, s / w**2, 0.0]])
+    B = np.array([[0], [0], [b * current / (error * w**2)]])
     if period is not None:
-        fastest = max(1.0, abs(scaled_A[2, 1]) ** 0.5)
-        scaled_A, scaled_B = discretised(scaled_A, scaled_B, min(period * w, LONGEST / fastest))
-    K = riccati_gain(scaled_A, scaled_B, cost, np.eye(1), period is None)
-    gains = K[0] / units * CURRENT * float(model.i_0)
+        fastest = max(1.0, abs(A[2, 1]) ** 0.5)
+        A, B = discretised(A, B, min(period * w, LONGEST / fastest))
+    K = riccati_gain(A, B, np.diag([INTEGRAL**2, 1.0, 0.0]), np.eye(1), period is None)
+    gains = K[0] * np.array([w, 1.0, 1 / w]) * current / error
     if not np.all((gains > 0) & np.isfinite(gains)):
         raise ValueError(f"the model has no positive optimal gains: {', '.join(f'{x:.3g}' for x in gains)}")
     return gains

@@ -1,7 +1,7 @@
 """Control in the coordinates of the rigid rotor: translation and tilt instead of the axes of the bearings."""
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,18 +13,11 @@ from ambjax.control.machine_law import Demanded, MachineInputs, MachineLaw
 from ambjax.control.schedule import extremes
 from ambjax.control.stages import ForceDemand, rates_along
 from ambjax.numerics.linear import rk4_step
-from ambjax.numerics.records import leaf, matrix, part, record
+from ambjax.numerics.records import Scalar, leaf, matrix, part, record
 from ambjax.numerics.small_matrices import times
 from ambjax.world.plant import State
 from ambjax.world.sensor import Measurement
 from ambjax.world.waveforms import Reference
-
-
-class RigidState(NamedTuple):
-    """States of the observers and of the position laws of all coordinates."""
-
-    observer: Any
-    position: Any
 
 
 @record
@@ -55,27 +48,22 @@ class RigidBody(MachineLaw):
         doc="M^-1 G: gyroscopic accelerations to compensate, per speed (rad/s) and rate; none: no compensation",
     )  # fmt: skip
 
-    def scale(self) -> RigidState:
-        def one(law: Cascade) -> RigidState:
-            size = law.scale()
-            return RigidState(size.observer, size.position)
+    def scale(self) -> CascadeState:
+        sizes = jax.vmap(lambda law: law.scale()._replace(inversion=(), current=()))(self.laws)
+        return jax.tree.map(jnp.asarray, sizes)
 
-        return jax.tree.map(jnp.asarray, jax.vmap(one)(self.laws))
-
-    def begin(self, measured: Measurement, inputs: MachineInputs) -> RigidState:
+    def begin(self, measured: Measurement, inputs: MachineInputs) -> CascadeState:
         now, reference = self._read(measured, inputs), self._reference(inputs)
         observed = jax.vmap(lambda law, m: extremes(law.observer)[0].init(law.model, m))(self.laws, now)
-        if not self.laws.sampled:
-            states = jax.vmap(lambda law, m, r: law.init(m, r))(self.laws, now, reference)
-            return RigidState(states.observer, states.position)
-        estimate, _ = self._observed(now, observed, reference, inputs)
+        period = inputs.period if self.laws.sampled else None
+        estimate, _ = self._observed(now, observed, reference, period)
         estimate, _ = self._predicted(estimate, measured.i, inputs)
-        begun = jax.vmap(lambda law, m, r: law.begun_position(m, r, inputs.period))
-        return RigidState(observed, begun(self.laws, estimate, reference))
+        begun = jax.vmap(lambda law, m, r: law.begun_position(m, r, period))
+        return CascadeState(observed, begun(self.laws, estimate, reference), (), ())
 
-    def step(self, measured: Measurement, state: RigidState, inputs: MachineInputs) -> tuple[Demanded, RigidState]:
+    def step(self, measured: Measurement, state: CascadeState, inputs: MachineInputs) -> tuple[Demanded, CascadeState]:
         reference = self._reference(inputs)
-        now, observed = self._observed(self._read(measured, inputs), state.observer, reference, inputs)
+        now, observed = self._observed(self._read(measured, inputs), state.observer, reference, inputs.period)
         estimate, i = self._predicted(now, measured.i, inputs)
 
         def one(law: Cascade, estimate: Measurement, r: Reference, before: Any) -> tuple[ForceDemand, Any]:
@@ -87,24 +75,24 @@ class RigidBody(MachineLaw):
             return ForceDemand(estimate.z, rates[0], v_star, rates[1]), after
 
         force, positioned = jax.vmap(one)(self.laws, estimate, reference, state.position)
-        return self._demanded(force, estimate, i, now, inputs), RigidState(observed, positioned)
+        after = CascadeState(observed, positioned, (), ())
+        return self._demanded(force, estimate, i, now, inputs), after
 
-    def __call__(self, measured: Measurement, state: RigidState, inputs: MachineInputs) -> tuple[Demanded, RigidState]:
+    def __call__(
+        self, measured: Measurement, state: CascadeState, inputs: MachineInputs
+    ) -> tuple[Demanded, CascadeState]:
         now, reference = self._read(measured, inputs), self._reference(inputs)
-
-        def one(law: Cascade, m: Measurement, own: RigidState, r: Reference) -> tuple:
-            return law.demand(m, CascadeState(*own, (), ()), Sample(r))[:3]
-
-        force, estimate, rates = jax.vmap(one)(self.laws, now, state, reference)
-        return self._demanded(force, estimate, measured.i, estimate, inputs), RigidState(*rates[:2])
+        demand = jax.vmap(lambda law, m, own, r: law.demand(m, own, Sample(r))[:3])
+        force, estimate, rates = demand(self.laws, now, state, reference)
+        return self._demanded(force, estimate, measured.i, estimate, inputs), rates
 
     def _reference(self, inputs: MachineInputs) -> Reference:
         return jax.tree.map(lambda x: times(self.from_sensors, x), inputs.reference)
 
     def _observed(
-        self, now: Measurement, state: Any, reference: Reference, inputs: MachineInputs
+        self, now: Measurement, state: Any, reference: Reference, period: Scalar | None
     ) -> tuple[Measurement, Any]:
-        observe = jax.vmap(lambda law, m, own, r: law.observed(m, own, r, inputs.period))
+        observe = jax.vmap(lambda law, m, own, r: law.observed(m, own, r, period))
         return observe(self.laws, now, state, reference)
 
     def _read(self, measured: Measurement, inputs: MachineInputs) -> Measurement:
