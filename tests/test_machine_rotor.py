@@ -4,7 +4,6 @@ import functools
 import itertools
 import tomllib
 
-import jax
 import numpy as np
 import pytest
 import scipy.io
@@ -18,9 +17,6 @@ from ambjax.world.shaft import Section, element
 FLEXIBLE = tomllib.loads(template("machine-flexible"))
 MAGNETS = (0.113, 0.623)
 MATRICES = ("M", "D", "G", "K", "at_magnets", "at_sensors")
-
-
-compiled = jax.jit(element)
 
 
 @functools.cache
@@ -41,7 +37,7 @@ def finite_elements(own):
         size = rotor["elements"][np.searchsorted(ends, (nodes[k] + nodes[k + 1]) / 2) - 1]["diameter"]
         length = nodes[k + 1] - nodes[k]
         section = Section(nodes[k], length, size, 0.0, rotor["E"], rotor["rho"], rotor["nu"])
-        mass, spin, stiffness = map(np.asarray, compiled(section, length))
+        mass, spin, stiffness = element(section, length)
         at_x, at_y = (np.array([own * (k + n) + c for n in (0, 1) for c in pair]) for pair in (x, y))
         for whole, part in ((M, mass), (K, stiffness)):
             whole[np.ix_(at_x, at_x)] += part

@@ -8,7 +8,6 @@ import numpy as np
 from ambjax.cases.named_files import contents_of
 from ambjax.cases.rotor_body import DAMPING, MODES, RotorBody, dampings_of
 from ambjax.cases.table import Table
-from ambjax.compiler.short_compilation import compiled_quickest, precision
 from ambjax.world.shaft import reduced
 
 MATRICES, TABLE, SHAPES = ("M", "K", "G", "nodes"), ("f_hz", "m", "It", "Ip", "zc"), "phi_"
@@ -22,8 +21,6 @@ PLANES = {4: ((0, 3), (1, 2)), 6: ((0, 4), (1, 3))}
 CLOSE = 0.1
 # Largest distance between a place and the one at which a modal table has shapes, as a share of its length.
 SAME = 1e-3
-
-_reduced = compiled_quickest(reduced, static_argnames=("rows", "modes"))
 
 
 def body_of_file(table: Table, folder: pathlib.Path) -> RotorBody:
@@ -94,18 +91,14 @@ def _of_matrices(arrays: dict[str, np.ndarray], table: Table) -> RotorBody:
     modes = table.leaf("modes", MODES, MODES.default)
     if modes > 2 * count - 2:
         raise ValueError(f"{count} nodes have {2 * count - 2} bending modes, and {table.at('modes')} = {modes}.")
-    with precision("double"):  # the bending modes are small differences of stiffnesses
-        model = _reduced(own["M"], own["G"], K, nodes, rows=tuple(range(2 * count)), modes=modes)
-    if float(model.I_p) < 0:
+    model = reduced(own["M"], own["G"], K, nodes, modes)
+    if model.I_p < 0:
         raise ValueError("G has the opposite sign: G[tilt about x, tilt about y] must be the polar inertia.")
-    shapes, frequencies = np.asarray(model.shapes), np.asarray(model.frequencies)
-    dampings = np.full(modes, DAMPING.default)
+    shapes, dampings = model.shapes, np.full(modes, DAMPING.default)
     if "C" in own:
-        dampings = np.sum(shapes * (own["C"] @ shapes), 0) / (4 * np.pi * frequencies)
-    return RotorBody(
-        float(model.m), float(model.I_t), float(model.I_p), float(model.centre), frequencies,
-        dampings_of(table, dampings), np.asarray(model.gyroscopic), partial(_interpolated, nodes, shapes),
-    )  # fmt: skip
+        dampings = np.sum(shapes * (own["C"] @ shapes), 0) / (4 * np.pi * model.frequencies)
+    at = partial(_interpolated, nodes, shapes)
+    return RotorBody(*model[:5], dampings_of(table, dampings), model.gyroscopic, at)
 
 
 def _interpolated(nodes: np.ndarray, shapes: np.ndarray, place: float) -> np.ndarray:

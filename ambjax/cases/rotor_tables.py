@@ -29,7 +29,6 @@ from ambjax.cases.rotor_body import (
 from ambjax.cases.rotor_file import body_of_file
 from ambjax.cases.speed_table import speed_of
 from ambjax.cases.table import Table, show
-from ambjax.compiler.short_compilation import compiled_quickest, precision
 from ambjax.numerics.records import leaf
 from ambjax.world.rotor import Rotor
 from ambjax.world.shaft import Disc, Section, shaft_model
@@ -54,8 +53,6 @@ MATERIAL = {
     "rho": leaf(default=7850.0, unit="kg/m^3", at_least=100.0, at_most=1e5, doc="density"),
     "nu": leaf(default=0.3, unit="1", at_least=0.0, at_most=0.5, doc="Poisson's ratio"),
 }
-# One program: operation by operation, about 90 would be compiled.
-_shaft_model = compiled_quickest(shaft_model, static_argnames=("sizes", "places", "modes"))
 
 
 class BearingAxis(NamedTuple):
@@ -163,7 +160,7 @@ def _shaft(table: Table, places: list[float]) -> RotorBody:
     for one in elements:
         sections.append(_section(one, begin, table))
         begin += float(sections[-1].length)
-    end, shaft = begin, len(sections)
+    end = begin
     for one in table.tables("sleeves"):
         sections.append(_section(one, needed(one, "at", PLACE), table, sleeve=True))
     discs = []
@@ -181,26 +178,13 @@ def _shaft(table: Table, places: list[float]) -> RotorBody:
         [x for a, b in itertools.pairwise(points)
          for x in np.linspace(a, b, max(1, math.ceil((b - a) / (LONGEST_ELEMENT * end) - 1e-9)) + 1)], 1e-6 * end,
     )  # fmt: skip
-    middles = (nodes[1:] + nodes[:-1]) / 2
-    layers = [range(shaft), *([number] for number in range(shaft, len(sections)))]
-    sizes = [
-        next((n for n in layer if sections[n].begin < x < sections[n].begin + sections[n].length), -1)
-        for layer in layers
-        for x in middles
-    ]
     count = table.leaf("modes", MODES, MODES.default)
-    numbers = tuple(range(len(nodes)))
-    with precision("double"):  # the bending modes are small differences of stiffnesses
-        model = _shaft_model(sections, discs, nodes, sizes=tuple(sizes), places=numbers, modes=count)
-    shapes = np.asarray(model.shapes)
+    model = shaft_model(sections, discs, nodes, count)
 
     def at(place: float) -> np.ndarray:
-        return shapes[int(np.argmin(np.abs(nodes - place)))]
+        return model.shapes[2 * int(np.argmin(np.abs(nodes - place)))]
 
-    return RotorBody(
-        float(model.m), float(model.I_t), float(model.I_p), float(model.centre), np.asarray(model.frequencies),
-        dampings_of(table, np.full(count, DAMPING.default)), np.asarray(model.gyroscopic), at,
-    )  # fmt: skip
+    return RotorBody(*model[:5], dampings_of(table, np.full(count, DAMPING.default)), model.gyroscopic, at)
 
 
 def _distinct(x: Any, close: float) -> np.ndarray:
