@@ -254,6 +254,15 @@ def test_wrong_arrays_are_refused(tmp_path):
             case_from({"disturbance": {"q_z": {"kind": "table", "file": "x.npz"}}}, folder=tmp_path)
 
 
+@pytest.mark.parametrize("name", ["x.npz", "y.csv"])
+def test_a_link_to_a_file_of_another_ending_is_read(name, tmp_path):
+    with (tmp_path / "data").open("wb") as file:
+        np.savez(file, t=np.arange(2.0), value=np.array([1.0, 3.0])) if name == "x.npz" else file.write(b"0,1\n1,3\n")
+    (tmp_path / name).symlink_to("data")
+    case = case_from({"disturbance": {"q_z": {"kind": "table", "file": name}}}, folder=tmp_path)
+    assert case.scenario.q_z(0.5) == 2.0
+
+
 def test_samples_are_checked_and_converted():
     Samples = amb.signals.Samples
     for times, values, said in (
@@ -277,7 +286,7 @@ def test_samples_are_checked_and_converted():
 def test_parquet_needs_its_extra(tmp_path):
     table = {"disturbance": {"q_z": {"kind": "table", "file": "x.parquet"}}}
     if importlib.util.find_spec("pyarrow") is None:
-        with pytest.raises(ValueError, match=r"needs pyarrow. Install it with: pip install 'ambjax\[tables\]'"):
+        with pytest.raises(ValueError, match=r"pyarrow is not installed. Install it .*'ambjax\[tables\]'"):
             case_from(table, folder=tmp_path)
         return
     from pyarrow import parquet
@@ -297,7 +306,7 @@ def load(table, name="q_z"):
 @pytest.mark.parametrize(
     ("tables", "said"),
     [
-        (load([]), "disturbance.q_z: 0 signals"),
+        (load([]), r"disturbance.q_z = \[\]: it must be a list of 1 to 100 signal tables"),
         (load([STEP, 3]), r"disturbance.q_z\[1\] = 3: it must be a table"),
         (load([STEP | {"unit": "kg"}]), r"q_z\[0\].unit = \"kg\": it must be one of 'm/s\^2', 'N' or"),
         (load(STEP | {"unit": "N"}, "base"), "disturbance.base.unit"),

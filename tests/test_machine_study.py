@@ -157,6 +157,7 @@ def test_shapes_of_modes():
         ({"initial": {"q": {"3": {"normal": 1e-3}}}}, r"axis left.y, \|z\| reaches"),
         ({"bearing": {"top": {"plant": {"A": {"percent": 1}}}}}, "left, right, thrust"),
         ({"bearing": {"thrust": {"x": {"plant": {"A": {"percent": 1}}}}}}, "bearing.thrust.x"),
+        ({"bearing": {"left": {"x": 3}}}, "spread.bearing.left.x = 3: it must be a table"),
         ({"rotor": {"kind": {"percent": 1}}}, "spread.rotor.kind"),
         ({"rotor": {"m": {"uniform": [-1.0, 2.0]}}}, "rotor.m"),
         ({"plant": {"B": {"percent": 1}}}, "plant.B"),

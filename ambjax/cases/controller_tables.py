@@ -181,14 +181,9 @@ def law_from(table: Table, kind: type[Law], base: Law | None) -> Any:
 
 def _schedule(table: Table) -> Schedule:
     table.only(["over", "at", "values"])
-    over = table.choice("over", list(OVER))
-    return Schedule(_numbers(table, "values"), at=_numbers(table, "at"), over=over)
-
-
-def _numbers(table: Table, key: str) -> tuple[float, ...]:
-    if key not in table.raw:
-        raise ValueError(f"{table.at(key)} is missing: a schedule is a table such as {EXAMPLE}.")
-    return tuple(table.column(key, f"a list of numbers, as in {EXAMPLE}"))
+    over, words = table.choice("over", list(OVER)), f"a list of numbers, as in {EXAMPLE}"
+    values, at = (tuple(table.column(key, words)) for key in ("values", "at"))
+    return Schedule(values, at=at, over=over)
 
 
 def notch_from(top: Table, scenario: Scenario) -> SynchronousNotch | None:

@@ -36,13 +36,19 @@ INNER = ("model", "inversion", "current")  # tables beside a custom law
 WAYS, LAWS = ["axes", "rigid-body"], ["cascade", "linear", "lqg"]
 
 
-def merged(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """Return the common table with the keys of another one, recursively. Another `kind` replaces the whole table."""
+def merged(
+    common: dict[str, Any], own: dict[str, Any], joins: Callable[[Any], bool] = lambda x: isinstance(x, dict)
+) -> dict[str, Any]:
+    """Return the common table with the keys of another one, recursively. Another `kind` replaces the whole table.
+
+    `joins`: whether a value is joined with that of the common table, and does not replace it.
+    """
     if "kind" in own and own["kind"] != common.get("kind", own["kind"]):
         return own
     both = dict(common)
     for key, value in own.items():
-        both[key] = merged(both[key], value) if isinstance(value, dict) and isinstance(both.get(key), dict) else value
+        joined = joins(value) and isinstance(both.get(key), dict)
+        both[key] = merged(both[key], value, joins) if joined else value
     return both
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ambjax.cases.axis_case import FROM_ROTOR
+from ambjax.cases.machine_controller import merged
 from ambjax.cases.reader import Case
 from ambjax.cases.rotor_numbers import OF_BEARING, SHAPES, rotor_places
 from ambjax.cases.rotor_tables import COORDINATES, BearingAxis
@@ -36,31 +37,28 @@ def axis_table(raw: dict[str, Any], axis: BearingAxis, name: str) -> tuple[dict[
     The second table is that of the notch, which the case of an axis does not have. `name`: of the bearing. Raises
     ValueError, one line, for a number that an axis does not have of its own.
     """
-    table = raw.get("spread", {})
-    if not isinstance(table, dict):
-        return {"spread": table}, {}
-    own = table.get(OF_BEARING, {}).get(name, {}) if isinstance(table.get(OF_BEARING, {}), dict) else {}
-    own = {key: value for key, value in own.items() if key not in SHAPES} if isinstance(own, dict) else own
-    label = axis.name.removeprefix(f"{name}.")
-    parts = [table, own, own.get(label, {})] if isinstance(own, dict) else [table]
+    table = Table(raw).table("spread")
+    own = table.table(OF_BEARING).table(name)
+    of_axis = own.table(axis.name.removeprefix(f"{name}."))
+    parts = [table.raw, {key: value for key, value in own.raw.items() if key not in SHAPES}, of_axis.raw]
     for key in (*OF_ROTOR, OF_START):
         if any(key in part for part in parts[1:]):
             raise ValueError(f"spread.{OF_BEARING}.{name}.{key}: it belongs to the whole rotor. Spread {key} instead.")
-    merged: dict[str, Any] = {}
+    joined: dict[str, Any] = {}
     for part in parts:
-        merged = _joined(merged, part)
+        joined = merged(joined, part, lambda x: not is_distribution(x))
     dropped = (*OF_ROTOR, OF_START, OF_BEARING, "x", "y", "z")
-    merged = {key: value for key, value in merged.items() if key not in dropped}
-    if ABSENT in merged:
+    joined = {key: value for key, value in joined.items() if key not in dropped}
+    if ABSENT in joined:
         raise ValueError(f"spread.{ABSENT}: the members of a machine do not vary it. Leave it out.")
     for key in FROM_ROTOR:
-        if isinstance(merged.get("plant"), dict) and key in merged["plant"]:
+        if isinstance(joined.get("plant"), dict) and key in joined["plant"]:
             raise ValueError(f"spread.plant.{key}: the rotor gives it. Spread rotor.m instead.")
-    notch, laws = {}, merged.get("controller")
+    notch, laws = {}, joined.get("controller")
     if isinstance(laws, dict) and "notch" in laws:
         notch, laws = {"notch": laws["notch"]}, {key: value for key, value in laws.items() if key != "notch"}
-        merged = {key: laws if key == "controller" else x for key, x in merged.items() if key != "controller" or laws}
-    return {"spread": merged} if merged else {}, notch
+        joined = {key: laws if key == "controller" else x for key, x in joined.items() if key != "controller" or laws}
+    return {"spread": joined} if joined else {}, notch
 
 
 def with_notches(
@@ -82,15 +80,6 @@ def refuse_unused(spread: Spread, output: str) -> None:
     for path, _ in spread.entries:
         if any(f".controller.{part}." in path for part in unused):
             raise ValueError(f"spread.{path}: one law commands all axes, so an axis has none. Leave it out.")
-
-
-def _joined(common: dict[str, Any], own: Any) -> dict[str, Any]:
-    """Return the common table with the distributions of another one, recursively."""
-    both = dict(common)
-    for key, value in own.items() if isinstance(own, dict) else ():
-        nested = not is_distribution(value) and isinstance(both.get(key), dict)
-        both[key] = _joined(both[key], value) if nested else value
-    return both
 
 
 def machine_spread(

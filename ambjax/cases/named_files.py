@@ -15,6 +15,7 @@ from ambjax.cases.own_laws import OwnLaw
 from ambjax.cases.table import Table, file_to_write, quoted, show
 from ambjax.control.linear_controller import state_space_of
 from ambjax.control.realisation import realisation
+from ambjax.host.extensions import extra
 from ambjax.world.recorded import Recorded, Samples
 
 INTERPOLATIONS = ["linear", "held"]
@@ -59,27 +60,25 @@ class CaseFiles:
         table.only(["kind", *KEYS, *extra])
         held = table.choice("interpolation", INTERPOLATIONS, INTERPOLATIONS[0]) == "held"
         scale, start = (table.leaf(name, FIELDS[name], FIELDS[name].default) for name in ("scale", "start"))
-        columns, key = _columns(table), table.at("file")
-        samples = self.contents(key, lambda: _recording(key, table.raw.get("file"), self.folder, columns))
+        columns = _columns(table)
+        samples = self.contents(table.at("file"), lambda: _recording(table, self.folder, columns))
         return Recorded(samples, held, scale, start)
 
 
-def _recording(key: str, written: object, folder: pathlib.Path, columns: tuple[str, str] | None) -> NamedFile:
-    words = f"the path of a file, {quoted(list(READERS))}"
-    if written is None:
-        raise ValueError(f"{key} is missing: give {words}.")
+def _recording(table: Table, folder: pathlib.Path, columns: tuple[str, str] | None) -> NamedFile:
+    written, words = table.raw.get("file"), f"the path of a file, {quoted(list(READERS))}"
     if not isinstance(written, str) or pathlib.PurePath(written).suffix.lower() not in READERS:
-        raise ValueError(f"{key} = {show(written)}: it must be {words}, relative to the case file.")
+        raise table.refuse("file", f"it must be {words}, relative to the case file.")
     convert = lambda file: Samples(*_chosen(READERS[file.suffix.lower()](file), columns))  # noqa: E731
-    return _opened(key, written, folder, convert)
+    return _opened(table.at("file"), written, folder, convert)
 
 
 def _opened(key: str, written: str, folder: pathlib.Path, read: Callable[[pathlib.Path], Any]) -> NamedFile:
-    file = (folder / written).resolve()
+    named = folder / written  # the file that a link leads to may have another ending
     try:
-        return NamedFile(key, written, file, read(file))
+        return NamedFile(key, written, named.resolve(), read(named))
     except OSError as error:
-        unread = f"{file} cannot be read ({error.strerror or error})"
+        unread = f"{named.resolve()} cannot be read ({error.strerror or error})"
         why = f"{unread}. A path is relative to the folder of the case file."
     except ValueError as error:
         why = str(error)
@@ -168,10 +167,7 @@ def npz_arrays(file: pathlib.Path) -> dict[str, np.ndarray]:
 
 
 def _parquet(file: pathlib.Path) -> dict[str, np.ndarray]:
-    try:
-        from pyarrow import lib, parquet  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise ValueError("a Parquet file needs pyarrow. Install it with: pip install 'ambjax[tables]'.") from None
+    lib, parquet = (extra(f"pyarrow.{name}") for name in ("lib", "parquet"))
     try:
         table = parquet.read_table(file)
     except lib.ArrowInvalid:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ambjax.cases.named_files import CaseFiles
 from ambjax.cases.scenario_tables import signal_from
-from ambjax.cases.table import Table, show
+from ambjax.cases.table import Table
 from ambjax.numerics.records import leaf
 from ambjax.world.rotation import GRAM_MM, UnbalanceGrade
 from ambjax.world.rotor import BaseMotion, RotorLoad, RotorUnbalance
@@ -70,8 +70,7 @@ def vector(table: Table, key: str, length: int, default: Any = None) -> np.ndarr
         return np.asarray(default, float)
     value = table.array(key, None, f"a list of {length} numbers")
     if value is None or np.shape(value) != (length,) or not np.all(np.isfinite(np.asarray(value, float))):
-        given = "is missing" if key not in table.raw else f"= {show(table.raw[key])}"
-        raise ValueError(f"{table.at(key)} {given}: it must be a list of {length} numbers.")
+        raise table.refuse(key, f"it must be a list of {length} numbers.")
     return np.asarray(value, float)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from ambjax.cases.named_files import CaseFiles
 from ambjax.cases.speed_table import OWN_SPEED, check_turning, rotation_from, turning_from
-from ambjax.cases.table import Table, show
+from ambjax.cases.table import Table
 from ambjax.numerics.records import leaf
 from ambjax.simulation.clock import Clock
 from ambjax.world import waveforms
@@ -56,12 +56,7 @@ def signal_from(table: Table, unit: str, files: CaseFiles, extra: tuple[str, ...
     kind = table.choice("kind", list(SIGNALS))
     if kind == "sum":
         table.only(["kind", "terms", *extra])
-        terms = table.raw.get("terms")
-        if not isinstance(terms, list) or not terms:
-            raise table.refuse("terms", "it must be a list of at least one signal table.")
-        if len(terms) > MOST_TERMS:
-            raise ValueError(f"{table.at('terms')}: {len(terms)} terms are too many; give at most {MOST_TERMS}.")
-        return waveforms.Sum(tuple(signal_from(part, unit, files) for part in table.tables("terms")))
+        return waveforms.Sum(tuple(signal_from(part, unit, files) for part in _several(table, "terms")))
     if kind == "table":
         return files.signal(table, extra)
     turns = "rotation" in {field.name for field in dataclasses.fields(SIGNALS[kind])}
@@ -91,12 +86,15 @@ def usual_unit(name: str, raw: dict[str, Any]) -> str:
 
 def _each(table: Table, name: str) -> list[Table]:
     """Return the tables of a key: its one table, or its list of tables, written as [[disturbance.q_z]]."""
-    raw = table.raw[name]
-    if not isinstance(raw, list):
-        return [table.table(name)]
-    if not 0 < len(raw) <= MOST_TERMS:
-        raise ValueError(f"{table.at(name)}: {len(raw)} signals; give 1 to {MOST_TERMS}.")
-    return table.tables(name)
+    return _several(table, name) if isinstance(table.raw[name], list) else [table.table(name)]
+
+
+def _several(table: Table, key: str, words: str = "signal tables") -> list[Table]:
+    """Return the tables of a list of 1 to MOST_TERMS."""
+    raw = table.raw.get(key)
+    if not isinstance(raw, list) or not 0 < len(raw) <= MOST_TERMS:
+        raise table.refuse(key, f"it must be a list of 1 to {MOST_TERMS} {words}.")
+    return table.tables(key)
 
 
 def scenario_from(top: Table, plant: Bearing, files: CaseFiles) -> tuple[Scenario, float | None]:
@@ -114,7 +112,7 @@ def scenario_from(top: Table, plant: Bearing, files: CaseFiles) -> tuple[Scenari
         amplifier=_amplifier(actuator),
         clearance=run.leaf("clearance", FIELDS["clearance"]),
         stop=_stop(run),
-        seed=_seed(run),
+        seed=run.leaf("seed", FIELDS["seed"], 0),
         **_disturbances(top.table("disturbance"), files),
     )
     check_turning(scenario)
@@ -165,15 +163,9 @@ def _sensor(table: Table) -> Sensor:
 
 
 def _runout(table: Table) -> Runout:
-    raw = table.raw.get("harmonics")
     table.only(["harmonics", *OWN_SPEED])
-    if not isinstance(raw, list) or not 0 < len(raw) <= MOST_TERMS:
-        given = "is missing" if raw is None else f"= {show(raw)}"
-        raise ValueError(
-            f"{table.at('harmonics')} {given}: it must be a list of 1 to {MOST_TERMS} tables, "
-            "[{ number = 1, amplitude = 1e-6, phase = 0.0 }] for example."
-        )
-    waves = tuple(one.record(Harmonic) for one in table.tables("harmonics"))
+    words = "tables, [{ number = 1, amplitude = 1e-6, phase = 0.0 }] for example"
+    waves = tuple(one.record(Harmonic) for one in _several(table, "harmonics", words))
     return dataclasses.replace(turning_from(table, Runout, ("harmonics",)), harmonics=waves)
 
 
@@ -190,13 +182,6 @@ def _stop(run: Table) -> Stop | None:
     if "stiffness" not in given:
         raise run.refuse("stop_damping", "there is no stop to damp. Give run.stop_stiffness (N/m) too.")
     return Stop(*(run.leaf(f"stop_{name}", field, field.default) for name, field in STOP.items()))
-
-
-def _seed(run: Table) -> int:
-    seed = run.raw.get("seed", 0)
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
-        raise run.refuse("seed", "it must be a whole number from 0 to 4294967295.")
-    return seed
 
 
 def check_start(scenario: Scenario) -> None:

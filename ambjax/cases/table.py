@@ -125,8 +125,9 @@ class Table:
         return f"{self.path}.{cut(key)}" if self.path else cut(key)
 
     def refuse(self, key: str, why: str) -> ValueError:
-        """Return the error that the value of a key is wrong."""
-        return ValueError(f"{self.at(key)} = {show(self.raw.get(key))}: {why}")
+        """Return the error that the value of a key is wrong, or that the key is missing."""
+        given = f"= {show(self.raw[key])}" if key in self.raw else "is missing"
+        return ValueError(f"{self.at(key)} {given}: {why}")
 
     def only(self, allowed: list[str], elsewhere: Iterable[str] = ()) -> None:
         """Raise ValueError for a key that is not in `allowed`, and suggest the one that is meant."""
