@@ -13,7 +13,6 @@ import pytest
 from matplotlib.collections import LineCollection, PolyQuadMesh, QuadMesh
 
 import tuning.report.pictures as tuned
-from ambjax.commands import map as map_command
 from ambjax.ensemble.maps import PERIOD, Axis, Map
 from ambjax.pictures import ensembles, figures, heatmaps
 from ambjax.pictures.ensembles import tornado
@@ -268,7 +267,7 @@ def test_the_cells_of_a_map_lie_at_their_coordinates(path, monkeypatch):
     one = Map(x, y, survival, survival - 0.05, survival + 0.05, error, 0 * error, 0 * survival, 0 * survival, 100)
     other = one._replace(survival=survival[::-1], low=survival[::-1] - 0.05, high=survival[::-1])
     case = types.SimpleNamespace(name="the case", cascade=None, scenario=None)
-    figure = map_command._drawn([case, case], [one, other])
+    figure = case_map.figure_of([case, case], [one, other])
     axes = figure.axes[:3]
     for ax, shown in zip(axes, (survival, survival[::-1], error), strict=True):
         (mesh,) = (c for c in ax.collections if isinstance(c, QuadMesh | PolyQuadMesh))
@@ -293,7 +292,7 @@ def test_the_outlines_of_a_map_follow_the_confidence_bounds():
     x, y = Axis("x", np.arange(4.0)), Axis("y", np.arange(3.0))
     survival, low, high = (np.tile(np.arange(4) >= k, (3, 1)).astype(float) for k in (2, 3, 1))
     one = Map(x, y, survival, low, high, *[0 * survival] * 4, members=100)
-    figure = heatmaps.map_figure([one], [""], "x", "y")
+    figure = heatmaps.map_figure([one], [""], ["", ""])
     outlines = [c for c in figure.axes[0].collections if isinstance(c, LineCollection)]
     places = [{float(segment[0, 0]) for segment in one.get_segments()} for one in outlines]
     assert places == [{2.5}, {2.5}, {0.5}, {0.5}, {1.5}, {1.5}]  # each a line on its white seam

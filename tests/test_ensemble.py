@@ -173,9 +173,9 @@ def run(study, directory, chunk=64, resume=False, stop_after=None):
     store = Store(directory, study.fingerprint(), study.members, chunk)
     store.check(COLUMNS, resume)
     store.begin()
-    for span in store.survey().missing[:stop_after]:
+    for span in store.survey()[0][:stop_after]:
         store.put(span, study.columns(*span, call=64))
-    if not store.survey().missing:
+    if not store.survey()[0]:
         store.finish()
     return directory / "members.npz"
 

@@ -14,10 +14,9 @@ from ambjax.codegen.plant_step import PlantStep
 from ambjax.codegen.trace import in_jax
 from ambjax.codegen.twins import Horizon, LoopCase, farthest, horizons, series
 from ambjax.control.cascade_state import Command
-from ambjax.numerics.records import Scalar, canonical, record, static
+from ambjax.numerics.records import Scalar, canonical, record, replaced, static
 from ambjax.simulation.between import SampledState
-from ambjax.simulation.clock import Clock
-from ambjax.simulation.rollout import begin, segment
+from ambjax.simulation.rollout import run
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import sampled_of
 from ambjax.world.sensor import Errors
@@ -85,9 +84,7 @@ class LoopComparison(NamedTuple):
 # Largest allowed `times`. Correct programs stay below 1 (tests/test_export_verify.py), because every state of a twin is
 # changed, whereas a program rounds only in its arithmetic.
 TIMES = 2.0
-# Samples per call, until the horizon is reached.
-BLOCK = 1000
-begin_jit, segment_jit = jax.jit(begin), jax.jit(segment, static_argnames=("count", "record_every"))
+run_jit = jax.jit(run, static_argnames=("record_every",))
 
 
 def compare(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, LoopComparison]:
@@ -97,12 +94,15 @@ def compare(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, LoopComp
     held, found, host = isinstance(plant, PlantStep), {}, Machines(*machines.values())
     if isinstance(plant, PlantStep):
         case = case._replace(clock=case.clock.with_method(plant.method))
-    given = sampled_of(case.cascade, case.scenario, case.clock)
-    for which, (precision, horizon) in enumerate(horizons(case, list(machines), held=held).items()):
+    given, measured = sampled_of(case.cascade, case.scenario, case.clock), horizons(case, list(machines), held=held)
+    count = max(1, *(horizon.samples for horizon in measured.values()))
+    clock = replaced(case.clock, samples=count)  # one program for both precisions
+    for which, (precision, horizon) in enumerate(measured.items()):
         if held:
-            z = _plant_motion(machines[precision], case, max(horizon.samples, 1))
+            z = _plant_motion(machines[precision], case, count)
         else:
-            z = _displacement(CompiledLoop(**vars(given), which=which, machines=host), case.clock, horizon.samples)
+            system = CompiledLoop(**vars(given), which=which, machines=host)
+            z = np.asarray(run_jit(*canonical((system, clock)), None, record_every=1).trajectory.rows.z)
         found[precision] = LoopComparison(horizon, times_of(z, horizon))
     return found
 
@@ -116,16 +116,6 @@ def times_of(z: np.ndarray, horizon: Horizon) -> float:
     with np.errstate(all="ignore"):
         times = np.where(found == 0, 0.0, found / twins)
     return float(np.max(np.where(np.isnan(times), np.inf, times)))
-
-
-def _displacement(system: CompiledLoop, clock: Clock, count: int) -> np.ndarray:
-    """Return z of a loop over at least its first `count` samples, m."""
-    system, clock = canonical((system, clock))
-    progress, rows, block = begin_jit(system, clock, None), [], min(BLOCK, clock.samples)
-    for first in range(0, max(count, 1), block):
-        progress, row = segment_jit(system, clock, None, progress, first, count=block, record_every=1)
-        rows.append(np.asarray(row.z))
-    return np.concatenate(rows)
 
 
 def _plant_motion(machine: Compiled, case: LoopCase, count: int) -> np.ndarray:

@@ -22,6 +22,7 @@ from ambjax.ensemble.batching import cores
 from ambjax.ensemble.store import Store
 from ambjax.ensemble.study import COLUMNS, AnyStudy, Study
 from ambjax.ensemble.worker import CALL, chunk, ignore_sigint, processes, work
+from ambjax.host.extensions import extra
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
 from ambjax.host.interrupts import reporting, uninterrupted
 from ambjax.host.lock import locked
@@ -136,19 +137,16 @@ def _state_words(store: Store) -> str:
 def _executor(args: argparse.Namespace) -> Iterator[tuple[Executor, int] | None]:
     """Yield an executor and the largest number of its unfinished chunks, or None to run in this process."""
     if args.cluster is not None:
+        distributed = extra("distributed", "cluster")
         try:
-            from distributed import Client, KilledWorker
-        except ImportError:
-            raise ValueError("--cluster: Dask is not installed. Run: pip install 'ambjax[cluster]'.") from None
-        try:
-            client = Client(args.cluster, timeout=PATIENCE)
+            client = distributed.Client(args.cluster, timeout=PATIENCE)
         except (OSError, ValueError) as error:
             advice = "Check the address."
             raise ValueError(f"--cluster {args.cluster}: no scheduler answers there ({error}). {advice}") from None
         try:
             with client:
                 yield client.get_executor(), AHEAD * max(len(client.scheduler_info()["workers"]), 1)
-        except (KilledWorker, CancelledError):
+        except (distributed.KilledWorker, CancelledError):
             why = f"the cluster died, or its workers died repeatedly. {CONTINUE}"
             raise ValueError(f"--cluster {args.cluster}: {why}") from None
     elif args.processes is not None:

@@ -12,7 +12,7 @@ from ambjax.commands.reading import read_any_with_warnings, results
 from ambjax.ensemble.intervals import wilson
 from ambjax.ensemble.maps import CERTAIN, GRIDS, Map
 from ambjax.host.heartbeat import FIRST_RUN, doing, say
-from ambjax.results.case_map import computed, labels, study_and_axes, title
+from ambjax.results.case_map import computed, figure_of, study_and_axes
 from ambjax.results.outputs import directory, drawn, plain, table, write_json
 
 WRITTEN = ("map.png", "map.json")
@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> tuple[int, Mapping[str, object]]:
                 maps.append(computed(case, study, x, y))
         summary = {"cases": [_summary(case, one) for case, one in zip(cases, maps, strict=True)], "out": str(out)}
         write_json(part / "map.json", summary)
-        drawn(part / "map.png", lambda: _drawn(cases, maps), 150)
+        drawn(part / "map.png", lambda: figure_of(cases, maps), 150)
     return 0, plain(summary)
 
 
@@ -82,12 +82,6 @@ def _confidence_note(one: Map) -> str:
     enough = next(n for n in itertools.count(1) if wilson(n, n).low >= CERTAIN)
     runs = f"{one.members} run{'s' * (one.members > 1)} a cell"
     return f"{runs}: too few for a confidence statement about a cell; give --members {enough} or more"
-
-
-def _drawn(cases: Sequence[AnyCase], maps: list[Map]) -> Any:
-    from ambjax.pictures import heatmaps
-
-    return heatmaps.map_figure(maps, list(map(title, cases, maps)), *labels(cases[0], maps[0]))
 
 
 def _summary(case: AnyCase, one: Map) -> Mapping[str, object]:

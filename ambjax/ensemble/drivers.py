@@ -52,7 +52,7 @@ def shares(x: Sequence[np.ndarray], y: Sequence[np.ndarray], confidence: float =
     columns = [np.asarray(column, float) for column in y]
     if not all(np.isfinite(column).all() for column in columns):
         raise ValueError("a column of y is not finite, so its variance is undefined. Pass its ranks instead.")
-    Y = np.stack([_standard(column) for column in columns])
+    Y = np.stack([standard(column) for column in columns])
     terms = _terms(columns)
     results = [_explanation(_cosines(column, TERMS), Y, terms, confidence) for column in x]
     return Shares(*(np.array(part) for part in zip(*results, strict=True)))
@@ -72,8 +72,10 @@ def drivers(
     significant share (None: no pair is significant); and "says", a sentence. Significance is at the level
     1 - confidence for all tests of a metric together (Bonferroni's correction).
     """
-    if not spread:
-        return {name: [] for name in metrics}, {name: _account(0.0, None, "the case has no spread") for name in metrics}
+    empty = not all(len(column) for column in metrics.values())
+    if empty or not spread:
+        says = "no member survives" if empty else "the case has no spread"
+        return {name: [] for name in metrics}, {name: _account(0.0, None, says) for name in metrics}
     x, ranks = list(spread.values()), list(_standard_ranks(list(metrics.values())))
     parts, paths = shares(x, ranks, confidence), list(spread)
     rho = np.clip(_standard_ranks(x) @ np.stack(ranks).T / len(x[0]), -1.0, 1.0)
@@ -118,7 +120,7 @@ def _pairs(
 ) -> list[dict[str, Any] | None]:
     """Return, for each metric, the pair whose interaction has the largest significant share; None: there is none."""
     sample = slice(0, PAIR_MEMBERS)
-    Y = np.stack([_standard(column[sample]) for column in ranks])
+    Y = np.stack([standard(column[sample]) for column in ranks])
     waves = {path: _cosines(x[sample], PAIR_TERMS) for path, x in spread.items()}
     enough = [PAIR_TERMS**2 * (terms >= PAIR_TERMS**2) for terms in _terms(list(Y), PAIR_TERMS**2)]
     couples = list(itertools.combinations(spread, 2))
@@ -178,10 +180,10 @@ def _cosines(column: np.ndarray, terms: int) -> np.ndarray:
 def _standard_ranks(columns: Sequence[np.ndarray]) -> np.ndarray:
     from scipy.stats import rankdata
 
-    return np.stack([_standard(rankdata(column)) for column in columns])
+    return np.stack([standard(rankdata(column)) for column in columns])
 
 
-def _standard(column: np.ndarray) -> np.ndarray:
+def standard(column: np.ndarray) -> np.ndarray:
     """Scale a column to mean 0 and mean square 1; return zeros if all values are equal."""
     x = column - column.mean()
     size = np.abs(x).max()

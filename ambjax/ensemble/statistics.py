@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ambjax.ensemble.drivers import drivers
+from ambjax.ensemble.drivers import drivers, standard
 from ambjax.ensemble.intervals import STATISTICS, TAIL, Estimate, bootstrap, column_of, quantile, wilson
 
 # Level of the CVaR: the mean of the largest values, which are a share of 1 - ALPHA of all values.
@@ -66,7 +66,9 @@ def summary(
     survivors = int(np.sum(~ended))
     held = {name: x[~ended] for name, x in metrics.items()}
     spread = {path: column_of(columns[SPREAD + path]) for path in spread_names}
-    ranking, accounts = _drivers(spread, held, lost_at, confidence)
+    alive = {path: x[~ended] for path, x in spread.items()}
+    found = drivers(alive, held, confidence), drivers(spread, {"lost_at_s": lost_at}, confidence)
+    ranking, accounts = (of_held | of_all for of_held, of_all in zip(*found, strict=True))
     return {
         "members": len(lost_at),
         "survivors": survivors,
@@ -84,21 +86,6 @@ def summary(
     }
 
 
-def _drivers(
-    spread: dict[str, np.ndarray], held: dict[str, np.ndarray], lost_at: np.ndarray, confidence: float
-) -> tuple[Mapping[str, object], Mapping[str, object]]:
-    """Return the drivers of each metric, computed from the survivors, and of lost_at_s, computed from all members."""
-    ended = np.isfinite(lost_at)
-    if ended.all():
-        nothing = {"alone": 0.0, "pair": None, "says": "no member survives"}
-        parts = [({name: [] for name in held}, {name: dict(nothing) for name in held})]
-    else:
-        parts = [drivers({path: x[~ended] for path, x in spread.items()}, held, confidence)]
-    parts.append(drivers(spread, {"lost_at_s": lost_at}, confidence))
-    ranking, accounts = ({name: x for part in parts for name, x in part[k].items()} for k in (0, 1))
-    return ranking, accounts
-
-
 def _notes(n: int, metrics: Mapping[str, np.ndarray], confidence: float) -> list[str]:
     """Return notes on statistics that may mislead: of equal members, of the CVaR, and of the std of heavy tails."""
     if not n:
@@ -112,22 +99,13 @@ def _notes(n: int, metrics: Mapping[str, np.ndarray], confidence: float) -> list
             f"the worst 5 % are {tail:.3g} survivors: the {level} interval of their mean may have a lower coverage or "
             f"no upper end; use at least {least} survivors"
         )
-    heavy = [name for name, x in metrics.items() if np.isfinite(x).all() and _kurtosis(x) > HEAVY]
+    heavy = [name for name, x in metrics.items() if np.isfinite(x).all() and np.mean(standard(x) ** 4) > HEAVY]
     if heavy:
         which = ", ".join(heavy[:3]) + f" and {len(heavy) - 3} more" * (len(heavy) > 3)
         at = max((k for k in COVERED if k <= n), default=min(COVERED))
         covered = f"a 95 % interval covers {COVERED[at]} % for lognormal values of {at:,} members"
         notes.append(f"heavy tails ({which}): the interval of a standard deviation is too short; {covered}")
     return notes
-
-
-def _kurtosis(x: np.ndarray) -> float:
-    """Return the kurtosis of x [N], m_4/m_2^2 with the central moments m_k; 0 if all values are equal."""
-    size = np.abs(x - x.mean()).max()
-    if size <= 1e-14 * np.abs(x).max():
-        return 0.0
-    d = (x - x.mean()) / size
-    return float(np.mean(d**4) / np.mean(d**2) ** 2)
 
 
 def _number(x: float | np.ndarray) -> float | None:

@@ -12,20 +12,12 @@ import json
 import os
 import pathlib
 import shutil
-from typing import NamedTuple
 
 from ambjax.ensemble.chunks import Chunks, Span, check_whole, kinds_of
 from ambjax.host.sealed import CHECKSUM, Arrays, DamagedError, checksum_of, difference, write_whole
 
 MANIFEST = "study.json"
 RESULT = "members.npz"
-
-
-class Survey(NamedTuple):
-    """Chunks that must be computed, in order, and one remark for each damaged file."""
-
-    missing: list[Span]
-    remarks: list[str]
 
 
 class Store:
@@ -79,8 +71,11 @@ class Store:
         self.chunk = chunk
         self._write_manifest()
 
-    def survey(self) -> Survey:
-        """Return the missing and damaged chunks. Reads every chunk and verifies its checksum and its columns."""
+    def survey(self) -> tuple[list[Span], list[str]]:
+        """Return the chunks that must be computed, in order, and one remark for each damaged file.
+
+        Reads every chunk and verifies its checksum and its columns.
+        """
         parts, missing, remarks, layouts = self.parts, [], list[str](), dict[Span, str]()
         if self.result:
             reason = "its checksum is wrong" if self.path.exists() else "the file is missing"
@@ -102,7 +97,7 @@ class Store:
                     f"{span[1] - 1} are computed again"
                 )
                 missing.append(span)
-        return Survey(sorted(missing), remarks)
+        return sorted(missing), remarks
 
     @property
     def parts(self) -> Chunks:

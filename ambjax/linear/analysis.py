@@ -28,7 +28,7 @@ from ambjax.linear.margins import (
 from ambjax.linear.matrices import loop_matrices, rest
 from ambjax.linear.state_space import StateSpace
 from ambjax.numerics.declared import require_number
-from ambjax.numerics.records import Scalar, canonical, leaf, record, require_concrete
+from ambjax.numerics.records import Scalar, bounded, canonical, positive, record, require_concrete
 from ambjax.numerics.shapes import require_one_member, varying
 from ambjax.simulation.clock import Clock, takes_case
 from ambjax.simulation.rollout import prepare
@@ -46,31 +46,20 @@ class Zones:
     as secondary sources cite them.
     """
 
-    f_low: Scalar = leaf(default=1.0, unit="Hz", above=0, at_most=1e6, doc="lowest frequency; 0 is always included")
-    f_high: Scalar | None = leaf(
-        default=None,
-        unit="Hz",
-        above=0,
-        at_most=1e6,
-        doc="highest frequency; none: 0.45 of the sampling rate, in continuous time where |S - 1| has decayed",
+    f_low: Scalar = positive(1.0, "Hz", 1e6, "lowest frequency; 0 is always included")
+    f_high: Scalar | None = positive(
+        None,
+        "Hz",
+        1e6,
+        "highest frequency; none: 0.45 of the sampling rate, in continuous time where |S - 1| has decayed",
     )
-    amplitude: Scalar | None = leaf(
-        default=None, unit="m", above=0, at_most=1, doc="amplitude of an injected multi-sine; none: 1 % of the gap s_0"
-    )
-    zone_a: Scalar = leaf(
-        default=3.0, unit="1", at_least=1, at_most=1e3, doc="upper limit of zone A for the peak of |S|"
-    )
-    zone_b: Scalar = leaf(default=4.0, unit="1", at_least=1, at_most=1e3, doc="upper limit of zone B")
-    zone_c: Scalar = leaf(
-        default=5.0, unit="1", at_least=1, at_most=1e3, doc="upper limit of zone C; above it is zone D"
-    )
-    clearance_a: Scalar = leaf(
-        default=0.3, unit="1", above=0, at_most=1, doc="upper limit of zone A for max |z| as a share of the clearance"
-    )
-    clearance_b: Scalar = leaf(default=0.4, unit="1", above=0, at_most=1, doc="upper limit of zone B")
-    clearance_c: Scalar = leaf(
-        default=0.5, unit="1", above=0, at_most=1, doc="upper limit of zone C; above it is zone D"
-    )
+    amplitude: Scalar | None = positive(None, "m", 1, "amplitude of an injected multi-sine; none: 1 % of the gap s_0")
+    zone_a: Scalar = bounded(3.0, "1", 1, 1e3, "upper limit of zone A for the peak of |S|")
+    zone_b: Scalar = bounded(4.0, "1", 1, 1e3, "upper limit of zone B")
+    zone_c: Scalar = bounded(5.0, "1", 1, 1e3, "upper limit of zone C; above it is zone D")
+    clearance_a: Scalar = positive(0.3, "1", 1, "upper limit of zone A for max |z| as a share of the clearance")
+    clearance_b: Scalar = positive(0.4, "1", 1, "upper limit of zone B")
+    clearance_c: Scalar = positive(0.5, "1", 1, "upper limit of zone C; above it is zone D")
 
     def check(self, period: Scalar | None) -> None:
         """Raise ValueError if the limits are not in ascending order, or as `range` does."""

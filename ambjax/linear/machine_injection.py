@@ -18,15 +18,7 @@ from ambjax.linear.analysis import Zones
 from ambjax.linear.injection import Injection, frequency_lines, injection_of
 from ambjax.linear.linear_machine import machine_rest
 from ambjax.linear.machine_at_speed import MachineRest
-from ambjax.linear.member_responses import (
-    AMPLITUDE,
-    FourierSums,
-    MultiSine,
-    Response,
-    multisine,
-    padded,
-    responses_of,
-)
+from ambjax.linear.member_responses import AMPLITUDE, FourierSums, MultiSine, Response, multisine, padded, responses_of
 from ambjax.numerics.records import Scalar, canonical, replaced
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.loop import ClosedLoop

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ambjax.host.extensions import extra
 from ambjax.numerics.records import Scalar
 from ambjax.numerics.small_matrices import array_module, held, solve
 
@@ -182,12 +183,7 @@ class StateSpace(NamedTuple):
 
         Raises ValueError if python-control is not installed (extra `[control]`).
         """
-        try:
-            import control
-        except ImportError:
-            raise ValueError(
-                "to_control: python-control is not installed. Install it with: pip install 'ambjax[control]'."
-            ) from None
+        control = extra("control", "control")
         matrices = [np.asarray(x) for x in (self.A, self.B, self.C, self.D)]
         step = 0 if self.period is None else float(self.period)
         return control.StateSpace(*matrices, step, inputs=list(INPUTS), outputs=list(OUTPUTS))

@@ -77,6 +77,11 @@ def bounded(default: object, unit: str, at_least: float, at_most: float, doc: st
     return leaf(default, unit=unit, at_least=at_least, at_most=at_most, doc=doc, **more)
 
 
+def positive(default: object, unit: str, at_most: float, doc: str, **more: Any) -> Any:
+    """Declare a numeric field with a default and values above 0. The arguments are those of `leaf`."""
+    return leaf(default, unit=unit, above=0, at_most=at_most, doc=doc, **more)
+
+
 def matrix(shape: str, doc: str, **more: Any) -> Any:
     """Declare a field with a matrix or a vector of any size. The arguments are those of `leaf`."""
     return leaf(shape=shape, at_least=-1e30, at_most=1e30, doc=doc, **more)

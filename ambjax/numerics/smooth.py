@@ -1,6 +1,6 @@
 """Smooth replacements of functions with discontinuous or unbounded derivatives, and fast vectorised functions."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -56,38 +56,25 @@ def reciprocal(x: Array) -> Array:
     return refined_reciprocal(x)
 
 
-@reciprocal.defjvp
-def _reciprocal_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    value = reciprocal(*primals)
-    return value, -(value * value) * tangents[0]
+reciprocal.defjvps(lambda dx, value, _: -(value * value) * dx)
 
 
-@jax.custom_jvp
-def larger(a: Scalar, b: Scalar) -> Array:
-    """Return `jnp.maximum(a, b)`, with the derivative of a where a >= b, otherwise that of b.
+def _extreme(of: Callable[..., Array], first: Callable[..., Array]) -> Callable[[Scalar, Scalar], Array]:
+    """Return the function `of` (a, b) with the derivative of a where first(a, b), otherwise that of b.
 
     JAX's rule compares the result with a and b. If XLA computes an argument twice with different rounding, the result
     equals neither, and reverse mode returns 0.
     """
-    return jnp.maximum(a, b)
+    extreme = jax.custom_jvp(lambda a, b: of(a, b))
+
+    @extreme.defjvp
+    def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+        return extreme(*primals), jnp.where(first(*primals), *tangents)
+
+    return extreme
 
 
-@larger.defjvp
-def _larger_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    (a, b), (da, db) = primals, tangents
-    return larger(a, b), jnp.where(a >= b, da, db)
-
-
-@jax.custom_jvp
-def smaller(a: Scalar, b: Scalar) -> Array:
-    """Return `jnp.minimum(a, b)`, with the derivative of a where a <= b, otherwise that of b; see `larger`."""
-    return jnp.minimum(a, b)
-
-
-@smaller.defjvp
-def _smaller_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    (a, b), (da, db) = primals, tangents
-    return smaller(a, b), jnp.where(a <= b, da, db)
+larger, smaller = _extreme(jnp.maximum, jnp.greater_equal), _extreme(jnp.minimum, jnp.less_equal)
 
 
 def polynomial(u: Array, coefficients: Sequence[Scalar]) -> Scalar:
@@ -161,16 +148,8 @@ def cosine(x: Array) -> Array:
     return _quarter(0.25 - jnp.abs(_reduced_angle(x)))
 
 
-@sine.defjvp
-def _sine_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    (x,), (dx,) = primals, tangents
-    return sine(x), TWO_PI * cosine(x) * dx
-
-
-@cosine.defjvp
-def _cosine_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    (x,), (dx,) = primals, tangents
-    return cosine(x), -TWO_PI * sine(x) * dx
+sine.defjvps(lambda dx, _, x: TWO_PI * cosine(x) * dx)
+cosine.defjvps(lambda dx, _, x: -TWO_PI * sine(x) * dx)
 
 
 def smooth_sign(x: Scalar, p: Scalar | None, per: Scalar = 1.0) -> Array:

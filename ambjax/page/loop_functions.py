@@ -125,15 +125,8 @@ class LoopPoint(NamedTuple):
     e: Array
 
 
-class PointValues(NamedTuple):
-    """Rates of the plant and its lags, next states of the laws, commanded voltage u (V), and reading of z (m)."""
-
-    rates: LagState
-    control: CascadeState
-    u: Array
-    z: Array
-
-
+# Rates of the plant and its lags, next states of the laws, commanded voltage u (V), and reading of z (m).
+PointValues: TypeAlias = tuple[LagState, CascadeState, Array, Array]
 # An equilibrium: state of the plant and its lags, voltage (V), states of the laws.
 EquilibriumPoint: TypeAlias = tuple[LagState, Array, CascadeState]
 
@@ -168,7 +161,7 @@ def _values(numbers: Numbers, x: LoopPoint) -> PointValues:
     measured = x.lagged.read(scenario, (x.e, jnp.zeros(())))
     sample = Sample(at_rest(0.0), jnp.asarray(numbers.period), jnp.asarray(jnp.inf), x.past)
     command, control, _ = numbers.cascade.step(measured, x.control, sample)
-    return PointValues(rates._replace(plant=scenario.plant.rates(x.lagged.plant, u)), control, command.u, measured.z)
+    return rates._replace(plant=scenario.plant.rates(x.lagged.plant, u)), control, command.u, measured.z
 
 
 def _ideal(numbers: Numbers) -> Numbers:

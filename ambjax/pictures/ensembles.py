@@ -20,12 +20,9 @@ from ambjax.simulation.metrics import REACHED
 # Quantities of a fan chart: label and SI unit.
 QUANTITIES = {
     "z - r": ("$z - r$", "m"),
-    "z": ("position $z$", "m"),
     "sigma": (r"sliding variable $\sigma$", "m/s"),
     "u": ("voltage $u$", "V"),
-    "i": ("current $i$", "A"),
     "variation of u": ("variation of $u$", "V/s"),
-    "v_tilde": (r"force error $\tilde v$", "A²/m²"),
 }
 # Metrics that are drawn by default.
 CHIEF = (

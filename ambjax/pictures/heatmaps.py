@@ -27,35 +27,33 @@ EMPTY_CELL = {"facecolor": "#d4d4d4", "edgecolor": "#8a8a8a", "hatch": "////", "
 
 
 @own_style
-def map_figure(maps: Sequence[Map], titles: Sequence[str], x_label: str, y_label: str) -> Figure:
-    """Return heat maps side by side: survival above, the error below. `titles`: one of each map.
+def map_figure(maps: Sequence[Map], titles: Sequence[str], units: Sequence[str]) -> Figure:
+    """Return heat maps side by side: survival above, the error below. `titles`: of each map. `units`: of x and y, SI.
 
     The bounds of the confidence interval are drawn if a map is decisive; without them the contour encloses the cells in
-    which all runs survive, instead of those in which a share of CONTOUR survives. A survival of NaN: not run. A label
-    that ends in an SI unit, such as "z (m)", gets a prefix. All maps of a row share the colours. Raises ValueError if a
-    log axis has values that are not positive.
+    which all runs survive, instead of those in which a share of CONTOUR survives. All maps of a row share the colours.
     """
     figure = Figure(figsize=(max(3.9 * len(maps) + 1.4, 6.5), 7.7), layout="constrained")
     axes = figure.subplots(2, len(maps), squeeze=False)
-    labels, norm = (x_label, y_label), Normalize(0, 100)
+    norm = Normalize(0, 100)
     for ax, one, title in zip(axes[0], maps, titles, strict=True):
-        _cells(ax, one, 100 * one.survival, norm, SURVIVAL, labels)
+        _cells(ax, one, 100 * one.survival, norm, SURVIVAL, units)
         ax.set_title(f"{title}\n{_range(one)}", fontsize=10)
     figure.colorbar(ScalarMappable(norm, SURVIVAL), ax=list(axes[0]), label="survival (%)", pad=0.02)
-    _errors(figure, axes[1], maps, labels)
+    _errors(figure, axes[1], maps, units)
     keys: list[Any] = [Line2D([], [], color=INK, linewidth=LINES["survival"], label=_contour_words(maps))]
     if any(one.decisive for one in maps):
         words = "bounds of the confidence interval at 95 %"
         keys.append(Line2D([], [], color=INK, linewidth=LINES["low"], label=words))
     if any(np.any(one.unstable) for one in maps):
         keys.append(Patch(label="held, but not stable", **UNSTABLE_CELL))
-    if empty := _empty_words(maps):
-        keys.append(Patch(label=empty, **EMPTY_CELL))
+    if not all(np.isfinite(one.error).all() for one in maps):
+        keys.append(Patch(label="no survivor", **EMPTY_CELL))
     figure.legend(handles=keys, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     return figure
 
 
-def _errors(figure: Figure, axes: Sequence[Axes], maps: Sequence[Map], labels: tuple[str, str]) -> None:
+def _errors(figure: Figure, axes: Sequence[Axes], maps: Sequence[Map], units: Sequence[str]) -> None:
     values = np.concatenate([np.ravel(one.error) for one in maps])
     values = values[np.isfinite(values) & (values > 0)]
     factor, words, unit = axis_of("settled_max_abs_error_m", size_of(values, log=True))
@@ -65,18 +63,18 @@ def _errors(figure: Figure, axes: Sequence[Axes], maps: Sequence[Map], labels: t
     norm = LogNorm(low, high)
     for ax, one in zip(axes, maps, strict=True):
         error = factor * one.error
-        _cells(ax, one, np.where(error == 0, low, error), norm, ERROR, labels)
+        _cells(ax, one, np.where(error == 0, low, error), norm, ERROR, units)
     if values.size:
         bar = figure.colorbar(ScalarMappable(norm, ERROR), ax=list(axes), label=f"{words} ({unit})", pad=0.02)
         log_ticks(bar.ax.yaxis, low, high)
         bar.ax.minorticks_off()
 
 
-def _cells(ax: Axes, one: Map, values: np.ndarray, norm: Normalize, colours: str, labels: tuple[str, str]) -> None:
+def _cells(ax: Axes, one: Map, values: np.ndarray, norm: Normalize, colours: str, units: Sequence[str]) -> None:
     """Draw one heat map with its axes and contours. Cells that are not finite show the hatched background."""
-    (_, x, x_log), (_, y, y_log) = one.x, one.y
-    x_factor, x_label = label_of(labels[0], size_of(x, x_log))
-    y_factor, y_label = label_of(labels[1], size_of(y, y_log))
+    (x_path, x, x_log), (y_path, y, y_log) = one.x, one.y
+    x_factor, x_label = label_of(x_path, units[0], size_of(x, x_log))
+    y_factor, y_label = label_of(y_path, units[1], size_of(y, y_log))
     x_edges, y_edges = edges(x_factor * x, x_log), edges(y_factor * y, y_log)
     ax.patch.set(**EMPTY_CELL)
     ax.set(xscale="log" if x_log else "linear", yscale="log" if y_log else "linear")
@@ -110,14 +108,6 @@ def _outline(ax: Axes, x_edges: np.ndarray, y_edges: np.ndarray, inside: np.ndar
         ax.add_collection(lines, autolim=False)
 
 
-def _empty_words(maps: Sequence[Map]) -> str:
-    """Return what the hatched cells of the maps show: cells that were not run, cells without a survivor, or both."""
-    unrun = [np.isnan(one.survival) for one in maps]
-    lost = [~np.isfinite(one.error) & ~cells for one, cells in zip(maps, unrun, strict=True)]
-    words = {"not run": unrun, "no survivor": lost}
-    return " or ".join(word for word, cells in words.items() if any(one.any() for one in cells))
-
-
 def _contour_words(maps: Sequence[Map]) -> str:
     decisive = [one.decisive for one in maps]
     if all(decisive):
@@ -127,9 +117,5 @@ def _contour_words(maps: Sequence[Map]) -> str:
 
 def _range(one: Map) -> str:
     """Return in words in how many cells enough runs survive. Without a contour, this tells whether all or none do."""
-    cells = one.survival[np.isfinite(one.survival)]
-    if not cells.size:
-        return "no cell was run"
-    if not one.decisive:
-        return f"all runs survive in {int(np.sum(cells == 1))} of {cells.size} cells"
-    return f"95 % or more survive in {int(np.sum(cells >= CONTOUR))} of {cells.size} cells"
+    words, level = ("95 % or more survive", CONTOUR) if one.decisive else ("all runs survive", 1)
+    return f"{words} in {np.sum(one.survival >= level)} of {one.survival.size} cells"

@@ -102,19 +102,10 @@ def _typeset(unit: str) -> str:
     return re.sub(r"\^(2|3)(?![.\d])", lambda power: "²³"[int(power[1]) - 2], unit).replace("ohm", "Ω")
 
 
-def label_of(label: str, size: float) -> tuple[float, str]:
-    """Return factor and label of an axis whose label ends in its SI unit.
-
-    For example, "initial z (m)" of size 2e-5 becomes "initial z (µm)". The power in m/s^2 becomes m/s²; the unit 1 is
-    omitted.
-    """
-    match = re.fullmatch(r"(.*)\(([^()]*)\)\s*", label)
-    if not match:
-        return 1.0, label
-    if match[2] == "1":
-        return 1.0, match[1].rstrip()
-    factor, unit = prefix_of(_typeset(match[2]), size)
-    return factor, f"{match[1]}({unit})"
+def label_of(path: str, unit: str, size: float) -> tuple[float, str]:
+    """Return factor and label of an axis: (1e6, "initial.z (µm)") for m of size 2e-5. The unit 1 is omitted."""
+    factor, unit = prefix_of(_typeset(unit), size)
+    return factor, path if unit in ("", "1") else f"{path} ({unit})"
 
 
 def digits(value: float) -> str:
@@ -123,17 +114,10 @@ def digits(value: float) -> str:
 
 
 def edges(centres: np.ndarray, log: bool) -> np.ndarray:
-    """Return the n + 1 edges halfway between n ascending centres, on a logarithmic scale if `log`."""
-    centres = np.asarray(centres, float)
-    if log and not np.all(centres > 0):
-        raise ValueError(f"a log axis cannot show {centres.min():g}: use positive values, or a linear axis")
+    """Return the n + 1 edges halfway between n ascending centres, n > 1, on a logarithmic scale if `log`."""
     c = np.log(centres) if log else centres
-    if len(c) == 1:
-        half = 0.5 if log else 0.1 * abs(c[0]) or 1.0
-        bounds = np.array([c[0] - half, c[0] + half])
-    else:
-        middle = (c[1:] + c[:-1]) / 2
-        bounds = np.concatenate([[2 * c[0] - middle[0]], middle, [2 * c[-1] - middle[-1]]])
+    middle = (c[1:] + c[:-1]) / 2
+    bounds = np.concatenate([[2 * c[0] - middle[0]], middle, [2 * c[-1] - middle[-1]]])
     return np.exp(bounds) if log else bounds
 
 

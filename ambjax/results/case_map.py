@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -63,9 +64,7 @@ class CaseMap:
 
     def plot(self) -> Any:
         """Return a matplotlib Figure with heat maps of the survival and of the error, as map.png shows them."""
-        from ambjax.pictures.heatmaps import map_figure
-
-        return map_figure([self.map], [title(self.case, self.map)], *labels(self.case, self.map))
+        return figure_of([self.case], [self.map])
 
     def _repr_html_(self) -> str:
         one = self.map
@@ -154,14 +153,11 @@ def title(case: AnyCase, one: Map) -> str:
     return words + f"; {int(one.stalled.sum())} runs not decided" * bool(one.stalled.any())
 
 
-def labels(case: AnyCase, one: Map) -> tuple[str, str]:
-    """Return the labels of x and y with their units."""
+def figure_of(cases: Sequence[AnyCase], maps: Sequence[Map]) -> Any:
+    """Return the picture of the maps of cases over the same axes."""
+    from ambjax.pictures.heatmaps import map_figure
 
-    def label(axis: Axis) -> str:
-        unit = unit_of(case, axis)
-        return f"{axis.path} ({unit})" if unit else axis.path
-
-    return label(one.x), label(one.y)
+    return map_figure(maps, list(map(title, cases, maps)), [unit_of(cases[0], axis) for axis in (maps[0].x, maps[0].y)])
 
 
 def _axis(flag: str, text: str, case: AnyCase) -> Axis:

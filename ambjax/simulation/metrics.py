@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from jax import Array
 
-from ambjax.numerics.records import Scalar, bounded, is_traced, leaf, part, record, static
+from ambjax.numerics.records import Scalar, bounded, is_traced, leaf, part, positive, record, static
 from ambjax.simulation import response
 from ambjax.simulation.clock import Clock, Triple
 from ambjax.simulation.folds import Count, Driven, Ending, Fold, Named, Peak, Reaching, Rms, Variation
@@ -55,12 +55,10 @@ class Metrics:
     """
 
     settle: Scalar = bounded(0.5, "s", 0, 1e6, "time from which metrics count as settled")
-    touchdown: Scalar = leaf(
-        default=4.5e-3, unit="m", above=0, at_most=1.0, doc="clearance; `clearance_used` is |z| as a share of it"
-    )
-    sigma_band: Scalar = leaf(default=1e-3, unit="m/s", above=0, at_most=1e30, doc="|sigma| that counts as zero")
-    v_tilde_band: Scalar = leaf(default=0.1, unit="A^2/m^2", above=0, at_most=1e30, doc="|v_tilde| that counts as zero")
-    e_band: Scalar = leaf(default=1e-3, unit="A", above=0, at_most=1e6, doc="|current error| that counts as zero")
+    touchdown: Scalar = positive(4.5e-3, "m", 1.0, "clearance; `clearance_used` is |z| as a share of it")
+    sigma_band: Scalar = positive(1e-3, "m/s", 1e30, "|sigma| that counts as zero")
+    v_tilde_band: Scalar = positive(0.1, "A^2/m^2", 1e30, "|v_tilde| that counts as zero")
+    e_band: Scalar = positive(1e-3, "A", 1e6, "|current error| that counts as zero")
     largest_force: Scalar = leaf(
         default=float("inf"),
         unit="N",
