@@ -204,8 +204,7 @@ class _Members:
 
 def _first(eqn: JaxprEqn) -> Array:
     """Return index 0, with the type of the equation's last operand, an index."""
-    index: Any = eqn.invars[-1].aval
-    return jnp.zeros((), index.dtype)
+    return jnp.zeros((), jnp.result_type(eqn.invars[-1].aval))
 
 
 def _flagged(eqn: JaxprEqn, results: Any, moves: bool) -> Flagged:
