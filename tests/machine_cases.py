@@ -19,9 +19,8 @@ def processor(**keys):
 MACHINES = {
     # the paper's cascade on four axes, default gains, a delay of one sample with prediction; off centre and tilted
     "rigid": {
-        "plant": RIG, "rotor": SHORT, "bearing": [LEFT, RIGHT], "processor": processor(delay=1.0),
+        "plant": RIG, "rotor": SHORT, "bearing": [LEFT, RIGHT], "processor": processor(delay=1.0), "clock": CLOCK,
         "initial": {"q": [3e-5, -4e-5, 0.0, 1e-4, -5e-5]},
-        "clock": CLOCK,
     },
     # a disc: I_p above I_t, 12,000 rpm; PID, linearised inversion, PI; no prediction; sensors apart; a limited supply;
     # own gains and an own magnet on the right; currents that do not begin at 0

@@ -101,8 +101,8 @@ def test_what_has_changed_is_not_reused(world, change):
 
 
 def test_a_case_without_gains_is_taken_as_it_is(world, capsys):
-    own = re.sub(r"damp: .*", "", re.sub(r"stiff: .*", 'demand = "voltage"', LAW))
-    pathlib.Path("own.py").write_text(own.replace("self.stiff", "1e4").replace("self.damp", "400.0"))
+    own = re.sub(r"damp: .*", "", re.sub(r"spring: .*", 'demand = "voltage"', LAW))
+    pathlib.Path("own.py").write_text(own.replace("self.spring", "1e4").replace("self.damp", "400.0"))
     stages = {"position": "own.py:PD", "inversion": "linearised", "current": "open-loop"}
     laws = {stage: {"kind": kind} for stage, kind in stages.items()}
     raw = {name: table for name, table in document().items() if name != "tune"}

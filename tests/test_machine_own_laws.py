@@ -19,13 +19,13 @@ LAWS = (
 
 @record
 class Whole(MachineLaw):
-    stiff: float = gain(default=1e4, unit="1/s^2", doc="proportional gain")
+    spring: float = gain(default=1e4, unit="1/s^2", doc="proportional gain")
     damp: float = gain(default=400.0, unit="1/s", doc="derivative gain")
     mass: object = leaf(default=None, shape="c", unit="kg", at_least=0, at_most=1e6, optional=True, doc="of the axes")
 
     def designed(self, rotor):
         B = rotor.at_magnets
-        return type(self)(self.stiff, self.damp, 1 / jnp.sum(B * jnp.linalg.solve(rotor.M, B.T).T, 1))
+        return type(self)(self.spring, self.damp, 1 / jnp.sum(B * jnp.linalg.solve(rotor.M, B.T).T, 1))
 
     def scale(self):
         return jnp.ones_like(self.mass)
@@ -34,8 +34,8 @@ class Whole(MachineLaw):
         return 0.0 * measured.z
 
     def __call__(self, measured, state, inputs):
-        wanted = -self.stiff * measured.z - self.damp * measured.z_dot - state
-        return demand_of(inputs.scaled(self.mass * wanted), measured), 10 * self.stiff * measured.z
+        wanted = -self.spring * measured.z - self.damp * measured.z_dot - state
+        return demand_of(inputs.scaled(self.mass * wanted), measured), 10 * self.spring * measured.z
 """
 )
 INNER = {"inversion": {"kind": "closed-form"}, "current": {"kind": "pi"}}
@@ -55,8 +55,8 @@ def read(tmp_path):
 
 @pytest.mark.slow
 def test_a_law_of_the_machine_that_treats_every_axis_alike_equals_that_law_on_each_axis(read):
-    each = read({"position": {"kind": "mine.py:PD", "stiff": 3e4, "damp": 300.0}})
-    whole = read({"kind": "mine.py:Whole", "stiff": 3e4, "damp": 300.0})
+    each = read({"position": {"kind": "mine.py:PD", "spring": 3e4, "damp": 300.0}})
+    whole = read({"kind": "mine.py:Whole", "spring": 3e4, "damp": 300.0})
     assert [law.law.__name__ for case in (each, whole) for law in case.own_laws] == ["PD", "Whole"]
     signals = [simulate_machine(case).signals for case in (each, whole)]
     assert np.ptp(signals[0]["z"][:, 0]) > 1e-5

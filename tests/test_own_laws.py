@@ -27,7 +27,7 @@ print("a remark of the file")
 class PD(PositionLaw):
     """Proportional and derivative, with an integral."""
 
-    stiff: float = gain(default=1e4, unit="1/s^2", doc="proportional gain")
+    spring: float = gain(default=1e4, unit="1/s^2", doc="proportional gain")
     damp: float = gain(default=400.0, unit="1/s", doc="derivative gain")
 
     def init(self, model):
@@ -40,12 +40,12 @@ class PD(PositionLaw):
         return self.damp
 
     def sigma(self, motion, reference):
-        return motion.z_dot - reference.r_dot + self.stiff / self.damp * (motion.z - reference.r)
+        return motion.z_dot - reference.r_dot + self.spring / self.damp * (motion.z - reference.r)
 
     def __call__(self, model, inputs, state):
         motion, reference = inputs
         wanted = -self.damp * self.sigma(motion, reference) - state
-        return force_for(0.0, model, motion, reference, wanted), 10 * self.stiff * (motion.z - reference.r)
+        return force_for(0.0, model, motion, reference, wanted), 10 * self.spring * (motion.z - reference.r)
 '''
 CASE = """
 processor = { delay = 1.0 }
@@ -77,7 +77,7 @@ def case(elsewhere):
         thorough("ensemble --members 3 --out there"),
         thorough("check"),
         thorough("sensitivity --out there"),
-        thorough("map --x controller.position.stiff=8e3:1e4:2 --y plant.m=-1%:1%:2"),
+        thorough("map --x controller.position.spring=8e3:1e4:2 --y plant.m=-1%:1%:2"),
         "export --out there",
     ],
 )
@@ -131,7 +131,8 @@ WRONG = {
                    "mine.py:PD", ["non-default argument 'damp' follows", "(line 8)"]),
     "a field that is no gain": (LAW.replace("@record", "@record", 1).replace(
         "    def init", "    name: str = 'x'\n\n    def init", 1), "mine.py:PD", ["PD.name: declare it by gain(...)"]),
-    "the name kind": (LAW.replace("stiff", "kind"), "mine.py:PD", ["PD.kind", "Choose another"]),
+    "the name kind": (LAW.replace("spring", "kind"), "mine.py:PD", ["PD.kind", "Choose another"]),
+    "the name of an attribute": (LAW.replace("spring", "analytic"), "mine.py:PD", ["PD.analytic", "Choose another"]),
     "a syntax error": ("def f(:\n", "mine.py:PD", ["importing it raised SyntaxError: invalid syntax (line 1)."]),
     "an error at import": ("x = 1\ny = 1 / 0\n", "mine.py:PD", ["raised ZeroDivisionError: division by zero (line 2)"]),
     "no module": (LAW, "no_such_module:PD", ["raised ModuleNotFoundError: No module named", "Install it"]),
@@ -140,7 +141,7 @@ WRONG = {
     "an if on a traced value": (LAW.replace("        return force_for", "        if motion.z > 0:\n            pass\n"
                                             "        return force_for"), "mine.py:PD",
                                 ["raised TracerBoolConversionError", "jnp.where in place of `if`"]),
-    "a rate of another shape": (LAW.replace("10 * self.stiff * (motion.z - reference.r)", "()"), "mine.py:PD",
+    "a rate of another shape": (LAW.replace("10 * self.spring * (motion.z - reference.r)", "()"), "mine.py:PD",
                                 ["PD raised TypeError: the rate of the state must be like init(model)"]),
     "an output of another shape": (LAW.replace("return force_for", "return inputs or force_for"), "mine.py:PD",
                                    ["must return the number v_star and the rate"]),
@@ -164,7 +165,7 @@ def test_a_wrong_law_is_refused_in_one_line(wrong, case, capsys):
 
 
 def test_keys_are_those_of_the_record(case):
-    with pytest.raises(ValueError, match=r"controller\.position\.dmap = 1.*Did you mean 'damp'\? Keys.*stiff, damp"):
+    with pytest.raises(ValueError, match=r"controller\.position\.dmap = 1.*Did you mean 'damp'\? Keys.*spring, damp"):
         read_case(write(CASE.replace("damp = 300.0", "dmap = 1")))
     with pytest.raises(ValueError, match=r"controller\.position\.damp = -1: it must be a finite number above"):
         read_case(write(CASE.replace("damp = 300.0", "damp = -1.0")))

@@ -32,6 +32,8 @@ class Requirement(NamedTuple):
 class Law(abc.ABC):
     """Base class of a law; it has no fields. A subclass is a frozen record whose leaves are the gains.
 
+    Raises TypeError for a subclass with a gain that has the name of an attribute or a method of its base classes.
+
     Class attributes:
 
     - `requirement`: condition of Theorem 1 on a gain; None: there is none.
@@ -70,6 +72,10 @@ class Law(abc.ABC):
     def __init_subclass__(cls, **kwargs: object) -> None:
         super().__init_subclass__(**kwargs)
         written = vars(cls)
+        bases = [base for base in cls.__mro__[1:] if not dataclasses.is_dataclass(base)]
+        for name in (name for name, value in written.items() if isinstance(value, dataclasses.Field)):
+            if any(name in vars(base) for base in bases):
+                raise TypeError(f"{cls.__name__}.{name}: a law has an attribute of this name. Choose another name.")
         if "step" in written and "own_steps" not in written:
             cls.own_steps = ("implicit",)
         if "__call__" in written and "analytic" not in written:
