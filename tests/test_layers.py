@@ -80,6 +80,22 @@ def test_imports_have_no_cycles():
     list(graphlib.TopologicalSorter(graph).static_order())
 
 
+def test_no_loop_overrides_a_method_with_a_body():
+    nodes = (node for module in MODULES for node in ast.walk(ast.parse(MODULES[module].read_text())))
+    classes = {node.name: node for node in nodes if isinstance(node, ast.ClassDef)}
+    own = {name: {x.name: x for x in node.body if isinstance(x, ast.FunctionDef)} for name, node in classes.items()}
+
+    def above(name):
+        bases = [x.id for x in classes[name].bases if isinstance(x, ast.Name) and x.id in classes]
+        return bases + [further for base in bases for further in above(base)]
+
+    loops = {name: above(name) for name in classes if any("advance" in own[x] for x in [name, *above(name)])}
+    assert {"Sampled", "ClosedLoop", "SampledMachine", "Twin", "Monitored"} <= set(loops)
+    for name, base, method in ((n, b, m) for n, bases in loops.items() for b in bases for m in own[n]):
+        abstract = method not in own[base] or "NotImplementedError" in ast.unparse(own[base][method])
+        assert abstract, f"{name}.{method} overrides that of {base}: hold a {base} in place of deriving from it"
+
+
 # Ensembles, linear analysis, the design of default gains, controllers in files, and the number of threads.
 SCIPY = ("ambjax.ensemble", "ambjax.linear", "ambjax.control.regulator", "ambjax.results.runs")
 SCIPY += ("ambjax.control.realisation", "ambjax.control.lqg", "ambjax.cases.named_files", "ambjax.host.one_thread")

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from ambjax.codegen.c99.machine import Compiled
 from ambjax.codegen.controller import controller_of
@@ -16,9 +17,10 @@ from ambjax.codegen.twins import Horizon, LoopCase, farthest, horizons, series
 from ambjax.control.cascade_state import Command
 from ambjax.numerics.records import Scalar, canonical, record, replaced, static
 from ambjax.simulation.between import SampledState
-from ambjax.simulation.rollout import run
+from ambjax.simulation.rollout import ExtendedOnProcessor, run
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import sampled_of
+from ambjax.simulation.trajectory import Row
 from ambjax.world.sensor import Errors
 
 BITS = {name: 1 << k for k, name in enumerate(STATUS)}
@@ -44,30 +46,42 @@ class Machines:
         return np.array([*machine.state["numbers"], *rest, machine.state["started"], bits, *machine.outputs], float)
 
 
+class CompiledState(NamedTuple):
+    """State of the sampled loop, whose own laws do not step, and the memory of the compiled controller."""
+
+    loop: SampledState
+    memory: Array
+
+
 @record
-class CompiledLoop(Sampled):
+class CompiledLoop(ExtendedOnProcessor):
     """The sampled loop whose laws are the compiled controller `which` of `machines`."""
 
+    loop: Sampled
     which: Scalar = 0.0
     machines: Machines = static(default=None)
 
-    def start(self) -> SampledState:
-        return super().start()._replace(control=jnp.zeros(self.machines.room + 1))
+    def start(self) -> CompiledState:
+        return CompiledState(self.loop.start(), jnp.zeros(self.machines.room + 1))
 
-    def jump(self, t: Scalar, state: SampledState, errors: Errors) -> SampledState:
-        state, measured = self.read(state, errors)
-        processor, size = self.processor, self.machines.room + 1
+    def row(self, t: Scalar, state: CompiledState, errors: Errors, alive: Array) -> Row:
+        return self.loop.row(t, state.loop, errors, alive)
+
+    def jump(self, t: Scalar, state: CompiledState, errors: Errors) -> CompiledState:
+        own, measured = self.loop.read(state.loop, errors)
+        processor, size = self.loop.processor, self.machines.room + 1
         shape = jax.ShapeDtypeStruct((size + 1 + len(OUTPUTS),), float)
-        given = self.which, state.control, jnp.stack([*measured, *self.reference(t)])
+        given = self.which, state.memory, jnp.stack([*measured, *self.loop.reference(t)])
         found = jax.pure_callback(self.machines.step, shape, *given, vmap_method="sequential")
         bits = found[size].astype(int)
         command = Command(**dict(zip(OUTPUTS, found[size + 1 :], strict=True)), i_ref_dot=jnp.zeros(()))
         faulty = bits & (BITS["invalid"] | BITS["failed"]) != 0
-        past, finite = processor.remembered(state.command.u, *state.past), jnp.where(faulty, 0.0, state.finite)
-        watch, guard = state.watch, processor.guard
+        past, finite = processor.remembered(own.command.u, *own.past), jnp.where(faulty, 0.0, own.finite)
+        watch, guard = own.watch, processor.guard
         if watch and guard:  # from `left`, `Sampled.row` finds whether a reading was refused
             watch = watch._replace(left=jnp.where(bits & BITS["refused"], 0.0, jnp.asarray(guard.samples)))
-        return state._replace(control=found[:size], command=command, past=past, finite=finite, watch=watch)
+        own = own._replace(command=command, past=past, finite=finite, watch=watch)
+        return CompiledState(own, found[:size])
 
 
 class LoopComparison(NamedTuple):
@@ -101,7 +115,7 @@ def compare(case: LoopCase, machines: dict[str, Compiled]) -> dict[str, LoopComp
         if held:
             z = _plant_motion(machines[precision], case, count)
         else:
-            system = CompiledLoop(**vars(given), which=which, machines=host)
+            system = CompiledLoop(given, which=which, machines=host)
             z = np.asarray(run_jit(*canonical((system, clock)), None, record_every=1).trajectory.rows.z)
         found[precision] = LoopComparison(horizon, times_of(z, horizon))
     return found

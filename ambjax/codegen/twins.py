@@ -24,9 +24,10 @@ from ambjax.numerics.records import Scalar, canonical, record, static
 from ambjax.simulation.between import SampledState
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.integrate import Advanced, Begin, Integrator
-from ambjax.simulation.rollout import run
+from ambjax.simulation.rollout import Extended, run
 from ambjax.simulation.sampled import Sampled
 from ambjax.simulation.system import sampled_of
+from ambjax.simulation.trajectory import Row
 from ambjax.world.scenario import Scenario
 from ambjax.world.sensor import Errors
 from ambjax.world.waveforms import Constant
@@ -96,33 +97,50 @@ class Horizon(NamedTuple):
         return self.samples >= LEAST
 
 
+class TwinState(NamedTuple):
+    """State of a twin: that of its loop."""
+
+    loop: SampledState
+
+
 @record
-class Twin(Sampled):
+class Twin(Extended):
     """The loop with every state changed at every sample. `seed` draws the signs.
 
     The change of a number is `unit` times its magnitude or its scale, whichever is larger.
     """
 
+    loop: Sampled
     seed: Scalar = 0.0
     unit: Scalar = 0.0
     held: bool = static(default=False, doc="disturbances are constant over each sample")
 
-    def jump(self, t: Scalar, state: SampledState, errors: Errors) -> SampledState:
+    def start(self) -> TwinState:
+        return TwinState(self.loop.start())
+
+    def row(self, t: Scalar, state: TwinState, errors: Errors, alive: Array) -> Row:
+        return self.loop.row(t, state.loop, errors, alive)
+
+    def jump(self, t: Scalar, state: TwinState, errors: Errors) -> TwinState:
         """Change the states, compute the laws' step from them, and change the resulting command."""
-        sample = jnp.rint(t / self.period).astype(jnp.int32)
+        first, sample = state.loop, jnp.rint(t / self.loop.period).astype(jnp.int32)
         key = jax.random.fold_in(jax.random.key(jnp.asarray(self.seed, jnp.int32)), sample)
         before, after = jax.random.split(key)
-        moved = self._moved(before, state, self._sizes(state))
+        moved = self._moved(before, first, self._sizes(first))
         # flags, counters and the state of a faulty sensor are not changed
-        watch = moved.watch._replace(left=state.watch.left) if state.watch else ()
-        state = moved._replace(finite=state.finite, watch=watch, started=state.started, sensed=state.sensed)
-        stepped = super().jump(t, state, errors)
-        return stepped._replace(command=self._moved(after, stepped.command, self._sizes(stepped).command))
+        watch = moved.watch._replace(left=first.watch.left) if first.watch else ()
+        moved = moved._replace(finite=first.finite, watch=watch, started=first.started, sensed=first.sensed)
+        stepped = self.loop.jump(t, moved, errors)
+        return TwinState(stepped._replace(command=self._moved(after, stepped.command, self._sizes(stepped).command)))
 
     def advance(self, method: Integrator, errors: Errors, begin: Begin, period: Scalar) -> Advanced:
-        if not self.held:
-            return super().advance(method, errors, begin, period)
-        loop, t = self.loop, begin.t
+        begin = begin._replace(state=begin.state.loop)
+        advanced = self._held if self.held else self.loop.advance
+        after = advanced(method, errors, begin, period)
+        return after._replace(state=TwinState(after.state))
+
+    def _held(self, method: Integrator, errors: Errors, begin: Begin, period: Scalar) -> Advanced:
+        loop, t = self.loop.loop, begin.t
         outside, none = loop.inputs(just_after(t)), loop.scenario.undisturbed()
         scenario = dataclasses.replace(none, q_z=Constant(outside.q_z), q_i=Constant(outside.q_i))
         # the exported plant has no time: t = 0 at the start of each sample
@@ -143,11 +161,11 @@ class Twin(Sampled):
         The scale of a voltage includes the voltage that changes the current by i_ref within one sample, because the
         laws divide the difference of two references by the period.
         """
-        cascade, plant = self.loop.cascade, self.loop.scenario.plant
-        model = cascade.model
+        loop, period = self.loop.loop, self.loop.period
+        cascade, plant, model = loop.cascade, loop.scenario.plant, loop.cascade.model
         i, v = jnp.asarray(model.i_0) / 25, jnp.asarray(model.v_size)
         gap = jnp.maximum(model.s_0 - jnp.abs(plant.measurement(state.plant).z), 0.01 * model.s_0)
-        driven = model.L * model.s_0 / gap * jnp.maximum(jnp.abs(state.command.i_ref), i) / self.period
+        driven = model.L * model.s_0 / gap * jnp.maximum(jnp.abs(state.command.i_ref), i) / period
         volt = i if cascade.current.commands == "current" else jnp.abs(model.R * model.i_0) + driven
         return SampledState(
             plant=plant.scale(),
@@ -166,7 +184,7 @@ class Twin(Sampled):
 def horizons(case: LoopCase, precisions: list[str], *, held: bool = False) -> dict[str, Horizon]:
     """Simulate JAX's loop and its twins. Return the horizon of each precision."""
     given = sampled_of(case.cascade, case.scenario, case.clock)
-    twin, clock = canonical((Twin(**vars(given), held=held), case.clock))
+    twin, clock = canonical((Twin(given, held=held), case.clock))
     units = [0.0] + [float(np.finfo(PRECISIONS[x]).eps) for x in precisions for _ in range(TWINS)]
     signals, r, lost_at = _together(twin, clock, jnp.asarray(units), jnp.arange(len(units)))
     z_and_u = {name: np.asarray(x) for name, x in zip(SIGNALS, signals, strict=True)}

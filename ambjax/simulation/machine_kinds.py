@@ -36,6 +36,9 @@ class SampledMachine(Machine):
         axes = self.each(lambda axis, own, error: axis.jump(t, own, error), self.at_sensors(state), errors)
         return state._replace(axes=still(axes))
 
+    def demands(self, t: Scalar, state: MachineState, errors: Sequence[object]) -> Groups:
+        return ((),) * len(self.groups)
+
     def advance(self, method: Integrator, errors: object, begin: Begin, period: Scalar) -> Advanced:
         t, state, memory, code = begin
         finite = jnp.min(self.join([own.finite for own in state.axes]))
@@ -108,7 +111,7 @@ class ContinuousMachine(WholeState, Machine):
 
     def demands(self, t: Scalar, state: MachineState, errors: Sequence[object]) -> Groups:
         if self.law is None:
-            return super().demands(t, state, errors)
+            return ((),) * len(self.groups)
         own = self.each(lambda axis: axis.inputs(t))
         found = demanded_now(self, self.rotor.speed_at(t), own, self.at_sensors(state), state.law, errors)[0]
         return tuple((one,) for one in found)

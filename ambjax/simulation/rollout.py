@@ -97,6 +97,14 @@ class Extended:
         return self.loop.singularity(row)
 
 
+class ExtendedOnProcessor(Extended):
+    """Base class of a system on a processor whose further states change only at the samples."""
+
+    def advance(self, method: Integrator, errors: Errors, begin: Begin, period: Scalar) -> Advanced:
+        after = self.loop.advance(method, errors, begin._replace(state=begin.state.loop), period)
+        return after._replace(state=begin.state._replace(loop=after.state))
+
+
 class RolloutState(NamedTuple):
     """State of a rollout between two samples.
 

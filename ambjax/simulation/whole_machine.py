@@ -173,7 +173,7 @@ class Machine(MachineAxes):
 
     def demands(self, t: Scalar, state: MachineState, errors: Sequence[object]) -> Groups:
         """Return further arguments of the row of each group: the demanded forces, if the row computes the command."""
-        return ((),) * len(self.groups)
+        raise NotImplementedError
 
     def row(self, t: Scalar, state: MachineState, errors: Sequence[object], alive: Array) -> MachineRow:
         demands = self.demands(t, state, errors)

@@ -16,9 +16,9 @@ from ambjax.control.cascade_state import Sample
 from ambjax.control.schedule import with_gains_at
 from ambjax.numerics.records import Scalar, record
 from ambjax.simulation.between import SampledState
-from ambjax.simulation.integrate import Advanced, Begin, InitialValueProblem, Integrator, WholeState
+from ambjax.simulation.integrate import InitialValueProblem, WholeState
 from ambjax.simulation.loop import ClosedLoop, ExternalInputs, LoopState
-from ambjax.simulation.rollout import Extended
+from ambjax.simulation.rollout import Extended, ExtendedOnProcessor
 from ambjax.simulation.sampled import Sampled
 from ambjax.world.sensor import Errors, Measurement
 from ambjax.world.waveforms import Reference
@@ -188,7 +188,7 @@ class LawSignalsState(NamedTuple):
 
 
 @record
-class LawSignalsRecorder(Extended):
+class LawSignalsRecorder(ExtendedOnProcessor):
     """System of a loop on a processor whose rows record the signals that its laws compute."""
 
     loop: Sampled
@@ -205,11 +205,6 @@ class LawSignalsRecorder(Extended):
         estimate, *_ = cascade.estimate(measured, laws.observer, sample)
         sigma, command = cascade.sigma(estimate, reference), after.command
         return LawSignalsState(after, LawSignals(sigma, command.v_tilde, estimate.i - command.i_ref))
-
-    def advance(self, method: Integrator, errors: Errors, begin: Begin, period: Scalar) -> Advanced:
-        first = Begin(begin.t, begin.state.loop, begin.memory, begin.code)
-        after = self.loop.advance(method, errors, first, period)
-        return after._replace(state=begin.state._replace(loop=after.state))
 
     def row(self, t: Scalar, state: LawSignalsState, errors: Errors, alive: Array) -> LawSignalsRow:
         row = self.loop.row(t, state.loop, errors, alive)
