@@ -57,9 +57,9 @@ def test_the_differentiable_quantities_agree_with_the_analysis(name):
     found = find(system)
     # a peak's frequency is found to 1e-5; the zeros of a deadbeat loop, all at 0, to 1e-5 too, and KS from them to 3e-4
     tolerance = 3e-4 if name == "true signs" else 1e-6
-    peaks = (expected.S.height, expected.T.height, expected.KS.height)
+    peaks = [(peak.outside or peak).height for peak in (expected.S, expected.T, expected.KS)]
     assert np.allclose(found[:3], peaks, rtol=tolerance)
-    assert found.delay_margin_s == pytest.approx(expected.margins.delay, rel=1e-7)
+    assert found.delay_margin_s == pytest.approx(expected.margins.delay, rel=max(1e-7, tolerance / 100))
     at_speeds = np.abs(np.asarray(system.response(np.asarray(speeds)))[:, 0, 0])
     assert found.sensitivity_1x == pytest.approx(at_speeds.max(), rel=1e-7)
     assert found.growth == pytest.approx(expected.poles[0].real, rel=1e-9)
