@@ -163,8 +163,11 @@ def document(tables=None, **tune):
 
 
 def instead_of_engines(monkeypatch, world):
-    """Replace every engine that is made from now on by a Bowl in this world."""
+    """Replace every engine that is made from now on by a Bowl in this world, whose loops are stable."""
     import tuning.problem.tuning_problem
+    import tuning.validate
+
+    monkeypatch.setattr(tuning.validate, "_unstable", lambda course, x, numbers: numbers[:0])
 
     monkeypatch.setattr(Bowl, "world", world, raising=False)
     monkeypatch.setattr(tuning.problem.tuning_problem, "Engine", Bowl)

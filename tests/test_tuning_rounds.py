@@ -144,7 +144,7 @@ def test_the_best_answer_of_all_rounds_is_returned(lost, within, errors, best, m
 
     def validated(course, x, error=None):
         count, size = next(outcomes, (9, 9.0))  # at last, the gains of the case
-        return Validation(course.answer(x, error, count, size), error, np.arange(1), np.zeros(0, int))
+        return Validation(course.answer(x, error, count, size), error, np.arange(1), *np.zeros((2, 0), int))
 
     monkeypatch.setattr(tuning.rounds, "search_within_limits", lambda course, x: (x, next(inside)))
     monkeypatch.setattr(tuning.rounds, "validated", validated)

@@ -143,11 +143,10 @@ def _validated_point(course: Course, answer: SearchResult, seen: list[FrontPoint
         if best is seen[0]:
             return answer
         found = validated(course, best.x).result
-        if found.good:
+        if found.good and not found.unstable > answer.unstable:
             return found
-        course.tell(
-            f"the answer of {best.volts:.4g} V is rejected: it loses members, or accurate steps do not confirm it"
-        )
+        why = "it loses members, is not stable, or accurate steps do not confirm it"
+        course.tell(f"the answer of {best.volts:.4g} V is rejected: {why}")
         seen[:] = [point for point in seen if point is not best]
 
 

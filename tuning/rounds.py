@@ -39,9 +39,9 @@ def rounds(
     `out`: directory of the checkpoints. `facts`: settings that a checkpoint must match. `resume`: whether to continue
     from the checkpoints. `listen`: receives the events.
 
-    The result is the confirmed answer that loses the fewest members; of several such answers, one within all limits,
-    and of those the one of least error on the validation ensemble. If a front is traced, the result is the answer that
-    `trace_front` selects.
+    The result is the confirmed answer that loses the fewest members; of several such answers, a stable one, of those
+    one within all limits, and of those the one of least error on the validation ensemble. If a front is traced, the
+    result is the answer that `trace_front` selects.
 
     Raises ValueError if the goal is finite at no starting point, or if a checkpoint belongs to another search.
     """
@@ -80,21 +80,22 @@ def solved(course: Course, x: np.ndarray) -> tuple[np.ndarray, StepError | None,
 
 
 def _best_of(answers: Sequence[SearchResult]) -> SearchResult:
-    """Return the best answer: confirmed, with the fewest lost members, within all limits, of least error."""
-    return min(answers, key=lambda one: (not one.confirmed, one.lost, not one.within, one.validation_error))
+    """Return the best answer: confirmed, with the fewest lost members, stable, within all limits, of least error."""
+    rank = lambda one: (not one.confirmed, one.lost, one.unstable > 0, not one.within, one.validation_error)  # noqa: E731
+    return min(answers, key=rank)
 
 
 def _given(course: Course, start: np.ndarray, best: SearchResult) -> list[SearchResult]:
     """Return the gains of the case, `start` [m], as a validated answer if they may be better than `best`.
 
-    They are validated if they hold all training members, and if `best` breaks a limit or has a larger error than theirs
-    on these members.
+    They are validated if they hold all training members, and if `best` is not stable, breaks a limit or has a larger
+    error than theirs on these members.
     """
     space = course.problem.objective.space
     x = space.encode(space.clip(start))
     terms = terms_at(course.problem, x, course.members)
     error = math.sqrt(terms["tracking"][: course.members.ordinary].mean())
-    if (terms["survival"] > 0).any() or (best.within and error >= best.validation_error):
+    if (terms["survival"] > 0).any() or (best.within and not best.unstable and error >= best.validation_error):
         return []
     within = judged_at(course, x).holds(course.problem.limits)
     return [dataclasses.replace(validated(course, x).result, within=within)]

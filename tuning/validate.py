@@ -1,13 +1,16 @@
 """Validation of an answer on members that the search does not use."""
 
+import dataclasses
 import math
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from tuning.judge.evaluate import StepError, comparison_members, describe, rms, step_error, worst_of
-from tuning.problem.members import Members
+from ambjax.linear import suspects
+from ambjax.linear.quiet_run import KICK
+from tuning.judge.evaluate import StepError, comparison_members, describe, rms, stability, step_error, worst_of
+from tuning.problem.members import FEW, Members
 from tuning.problem.tuning_problem import TuningProblem
 from tuning.solve.course import Course, SearchResult
 from tuning.solve.multipliers import MOST_JOINING, largest_unseen
@@ -21,18 +24,20 @@ class Validation(NamedTuple):
     """Result of `validated`.
 
     `result`: the answer. `error`: its step error. `lost`: numbers of the validation members that are lost, the earliest
-    loss first. `large`: numbers of members with larger errors than the training members have.
+    loss first. `large`: numbers of members with larger errors than the training members have. `unstable`: numbers of
+    members whose loop is not stable; none if such members have joined the training ensemble.
     """
 
     result: SearchResult
     error: StepError
     lost: np.ndarray
     large: np.ndarray
+    unstable: np.ndarray
 
     @property
     def failed(self) -> bool:
         """Whether members join the training ensemble (`joining`)."""
-        return not self.result.good or self.large.size > 0
+        return not self.result.good or self.large.size + self.unstable.size > 0
 
 
 def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> Validation:
@@ -44,7 +49,7 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
     problem, count, none = course.problem, course.problem.tune.budget.validation, np.zeros(0, int)
     error = step_error(problem, x) if error is None else error
     if course.interrupted or not count:
-        return Validation(course.answer(x, error, error.unconfirmed), error, none, none)
+        return Validation(course.answer(x, error, error.unconfirmed), error, none, none, none)
     course.tell(f"validating the answer on {count} members")
     terms = terms_at(problem, x, problem.validation(np.arange(count)))
     share = terms["survival"]
@@ -60,7 +65,18 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
     found = course.answer(x, error, lost.size + error.unconfirmed, overall)
     trained = terms_at(problem, x, course.members)["tracking"][: course.members.ordinary]
     large = largest_unseen(course, errors) if overall > LARGER * math.sqrt(trained.mean()) else none
-    return Validation(found, error, lost, large)
+    unstable = _unstable(course, x, suspects(terms["peak"], share <= 0)) if found.good else none
+    found = dataclasses.replace(found, unstable=unstable.size)
+    return Validation(found, error, lost, large, none if np.any(course.members.displaced) else unstable)
+
+
+def _unstable(course: Course, x: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Return the numbers of those of these validation members whose loops are not stable at x [m]."""
+    course.tell(f"testing whether the loops of {numbers.size} of them are stable")
+    bad = numbers[~stability(course.problem, x, course.problem.validation(numbers)).stable]
+    if bad.size:
+        course.tell(f"{bad.size} of them are held, but not stable")
+    return bad
 
 
 def joining(course: Course, found: Validation) -> Members:
@@ -68,13 +84,17 @@ def joining(course: Course, found: Validation) -> Members:
 
     The first MOST_JOINING of the lost members, and the members that are lost or stall with accurate steps, join as
     stressed ones with half of the additional noise of these, as a margin. Members with large errors join as ordinary
-    ones.
+    ones. So do the first FEW of those that are not stable, with the displaced start of a quiet run: what remains of it
+    counts as an error.
     """
     problem, those = course.problem, course.problem.validation(found.lost[:MOST_JOINING])
     both: Members = jax.tree.map(lambda a, b: np.concatenate([a, b]), those, found.error.unheld)
     members = course.members.joined(both._replace(noise_factor=both.noise_factor * (1 + problem.tune.stress) / 2))
-    course.tell(f"{len(both.member)} lost members and {found.large.size} of large errors join the training ensemble")
-    return members.joined(problem.validation(found.large), stressed=False)
+    displaced = problem.validation(found.unstable[:FEW])
+    displaced = displaced._replace(displaced=np.full(len(displaced.member), KICK))
+    others = f"{found.large.size} of large errors and {len(displaced.member)} with a displaced start"
+    course.tell(f"{len(both.member)} lost members, {others} join the training ensemble")
+    return members.joined(problem.validation(found.large), stressed=False).joined(displaced, stressed=False)
 
 
 def terms_at(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, np.ndarray]:

@@ -86,11 +86,7 @@ def quiet(scenario: Scenario) -> Scenario:
     loads = {slot: _silent(getattr(scenario, slot)) for slot in ("q_z", "q_v", "q_i", "q_f", "base")}
     fine = {name: FINE_BITS for name in ("bits", "bits_i") if getattr(scenario.sensors, name) is not None}
     calm = scenario.louder(0.0).with_sensor(outliers=None, dropouts=None, runout=None, **fine)
-    initial, z = scenario.initial, np.asarray(scenario.initial.z, float)
-    z = z + np.where(z > 0, -1.0, 1.0) * KICK * np.asarray(scenario.touchdown)
-    return dataclasses.replace(
-        calm, **loads, reference=Constant(_at_start(scenario.reference)), initial=dataclasses.replace(initial, z=z)
-    )
+    return dataclasses.replace(calm, **loads, reference=Constant(_at_start(scenario.reference))).displaced(KICK)
 
 
 def _silent(load: Signal | None) -> Signal | None:

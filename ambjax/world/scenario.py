@@ -189,6 +189,12 @@ class Scenario:
     def louder(self, factor: Scalar) -> "Scenario":
         return dataclasses.replace(self, sensor=self.sensor and self.sensor.louder(factor))
 
+    def displaced(self, share: Scalar) -> "Scenario":
+        """Return the scenario with its start displaced by this share of the clearance, towards z = 0."""
+        z = jnp.asarray(self.initial.z)
+        z = z + jnp.where(z > 0, -1.0, 1.0) * share * jnp.asarray(self.touchdown)
+        return dataclasses.replace(self, initial=dataclasses.replace(self.initial, z=z))
+
     def acceleration(self, t: Scalar) -> Array:
         """Return the total disturbance of Eq. (1) at time t: q_z + a q_v + q_f / m - base, m/s^2."""
         total = self.q_z(t) + self.plant.a * self.q_v(t)

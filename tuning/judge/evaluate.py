@@ -9,6 +9,7 @@ import numpy as np
 
 from ambjax.ensemble import wilson
 from ambjax.ensemble.study import Study
+from ambjax.linear import Stability, stability_of
 from tuning.problem.config import seeds
 from tuning.problem.members import FEW, Members
 from tuning.problem.tuning_problem import REFERENCE_TOLERANCE, TuningProblem
@@ -143,6 +144,13 @@ def comparison_members(problem: TuningProblem) -> Members:
 def worst_of(values: np.ndarray) -> np.ndarray:
     """Return the indices of the FEW largest values [n], largest first."""
     return np.argsort(-values, kind="stable")[:FEW]
+
+
+def stability(problem: TuningProblem, x: np.ndarray, members: Members) -> Stability:
+    """Return the stability of the loops of members at coordinates x [m]."""
+    # in continuous time, the step of the case may be too coarse for these gains
+    clock = problem.case.clock if problem.sampled else problem.case.clock.with_method(None)
+    return stability_of(*problem.objective.fixed(x, members), clock)
 
 
 def step_error(problem: TuningProblem, x: np.ndarray, members: Members | None = None) -> StepError:

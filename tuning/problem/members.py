@@ -44,6 +44,7 @@ class Members(NamedTuple):
     `member` [n]: their numbers. `seed` [n]: of their ensembles. `values`: the spread values [n] by path.
     `noise_factor` [n]: factor on the sensor noise. `shift` [n, m]: offset of the coordinates of the gains.
     `stressed` [n]: whether only clearance and survival count for a member (`weigh`); stressed members come last.
+    `displaced` [n]: displacement of the start, as a share of the clearance (`Scenario.displaced`).
     """
 
     member: Any
@@ -52,6 +53,7 @@ class Members(NamedTuple):
     noise_factor: Any
     shift: Any
     stressed: Any
+    displaced: Any
 
     @property
     def ordinary(self) -> int:
@@ -129,7 +131,7 @@ class Objective:
         values = draw(self.spread, self.cascade, self.scenario, seed, numbers, total) if self.spread.entries else {}
         n = len(numbers)
         still = np.zeros((n, len(self.space)))
-        return Members(numbers, np.full(n, seed), values, np.ones(n), still, np.zeros(n, bool))
+        return Members(numbers, np.full(n, seed), values, np.ones(n), still, np.zeros(n, bool), np.zeros(n))
 
     def world(self, members: Members) -> tuple[Cascade, Scenario]:
         """Return the cascade and the scenario of one member with scalar fields. The gains are the case's."""
@@ -137,7 +139,7 @@ class Objective:
         cascade, scenario = (
             apply(self.cascade, scenario, members.values) if members.values else (self.cascade, scenario)
         )
-        return cascade, scenario.louder(members.noise_factor)
+        return cascade, scenario.louder(members.noise_factor).displaced(members.displaced)
 
     def notched(self, x: np.ndarray, cascade: Cascade) -> Cascade:
         """Return a cascade with the notch designed for the gains at coordinates x [m], or for those at each x [S, m].
@@ -160,6 +162,8 @@ class Objective:
         cascade, scenario = apply(self.cascade, scenario, members.values)
         at = (x + members.shift).T if np.any(members.shift) else x  # [m] or [m, n]
         cascade = self.notched(x, self.space.decode(jnp.asarray(at), cascade))
+        if np.any(members.displaced):
+            scenario = scenario.displaced(members.displaced)
         return cascade, scenario.louder(members.noise_factor) if np.any(members.noise_factor != 1) else scenario
 
     def run(self, x: Array, members: Members, fold: Any, *, in_parts: bool = False) -> Any:

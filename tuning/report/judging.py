@@ -6,13 +6,13 @@ import math
 import jax.numpy as jnp
 import numpy as np
 
-from ambjax.linear import Findings, stability_of, suspects
+from ambjax.linear import Findings, suspects
 from ambjax.results.outputs import described
 from ambjax.theorem.advice import advice as on_conditions
 from ambjax.theorem.conditions import Report as Check
 from ambjax.theorem.conditions import check, required
 from tuning.events import Tell
-from tuning.judge.evaluate import JudgedMembers, describe, held, judge, step_error, summarise, worst_of
+from tuning.judge.evaluate import JudgedMembers, describe, held, judge, stability, step_error, summarise, worst_of
 from tuning.judge.peaks import delay_test, injections
 from tuning.problem.config import seeds, settings
 from tuning.problem.members import FEW, Members
@@ -93,13 +93,11 @@ def _held_out(after: JudgedMembers, refuted: str, tell: Tell) -> Row:
 
 def _stability(of: JudgedMembers, tell: Tell) -> Row:
     """Return whether the loops of the held members with the largest settled errors are stable (`linear.Findings`)."""
-    problem, index = of.problem, suspects(of.columns["settled_max_abs_error_m"], held(of.columns))
+    index = suspects(of.columns["settled_max_abs_error_m"], held(of.columns))
     if not index.size:
         return Findings(0, 0)._asdict()
     tell(f"testing whether the loops of {index.size} held-out members are stable")
-    # in continuous time, the step of the case may be too coarse for these gains
-    clock = problem.case.clock if problem.sampled else problem.case.clock.with_method(None)
-    return stability_of(*problem.objective.fixed(of.x, of.chosen(index)), clock).findings()._asdict()
+    return stability(of.problem, of.x, of.chosen(index)).findings()._asdict()
 
 
 def _steps(answer: SearchResult, of: JudgedMembers, tell: Tell) -> Row:

@@ -32,8 +32,9 @@ class SearchResult:
     `problem`, `members`: of the last search. `x` [m]: coordinates of the gains. `error`: step error at x; None if it
     was not computed. `history`, `seconds`: as in `Course`. `lost`: number of lost validation members, plus the number
     of members that are lost or stall with accurate steps. `validation_error`: rms error of the validation members that
-    are held, relative to s_0; inf if it was not computed. `within`: whether the answer is within all limits on the
-    validation members. `complete`: whether neither Ctrl-C nor the end of the time has ended the searches early.
+    are held, relative to s_0; inf if it was not computed. `unstable`: number of those tested whose loop is not stable.
+    `within`: whether the answer is within all limits on the validation members. `complete`: whether neither Ctrl-C nor
+    the end of the time has ended the searches early.
     `front`: points of the front of error against voltage (`front.FrontPoint`); empty if it was not traced.
     """
 
@@ -45,6 +46,7 @@ class SearchResult:
     lost: int
     seconds: float
     validation_error: float = math.inf
+    unstable: int = 0
     within: bool = True
     complete: bool = True
     front: tuple[Any, ...] = ()
