@@ -26,16 +26,7 @@ actuator = { mode = "current", bandwidth = 1500.0, u_max = 100.0, i_max = 2.5 }
 processor = { delay = 1.0, predict = false }
 sensor = { velocity = false }
 clock = { duration = 0.1, sample_period = 1e-4 }
-[plant]
-kind = "two-coil"
-m = 3.274
-k_z = 0.0
-mu_0 = 1.25663706e-6
-n = 208.0
-A = 2.6792506e-4
-s_0 = 7.8e-4
-i_0 = 2.5
-R = 1.0
+plant = { kind = "two-coil", m = 3.27, k_z = 0, mu_0 = 1.2566e-6, n = 208, A = 2.68e-4, s_0 = 7.8e-4, i_0 = 2.5, R = 1 }
 """)
 
 

@@ -24,24 +24,14 @@ actuator = { u_max = 48.0 }
 initial = { z = 1e-4 }
 clock = { duration = 0.02, sample_period = 5e-5 }
 run = { settle = 0.001 }
-[plant]
-kind = "two-coil"
-m = 1.64
-k_z = 0.0
-mu_0 = 1.2566e-6
-n = 208.0
-A = 2.68e-4
-s_0 = 5e-4
-i_0 = 1.0
-R = 1.0
+plant = { kind = "two-coil", m = 1.64, k_z = 0, mu_0 = 1.2566e-6, n = 208, A = 2.68e-4, s_0 = 5e-4, i_0 = 1.0, R = 1.0 }
 [controller]
 position = { c = 2500.0, k = 9.0, p = 500.0 }
 inversion = { gamma = 7e11, p = 1e-8 }
 current = { k_i = 1100.0, p = 50.0 }
 [processor]
 """
-MOVED += SMALL_SEARCH
-MOVED += """
+MOVED += SMALL_SEARCH + """
 gains = ["controller.position.c"]
 bounds.controller.position.c = [100.0, 10000.0]
 members = 4
@@ -62,8 +52,7 @@ inversion = { kind = "closed-form" }
 current = { kind = "pi" }
 [processor]
 """
-TURNING += SMALL_SEARCH
-TURNING += """
+TURNING += SMALL_SEARCH + """
 gains = ["controller.position.k_d"]
 bounds.controller.position.k_d = [100.0, 1500.0]
 members = 2
