@@ -25,7 +25,7 @@ class Validation(NamedTuple):
 
     `result`: the answer. `error`: its step error. `lost`: numbers of the validation members that are lost, the earliest
     loss first. `large`: numbers of members with larger errors than the training members have. `unstable`: numbers of
-    members whose loop is not stable; none if such members have joined the training ensemble.
+    further members whose loop is not stable, at most FEW; none if FEW^2 have joined the training ensemble.
     """
 
     result: SearchResult
@@ -67,7 +67,9 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
     large = largest_unseen(course, errors) if overall > LARGER * math.sqrt(trained.mean()) else none
     unstable = _unstable(course, x, suspects(terms["peak"], share <= 0)) if found.good else none
     found = dataclasses.replace(found, unstable=unstable.size)
-    return Validation(found, error, lost, large, none if np.any(course.members.displaced) else unstable)
+    joined = course.members.member[course.members.displaced > 0]
+    more = np.setdiff1d(unstable, joined)[:FEW] if len(joined) < FEW**2 else none
+    return Validation(found, error, lost, large, more)
 
 
 def _unstable(course: Course, x: np.ndarray, numbers: np.ndarray) -> np.ndarray:
@@ -84,13 +86,13 @@ def joining(course: Course, found: Validation) -> Members:
 
     The first MOST_JOINING of the lost members, and the members that are lost or stall with accurate steps, join as
     stressed ones with half of the additional noise of these, as a margin. Members with large errors join as ordinary
-    ones. So do the first FEW of those that are not stable, with the displaced start of a quiet run: what remains of it
-    counts as an error.
+    ones. So do members that are not stable, with the displaced start of a quiet run: what remains of it counts as an
+    error.
     """
     problem, those = course.problem, course.problem.validation(found.lost[:MOST_JOINING])
     both: Members = jax.tree.map(lambda a, b: np.concatenate([a, b]), those, found.error.unheld)
     members = course.members.joined(both._replace(noise_factor=both.noise_factor * (1 + problem.tune.stress) / 2))
-    displaced = problem.validation(found.unstable[:FEW])
+    displaced = problem.validation(found.unstable)
     displaced = displaced._replace(displaced=np.full(len(displaced.member), KICK))
     others = f"{found.large.size} of large errors and {len(displaced.member)} with a displaced start"
     course.tell(f"{len(both.member)} lost members, {others} join the training ensemble")
