@@ -8,7 +8,6 @@ import jax
 import numpy as np
 
 from ambjax.linear import suspects
-from ambjax.linear.quiet_run import KICK
 from tuning.judge.evaluate import StepError, comparison_members, describe, rms, stability, step_error, worst_of
 from tuning.problem.members import FEW, Members
 from tuning.problem.tuning_problem import TuningProblem
@@ -67,7 +66,7 @@ def validated(course: Course, x: np.ndarray, error: StepError | None = None) -> 
     large = largest_unseen(course, errors) if overall > LARGER * math.sqrt(trained.mean()) else none
     unstable = _unstable(course, x, suspects(terms["peak"], share <= 0)) if found.good else none
     found = dataclasses.replace(found, unstable=unstable.size)
-    joined = course.members.member[course.members.displaced > 0]
+    joined = course.members.member[course.members.quiet > 0]
     more = np.setdiff1d(unstable, joined)[:FEW] if len(joined) < FEW**2 else none
     return Validation(found, error, lost, large, more)
 
@@ -86,17 +85,16 @@ def joining(course: Course, found: Validation) -> Members:
 
     The first MOST_JOINING of the lost members, and the members that are lost or stall with accurate steps, join as
     stressed ones with half of the additional noise of these, as a margin. Members with large errors join as ordinary
-    ones. So do members that are not stable, with the displaced start of a quiet run: what remains of it counts as an
-    error.
+    ones. So do members that are not stable, in a quiet run: what remains of the displaced start counts as an error.
     """
     problem, those = course.problem, course.problem.validation(found.lost[:MOST_JOINING])
     both: Members = jax.tree.map(lambda a, b: np.concatenate([a, b]), those, found.error.unheld)
     members = course.members.joined(both._replace(noise_factor=both.noise_factor * (1 + problem.tune.stress) / 2))
-    displaced = problem.validation(found.unstable)
-    displaced = displaced._replace(displaced=np.full(len(displaced.member), KICK))
-    others = f"{found.large.size} of large errors and {len(displaced.member)} with a displaced start"
+    quiet = problem.validation(found.unstable)
+    quiet = quiet._replace(quiet=np.ones(len(quiet.member)))
+    others = f"{found.large.size} of large errors and {len(quiet.member)} in quiet runs"
     course.tell(f"{len(both.member)} lost members, {others} join the training ensemble")
-    return members.joined(problem.validation(found.large), stressed=False).joined(displaced, stressed=False)
+    return members.joined(problem.validation(found.large), stressed=False).joined(quiet, stressed=False)
 
 
 def terms_at(problem: TuningProblem, x: np.ndarray, members: Members) -> dict[str, np.ndarray]:

@@ -1,6 +1,7 @@
 """Quiet runs: runs without noise and loads at a constant reference, from a displaced start."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -12,6 +13,7 @@ from ambjax.compiler.short_compilation import compiled_quickest
 from ambjax.control.cascade import Cascade
 from ambjax.ensemble.batching import run_ensemble
 from ambjax.ensemble.blocks import QUARTERS, quarters
+from ambjax.numerics.records import Scalar
 from ambjax.numerics.shapes import varying
 from ambjax.simulation.clock import Clock
 from ambjax.world.ramps import Ramp, Trapezoid
@@ -27,6 +29,7 @@ SHARED = 0.5
 CALM = 1e-4
 # Resolution that stands for an ideal converter, bits.
 FINE_BITS = 32
+LOADS = ("q_z", "q_v", "q_i", "q_f", "base")
 # The field of a load with which all of its values scale.
 SIZES = {Constant: "value", Unbalance: "unbalance", UnbalanceGrade: "grade"}
 SIZES |= dict.fromkeys((Step, Pulse, Sine, SmoothStep, Chirp, Ramp, Trapezoid), "amplitude")
@@ -83,18 +86,32 @@ def quiet(scenario: Scenario) -> Scenario:
 
     Noise, converters and most loads stay in it, without effect, so that its compiled program is that of the scenario.
     """
-    loads = {slot: _silent(getattr(scenario, slot)) for slot in ("q_z", "q_v", "q_i", "q_f", "base")}
+    loads = {slot: _scaled(getattr(scenario, slot), 0.0, _none) for slot in LOADS}
     fine = {name: FINE_BITS for name in ("bits", "bits_i") if getattr(scenario.sensors, name) is not None}
     calm = scenario.louder(0.0).with_sensor(outliers=None, dropouts=None, runout=None, **fine)
     return dataclasses.replace(calm, **loads, reference=Constant(_at_start(scenario.reference))).displaced(KICK)
 
 
-def _silent(load: Signal | None) -> Signal | None:
-    """Return a load of size 0: of the same class if it is one of SIZES or a sum, otherwise a constant."""
+def calmed(scenario: Scenario, calm: Scalar) -> Scenario:
+    """Return the scenario of a quiet run if `calm` is 1, and the scenario itself if it is 0; both have one program.
+
+    Faults, runout, converters, and signals of other classes than SIZES remain.
+    """
+    slots = LOADS if isinstance(scenario.reference, Constant) else (*LOADS, "reference")
+    signals = {slot: _scaled(getattr(scenario, slot), 1.0 - calm, lambda signal: signal) for slot in slots}
+    return dataclasses.replace(scenario.louder(1.0 - calm), **signals).displaced(KICK * calm)
+
+
+def _scaled(load: Any, factor: Scalar, other: Callable[[Any], Any]) -> Any:
+    """Return a load whose size is multiplied by `factor`. `other`: function for loads that have no size."""
     if isinstance(load, Sum):
-        return Sum(tuple(_silent(term) for term in load.terms))  # pyright: ignore
+        return Sum(tuple(_scaled(term, factor, other) for term in load.terms))
     if name := SIZES.get(type(load)):
-        return dataclasses.replace(load, **{name: 0.0 * getattr(load, name)})  # pyright: ignore
+        return dataclasses.replace(load, **{name: factor * getattr(load, name)})
+    return other(load)
+
+
+def _none(load: Signal | None) -> Signal | None:
     return None if load is None else Constant()
 
 

@@ -16,6 +16,7 @@ from ambjax.ensemble import Spread, apply, draw
 from ambjax.extend import Scalar, canonical
 from ambjax.linear import linearisation_inputs
 from ambjax.linear.notch_design import redesigned
+from ambjax.linear.quiet_run import calmed
 from ambjax.simulation.clock import Clock
 from ambjax.simulation.rollout import prepare, rolled_in_parts, rollout
 from ambjax.world.scenario import Scenario
@@ -44,7 +45,7 @@ class Members(NamedTuple):
     `member` [n]: their numbers. `seed` [n]: of their ensembles. `values`: the spread values [n] by path.
     `noise_factor` [n]: factor on the sensor noise. `shift` [n, m]: offset of the coordinates of the gains.
     `stressed` [n]: whether only clearance and survival count for a member (`weigh`); stressed members come last.
-    `displaced` [n]: displacement of the start, as a share of the clearance (`Scenario.displaced`).
+    `quiet` [n]: 1 for members that make a quiet run (`linear.quiet_run.calmed`), else 0.
     """
 
     member: Any
@@ -53,7 +54,7 @@ class Members(NamedTuple):
     noise_factor: Any
     shift: Any
     stressed: Any
-    displaced: Any
+    quiet: Any
 
     @property
     def ordinary(self) -> int:
@@ -139,7 +140,7 @@ class Objective:
         cascade, scenario = (
             apply(self.cascade, scenario, members.values) if members.values else (self.cascade, scenario)
         )
-        return cascade, scenario.louder(members.noise_factor).displaced(members.displaced)
+        return cascade, calmed(scenario.louder(members.noise_factor), members.quiet)
 
     def notched(self, x: np.ndarray, cascade: Cascade) -> Cascade:
         """Return a cascade with the notch designed for the gains at coordinates x [m], or for those at each x [S, m].
@@ -162,8 +163,8 @@ class Objective:
         cascade, scenario = apply(self.cascade, scenario, members.values)
         at = (x + members.shift).T if np.any(members.shift) else x  # [m] or [m, n]
         cascade = self.notched(x, self.space.decode(jnp.asarray(at), cascade))
-        if np.any(members.displaced):
-            scenario = scenario.displaced(members.displaced)
+        if np.any(members.quiet):
+            scenario = calmed(scenario, members.quiet)
         return cascade, scenario.louder(members.noise_factor) if np.any(members.noise_factor != 1) else scenario
 
     def run(self, x: Array, members: Members, fold: Any, *, in_parts: bool = False) -> Any:
