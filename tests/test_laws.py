@@ -225,8 +225,7 @@ def accepted(law):
     return "force" in getattr(law, "accepts", ("force",))
 
 
-# L: the jerk of FilterChain where the reference starts is 2e5 m/s^3
-FAST = [("inversion", inversion.Adaptive(gamma=1e6, p=2.0)), ("observer", observer.IRED2(L=3e5))]
+FAST = [("inversion", inversion.Adaptive(gamma=1e6, p=2.0)), ("observer", observer.IRED2(L=3e5))]  # jerk: 2e5 m/s^3
 LAWS_BY_STAGE = [
     list({type(law): law for s, law in [*LAWS[::-1], *FAST] if s == stage and accepted(law)}.values())[::-1]
     for stage in STAGES

@@ -33,7 +33,7 @@ position.kind = "super-twisting"
 inversion.kind = "closed-form"
 current.kind = "pi"
 """
-SLOW = {"regulation": pytest.mark.slow}
+SLOW = {"regulation": pytest.mark.slow}  # its first answers are held, but not stable
 SCALES = {
     "position": lambda plant: (
         plant.s_0 * (plant.mu_0 * plant.n**2 * plant.A * plant.i_0**2 / plant.s_0**3 / plant.m) ** 0.5
@@ -189,7 +189,6 @@ def report_of(out):
     return json.loads((out / "report.json").read_text())
 
 
-# the first answers for regulation hold the rotor, but not after the start of a quiet run
 @pytest.mark.parametrize("name", [pytest.param(x, marks=SLOW.get(x, pytest.mark.thorough)) for x in COMMON])
 def test_common_bearings_are_tuned_without_settings(name, tmp_path):
     out = tmp_path / "out"

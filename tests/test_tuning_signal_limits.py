@@ -31,7 +31,8 @@ inversion = { gamma = 7e11, p = 1e-8 }
 current = { k_i = 1100.0, p = 50.0 }
 [processor]
 """
-MOVED += SMALL_SEARCH + """
+MOVED += SMALL_SEARCH
+MOVED += """
 gains = ["controller.position.c"]
 bounds.controller.position.c = [100.0, 10000.0]
 members = 4
@@ -52,7 +53,8 @@ inversion = { kind = "closed-form" }
 current = { kind = "pi" }
 [processor]
 """
-TURNING += SMALL_SEARCH + """
+TURNING += SMALL_SEARCH
+TURNING += """
 gains = ["controller.position.k_d"]
 bounds.controller.position.k_d = [100.0, 1500.0]
 members = 2
