@@ -118,13 +118,16 @@ def test_a_quiet_run_has_no_load_and_the_compiled_program_of_its_case():
     }
     noisy = case_of(sensor={"std": 1e-6, "bits": 12}).scenario
     scenario = dataclasses.replace(noisy, rotor=amb.signals.Rotation(3000.0), **loads)
-    calm = quiet_run.quiet(scenario)
-    assert jax.tree.structure(calm) == jax.tree.structure(scenario)
-    assert not np.any(calm.sensor.noises)
-    np.testing.assert_array_equal(calm.reference.value, loads["reference"].value)
-    for t in (0.0, 0.05, 0.3):
-        assert scenario.turning().acceleration(t) != 0
-        assert calm.turning().acceleration(t) == 0
+    for calm in (quiet_run.quiet(scenario), quiet_run.calmed(scenario, 1.0)):
+        assert jax.tree.structure(calm) == jax.tree.structure(scenario)
+        assert not np.any(calm.sensor.noises)
+        assert abs(calm.initial.z - scenario.initial.z) == pytest.approx(0.01 * scenario.touchdown)
+        np.testing.assert_array_equal(calm.reference.value, loads["reference"].value)
+        for t in (0.0, 0.05, 0.3):
+            assert scenario.turning().acceleration(t) != 0
+            assert calm.turning().acceleration(t) == 0
+    unchanged = quiet_run.calmed(scenario, 0.0)
+    assert jax.tree.all(jax.tree.map(np.array_equal, unchanged, scenario))
 
 
 @pytest.mark.slow

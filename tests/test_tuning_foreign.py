@@ -185,15 +185,11 @@ def write(path, text, **tune):
     return path
 
 
-def report_of(out):
-    return json.loads((out / "report.json").read_text())
-
-
 @pytest.mark.parametrize("name", [pytest.param(x, marks=SLOW.get(x, pytest.mark.thorough)) for x in COMMON])
 def test_common_bearings_are_tuned_without_settings(name, tmp_path):
     out = tmp_path / "out"
     assert main([str(write(tmp_path / "case.toml", COMMON[name])), "--out", str(out), "--json"]) == 0
-    facts = report_of(out)
+    facts = json.loads((out / "report.json").read_text())
     assert facts["verified"] is True
     assert facts["after"]["lost"] == 0
     assert facts["step_error"]["tried"] == 8
